@@ -1,0 +1,1 @@
+"""The kernel's side: inodes, handles, options, pyfuse3 operations."""

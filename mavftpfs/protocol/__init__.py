@@ -1,0 +1,1 @@
+"""MAVLink FTP without I/O: codec, listings, client engine. Time and randomness are arguments."""

@@ -1,0 +1,129 @@
+"""The 251-byte body of FILE_TRANSFER_PROTOCOL (message 110). Layer: protocol; pure.
+
+Layout (MAVLink FTP guide, "Payload Format"): seq u16 LE, session, opcode, size, req_opcode,
+burst_complete, padding, offset u32 LE, then up to 239 bytes of data. Own enums, because pymavlink's
+dialects lack opcode 16.
+"""
+
+from __future__ import annotations
+
+import struct
+from enum import IntEnum
+from typing import NamedTuple
+
+from mavftpfs.shared.errors import LocalProtocolError, RemoteProtocolError
+
+PAYLOAD_SIZE = 251
+HEADER_SIZE = 12
+MAX_DATA = 239
+
+_HEADER = struct.Struct("<HBBBBBxI")
+_ZEROS = bytes(PAYLOAD_SIZE)
+
+
+class Opcode(IntEnum):
+    """Request opcodes 0..16 and the two reply opcodes."""
+
+    NONE = 0
+    TERMINATE_SESSION = 1
+    RESET_SESSIONS = 2
+    LIST_DIRECTORY = 3
+    OPEN_FILE_RO = 4
+    READ_FILE = 5
+    CREATE_FILE = 6
+    WRITE_FILE = 7
+    REMOVE_FILE = 8
+    CREATE_DIRECTORY = 9
+    REMOVE_DIRECTORY = 10
+    OPEN_FILE_WO = 11
+    TRUNCATE_FILE = 12
+    RENAME = 13
+    CALC_FILE_CRC32 = 14
+    BURST_READ_FILE = 15
+    LIST_DIRECTORY_WITH_TIME = 16
+    ACK = 128
+    NAK = 129
+
+
+class NakCode(IntEnum):
+    """First data byte of a NAK."""
+
+    NONE = 0
+    FAIL = 1
+    FAIL_ERRNO = 2
+    INVALID_DATA_SIZE = 3
+    INVALID_SESSION = 4
+    NO_SESSIONS_AVAILABLE = 5
+    EOF = 6
+    UNKNOWN_COMMAND = 7
+    FILE_EXISTS = 8
+    FILE_PROTECTED = 9
+    FILE_NOT_FOUND = 10
+
+
+class Payload(NamedTuple):
+    """A decoded payload.
+
+    `size` is the header field. In a reply `data` is exactly `size` bytes: what servers leave behind
+    it is stray memory (servers.md 2). In a decoded request `data` is the whole 239-byte field,
+    because old ArduPilot servers look past `size` (servers.md 13).
+    """
+
+    seq: int
+    session: int
+    opcode: int
+    size: int
+    req_opcode: int = 0
+    burst_complete: int = 0
+    offset: int = 0
+    data: bytes = b""
+
+    def encode(self) -> bytes:
+        """Return the 251 wire bytes, zero-filled behind the data.
+
+        Raises:
+            LocalProtocolError: a field does not fit.
+        """
+        data = self.data
+        if len(data) > MAX_DATA:
+            raise LocalProtocolError(f"{len(data)} bytes of data do not fit {MAX_DATA}")
+        try:
+            header = _HEADER.pack(*self[:7])
+        except struct.error as exc:
+            raise LocalProtocolError(f"payload field out of range: {exc}") from exc
+        return header + data + _ZEROS[HEADER_SIZE + len(data) :]
+
+
+def request(
+    seq: int, opcode: int, *, session: int = 0, offset: int = 0, data: bytes = b"", size: int | None = None
+) -> Payload:
+    """Build a request; `size` is len(data) unless given (ReadFile puts the wanted count there)."""
+    return Payload(seq, session, opcode, len(data) if size is None else size, 0, 0, offset, data)
+
+
+def decode_reply(wire: bytes) -> Payload:
+    """Decode a reply's 251 bytes.
+
+    Raises:
+        RemoteProtocolError: wrong length, or `size` over 239.
+    """
+    seq, session, opcode, size, req_opcode, burst_complete, offset = _unpack(wire)
+    if size > MAX_DATA:
+        raise RemoteProtocolError(f"reply says it holds {size} bytes of data, more than {MAX_DATA}")
+    data = wire[HEADER_SIZE : HEADER_SIZE + size]
+    return Payload(seq, session, opcode, size, req_opcode, burst_complete, offset, data)
+
+
+def decode_request(wire: bytes) -> Payload:
+    """Decode a request's 251 bytes, as a server does; `data` is all 239 bytes.
+
+    Raises:
+        RemoteProtocolError: wrong length. An oversize `size` is left for the server to refuse.
+    """
+    return Payload(*_unpack(wire), wire[HEADER_SIZE:])
+
+
+def _unpack(wire: bytes) -> tuple[int, int, int, int, int, int, int]:
+    if len(wire) != PAYLOAD_SIZE:
+        raise RemoteProtocolError(f"payload of {len(wire)} bytes, {PAYLOAD_SIZE} expected")
+    return _HEADER.unpack_from(wire)

@@ -1,0 +1,1 @@
+"""The one owner of the server session: pump, vehicle, scheduler, store."""

@@ -1,0 +1,84 @@
+"""The exception tree. Layer: shared; imports only the standard library.
+
+Every error that leaves a layer is one of these; `shared.errnos` turns them into the kernel's numbers.
+"""
+
+from __future__ import annotations
+
+
+class MavftpfsError(Exception):
+    """Base of every error this package raises on purpose; its text is one line for a person."""
+
+
+class UsageError(MavftpfsError):
+    """The caller asked for something that cannot be (bad option, bad SOURCE); exit code 1."""
+
+
+class LinkError(MavftpfsError):
+    """The pipe to the vehicle does not work."""
+
+
+class LinkClosed(LinkError):
+    """The transport could not be opened, or was closed for good."""
+
+
+class VehicleLost(LinkError):
+    """No heartbeat for a while and a request timed out: requests fail at once until a heartbeat returns."""
+
+
+class ProtocolError(MavftpfsError):
+    """A rule of the protocol was broken."""
+
+
+class LocalProtocolError(ProtocolError):
+    """By us: a bug, or a request that cannot be expressed (a path that is too long)."""
+
+
+class PathTooLong(LocalProtocolError):
+    """The path does not fit a request; refused before a byte is sent (servers cut it silently)."""
+
+
+class RemoteProtocolError(ProtocolError):
+    """By the peer: malformed bytes, or an answer that cannot be right."""
+
+
+class RequestTimeout(MavftpfsError):
+    """No answer, or no progress, within the deadline."""
+
+
+class FileChanged(MavftpfsError):
+    """The remote file is no longer the one that was opened (ESTALE)."""
+
+
+class DataUnproven(MavftpfsError):
+    """Bytes arrived but could not be proven to belong to the file; they are dropped (EIO)."""
+
+
+class SessionBusy(MavftpfsError):
+    """The server's session stayed taken by someone else (EBUSY)."""
+
+
+class Armed(MavftpfsError):
+    """The vehicle is armed (or was never heard), and what was asked is not done in flight."""
+
+
+class FtpNak(MavftpfsError):
+    """The server refused a request.
+
+    Attributes:
+        opcode: the request's opcode (0..16).
+        code: the NAK code as sent, 0..255 (`protocol.payload.NakCode` names 1..10).
+        server_errno: errno byte behind FailErrno, else None; the number is the *drone's* OS's.
+        retransmitted: the request was sent more than once, so the refusal may answer the second
+            execution of a request whose first one worked (servers.md 14.4: "maybe done").
+    """
+
+    def __init__(
+        self, opcode: int, code: int, server_errno: int | None = None, *, retransmitted: bool = False
+    ) -> None:
+        errno_text = "" if server_errno is None else f", errno {server_errno}"
+        super().__init__(f"the vehicle refused opcode {opcode} with NAK {code}{errno_text}")
+        self.opcode = opcode
+        self.code = code
+        self.server_errno = server_errno
+        self.retransmitted = retransmitted

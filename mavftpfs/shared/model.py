@@ -1,0 +1,93 @@
+"""Small frozen values: what a listing says, how a path is written. Layer: shared; pure.
+
+Paths are bytes, absolute in the *mount's* spelling: `/a/b`, `/@SYS/uarts.txt`; the root is `/`.
+`wire_path` gives the server's spelling: virtual trees have no leading slash (servers.md 11).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+from mavftpfs.shared.errors import LocalProtocolError, PathTooLong
+
+MAX_WIRE_PATH = 200
+"""Bytes of a path that fit every known server with room to spare (servers.md 14.33)."""
+
+ROOT = b"/"
+
+
+class EntryKind(Enum):
+    """What a directory entry is."""
+
+    FILE = "F"
+    DIRECTORY = "D"
+
+
+@dataclass(frozen=True, slots=True)
+class DirEntry:
+    """One listed name. size in bytes, None where the server sent none; mtime in seconds UTC or None."""
+
+    name: bytes
+    kind: EntryKind
+    size: int | None = None
+    mtime: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Listing:
+    """A whole directory, duplicates and unusable names removed.
+
+    took: seconds the sweep needed. complete: False when a cap ended it (absence then proves nothing).
+    hidden: how many names could not be shown.
+    """
+
+    entries: tuple[DirEntry, ...]
+    took: float
+    complete: bool = True
+    hidden: int = 0
+
+
+def join(parent: bytes, name: bytes) -> bytes:
+    """Return the path of `name` in the directory `parent`."""
+    return parent + name if parent.endswith(b"/") else parent + b"/" + name
+
+
+def split(path: bytes) -> tuple[bytes, bytes]:
+    """Return (parent, name) of an absolute path; the root gives (b"/", b"")."""
+    parent, _, name = path.rstrip(b"/").rpartition(b"/")
+    return (parent or ROOT, name)
+
+
+def normalise(path: bytes) -> bytes:
+    """Return the absolute path without empty and `.` parts.
+
+    Raises:
+        LocalProtocolError: `..` or a NUL occurs (servers do not jail paths, servers.md 13).
+    """
+    parts = [part for part in path.split(b"/") if part not in (b"", b".")]
+    if b".." in parts or b"\0" in path:
+        raise LocalProtocolError(f"path {path!r} may hold neither '..' nor NUL")
+    return b"/" + b"/".join(parts)
+
+
+def is_virtual(path: bytes) -> bool:
+    """Return whether the path lies in an `@` tree (servers.md 11: the prefix decides)."""
+    return path.startswith(b"/@")
+
+
+def wire_path(path: bytes) -> bytes:
+    """Return the server's spelling of a normalised path.
+
+    Raises:
+        PathTooLong: it does not fit (servers cut silently, servers.md 13).
+    """
+    wire = path[1:] if is_virtual(path) else path
+    if len(wire) > MAX_WIRE_PATH:
+        raise PathTooLong(f"path of {len(wire)} bytes is longer than the {MAX_WIRE_PATH} a vehicle takes")
+    return wire
+
+
+def usable_name(name: bytes) -> bool:
+    """Return whether a listed name may enter the tree (promise 10)."""
+    return bool(name) and name not in (b".", b"..") and b"/" not in name and b"\0" not in name
