@@ -1,0 +1,39 @@
+"""Order of the tiers, and hypothesis profiles. Fixtures of one tier live in that tier's own conftest."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+from hypothesis import HealthCheck, settings
+
+TIERS = ("unit", "property", "sim", "ops", "conformance", "mount")
+"""Lower tiers run first, so that the first failure is the one nearest to its cause."""
+
+TESTS = Path(__file__).parent
+
+settings.register_profile(
+    "default",
+    deadline=None,  # no assertion on wall time
+    derandomize=True,  # the same examples at every run: what fails here fails everywhere
+    suppress_health_check=[HealthCheck.too_slow],
+)
+settings.register_profile(
+    "soak", parent=settings.get_profile("default"), derandomize=False, max_examples=2000
+)
+settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "default"))
+
+
+def tier_of(path: Path) -> str:
+    """Return the directory below tests/ that a test file lies in."""
+    return path.relative_to(TESTS).parts[0]
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Sort by tier and mark the mount tier."""
+    for item in items:
+        if tier_of(item.path) == "mount":
+            item.add_marker(pytest.mark.mount)
+    rank = {tier: number for number, tier in enumerate(TIERS)}
+    items.sort(key=lambda item: rank.get(tier_of(item.path), len(TIERS)))
