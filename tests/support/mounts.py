@@ -1,0 +1,168 @@
+"""A mount in its own process, and commands run on it with a bound.
+
+A process that waits in a FUSE request cannot be killed, so a command that runs out of time is freed by
+aborting the connection; then the test fails.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+from tests.support.logs import assert_clean
+from tests.support.vehicles import Process
+
+MOUNT_TIMEOUT = 40.0
+COMMAND_TIMEOUT = 90.0
+END_TIMEOUT = 30.0
+
+
+def wait_until(what: str, condition: Callable[[], bool], timeout: float) -> None:
+    """Poll until `condition` holds; else fail, saying `what` was awaited."""
+    deadline = time.monotonic() + timeout
+    while not condition():
+        assert time.monotonic() < deadline, f"not within {timeout} s: {what}"
+        time.sleep(0.02)
+
+
+def mounted_at(path: Path) -> bool:
+    """Return whether something is mounted there, without touching it."""
+    escaped = re.sub(r"[\\\s]", lambda hit: f"\\{ord(hit[0]):03o}", str(path))
+    lines = Path("/proc/self/mounts").read_text().splitlines()
+    return any(line.split(" ")[1] == escaped for line in lines)
+
+
+def abort_mount(path: Path) -> None:
+    """Free whoever waits in the mount, and take it away; harmless if nothing is mounted."""
+    for command in (["umount", "-f"], ["umount", "-l"], ["fusermount3", "-uz"]):
+        if mounted_at(path):
+            subprocess.run([*command, str(path)], capture_output=True, timeout=20, check=False)
+
+
+class Mount:
+    """`python -m mavftpfs SOURCE MOUNTPOINT -f`, ended and judged by `finish`."""
+
+    def __init__(
+        self, source: str, path: Path, folder: Path, options: Sequence[str] = (), argv: Sequence[str] = ()
+    ) -> None:
+        self.source = source
+        self.path = path
+        self.folder = folder
+        self.options = options
+        self.extra = argv
+        self.allowed_log: tuple[str, ...] = ()
+        self.process: Process | None = None
+
+    def argv(self) -> list[str]:
+        """Return the command line."""
+        base = [sys.executable, "-W", "default", "-m", "mavftpfs", self.source, str(self.path), "-f"]
+        options = ["-o", ",".join(self.options)] if self.options else []
+        return [*base, *options, *self.extra]
+
+    def start(self) -> None:
+        """Start it and wait until it is mounted; a daemon that ends instead fails the test."""
+        process = self.process = Process("mount", self.argv(), self.folder)
+        wait_until(
+            f"{self.argv()} mounted", lambda: mounted_at(self.path) or not process.running, MOUNT_TIMEOUT
+        )
+        assert process.running, f"the mount ended with {process.popen.returncode}:\n{process.text()}"
+
+    def alive(self) -> Process:
+        """Return the process, which must run."""
+        assert self.process is not None
+        assert self.process.running, self.process.text()
+        return self.process
+
+    def run(
+        self,
+        *argv: str | Path,
+        timeout: float = COMMAND_TIMEOUT,
+        code: int | None = 0,
+        cwd: Path | None = None,
+    ) -> subprocess.CompletedProcess[str]:
+        """Run a command that may touch the mount. `code`: the exit code it must have, None for any."""
+        command = [str(part) for part in argv]
+        with self.started(*command, cwd=cwd) as child:
+            try:
+                out, err = child.communicate(timeout=timeout)
+            except subprocess.TimeoutExpired:
+                log = self.process.text() if self.process else ""
+                raise AssertionError(f"{command} hung for {timeout} s; the mount says\n{log}") from None
+        result = subprocess.CompletedProcess(command, child.returncode, out, err)
+        assert code is None or child.returncode == code, f"{command}: exit {child.returncode}\n{out}\n{err}"
+        return result
+
+    @contextmanager
+    def started(self, *argv: str | Path, cwd: Path | None = None) -> Iterator[subprocess.Popen[str]]:
+        """Run a command beside the test's own steps; if it still runs at the end it is freed and killed."""
+        child = subprocess.Popen(
+            [str(part) for part in argv],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            errors="surrogateescape",
+            cwd=cwd,
+            env={**os.environ, "LC_ALL": "C.UTF-8"},
+        )
+        try:
+            yield child
+        finally:
+            if child.poll() is None:
+                child.kill()
+                try:
+                    child.communicate(timeout=2)
+                except subprocess.TimeoutExpired:
+                    abort_mount(self.path)
+                    child.communicate(timeout=20)
+
+    def python(self, code: str, *args: str | Path, timeout: float = COMMAND_TIMEOUT) -> str:
+        """Run a Python snippet as its own process and return its stdout; it must exit 0."""
+        return self.run(sys.executable, "-c", code, *args, timeout=timeout).stdout
+
+    def errno_of(self, code: str, *args: str | Path, timeout: float = COMMAND_TIMEOUT) -> str:
+        """Return the name of the errno of the OSError that a snippet ends with, '' if it succeeds."""
+        wrapped = (
+            f"import errno, os, sys\ntry:\n    exec({code!r})\n"
+            "except OSError as error:\n    print(errno.errorcode[error.errno], end='')"
+        )
+        return self.python(wrapped, *args, timeout=timeout)
+
+    def unmount(self) -> int:
+        """Unmount as a user does and return the daemon's exit code."""
+        assert self.process is not None
+        if mounted_at(self.path):
+            subprocess.run(["fusermount3", "-u", str(self.path)], check=True, timeout=END_TIMEOUT)
+        return self.process.wait(END_TIMEOUT)
+
+    def end_by(self, number: signal.Signals) -> int:
+        """End the daemon by a signal and return its exit code."""
+        process = self.alive()
+        process.send_signal(number)
+        return process.wait(END_TIMEOUT)
+
+    def finish(self) -> None:
+        """Unmount if mounted; then the daemon must have ended with 0 and a clean log."""
+        process, self.process = self.process, None
+        if process is None:
+            return
+        try:
+            if mounted_at(self.path) and process.running:
+                subprocess.run(
+                    ["fusermount3", "-u", str(self.path)],
+                    check=False,
+                    timeout=END_TIMEOUT,
+                    capture_output=True,
+                )
+            code = process.wait(END_TIMEOUT)
+        finally:
+            abort_mount(self.path)
+        assert_clean("mount", process.text(), self.allowed_log)
+        assert code == 0, f"the mount ended with {code}:\n{process.text()}"

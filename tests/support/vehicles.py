@@ -1,0 +1,187 @@
+"""Vehicles as processes: the simulator with any profile, and the MAVSDK library's server, optionally behind
+the bad link of `proxy`. Each speaks UDP to a port on 127.0.0.1 where the mount listens, as a vehicle does.
+"""
+
+from __future__ import annotations
+
+import json
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Protocol
+
+from tests.support.logs import assert_clean
+
+HOST = "127.0.0.1"
+STOP_TIMEOUT = 20.0
+
+PROFILES = ("spec", "px4", "px4-nuttx", "ardupilot", "ardupilot5", "littlefs", "mavsdk")
+"""What `mavftpfs sim --profile` takes."""
+
+
+def free_udp_port() -> int:
+    """Return a UDP port of the loopback that nobody uses at the moment."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+        sock.bind((HOST, 0))
+        port: int = sock.getsockname()[1]
+        return port
+
+
+class Process:
+    """A child with its output in files; ended by its own pid, never by name."""
+
+    def __init__(self, name: str, argv: Sequence[str], folder: Path) -> None:
+        self.name = name
+        self.log = folder / f"{name}.log"
+        self.output = folder / f"{name}.out"
+        with self.log.open("ab") as log, self.output.open("ab") as output:
+            self.popen = subprocess.Popen(argv, stdin=subprocess.DEVNULL, stdout=output, stderr=log)
+
+    @property
+    def running(self) -> bool:
+        """Whether it has not ended yet."""
+        return self.popen.poll() is None
+
+    def send_signal(self, number: signal.Signals) -> None:
+        """Send a signal to a process that still runs."""
+        if self.running:
+            self.popen.send_signal(number)
+
+    def wait(self, timeout: float = STOP_TIMEOUT) -> int:
+        """Return the exit code; a process that does not end fails the test."""
+        try:
+            return self.popen.wait(timeout)
+        except subprocess.TimeoutExpired:
+            self.kill()
+            raise AssertionError(f"{self.name} did not end in {timeout} s\n{self.text()}") from None
+
+    def stop(self, number: signal.Signals = signal.SIGTERM) -> int:
+        """End it politely and return the exit code."""
+        self.send_signal(number)
+        return self.wait()
+
+    def kill(self) -> None:
+        """kill -9, and reap."""
+        self.send_signal(signal.SIGKILL)
+        self.popen.wait(STOP_TIMEOUT)
+
+    def text(self) -> str:
+        """Everything it wrote to stderr and stdout."""
+        return self.log.read_text(errors="replace") + self.output.read_text(errors="replace")
+
+
+class Vehicle(Protocol):
+    """Something that serves the directory `root` to a mount of `source`."""
+
+    root: Path
+
+    @property
+    def source(self) -> str:
+        """SOURCE for mavftpfs."""
+        ...
+
+    def start(self) -> None:
+        """Start, or start again after kill."""
+        ...
+
+    def kill(self) -> None:
+        """kill -9: the vehicle is gone without a word."""
+        ...
+
+    def finish(self) -> None:
+        """End it and fail if it logged anything suspicious or kept a session open."""
+        ...
+
+
+class UdpVehicle:
+    """What both kinds of vehicle share: a port of the mount, a process, perhaps a bad link between."""
+
+    name = "vehicle"
+    allowed_log: tuple[str, ...] = ()
+
+    def __init__(self, root: Path, folder: Path, *, bad_link: Sequence[str] = ()) -> None:
+        self.root = root
+        self.folder = folder
+        self.client_port = free_udp_port()
+        self.vehicle_port = free_udp_port() if bad_link else self.client_port
+        self.bad_link = bad_link
+        self.process: Process | None = None
+        self.proxy: Process | None = None
+
+    @property
+    def source(self) -> str:
+        return f"udpin:{HOST}:{self.client_port}"
+
+    def argv(self) -> list[str]:
+        """Return the command line of the vehicle."""
+        raise NotImplementedError
+
+    def start(self) -> None:
+        if self.bad_link and self.proxy is None:
+            ports = [str(self.vehicle_port), str(self.client_port)]
+            proxy = [sys.executable, "-m", "tests.support.proxy", *ports, *self.bad_link]
+            self.proxy = Process("proxy", proxy, self.folder)
+        self.process = Process(self.name, self.argv(), self.folder)
+
+    def kill(self) -> None:
+        if self.process is not None:
+            self.process.kill()
+            self.process = None
+
+    def finish(self) -> None:
+        """End vehicle and link, whatever state they are in, then judge what they logged."""
+        process, self.process = self.process, None
+        proxy, self.proxy = self.proxy, None
+        codes = [child.stop() for child in (process, proxy) if child is not None]
+        if process is not None:
+            assert_clean(process.name, process.text(), self.allowed_log)
+            self.check_end(process)
+        assert not any(codes), f"exit codes {codes} of {process and process.text()} {proxy and proxy.text()}"
+
+    def check_end(self, process: Process) -> None:
+        """Judge the vehicle's last words."""
+
+    def link_counts(self) -> dict[str, Any]:
+        """Stop the proxy and return what it did to the datagrams."""
+        assert self.proxy is not None
+        proxy, self.proxy = self.proxy, None
+        assert proxy.stop() == 0
+        counts: dict[str, Any] = json.loads(proxy.output.read_text())
+        return counts
+
+
+class MavsdkVehicle(UdpVehicle):
+    """The MAVSDK library's FtpServer."""
+
+    name = "mavsdk"
+    allowed_log = (r"\|Warn \||\|Error\|",)  # its own opinion of lost packets
+
+    def argv(self) -> list[str]:
+        url = f"udpout://{HOST}:{self.vehicle_port}"
+        return [sys.executable, "-m", "tests.support.mavsdk_server", str(self.root), url]
+
+
+class SimVehicle(UdpVehicle):
+    """`mavftpfs sim` with a profile; `options` are its further arguments (link model, seed)."""
+
+    def __init__(
+        self,
+        root: Path,
+        folder: Path,
+        profile: str,
+        options: Sequence[str] = (),
+        *,
+        bad_link: Sequence[str] = (),
+    ) -> None:
+        super().__init__(root, folder, bad_link=bad_link)
+        self.name = f"sim-{profile}"
+        self.profile = profile
+        self.options = options
+
+    def argv(self) -> list[str]:
+        link = f"udpout:{HOST}:{self.vehicle_port}"
+        base = [sys.executable, "-m", "mavftpfs", "sim", str(self.root)]
+        return [*base, "--profile", self.profile, "--link", link, *self.options]
