@@ -46,6 +46,30 @@ class RequestTimeout(MavftpfsError):
     """No answer, or no progress, within the deadline."""
 
 
+class NotFound(MavftpfsError):
+    """No such name, by a fresh and complete listing (ENOENT)."""
+
+
+class NotADirectory(MavftpfsError):
+    """A directory was needed and the path is a file, or runs through one (ENOTDIR)."""
+
+
+class IsADirectory(MavftpfsError):
+    """A file was needed and the path is a directory (EISDIR)."""
+
+
+class NotFound(MavftpfsError):
+    """The path does not exist on the vehicle, by a listing (ENOENT)."""
+
+
+class NotADirectory(MavftpfsError):
+    """A file stands where a directory is needed (ENOTDIR)."""
+
+
+class IsADirectory(MavftpfsError):
+    """A directory stands where a file is needed (EISDIR)."""
+
+
 class FileChanged(MavftpfsError):
     """The remote file is no longer the one that was opened (ESTALE)."""
 

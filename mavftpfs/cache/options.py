@@ -1,0 +1,54 @@
+"""What the caches are told by the mount's options. Layer: cache; pure."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+from mavftpfs.shared.errors import UsageError
+from mavftpfs.shared.model import ROOT, normalise
+
+KIB = 1024
+MIB = 1024 * KIB
+
+MIN_CACHE_SIZE = MIB
+"""Below this, a few of the kernel's read requests would not fit beside each other."""
+
+
+@dataclass(frozen=True, slots=True)
+class CacheOptions:
+    """Times in seconds, sizes in bytes.
+
+    root: the vehicle's directory that is the mount's `/`.
+    dir_timeout: how long a listing (and the proof that a cached file is the vehicle's) holds.
+    attr_timeout, negative_timeout: how long the kernel may keep attributes, and an absence.
+    cache_size: budget for file blocks; max_entries: directory entries remembered over all listings.
+    at_file_limit: largest `@` file that is read; at_cache_size: how much of such snapshots is kept.
+    at_stat_limit: an `@SYS` file listed as larger than this is not read to answer a stat.
+    probe_time: how long listing an `@` directory may spend on finding out which entries open.
+    op_deadline: a read ends when none of its bytes came for so long.
+
+    Raises:
+        UsageError: a value is out of range.
+    """
+
+    root: bytes = ROOT
+    dir_timeout: float = 20.0
+    attr_timeout: float = 1.0
+    negative_timeout: float = 2.0
+    cache_size: int = 64 * MIB
+    max_entries: int = 100_000
+    at_file_limit: int = 4 * MIB
+    at_cache_size: int = 4 * MIB
+    at_stat_limit: int = 128 * KIB
+    probe_time: float = 3.0
+    op_deadline: float = 30.0
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if not isinstance(value, bytes) and not value >= 0:
+                raise UsageError(f"{field.name} may not be negative")
+        if self.cache_size < MIN_CACHE_SIZE:
+            raise UsageError(f"cache_size may not be less than {MIN_CACHE_SIZE} bytes")
+        if normalise(self.root) != self.root:
+            raise UsageError(f"root {self.root!r} is not a plain absolute path")
