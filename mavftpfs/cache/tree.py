@@ -55,7 +55,7 @@ class OpenFile(Protocol):
 
 
 class Tree:
-    """The vehicle's files below `options.root`. Paths given and called back are the mount's: `/` is that root."""
+    """The vehicle's files below `options.root`, which is `/` in every path given and called back."""
 
     def __init__(
         self,

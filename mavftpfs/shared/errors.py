@@ -58,18 +58,6 @@ class IsADirectory(MavftpfsError):
     """A file was needed and the path is a directory (EISDIR)."""
 
 
-class NotFound(MavftpfsError):
-    """The path does not exist on the vehicle, by a listing (ENOENT)."""
-
-
-class NotADirectory(MavftpfsError):
-    """A file stands where a directory is needed (ENOTDIR)."""
-
-
-class IsADirectory(MavftpfsError):
-    """A directory stands where a file is needed (EISDIR)."""
-
-
 class FileChanged(MavftpfsError):
     """The remote file is no longer the one that was opened (ESTALE)."""
 
