@@ -1,0 +1,330 @@
+"""Bytes to MAVLink messages and back; the only importer of pymavlink. Layer: link; pure.
+
+Frame boundaries and CRCs are found here, the fields of the few messages that matter are decoded by
+pymavlink, and message 110 takes the short way through `fastframe`. pymavlink's own stream parser is
+not used: after a bad byte it may swallow the good frame behind it.
+
+Finding frames in a stream. A frame is believed when its CRC fits; the message's extra byte makes that a
+check of the message's layout too. When the CRC does not fit, or cannot be known because the dialect lacks
+the message, the byte behind the claimed end decides: if a frame begins there, the claimed frame is
+skipped whole (it was corrupted, or foreign), else its first byte was garbage and the search goes on one
+byte further. Skipping whole matters: the payload may be a piece of a recorded flight, whose old
+heartbeats must not be taken for live ones. The verdict depends on the bytes alone, never on how they
+were split. What waits for its rest is at most one frame.
+
+A datagram ends what it holds; a frame cut at its end is kept in case a serial bridge split it, and dropped
+when the next datagram begins with a frame of its own.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from pymavlink.dialects.v20 import ardupilotmega as dialect
+
+from mavftpfs.link.decoding import DECODERS
+from mavftpfs.link.fastframe import FTP_MESSAGE_ID, FTP_PAYLOAD_SIZE, FtpFrameCodec, frame_crc
+from mavftpfs.link.messages import MAV_AUTOPILOT_INVALID, Address, Message, Other
+from mavftpfs.link.signing import SIGNATURE_BLOCK, SignatureCheck
+from mavftpfs.shared.errors import LocalProtocolError
+
+MAV_CMD_REQUEST_MESSAGE = 512
+MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES = 520
+AUTOPILOT_VERSION_ID = 148
+STORAGE_INFORMATION_ID = 261
+
+_V2 = 0xFD
+_V1 = 0xFE
+_SIGNED = 1
+_HIGHEST_ID = 0xFFFF  # no public dialect goes beyond; keeps garbage from claiming 280 bytes
+_UNSIGNED_ALLOWED = (109, 166)  # the radios' own reports: a radio has no key
+_MAGIC = re.compile(b"[\xfd\xfe]")
+_CRC_EXTRA: dict[int, int] = {number: kind.crc_extra for number, kind in dialect.mavlink_map.items()}
+
+
+@dataclass(slots=True)
+class FramerStats:
+    """Plain sums. frames: all accepted; other: those of them that are `Other`; unreadable: whole and
+    valid, but their fields made no sense; bad_signature also counts unsigned frames refused."""
+
+    frames: int = 0
+    other: int = 0
+    bad_crc: int = 0
+    bad_signature: int = 0
+    unreadable: int = 0
+    garbage_bytes: int = 0
+
+
+class Framer:
+    """Both directions of one connection.
+
+    Args:
+        source: who we are in the frames we send.
+        stream: False if `feed` gets datagrams.
+        signing_key: 32 bytes; then all is sent signed, and unsigned or wrongly signed frames are refused.
+        signing_clock: now, in units of 10 µs since 2015-01-01; must not go back from one run to the next,
+            or the vehicle refuses us.
+
+    Raises:
+        UsageError: the key has another length.
+    """
+
+    def __init__(
+        self,
+        source: Address,
+        *,
+        stream: bool,
+        signing_key: bytes | None = None,
+        signing_clock: Callable[[], int] | None = None,
+    ) -> None:
+        self.stats = FramerStats()
+        self.on_frame: Callable[[bytes], None] | None = None
+        """Called with each accepted frame's bytes (for a .tlog); None costs nothing."""
+        self._stream = stream
+        self._tail = b""
+        self._codec = FtpFrameCodec(source, _CRC_EXTRA[FTP_MESSAGE_ID])
+        self._decoder = dialect.MAVLink(None)
+        self._sender = dialect.MAVLink(None, source.system, source.component)
+        self._check: SignatureCheck | None = None
+        if signing_key is not None:
+            self._check = SignatureCheck(signing_key, signing_clock)
+            self._sender.signing.secret_key = signing_key
+            self._sender.signing.sign_outgoing = True
+
+    @property
+    def source(self) -> Address:
+        """Who we are in the frames we send; may be changed."""
+        return Address(self._sender.srcSystem, self._sender.srcComponent)
+
+    @source.setter
+    def source(self, source: Address) -> None:
+        self._sender.srcSystem, self._sender.srcComponent = source
+        self._codec.source = source
+
+    # ------------------------------------------------------------------ receiving
+
+    def feed(self, data: bytes) -> list[Message]:
+        """Take a chunk of the stream, or a datagram, and return the messages it completed."""
+        if self._tail:
+            data = self._join(data)
+        out: list[Message] = []
+        position = self._scan(data, out)
+        self._tail = data[position:]
+        self.stats.frames += len(out)
+        return out
+
+    def reset(self) -> None:
+        """Forget a half-received frame: the stream was reopened."""
+        self.stats.garbage_bytes += len(self._tail)
+        self._tail = b""
+
+    def _join(self, data: bytes) -> bytes:
+        if not self._stream and data[:1] in (b"\xfd", b"\xfe"):
+            self.reset()
+        return self._tail + data
+
+    def _scan(self, data: bytes, out: list[Message]) -> int:
+        """Append the messages of `data` to `out`; return where an unfinished frame begins."""
+        position = 0
+        while True:
+            if self._check is None:
+                start, position = position, self._codec.decode_run(data, position, out)
+                if self.on_frame is not None:
+                    self._report_run(data, start, position)
+            if position >= len(data):
+                return position
+            after = self._step(data, position, out)
+            if after == position:
+                return position
+            position = after
+
+    def _report_run(self, data: bytes, start: int, stop: int) -> None:
+        while start < stop and self.on_frame is not None:
+            end = start + data[start + 1] + 12
+            self.on_frame(data[start:end])
+            start = end
+
+    def _step(self, data: bytes, position: int, out: list[Message]) -> int:
+        """Deal with what begins at `position`; return where to go on, the same if more is needed."""
+        magic = data[position]
+        if magic not in (_V1, _V2):
+            found = _MAGIC.search(data, position)
+            return self._skip(position, found.start() if found else len(data))
+        header = 10 if magic == _V2 else 6
+        if len(data) - position < header:
+            return position
+        signature = 0
+        if magic == _V2:
+            flags = data[position + 2]
+            message_id = int.from_bytes(data[position + 7 : position + 10], "little")
+            if flags & ~_SIGNED or message_id > _HIGHEST_ID:
+                return self._skip(position, position + 1)
+            signature = SIGNATURE_BLOCK if flags else 0
+        else:
+            message_id = data[position + 5]
+        stop = position + header + data[position + 1] + 2 + signature
+        if stop > len(data):
+            return position
+        return self._judge(data, position, stop, message_id, signature, out)
+
+    def _judge(
+        self, data: bytes, start: int, stop: int, message_id: int, signature: int, out: list[Message]
+    ) -> int:
+        frame = data[start:stop]
+        crc_at = len(frame) - signature - 2
+        extra = _CRC_EXTRA.get(message_id)
+        if extra is None or frame_crc(frame[1:crc_at], extra) != frame[crc_at] | frame[crc_at + 1] << 8:
+            if stop == len(data) and self._stream:
+                return start  # the byte behind decides
+            if stop < len(data) and data[stop] not in (_V1, _V2):
+                return self._skip(start, start + 1)
+            if extra is not None:
+                self.stats.bad_crc += 1
+                return stop
+        self._accept(frame, message_id, signature > 0, out)
+        return stop
+
+    def _skip(self, start: int, stop: int) -> int:
+        self.stats.garbage_bytes += stop - start
+        return stop
+
+    def _accept(self, frame: bytes, message_id: int, signed: bool, out: list[Message]) -> None:
+        at = 5 if frame[0] == _V2 else 3
+        source = Address(frame[at], frame[at + 1])
+        if not self._authentic(frame, message_id, signed, source):
+            self.stats.bad_signature += 1
+            return
+        decode = DECODERS.get(message_id)
+        if decode is None:
+            self.stats.other += 1
+            out.append(Other(source, message_id))
+        else:
+            try:
+                out.append(decode(source, self._decoder.decode(bytearray(frame))))
+            except (dialect.MAVError, AttributeError, TypeError, ValueError):
+                self.stats.unreadable += 1
+                return
+        if self.on_frame is not None:
+            self.on_frame(frame)
+
+    def _authentic(self, frame: bytes, message_id: int, signed: bool, source: Address) -> bool:
+        if self._check is None or message_id in _UNSIGNED_ALLOWED:
+            return True
+        return signed and self._check.accept(frame, source)
+
+    # ------------------------------------------------------------------ sending
+
+    def encode_ftp(self, target: Address, payload: bytes) -> bytes:
+        """Return a FILE_TRANSFER_PROTOCOL frame.
+
+        Raises:
+            LocalProtocolError: the payload is not 251 bytes.
+        """
+        if len(payload) != FTP_PAYLOAD_SIZE:
+            raise LocalProtocolError(f"FTP payload of {len(payload)} bytes, {FTP_PAYLOAD_SIZE} needed")
+        if self._check is not None:
+            return self._pack(
+                dialect.MAVLink_file_transfer_protocol_message(0, target[0], target[1], list(payload))
+            )
+        seq = self._sender.seq
+        self._sender.seq = (seq + 1) & 0xFF
+        return self._codec.encode(seq, target, payload)
+
+    def encode_heartbeat(
+        self,
+        vehicle_type: int,
+        autopilot: int = MAV_AUTOPILOT_INVALID,
+        base_mode: int = 0,
+        system_status: int = 4,
+    ) -> bytes:
+        """Return a HEARTBEAT frame (system_status 4: active)."""
+        return self._pack(
+            dialect.MAVLink_heartbeat_message(vehicle_type, autopilot, base_mode, 0, system_status, 3)
+        )
+
+    def encode_command(self, target: Address, command: int, params: Sequence[float] = ()) -> bytes:
+        """Return a COMMAND_LONG frame; missing params are 0."""
+        values = [*params, *([0.0] * (7 - len(params)))]
+        return self._pack(
+            dialect.MAVLink_command_long_message(target.system, target.component, command, 0, *values)
+        )
+
+    def encode_request_message(self, target: Address, message_id: int) -> bytes:
+        """Return MAV_CMD_REQUEST_MESSAGE for `message_id`."""
+        return self.encode_command(target, MAV_CMD_REQUEST_MESSAGE, (float(message_id),))
+
+    def encode_request_capabilities(self, target: Address) -> bytes:
+        """Return the older way to ask for AUTOPILOT_VERSION (ArduPilot before 4.1, PX4 before 1.13)."""
+        return self.encode_command(target, MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES, (1.0,))
+
+    # ------------------------------------------------------------------ the vehicle's side (simulator)
+
+    def encode_command_ack(self, command: int, result: int, target: Address) -> bytes:
+        """Return a COMMAND_ACK frame (result: MAV_RESULT)."""
+        return self._pack(dialect.MAVLink_command_ack_message(command, result, 0, 0, *target))
+
+    def encode_autopilot_version(
+        self, capabilities: int, flight_sw_version: int, git_hash: bytes, uid: int, uid2: bytes = bytes(18)
+    ) -> bytes:
+        """Return an AUTOPILOT_VERSION frame; git_hash: 8 bytes, uid2: 18 bytes."""
+        zeros = [0] * 8
+        return self._pack(
+            dialect.MAVLink_autopilot_version_message(
+                capabilities, flight_sw_version, 0, 0, 0, list(git_hash), zeros, zeros, 0, 0, uid, list(uid2)
+            )
+        )
+
+    def encode_storage_information(
+        self, time_boot_ms: int, total: float, used: float, *, storage_id: int = 1, status: int = 2
+    ) -> bytes:
+        """Return a STORAGE_INFORMATION frame; sizes in MiB, status 2: ready."""
+        return self._pack(
+            dialect.MAVLink_storage_information_message(
+                time_boot_ms, storage_id, 1, status, total, used, total - used, 0.0, 0.0
+            )
+        )
+
+    def encode_system_time(self, unix_usec: int, time_boot_ms: int) -> bytes:
+        """Return a SYSTEM_TIME frame."""
+        return self._pack(dialect.MAVLink_system_time_message(unix_usec, time_boot_ms))
+
+    def encode_radio_status(self, rssi: int, remrssi: int, txbuf: int, rxerrors: int = 0) -> bytes:
+        """Return a RADIO_STATUS frame; txbuf: free share of the transmit buffer in percent."""
+        return self._pack(dialect.MAVLink_radio_status_message(rssi, remrssi, txbuf, 20, 20, rxerrors, 0))
+
+    def encode_statustext(self, severity: int, text: str) -> bytes:
+        """Return a STATUSTEXT frame; text is cut to 50 bytes."""
+        return self._pack(dialect.MAVLink_statustext_message(severity, text.encode()[:50]))
+
+    def encode_telemetry(self, step: int, time_boot_ms: int) -> bytes:
+        """Return the next message of an autopilot's usual mix; `step` counts up."""
+        ms, us = time_boot_ms & 0xFFFFFFFF, time_boot_ms * 1000
+        match step % 5:
+            case 0:
+                message = dialect.MAVLink_attitude_message(ms, 0.1, 0.2, 0.3, 0.01, 0.02, 0.03)
+            case 1:
+                message = dialect.MAVLink_global_position_int_message(
+                    ms, 473977418, 85455938, 488000, 50000, 120, -30, 4, 9000
+                )
+            case 2:
+                message = dialect.MAVLink_vfr_hud_message(12.5, 12.0, 90, 55, 488.1, 0.4)
+            case 3:
+                message = dialect.MAVLink_sys_status_message(
+                    0x3FFFFF, 0x3FFFFF, 0x3FFFFF, 350, 15800, 1200, 80, 0, 0, 1, 1, 1, 1
+                )
+            case _:
+                message = dialect.MAVLink_highres_imu_message(
+                    us, 0.1, 0.2, -9.8, 0.01, 0.02, 0.03, 0.2, 0.01, 0.4, 958.0, 1.0, 488.0, 31.5, 0x1FFF
+                )
+        return self._pack(message)
+
+    def _pack(self, message: Any) -> bytes:
+        sender = self._sender
+        if self._check is not None:
+            sender.signing.timestamp = max(sender.signing.timestamp, self._check.now)
+        frame: bytes = message.pack(sender)
+        sender.seq = (sender.seq + 1) & 0xFF
+        return frame
