@@ -1,0 +1,95 @@
+"""File and directory handles, and what the operations need of the tree. Layer: fuse; pure."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Generic, Protocol, TypeVar
+
+from mavftpfs.shared.model import EntryKind
+
+
+class Stat(Protocol):
+    """What the tree says of one path. size in bytes, mtime in seconds UTC, valid_for in seconds."""
+
+    @property
+    def kind(self) -> EntryKind: ...
+    @property
+    def size(self) -> int: ...
+    @property
+    def mtime(self) -> int: ...
+    @property
+    def valid_for(self) -> float: ...
+
+
+class OpenFile(Protocol):
+    """A file open for reading, as cache.tree gives it."""
+
+    @property
+    def size(self) -> int: ...
+    @property
+    def direct_io(self) -> bool: ...
+    @property
+    def keep_cache(self) -> bool: ...
+    async def read(self, offset: int, size: int) -> bytes | memoryview: ...
+    def close(self) -> None: ...
+
+
+class FileTree(Protocol):
+    """The vehicle's files behind their caches (cache.tree.Tree); raises only MavftpfsError."""
+
+    async def stat(self, path: bytes) -> Stat: ...
+    def negative_valid_for(self, path: bytes) -> float: ...
+    async def list(self, path: bytes) -> Sequence[tuple[bytes, Stat]]: ...
+    async def open(self, path: bytes) -> OpenFile: ...
+    async def crc32(self, path: bytes) -> int: ...
+
+
+@dataclass(slots=True)
+class FileHandle:
+    """One open() of a file."""
+
+    ino: int
+    file: OpenFile
+
+
+@dataclass(slots=True)
+class DirectoryHandle:
+    """One opendir(). `entries` is the snapshot that its offsets count in: entry i has offset i + 1."""
+
+    ino: int
+    entries: Sequence[tuple[bytes, Stat]] = field(default_factory=list)
+
+
+HandleT = TypeVar("HandleT")
+
+
+class HandleTable(Generic[HandleT]):
+    """Numbers for open things; a number is never used twice in one mount."""
+
+    def __init__(self) -> None:
+        self._next = 1
+        self._handles: dict[int, HandleT] = {}
+
+    def __len__(self) -> int:
+        """Return how many are open."""
+        return len(self._handles)
+
+    def __iter__(self) -> Iterator[HandleT]:
+        """Yield what is open."""
+        return iter(list(self._handles.values()))
+
+    def add(self, handle: HandleT) -> int:
+        """Return a new number for `handle`."""
+        number = self._next
+        self._next += 1
+        self._handles[number] = handle
+        return number
+
+    def get(self, number: int) -> HandleT | None:
+        """Return what is open under a number, or None."""
+        return self._handles.get(number)
+
+    def remove(self, number: int) -> HandleT | None:
+        """Forget a number and return what was open under it, or None."""
+        return self._handles.pop(number, None)

@@ -1,0 +1,148 @@
+"""Inode numbers, paths and lookup counts. Layer: fuse; pure (no pyfuse3, no clock).
+
+The kernel knows a file by number and says with forget how many of our answers it dropped. A number
+is a hash of the path at the time it was given out, so it is the same after the kernel forgot it, and in
+the next mount too: git's index and incremental backups compare st_ino, and every doubt costs them a
+re-read over a radio. A number that is taken (a hash collision, or a file that was renamed or unlinked
+while the kernel knows it) is stepped over. `generation` is a counter, so that a (number, generation)
+pair never names two files.
+
+An inode lives while its lookup count is above zero; the root always does.
+
+# INVARIANT: every inode with a path is found under that path, and no two share one.
+# INVARIANT: counts are never negative; an inode with count zero exists only between reserve and
+#            count/discard, which no await may part (except the root).
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from mavftpfs.shared.model import ROOT
+
+ROOT_INO = 1
+_INO_MASK = (1 << 63) - 1
+"""Numbers stay positive in a signed 64-bit field, which some programs use."""
+
+
+@dataclass(slots=True)
+class Inode:
+    """One number the kernel may use. path is None once the name was removed."""
+
+    ino: int
+    generation: int
+    path: bytes | None
+    lookups: int = 0
+
+
+class InodeTable:
+    """All inodes of one mount."""
+
+    def __init__(self) -> None:
+        self._generation = 0
+        root = Inode(ROOT_INO, 0, ROOT)
+        self._by_ino: dict[int, Inode] = {ROOT_INO: root}
+        self._by_path: dict[bytes, Inode] = {ROOT: root}
+        self.excess_forgets = 0
+        """Forgets beyond the count: a bug here or in the kernel, never a crash."""
+
+    def __len__(self) -> int:
+        """Return how many inodes are alive, the root included."""
+        return len(self._by_ino)
+
+    def get(self, ino: int) -> Inode | None:
+        """Return the inode behind a number, or None."""
+        return self._by_ino.get(ino)
+
+    def known(self, path: bytes) -> int | None:
+        """Return the number the kernel knows this path by, or None."""
+        inode = self._by_path.get(path)
+        return None if inode is None else inode.ino
+
+    def reserve(self, path: bytes) -> Inode:
+        """Return the path's inode, made if need be, without counting a lookup."""
+        inode = self._by_path.get(path)
+        if inode is None:
+            self._generation += 1
+            inode = Inode(self._free_number(path), self._generation, path)
+            self._by_ino[inode.ino] = inode
+            self._by_path[path] = inode
+        return inode
+
+    def count(self, inode: Inode) -> None:
+        """Count one answer that told the kernel about this inode."""
+        inode.lookups += 1
+
+    def discard(self, inode: Inode) -> None:
+        """Drop a reserved inode that the kernel was not told about after all."""
+        if inode.lookups == 0:
+            self._free(inode)
+
+    def lookup(self, path: bytes) -> Inode:
+        """Reserve and count in one step."""
+        inode = self.reserve(path)
+        self.count(inode)
+        return inode
+
+    def forget(self, ino: int, lookups: int) -> None:
+        """Take back `lookups` answers; at zero the inode is freed. Never raises: nobody could be told."""
+        inode = self._by_ino.get(ino)
+        if inode is None:
+            self.excess_forgets += 0 if ino == ROOT_INO else 1
+            return
+        if lookups > inode.lookups and ino != ROOT_INO:
+            self.excess_forgets += 1  # the kernel holds one uncounted reference to the root
+        inode.lookups = max(0, inode.lookups - lookups)
+        if inode.lookups == 0:
+            self._free(inode)
+
+    def unlink(self, path: bytes) -> None:
+        """The name is gone; the kernel may still hold the inode (an open file)."""
+        inode = self._by_path.pop(path, None)
+        if inode is not None:
+            inode.path = None
+
+    def rename(self, old: bytes, new: bytes) -> None:
+        """Move a name and everything below it; what was at `new` becomes nameless."""
+        if old == new:
+            return
+        self.unlink(new)
+        for path in self._subtree(old):
+            inode = self._by_path.pop(path)
+            inode.path = new + path[len(old) :]
+            self._by_path[inode.path] = inode
+
+    def paths_below(self, path: bytes) -> Sequence[bytes]:
+        """Return the known paths at and below `path`, parents first."""
+        return sorted(self._subtree(path))
+
+    def check_invariants(self) -> None:
+        """Assert what the module's docstring promises (for tests)."""
+        assert self._by_ino[ROOT_INO].path == ROOT
+        for path, inode in self._by_path.items():
+            assert inode.path == path
+            assert self._by_ino[inode.ino] is inode
+        for ino, inode in self._by_ino.items():
+            assert inode.ino == ino
+            assert inode.lookups > 0 or ino == ROOT_INO
+            assert inode.path is None or self._by_path[inode.path] is inode
+
+    def _subtree(self, path: bytes) -> list[bytes]:
+        prefix = path if path.endswith(b"/") else path + b"/"
+        return [known for known in self._by_path if known == path or known.startswith(prefix)]
+
+    def _free_number(self, path: bytes) -> int:
+        digest = hashlib.blake2b(path, digest_size=8).digest()
+        number = int.from_bytes(digest, "little") & _INO_MASK
+        while number <= ROOT_INO or number in self._by_ino:
+            number = (number + 1) & _INO_MASK
+        return number
+
+    def _free(self, inode: Inode) -> None:
+        if inode.ino == ROOT_INO:
+            return
+        del self._by_ino[inode.ino]
+        if inode.path is not None:
+            del self._by_path[inode.path]

@@ -1,0 +1,356 @@
+"""Mount options: one table, parsed into a frozen value. Layer: fuse; pure.
+
+`-o` text may come from a person, /etc/fstab or mount(8), which adds words of its own (`rw,dev,suid`).
+Words that the kernel understands go to FUSE, words that only mount(8) and systemd need are ignored,
+and everything else that is not in the table is refused by name.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
+from typing import Any, TypeVar
+
+from mavftpfs.shared.errors import MavftpfsError, UsageError
+from mavftpfs.shared.model import ROOT, normalise
+
+SUBTYPE = "mavftp"
+"""The mount shows as type fuse.mavftp."""
+
+KERNEL_WORDS = frozenset(
+    {"dev", "nodev", "suid", "nosuid", "exec", "noexec", "atime", "noatime", "sync", "async", "dirsync"}
+)
+"""VFS words that libfuse takes."""
+
+_NO_MEANING = {
+    *("defaults", "diratime", "nodiratime", "relatime", "norelatime", "strictatime", "nostrictatime"),
+    *("lazytime", "nolazytime", "nodirsync"),
+}
+"""VFS words for access times, which are not kept; libfuse does not know them."""
+
+_FOR_OTHERS = {
+    *("auto", "noauto", "user", "nouser", "users", "nousers", "owner", "noowner", "group", "nogroup"),
+    *("_netdev", "nofail"),
+}
+"""Words for mount(8) and systemd."""
+
+IGNORED_WORDS = frozenset(_NO_MEANING | _FOR_OTHERS)
+IGNORED_PREFIXES = ("x-", "X-", "comment=", "user=")
+
+DEFAULT_LOCAL = (".*.sw?", "4913", ".~lock*", ".Trash-*", "._*")
+"""Names that editors and file managers make for themselves; they never reach the card."""
+
+_UNITS = {"": 1, "K": 1 << 10, "M": 1 << 20, "G": 1 << 30}
+_DAY = 86400.0
+
+
+@dataclass(frozen=True, slots=True)
+class MountOptions:
+    """Everything `-o` can say. Seconds, bytes, bytes/s; None = auto or not given."""
+
+    read_only: bool = False
+    allow_other: bool = False
+    auto_unmount: bool = False
+    uid: int | None = None
+    gid: int | None = None
+    umask: int | None = None
+    fmask: int | None = None
+    dmask: int | None = None
+    fsname: str | None = None
+    root: bytes = ROOT
+    target_system: int = 0
+    target_component: int = 0
+    source_system: int | None = None
+    source_component: int | None = None
+    heartbeat: str = "onboard"
+    baud: int | None = None
+    signing_key: str | None = None
+    dir_timeout: float = 20.0
+    attr_timeout: float = 1.0
+    negative_timeout: float = 2.0
+    cache_size: int = 64 << 20
+    cache_dir: str | None = None
+    dirty_max: int | None = None
+    spool_max: int = 1 << 30
+    rmw_max: int = 64 << 20
+    op_deadline: float = 30.0
+    connect_timeout: float = 30.0
+    read_mode: str = "auto"
+    chunk: int | None = None
+    window: int | None = None
+    bwlimit: int | None = None
+    verify: str = "auto"
+    verify_max: int = 4 << 20
+    when_armed: str = "ro"
+    force: bool = False
+    inplace: bool = False
+    local: tuple[str, ...] = DEFAULT_LOCAL
+    log_file: str | None = None
+    trace: str | None = None
+    tlog: str | None = None
+    kernel_words: tuple[str, ...] = ()
+
+    def file_mode(self, default_umask: int) -> int:
+        """Return the permission bits of files; write bits go where the mount is read-only."""
+        return self._bits(0o666, self.fmask, default_umask)
+
+    def directory_mode(self, default_umask: int) -> int:
+        """Return the permission bits of directories."""
+        return self._bits(0o777, self.dmask, default_umask)
+
+    def _bits(self, full: int, own_mask: int | None, default_umask: int) -> int:
+        mask = own_mask if own_mask is not None else self.umask
+        bits = full & ~(default_umask if mask is None else mask)
+        return bits & ~0o222 if self.read_only else bits
+
+
+Parser = Callable[[str], Any]
+
+
+def size(low: int, high: int, *, auto: bool = False) -> Parser:
+    """Return a parser of sizes: a number with K, M or G (powers of 1024), within [low, high]."""
+
+    def parse(text: str) -> int | None:
+        if auto and text == "auto":
+            return None
+        unit = text[-1:].upper()
+        digits = text[:-1] if unit in _UNITS and unit else text
+        value = _digits(digits) * _UNITS.get(unit, 1)
+        return _within(value, low, high)
+
+    return parse
+
+
+def number(low: int, high: int, *, auto: bool = False) -> Parser:
+    """Return a parser of whole numbers within [low, high]."""
+
+    def parse(text: str) -> int | None:
+        if auto and text == "auto":
+            return None
+        return _within(_digits(text), low, high)
+
+    return parse
+
+
+def seconds(low: float, high: float) -> Parser:
+    """Return a parser of seconds within [low, high]."""
+
+    def parse(text: str) -> float:
+        return _within(float(text), low, high)
+
+    return parse
+
+
+def choice(*words: str) -> Parser:
+    """Return a parser that takes one of `words`."""
+
+    def parse(text: str) -> str:
+        if text not in words:
+            raise ValueError(f"must be one of {', '.join(words)}")
+        return text
+
+    return parse
+
+
+def mask(text: str) -> int:
+    """Parse an octal permission mask."""
+    value = int(text, 8) if text.isdigit() else -1
+    return _within(value, 0, 0o777)
+
+
+def text_value(text: str) -> str:
+    """Take any text but none."""
+    if not text:
+        raise ValueError("must not be empty")
+    return text
+
+
+def remote_path(text: str) -> bytes:
+    """Parse a directory on the vehicle."""
+    return normalise(text_value(text).encode("utf-8", "surrogateescape"))
+
+
+def patterns(text: str) -> tuple[str, ...]:
+    """Parse colon-separated name patterns; none switches the feature off."""
+    return tuple(part for part in text.split(":") if part)
+
+
+_SIZE_MAX = 1 << 40
+
+VALUES: dict[str, Parser] = {
+    "uid": number(0, 2**32 - 2),
+    "gid": number(0, 2**32 - 2),
+    "umask": mask,
+    "fmask": mask,
+    "dmask": mask,
+    "fsname": text_value,
+    "root": remote_path,
+    "target_system": number(0, 255),
+    "target_component": number(0, 255),
+    "source_system": number(1, 255),
+    "source_component": number(1, 255),
+    "heartbeat": choice("onboard", "gcs", "none"),
+    "baud": number(300, 12_000_000),
+    "signing_key": text_value,
+    "dir_timeout": seconds(0, _DAY),
+    "attr_timeout": seconds(0, _DAY),
+    "negative_timeout": seconds(0, _DAY),
+    "cache_size": size(1 << 20, _SIZE_MAX),
+    "cache_dir": text_value,
+    "dirty_max": size(1 << 16, _SIZE_MAX, auto=True),
+    "spool_max": size(0, _SIZE_MAX),
+    "rmw_max": size(0, _SIZE_MAX),
+    "op_deadline": seconds(1, 3600),
+    "connect_timeout": seconds(1, 3600),
+    "read_mode": choice("auto", "burst", "window"),
+    "chunk": number(16, 239, auto=True),
+    "window": number(1, 256, auto=True),
+    "bwlimit": size(100, _SIZE_MAX),
+    "verify": choice("auto", "size", "crc", "none"),
+    "verify_max": size(0, _SIZE_MAX),
+    "when_armed": choice("ro", "ok"),
+    "local": patterns,
+    "log_file": text_value,
+    "trace": text_value,
+    "tlog": text_value,
+}
+"""Options with a value."""
+
+FLAGS: dict[str, tuple[str, bool]] = {
+    "ro": ("read_only", True),
+    "rw": ("read_only", False),
+    "allow_other": ("allow_other", True),
+    "auto_unmount": ("auto_unmount", True),
+    "force": ("force", True),
+    "inplace": ("inplace", True),
+    "default_permissions": ("", True),
+}
+"""Words without a value: the field and what it becomes; default_permissions is always on."""
+
+
+def parse_options(texts: Iterable[str]) -> MountOptions:
+    """Parse the values of all `-o`; what is said later wins.
+
+    Raises:
+        UsageError: an unknown option, a missing or bad value; the message names the option.
+    """
+    values: dict[str, Any] = {}
+    words: list[str] = []
+    for word in _words(texts):
+        _take(word, values, words)
+    return MountOptions(**values, kernel_words=tuple(words))
+
+
+def with_root(options: MountOptions, subtree: bytes) -> MountOptions:
+    """Return the options with the `#subtree` of SOURCE as root.
+
+    Raises:
+        UsageError: root= says it too.
+    """
+    if subtree == ROOT:
+        return options
+    if options.root != ROOT:
+        raise UsageError("give the remote directory either behind '#' or as root=, not both")
+    return replace(options, root=subtree)
+
+
+def fuse_words(options: MountOptions, source: str) -> set[str]:
+    """Return the options that go to FUSE's init."""
+    name = options.fsname or source
+    words = {f"fsname={_escape(name)}", f"subtype={SUBTYPE}", "default_permissions", *options.kernel_words}
+    words.add("ro" if options.read_only else "rw")
+    if options.allow_other:
+        words.add("allow_other")
+    if options.auto_unmount:
+        words.add("auto_unmount")
+    return words
+
+
+def option_names() -> list[str]:
+    """Return every option of the table, as written in help."""
+    flags = [name for name in FLAGS if name != "default_permissions"]
+    return flags + [f"{name}=" for name in VALUES]
+
+
+def _take(word: str, values: dict[str, Any], kernel_words: list[str]) -> None:
+    name, equals, value = word.partition("=")
+    if word in FLAGS:
+        field, becomes = FLAGS[word]
+        if field:
+            values[field] = becomes
+    elif word in KERNEL_WORDS:
+        _replace_word(word, kernel_words)
+    elif name in VALUES:
+        values[name] = _parse(name, value, given=bool(equals))
+    elif word not in IGNORED_WORDS and not word.startswith(IGNORED_PREFIXES):
+        raise UsageError(_refusal(name, word))
+
+
+def _refusal(name: str, word: str) -> str:
+    if name in FLAGS or name in KERNEL_WORDS or name in IGNORED_WORDS:
+        return f"option {name} takes no value"
+    if name == "max_read":
+        return "option max_read is not supported: the FUSE binding cannot start with it"
+    return f"unknown option {word!r}"
+
+
+def _replace_word(word: str, words: list[str]) -> None:
+    """Keep one of a word and its opposite: libfuse would apply both in the order of a set."""
+    opposite = {"sync": "async", "async": "sync"}.get(
+        word, word[2:] if word.startswith("no") else "no" + word
+    )
+    for stale in (word, opposite):
+        if stale in words:
+            words.remove(stale)
+    words.append(word)
+
+
+def _parse(name: str, value: str, *, given: bool) -> Any:
+    if not given:
+        raise UsageError(f"option {name} needs a value ({name}=...)")
+    try:
+        return VALUES[name](value)
+    except (ValueError, MavftpfsError) as exc:
+        raise UsageError(f"option {name}={value}: {exc}") from exc
+
+
+def _words(texts: Iterable[str]) -> Iterator[str]:
+    """Yield the words of comma-separated lists; a backslash protects a comma, as in mount(8)."""
+    for text in texts:
+        word = ""
+        characters = iter(text)
+        for character in characters:
+            if character == "\\":
+                word += next(characters, "\\")
+            elif character == ",":
+                yield from _nonempty(word)
+                word = ""
+            else:
+                word += character
+        yield from _nonempty(word)
+
+
+def _nonempty(word: str) -> Iterator[str]:
+    if word.strip():
+        yield word.strip()
+
+
+def _escape(name: str) -> str:
+    """Make a name fit for one ASCII option of a comma-separated list."""
+    ascii_name = name.encode("ascii", "backslashreplace").decode("ascii").replace("\n", " ")
+    return ascii_name.replace("\\", "\\\\").replace(",", "\\,")
+
+
+def _digits(text: str) -> int:
+    if not (text.isascii() and text.isdigit()):
+        raise ValueError("must be a whole number")
+    return int(text)
+
+
+NumberT = TypeVar("NumberT", int, float)
+
+
+def _within(value: NumberT, low: NumberT, high: NumberT) -> NumberT:
+    if not low <= value <= high:
+        raise ValueError(f"must be within {low} and {high}")
+    return value

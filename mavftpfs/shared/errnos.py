@@ -1,0 +1,135 @@
+"""The kernel's number for every error. Layer: shared; pure, one total table.
+
+A NAK means different things by request (servers.md 12 and 14.35): FileExists on a read from PX4 is a
+leftover of an older request, FileNotFound on a read from ArduPilot means that the session is gone. So
+the key is (opcode, NAK code), then the code alone, then EIO. Numbers behind FailErrno are the drone OS's
+and sometimes stale, so only those pass that make sense for the request.
+
+Opcodes and codes are plain numbers here because their enums live one layer up; a test holds them equal.
+"""
+
+from __future__ import annotations
+
+import errno
+
+from mavftpfs.shared import errors
+
+_LIST, _LIST_WITH_TIME, _OPEN_RO, _CREATE, _OPEN_WO = 3, 16, 4, 6, 11
+_REMOVE, _MKDIR, _RMDIR, _TRUNCATE, _RENAME, _CRC = 8, 9, 10, 12, 13, 14
+_TERMINATE, _READ, _WRITE, _BURST = 1, 5, 7, 15
+
+PATH_OPCODES = frozenset(
+    {_LIST, _LIST_WITH_TIME, _OPEN_RO, _CREATE, _OPEN_WO, _REMOVE, _MKDIR, _RMDIR, _TRUNCATE, _RENAME, _CRC}
+)
+"""Requests that carry a path: only for these can a NAK say something about a name."""
+
+_FAIL, _FAIL_ERRNO, _DATA_SIZE, _SESSION, _NO_SESSIONS, _EOF, _UNKNOWN = 1, 2, 3, 4, 5, 6, 7
+_EXISTS, _PROTECTED, _NOT_FOUND = 8, 9, 10
+
+_BY_CODE: dict[int, int] = {
+    _DATA_SIZE: errno.EINVAL,
+    _SESSION: errno.EBUSY,
+    _NO_SESSIONS: errno.EBUSY,
+    _UNKNOWN: errno.EOPNOTSUPP,
+    _PROTECTED: errno.EACCES,
+}
+
+_BY_REQUEST: dict[tuple[int, int], int] = {
+    **{(opcode, _DATA_SIZE): errno.ENAMETOOLONG for opcode in PATH_OPCODES},
+    **{(opcode, _NOT_FOUND): errno.ENOENT for opcode in PATH_OPCODES},
+    # Elsewhere FileExists is PX4's sticky EEXIST and says nothing (servers.md 12).
+    **{(opcode, _EXISTS): errno.EEXIST for opcode in (_CREATE, _MKDIR, _RENAME, _OPEN_WO)},
+    # ArduPilot without these opcodes answers plain Fail (servers.md 6 and 8).
+    (_TRUNCATE, _FAIL): errno.EOPNOTSUPP,
+    (_LIST_WITH_TIME, _FAIL): errno.EOPNOTSUPP,
+    # Not the caller's fault: our own request was wrong.
+    (_READ, _DATA_SIZE): errno.EIO,
+    (_BURST, _DATA_SIZE): errno.EIO,
+    (_WRITE, _DATA_SIZE): errno.EIO,
+}
+
+_SAME_ON_ALL = (
+    errno.EPERM,
+    errno.ENOENT,
+    errno.EIO,
+    errno.ENXIO,
+    errno.ENOMEM,
+    errno.EACCES,
+    errno.EBUSY,
+    errno.EEXIST,
+    errno.EXDEV,
+    errno.ENODEV,
+    errno.ENOTDIR,
+    errno.EISDIR,
+    errno.EINVAL,
+    errno.ENFILE,
+    errno.EMFILE,
+    errno.EFBIG,
+    errno.ENOSPC,
+    errno.EROFS,
+)
+"""Numbers up to 34 agree on Linux, NuttX and newlib (servers.md 12)."""
+
+_DRONE_ERRNO: dict[int, int] = {
+    **{number: number for number in _SAME_ON_ALL},
+    36: errno.ENAMETOOLONG,
+    38: errno.EOPNOTSUPP,  # ENOSYS; told as such, the kernel would never ask again
+    39: errno.ENOTEMPTY,
+    40: errno.ELOOP,
+    # newlib (ChibiOS, ESP32); on Linux these are socket errors, which no file request can mean
+    88: errno.EOPNOTSUPP,
+    90: errno.ENOTEMPTY,
+    91: errno.ENAMETOOLONG,
+    92: errno.ELOOP,
+    95: errno.EOPNOTSUPP,
+}
+
+_SESSION_ERRNO = frozenset({errno.EIO, errno.EFBIG, errno.ENOSPC, errno.EROFS, errno.ENXIO})
+"""What a request on an open file may say; a name cannot be missing or exist there, so others are stale."""
+
+_RMDIR_NOT_EMPTY = frozenset({errno.EEXIST, errno.EISDIR, errno.ENOTEMPTY})
+"""RemoveDirectory of a full directory: unlink's EISDIR shows on POSIX ArduPilot (servers.md 9)."""
+
+_BY_CLASS: dict[type[BaseException], int] = {
+    errors.MavftpfsError: errno.EIO,
+    errors.UsageError: errno.EINVAL,
+    errors.LinkError: errno.EIO,
+    errors.VehicleLost: errno.ETIMEDOUT,
+    errors.LocalProtocolError: errno.EINVAL,
+    errors.PathTooLong: errno.ENAMETOOLONG,
+    errors.RemoteProtocolError: errno.EIO,
+    errors.RequestTimeout: errno.ETIMEDOUT,
+    errors.NotFound: errno.ENOENT,
+    errors.NotADirectory: errno.ENOTDIR,
+    errors.IsADirectory: errno.EISDIR,
+    errors.FileChanged: errno.ESTALE,
+    errors.DataUnproven: errno.EIO,
+    errors.SessionBusy: errno.EBUSY,
+    errors.Armed: errno.EROFS,
+}
+
+
+def errno_for(error: BaseException) -> int:
+    """Return the errno a system call ends with; total: anything unknown is EIO."""
+    if isinstance(error, errors.FtpNak):
+        return _errno_of_nak(error.opcode, error.code, error.server_errno)
+    for cls in type(error).__mro__:
+        if cls in _BY_CLASS:
+            return _BY_CLASS[cls]
+    return errno.EIO
+
+
+def _errno_of_nak(opcode: int, code: int, server_errno: int | None) -> int:
+    if code == _FAIL_ERRNO:
+        return _errno_of_drone(opcode, server_errno)
+    specific = _BY_REQUEST.get((opcode, code))
+    return _BY_CODE.get(code, errno.EIO) if specific is None else specific
+
+
+def _errno_of_drone(opcode: int, server_errno: int | None) -> int:
+    number = _DRONE_ERRNO.get(server_errno or 0, errno.EIO)
+    if opcode == _RMDIR and number in _RMDIR_NOT_EMPTY:
+        return errno.ENOTEMPTY
+    if opcode not in PATH_OPCODES and number not in _SESSION_ERRNO:
+        return errno.EIO
+    return number
