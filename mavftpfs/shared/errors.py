@@ -66,6 +66,18 @@ class DataUnproven(MavftpfsError):
     """Bytes arrived but could not be proven to belong to the file; they are dropped (EIO)."""
 
 
+class SessionLost(MavftpfsError):
+    """The server's session is gone, or no longer to be believed: reopen and go on at the same offset.
+
+    Attributes:
+        by_server: an answer said so (else it is our own doubt, after a silence).
+    """
+
+    def __init__(self, reason: str, *, by_server: bool = False) -> None:
+        super().__init__(reason)
+        self.by_server = by_server
+
+
 class SessionBusy(MavftpfsError):
     """The server's session stayed taken by someone else (EBUSY)."""
 

@@ -1,0 +1,168 @@
+"""How many requests may be in flight. Layer: protocol; pure.
+
+Theory. A window of W answered requests per round trip is a rate; beyond what the path carries, more of
+them only wait in a queue, ours and everybody else's. So the window aims at what the path holds:
+bandwidth (the best recent rate of answers) times base round trip (the least one seen), a quarter more to
+find out when the path improves, and a few requests of slack. Random loss does not shrink it, because
+loss alone changes neither product; loss *with* a standing queue (the round's least round trip well over
+the base) is congestion, and brakes by a third at most once a round. A silent time-out round falls back
+to a probe of two. Start: double each round while the rate grows by a quarter.
+
+A round is the time until a request sent after the round's start is answered.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from math import inf
+
+INITIAL = 4
+DEFAULT_CAP = 1024
+SERIAL_CAP = 16
+
+_GAIN = 1.25
+_SLACK = 3
+_FAST_PATH_SECONDS = 0.010
+_FAST_PATH_WINDOW = 96
+_ROUNDS_REMEMBERED = 10
+_PLATEAU_ROUNDS = 3
+_BASE_LIFETIME = 30.0
+
+
+class Flow:
+    """The in-flight window, in requests. serial: small receive buffers are likely, so start at 1 and
+    grow by one. limit: the most that may ever be in flight, None for the default."""
+
+    __slots__ = (
+        "_app_limited",
+        "_base_at",
+        "_base_rtt",
+        "_best_rate",
+        "_brake",
+        "_cap",
+        "_collapsed",
+        "_losses",
+        "_plateau",
+        "_rates",
+        "_replies",
+        "_round_end",
+        "_round_least",
+        "_round_start",
+        "_serial",
+        "_starting",
+        "loss",
+        "window",
+    )
+
+    def __init__(self, *, serial: bool = False, limit: int | None = None) -> None:
+        self._serial = serial
+        self._cap = max(1, limit or (SERIAL_CAP if serial else DEFAULT_CAP))
+        self.window = min(1 if serial else INITIAL, self._cap)
+        self.loss = 0.0
+        self._starting = not serial
+        self._rates: deque[float] = deque(maxlen=_ROUNDS_REMEMBERED)
+        self._best_rate = 0.0
+        self._base_rtt = inf
+        self._base_at = 0.0
+        self._brake = 1.0
+        self._plateau = 0
+        self._collapsed = 0
+        self._round_end = -1
+        self._round_start = 0.0
+        self._round_least = inf
+        self._replies = 0
+        self._losses = 0
+        self._app_limited = False
+
+    @property
+    def cap(self) -> int:
+        """The most requests that may ever be in flight."""
+        return self._cap
+
+    def set_cap(self, cap: int) -> None:
+        """Never have more than `cap` in flight, for example because the server's queue is that short."""
+        self._cap = max(1, min(cap, self._cap))
+        self.window = min(self.window, self._cap)
+
+    def on_starved(self) -> None:
+        """There was room in the window and nothing to send: this round's rate says little."""
+        self._app_limited = True
+
+    def on_reply(self, now: float, rtt: float | None, order: int, next_order: int) -> None:
+        """A request was answered. order: of its transmission; next_order: what the next one will get."""
+        self._replies += 1
+        if rtt is not None and rtt < self._round_least:
+            self._round_least = rtt
+        if self._collapsed:
+            self.window, self._collapsed = self._collapsed, 0
+        if order >= self._round_end:
+            self._end_round(now, next_order)
+
+    def on_loss(self) -> None:
+        """A transmission is taken to be lost."""
+        self._losses += 1
+
+    def on_silence(self) -> None:
+        """Nothing at all was heard for a retransmission timeout: probe with two until something is."""
+        if not self._collapsed:
+            self._collapsed = max(1, self.window // 2)
+            self.window = min(2, self.window)
+
+    def _end_round(self, now: float, next_order: int) -> None:
+        if self._round_end >= 0:
+            self._learn(now)
+        self._round_end = next_order
+        self._round_start = now
+        self._round_least = inf
+        self._replies = self._losses = 0
+        self._app_limited = False
+
+    def _learn(self, now: float) -> None:
+        total = self._replies + self._losses
+        self.loss += (self._losses / total - self.loss) * 0.2
+        self._learn_base(now)
+        took = now - self._round_start
+        rate = self._replies / took if took > 0 else 0.0
+        if rate > self._best_rate or not self._app_limited:
+            self._rates.append(rate)
+        grown = rate > 1.25 * self._best_rate
+        self._best_rate = max(self._rates, default=0.0)
+        if self._app_limited:
+            return
+        self._learn_congestion()
+        if self._starting and not self._leaves_start(grown):
+            self.window = min(self._cap, self.window * 2)
+        else:
+            self._approach(self._target())
+
+    def _learn_base(self, now: float) -> None:
+        expired = now - self._base_at > _BASE_LIFETIME and self._round_least < inf
+        if self._round_least <= self._base_rtt or expired:
+            self._base_rtt = self._round_least
+            self._base_at = now
+
+    def _learn_congestion(self) -> None:
+        queued = self._round_least > 1.5 * self._base_rtt + 0.01
+        if self._losses and queued and self._round_least < inf:
+            self._brake = max(0.4, self._brake * 0.7)
+        else:
+            self._brake = min(1.0, self._brake * 1.05)
+
+    def _leaves_start(self, grown: bool) -> bool:
+        self._plateau = 0 if grown else self._plateau + 1
+        if self._plateau >= _PLATEAU_ROUNDS or self.window >= self._cap:
+            self._starting = False
+        return not self._starting
+
+    def _target(self) -> float:
+        rate, base = self._best_rate, self._base_rtt
+        if base == inf or rate == 0.0:
+            return INITIAL
+        held = _GAIN * rate * base / max(0.3, 1.0 - self.loss) + _SLACK
+        return self._brake * max(held, min(rate * _FAST_PATH_SECONDS, _FAST_PATH_WINDOW))
+
+    def _approach(self, target: float) -> None:
+        if self._serial:
+            step = self.window + 1 if not self._losses else self.window - 1
+            target = min(target, step)
+        self.window = max(1, min(self._cap, round(target)))

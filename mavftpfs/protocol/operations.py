@@ -1,0 +1,227 @@
+"""Operations that ask one thing at a time. Layer: protocol; pure."""
+
+from __future__ import annotations
+
+from mavftpfs.protocol.listing import parse_page
+from mavftpfs.protocol.payload import MAX_DATA, NakCode, Opcode, Payload
+from mavftpfs.protocol.requests import Operation, Priority, Request, manner_of, nak_of
+from mavftpfs.shared.errors import FtpNak, LocalProtocolError, PathTooLong
+from mavftpfs.shared.model import DirEntry
+
+__all__ = ["ListDirectory", "OpenFile", "Operation", "Priority", "Simple", "Terminate"]
+
+MAX_ENTRIES = 100_000
+MAX_PAGES = 60_000
+_MAX_STALE_PAGES = 32
+_MAX_EMPTY_PAGES = 4
+
+
+class Simple(Operation):
+    """One request, one reply.
+
+    Args:
+        session: the id to send; None sends the engine's, and asks again with the new one if it changed.
+        size: header field; None means len(data).
+        side_effect: repeat under the same seq first, because a second execution would be another act.
+        patience: seconds until RequestTimeout, None for the engine's deadline.
+
+    Attributes:
+        reply: the ACK, once done without error.
+        retransmitted: the request went out more than once, so a refusal may answer the second execution.
+
+    Raises:
+        PathTooLong: the data does not fit a request.
+    """
+
+    def __init__(
+        self,
+        opcode: int,
+        data: bytes = b"",
+        *,
+        offset: int = 0,
+        session: int | None = None,
+        size: int | None = None,
+        side_effect: bool | None = None,
+        patience: float | None = None,
+    ) -> None:
+        super().__init__()
+        if len(data) > MAX_DATA:
+            raise PathTooLong(f"{len(data)} bytes do not fit the {MAX_DATA} of a request")
+        self.patience = patience
+        self.opcode = opcode
+        self.retransmitted = False
+        manner = manner_of(opcode)
+        if side_effect is not None:
+            manner = manner._replace(same_seq=side_effect)
+        count = len(data) if size is None else size
+        self._request: Request | None = Request(
+            self, opcode, manner, session or 0, offset, count, data, follows=session is None
+        )
+        self._reply: Payload | None = None
+
+    @property
+    def reply(self) -> Payload:
+        """The ACK.
+
+        Raises:
+            LocalProtocolError: there is none (yet).
+        """
+        if self._reply is None:
+            raise LocalProtocolError("no reply yet")
+        return self._reply
+
+    def next_request(self, now: float) -> Request | None:
+        """Return the one request, once."""
+        request, self._request = self._request, None
+        return request
+
+    def on_reply(self, request: Request, reply: Payload, now: float) -> None:
+        """End with the ACK or the NAK."""
+        self.retransmitted = request.sends > 1
+        if reply.opcode == Opcode.NAK:
+            self.on_nak(nak_of(request, reply))
+        else:
+            self._reply = reply
+            self.on_ack(request, reply)
+            self.finish()
+
+    def on_ack(self, request: Request, reply: Payload) -> None:
+        """Take what the ACK says."""
+
+    def on_nak(self, nak: FtpNak) -> None:
+        """End with the refusal."""
+        self.fail(nak)
+
+
+class OpenFile(Simple):
+    """OpenFileRO, OpenFileWO or CreateFile. `sent` after a time-out: it may have been executed.
+
+    Attributes:
+        session: the id that the ACK carried, to be used from then on (servers.md 14.6).
+        size: as the ACK says, None where it says nothing (ArduPilot's CreateFile).
+    """
+
+    def __init__(self, opcode: int, path: bytes, session: int) -> None:
+        super().__init__(opcode, path, session=session)
+        self.session = session
+        self.size: int | None = None
+
+    def on_ack(self, request: Request, reply: Payload) -> None:
+        """Take session and size; learn whether the server echoes ids."""
+        self.session = reply.session
+        if len(reply.data) >= 4:
+            self.size = int.from_bytes(reply.data[:4], "little")
+        if request.session:
+            self.port.traits.learn_session_echo(reply.session == request.session)
+
+
+class Terminate(Simple):
+    """TerminateSession, whose ACK is what makes written data durable on some servers.
+
+    Attributes:
+        already_closed: the server knew no such session (NAK 4), which is no error here.
+    """
+
+    def __init__(self, session: int) -> None:
+        super().__init__(Opcode.TERMINATE_SESSION, session=session)
+        self.already_closed = False
+
+    def on_nak(self, nak: FtpNak) -> None:
+        """A session that is not there is closed."""
+        if nak.code == NakCode.INVALID_SESSION:
+            self.already_closed = True
+            self.finish()
+        else:
+            self.fail(nak)
+
+
+class ListDirectory(Operation):
+    """A sweep of a whole directory, page by page (servers.md 6, 14.28, 14.29).
+
+    Only for paths known to be directories: listing a file kills a MAVSDK server.
+
+    Attributes:
+        entries: what was listed, each name once, `.` and `..` left out.
+        complete: False when a cap ended the sweep: absence of a name then proves nothing.
+        hidden: names that cannot be shown (with a slash, a tab, or unparsable).
+    """
+
+    def __init__(self, path: bytes, with_time: bool = False) -> None:
+        super().__init__()
+        if len(path) > MAX_DATA:
+            raise PathTooLong(f"path of {len(path)} bytes does not fit the {MAX_DATA} of a request")
+        self.entries: list[DirEntry] = []
+        self.complete = True
+        self.hidden = 0
+        self._path = path
+        self._with_time = with_time
+        self._opcode = Opcode.LIST_DIRECTORY_WITH_TIME if with_time else Opcode.LIST_DIRECTORY
+        self._names: set[bytes] = set()
+        self._offset = 0
+        self._asked = False
+        self._pages = 0
+        self._stale_pages = 0
+        self._empty_pages = 0
+
+    def next_request(self, now: float) -> Request | None:
+        """Return the request for the next page, one at a time."""
+        if self._asked:
+            return None
+        self._asked = True
+        manner = manner_of(self._opcode)
+        size = len(self._path)
+        return Request(self, self._opcode, manner, 0, self._offset, size, self._path, follows=True)
+
+    def on_reply(self, request: Request, reply: Payload, now: float) -> None:
+        """Take a page, or find that there are no more."""
+        if reply.opcode == Opcode.NAK:
+            self._on_nak(nak_of(request, reply))
+            return
+        self._asked = False
+        self._pages += 1
+        page = parse_page(reply.data, with_time=self._with_time)
+        if page.strings == 0:
+            self._on_empty_page()
+            return
+        self._empty_pages = 0
+        self._offset += page.strings
+        self.hidden += page.hidden
+        self._take(page.entries)
+        if (
+            self._pages >= MAX_PAGES
+            or len(self.entries) >= MAX_ENTRIES
+            or self._stale_pages > _MAX_STALE_PAGES
+        ):
+            self._cut_short()
+
+    def _take(self, entries: list[DirEntry]) -> None:
+        fresh = [entry for entry in entries if entry.name not in self._names]
+        for entry in fresh:
+            # A page may name something twice, too.
+            if entry.name not in self._names:
+                self._names.add(entry.name)
+                self.entries.append(entry)
+        # MAVSDK repeats entries where it left some out; a server that ignores the offset never stops.
+        if entries and not fresh:
+            self._stale_pages += 1
+        elif fresh:
+            self._stale_pages = 0
+
+    def _on_nak(self, nak: FtpNak) -> None:
+        # PX4 says 8 for everything after one "file exists" (servers.md 12), the end included.
+        ended = nak.code == NakCode.EOF or (nak.code == NakCode.FILE_EXISTS and self._pages > 0)
+        if ended:
+            self.finish()
+        else:
+            self.fail(nak)
+
+    def _on_empty_page(self) -> None:
+        # Old PX4 ends so; newer ones when an entry fits no page, and offset + 1 gets past it.
+        self._empty_pages += 1
+        self._offset += 1
+        if self._empty_pages >= _MAX_EMPTY_PAGES:
+            self.finish()
+
+    def _cut_short(self) -> None:
+        self.complete = False
+        self.finish()

@@ -1,0 +1,244 @@
+"""One request on its way, and the manner in which each opcode is repeated. Layer: protocol; pure.
+
+A manner says what a lost answer may cost. Reads, writes and listings may be executed twice, so each
+transmission gets its own seq and can be told apart. Everything that changes the server goes out
+again under the *same* seq first, because PX4 and ArduPilot replay their last reply (servers.md 2).
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum
+from math import inf
+from struct import Struct
+from typing import NamedTuple, Protocol
+
+from mavftpfs.protocol.payload import HEADER_SIZE, MAX_DATA, PAYLOAD_SIZE, NakCode, Opcode, Payload
+from mavftpfs.shared.errors import FtpNak, LocalProtocolError, MavftpfsError
+from mavftpfs.shared.traits import Traits
+
+_pack_header = Struct("<HBBBBBxI").pack
+_ZEROS = bytes(PAYLOAD_SIZE)
+_EMPTY_TAIL = bytes(PAYLOAD_SIZE - HEADER_SIZE)
+
+
+class Manner(NamedTuple):
+    """How requests of one opcode are timed and repeated.
+
+    family: whose round trips are alike. same_seq: repeat under the same seq. ordered: servers answer
+    in order, so answers to later requests prove a loss. echoes_offset: an ACK carries the request's
+    offset. patient_after: from so many transmissions on, wait at least `patience` seconds (a slow
+    server executes every one of them, servers.md 14.38).
+    """
+
+    family: str
+    same_seq: bool
+    ordered: bool = False
+    echoes_offset: bool = False
+    patient_after: int = 1 << 30
+    patience: float = 0.0
+
+
+FLOORS = {"data": 0.03, "write": 0.05, "list": 0.25, "path": 0.2, "slow": 10.0}
+"""Least retransmission timeout of each family in seconds."""
+
+READ_MANNER = Manner("data", same_seq=False, ordered=True, echoes_offset=True)
+_WRITE = Manner("write", same_seq=False, ordered=True)
+_LIST = Manner("list", same_seq=False, ordered=True, patient_after=4, patience=2.5)
+_PATH = Manner("path", same_seq=True)
+_SLOW = Manner("slow", same_seq=True, patient_after=2, patience=20.0)
+
+_MANNERS = {
+    Opcode.READ_FILE: READ_MANNER,
+    Opcode.WRITE_FILE: _WRITE,
+    Opcode.LIST_DIRECTORY: _LIST,
+    Opcode.LIST_DIRECTORY_WITH_TIME: _LIST,
+    Opcode.TRUNCATE_FILE: _SLOW,
+    Opcode.CALC_FILE_CRC32: _SLOW,
+}
+
+
+def manner_of(opcode: int) -> Manner:
+    """Return how requests with `opcode` are repeated; unknown ones are taken to have side effects."""
+    return _MANNERS.get(opcode, _PATH)  # type: ignore[call-overload,no-any-return]
+
+
+class Request:
+    """What is asked, and what became of it so far. `follows` means: carries the engine's session."""
+
+    __slots__ = (
+        "aliases",
+        "answered",
+        "data",
+        "first_sent",
+        "flying",
+        "follows",
+        "fresh_seq",
+        "manner",
+        "offset",
+        "op",
+        "opcode",
+        "order",
+        "replays",
+        "sends",
+        "sent_at",
+        "seq",
+        "session",
+        "single",
+        "size",
+        "timer",
+    )
+
+    # Set by each transmission.
+    seq: int
+    order: int
+    sent_at: float
+    first_sent: float
+    timer: float
+
+    def __init__(
+        self,
+        op: Operation,
+        opcode: int,
+        manner: Manner,
+        session: int,
+        offset: int,
+        size: int,
+        data: bytes = b"",
+        follows: bool = False,
+    ) -> None:
+        self.op = op
+        self.opcode = opcode
+        self.manner = manner
+        self.session = session
+        self.offset = offset
+        self.size = size
+        self.data = data
+        self.follows = follows
+        self.aliases: list[int] | None = None
+        self.answered = False
+        self.flying = False
+        self.fresh_seq = False
+        self.sends = 0
+        self.replays = 0
+        self.single = True
+
+    def encode(self) -> bytes:
+        """Return the 251 wire bytes under the present seq.
+
+        Raises:
+            LocalProtocolError: a field does not fit; a bug of the caller.
+        """
+        data = self.data
+        header = _pack_header(self.seq, self.session, self.opcode, self.size, 0, 0, self.offset)
+        if not data:
+            return header + _EMPTY_TAIL
+        if len(data) > MAX_DATA:
+            raise LocalProtocolError(f"{len(data)} bytes of data do not fit {MAX_DATA}")
+        return header + data + _ZEROS[HEADER_SIZE + len(data) :]
+
+
+def nak_of(request: Request, reply: Payload) -> FtpNak:
+    """Return the error that a NAK stands for; one without data has code 0."""
+    data = reply.data
+    code = data[0] if data else NakCode.NONE
+    errno = data[1] if code == NakCode.FAIL_ERRNO and len(data) > 1 else None
+    return FtpNak(request.opcode, code, errno, retransmitted=request.sends > 1)
+
+
+class Priority(IntEnum):
+    """Who goes first when the window has room for one."""
+
+    METADATA = 0
+    DEMAND = 1
+    WRITE = 2
+    READAHEAD = 3
+
+
+class Port(Protocol):
+    """What an operation may know of the engine it runs in."""
+
+    session: int
+    traits: Traits
+
+    def round_trip(self, family: str) -> float:
+        """Return the present retransmission timeout of a family, in seconds."""
+        ...
+
+    def note(self, text: str) -> None:
+        """Tell the trace something; cheap when nobody listens."""
+        ...
+
+
+class Operation:
+    """A state machine which the engine asks for requests and tells of replies.
+
+    The engine sets `progress_at` (inf while nothing is wanted of the server) and fails the operation
+    with RequestTimeout when there was no progress for `patience` seconds (None: the engine's deadline).
+    `timer` is when `on_timer` wants to be called. An operation ends by `finish` or `fail`, once.
+    """
+
+    rank = Priority.METADATA
+
+    def __init__(self) -> None:
+        self.done = False
+        self.error: MavftpfsError | None = None
+        self.patience: float | None = None
+        self.started_at = 0.0
+        self.progress_at = inf
+        self.timer = inf
+        self.sent = False
+        self._port: Port | None = None
+
+    @property
+    def port(self) -> Port:
+        """The engine; only while started."""
+        if self._port is None:
+            raise LocalProtocolError("the operation was not started")
+        return self._port
+
+    @property
+    def priority(self) -> Priority:
+        """Who goes first."""
+        return self.rank
+
+    @property
+    def idle(self) -> bool:
+        """Whether nothing is wanted of the server, so that silence is no failure."""
+        return False
+
+    def attach(self, port: Port, now: float) -> None:
+        """Called by the engine when it takes the operation on."""
+        if self._port is not None:
+            raise LocalProtocolError("an operation runs once")
+        self._port = port
+        self.started_at = now
+
+    def next_request(self, now: float) -> Request | None:
+        """Return the next new request, or None if there is none for now."""
+        raise NotImplementedError
+
+    def on_reply(self, request: Request, reply: Payload, now: float) -> None:
+        """Take the believed ACK or NAK to `request`."""
+        raise NotImplementedError
+
+    def on_burst_sent(self, request: Request, now: float) -> None:
+        """A BurstReadFile of this operation went out under request.seq."""
+
+    def on_burst(self, reply: Payload, now: float) -> bool:
+        """Take a packet with req_opcode BurstReadFile; return False if it is not of the running burst."""
+        return False
+
+    def on_timer(self, now: float) -> None:
+        """`timer` has passed; set it anew."""
+        self.timer = inf
+
+    def finish(self) -> None:
+        """End well."""
+        self.done = True
+        self.timer = inf
+
+    def fail(self, error: MavftpfsError) -> None:
+        """End with an error; the first one counts."""
+        if not self.done:
+            self.error = error
+            self.finish()
