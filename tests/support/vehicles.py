@@ -16,10 +16,8 @@ from typing import Any, Protocol
 from tests.support.logs import assert_clean
 
 HOST = "127.0.0.1"
+PROJECT = Path(__file__).resolve().parents[2]
 STOP_TIMEOUT = 20.0
-
-PROFILES = ("spec", "px4", "px4-nuttx", "ardupilot", "ardupilot5", "littlefs", "mavsdk")
-"""What `mavftpfs sim --profile` takes."""
 
 
 def free_udp_port() -> int:
@@ -38,7 +36,9 @@ class Process:
         self.log = folder / f"{name}.log"
         self.output = folder / f"{name}.out"
         with self.log.open("ab") as log, self.output.open("ab") as output:
-            self.popen = subprocess.Popen(argv, stdin=subprocess.DEVNULL, stdout=output, stderr=log)
+            self.popen = subprocess.Popen(
+                argv, stdin=subprocess.DEVNULL, stdout=output, stderr=log, cwd=PROJECT
+            )
 
     @property
     def running(self) -> bool:
@@ -162,6 +162,18 @@ class MavsdkVehicle(UdpVehicle):
     def argv(self) -> list[str]:
         url = f"udpout://{HOST}:{self.vehicle_port}"
         return [sys.executable, "-m", "tests.support.mavsdk_server", str(self.root), url]
+
+
+class HostileVehicle(UdpVehicle):
+    """`tests.support.hostile` in one of its modes; it serves no directory."""
+
+    def __init__(self, folder: Path, mode: str) -> None:
+        super().__init__(folder, folder)
+        self.name = f"hostile-{mode}"
+        self.mode = mode
+
+    def argv(self) -> list[str]:
+        return [sys.executable, "-m", "tests.support.hostile", self.mode, str(self.vehicle_port)]
 
 
 class SimVehicle(UdpVehicle):

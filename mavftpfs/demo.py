@@ -1,0 +1,356 @@
+"""`mavftpfs demo`: a short tour with a simulated drone behind a bad radio. Layer: top, beside cli.
+
+It runs the same commands that a user would (`mavftpfs sim`, `mavftpfs SOURCE MOUNTPOINT`, ls, cat, cp, diff),
+each as its own process, in one temporary directory, and leaves nothing behind: no process, no mount, no file,
+also after Ctrl-C or an error. Exit code 0 only if every byte that arrived is the one on the vehicle's card.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import random
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.panel import Panel
+from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TransferSpeedColumn
+from rich.syntax import Syntax
+from rich.table import Table
+
+HOST = "127.0.0.1"
+PROFILE = "px4"
+RADIO = ("--rate", "40000", "--delay", "0.05", "--jitter", "0.01", "--loss", "0.08", "--seed", "1")
+RADIO_WORDS = "40 kB/s, 100 ms there and back, 8 of 100 packets lost in each direction"
+
+LOG_SIZE = 300_000
+STEP_TIMEOUT = 60.0
+"""Seconds after which any step of the tour counts as failed."""
+END_TIMEOUT = 15.0
+
+LOG = "fs/microsd/log/2026-11-20/10_32_15.ulg"
+SCRIPT = "fs/microsd/etc/extras.txt"
+SCRIPT_TEXT = """\
+# Run by the autopilot at every start
+mavlink start -d /dev/ttyS1 -b 57600
+camera_trigger start
+param set COM_DISARM_LAND 2
+"""
+
+
+class DemoFailed(Exception):
+    """The tour cannot go on; the text is one line for a person."""
+
+
+@dataclass
+class Tour:
+    """What the steps share. `proofs`: one entry for each comparison that was made."""
+
+    console: Console
+    folder: Path
+    proofs: list[bool] = field(default_factory=list)
+
+    @property
+    def card(self) -> Path:
+        """What lies on the vehicle's memory card."""
+        return self.folder / "card"
+
+    @property
+    def drone(self) -> Path:
+        """Where the vehicle is mounted."""
+        return self.folder / "drone"
+
+    def say(self, text: str) -> None:
+        """Explain."""
+        self.console.print(f"\n{text}")
+
+    def show_command(self, *words: str) -> None:
+        """Print a command as a user would type it in the temporary directory."""
+        self.console.print(f"[bold green]$[/] [bold]{' '.join(words)}[/]", highlight=False)
+
+    def command(self, *words: str) -> str:
+        """Show and run a command in the temporary directory, and show and return its output."""
+        self.show_command(*words)
+        with running(words, self.folder) as child:
+            try:
+                output, errors = child.communicate(timeout=STEP_TIMEOUT)
+            except subprocess.TimeoutExpired:
+                raise DemoFailed(f"{words[0]} did not end within {STEP_TIMEOUT:.0f} s") from None
+        text = output.decode(errors="replace") + errors.decode(errors="replace")
+        self.console.print(text.rstrip() or "[dim](no output)[/]", highlight=False, markup=not text.strip())
+        if child.returncode:
+            raise DemoFailed(f"{words[0]} ended with {child.returncode}")
+        return text
+
+    def prove(self, holds: bool) -> None:
+        """Record a comparison."""
+        self.proofs.append(holds)
+
+
+@contextmanager
+def running(words: Sequence[str], folder: Path) -> Iterator[subprocess.Popen[bytes]]:
+    """Run a command that may read the mount; it is killed at the end.
+
+    It is not waited for long: a reader inside a mount ends only when the mount answers, and ending the mount
+    is another step's business.
+    """
+    child = subprocess.Popen(
+        words, cwd=folder, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    )
+    try:
+        yield child
+    finally:
+        if child.poll() is None:
+            child.kill()
+            with suppress(subprocess.TimeoutExpired):
+                child.wait(1)
+
+
+@contextmanager
+def daemon(name: str, arguments: Sequence[str], folder: Path) -> Iterator[subprocess.Popen[bytes]]:
+    """Run `mavftpfs ARGUMENTS` beside the tour; end it with SIGTERM, in the end with SIGKILL.
+
+    It gets a session of its own, so that Ctrl-C reaches only the tour, which then ends things in order.
+    """
+    with (folder / f"{name}.log").open("wb") as log:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "mavftpfs", *arguments],
+            stdin=subprocess.DEVNULL,
+            stdout=log,
+            stderr=log,
+            start_new_session=True,
+        )
+    try:
+        yield process
+    finally:
+        end(process)
+
+
+def end(process: subprocess.Popen[bytes]) -> None:
+    """End a daemon, gently first."""
+    if process.poll() is None:
+        process.terminate()
+        try:
+            process.wait(END_TIMEOUT)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait(END_TIMEOUT)
+
+
+def ignore_interrupts() -> None:
+    """Let no further Ctrl-C stop the cleaning up half-way."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def last_words(folder: Path, name: str) -> str:
+    """Return the last line that a daemon logged."""
+    lines = (folder / f"{name}.log").read_text(errors="replace").split("\n")
+    return next((line for line in reversed(lines) if line.strip()), "it said nothing")
+
+
+def free_port() -> int:
+    """Return a UDP port of the loopback that is free at the moment."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+        sock.bind((HOST, 0))
+        port: int = sock.getsockname()[1]
+        return port
+
+
+def fill_card(card: Path) -> None:
+    """Write what the vehicle has: two flight logs, a start script, a note."""
+    rng = random.Random(1)
+    (card / LOG).parent.mkdir(parents=True)
+    (card / SCRIPT).parent.mkdir(parents=True)
+    (card / LOG).write_bytes(b"ULog\x01\x12\x35\x01" + rng.randbytes(LOG_SIZE - 8))
+    (card / LOG).with_name("10_21_03.ulg").write_bytes(rng.randbytes(18_251))
+    (card / SCRIPT).write_text(SCRIPT_TEXT)
+    for path in card.rglob("*"):
+        os.utime(path, (1795170735, 1795170735))
+
+
+def is_mounted(path: Path) -> bool:
+    """Return whether something is mounted there, without asking it."""
+    return f" {path} " in Path("/proc/self/mounts").read_text()
+
+
+def introduce(tour: Tour) -> None:
+    """Say what this is about."""
+    tour.console.print(
+        Panel(
+            "A drone keeps its flight logs, scripts and settings on a memory card. Over the air the only way "
+            "to them is a request-and-answer protocol (MAVLink FTP): 239 bytes at a time, over whatever "
+            "radio there is. [bold]mavftpfs makes the drone a directory[/], so that every program you know "
+            "can work with it.\n\n"
+            f"This tour simulates a drone behind a bad radio ({RADIO_WORDS}), mounts it, reads it, "
+            "and checks every byte. It needs no hardware and leaves nothing behind.",
+            title="mavftpfs",
+            border_style="cyan",
+        )
+    )
+
+
+def mount(tour: Tour, stack: ExitStack) -> None:
+    """Start the vehicle and mount it."""
+    port = free_port()
+    link = f"udpout:{HOST}:{port}"
+    vehicle = ["sim", str(tour.card), "--profile", PROFILE, "--link", link, *RADIO]
+    stack.enter_context(daemon("vehicle", vehicle, tour.folder))
+    tour.say("The drone is switched on. Now we mount it, over UDP, as a telemetry radio would hand it to us:")
+    source = f"udpin:{HOST}:{port}"
+    tour.show_command("mavftpfs", source, "drone")
+    process = stack.enter_context(daemon("mount", [source, str(tour.drone), "-f"], tour.folder))
+    deadline = time.monotonic() + STEP_TIMEOUT
+    while not is_mounted(tour.drone):
+        if process.poll() is not None or time.monotonic() > deadline:
+            raise DemoFailed(f"the drone could not be mounted: {last_words(tour.folder, 'mount')}")
+        time.sleep(0.05)
+    stack.callback(release, tour.drone)
+
+
+def release(path: Path) -> None:
+    """Take the mount away if the daemon could not."""
+    if is_mounted(path):
+        subprocess.run(
+            ["fusermount3", "-uz", str(path)], capture_output=True, timeout=END_TIMEOUT, check=False
+        )
+
+
+def look_around(tour: Tour) -> None:
+    """ls and cat."""
+    tour.say("It looks like any other directory:")
+    tour.command("ls", "-l", f"drone/{Path(LOG).parent}")
+    tour.say("Reading a file needs nothing special either:")
+    text = tour.command("cat", f"drone/{SCRIPT}")
+    tour.prove(text == SCRIPT_TEXT)
+
+
+def copy_log(tour: Tour) -> None:
+    """cp a log with a progress bar, then compare checksums."""
+    tour.say(
+        "Copying a flight log over the bad radio. Lost packets are asked for again while the rest flows:"
+    )
+    words = ("cp", f"drone/{LOG}", "flight.ulg")
+    tour.show_command(*words)
+    copy = tour.folder / "flight.ulg"
+    start = time.monotonic()
+    columns = (TextColumn("  flight.ulg"), BarColumn(), DownloadColumn(), TransferSpeedColumn())
+    with Progress(*columns, console=tour.console) as progress, running(words, tour.folder) as child:
+        bar = progress.add_task("", total=LOG_SIZE)
+        while child.poll() is None and time.monotonic() < start + STEP_TIMEOUT:
+            progress.update(bar, completed=copy.stat().st_size if copy.exists() else 0)
+            time.sleep(0.1)
+        progress.update(bar, completed=copy.stat().st_size if copy.exists() else 0)
+    if child.returncode != 0:
+        raise DemoFailed(f"cp ended with {child.returncode}")
+    compare_checksums(tour, copy)
+
+
+def compare_checksums(tour: Tour, copy: Path) -> None:
+    """Show the SHA-256 of what the card holds and of what arrived."""
+    there = hashlib.sha256((tour.card / LOG).read_bytes()).hexdigest()
+    here = hashlib.sha256(copy.read_bytes()).hexdigest()
+    table = Table(title="SHA-256", title_justify="left")
+    table.add_column("where")
+    table.add_column("checksum")
+    table.add_row("on the drone's card", there)
+    table.add_row("what arrived here", here)
+    tour.console.print(table)
+    same = there == here
+    tour.prove(same)
+    tour.console.print("[bold green]The same, byte for byte.[/]" if same else "[bold red]They differ.[/]")
+
+
+def show_link(tour: Tour) -> None:
+    """Say what the link did meanwhile, by the mount's own account."""
+    words = [sys.executable, "-m", "mavftpfs", "status", str(tour.drone), "--json"]
+    result = subprocess.run(words, capture_output=True, timeout=STEP_TIMEOUT, check=False)
+    if result.returncode:
+        raise DemoFailed(f"status ended with {result.returncode}: {result.stderr.decode().strip()}")
+    status: dict[str, Any] = json.loads(result.stdout)
+    tour.say("What happened on the radio meanwhile ([bold]mavftpfs status drone[/]):")
+    tour.console.print(Syntax(json.dumps(status, indent=2), "json"))
+
+
+def compare_all(tour: Tour) -> None:
+    """diff the whole mount with the card."""
+    tour.say("And the whole drone compared with what is on its card (silence means: no difference):")
+    output = tour.command("diff", "-r", "card", "drone")
+    tour.prove(output == "")
+
+
+def conclude(tour: Tour) -> int:
+    """Give the verdict and the way to a real vehicle; return the exit code."""
+    good = len(tour.proofs) == 3 and all(tour.proofs)
+    verdict = (
+        "[bold green]Every byte was right.[/]" if good else "[bold red]Something differed: this is a bug.[/]"
+    )
+    tour.console.print(
+        Panel(
+            f"{verdict} The drone is unmounted and everything is cleaned up.\n\n"
+            "With a real one:\n"
+            "  mavftpfs udpin:0.0.0.0:14550 ~/drone        [dim]# telemetry over Wi-Fi or from a router[/]\n"
+            "  mavftpfs /dev/ttyACM0 ~/drone               [dim]# USB cable[/]\n"
+            "  mavftpfs /dev/ttyUSB0,57600 ~/drone         [dim]# telemetry radio[/]",
+            border_style="green" if good else "red",
+        ),
+        highlight=False,
+    )
+    return 0 if good else 1
+
+
+def take_tour(tour: Tour) -> None:
+    """Go through all steps and end everything that was started."""
+    with ExitStack() as stack:
+        try:
+            mount(tour, stack)
+            look_around(tour)
+            copy_log(tour)
+            show_link(tour)
+            compare_all(tour)
+            tour.say("Done. Unmounting:")
+            tour.show_command("fusermount3", "-u", "drone")
+        finally:
+            ignore_interrupts()
+
+
+def remove(folder: Path) -> None:
+    """Delete the temporary directory; never what is still mounted in it."""
+    release(folder / "drone")
+    if not is_mounted(folder / "drone"):
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def run() -> int:
+    """Run the demo and return its exit code: 0 only if all comparisons held."""
+    console = Console()
+    tour = Tour(console, Path(tempfile.mkdtemp(prefix="mavftpfs-demo-")))
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.default_int_handler)
+    try:
+        tour.card.mkdir()
+        tour.drone.mkdir()
+        fill_card(tour.card)
+        introduce(tour)
+        take_tour(tour)
+        return conclude(tour)
+    except DemoFailed as error:
+        console.print(f"[red]mavftpfs demo: {error}[/]", highlight=False)
+        return 1
+    except KeyboardInterrupt:
+        console.print("\nStopped; everything is cleaned up.")
+        return 130
+    finally:
+        ignore_interrupts()
+        remove(tour.folder)

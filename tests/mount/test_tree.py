@@ -1,0 +1,178 @@
+"""A whole tree through a real mount, from every simulated profile and from the MAVSDK library's own server.
+
+Each vehicle is mounted once for all tests of this module. Every tool runs as its own process.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from mavftpfs.sim.profiles import PROFILES
+from tests.mount.conftest import Field
+from tests.support.mounts import Mount
+from tests.support.trees import AWKWARD_SIZES, MANY
+from tests.support.vehicles import UdpVehicle
+
+BAD_LINK = ("--seed", "7", "--loss", "0.05", "--dup", "0.02", "--reorder", "0.02", "--corrupt", "0.01")
+VEHICLES = (*PROFILES, "mavsdk-server", "mavsdk-server-bad-link")
+
+DD_STEPS = ((1, 100, 37), (238, 5, 3), (241, 7, 11), (4097, 3, 2), (65537, 2, 1))
+"""(block size, skip, count): none is a multiple of a chunk or a page."""
+
+
+@dataclass
+class Scene:
+    """A vehicle's directory, and the mount that shows it."""
+
+    expected: Path
+    mount: Mount
+    vehicle: UdpVehicle
+
+    @property
+    def path(self) -> Path:
+        """The mountpoint."""
+        return self.mount.path
+
+
+@pytest.fixture(scope="module", params=VEHICLES)
+def scene(request: pytest.FixtureRequest, module_field: Field, tree: Path) -> Scene:
+    """The reference tree, mounted from the vehicle that the parameter names."""
+    kind: str = request.param
+    vehicle: UdpVehicle
+    if kind.startswith("mavsdk-server"):
+        vehicle = module_field.mavsdk(tree, BAD_LINK if kind.endswith("bad-link") else ())
+    else:
+        vehicle = module_field.sim(tree, kind)
+    return Scene(tree, module_field.mount(vehicle.source), vehicle)
+
+
+def bytes_of(*argv: str | Path) -> bytes:
+    """Return what a command prints of a local file."""
+    return subprocess.run([str(a) for a in argv], check=True, capture_output=True, timeout=30).stdout
+
+
+def local_copy_differs(expected: Path, actual: Path) -> str:
+    """Return the differences of two local trees."""
+    argv = ["diff", "-r", "--no-dereference", str(expected), str(actual)]
+    return subprocess.run(
+        argv, capture_output=True, text=True, errors="replace", timeout=60, check=False
+    ).stdout
+
+
+def test_walk_finds_the_same_names_sizes_and_bytes(scene: Scene) -> None:
+    command = (sys.executable, "-m", "tests.support.trees", "compare", scene.expected, scene.path)
+    scene.mount.run(*command, timeout=240)
+
+
+def test_diff_r_finds_nothing(scene: Scene) -> None:
+    result = scene.mount.run("diff", "-r", "-x", "@*", scene.expected, scene.path, timeout=240)
+    assert result.stdout == ""
+
+
+def test_cp_r_copies_the_tree(scene: Scene, tmp_path: Path) -> None:
+    for part in ("sizes", "names", "deep", "many"):
+        scene.mount.run("cp", "-r", scene.path / part, tmp_path / part, timeout=240)
+        assert local_copy_differs(scene.expected / part, tmp_path / part) == ""
+
+
+def test_cmp_and_cat(scene: Scene) -> None:
+    for size in AWKWARD_SIZES:
+        name = f"sizes/{size}.bin"
+        scene.mount.run("cmp", scene.expected / name, scene.path / name, timeout=120)
+    out = scene.mount.run("cat", scene.path / "deep/d0/d1/at2.txt", scene.path / "README.txt").stdout
+    assert out == "level 2\n" + (scene.expected / "README.txt").read_text()
+
+
+@pytest.mark.parametrize("step", DD_STEPS, ids=str)
+def test_dd_reads_odd_offsets(scene: Scene, tmp_path: Path, step: tuple[int, int, int]) -> None:
+    block, skip, count = step
+    numbers = (f"bs={block}", f"skip={skip}", f"count={count}", "status=none")
+    for name in ("sizes/131073.bin", "sizes/119500.bin"):
+        copy = tmp_path / "piece"
+        scene.mount.run("dd", f"if={scene.path / name}", f"of={copy}", *numbers)
+        assert copy.read_bytes() == bytes_of("dd", f"if={scene.expected / name}", *numbers)
+
+
+def test_tail_reads_the_end_alone(scene: Scene) -> None:
+    code = "import sys; f = open(sys.argv[1], 'rb'); f.seek(-300, 2); print(f.read().hex(), f.read(), end='')"
+    out = scene.mount.python(code, scene.path / "sizes/131073.bin")
+    assert out == (scene.expected / "sizes/131073.bin").read_bytes()[-300:].hex() + " b''"
+
+
+def test_find_and_ls_and_du_agree_with_the_disk(scene: Scene) -> None:
+    argv = ("-not", "-path", "*/@*", "-printf", "%P %y %s\\n")
+    sizes_only = ("-type", "f")  # a directory's size is the file system's own affair
+    shown = scene.mount.run("find", ".", *sizes_only, *argv, cwd=scene.path).stdout
+    there = bytes_of("find", scene.expected, *sizes_only, *argv).decode(errors="surrogateescape")
+    assert sorted(shown.splitlines()) == sorted(there.splitlines())
+    names = scene.mount.run("ls", "-l", scene.path / "many").stdout.splitlines()
+    assert len(names) == MANY + 1
+    used = int(scene.mount.run("du", "-sb", "--apparent-size", scene.path / "sizes").stdout.split()[0])
+    assert used >= sum(AWKWARD_SIZES)
+    kilobytes = int(scene.mount.run("du", "-sk", scene.path / "sizes").stdout.split()[0])
+    assert kilobytes >= sum(AWKWARD_SIZES) // 1024
+
+
+def test_df_answers(scene: Scene) -> None:
+    last = scene.mount.run("df", "--output=size,avail,target", "-B1", scene.path).stdout.splitlines()[-1]
+    assert last.split()[-1] == str(scene.path)
+    assert int(last.split()[0]) > 0
+
+
+def test_rsync_twice_transfers_once(scene: Scene, tmp_path: Path) -> None:
+    argv = ("rsync", "-a", "--exclude", "@*", "--itemize-changes", f"{scene.path}/", f"{tmp_path}/copy/")
+    first = scene.mount.run(*argv, timeout=240).stdout
+    assert "131073.bin" in first
+    assert local_copy_differs(scene.expected, tmp_path / "copy") == ""
+    second = scene.mount.run(*argv, timeout=120).stdout
+    assert second == ""
+
+
+def test_tar_packs_the_tree(scene: Scene, tmp_path: Path) -> None:
+    archive = tmp_path / "all.tar"
+    scene.mount.run("tar", "-cf", archive, "--exclude", "./@*", "-C", scene.path, ".", timeout=240)
+    (tmp_path / "out").mkdir()
+    subprocess.run(["tar", "-xf", archive, "-C", tmp_path / "out"], check=True, timeout=60)
+    assert local_copy_differs(scene.expected, tmp_path / "out") == ""
+
+
+WRITES = {
+    "create": "open(sys.argv[1] + '/new.txt', 'w')",
+    "append": "open(sys.argv[1] + '/README.txt', 'a')",
+    "truncate": "os.truncate(sys.argv[1] + '/README.txt', 0)",
+    "mkdir": "os.mkdir(sys.argv[1] + '/new')",
+    "rmdir": "os.rmdir(sys.argv[1] + '/empty')",
+    "unlink": "os.unlink(sys.argv[1] + '/README.txt')",
+    "rename": "os.rename(sys.argv[1] + '/README.txt', sys.argv[1] + '/other.txt')",
+    "symlink": "os.symlink('README.txt', sys.argv[1] + '/sym')",
+    "link": "os.link(sys.argv[1] + '/README.txt', sys.argv[1] + '/hard')",
+    "chmod": "os.chmod(sys.argv[1] + '/README.txt', 0o600)",
+    "utime": "os.utime(sys.argv[1] + '/README.txt', (1, 1))",
+}
+
+
+@pytest.mark.parametrize("what", WRITES)
+def test_a_read_only_mount_refuses_every_change(scene: Scene, what: str) -> None:
+    assert scene.mount.errno_of(WRITES[what], scene.path) == "EROFS"
+
+
+def test_what_is_not_there_is_enoent(scene: Scene) -> None:
+    for name in ("nothing", "sizes/nothing", "nothing/below", "README.txtx"):
+        assert scene.mount.errno_of("os.stat(sys.argv[1])", scene.path / name) == "ENOENT"
+    assert scene.mount.errno_of("os.listdir(sys.argv[1])", scene.path / "README.txt") == "ENOTDIR"
+    assert scene.mount.errno_of("open(sys.argv[1])", scene.path / "sizes") == "EISDIR"
+
+
+def test_attributes_are_sane(scene: Scene) -> None:
+    code = "import os, sys; s = os.stat(sys.argv[1]); print(oct(s.st_mode), s.st_uid, s.st_nlink, s.st_mtime)"
+    mode, uid, links, mtime = scene.mount.python(code, scene.path / "README.txt").split()
+    assert (mode[:4], int(uid), int(links)) == ("0o10", os.getuid(), 1)
+    assert mode[-3:] in ("644", "444")
+    again = scene.mount.python(code, scene.path / "README.txt").split()
+    assert again[3] == mtime, "an mtime that moves makes every rsync copy everything"
