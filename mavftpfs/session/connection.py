@@ -1,0 +1,277 @@
+"""A live connection to one vehicle: builds the session's objects and runs their tasks. Layer: session."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import asynccontextmanager
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import trio
+
+from mavftpfs.link.base import Link
+from mavftpfs.link.framing import Framer
+from mavftpfs.link.messages import (
+    MAV_AUTOPILOT_INVALID,
+    MAV_TYPE_GCS,
+    MAV_TYPE_ONBOARD_CONTROLLER,
+    Address,
+)
+from mavftpfs.protocol.engine import Engine
+from mavftpfs.protocol.flow import Flow
+from mavftpfs.session.driver import Driver, PayloadTrace
+from mavftpfs.session.policy import ReadMode
+from mavftpfs.session.readmode import ReadSteering
+from mavftpfs.session.scheduler import Scheduler
+from mavftpfs.session.store import Store
+from mavftpfs.session.vehicle import Vehicle
+from mavftpfs.shared.errors import MavftpfsError, VehicleLost
+
+AUTOPILOT_VERSION_ID = 148
+STORAGE_INFORMATION_ID = 261
+
+HEARTBEAT_PERIOD = 1.0
+TERMINATE_ON_EXIT = 3.0
+"""Seconds to spend on closing the server's session when we leave."""
+
+_INFO_TRIES = 4
+_INFO_PERIOD = 2.0
+
+
+@dataclass(frozen=True, slots=True)
+class ConnectOptions:
+    """How to talk to the vehicle. 0 = find out; seconds for times."""
+
+    target_system: int = 0
+    target_component: int = 0
+    source_system: int = 254
+    source_component: int = 191
+    heartbeat: Literal["onboard", "gcs", "none"] = "onboard"
+    signing_key: bytes | None = None
+    op_deadline: float = 30.0
+    read_mode: ReadMode = "auto"
+    chunk: int | None = None
+    window: int | None = None
+
+
+@dataclass(slots=True)
+class Connection:
+    """One vehicle, reachable. Made by `connected`."""
+
+    store: Store
+    vehicle: Vehicle
+    scheduler: Scheduler
+    engine: Engine
+    driver: Driver
+    link: Link
+    options: ConnectOptions
+    clock: Callable[[], float]
+    news: list[Callable[[str], None]] = field(default_factory=list)
+    _first_heartbeat: trio.Event = field(default_factory=trio.Event)
+
+    async def ready(self, timeout: float) -> None:
+        """Wait for the vehicle's first heartbeat.
+
+        Raises:
+            VehicleLost: none within `timeout` seconds; the text says what was heard instead.
+        """
+        with trio.move_on_after(timeout):
+            await self._first_heartbeat.wait()
+            return
+        raise VehicleLost(f"no vehicle on {self.link.description} within {timeout:g} s{self._heard()}")
+
+    def subscribe(self, listener: Callable[[str], None]) -> None:
+        """Have `listener` called with "reboot", "armed", "disarmed" or "back"."""
+        self.news.append(listener)
+
+    def status(self) -> dict[str, Any]:
+        """Return facts for people and scripts; JSON-able."""
+        now = self.clock()
+        vehicle = self.vehicle
+        stats = self.engine.stats
+        return {
+            "source": self.link.description,
+            "vehicle": None if vehicle.address is None else list(vehicle.address),
+            "autopilot": None if vehicle.heartbeat is None else vehicle.heartbeat.autopilot,
+            "armed": vehicle.armed,
+            "heartbeat_age": None if vehicle.heartbeat_at is None else round(vehicle.silence(now), 1),
+            "ftp_flag": vehicle.ftp_flag,
+            "lost": vehicle.lost(now),
+            "reboots": vehicle.reboots,
+            "other_ftp_client": vehicle.foreign_client(now),
+            "rtt": self.engine.rtt,
+            "session_open": None
+            if self.scheduler.session is None
+            else self.scheduler.session.path.decode("utf-8", "replace"),
+            "requests": stats.requests,
+            "retransmissions": stats.retransmissions,
+            "lists_times": self.store.lists_times,
+            "link": {
+                "received_bytes": self.link.stats.received_bytes,
+                "sent_bytes": self.link.stats.sent_bytes,
+                "dropped_sends": self.link.stats.dropped_sends,
+                "reopened": self.link.stats.reopened,
+            },
+            "bad_frames": self.driver.framer.stats.bad_crc,
+        }
+
+    def _heard(self) -> str:
+        heard = sorted(self.vehicle.heard)
+        if not heard:
+            return ": no heartbeat heard at all; check SOURCE, cable, baud rate and port"
+        names = ", ".join(f"{system}/{component}" for system, component in heard)
+        return f": heard only {names}; check target_system and target_component"
+
+    def _on_heartbeat(self) -> None:
+        self._first_heartbeat.set()
+
+    def _tell(self, news: str) -> None:
+        for listener in self.news:
+            listener(news)
+
+
+@asynccontextmanager
+async def connected(
+    link: Link,
+    options: ConnectOptions,
+    *,
+    rng: random.Random | None = None,
+    clock: Callable[[], float] = trio.current_time,
+    trace: PayloadTrace | None = None,
+) -> AsyncIterator[Connection]:
+    """Run a connection over an open link for the length of the body; the session is terminated at its end."""
+    connection = _build(link, options, rng or random.SystemRandom(), clock, trace)
+    failure: Exception | None = None
+    async with trio.open_nursery() as nursery:
+        tasks = _Tasks(nursery)
+        tasks.start(connection.driver.pump)
+        tasks.start(lambda: _send_heartbeats(connection))
+        tasks.start(lambda: _ask_about_vehicle(connection))
+        serving = tasks.start(connection.scheduler.serve)
+        try:
+            yield connection
+        except Exception as error:  # raised again outside, so that it is not wrapped in a group
+            failure = error
+        finally:
+            with trio.CancelScope(deadline=trio.current_time() + TERMINATE_ON_EXIT, shield=True):
+                serving.scope.cancel()
+                await serving.ended.wait()
+                await _leave(connection.scheduler)
+            tasks.cancel()
+    failure = tasks.failure or failure
+    if failure is not None:
+        raise failure
+
+
+@dataclass(slots=True)
+class _Task:
+    scope: trio.CancelScope
+    ended: trio.Event
+
+
+class _Tasks:
+    """Tasks that whoever cancels us (Ctrl-C) cannot stop: the session must be terminated first."""
+
+    def __init__(self, nursery: trio.Nursery) -> None:
+        self.failure: MavftpfsError | None = None
+        self._nursery = nursery
+        self._tasks: list[_Task] = []
+
+    def start(self, function: Callable[[], Awaitable[None]]) -> _Task:
+        task = _Task(trio.CancelScope(shield=True), trio.Event())
+        self._tasks.append(task)
+        self._nursery.start_soon(self._run, task, function)
+        return task
+
+    def cancel(self) -> None:
+        for task in self._tasks:
+            task.scope.cancel()
+
+    async def _run(self, task: _Task, function: Callable[[], Awaitable[None]]) -> None:
+        try:
+            with task.scope:
+                await function()
+        except MavftpfsError as error:
+            self.failure = error
+            self._nursery.cancel_scope.cancel()
+        finally:
+            task.ended.set()
+
+
+async def _leave(scheduler: Scheduler) -> None:
+    try:
+        await scheduler.close()
+    except MavftpfsError:
+        return  # best effort: a server forgets a session by itself, sooner or later
+
+
+def _build(
+    link: Link,
+    options: ConnectOptions,
+    rng: random.Random,
+    clock: Callable[[], float],
+    trace: PayloadTrace | None,
+) -> Connection:
+    own = Address(options.source_system, options.source_component)
+    framer = Framer(own, stream=link.is_stream, signing_key=options.signing_key)
+    vehicle = Vehicle(options.target_system, options.target_component, own)
+    engine = Engine(rng, Flow(serial=link.is_serial, limit=options.window), op_deadline=options.op_deadline)
+    driver = Driver(link, framer, engine, vehicle, clock=clock, trace=trace)
+    steering = ReadSteering(engine, options.read_mode, options.chunk)
+    scheduler = Scheduler(driver, engine, vehicle, steering, clock=clock)
+    store = Store(scheduler, vehicle, clock=clock)
+    connection = Connection(store, vehicle, scheduler, engine, driver, link, options, clock)
+    driver.on_batch = scheduler.on_batch
+
+    def on_reboot() -> None:
+        scheduler.on_reboot()
+        store.forget_traits()
+        steering.forget()
+        connection._tell("reboot")
+
+    vehicle.on_reboot = on_reboot
+    vehicle.on_foreign = lambda: scheduler.on_suspect("another FTP client is active")
+    vehicle.on_heartbeat = connection._on_heartbeat
+    vehicle.on_double = lambda: _move_away(connection)
+    vehicle.on_armed = lambda armed: connection._tell("armed" if armed else "disarmed")
+    return connection
+
+
+def _move_away(connection: Connection) -> None:
+    """Somebody else uses our address: replies could not be told apart, so take the next component id."""
+    vehicle = connection.vehicle
+    if vehicle.own.component - connection.options.source_component > 5:
+        return  # more likely our own echo than five neighbours
+    component = vehicle.own.component % 249 + 1
+    vehicle.own = connection.driver.framer.source = Address(vehicle.own.system, component)
+
+
+async def _send_heartbeats(connection: Connection) -> None:
+    """Heartbeats of an onboard controller: a GCS heartbeat would feed the GCS-loss failsafe (promise 6)."""
+    kind = connection.options.heartbeat
+    if kind == "none":
+        return
+    vehicle_type = MAV_TYPE_GCS if kind == "gcs" else MAV_TYPE_ONBOARD_CONTROLLER
+    while True:
+        frame = connection.driver.framer.encode_heartbeat(vehicle_type, MAV_AUTOPILOT_INVALID)
+        connection.driver.send(frame)
+        await trio.sleep(HEARTBEAT_PERIOD)
+
+
+async def _ask_about_vehicle(connection: Connection) -> None:
+    """Ask for AUTOPILOT_VERSION and STORAGE_INFORMATION a few times; neither is needed to work."""
+    vehicle, driver = connection.vehicle, connection.driver
+    await connection._first_heartbeat.wait()
+    for _ in range(_INFO_TRIES):
+        wanted = []
+        if vehicle.version is None:
+            wanted.append(AUTOPILOT_VERSION_ID)
+        if vehicle.storage is None:
+            wanted.append(STORAGE_INFORMATION_ID)
+        for message_id in wanted:
+            if vehicle.address is not None:
+                driver.send(driver.framer.encode_request_message(vehicle.address, message_id))
+        if not wanted:
+            return
+        await trio.sleep(_INFO_PERIOD)

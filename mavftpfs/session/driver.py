@@ -1,0 +1,166 @@
+"""The pump between link and engine. Layer: session; the only task that reads the link.
+
+Everything but `pump` and `run` is synchronous: an operation started by any task is on the wire before
+that task next awaits. Waiters are woken once per batch of input, never once per packet (a trio event
+and a time-out per request cost more than the rest of a chunk together).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Protocol
+
+import trio
+
+from mavftpfs.link.base import Link
+from mavftpfs.link.framing import Framer
+from mavftpfs.link.messages import Address, FtpFrame, Message
+from mavftpfs.protocol.engine import Engine
+from mavftpfs.protocol.operations import Operation
+from mavftpfs.protocol.payload import decode_reply
+from mavftpfs.session.vehicle import Vehicle
+from mavftpfs.shared.errors import RemoteProtocolError, RequestTimeout
+
+BACKLOG_LIMIT = 16 * 1024
+"""Bytes the link may hold unsent before the engine is asked for more: nothing overtakes what waits there."""
+
+
+class PayloadTrace(Protocol):
+    """Sees every FTP payload, both ways."""
+
+    def payload(self, now: float, direction: str, wire: bytes, note: str = "") -> None:
+        """Record 251 bytes; direction is "request" or "reply"."""
+        ...
+
+
+class Driver:
+    """Moves payloads between one link and one engine, and everything else to the vehicle."""
+
+    def __init__(
+        self,
+        link: Link,
+        framer: Framer,
+        engine: Engine,
+        vehicle: Vehicle,
+        *,
+        clock: Callable[[], float],
+        on_batch: Callable[[float], None] = lambda now: None,
+        trace: PayloadTrace | None = None,
+    ) -> None:
+        self.link = link
+        self.framer = framer
+        self.engine = engine
+        self.vehicle = vehicle
+        self.bad_payloads = 0
+        self.last_reply_at = clock()
+        self.on_batch = on_batch
+        self._clock = clock
+        self._trace = trace
+        self._scope: trio.CancelScope | None = None
+        self._waiting: dict[Operation, Callable[[], None]] = {}
+
+    async def pump(self) -> None:
+        """Run until cancelled or the link is closed for good (LinkClosed)."""
+        while True:
+            with trio.CancelScope(deadline=self._next_deadline()) as scope:
+                self._scope = scope
+                try:
+                    chunks = await self.link.receive()
+                finally:
+                    self._scope = None
+            now = self._clock()
+            if scope.cancelled_caught:
+                self.engine.on_deadline(now)
+            else:
+                self._take(chunks, now)
+            self._settle(now)
+
+    async def run(self, operation: Operation) -> None:
+        """Carry an operation out; a cancelled caller takes its operation with it.
+
+        Raises:
+            MavftpfsError: the operation's error.
+        """
+        finished = trio.Event()
+        self.start(operation, finished.set)
+        try:
+            await finished.wait()
+        finally:
+            self.cancel(operation)
+        if operation.error is not None:
+            if isinstance(operation.error, RequestTimeout):
+                self.vehicle.note_timeout()
+            raise operation.error
+
+    def start(self, operation: Operation, on_finished: Callable[[], None]) -> None:
+        """Begin an operation; `on_finished` is called from the pump when it is done or failed."""
+        self._waiting[operation] = on_finished
+        self.engine.start(operation, self._clock())
+        self.kick()
+
+    def cancel(self, operation: Operation) -> None:
+        """Forget an operation (harmless when it is finished)."""
+        if self._waiting.pop(operation, None) is not None:
+            self.engine.cancel(operation, self._clock())
+            self.kick()
+
+    def kick(self) -> None:
+        """Send what the engine has to send now; call after anything that may have given it work."""
+        self._settle(self._clock())
+
+    def send(self, frame: bytes) -> None:
+        """Send one ready frame that is not FTP (a heartbeat, a command)."""
+        self.link.send_nowait([frame])
+
+    def _take(self, chunks: list[bytes], now: float) -> None:
+        if not chunks:
+            self.framer.reset()
+            return
+        for chunk in chunks:
+            for message in self.framer.feed(chunk):
+                if type(message) is FtpFrame and self.vehicle.is_reply_to_us(message):
+                    self._on_reply(message.payload, now)
+                else:
+                    self._on_other(message, now)
+        self.on_batch(now)
+
+    def _on_reply(self, wire: bytes, now: float) -> None:
+        if self._trace is not None:
+            self._trace.payload(now, "reply", wire)
+        try:
+            reply = decode_reply(wire)
+        except RemoteProtocolError:
+            self.bad_payloads += 1
+            return
+        self.last_reply_at = now
+        self.engine.receive(reply, now)
+
+    def _on_other(self, message: Message, now: float) -> None:
+        self.vehicle.on_message(message, now)
+
+    def _settle(self, now: float) -> None:
+        target = self.vehicle.address
+        if target is not None and self.link.backlog < BACKLOG_LIMIT:
+            self._send(target, self.engine.outgoing(now), now)
+        for operation in self.engine.take_finished():
+            on_finished = self._waiting.pop(operation, None)
+            if on_finished is not None:
+                on_finished()
+        if self._scope is not None:
+            self._scope.deadline = self._next_deadline()
+
+    def _send(self, target: Address, payloads: list[bytes], now: float) -> None:
+        if not payloads:
+            return
+        if self._trace is not None:
+            for wire in payloads:
+                self._trace.payload(now, "request", wire)
+        encode = self.framer.encode_ftp
+        self.link.send_nowait([encode(target, wire) for wire in payloads])
+
+    def _next_deadline(self) -> float:
+        deadline = self.engine.next_deadline()
+        if self.link.backlog >= BACKLOG_LIMIT:
+            soon = self._clock() + 0.01  # nobody tells us that the link drained
+            return soon if deadline is None else min(deadline, soon)
+        return float("inf") if deadline is None else deadline

@@ -1,0 +1,54 @@
+"""A gate that all FTP traffic passes, and that can be held shut. Layer: session.
+
+A stale session of ArduPilot's dies only if *nothing* is answered for 3 s, NAKs included (servers.md 1), so
+waiting for it means that everybody waits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+
+import trio
+
+
+class Gate:
+    """Counts who is inside; while shut nobody enters."""
+
+    def __init__(self) -> None:
+        self._inside = 0
+        self._shut = False
+        self._changed = trio.Event()
+
+    @property
+    def shut(self) -> bool:
+        """Whether entering would wait."""
+        return self._shut
+
+    @asynccontextmanager
+    async def passing(self) -> AsyncIterator[None]:
+        """Hold this while requests may be on the wire."""
+        while self._shut:
+            await self._changed.wait()
+        self._inside += 1
+        try:
+            yield
+        finally:
+            self._inside -= 1
+            self._notify()
+
+    @asynccontextmanager
+    async def held_shut(self) -> AsyncIterator[None]:
+        """Let nobody in, wait until everybody is out, and stay shut for the body."""
+        self._shut = True
+        try:
+            while self._inside:
+                await self._changed.wait()
+            yield
+        finally:
+            self._shut = False
+            self._notify()
+
+    def _notify(self) -> None:
+        self._changed.set()
+        self._changed = trio.Event()

@@ -1,0 +1,190 @@
+"""Opening and closing the one server session, with what to do when it is taken. Layer: session.
+
+Servers answer an open while a session is (still) taken with NAK 5 (PX4), 4 (ArduPilot, another id) or 1
+(ArduPilot, the same id). Asking again soon keeps a stale session alive (servers.md 1), so the remedies
+are: close what may be our own, then silence, then, if nobody else is about, ResetSessions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
+
+import trio
+
+from mavftpfs.protocol.engine import Engine
+from mavftpfs.protocol.operations import ListDirectory, OpenFile, Simple, Terminate
+from mavftpfs.protocol.payload import NakCode, Opcode
+from mavftpfs.session.driver import Driver
+from mavftpfs.session.gate import Gate
+from mavftpfs.session.vehicle import Vehicle
+from mavftpfs.shared.errors import FtpNak, MavftpfsError, RequestTimeout, SessionBusy
+from mavftpfs.shared.model import wire_path
+
+SILENCE_ARDUPILOT = 3.5
+"""ArduPilot lets a session be taken over after 3 s without any reply."""
+
+SILENCE_PX4 = 10.5
+"""PX4 closes a session 10 s after the last request of anybody on the link."""
+
+TERMINATE_LIMIT = 5.0
+"""Seconds to wait for a Terminate before the session is treated as doubtful."""
+
+
+@dataclass(frozen=True, slots=True)
+class OpenSession:
+    """The server's session, open on a file. size: as the open ACK said, None where it said nothing."""
+
+    path: bytes
+    id: int
+    size: int | None
+    opened_at: float
+
+
+class SessionOpener:
+    """Opens and closes; knows whether something of ours may still be open over there."""
+
+    def __init__(
+        self, driver: Driver, engine: Engine, vehicle: Vehicle, gate: Gate, clock: Callable[[], float]
+    ) -> None:
+        self._driver = driver
+        self._engine = engine
+        self._vehicle = vehicle
+        self._gate = gate
+        self._clock = clock
+        self._doubtful: int | None = None
+        self._server_assigns: bool | None = None
+        self.resets = 0
+        self.quiet_periods = 0
+
+    async def open(self, path: bytes) -> OpenSession:
+        """Open a file read-only.
+
+        Raises:
+            FtpNak: the server refused. SessionBusy: its session stayed taken. RequestTimeout.
+        """
+        if self._doubtful is not None:
+            await self._close_doubtful()
+        remedies = [self._close_own, self._fall_silent, self._reset]
+        last: FtpNak | None = None
+        while True:
+            try:
+                return await self._open_once(path)
+            except FtpNak as nak:
+                last = nak
+                if not self._looks_taken(nak):
+                    raise
+            while remedies:
+                if await remedies.pop(0)(last):
+                    break
+            else:
+                if last.code == NakCode.FAIL:
+                    raise last
+                raise SessionBusy("the vehicle's only FTP session is in use by another client")
+
+    async def close(self, session: OpenSession) -> bool:
+        """Terminate and check the answer; return False if the server had already closed it.
+
+        Raises:
+            FtpNak: closing failed over there. RequestTimeout: no answer; the next open tries again first.
+        """
+        self._engine.session = self._engine.home_session
+        operation = Terminate(session.id)
+        self._doubtful = session.id
+        try:
+            with trio.fail_after(TERMINATE_LIMIT):
+                await self._run(operation)
+        except trio.TooSlowError:
+            raise RequestTimeout("no answer to TerminateSession") from None
+        except FtpNak as nak:
+            self._doubtful = None
+            if nak.code != NakCode.INVALID_SESSION:
+                raise
+            return False
+        self._doubtful = None
+        return not operation.already_closed
+
+    async def close_doubtful(self) -> None:
+        """Close what may still be ours, on leaving.
+
+        Raises:
+            RequestTimeout: no answer.
+        """
+        await self._close_doubtful()
+
+    def abandon(self, session: OpenSession) -> None:
+        """Stop believing in a session after silence or a reboot; the next open closes it first."""
+        self._doubtful = session.id
+        self._engine.session = self._engine.home_session
+
+    def forget(self) -> None:
+        """The server rebooted: nothing of ours is open."""
+        self._doubtful = None
+        self._server_assigns = None
+        self._engine.session = self._engine.home_session
+
+    async def _open_once(self, path: bytes) -> OpenSession:
+        asked = self._engine.home_session
+        operation = OpenFile(Opcode.OPEN_FILE_RO, wire_path(path), asked)
+        self._doubtful = asked if self._server_assigns is not True else 0
+        await self._run(
+            operation
+        )  # a time-out or cancellation leaves it doubtful: the open may have been executed
+        self._doubtful = None
+        self._server_assigns = operation.session != asked
+        self._engine.session = operation.session
+        return OpenSession(path, operation.session, operation.size, self._clock())
+
+    def _looks_taken(self, nak: FtpNak) -> bool:
+        """8 may hide any other code on PX4 (sticky EEXIST), and makes no sense as an answer to an open."""
+        if nak.code in (NakCode.NO_SESSIONS_AVAILABLE, NakCode.INVALID_SESSION, NakCode.FILE_EXISTS):
+            return True
+        self._doubtful = None
+        return nak.code == NakCode.FAIL and self._server_assigns is not True
+
+    async def _close_own(self, nak: FtpNak) -> bool:
+        """Terminate what may be ours: an open of ours whose ACK was lost, or (8) clear the sticky errno."""
+        if nak.code == NakCode.FILE_EXISTS:
+            return await self._tolerate(lambda: self._run(ListDirectory(b"/", False)))
+        if nak.retransmitted or nak.code == NakCode.FAIL:
+            return await self._close_doubtful()
+        return False
+
+    async def _fall_silent(self, nak: FtpNak) -> bool:
+        seconds = (
+            SILENCE_PX4
+            if nak.code in (NakCode.NO_SESSIONS_AVAILABLE, NakCode.FILE_EXISTS)
+            else SILENCE_ARDUPILOT
+        )
+        self.quiet_periods += 1
+        async with self._gate.held_shut():
+            await trio.sleep(seconds)
+        return True
+
+    async def _reset(self, nak: FtpNak) -> bool:
+        if self._vehicle.foreign_client(self._clock()):
+            return False
+        self.resets += 1
+        reset = Simple(Opcode.RESET_SESSIONS, b"", session=self._engine.home_session, side_effect=True)
+        return await self._tolerate(lambda: self._run(reset))
+
+    async def _close_doubtful(self) -> bool:
+        """Close a session that may still be ours, unless another client may own it by now."""
+        doubtful, self._doubtful = self._doubtful, None
+        if doubtful is None or (doubtful == 0 and self._vehicle.foreign_client(self._clock())):
+            return False
+        return await self._tolerate(lambda: self._run(Terminate(doubtful)))
+
+    async def _tolerate(self, step: Callable[[], Awaitable[None]]) -> bool:
+        """Run a remedy whose refusal changes nothing; a time-out is the caller's news."""
+        try:
+            await step()
+        except RequestTimeout:
+            raise
+        except MavftpfsError:
+            return True
+        return True
+
+    async def _run(self, operation: ListDirectory | OpenFile | Simple | Terminate) -> None:
+        async with self._gate.passing():
+            await self._driver.run(operation)

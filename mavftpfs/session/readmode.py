@@ -1,0 +1,50 @@
+"""Remembers what reading cost and steers transfers by the policy. Layer: session."""
+
+from __future__ import annotations
+
+from mavftpfs.protocol.engine import Engine
+from mavftpfs.protocol.payload import MAX_DATA
+from mavftpfs.protocol.transfers import ReadTransfer
+from mavftpfs.session.policy import ReadFacts, ReadMode, choose_strategy
+
+
+class ReadSteering:
+    """Chooses strategy and chunk for each transfer from what earlier ones measured.
+
+    chunk: bytes a request asks for, 1..239; None = the most that fits.
+    """
+
+    def __init__(self, engine: Engine, mode: ReadMode = "auto", chunk: int | None = None) -> None:
+        self.mode: ReadMode = mode
+        self.chunk = MAX_DATA if chunk is None else chunk
+        self._engine = engine
+        self._window_rate: float | None = None
+        self._burst_rate: float | None = None
+
+    def steer(self, transfer: ReadTransfer, wanted: int, *, others_waiting: bool) -> None:
+        """Let a running transfer go on by what is the better strategy now."""
+        self.learn(transfer)
+        traits = self._engine.traits
+        facts = ReadFacts(
+            mode=self.mode,
+            wanted=wanted,
+            rtt=self._engine.rtt,
+            chunk=self.chunk,
+            in_flight_limit=traits.queue_limit,
+            window_rate=self._window_rate,
+            burst_rate=self._burst_rate,
+            burst_stoppable=traits.answers_during_burst,
+            others_waiting=others_waiting,
+        )
+        strategy = choose_strategy(facts)
+        if strategy != transfer.strategy:
+            transfer.set_strategy(strategy)
+
+    def learn(self, transfer: ReadTransfer) -> None:
+        """Take over what a transfer measured."""
+        self._window_rate = transfer.window_rate or self._window_rate
+        self._burst_rate = transfer.burst_rate or self._burst_rate
+
+    def forget(self) -> None:
+        """The server may be another one now."""
+        self._window_rate = self._burst_rate = None

@@ -1,0 +1,106 @@
+"""The vehicle's files, as the caches see them. Layer: session; implements cache.remote.RemoteStore."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import trio
+
+from mavftpfs.cache.remote import ReadSink
+from mavftpfs.protocol.operations import ListDirectory, Simple
+from mavftpfs.protocol.payload import NakCode, Opcode
+from mavftpfs.session.scheduler import Scheduler
+from mavftpfs.session.stream import FileStream
+from mavftpfs.session.vehicle import Vehicle
+from mavftpfs.shared.errors import Armed, FtpNak, RemoteProtocolError, RequestTimeout
+from mavftpfs.shared.model import DirEntry, Listing, wire_path
+
+TIME_PROBE_LIMIT = 10.0
+"""Seconds of silence after which ListDirectoryWithTime is taken to be unknown, if ListDirectory answers."""
+
+CRC_PATIENCE = 120.0
+"""Seconds a vehicle may need for a checksum (design promise 2)."""
+
+
+class Store:
+    """Reads, lists and checks remote files."""
+
+    def __init__(self, scheduler: Scheduler, vehicle: Vehicle, *, clock: Callable[[], float]) -> None:
+        self._scheduler = scheduler
+        self._vehicle = vehicle
+        self._clock = clock
+        self._lists_times: bool | None = None
+
+    @property
+    def lists_times(self) -> bool | None:
+        """Whether this server answers opcode 16; None until it was asked."""
+        return self._lists_times
+
+    def forget_traits(self) -> None:
+        """The vehicle rebooted, perhaps with other firmware."""
+        self._lists_times = None
+
+    async def list_directory(self, path: bytes) -> Listing:
+        """Sweep a directory (see RemoteStore)."""
+        wire = wire_path(path)
+        started = self._clock()
+        if self._lists_times is False:
+            operation = await self._sweep(wire, with_time=False)
+        else:
+            operation = await self._sweep_asking_times(wire)
+        entries: tuple[DirEntry, ...] = tuple(operation.entries)
+        return Listing(entries, self._clock() - started, operation.complete, operation.hidden)
+
+    async def open_reader(
+        self, path: bytes, sink: ReadSink, *, expected_size: int | None = None
+    ) -> FileStream:
+        """Open a regular file for reading (see RemoteStore)."""
+        wire_path(path)
+        if expected_size is None:
+            self._scheduler.require_link()
+        stream = self._scheduler.open_stream(path, sink, expected_size)
+        try:
+            await stream.wait_opened()
+        except BaseException:
+            stream.close()
+            raise
+        return stream
+
+    async def read_whole(self, path: bytes, limit: int) -> bytes:
+        """Read an `@` file to its end (see RemoteStore)."""
+        wire_path(path)
+        return await self._scheduler.read_whole(path, limit)
+
+    async def crc32(self, path: bytes) -> int:
+        """Ask for a checksum (see RemoteStore)."""
+        if self._vehicle.armed:
+            raise Armed("checksums are not asked for in flight")
+        operation = Simple(Opcode.CALC_FILE_CRC32, wire_path(path), patience=CRC_PATIENCE)
+        await self._scheduler.metadata(operation)
+        data = operation.reply.data
+        if len(data) < 4:
+            raise RemoteProtocolError("the vehicle's checksum reply holds no checksum")
+        return int.from_bytes(data[:4], "little")
+
+    async def _sweep(self, wire: bytes, *, with_time: bool) -> ListDirectory:
+        operation = ListDirectory(wire, with_time)
+        await self._scheduler.metadata(operation)
+        return operation
+
+    async def _sweep_asking_times(self, wire: bytes) -> ListDirectory:
+        """Try opcode 16; a refusal or a silence counts only if opcode 3 then answers (design section 4)."""
+        sure = self._lists_times is True
+        try:
+            with trio.move_on_after(float("inf") if sure else TIME_PROBE_LIMIT):
+                operation = await self._sweep(wire, with_time=True)
+                self._lists_times = True
+                return operation
+        except FtpNak as nak:
+            if sure or nak.code not in (NakCode.FAIL, NakCode.UNKNOWN_COMMAND, NakCode.FILE_EXISTS):
+                raise
+        except RequestTimeout:
+            if sure:
+                raise
+        operation = await self._sweep(wire, with_time=False)
+        self._lists_times = False
+        return operation

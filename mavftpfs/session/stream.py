@@ -1,0 +1,153 @@
+"""A remote file open for reading: the Reader that the caches hold. Layer: session.
+
+A stream outlives the server's session on its file: wants that are not yet fulfilled are kept here and
+handed to whatever transfer is attached next.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import trio
+
+from mavftpfs.cache.remote import ReadSink
+from mavftpfs.protocol.transfers import ReadTransfer
+from mavftpfs.session.policy import Service
+from mavftpfs.shared.errors import FileChanged, MavftpfsError
+from mavftpfs.shared.extents import ExtentSet
+
+
+class FileStream:
+    """Implements cache.remote.Reader. The scheduler attaches and detaches transfers."""
+
+    def __init__(
+        self, path: bytes, sink: ReadSink, size: int | None, wake: Callable[[FileStream], None]
+    ) -> None:
+        self.path = path
+        self.sink = sink
+        self.closed = False
+        self.use = Service()
+        self.demand_since: float | None = None
+        self.wants_open = size is None
+        self.last_data_at: float | None = None
+        self.clean_failures = 0
+        self._size = size
+        self._demand = ExtentSet()
+        self._ahead = ExtentSet()
+        self._wake = wake
+        self._opened = trio.Event()
+        self._open_error: MavftpfsError | None = None
+        self._transfer: ReadTransfer | None = None
+
+    # --- the cache's side
+
+    @property
+    def size(self) -> int:
+        """Size by the first open ACK, in bytes."""
+        return self._size or 0
+
+    def want(self, start: int, stop: int, *, demand: bool) -> None:
+        """Ask for bytes of [start, stop), clamped to the size."""
+        stop = min(stop, self.size)
+        if start >= stop or self.closed:
+            return
+        (self._demand if demand else self._ahead).add(start, stop)
+        if self._transfer is not None:
+            self._transfer.want(start, stop, demand)
+        self._wake(self)
+
+    def drop_readahead(self) -> None:
+        """Forget what nobody waits for."""
+        self._ahead.clear()
+        if self._transfer is not None:
+            self._transfer.drop_readahead()
+
+    def close(self) -> None:
+        """No more wants; what is still wanted is forgotten."""
+        self.closed = True
+        self._demand.clear()
+        self._ahead.clear()
+        self.wants_open = False
+        self._wake(self)
+
+    # --- the scheduler's side
+
+    @property
+    def has_demand(self) -> bool:
+        """Whether somebody waits for this file."""
+        if self.closed:
+            return False
+        return self.wants_open or not self._unmet(self._demand).empty
+
+    @property
+    def has_ahead(self) -> bool:
+        """Whether readahead is wanted."""
+        return not self.closed and not self._unmet(self._ahead).empty
+
+    async def wait_opened(self) -> None:
+        """Wait for the first open's outcome; raise its error."""
+        if self._size is None:
+            await self._opened.wait()
+        if self._open_error is not None:
+            raise self._open_error
+
+    def on_opened(self, size: int) -> None:
+        """Take the size of an open ACK.
+
+        Raises:
+            FileChanged: the file is smaller than what was opened. A larger one only grew: it is served at
+                its opened size.
+        """
+        self.wants_open = False
+        if self._size is None:
+            self._size = size
+            self._opened.set()
+        elif size < self._size:
+            raise FileChanged(f"{self.path!r} shrank from {self._size} to {size} bytes")
+
+    def attach(self, transfer: ReadTransfer) -> None:
+        """Hand what is wanted to a transfer; later wants go to it directly."""
+        self._transfer = transfer
+        self._demand = self._unmet(self._demand)
+        self._ahead = self._unmet(self._ahead)
+        for start, stop in self._demand:
+            transfer.want(start, stop, True)
+        for start, stop in self._ahead:
+            transfer.want(start, stop, False)
+
+    def detach(self) -> None:
+        """Take back what the transfer did not deliver."""
+        self._transfer = None
+        self._demand = self._unmet(self._demand)
+        self._ahead = self._unmet(self._ahead)
+
+    def on_idle(self) -> None:
+        """Everything wanted has come."""
+        self._demand.clear()
+        self._ahead.clear()
+
+    def fail(self, error: MavftpfsError) -> None:
+        """What is wanted cannot be had now; whoever waits gets the error."""
+        self.wants_open = False
+        self._demand.clear()
+        self._ahead.clear()
+        if self._size is None:
+            self._open_error = error
+            self._opened.set()
+        else:
+            self.sink.on_failed(error)
+
+    def contiguous_want(self) -> int:
+        """Return the length of the first wanted run, demand and readahead taken together."""
+        both = self._unmet(self._demand)
+        for start, stop in self._unmet(self._ahead):
+            both.add(start, stop)
+        first = both.first()
+        return 0 if first is None else first[1] - first[0]
+
+    def _unmet(self, wanted: ExtentSet) -> ExtentSet:
+        unmet = ExtentSet()
+        for start, stop in wanted:
+            for gap_start, gap_stop in self.sink.missing(start, stop):
+                unmet.add(gap_start, gap_stop)
+        return unmet

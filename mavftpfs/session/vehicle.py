@@ -1,0 +1,175 @@
+"""What is known of the vehicle and of the others on the link. Layer: session; pure (told messages and `now`).
+
+Everything here is learned by listening. Link health (promise 4) is heartbeats plus one fact from the
+session: that a request timed out since the last heartbeat.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from mavftpfs.link.messages import (
+    MAV_COMP_ID_AUTOPILOT1,
+    MAV_PROTOCOL_CAPABILITY_FTP,
+    Address,
+    AutopilotVersion,
+    FtpFrame,
+    Heartbeat,
+    Message,
+    RadioStatus,
+    StatusText,
+    StorageInformation,
+    SystemTime,
+)
+from mavftpfs.protocol.payload import Opcode
+
+SILENCE_LIMIT = 5.0
+"""Seconds without heartbeats after which one timed-out request means that the vehicle is lost."""
+
+FOREIGN_MEMORY = 10.0
+"""Seconds for which an FTP client that was heard counts as present."""
+
+_OPCODE_INDEX = 3
+_REBOOT_SLACK_MS = 2000
+
+
+@dataclass(slots=True)
+class Vehicle:
+    """The target and its neighbourhood.
+
+    wanted_system, wanted_component: 0 = the first autopilot heard, resp. that system's autopilot.
+    own: our address; replies to anyone else are another FTP client's.
+    """
+
+    wanted_system: int
+    wanted_component: int
+    own: Address
+    on_reboot: Callable[[], None] = lambda: None
+    on_foreign: Callable[[], None] = lambda: None
+    on_heartbeat: Callable[[], None] = lambda: None
+    on_armed: Callable[[bool], None] = lambda armed: None
+    on_double: Callable[[], None] = lambda: None
+    address: Address | None = None
+    heartbeat: Heartbeat | None = None
+    heartbeat_at: float | None = None
+    version: AutopilotVersion | None = None
+    storage: StorageInformation | None = None
+    radio: RadioStatus | None = None
+    last_text: StatusText | None = None
+    foreign_at: float | None = None
+    reboots: int = 0
+    heard: dict[Address, Heartbeat] = field(default_factory=dict)
+    _boot_ms: int | None = None
+    _timed_out: bool = False
+
+    @property
+    def armed(self) -> bool:
+        """Whether to treat the vehicle as armed; never heard counts as armed (promise 9)."""
+        return self.heartbeat is None or self.heartbeat.armed
+
+    @property
+    def ftp_flag(self) -> bool | None:
+        """AUTOPILOT_VERSION's FTP capability, None while unknown. It proves nothing (servers.md 5)."""
+        return None if self.version is None else bool(self.version.capabilities & MAV_PROTOCOL_CAPABILITY_FTP)
+
+    def silence(self, now: float) -> float:
+        """Return the seconds since the vehicle's last heartbeat (infinite before the first)."""
+        return float("inf") if self.heartbeat_at is None else now - self.heartbeat_at
+
+    def lost(self, now: float) -> bool:
+        """Return whether requests that need the link should fail at once."""
+        return self._timed_out and self.silence(now) > SILENCE_LIMIT
+
+    def foreign_client(self, now: float) -> bool:
+        """Return whether another FTP client of this vehicle was heard lately."""
+        return self.foreign_at is not None and now - self.foreign_at < FOREIGN_MEMORY
+
+    def note_timeout(self) -> None:
+        """A request to the vehicle went unanswered to its deadline."""
+        self._timed_out = True
+
+    def is_reply_to_us(self, frame: FtpFrame) -> bool:
+        """Return whether an FTP message is from our vehicle to us."""
+        return frame.target == self.own and frame.source == self.address
+
+    def on_message(self, message: Message, now: float) -> None:
+        """Learn from any message except FTP replies to us."""
+        match message:
+            case Heartbeat():
+                self._on_heartbeat(message, now)
+            case FtpFrame():
+                self._on_foreign_ftp(message, now)
+            case RadioStatus():
+                self.radio = message
+            case _ if self.address is None or message.source.system != self.address.system:
+                return
+            case AutopilotVersion() if message.source == self.address:
+                self.version = message
+            case StorageInformation():
+                self._on_storage(message)
+            case SystemTime() if message.source == self.address:
+                self._on_boot_time(message.time_boot_ms)
+            case StatusText():
+                self.last_text = message
+
+    def _on_heartbeat(self, heartbeat: Heartbeat, now: float) -> None:
+        if heartbeat.source == self.own:
+            self.on_double()
+            return
+        if len(self.heard) < 256 or heartbeat.source in self.heard:
+            self.heard[heartbeat.source] = heartbeat
+        if self.address is None and self._is_wanted(heartbeat):
+            self.address = self._target_of(heartbeat)
+        if not self._proves_life(heartbeat.source):
+            return
+        was_armed = None if self.heartbeat is None else self.heartbeat.armed
+        self.heartbeat_at = now
+        self._timed_out = False
+        self.heartbeat = heartbeat
+        if was_armed != heartbeat.armed:
+            self.on_armed(heartbeat.armed)
+        self.on_heartbeat()
+
+    def _is_wanted(self, heartbeat: Heartbeat) -> bool:
+        if self.wanted_system and heartbeat.source.system != self.wanted_system:
+            return False
+        if self.wanted_component:
+            return heartbeat.source.component == self.wanted_component or heartbeat.is_autopilot
+        return heartbeat.is_autopilot
+
+    def _target_of(self, heartbeat: Heartbeat) -> Address:
+        if self.wanted_component:
+            return Address(heartbeat.source.system, self.wanted_component)
+        return heartbeat.source
+
+    def _proves_life(self, source: Address) -> bool:
+        """A component may send no heartbeats of its own; its system's autopilot then speaks for it."""
+        if self.address is None or source.system != self.address.system:
+            return False
+        if source == self.address:
+            return True
+        return self.address not in self.heard and source.component == MAV_COMP_ID_AUTOPILOT1
+
+    def _on_foreign_ftp(self, frame: FtpFrame, now: float) -> None:
+        if self.address is None or frame.source == self.own:
+            return
+        is_reply = frame.payload[_OPCODE_INDEX] in (Opcode.ACK, Opcode.NAK)
+        if is_reply:
+            theirs = frame.source == self.address and frame.target != self.own
+        else:
+            theirs = frame.target.system in (0, self.address.system)
+        if theirs:
+            self.foreign_at = now
+            self.on_foreign()
+
+    def _on_storage(self, message: StorageInformation) -> None:
+        if self.storage is None or message.storage_id <= self.storage.storage_id:
+            self.storage = message
+
+    def _on_boot_time(self, boot_ms: int) -> None:
+        before = self._boot_ms
+        self._boot_ms = boot_ms
+        if before is not None and boot_ms + _REBOOT_SLACK_MS < before:
+            self.reboots += 1
+            self.on_reboot()

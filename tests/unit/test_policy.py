@@ -1,0 +1,93 @@
+"""The session layer's decisions, as tables."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+
+from mavftpfs.session.policy import (
+    MAX_QUANTUM,
+    MIN_QUANTUM,
+    USE_MEMORY,
+    ReadFacts,
+    Service,
+    choose_strategy,
+    quantum,
+    should_switch,
+)
+
+LONG_ROUND_TRIP = ReadFacts(
+    mode="auto",
+    wanted=1_000_000,
+    rtt=0.3,
+    chunk=239,
+    in_flight_limit=4,
+    window_rate=None,
+    burst_rate=40_000.0,
+    burst_stoppable=False,
+    others_waiting=False,
+)
+
+
+@pytest.mark.parametrize(
+    ("change", "strategy"),
+    [
+        ({}, "burst"),
+        ({"mode": "window"}, "window"),
+        ({"rtt": 0.005}, "window"),
+        ({"wanted": 4096}, "window"),
+        ({"others_waiting": True}, "window"),
+        ({"burst_rate": None}, "window"),
+        ({"in_flight_limit": None}, "window"),
+        ({"rtt": None}, "window"),
+        ({"window_rate": 38_000.0}, "window"),
+        ({"window_rate": 3_000.0}, "burst"),
+        ({"mode": "burst", "burst_rate": None, "wanted": 1}, "burst"),
+    ],
+)
+def test_a_burst_is_chosen_only_where_the_window_is_capped_and_the_way_is_long(
+    change: dict[str, object], strategy: str
+) -> None:
+    facts = dataclasses.replace(LONG_ROUND_TRIP, **change)  # type: ignore[arg-type]
+    assert choose_strategy(facts) == strategy
+
+
+def test_quantum_grows_with_the_round_trip_within_bounds() -> None:
+    assert quantum(None) == quantum(0.001) == MIN_QUANTUM
+    assert quantum(0.2) == pytest.approx(2.0)
+    assert quantum(5.0) == MAX_QUANTUM
+
+
+def test_service_fades() -> None:
+    service = Service()
+    service.add(2.0, now=100.0)
+    assert service.recent(100.0) == 2.0
+    assert service.recent(100.0 + USE_MEMORY / 2) == pytest.approx(1.0)
+    assert service.recent(100.0 + 2 * USE_MEMORY) == 0.0
+    service.add(1.0, now=100.0 + USE_MEMORY / 2)
+    assert service.seconds == pytest.approx(2.0)
+
+
+@pytest.mark.parametrize(
+    ("demand", "slice_", "use", "waiting", "switch"),
+    [
+        (False, 0.0, 0.0, 9.0, True),  # readahead yields to any demand
+        (True, 0.0, 5.0, 0.0, True),  # an editor beside a bulk copy goes first
+        (True, 0.1, 0.0, 0.0, False),  # two newcomers do not thrash
+        (True, 0.4, 0.0, 0.0, True),
+        (True, 0.5, 5.0, 5.0, False),  # two bulk copies alternate
+        (True, 1.1, 5.0, 5.0, True),
+    ],
+)
+def test_who_gets_the_session(demand: bool, slice_: float, use: float, waiting: float, switch: bool) -> None:
+    assert (
+        should_switch(
+            current_has_demand=demand,
+            current_slice=slice_,
+            current_use=use,
+            waiting_use=waiting,
+            rtt=0.02,
+        )
+        is switch
+    )

@@ -1,0 +1,128 @@
+"""What is learned of the vehicle by listening."""
+
+from __future__ import annotations
+
+from mavftpfs.link.messages import (
+    MAV_AUTOPILOT_INVALID,
+    Address,
+    AutopilotVersion,
+    FtpFrame,
+    Heartbeat,
+    StorageInformation,
+    SystemTime,
+)
+from mavftpfs.protocol.payload import Opcode, Payload, request
+from mavftpfs.session.vehicle import FOREIGN_MEMORY, SILENCE_LIMIT, Vehicle
+
+OWN = Address(254, 191)
+PILOT = Address(1, 1)
+GCS = Address(255, 190)
+
+
+def heartbeat(source: Address, *, autopilot: int = 12, armed: bool = False) -> Heartbeat:
+    return Heartbeat(source, 2, autopilot, 0x80 if armed else 0, 4)
+
+
+def listener(system: int = 0, component: int = 0) -> Vehicle:
+    return Vehicle(system, component, OWN)
+
+
+def test_the_first_autopilot_becomes_the_target_and_others_do_not_replace_it() -> None:
+    vehicle = listener()
+    vehicle.on_message(heartbeat(GCS, autopilot=MAV_AUTOPILOT_INVALID), 0.0)
+    assert vehicle.address is None
+    vehicle.on_message(heartbeat(Address(7, 1)), 1.0)
+    vehicle.on_message(heartbeat(PILOT), 2.0)
+    assert vehicle.address == (7, 1)
+    assert vehicle.heartbeat_at == 1.0
+
+
+def test_a_wanted_system_waits_for_its_own_autopilot() -> None:
+    vehicle = listener(system=9)
+    vehicle.on_message(heartbeat(PILOT), 0.0)
+    assert vehicle.address is None
+    vehicle.on_message(heartbeat(Address(9, 1)), 0.0)
+    assert vehicle.address == (9, 1)
+
+
+def test_a_wanted_component_without_heartbeats_lives_by_its_systems_autopilot() -> None:
+    vehicle = listener(system=1, component=100)
+    vehicle.on_message(heartbeat(PILOT), 3.0)
+    assert vehicle.address == (1, 100)
+    assert vehicle.heartbeat_at == 3.0
+    vehicle.on_message(heartbeat(Address(1, 100), autopilot=MAV_AUTOPILOT_INVALID), 4.0)
+    vehicle.on_message(heartbeat(PILOT), 9.0)
+    assert vehicle.heartbeat_at == 4.0
+
+
+def test_never_heard_is_armed_and_lost_needs_silence_and_a_time_out() -> None:
+    vehicle = listener()
+    assert vehicle.armed
+    vehicle.on_message(heartbeat(PILOT), 10.0)
+    assert not vehicle.armed
+    assert not vehicle.lost(10.0 + SILENCE_LIMIT + 1)
+    vehicle.note_timeout()
+    assert not vehicle.lost(10.0 + SILENCE_LIMIT - 1)
+    assert vehicle.lost(10.0 + SILENCE_LIMIT + 1)
+    vehicle.on_message(heartbeat(PILOT), 30.0)
+    assert not vehicle.lost(40.0)
+
+
+def test_arming_is_told_once_each_way() -> None:
+    news: list[bool] = []
+    vehicle = listener()
+    vehicle.on_armed = news.append
+    for armed in (False, False, True, True, False):
+        vehicle.on_message(heartbeat(PILOT, armed=armed), 0.0)
+    assert news == [False, True, False]
+
+
+def test_ftp_of_others_is_foreign_and_our_own_replies_are_not() -> None:
+    vehicle = listener()
+    vehicle.on_message(heartbeat(PILOT), 0.0)
+    reply = Payload(2, 0, Opcode.ACK, 0, Opcode.READ_FILE).encode()
+    ask = request(1, Opcode.READ_FILE).encode()
+    assert vehicle.is_reply_to_us(FtpFrame(PILOT, OWN, reply))
+    vehicle.on_message(FtpFrame(Address(5, 1), GCS, reply), 1.0)
+    vehicle.on_message(FtpFrame(GCS, Address(5, 1), ask), 1.0)
+    assert not vehicle.foreign_client(1.0)
+    vehicle.on_message(FtpFrame(PILOT, GCS, reply), 2.0)
+    assert vehicle.foreign_client(2.0)
+    assert not vehicle.foreign_client(2.0 + FOREIGN_MEMORY)
+    vehicle.on_message(FtpFrame(GCS, PILOT, ask), 20.0)
+    assert vehicle.foreign_client(20.0)
+
+
+def test_boot_time_going_back_is_a_reboot_and_reordering_is_not() -> None:
+    reboots: list[int] = []
+    vehicle = listener()
+    vehicle.on_reboot = lambda: reboots.append(1)
+    vehicle.on_message(heartbeat(PILOT), 0.0)
+    for boot_ms in (5000, 4500, 6000, 600_000, 1200):
+        vehicle.on_message(SystemTime(PILOT, 0, boot_ms), 0.0)
+    assert reboots == [1]
+    vehicle.on_message(SystemTime(Address(8, 1), 0, 10), 0.0)
+    assert reboots == [1]
+
+
+def test_facts_are_taken_from_the_target_alone() -> None:
+    vehicle = listener()
+    vehicle.on_message(heartbeat(PILOT), 0.0)
+    vehicle.on_message(AutopilotVersion(Address(3, 1), 0x20, 1, b"", 1, b""), 0.0)
+    assert vehicle.ftp_flag is None
+    vehicle.on_message(AutopilotVersion(PILOT, 0x20, 1, b"", 1, b""), 0.0)
+    assert vehicle.ftp_flag is True
+    vehicle.on_message(StorageInformation(PILOT, 2, 2, 2, 8.0, 1.0, 7.0), 0.0)
+    vehicle.on_message(StorageInformation(PILOT, 1, 2, 2, 16.0, 1.0, 15.0), 0.0)
+    vehicle.on_message(StorageInformation(PILOT, 2, 2, 2, 8.0, 1.0, 7.0), 0.0)
+    assert vehicle.storage is not None
+    assert vehicle.storage.total_capacity == 16.0
+
+
+def test_our_own_address_heard_from_somebody_else_is_told() -> None:
+    doubles: list[int] = []
+    vehicle = listener()
+    vehicle.on_double = lambda: doubles.append(1)
+    vehicle.on_message(heartbeat(OWN, autopilot=MAV_AUTOPILOT_INVALID), 0.0)
+    assert doubles == [1]
+    assert vehicle.address is None
