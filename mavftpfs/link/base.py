@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 
 @dataclass(slots=True)
@@ -68,4 +68,17 @@ class Link(Protocol):
 
     async def aclose(self) -> None:
         """Flush what can be flushed at once and close."""
+        ...
+
+
+@runtime_checkable
+class PinsPeer(Protocol):
+    """A link that may hear several senders on one port and answers the latest until told whom to answer."""
+
+    def pin_peer(self, chunk_index: int) -> None:
+        """From now on send to whoever sent this chunk of the list `receive` returned last.
+
+        Call again with each heartbeat of the vehicle, so that the link follows a vehicle whose
+        address changes and nobody else. An index out of range is ignored.
+        """
         ...

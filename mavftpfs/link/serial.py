@@ -1,0 +1,70 @@
+"""Serial links: USB ports, telemetry radios, ptys. Layer: link; the only importer of pyserial.
+
+pyserial opens the port (settings, exclusive lock); from then on it is a plain descriptor. A port that
+vanishes (unplugged, vehicle rebooted) is opened again when it returns, under the same name.
+"""
+
+from __future__ import annotations
+
+import termios
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+
+import serial
+import trio
+
+from mavftpfs.link.lifetime import background
+from mavftpfs.link.problems import cannot_open
+from mavftpfs.link.stream import Pipe, StreamLink
+from mavftpfs.link.uri import LinkSpec
+
+_LEAST_OUTBOX = 4096
+
+
+@asynccontextmanager
+async def open_serial(spec: LinkSpec) -> AsyncIterator[StreamLink]:
+    """Open a serial port, and again whenever it vanishes.
+
+    Raises:
+        LinkClosed: no such port, no permission, or in use.
+    """
+
+    async def reopen() -> Pipe:
+        return await trio.to_thread.run_sync(_open_port, spec)
+
+    try:
+        pipe = await reopen()
+    except OSError as exc:
+        raise cannot_open(spec, exc) from exc
+    # About a second of the line: what waits longer than that is answered too late anyway.
+    limit = max(_LEAST_OUTBOX, spec.baud // 10)
+    link = StreamLink(spec.description, reopen, pipe, is_serial=True, outbox_limit=limit)
+    async with background(link.run, link.aclose):
+        yield link
+
+
+def _open_port(spec: LinkSpec) -> Pipe:
+    """Open the port for non-blocking use.
+
+    Raises:
+        OSError: also for settings that the port refuses.
+    """
+    try:
+        port = serial.Serial(spec.device, spec.baud, timeout=0, exclusive=True)
+    except ValueError as exc:
+        raise OSError(0, f"the port refuses {spec.baud} baud: {exc}") from exc
+    try:
+        _make_reads_tell_empty_from_gone(port.fileno())
+    except termios.error as exc:
+        port.close()
+        raise OSError(*exc.args) from exc
+    result: Pipe = port
+    return result
+
+
+def _make_reads_tell_empty_from_gone(fd: int) -> None:
+    # pyserial sets VMIN 0, with which a read of nothing and of a port that is gone both return b"".
+    attributes = termios.tcgetattr(fd)
+    attributes[6][termios.VMIN] = 1
+    attributes[6][termios.VTIME] = 0
+    termios.tcsetattr(fd, termios.TCSANOW, attributes)

@@ -1,0 +1,257 @@
+"""Byte streams that come back by themselves: what TCP and serial links share. Layer: link.
+
+A `Pipe` is an open, non-blocking file descriptor. When it fails, reading and writing stop, what waited to
+be sent is dropped (and counted: a stale request is worse than a lost one), and the helper task asks the
+opener for a new one, with growing pauses, for ever. `receive` then returns an empty list once, so that the
+caller resets its parser.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Awaitable, Callable, Sequence
+from typing import Protocol
+
+import trio
+
+from mavftpfs.link.base import LinkStats
+from mavftpfs.link.outbox import Outbox
+from mavftpfs.shared.errors import LinkClosed
+
+MAX_READS = 64
+_READ_SIZE = 16 * 1024
+
+FIRST_PAUSE = 0.25
+LONGEST_PAUSE = 2.0
+"""Seconds between attempts to reopen."""
+
+
+class Pipe(Protocol):
+    """A socket or a serial port, open and non-blocking."""
+
+    def fileno(self) -> int:
+        """The descriptor."""
+        ...
+
+    def close(self) -> None:
+        """Close it; harmless twice."""
+        ...
+
+
+Opener = Callable[[], Awaitable[Pipe]]
+"""Opens a new Pipe, waiting as long as it takes. Raises OSError or LinkClosed: try again later."""
+
+
+class StreamLink:
+    """Implements link.base.Link over whatever `opener` opens.
+
+    Args:
+        pipe: the first one, where it is already open.
+        outbox_limit: bytes to hold for a slow peer.
+    """
+
+    is_stream = True
+
+    def __init__(
+        self, description: str, opener: Opener, pipe: Pipe | None, *, is_serial: bool, outbox_limit: int
+    ) -> None:
+        self.stats = LinkStats()
+        self.description = description
+        self.is_serial = is_serial
+        self._opener = opener
+        self._pipe = pipe
+        self._was_open = pipe is not None
+        self._fresh = False
+        self._closed = False
+        self._heard_at = trio.current_time()
+        self._outbox = Outbox(outbox_limit)
+        self._work = trio.Event()
+        self._changed = trio.Event()
+
+    @property
+    def backlog(self) -> int:
+        """Bytes accepted by send_nowait and not yet handed to the kernel."""
+        return self._outbox.size
+
+    @property
+    def connected(self) -> bool:
+        """Whether there is a pipe at the moment."""
+        return self._pipe is not None
+
+    @property
+    def silence(self) -> float:
+        """Seconds since anything came in on the present pipe, or since it was opened."""
+        return trio.current_time() - self._heard_at
+
+    async def receive(self) -> list[bytes]:
+        """Wait for bytes; an empty list says that the stream was reopened.
+
+        Raises:
+            LinkClosed: aclose was called.
+        """
+        await trio.lowlevel.checkpoint_if_cancelled()
+        waited = False
+        while True:
+            if self._closed:
+                raise LinkClosed(f"{self.description} is closed")
+            chunks = None if self._fresh else self._drain()
+            if chunks is None or chunks:
+                self._fresh = False
+                if not waited:  # one checkpoint per batch, and none where data could be lost
+                    await trio.lowlevel.cancel_shielded_checkpoint()
+                return chunks or []
+            waited = True
+            await self._wait_for_input()
+
+    def send_nowait(self, frames: Sequence[bytes]) -> None:
+        """Send frames in one write; drop and count, whole, what cannot be kept."""
+        if self._pipe is None:
+            self.stats.dropped_sends += len(frames)
+            return
+        if not self._outbox.size:
+            data = b"".join(frames)
+            sent = self._write(data)
+            if sent:
+                # The rest of a frame must follow its beginning, whatever the limit says.
+                self._keep([data[sent:]] if sent < len(data) else [], force=True)
+                return
+        self._keep(frames, force=False)
+
+    def _keep(self, frames: Sequence[bytes], *, force: bool) -> None:
+        for frame in frames:
+            if not self._outbox.offer(frame, force=force):
+                self.stats.dropped_sends += 1
+        if self._outbox.size:
+            self._work.set()
+
+    def replace(self, pipe: Pipe) -> None:
+        """Go on with another pipe (the peer came back on a new connection)."""
+        self._drop()
+        self._pipe = pipe
+        self._heard_at = trio.current_time()
+        self._fresh = self._was_open
+        if self._was_open:
+            self.stats.reopened += 1
+        self._was_open = True
+        self._notify()
+
+    async def wait_replaceable(self, patience: float) -> None:
+        """Wait until there is no pipe, or it has been silent for `patience` seconds."""
+        while self.connected and (left := patience - self.silence) > 0:
+            with trio.move_on_after(left):
+                await self._changed.wait()
+
+    async def run(self) -> None:
+        """Write what had to wait, and reopen what failed; runs until cancelled."""
+        async with trio.open_nursery() as nursery:
+            nursery.start_soon(self._write_waiting)
+            nursery.start_soon(self._keep_open)
+
+    async def run_writer(self) -> None:
+        """Only the writing half of `run`, where somebody else calls `replace`."""
+        await self._write_waiting()
+
+    async def aclose(self) -> None:
+        """Close; what the kernel does not take now is lost."""
+        head = self._outbox.head()
+        if head is not None and self._pipe is not None:
+            self._write(head)
+        self._closed = True
+        self._drop()
+        self._notify()
+        await trio.lowlevel.checkpoint()
+
+    def _notify(self) -> None:
+        self._changed.set()
+        self._changed = trio.Event()
+
+    async def _wait_for_input(self) -> None:
+        if self._pipe is None:
+            await self._changed.wait()
+            return
+        try:
+            await trio.lowlevel.wait_readable(self._pipe.fileno())
+        except (trio.ClosedResourceError, OSError):
+            return  # replaced or lost meanwhile; look again
+
+    def _drain(self) -> list[bytes]:
+        chunks: list[bytes] = []
+        while self._pipe is not None and len(chunks) < MAX_READS:
+            try:
+                data = os.read(self._pipe.fileno(), _READ_SIZE)
+            except BlockingIOError:
+                break
+            except OSError:
+                data = b""
+            if not data:
+                self._lose()
+                break
+            chunks.append(data)
+            if len(data) < _READ_SIZE:
+                break  # saves the read that would say "nothing more"
+        if chunks:
+            self._heard_at = trio.current_time()
+            self.stats.received_chunks += len(chunks)
+            self.stats.received_bytes += sum(map(len, chunks))
+        return chunks
+
+    def _write(self, data: bytes) -> int:
+        """Return how much the kernel took; a broken pipe takes all."""
+        if self._pipe is None:
+            return len(data)
+        try:
+            sent = os.write(self._pipe.fileno(), data)
+        except BlockingIOError:
+            return 0
+        except OSError:
+            self.stats.dropped_sends += 1
+            self._lose()
+            return len(data)
+        self.stats.sent_bytes += sent
+        self.stats.sent_chunks += 1
+        return sent
+
+    def _lose(self) -> None:
+        self._drop()
+        self._notify()
+
+    def _drop(self) -> None:
+        pipe, self._pipe = self._pipe, None
+        if pipe is not None:
+            trio.lowlevel.notify_closing(pipe.fileno())
+            pipe.close()
+        self.stats.dropped_sends += self._outbox.clear()
+
+    async def _write_waiting(self) -> None:
+        while True:
+            await self._work.wait()
+            self._work = trio.Event()
+            while self._pipe is not None and (data := self._outbox.head()) is not None:
+                sent = self._write(data)
+                if sent and self._outbox.head() is data:  # a pipe that broke has emptied the outbox
+                    self._outbox.advance(sent)
+                if sent < len(data):
+                    await self._wait_for_room()
+
+    async def _wait_for_room(self) -> None:
+        if self._pipe is None:
+            return
+        try:
+            await trio.lowlevel.wait_writable(self._pipe.fileno())
+        except (trio.ClosedResourceError, OSError):
+            return
+
+    async def _keep_open(self) -> None:
+        pause = FIRST_PAUSE
+        while not self._closed:
+            if self._pipe is not None:
+                pause = FIRST_PAUSE
+                await self._changed.wait()
+                continue
+            try:
+                pipe = await self._opener()
+            except (OSError, LinkClosed):
+                await trio.sleep(pause)
+                pause = min(pause * 2, LONGEST_PAUSE)
+            else:
+                self.replace(pipe)

@@ -1,0 +1,152 @@
+"""TCP links: `tcp` connects (again and again), `tcpin` accepts one peer at a time. Layer: link.
+
+Both ends use keep-alives and a user timeout, so that a vehicle that lost power is noticed within about
+15 s although TCP alone would wait for minutes.
+"""
+
+from __future__ import annotations
+
+import errno
+import socket
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager, suppress
+
+import trio
+
+from mavftpfs.link.lifetime import background
+from mavftpfs.link.problems import cannot_open
+from mavftpfs.link.stream import Pipe, StreamLink
+from mavftpfs.link.uri import LinkSpec
+
+CONNECT_TIMEOUT = 5.0
+"""Seconds for each attempt."""
+
+PEER_PATIENCE = 5.0
+"""Seconds of silence after which a new peer replaces the present one, which may be a dead connection."""
+
+_OUTBOX_LIMIT = 64 * 1024
+_SOCKET_BUFFER = 1 << 20
+_MAX_ADDRESSES = 4
+_PAUSE = 0.2
+
+
+@asynccontextmanager
+async def open_tcp(spec: LinkSpec) -> AsyncIterator[StreamLink]:
+    """Connect to a listening vehicle or bridge, and again whenever the connection is lost.
+
+    Raises:
+        LinkClosed: the first attempt failed.
+    """
+
+    async def connect() -> Pipe:
+        return await _connect(spec)
+
+    try:
+        pipe = await connect()
+    except OSError as exc:
+        raise cannot_open(spec, exc) from exc
+    link = StreamLink(spec.description, connect, pipe, is_serial=False, outbox_limit=_OUTBOX_LIMIT)
+    async with background(link.run, link.aclose):
+        yield link
+
+
+@asynccontextmanager
+async def open_tcp_server(spec: LinkSpec) -> AsyncIterator[StreamLink]:
+    """Listen; the link is usable at once and drops what is sent before somebody connects.
+
+    Raises:
+        LinkClosed: the port is taken or the address is not ours.
+    """
+    try:
+        listener = await _listen(spec)
+    except OSError as exc:
+        raise cannot_open(spec, exc) from exc
+    with listener:
+        link = StreamLink(spec.description, _never, None, is_serial=False, outbox_limit=_OUTBOX_LIMIT)
+
+        async def serve() -> None:
+            async with trio.open_nursery() as nursery:
+                nursery.start_soon(link.run_writer)
+                nursery.start_soon(_accept_peers, listener, link)
+
+        async with background(serve, link.aclose):
+            yield link
+
+
+async def _never() -> Pipe:
+    raise OSError(errno.ENOTCONN, "a listening link is opened by its peer")
+
+
+async def _connect(spec: LinkSpec) -> socket.socket:
+    """Try the host's addresses in turn.
+
+    Raises:
+        OSError: that of the last address.
+    """
+    found = await trio.socket.getaddrinfo(spec.host, spec.port, type=socket.SOCK_STREAM)
+    problem: OSError = OSError(errno.EHOSTUNREACH, "no address")
+    for family, kind, protocol, _, address in found[:_MAX_ADDRESSES]:
+        sock = trio.socket.socket(family, kind, protocol)
+        try:
+            with trio.fail_after(CONNECT_TIMEOUT):
+                await sock.connect(address)
+        except OSError as exc:
+            problem = exc
+            sock.close()
+        except trio.TooSlowError:
+            problem = OSError(errno.ETIMEDOUT, "no answer")
+            sock.close()
+        except BaseException:
+            sock.close()
+            raise
+        else:
+            return _configure(socket.socket(fileno=sock.detach()))
+    raise problem
+
+
+async def _listen(spec: LinkSpec) -> socket.socket:
+    found = await trio.socket.getaddrinfo(
+        spec.host, spec.port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
+    )
+    family, kind, protocol, _, address = found[0]
+    listener = socket.socket(family, kind, protocol)
+    try:
+        listener.setblocking(False)
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # past connections in TIME_WAIT
+        listener.bind(address)
+        listener.listen(4)
+    except BaseException:
+        listener.close()
+        raise
+    return listener
+
+
+async def _accept_peers(listener: socket.socket, link: StreamLink) -> None:
+    while True:
+        await trio.lowlevel.wait_readable(listener)
+        try:
+            peer, _ = listener.accept()
+        except OSError:  # it went away again before we looked
+            await trio.sleep(_PAUSE)
+            continue
+        try:
+            await link.wait_replaceable(PEER_PATIENCE)
+        except BaseException:
+            peer.close()
+            raise
+        link.replace(_configure(peer))
+
+
+def _configure(sock: socket.socket) -> socket.socket:
+    sock.setblocking(False)
+    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+    for name, value in (
+        ("TCP_KEEPIDLE", 5),
+        ("TCP_KEEPINTVL", 3),
+        ("TCP_KEEPCNT", 3),
+        ("TCP_USER_TIMEOUT", 15_000),
+    ):
+        with suppress(OSError, AttributeError):  # not on every system; a comfort only
+            sock.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)
+    return sock

@@ -1,0 +1,209 @@
+"""UDP links. Layer: link.
+
+`udpin` binds a port and answers whoever spoke last, until `pin_peer` names the vehicle's address (several
+senders on one port must not steal the answers). `udpout` speaks first, to one host, from one source port
+for the life of the process (PX4 answers only the first address it heard, servers.md 5). The socket is never
+connected, so that ICMP "port unreachable" of a vehicle that reboots is not an error.
+"""
+
+from __future__ import annotations
+
+import socket
+from collections.abc import AsyncIterator, Sequence
+from contextlib import asynccontextmanager
+from typing import Any
+
+import trio
+
+from mavftpfs.link.base import LinkStats
+from mavftpfs.link.lifetime import background
+from mavftpfs.link.outbox import Outbox, pack
+from mavftpfs.link.problems import cannot_open
+from mavftpfs.link.uri import LinkKind, LinkSpec
+from mavftpfs.shared.errors import LinkClosed
+
+MAX_CHUNKS = 256
+"""Datagrams taken per wake-up: more would starve heartbeats and the kernel's requests."""
+
+_SOCKET_BUFFER = 1 << 20
+_OUTBOX_LIMIT = 64 * 1024
+_LARGEST = 65535
+
+_SockAddr = tuple[Any, ...]
+
+
+class UdpLink:
+    """A bound UDP socket; implements link.base.Link. Made by `open_udp`.
+
+    Args:
+        sock: bound, non-blocking.
+        peer: udpout's target; then datagrams from other hosts are ignored. None: udpin.
+    """
+
+    is_stream = False
+    is_serial = False
+
+    def __init__(self, sock: socket.socket, description: str, peer: _SockAddr | None = None) -> None:
+        self.stats = LinkStats()
+        self.description = description
+        self._sock = sock
+        self._peer = peer
+        self._only_host = None if peer is None else peer[0]
+        self._pinned = False
+        self._senders: list[_SockAddr] = []
+        self._outbox = Outbox(_OUTBOX_LIMIT)
+        self._work = trio.Event()
+        self._closed = False
+
+    @property
+    def backlog(self) -> int:
+        """Bytes accepted by send_nowait and not yet handed to the kernel."""
+        return self._outbox.size
+
+    @property
+    def local_address(self) -> _SockAddr:
+        """The bound address; its second item is the port."""
+        return self._sock.getsockname()  # type: ignore[no-any-return]
+
+    async def receive(self) -> list[bytes]:
+        """Wait for datagrams and return 1..256 of them.
+
+        Raises:
+            LinkClosed: aclose was called.
+        """
+        await trio.lowlevel.checkpoint_if_cancelled()
+        waited = False
+        while True:
+            if self._closed:
+                raise LinkClosed(f"{self.description} is closed")
+            chunks = self._drain()
+            if chunks:
+                if not waited:  # one checkpoint per batch, and none where data could be lost
+                    await trio.lowlevel.cancel_shielded_checkpoint()
+                return chunks
+            waited = True
+            try:
+                await trio.lowlevel.wait_readable(self._sock)
+            except trio.ClosedResourceError:
+                continue
+
+    def send_nowait(self, frames: Sequence[bytes]) -> None:
+        """Send frames, packed into datagrams below 1400 bytes; drop and count what cannot go."""
+        for datagram in pack(frames):
+            if self._peer is None or self._closed:
+                self.stats.dropped_sends += 1
+            elif self._outbox.size or not self._send(datagram):
+                if self._outbox.offer(datagram):
+                    self._work.set()
+                else:
+                    self.stats.dropped_sends += 1
+
+    def pin_peer(self, chunk_index: int) -> None:
+        """From now on send to whoever sent this chunk of the last batch (see base.PinsPeer)."""
+        if self._only_host is None and 0 <= chunk_index < len(self._senders):
+            self._peer = self._senders[chunk_index]
+            self._pinned = True
+
+    async def run_writer(self) -> None:
+        """Send what had to wait for the kernel; runs until cancelled."""
+        while True:
+            await self._work.wait()
+            self._work = trio.Event()
+            while (datagram := self._outbox.head()) is not None:
+                if self._send(datagram):
+                    self._outbox.advance(len(datagram))
+                    continue
+                try:
+                    await trio.lowlevel.wait_writable(self._sock)
+                except trio.ClosedResourceError:
+                    return
+
+    async def aclose(self) -> None:
+        """Close; what the kernel has not taken by now is lost."""
+        if not self._closed:
+            self._closed = True
+            trio.lowlevel.notify_closing(self._sock)
+            self._sock.close()
+        await trio.lowlevel.checkpoint()
+
+    def _drain(self) -> list[bytes]:
+        """Take what is there. Errors of the socket are other people's ICMP messages: go on."""
+        receive = self._sock.recvfrom
+        chunks: list[bytes] = []
+        senders: list[_SockAddr] = []
+        for _ in range(MAX_CHUNKS):
+            try:
+                data, sender = receive(_LARGEST)
+            except BlockingIOError:
+                break
+            except OSError:
+                continue
+            if self._only_host is None or sender[0] == self._only_host:
+                chunks.append(data)
+                senders.append(sender)
+        if chunks:
+            self._senders = senders
+            self.stats.received_chunks += len(chunks)
+            self.stats.received_bytes += sum(map(len, chunks))
+            if self._only_host is None and not self._pinned:
+                self._peer = senders[-1]
+        return chunks
+
+    def _send(self, datagram: bytes) -> bool:
+        """Return False if the kernel has no room; anything else that goes wrong is a lost datagram."""
+        try:
+            self._sock.sendto(datagram, self._peer)  # type: ignore[arg-type]
+        except BlockingIOError:
+            return False
+        except OSError:  # no route, no buffer: waiting would not help
+            self.stats.dropped_sends += 1
+            return True
+        self.stats.sent_chunks += 1
+        self.stats.sent_bytes += len(datagram)
+        return True
+
+
+@asynccontextmanager
+async def open_udp(spec: LinkSpec) -> AsyncIterator[UdpLink]:
+    """Open udpin or udpout and run its writer for the length of the `async with`.
+
+    Raises:
+        LinkClosed: unknown host, or the port is taken.
+    """
+    family, address = await _resolve(spec)
+    listens = spec.kind is LinkKind.UDP_IN
+    sock = socket.socket(family, socket.SOCK_DGRAM)
+    try:
+        _configure(sock)
+        _bind(sock, spec, address if listens else (("::" if family == socket.AF_INET6 else "0.0.0.0"), 0))
+    except BaseException:
+        sock.close()
+        raise
+    link = UdpLink(sock, spec.description, None if listens else address)
+    async with background(link.run_writer, link.aclose):
+        yield link
+
+
+async def _resolve(spec: LinkSpec) -> tuple[socket.AddressFamily, _SockAddr]:
+    try:
+        found = await trio.socket.getaddrinfo(spec.host, spec.port, type=socket.SOCK_DGRAM)
+    except OSError as exc:
+        raise LinkClosed(
+            f"{spec.description}: host {spec.host!r} is unknown ({exc.strerror or exc})"
+        ) from exc
+    # IPv4 first: a name like localhost often has both, and vehicles listen on IPv4.
+    found.sort(key=lambda entry: entry[0] != socket.AF_INET)
+    return found[0][0], found[0][4]
+
+
+def _configure(sock: socket.socket) -> None:
+    sock.setblocking(False)
+    for option in (socket.SO_RCVBUF, socket.SO_SNDBUF):
+        sock.setsockopt(socket.SOL_SOCKET, option, _SOCKET_BUFFER)  # the kernel caps it silently
+
+
+def _bind(sock: socket.socket, spec: LinkSpec, address: _SockAddr) -> None:
+    try:
+        sock.bind(address)
+    except OSError as exc:
+        raise cannot_open(spec, exc) from exc
