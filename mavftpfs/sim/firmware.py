@@ -1,0 +1,103 @@
+"""What the simulated firmwares have in common: a timeline, an outbox, counters. Layer: sim; pure.
+
+Time: `handle` and `outgoing` first let everything happen that was due by `now`, in order, at its own instant.
+Replies are emitted in the order of their due times: the outbox is a list of those that are due and a queue
+of the others.
+"""
+
+from __future__ import annotations
+
+import random
+from abc import ABC, abstractmethod
+from collections import deque
+from collections.abc import Callable
+
+from mavftpfs.link.messages import Address
+from mavftpfs.sim.profiles import Profile
+from mavftpfs.sim.storage import Storage
+from mavftpfs.sim.wire import FULL_FRAME, frame_size
+
+Room = Callable[[], int]
+
+
+class Firmware(ABC):
+    """One server's code. Subclasses decide; this class keeps time and the outbox."""
+
+    def __init__(self, storage: Storage, profile: Profile, rng: random.Random) -> None:
+        self.storage = storage
+        self.profile = profile
+        self.rng = rng
+        self.tx_room: Room | None = None
+        self.crashed = False
+        self.dropped_requests = 0
+        self.dropped_replies = 0
+        self.replays = 0
+        self.now = float("-inf")
+        self._ready: list[tuple[Address, bytes]] = []
+        self._ready_bytes = 0
+        self._later: deque[tuple[float, Address, bytes]] = deque()
+
+    @abstractmethod
+    def handle(self, wire: bytes, source: Address, now: float) -> None:
+        """Take a request of 251 bytes."""
+
+    @abstractmethod
+    def advance(self, now: float) -> None:
+        """Let everything happen that is due by `now`."""
+
+    @abstractmethod
+    def next_wake(self) -> float | None:
+        """When `advance` has something to do next."""
+
+    @abstractmethod
+    def open_paths(self) -> list[bytes]:
+        """Paths of the files that are open, as the client named them."""
+
+    @abstractmethod
+    def reboot(self, now: float) -> None:
+        """Close everything and start afresh at `now`."""
+
+    def outgoing(self, now: float) -> list[tuple[Address, bytes]]:
+        """Return the replies due by `now`."""
+        self.advance(now)
+        if self._later:
+            self._promote(now)
+        ready, self._ready = self._ready, []
+        self._ready_bytes = 0
+        return ready
+
+    def next_deadline(self) -> float | None:
+        """When `outgoing` may have something, or a timer runs; None if only a request can change anything."""
+        if self._ready:
+            return self.now
+        wake = self.next_wake()
+        if self._later:
+            due = self._later[0][0]
+            return due if wake is None else min(due, wake)
+        return wake
+
+    def forget_outbox(self) -> None:
+        """Drop what was not sent yet."""
+        self._ready = []
+        self._ready_bytes = 0
+        self._later.clear()
+
+    def _promote(self, now: float) -> None:
+        while self._later and self._later[0][0] <= now:
+            _, target, wire = self._later.popleft()
+            self._ready.append((target, wire))
+
+    def emit(self, target: Address, wire: bytes, due: float, now: float) -> None:
+        """Put a reply into the outbox, to leave at `due` (not before earlier ones)."""
+        if due > now or self._later:
+            self._later.append((due, target, wire))
+        else:
+            self._ready.append((target, wire))
+        if self.tx_room is not None:
+            self._ready_bytes += frame_size(wire)
+
+    def room(self) -> int:
+        """Bytes free in the link's transmit buffer, less what waits in the outbox; plenty if nobody told."""
+        if self.tx_room is None:
+            return 10 * FULL_FRAME + self.profile.tx_buffer
+        return self.tx_room() - self._ready_bytes

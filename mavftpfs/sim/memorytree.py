@@ -1,0 +1,317 @@
+"""A directory tree in memory. Layer: sim; pure."""
+
+from __future__ import annotations
+
+import errno
+from collections.abc import Callable, Iterable
+
+from mavftpfs.sim.filesystem import Entry, Kind, Stat, TreeFile, fail, parent_and_name, split_path
+
+DEFAULT_MTIME = 1_700_000_000
+MAX_FILE = 256 * 2**20
+_MAX_LINKS = 8
+_DIRECTORY_SIZE = 4096
+
+
+class _Node:
+    """A file, directory, symlink or something else; `linked` until it is removed."""
+
+    __slots__ = ("children", "data", "kind", "linked", "mtime", "order", "target")
+
+    def __init__(self, kind: Kind, mtime: int) -> None:
+        self.kind = kind
+        self.mtime = mtime
+        self.data = bytearray()
+        self.children: dict[bytes, _Node] = {}
+        self.order: list[bytes] = []
+        self.target = b""
+        self.linked = True
+
+    def stat(self) -> Stat:
+        size = _DIRECTORY_SIZE if self.kind is Kind.DIRECTORY else len(self.data) or len(self.target)
+        return Stat(self.kind, size, self.mtime)
+
+
+class MemoryTree:
+    """A tree in memory.
+
+    capacity: bytes all files together may hold; None = no limit. Single files end at 256 MiB (EFBIG).
+    newest_first: whether readdir shows new names first (tmpfs) or last.
+    clock: tells new mtimes, seconds since 1970; a constant unless given.
+    """
+
+    def __init__(
+        self,
+        *,
+        capacity: int | None = None,
+        newest_first: bool = False,
+        clock: Callable[[], float] | None = None,
+    ) -> None:
+        self.capacity = capacity
+        self.used = 0
+        self._newest_first = newest_first
+        self._clock = clock
+        self._root = _Node(Kind.DIRECTORY, self._now())
+        self._root.order = [b".", b".."]
+
+    # -- building a tree ---------------------------------------------------------------------
+
+    def add(self, path: bytes, data: bytes = b"", mtime: int | None = None) -> None:
+        """Put a file there, replacing its content, making parents as needed."""
+        self.add_directory(parent_and_name(path)[0])
+        with_file = self.open(path, write=True, create=True, truncate=True)
+        if data:
+            with_file.write(0, data)
+        if mtime is not None:
+            self._find(path).mtime = mtime
+
+    def add_directory(self, path: bytes, mtime: int | None = None) -> None:
+        """Make a directory and its parents; one that exists is left alone."""
+        made = b""
+        for name in split_path(path):
+            made += b"/" + name
+            try:
+                self.mkdir(made)
+            except FileExistsError:
+                continue
+        if mtime is not None:
+            self._find(path).mtime = mtime
+
+    def add_symlink(self, path: bytes, target: bytes) -> None:
+        """Put a symlink there; `target` may dangle."""
+        node = _Node(Kind.SYMLINK, self._now())
+        node.target = target
+        self._link(path, node)
+
+    def add_other(self, path: bytes) -> None:
+        """Put a thing there that is neither file, directory nor symlink (a fifo, say)."""
+        self._link(path, _Node(Kind.OTHER, self._now()))
+
+    def data(self, path: bytes) -> bytes:
+        """Return a file's content."""
+        return bytes(self._find_file(path).data)
+
+    def set_order(self, path: bytes, names: Iterable[bytes]) -> None:
+        """Fix the readdir order of a directory; names may include `.` and `..`, others follow."""
+        node = self._find(path)
+        first = list(names)
+        node.order = first + [name for name in node.order if name not in first]
+
+    # -- the Tree protocol -------------------------------------------------------------------
+
+    def entries(self, path: bytes) -> list[Entry]:
+        """See Tree."""
+        node = self._find(path)
+        if node.kind is not Kind.DIRECTORY:
+            raise fail(errno.ENOTDIR, path)
+        return [Entry(name, node.children.get(name, node).stat()) for name in node.order]
+
+    def stat(self, path: bytes) -> Stat:
+        """See Tree."""
+        return self._find(path).stat()
+
+    def open(
+        self, path: bytes, *, write: bool = False, create: bool = False, truncate: bool = False
+    ) -> TreeFile:
+        """See Tree."""
+        try:
+            node = self._find_file(path)
+        except FileNotFoundError:
+            if not create:
+                raise
+            node = _Node(Kind.FILE, self._now())
+            self._link(path, node)
+        if truncate:
+            self._resize(node, 0)
+        return _MemoryFile(self, node, write)
+
+    def truncate(self, path: bytes, size: int) -> None:
+        """See Tree."""
+        node = self._find_file(path)
+        if size > self._limit(node):
+            raise fail(errno.EFBIG if size > MAX_FILE else errno.ENOSPC, path)
+        self._resize(node, size)
+
+    def remove(self, path: bytes) -> None:
+        """See Tree."""
+        parent, name, node = self._entry(path)
+        if node.kind is Kind.DIRECTORY:
+            raise fail(errno.EISDIR, path)
+        self._unlink(parent, name)
+
+    def rename(self, old: bytes, new: bytes) -> None:
+        """See Tree."""
+        old_parent, old_name, node = self._entry(old)
+        new_parent, new_name = self._parent(new)
+        target = new_parent.children.get(new_name)
+        if target is node:
+            return
+        if node in self._chain(new):
+            raise fail(errno.EINVAL, new)
+        if target is not None:
+            self._check_replaceable(node, target, new)
+            self._unlink(new_parent, new_name)
+        self._unlink(old_parent, old_name)
+        self._link(new, node)
+
+    def mkdir(self, path: bytes) -> None:
+        """See Tree."""
+        if not split_path(path):
+            raise fail(errno.EEXIST, path)
+        node = _Node(Kind.DIRECTORY, self._now())
+        node.order = [b".", b".."]
+        self._link(path, node)
+
+    def rmdir(self, path: bytes) -> None:
+        """See Tree."""
+        parent, name, node = self._entry(path)
+        if node.kind is not Kind.DIRECTORY:
+            raise fail(errno.ENOTDIR, path)
+        if node.children:
+            raise fail(errno.ENOTEMPTY, path)
+        self._unlink(parent, name)
+
+    # -- nodes -------------------------------------------------------------------------------
+
+    def _now(self) -> int:
+        return int(self._clock()) if self._clock is not None else DEFAULT_MTIME
+
+    def _chain(self, path: bytes) -> list[_Node]:
+        """Return the nodes from the root to `path`'s parent, symlinks followed."""
+        return self._walk(split_path(path)[:-1])
+
+    def _walk(self, names: list[bytes]) -> list[_Node]:
+        chain, pending, links = [self._root], list(reversed(names)), 0
+        while pending:
+            name = pending.pop()
+            if chain[-1].kind is not Kind.DIRECTORY:
+                raise fail(errno.ENOTDIR, name)
+            if name == b"..":
+                chain = chain[:-1] or chain
+                continue
+            node = chain[-1].children.get(name)
+            if node is None:
+                raise fail(errno.ENOENT, name)
+            if node.kind is Kind.SYMLINK:
+                links += 1
+                if links > _MAX_LINKS:
+                    raise fail(errno.ELOOP, name)
+                chain = [self._root] if node.target.startswith(b"/") else chain
+                pending += reversed(split_path(node.target))
+            else:
+                chain.append(node)
+        return chain
+
+    def _find(self, path: bytes) -> _Node:
+        return self._walk(split_path(path))[-1]
+
+    def _find_file(self, path: bytes) -> _Node:
+        node = self._find(path)
+        if node.kind is Kind.DIRECTORY:
+            raise fail(errno.EISDIR, path)
+        if node.kind is Kind.OTHER:
+            raise fail(errno.ENXIO, path)
+        return node
+
+    def _parent(self, path: bytes) -> tuple[_Node, bytes]:
+        names = split_path(path)
+        if not names or names[-1] == b"..":
+            raise fail(errno.EBUSY, path)
+        parent = self._walk(names[:-1])[-1]
+        if parent.kind is not Kind.DIRECTORY:
+            raise fail(errno.ENOTDIR, path)
+        return parent, names[-1]
+
+    def _entry(self, path: bytes) -> tuple[_Node, bytes, _Node]:
+        parent, name = self._parent(path)
+        if name not in parent.children:
+            raise fail(errno.ENOENT, path)
+        return parent, name, parent.children[name]
+
+    @staticmethod
+    def _check_replaceable(node: _Node, target: _Node, path: bytes) -> None:
+        if target.kind is Kind.DIRECTORY:
+            if node.kind is not Kind.DIRECTORY:
+                raise fail(errno.EISDIR, path)
+            if target.children:
+                raise fail(errno.ENOTEMPTY, path)
+        elif node.kind is Kind.DIRECTORY:
+            raise fail(errno.ENOTDIR, path)
+
+    def _link(self, path: bytes, node: _Node) -> None:
+        parent, name = self._parent(path)
+        if name in parent.children:
+            raise fail(errno.EEXIST, path)
+        parent.children[name] = node
+        parent.order.insert(0 if self._newest_first else len(parent.order), name)
+        parent.mtime = self._now()
+        node.linked = True
+        self.used += len(node.data)
+
+    def _unlink(self, parent: _Node, name: bytes) -> None:
+        node = parent.children.pop(name)
+        parent.order.remove(name)
+        parent.mtime = self._now()
+        node.linked = False
+        self.used -= len(node.data)
+
+    def _limit(self, node: _Node) -> int:
+        """Return the size that a file may have now."""
+        if self.capacity is None:
+            return MAX_FILE
+        return min(MAX_FILE, len(node.data) + max(0, self.capacity - self.used))
+
+    def _resize(self, node: _Node, size: int) -> None:
+        grown = size - len(node.data)
+        if grown > 0:
+            node.data.extend(bytes(grown))
+        else:
+            del node.data[size:]
+        if node.linked:
+            self.used += grown
+        node.mtime = self._now()
+
+
+class _MemoryFile:
+    """An open file of a MemoryTree; lives on when the name is removed."""
+
+    __slots__ = ("_data", "_node", "_tree", "_write")
+
+    def __init__(self, tree: MemoryTree, node: _Node, write: bool) -> None:
+        self._tree = tree
+        self._node = node
+        self._data = node.data
+        self._write = write
+
+    def read(self, offset: int, size: int) -> bytes:
+        """See TreeFile."""
+        return bytes(self._data[offset : offset + size])
+
+    def write(self, offset: int, data: bytes) -> int:
+        """See TreeFile."""
+        if not self._write:
+            raise fail(errno.EBADF)
+        stop = offset + len(data)
+        if stop > len(self._data):
+            stop = self._grow(offset, stop)
+            data = data[: stop - offset]
+        self._data[offset:stop] = data
+        self._node.mtime = self._tree._now()
+        return len(data)
+
+    def _grow(self, offset: int, stop: int) -> int:
+        """Make room up to `stop` if the tree has it, and return how far the write may go."""
+        limit = self._tree._limit(self._node)
+        if limit <= offset:
+            raise fail(errno.EFBIG if offset >= MAX_FILE else errno.ENOSPC)
+        stop = min(stop, limit)
+        if stop > len(self._data):
+            self._tree._resize(self._node, stop)
+        return stop
+
+    def size(self) -> int:
+        """See TreeFile."""
+        return len(self._data)
+
+    def close(self) -> None:
+        """See TreeFile."""

@@ -1,0 +1,228 @@
+"""Firmware profiles: what a simulated server is, as data. Layer: sim; pure.
+
+The profiles named in design.md section 6 and a few odd variants. Sources of the numbers: servers.md, PX4
+`mavlink_ftp.cpp`, ArduPilot `GCS_FTP.cpp`, MAVSDK `mavlink_ftp_server.cpp`, and the recordings in tests/data.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from enum import Enum
+
+
+class Family(Enum):
+    """Whose code the server runs."""
+
+    SPEC = "spec"
+    PX4 = "px4"
+    ARDUPILOT = "ardupilot"
+    MAVSDK = "mavsdk"
+
+
+class Storage(Enum):
+    """What the files lie on, as far as it shows."""
+
+    POSIX = "posix"
+    NUTTX_FAT = "nuttx-fat"
+    FATFS = "fatfs"
+    LITTLEFS = "littlefs"
+
+
+@dataclass(frozen=True, slots=True)
+class Profile:
+    """One server. Times in seconds, sizes in bytes, rates in bytes per second.
+
+    Fields that a family has no use for are ignored by it.
+    """
+
+    name: str
+    family: Family
+    storage: Storage = Storage.POSIX
+    case_fold: bool = False
+    """Names are found whatever their case (FatFs)."""
+    newlib_errnos: bool = False
+    """ENOTEMPTY is 90, ENAMETOOLONG 91, ENOSYS 88, ELOOP 92 (servers.md 12)."""
+
+    # Requests
+    list_with_time: bool = False
+    """Opcode 16 is answered; otherwise it is an unknown opcode like any other."""
+    bare_time_directories: bool = False
+    """Opcode 16 lists directories as a bare D<name> (PX4 of early 2026)."""
+    unknown_code: int = 7
+    """NAK code for an unknown opcode (ArduPilot before mid-2026: 1)."""
+    truncate_file: bool = True
+    """TruncateFile works."""
+    virtual_trees: bool = False
+    """@SYS, @ROMFS, @PARAM and @MISSION exist (ArduPilot)."""
+    exact_virtual_sizes: bool = False
+    """Sizes of generated files are right (PX4 of 2026: @PARAM/param.pck)."""
+    double_nul: bool = False
+    """Listing entries end in two zero bytes (ArduPilot before mid-2026)."""
+    drop_long_names: bool = False
+    """A name too long for a page is left out; else it ends the listing early (ArduPilot)."""
+    root_hides_files: bool = False
+    """Listing `/` shows no plain files, listing `.` does (ArduPilot SITL, generation A)."""
+    counted_path_nul: bool = True
+    """A path may count its trailing NUL in `size` (ArduPilot since mid-2025)."""
+    path_limit: int = 238
+    """Longer paths are cut silently (PX4, ArduPilot)."""
+
+    # Sessions
+    sessions: int = 1
+    idle_close: float | None = None
+    """PX4: 10; ArduPilot generation B: 20 when the queue is idle."""
+    steal_after: float = 3.0
+    """ArduPilot: a session idle for so long may be taken by another."""
+    write_only_truncates: bool = False
+    """OpenFileWO cuts the file to nothing (MAVSDK)."""
+    write_only_creates: bool = True
+    """OpenFileWO makes a missing file (PX4, ArduPilot generation B)."""
+    short_write_acks: bool = False
+    """A write that found room for a part is ACKed as if whole (ArduPilot)."""
+    sticky_stream_failure: bool = False
+    """A read that crossed the end spoils every later read until reopened (MAVSDK before 4.1)."""
+
+    # Whitelist of PX4 on NuttX
+    writable_root: bytes = b""
+    """Writes must start with this; the check looks at a scratch buffer (servers.md 8)."""
+
+    # Timing
+    tick: float = 0.010
+    """PX4: period of the loop that sends bursts."""
+    latency: float = 0.010
+    """ArduPilot: from an idle queue to the first answer."""
+    queue_length: int = 5
+    """ArduPilot: requests that wait; more are dropped silently."""
+    request_cost: float = 0.0
+    """Time each request takes, during which the server does nothing else."""
+    stall_chance: float = 0.0
+    """Share of reads and writes that hit a slow SD card."""
+    stall: tuple[float, float] = (0.05, 0.3)
+    """Shortest and longest such stall."""
+    crc_rate: float = 100e6
+    """How fast CalcFileCRC32 reads."""
+    readdir_cost: float = 0.0
+    """Time per entry read, also those before the page's offset."""
+    rx_buffer: int = 212_992
+    """Frame bytes that may wait while the server is busy; more are lost (PX4)."""
+    tx_buffer: int = 15_000
+    """Bytes a burst may send per tick (PX4); the link's own room may be less."""
+
+    # Bursts
+    burst_packets: int = 0
+    """Packets in one burst; 0 = no limit. PX4 counts bytes instead."""
+    burst_bytes: int = 35_000
+    """PX4: a burst ends with the first tick that ends beyond this."""
+    burst_interval: float = 0.0
+    """Time per burst packet at best."""
+    bandwidth: float | None = None
+    """ArduPilot without flow control: a burst takes a third of this at most."""
+    short_packet_completes: bool = False
+    """burst_complete is set on the short last packet and its NAK; else on the NAK (ArduPilot)."""
+    exact_eof_offset: bool = True
+    """False: the EOF NAK's offset is a packet too small where sizes divide (ArduPilot generation A)."""
+    garbage_complete: float = 0.0
+    """PX4: chance of a spurious burst_complete on a packet that is alone in its tick."""
+
+
+_PX4 = Profile(
+    name="px4",
+    family=Family.PX4,
+    path_limit=237,
+    idle_close=10.0,
+    garbage_complete=0.1,
+)
+_ARDUPILOT = Profile(
+    name="ardupilot",
+    family=Family.ARDUPILOT,
+    unknown_code=1,
+    truncate_file=False,
+    virtual_trees=True,
+    double_nul=True,
+    root_hides_files=True,
+    counted_path_nul=False,
+    write_only_creates=False,
+    short_write_acks=True,
+    burst_packets=500,
+    burst_interval=0.0056,
+    short_packet_completes=True,
+    exact_eof_offset=False,
+)
+_ARDUPILOT5 = Profile(
+    name="ardupilot5",
+    family=Family.ARDUPILOT,
+    storage=Storage.FATFS,
+    case_fold=True,
+    newlib_errnos=True,
+    list_with_time=True,
+    truncate_file=False,
+    virtual_trees=True,
+    drop_long_names=True,
+    sessions=5,
+    idle_close=20.0,
+    short_write_acks=True,
+    crc_rate=400e3,
+    burst_packets=2000,
+    burst_interval=0.0056,
+)
+_MAVSDK = Profile(
+    name="mavsdk",
+    family=Family.MAVSDK,
+    list_with_time=True,
+    truncate_file=False,
+    path_limit=239,
+    write_only_truncates=True,
+    write_only_creates=False,
+    burst_packets=150,
+    burst_interval=0.00206,
+)
+
+_ALL = (
+    Profile(name="spec", family=Family.SPEC, list_with_time=True, sessions=4, path_limit=239),
+    _PX4,
+    replace(
+        _PX4,
+        name="px4-nuttx",
+        storage=Storage.NUTTX_FAT,
+        path_limit=238,
+        writable_root=b"/fs/microsd/",
+        request_cost=0.0005,
+        stall_chance=0.002,
+        crc_rate=600e3,
+        readdir_cost=0.0002,
+        rx_buffer=1500,
+        tx_buffer=1500,
+    ),
+    replace(
+        _PX4,
+        name="px4-2026",
+        idle_close=30.0,
+        list_with_time=True,
+        bare_time_directories=True,
+        virtual_trees=True,
+        exact_virtual_sizes=True,
+    ),
+    _ARDUPILOT,
+    _ARDUPILOT5,
+    replace(
+        _ARDUPILOT5,
+        name="littlefs",
+        storage=Storage.LITTLEFS,
+        case_fold=False,
+        list_with_time=False,
+        unknown_code=1,
+        double_nul=True,
+        crc_rate=150e3,
+    ),
+    _MAVSDK,
+    replace(
+        _MAVSDK,
+        name="mavsdk-old",
+        list_with_time=False,
+        sticky_stream_failure=True,
+        burst_packets=0,
+        burst_interval=0.0001,
+    ),
+)
+
+PROFILES: dict[str, Profile] = {profile.name: profile for profile in _ALL}

@@ -1,0 +1,401 @@
+"""PX4's FTP server. Layer: sim; pure. Source: mavlink_ftp.cpp, servers.md 1-13 and 15.
+
+One session for everybody on the link; requests run inline in the receiver thread, which also sends bursts
+every 10 ms.
+"""
+
+from __future__ import annotations
+
+import errno
+import random
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from mavftpfs.link.messages import Address
+from mavftpfs.protocol.payload import MAX_DATA, NakCode, Opcode
+from mavftpfs.sim import px4ops
+from mavftpfs.sim.firmware import Firmware
+from mavftpfs.sim.profiles import Profile
+from mavftpfs.sim.px4ops import Refusal
+from mavftpfs.sim.storage import OpenFile, StaleErrno, Storage
+from mavftpfs.sim.wire import ACK, FULL_FRAME, HEADER, NAK, REPLY, Request, frame_size, parse
+
+_BUFFER_LIFE = 2.0
+_CACHED_DATA = 4
+_READ = int(Opcode.READ_FILE)
+_WRITE = int(Opcode.WRITE_FILE)
+_BURST = int(Opcode.BURST_READ_FILE)
+_EOF = int(NakCode.EOF)
+_FAIL_ERRNO = int(NakCode.FAIL_ERRNO)
+
+
+@dataclass(slots=True)
+class _Stream:
+    """A running burst."""
+
+    target: Address
+    offset: int
+    seq: int
+    sent: int = 0
+
+
+class Px4(Firmware):
+    """One instance, as each MAVLink link of a vehicle has one."""
+
+    def __init__(self, storage: Storage, profile: Profile, rng: random.Random) -> None:
+        super().__init__(storage, profile, rng)
+        self._file: OpenFile | None = None
+        self._path = b""
+        self._file_size = 0
+        self._writing = False
+        self._stream: _Stream | None = None
+        self._cached: bytes | None = None
+        self._cached_seq = -1
+        self._cached_target = Address(0, 0)
+        self._errno = 0
+        self._last_request = 0.0
+        self._started: float | None = None
+        self._tick = 0
+        self._busy_until = float("-inf")
+        self._pending: deque[tuple[bytes, Address]] = deque()
+        self._pending_bytes = 0
+        self._extra_cost = 0.0
+        self._has_cost = bool(profile.request_cost or profile.stall_chance)
+        self.scratch = b""
+        self._handlers: dict[int, Callable[[Request], bytes]] = {
+            Opcode.NONE: lambda request: request.data[: request.size],
+            Opcode.TERMINATE_SESSION: self._terminate,
+            Opcode.RESET_SESSIONS: self._reset,
+            Opcode.OPEN_FILE_RO: self._open_read,
+            Opcode.CREATE_FILE: self._create,
+            Opcode.OPEN_FILE_WO: self._open_write,
+            Opcode.BURST_READ_FILE: self._burst,
+            **px4ops.handlers(self),
+        }
+
+    # -- timeline ----------------------------------------------------------------------------
+
+    def handle(self, wire: bytes, source: Address, now: float) -> None:
+        """See Firmware."""
+        if self._started is None:
+            self._started = now
+        self.advance(now)
+        if self._busy_until > now:
+            self._wait(wire, source)
+        else:
+            self._execute(wire, source, now)
+
+    def _wait(self, wire: bytes, source: Address) -> None:
+        size = frame_size(wire)
+        if self._pending_bytes + size > self.profile.rx_buffer:
+            self.dropped_requests += 1
+            return
+        self._pending.append((wire, source))
+        self._pending_bytes += size
+
+    def advance(self, now: float) -> None:
+        """See Firmware."""
+        self.now = now
+        while (wake := self.next_wake()) is not None and wake <= now:
+            if self._pending and self._busy_until <= wake:
+                wire, source = self._pending.popleft()
+                self._pending_bytes -= frame_size(wire)
+                self._execute(wire, source, wake)
+            elif self._idle_deadline() <= wake:
+                self._close_idle()
+            else:
+                self._send(wake)
+
+    def next_wake(self) -> float | None:
+        """See Firmware."""
+        if self._pending:
+            return self._busy_until
+        if self._stream is not None:
+            return min(self._next_tick(), self._idle_deadline())
+        return self._idle_deadline() if self._file is not None else None
+
+    def _idle_deadline(self) -> float:
+        if self._file is None or self.profile.idle_close is None:
+            return float("inf")
+        return self._last_request + self.profile.idle_close
+
+    def _next_tick(self) -> float:
+        start = self._started or 0.0
+        return max(start + self._tick * self.profile.tick, self._busy_until)
+
+    def _execute(self, wire: bytes, source: Address, now: float) -> None:
+        seq, session, opcode, size, _, _, offset = HEADER.unpack_from(wire)
+        if now - self._last_request > _BUFFER_LIFE:
+            self.scratch = b""  # freed, and allocated again uninitialised
+        self._last_request = now
+        if size > MAX_DATA:
+            self._reply(source, wire, self._refuse(NakCode.INVALID_DATA_SIZE), now)
+        elif self._cached is not None and seq + 1 == self._cached_seq:
+            self._replay(now)
+        elif opcode == _READ and self._readable(session, offset):
+            self._fast_read(wire, source, now)
+        elif opcode == _WRITE:
+            self._fast_write(wire, source, now)
+        else:
+            self._dispatch(parse(wire, source), wire, now)
+
+    def _dispatch(self, request: Request, wire: bytes, now: float) -> None:
+        try:
+            handler = self._handlers.get(request.opcode)
+            if handler is None:
+                raise Refusal(NakCode.UNKNOWN_COMMAND)
+            data = handler(request)
+        except Refusal as refusal:
+            self._reply(request.source, wire, self._refuse(refusal.code), now)
+            return
+        except OSError as exc:
+            self._reply(request.source, wire, self._failed(exc), now)
+            return
+        self._cached = None
+        if request.opcode != _BURST:
+            self._reply(request.source, wire, data, now, ack=True)
+
+    # -- replies -----------------------------------------------------------------------------
+
+    def _refuse(self, code: int) -> bytes:
+        """Return a NAK's data; once errno is EEXIST every NAK says so (mavlink_ftp.cpp, _process_request)."""
+        if self._errno == errno.EEXIST:
+            return bytes([NakCode.FILE_EXISTS])
+        if code == _FAIL_ERRNO:
+            if self._errno == errno.ENOENT:
+                return bytes([NakCode.FILE_NOT_FOUND])
+            return bytes([_FAIL_ERRNO, self._errno & 0xFF])
+        return bytes([code])
+
+    def _failed(self, exc: OSError) -> bytes:
+        if not isinstance(exc, StaleErrno) and exc.errno is not None:
+            self._errno = exc.errno
+        return self._refuse(_FAIL_ERRNO)
+
+    def _reply(self, target: Address, wire: bytes, data: bytes, now: float, ack: bool = False) -> None:
+        """Answer a request; PX4 writes the answer into the request's buffer, so other fields are echoed."""
+        seq, session, opcode, _, _, complete, offset = HEADER.unpack_from(wire)
+        if ack and opcode in (Opcode.OPEN_FILE_RO, Opcode.OPEN_FILE_WO, Opcode.CREATE_FILE):
+            session = 0
+        self._cached = None
+        header = (seq + 1 & 0xFFFF, session, ACK if ack else NAK, len(data), opcode, complete, offset)
+        self._deliver(target, REPLY.pack(*header, data), now)
+
+    def _deliver(self, target: Address, wire: bytes, now: float) -> None:
+        size = wire[4]
+        if size <= _CACHED_DATA and not (size and wire[12] == NakCode.NO_SESSIONS_AVAILABLE):
+            self._cached = wire[: 12 + _CACHED_DATA]
+            self._cached_seq = wire[0] | wire[1] << 8
+            self._cached_target = target
+        self._transmit(target, wire, now)
+
+    def _transmit(self, target: Address, wire: bytes, now: float) -> None:
+        if self.tx_room is not None and self.room() < frame_size(wire):
+            self.dropped_replies += 1
+            return
+        due = now
+        if self._has_cost or self._extra_cost:
+            due = self._busy_until = now + self.cost(wire[5])
+        self.emit(target, wire, due, self.now)
+
+    def _replay(self, now: float) -> None:
+        """Send 254 bytes out of a cache of 19: what follows the data is stray memory."""
+        assert self._cached is not None
+        self.replays += 1
+        stray = self.rng.randbytes(MAX_DATA - _CACHED_DATA)
+        self._transmit(self._cached_target, self._cached + stray, now)
+
+    def cost(self, opcode: int) -> float:
+        """Return how long the request that is being answered takes."""
+        cost = self.profile.request_cost + self._extra_cost
+        self._extra_cost = 0.0
+        if opcode in (_READ, _WRITE) and self.rng.random() < self.profile.stall_chance:
+            cost += self.rng.uniform(*self.profile.stall)
+        return cost
+
+    def set_errno(self, number: int) -> None:
+        """Set the errno that NAKs report."""
+        self._errno = number
+
+    def spend(self, seconds: float) -> None:
+        """Let the request that is being answered take longer."""
+        self._extra_cost += seconds
+
+    # -- the session -------------------------------------------------------------------------
+
+    def open_paths(self) -> list[bytes]:
+        """See Firmware."""
+        return [] if self._file is None else [self._path]
+
+    def reboot(self, now: float) -> None:
+        """See Firmware."""
+        self._close()
+        self.forget_outbox()
+        self._pending.clear()
+        self._pending_bytes = 0
+        self._cached = None
+        self._errno = 0
+        self._file_size = 0
+        self._busy_until = float("-inf")
+        self._started = now
+        self._tick = 0
+
+    def _close(self) -> None:
+        opened, self._file = self._file, None
+        self._stream = None
+        if opened is not None:
+            try:
+                opened.close()
+            except OSError:
+                return  # PX4 does not look at what close() says
+
+    def _close_idle(self) -> None:
+        self._close()
+        self._cached = None
+
+    def _terminate(self, request: Request) -> bytes:
+        if request.session != 0 or self._file is None:
+            raise Refusal(NakCode.INVALID_SESSION)
+        self._close()
+        return b""
+
+    def _reset(self, request: Request) -> bytes:
+        self._close()
+        return b""
+
+    def _open_read(self, request: Request) -> bytes:
+        return self._open(px4ops.path_of(self, request), write=False, create=False, truncate=False)
+
+    def _create(self, request: Request) -> bytes:
+        return self._open(px4ops.path_of(self, request), write=True, create=True, truncate=True)
+
+    def _open_write(self, request: Request) -> bytes:
+        return self._open(px4ops.path_of(self, request), write=True, create=True, truncate=False)
+
+    def _open(self, path: bytes, *, write: bool, create: bool, truncate: bool) -> bytes:
+        """Open; the ACK tells the size before a truncation, and reads end there for ever."""
+        if self._file is not None:
+            raise Refusal(NakCode.NO_SESSIONS_AVAILABLE)
+        self.scratch = path
+        size, opened = px4ops.open_file(self.storage, path, write=write, create=create, truncate=truncate)
+        self._file, self._path, self._file_size, self._writing = opened, path, size, write
+        self._stream = None
+        return (size & 0xFFFFFFFF).to_bytes(4, "little")
+
+    # -- reading and writing -----------------------------------------------------------------
+
+    def _readable(self, session: int, offset: int) -> bool:
+        return session == 0 and self._file is not None and not self._writing and offset < self._file_size
+
+    def _fast_read(self, wire: bytes, source: Address, now: float) -> None:
+        assert self._file is not None
+        seq, session, opcode, size, _, complete, offset = HEADER.unpack_from(wire)
+        try:
+            data = self._file.read(offset, size)
+        except OSError as exc:
+            self._reply(source, wire, self._failed(exc), now)
+            return
+        self._cached = None
+        packed = REPLY.pack(seq + 1 & 0xFFFF, session, ACK, len(data), opcode, complete, offset, data)
+        if len(data) <= _CACHED_DATA or self._has_cost or self.tx_room is not None:
+            self._deliver(source, packed, now)
+        else:
+            self.emit(source, packed, now, self.now)
+
+    def refuse_read(self, request: Request) -> bytes:
+        """Say why a ReadFile cannot be served."""
+        if request.session != 0 or self._file is None:
+            raise Refusal(NakCode.INVALID_SESSION)
+        if request.offset >= self._file_size:
+            raise Refusal(_EOF)
+        nuttx = bool(self.profile.writable_root)
+        raise OSError(errno.EACCES if nuttx else errno.EBADF, "opened for writing")
+
+    def _fast_write(self, wire: bytes, source: Address, now: float) -> None:
+        seq, session, opcode, size, _, complete, offset = HEADER.unpack_from(wire)
+        try:
+            self._check_write(session)
+            assert self._file is not None
+            written = self._file.write(offset, wire[12 : 12 + size]) if size else 0
+        except Refusal as refusal:
+            self._reply(source, wire, self._refuse(refusal.code), now)
+            return
+        except OSError as exc:
+            self._reply(source, wire, self._failed(exc), now)
+            return
+        count = written.to_bytes(4, "little")
+        self._cached = None
+        packed = REPLY.pack(seq + 1 & 0xFFFF, session, ACK, 4, opcode, complete, offset, count)
+        self._deliver(source, packed, now)
+
+    def _check_write(self, session: int) -> None:
+        if session != 0 and self._file is None:
+            raise Refusal(NakCode.INVALID_SESSION)
+        self.check_writable(self.scratch)
+        if self._file is None or not self._writing:
+            raise OSError(errno.EBADF, "not open for writing")
+
+    def check_writable(self, path: bytes) -> None:
+        """Refuse paths outside the whitelist; for WriteFile the path is what the scratch buffer holds."""
+        root = self.profile.writable_root
+        if root and (not path.startswith(root) or b"/../" in path):
+            raise Refusal(NakCode.FILE_PROTECTED)
+
+    # -- bursts ------------------------------------------------------------------------------
+
+    def _burst(self, request: Request) -> bytes:
+        """Start a stream. Session 0 is accepted with no file open; the request's size is ignored."""
+        if request.session != 0 and self._file is None:
+            raise Refusal(NakCode.INVALID_SESSION)
+        self._stream = _Stream(request.source, request.offset, request.seq + 1)
+        elapsed = self.now - (self._started or 0.0)
+        self._tick = max(self._tick, int(elapsed / self.profile.tick) + 1)
+        return b""
+
+    def _send(self, now: float) -> None:
+        """Send as many burst packets as the transmit buffer takes in this tick."""
+        self._tick += 1
+        room = min(self.room(), self.profile.tx_buffer)
+        alone = room < 2 * FULL_FRAME
+        while room >= FULL_FRAME and self._stream is not None:
+            last = room < 2 * FULL_FRAME
+            self._send_packet(self._stream, now, last, alone)
+            if last:
+                return
+            room -= FULL_FRAME
+
+    def _send_packet(self, stream: _Stream, now: float, last: bool, alone: bool) -> None:
+        offset = stream.offset
+        try:
+            if offset >= self._file_size:
+                raise Refusal(_EOF)
+            if self._file is None:
+                raise Refusal(_FAIL_ERRNO)
+            data = self._file.read(offset, MAX_DATA)
+        except (Refusal, OSError) as exc:
+            self._end_stream(stream, exc, now)
+            return
+        stream.offset += len(data)
+        stream.sent += len(data)
+        complete = 0
+        if last and stream.sent > self.profile.burst_bytes:
+            complete, self._stream = 1, None
+        elif last and alone:
+            # The field is not written on a tick's last packet; only then is it the stack's garbage.
+            complete = int(self.rng.random() < self.profile.garbage_complete)
+        self._send_stream(stream, ACK, complete, offset, data, now)
+
+    def _end_stream(self, stream: _Stream, exc: Refusal | OSError, now: float) -> None:
+        self._stream = None
+        code = exc.code if isinstance(exc, Refusal) else _FAIL_ERRNO
+        number = exc.errno if isinstance(exc, OSError) and exc.errno else self._errno
+        data = bytes([code, number & 0xFF]) if code == _FAIL_ERRNO else bytes([code])
+        self._send_stream(stream, NAK, 0, stream.offset, data, now)
+
+    def _send_stream(
+        self, stream: _Stream, opcode: int, complete: int, offset: int, data: bytes, now: float
+    ) -> None:
+        packed = REPLY.pack(stream.seq & 0xFFFF, 0, opcode, len(data), _BURST, complete, offset, data)
+        stream.seq += 1
+        self._deliver(stream.target, packed, now)

@@ -1,0 +1,233 @@
+"""A tree as one firmware's filesystem shows it. Layer: sim; pure.
+
+Adds what FatFs, LittleFS and NuttX do differently (servers.md 6, 8, 9) and the virtual `@` trees.
+StaleErrno means that the firmware reports a failure and leaves its errno as it was.
+"""
+
+from __future__ import annotations
+
+import errno
+import random
+from typing import Protocol
+
+from mavftpfs.protocol.crc import crc32
+from mavftpfs.sim import profiles
+from mavftpfs.sim.filesystem import Entry, Kind, Stat, Tree, TreeFile, fail, parent_and_name
+from mavftpfs.sim.profiles import Profile
+from mavftpfs.sim.pseudo import VirtualTrees
+
+_FAT_FORBIDDEN = frozenset(b'"*:<>?|\x7f') | frozenset(range(32))
+_GAP_LIMIT = 65_536
+_CRC_BLOCK = 65_536
+
+
+class OpenFile(Protocol):
+    """What a session reads from."""
+
+    def read(self, offset: int, size: int) -> bytes:
+        """Return up to `size` bytes. Raises OSError."""
+        ...
+
+    def write(self, offset: int, data: bytes) -> int:
+        """Write. Raises OSError."""
+        ...
+
+    def size(self) -> int:
+        """The size the server reports, which may be a lie."""
+        ...
+
+    def close(self) -> None:
+        """Close. Raises OSError."""
+        ...
+
+
+class StaleErrno(OSError):
+    """A failure that sets no errno: the server reports whatever the last one left."""
+
+    def __init__(self) -> None:
+        super().__init__()
+
+
+class Storage:
+    """The filesystem of one server. Every method raises OSError."""
+
+    def __init__(
+        self, tree: Tree, profile: Profile, rng: random.Random, virtual: VirtualTrees | None = None
+    ) -> None:
+        self._tree = tree
+        self.kind = profile.storage
+        self._fold = profile.case_fold
+        self._rng = rng
+        self._fat = self.kind in (profiles.Storage.FATFS, profiles.Storage.NUTTX_FAT)
+        if virtual is None and profile.virtual_trees:
+            virtual = VirtualTrees(exact=profile.exact_virtual_sizes)
+        self.virtual = virtual
+
+    def is_virtual(self, path: bytes) -> bool:
+        """Whether `path` lies in an `@` tree."""
+        return self.virtual is not None and self.virtual.owns(path)
+
+    def entries(self, path: bytes) -> list[Entry]:
+        """Return the directory in readdir order; FAT has no dot entries."""
+        if self.virtual is not None and self.virtual.owns(path):
+            return self.virtual.entries(path)
+        found = self._tree.entries(self._resolve(path))
+        if self._fat:
+            found = [self._fat_entry(entry) for entry in found if entry.name not in (b".", b"..")]
+        return found
+
+    def stat(self, path: bytes) -> Stat:
+        """Describe `path`."""
+        if self.virtual is not None and self.virtual.owns(path):
+            return self.virtual.stat(path)
+        return self._tree.stat(self._resolve(path))
+
+    def open(
+        self, path: bytes, *, write: bool = False, create: bool = False, truncate: bool = False
+    ) -> OpenFile:
+        """Open a file."""
+        if self.virtual is not None and self.virtual.owns(path):
+            return self.virtual.open(path, write=write)
+        if create:
+            self._check_name(path)
+        real = self._tree.open(self._resolve(path), write=write, create=create, truncate=truncate)
+        if write and self.kind is profiles.Storage.FATFS:
+            return _FatFsFile(real, self._rng)
+        return real
+
+    def crc(self, path: bytes) -> tuple[int, int]:
+        """Return the CRC32 of a file and how many bytes went into it."""
+        if self.virtual is not None and self.virtual.owns(path):
+            content = self.virtual.content(path, block=64)
+            return crc32(content), len(content)
+        opened = self._tree.open(self._resolve(path))
+        try:
+            checksum, offset = 0, 0
+            while block := opened.read(offset, _CRC_BLOCK):
+                checksum = crc32(block, checksum)
+                offset += len(block)
+            return checksum, offset
+        finally:
+            opened.close()
+
+    def truncate(self, path: bytes, size: int) -> None:
+        """Cut or extend a file."""
+        self._refuse_virtual(path)
+        self._tree.truncate(self._resolve(path), size)
+
+    def mkdir(self, path: bytes) -> None:
+        """Make a directory."""
+        self._refuse_virtual(path)
+        self._check_name(path)
+        try:
+            self._tree.mkdir(self._resolve(path))
+        except FileNotFoundError as exc:
+            if self.kind is profiles.Storage.NUTTX_FAT:
+                raise fail(errno.EIO, path) from exc
+            raise
+
+    def unlink(self, path: bytes) -> None:
+        """Remove a file; EISDIR for a directory."""
+        self._refuse_virtual(path)
+        self._tree.remove(self._resolve(path))
+
+    def rmdir(self, path: bytes) -> None:
+        """Remove an empty directory; ENOTDIR, ENOTEMPTY."""
+        self._refuse_virtual(path)
+        self._tree.rmdir(self._resolve(path))
+
+    def remove_any(self, path: bytes) -> None:
+        """Remove a file or an empty directory, as ArduPilot's one unlink does (servers.md 9)."""
+        try:
+            self.rmdir(path)
+        except NotADirectoryError:
+            self.unlink(path)
+        except OSError as exc:
+            if exc.errno != errno.ENOTEMPTY:
+                raise
+            if self.kind is profiles.Storage.FATFS:
+                raise fail(errno.EACCES, path) from exc
+            if self.kind is profiles.Storage.POSIX:
+                self.unlink(path)  # tried after rmdir failed; its EISDIR is what gets reported
+            raise
+
+    def rename(self, old: bytes, new: bytes) -> None:
+        """Rename, with this filesystem's view of an existing target."""
+        self._refuse_virtual(old)
+        self._refuse_virtual(new)
+        if self.kind is profiles.Storage.LITTLEFS:
+            raise StaleErrno
+        source, target = self._resolve(old), self._resolve(new)
+        if self._fat:
+            self._check_name(new)
+            target = self._fat_target(source, target)
+        self._tree.rename(source, target)
+
+    def _fat_target(self, source: bytes, target: bytes) -> bytes:
+        self._tree.stat(source)
+        try:
+            there = self._tree.stat(target)
+        except FileNotFoundError:
+            return target
+        if self.kind is profiles.Storage.FATFS:
+            if source == target:
+                return target
+            raise fail(errno.EEXIST, target)
+        if there.kind is Kind.DIRECTORY:
+            return target.rstrip(b"/") + b"/" + parent_and_name(source)[1]
+        if source != target:
+            self._tree.remove(target)  # NuttX fs_rename: not atomic
+        return target
+
+    def _refuse_virtual(self, path: bytes) -> None:
+        if self.is_virtual(path):
+            raise fail(errno.EROFS, path)
+
+    def _check_name(self, path: bytes) -> None:
+        if self._fat and _FAT_FORBIDDEN.intersection(parent_and_name(path)[1]):
+            raise fail(errno.EINVAL, path)
+
+    def _fat_entry(self, entry: Entry) -> Entry:
+        return Entry(entry.name, entry.stat._replace(mtime=entry.stat.mtime & ~1))
+
+    def _resolve(self, path: bytes) -> bytes:
+        """Replace each name by the one that exists in another case, if there is none in this."""
+        if not self._fold:
+            return path
+        resolved = b""
+        for name in path.split(b"/"):
+            if name:
+                resolved += b"/" + self._folded(resolved or b"/", name)
+        return resolved or b"/"
+
+    def _folded(self, parent: bytes, name: bytes) -> bytes:
+        try:
+            names = [entry.name for entry in self._tree.entries(parent)]
+        except OSError:
+            return name
+        if name in names:
+            return name
+        return next((other for other in names if other.lower() == name.lower()), name)
+
+
+class _FatFsFile:
+    """A FatFs file open for writing: full cards are EIO, gaps hold what the card held."""
+
+    def __init__(self, real: TreeFile, rng: random.Random) -> None:
+        self._real = real
+        self._rng = rng
+        self.read = real.read
+        self.size = real.size
+        self.close = real.close
+
+    def write(self, offset: int, data: bytes) -> int:
+        """See OpenFile."""
+        if not data:
+            raise fail(errno.EIO)
+        try:
+            size = self._real.size()
+            if size < offset:
+                self._real.write(size, self._rng.randbytes(min(offset - size, _GAP_LIMIT)))
+            return self._real.write(offset, data)
+        except OSError as exc:
+            raise fail(errno.EIO if exc.errno == errno.ENOSPC else exc.errno or errno.EIO) from exc
