@@ -29,12 +29,16 @@ _INO_MASK = (1 << 63) - 1
 
 @dataclass(slots=True)
 class Inode:
-    """One number the kernel may use. path is None once the name was removed."""
+    """One number the kernel may use.
+
+    path: None once the name was removed. told_size: the size in bytes that the kernel last heard, if any.
+    """
 
     ino: int
     generation: int
     path: bytes | None
     lookups: int = 0
+    told_size: int | None = None
 
 
 class InodeTable:

@@ -15,7 +15,7 @@ import json
 import logging
 import os
 import stat as stat_bits
-from collections.abc import Callable, Coroutine, Sequence
+from collections.abc import Awaitable, Callable, Coroutine, Sequence
 from dataclasses import dataclass
 from typing import Any, Concatenate, NoReturn, ParamSpec, TypeVar
 
@@ -73,6 +73,14 @@ class Presentation:
     op_deadline: float
 
 
+Refresh = Callable[[int], Awaitable[None]]
+"""Has the kernel forget an inode's attributes (not its pages)."""
+
+
+async def _no_refresh(ino: int) -> None:
+    """For callers without a kernel."""
+
+
 def handler(method: Handler[P, T]) -> Handler[P, T]:
     """Guard a handler: let only FUSEError out, within the time that `Operations.budget` allows."""
 
@@ -105,15 +113,18 @@ class Operations(pyfuse3.Operations):
         tree: FileTree,
         presentation: Presentation,
         *,
+        inodes: InodeTable | None = None,
+        refresh: Refresh = _no_refresh,
         space: Callable[[], Space | None] = lambda: None,
         status: Callable[[], dict[str, Any]] = dict,
     ) -> None:
         super().__init__()
         self._tree = tree
         self._look = presentation
+        self._refresh = refresh
         self._space = space
         self._status = status
-        self.inodes = InodeTable()
+        self.inodes = InodeTable() if inodes is None else inodes
         self.files: HandleTable[FileHandle] = HandleTable()
         self.directories: HandleTable[DirectoryHandle] = HandleTable()
 
@@ -201,8 +212,12 @@ class Operations(pyfuse3.Operations):
         """Open a file for reading."""
         if flags & os.O_ACCMODE != os.O_RDONLY or flags & os.O_TRUNC:
             raise FUSEError(errno.EROFS)
+        known = self._inode(inode)
         file = await self._tree.open(self._path(inode))
         fh = self.files.add(FileHandle(inode, file))
+        if known.told_size not in (None, file.size):
+            # Else the kernel ends reads at the size it remembers for up to attr_timeout.
+            await self._refresh(inode)
         return FileInfo(fh=fh, direct_io=file.direct_io, keep_cache=file.keep_cache)
 
     @handler
@@ -315,6 +330,7 @@ class Operations(pyfuse3.Operations):
 
     def _attributes(self, inode: Inode, found: Stat) -> EntryAttributes:
         look = self._look
+        inode.told_size = found.size
         entry = EntryAttributes()
         entry.st_ino = inode.ino
         entry.generation = inode.generation

@@ -1,0 +1,171 @@
+"""Builds link, connection and tree from the options, for mounts and one-shot commands. Layer: top."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal, cast
+
+import trio
+
+from mavftpfs.cache.options import CacheOptions
+from mavftpfs.cache.tree import Tree
+from mavftpfs.exits import NoFtp
+from mavftpfs.fuse.operations import Space
+from mavftpfs.fuse.options import MountOptions
+from mavftpfs.link.opening import open_link
+from mavftpfs.link.uri import LinkSpec
+from mavftpfs.session.connection import Connection, ConnectOptions, connected
+from mavftpfs.session.driver import PayloadTrace
+from mavftpfs.shared.errors import FtpNak, RequestTimeout, UsageError, VehicleLost
+from mavftpfs.shared.model import ROOT
+
+MIB = 1 << 20
+KEY_SIZE = 32
+
+
+@dataclass(frozen=True, slots=True)
+class Attached:
+    """A vehicle whose root was listed."""
+
+    connection: Connection
+    tree: Tree
+
+    def status(self) -> dict[str, Any]:
+        """Return facts about the connection and the caches; JSON-able."""
+        return {"connection": self.connection.status(), "cache": self.tree.status()}
+
+    def space(self) -> Space | None:
+        """Return what STORAGE_INFORMATION said, if it was sent."""
+        storage = self.connection.vehicle.storage
+        if storage is None or not storage.total_capacity > 0:
+            return None
+        free = min(max(storage.available_capacity, 0.0), storage.total_capacity)
+        return Space(int(storage.total_capacity * MIB), int(free * MIB))
+
+
+@asynccontextmanager
+async def attached(
+    spec: LinkSpec,
+    options: MountOptions,
+    *,
+    invalidate: Callable[[bytes], None] = lambda path: None,
+    trace: PayloadTrace | None = None,
+    list_root: bool = True,
+) -> AsyncIterator[Attached]:
+    """Connect, wait for the first heartbeat and the first listing, and keep it up for the length of the body.
+
+    Raises:
+        LinkClosed, VehicleLost, NoFtp: within connect_timeout, with the reason.
+        NotFound, NotADirectory: the remote root is not there.
+    """
+    deadline = trio.current_time() + options.connect_timeout
+    async with open_link(spec) as link, connected(link, connect_options(options), trace=trace) as connection:
+        await connection.ready(options.connect_timeout)
+        tree = Tree(connection.store, cache_options(options), clock=trio.current_time, invalidate=invalidate)
+        _subscribe(connection, tree)
+        if list_root:
+            await _list_root(connection, tree, deadline, options.connect_timeout)
+        yield Attached(connection, tree)
+
+
+async def _list_root(connection: Connection, tree: Tree, deadline: float, timeout: float) -> None:
+    try:
+        with trio.move_on_at(deadline):
+            await tree.list(ROOT)
+            return
+    except (RequestTimeout, VehicleLost):
+        pass  # the same to the user: no answer
+    except FtpNak as exc:
+        raise NoFtp(f"{_vehicle(connection)} does not show its files: {exc}") from exc
+    raise NoFtp(
+        f"{_vehicle(connection)} sends heartbeats but did not answer MAVLink FTP within {timeout:g} s "
+        f"({_flag(connection)})"
+    )
+
+
+def _vehicle(connection: Connection) -> str:
+    address = connection.vehicle.address
+    return "the vehicle" if address is None else f"vehicle {address.system}/{address.component}"
+
+
+def _flag(connection: Connection) -> str:
+    flag = connection.vehicle.ftp_flag
+    if flag is None:
+        return "it did not say whether it supports FTP"
+    return "it says it supports FTP" if flag else "it says it does not support FTP"
+
+
+def _subscribe(connection: Connection, tree: Tree) -> None:
+    reactions = {"reboot": tree.rebooted, "back": tree.link_back, "lost": tree.link_lost}
+
+    def on_news(news: str) -> None:
+        if news in reactions:
+            reactions[news]()
+
+    connection.subscribe(on_news)
+
+
+def connect_options(options: MountOptions) -> ConnectOptions:
+    """Return the session's part of the options.
+
+    Raises:
+        UsageError: the signing key cannot be read.
+    """
+    defaults = ConnectOptions()
+    return ConnectOptions(
+        target_system=options.target_system,
+        target_component=options.target_component,
+        source_system=options.source_system or defaults.source_system,
+        source_component=options.source_component or defaults.source_component,
+        heartbeat=cast(Literal["onboard", "gcs", "none"], options.heartbeat),
+        signing_key=None if options.signing_key is None else read_key(options.signing_key),
+        op_deadline=options.op_deadline,
+        read_mode=cast(Literal["auto", "burst", "window"], options.read_mode),
+        chunk=options.chunk,
+        window=options.window,
+    )
+
+
+def cache_options(options: MountOptions) -> CacheOptions:
+    """Return the caches' part of the options."""
+    return CacheOptions(
+        root=options.root,
+        dir_timeout=options.dir_timeout,
+        attr_timeout=options.attr_timeout,
+        negative_timeout=options.negative_timeout,
+        cache_size=options.cache_size,
+        op_deadline=options.op_deadline,
+    )
+
+
+def with_baud(spec: LinkSpec, options: MountOptions) -> LinkSpec:
+    """Return the link with baud= applied."""
+    return spec if options.baud is None else replace(spec, baud=options.baud)
+
+
+def read_key(path: str) -> bytes:
+    """Return the MAVLink 2 signing key in a file: 32 raw bytes, 64 hex digits, or a passphrase.
+
+    A passphrase becomes a key by SHA-256, as ground stations do it.
+
+    Raises:
+        UsageError: it cannot be read, or is empty.
+    """
+    try:
+        content = Path(path).read_bytes()
+    except OSError as exc:
+        raise UsageError(f"signing_key={path}: {exc.strerror}") from exc
+    if len(content) == KEY_SIZE:
+        return content
+    text = content.strip()
+    if not text:
+        raise UsageError(f"signing_key={path}: the file is empty")
+    try:
+        key = bytes.fromhex(text.decode("ascii"))
+    except ValueError:
+        key = b""
+    return key if len(key) == KEY_SIZE else hashlib.sha256(text).digest()

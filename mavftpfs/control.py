@@ -1,0 +1,231 @@
+"""The control socket: how `status` and `umount` talk to a running mount. Layer: top.
+
+One Unix socket (0600, in a 0700 directory) for each mount, named after a hash of the mountpoint. One
+request and one reply, each a JSON object on a line; the reply to `umount` comes when all is delivered and
+the session is closed. The server runs under trio; the client is plain blocking code for short-lived commands.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+import os
+import pwd
+import socket
+import stat
+from collections.abc import Awaitable, Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import trio
+
+from mavftpfs.shared.errors import MavftpfsError
+
+log = logging.getLogger("mavftpfs.control")
+
+Reply = dict[str, Any]
+Command = Callable[[Reply], Awaitable[Reply]]
+
+MAX_LINE = 1 << 20
+REQUEST_PATIENCE = 10.0
+"""Seconds for a client to send its line, and for us to hand it the reply."""
+MAX_CLIENTS = 16
+"""Clients served at a time; more wait."""
+_MAX_SOCKET_PATH = 107
+_SUFFIX = ".sock"
+
+
+class ControlError(MavftpfsError):
+    """No running mount answers there."""
+
+
+# -- where the sockets are ------------------------------------------------------------------------
+
+
+def socket_directories(environment: Mapping[str, str], uid: int, home: str) -> list[Path]:
+    """Return where sockets may lie, the preferred place first.
+
+    A mount from fstab has no XDG_RUNTIME_DIR and a shell of the same user has one, so all are searched.
+    """
+    directories = []
+    if environment.get("XDG_RUNTIME_DIR"):
+        directories.append(Path(environment["XDG_RUNTIME_DIR"]) / "mavftpfs")
+    directories += [Path(f"/run/user/{uid}/mavftpfs"), Path(home) / ".cache" / "mavftpfs"]
+    return list(dict.fromkeys(directories))
+
+
+def own_directories() -> list[Path]:
+    """Return `socket_directories` of this process."""
+    try:
+        home = pwd.getpwuid(os.getuid()).pw_dir
+    except KeyError:
+        home = os.environ.get("HOME", "/tmp")
+    return socket_directories(os.environ, os.getuid(), os.environ.get("HOME") or home)
+
+
+def socket_name(mountpoint: str) -> str:
+    """Return the socket's file name for a mountpoint (an absolute path)."""
+    digest = hashlib.sha256(mountpoint.encode("utf-8", "surrogateescape")).hexdigest()
+    return digest[:20] + _SUFFIX
+
+
+def usable_directory(directories: list[Path]) -> Path:
+    """Return the first directory that is, or can be made, ours alone.
+
+    Raises:
+        ControlError: none can.
+    """
+    for directory in directories:
+        try:
+            # Not parents=True for a runtime directory: only the system creates /run/user/UID.
+            directory.parent.mkdir(mode=0o700, exist_ok=True)
+            directory.mkdir(mode=0o700, exist_ok=True)
+            facts = directory.lstat()
+        except OSError:
+            continue
+        ours = stat.S_ISDIR(facts.st_mode) and facts.st_uid == os.getuid() and not facts.st_mode & 0o077
+        if ours and len(os.fsencode(directory)) + 1 + len(socket_name("")) <= _MAX_SOCKET_PATH:
+            return directory
+    raise ControlError(
+        f"no private directory for the control socket (tried {', '.join(map(str, directories))})"
+    )
+
+
+# -- the mount's side -----------------------------------------------------------------------------
+
+
+class ControlServer:
+    """Answers requests at a socket path: one `command` after its name."""
+
+    def __init__(self, path: Path, commands: Mapping[str, Command]) -> None:
+        self._path = path
+        self._commands = commands
+        self._limiter = trio.CapacityLimiter(MAX_CLIENTS)
+        self._accepting = trio.CancelScope()
+        self.closed = trio.Event()
+
+    async def run(self, task_status: trio.TaskStatus[None] = trio.TASK_STATUS_IGNORED) -> None:
+        """Serve until `close`, then until the clients at work have their replies.
+
+        Raises:
+            OSError: the socket cannot be bound.
+        """
+        listener = _bind(self._path)
+        try:
+            async with trio.open_nursery() as clients:
+                task_status.started()
+                with self._accepting:
+                    while True:
+                        accepted, _ = await listener.accept()
+                        clients.start_soon(self._serve_client, trio.SocketStream(accepted))
+        finally:
+            listener.close()
+            self._path.unlink(missing_ok=True)
+            self.closed.set()
+
+    def close(self) -> None:
+        """Take no more clients."""
+        self._accepting.cancel()
+
+    async def _serve_client(self, stream: trio.SocketStream) -> None:
+        async with stream:
+            try:
+                async with self._limiter:
+                    reply = await _answer(stream, self._commands)
+                with trio.move_on_after(REQUEST_PATIENCE):
+                    await stream.send_all(json.dumps(reply, default=str).encode() + b"\n")
+            except (trio.BrokenResourceError, trio.ClosedResourceError):
+                log.debug("a control client went away")
+
+
+def _bind(path: Path) -> trio.socket.SocketType:
+    """Bind and listen; the socket is never visible with wider permissions than 0600."""
+    path.unlink(missing_ok=True)  # of a mount that was killed; a living one was refused before
+    listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    mask = os.umask(0o177)
+    try:
+        listener.bind(str(path))
+        listener.listen(MAX_CLIENTS)
+    except OSError:
+        listener.close()
+        raise
+    finally:
+        os.umask(mask)
+    return trio.socket.from_stdlib_socket(listener)
+
+
+async def _answer(stream: trio.SocketStream, commands: Mapping[str, Command]) -> Reply:
+    line = b""
+    with trio.move_on_after(REQUEST_PATIENCE):
+        line = await _receive_line(stream)
+    try:
+        request = json.loads(line)
+        command = commands[request["command"]]
+    except (ValueError, KeyError, TypeError):
+        return failure("not a command of this mount")
+    try:
+        return {"ok": True, **await command(request)}
+    except MavftpfsError as exc:
+        return failure(str(exc))
+    except Exception as exc:
+        log.exception("bug in a control command")
+        return failure(f"internal error: {exc!r}")
+
+
+def failure(reason: str) -> Reply:
+    """Return the reply of a command that did not work."""
+    return {"ok": False, "error": reason}
+
+
+async def _receive_line(stream: trio.SocketStream) -> bytes:
+    line = b""
+    while b"\n" not in line and len(line) < MAX_LINE:
+        data = await stream.receive_some(4096)
+        if not data:
+            break
+        line += data
+    return line.partition(b"\n")[0]
+
+
+# -- the command's side ---------------------------------------------------------------------------
+
+
+def ask(path: Path, request: Reply, *, timeout: float) -> Reply:
+    """Send one request and return the reply.
+
+    Raises:
+        ControlError: nobody answers within `timeout` seconds, or refuses.
+    """
+    try:
+        with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as client:
+            client.settimeout(timeout)
+            client.connect(str(path))
+            client.sendall(json.dumps(request).encode() + b"\n")
+            with client.makefile("rb") as lines:
+                line = lines.readline(MAX_LINE)
+        reply = json.loads(line)
+    except (OSError, ValueError) as exc:
+        raise ControlError(f"no answer from the mount's process: {exc}") from exc
+    if not isinstance(reply, dict) or not reply.get("ok"):
+        raise ControlError(str(reply.get("error")) if isinstance(reply, dict) else "malformed answer")
+    return reply
+
+
+def find_socket(mountpoint: str, directories: list[Path]) -> Path:
+    """Return the socket of the mount on `mountpoint`.
+
+    Raises:
+        ControlError: there is none.
+    """
+    for directory in directories:
+        path = directory / socket_name(mountpoint)
+        if path.is_socket():
+            return path
+    raise ControlError(f"no vehicle of yours is mounted on {mountpoint}")
+
+
+def all_sockets(directories: list[Path]) -> Iterator[Path]:
+    """Yield the sockets of all mounts of this user, the dead ones too."""
+    for directory in directories:
+        yield from sorted(path for path in directory.glob(f"*{_SUFFIX}") if path.is_socket())

@@ -1,0 +1,142 @@
+"""Going to the background, and logging there. Layer: top; imports no trio.
+
+The fork happens before trio and threads start. The parent stays until the child says over a pipe how it
+went, so that `mavftpfs SOURCE DIR && ls DIR` works and a failure has an exit code and a reason.
+"""
+
+from __future__ import annotations
+
+import logging
+import logging.handlers
+import os
+import signal
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import NoReturn
+
+from mavftpfs.exits import ExitCode
+
+Report = Callable[[int, str], None]
+"""Tells the waiting parent (exit code, one line); only the first call counts."""
+
+SYSLOG_SOCKET = "/dev/log"
+MAX_REPORT = 64 * 1024
+_LOG_SIZE = 1 << 20
+
+
+def in_background(work: Callable[[Report], int]) -> int:
+    """Fork; run `work(report)` in the child, and return in the parent what the child reported.
+
+    The child never returns from here. After report(0, ...) it is detached: no terminal, cwd `/`.
+    """
+    read_end, write_end = os.pipe()
+    sys.stdout.flush()
+    sys.stderr.flush()
+    pid = os.fork()
+    if pid == 0:
+        os.close(read_end)
+        _be_child(write_end, work)
+    os.close(write_end)
+    return _await_report(read_end, pid)
+
+
+def _be_child(write_end: int, work: Callable[[Report], int]) -> NoReturn:
+    code: int = ExitCode.MOUNT_FAILED
+    reporter = _Reporter(write_end)
+    try:
+        os.setsid()
+        code = work(reporter)
+        reporter(code, "")
+    except BaseException as exc:
+        # Nothing above us: a bug must reach the log and the waiting parent, not vanish with the process.
+        logging.getLogger("mavftpfs").exception("the daemon failed")
+        reporter(code, f"internal error: {exc!r}")
+    finally:
+        logging.shutdown()
+        os._exit(code)
+
+
+class _Reporter:
+    def __init__(self, write_end: int) -> None:
+        self._write_end: int | None = write_end
+
+    def __call__(self, code: int, message: str) -> None:
+        if self._write_end is None:
+            return
+        line = message.replace("\n", " ")[:4096]
+        os.write(self._write_end, f"{code} {line}\n".encode("utf-8", "surrogateescape"))
+        os.close(self._write_end)
+        self._write_end = None
+        if code == 0:
+            _detach()
+
+
+def _detach() -> None:
+    """Let go of the terminal and the working directory."""
+    os.chdir("/")
+    null = os.open(os.devnull, os.O_RDWR)
+    for fd in (0, 1, 2):
+        os.dup2(null, fd)
+    if null > 2:
+        os.close(null)
+
+
+def _await_report(read_end: int, pid: int) -> int:
+    try:
+        with os.fdopen(read_end, "rb") as pipe:
+            text = pipe.read(MAX_REPORT).decode("utf-8", "surrogateescape")
+    except KeyboardInterrupt:
+        os.kill(pid, signal.SIGTERM)
+        os.waitpid(pid, 0)
+        return ExitCode.INTERRUPTED
+    code, _, message = text.partition(" ")
+    if not code:
+        return _explain_death(pid)
+    if message.strip():
+        print(f"mavftpfs: {message.strip()}", file=sys.stderr)
+    return int(code)
+
+
+def _explain_death(pid: int) -> int:
+    _, status = os.waitpid(pid, 0)
+    code = os.waitstatus_to_exitcode(status)
+    reason = f"signal {-code}" if code < 0 else f"exit code {code}"
+    print(f"mavftpfs: the background process ended without a word ({reason})", file=sys.stderr)
+    return ExitCode.MOUNT_FAILED
+
+
+def log_to_stderr(level: int) -> None:
+    """Log to the terminal, for foreground runs."""
+    _install(logging.StreamHandler(), "mavftpfs: %(message)s", level)
+
+
+def log_to_file(path: str, level: int) -> None:
+    """Log to a file of the user's choice.
+
+    Raises:
+        OSError: it cannot be opened.
+    """
+    _install(logging.FileHandler(path), "%(asctime)s %(levelname)s %(name)s: %(message)s", level)
+
+
+def log_in_background(fallback: Path, level: int, *, socket: str = SYSLOG_SOCKET) -> None:
+    """Log to syslog, or where there is none to a small file that is kept in turns."""
+    form = f"mavftpfs[{os.getpid()}]: %(levelname)s %(name)s: %(message)s"
+    try:
+        handler: logging.Handler = logging.handlers.SysLogHandler(socket)
+    except OSError:
+        fallback.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        handler = logging.handlers.RotatingFileHandler(fallback, maxBytes=_LOG_SIZE, backupCount=1)
+        form = f"%(asctime)s {form}"
+    _install(handler, form, level)
+
+
+def _install(handler: logging.Handler, form: str, level: int) -> None:
+    handler.setFormatter(logging.Formatter(form))
+    root = logging.getLogger()
+    for old in root.handlers[:]:
+        root.removeHandler(old)
+    root.addHandler(handler)
+    root.setLevel(logging.WARNING)
+    logging.getLogger("mavftpfs").setLevel(level)

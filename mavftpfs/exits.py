@@ -1,0 +1,54 @@
+"""Exit codes of the command line, and which error means which. Layer: top."""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+from mavftpfs.shared.errors import (
+    IsADirectory,
+    LinkError,
+    MavftpfsError,
+    NotADirectory,
+    NotFound,
+    RequestTimeout,
+    UsageError,
+)
+
+
+class ExitCode(IntEnum):
+    """What the shell is told."""
+
+    OK = 0
+    USAGE = 1
+    NO_VEHICLE = 2
+    MOUNT_FAILED = 3
+    UNDELIVERED = 4
+    INTERRUPTED = 130
+
+
+class MountFailed(MavftpfsError):
+    """The kernel side cannot be set up or taken down."""
+
+
+class NoFtp(MavftpfsError):
+    """A vehicle is there, but its files are not."""
+
+
+_CODES: tuple[tuple[type[MavftpfsError], ExitCode], ...] = (
+    (UsageError, ExitCode.USAGE),
+    (NotFound, ExitCode.USAGE),
+    (NotADirectory, ExitCode.USAGE),
+    (IsADirectory, ExitCode.USAGE),
+    (MountFailed, ExitCode.MOUNT_FAILED),
+    (NoFtp, ExitCode.NO_VEHICLE),
+    (LinkError, ExitCode.NO_VEHICLE),
+    (RequestTimeout, ExitCode.NO_VEHICLE),
+)
+
+
+def exit_code_for(error: MavftpfsError) -> ExitCode:
+    """Return the exit code an error ends a command with."""
+    for cls, code in _CODES:
+        if isinstance(error, cls):
+            return code
+    return ExitCode.NO_VEHICLE

@@ -1,0 +1,270 @@
+"""The kernel mount: composition root, and a mount's life from first heartbeat to unmount. Layer: top.
+
+Order matters. The vehicle must have answered before the kernel mount appears; at the end the kernel lets go
+first and the server session is closed after it, each within a bound. While mounted, nothing in the event loop
+may make a system call on the mountpoint: it would wait for itself.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import time
+from collections.abc import AsyncIterator, Callable, Iterator
+from contextlib import AbstractAsyncContextManager, asynccontextmanager, contextmanager
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pyfuse3
+import trio
+
+import mavftpfs
+from mavftpfs.compose import attached
+from mavftpfs.control import ControlServer, Reply
+from mavftpfs.exits import ExitCode, MountFailed, exit_code_for
+from mavftpfs.fuse.handles import FileTree
+from mavftpfs.fuse.inodes import InodeTable
+from mavftpfs.fuse.operations import Operations, Presentation, Space
+from mavftpfs.fuse.options import MountOptions, fuse_words
+from mavftpfs.kernelnews import Invalidator
+from mavftpfs.link.uri import LinkSpec
+from mavftpfs.mountpoint import stderr_of, unmount
+from mavftpfs.session.driver import PayloadTrace
+from mavftpfs.shared.errors import MavftpfsError
+
+log = logging.getLogger("mavftpfs.mount")
+
+MIN_TASKS = 10
+MAX_TASKS = 2000
+"""Requests in the works at once. At pyfuse3's default of 99, 120 blocked opens freeze even `df`."""
+
+GRACE = 2.0
+"""Seconds that requests in the works get to finish after a signal."""
+
+LAST_REPLIES = 3.0
+"""Seconds to hand waiting control clients their reply at the end."""
+
+Report = Callable[[int, str], None]
+"""Takes (exit code, one line): (0, "") once the mount is up, else why there will be none."""
+
+
+@dataclass(frozen=True, slots=True)
+class MountRequest:
+    """What to mount where. mountpoint: absolute; control: the control socket's path, None = without."""
+
+    source: str
+    spec: LinkSpec
+    mountpoint: str
+    options: MountOptions
+    control: Path | None = None
+    trace: PayloadTrace | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Content:
+    """What is behind a mount."""
+
+    tree: FileTree
+    status: Callable[[], dict[str, Any]] = dict
+    space: Callable[[], Space | None] = lambda: None
+
+
+Attach = Callable[[Callable[[bytes], None]], AbstractAsyncContextManager[Content]]
+"""Brings the content up; is given the callback for paths whose bytes changed."""
+
+
+def run_mount(request: MountRequest, report: Report) -> int:
+    """Mount and serve until unmounted; returns the exit code."""
+
+    @asynccontextmanager
+    async def attach(invalidate: Callable[[bytes], None]) -> AsyncIterator[Content]:
+        vehicle = attached(request.spec, request.options, invalidate=invalidate, trace=request.trace)
+        async with vehicle as up:
+            yield Content(up.tree, up.status, up.space)
+
+    return trio.run(serve_mount, request, attach, report)
+
+
+async def serve_mount(request: MountRequest, attach: Attach, report: Report) -> int:
+    """Bring the content up, mount it, serve until unmounted; returns the exit code."""
+    life = _Life(request, report)
+    async with trio.open_nursery() as nursery:
+        await nursery.start(life.watch_signals)
+        try:
+            with life.scope:
+                await life.attach_and_serve(attach, nursery)
+        except MavftpfsError as exc:
+            life.fail(exc)
+        if life.scope.cancelled_caught and not life.mounted:
+            life.code = ExitCode.INTERRUPTED
+            report(life.code, "interrupted")
+        life.finished.set()
+        if life.control is not None:
+            life.control.close()
+            with trio.move_on_after(LAST_REPLIES):
+                await life.control.closed.wait()
+        nursery.cancel_scope.cancel()
+    return life.code
+
+
+class _Life:
+    """One mount from start to end."""
+
+    def __init__(self, request: MountRequest, report: Report) -> None:
+        self.request = request
+        self.report = report
+        self.code = ExitCode.OK
+        self.scope = trio.CancelScope()
+        self.mounted = False
+        self.finished = trio.Event()
+        self.control: ControlServer | None = None
+        self._loop_scope: trio.CancelScope | None = None
+        self._signals = 0
+        self._started = time.time()
+
+    def fail(self, error: MavftpfsError) -> None:
+        """The content failed: tell whoever waits for the mount, or else the log."""
+        self.code = exit_code_for(error)
+        if self.mounted:
+            log.error("unmounted: %s", error)
+        else:
+            self.report(self.code, str(error))
+
+    async def attach_and_serve(self, attach: Attach, nursery: trio.Nursery) -> None:
+        """Run until the kernel mount is gone."""
+        inodes = InodeTable()
+        invalidator = Invalidator(inodes, pyfuse3.invalidate_inode)
+        async with attach(invalidator.on_changed) as content:
+            operations = Operations(
+                content.tree,
+                presentation(self.request.options),
+                inodes=inodes,
+                refresh=invalidator.forget_attributes,
+                space=content.space,
+                status=lambda: self.status(content),
+            )
+            with kernel_mount(operations, self.request, invalidator):
+                self.mounted = True
+                await self._start_control(content, nursery)
+                await self._serve(invalidator)
+
+    async def _serve(self, invalidator: Invalidator) -> None:
+        async with trio.open_nursery() as nursery:
+            nursery.start_soon(invalidator.run)
+            self.report(0, "")
+            with trio.CancelScope() as self._loop_scope:
+                await fuse_loop()
+            self._loop_scope = None
+            nursery.cancel_scope.cancel()
+
+    # -- control ----------------------------------------------------------------------------------
+
+    async def _start_control(self, content: Content, nursery: trio.Nursery) -> None:
+        if self.request.control is None:
+            return
+
+        async def status(_: Reply) -> Reply:
+            return {"status": self.status(content)}
+
+        server = ControlServer(self.request.control, {"status": status, "umount": self._umount})
+        try:
+            await nursery.start(server.run)
+        except OSError as exc:
+            log.warning("no control socket, so no `mavftpfs status`: %s", exc)
+        else:
+            self.control = server
+
+    async def _umount(self, request: Reply) -> Reply:
+        lazy = bool(request.get("lazy"))
+        action = partial(unmount, self.request.mountpoint, lazy=lazy)
+        await trio.to_thread.run_sync(action, abandon_on_cancel=True)
+        await self.finished.wait()
+        return {"exit_code": int(self.code)}
+
+    def status(self, content: Content) -> dict[str, Any]:
+        """Return facts for people and scripts; JSON-able."""
+        return {
+            "mountpoint": self.request.mountpoint,
+            "source": self.request.source,
+            "pid": os.getpid(),
+            "version": mavftpfs.__version__,
+            "uptime": round(time.time() - self._started, 1),
+            **content.status(),
+        }
+
+    # -- signals ----------------------------------------------------------------------------------
+
+    async def watch_signals(self, task_status: trio.TaskStatus[None] = trio.TASK_STATUS_IGNORED) -> None:
+        """Unmount on the first signal, stop waiting for anybody on the second, just end on the third."""
+        with trio.open_signal_receiver(signal.SIGINT, signal.SIGTERM, signal.SIGHUP) as signals:
+            task_status.started()
+            async for number in signals:
+                log.info("signal %s", signal.Signals(number).name)
+                self._signals += 1
+                self._on_signal()
+
+    def _on_signal(self) -> None:
+        if self._signals > 2:
+            self._end_at_once()
+        elif self._signals == 1 and self._loop_scope is not None:
+            pyfuse3.terminate()
+            self._loop_scope.deadline = trio.current_time() + GRACE
+        elif self._signals == 2 or not self.mounted:
+            self.scope.cancel()
+
+    def _end_at_once(self) -> None:
+        if self.mounted:
+            try:
+                unmount(self.request.mountpoint, lazy=True)
+            except MavftpfsError as exc:
+                log.warning("%s", exc)
+        os._exit(ExitCode.MOUNT_FAILED)
+
+
+async def fuse_loop() -> None:
+    """Serve the kernel until the mount is gone, from inside or outside."""
+    try:
+        await pyfuse3.main(min_tasks=MIN_TASKS, max_tasks=MAX_TASKS)
+    except* OSError as group:
+        # Reading from /dev/fuse fails when the connection was aborted (`umount -f`, fusectl).
+        log.warning("the kernel ended the mount: %s", group.exceptions[0])
+
+
+@contextmanager
+def kernel_mount(operations: Operations, request: MountRequest, invalidator: Invalidator) -> Iterator[None]:
+    """Have the kernel show `operations` at the mountpoint for the length of the body.
+
+    Raises:
+        MountFailed: with what libfuse or fusermount3 said.
+    """
+    words = fuse_words(request.options, request.source)
+    with stderr_of() as said:
+        try:
+            pyfuse3.init(operations, request.mountpoint, words)
+        except RuntimeError as exc:
+            reason = said() or str(exc)
+            raise MountFailed(f"cannot mount on {request.mountpoint}: {reason}") from exc
+    try:
+        yield
+    finally:
+        if invalidator.busy:
+            # A thread is still inside the library; freeing the library's session would pull it away.
+            unmount(request.mountpoint, lazy=True)
+        else:
+            pyfuse3.close(unmount=True)
+
+
+def presentation(options: MountOptions) -> Presentation:
+    """Return how entries look for these options, with this process's user and umask for what is not given."""
+    umask = os.umask(0o022)
+    os.umask(umask)
+    return Presentation(
+        uid=os.getuid() if options.uid is None else options.uid,
+        gid=os.getgid() if options.gid is None else options.gid,
+        file_mode=options.file_mode(umask),
+        directory_mode=options.directory_mode(umask),
+        op_deadline=options.op_deadline,
+    )

@@ -1,0 +1,144 @@
+"""Checks before a mount, one line each, and taking a mount down. Layer: top; only the standard library.
+
+Everything here is called before our own mount exists, or from another process or a worker thread: a
+system call on our own mount from the event loop would wait for itself.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import shutil
+import stat
+import subprocess
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from mavftpfs.exits import MountFailed
+from mavftpfs.fuse.options import SUBTYPE
+
+FUSE_DEVICE = "/dev/fuse"
+MOUNT_TABLE = "/proc/self/mountinfo"
+UNMOUNT_PATIENCE = 60.0
+"""Seconds for an unmount: it waits for the last flush."""
+
+
+def check_mountpoint(path: str, *, table: str = MOUNT_TABLE) -> None:
+    """Check that a file system can be mounted on `path`.
+
+    Raises:
+        MountFailed: and what to do about it.
+    """
+    if is_ours(path, table=table):
+        raise MountFailed(_describe_mounted(path))
+    try:
+        mode = os.stat(path).st_mode
+    except OSError as exc:
+        raise MountFailed(_describe(path, exc)) from exc
+    if not stat.S_ISDIR(mode):
+        raise MountFailed(f"mountpoint {path} is not a directory")
+
+
+def check_fuse(device: str = FUSE_DEVICE, *, uid: int | None = None) -> None:
+    """Check that this machine and user can mount FUSE at all.
+
+    Raises:
+        MountFailed: and what to do about it.
+    """
+    if not os.path.exists(device):
+        raise MountFailed(
+            f"no {device}: load the kernel module (modprobe fuse), or give the container --device"
+        )
+    if (os.getuid() if uid is None else uid) == 0:
+        if not os.access(device, os.R_OK | os.W_OK):
+            raise MountFailed(f"{device} may not be opened here")
+    elif shutil.which("fusermount3") is None:
+        raise MountFailed("fusermount3 is missing, which mounts for users: install the package fuse3")
+
+
+def is_ours(path: str, *, table: str = MOUNT_TABLE) -> bool:
+    """Return whether the topmost mount on `path` is of this program."""
+    return mounted_types(table).get(path, "") == f"fuse.{SUBTYPE}"
+
+
+def mounted_types(table: str = MOUNT_TABLE) -> dict[str, str]:
+    """Return mountpoint -> file system type of the mount on top, from the kernel's table."""
+    found: dict[str, str] = {}
+    for line in Path(table).read_text(errors="surrogateescape").splitlines():
+        left, _, right = line.partition(" - ")
+        columns = left.split(" ")
+        if len(columns) > 4:
+            found[_unescape(columns[4])] = right.split(" ")[0]
+    return found
+
+
+def unmount(path: str, *, lazy: bool = False) -> None:
+    """Unmount, waiting for it; with `lazy` even if it is in use.
+
+    Raises:
+        MountFailed: busy, or whatever fusermount3 said.
+    """
+    program = "fusermount3" if shutil.which("fusermount3") else "umount"
+    words = [program, *(["-u"] if program == "fusermount3" else []), *(["-z"] if lazy else []), "--", path]
+    if program == "umount" and lazy:
+        words[1] = "-l"
+    try:
+        done = subprocess.run(words, capture_output=True, text=True, timeout=UNMOUNT_PATIENCE, check=False)
+    except (OSError, subprocess.TimeoutExpired) as exc:
+        raise MountFailed(f"cannot unmount {path}: {exc}") from exc
+    if done.returncode != 0:
+        raise MountFailed(_describe_unmount(path, done.stderr.strip()))
+
+
+@contextmanager
+def stderr_of() -> Iterator[Callable[[], str]]:
+    """Catch what C libraries and child programs write to stderr during the body.
+
+    Yields a function that returns the first line of it, without libfuse's `fuse: `.
+    """
+    saved = os.dup(2)
+    with tempfile.TemporaryFile() as capture:
+
+        def first_line() -> str:
+            text = os.pread(capture.fileno(), 4096, 0).decode(errors="replace").strip()
+            return text.partition("\n")[0].removeprefix("fuse: ")
+
+        os.dup2(capture.fileno(), 2)
+        try:
+            yield first_line
+        finally:
+            os.dup2(saved, 2)
+            os.close(saved)
+
+
+def _describe(path: str, exc: OSError) -> str:
+    if exc.errno == errno.ENOTCONN:
+        return f"mountpoint {path} is a dead mount whose program is gone; run: fusermount3 -u {path}"
+    if exc.errno == errno.ENOENT:
+        return f"mountpoint {path} does not exist; run: mkdir -p {path}"
+    return f"mountpoint {path}: {os.strerror(exc.errno or errno.EIO)}"
+
+
+def _describe_mounted(path: str) -> str:
+    try:
+        os.stat(path)
+    except OSError as exc:
+        if exc.errno == errno.ENOTCONN:
+            return _describe(path, exc)
+    return f"a vehicle is already mounted on {path}; run: mavftpfs umount {path}"
+
+
+def _describe_unmount(path: str, said: str) -> str:
+    if "busy" in said.lower():
+        return f"{path} is in use; close what has it open (fuser -vm {path}) and try again"
+    first_line = said.splitlines()[0] if said else "no reason given"
+    return f"cannot unmount {path}: {first_line}"
+
+
+def _unescape(text: str) -> str:
+    """Undo the kernel's octal escapes of blanks and backslashes."""
+    for code in ("\\040", "\\011", "\\012", "\\134"):
+        text = text.replace(code, chr(int(code[1:], 8)))
+    return text
