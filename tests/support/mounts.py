@@ -74,6 +74,11 @@ class Mount:
         )
         assert process.running, f"the mount ended with {process.popen.returncode}:\n{process.text()}"
 
+    def alive_or_ended(self) -> Process:
+        """Return the process."""
+        assert self.process is not None
+        return self.process
+
     def alive(self) -> Process:
         """Return the process, which must run."""
         assert self.process is not None
@@ -126,6 +131,11 @@ class Mount:
     def python(self, code: str, *args: str | Path, timeout: float = COMMAND_TIMEOUT) -> str:
         """Run a Python snippet as its own process and return its stdout; it must exit 0."""
         return self.run(sys.executable, "-c", code, *args, timeout=timeout).stdout
+
+    def read_bytes(self, path: str | Path, timeout: float = COMMAND_TIMEOUT) -> bytes:
+        """Return a file's content, read by a process of its own."""
+        code = "import sys; print(open(sys.argv[1], 'rb').read().hex())"
+        return bytes.fromhex(self.python(code, path, timeout=timeout))
 
     def errno_of(self, code: str, *args: str | Path, timeout: float = COMMAND_TIMEOUT) -> str:
         """Return the name of the errno of the OSError that a snippet ends with, '' if it succeeds."""

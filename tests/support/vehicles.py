@@ -61,12 +61,27 @@ class Process:
     def stop(self, number: signal.Signals = signal.SIGTERM) -> int:
         """End it politely and return the exit code."""
         self.send_signal(number)
+        self.resume()  # a paused process takes the signal only then
         return self.wait()
 
     def kill(self) -> None:
         """kill -9, and reap."""
         self.send_signal(signal.SIGKILL)
         self.popen.wait(STOP_TIMEOUT)
+
+    def peak_memory(self) -> int:
+        """Return the largest resident size so far, in bytes."""
+        lines = Path(f"/proc/{self.popen.pid}/status").read_text().splitlines()
+        peak = next(line for line in lines if line.startswith("VmHWM:"))
+        return int(peak.split()[1]) * 1024
+
+    def pause(self) -> None:
+        """Let it fall silent (SIGSTOP), as on a dead link."""
+        self.send_signal(signal.SIGSTOP)
+
+    def resume(self) -> None:
+        """Let it go on."""
+        self.send_signal(signal.SIGCONT)
 
     def text(self) -> str:
         """Everything it wrote to stderr and stdout."""
@@ -130,6 +145,16 @@ class UdpVehicle:
         if self.process is not None:
             self.process.kill()
             self.process = None
+
+    def pause(self) -> None:
+        """Let the vehicle fall silent without ending, as behind a dead link."""
+        assert self.process is not None
+        self.process.pause()
+
+    def resume(self) -> None:
+        """Let it speak again."""
+        assert self.process is not None
+        self.process.resume()
 
     def finish(self) -> None:
         """End vehicle and link, whatever state they are in, then judge what they logged."""

@@ -1,0 +1,166 @@
+"""What can go wrong at the start: one line that says what and why, the documented exit code, no traceback,
+in the foreground and as a daemon."""
+
+from __future__ import annotations
+
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.mount.conftest import Field
+from tests.support.logs import suspects
+from tests.support.mounts import COMMAND_TIMEOUT, Mount, abort_mount, mounted_at, wait_until
+from tests.support.vehicles import HOST, PROJECT, free_udp_port
+
+NOBODY = f"udpin:{HOST}:0"
+
+
+def mavftpfs(*argv: str | Path, code: int, timeout: float = COMMAND_TIMEOUT) -> str:
+    """Run the command, which must end with `code`, and return its one line of complaint."""
+    command = [sys.executable, "-m", "mavftpfs", *map(str, argv)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=timeout, cwd=PROJECT, check=False)
+    assert done.returncode == code, f"{command}: exit {done.returncode}\n{done.stdout}{done.stderr}"
+    assert done.stdout == ""
+    assert suspects(done.stderr) == []
+    lines = done.stderr.splitlines()
+    assert len(lines) == 1, done.stderr
+    return lines[0]
+
+
+@pytest.fixture
+def mountpoint(tmp_path: Path) -> Path:
+    """An empty directory."""
+    path = tmp_path / "mnt"
+    path.mkdir()
+    return path
+
+
+@pytest.mark.parametrize("option", ["frobnicate", "max_read=4096", "cache_sise=1M", "ro=1", "umask=999"])
+def test_a_wrong_option_is_named(mountpoint: Path, option: str) -> None:
+    line = mavftpfs(NOBODY, mountpoint, "-o", f"rw,{option}", code=1)
+    assert option.partition("=")[0] in line
+
+
+@pytest.mark.parametrize("source", ["warp:somewhere", "udpin:127.0.0.1:notaport", "udpin:127.0.0.1:99999"])
+def test_a_wrong_source_is_named(mountpoint: Path, source: str) -> None:
+    assert source in mavftpfs(source, mountpoint, code=1)
+
+
+def test_a_missing_mountpoint_is_exit_3(tmp_path: Path) -> None:
+    line = mavftpfs(f"udpin:{HOST}:{free_udp_port()}", tmp_path / "nowhere", code=3)
+    assert str(tmp_path / "nowhere") in line
+
+
+def test_a_file_as_mountpoint_is_exit_3(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    assert "not a directory" in mavftpfs(f"udpin:{HOST}:{free_udp_port()}", tmp_path / "file", code=3)
+
+
+def test_a_dead_mountpoint_is_exit_3_and_says_the_cure(field: Field, small_tree: Path) -> None:
+    vehicle = field.sim(small_tree)
+    mount = field.mount(vehicle.source)
+    process, mount.process = mount.alive(), None
+    process.kill()
+    try:
+        line = mavftpfs(vehicle.source, mount.path, code=3)
+        assert "fusermount3 -u" in line
+    finally:
+        abort_mount(mount.path)
+    again = Mount(vehicle.source, mount.path, mount.folder)
+    again.start()
+    again.finish()
+
+
+def test_a_second_mount_on_the_same_place_is_refused(field: Field, small_tree: Path) -> None:
+    mount = field.mount(field.sim(small_tree).source)
+    assert str(mount.path) in mavftpfs(f"udpin:{HOST}:{free_udp_port()}", mount.path, code=3)
+
+
+@pytest.mark.parametrize("foreground", [True, False], ids=["foreground", "daemon"])
+def test_no_vehicle_is_exit_2(mountpoint: Path, foreground: bool) -> None:
+    source = f"udpin:{HOST}:{free_udp_port()}"
+    extra = ["-f"] if foreground else []
+    line = mavftpfs(source, mountpoint, "-o", "connect_timeout=1", *extra, code=2)
+    assert "heartbeat" in line or "vehicle" in line
+    assert not mounted_at(mountpoint)
+
+
+def test_a_busy_port_is_exit_2(mountpoint: Path) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+        sock.bind((HOST, 0))
+        port = sock.getsockname()[1]
+        assert str(port) in mavftpfs(f"udpin:{HOST}:{port}", mountpoint, code=2)
+
+
+def test_a_missing_serial_port_is_exit_2(mountpoint: Path) -> None:
+    line = mavftpfs("/dev/ttyNOTHERE,57600", mountpoint, "-o", "connect_timeout=2", code=2)
+    assert "/dev/ttyNOTHERE" in line
+
+
+def test_a_missing_remote_root_is_named(field: Field, small_tree: Path, mountpoint: Path) -> None:
+    source = field.sim(small_tree).source
+    assert "/no/such" in mavftpfs(f"{source}#/no/such", mountpoint, code=1)
+
+
+def test_no_fuse_device_is_exit_3(mountpoint: Path) -> None:
+    hide = 'mount -t tmpfs none /dev && exec "$@"'
+    command = ["unshare", "--mount", "sh", "-c", hide, "sh", sys.executable, "-m", "mavftpfs"]
+    argv = [*command, f"udpin:{HOST}:{free_udp_port()}", str(mountpoint)]
+    done = subprocess.run(argv, capture_output=True, text=True, timeout=60, cwd=PROJECT, check=False)
+    assert done.returncode == 3, done.stderr
+    assert len(done.stderr.splitlines()) == 1
+    assert "/dev/fuse" in done.stderr
+
+
+def test_no_arguments_is_exit_1_with_help() -> None:
+    command = [sys.executable, "-m", "mavftpfs"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=30, cwd=PROJECT, check=False)
+    assert done.returncode == 1
+    assert "usage" in (done.stdout + done.stderr).lower()
+
+
+def test_a_path_too_long_for_the_wire_is_enametoolong(field: Field, tmp_path: Path) -> None:
+    root = tmp_path / "root"
+    deep = root
+    for letter in "abcdefg":
+        deep = deep / (letter * 40)
+    deep.mkdir(parents=True)
+    (deep / "file").write_text("too deep")
+    mount = field.mount(field.sim(root).source)
+    inner = mount.path / deep.relative_to(root)
+    assert mount.errno_of("os.listdir(sys.argv[1])", inner) == "ENAMETOOLONG"
+    assert mount.run("ls", inner.parent.parent.parent.parent).stdout.split() == ["d" * 40]
+
+
+def test_the_daemon_returns_when_mounted_and_goes_on(field: Field, small_tree: Path, tmp_path: Path) -> None:
+    mount = field.prepare(field.sim(small_tree).source)
+    log = tmp_path / "daemon.log"
+    # Run with pipes as a script would: a daemon that keeps them open would hang this call.
+    argv = (sys.executable, "-m", "mavftpfs", mount.source, str(mount.path), "-o", f"log_file={log}")
+    done = subprocess.run(argv, capture_output=True, timeout=60, cwd=PROJECT, check=False)
+    try:
+        assert (done.returncode, done.stdout, done.stderr) == (0, b"", b"")
+        assert mounted_at(mount.path)
+        assert "sizes" in mount.run("ls", mount.path).stdout.split()
+        pids = processes_about(mount.path)
+        assert len(pids) == 1
+        subprocess.run(["fusermount3", "-u", str(mount.path)], check=True, timeout=30)
+        wait_until("the daemon ended", lambda: not processes_about(mount.path), 30)
+    finally:
+        abort_mount(mount.path)
+    assert suspects(log.read_text()) == []
+
+
+def processes_about(path: Path) -> list[int]:
+    """Return the processes with `path` in their command line."""
+    found = []
+    for entry in Path("/proc").iterdir():
+        try:
+            if entry.name.isdigit() and str(path).encode() in (entry / "cmdline").read_bytes().split(b"\0"):
+                found.append(int(entry.name))
+        except OSError:  # it ended meanwhile
+            continue
+    return found

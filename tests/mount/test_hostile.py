@@ -1,0 +1,82 @@
+"""A vehicle that lies: every answer is a documented errno, never a hang, a traceback, or a wrong byte.
+
+Deadlines are short here; that each command ends is what `Mount.run` insists on.
+"""
+
+from __future__ import annotations
+
+import sys
+
+import pytest
+
+from tests.mount.conftest import Field
+from tests.support.hostile import BROKEN, FINE, GOOD, GOOD_NAMES, NAKED
+from tests.support.mounts import Mount, mounted_at
+
+QUICK = ("op_deadline=3", "dir_timeout=60")
+REFUSALS = {"EIO", "ENOENT", "EACCES", "EBUSY", "EINVAL", "ESTALE", "ETIMEDOUT", "EEXIST", "ENOTSUP"}
+REFUSALS |= {"EROFS", "EPERM", "EOPNOTSUPP", "ENAMETOOLONG"}
+
+MAX_RESIDENT = 150 << 20
+"""Bytes; far above what a capped listing needs, far below what an endless one would take."""
+
+
+@pytest.fixture(scope="module")
+def liar(module_field: Field) -> Mount:
+    """A mount of the vehicle with hostile listings and broken files."""
+    return module_field.mount(module_field.hostile("files").source, *QUICK)
+
+
+def test_only_usable_names_enter_the_tree(liar: Mount) -> None:
+    out = liar.python("import os, sys; print(ascii(sorted(os.listdir(sys.argv[1]))))", liar.path / "names")
+    assert out.strip() == ascii(sorted(GOOD_NAMES))
+
+
+def test_good_files_among_bad_names_are_readable(liar: Mount) -> None:
+    for name in sorted(GOOD_NAMES):
+        assert liar.read_bytes(liar.path / "names" / name) == GOOD
+
+
+def test_a_whole_file_is_right(liar: Mount) -> None:
+    assert liar.read_bytes(liar.path / "fine.bin") == FINE
+
+
+@pytest.mark.parametrize("directory", ["endless", "same"])
+def test_endless_listings_end(liar: Mount, directory: str) -> None:
+    code = "import os, sys\ntry: print(len(os.listdir(sys.argv[1])))\nexcept OSError as e: print(-e.errno)"
+    answer = int(liar.python(code, liar.path / directory, timeout=120))
+    assert answer != 0
+    assert liar.alive().peak_memory() < MAX_RESIDENT
+    assert liar.run("cat", liar.path / "names/good.txt").stdout == GOOD.decode()
+
+
+@pytest.mark.parametrize("name", BROKEN)
+def test_a_file_that_cannot_be_completed_is_an_error(liar: Mount, name: str) -> None:
+    error = liar.errno_of("open(sys.argv[1], 'rb').read()", liar.path / "broken" / name, timeout=60)
+    assert error in {"EIO", "ESTALE", "ETIMEDOUT"}
+    assert liar.read_bytes(liar.path / "fine.bin") == FINE
+
+
+@pytest.mark.parametrize("step", ["open", "read"])
+@pytest.mark.parametrize("code", NAKED)
+def test_every_refusal_has_an_errno(liar: Mount, step: str, code: int) -> None:
+    error = liar.errno_of("open(sys.argv[1], 'rb').read()", liar.path / "nak" / f"{step}{code}", timeout=60)
+    assert error in REFUSALS
+
+
+def test_noise_and_forged_replies_change_nothing(field: Field) -> None:
+    mount = field.mount(field.hostile("noise").source, *QUICK)
+    assert mount.read_bytes(mount.path / "fine.bin") == FINE
+    for name in sorted(GOOD_NAMES):
+        assert mount.read_bytes(mount.path / "names" / name) == GOOD
+
+
+def test_a_vehicle_that_never_answers_ftp_is_exit_2(field: Field) -> None:
+    vehicle = field.hostile("mute")
+    mount = field.prepare(vehicle.source, "connect_timeout=3")
+    result = mount.run(
+        sys.executable, "-m", "mavftpfs", vehicle.source, mount.path, "-o", "connect_timeout=3", code=2
+    )
+    assert len(result.stderr.splitlines()) == 1, result.stderr
+    assert "FTP" in result.stderr
+    assert not mounted_at(mount.path)

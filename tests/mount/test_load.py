@@ -1,0 +1,122 @@
+"""Many things at once, and large things: the mount stays responsive and small."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from tests.mount.conftest import Field
+from tests.support.trees import content
+from tests.support.vehicles import UdpVehicle
+
+FRESH_DIRECTORIES = 60
+MIB = 1 << 20
+
+COPIES = {
+    "px4": (4_000_000, ("--rate", "400000")),
+    "px4-nuttx": (1_500_000, ("--rate", "150000")),
+    "ardupilot": (1_000_000, ()),
+    "mavsdk": (60_000_000, ()),
+    "mavsdk-server": (60_000_000, ()),
+}
+"""Vehicle -> (bytes to copy, options of the link), so that the copy takes several seconds."""
+
+
+@pytest.mark.parametrize("kind", COPIES)
+def test_ls_overtakes_a_large_copy(
+    field: Field, tmp_path: Path, kind: str, record_property: Callable[[str, object], None]
+) -> None:
+    size, link = COPIES[kind]
+    card = field.local("card")
+    (card / "large.bin").write_bytes(content(kind, size))
+    for number in range(FRESH_DIRECTORIES):
+        (card / f"fresh{number}").mkdir()
+        (card / f"fresh{number}" / f"file{number}").touch()
+    vehicle: UdpVehicle = field.mavsdk(card) if kind == "mavsdk-server" else field.sim(card, kind, link)
+    mount = field.mount(vehicle.source)
+    times = []
+    start = time.monotonic()
+    with mount.started("cp", mount.path / "large.bin", tmp_path / "copy") as copy:
+        for number in range(FRESH_DIRECTORIES):
+            time.sleep(0.1)
+            if copy.poll() is not None:
+                break
+            before = time.monotonic()
+            names = mount.run("ls", mount.path / f"fresh{number}").stdout
+            times.append(time.monotonic() - before)
+            assert names == f"file{number}\n"
+        _, errors = copy.communicate(timeout=300)
+    took = time.monotonic() - start
+    assert (copy.returncode, errors) == (0, "")
+    assert (tmp_path / "copy").read_bytes() == (card / "large.bin").read_bytes()
+    ordered = sorted(times)
+    report = (
+        f"cp {took:.1f} s, {len(times)} ls: median {ordered[len(times) // 2]:.3f} s, max {ordered[-1]:.3f} s"
+    )
+    record_property("ls during cp", report)
+    print(f"{kind}: {report}")
+    assert len(times) >= 5, report
+    assert max(times) < took / 2, f"an ls waited for the copy: {report}"
+
+
+def test_memory_is_bounded_while_reading_ten_times_the_cache(field: Field, tmp_path: Path) -> None:
+    cache = 2 * MIB
+    card = field.local("card")
+    (card / "large.bin").write_bytes(content("memory", 10 * cache))
+    mount = field.mount(field.sim(card).source, f"cache_size={cache}")
+    mount.run("cp", mount.path / "large.bin", tmp_path / "copy", timeout=300)
+    assert (tmp_path / "copy").read_bytes() == (card / "large.bin").read_bytes()
+    dirty_max = 8 * MIB
+    assert mount.alive().peak_memory() <= cache + dirty_max + 60 * MIB
+
+
+OPEN_ALL = """
+import concurrent.futures, os, sys
+def read(name):
+    for attempt in range(3):
+        try:
+            with open(os.path.join(sys.argv[1], name), "rb") as file:
+                return name, file.read()
+        except OSError as error:
+            failed = error
+    return name, failed
+names = sys.argv[2:]
+with concurrent.futures.ThreadPoolExecutor(len(names)) as pool:
+    print("started", flush=True)
+    for name, data in pool.map(read, names):
+        print(name, data.hex() if isinstance(data, bytes) else data)
+"""
+
+
+def test_120_blocked_opens_do_not_freeze_df(field: Field, tree: Path) -> None:
+    vehicle = field.sim(tree)
+    mount = field.mount(vehicle.source)
+    names = mount.run("ls", mount.path / "many").stdout.split()[:120]
+    assert len(names) == 120
+    vehicle.pause()
+    with mount.started(sys.executable, "-c", OPEN_ALL, mount.path / "many", *names) as readers:
+        assert readers.stdout is not None
+        readers.stdout.readline()
+        time.sleep(1.0)
+        mount.run("df", mount.path, timeout=20)
+        mount.run("stat", mount.path / "many" / names[0], timeout=20)
+        vehicle.resume()
+        out, errors = readers.communicate(timeout=120)
+    assert readers.returncode == 0, errors
+    read = dict(line.partition(" ")[::2] for line in out.splitlines())
+    assert read == {name: (tree / "many" / name).read_bytes().hex() for name in names}
+
+
+@pytest.mark.parametrize("profile", ["px4", "ardupilot", "ardupilot5", "mavsdk"])
+def test_several_files_are_read_at_once_over_one_session(
+    field: Field, tree: Path, tmp_path: Path, profile: str
+) -> None:
+    mount = field.mount(field.sim(tree, profile).source)
+    names = ("40152.bin", "119500.bin", "131073.bin", "35850.bin")
+    starts = [f"cmp {mount.path}/sizes/{name} {tree}/sizes/{name} & p{i}=$!" for i, name in enumerate(names)]
+    waits = [f"wait $p{i} || exit 1" for i in range(len(names))]
+    mount.run("sh", "-c", "\n".join(starts + waits), timeout=120)

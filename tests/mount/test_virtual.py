@@ -1,0 +1,88 @@
+"""ArduPilot's and PX4's `@` trees: their sizes lie, what is read must not (servers.md 11)."""
+
+from __future__ import annotations
+
+import filecmp
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from mavftpfs.sim.pseudo import VirtualTrees
+from tests.mount.conftest import Field
+from tests.support.mounts import Mount
+
+TRUTH = VirtualTrees()
+FILLED = {name.decode(): data for name, data in TRUTH.sys_files.items() if data}
+"""What is in @SYS and can be opened; the vehicle lists more names than it can open."""
+
+
+@pytest.fixture(scope="module", params=["ardupilot", "ardupilot5", "littlefs"])
+def ardupilot(request: pytest.FixtureRequest, module_field: Field, small_tree: Path) -> Mount:
+    """A mount of a vehicle with all virtual trees."""
+    return module_field.mount(module_field.sim(small_tree, request.param).source)
+
+
+def test_sys_files_are_whole_although_their_sizes_lie(ardupilot: Mount) -> None:
+    for name, data in FILLED.items():
+        path = ardupilot.path / "@SYS" / name
+        assert ardupilot.read_bytes(path) == data
+        assert int(ardupilot.run("stat", "-c", "%s", path).stdout) == len(data)
+
+
+def test_sys_appears_in_the_root(ardupilot: Mount) -> None:
+    assert "@SYS" in ardupilot.run("ls", ardupilot.path).stdout.split()
+    assert set(FILLED) <= set(ardupilot.run("ls", ardupilot.path / "@SYS").stdout.split())
+
+
+def test_parameters_are_one_consistent_file(ardupilot: Mount, tmp_path: Path) -> None:
+    ardupilot.run("cp", ardupilot.path / "@PARAM/param.pck", tmp_path)
+    packed = (tmp_path / "param.pck").read_bytes()
+    blocks = [block for block in range(16, 240) if TRUTH.content(b"@PARAM/param.pck", block) == packed]
+    assert blocks, "param.pck is none of the vehicle's files, whatever the block size"
+
+
+def test_a_query_selects_parameters(ardupilot: Mount) -> None:
+    name = "param.pck?start=2&count=3"
+    assert ardupilot.read_bytes(ardupilot.path / "@PARAM" / name) == TRUTH.content(
+        b"@PARAM/" + name.encode(), 239
+    )
+
+
+def test_romfs_is_an_ordinary_tree(ardupilot: Mount) -> None:
+    for name, data in TRUTH.romfs.items():
+        assert ardupilot.read_bytes(ardupilot.path / "@ROMFS" / name.decode()) == data
+
+
+def test_missions_read_to_their_end(ardupilot: Mount) -> None:
+    out = ardupilot.read_bytes(ardupilot.path / "@MISSION/mission.dat")
+    assert out == TRUTH.content(b"@MISSION/mission.dat", 239)
+
+
+@pytest.mark.parametrize("tool", ["cp", "rsync", "tar"])
+def test_copying_tools_get_the_true_bytes(ardupilot: Mount, tmp_path: Path, tool: str) -> None:
+    sources = [f"./@SYS/{name}" for name in FILLED]
+    if tool == "cp":
+        (tmp_path / "@SYS").mkdir()
+        ardupilot.run("cp", *sources, tmp_path / "@SYS", cwd=ardupilot.path)
+    elif tool == "rsync":
+        ardupilot.run("rsync", "-aR", *sources, f"{tmp_path}/", cwd=ardupilot.path)
+        again = ardupilot.run("rsync", "-aRi", *sources, f"{tmp_path}/", cwd=ardupilot.path).stdout
+        assert again == ""
+    else:
+        archive = tmp_path / "sys.tar"
+        ardupilot.run("tar", "-cf", archive, *sources, cwd=ardupilot.path)
+        subprocess.run(["tar", "-xf", archive, "-C", tmp_path], check=True, timeout=30)
+    assert {path.name: path.read_bytes() for path in (tmp_path / "@SYS").iterdir()} == FILLED
+
+
+def test_writing_below_at_is_refused(ardupilot: Mount) -> None:
+    assert ardupilot.errno_of("open(sys.argv[1], 'w')", ardupilot.path / "@PARAM/param.pck") == "EROFS"
+    assert ardupilot.errno_of("open(sys.argv[1], 'w')", ardupilot.path / "@SYS/new.txt") == "EROFS"
+
+
+def test_px4_parameters_have_a_true_size(field: Field, small_tree: Path, tmp_path: Path) -> None:
+    mount = field.mount(field.sim(small_tree, "px4-2026").source)
+    mount.run("cp", mount.path / "@PARAM/param.pck", tmp_path)
+    (tmp_path / "truth").write_bytes(VirtualTrees(exact=True).content(b"@PARAM/param.pck", 239))
+    assert filecmp.cmp(tmp_path / "param.pck", tmp_path / "truth", shallow=False)
