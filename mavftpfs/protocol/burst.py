@@ -10,9 +10,9 @@ from __future__ import annotations
 
 from math import inf
 
-from mavftpfs.protocol.payload import NakCode, Opcode, Payload
+from mavftpfs.protocol.payload import MAX_DATA, NakCode, Opcode, Payload
 
-_MAX_STRAY_NAK = 40_000
+_MOST_PACKETS = 40_000
 _MIN_QUIET = 1.0
 _SLOW_PACKET = 0.03
 _SLOW_QUIET = 2.0
@@ -83,79 +83,69 @@ class Burst:
     def take(self, reply: Payload, now: float) -> bytes | None:
         """Take a packet; return its data (b"" for a control packet), or None if it does not belong."""
         index = (reply.seq - self.seq - 1) & 0xFFFF
-        if reply.opcode == Opcode.ACK:
+        if reply.opcode == Opcode.ACK and reply.data:
             return self._take_data(reply, index, now)
-        if reply.opcode == Opcode.NAK and index <= self._most_packets():
-            return self._take_nak(reply, now)
-        return None
+        # Neither a NAK's offset nor that of an empty packet can be relied on: the seq must do.
+        if index > self._most_packets():
+            return None
+        if reply.opcode == Opcode.ACK:
+            self.empties += 1
+        elif reply.opcode == Opcode.NAK:
+            self._take_nak(reply)
+        else:
+            return None
+        self._touch(now)
+        return b""
 
     def _most_packets(self) -> int:
-        # One packet may be as small as what was asked for; the NAK comes right behind the last.
         packet = self.packet or self.asked
-        return min((self.size - self.start) // packet + 2, _MAX_STRAY_NAK)
+        return min((self.size - self.start) // packet + 2, _MOST_PACKETS)
 
-    def _take_nak(self, reply: Payload, now: float) -> bytes:
-        code = reply.data[0] if reply.data else int(NakCode.NONE)
-        self._touch(now)
-        self.nak = code
-        if code == NakCode.EOF:
+    def _take_nak(self, reply: Payload) -> None:
+        self.nak = reply.data[0] if reply.data else int(NakCode.NONE)
+        if self.nak == NakCode.EOF or not self.packets:
             self.over = True
         else:
+            # ArduPilot stops after one, MAVSDK never does: quiet, or the next one, will tell.
+            self.complete_seen = True
             self.failures += 1
-        return b""
 
     def _take_data(self, reply: Payload, index: int, now: float) -> bytes | None:
         data = reply.data
-        if not self._fits(reply.offset, len(data), index):
+        offset = reply.offset
+        stop = offset + len(data)
+        if not self._fits(offset - self.start, len(data), index, at_end=stop >= self.size):
             return None
         self._touch(now)
+        self.packets += 1
+        self.empties = self.failures = 0
         if reply.burst_complete:
             self.complete_seen = True
-        if not data:
-            self.empties += 1
-            return b""
-        self.empties = self.failures = 0
-        stop = reply.offset + len(data)
-        if stop > self.highest:
-            self.highest = stop
         if stop >= self.size:
             self.over = True
-            data = data[: max(0, self.size - reply.offset)]
-        self.packets += 1
+            data = data[: max(0, self.size - offset)]
+            stop = self.size
+        self.highest = max(self.highest, stop)
         self.received += len(data)
         return data
 
-    def _fits(self, offset: int, count: int, index: int) -> bool:
-        ahead = offset - self.start
+    def _fits(self, ahead: int, count: int, index: int, *, at_end: bool) -> bool:
         packet = self.packet
-        if packet == 0:
-            packet = self._learn_packet(ahead, count, index, offset)
-            if packet == 0:
-                return False
-        steps, odd = divmod(ahead, packet)
-        if odd or ahead < 0 or steps & 0xFFFF != index or count > packet:
+        if packet:
+            steps, odd = divmod(ahead, packet)
+            return not odd and ahead >= 0 and steps & 0xFFFF == index and count <= packet
+        if index == 0:
+            if ahead == 0 and not at_end:  # a last packet may be short and tells no size
+                self.packet = count
+            return ahead == 0
+        packet, odd = divmod(ahead, index)
+        if odd or not count <= packet <= MAX_DATA or (count < packet and not at_end):
             return False
-        if count == packet or offset + count >= self.size or count == 0:
-            # A last packet may be short; only a full one (or k > 0) tells the packet size.
-            if index > 0 or offset + count < self.size:
-                self.packet = packet
-            return True
         self.packet = packet
         return True
 
-    def _learn_packet(self, ahead: int, count: int, index: int, offset: int) -> int:
-        """Return the packet size that the first packet proves, or 0 if it cannot be right."""
-        if index == 0:
-            return count or self.asked
-        if ahead <= 0 or ahead % index:
-            return 0
-        packet = ahead // index
-        if packet > 239 or (count != packet and offset + count != self.size):
-            return 0
-        return packet
-
     def _touch(self, now: float) -> None:
-        if self.packets:
+        if self.first_at < inf:
             self.interval += (now - self.last_at - self.interval) * 0.1
         else:
             self.first_at = now

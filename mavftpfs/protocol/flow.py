@@ -41,6 +41,7 @@ class Flow:
         "_brake",
         "_cap",
         "_collapsed",
+        "_limit",
         "_losses",
         "_plateau",
         "_rates",
@@ -56,7 +57,8 @@ class Flow:
 
     def __init__(self, *, serial: bool = False, limit: int | None = None) -> None:
         self._serial = serial
-        self._cap = max(1, limit or (SERIAL_CAP if serial else DEFAULT_CAP))
+        self._limit = max(1, limit or (SERIAL_CAP if serial else DEFAULT_CAP))
+        self._cap = self._limit
         self.window = min(1 if serial else INITIAL, self._cap)
         self.loss = 0.0
         self._starting = not serial
@@ -79,9 +81,9 @@ class Flow:
         """The most requests that may ever be in flight."""
         return self._cap
 
-    def set_cap(self, cap: int) -> None:
-        """Never have more than `cap` in flight, for example because the server's queue is that short."""
-        self._cap = max(1, min(cap, self._cap))
+    def set_queue_limit(self, limit: int | None) -> None:
+        """Never have more in flight than the server queues; None if it is not known to be limited."""
+        self._cap = self._limit if limit is None else max(1, min(limit, self._limit))
         self.window = min(self.window, self._cap)
 
     def on_starved(self) -> None:

@@ -112,7 +112,7 @@ class OpenFile(Simple):
         if len(reply.data) >= 4:
             self.size = int.from_bytes(reply.data[:4], "little")
         if request.session:
-            self.port.traits.learn_session_echo(reply.session == request.session)
+            self.port.learn_session_echo(reply.session == request.session)
 
 
 class Terminate(Simple):

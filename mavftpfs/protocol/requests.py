@@ -26,30 +26,34 @@ class Manner(NamedTuple):
 
     family: whose round trips are alike. same_seq: repeat under the same seq. ordered: servers answer
     in order, so answers to later requests prove a loss. echoes_offset: an ACK carries the request's
-    offset. patient_after: from so many transmissions on, wait at least `patience` seconds (a slow
-    server executes every one of them, servers.md 14.38).
+    offset. free_sends: transmissions before the waits double. patient_after: from so many transmissions
+    on, wait at least `patience` seconds (a slow server executes every one of them, servers.md 14.38).
+    once: never repeated, and its loss matters to nobody.
     """
 
     family: str
     same_seq: bool
     ordered: bool = False
     echoes_offset: bool = False
+    free_sends: int = 1
     patient_after: int = 1 << 30
     patience: float = 0.0
+    once: bool = False
 
 
 FLOORS = {"data": 0.03, "write": 0.05, "list": 0.25, "path": 0.2, "slow": 10.0}
 """Least retransmission timeout of each family in seconds."""
 
-READ_MANNER = Manner("data", same_seq=False, ordered=True, echoes_offset=True)
-_WRITE = Manner("write", same_seq=False, ordered=True)
+READ_MANNER = Manner("data", same_seq=False, ordered=True, echoes_offset=True, free_sends=3)
+WRITE_MANNER = Manner("write", same_seq=False, ordered=True, free_sends=3)
+KEEP_ALIVE_MANNER = Manner("path", same_seq=False, once=True)
 _LIST = Manner("list", same_seq=False, ordered=True, patient_after=4, patience=2.5)
 _PATH = Manner("path", same_seq=True)
-_SLOW = Manner("slow", same_seq=True, patient_after=2, patience=20.0)
+_SLOW = Manner("slow", same_seq=True, patient_after=2, patience=40.0)
 
 _MANNERS = {
     Opcode.READ_FILE: READ_MANNER,
-    Opcode.WRITE_FILE: _WRITE,
+    Opcode.WRITE_FILE: WRITE_MANNER,
     Opcode.LIST_DIRECTORY: _LIST,
     Opcode.LIST_DIRECTORY_WITH_TIME: _LIST,
     Opcode.TRUNCATE_FILE: _SLOW,
@@ -67,7 +71,6 @@ class Request:
 
     __slots__ = (
         "aliases",
-        "answered",
         "data",
         "first_sent",
         "flying",
@@ -115,7 +118,6 @@ class Request:
         self.data = data
         self.follows = follows
         self.aliases: list[int] | None = None
-        self.answered = False
         self.flying = False
         self.fresh_seq = False
         self.sends = 0
@@ -160,8 +162,12 @@ class Port(Protocol):
     session: int
     traits: Traits
 
-    def round_trip(self, family: str) -> float:
+    def timeout(self, family: str) -> float:
         """Return the present retransmission timeout of a family, in seconds."""
+        ...
+
+    def learn_session_echo(self, echoed: bool) -> None:
+        """An Open ACK carried the session id asked for, or another."""
         ...
 
     def note(self, text: str) -> None:
@@ -206,12 +212,19 @@ class Operation:
         """Whether nothing is wanted of the server, so that silence is no failure."""
         return False
 
+    @property
+    def bursting(self) -> bool:
+        """Whether a burst of this operation is running."""
+        return False
+
     def attach(self, port: Port, now: float) -> None:
         """Called by the engine when it takes the operation on."""
         if self._port is not None:
             raise LocalProtocolError("an operation runs once")
         self._port = port
         self.started_at = now
+        if not self.idle:
+            self.progress_at = now
 
     def next_request(self, now: float) -> Request | None:
         """Return the next new request, or None if there is none for now."""

@@ -7,7 +7,15 @@ from typing import Literal, Protocol
 
 from mavftpfs.protocol.burst import Burst
 from mavftpfs.protocol.payload import MAX_DATA, NakCode, Opcode, Payload
-from mavftpfs.protocol.requests import READ_MANNER, Operation, Priority, Request, manner_of, nak_of
+from mavftpfs.protocol.requests import (
+    KEEP_ALIVE_MANNER,
+    READ_MANNER,
+    Operation,
+    Priority,
+    Request,
+    manner_of,
+    nak_of,
+)
 from mavftpfs.protocol.toeof import ReadToEof
 from mavftpfs.shared.errors import FileChanged, FtpNak, LocalProtocolError, MavftpfsError, SessionLost
 from mavftpfs.shared.extents import ExtentSet
@@ -16,11 +24,17 @@ __all__ = ["DataSink", "ReadToEof", "ReadTransfer", "Strategy"]
 
 Strategy = Literal["window", "burst"]
 
+KEEP_ALIVE = 3.0
+"""Seconds between harmless requests during a burst: PX4 closes a session 10 s after the last *request*."""
+
 _READ = int(Opcode.READ_FILE)
-_LOST_CODES = frozenset((NakCode.INVALID_SESSION, NakCode.FILE_NOT_FOUND, NakCode.FAIL, NakCode.FILE_EXISTS))
+_SESSION_CODES = frozenset((NakCode.INVALID_SESSION, NakCode.FILE_NOT_FOUND))
+_DOUBTFUL_CODES = frozenset((NakCode.FAIL, NakCode.FILE_EXISTS))
 _EBADF = 9
-_MAX_ERRORS = 1
-_MAX_BARREN_BURSTS = 2
+_ERRORS_TOLERATED = 2
+_BARREN_BURSTS = 2
+_SHORTS_TO_LEARN = 3
+_MEASURE_SECONDS = 0.25
 
 
 class DataSink(Protocol):
@@ -31,7 +45,7 @@ class DataSink(Protocol):
         ...
 
     def on_data(self, offset: int, data: bytes) -> None:
-        """Take bytes; what is already held must not be overwritten."""
+        """Take bytes, which may be more than was wanted; what is already held must not be overwritten."""
         ...
 
 
@@ -44,11 +58,10 @@ class ReadTransfer(Operation):
         strategy: how to begin; `set_strategy` changes it at the next safe point.
 
     Attributes:
-        received_bytes: delivered to the sink so far. window_bytes, burst_bytes: by strategy.
-        window_seconds, burst_seconds: time during which each had work to do.
+        received_bytes: delivered to the sink so far.
 
-    Fails with SessionLost (reopen and start another with `wants`), FileChanged (the file ends before its
-    size), FtpNak, or RequestTimeout.
+    Fails with SessionLost (reopen, and start another with `wants`), FileChanged (the file ends before its
+    size), FtpNak, or RequestTimeout. `wants` stays valid after a failure.
     """
 
     def __init__(
@@ -60,52 +73,52 @@ class ReadTransfer(Operation):
         self.session = session
         self.size = size
         self.chunk = chunk
+        self.strategy: Strategy = strategy
         self.received_bytes = 0
-        self.window_bytes = 0
-        self.burst_bytes = 0
-        self.window_seconds = 0.0
-        self.burst_seconds = 0.0
         self._sink = sink
-        self._strategy: Strategy = strategy
         self._demand = ExtentSet()
         self._ahead = ExtentSet()
         self._gaps = ExtentSet()
-        self._flying: dict[Request, None] = {}
+        self._unanswered: dict[Request, None] = {}
         self._burst: Burst | None = None
+        self._keep_alive_at = inf
         self._barren_bursts = 0
         self._errors = 0
-        self._window_since: float | None = None
+        self._shorts: dict[int, int] = {}
+        self._window_mark = 0.0
+        self._window_seconds = 0.0
+        self._window_bytes = 0
+        self._burst_seconds = 0.0
+        self._burst_bytes = 0
 
     # --- what the owner says and sees
 
     def want(self, start: int, stop: int, demand: bool) -> None:
         """Ask for what the sink lacks of [start, stop), clamped to the size, if it is not on its way."""
-        flying = ExtentSet((request.offset, request.offset + request.size) for request in self._flying)
+        asked = ExtentSet((request.offset, request.offset + request.size) for request in self._unanswered)
         for gap_start, gap_stop in self._sink.missing(start, min(stop, self.size)):
-            for piece_start, piece_stop in flying.missing(gap_start, gap_stop):
-                if demand:
-                    self._demand.add(piece_start, piece_stop)
-                    self._ahead.discard(piece_start, piece_stop)
-                else:
-                    for begin, end in self._demand.missing(piece_start, piece_stop):
-                        self._ahead.add(begin, end)
+            for piece_start, piece_stop in asked.missing(gap_start, gap_stop):
+                self._want_piece(piece_start, piece_stop, demand)
+
+    def _want_piece(self, start: int, stop: int, demand: bool) -> None:
+        if demand:
+            self._demand.add(start, stop)
+            self._ahead.discard(start, stop)
+        else:
+            for ahead_start, ahead_stop in self._demand.missing(start, stop):
+                self._ahead.add(ahead_start, ahead_stop)
 
     def drop_readahead(self) -> None:
         """Forget wants that nobody waits for; what is on its way still arrives."""
         self._ahead.clear()
 
     def set_strategy(self, strategy: Strategy) -> None:
-        """Go on by this strategy from the next safe point (no burst running)."""
-        self._strategy = strategy
-
-    @property
-    def strategy(self) -> Strategy:
-        """The strategy wished for."""
-        return self._strategy
+        """Go on by this strategy from the next safe point, which is the end of a running burst."""
+        self.strategy = strategy
 
     @property
     def bursting(self) -> bool:
-        """Whether a burst is running (on ArduPilot nothing else is answered until it ends)."""
+        """Whether a burst is running (ArduPilot answers nothing else until it ends)."""
         return self._burst is not None
 
     @property
@@ -114,14 +127,14 @@ class ReadTransfer(Operation):
         wants = self._demand.copy()
         for start, stop in self._ahead:
             wants.add(start, stop)
-        for request in self._flying:
+        for request in self._unanswered:
             wants.add(request.offset, request.offset + request.size)
         return wants
 
     @property
     def idle(self) -> bool:
         """Whether nothing is wanted, on its way or streaming."""
-        return not self._flying and self._burst is None and self._demand.empty and self._ahead.empty
+        return not self._unanswered and self._burst is None and self._demand.empty and self._ahead.empty
 
     @property
     def priority(self) -> Priority:
@@ -131,93 +144,121 @@ class ReadTransfer(Operation):
     @property
     def window_rate(self) -> float | None:
         """Measured bytes per second of windowed reading, None before a quarter of a second of it."""
-        return self.window_bytes / self.window_seconds if self.window_seconds >= 0.25 else None
+        return self._window_bytes / self._window_seconds if self._window_seconds >= _MEASURE_SECONDS else None
 
     @property
     def burst_rate(self) -> float | None:
-        """Measured bytes per second of bursts, None before the first one ended."""
-        return self.burst_bytes / self.burst_seconds if self.burst_seconds > 0 else None
+        """Measured bytes per second of bursts with their pauses, None before the first one ended."""
+        return self._burst_bytes / self._burst_seconds if self._burst_seconds > 0 else None
 
     # --- requests
 
     def next_request(self, now: float) -> Request | None:
-        """Return the next ReadFile, or the BurstReadFile that is due."""
+        """Return the next ReadFile, the BurstReadFile that is due, or a keep-alive during a burst."""
         if self._burst is not None:
-            return None
-        if self._strategy == "burst" and self._gaps.empty:
-            return self._next_burst(now)
+            return self._next_keep_alive(now)
+        if not self._gaps.empty:
+            return self._next_gap(now)
+        if self.strategy == "burst":
+            return self._next_burst()
         return self._next_read(now)
 
     def _next_read(self, now: float) -> Request | None:
         piece = self._demand.take_first(self.chunk) or self._ahead.take_first(self.chunk)
+        return None if piece is None else self._ask(piece[0], piece[1], now)
+
+    def _next_gap(self, now: float) -> Request | None:
+        piece = self._gaps.take_first(self.chunk)
         if piece is None:
             return None
-        if self._window_since is None:
-            self._window_since = now
-        start, stop = piece
-        if not self._gaps.empty:
-            self._gaps.discard(0, stop)
-        return self._ask(start, stop)
+        self._forget_want(*piece)
+        return self._ask(piece[0], piece[1], now)
 
-    def _ask(self, start: int, stop: int) -> Request:
+    def _forget_want(self, start: int, stop: int) -> None:
+        self._demand.discard(start, stop)
+        self._ahead.discard(start, stop)
+
+    def _ask(self, start: int, stop: int, now: float) -> Request:
         request = Request(self, _READ, READ_MANNER, self.session, start, stop - start)
-        self._flying[request] = None
+        if not self._unanswered:
+            self._window_mark = now
+        self._unanswered[request] = None
         return request
 
-    def _next_burst(self, now: float) -> Request | None:
+    def _next_burst(self) -> Request | None:
         # ReadFile during a burst moves MAVSDK's shared stream position: never both at once.
         first = self._demand.first() or self._ahead.first()
-        if self._flying or first is None:
+        if self._unanswered or first is None:
             return None
         opcode = Opcode.BURST_READ_FILE
         return Request(self, opcode, manner_of(opcode), self.session, first[0], self.chunk)
+
+    def _next_keep_alive(self, now: float) -> Request | None:
+        if now < self._keep_alive_at:
+            return None
+        self._keep_alive_at = now + KEEP_ALIVE
+        self._arm(now)
+        return Request(self, Opcode.NONE, KEEP_ALIVE_MANNER, self.session, 0, 0)
 
     # --- replies to ReadFile
 
     def on_reply(self, request: Request, reply: Payload, now: float) -> None:
         """Place a chunk, or find out what a refusal means."""
-        del self._flying[request]
-        if not self._flying and self._window_since is not None:
-            self.window_seconds += now - self._window_since
-            self._window_since = None
+        if request.opcode != _READ:
+            return
+        del self._unanswered[request]
+        self._window_seconds += now - self._window_mark
+        self._window_mark = now
         if reply.opcode == Opcode.NAK:
             self._on_nak(request, nak_of(request, reply))
             return
         data = reply.data
         count = len(data)
-        if count < request.size:
-            self._on_short(request, count)
-        elif count > request.size:
+        if count != request.size:
             data = data[: request.size]
-            count = request.size
+            count = len(data)
+            if count < request.size:
+                self._on_short(request, count)
         if count:
             self.received_bytes += count
-            self.window_bytes += count
+            self._window_bytes += count
             self._sink.on_data(request.offset, data)
 
     def _on_short(self, request: Request, count: int) -> None:
-        start, stop = request.offset + count, request.offset + request.size
-        self._demand.add(start, stop)
+        start = request.offset + count
+        self._demand.add(start, request.offset + request.size)
         if count == 0:
             self.fail(FileChanged(f"the file ends at {start}, before its size of {self.size}"))
+        elif request.size == self.chunk:
+            # A server that never sends more than this (servers.md 7) should not be asked for more.
+            self._shorts[count] = self._shorts.get(count, 0) + 1
+            if self._shorts[count] >= _SHORTS_TO_LEARN:
+                self.chunk = count
 
     def _on_nak(self, request: Request, nak: FtpNak) -> None:
-        start, stop = request.offset, request.offset + request.size
-        self._demand.add(start, stop)
-        if nak.code == NakCode.EOF:
-            self.fail(FileChanged(f"the file ends at or before {start}, before its size of {self.size}"))
-        elif nak.code in _LOST_CODES or nak.server_errno == _EBADF:
-            self.fail(SessionLost(str(nak), by_server=True))
-        elif self._errors < _MAX_ERRORS:
-            self._errors += 1
+        self._demand.add(request.offset, request.offset + request.size)
+        error = self._meaning(request, nak)
+        if error is not nak or self._errors >= _ERRORS_TOLERATED:
+            self.fail(error)
         else:
-            self.fail(nak)
+            self._errors += 1
+
+    def _meaning(self, request: Request, nak: FtpNak) -> MavftpfsError:
+        """Return what a refused ReadFile within the size means (servers.md 1, 7, 12)."""
+        if nak.code == NakCode.EOF:
+            if self.port.traits.ack_carries_own_session:
+                return FileChanged(f"the file ends at or before {request.offset}, not at {self.size}")
+            # MAVSDK says EOF when another client has closed the file; a reopen tells which it is.
+            return SessionLost(f"end of file at {request.offset}, before {self.size}", by_server=True)
+        if nak.code in _SESSION_CODES or nak.code in _DOUBTFUL_CODES or nak.server_errno == _EBADF:
+            return SessionLost(str(nak), by_server=True)
+        return nak
 
     def fail(self, error: MavftpfsError) -> None:
         """End; what was on its way is wanted again."""
-        for request in self._flying:
+        for request in self._unanswered:
             self._demand.add(request.offset, request.offset + request.size)
-        self._flying.clear()
+        self._unanswered.clear()
         self._burst = None
         super().fail(error)
 
@@ -225,9 +266,11 @@ class ReadTransfer(Operation):
 
     def on_burst_sent(self, request: Request, now: float) -> None:
         """Begin to follow the burst."""
-        rto = self.port.round_trip("data")
+        rto = self.port.timeout("data")
         self._burst = Burst(request.seq, request.offset, self.size, self.chunk, now, rto)
-        self.timer = self._burst.quiet_deadline()
+        echoes = self.port.traits.ack_carries_own_session
+        self._keep_alive_at = now + KEEP_ALIVE if echoes is False else inf
+        self._arm(now)
 
     def on_burst(self, reply: Payload, now: float) -> bool:
         """Place a packet of the running burst."""
@@ -238,41 +281,49 @@ class ReadTransfer(Operation):
         if data is None:
             return False
         if data:
-            count = len(data)
-            self._demand.discard(reply.offset, reply.offset + count)
-            self._ahead.discard(reply.offset, reply.offset + count)
-            self.received_bytes += count
+            self._forget_want(reply.offset, reply.offset + len(data))
+            self.received_bytes += len(data)
             self._sink.on_data(reply.offset, data)
         if burst.endless:
-            self.fail(SessionLost("the server repeats itself in a burst", by_server=True))
+            self.fail(SessionLost("the vehicle repeats itself in a burst", by_server=True))
         elif burst.over:
-            self._end_burst(now)
+            self._end_burst(burst, now)
         return True
 
     def on_timer(self, now: float) -> None:
         """End a burst that went quiet."""
-        self.timer = inf
-        burst = self._burst
-        if burst is not None:
-            deadline = burst.quiet_deadline()
-            if now >= deadline:
-                self._end_burst(now)
-            else:
-                self.timer = deadline
+        if self._burst is not None and now >= self._burst.quiet_deadline():
+            self._end_burst(self._burst, now)
+        else:
+            self._arm(now)
 
-    def _end_burst(self, now: float) -> None:
+    def _arm(self, now: float) -> None:
+        """Set the timer; packets that come meanwhile only move the deadline, which on_timer looks up.
+
+        A keep-alive that is overdue waits for room in the window, not for the timer.
+        """
         burst = self._burst
-        assert burst is not None
+        self.timer = inf if burst is None else burst.quiet_deadline()
+        if now < self._keep_alive_at < self.timer:
+            self.timer = self._keep_alive_at
+
+    def _end_burst(self, burst: Burst, now: float) -> None:
         self._burst = None
-        self.timer = inf
+        self._keep_alive_at = self.timer = inf
+        self._gaps = ExtentSet(self.wants.intersection(0, burst.highest))
         if burst.packets:
             self._barren_bursts = 0
-            self.burst_bytes += burst.received
-            self.burst_seconds += max(now - burst.sent_at, 1e-6)
+            self._burst_bytes += burst.received
+            self._burst_seconds += max(now - burst.sent_at, 1e-6)
             if burst.packet:
                 self.port.traits.burst_size_honoured = burst.packet == burst.asked
         else:
-            self._barren_bursts += 1
-        self._gaps = ExtentSet(self.wants.intersection(0, burst.highest))
-        if self._barren_bursts >= _MAX_BARREN_BURSTS or (burst.nak is not None and not burst.packets):
-            self._strategy = "window"
+            self._on_barren(burst)
+
+    def _on_barren(self, burst: Burst) -> None:
+        """A burst without data: lost, refused, or the session is gone. ReadFile answers more clearly."""
+        self._barren_bursts += 1
+        if burst.nak in _SESSION_CODES:
+            self.fail(SessionLost(f"a burst was refused with NAK {burst.nak}", by_server=True))
+        elif burst.nak is not None or self._barren_bursts >= _BARREN_BURSTS:
+            self.strategy = "window"

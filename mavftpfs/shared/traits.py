@@ -22,8 +22,6 @@ class Traits:
         queue_limit: the most requests that may be in flight; None where no limit is known.
         burst_size_honoured: burst packets had the size asked for (False: PX4 always sends 239).
         answers_during_burst: another request was answered between the packets of a burst.
-        reads_during_burst: ReadFile during a burst is known to be harmless (PX4; on MAVSDK it moves the
-            shared stream position). Only the owner sets this one.
         write_ack_counts: WriteFile ACKs say how many bytes were written.
     """
 
@@ -31,7 +29,6 @@ class Traits:
     queue_limit: int | None = None
     burst_size_honoured: bool | None = None
     answers_during_burst: bool | None = None
-    reads_during_burst: bool | None = None
     write_ack_counts: bool | None = None
 
     def learn_session_echo(self, echoed: bool) -> None:

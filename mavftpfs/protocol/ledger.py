@@ -1,0 +1,185 @@
+"""Which requests are out, under which seqs, and which of them are lost. Layer: protocol; pure.
+
+Every transmission has a seq, by which its reply is found, and an *order* number, by which losses are
+found: servers answer in order (servers.md 3), so once a request sent `reorder` or more transmissions
+later was answered, an idempotent request is lost. Old seqs stay valid as aliases until the request is
+answered. A lost request waits in `again`; one whose operation was cancelled becomes a ghost, which keeps
+its place in the window, because the server still has it in its queue.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+
+from mavftpfs.protocol.payload import Payload
+from mavftpfs.protocol.requests import Operation, Request
+from mavftpfs.shared.errors import LocalProtocolError
+
+LAST_SEQ = 65534
+"""65535 is never used: it defeats the servers' duplicate test (servers.md 2)."""
+
+_MIN_REORDER = 3
+_MAX_REORDER = 64
+
+
+class Ghost(Operation):
+    """Owns the requests of cancelled operations until they are answered or given up."""
+
+    def next_request(self, now: float) -> Request | None:
+        """Never asked: a ghost is in no engine's list."""
+        raise LocalProtocolError("a ghost asks for nothing")
+
+    def on_reply(self, request: Request, reply: Payload, now: float) -> None:
+        """Nobody wants to know."""
+
+
+class Ledger:
+    """The outstanding requests of one engine. next_seq: the first seq to use.
+
+    Attributes:
+        again: lost requests which go out again as soon as there is room.
+        order: number of the next transmission.
+        reorder: how many transmissions later an answer must be to prove a loss; grows when that was wrong.
+    """
+
+    __slots__ = (
+        "_flying",
+        "_newest_answered",
+        "_ordered",
+        "_seq",
+        "_table",
+        "again",
+        "ghost",
+        "order",
+        "reorder",
+    )
+
+    def __init__(self, next_seq: int) -> None:
+        self._seq = next_seq
+        self._table: dict[int, Request] = {}
+        self._flying: dict[int, Request] = {}
+        self._ordered: OrderedDict[int, Request] = OrderedDict()
+        self._newest_answered = -1
+        self.again: list[Request] = []
+        self.ghost = Ghost()
+        self.order = 0
+        self.reorder = _MIN_REORDER
+
+    @property
+    def in_flight(self) -> int:
+        """Requests on their way, ghosts included."""
+        return len(self._flying)
+
+    def flying(self) -> list[Request]:
+        """Return the requests on their way, oldest transmission first."""
+        return list(self._flying.values())
+
+    def find(self, seq: int) -> Request | None:
+        """Return the unanswered request to which a reply with `seq` belongs."""
+        return self._table.get(seq)
+
+    # --- going out
+
+    def take_seq(self) -> int:
+        """Return an unused seq, 0..65534, and count on."""
+        table = self._table
+        seq = self._seq
+        while seq > LAST_SEQ or seq + 1 in table:  # bounded: the table is far smaller than 65535
+            seq = 0 if seq > LAST_SEQ else seq + 1
+        self._seq = seq + 1
+        return seq
+
+    def jump(self, distance: int) -> None:
+        """Leave out `distance` seqs, which a server may use by itself in a burst (servers.md 14.3)."""
+        self._seq = (self._seq + distance) % (LAST_SEQ + 1)
+
+    def number(self, request: Request) -> None:
+        """Give a request that goes out (again) its seq and order number."""
+        request.order = self.order
+        self.order += 1
+        if request.sends == 0:
+            request.seq = self.take_seq()
+        elif request.manner.same_seq and not request.fresh_seq:
+            request.single = False
+        else:
+            if request.aliases is None:
+                request.aliases = []
+            request.aliases.append(request.seq + 1)
+            request.seq = self.take_seq()
+            request.single = True
+            request.fresh_seq = False
+
+    def enter(self, request: Request) -> None:
+        """Note that a numbered request is on its way."""
+        self._table[request.seq + 1] = request
+        self._flying[request.order] = request
+        request.flying = True
+        if request.manner.ordered:
+            self._ordered[request.order] = request
+
+    # --- coming in
+
+    def settle(self, request: Request, seq: int) -> bool:
+        """Take out a request answered under `seq`; return False if that was an alias."""
+        current = seq == request.seq + 1
+        if not current:
+            # An earlier transmission was answered after all: the path reorders more than we thought.
+            self.reorder = min(self.reorder * 2, _MAX_REORDER)
+        elif request.order > self._newest_answered:
+            self._newest_answered = request.order
+            if request.sends > 1 and self.reorder > _MIN_REORDER:
+                self.reorder -= 1
+        self.forget(request)
+        return current
+
+    def forget(self, request: Request) -> None:
+        """Take an answered or hopeless request out of everything."""
+        table = self._table
+        table.pop(request.seq + 1, None)
+        if request.aliases is not None:
+            for key in request.aliases:
+                table.pop(key, None)
+        if request.flying:
+            self._land(request)
+        else:
+            self.again = [other for other in self.again if other is not request]
+
+    def next_loss(self) -> Request | None:
+        """Return a request that later answers prove to be lost, or None; the caller calls `lose`."""
+        ordered = self._ordered
+        if ordered:
+            order = next(iter(ordered))
+            if order <= self._newest_answered - self.reorder:
+                return ordered[order]
+        return None
+
+    def lose(self, request: Request) -> None:
+        """This transmission will not be answered: ask again, unless nobody would want to know."""
+        self._land(request)
+        if request.op is self.ghost or request.manner.once:
+            self.forget(request)
+        else:
+            self.again.append(request)
+
+    def _land(self, request: Request) -> None:
+        request.flying = False
+        del self._flying[request.order]
+        if request.manner.ordered:
+            del self._ordered[request.order]
+
+    # --- by operation
+
+    def take_again(self, op: Operation) -> Request | None:
+        """Remove and return the oldest lost request of `op`, or None."""
+        for index, request in enumerate(self.again):
+            if request.op is op:
+                return self.again.pop(index)
+        return None
+
+    def release(self, op: Operation) -> None:
+        """Forget what `op` had lost, and make ghosts of what it has on its way."""
+        for request in [request for request in self.again if request.op is op]:
+            self.forget(request)
+        for request in self._flying.values():
+            if request.op is op:
+                request.op = self.ghost
