@@ -16,6 +16,7 @@ from collections import deque
 from collections.abc import Callable
 from math import inf
 
+from mavftpfs.protocol.burstwatch import BurstWatch
 from mavftpfs.protocol.flow import Flow
 from mavftpfs.protocol.ledger import LAST_SEQ, Ledger
 from mavftpfs.protocol.payload import NakCode, Opcode, Payload
@@ -30,7 +31,6 @@ __all__ = ["Engine", "EngineStats"]
 OP_DEADLINE = 30.0
 BURST_JUMP = 4096
 _MAX_REPLAYS = 8
-_PACKETS_TO_BELIEVE = 3
 _LONGEST_WAIT = 5.0
 _INVALID_SESSION = bytes((NakCode.INVALID_SESSION,))
 _BURST = int(Opcode.BURST_READ_FILE)
@@ -75,10 +75,7 @@ class Engine:
         self._timers = {family: RttEstimator(floor) for family, floor in FLOORS.items()}
         self._due = inf
         self._heard_at = -inf
-        self._burst_op: Operation | None = None
-        self._burst_order = 0
-        self._burst_heard_at = -inf
-        self._proof_wanted = 0
+        self._bursts = BurstWatch()
         self._apply_queue_limit()
 
     # --- facts
@@ -100,7 +97,7 @@ class Engine:
         return self.flow.loss
 
     def timeout(self, family: str) -> float:
-        """Return the present retransmission timeout of a family of opcodes (a guess before the first reply)."""
+        """Return the present retransmission timeout of a family of opcodes, in seconds."""
         if self._timers[family].known:
             return self._timers[family].rto
         return min((timer.rto for timer in self._timers.values() if timer.known), default=INITIAL_RTO)
@@ -147,8 +144,7 @@ class Engine:
 
     def _release(self, op: Operation) -> None:
         self._ledger.release(op)
-        if self._burst_op is op:
-            self._burst_op = None
+        self._bursts.release(op)
 
     def _retire(self) -> None:
         """Move ended operations to the finished ones."""
@@ -192,8 +188,8 @@ class Engine:
         rtt: float | None = None
         if not self._ledger.settle(request, reply.seq):
             stats.spurious += 1
-        elif self._burst_heard_at >= request.sent_at:
-            self._learn_about_bursts(request)
+        elif self._bursts.heard_at >= request.sent_at:
+            self._bursts.on_answer(request, self.traits, self.timeout(request.manner.family))
         elif request.single:
             rtt = now - request.sent_at
             self._timers[request.manner.family].sample(rtt)
@@ -209,7 +205,7 @@ class Engine:
             self._retire()
 
     def _on_unknown(self, reply: Payload) -> None:
-        if reply.req_opcode == _BURST and self._burst_op is not None:
+        if reply.req_opcode == _BURST and self._bursts.op is not None:
             self.stats.incoherent += 1
         else:
             self.stats.unknown += 1
@@ -238,39 +234,24 @@ class Engine:
     # --- bursts
 
     def _on_burst(self, reply: Payload, now: float) -> bool:
-        self._burst_heard_at = now
-        op = self._burst_op
+        bursts = self._bursts
+        bursts.heard_at = now
+        op = bursts.op
         if op is None or not op.on_burst(reply, now):
             return False
         self.stats.replies += 1
         self._heard_at = now
         op.progress_at = now
-        if self._proof_wanted:
-            self._proof_wanted -= 1
-            if not self._proof_wanted:
-                self.traits.answers_during_burst = True
+        bursts.on_packet(self.traits)
         if op.done:
             self._retire()
         return True
 
     def _begin_burst(self, request: Request, now: float) -> None:
-        self._burst_op = request.op
-        self._burst_order = request.order
-        self._proof_wanted = 0
+        self._bursts.begin(request)
         # Whatever the burst's packets use as seq must not be a seq of ours (servers.md 2, collision).
         self._ledger.jump(BURST_JUMP)
         request.op.on_burst_sent(request, now)
-
-    def _learn_about_bursts(self, request: Request) -> None:
-        """A request sent during a burst was answered: in between, or only behind it (servers.md 4)?"""
-        traits = self.traits
-        if traits.answers_during_burst is not None or request.sends > 1 or request.order < self._burst_order:
-            return
-        waited = self._burst_heard_at - request.sent_at
-        if self._burst_op is not None and self._burst_op.bursting:
-            self._proof_wanted = _PACKETS_TO_BELIEVE
-        elif waited > 2 * self.timeout(request.manner.family):
-            traits.answers_during_burst = False
 
     # --- what goes out
 
@@ -382,7 +363,7 @@ class Engine:
 
     def _postpone(self, request: Request) -> None:
         """During a burst silence proves nothing, unless this server was seen to answer in between."""
-        heard = self._burst_heard_at
+        heard = self._bursts.heard_at
         if heard > request.sent_at and not self.traits.answers_during_burst:
             request.timer = heard + self._wait(request)
 
