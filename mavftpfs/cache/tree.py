@@ -1,28 +1,35 @@
-"""The remote tree as the FUSE layer sees it. Layer: cache."""
+"""The remote tree as the FUSE layer sees it. Layer: cache.
+
+`Tree` decides who answers: remembered listings (`directories`), blocks of regular files (`files`) or
+snapshots of `@` files (`virtual`), and translates paths: callers name them below the mount's root, the
+modules behind it name them as the vehicle does.
+"""
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Protocol
 
+import trio
+
+from mavftpfs.cache.attributes import UNKNOWN_MTIME, Stat, shown_mtime
+from mavftpfs.cache.blocks import BlockCache
+from mavftpfs.cache.dentries import Dentries
+from mavftpfs.cache.directories import Directories, Found
+from mavftpfs.cache.files import Files
+from mavftpfs.cache.flights import Flights
 from mavftpfs.cache.options import CacheOptions
 from mavftpfs.cache.remote import RemoteStore
-from mavftpfs.shared.model import EntryKind
+from mavftpfs.cache.virtual import VirtualTrees, is_snapshot
+from mavftpfs.shared.errors import FtpNak, IsADirectory, VehicleLost
+from mavftpfs.shared.model import ROOT, DirEntry, EntryKind, join, normalise
 
+__all__ = ["OpenFile", "Stat", "Tree"]
 
-@dataclass(frozen=True, slots=True)
-class Stat:
-    """What is known of one path.
-
-    size: bytes, 0 <= size < 2**63. mtime: seconds UTC, never unknown. valid_for: seconds the kernel
-    may keep these attributes; 0 means ask again.
-    """
-
-    kind: EntryKind
-    size: int
-    mtime: int
-    valid_for: float
+MAX_CHECKSUMS = 1024
 
 
 class OpenFile(Protocol):
@@ -54,8 +61,19 @@ class OpenFile(Protocol):
         ...
 
 
+@dataclass(frozen=True, slots=True)
+class _Checksum:
+    size: int
+    mtime: int | None
+    value: int
+    asked_at: float
+
+
 class Tree:
-    """The vehicle's files below `options.root`, which is `/` in every path given and called back."""
+    """The vehicle's files below `options.root`, which is `/` in every path given and called back.
+
+    Paths are normalised (shared.model.normalise) before they are used.
+    """
 
     def __init__(
         self,
@@ -64,23 +82,69 @@ class Tree:
         *,
         clock: Callable[[], float],
         invalidate: Callable[[bytes], None],
+        nursery: trio.Nursery | None = None,
     ) -> None:
+        """`invalidate(path)`: the kernel's pages and attributes of a path are wrong; must not block.
+
+        With a nursery, listings and snapshots under way survive the cancellation of who asked for them.
+        """
         self._store = store
         self._options = options
         self._clock = clock
-        self._invalidate = invalidate
+        self._tell_kernel = invalidate
+        self._dentries = Dentries(dir_timeout=options.dir_timeout, max_entries=options.max_entries)
+        self._directories = Directories(store, self._dentries, options.root, clock=clock, nursery=nursery)
+        self._blocks = BlockCache(options.cache_size, clock=clock, patience=options.op_deadline)
+        self._files = Files(
+            store,
+            self._blocks,
+            dir_timeout=options.dir_timeout,
+            facts=self._facts,
+            on_size=self._on_size,
+            invalidate=self._invalidate,
+        )
+        self._virtual = VirtualTrees(
+            store,
+            self._directories,
+            self._dentries,
+            options,
+            clock=clock,
+            invalidate=self._invalidate,
+            nursery=nursery,
+        )
+        self._learning: Flights[bytes, int] = Flights()
+        self._checksums: OrderedDict[bytes, _Checksum] = OrderedDict()
+        self._summing: Flights[bytes, int] = Flights()
+        self._rebooted_at = float("-inf")
+
+    # --- asking
 
     async def stat(self, path: bytes) -> Stat:
-        """Return a path's attributes.
+        """Return a path's attributes. The root's cost no traffic.
 
         Raises:
             NotFound, NotADirectory; else as RemoteStore.list_directory.
         """
-        raise NotImplementedError
+        remote = self._remote(path)
+        if remote == self._options.root:
+            return Stat(EntryKind.DIRECTORY, 0, UNKNOWN_MTIME, self._options.attr_timeout)
+        if is_snapshot(remote):
+            return await self._virtual.stat(remote)
+        found = await self._directories.find(remote)
+        if found.entry.kind is EntryKind.FILE and found.size is None:
+            await self._learning.run(remote, partial(self._learn_size, remote))
+        return self._listed_stat(remote, found)
 
     def negative_valid_for(self, path: bytes) -> float:
-        """Return for how many seconds the kernel may remember that stat(path) raised NotFound."""
-        raise NotImplementedError
+        """Return for how many seconds the kernel may remember that stat(path) raised NotFound.
+
+        0 where the absence is not proven: the listing was incomplete or is not fresh any more.
+        """
+        remote, now = self._remote(path), self._clock()
+        if self._virtual.hides(remote):
+            return self._options.negative_timeout
+        until = self._dentries.absent_until(remote, now)
+        return max(0.0, min(self._options.negative_timeout, until - now))
 
     async def list(self, path: bytes) -> list[tuple[bytes, Stat]]:
         """Return a directory's entries without `.` and `..`.
@@ -88,7 +152,15 @@ class Tree:
         Raises:
             NotFound, NotADirectory; else as RemoteStore.list_directory.
         """
-        raise NotImplementedError
+        remote = self._remote(path)
+        if is_snapshot(remote):
+            return await self._virtual.list(remote)
+        directory = await self._directories.get(remote)
+        founds = {name: Found(entry, directory) for name, entry in directory.entries.items()}
+        if remote == ROOT:
+            for name in self._virtual.shown_in_root(directory.entries):
+                founds[name] = Found(DirEntry(name, EntryKind.DIRECTORY), directory)
+        return [(name, self._listed_stat(join(remote, name), found)) for name, found in founds.items()]
 
     async def open(self, path: bytes) -> OpenFile:
         """Open a file for reading.
@@ -96,32 +168,132 @@ class Tree:
         Raises:
             NotFound, NotADirectory, IsADirectory; else as RemoteStore.open_reader and read_whole.
         """
-        raise NotImplementedError
+        remote = self._remote(path)
+        if is_snapshot(remote):
+            return await self._virtual.open(remote)
+        found = await self._find_file(remote)
+        return await self._files.open(remote, found.entry, found.directory.listed_at)
 
     async def crc32(self, path: bytes) -> int:
-        """Return the vehicle's CRC32 of a file, remembered by size and mtime.
+        """Return the vehicle's CRC32 of a file (start value 0, no final xor), remembered by size and mtime.
+
+        Of an `@` file it is that of the bytes a reader gets: these are made anew at every open.
 
         Raises:
             NotFound, NotADirectory, IsADirectory, Armed; else as RemoteStore.crc32.
         """
-        raise NotImplementedError
+        remote = self._remote(path)
+        if is_snapshot(remote):
+            return await self._virtual.crc32(remote)
+        found = await self._find_file(remote)
+        known = self._checksums.get(remote)
+        if known is not None and self._still_holds(known, found):
+            return known.value
+        return await self._summing.run(remote, partial(self._ask_crc32, remote, found))
+
+    # --- news and housekeeping
 
     def forget_caches(self) -> None:
         """Drop everything that is not in use by an open file."""
-        raise NotImplementedError
+        self._dentries.forget(ROOT)
+        self._files.forget_closed()
+        self._virtual.snapshots.clear()
+        self._checksums.clear()
 
     def status(self) -> dict[str, object]:
-        """Return counters: hits, misses, bytes_cached, listings_cached, open_files, ..."""
-        raise NotImplementedError
+        """Return counters; bytes_... in bytes, rate in bytes per second or None."""
+        files, blocks = self._files, self._blocks
+        return {
+            "hits": files.hits,
+            "misses": files.misses,
+            "bytes_cached": blocks.bytes_cached + self._virtual.snapshots.bytes_cached,
+            "bytes_evicted_blocks": blocks.evictions,
+            "rate": blocks.meter.rate,
+            "reads_unproven": files.fetcher.unproven,
+            "listings_cached": len(self._dentries),
+            "entries_cached": self._dentries.entry_count,
+            "listings_asked": self._directories.sweeps,
+            "listings_served_stale": self._directories.served_stale,
+            "open_files": files.open_count + self._virtual.open_count,
+        }
 
     def link_lost(self) -> None:
         """Heartbeats stopped: expired listings are served until link_back."""
-        raise NotImplementedError
+        self._directories.lost = True
 
     def link_back(self) -> None:
         """Heartbeats are back."""
-        raise NotImplementedError
+        self._directories.lost = False
 
     def rebooted(self) -> None:
         """The vehicle restarted: what was known of it must be asked again."""
-        raise NotImplementedError
+        self._rebooted_at = self._clock()
+        self._dentries.expire_all(self._rebooted_at)
+        self._directories.rebooted()
+        self._virtual.rebooted()
+        self._files.rebooted()
+        self._checksums.clear()
+
+    # --- inside
+
+    def _remote(self, path: bytes) -> bytes:
+        return normalise(self._options.root + b"/" + path)
+
+    def _invalidate(self, remote: bytes) -> None:
+        below = remote if self._options.root == ROOT else remote[len(self._options.root) :]
+        self._tell_kernel(below)
+
+    def _listed_stat(self, remote: bytes, found: Found) -> Stat:
+        if is_snapshot(remote):
+            return self._virtual.listed_stat(remote, found)
+        left = found.directory.fresh_until - self._clock()
+        unknown = found.entry.kind is EntryKind.FILE and found.size is None
+        valid_for = 0.0 if unknown else max(0.0, min(self._options.attr_timeout, left))
+        size = 0 if found.entry.kind is EntryKind.DIRECTORY else found.size or 0
+        return Stat(found.entry.kind, size, shown_mtime(remote, found.entry.mtime), valid_for)
+
+    async def _find_file(self, remote: bytes) -> Found:
+        if remote == self._options.root:
+            raise IsADirectory("the mount's root is a directory")
+        found = await self._directories.find(remote)
+        if found.entry.kind is not EntryKind.FILE:
+            raise IsADirectory(f"{remote!r} is a directory")
+        return found
+
+    async def _facts(self, remote: bytes) -> DirEntry:
+        """Return an entry listed since the last reboot."""
+        found = await self._directories.find(remote)
+        if found.directory.listed_at < self._rebooted_at:
+            raise VehicleLost("the vehicle restarted and does not answer yet")
+        return found.entry
+
+    async def _learn_size(self, remote: bytes) -> int:
+        """Open a file whose listing tells no size; one that is refused counts as empty until listed again."""
+        try:
+            size = await self._files.learn_size(remote)
+        except FtpNak:
+            size = 0
+        self._dentries.learn_size(remote, size)
+        return size
+
+    def _on_size(self, remote: bytes, size: int) -> None:
+        """An open told another size than the listing: what the kernel was told is wrong."""
+        self._dentries.learn_size(remote, size)
+        self._invalidate(remote)
+
+    def _still_holds(self, known: _Checksum, found: Found) -> bool:
+        if known.size != found.size:
+            return False
+        if known.mtime is not None and known.mtime == found.entry.mtime:
+            return True
+        same = known.mtime == found.entry.mtime
+        return same and self._clock() - known.asked_at < self._options.dir_timeout
+
+    async def _ask_crc32(self, remote: bytes, found: Found) -> int:
+        value = await self._store.crc32(remote)
+        if found.size is not None:
+            self._checksums.pop(remote, None)
+            self._checksums[remote] = _Checksum(found.size, found.entry.mtime, value, self._clock())
+        if len(self._checksums) > MAX_CHECKSUMS:
+            self._checksums.popitem(last=False)
+        return value

@@ -1,0 +1,199 @@
+"""Asks the vehicle for listings and answers from remembered ones. Layer: cache.
+
+Only a path that its parent's listing shows as a directory is listed: listing a file ends a MAVSDK server
+(servers.md 6), so a path is walked from the root. A walk costs nothing where listings are fresh.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+
+import trio
+
+from mavftpfs.cache.dentries import Dentries, Directory
+from mavftpfs.cache.flights import Flights
+from mavftpfs.cache.remote import RemoteStore
+from mavftpfs.shared.errors import FtpNak, NotADirectory, NotFound, PathTooLong, VehicleLost
+from mavftpfs.shared.model import ROOT, DirEntry, EntryKind, Listing, join, split
+
+DOT = b"."
+"""The working directory of a server that runs as a process (ArduPilot SITL)."""
+
+MAX_DEPTH = 256
+"""More components than any path that fits a request has."""
+
+SWEEP_TRIES = 3
+"""How often a listing is repeated because names came or went meanwhile through us."""
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """A directory entry and the listing that shows it."""
+
+    entry: DirEntry
+    directory: Directory
+
+    @property
+    def size(self) -> int | None:
+        """Best known size in bytes."""
+        return self.directory.size_of(self.entry.name)
+
+
+class Directories:
+    """Listings of the vehicle's directories. All paths are the vehicle's, normalised."""
+
+    def __init__(
+        self,
+        store: RemoteStore,
+        dentries: Dentries,
+        root: bytes,
+        *,
+        clock: Callable[[], float],
+        nursery: trio.Nursery | None = None,
+    ) -> None:
+        self._store = store
+        self._dentries = dentries
+        self._root = root
+        self._clock = clock
+        self._flights: Flights[bytes, Directory] = Flights(nursery)
+        self._root_proven = root == ROOT
+        self._dot_shows_files: bool | None = None
+        self.lost = False
+        self.sweeps = 0
+        self.served_stale = 0
+
+    async def find(self, path: bytes) -> Found:
+        """Return what is known of a path below the root.
+
+        Raises:
+            NotFound: its parent's listing does not show it. An incomplete listing (a cap ended it) proves
+                no absence, so nobody may remember the answer, but there is no other way to ask: opening
+                what is not known to be a file is forbidden.
+            NotADirectory: a part of it is a file. Else as RemoteStore.list_directory.
+        """
+        if path.count(b"/") > MAX_DEPTH:
+            raise PathTooLong(f"path of {len(path)} bytes has more parts than a vehicle takes")
+        parent, name = split(path)
+        directory = await self.get(parent)
+        entry = directory.entries.get(name)
+        if entry is None:
+            raise NotFound(f"{path!r} does not exist")
+        return Found(entry, directory)
+
+    async def get(self, path: bytes) -> Directory:
+        """Return a directory's listing: fresh, else swept, else (the vehicle being lost) expired.
+
+        Raises:
+            NotFound, NotADirectory; else as RemoteStore.list_directory.
+        """
+        fresh = self._dentries.fresh(path, self._clock())
+        if fresh is not None:
+            return fresh
+        stale = self._dentries.known(path)
+        if self.lost and stale is not None:
+            self.served_stale += 1
+            return stale
+        try:
+            await self._require_directory(path)
+            return await self._flights.run(path, partial(self._sweep, path))
+        except VehicleLost:
+            if stale is None:
+                raise
+            self.served_stale += 1
+            return stale
+
+    def rebooted(self) -> None:
+        """What was learnt of the server's ways may no longer hold."""
+        self._root_proven = self._root == ROOT
+        self._dot_shows_files = None
+
+    async def _require_directory(self, path: bytes) -> None:
+        if path == self._root:
+            await self._require_root()
+        elif path != ROOT and (await self.find(path)).entry.kind is not EntryKind.DIRECTORY:
+            raise NotADirectory(f"{path!r} is not a directory")
+
+    async def _require_root(self) -> None:
+        """Walk to the mount's root once.
+
+        A part that no listing shows may still be listed, because PX4 hides symlinked directories
+        (MavlinkFTP::_workList sends them as skip entries) and some trees are not announced; a part shown
+        as a file may not.
+        """
+        if self._root_proven:
+            return
+        path = ROOT
+        for part in self._root.split(b"/")[1:]:
+            directory = await self._listed(path)
+            entry = directory.entries.get(part)
+            path = join(path, part)
+            if entry is not None and entry.kind is not EntryKind.DIRECTORY:
+                raise NotADirectory(f"{path!r} is not a directory")
+        self._root_proven = True
+
+    async def _listed(self, path: bytes) -> Directory:
+        """Return the listing of a directory on the way to the root."""
+        fresh = self._dentries.fresh(path, self._clock())
+        return fresh or await self._flights.run(path, partial(self._sweep, path))
+
+    async def _sweep(self, path: bytes) -> Directory:
+        """List until no change of ours came between."""
+        for _ in range(SWEEP_TRIES - 1):
+            directory, raced = await self._sweep_once(path)
+            if not raced:
+                return directory
+        return (await self._sweep_once(path))[0]
+
+    async def _sweep_once(self, path: bytes) -> tuple[Directory, bool]:
+        sweep = self._dentries.begin(path, self._clock())
+        self.sweeps += 1
+        try:
+            listing = await self._list(path)
+        except FtpNak:
+            self._dentries.abandon(sweep)
+            self._doubt(path)
+            raise
+        except BaseException:
+            self._dentries.abandon(sweep)
+            raise
+        return self._dentries.finish(sweep, listing, self._clock()), sweep.reshaped
+
+    def _doubt(self, path: bytes) -> None:
+        """The server refused to list it: perhaps it is gone, so the parent is asked again."""
+        self._dentries.forget(path)
+        if path != ROOT:
+            self._dentries.expire(split(path)[0], self._clock())
+
+    async def _list(self, path: bytes) -> Listing:
+        listing = await self._store.list_directory(path)
+        if path == ROOT and self._dot_shows_files is not False and _hides_files(listing):
+            return await self._with_dot(listing)
+        return listing
+
+    async def _with_dot(self, listing: Listing) -> Listing:
+        """Add what only `.` shows: ArduPilot on SITL omits every plain file of `/` (servers.md 14.32)."""
+        try:
+            dot = await self._store.list_directory(DOT)
+        except FtpNak:
+            self._dot_shows_files = False
+            return listing
+        self._dot_shows_files = any(entry.kind is EntryKind.FILE for entry in dot.entries)
+        if not self._dot_shows_files:
+            return listing
+        shown = {entry.name for entry in listing.entries}
+        more = tuple(entry for entry in dot.entries if entry.name not in shown)
+        return Listing(
+            listing.entries + more,
+            listing.took + dot.took,
+            listing.complete and dot.complete,
+            listing.hidden + dot.hidden,
+        )
+
+
+def _hides_files(listing: Listing) -> bool:
+    """Return whether this looks like ArduPilot's `/` with its files left out."""
+    names = {entry.name for entry in listing.entries}
+    plain = any(entry.kind is EntryKind.FILE for entry in listing.entries)
+    return not plain and not names.isdisjoint((b"@SYS", b"@ROMFS"))

@@ -1,0 +1,279 @@
+"""Open regular files: close-to-open consistency over cached blocks. Layer: cache.
+
+At open it is decided whether what is cached of the path is still the vehicle's file:
+- size and mtime of a listing are known and equal the version's, or
+- the version was proven (by an open ACK, a CRC32 or a listing) less than `dir_timeout` ago and no later
+  listing says otherwise: it is kept, and nothing is asked;
+- else the file is opened on the vehicle and a new version starts with the size in the ACK, because equal
+  sizes without an mtime prove nothing.
+Old handles of a file that turned out smaller, or of the same size with another mtime, get FileChanged; of
+one that is larger they go on at the size they opened: logs grow.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Awaitable, Callable
+from functools import partial
+from itertools import islice
+
+from mavftpfs.cache.blocks import BlockCache, FileBlocks
+from mavftpfs.cache.flights import Flights
+from mavftpfs.cache.options import MIB
+from mavftpfs.cache.readahead import Pace, Readahead
+from mavftpfs.cache.remote import RemoteStore
+from mavftpfs.cache.versions import Fetcher, Version
+from mavftpfs.shared.errors import FileChanged, LocalProtocolError, NotADirectory, NotFound
+from mavftpfs.shared.model import DirEntry
+
+MAX_CLOSED = 4096
+"""How many files that nobody has open are remembered with their blocks."""
+
+MAX_PIECE = MIB
+"""A read is served in pieces of at most so many bytes (or a quarter of the cache)."""
+
+
+class Files:
+    """All regular files that are open or cached. Paths are the vehicle's."""
+
+    def __init__(
+        self,
+        store: RemoteStore,
+        cache: BlockCache,
+        *,
+        dir_timeout: float,
+        facts: Callable[[bytes], Awaitable[DirEntry]],
+        on_size: Callable[[bytes, int], None],
+        invalidate: Callable[[bytes], None],
+    ) -> None:
+        """`facts` asks a fresh listing; `on_size` hears sizes that open ACKs told and listings did not."""
+        self._store = store
+        self._cache = cache
+        self._clock = cache.clock
+        self._dir_timeout = dir_timeout
+        self._facts = facts
+        self._on_size = on_size
+        self._invalidate = invalidate
+        self.fetcher = Fetcher(store, cache, on_distrust=self._distrust, on_changed=self._kill)
+        self.piece = min(MAX_PIECE, cache.budget // 4)
+        self._current: OrderedDict[bytes, Version] = OrderedDict()
+        self._open_versions: dict[Version, None] = {}
+        self._opening: Flights[bytes, tuple[Version, bool]] = Flights()
+        self._rechecking: Flights[Version, None] = Flights()
+        self.open_count = 0
+        self.hits = 0
+        self.misses = 0
+
+    # --- opening
+
+    async def open(self, path: bytes, entry: DirEntry, listed_at: float) -> FileHandle:
+        """Open a path that a listing (begun at `listed_at`) shows as the file `entry`.
+
+        Raises:
+            As RemoteStore.open_reader.
+        """
+        work = partial(self._open_version, path, entry, listed_at)
+        version, kept = await self._opening.run(path, work)
+        keep_cache = kept and version.shown
+        version.handles += 1
+        version.shown = True
+        self.open_count += 1
+        self._open_versions[version] = None
+        return FileHandle(self, version, keep_cache=keep_cache)
+
+    async def learn_size(self, path: bytes) -> int:
+        """Return the size that an open ACK tells, for listings that tell none.
+
+        Raises:
+            As RemoteStore.open_reader.
+        """
+        version = self._current.get(path)
+        if version is not None and version.handles and version.dead is None:
+            return version.size
+        reader = await self._store.open_reader(path, FileBlocks(self._cache))
+        reader.close()
+        return reader.size
+
+    async def _open_version(self, path: bytes, entry: DirEntry, listed_at: float) -> tuple[Version, bool]:
+        """Return the version to serve, and whether it is the one that was served before."""
+        version = self._current.get(path)
+        if version is not None and self._still_right(version, entry, listed_at):
+            self._current.move_to_end(path)
+            return version, True
+        return await self._start_version(path, entry), False
+
+    def _still_right(self, version: Version, entry: DirEntry, listed_at: float) -> bool:
+        """Return whether a version is known to be what the vehicle holds now."""
+        if version.dead is not None or version.recheck:
+            return False
+        newer = listed_at >= version.proven_at
+        if newer and _became_another(version, entry):
+            self._kill(version)
+            return False
+        same_size = entry.size in (None, version.size)
+        if entry.size == version.size and entry.mtime is not None and entry.mtime == version.mtime:
+            version.proven_at = max(version.proven_at, listed_at)
+            return True
+        recent = self._clock() - version.proven_at < self._dir_timeout
+        return recent and (same_size or not newer)
+
+    async def _start_version(self, path: bytes, entry: DirEntry) -> Version:
+        blocks = FileBlocks(self._cache)
+        reader = await self._store.open_reader(path, blocks)
+        blocks.size = reader.size
+        old = self._current.get(path)
+        if old is not None and old.size > reader.size:
+            self._kill(old)
+        mtime = entry.mtime if entry.size in (None, reader.size) else None
+        version = Version(path, mtime, blocks, self._clock(), reader)
+        self._replace(path, version)
+        if entry.size != reader.size:
+            self._on_size(path, reader.size)
+        return version
+
+    def _replace(self, path: bytes, version: Version) -> None:
+        old = self._current.pop(path, None)
+        if old is not None and not old.handles:
+            old.blocks.clear()
+        self._current[path] = version
+        if len(self._current) > MAX_CLOSED:
+            closed = (v for v in self._current.values() if not v.handles and v is not version)
+            for surplus in list(islice(closed, 1)):
+                self._forget(surplus)
+
+    def pace(self) -> Pace:
+        """Return the bounds for readahead now."""
+        return self._cache.pace(len(self._open_versions))
+
+    # --- the file changed
+
+    def _kill(self, version: Version) -> None:
+        """The path is another file now."""
+        if version.dead is None:
+            version.dead = FileChanged(f"{version.path!r} changed on the vehicle after it was opened")
+            version.close_reader()
+            version.blocks.on_failed(version.dead)
+            version.blocks.clear()
+            self._invalidate(version.path)
+
+    def _distrust(self, version: Version) -> None:
+        """Bytes of it were dropped as doubtful: the kernel may hold copies."""
+        version.shown = False
+        self._invalidate(version.path)
+
+    def rebooted(self) -> None:
+        """Nothing is proven any more; open files are compared with a listing before their next read."""
+        for version in self._current.values():
+            version.proven_at = float("-inf")
+        for version in self._open_versions:
+            version.recheck = True
+
+    async def recheck(self, version: Version) -> None:
+        """Compare an open version with a fresh listing.
+
+        Raises:
+            FileChanged. Else as RemoteStore.list_directory.
+        """
+        if version.recheck:
+            await self._rechecking.run(version, partial(self._recheck_once, version))
+        version.require_alive()
+
+    async def _recheck_once(self, version: Version) -> None:
+        try:
+            entry = await self._facts(version.path)
+        except (NotFound, NotADirectory):
+            self._kill(version)
+            return
+        version.recheck = False
+        if _became_another(version, entry):
+            self._kill(version)
+
+    # --- closing
+
+    def release(self, version: Version) -> None:
+        """A handle of the version was closed."""
+        self.open_count -= 1
+        version.handles -= 1
+        if version.handles:
+            return
+        del self._open_versions[version]
+        version.close_reader()
+        if version.blocks.suspicion is not None:
+            version.blocks.drop_unproven()
+            self._distrust(version)
+        if self._current.get(version.path) is not version:
+            version.blocks.clear()
+        elif version.dead is not None or version.recheck:
+            self._forget(version)
+
+    def forget_closed(self) -> None:
+        """Drop everything that is not open."""
+        for version in list(self._current.values()):
+            if not version.handles:
+                self._forget(version)
+
+    def _forget(self, version: Version) -> None:
+        version.blocks.clear()
+        del self._current[version.path]
+
+
+class FileHandle:
+    """One open() of a regular file (see cache.tree.OpenFile)."""
+
+    direct_io = False
+
+    def __init__(self, files: Files, version: Version, *, keep_cache: bool) -> None:
+        self._files = files
+        self._version = version
+        self._readahead = Readahead(version.size)
+        self._closed = False
+        self.size = version.size
+        self.keep_cache = keep_cache
+
+    async def read(self, offset: int, size: int) -> bytes | memoryview:
+        """Return `size` bytes at `offset`, fewer only at the end of the opened size.
+
+        Raises:
+            FileChanged, DataUnproven, RequestTimeout, VehicleLost, FtpNak.
+        """
+        if self._closed:
+            raise LocalProtocolError("read of a closed handle")
+        stop = min(offset + size, self.size)
+        if offset >= stop:
+            return b""
+        await self._files.recheck(self._version)
+        if stop - offset <= self._files.piece:
+            return await self._read_piece(offset, stop)
+        step = self._files.piece
+        pieces = [await self._read_piece(at, min(at + step, stop)) for at in range(offset, stop, step)]
+        return b"".join(pieces)
+
+    def close(self) -> None:
+        """Release the handle."""
+        if not self._closed:
+            self._closed = True
+            self._files.release(self._version)
+
+    async def _read_piece(self, start: int, stop: int) -> bytes | memoryview:
+        files, version = self._files, self._version
+        pace = files.pace()
+        plan = self._readahead.on_read(start, stop, limit=pace.limit, small=pace.small)
+        if plan.seeked and version.reader is not None:
+            version.reader.drop_readahead()
+        data = version.blocks.get(start, stop)
+        if data is None:
+            files.misses += 1
+            return await files.fetcher.fetch(version, start, stop, plan)
+        files.hits += 1
+        if version.reader is not None and plan.start < plan.stop:
+            version.reader.want(plan.start, plan.stop, demand=False)
+        return data
+
+
+def _became_another(version: Version, entry: DirEntry) -> bool:
+    """Return whether a listing newer than the version's proof contradicts it (a larger file only grew)."""
+    if entry.size is None or entry.size > version.size:
+        return False
+    if entry.size < version.size:
+        return True
+    return entry.mtime is not None and version.mtime is not None and entry.mtime != version.mtime

@@ -1,0 +1,139 @@
+"""When to fetch what nobody asked for yet. Layer: cache; pure: the time is an argument.
+
+One `Readahead` per open handle watches its reads. Reads that follow each other open a window ahead of the
+reader, which doubles as it is used up; a seek closes it. A small file is wanted whole at once. On a slow
+link the window holds no more than a few seconds of it, so that `head` of a log costs no megabyte.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+FIRST_WINDOW = 128 * 1024
+MAX_WINDOW = 8 * 1024 * 1024
+SMALL_FILE = 64 * 1024
+
+AHEAD_SECONDS = 3.0
+"""How much of the link's measured rate may lie ahead of the reader."""
+
+SMALL_SECONDS = 2.0
+"""A file that the link carries in this time is small."""
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """What to ask for besides the read itself: [start, stop), empty if start == stop.
+
+    seeked: what was asked ahead before is of no use any more.
+    """
+
+    start: int = 0
+    stop: int = 0
+    seeked: bool = False
+
+
+NOTHING = Plan()
+
+
+class Readahead:
+    """The read pattern of one handle on a file of `size` bytes."""
+
+    def __init__(self, size: int) -> None:
+        self._size = size
+        self._next: int | None = None  # where a sequential reader would go on
+        self._last_start = 0
+        self._window = 0
+        self._used = 0  # bytes read since the window last doubled
+        self._asked = 0  # what lies below was asked for already
+
+    def on_read(self, start: int, stop: int, *, limit: int, small: int) -> Plan:
+        """Note a read of [start, stop) and return what to ask for.
+
+        limit: the largest window now; small: files up to this size are wanted whole (see `Pace`).
+        """
+        if self._next is None:
+            return self._first(start, stop, small)
+        if stop == self._last_start:  # the kernel has two requests under way; the earlier one came late
+            return NOTHING
+        follows = 0 <= start - self._next <= stop - start
+        self._last_start, self._next = start, stop
+        if not follows:
+            return self._seek()
+        return self._advance(start, stop, limit)
+
+    def _first(self, start: int, stop: int, small: int) -> Plan:
+        self._last_start, self._next = start, stop
+        if start != 0 or self._size > small:
+            return NOTHING
+        self._asked = self._size
+        return Plan(min(stop, self._size), self._size)
+
+    def _seek(self) -> Plan:
+        had_window = self._window > 0
+        self._window = self._used = self._asked = 0
+        return Plan(seeked=had_window)
+
+    def _advance(self, start: int, stop: int, limit: int) -> Plan:
+        self._used += stop - start
+        if self._window == 0:
+            self._window = FIRST_WINDOW
+        elif self._used >= self._window:
+            self._window, self._used = self._window * 2, 0
+        self._window = min(self._window, max(limit, 0))
+        first = max(self._asked, stop)
+        goal = min(stop + self._window, self._size)
+        if goal <= first or (goal - first < self._window // 2 and goal != self._size):
+            return NOTHING
+        self._asked = goal
+        return Plan(first, goal)
+
+
+class RateMeter:
+    """How many bytes per second come while some are wanted; pauses between requests are not counted."""
+
+    PAUSE = 1.0
+    ENOUGH = 0.2
+    MEMORY = 4.0
+
+    def __init__(self) -> None:
+        self._last: float | None = None
+        self._bytes = 0.0
+        self._busy = 0.0
+
+    def on_bytes(self, count: int, now: float) -> None:
+        """Note that `count` bytes arrived."""
+        elapsed = self.PAUSE if self._last is None else now - self._last
+        self._last = now
+        if elapsed >= self.PAUSE:
+            return
+        self._bytes += count
+        self._busy += elapsed
+        if self._busy > self.MEMORY:  # older traffic counts half
+            self._bytes /= 2
+            self._busy /= 2
+
+    @property
+    def rate(self) -> float | None:
+        """Bytes per second, None while too little was seen."""
+        return self._bytes / self._busy if self._busy >= self.ENOUGH else None
+
+
+@dataclass(frozen=True, slots=True)
+class Pace:
+    """Bounds for readahead, from the cache's size in bytes, the files being read and the link's rate."""
+
+    cache_size: int
+    streams: int
+    rate: float | None
+
+    @property
+    def limit(self) -> int:
+        """The largest window: all windows together fit half of the cache."""
+        room = min(self.cache_size // (2 * (max(self.streams, 1) + 1)), MAX_WINDOW)
+        return room if self.rate is None else min(room, int(self.rate * AHEAD_SECONDS))
+
+    @property
+    def small(self) -> int:
+        """Files up to this size are wanted whole at the first read."""
+        seconds = 0 if self.rate is None else int(self.rate * SMALL_SECONDS)
+        return max(SMALL_FILE, min(seconds, self.limit))
