@@ -27,7 +27,6 @@ from typing import Any
 from rich.console import Console
 from rich.panel import Panel
 from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TransferSpeedColumn
-from rich.syntax import Syntax
 from rich.table import Table
 
 HOST = "127.0.0.1"
@@ -278,9 +277,35 @@ def show_link(tour: Tour) -> None:
     result = subprocess.run(words, capture_output=True, timeout=STEP_TIMEOUT, check=False)
     if result.returncode:
         raise DemoFailed(f"status ended with {result.returncode}: {result.stderr.decode().strip()}")
-    status: dict[str, Any] = json.loads(result.stdout)
-    tour.say("What happened on the radio meanwhile ([bold]mavftpfs status drone[/]):")
-    tour.console.print(Syntax(json.dumps(status, indent=2), "json"))
+    status = json.loads(result.stdout)
+    requests: dict[str, int] = find_fact(status, "requests")
+    table = Table(show_header=False)
+    table.add_row("requests answered", str(sum(requests.values())))
+    table.add_row(
+        "sent again, because they or their answers were lost", str(find_fact(status, "retransmissions"))
+    )
+    table.add_row("there and back, measured", f"{1000 * find_fact(status, 'rtt'):.0f} ms")
+    table.add_row("bytes received over the air", f"{find_fact(status, 'received_bytes'):,}")
+    tour.say("What the radio did meanwhile (from [bold]mavftpfs status drone[/]):")
+    tour.console.print(table, highlight=False)
+
+
+def find_fact(facts: Any, name: str) -> Any:
+    """Return the first value called `name` in nested facts.
+
+    Raises:
+        DemoFailed: there is none.
+    """
+    layers = [facts]
+    while layers:
+        layer = layers.pop(0)
+        if isinstance(layer, dict):
+            if layer.get(name) is not None:
+                return layer[name]
+            layers += layer.values()
+        elif isinstance(layer, list):
+            layers += layer
+    raise DemoFailed(f"the status says nothing about {name}")
 
 
 def compare_all(tour: Tour) -> None:

@@ -12,7 +12,7 @@ import pytest
 
 from tests.mount.conftest import Field
 from tests.support.logs import suspects
-from tests.support.mounts import COMMAND_TIMEOUT, Mount, abort_mount, mounted_at, wait_until
+from tests.support.mounts import COMMAND_TIMEOUT, Mount, abort_mount, mounted_at, processes_in, wait_until
 from tests.support.vehicles import HOST, PROJECT, free_udp_port
 
 NOBODY = f"udpin:{HOST}:0"
@@ -145,22 +145,10 @@ def test_the_daemon_returns_when_mounted_and_goes_on(field: Field, small_tree: P
         assert (done.returncode, done.stdout, done.stderr) == (0, b"", b"")
         assert mounted_at(mount.path)
         assert "sizes" in mount.run("ls", mount.path).stdout.split()
-        pids = processes_about(mount.path)
+        pids = processes_in(mount.path)
         assert len(pids) == 1
         subprocess.run(["fusermount3", "-u", str(mount.path)], check=True, timeout=30)
-        wait_until("the daemon ended", lambda: not processes_about(mount.path), 30)
+        wait_until("the daemon ended", lambda: not processes_in(mount.path), 30)
     finally:
         abort_mount(mount.path)
     assert suspects(log.read_text()) == []
-
-
-def processes_about(path: Path) -> list[int]:
-    """Return the processes with `path` in their command line."""
-    found = []
-    for entry in Path("/proc").iterdir():
-        try:
-            if entry.name.isdigit() and str(path).encode() in (entry / "cmdline").read_bytes().split(b"\0"):
-                found.append(int(entry.name))
-        except OSError:  # it ended meanwhile
-            continue
-    return found

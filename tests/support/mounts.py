@@ -46,6 +46,18 @@ def abort_mount(path: Path) -> None:
             subprocess.run([*command, str(path)], capture_output=True, timeout=20, check=False)
 
 
+def processes_in(path: Path) -> list[int]:
+    """Return the processes with `path`, or something below it, in their command line."""
+    found = []
+    for entry in Path("/proc").iterdir():
+        try:
+            if entry.name.isdigit() and os.fsencode(path) in (entry / "cmdline").read_bytes():
+                found.append(int(entry.name))
+        except OSError:  # it ended meanwhile
+            continue
+    return found
+
+
 class Mount:
     """`python -m mavftpfs SOURCE MOUNTPOINT -f`, ended and judged by `finish`."""
 

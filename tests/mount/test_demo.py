@@ -1,0 +1,82 @@
+"""The demo: a newcomer's first command. It shows what it promises and leaves nothing behind."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.support.logs import suspects
+from tests.support.mounts import abort_mount, processes_in, wait_until
+from tests.support.vehicles import PROJECT
+
+HANG = 120.0
+
+
+@pytest.fixture
+def place(tmp_path: Path) -> Iterator[Path]:
+    """The demo's TMPDIR; whatever of it is still mounted at the end is freed."""
+    yield tmp_path
+    for line in Path("/proc/self/mounts").read_text().splitlines():
+        if line.split()[1].startswith(str(tmp_path)):
+            abort_mount(Path(line.split()[1]))
+
+
+def start_demo(place: Path) -> subprocess.Popen[str]:
+    """Start it as `scripts/demo` does, without a terminal."""
+    return subprocess.Popen(
+        [sys.executable, "-m", "mavftpfs", "demo"],
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        cwd=PROJECT,
+        env={**os.environ, "TMPDIR": str(place), "COLUMNS": "100"},
+    )
+
+
+def assert_nothing_is_left(place: Path) -> None:
+    """No file, no mount, no process."""
+    wait_until("all processes ended", lambda: not processes_in(place), 10)
+    assert list(place.iterdir()) == []
+    assert str(place) not in Path("/proc/self/mounts").read_text()
+
+
+def test_the_demo_shows_the_tour_and_cleans_up(place: Path) -> None:
+    demo = start_demo(place)
+    out, _ = demo.communicate(timeout=HANG)
+    assert demo.returncode == 0, out
+    assert suspects(out) == []
+    for word in (
+        "ls -l",
+        "cat drone",
+        "cp drone",
+        "diff -r",
+        "SHA-256",
+        "10_32_15.ulg",
+        "Every byte was right",
+    ):
+        assert word in out
+    assert_nothing_is_left(place)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("moment", ["mavftpfs udpin", "cp drone"])
+def test_a_demo_that_is_stopped_cleans_up(place: Path, number: signal.Signals, moment: str) -> None:
+    demo = start_demo(place)
+    assert demo.stdout is not None
+    seen = ""
+    while moment not in seen:
+        line = demo.stdout.readline()
+        assert line, seen
+        seen += line
+    demo.send_signal(number)
+    rest, _ = demo.communicate(timeout=HANG)
+    assert demo.returncode == 130, seen + rest
+    assert suspects(seen + rest) == []
+    assert_nothing_is_left(place)
