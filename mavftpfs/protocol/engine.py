@@ -98,9 +98,11 @@ class Engine:
 
     def timeout(self, family: str) -> float:
         """Return the present retransmission timeout of a family of opcodes, in seconds."""
-        if self._timers[family].known:
-            return self._timers[family].rto
-        return min((timer.rto for timer in self._timers.values() if timer.known), default=INITIAL_RTO)
+        timer = self._timers[family]
+        if timer.known:
+            return timer.rto
+        known = (other.unfloored for other in self._timers.values() if other.known)
+        return max(min(known, default=INITIAL_RTO), FLOORS[family])
 
     def note(self, text: str) -> None:
         """Tell the trace something."""
@@ -353,7 +355,7 @@ class Engine:
         silent = False
         for request in self._ledger.flying():
             if request.timer <= now:
-                self._postpone(request)
+                request.timer = self._reconsidered(request)
             if request.timer <= now:
                 silent = self._expire(request, now) or silent
             else:
@@ -361,11 +363,13 @@ class Engine:
         if silent:
             self.flow.on_silence()
 
-    def _postpone(self, request: Request) -> None:
-        """During a burst silence proves nothing, unless this server was seen to answer in between."""
-        heard = self._bursts.heard_at
-        if heard > request.sent_at and not self.traits.answers_during_burst:
-            request.timer = heard + self._wait(request)
+    def _reconsidered(self, request: Request) -> float:
+        """Return when this transmission is overdue by what is known now: round trips may have grown."""
+        since = request.sent_at
+        if not self.traits.answers_during_burst:
+            # ArduPilot answers nothing else during a burst: silence proves nothing then.
+            since = max(since, self._bursts.heard_at)
+        return since + self._wait(request)
 
     def _expire(self, request: Request, now: float) -> bool:
         """A timer ran out; return whether nothing at all was heard since the request was sent."""
@@ -374,7 +378,7 @@ class Engine:
             self._time_out(op)
         silent = self._heard_at < request.sent_at
         if silent:
-            self._timers[request.manner.family].back_off()
+            self._timers[request.manner.family].on_silence()
         self.flow.on_loss()
         self._ledger.lose(request)
         return silent

@@ -17,16 +17,18 @@ from collections import deque
 from math import inf
 
 INITIAL = 4
-DEFAULT_CAP = 1024
+DEFAULT_CAP = 2048
 SERIAL_CAP = 16
 
 _GAIN = 1.25
 _SLACK = 3
 _FAST_PATH_SECONDS = 0.010
 _FAST_PATH_WINDOW = 96
+_QUEUE_SECONDS = 0.005
 _ROUNDS_REMEMBERED = 10
 _PLATEAU_ROUNDS = 3
 _BASE_LIFETIME = 30.0
+_DRAIN_ROUNDS = 2
 
 
 class Flow:
@@ -37,6 +39,7 @@ class Flow:
         "_app_limited",
         "_base_at",
         "_base_rtt",
+        "_draining",
         "_best_rate",
         "_brake",
         "_cap",
@@ -66,6 +69,7 @@ class Flow:
         self._best_rate = 0.0
         self._base_rtt = inf
         self._base_at = 0.0
+        self._draining = 0
         self._brake = 1.0
         self._plateau = 0
         self._collapsed = 0
@@ -138,21 +142,34 @@ class Flow:
             self._approach(self._target())
 
     def _learn_base(self, now: float) -> None:
-        expired = now - self._base_at > _BASE_LIFETIME and self._round_least < inf
-        if self._round_least <= self._base_rtt or expired:
-            self._base_rtt = self._round_least
+        """Keep the least round trip; one that was not seen again for long is measured with a drained queue."""
+        least = self._round_least
+        if least == inf:
+            return
+        if least <= 1.1 * self._base_rtt:
+            self._base_rtt = min(least, self._base_rtt)
             self._base_at = now
+            self._draining = 0
+        elif self._draining:
+            self._draining -= 1
+            if not self._draining:
+                self._base_rtt, self._base_at = least, now
+        elif now - self._base_at > _BASE_LIFETIME:
+            self._draining = _DRAIN_ROUNDS
 
     def _learn_congestion(self) -> None:
-        queued = self._round_least > 1.5 * self._base_rtt + 0.01
-        if self._losses and queued and self._round_least < inf:
+        if self._losses and self._queued():
             self._brake = max(0.4, self._brake * 0.7)
         else:
             self._brake = min(1.0, self._brake * 1.05)
 
+    def _queued(self) -> bool:
+        """Whether even the quickest answer of the round had to wait in a queue."""
+        return 1.25 * self._base_rtt + _QUEUE_SECONDS < self._round_least < inf
+
     def _leaves_start(self, grown: bool) -> bool:
         self._plateau = 0 if grown else self._plateau + 1
-        if self._plateau >= _PLATEAU_ROUNDS or self.window >= self._cap:
+        if self._plateau >= _PLATEAU_ROUNDS or self.window >= self._cap or self._queued():
             self._starting = False
         return not self._starting
 
@@ -161,7 +178,8 @@ class Flow:
         if base == inf or rate == 0.0:
             return INITIAL
         held = _GAIN * rate * base / max(0.3, 1.0 - self.loss) + _SLACK
-        return self._brake * max(held, min(rate * _FAST_PATH_SECONDS, _FAST_PATH_WINDOW))
+        wanted = self._brake * max(held, min(rate * _FAST_PATH_SECONDS, _FAST_PATH_WINDOW))
+        return wanted / 2 if self._draining else wanted
 
     def _approach(self, target: float) -> None:
         if self._serial:

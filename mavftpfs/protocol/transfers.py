@@ -288,6 +288,8 @@ class ReadTransfer(Operation):
             self.fail(SessionLost("the vehicle repeats itself in a burst", by_server=True))
         elif burst.over:
             self._end_burst(burst, now)
+        elif burst.complete_seen:
+            self._arm(now)
         return True
 
     def on_timer(self, now: float) -> None:

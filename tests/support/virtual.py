@@ -1,0 +1,140 @@
+"""Runs an engine against a server over a modelled link, on virtual time without trio.
+
+The server is anything with `handle`, `outgoing` and `next_deadline` (mavftpfs.sim.server.FtpServer, or a
+scripted one). Frames are the trimmed payloads behind 15 bytes that stand for MAVLink's overhead.
+"""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable
+from typing import Protocol
+
+from mavftpfs.link.messages import Address
+from mavftpfs.protocol.engine import Engine
+from mavftpfs.protocol.flow import Flow
+from mavftpfs.protocol.operations import Operation
+from mavftpfs.protocol.payload import PAYLOAD_SIZE, decode_reply
+from mavftpfs.shared.errors import RemoteProtocolError
+from mavftpfs.shared.extents import ExtentSet
+from mavftpfs.sim.linkmodel import Direction, LinkModel, LinkSettings
+
+CLIENT = Address(254, 191)
+OVERHEAD = bytes(15)
+MAX_STEPS = 2_000_000
+
+
+class Server(Protocol):
+    """What the other end must be."""
+
+    def handle(self, wire: bytes, source: Address, now: float) -> None: ...
+
+    def outgoing(self, now: float) -> list[tuple[Address, bytes]]: ...
+
+    def next_deadline(self) -> float | None: ...
+
+
+class MemorySink:
+    """A file's bytes as they come; what is held is never overwritten."""
+
+    def __init__(self, size: int) -> None:
+        self.data = bytearray(size)
+        self.held = ExtentSet()
+        self.repeats = 0
+
+    def missing(self, start: int, stop: int) -> list[tuple[int, int]]:
+        return self.held.missing(start, stop)
+
+    def on_data(self, offset: int, data: bytes) -> None:
+        assert offset + len(data) <= len(self.data), "data beyond the size of the file"
+        gaps = self.held.missing(offset, offset + len(data))
+        if gaps != [(offset, offset + len(data))]:
+            self.repeats += 1
+        for start, stop in gaps:
+            self.data[start:stop] = data[start - offset : stop - offset]
+        self.held.add(offset, offset + len(data))
+
+
+class VirtualLink:
+    """The loop. `now` is virtual time in seconds."""
+
+    def __init__(
+        self,
+        server: Server,
+        settings: LinkSettings | None = None,
+        *,
+        seed: int = 0,
+        flow: Flow | None = None,
+        op_deadline: float = 30.0,
+    ) -> None:
+        rng = random.Random(seed)
+        self.server = server
+        self.model = LinkModel(rng, settings)
+        self.engine = Engine(random.Random(rng.random()), flow or Flow(), op_deadline=op_deadline)
+        self.now = 100.0
+        self.on_step: Callable[[float], None] = lambda now: None
+
+    def run(self, *operations: Operation, limit: float = 600.0) -> None:
+        """Start operations and go on until all are done."""
+        for operation in operations:
+            self.engine.start(operation, self.now)
+        self.run_until(lambda: all(operation.done for operation in operations), limit)
+
+    def run_until(self, finished: Callable[[], bool], limit: float = 600.0) -> None:
+        """Go on until `finished`, at most `limit` virtual seconds."""
+        end = self.now + limit
+        for _ in range(MAX_STEPS):
+            self._exchange()
+            if finished():
+                return
+            self.now = self._next_time()
+            assert self.now <= end, f"not finished within {limit} virtual seconds"
+        raise AssertionError("too many steps")
+
+    def rest(self, seconds: float) -> None:
+        """Let time pass until nothing is under way, at least so long."""
+        end = self.now + seconds
+        self.run_until(lambda: self._next_time(end) >= end, seconds + 1.0)
+        self.now = end
+
+    def _exchange(self) -> None:
+        now = self.now
+        for wire in self.engine.outgoing(now):
+            assert len(wire) == PAYLOAD_SIZE
+            self.model.push(Direction.TO_VEHICLE, OVERHEAD + wire.rstrip(b"\0"), now)
+        for frame in self.model.pop(Direction.TO_VEHICLE, now):
+            self.server.handle(_payload(frame), CLIENT, now)
+        for target, wire in self.server.outgoing(now):
+            if target == CLIENT:
+                self.model.push(Direction.TO_CLIENT, OVERHEAD + wire.rstrip(b"\0"), now)
+        for frame in self.model.pop(Direction.TO_CLIENT, now):
+            self._receive(_payload(frame))
+        deadline = self.engine.next_deadline()
+        if deadline is not None and deadline <= now:
+            self.engine.on_deadline(now)
+        self.engine.take_finished()
+        for wire in self.engine.outgoing(now):
+            self.model.push(Direction.TO_VEHICLE, OVERHEAD + wire.rstrip(b"\0"), now)
+        self.on_step(now)
+
+    def _receive(self, wire: bytes) -> None:
+        try:
+            reply = decode_reply(wire)
+        except RemoteProtocolError:
+            return
+        self.engine.receive(reply, self.now)
+
+    def _next_time(self, default: float | None = None) -> float:
+        candidates = (
+            self.engine.next_deadline(),
+            self.server.next_deadline(),
+            self.model.next_deadline(),
+            default,
+        )
+        times = [time for time in candidates if time is not None]
+        assert times, "everybody waits for ever"
+        return max(min(times), self.now)
+
+
+def _payload(frame: bytes) -> bytes:
+    return frame[len(OVERHEAD) :].ljust(PAYLOAD_SIZE, b"\0")
