@@ -12,8 +12,10 @@ from collections.abc import Callable
 
 from mavftpfs.link.messages import Address
 from mavftpfs.protocol.payload import PAYLOAD_SIZE
+from mavftpfs.sim.ardupilot import ArduPilot
 from mavftpfs.sim.filesystem import Tree
 from mavftpfs.sim.firmware import Firmware
+from mavftpfs.sim.mavsdk import Mavsdk
 from mavftpfs.sim.profiles import Family, Profile
 from mavftpfs.sim.pseudo import VirtualTrees
 from mavftpfs.sim.px4 import Px4
@@ -24,6 +26,8 @@ AUTOPILOT = Address(1, 1)
 _FIRMWARES: dict[Family, type[Firmware]] = {
     Family.SPEC: Spec,
     Family.PX4: Px4,
+    Family.ARDUPILOT: ArduPilot,
+    Family.MAVSDK: Mavsdk,
 }
 
 

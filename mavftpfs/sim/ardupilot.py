@@ -1,0 +1,294 @@
+"""ArduPilot's FTP server: queue, worker thread and sessions. Layer: sim; pure.
+
+Source: GCS_FTP.cpp of generation A (one session for the vehicle) and of generations B and C (five),
+servers.md 1-13 and 15, a recording. The worker is a generator that yields the time at which it wants to go
+on, None while it is idle.
+"""
+
+from __future__ import annotations
+
+import errno
+import random
+from collections import deque
+from collections.abc import Iterator
+
+from mavftpfs.link.messages import Address
+from mavftpfs.protocol.payload import MAX_DATA, NakCode, Opcode
+from mavftpfs.sim import ardupilotops
+from mavftpfs.sim.ardupilotops import NOBODY, Session
+from mavftpfs.sim.firmware import Firmware
+from mavftpfs.sim.profiles import Profile
+from mavftpfs.sim.storage import StaleErrno, Storage
+from mavftpfs.sim.wire import ACK, FULL_FRAME, NAK, Reply, Request, frame_size, parse
+
+_ROOM_POLL = 0.002
+_NEWLIB = {errno.ENOTEMPTY: 90, errno.ENAMETOOLONG: 91, errno.ENOSYS: 88, errno.ELOOP: 92}
+
+
+class ArduPilot(Firmware):
+    """One vehicle."""
+
+    def __init__(self, storage: Storage, profile: Profile, rng: random.Random) -> None:
+        super().__init__(storage, profile, rng)
+        self._ops = ardupilotops.Operations(storage, profile)
+        self._errno = 0
+        self._queue: deque[Request] = deque()
+        self._reply = Reply(NOBODY, 0, 255, 0, 0, 0, 0, 0, b"")
+        self._horizon = float("-inf")
+        self._slots = [Session() for _ in range(profile.sessions)]
+        self._worker = self._run()
+        self._wake: float | None = next(self._worker)
+
+    # -- timeline ----------------------------------------------------------------------------
+
+    def handle(self, wire: bytes, source: Address, now: float) -> None:
+        """Queue a request, or drop it if five wait."""
+        self.advance(now)
+        if len(self._queue) >= self.profile.queue_length:
+            self.dropped_requests += 1
+            return
+        self._queue.append(parse(wire, source))
+        if self._wake is None:
+            self._wake = now + self.profile.latency
+
+    def advance(self, now: float) -> None:
+        """See Firmware."""
+        self._horizon = now
+        while self._wake is not None and self._wake <= now:
+            self.now = self._wake
+            self._wake = next(self._worker)
+        self.now = now
+        self._kill_idle(now)
+
+    def next_wake(self) -> float | None:
+        """See Firmware."""
+        limit = self.profile.idle_close
+        if self._wake is not None or limit is None:
+            return self._wake
+        sent = [slot.last_sent for slot in self._slots if slot.file is not None]
+        return min(sent) + limit if sent else None
+
+    def open_paths(self) -> list[bytes]:
+        """See Firmware."""
+        return [slot.path for slot in self._slots if slot.file is not None]
+
+    def reboot(self, now: float) -> None:
+        """See Firmware."""
+        for slot in self._slots:
+            self._close_quietly(slot)
+        self._slots = [Session() for _ in range(self.profile.sessions)]
+        self._queue.clear()
+        self._reply = Reply(NOBODY, 0, 255, 0, 0, 0, 0, 0, b"")
+        self._errno = 0
+        self.forget_outbox()
+        self.now = now
+        self._worker = self._run()
+        self._wake = next(self._worker)
+
+    def _kill_idle(self, now: float) -> None:
+        limit = self.profile.idle_close
+        if limit is None or self._wake is not None:
+            return
+        for slot in self._slots:
+            if slot.last_sent and now - slot.last_sent >= limit:
+                self._close_quietly(slot)
+
+    @staticmethod
+    def _close_quietly(slot: Session) -> None:
+        try:
+            slot.close()
+        except OSError:
+            return  # a result the firmware throws away
+
+    # -- the worker --------------------------------------------------------------------------
+
+    def _run(self) -> Iterator[float | None]:
+        while True:
+            while not self._queue:
+                yield None
+            request = self._queue.popleft()
+            if self.profile.sessions == 1:
+                yield from self._run_single(request)
+            else:
+                yield from self._run_shared(request)
+
+    def _run_single(self, request: Request) -> Iterator[float | None]:
+        """Generation A: `number` is the id of the one session, whoever uses it."""
+        slot = self._slots[0]
+        if self._is_repeat(request):
+            self.replays += 1
+            yield from self._push(slot)
+            return
+        self._prepare(request)
+        idle = self.now - slot.last_sent
+        ending = request.opcode in (Opcode.TERMINATE_SESSION, Opcode.RESET_SESSIONS)
+        stranger = slot.file is not None and request.session != slot.number
+        if request.size > MAX_DATA:
+            self._nak(NakCode.INVALID_DATA_SIZE)
+        elif ending and request.session != slot.number:
+            self._reply.opcode = ACK  # believed to end another session, of which there is none
+        elif stranger and idle < self.profile.steal_after:
+            self._nak(NakCode.INVALID_SESSION)
+        else:
+            if stranger:
+                self._close_quietly(slot)
+            if ending:
+                self._close_quietly(slot)
+                self._reply.opcode = ACK
+            else:
+                yield from self._execute(slot, request)
+                return
+        yield from self._push(slot)
+
+    def _run_shared(self, request: Request) -> Iterator[float | None]:
+        """Generations B and C: find the sender's session, or claim one that is idle."""
+        if request.opcode == Opcode.RESET_SESSIONS:
+            for slot in self._slots:
+                if slot.owner == request.source:
+                    self._close_quietly(slot)
+            self._prepare(request)
+            self._reply.opcode = ACK
+            self._send_once()
+            return
+        found = self._find_slot(request)
+        if found is None:
+            self._prepare(request)
+            self._nak(NakCode.NO_SESSIONS_AVAILABLE)
+            self._send_once()
+            return
+        if self._is_repeat(request) and self._reply.data[:1] != bytes([NakCode.NO_SESSIONS_AVAILABLE]):
+            self.replays += 1
+            yield from self._push(found)
+            return
+        self._prepare(request)
+        if request.size > MAX_DATA:
+            self._nak(NakCode.INVALID_DATA_SIZE)
+            yield from self._push(found)
+        else:
+            yield from self._execute(found, request)
+
+    def _find_slot(self, request: Request) -> Session | None:
+        for slot in self._slots:
+            if slot.owner == request.source and slot.number == request.session:
+                return slot
+        oldest = min(self._slots, key=lambda slot: slot.last_sent)
+        if oldest.last_sent and self.now - oldest.last_sent < self.profile.steal_after:
+            return None
+        self._close_quietly(oldest)
+        oldest.owner, oldest.number = request.source, request.session
+        return oldest
+
+    def _is_repeat(self, request: Request) -> bool:
+        """Whether this seems to be the request last replied to, by anybody's session on the server."""
+        reply = self._reply
+        return (
+            request.source == reply.target
+            and request.session == reply.session
+            and request.seq + 1 == reply.seq & 0xFFFF
+        )
+
+    def _execute(self, slot: Session, request: Request) -> Iterator[float | None]:
+        """Run a request that has a session; a burst keeps the worker until it is through."""
+        if request.opcode in (ACK, NAK):
+            return
+        if request.opcode == Opcode.BURST_READ_FILE:
+            yield from self._burst(slot, request)
+            return
+        try:
+            cost = self._ops.execute(slot, request, self._reply, self.now)
+        except ardupilotops.Refusal as refusal:
+            self._nak(refusal.code)
+        except OSError as exc:
+            self._fail(exc)
+        else:
+            if cost:
+                yield self.now + cost
+        yield from self._push(slot)
+        if request.opcode == Opcode.TERMINATE_SESSION:
+            slot.last_sent = 0.0
+
+    # -- replies -----------------------------------------------------------------------------
+
+    def _prepare(self, request: Request) -> None:
+        self._reply = Reply(
+            request.source, request.seq + 1, request.session, ACK, 0, request.opcode, 0, 0, b""
+        )
+
+    def _nak(self, code: int) -> None:
+        self._reply.opcode, self._reply.size, self._reply.data = NAK, 1, bytes([code])
+
+    def _fail(self, exc: OSError) -> None:
+        """Refuse with errno, or with whatever errno was left by an earlier failure."""
+        if not isinstance(exc, StaleErrno) and exc.errno is not None:
+            self._errno = exc.errno
+        if self._errno == errno.EEXIST:
+            self._nak(NakCode.FILE_EXISTS)
+        elif self._errno == errno.ENOENT:
+            self._nak(NakCode.FILE_NOT_FOUND)
+        else:
+            number = self._errno
+            if self.profile.newlib_errnos:
+                number = _NEWLIB.get(number, number)
+            self._nak(NakCode.FAIL_ERRNO)
+            self._reply.size, self._reply.data = 2, bytes([NakCode.FAIL_ERRNO, number & 0xFF])
+
+    def _push(self, slot: Session) -> Iterator[float | None]:
+        """Send the reply as soon as the link has room, however long that takes; nothing else happens then."""
+        while not self._has_room():
+            yield self._horizon + _ROOM_POLL  # room changes between two calls of advance only
+        slot.last_sent = self.now
+        self._emit()
+
+    def _send_once(self) -> None:
+        if self._has_room():
+            self._emit()
+        else:
+            self.dropped_replies += 1
+
+    def _emit(self) -> None:
+        self.emit(self._reply.target, self._reply.encode(), self.now, self.now)
+
+    def _has_room(self) -> bool:
+        return self.tx_room is None or self.room() >= frame_size(self._reply.encode())
+
+    # -- bursts ------------------------------------------------------------------------------
+
+    def _burst(self, slot: Session, request: Request) -> Iterator[float | None]:
+        """Send up to burst_packets packets; nothing can stop it."""
+        size = request.size or MAX_DATA
+        reply = self._reply
+        reply.offset = request.offset if self.profile.exact_eof_offset else 0
+        try:
+            ardupilotops.check_readable(slot)
+            for index in range(self.profile.burst_packets):
+                data = ardupilotops.read(slot, request.offset + index * size, size)
+                if not data:
+                    raise ardupilotops.Refusal(NakCode.EOF)
+                self._fill(reply, request.offset + index * size, data, size, index)
+                yield from self._push(slot)
+                if self.profile.exact_eof_offset or len(data) < size:
+                    reply.offset += len(data)
+                reply.seq += 1
+                yield self.now + self._interval(size)
+        except ardupilotops.Refusal as refusal:
+            self._nak(refusal.code)
+        except OSError as exc:
+            self._fail(exc)
+        else:
+            return
+        if not self.profile.short_packet_completes:
+            reply.burst_complete = 1
+        yield from self._push(slot)
+
+    def _fill(self, reply: Reply, offset: int, data: bytes, size: int, index: int) -> None:
+        reply.opcode, reply.size, reply.data, reply.offset = ACK, len(data), data, offset
+        last = index == self.profile.burst_packets - 1
+        short = self.profile.short_packet_completes and len(data) < size
+        reply.burst_complete = int(last or short)
+
+    def _interval(self, size: int) -> float:
+        """Return the pause after a packet: a third of the bandwidth where there is no flow control."""
+        interval = self.profile.burst_interval
+        if self.profile.bandwidth is None:
+            return interval
+        return max(interval, 3 * (FULL_FRAME - MAX_DATA + size) / self.profile.bandwidth)

@@ -1,0 +1,254 @@
+"""A bad link, as a pure and seeded model of both directions. Layer: sim; pure.
+
+Each direction has a drop-tail queue in front of a transmitter of a fixed rate. In half duplex there is one
+transmitter, which takes frames from the two queues in turn (what a time-division radio amounts to). A frame
+that was sent is lost, doubled, damaged or held back with the given probabilities; else it arrives `delay`
+plus up to `jitter` after its last byte, in order. It is lost too if the link is cut when its last byte leaves
+or when it would arrive.
+"""
+
+from __future__ import annotations
+
+import heapq
+import random
+from collections import deque
+from dataclasses import dataclass
+from enum import Enum, IntEnum
+
+_BURST_LENGTH = 8.0
+_REORDER_HOLD = 0.020
+
+
+class Direction(IntEnum):
+    """Which way a frame goes."""
+
+    TO_VEHICLE = 0
+    TO_CLIENT = 1
+
+
+class Duplex(Enum):
+    """Whether the directions share the airtime."""
+
+    HALF = "half"
+    FULL = "full"
+
+
+@dataclass(frozen=True, slots=True)
+class LinkSettings:
+    """What a link is like; the same in both directions.
+
+    rate: bytes per second, None = no limit and no queue. queue: bytes that may wait for the transmitter.
+    delay, jitter: seconds one way. loss, duplicate, reorder, corrupt: probabilities per frame.
+    burst_loss: share of frames lost in runs of 8 on average. cuts: (start, stop) times without a link.
+    """
+
+    rate: float | None = None
+    queue: int = 65_536
+    duplex: Duplex = Duplex.FULL
+    delay: float = 0.0
+    jitter: float = 0.0
+    loss: float = 0.0
+    burst_loss: float = 0.0
+    duplicate: float = 0.0
+    reorder: float = 0.0
+    corrupt: float = 0.0
+    cuts: tuple[tuple[float, float], ...] = ()
+
+
+@dataclass(slots=True)
+class LinkCounters:
+    """What happened to the frames of one direction.
+
+    INVARIANT: pushed + duplicated == dropped + lost + cut + delivered + those under way.
+    """
+
+    pushed: int = 0
+    pushed_bytes: int = 0
+    dropped: int = 0
+    """For want of room in the queue."""
+    lost: int = 0
+    cut: int = 0
+    duplicated: int = 0
+    reordered: int = 0
+    corrupted: int = 0
+    delivered: int = 0
+    delivered_bytes: int = 0
+
+
+class _Lane:
+    """One direction."""
+
+    __slots__ = ("arrivals", "bad", "counters", "free_at", "last_arrival", "on_air", "queue", "queued")
+
+    def __init__(self) -> None:
+        self.counters = LinkCounters()
+        self.queue: deque[tuple[float, bytes]] = deque()
+        self.queued = 0
+        self.on_air = 0
+        self.free_at = float("-inf")
+        self.arrivals: list[tuple[float, int, float, bytes]] = []
+        self.last_arrival = float("-inf")
+        self.bad = False
+
+
+class LinkModel:
+    """Both directions of one link. `now` must not go back."""
+
+    def __init__(self, rng: random.Random, settings: LinkSettings | None = None) -> None:
+        self.settings = settings if settings is not None else LinkSettings()
+        self._rng = rng
+        self._lanes = (_Lane(), _Lane())
+        self._cuts: list[tuple[float, float]] = list(self.settings.cuts)
+        self._turn = 0
+        self._serial = 0
+        self._now = float("-inf")
+
+    # -- the ends ----------------------------------------------------------------------------
+
+    def push(self, direction: Direction, frame: bytes, now: float) -> bool:
+        """Hand a frame to the transmitter's queue; returns False if it was dropped for want of room."""
+        self._advance(now)
+        lane = self._lanes[direction]
+        lane.counters.pushed += 1
+        lane.counters.pushed_bytes += len(frame)
+        if self.settings.rate is not None and len(frame) > self.room(direction):
+            lane.counters.dropped += 1
+            return False
+        lane.queue.append((now, frame))
+        lane.queued += len(frame)
+        self._advance(now)
+        return True
+
+    def pop(self, direction: Direction, now: float) -> list[bytes]:
+        """Return the frames that arrived by `now`, in order of arrival."""
+        self._advance(now)
+        lane = self._lanes[direction]
+        frames: list[bytes] = []
+        while lane.arrivals and lane.arrivals[0][0] <= now:
+            arrival, _, sent, frame = heapq.heappop(lane.arrivals)
+            if self.is_cut(sent) or self.is_cut(arrival):
+                lane.counters.cut += 1
+                continue
+            frames.append(frame)
+            lane.counters.delivered_bytes += len(frame)
+        lane.counters.delivered += len(frames)
+        return frames
+
+    def next_deadline(self) -> float | None:
+        """When something may arrive next (never too late, at times too early); None if nothing will."""
+        times = [lane.arrivals[0][0] for lane in self._lanes if lane.arrivals]
+        for lane in self._lanes:
+            if lane.queue:
+                times.append(lane.free_at + self._airtime(lane.queue[0][1]) + self.settings.delay)
+        return min(times, default=None)
+
+    def room(self, direction: Direction) -> int:
+        """Bytes that the queue still takes, as of the last push or pop; a frame counts until it is sent."""
+        lane = self._lanes[direction]
+        on_air = lane.on_air if lane.free_at > self._now else 0
+        return max(0, self.settings.queue - lane.queued - on_air)
+
+    def counters(self, direction: Direction) -> LinkCounters:
+        """Return one direction's counters."""
+        return self._lanes[direction].counters
+
+    def pending(self, direction: Direction) -> int:
+        """Return how many frames are queued or under way."""
+        lane = self._lanes[direction]
+        return len(lane.queue) + len(lane.arrivals)
+
+    # -- cuts --------------------------------------------------------------------------------
+
+    def cut(self, now: float) -> None:
+        """Cut the link from `now` on."""
+        self._advance(now)
+        if not self.is_cut(now):
+            self._cuts.append((now, float("inf")))
+
+    def restore(self, now: float) -> None:
+        """End a cut."""
+        self._advance(now)
+        self._cuts = [(start, min(stop, now) if start <= now else stop) for start, stop in self._cuts]
+
+    def is_cut(self, when: float) -> bool:
+        """Whether the link is cut at that time."""
+        return any(start <= when < stop for start, stop in self._cuts)
+
+    # -- the middle --------------------------------------------------------------------------
+
+    def _airtime(self, frame: bytes) -> float:
+        return len(frame) / self.settings.rate if self.settings.rate else 0.0
+
+    def _advance(self, now: float) -> None:
+        """Start every transmission whose turn comes by `now`."""
+        self._now = now
+        if self.settings.duplex is Duplex.HALF and self.settings.rate is not None:
+            while (lane := self._next_in_turn(now)) is not None:
+                for other in self._lanes:
+                    other.on_air = 0
+                self._transmit(lane)
+                for other in self._lanes:
+                    other.free_at = lane.free_at
+            return
+        for lane in self._lanes:
+            while lane.queue and max(lane.free_at, lane.queue[0][0]) <= now:
+                self._transmit(lane)
+
+    def _next_in_turn(self, now: float) -> _Lane | None:
+        waiting = [lane for lane in self._lanes if lane.queue]
+        if not waiting:
+            return None
+        start = max(waiting[0].free_at, min(lane.queue[0][0] for lane in waiting))
+        if start > now:
+            return None
+        ready = [i for i, lane in enumerate(self._lanes) if lane.queue and lane.queue[0][0] <= start]
+        index = self._turn if self._turn in ready else ready[0]
+        self._turn = 1 - index
+        return self._lanes[index]
+
+    def _transmit(self, lane: _Lane) -> None:
+        pushed_at, frame = lane.queue.popleft()
+        lane.queued -= len(frame)
+        lane.on_air = len(frame)
+        sent = max(lane.free_at, pushed_at) + self._airtime(frame)
+        lane.free_at = sent
+        if self._is_lost(lane):
+            lane.counters.lost += 1
+            return
+        self._schedule(lane, sent, self._maybe_corrupt(lane, frame))
+        if self._chance(self.settings.duplicate):
+            lane.counters.duplicated += 1
+            self._schedule(lane, sent, frame)
+
+    def _schedule(self, lane: _Lane, sent: float, frame: bytes) -> None:
+        arrival = sent + self.settings.delay
+        if self.settings.jitter:
+            arrival += self._rng.random() * self.settings.jitter
+        if self._chance(self.settings.reorder):
+            lane.counters.reordered += 1
+            arrival += _REORDER_HOLD + 3 * self._airtime(frame)
+        else:
+            arrival = lane.last_arrival = max(arrival, lane.last_arrival)
+        self._serial += 1
+        heapq.heappush(lane.arrivals, (arrival, self._serial, sent, frame))
+
+    def _is_lost(self, lane: _Lane) -> bool:
+        share = self.settings.burst_loss
+        if share:
+            # Two states (Gilbert): in the bad one every frame is lost, and `share` is lost in the long run.
+            leave = 1 / _BURST_LENGTH
+            enter = min(1.0, leave * share / (1 - share)) if share < 1 else 1.0
+            lane.bad = not self._chance(leave) if lane.bad else self._chance(enter)
+        return (lane.bad and bool(share)) or self._chance(self.settings.loss)
+
+    def _maybe_corrupt(self, lane: _Lane, frame: bytes) -> bytes:
+        if not frame or not self._chance(self.settings.corrupt):
+            return frame
+        lane.counters.corrupted += 1
+        damaged = bytearray(frame)
+        for at in self._rng.sample(range(len(damaged)), min(len(damaged), self._rng.randint(1, 3))):
+            damaged[at] ^= self._rng.randint(1, 255)
+        return bytes(damaged)
+
+    def _chance(self, probability: float) -> bool:
+        return probability > 0 and self._rng.random() < probability
