@@ -39,11 +39,11 @@ class Flow:
         "_app_limited",
         "_base_at",
         "_base_rtt",
-        "_draining",
         "_best_rate",
         "_brake",
         "_cap",
         "_collapsed",
+        "_draining",
         "_limit",
         "_losses",
         "_plateau",
@@ -100,7 +100,7 @@ class Flow:
         if rtt is not None and rtt < self._round_least:
             self._round_least = rtt
         if self._collapsed:
-            self.window, self._collapsed = self._collapsed, 0
+            self.window, self._collapsed = min(self._cap, self._collapsed), 0
         if order >= self._round_end:
             self._end_round(now, next_order)
 
@@ -142,7 +142,7 @@ class Flow:
             self._approach(self._target())
 
     def _learn_base(self, now: float) -> None:
-        """Keep the least round trip; one that was not seen again for long is measured with a drained queue."""
+        """Keep the least round trip; one not seen again for long is measured anew with a drained queue."""
         least = self._round_least
         if least == inf:
             return
@@ -158,18 +158,18 @@ class Flow:
             self._draining = _DRAIN_ROUNDS
 
     def _learn_congestion(self) -> None:
-        if self._losses and self._queued():
+        if self._losses and self._queued(2.0):
             self._brake = max(0.4, self._brake * 0.7)
         else:
             self._brake = min(1.0, self._brake * 1.05)
 
-    def _queued(self) -> bool:
-        """Whether even the quickest answer of the round had to wait in a queue."""
-        return 1.25 * self._base_rtt + _QUEUE_SECONDS < self._round_least < inf
+    def _queued(self, factor: float) -> bool:
+        """Whether even the quickest answer of the round took `factor` times the base, and a little."""
+        return factor * self._base_rtt + _QUEUE_SECONDS < self._round_least < inf
 
     def _leaves_start(self, grown: bool) -> bool:
         self._plateau = 0 if grown else self._plateau + 1
-        if self._plateau >= _PLATEAU_ROUNDS or self.window >= self._cap or self._queued():
+        if self._plateau >= _PLATEAU_ROUNDS or self.window >= self._cap or self._queued(1.25):
             self._starting = False
         return not self._starting
 
@@ -183,6 +183,7 @@ class Flow:
 
     def _approach(self, target: float) -> None:
         if self._serial:
-            step = self.window + 1 if not self._losses else self.window - 1
-            target = min(target, step)
+            # One at a time, and back where most of a round was lost: what the far end's buffer survived.
+            step = -1 if self._losses > self._replies else 1
+            target = min(target, self.window + step)
         self.window = max(1, min(self._cap, round(target)))

@@ -53,22 +53,15 @@ def _parse_entry(text: bytes, *, with_time: bool) -> DirEntry | None:
     kind = _KINDS.get(text[:1])
     if kind is None:
         return None
-    # From the right: MAVSDK lists names that hold a tab, which then cannot be told from fields.
+    # A tab in a name (MAVSDK lists those) shows as a field that is no number: such a name is not believed.
     name, *fields = text[1:].split(b"\t")
-    wanted = 2 if with_time else 1
-    if len(fields) > wanted and not all(_is_number(field) for field in fields):
+    if not all(_is_number(field) for field in fields):
         return None
-    numbers = [_number(field) for field in fields]
-    if None in numbers and kind is EntryKind.FILE:
-        return None
-    size = numbers[0] if numbers and kind is EntryKind.FILE else None
-    mtime = numbers[1] if with_time and len(numbers) > 1 else None
+    is_file = kind is EntryKind.FILE
+    size = int(fields[0]) if fields and is_file else None
+    mtime = int(fields[1]) if with_time and len(fields) > 1 else 0
     return DirEntry(name, kind, size, mtime or None)
 
 
 def _is_number(field: bytes) -> bool:
     return field.isdigit() and len(field) <= _MAX_DIGITS
-
-
-def _number(field: bytes) -> int | None:
-    return int(field) if _is_number(field) else None

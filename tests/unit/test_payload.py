@@ -1,0 +1,61 @@
+"""The 251-byte payload: layout, ranges, refusal of what does not fit."""
+
+from __future__ import annotations
+
+import pytest
+
+from mavftpfs.protocol.payload import (
+    MAX_DATA,
+    PAYLOAD_SIZE,
+    Opcode,
+    Payload,
+    decode_reply,
+    decode_request,
+    request,
+)
+from mavftpfs.shared.errors import LocalProtocolError, RemoteProtocolError
+
+
+def test_layout_is_the_guides() -> None:
+    wire = Payload(0x1234, 5, 4, 3, 7, 1, 0xAABBCCDD, b"xyz").encode()
+    assert wire[:12] == bytes.fromhex("3412 05 04 03 07 01 00 ddccbbaa")
+    assert wire[12:15] == b"xyz"
+    assert wire[15:] == bytes(PAYLOAD_SIZE - 15)
+
+
+def test_a_reply_holds_exactly_size_bytes() -> None:
+    wire = bytearray(Payload(1, 0, 128, 2, 5, 0, 0, b"ab").encode())
+    wire[14:20] = b"stray!"
+    assert decode_reply(bytes(wire)).data == b"ab"
+
+
+def test_a_request_holds_the_whole_field() -> None:
+    wire = Payload(1, 0, 3, 1, 0, 0, 0, b"/").encode()
+    assert decode_request(wire).data == b"/" + bytes(MAX_DATA - 1)
+
+
+def test_request_helper() -> None:
+    assert request(7, Opcode.LIST_DIRECTORY, data=b"/a").size == 2
+    assert request(7, Opcode.READ_FILE, session=2, offset=9, size=100) == Payload(7, 2, 5, 100, 0, 0, 9)
+
+
+@pytest.mark.parametrize("length", [0, 250, 252])
+def test_wrong_length_is_the_peers_fault(length: int) -> None:
+    with pytest.raises(RemoteProtocolError):
+        decode_reply(bytes(length))
+
+
+def test_oversize_reply_is_the_peers_fault() -> None:
+    wire = bytearray(PAYLOAD_SIZE)
+    wire[4] = 240
+    with pytest.raises(RemoteProtocolError):
+        decode_reply(bytes(wire))
+    assert decode_request(bytes(wire)).size == 240
+
+
+@pytest.mark.parametrize(
+    "bad", [Payload(65536, 0, 0, 0), Payload(0, -1, 0, 0), Payload(0, 0, 0, 0, data=bytes(240))]
+)
+def test_what_does_not_fit_is_our_fault(bad: Payload) -> None:
+    with pytest.raises(LocalProtocolError):
+        bad.encode()
