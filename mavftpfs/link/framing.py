@@ -82,8 +82,9 @@ class Framer:
     ) -> None:
         self.stats = FramerStats()
         self.on_frame: Callable[[bytes], None] | None = None
-        """Called with each accepted frame's bytes (for a .tlog); None costs nothing."""
-        self._stream = stream
+        """Called with the bytes of each frame accepted or built (for a .tlog); None costs nothing."""
+        self.stream = stream
+        """Whether `feed` gets pieces of a stream; not to be changed once it was fed."""
         self._tail = b""
         self._codec = FtpFrameCodec(source, _CRC_EXTRA[FTP_MESSAGE_ID])
         self._decoder = dialect.MAVLink(None)
@@ -122,7 +123,7 @@ class Framer:
         self._tail = b""
 
     def _join(self, data: bytes) -> bytes:
-        if not self._stream and data[:1] in (b"\xfd", b"\xfe"):
+        if not self.stream and data[:1] in (b"\xfd", b"\xfe"):
             self.reset()
         return self._tail + data
 
@@ -177,7 +178,7 @@ class Framer:
         crc_at = len(frame) - signature - 2
         extra = _CRC_EXTRA.get(message_id)
         if extra is None or frame_crc(frame[1:crc_at], extra) != frame[crc_at] | frame[crc_at + 1] << 8:
-            if stop == len(data) and self._stream:
+            if stop == len(data) and self.stream:
                 return start  # the byte behind decides
             if stop < len(data) and data[stop] not in (_V1, _V2):
                 return self._skip(start, start + 1)
@@ -231,7 +232,10 @@ class Framer:
             )
         seq = self._sender.seq
         self._sender.seq = (seq + 1) & 0xFF
-        return self._codec.encode(seq, target, payload)
+        frame = self._codec.encode(seq, target, payload)
+        if self.on_frame is not None:
+            self.on_frame(frame)
+        return frame
 
     def encode_heartbeat(
         self,
@@ -327,4 +331,6 @@ class Framer:
             sender.signing.timestamp = max(sender.signing.timestamp, self._check.now)
         frame: bytes = message.pack(sender)
         sender.seq = (sender.seq + 1) & 0xFF
+        if self.on_frame is not None:
+            self.on_frame(frame)
         return frame

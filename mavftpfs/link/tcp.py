@@ -10,6 +10,7 @@ import errno
 import socket
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, suppress
+from dataclasses import replace
 
 import trio
 
@@ -31,8 +32,10 @@ _PAUSE = 0.2
 
 
 @asynccontextmanager
-async def open_tcp(spec: LinkSpec) -> AsyncIterator[StreamLink]:
+async def open_tcp(spec: LinkSpec, *, patient: bool = False) -> AsyncIterator[StreamLink]:
     """Connect to a listening vehicle or bridge, and again whenever the connection is lost.
+
+    patient: return at once and connect as soon as somebody listens.
 
     Raises:
         LinkClosed: the first attempt failed.
@@ -42,7 +45,7 @@ async def open_tcp(spec: LinkSpec) -> AsyncIterator[StreamLink]:
         return await _connect(spec)
 
     try:
-        pipe = await connect()
+        pipe = None if patient else await connect()
     except OSError as exc:
         raise cannot_open(spec, exc) from exc
     link = StreamLink(spec.description, connect, pipe, is_serial=False, outbox_limit=_OUTBOX_LIMIT)
@@ -62,7 +65,8 @@ async def open_tcp_server(spec: LinkSpec) -> AsyncIterator[StreamLink]:
     except OSError as exc:
         raise cannot_open(spec, exc) from exc
     with listener:
-        link = StreamLink(spec.description, _never, None, is_serial=False, outbox_limit=_OUTBOX_LIMIT)
+        bound = replace(spec, port=listener.getsockname()[1])
+        link = StreamLink(bound.description, _never, None, is_serial=False, outbox_limit=_OUTBOX_LIMIT)
 
         async def serve() -> None:
             async with trio.open_nursery() as nursery:

@@ -11,6 +11,7 @@ from __future__ import annotations
 import socket
 from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager
+from dataclasses import replace
 from typing import Any
 
 import trio
@@ -179,6 +180,8 @@ async def open_udp(spec: LinkSpec) -> AsyncIterator[UdpLink]:
     except BaseException:
         sock.close()
         raise
+    if listens:
+        spec = replace(spec, port=sock.getsockname()[1])
     link = UdpLink(sock, spec.description, None if listens else address)
     async with background(link.run_writer, link.aclose):
         yield link

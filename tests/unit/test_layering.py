@@ -41,6 +41,10 @@ PURE_MODULES = {
     "link.framing",
     "link.fastframe",
     "link.messages",
+    "link.decoding",
+    "link.outbox",
+    "link.problems",
+    "link.signing",
     "link.uri",
     "session.policy",
     "cache.dentries",
@@ -49,7 +53,7 @@ PURE_MODULES = {
     "fuse.handles",
     "fuse.options",
 }
-IMPURE_MODULES = {"sim.vehicle", "sim.endpoints", "sim.memory", "sim.run"}
+IMPURE_MODULES = {"sim.endpoints", "sim.memory", "sim.command"}
 IMPURE_IMPORTS = {"trio", "time", "socket", "logging", "pyfuse3"}
 
 SOLE_IMPORTERS = {

@@ -1,0 +1,226 @@
+"""A simulated vehicle: an FTP server with the rest of an autopilot's MAVLink around it. Layer: sim; pure.
+
+Frames in, frames out, and `now` in monotonic seconds. It beats once a second, says on request who it is and
+how full its card is, sends its boot time and as much telemetry as it is told to, can be armed, rebooted, and
+overheard while it talks to another ground station.
+"""
+
+from __future__ import annotations
+
+import random
+
+from mavftpfs.link.framing import (
+    AUTOPILOT_VERSION_ID,
+    MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES,
+    MAV_CMD_REQUEST_MESSAGE,
+    STORAGE_INFORMATION_ID,
+    Framer,
+)
+from mavftpfs.link.messages import (
+    MAV_MODE_FLAG_SAFETY_ARMED,
+    MAV_PROTOCOL_CAPABILITY_FTP,
+    Address,
+    CommandLong,
+    FtpFrame,
+    Heartbeat,
+)
+from mavftpfs.sim.filesystem import Tree
+from mavftpfs.sim.profiles import Family, Profile
+from mavftpfs.sim.pseudo import VirtualTrees
+from mavftpfs.sim.server import AUTOPILOT, FtpServer
+
+HEARTBEAT_PERIOD = 1.0
+CAPACITY_MIB = 30436.0
+"""A 32 GB card."""
+
+_TYPE_QUADROTOR = 2
+_AUTOPILOT_TYPE = {Family.SPEC: 0, Family.ARDUPILOT: 3, Family.PX4: 12, Family.MAVSDK: 0}
+_MAVLINK2 = 0x2000
+_MODE_ENABLED = 0x01 | 0x40
+_ACCEPTED = 0
+_UNSUPPORTED = 3
+_UNIX_AT_START = 1_795_000_000
+_MOST_TELEMETRY_PER_CALL = 50
+_SLOWED = 4.0
+_SLOWED_FOR = 1.0
+
+
+class SimVehicle:
+    """One vehicle on one link.
+
+    Args:
+        telemetry: bytes per second of unasked messages beside heartbeat and system time.
+        stream: whether `receive` gets pieces of a byte stream rather than datagrams.
+        armed: state at the start; also after a reboot it is disarmed.
+        signing_key: as for Framer.
+    """
+
+    def __init__(
+        self,
+        tree: Tree,
+        profile: Profile,
+        *,
+        rng: random.Random,
+        address: Address = AUTOPILOT,
+        virtual: VirtualTrees | None = None,
+        telemetry: float = 0.0,
+        stream: bool = False,
+        armed: bool = False,
+        signing_key: bytes | None = None,
+    ) -> None:
+        self.server = FtpServer(tree, profile, rng=rng, address=address, virtual=virtual)
+        self.framer = Framer(address, stream=stream, signing_key=signing_key)
+        self.profile = profile
+        self.address = address
+        self.telemetry = telemetry
+        self.armed = armed
+        self.heard: dict[Address, Heartbeat] = {}
+        self.commands = 0
+        self._uid = rng.getrandbits(64)
+        self._booted_at: float | None = None
+        self._down_until = float("-inf")
+        self._next_beat = float("-inf")
+        self._next_telemetry = float("-inf")
+        self._telemetry_step = 0
+        self._replied_at = float("-inf")
+        self._ready: list[bytes] = []
+
+    def arm(self) -> None:
+        """Be armed from the next heartbeat on, which is sent at once."""
+        self._set_armed(True)
+
+    def disarm(self) -> None:
+        """Be disarmed from the next heartbeat on, which is sent at once."""
+        self._set_armed(False)
+
+    def reboot(self, now: float, downtime: float = 0.0) -> None:
+        """Restart: sessions and boot time are lost, files stay; deaf and mute for `downtime` seconds."""
+        self.server.reboot(now)
+        self.framer.reset()
+        self.armed = False
+        self._ready.clear()
+        self._booted_at = now
+        self._down_until = now + downtime
+        self._next_beat = self._next_telemetry = float("-inf")
+
+    def set_stream(self, stream: bool) -> None:
+        """Say what `receive` will get, before it gets anything."""
+        self.framer.stream = stream
+
+    def receive(self, data: bytes, now: float) -> None:
+        """Take a datagram or a piece of the stream."""
+        if now < self._down_until:
+            return
+        for message in self.framer.feed(data):
+            match message:
+                case FtpFrame():
+                    if self._is_for_us(message.target):
+                        self.server.handle(message.payload, message.source, now)
+                case CommandLong():
+                    if self._is_for_us(message.target):
+                        self._on_command(message, now)
+                case Heartbeat():
+                    self.heard[message.source] = message
+
+    def foreign_request(self, payload: bytes, source: Address, now: float, *, audible: bool = True) -> None:
+        """Let another ground station ask something over another link.
+
+        The answers, to `source`, are heard on this link too; so is the request where `audible`, as a
+        router forwards it.
+        """
+        if audible:
+            self._ready.append(Framer(source, stream=False).encode_ftp(self.address, payload))
+        self.server.handle(payload, source, now)
+
+    def say(self, severity: int, text: str) -> None:
+        """Send a STATUSTEXT."""
+        self._ready.append(self.framer.encode_statustext(severity, text))
+
+    def outgoing(self, now: float) -> list[bytes]:
+        """Return the frames to send now, in order."""
+        if now < self._down_until:
+            return []
+        if self._booted_at is None:
+            self._booted_at = now
+        frames, self._ready = self._ready, []
+        if now >= self._next_beat:
+            self._beat(frames, now)
+        encode = self.framer.encode_ftp
+        replies = self.server.outgoing(now)
+        if replies:
+            self._replied_at = now
+            frames += [encode(target, wire) for target, wire in replies]
+        if self.telemetry > 0:
+            self._add_telemetry(frames, now)
+        return frames
+
+    def next_deadline(self) -> float:
+        """When to call `outgoing` again if nothing is received; in the past if there is something now."""
+        if self._ready:
+            return self._down_until
+        due = self._next_beat
+        if self.telemetry > 0:
+            due = min(due, self._next_telemetry)
+        server = self.server.next_deadline()
+        if server is not None:
+            due = min(due, server)
+        return max(due, self._down_until)
+
+    def _set_armed(self, armed: bool) -> None:
+        self.armed = armed
+        self._next_beat = float("-inf")
+
+    def _is_for_us(self, target: Address) -> bool:
+        if target.system not in (0, self.address.system):
+            return False
+        # ArduPilot also answers for components of its system that it cannot reach (MAVLink_routing.cpp).
+        answers_for_all = self.profile.family is Family.ARDUPILOT
+        return target.component in (0, self.address.component) or answers_for_all
+
+    def _boot_ms(self, now: float) -> int:
+        return int((now - (now if self._booted_at is None else self._booted_at)) * 1000)
+
+    def _beat(self, frames: list[bytes], now: float) -> None:
+        mode = _MODE_ENABLED | (MAV_MODE_FLAG_SAFETY_ARMED if self.armed else 0)
+        status = 4 if self.armed else 3
+        frames.append(
+            self.framer.encode_heartbeat(_TYPE_QUADROTOR, _AUTOPILOT_TYPE[self.profile.family], mode, status)
+        )
+        boot_ms = self._boot_ms(now)
+        frames.append(self.framer.encode_system_time(_UNIX_AT_START * 1_000_000 + boot_ms * 1000, boot_ms))
+        self._next_beat = now + HEARTBEAT_PERIOD
+
+    def _add_telemetry(self, frames: list[bytes], now: float) -> None:
+        """Add what is due; ArduPilot sends a quarter for a second after each FTP reply (GCS_Common.cpp)."""
+        slowed = self.profile.family is Family.ARDUPILOT and now - self._replied_at < _SLOWED_FOR
+        rate = self.telemetry / (_SLOWED if slowed else 1.0)
+        for _ in range(_MOST_TELEMETRY_PER_CALL):
+            if self._next_telemetry > now:
+                return
+            frame = self.framer.encode_telemetry(self._telemetry_step, self._boot_ms(now))
+            self._telemetry_step += 1
+            frames.append(frame)
+            # Nothing is made up for after a pause: an autopilot skips what it could not send.
+            self._next_telemetry = max(self._next_telemetry, now - HEARTBEAT_PERIOD) + len(frame) / rate
+        self._next_telemetry = now
+
+    def _on_command(self, command: CommandLong, now: float) -> None:
+        self.commands += 1
+        wanted = int(command.params[0]) if abs(command.params[0]) < 1e6 else -1
+        asks = command.command == MAV_CMD_REQUEST_MESSAGE
+        frame: bytes | None = None
+        if command.command == MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES or (
+            asks and wanted == AUTOPILOT_VERSION_ID
+        ):
+            frame = self._version()
+        elif asks and wanted == STORAGE_INFORMATION_ID:
+            frame = self.framer.encode_storage_information(self._boot_ms(now), CAPACITY_MIB, CAPACITY_MIB / 4)
+        result = _UNSUPPORTED if frame is None else _ACCEPTED
+        self._ready.append(self.framer.encode_command_ack(command.command, result, command.source))
+        if frame is not None:
+            self._ready.append(frame)
+
+    def _version(self) -> bytes:
+        # MAVSDK's server never says that it speaks FTP (servers.md 5).
+        ftp = 0 if self.profile.family is Family.MAVSDK else MAV_PROTOCOL_CAPABILITY_FTP
+        return self.framer.encode_autopilot_version(ftp | _MAVLINK2, 0x01100000, b"simulate", self._uid)

@@ -1,0 +1,218 @@
+"""Records of what went over the link: FTP payloads as text or JSON lines, frames as .tlog. Layer: top.
+
+A sink is handed to the session layer, which calls `payload` for each of the 251-byte payloads; without a sink
+nothing is computed. A sink that cannot write any more (disk full) says so once and falls silent: a trace must
+never break what it watches.
+
+JSON lines: {"t", "dir", "seq", "session", "opcode", "size", "offset", "data"}, in replies also "req_opcode"
+and "burst_complete", and "note" if there is one (retransmit, dup, stale, dropped); opcodes by name, data in
+hex (the part that counts). The .tlog format is pymavlink's: 8 bytes big-endian microseconds since 1970, then
+the frame.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import struct
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import BinaryIO, Protocol, Self
+
+from mavftpfs.protocol.payload import HEADER_SIZE, PAYLOAD_SIZE, NakCode, Opcode, Payload, decode_request
+from mavftpfs.shared.errors import UsageError
+
+REQUEST = "request"
+REPLY = "reply"
+
+_FLUSH_PERIOD = 1.0
+_TEXT_DATA = 16
+_OPCODES = {opcode.value: opcode.name for opcode in Opcode}
+_NAK_CODES = {code.value: code.name for code in NakCode}
+_timestamp = struct.Struct(">Q").pack
+_log = logging.getLogger(__name__)
+
+
+class PayloadSink(Protocol):
+    """What the session layer calls."""
+
+    def payload(self, now: float, direction: str, wire: bytes, note: str = "") -> None:
+        """Record 251 bytes; direction is "request" or "reply"."""
+        ...
+
+
+class _File:
+    """A file that is written to until it fails.
+
+    Raises:
+        UsageError: it cannot be created.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self._path = path
+        self._flushed_at = 0.0
+        try:
+            self._file: BinaryIO | None = Path(path).open("wb")  # noqa: SIM115 (closed by close)
+        except OSError as exc:
+            raise UsageError(f"cannot write {path}: {exc.strerror}") from exc
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Write out what is buffered and close."""
+        file, self._file = self._file, None
+        if file is not None:
+            try:
+                file.close()
+            except OSError as exc:
+                self._complain(exc)
+
+    def _write(self, data: bytes, now: float) -> None:
+        if self._file is None:
+            return
+        try:
+            self._file.write(data)
+            if now - self._flushed_at > _FLUSH_PERIOD:
+                self._file.flush()
+                self._flushed_at = now
+        except OSError as exc:
+            self._complain(exc)
+            self.close()
+
+    def _complain(self, problem: OSError) -> None:
+        _log.warning("no further trace in %s: %s", self._path, problem.strerror)
+
+
+class JsonTrace(_File):
+    """Payloads as JSON lines.
+
+    data_limit: most bytes of data to record for a payload, None = all.
+
+    Raises:
+        UsageError: the file cannot be created.
+    """
+
+    def __init__(self, path: str | Path, *, data_limit: int | None = None) -> None:
+        super().__init__(path)
+        self._data_limit = data_limit
+
+    def payload(self, now: float, direction: str, wire: bytes, note: str = "") -> None:
+        """See PayloadSink."""
+        record = describe(direction, wire, data_limit=self._data_limit)
+        if note:
+            record["note"] = note
+        line = json.dumps({"t": round(now, 6), **record}, separators=(",", ":"))
+        self._write(line.encode() + b"\n", now)
+
+
+class TlogWriter(_File):
+    """Frames in pymavlink's .tlog format, for every tool that reads these.
+
+    wall_clock: seconds since 1970.
+
+    Raises:
+        UsageError: the file cannot be created.
+    """
+
+    def __init__(self, path: str | Path, *, wall_clock: Callable[[], float] = time.time) -> None:
+        super().__init__(path)
+        self._wall_clock = wall_clock
+
+    def frame(self, frame: bytes) -> None:
+        """Record a whole frame, received or sent; made to be Framer.on_frame."""
+        now = self._wall_clock()
+        self._write(_timestamp(int(now * 1e6)) + frame, now)
+
+
+class TextTrace:
+    """Payloads as lines for a person.
+
+    write: takes a line without line end.
+    """
+
+    def __init__(self, write: Callable[[str], None]) -> None:
+        self._write = write
+
+    def payload(self, now: float, direction: str, wire: bytes, note: str = "") -> None:
+        """See PayloadSink."""
+        self._write(f"{now:.6f} {text_line(direction, wire)}{f' ({note})' if note else ''}")
+
+
+class Tee:
+    """Hands each payload to several sinks."""
+
+    def __init__(self, sinks: Sequence[PayloadSink]) -> None:
+        self._sinks = tuple(sinks)
+
+    def payload(self, now: float, direction: str, wire: bytes, note: str = "") -> None:
+        """See PayloadSink."""
+        for sink in self._sinks:
+            sink.payload(now, direction, wire, note)
+
+
+def describe(direction: str, wire: bytes, *, data_limit: int | None = None) -> dict[str, str | int]:
+    """Return a payload's fields by name, as JSON takes them; what is no payload shows as its bytes."""
+    if len(wire) != PAYLOAD_SIZE:
+        return {"dir": direction, "malformed": wire.hex()}
+    payload = decode_request(wire)
+    record: dict[str, str | int] = {
+        "dir": direction,
+        "seq": payload.seq,
+        "session": payload.session,
+        "opcode": opcode_name(payload.opcode),
+        "size": payload.size,
+        "offset": payload.offset,
+    }
+    if direction == REPLY:
+        record["req_opcode"] = opcode_name(payload.req_opcode)
+        record["burst_complete"] = payload.burst_complete
+    record["data"] = _data_that_counts(direction, payload)[:data_limit].hex()
+    return record
+
+
+def text_line(direction: str, wire: bytes) -> str:
+    """Return a payload in one line."""
+    if len(wire) != PAYLOAD_SIZE:
+        return f"{direction} of {len(wire)} bytes, malformed"
+    payload = decode_request(wire)
+    place = f"seq {payload.seq} session {payload.session} offset {payload.offset} size {payload.size}"
+    data = _data_that_counts(direction, payload)
+    if direction != REPLY:
+        return f"-> {opcode_name(payload.opcode)} {place}{_quoted(data)}"
+    complete = " complete" if payload.burst_complete else ""
+    answer = opcode_name(payload.opcode)
+    if payload.opcode == Opcode.NAK and data:
+        answer, data = f"{answer} {nak_name(data[0])}", data[1:]
+    return f"<- {opcode_name(payload.req_opcode)} {answer} {place}{complete}{_quoted(data)}"
+
+
+def opcode_name(opcode: int) -> str:
+    """Return an opcode's name, or its number as text."""
+    return _OPCODES.get(opcode) or str(opcode)
+
+
+def nak_name(code: int) -> str:
+    """Return a NAK code's name, or its number as text."""
+    return _NAK_CODES.get(code) or str(code)
+
+
+def _data_that_counts(direction: str, payload: Payload) -> bytes:
+    # A reply's bytes behind `size` are stray memory; ReadFile's `size` is what it wants, not what it holds.
+    wants_data = payload.opcode in (Opcode.READ_FILE, Opcode.BURST_READ_FILE)
+    if direction != REPLY and wants_data:
+        return b""
+    return payload.data[: min(payload.size, PAYLOAD_SIZE - HEADER_SIZE)]
+
+
+def _quoted(data: bytes) -> str:
+    if not data:
+        return ""
+    return f" {data[:_TEXT_DATA]!r}{'...' if len(data) > _TEXT_DATA else ''}"
