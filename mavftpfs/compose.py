@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import AsyncIterator, Callable
-from contextlib import asynccontextmanager
-from dataclasses import dataclass, replace
+import sys
+from collections.abc import AsyncIterator, Callable, Iterator
+from contextlib import ExitStack, asynccontextmanager, contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, cast
 
@@ -19,9 +20,9 @@ from mavftpfs.fuse.options import MountOptions
 from mavftpfs.link.opening import open_link
 from mavftpfs.link.uri import LinkSpec
 from mavftpfs.session.connection import Connection, ConnectOptions, connected
-from mavftpfs.session.driver import PayloadTrace
-from mavftpfs.shared.errors import FtpNak, RequestTimeout, UsageError, VehicleLost
+from mavftpfs.shared.errors import FtpNak, NotADirectory, NotFound, RequestTimeout, UsageError, VehicleLost
 from mavftpfs.shared.model import ROOT
+from mavftpfs.trace import JsonTrace, PayloadSink, Tee, TextTrace, TlogWriter
 
 MIB = 1 << 20
 KEY_SIZE = 32
@@ -47,43 +48,77 @@ class Attached:
         return Space(int(storage.total_capacity * MIB), int(free * MIB))
 
 
+@dataclass(frozen=True, slots=True)
+class Sinks:
+    """Where what goes over the link is recorded: FTP payloads, and whole frames."""
+
+    payload: PayloadSink | None = None
+    frame: Callable[[bytes], None] | None = None
+
+
+NO_SINKS = Sinks()
+
+
+@contextmanager
+def open_sinks(options: MountOptions, *, debug: bool) -> Iterator[Sinks]:
+    """Open what trace=, tlog= and -d ask for, and close it after the body.
+
+    Raises:
+        UsageError: a file cannot be created.
+    """
+    with ExitStack() as stack:
+        payload: list[PayloadSink] = []
+        if debug:
+            payload.append(TextTrace(lambda line: print(line, file=sys.stderr)))
+        if options.trace is not None:
+            payload.append(stack.enter_context(JsonTrace(options.trace)))
+        tlog = None if options.tlog is None else stack.enter_context(TlogWriter(options.tlog))
+        yield Sinks(Tee(payload) if payload else None, None if tlog is None else tlog.frame)
+
+
 @asynccontextmanager
 async def attached(
     spec: LinkSpec,
     options: MountOptions,
     *,
     invalidate: Callable[[bytes], None] = lambda path: None,
-    trace: PayloadTrace | None = None,
+    sinks: Sinks = NO_SINKS,
     list_root: bool = True,
 ) -> AsyncIterator[Attached]:
     """Connect, wait for the first heartbeat and the first listing, and keep it up for the length of the body.
 
     Raises:
         LinkClosed, VehicleLost, NoFtp: within connect_timeout, with the reason.
-        NotFound, NotADirectory: the remote root is not there.
+        UsageError: the remote root is not a directory.
     """
     deadline = trio.current_time() + options.connect_timeout
-    async with open_link(spec) as link, connected(link, connect_options(options), trace=trace) as connection:
+    settings = connect_options(options)
+    async with open_link(spec) as link, connected(link, settings, trace=sinks.payload) as connection:
+        connection.driver.framer.on_frame = sinks.frame
         await connection.ready(options.connect_timeout)
         tree = Tree(connection.store, cache_options(options), clock=trio.current_time, invalidate=invalidate)
         _subscribe(connection, tree)
         if list_root:
-            await _list_root(connection, tree, deadline, options.connect_timeout)
+            await _list_root(connection, tree, deadline, options)
         yield Attached(connection, tree)
 
 
-async def _list_root(connection: Connection, tree: Tree, deadline: float, timeout: float) -> None:
+async def _list_root(connection: Connection, tree: Tree, deadline: float, options: MountOptions) -> None:
     try:
         with trio.move_on_at(deadline):
             await tree.list(ROOT)
             return
     except (RequestTimeout, VehicleLost):
         pass  # the same to the user: no answer
+    except (NotFound, NotADirectory) as exc:
+        raise UsageError(
+            f"{options.root.decode(errors='replace')} is not a directory of the vehicle"
+        ) from exc
     except FtpNak as exc:
         raise NoFtp(f"{_vehicle(connection)} does not show its files: {exc}") from exc
     raise NoFtp(
-        f"{_vehicle(connection)} sends heartbeats but did not answer MAVLink FTP within {timeout:g} s "
-        f"({_flag(connection)})"
+        f"{_vehicle(connection)} sends heartbeats but did not answer MAVLink FTP "
+        f"within {options.connect_timeout:g} s ({_flag(connection)})"
     )
 
 
@@ -140,11 +175,6 @@ def cache_options(options: MountOptions) -> CacheOptions:
         cache_size=options.cache_size,
         op_deadline=options.op_deadline,
     )
-
-
-def with_baud(spec: LinkSpec, options: MountOptions) -> LinkSpec:
-    """Return the link with baud= applied."""
-    return spec if options.baud is None else replace(spec, baud=options.baud)
 
 
 def read_key(path: str) -> bytes:

@@ -20,6 +20,7 @@ from typing import Any
 
 import trio
 
+from mavftpfs.exits import MountFailed
 from mavftpfs.shared.errors import MavftpfsError
 
 log = logging.getLogger("mavftpfs.control")
@@ -36,7 +37,11 @@ _MAX_SOCKET_PATH = 107
 _SUFFIX = ".sock"
 
 
-class ControlError(MavftpfsError):
+class ControlError(MountFailed):
+    """The mount's process refused, or did not answer in time."""
+
+
+class NobodyThere(ControlError):
     """No running mount answers there."""
 
 
@@ -195,7 +200,8 @@ def ask(path: Path, request: Reply, *, timeout: float) -> Reply:
     """Send one request and return the reply.
 
     Raises:
-        ControlError: nobody answers within `timeout` seconds, or refuses.
+        NobodyThere: the process is gone.
+        ControlError: it does not answer within `timeout` seconds, or refuses.
     """
     try:
         with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as client:
@@ -205,6 +211,8 @@ def ask(path: Path, request: Reply, *, timeout: float) -> Reply:
             with client.makefile("rb") as lines:
                 line = lines.readline(MAX_LINE)
         reply = json.loads(line)
+    except (ConnectionError, FileNotFoundError) as exc:
+        raise NobodyThere(f"the mount's process is gone: {exc}") from exc
     except (OSError, ValueError) as exc:
         raise ControlError(f"no answer from the mount's process: {exc}") from exc
     if not isinstance(reply, dict) or not reply.get("ok"):
@@ -216,13 +224,13 @@ def find_socket(mountpoint: str, directories: list[Path]) -> Path:
     """Return the socket of the mount on `mountpoint`.
 
     Raises:
-        ControlError: there is none.
+        NobodyThere: there is none.
     """
     for directory in directories:
         path = directory / socket_name(mountpoint)
         if path.is_socket():
             return path
-    raise ControlError(f"no vehicle of yours is mounted on {mountpoint}")
+    raise NobodyThere(f"no vehicle of yours is mounted on {mountpoint}")
 
 
 def all_sockets(directories: list[Path]) -> Iterator[Path]:

@@ -23,6 +23,7 @@ class ExitCode(IntEnum):
     NO_VEHICLE = 2
     MOUNT_FAILED = 3
     UNDELIVERED = 4
+    BUG = 70
     INTERRUPTED = 130
 
 

@@ -22,7 +22,7 @@ import pyfuse3
 import trio
 
 import mavftpfs
-from mavftpfs.compose import attached
+from mavftpfs.compose import NO_SINKS, Sinks, attached
 from mavftpfs.control import ControlServer, Reply
 from mavftpfs.exits import ExitCode, MountFailed, exit_code_for
 from mavftpfs.fuse.handles import FileTree
@@ -32,7 +32,6 @@ from mavftpfs.fuse.options import MountOptions, fuse_words
 from mavftpfs.kernelnews import Invalidator
 from mavftpfs.link.uri import LinkSpec
 from mavftpfs.mountpoint import stderr_of, unmount
-from mavftpfs.session.driver import PayloadTrace
 from mavftpfs.shared.errors import MavftpfsError
 
 log = logging.getLogger("mavftpfs.mount")
@@ -60,7 +59,7 @@ class MountRequest:
     mountpoint: str
     options: MountOptions
     control: Path | None = None
-    trace: PayloadTrace | None = None
+    sinks: Sinks = NO_SINKS
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,7 +80,7 @@ def run_mount(request: MountRequest, report: Report) -> int:
 
     @asynccontextmanager
     async def attach(invalidate: Callable[[bytes], None]) -> AsyncIterator[Content]:
-        vehicle = attached(request.spec, request.options, invalidate=invalidate, trace=request.trace)
+        vehicle = attached(request.spec, request.options, invalidate=invalidate, sinks=request.sinks)
         async with vehicle as up:
             yield Content(up.tree, up.status, up.space)
 
@@ -182,7 +181,7 @@ class _Life:
         action = partial(unmount, self.request.mountpoint, lazy=lazy)
         await trio.to_thread.run_sync(action, abandon_on_cancel=True)
         await self.finished.wait()
-        return {"exit_code": int(self.code)}
+        return {"exit_code": int(self.code), "pid": os.getpid()}
 
     def status(self, content: Content) -> dict[str, Any]:
         """Return facts for people and scripts; JSON-able."""

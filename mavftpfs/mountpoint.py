@@ -25,6 +25,19 @@ UNMOUNT_PATIENCE = 60.0
 """Seconds for an unmount: it waits for the last flush."""
 
 
+def canonical(path: str) -> str:
+    """Return the absolute path without symbolic links on the way; a trailing link is followed too.
+
+    Only the parents of the mountpoint are looked at, for the mountpoint itself may be a mount that hangs.
+    """
+    absolute = os.path.abspath(path)
+    if absolute in mounted_types():
+        return absolute
+    parent, name = os.path.split(absolute)
+    candidate = os.path.join(os.path.realpath(parent), name)
+    return candidate if candidate in mounted_types() else os.path.realpath(candidate)
+
+
 def check_mountpoint(path: str, *, table: str = MOUNT_TABLE) -> None:
     """Check that a file system can be mounted on `path`.
 

@@ -1,0 +1,211 @@
+"""The command line: arguments, exit codes, one-line errors. Layer: top.
+
+What only one command needs is imported when it runs: a mount in the background should not hold rich or
+the simulator in memory.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from collections.abc import Callable, Sequence
+from typing import NoReturn
+
+import mavftpfs
+from mavftpfs import commands
+from mavftpfs.exits import ExitCode, exit_code_for
+from mavftpfs.fuse.options import option_names
+from mavftpfs.shared.errors import MavftpfsError, UsageError
+
+_DESCRIPTION = """Mount a drone's files (MAVLink FTP: PX4, ArduPilot, MAVSDK) as a local directory.
+
+  mavftpfs SOURCE MOUNTPOINT [-o opt,...] [-f] [-d]
+"""
+_SOURCES = """SOURCE: udpin:0.0.0.0:14550, udpout:host:port, tcp:host:port, tcpin:host:port, /dev/ttyACM0,
+/dev/ttyUSB0,57600, or the same as a URL; `#/remote/dir` behind it names a subtree."""
+
+
+class Parser(argparse.ArgumentParser):
+    """Says what is wrong in one line and exits with our code for it."""
+
+    def error(self, message: str) -> NoReturn:
+        raise UsageError(f"{message}; try: {self.prog} --help")
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run a command; returns the exit code and prints errors as one line."""
+    words = list(sys.argv[1:] if argv is None else argv)
+    debug = "-d" in words or "--debug" in words
+    try:
+        return _run(words)
+    except MavftpfsError as exc:
+        return _complain(str(exc), exit_code_for(exc))
+    except KeyboardInterrupt:
+        return ExitCode.INTERRUPTED
+    except BrokenPipeError:
+        # `mavftpfs ls ... | head`: nobody reads on, and the interpreter must not try to flush again
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return ExitCode.OK
+    except Exception as exc:
+        if debug:
+            raise
+        return _complain(f"internal error: {exc!r}; please report it with the output of -d", ExitCode.BUG)
+
+
+def _complain(message: str, code: int) -> int:
+    print(f"mavftpfs: {message}", file=sys.stderr)
+    return code
+
+
+Run = Callable[[argparse.Namespace], int]
+
+
+def _run(words: list[str]) -> int:
+    name = words[0] if words else ""
+    if name in _COMMANDS:
+        make_parser, run = _COMMANDS[name]
+        return run(make_parser(name).parse_args(words[1:]))
+    parser = _top_parser()
+    if not words:
+        parser.print_help(sys.stderr)
+        return ExitCode.USAGE
+    return commands.mount(parser.parse_args(words))
+
+
+# -- parsers --------------------------------------------------------------------------------------
+
+
+def _top_parser() -> Parser:
+    parser = Parser(
+        "mavftpfs",
+        description=_DESCRIPTION,
+        epilog=f"commands: {', '.join(_COMMANDS)}; see mavftpfs COMMAND --help\n\n{_sources_and_options()}",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("-V", "--version", action="version", version=f"mavftpfs {mavftpfs.__version__}")
+    _add_mount_arguments(parser)
+    return parser
+
+
+def _mount_parser(name: str) -> Parser:
+    parser = Parser(
+        f"mavftpfs {name}",
+        description="Mount a vehicle's files.",
+        epilog=_sources_and_options(),
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    _add_mount_arguments(parser)
+    return parser
+
+
+def _add_mount_arguments(parser: Parser) -> None:
+    parser.add_argument("source", metavar="SOURCE", help="how to reach the vehicle")
+    parser.add_argument("mountpoint", metavar="MOUNTPOINT", help="an existing directory")
+    _add_options(parser)
+    parser.add_argument("-f", "--foreground", action="store_true", help="stay in the foreground")
+    parser.add_argument(
+        "-d", "--debug", action="store_true", help="foreground, and print every payload, decoded"
+    )
+
+
+def _add_options(parser: Parser) -> None:
+    parser.add_argument(
+        "-o", dest="options", metavar="OPT,...", action="append", default=[], help="mount options"
+    )
+
+
+def _sources_and_options() -> str:
+    words = [f"  -o {name}" for name in option_names()]
+    lines = ["".join(f"{word:<24}" for word in words[i : i + 4]).rstrip() for i in range(0, len(words), 4)]
+    return "\n".join([_SOURCES, "", "options:", *lines])
+
+
+def _source_parser(name: str, description: str) -> Parser:
+    parser = Parser(f"mavftpfs {name}", description=description, epilog=_SOURCES)
+    parser.add_argument("source", metavar="SOURCE", help="how to reach the vehicle")
+    _add_options(parser)
+    parser.add_argument("-d", "--debug", action="store_true", help="print every payload, decoded")
+    return parser
+
+
+def _paths_parser(name: str, description: str, least: str = "+") -> Parser:
+    parser = _source_parser(name, description)
+    parser.add_argument("paths", metavar="PATH", nargs=least, help="a path on the vehicle, or an mftp:// URL")
+    return parser
+
+
+def _scan_parser(name: str) -> Parser:
+    parser = _source_parser(name, "Show who answers on a link.")
+    parser.add_argument("--json", action="store_true", help="print JSON")
+    return parser
+
+
+def _ls_parser(name: str) -> Parser:
+    parser = _paths_parser(name, "List directories of the vehicle.", least="*")
+    parser.add_argument("-l", dest="detailed", action="store_true", help="with sizes and times")
+    parser.add_argument("--json", action="store_true", help="print JSON")
+    return parser
+
+
+def _get_parser(name: str) -> Parser:
+    parser = _paths_parser(name, "Fetch files and verify them by size and CRC32.")
+    parser.add_argument("--to", metavar="LOCAL", default=".", help="directory, or new name of a single file")
+    parser.add_argument("-r", dest="recursive", action="store_true", help="directories too")
+    return parser
+
+
+def _crc_parser(name: str) -> Parser:
+    return _paths_parser(name, "Have the vehicle compute the CRC32 of files.")
+
+
+def _umount_parser(name: str) -> Parser:
+    parser = Parser(f"mavftpfs {name}", description="Deliver what is held, close the session, unmount.")
+    parser.add_argument("mountpoint", metavar="MOUNTPOINT")
+    parser.add_argument("-l", "--lazy", action="store_true", help="even if it is in use")
+    return parser
+
+
+def _status_parser(name: str) -> Parser:
+    parser = Parser(f"mavftpfs {name}", description="Show what mounts are doing.")
+    parser.add_argument("mountpoint", metavar="MOUNTPOINT", nargs="?", help="default: all of this user")
+    parser.add_argument("--json", action="store_true", help="print JSON")
+    parser.add_argument("--watch", action="store_true", help="redraw each second")
+    return parser
+
+
+def _demo_parser(name: str) -> Parser:
+    return Parser(f"mavftpfs {name}", description="A short tour with a simulated drone.")
+
+
+def _sim_parser(name: str) -> Parser:
+    from mavftpfs.sim.command import add_arguments
+
+    parser = Parser(f"mavftpfs {name}", description="Run a simulated vehicle.")
+    add_arguments(parser)
+    return parser
+
+
+def _sim(args: argparse.Namespace) -> int:
+    from mavftpfs.sim.command import run
+
+    return run(args)
+
+
+def _demo(args: argparse.Namespace) -> int:
+    from mavftpfs.demo import run
+
+    return run()
+
+
+_COMMANDS: dict[str, tuple[Callable[[str], Parser], Run]] = {
+    "mount": (_mount_parser, commands.mount),
+    "umount": (_umount_parser, commands.umount),
+    "status": (_status_parser, commands.status),
+    "scan": (_scan_parser, commands.scan),
+    "ls": (_ls_parser, commands.ls),
+    "get": (_get_parser, commands.get),
+    "crc": (_crc_parser, commands.crc),
+    "sim": (_sim_parser, _sim),
+    "demo": (_demo_parser, _demo),
+}

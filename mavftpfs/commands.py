@@ -1,0 +1,286 @@
+"""What each command does; `cli` parses the words. Layer: top."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+import os
+import signal
+import sys
+import time
+from collections.abc import Callable, Coroutine, Mapping
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import trio
+
+from mavftpfs import control, daemon
+from mavftpfs.exits import ExitCode, MountFailed
+from mavftpfs.fuse.options import MountOptions, parse_options, with_root
+from mavftpfs.link.uri import LinkSpec, parse_source
+from mavftpfs.mountpoint import canonical, check_fuse, check_mountpoint, is_ours, unmount
+from mavftpfs.shared.errors import UsageError
+
+if TYPE_CHECKING:
+    from mavftpfs.oneshot import Target
+
+STATUS_PATIENCE = 10.0
+DELIVERY_PATIENCE = 3600.0
+"""Seconds for `umount`: what is held has to travel first, perhaps over a radio."""
+END_PATIENCE = 5.0
+"""Seconds for a mount's process to end after its last word."""
+
+_PATH_OPTIONS = ("cache_dir", "signing_key", "log_file", "trace", "tlog")
+
+
+# -- mount ----------------------------------------------------------------------------------------
+
+
+def mount(args: argparse.Namespace) -> int:
+    """Mount; in the background unless told otherwise."""
+    options, spec = connection_of(args)
+    # Until there is a write side, the kernel is told that nothing here can be written.
+    options = absolute_paths(replace(options, read_only=True))
+    mountpoint = canonical(args.mountpoint)
+    check_fuse()
+    check_mountpoint(mountpoint)
+    work = partial(_serve, args, options, spec, mountpoint)
+    if args.foreground or args.debug:
+        return work(_report_in_foreground)
+    return daemon.in_background(work)
+
+
+def connection_of(args: argparse.Namespace) -> tuple[MountOptions, LinkSpec]:
+    """Return the parsed options and SOURCE.
+
+    Raises:
+        UsageError: one of them is wrong.
+    """
+    options = parse_options(args.options)
+    spec = parse_source(args.source)
+    options = with_root(options, spec.subtree)
+    return options, spec if options.baud is None else replace(spec, baud=options.baud)
+
+
+def absolute_paths(options: MountOptions) -> MountOptions:
+    """Return the options with local paths absolute: the background process works in `/`."""
+    found = {name: getattr(options, name) for name in _PATH_OPTIONS}
+    return replace(options, **{name: os.path.abspath(path) for name, path in found.items() if path})
+
+
+def _serve(
+    args: argparse.Namespace, options: MountOptions, spec: LinkSpec, mountpoint: str, report: daemon.Report
+) -> int:
+    from mavftpfs.compose import open_sinks
+    from mavftpfs.mount import MountRequest, run_mount
+
+    foreground = args.foreground or args.debug
+    _start_logging(options, foreground=foreground, debug=args.debug)
+    with open_sinks(options, debug=args.debug) as sinks:
+        request = MountRequest(
+            args.source, spec, mountpoint, options, control=_control_path(mountpoint), sinks=sinks
+        )
+        return run_mount(request, report)
+
+
+def _report_in_foreground(code: int, message: str) -> None:
+    if code == 0:
+        logging.getLogger("mavftpfs").info("mounted; Ctrl-C unmounts")
+    elif message:
+        print(f"mavftpfs: {message}", file=sys.stderr)
+
+
+def _start_logging(options: MountOptions, *, foreground: bool, debug: bool) -> None:
+    level = logging.DEBUG if debug else logging.INFO
+    try:
+        if options.log_file is not None:
+            daemon.log_to_file(options.log_file, level)
+        elif foreground:
+            daemon.log_to_stderr(level)
+        else:
+            daemon.log_in_background(control.own_directories()[-1] / "mavftpfs.log", level)
+    except OSError as exc:
+        raise UsageError(f"cannot open the log: {exc}") from exc
+
+
+def _control_path(mountpoint: str) -> Path | None:
+    try:
+        directory = control.usable_directory(control.own_directories())
+    except control.ControlError as exc:
+        logging.getLogger("mavftpfs").warning("%s", exc)
+        return None
+    return directory / control.socket_name(mountpoint)
+
+
+# -- umount and status ----------------------------------------------------------------------------
+
+
+def umount(args: argparse.Namespace) -> int:
+    """Have a mount's process deliver and unmount; a mount whose process is gone is just taken away."""
+    mountpoint = canonical(args.mountpoint)
+    try:
+        socket = control.find_socket(mountpoint, control.own_directories())
+        request = {"command": "umount", "lazy": args.lazy}
+        reply = control.ask(socket, request, timeout=DELIVERY_PATIENCE)
+    except control.NobodyThere as exc:
+        if not is_ours(mountpoint):
+            raise MountFailed(f"no vehicle is mounted on {mountpoint}") from exc
+        unmount(mountpoint, lazy=args.lazy)
+        return ExitCode.OK
+    _wait_for_end(int(reply["pid"]))
+    return int(reply["exit_code"])
+
+
+def _wait_for_end(pid: int) -> None:
+    """Wait until a process is gone, so that the link is free when `umount` returns."""
+    deadline = time.monotonic() + END_PATIENCE
+    while time.monotonic() < deadline:
+        try:
+            os.kill(pid, 0)
+        except OSError:
+            return
+        time.sleep(0.02)
+
+
+def status(args: argparse.Namespace) -> int:
+    """Show what one mount, or all mounts of this user, are doing."""
+    if args.mountpoint is None:
+        fetch = all_statuses
+    else:
+        fetch = partial(_one_status, canonical(args.mountpoint))
+    if args.json:
+        facts = fetch()
+        print(json.dumps(facts[0] if args.mountpoint is not None else facts, indent=2))
+        return ExitCode.OK
+    from mavftpfs import report
+
+    if args.watch:
+        report.watch_status(fetch)
+    report.print_status(fetch())
+    return ExitCode.OK
+
+
+def _one_status(mountpoint: str) -> list[Mapping[str, Any]]:
+    return [_ask_status(control.find_socket(mountpoint, control.own_directories()))]
+
+
+def all_statuses() -> list[Mapping[str, Any]]:
+    """Return the status of each living mount; sockets of dead ones are removed."""
+    found = []
+    for path in control.all_sockets(control.own_directories()):
+        try:
+            found.append(_ask_status(path))
+        except control.NobodyThere:
+            path.unlink(missing_ok=True)
+    return found
+
+
+def _ask_status(path: Path) -> Mapping[str, Any]:
+    facts: Mapping[str, Any] = control.ask(path, {"command": "status"}, timeout=STATUS_PATIENCE)["status"]
+    return facts
+
+
+# -- without a mount ------------------------------------------------------------------------------
+
+
+ResultT = TypeVar("ResultT")
+
+
+def _run(args: argparse.Namespace, function: Callable[[Target], Coroutine[Any, Any, ResultT]]) -> ResultT:
+    """Run a one-shot command; Ctrl-C ends it in order, so that the vehicle's session is closed."""
+    from mavftpfs.compose import open_sinks
+    from mavftpfs.oneshot import Target
+
+    options, spec = connection_of(args)
+    daemon.log_to_stderr(logging.DEBUG if args.debug else logging.WARNING)
+    with open_sinks(options, debug=args.debug) as sinks:
+        return trio.run(until_interrupted, partial(function, Target(spec, options, sinks)))
+
+
+async def until_interrupted(function: Callable[[], Coroutine[Any, Any, ResultT]]) -> ResultT:
+    """Return the function's result.
+
+    Raises:
+        KeyboardInterrupt: SIGINT or SIGTERM came first; the function was cancelled and has cleaned up.
+        MavftpfsError, OSError: the function's own.
+    """
+    results: list[ResultT] = []
+    errors: list[Exception] = []
+    with trio.open_signal_receiver(signal.SIGINT, signal.SIGTERM) as signals:
+        async with trio.open_nursery() as nursery:
+
+            async def watch() -> None:
+                async for _ in signals:
+                    nursery.cancel_scope.cancel()
+
+            nursery.start_soon(watch)
+            try:
+                results.append(await function())
+            except Exception as exc:  # raised again outside of the nursery, which would wrap it in a group
+                errors.append(exc)
+            nursery.cancel_scope.cancel()
+    if errors:
+        raise errors[0]
+    if not results:
+        raise KeyboardInterrupt
+    return results[0]
+
+
+def ls(args: argparse.Namespace) -> int:
+    """List directories."""
+    from mavftpfs import oneshot, report
+
+    paths = [oneshot.parse_path(text) for text in args.paths or ["/"]]
+    entries = _run(args, lambda target: oneshot.list_paths(target, paths))
+    if args.json:
+        print(json.dumps(entries, indent=2))
+    else:
+        report.print_names(entries, detailed=args.detailed)
+    return ExitCode.OK
+
+
+def get(args: argparse.Namespace) -> int:
+    """Fetch files."""
+    from mavftpfs import oneshot, report
+
+    paths = [oneshot.parse_path(text) for text in args.paths]
+    local = Path(args.to)
+
+    def tell(fetched: oneshot.Fetched) -> None:
+        name = report.printable(os.fsdecode(fetched.remote))
+        print(f"{name}: {report.readable_size(fetched.size)}, verified by {fetched.proof}")
+
+    with report.transfer_meter() as meter:
+        _run(
+            args,
+            lambda target: oneshot.get_paths(target, paths, local, meter, tell, recursive=args.recursive),
+        )
+    return ExitCode.OK
+
+
+def crc(args: argparse.Namespace) -> int:
+    """Print checksums the vehicle computed, as cksum's relatives do: number, two blanks, name."""
+    from mavftpfs import oneshot, report
+
+    paths = [oneshot.parse_path(text) for text in args.paths]
+
+    def tell(path: bytes, number: int) -> None:
+        print(f"{number:08x}  {report.printable(os.fsdecode(path))}")
+
+    _run(args, lambda target: oneshot.checksum_paths(target, paths, tell))
+    return ExitCode.OK
+
+
+def scan(args: argparse.Namespace) -> int:
+    """Show who answers on a link."""
+    from mavftpfs import oneshot, report
+
+    found = _run(args, oneshot.scan)
+    if args.json:
+        print(json.dumps(found, indent=2, default=str))
+    else:
+        report.print_scan(found)
+    return ExitCode.OK

@@ -1,0 +1,167 @@
+"""Tables, progress bars and listings for people. Layer: top; with demo and cli the only user of rich.
+
+Names come from the vehicle, so nothing reaches the terminal that could be an escape sequence.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from datetime import UTC, datetime
+from typing import Any, Protocol
+
+from rich.console import Console, Group, RenderableType
+from rich.live import Live
+from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import TransferSpeedColumn as SpeedColumn
+from rich.table import Table
+from rich.text import Text
+
+WATCH_PERIOD = 1.0
+
+_WORDS = {
+    "rtt": "round trip",
+    "ftp_flag": "says it supports FTP",
+    "heartbeat_age": "last heartbeat",
+    "lists_times": "listings carry times",
+    "other_ftp_client": "another FTP client heard",
+    "pid": "process",
+}
+_SECONDS = {"rtt", "heartbeat_age", "uptime", "eta"}
+
+
+class Meter(Protocol):
+    """Is told how a transfer goes."""
+
+    def start(self, name: str, total: int) -> Callable[[int], None]:
+        """Begin a file of `total` bytes; returns what to call with the bytes that came."""
+        ...
+
+
+class SilentMeter:
+    """For output that is not a terminal."""
+
+    def start(self, name: str, total: int) -> Callable[[int], None]:
+        """Begin a file."""
+        return lambda count: None
+
+
+class _BarMeter:
+    def __init__(self, progress: Progress) -> None:
+        self._progress = progress
+
+    def start(self, name: str, total: int) -> Callable[[int], None]:
+        task = self._progress.add_task(printable(name), total=total)
+        return lambda count: self._progress.advance(task, count)
+
+
+@contextmanager
+def transfer_meter() -> Iterator[Meter]:
+    """Show progress bars on stderr during the body, if it is a terminal."""
+    console = Console(stderr=True)
+    if not console.is_terminal:
+        yield SilentMeter()
+        return
+    columns = (
+        TextColumn("{task.description}", markup=False),
+        BarColumn(),
+        DownloadColumn(),
+        SpeedColumn(),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=console) as progress:
+        yield _BarMeter(progress)
+
+
+def printable(name: str) -> str:
+    """Return a name without control characters and undecodable bytes."""
+    return "".join(character if character.isprintable() else "?" for character in name)
+
+
+def print_status(statuses: Sequence[Mapping[str, Any]]) -> None:
+    """Print one block for each mount."""
+    Console().print(_blocks(statuses))
+
+
+def watch_status(fetch: Callable[[], Sequence[Mapping[str, Any]]]) -> None:
+    """Redraw the status each second until interrupted."""
+    with Live(_blocks(fetch()), auto_refresh=False) as live:
+        while True:
+            time.sleep(WATCH_PERIOD)
+            live.update(_blocks(fetch()), refresh=True)
+
+
+def _blocks(statuses: Sequence[Mapping[str, Any]]) -> RenderableType:
+    if not statuses:
+        return Text("no vehicle is mounted")
+    return Group(*(_block(status) for status in statuses))
+
+
+def _block(status: Mapping[str, Any]) -> Table:
+    title = printable(f"{status.get('source', '?')} on {status.get('mountpoint', '?')}")
+    table = Table(title=Text(title), show_header=False, title_justify="left")
+    table.add_column(style="bold")
+    table.add_column(overflow="fold")
+    facts = {key: value for key, value in status.items() if key not in ("source", "mountpoint")}
+    for name, value in _rows(facts):
+        table.add_row(Text(name), Text(value))
+    return table
+
+
+def _rows(facts: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
+    """Flatten nested facts; a group's name goes before the names in it."""
+    for key, value in facts.items():
+        name = prefix + _WORDS.get(key, key.replace("_", " "))
+        if isinstance(value, Mapping) and value:
+            yield from _rows(value, f"{name}: ")
+        else:
+            yield printable(name), printable(describe(key, value))
+
+
+def describe(key: str, value: Any) -> str:
+    """Return a fact as a person reads it."""
+    if value is None:
+        return "unknown"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if key in _SECONDS and isinstance(value, int | float):
+        return f"{value * 1000:.0f} ms" if value < 1 else f"{value:.1f} s"
+    if isinstance(value, int) and "bytes" in key:
+        return readable_size(value)
+    if isinstance(value, list | tuple):
+        return ", ".join(map(str, value)) or "none"
+    return "none" if value == {} else str(value)
+
+
+def readable_size(count: float) -> str:
+    """Return a number of bytes with a unit."""
+    for unit in ("B", "KiB", "MiB"):
+        if count < 1024:
+            return f"{count:.0f} {unit}" if unit == "B" else f"{count:.1f} {unit}"
+        count /= 1024
+    return f"{count:.1f} GiB"
+
+
+def print_names(entries: Sequence[Mapping[str, Any]], *, detailed: bool) -> None:
+    """Print a listing: one name a line, directories with a slash; detailed with size and time."""
+    for entry in entries:
+        name = entry["name"] + ("/" if entry["kind"] == "directory" else "")
+        if sys.stdout.isatty():
+            name = printable(name)
+        if detailed:
+            when = datetime.fromtimestamp(entry["mtime"], UTC).strftime("%Y-%m-%d %H:%M")
+            name = f"{entry['size']:>12} {when} {name}"
+        sys.stdout.buffer.write(name.encode("utf-8", "surrogateescape") + b"\n")
+    sys.stdout.flush()
+
+
+def print_scan(found: Sequence[Mapping[str, Any]]) -> None:
+    """Print who answered on a link."""
+    table = Table()
+    for heading in ("system/component", "what it is", "FTP"):
+        table.add_column(heading)
+    for peer in found:
+        table.add_row(f"{peer['system']}/{peer['component']}", Text(peer["what"]), Text(peer["ftp"]))
+    Console().print(table)
