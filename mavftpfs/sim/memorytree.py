@@ -11,6 +11,7 @@ DEFAULT_MTIME = 1_700_000_000
 MAX_FILE = 256 * 2**20
 _MAX_LINKS = 8
 _DIRECTORY_SIZE = 4096
+_DOTS = (b".", b"..")
 
 
 class _Node:
@@ -23,7 +24,7 @@ class _Node:
         self.mtime = mtime
         self.data = bytearray()
         self.children: dict[bytes, _Node] = {}
-        self.order: list[bytes] = []
+        self.order: dict[bytes, None] = {}
         self.target = b""
         self.linked = True
 
@@ -36,7 +37,6 @@ class MemoryTree:
     """A tree in memory.
 
     capacity: bytes all files together may hold; None = no limit. Single files end at 256 MiB (EFBIG).
-    newest_first: whether readdir shows new names first (tmpfs) or last.
     clock: tells new mtimes, seconds since 1970; a constant unless given.
     """
 
@@ -44,15 +44,13 @@ class MemoryTree:
         self,
         *,
         capacity: int | None = None,
-        newest_first: bool = False,
         clock: Callable[[], float] | None = None,
     ) -> None:
         self.capacity = capacity
         self.used = 0
-        self._newest_first = newest_first
         self._clock = clock
         self._root = _Node(Kind.DIRECTORY, self._now())
-        self._root.order = [b".", b".."]
+        self._root.order = dict.fromkeys(_DOTS)
 
     # -- building a tree ---------------------------------------------------------------------
 
@@ -92,10 +90,9 @@ class MemoryTree:
         return bytes(self._find_file(path).data)
 
     def set_order(self, path: bytes, names: Iterable[bytes]) -> None:
-        """Fix the readdir order of a directory; names may include `.` and `..`, others follow."""
+        """Fix the readdir order of a directory; also of names to come and the dot entries. Others follow."""
         node = self._find(path)
-        first = list(names)
-        node.order = first + [name for name in node.order if name not in first]
+        node.order = dict.fromkeys([*names, *node.order])
 
     # -- the Tree protocol -------------------------------------------------------------------
 
@@ -104,7 +101,8 @@ class MemoryTree:
         node = self._find(path)
         if node.kind is not Kind.DIRECTORY:
             raise fail(errno.ENOTDIR, path)
-        return [Entry(name, node.children.get(name, node).stat()) for name in node.order]
+        present = [name for name in node.order if name in node.children or name in _DOTS]
+        return [Entry(name, node.children.get(name, node).stat()) for name in present]
 
     def stat(self, path: bytes) -> Stat:
         """See Tree."""
@@ -159,7 +157,7 @@ class MemoryTree:
         if not split_path(path):
             raise fail(errno.EEXIST, path)
         node = _Node(Kind.DIRECTORY, self._now())
-        node.order = [b".", b".."]
+        node.order = dict.fromkeys(_DOTS)
         self._link(path, node)
 
     def rmdir(self, path: bytes) -> None:
@@ -243,14 +241,14 @@ class MemoryTree:
         if name in parent.children:
             raise fail(errno.EEXIST, path)
         parent.children[name] = node
-        parent.order.insert(0 if self._newest_first else len(parent.order), name)
+        parent.order.setdefault(name)
         parent.mtime = self._now()
         node.linked = True
         self.used += len(node.data)
 
     def _unlink(self, parent: _Node, name: bytes) -> None:
         node = parent.children.pop(name)
-        parent.order.remove(name)
+        del parent.order[name]
         parent.mtime = self._now()
         node.linked = False
         self.used -= len(node.data)

@@ -1,0 +1,198 @@
+"""The simulated servers answer what real ones answered.
+
+Every request of a recording is handed to the matching profile at its recorded time, and the replies are
+compared field by field, all but stray bytes behind `size`. Differences stand in DIFFERENCES with their reasons;
+the table must be complete, and an entry that no longer occurs is an error. At present there are none.
+"""
+
+from __future__ import annotations
+
+import gzip
+import json
+import random
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from mavftpfs.link.messages import Address
+from mavftpfs.protocol.payload import Payload, decode_reply
+from mavftpfs.sim.profiles import PROFILES
+from mavftpfs.sim.pseudo import VirtualTrees, pack_parameters, unpack_parameters
+from mavftpfs.sim.server import FtpServer
+from mavftpfs.sim.tree import MemoryTree
+
+DATA = Path(__file__).parent.parent / "data"
+CLIENT = Address(255, 190)
+NAMES = ("px4", "ardupilot", "mavsdk")
+MTIME = 1_795_197_991
+
+# (profile, step, index of the reply in its step) -> what differs and why.
+DIFFERENCES: dict[tuple[str, str, int], str] = {}
+
+
+@dataclass
+class Step:
+    """What the client tried in one go: requests as (time, wire), and the replies that came."""
+
+    name: str
+    requests: list[tuple[float, bytes]] = field(default_factory=list)
+    replies: list[tuple[float, Payload]] = field(default_factory=list)
+
+
+def load(name: str) -> list[Step]:
+    with gzip.open(DATA / f"{name}.jsonl.gz", "rt", encoding="utf-8") as lines:
+        rows = [json.loads(line) for line in lines]
+    steps = []
+    for step, group in groupby(rows, key=lambda row: row["step"]):
+        steps.append(Step(str(step)))
+        for row in group:
+            payload = _payload(row)
+            if row["dir"] == "request":
+                steps[-1].requests.append((row["t"], payload.encode()))
+            else:
+                steps[-1].replies.append((row["t"], payload))
+    return steps
+
+
+def _payload(row: dict[str, Any]) -> Payload:
+    numbers = {key: int(row[key]) for key in Payload._fields if key != "data"}
+    return Payload(**numbers, data=bytes.fromhex(row["data"]))
+
+
+# -- the tree that was served --------------------------------------------------------------------
+
+
+def listed(steps: list[Step], name: str) -> list[bytes]:
+    """Return the entries of a recorded listing, each with its type letter."""
+    data = b"".join(
+        reply.data for step in steps if step.name == name for _, reply in step.replies if reply.opcode == 128
+    )
+    return [entry for entry in data.split(b"\0") if entry]
+
+
+def names(entries: list[bytes]) -> list[bytes]:
+    return [entry[1:].partition(b"\t")[0] for entry in entries]
+
+
+def build_tree(name: str, steps: list[Step]) -> MemoryTree:
+    tree = MemoryTree(clock=lambda: MTIME)
+    ardupilot = load("ardupilot")
+    tree.add_directory(b"/t/emptydir")
+    for size in (0, 1, 5, 238, 239, 240, 478, 4096, 40152, 119500):
+        tree.add(b"/t/s%d.bin" % size, bytes((7 * i + size) % 256 for i in range(size)))
+    for text in ("space in name.txt", "ünï.txt", "n" * 100):
+        tree.add(b"/t/" + text.encode(), b"x" * 10)
+    for i in range(120):
+        tree.add(b"/t/many/log_%03d.ulg" % i, b"y" * i)
+    # ArduPilot lists the dot entries by name, so its recording tells where readdir has them.
+    first_page = names(listed(ardupilot, "list /t page by page"))
+    tree.set_order(b"/t", [b"new.bin", *first_page, b"s40152.bin"])
+    tree.set_order(b"/t/many", names(listed(ardupilot, "list /t/many page by page")))
+    add_root_entries(tree, name, listed(steps, "list '.'"))
+    return tree
+
+
+def add_root_entries(tree: MemoryTree, name: str, entries: list[bytes]) -> None:
+    order = []
+    unnamed = iter((b".", b"..", b"fifo1", b"fifo2"))  # what PX4 lists as S
+    for entry in entries:
+        shown, _, size = entry[1:].partition(b"\t")
+        path = shown or next(unnamed)
+        order.append(path)
+        if entry[:1] == b"F":
+            tree.add(b"/" + path, bytes(int(size)))
+        elif entry[:1] == b"D" and path not in (b".", b".."):
+            tree.add_directory(b"/" + path)
+        elif path.startswith(b"fifo"):
+            tree.add_other(b"/" + path)
+    if name != "mavsdk":
+        tree.set_order(b"/", order)
+
+
+def downloaded(steps: list[Step], step_name: str) -> bytes:
+    step = next(step for step in steps if step.name == step_name)
+    return b"".join(reply.data for _, reply in step.replies if reply.opcode == 128)
+
+
+def build_virtual(name: str, steps: list[Step]) -> VirtualTrees | None:
+    if name != "ardupilot":
+        return None
+    sys_files = dict.fromkeys(names(listed(steps, "list '@SYS'")), b"")
+    sys_files[b"uarts.txt"] = downloaded(steps, "@SYS/uarts.txt: burst 239")
+    sys_files[b"storage.bin"] = bytes(16384)
+    locations = downloaded(steps, "@ROMFS/locations.txt: burst 239")
+    return VirtualTrees(
+        params=unpack_parameters(downloaded(steps, "@PARAM/param.pck: burst 239")),
+        sys_files=sys_files,
+        romfs={b"locations.txt": locations, b"models/x": b""},
+    )
+
+
+# -- the replay ----------------------------------------------------------------------------------
+
+
+def replay(name: str, steps: list[Step]) -> Iterator[tuple[Step, list[tuple[float, Payload]]]]:
+    """Hand every request over at its time and yield each step with the simulated replies."""
+    tree, virtual = build_tree(name, steps), build_virtual(name, steps)
+    server = FtpServer(tree, PROFILES[name], rng=random.Random(1), virtual=virtual)
+    ends = [step.requests[0][0] for step in steps[1:]] + [float("inf")]
+    for step, end in zip(steps, ends, strict=True):
+        replies: list[tuple[float, Payload]] = []
+        for when, wire in step.requests:
+            replies += collect(server, when)
+            server.handle(wire, CLIENT, when)
+        replies += collect(server, min(end, step.requests[-1][0] + 60))
+        yield step, replies
+
+
+def collect(server: FtpServer, until: float) -> list[tuple[float, Payload]]:
+    """Return what the server sends up to `until`."""
+    found = []
+    while (due := server.next_deadline()) is not None and due <= until:
+        for target, wire in server.outgoing(due):
+            assert target == CLIENT
+            found.append((due, decode_reply(wire)))
+    return found
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_replies_are_those_of_the_real_server(name: str) -> None:
+    steps = load(name)
+    found: dict[tuple[str, str, int], str] = {}
+    compared = 0
+    for step, replies in replay(name, steps):
+        simulated = [reply for _, reply in replies]
+        real = [reply for _, reply in step.replies]
+        for i in range(max(len(real), len(simulated))):
+            pair = (real[i : i + 1], simulated[i : i + 1])
+            compared += 1
+            if pair[0] != pair[1]:
+                found[name, step.name, i] = f"real {pair[0]}, simulated {pair[1]}"
+    expected = {key for key in DIFFERENCES if key[0] == name}
+    assert {key: text for key, text in found.items() if key not in expected} == {}
+    assert expected - set(found) == set(), "these differences no longer occur"
+    assert compared == sum(len(step.replies) for step in steps) > 1000
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_replies_take_as_long_as_those_of_the_real_server(name: str) -> None:
+    """Virtual time against recorded time: within 25 % and 25 ms (the recordings have a host's hiccups)."""
+    for step, replies in replay(name, load(name)):
+        if not step.replies:
+            continue
+        start = step.requests[-1][0]
+        real, simulated = step.replies[-1][0] - start, replies[-1][0] - start
+        assert simulated == pytest.approx(real, rel=0.25, abs=0.025), step.name
+
+
+def test_parameter_file_depends_on_the_block_size() -> None:
+    """The recorded vehicle's file had 14882 bytes in blocks of 239 and 14901 in blocks of 80."""
+    packed = downloaded(load("ardupilot"), "@PARAM/param.pck: burst 239")
+    params = unpack_parameters(packed)
+    assert pack_parameters(params, 239) == packed
+    assert len(pack_parameters(params, 80)) == 14901
+    assert unpack_parameters(pack_parameters(params, 80)) == params
