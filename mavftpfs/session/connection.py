@@ -67,6 +67,7 @@ class Connection:
     link: Link
     options: ConnectOptions
     clock: Callable[[], float]
+    was_lost: bool = False
     news: list[Callable[[str], None]] = field(default_factory=list)
     _first_heartbeat: trio.Event = field(default_factory=trio.Event)
 
@@ -82,7 +83,7 @@ class Connection:
         raise VehicleLost(f"no vehicle on {self.link.description} within {timeout:g} s{self._heard()}")
 
     def subscribe(self, listener: Callable[[str], None]) -> None:
-        """Have `listener` called with "reboot", "armed", "disarmed" or "back"."""
+        """Have `listener` called with "reboot", "armed", "disarmed", "lost" or "back"."""
         self.news.append(listener)
 
     def status(self) -> dict[str, Any]:
@@ -125,6 +126,9 @@ class Connection:
 
     def _on_heartbeat(self) -> None:
         self._first_heartbeat.set()
+        if self.was_lost:
+            self.was_lost = False
+            self._tell("back")
 
     def _tell(self, news: str) -> None:
         for listener in self.news:
@@ -148,6 +152,7 @@ async def connected(
         tasks.start(connection.driver.pump)
         tasks.start(lambda: _send_heartbeats(connection))
         tasks.start(lambda: _ask_about_vehicle(connection))
+        tasks.start(lambda: _watch_link(connection))
         serving = tasks.start(connection.scheduler.serve)
         try:
             yield connection
@@ -220,7 +225,7 @@ def _build(
     driver = Driver(link, framer, engine, vehicle, clock=clock, trace=trace)
     steering = ReadSteering(engine, options.read_mode, options.chunk)
     scheduler = Scheduler(driver, engine, vehicle, steering, clock=clock)
-    store = Store(scheduler, vehicle, clock=clock)
+    store = Store(scheduler, vehicle, clock=clock, op_deadline=options.op_deadline)
     connection = Connection(store, vehicle, scheduler, engine, driver, link, options, clock)
     driver.on_batch = scheduler.on_batch
 
@@ -257,6 +262,15 @@ async def _send_heartbeats(connection: Connection) -> None:
         frame = connection.driver.framer.encode_heartbeat(vehicle_type, MAV_AUTOPILOT_INVALID)
         connection.driver.send(frame)
         await trio.sleep(HEARTBEAT_PERIOD)
+
+
+async def _watch_link(connection: Connection) -> None:
+    """Tell when the vehicle is lost; its return is told by its heartbeat."""
+    while True:
+        await trio.sleep(HEARTBEAT_PERIOD)
+        if not connection.was_lost and connection.vehicle.lost(connection.clock()):
+            connection.was_lost = True
+            connection._tell("lost")
 
 
 async def _ask_about_vehicle(connection: Connection) -> None:

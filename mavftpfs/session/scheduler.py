@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from itertools import count
 
 import trio
 
@@ -18,7 +19,7 @@ from mavftpfs.protocol.transfers import ReadToEof, ReadTransfer
 from mavftpfs.session.driver import Driver
 from mavftpfs.session.gate import Gate
 from mavftpfs.session.opening import OpenSession, SessionOpener
-from mavftpfs.session.policy import should_switch
+from mavftpfs.session.policy import LIGHT_USE, should_switch
 from mavftpfs.session.readmode import ReadSteering
 from mavftpfs.session.stream import FileStream
 from mavftpfs.session.vehicle import Vehicle
@@ -31,6 +32,9 @@ buffers and the 3 s after which ArduPilot gives the session away: so a session i
 STALL = 2.0
 """Seconds without any reply during a read after which the server's session is no longer believed in."""
 
+FIRST_WANT = 0.05
+"""Seconds an opened file is kept open for its first read although another file waits."""
+
 REOPENS = 5
 """How often one want may lose its session without a byte of progress before it fails."""
 
@@ -41,7 +45,7 @@ class WholeRead:
 
     path: bytes
     limit: int
-    since: float
+    ticket: int
     finished: trio.Event = field(default_factory=trio.Event)
     data: bytes = b""
     error: MavftpfsError | None = None
@@ -70,6 +74,7 @@ class Scheduler:
         self._steering = steering
         self._clock = clock
         self._wake = trio.Event()
+        self._tickets = count(1)
         self._streams: set[FileStream] = set()
         self._wholes: list[WholeRead] = []
         self._active: FileStream | None = None
@@ -100,7 +105,7 @@ class Scheduler:
     async def read_whole(self, path: bytes, limit: int) -> bytes:
         """Read a file to EOF whatever its size claims."""
         self.require_link()
-        job = WholeRead(path, limit, self._clock())
+        job = WholeRead(path, limit, next(self._tickets))
         self._wholes.append(job)
         self._wake.set()
         try:
@@ -157,6 +162,7 @@ class Scheduler:
     async def serve(self) -> None:
         """Run until cancelled."""
         while True:
+            await trio.lowlevel.checkpoint()
             job = self._next()
             try:
                 if job is None:
@@ -179,21 +185,24 @@ class Scheduler:
     def _on_want(self, stream: FileStream) -> None:
         if stream.closed:
             self._streams.discard(stream)
-        elif stream.demand_since is None and stream.has_demand:
-            stream.demand_since = self._clock()
+        elif stream.ticket is None and stream.has_demand:
+            stream.ticket = next(self._tickets)
         self._wake.set()
 
     def _next(self) -> WholeRead | FileStream | None:
-        """Oldest demand first (the file that is open wins a tie by being asked last whether to switch)."""
-        demands: list[tuple[float, WholeRead | FileStream]] = [(job.since, job) for job in self._wholes]
+        """Demand before readahead, who used little lately before who used much, then who asked first."""
+        now = self._clock()
+        demands: list[tuple[bool, int, WholeRead | FileStream]] = [
+            (False, job.ticket, job) for job in self._wholes
+        ]
         readahead: FileStream | None = None
         for stream in self._streams:
             if stream.has_demand:
-                demands.append((stream.demand_since or 0.0, stream))
+                demands.append((stream.use.recent(now) >= LIGHT_USE, stream.ticket or 0, stream))
             elif stream.has_ahead and (readahead is None or self._is_open(stream)):
                 readahead = stream
         if demands:
-            return min(demands, key=lambda item: item[0])[1]
+            return min(demands, key=lambda item: item[:2])[2]
         return readahead
 
     def _is_open(self, stream: FileStream) -> bool:
@@ -249,7 +258,8 @@ class Scheduler:
     async def _serve_stream(self, stream: FileStream) -> None:
         try:
             self.require_link()
-            await self._ensure_open(stream)
+            if await self._ensure_open(stream):
+                await self._await_first_want(stream)
             if stream.has_demand or stream.has_ahead:
                 async with self.gate.passing():
                     await self._read(stream)
@@ -257,12 +267,13 @@ class Scheduler:
             await self._on_session_lost(stream, error)
         except MavftpfsError as error:
             stream.fail(error)
-        stream.demand_since = self._clock() if stream.has_demand else None
+        stream.ticket = next(self._tickets) if stream.has_demand else None
 
-    async def _ensure_open(self, stream: FileStream) -> None:
+    async def _ensure_open(self, stream: FileStream) -> bool:
+        """Have the stream's file open; return whether its opener was waiting for that."""
         session = self.session
-        fresh_enough = not stream.wants_open
-        if session is None or session.path != stream.path or not fresh_enough:
+        awaited = stream.wants_open
+        if session is None or session.path != stream.path or awaited:
             if session is not None:
                 await self._close_session()
                 self.switches += 1
@@ -273,6 +284,13 @@ class Scheduler:
             except FileChanged:
                 await self._close_quietly()
                 raise
+        return awaited
+
+    async def _await_first_want(self, stream: FileStream) -> None:
+        """Give whoever opened a file a moment to ask for its bytes, before another file takes its turn."""
+        with trio.move_on_after(FIRST_WANT):
+            while not (stream.has_demand or stream.has_ahead or stream.closed):
+                await self._sleep(FIRST_WANT)
 
     async def _read(self, stream: FileStream) -> None:
         session = self.session

@@ -15,8 +15,12 @@ from mavftpfs.session.vehicle import Vehicle
 from mavftpfs.shared.errors import Armed, FtpNak, RemoteProtocolError, RequestTimeout
 from mavftpfs.shared.model import DirEntry, Listing, wire_path
 
-TIME_PROBE_LIMIT = 10.0
-"""Seconds of silence after which ListDirectoryWithTime is taken to be unknown, if ListDirectory answers."""
+TIME_PROBE_LIMIT = 2.5
+"""Seconds of silence after which ListDirectory is tried in place of ListDirectoryWithTime."""
+
+TIME_SILENCES = 2
+"""How often that must happen, with ListDirectory answering, before opcode 16 counts as unknown: loss may
+look the same once."""
 
 CRC_PATIENCE = 120.0
 """Seconds a vehicle may need for a checksum (design promise 2)."""
@@ -25,11 +29,20 @@ CRC_PATIENCE = 120.0
 class Store:
     """Reads, lists and checks remote files."""
 
-    def __init__(self, scheduler: Scheduler, vehicle: Vehicle, *, clock: Callable[[], float]) -> None:
+    def __init__(
+        self,
+        scheduler: Scheduler,
+        vehicle: Vehicle,
+        *,
+        clock: Callable[[], float],
+        op_deadline: float = 30.0,
+    ) -> None:
         self._scheduler = scheduler
+        self._op_deadline = op_deadline
         self._vehicle = vehicle
         self._clock = clock
         self._lists_times: bool | None = None
+        self._time_silences = 0
 
     @property
     def lists_times(self) -> bool | None:
@@ -39,6 +52,7 @@ class Store:
     def forget_traits(self) -> None:
         """The vehicle rebooted, perhaps with other firmware."""
         self._lists_times = None
+        self._time_silences = 0
 
     async def list_directory(self, path: bytes) -> Listing:
         """Sweep a directory (see RemoteStore)."""
@@ -82,14 +96,17 @@ class Store:
             raise RemoteProtocolError("the vehicle's checksum reply holds no checksum")
         return int.from_bytes(data[:4], "little")
 
-    async def _sweep(self, wire: bytes, *, with_time: bool) -> ListDirectory:
+    async def _sweep(self, wire: bytes, *, with_time: bool, patience: float | None = None) -> ListDirectory:
         operation = ListDirectory(wire, with_time)
+        operation.patience = patience
         await self._scheduler.metadata(operation)
         return operation
 
     async def _sweep_asking_times(self, wire: bytes) -> ListDirectory:
         """Try opcode 16; a refusal or a silence counts only if opcode 3 then answers (design section 4)."""
         sure = self._lists_times is True
+        began = self._clock()
+        refused = False
         try:
             with trio.move_on_after(float("inf") if sure else TIME_PROBE_LIMIT):
                 operation = await self._sweep(wire, with_time=True)
@@ -98,9 +115,13 @@ class Store:
         except FtpNak as nak:
             if sure or nak.code not in (NakCode.FAIL, NakCode.UNKNOWN_COMMAND, NakCode.FILE_EXISTS):
                 raise
+            refused = True
         except RequestTimeout:
             if sure:
                 raise
-        operation = await self._sweep(wire, with_time=False)
-        self._lists_times = False
+        left = max(1.0, self._op_deadline - (self._clock() - began))
+        operation = await self._sweep(wire, with_time=False, patience=left)
+        self._time_silences += 1
+        if refused or self._time_silences >= TIME_SILENCES:
+            self._lists_times = False
         return operation

@@ -27,7 +27,7 @@ class FileStream:
         self.sink = sink
         self.closed = False
         self.use = Service()
-        self.demand_since: float | None = None
+        self.ticket: int | None = None
         self.wants_open = size is None
         self.last_data_at: float | None = None
         self.clean_failures = 0

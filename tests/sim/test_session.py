@@ -1,0 +1,180 @@
+"""The session layer against every profile, on virtual time."""
+
+from __future__ import annotations
+
+import random
+
+import pytest
+import trio
+from trio.testing import MockClock
+
+from mavftpfs.protocol.payload import Opcode
+from mavftpfs.session.connection import ConnectOptions
+from mavftpfs.shared.errors import FtpNak, RequestTimeout, VehicleLost
+from mavftpfs.sim.linkmodel import LinkSettings
+from mavftpfs.sim.profiles import PROFILES
+from tests.support.worlds import GOOD_LINK, ROOTS, MemorySink, World, read_file
+
+EVERY_PROFILE = sorted(PROFILES)
+BAD = LinkSettings(rate=60_000.0, delay=0.02, loss=0.1, duplicate=0.02, reorder=0.05)
+
+
+@pytest.fixture
+def autojump() -> MockClock:
+    return MockClock(autojump_threshold=0)
+
+
+def content(size: int, seed: int = 0) -> bytes:
+    return random.Random(seed).randbytes(size)
+
+
+def world(profile: str, settings: LinkSettings = GOOD_LINK, **files: bytes) -> World:
+    made = World(profile, settings)
+    for name, data in files.items():
+        made.tree.add(path(profile, name), data)
+    return made
+
+
+def path(profile: str, name: str) -> bytes:
+    return ROOTS.get(profile, b"") + b"/d/" + name.encode()
+
+
+@pytest.mark.parametrize("profile", EVERY_PROFILE)
+async def test_list_and_read_over_a_bad_link(profile: str, autojump: MockClock) -> None:
+    sizes = (0, 1, 238, 239, 240, 478, 5000, 60_000)
+    files = {f"f{size}": content(size, size) for size in sizes}
+    here = world(profile, BAD, **files)
+    async with here.connection() as connection:
+        listing = await connection.store.list_directory(path(profile, "")[:-1])
+        assert {entry.name.decode(): entry.size for entry in listing.entries} == {
+            name: len(data) for name, data in files.items()
+        }
+        for name, data in files.items():
+            assert await read_file(connection, path(profile, name)) == data
+    assert here.vehicle.server.open_sessions == 0
+
+
+@pytest.mark.parametrize("profile", EVERY_PROFILE)
+async def test_a_small_file_costs_open_read_terminate(profile: str, autojump: MockClock) -> None:
+    here = world(profile, small=b"hello")
+    async with here.connection() as connection:
+        assert await read_file(connection, path(profile, "small")) == b"hello"
+        await trio.sleep(5)
+        assert connection.engine.stats.by_opcode == {
+            Opcode.OPEN_FILE_RO: 1,
+            Opcode.READ_FILE: 1,
+            Opcode.TERMINATE_SESSION: 1,
+        }
+        assert here.vehicle.server.open_sessions == 0
+
+
+@pytest.mark.parametrize("profile", EVERY_PROFILE)
+async def test_several_files_at_once_share_the_session(profile: str, autojump: MockClock) -> None:
+    files = {f"f{index}": content(20_000, index) for index in range(5)}
+    here = world(profile, BAD, **files)
+    got: dict[str, bytes] = {}
+    async with here.connection() as connection, trio.open_nursery() as nursery:
+
+        async def fetch(name: str) -> None:
+            got[name] = await read_file(connection, path(profile, name))
+
+        for name in files:
+            nursery.start_soon(fetch, name)
+    assert got == files
+    assert here.vehicle.server.open_sessions == 0
+
+
+@pytest.mark.parametrize("profile", EVERY_PROFILE)
+async def test_a_small_read_overtakes_a_bulk_copy(profile: str, autojump: MockClock) -> None:
+    here = world(profile, LinkSettings(rate=20_000.0, delay=0.05), big=content(400_000), small=b"x" * 200)
+    async with here.connection() as connection, trio.open_nursery() as nursery:
+        sink = MemorySink(400_000)
+        reader = await connection.store.open_reader(path(profile, "big"), sink)
+        reader.want(0, 400_000, demand=True)
+        await trio.sleep(3)
+        copied_before = sink.have.total
+        assert await read_file(connection, path(profile, "small")) == b"x" * 200
+        await connection.store.list_directory(path(profile, "")[:-1])
+        assert sink.have.total < copied_before + 60_000
+        assert await sink.wait_for(0, 400_000) == content(400_000)
+        nursery.cancel_scope.cancel()
+
+
+@pytest.mark.parametrize("profile", EVERY_PROFILE)
+async def test_a_cut_in_mid_read_is_bridged(profile: str, autojump: MockClock) -> None:
+    data = content(100_000)
+    here = world(profile, LinkSettings(rate=20_000.0, delay=0.02, cuts=((4.0, 16.0),)), big=data)
+    async with here.connection() as connection:
+        assert await read_file(connection, path(profile, "big")) == data
+    assert here.vehicle.server.open_sessions == 0
+
+
+@pytest.mark.parametrize("profile", EVERY_PROFILE)
+async def test_a_reboot_in_mid_read_is_bridged(profile: str, autojump: MockClock) -> None:
+    data = content(300_000)
+    here = world(profile, LinkSettings(rate=20_000.0, delay=0.02), big=data)
+    async with here.connection() as connection, trio.open_nursery() as nursery:
+
+        async def reboot() -> None:
+            await trio.sleep(8)
+            here.vehicle.reboot(trio.current_time(), downtime=4.0)
+            here.link.kick()
+
+        nursery.start_soon(reboot)
+        assert await read_file(connection, path(profile, "big")) == data
+        assert connection.vehicle.reboots == 1
+
+
+@pytest.mark.parametrize("profile", EVERY_PROFILE)
+async def test_a_session_left_by_a_killed_client_is_got_over(profile: str, autojump: MockClock) -> None:
+    data = content(50_000)
+    here = world(profile, LinkSettings(rate=100_000.0, delay=0.02), big=data)
+    with trio.CancelScope():
+        async with here.connection(seed=3) as connection:
+            sink = MemorySink(50_000)
+            reader = await connection.store.open_reader(path(profile, "big"), sink)
+            reader.want(0, 50_000, demand=True)
+            await sink.wait_for(0, 1000)
+            here.link.cut()  # so that the farewell does not arrive: kill -9
+    here.link.restore()
+    async with here.connection(seed=4) as connection:
+        assert await read_file(connection, path(profile, "big")) == data
+
+
+async def test_silence_fails_one_request_and_then_all_at_once(autojump: MockClock) -> None:
+    here = world("px4", small=b"hello")
+    async with here.connection() as connection:
+        here.link.cut()
+        began = trio.current_time()
+        with pytest.raises(RequestTimeout):
+            await connection.store.list_directory(b"/d")
+        assert trio.current_time() - began == pytest.approx(30.0, abs=3.0)
+        began = trio.current_time()
+        for _ in range(500):
+            with pytest.raises(VehicleLost):
+                await connection.store.list_directory(b"/d")
+        with pytest.raises(VehicleLost):
+            await read_file(connection, b"/d/small")
+        assert trio.current_time() == began
+        here.link.restore()
+        await trio.sleep(3)
+        assert await read_file(connection, b"/d/small") == b"hello"
+
+
+async def test_no_vehicle_says_what_was_heard(autojump: MockClock) -> None:
+    here = world("px4")
+    with pytest.raises(VehicleLost, match="heard only 1/1"):
+        async with here.connection(ConnectOptions(target_system=9)):
+            raise AssertionError("connected to nobody")
+
+
+@pytest.mark.parametrize("profile", EVERY_PROFILE)
+async def test_refusals_reach_the_caller(profile: str, autojump: MockClock) -> None:
+    here = world(profile, small=b"hello")
+    async with here.connection() as connection:
+        with pytest.raises(FtpNak):
+            await connection.store.list_directory(path(profile, "missing"))
+        with pytest.raises(FtpNak) as refusal:
+            await read_file(connection, path(profile, "missing"))
+        assert refusal.value.code == 10
+        assert await read_file(connection, path(profile, "small")) == b"hello"

@@ -1,0 +1,102 @@
+"""A simulated vehicle, a bad link and a connection to it, in memory and on virtual time."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from dataclasses import dataclass, field
+
+import trio
+
+from mavftpfs.session.connection import Connection, ConnectOptions, connected
+from mavftpfs.shared.extents import ExtentSet
+from mavftpfs.sim.linkmodel import LinkModel, LinkSettings
+from mavftpfs.sim.memory import MemoryLink
+from mavftpfs.sim.memorytree import MemoryTree
+from mavftpfs.sim.profiles import PROFILES
+from mavftpfs.sim.vehicle import SimVehicle
+
+GOOD_LINK = LinkSettings()
+DEFAULTS = ConnectOptions()
+
+ROOTS = {"px4-nuttx": b"/fs/microsd"}
+"""Where a profile's files may be written; the root elsewhere."""
+
+
+@dataclass
+class World:
+    """One vehicle and one link; `connection()` may be entered again after it ended (a restarted client)."""
+
+    profile: str
+    settings: LinkSettings = GOOD_LINK
+    seed: int = 1
+    telemetry: float = 0.0
+    tree: MemoryTree = field(default_factory=MemoryTree)
+
+    def __post_init__(self) -> None:
+        rng = random.Random(self.seed)
+        self.vehicle = SimVehicle(self.tree, PROFILES[self.profile], rng=rng, telemetry=self.telemetry)
+        self.model = LinkModel(random.Random(self.seed + 1), self.settings)
+        self.link = MemoryLink(self.vehicle, self.model)
+
+    @asynccontextmanager
+    async def connection(
+        self, options: ConnectOptions = DEFAULTS, *, seed: int = 7
+    ) -> AsyncIterator[Connection]:
+        """Connect and wait for the first heartbeat."""
+        async with connected(self.link, options, rng=random.Random(seed)) as connection:
+            await connection.ready(30.0)
+            yield connection
+
+
+class MemorySink:
+    """A ReadSink that keeps everything and can be waited for."""
+
+    def __init__(self, size: int) -> None:
+        self.data = bytearray(size)
+        self.have = ExtentSet()
+        self.suspicions: list[str] = []
+        self.errors: list[Exception] = []
+        self._news = trio.Event()
+
+    def missing(self, start: int, stop: int) -> list[tuple[int, int]]:
+        return self.have.missing(start, stop)
+
+    def on_data(self, offset: int, data: bytes) -> None:
+        assert offset + len(data) <= len(self.data)
+        self.data[offset : offset + len(data)] = data
+        self.have.add(offset, offset + len(data))
+
+    def on_batch(self) -> None:
+        self._tell()
+
+    def on_suspect(self, reason: str) -> None:
+        self.suspicions.append(reason)
+
+    def on_failed(self, error: Exception) -> None:
+        self.errors.append(error)
+        self._tell()
+
+    async def wait_for(self, start: int, stop: int) -> bytes:
+        """Wait until a range is there, or raise the error that came instead."""
+        while not self.have.covers(start, stop):
+            if self.errors:
+                raise self.errors.pop(0)
+            await self._news.wait()
+        return bytes(self.data[start:stop])
+
+    def _tell(self) -> None:
+        self._news.set()
+        self._news = trio.Event()
+
+
+async def read_file(connection: Connection, path: bytes) -> bytes:
+    """Open, read whole, close."""
+    sink = MemorySink(1 << 22)
+    reader = await connection.store.open_reader(path, sink)
+    try:
+        reader.want(0, reader.size, demand=True)
+        return await sink.wait_for(0, reader.size)
+    finally:
+        reader.close()
