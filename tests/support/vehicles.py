@@ -5,6 +5,7 @@ the bad link of `proxy`. Each speaks UDP to a port on 127.0.0.1 where the mount 
 from __future__ import annotations
 
 import json
+import re
 import signal
 import socket
 import subprocess
@@ -217,8 +218,15 @@ class SimVehicle(UdpVehicle):
         self.name = f"sim-{profile}"
         self.profile = profile
         self.options = options
+        self.left_alone = False
+        """Set where a mount was killed, so that nobody could close its session."""
 
     def argv(self) -> list[str]:
         link = f"udpout:{HOST}:{self.vehicle_port}"
         base = [sys.executable, "-m", "mavftpfs", "sim", str(self.root)]
         return [*base, "--profile", self.profile, "--link", link, *self.options]
+
+    def check_end(self, process: Process) -> None:
+        left = re.search(r"open sessions: (\d+)", process.output.read_text())
+        assert left is not None, process.text()
+        assert self.left_alone or left[1] == "0", f"{left[1]} sessions were left open"
