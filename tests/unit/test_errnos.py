@@ -1,0 +1,151 @@
+"""shared.errnos is total, and says what servers.md 12 and 14.35 ask for."""
+
+from __future__ import annotations
+
+import errno
+import os
+
+import pytest
+
+from mavftpfs.protocol.payload import NakCode, Opcode
+from mavftpfs.shared import errnos, errors
+from mavftpfs.shared.errnos import errno_for
+
+REQUESTS = [opcode for opcode in Opcode if opcode < Opcode.ACK]
+SESSION_REQUESTS = [opcode for opcode in REQUESTS if opcode not in errnos.PATH_OPCODES]
+
+
+def nak(opcode: int, code: int, server_errno: int | None = None) -> int:
+    return errno_for(errors.FtpNak(opcode, code, server_errno))
+
+
+def all_error_classes() -> list[type[errors.MavftpfsError]]:
+    found = [errors.MavftpfsError]
+    for cls in found:
+        found.extend(cls.__subclasses__())
+    return [cls for cls in found if cls.__module__ == errors.__name__]
+
+
+def test_path_opcodes_are_those_with_a_path() -> None:
+    without = {0, 1, 2, Opcode.READ_FILE, Opcode.WRITE_FILE, Opcode.BURST_READ_FILE}
+    assert {int(opcode) for opcode in REQUESTS} - without == errnos.PATH_OPCODES
+
+
+@pytest.mark.parametrize("opcode", [*REQUESTS, 17, 255])
+def test_every_opcode_code_and_errno_gives_a_real_errno(opcode: int) -> None:
+    for code in range(256):
+        for server_errno in (None, *range(256)):
+            number = nak(opcode, code, server_errno)
+            assert number in errno.errorcode
+            assert number not in (errno.ENOSYS, 0), "ENOSYS would silence the kernel for good"
+
+
+def test_every_error_class_has_an_errno_of_its_own_or_a_reason() -> None:
+    for cls in all_error_classes():
+        if cls is not errors.FtpNak:
+            assert errno_for(cls("x")) in errno.errorcode
+
+
+@pytest.mark.parametrize(
+    ("error", "expected"),
+    [
+        (errors.NotFound("x"), errno.ENOENT),
+        (errors.NotADirectory("x"), errno.ENOTDIR),
+        (errors.IsADirectory("x"), errno.EISDIR),
+        (errors.PathTooLong("x"), errno.ENAMETOOLONG),
+        (errors.LocalProtocolError("x"), errno.EINVAL),
+        (errors.RemoteProtocolError("x"), errno.EIO),
+        (errors.RequestTimeout("x"), errno.ETIMEDOUT),
+        (errors.VehicleLost("x"), errno.ETIMEDOUT),
+        (errors.LinkClosed("x"), errno.EIO),
+        (errors.FileChanged("x"), errno.ESTALE),
+        (errors.DataUnproven("x"), errno.EIO),
+        (errors.SessionBusy("x"), errno.EBUSY),
+        (errors.Armed("x"), errno.EROFS),
+        (errors.UsageError("x"), errno.EINVAL),
+        (errors.MavftpfsError("x"), errno.EIO),
+        (ValueError("a bug"), errno.EIO),
+    ],
+)
+def test_errors_without_a_nak(error: Exception, expected: int) -> None:
+    assert errno_for(error) == expected
+
+
+@pytest.mark.parametrize(
+    ("code", "expected"),
+    [
+        (NakCode.FAIL, errno.EIO),
+        (NakCode.INVALID_DATA_SIZE, errno.ENAMETOOLONG),
+        (NakCode.INVALID_SESSION, errno.EBUSY),
+        (NakCode.NO_SESSIONS_AVAILABLE, errno.EBUSY),
+        (NakCode.EOF, errno.EIO),
+        (NakCode.UNKNOWN_COMMAND, errno.EOPNOTSUPP),
+        (NakCode.FILE_PROTECTED, errno.EACCES),
+        (NakCode.FILE_NOT_FOUND, errno.ENOENT),
+        (201, errno.EIO),
+    ],
+)
+def test_naks_of_an_open(code: int, expected: int) -> None:
+    assert nak(Opcode.OPEN_FILE_RO, code) == expected
+
+
+@pytest.mark.parametrize("opcode", SESSION_REQUESTS)
+def test_a_request_on_an_open_file_cannot_say_that_a_name_exists_or_is_missing(opcode: int) -> None:
+    """8 there is PX4's sticky EEXIST, 10 is ArduPilot's lost session."""
+    for code in (NakCode.FILE_EXISTS, NakCode.FILE_NOT_FOUND):
+        assert nak(opcode, code) == errno.EIO
+    for number in (errno.EEXIST, errno.ENOENT, errno.ENOTEMPTY, errno.ENOTDIR):
+        assert nak(opcode, NakCode.FAIL_ERRNO, number) == errno.EIO
+
+
+@pytest.mark.parametrize("opcode", [Opcode.CREATE_FILE, Opcode.CREATE_DIRECTORY, Opcode.RENAME])
+def test_exists_is_told_where_something_is_made(opcode: int) -> None:
+    assert nak(opcode, NakCode.FILE_EXISTS) == errno.EEXIST
+
+
+@pytest.mark.parametrize("opcode", [Opcode.LIST_DIRECTORY, Opcode.OPEN_FILE_RO, Opcode.REMOVE_FILE])
+def test_exists_is_sticky_where_nothing_is_made(opcode: int) -> None:
+    assert nak(opcode, NakCode.FILE_EXISTS) == errno.EIO
+
+
+@pytest.mark.parametrize("number", [1, 2, 5, 6, 12, 13, 16, 17, 18, 19, 20, 21, 22, 23, 24, 27, 28, 30])
+def test_low_errnos_are_the_same_everywhere(number: int) -> None:
+    assert nak(Opcode.OPEN_FILE_RO, NakCode.FAIL_ERRNO, number) == number
+
+
+@pytest.mark.parametrize(
+    ("number", "expected"),
+    [
+        (36, errno.ENAMETOOLONG),
+        (39, errno.ENOTEMPTY),
+        (40, errno.ELOOP),
+        (88, errno.EOPNOTSUPP),
+        (90, errno.ENOTEMPTY),
+        (91, errno.ENAMETOOLONG),
+        (92, errno.ELOOP),
+        (0, errno.EIO),
+        (4, errno.EIO),
+        (11, errno.EIO),
+        (110, errno.EIO),
+        (255, errno.EIO),
+        (None, errno.EIO),
+    ],
+)
+def test_other_errnos_by_allow_list(number: int | None, expected: int) -> None:
+    assert nak(Opcode.CREATE_DIRECTORY, NakCode.FAIL_ERRNO, number) == expected
+
+
+@pytest.mark.parametrize("number", [17, 21, 39, 90])
+def test_a_full_directory_has_many_numbers(number: int) -> None:
+    assert nak(Opcode.REMOVE_DIRECTORY, NakCode.FAIL_ERRNO, number) == errno.ENOTEMPTY
+
+
+def test_a_full_card_is_told() -> None:
+    assert nak(Opcode.WRITE_FILE, NakCode.FAIL_ERRNO, 28) == errno.ENOSPC
+
+
+@pytest.mark.parametrize("code", [NakCode.FAIL, NakCode.UNKNOWN_COMMAND])
+@pytest.mark.parametrize("opcode", [Opcode.TRUNCATE_FILE, Opcode.LIST_DIRECTORY_WITH_TIME])
+def test_opcodes_that_old_servers_lack(opcode: int, code: int) -> None:
+    assert nak(opcode, code) == errno.EOPNOTSUPP
+    assert os.strerror(nak(opcode, code))

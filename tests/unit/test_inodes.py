@@ -1,0 +1,178 @@
+"""fuse.inodes: numbers, lookup counts, renames."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
+
+from mavftpfs.fuse import inodes
+from mavftpfs.fuse.inodes import ROOT_INO, InodeTable
+from mavftpfs.shared.model import ROOT
+
+
+def test_the_root_is_there_and_stays() -> None:
+    table = InodeTable()
+    assert table.known(ROOT) == ROOT_INO
+    table.lookup(ROOT)
+    table.forget(ROOT_INO, 5)
+    assert table.known(ROOT) == ROOT_INO
+    assert table.excess_forgets == 0
+
+
+def test_a_path_keeps_its_number_over_forget_and_mounts() -> None:
+    table = InodeTable()
+    first = table.lookup(b"/log/1.ulg")
+    table.forget(first.ino, 1)
+    assert table.known(b"/log/1.ulg") is None
+    assert len(table) == 1
+    again = table.lookup(b"/log/1.ulg")
+    assert again.ino == first.ino
+    assert again.generation != first.generation
+    assert InodeTable().lookup(b"/log/1.ulg").ino == first.ino
+
+
+def test_forget_frees_at_zero_only() -> None:
+    table = InodeTable()
+    inode = table.lookup(b"/a")
+    assert table.lookup(b"/a") is inode
+    table.forget(inode.ino, 1)
+    assert table.get(inode.ino) is inode
+    table.forget(inode.ino, 1)
+    assert table.get(inode.ino) is None
+
+
+def test_too_many_forgets_are_counted_and_harmless() -> None:
+    table = InodeTable()
+    inode = table.lookup(b"/a")
+    table.forget(inode.ino, 3)
+    table.forget(inode.ino, 1)
+    assert table.excess_forgets == 2
+    table.check_invariants()
+
+
+def test_a_rejected_readdir_entry_leaves_nothing() -> None:
+    table = InodeTable()
+    table.discard(table.reserve(b"/a"))
+    assert len(table) == 1
+    known = table.lookup(b"/b")
+    table.discard(table.reserve(b"/b"))
+    assert table.get(known.ino) is known
+
+
+def test_a_taken_number_is_stepped_over(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(inodes, "_INO_MASK", 3)
+    table = InodeTable()
+    numbers = {table.lookup(path).ino for path in (b"/a", b"/b")}
+    assert numbers == {2, 3}
+
+
+def test_rename_moves_a_subtree_and_keeps_numbers() -> None:
+    table = InodeTable()
+    paths = [b"/d", b"/d/x", b"/d/e/y", b"/dx"]
+    numbers = {path: table.lookup(path).ino for path in paths}
+    table.rename(b"/d", b"/n/m")
+    assert table.known(b"/n/m") == numbers[b"/d"]
+    assert table.known(b"/n/m/x") == numbers[b"/d/x"]
+    assert table.known(b"/n/m/e/y") == numbers[b"/d/e/y"]
+    assert table.known(b"/dx") == numbers[b"/dx"], "a common prefix is not a parent"
+    assert table.known(b"/d/x") is None
+    assert list(table.paths_below(b"/n")) == [b"/n/m", b"/n/m/e/y", b"/n/m/x"]
+    table.check_invariants()
+
+
+def test_an_unlinked_open_file_lives_on_beside_a_new_one_of_its_name() -> None:
+    table = InodeTable()
+    old = table.lookup(b"/a")
+    table.unlink(b"/a")
+    new = table.lookup(b"/a")
+    assert new.ino != old.ino
+    assert (old.path, new.path) == (None, b"/a")
+    table.forget(old.ino, 1)
+    table.check_invariants()
+    assert table.known(b"/a") == new.ino
+
+
+def test_rename_over_a_file_leaves_the_old_one_nameless() -> None:
+    table = InodeTable()
+    moved, replaced = table.lookup(b"/new"), table.lookup(b"/old")
+    table.rename(b"/new", b"/old")
+    assert table.known(b"/old") == moved.ino
+    assert replaced.path is None
+    table.rename(b"/old", b"/old")
+    assert table.known(b"/old") == moved.ino
+    table.check_invariants()
+
+
+NAMES = st.lists(st.sampled_from([b"a", b"b", b"ab"]), min_size=1, max_size=3)
+PATHS = NAMES.map(lambda parts: b"/" + b"/".join(parts))
+
+
+class Kernel(RuleBasedStateMachine):
+    """A kernel that counts the answers it got, and forgets them in any portions."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.table = InodeTable()
+        self.counts: dict[int, int] = {}
+        self.seen: set[tuple[int, int]] = set()
+
+    @rule(path=PATHS)
+    def lookup(self, path: bytes) -> None:
+        inode = self.table.lookup(path)
+        assert inode.path == path
+        if inode.ino not in self.counts:
+            assert (inode.ino, inode.generation) not in self.seen
+            self.seen.add((inode.ino, inode.generation))
+        self.counts[inode.ino] = self.counts.get(inode.ino, 0) + 1
+
+    @rule(path=PATHS)
+    def reject(self, path: bytes) -> None:
+        self.table.discard(self.table.reserve(path))
+
+    @precondition(lambda self: self.counts)
+    @rule(data=st.data())
+    def forget(self, data: st.DataObject) -> None:
+        ino = data.draw(st.sampled_from(sorted(self.counts)))
+        count = data.draw(st.integers(1, self.counts[ino]))
+        self.table.forget(ino, count)
+        self.counts[ino] -= count
+        if not self.counts[ino]:
+            del self.counts[ino]
+            assert self.table.get(ino) is None
+
+    @rule(path=PATHS)
+    def unlink(self, path: bytes) -> None:
+        self.table.unlink(path)
+        assert self.table.known(path) is None
+
+    @rule(old=PATHS, new=PATHS)
+    def rename(self, old: bytes, new: bytes) -> None:
+        if not (old + b"/").startswith(new + b"/") and not (new + b"/").startswith(old + b"/"):
+            before = self.table.known(old)
+            self.table.rename(old, new)
+            assert self.table.known(new) == before
+
+    @invariant()
+    def agrees(self) -> None:
+        self.table.check_invariants()
+        assert self.table.excess_forgets == 0
+        assert len(self.table) == len(self.counts) + 1
+        for ino, count in self.counts.items():
+            inode = self.table.get(ino)
+            assert inode is not None
+            assert inode.lookups == count
+
+
+TestKernel = Kernel.TestCase
+TestKernel.settings = settings(max_examples=60, stateful_step_count=40)
+
+
+@given(st.lists(st.tuples(st.integers(0, 5), st.integers(0, 4))))
+def test_wild_forgets_never_break_the_table(forgets: list[tuple[int, int]]) -> None:
+    table = InodeTable()
+    numbers = [table.lookup(b"/%d" % index).ino for index in range(4)] + [ROOT_INO, 12345]
+    for index, count in forgets:
+        table.forget(numbers[index], count)
+        assert all(inode is None or inode.lookups >= 0 for inode in map(table.get, numbers))

@@ -1,0 +1,193 @@
+"""fuse.options: every word that `-o` may hold."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from dataclasses import fields
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mavftpfs.fuse.options import (
+    FLAGS,
+    IGNORED_WORDS,
+    KERNEL_WORDS,
+    VALUES,
+    MountOptions,
+    fuse_words,
+    option_names,
+    parse_options,
+    with_root,
+)
+from mavftpfs.shared.errors import UsageError
+
+FIELDS = {field.name for field in fields(MountOptions)}
+
+
+def test_the_table_fills_fields_and_no_others() -> None:
+    flag_fields = {field for field, _ in FLAGS.values() if field}
+    assert set(VALUES) | flag_fields | {"kernel_words"} == FIELDS
+    assert not set(VALUES) & (KERNEL_WORDS | IGNORED_WORDS | set(FLAGS))
+
+
+def test_no_options_are_the_defaults() -> None:
+    assert parse_options([]) == MountOptions()
+    assert parse_options(["", ",,", " , "]) == MountOptions()
+
+
+def test_what_mount_8_passes_is_taken() -> None:
+    options = parse_options(
+        ["rw,dev,suid,noatime,nodev", "noexec,x-systemd.automount,_netdev,nofail,user=joe"]
+    )
+    assert options.kernel_words == ("suid", "noatime", "nodev", "noexec")
+    assert not options.read_only
+
+
+@pytest.mark.parametrize(
+    "word", [*sorted(IGNORED_WORDS), "x-gvfs-show", "comment=systemd.automount", "user=x"]
+)
+def test_words_for_others_are_ignored(word: str) -> None:
+    assert parse_options([word]) == MountOptions()
+
+
+@pytest.mark.parametrize(
+    ("text", "field", "value"),
+    [
+        ("uid=1000", "uid", 1000),
+        ("umask=022", "umask", 0o022),
+        ("fmask=0133", "fmask", 0o133),
+        ("fsname=drone", "fsname", "drone"),
+        ("root=/fs/microsd/", "root", b"/fs/microsd"),
+        ("root=@SYS", "root", b"/@SYS"),
+        ("target_system=3", "target_system", 3),
+        ("heartbeat=gcs", "heartbeat", "gcs"),
+        ("dir_timeout=0.5", "dir_timeout", 0.5),
+        ("cache_size=16M", "cache_size", 16 << 20),
+        ("cache_size=2g", "cache_size", 2 << 30),
+        ("spool_max=0", "spool_max", 0),
+        ("dirty_max=auto", "dirty_max", None),
+        ("dirty_max=512K", "dirty_max", 512 << 10),
+        ("chunk=auto", "chunk", None),
+        ("chunk=110", "chunk", 110),
+        ("window=8", "window", 8),
+        ("bwlimit=5000", "bwlimit", 5000),
+        ("read_mode=burst", "read_mode", "burst"),
+        ("verify=crc", "verify", "crc"),
+        ("when_armed=ok", "when_armed", "ok"),
+        ("force", "force", True),
+        ("local=*.tmp:.x*", "local", ("*.tmp", ".x*")),
+        ("local=", "local", ()),
+        ("log_file=a=b", "log_file", "a=b"),
+        (r"fsname=/dev/ttyUSB0\,57600", "fsname", "/dev/ttyUSB0,57600"),
+        ("allow_other", "allow_other", True),
+        ("ro", "read_only", True),
+    ],
+)
+def test_values(text: str, field: str, value: object) -> None:
+    assert getattr(parse_options([text]), field) == value
+
+
+def test_the_last_word_wins() -> None:
+    options = parse_options(["ro,uid=1", "rw,uid=2"])
+    assert (options.read_only, options.uid) == (False, 2)
+    assert parse_options(["async,sync,async"]).kernel_words == ("async",)
+
+
+@pytest.mark.parametrize(
+    ("text", "named"),
+    [
+        ("frobnicate", "frobnicate"),
+        ("cache_sise=1M", "cache_sise"),
+        ("max_read=131072", "max_read"),
+        ("uid", "uid"),
+        ("uid=", "uid"),
+        ("uid=joe", "uid"),
+        ("uid=-1", "uid"),
+        ("umask=0888", "umask"),
+        ("umask=1777", "umask"),
+        ("ro=1", "ro"),
+        ("nodev=1", "nodev"),
+        ("auto=1", "auto"),
+        ("heartbeat=loud", "heartbeat"),
+        ("dir_timeout=soon", "dir_timeout"),
+        ("dir_timeout=nan", "dir_timeout"),
+        ("dir_timeout=inf", "dir_timeout"),
+        ("dir_timeout=-1", "dir_timeout"),
+        ("op_deadline=0", "op_deadline"),
+        ("cache_size=64X", "cache_size"),
+        ("cache_size=M", "cache_size"),
+        ("cache_size=1K", "cache_size"),
+        ("cache_size=9999999G", "cache_size"),
+        ("target_system=256", "target_system"),
+        ("source_system=0", "source_system"),
+        ("chunk=240", "chunk"),
+        ("chunk=²", "chunk"),
+        ("window=0", "window"),
+        ("root=", "root"),
+        ("root=/a/../b", "root"),
+        ("fsname=", "fsname"),
+        ("trace", "trace"),
+    ],
+)
+def test_wrong_words_are_named(text: str, named: str) -> None:
+    with pytest.raises(UsageError, match=named):
+        parse_options([f"rw,{text},dev"])
+
+
+@given(st.text(max_size=40))
+def test_any_text_is_parsed_or_refused(text: str) -> None:
+    with suppress(UsageError):
+        assert isinstance(parse_options([text]), MountOptions)
+
+
+def test_subtree_and_root_exclude_each_other() -> None:
+    assert with_root(MountOptions(), b"/log").root == b"/log"
+    assert with_root(MountOptions(root=b"/log"), b"/").root == b"/log"
+    with pytest.raises(UsageError, match="root="):
+        with_root(MountOptions(root=b"/log"), b"/fs")
+
+
+def test_what_goes_to_fuse() -> None:
+    words = fuse_words(parse_options(["ro,allow_other,auto_unmount,noexec"]), "udpin:0.0.0.0:14550")
+    assert words == {
+        "fsname=udpin:0.0.0.0:14550",
+        "subtype=mavftp",
+        "default_permissions",
+        "noexec",
+        "ro",
+        "allow_other",
+        "auto_unmount",
+    }
+    assert "rw" in fuse_words(MountOptions(), "x")
+
+
+def test_names_are_made_fit_for_a_comma_separated_list() -> None:
+    assert r"fsname=/dev/ttyUSB0\,57600" in fuse_words(MountOptions(), "/dev/ttyUSB0,57600")
+    words = fuse_words(MountOptions(fsname="drönë\\x\n"), "x")
+    assert all(word.isascii() and "\n" not in word for word in words)
+
+
+@pytest.mark.parametrize(
+    ("text", "files", "directories"),
+    [
+        ("", 0o644, 0o755),
+        ("ro", 0o444, 0o555),
+        ("umask=077", 0o600, 0o700),
+        ("umask=0,ro", 0o444, 0o555),
+        ("fmask=0111,dmask=0", 0o666, 0o777),
+        ("umask=077,fmask=022", 0o644, 0o700),
+    ],
+)
+def test_modes(text: str, files: int, directories: int) -> None:
+    options = parse_options([text])
+    assert options.file_mode(0o022) == files
+    assert options.directory_mode(0o022) == directories
+
+
+def test_help_names_every_option_but_the_one_that_is_always_on() -> None:
+    names = option_names()
+    assert "ro" in names
+    assert "cache_size=" in names
+    assert "default_permissions" not in names
+    assert parse_options(["default_permissions"]) == MountOptions()
