@@ -184,8 +184,7 @@ class Engine:
     def _believe(self, request: Request, reply: Payload, now: float) -> None:
         stats = self.stats
         stats.replies += 1
-        if reply.opcode == _NAK:
-            stats.naks += 1
+        stats.naks += reply.opcode == _NAK
         self._heard_at = now
         rtt: float | None = None
         if not self._ledger.settle(request, reply.seq):
@@ -207,7 +206,8 @@ class Engine:
             self._retire()
 
     def _on_unknown(self, reply: Payload) -> None:
-        if reply.req_opcode == _BURST and self._bursts.op is not None:
+        op = self._bursts.op
+        if reply.req_opcode == _BURST and op is not None and op.bursting:
             self.stats.incoherent += 1
         else:
             self.stats.unknown += 1
@@ -242,6 +242,7 @@ class Engine:
         if op is None or not op.on_burst(reply, now):
             return False
         self.stats.replies += 1
+        self.stats.naks += reply.opcode == _NAK
         self._heard_at = now
         op.progress_at = now
         bursts.on_packet(self.traits)
@@ -352,14 +353,18 @@ class Engine:
 
     def _check_timers(self, now: float) -> None:
         self._due = inf
-        silent = False
+        silent: set[str] = set()
         for request in self._ledger.flying():
             if request.timer <= now:
                 request.timer = self._reconsidered(request)
             if request.timer <= now:
-                silent = self._expire(request, now) or silent
+                if self._heard_at < request.sent_at:
+                    silent.add(request.manner.family)
+                self._expire(request, now)
             else:
                 self._due = min(self._due, request.timer)
+        for family in silent:
+            self._timers[family].on_silence()
         if silent:
             self.flow.on_silence()
 
@@ -371,17 +376,13 @@ class Engine:
             since = max(since, self._bursts.heard_at)
         return since + self._wait(request)
 
-    def _expire(self, request: Request, now: float) -> bool:
-        """A timer ran out; return whether nothing at all was heard since the request was sent."""
+    def _expire(self, request: Request, now: float) -> None:
+        """A timer ran out: ask again, or give up the operation when this one request took too long."""
         op = request.op
         if now - request.first_sent >= self._patience(op) and op is not self._ledger.ghost:
             self._time_out(op)
-        silent = self._heard_at < request.sent_at
-        if silent:
-            self._timers[request.manner.family].on_silence()
         self.flow.on_loss()
         self._ledger.lose(request)
-        return silent
 
     def _time_out(self, op: Operation) -> None:
         if not op.done:

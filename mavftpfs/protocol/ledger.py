@@ -20,6 +20,7 @@ LAST_SEQ = 65534
 
 _MIN_REORDER = 3
 _MAX_REORDER = 64
+_MOST_QUICK_SENDS = 8
 
 
 class Ghost(Operation):
@@ -114,7 +115,8 @@ class Ledger:
         self._table[request.seq + 1] = request
         self._flying[request.order] = request
         request.flying = True
-        if request.manner.ordered:
+        # One that was lost so often may never be answered: only its timer repeats it from now on.
+        if request.manner.ordered and request.sends <= _MOST_QUICK_SENDS:
             self._ordered[request.order] = request
 
     # --- coming in
@@ -122,8 +124,8 @@ class Ledger:
     def settle(self, request: Request, seq: int) -> bool:
         """Take out a request answered under `seq`; return False if that was an alias."""
         current = seq == request.seq + 1
-        if not current:
-            # An earlier transmission was answered after all: the path reorders more than we thought.
+        if not current or not request.flying:
+            # What was taken to be lost is answered after all: the path reorders more than we thought.
             self.reorder = min(self.reorder * 2, _MAX_REORDER)
         elif request.order > self._newest_answered:
             self._newest_answered = request.order
@@ -164,8 +166,7 @@ class Ledger:
     def _land(self, request: Request) -> None:
         request.flying = False
         del self._flying[request.order]
-        if request.manner.ordered:
-            del self._ordered[request.order]
+        self._ordered.pop(request.order, None)
 
     # --- by operation
 

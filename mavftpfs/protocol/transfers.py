@@ -288,7 +288,7 @@ class ReadTransfer(Operation):
             self.fail(SessionLost("the vehicle repeats itself in a burst", by_server=True))
         elif burst.over:
             self._end_burst(burst, now)
-        elif burst.complete_seen:
+        elif burst.complete_seen or burst.packets == 1:  # from here on it is over sooner
             self._arm(now)
         return True
 

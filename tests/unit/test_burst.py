@@ -1,0 +1,188 @@
+"""Which packets belong to a burst, and when it is over."""
+
+from __future__ import annotations
+
+import pytest
+
+from mavftpfs.protocol.burst import Burst
+from mavftpfs.protocol.payload import NakCode, Opcode, Payload
+
+SEQ = 65000
+RTO = 0.2
+
+
+def make(size: int = 10_000, *, start: int = 0, asked: int = 239) -> Burst:
+    return Burst(SEQ, start, size, asked, 0.0, RTO)
+
+
+def data(index: int, count: int = 239, *, step: int = 239, start: int = 0, complete: int = 0) -> Payload:
+    seq = (SEQ + 1 + index) & 0xFFFF
+    content = bytes([index % 251]) * count
+    return Payload(seq, 0, Opcode.ACK, count, 15, complete, start + index * step, content)
+
+
+def control(index: int, opcode: int, content: bytes = b"", offset: int = 0) -> Payload:
+    return Payload((SEQ + 1 + index) & 0xFFFF, 0, opcode, len(content), 15, 0, offset, content)
+
+
+def test_packets_are_placed_by_offset_across_the_wrap_of_seq() -> None:
+    burst = make(239 * 1000)
+    for index in range(999):
+        assert burst.take(data(index), 0.001 * index) == bytes([index % 251]) * 239
+    assert not burst.over
+    assert burst.take(data(999), 1.0) is not None
+    assert burst.over
+    assert burst.received == burst.highest == 239_000
+    assert burst.packet == 239
+
+
+def test_a_burst_of_more_than_65536_packets() -> None:
+    burst = make(239 * 70_000)
+    assert burst.take(data(0), 0.0) is not None
+    assert burst.take(data(66_000), 0.0) is not None
+    assert burst.take(data(66_001)._replace(seq=SEQ), 0.0) is None
+
+
+def test_the_size_is_what_the_server_sends() -> None:
+    burst = make(asked=110)
+    assert burst.take(data(0), 0.0) is not None
+    assert burst.packet == 239
+    assert burst.take(data(1, 110, step=110), 0.0) is None
+
+
+def test_the_size_is_learnt_from_a_later_packet_when_the_first_was_lost() -> None:
+    burst = make()
+    assert burst.take(data(3, 80, step=80), 0.0) is not None
+    assert burst.packet == 80
+    assert burst.take(data(0, 80, step=80), 0.0) is not None
+
+
+def test_a_single_short_packet_at_the_end_tells_no_size() -> None:
+    burst = make(100, asked=239)
+    assert burst.take(data(0, 100), 0.0) == bytes(100)
+    assert burst.packet == 0
+    assert burst.over
+
+
+@pytest.mark.parametrize(
+    "reply",
+    [
+        data(1, 239, step=238),
+        data(1, 239, step=240),
+        data(2, 100, step=239),
+        data(3)._replace(seq=SEQ + 1),
+        data(0)._replace(offset=1),
+        data(5)._replace(offset=0),
+        data(3, 10, step=400),
+    ],
+)
+def test_incoherent_first_packets_are_refused(reply: Payload) -> None:
+    burst = make(5000)
+    assert burst.take(reply, 0.0) is None
+    assert burst.packets == 0
+    assert burst.packet == 0
+
+
+@pytest.mark.parametrize(
+    "reply", [data(2)._replace(offset=0), data(2)._replace(offset=479), data(2, step=200)]
+)
+def test_incoherent_later_packets_are_refused(reply: Payload) -> None:
+    burst = make()
+    burst.take(data(0), 0.0)
+    assert burst.take(reply, 0.0) is None
+
+
+def test_packets_before_the_start_are_refused() -> None:
+    burst = make(start=1000)
+    assert burst.take(data(1, start=500), 0.0) is None
+    assert burst.take(data(0, start=1000), 0.0) is not None
+    assert burst.take(data(0)._replace(offset=761, seq=SEQ), 0.0) is None
+
+
+def test_packets_bigger_than_the_first_are_refused() -> None:
+    burst = make()
+    burst.take(data(0, 80, step=80), 0.0)
+    assert burst.take(data(1, 100, step=80), 0.0) is None
+
+
+def test_a_grown_file_is_clipped_to_its_size() -> None:
+    burst = make(300)
+    burst.take(data(0), 0.0)
+    assert burst.take(data(1), 0.0) == b"\x01" * 61
+    assert burst.over
+    assert burst.highest == 300
+    assert burst.take(data(2), 0.0) == b""
+
+
+def test_eof_ends_it_wherever_it_says_it_is() -> None:
+    burst = make()
+    burst.take(data(0), 0.0)
+    assert burst.take(control(1, Opcode.NAK, b"\x06", offset=77), 0.1) == b""
+    assert burst.over
+    assert burst.nak == NakCode.EOF
+
+
+def test_control_packets_of_another_burst_are_refused() -> None:
+    burst = make()
+    burst.take(data(0), 0.0)
+    assert burst.take(control(60, Opcode.NAK, b"\x06"), 0.1) is None
+    assert burst.take(control(-1, Opcode.NAK, b"\x06"), 0.1) is None
+    assert burst.take(control(60, Opcode.ACK), 0.1) is None
+    assert burst.take(control(1, 77), 0.1) is None
+    assert not burst.over
+
+
+def test_a_refusal_of_the_first_packet_ends_it() -> None:
+    burst = make()
+    burst.take(control(0, Opcode.NAK, b""), 0.1)
+    assert burst.over
+    assert burst.nak == NakCode.NONE
+
+
+def test_endless_refusals() -> None:
+    burst = make()
+    burst.take(data(0), 0.0)
+    burst.take(control(1, Opcode.NAK, b"\x01"), 0.1)
+    assert not burst.over
+    assert not burst.endless
+    burst.take(control(2, Opcode.NAK, b"\x01"), 0.1)
+    assert burst.endless
+
+
+def test_endless_empty_packets() -> None:
+    burst = make()
+    burst.take(data(0), 0.0)
+    burst.take(control(1, Opcode.ACK, offset=239), 0.1)
+    burst.take(data(2), 0.1)
+    assert not burst.endless
+    burst.take(control(3, Opcode.ACK, offset=239), 0.1)
+    burst.take(control(4, Opcode.ACK, offset=239), 0.1)
+    assert burst.endless
+
+
+def test_quiet_is_long_at_first() -> None:
+    assert make().quiet_deadline() == 1.0
+    assert Burst(SEQ, 0, 1000, 239, 5.0, 1.0).quiet_deadline() == 8.0
+
+
+def test_quiet_follows_the_packets() -> None:
+    burst = make()
+    for index in range(20):
+        burst.take(data(index), 0.01 * index)
+    assert burst.quiet_deadline() == pytest.approx(0.19 + 1.0)
+    slow = make()
+    for index in range(20):
+        slow.take(data(index), 0.14 * index)
+    assert slow.quiet_deadline() == pytest.approx(0.14 * 19 + 2.0)
+    crawling = make()
+    for index in range(20):
+        crawling.take(data(index), 1.0 * index)
+    assert crawling.quiet_deadline() > 19 + 6
+
+
+def test_quiet_is_short_behind_the_flag() -> None:
+    burst = make()
+    burst.take(data(0), 0.0)
+    burst.take(data(1, complete=1), 0.01)
+    assert burst.quiet_deadline() == pytest.approx(0.01 + RTO)
+    assert not burst.over

@@ -1,0 +1,642 @@
+"""The engine, step by step: hand-driven time, replies written by hand."""
+
+from __future__ import annotations
+
+import random
+
+import pytest
+
+from mavftpfs.protocol.engine import BURST_JUMP, Engine
+from mavftpfs.protocol.flow import Flow
+from mavftpfs.protocol.operations import ListDirectory, OpenFile, Operation, Simple
+from mavftpfs.protocol.payload import NakCode, Opcode, Payload
+from mavftpfs.protocol.transfers import ReadTransfer
+from mavftpfs.shared.errors import FtpNak, LocalProtocolError, RequestTimeout
+from mavftpfs.shared.traits import Traits
+from tests.support.replies import ack, burst_nak, chunk, nak, packet, sent
+from tests.support.virtual import MemorySink
+
+SIZE = 239 * 40
+
+
+class StuckRandom(random.Random):
+    """Starts every counter at a given number."""
+
+    def __init__(self, first: int) -> None:
+        super().__init__(0)
+        self.first = first
+
+    def randrange(self, *args: int, **kwargs: int) -> int:  # type: ignore[override]
+        return args[0] if len(args) > 1 else self.first
+
+
+def make(first_seq: int = 1000, *, limit: int | None = None, traits: Traits | None = None) -> Engine:
+    return Engine(StuckRandom(first_seq), Flow(limit=limit), traits=traits)
+
+
+def reading(engine: Engine, size: int = SIZE) -> tuple[ReadTransfer, MemorySink]:
+    sink = MemorySink(size)
+    transfer = ReadTransfer(0, size, sink)
+    engine.start(transfer, 0.0)
+    transfer.want(0, size, True)
+    return transfer, sink
+
+
+def mkdir(session: int | None = None) -> Simple:
+    return Simple(Opcode.CREATE_DIRECTORY, b"/d", session=session)
+
+
+# --- sequence numbers
+
+
+def test_starts_at_a_random_seq_and_counts_on_for_life() -> None:
+    seqs = set()
+    for seed in range(20):
+        engine = Engine(random.Random(seed), Flow())
+        engine.start(mkdir(), 0.0)
+        seqs.add(sent(engine, 0.0)[0].seq)
+    assert len(seqs) == 20
+    engine = make(7)
+    for expected in (7, 8, 9):
+        engine.start(mkdir(), 0.0)
+        assert sent(engine, 0.0)[0].seq == expected
+
+
+def test_65535_is_never_used() -> None:
+    engine = make(65533)
+    seqs = []
+    for _ in range(4):
+        engine.start(mkdir(), 0.0)
+        (request,) = sent(engine, 0.0)
+        engine.receive(ack(request), 0.1)
+        seqs.append(request.seq)
+    assert seqs == [65533, 65534, 0, 1]
+
+
+def test_a_seq_that_is_still_out_is_left_out() -> None:
+    engine = make(65534)
+    first = mkdir()
+    engine.start(first, 0.0)
+    (out,) = sent(engine, 0.0)
+    assert out.seq == 65534
+    engine._ledger._seq = 65534
+    second = mkdir()
+    engine.start(second, 0.0)
+    (other,) = sent(engine, 0.0)
+    assert other.seq == 0
+    engine.receive(ack(other), 0.1)
+    assert second.done
+    assert not first.done
+
+
+def test_the_counter_jumps_at_a_burst() -> None:
+    engine = make(10)
+    transfer, _ = reading(engine)
+    transfer.set_strategy("burst")
+    (burst,) = sent(engine, 0.0)
+    assert (burst.seq, burst.opcode) == (10, Opcode.BURST_READ_FILE)
+    engine.start(mkdir(), 0.0)
+    assert sent(engine, 0.0)[0].seq == 11 + BURST_JUMP
+
+
+# --- what is believed
+
+
+@pytest.mark.parametrize(
+    ("change", "counter"),
+    [
+        ({"seq": 1003}, "unknown"),
+        ({"seq": 999}, "unknown"),
+        ({"offset": 1}, "incoherent"),
+        ({"opcode": 5}, "incoherent"),
+    ],
+)
+def test_a_reply_that_does_not_fit_changes_nothing(change: dict[str, int], counter: str) -> None:
+    engine = make(limit=1)
+    transfer, sink = reading(engine)
+    (request,) = sent(engine, 0.0)
+    engine.receive(chunk(request, bytes(SIZE))._replace(**change), 0.1)  # type: ignore[arg-type]
+    assert sink.held.empty
+    assert not transfer.done
+    assert getattr(engine.stats, counter) == 1
+    assert engine.in_flight == 1
+
+
+def test_the_session_is_checked_once_it_is_known_to_be_echoed() -> None:
+    engine = make(limit=1, traits=Traits(ack_carries_own_session=True))
+    _, sink = reading(engine)
+    (request,) = sent(engine, 0.0)
+    engine.receive(chunk(request, b"x" * SIZE)._replace(session=9), 0.1)
+    assert engine.stats.incoherent == 1
+    engine.receive(chunk(request, b"y" * SIZE), 0.1)
+    assert bytes(sink.data[:239]) == b"y" * 239
+
+
+def test_a_server_that_answers_session_0_is_believed() -> None:
+    engine = make()
+    op = OpenFile(Opcode.OPEN_FILE_RO, b"/f", 77)
+    engine.start(op, 0.0)
+    (request,) = sent(engine, 0.0)
+    assert request.session == 77
+    engine.receive(ack(request, b"\x05\x01\x00\x00", session=0), 0.1)
+    assert (op.session, op.size) == (0, 261)
+    assert engine.traits.ack_carries_own_session is False
+    assert engine.traits.queue_limit is None
+
+
+def test_an_echoed_id_means_a_short_shared_queue() -> None:
+    engine = make()
+    op = OpenFile(Opcode.OPEN_FILE_RO, b"/f", 77)
+    engine.start(op, 0.0)
+    engine.receive(ack(sent(engine, 0.0)[0], b"\xff\xff\xff\xff"), 0.1)
+    assert (op.session, op.size) == (77, 0xFFFFFFFF)
+    assert engine.traits.queue_limit == 4
+    assert engine.flow.cap == 4
+    engine.forget_server()
+    assert engine.flow.cap > 4
+    assert engine.traits == Traits()
+
+
+def test_a_stale_replay_is_asked_again_under_a_new_seq_and_only_so_often() -> None:
+    engine = make()
+    notes: list[str] = []
+    engine._note = notes.append
+    op = mkdir()
+    engine.start(op, 0.0)
+    (request,) = sent(engine, 0.0)
+    seqs = [request.seq]
+    for _ in range(20):
+        engine.receive(nak(request, NakCode.EOF)._replace(req_opcode=Opcode.BURST_READ_FILE), 0.1)
+        again = sent(engine, 0.1)
+        if not again:
+            break
+        (request,) = again
+        seqs.append(request.seq)
+    assert len(seqs) == len(set(seqs)) == 9
+    assert not op.done
+    assert engine.stats.stale == 9
+    assert len(notes) == 8
+    engine.receive(ack(request), 0.2)
+    assert op.done
+    assert op.retransmitted
+
+
+def test_the_first_reply_counts_its_duplicates_do_not() -> None:
+    engine = make()
+    op = mkdir()
+    engine.start(op, 0.0)
+    (request,) = sent(engine, 0.0)
+    engine.receive(ack(request), 0.1)
+    engine.receive(nak(request, 8), 0.2)
+    assert op.done
+    assert op.error is None
+    assert engine.stats.unknown == 1
+    assert engine.take_finished() == [op]
+    assert engine.take_finished() == []
+
+
+# --- sessions of session-agnostic requests
+
+
+def test_requests_carry_the_engines_session_and_are_repeated_when_it_changed() -> None:
+    engine = make()
+    engine.session = 5
+    op = mkdir()
+    engine.start(op, 0.0)
+    (request,) = sent(engine, 0.0)
+    assert request.session == 5
+    engine.session = 6
+    engine.receive(nak(request, NakCode.INVALID_SESSION), 0.1)
+    (again,) = sent(engine, 0.1)
+    assert again.session == 6
+    assert again.seq != request.seq
+    engine.receive(nak(again, NakCode.INVALID_SESSION), 0.2)
+    assert isinstance(op.error, FtpNak)
+    assert op.error.code == NakCode.INVALID_SESSION
+
+
+def test_an_explicit_session_is_not_second_guessed() -> None:
+    engine = make()
+    op = mkdir(session=3)
+    engine.start(op, 0.0)
+    (request,) = sent(engine, 0.0)
+    assert request.session == 3
+    engine.receive(nak(request, NakCode.INVALID_SESSION), 0.1)
+    assert isinstance(op.error, FtpNak)
+
+
+def test_a_session_that_changes_all_the_time_ends_somewhere() -> None:
+    engine = make()
+    op = mkdir()
+    engine.start(op, 0.0)
+    for count in range(20):
+        out = sent(engine, 0.0)
+        if not out:
+            break
+        engine.session = (count % 200) + 1
+        engine.receive(nak(out[0], NakCode.INVALID_SESSION), 0.0)
+    assert isinstance(op.error, FtpNak)
+    assert engine.stats.requests < 12
+
+
+def test_a_late_refusal_under_an_old_session_does_not_repeat_twice() -> None:
+    engine = make()
+    op = mkdir()
+    engine.start(op, 0.0)
+    (request,) = sent(engine, 0.0)
+    engine.on_deadline(1.0)
+    engine.session = 9
+    engine.receive(nak(request, NakCode.INVALID_SESSION), 1.1)
+    assert engine.in_flight == 0
+    (again,) = sent(engine, 1.1)
+    assert again.session == 9
+    engine.receive(ack(again), 1.2)
+    assert op.done
+    assert op.error is None
+
+
+# --- retransmission
+
+
+def test_a_side_effect_goes_out_again_under_the_same_seq_with_growing_waits() -> None:
+    engine = make()
+    op = mkdir()
+    engine.start(op, 0.0)
+    (request,) = sent(engine, 0.0)
+    now, times = 0.0, []
+    while not op.done:
+        deadline = engine.next_deadline()
+        assert deadline is not None
+        assert deadline > now
+        now = deadline
+        engine.on_deadline(now)
+        for again in sent(engine, now):
+            assert again == request
+            times.append(now)
+    assert isinstance(op.error, RequestTimeout)
+    assert op.sent
+    assert now == pytest.approx(30.0)
+    assert times[:2] == pytest.approx([1.0, 3.0])
+    assert len(times) < 10
+    assert engine.stats.timeouts == 1
+    engine.on_deadline(40.0)  # the last transmission is a ghost for a while
+    assert engine.next_deadline() is None
+
+
+def test_a_late_reply_to_a_side_effect_is_taken_but_not_timed() -> None:
+    engine = make()
+    op = mkdir()
+    engine.start(op, 0.0)
+    (request,) = sent(engine, 0.0)
+    engine.on_deadline(1.0)
+    assert len(sent(engine, 1.0)) == 1
+    engine.receive(ack(request), 1.05)
+    assert op.done
+    assert op.retransmitted
+    assert engine.rtt is None
+
+
+def test_reads_go_out_again_under_new_seqs_and_old_answers_still_count() -> None:
+    engine = make(limit=1)
+    transfer, sink = reading(engine, 100)
+    (first,) = sent(engine, 0.0)
+    engine.on_deadline(1.0)
+    (second,) = sent(engine, 1.0)
+    assert second.seq != first.seq
+    assert (second.offset, second.size) == (first.offset, first.size)
+    engine.receive(chunk(first, b"a" * 100), 1.1)
+    assert bytes(sink.data) == b"a" * 100
+    assert engine.stats.spurious == 1
+    engine.receive(chunk(second, b"b" * 100), 1.2)
+    assert bytes(sink.data) == b"a" * 100
+    assert transfer.idle
+    assert engine.rtt is None
+
+
+def test_later_answers_prove_a_loss() -> None:
+    engine = make(limit=8)
+    _, sink = reading(engine)
+    engine.flow.window = 8
+    out = sent(engine, 0.0)
+    assert len(out) == 8
+    for request in out[1:3]:
+        engine.receive(chunk(request, bytes(SIZE)), 0.1)
+    assert out[0].offset not in [request.offset for request in sent(engine, 0.1)]
+    engine.receive(chunk(out[3], bytes(SIZE)), 0.1)
+    again = sent(engine, 0.1)
+    assert again[0].offset == out[0].offset
+    assert again[0].seq != out[0].seq
+    assert engine.stats.retransmissions == 1
+    assert engine.stats.by_opcode[Opcode.READ_FILE] == engine.stats.requests
+    assert not sink.held.covers(0, 1)
+
+
+def test_a_lost_listing_is_found_by_later_reads_too() -> None:
+    engine = make(limit=8)
+    engine.start(ListDirectory(b"/"), 0.0)
+    (listing,) = sent(engine, 0.0)
+    reading(engine)
+    for request in sent(engine, 0.0)[:3]:
+        engine.receive(chunk(request, bytes(SIZE)), 0.1)
+    again = [request for request in sent(engine, 0.1) if request.opcode == Opcode.LIST_DIRECTORY]
+    assert [request.data for request in again] == [listing.data]
+
+
+def test_reordering_is_learnt_and_forgotten() -> None:
+    engine = make(limit=4)
+    reading(engine)
+    out = sent(engine, 0.0)
+    engine.receive(chunk(out[3], bytes(SIZE)), 0.1)
+    assert engine._ledger.reorder == 3
+    engine.receive(chunk(out[0], bytes(SIZE)), 0.1)
+    assert (engine._ledger.reorder, engine.stats.spurious) == (6, 0)
+    out = [*out[1:3], *sent(engine, 0.1)]
+    assert engine.in_flight == 4
+    engine.on_deadline(5.0)
+    again = sent(engine, 5.0)
+    assert again[0].offset == out[0].offset
+    engine.receive(chunk(out[0], bytes(SIZE)), 5.1)
+    assert (engine._ledger.reorder, engine.stats.spurious) == (12, 1)
+    engine.receive(chunk(again[1], bytes(SIZE)), 5.1)
+    assert engine._ledger.reorder == 11
+
+
+def test_the_last_chunk_does_not_wait_for_a_second() -> None:
+    engine = make(limit=1)
+    transfer, _ = reading(engine, 239 * 3)
+    now = 0.0
+    for _ in range(2):
+        (request,) = sent(engine, now)
+        now += 0.1
+        engine.receive(chunk(request, bytes(SIZE)), now)
+    (request,) = sent(engine, now)
+    engine.on_deadline(now + 0.35)
+    (again,) = sent(engine, now + 0.35)
+    assert again.offset == request.offset
+    engine.receive(chunk(again, bytes(SIZE)), now + 0.4)
+    assert transfer.idle
+
+
+def test_on_deadline_called_early_or_with_grown_round_trips_sends_nothing() -> None:
+    engine = make(limit=2)
+    reading(engine)
+    first, second = sent(engine, 0.0)
+    engine.on_deadline(0.5)
+    assert sent(engine, 0.5) == []
+    engine.receive(chunk(first, bytes(SIZE)), 0.9)
+    sent(engine, 0.9)
+    engine.on_deadline(1.0)
+    assert engine.stats.retransmissions == 0
+    engine.receive(chunk(second, bytes(SIZE)), 1.1)
+    assert engine.stats.spurious == 0
+
+
+def test_silence_narrows_the_window_until_something_is_heard() -> None:
+    engine = make()
+    reading(engine)
+    out = sent(engine, 0.0)
+    assert len(out) == 4
+    engine.on_deadline(1.0)
+    again = sent(engine, 1.0)
+    assert [request.offset for request in again] == [0, 239]
+    engine.receive(chunk(again[0], bytes(SIZE)), 1.1)
+    assert engine.flow.window == 2
+
+
+def test_one_chunk_that_is_never_answered_fails_the_transfer() -> None:
+    engine = make(limit=4)
+    transfer, _ = reading(engine, 239 * 100_000)
+    now = 0.0
+    cursed = None
+    while not transfer.done:
+        assert now < 100
+        for request in sent(engine, now):
+            cursed = request.offset if cursed is None else cursed
+            if request.offset != cursed:
+                engine.receive(ack(request, bytes(request.size)), now)
+        now += 0.05
+        engine.on_deadline(now)
+    assert isinstance(transfer.error, RequestTimeout)
+    assert 29 < now < 45
+    assert transfer.wants.covers(cursed or 0, 239)
+
+
+def test_checksums_are_not_piled_up() -> None:
+    engine = make()
+    op = Simple(Opcode.CALC_FILE_CRC32, b"/f", patience=120.0)
+    engine.start(op, 0.0)
+    now, count = 0.0, len(sent(engine, 0.0))
+    while not op.done:
+        now = engine.next_deadline() or 1e9
+        engine.on_deadline(now)
+        count += len(sent(engine, now))
+    assert now == pytest.approx(120.0)
+    assert count <= 4
+
+
+def test_listings_are_not_piled_up() -> None:
+    engine = make()
+    for _ in range(20):
+        engine._timers["list"].sample(0.01)
+    op = ListDirectory(b"/big")
+    engine.start(op, 0.0)
+    now, count = 0.0, len(sent(engine, 0.0))
+    while now < 5.0:
+        now = engine.next_deadline() or 1e9
+        engine.on_deadline(now)
+        count += len(sent(engine, now))
+    assert 3 <= count <= 5
+
+
+# --- window and priority
+
+
+def test_metadata_goes_first_and_has_a_slot_of_its_own() -> None:
+    engine = make(limit=4)
+    reading(engine)
+    assert len(sent(engine, 0.0)) == 4
+    engine.start(mkdir(), 0.0)
+    engine.start(mkdir(), 0.0)
+    assert [request.opcode for request in sent(engine, 0.0)] == [Opcode.CREATE_DIRECTORY]
+    assert engine.in_flight == 5
+
+
+def test_demand_goes_before_readahead() -> None:
+    engine = make(limit=1)
+    ahead = ReadTransfer(1, SIZE, MemorySink(SIZE))
+    demand = ReadTransfer(2, SIZE, MemorySink(SIZE))
+    for transfer in (ahead, demand):
+        engine.start(transfer, 0.0)
+    ahead.want(0, SIZE, False)
+    demand.want(0, SIZE, True)
+    assert [request.session for request in sent(engine, 0.0)] == [2]
+
+
+def test_cancelled_requests_keep_their_place_until_they_are_answered() -> None:
+    engine = make(limit=4)
+    transfer, sink = reading(engine)
+    out = sent(engine, 0.0)
+    engine.cancel(transfer, 0.0)
+    engine.cancel(transfer, 0.0)
+    other, _ = reading(engine)
+    assert sent(engine, 0.0) == []
+    engine.receive(chunk(out[0], bytes(SIZE)), 0.1)
+    assert sink.held.empty
+    assert len(sent(engine, 0.1)) == 1
+    engine.on_deadline(1.2)
+    assert len(sent(engine, 1.2)) >= 1
+    engine.cancel(other, 1.2)
+    engine.on_deadline(50.0)
+    assert engine.in_flight == 0
+    assert engine.take_finished() == []
+    assert engine.next_deadline() is None
+
+
+def test_cancelling_forgets_what_was_to_be_sent_again() -> None:
+    engine = make()
+    op = mkdir()
+    engine.start(op, 0.0)
+    sent(engine, 0.0)
+    engine.on_deadline(1.0)
+    engine.cancel(op, 1.0)
+    assert sent(engine, 1.0) == []
+    assert engine.in_flight == 0
+
+
+def test_an_operation_runs_once() -> None:
+    engine = make()
+    op = mkdir()
+    engine.start(op, 0.0)
+    with pytest.raises(LocalProtocolError):
+        engine.start(op, 0.0)
+
+
+def test_an_idle_transfer_waits_for_ever() -> None:
+    engine = make(limit=1)
+    transfer, _ = reading(engine, 100)
+    (request,) = sent(engine, 0.0)
+    engine.receive(chunk(request, bytes(100)), 0.1)
+    sent(engine, 0.1)
+    assert engine.next_deadline() is None
+    engine.on_deadline(1000.0)
+    assert not transfer.done
+    transfer._sink.held.clear()  # type: ignore[attr-defined]
+    transfer.want(0, 100, True)
+    assert len(sent(engine, 1000.0)) == 1
+    engine.on_deadline(1029.0)
+    assert not transfer.done
+    engine.on_deadline(1031.0)
+    assert isinstance(transfer.error, RequestTimeout)
+
+
+# --- bursts and others
+
+
+def bursting(engine: Engine) -> tuple[ReadTransfer, Payload]:
+    transfer, _ = reading(engine)
+    transfer.set_strategy("burst")
+    (request,) = sent(engine, 0.0)
+    return transfer, request
+
+
+def test_timers_stand_still_while_burst_packets_come() -> None:
+    engine = make()
+    _, burst = bursting(engine)
+    op = mkdir()
+    engine.start(op, 0.0)
+    (request,) = sent(engine, 0.0)
+    for index in range(30):
+        now = 0.2 * (index + 1)
+        engine.receive(packet(burst, index, bytes(239)), now)
+        engine.on_deadline(now)
+        assert sent(engine, now) == []
+    engine.receive(burst_nak(burst, 30, NakCode.EOF), 6.2)
+    engine.receive(ack(request), 6.21)
+    assert op.done
+    assert not op.retransmitted
+    assert engine.traits.answers_during_burst is False
+    assert engine.rtt is None
+
+
+def test_a_server_that_answers_between_packets_is_noticed() -> None:
+    engine = make()
+    _, burst = bursting(engine)
+    engine.receive(packet(burst, 0, bytes(239)), 0.1)
+    engine.start(mkdir(), 0.1)
+    (request,) = sent(engine, 0.1)
+    engine.receive(packet(burst, 1, bytes(239)), 0.2)
+    engine.receive(ack(request), 0.2)
+    for index in range(2, 5):
+        assert engine.traits.answers_during_burst is None
+        engine.receive(packet(burst, index, bytes(239)), 0.3)
+    assert engine.traits.answers_during_burst is True
+    engine.start(mkdir(), 0.4)
+    (request,) = sent(engine, 0.4)
+    engine.receive(packet(burst, 5, bytes(239)), 1.4)
+    engine.on_deadline(1.45)
+    assert [again.seq for again in sent(engine, 1.45)] == [request.seq]
+    engine.receive(packet(burst, 6, bytes(239)), 1.5)
+    engine.receive(ack(request), 1.5)
+    assert engine.traits.answers_during_burst is True
+
+
+def test_packets_of_an_abandoned_burst_hold_timers_and_land_nowhere() -> None:
+    engine = make()
+    transfer, burst = bursting(engine)
+    engine.cancel(transfer, 0.0)
+    engine.start(mkdir(), 0.0)
+    (request,) = sent(engine, 0.0)
+    for index in range(20):
+        engine.receive(packet(burst, index, bytes(239)), 0.2 * index)
+        engine.on_deadline(0.2 * index)
+        assert sent(engine, 0.2 * index) == []
+    assert engine.stats.unknown == 20
+    engine.receive(ack(request), 4.0)
+    assert engine.stats.replies == 1
+
+
+def test_incoherent_burst_packets_are_counted() -> None:
+    engine = make()
+    _, burst = bursting(engine)
+    engine.receive(packet(burst, 0, bytes(239)), 0.1)
+    engine.receive(packet(burst, 7, bytes(239), size=200), 0.1)
+    assert engine.stats.incoherent == 1
+
+
+def test_a_burst_that_fails_is_finished() -> None:
+    engine = make()
+    transfer, burst = bursting(engine)
+    engine.receive(burst_nak(burst, 0, NakCode.INVALID_SESSION), 0.1)
+    assert engine.take_finished() == [transfer]
+
+
+# --- facts
+
+
+def test_facts() -> None:
+    engine = make()
+    assert engine.rtt is None
+    assert engine.loss == 0.0
+    assert engine.timeout("data") == 1.0
+    engine.start(mkdir(), 0.0)
+    engine.receive(ack(sent(engine, 0.0)[0]), 0.1)
+    assert engine.rtt == pytest.approx(0.1)
+    assert engine.timeout("data") == pytest.approx(0.3)
+    assert engine.timeout("path") == pytest.approx(0.3)
+    engine.note("nobody listens")
+
+
+def test_an_operation_must_be_started_to_see_the_engine() -> None:
+    op = Operation()
+    with pytest.raises(LocalProtocolError):
+        _ = op.port
+    with pytest.raises(NotImplementedError):
+        op.next_request(0.0)
+    with pytest.raises(NotImplementedError):
+        op.on_reply(None, None, 0.0)  # type: ignore[arg-type]
+    op.timer = 5.0
+    op.on_timer(5.0)
+    assert op.timer > 1e9
+    assert not op.on_burst(Payload(0, 0, 128, 0), 0.0)
+    assert not op.bursting
+    op.on_burst_sent(None, 0.0)  # type: ignore[arg-type]

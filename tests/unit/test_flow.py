@@ -1,0 +1,157 @@
+"""The in-flight window: what it does on paths whose every round trip is known."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import pytest
+
+from mavftpfs.protocol.flow import DEFAULT_CAP, SERIAL_CAP, Flow
+
+
+class Path:
+    """A path of a fixed rate (replies/s) and base round trip; the window is always full."""
+
+    def __init__(self, flow: Flow, *, rate: float, base: float, start: float = 0.0) -> None:
+        self.flow = flow
+        self.rate = rate
+        self.base = base
+        self.now = start
+        self.order = 0
+
+    def round(self, *, lost: int = 0) -> None:
+        window = self.flow.window
+        took = max(self.base, window / self.rate)
+        first = self.order
+        self.order += window
+        for index in range(window):
+            self.now += took / window
+            if index < lost:
+                self.flow.on_loss()
+            else:
+                self.flow.on_reply(self.now, took, first + index, self.order)
+
+    def rounds(self, count: int, *, lost: int = 0) -> None:
+        for _ in range(count):
+            self.round(lost=lost)
+
+
+def test_begins_small() -> None:
+    assert Flow().window == 4
+    assert Flow(serial=True).window == 1
+    assert Flow(limit=2).window == 2
+    assert Flow().cap == DEFAULT_CAP
+    assert Flow(serial=True).cap == SERIAL_CAP
+
+
+def test_grows_to_what_the_path_holds_and_not_far_beyond() -> None:
+    flow = Flow()
+    path = Path(flow, rate=2000.0, base=0.1)
+    path.rounds(40)
+    assert 200 <= flow.window <= 270
+
+
+def test_random_loss_does_not_shrink_it() -> None:
+    flow = Flow()
+    path = Path(flow, rate=1000.0, base=0.1)
+    path.rounds(20)
+    before = flow.window
+    path.rounds(40, lost=10)
+    assert flow.window >= before
+    assert flow.loss == pytest.approx(10 / flow.window, rel=0.2)
+
+
+def test_loss_with_a_standing_queue_brakes_and_comes_back() -> None:
+    flow = Flow()
+    path = Path(flow, rate=1000.0, base=0.1)
+    path.rounds(20)
+    before = flow.window
+    path.rate = 300.0
+    path.rounds(4, lost=5)
+    assert flow.window < 0.6 * before
+    path.rate = 1000.0
+    path.rounds(60)
+    assert flow.window >= 0.9 * before
+
+
+def test_a_queue_ends_the_start() -> None:
+    flow = Flow()
+    path = Path(flow, rate=50.0, base=0.1)
+    path.rounds(4)
+    assert flow.window < 20
+
+
+def test_limits() -> None:
+    flow = Flow(limit=8)
+    path = Path(flow, rate=1000.0, base=0.1)
+    path.rounds(10)
+    assert flow.window == 8
+    flow.set_queue_limit(4)
+    assert (flow.window, flow.cap) == (4, 4)
+    path.rounds(10)
+    assert flow.window == 4
+    flow.set_queue_limit(None)
+    assert flow.cap == 8
+    flow.set_queue_limit(0)
+    assert flow.window == 1
+
+
+def test_serial_grows_by_one_and_goes_back_where_most_is_lost() -> None:
+    flow = Flow(serial=True)
+    path = Path(flow, rate=100.0, base=0.1)
+    seen = []
+    for _ in range(12):
+        path.round()
+        seen.append(flow.window)
+    steps = {after - before for before, after in pairwise(seen)}
+    assert steps <= {0, 1}
+    assert flow.window <= SERIAL_CAP
+    high = flow.window
+    path.rounds(3, lost=flow.window * 2 // 3)
+    assert flow.window < high
+
+
+def test_a_starved_round_proves_nothing() -> None:
+    flow = Flow()
+    path = Path(flow, rate=1000.0, base=0.1)
+    path.rounds(20)
+    before = flow.window
+    for _ in range(30):
+        flow.on_starved()
+        flow.on_reply(path.now + 1.0, 0.1, path.order, path.order + 1)
+        path.order += 1
+        path.now += 1.0
+    assert flow.window == before
+
+
+def test_silence_probes_with_two_until_something_is_heard() -> None:
+    flow = Flow()
+    path = Path(flow, rate=1000.0, base=0.1)
+    path.rounds(20)
+    before = flow.window
+    flow.on_silence()
+    flow.on_silence()
+    assert flow.window == 2
+    flow.on_reply(path.now + 5.0, None, 0, path.order)
+    assert flow.window == before // 2
+    flow.on_silence()
+    flow.set_queue_limit(4)
+    flow.on_reply(path.now + 6.0, None, 0, path.order)
+    assert flow.window <= 4
+
+
+def test_a_longer_way_is_noticed_by_draining_the_queue() -> None:
+    flow = Flow()
+    path = Path(flow, rate=1000.0, base=0.05)
+    path.rounds(30)
+    path.base = 0.2
+    path.rounds(400)
+    assert flow.window >= 200
+
+
+def test_rounds_in_no_time_or_without_round_trips_are_survived() -> None:
+    flow = Flow()
+    for order in range(10):
+        flow.on_reply(1.0, None, order, order + 1)
+    assert flow.window == 4
+    assert flow.loss == 0.0

@@ -1,0 +1,274 @@
+"""Operations that ask one thing at a time."""
+
+from __future__ import annotations
+
+import random
+
+import pytest
+
+from mavftpfs.protocol.engine import Engine
+from mavftpfs.protocol.flow import Flow
+from mavftpfs.protocol.operations import MAX_ENTRIES, ListDirectory, OpenFile, Operation, Simple, Terminate
+from mavftpfs.protocol.payload import NakCode, Opcode, Payload
+from mavftpfs.shared.errors import FtpNak, LocalProtocolError, PathTooLong
+from mavftpfs.shared.model import DirEntry, EntryKind
+from tests.support.replies import ack, eof, nak, sent
+
+
+def begin(op: Operation) -> tuple[Engine, Payload]:
+    engine = Engine(random.Random(1), Flow())
+    engine.start(op, 0.0)
+    (request,) = sent(engine, 0.0)
+    return engine, request
+
+
+# --- Simple, OpenFile, Terminate
+
+
+def test_simple_carries_all_fields() -> None:
+    op = Simple(Opcode.TRUNCATE_FILE, b"/f", offset=500, session=3)
+    _, request = begin(op)
+    assert request == Payload(request.seq, 3, 12, 2, 0, 0, 500, b"/f")
+    assert op.opcode == Opcode.TRUNCATE_FILE
+
+
+def test_simple_gives_its_reply() -> None:
+    op = Simple(Opcode.CALC_FILE_CRC32, b"/f")
+    engine, request = begin(op)
+    with pytest.raises(LocalProtocolError):
+        _ = op.reply
+    engine.receive(ack(request, b"\1\2\3\4"), 0.1)
+    assert op.reply.data == b"\1\2\3\4"
+    assert op.done
+    assert not op.retransmitted
+
+
+def test_side_effect_decides_how_it_is_repeated() -> None:
+    for side_effect in (True, False):
+        engine, request = begin(Simple(Opcode.CALC_FILE_CRC32, b"/f", side_effect=side_effect))
+        engine.on_deadline(10.0)
+        (again,) = sent(engine, 10.0)
+        assert (again.seq == request.seq) is side_effect
+
+
+@pytest.mark.parametrize(
+    ("codes", "code", "errno"),
+    [
+        ((1,), 1, None),
+        ((2, 28), 2, 28),
+        ((2,), 2, None),
+        ((10, 7), 10, None),
+        ((), 0, None),
+        ((201,), 201, None),
+    ],
+)
+def test_refusals(codes: tuple[int, ...], code: int, errno: int | None) -> None:
+    op = Simple(Opcode.REMOVE_FILE, b"/f")
+    engine, request = begin(op)
+    engine.receive(nak(request, *codes), 0.1)
+    error = op.error
+    assert isinstance(error, FtpNak)
+    assert (error.opcode, error.code, error.server_errno, error.retransmitted) == (8, code, errno, False)
+
+
+def test_a_refusal_after_a_retransmission_says_so() -> None:
+    op = Simple(Opcode.REMOVE_FILE, b"/f")
+    engine, request = begin(op)
+    engine.on_deadline(1.0)
+    sent(engine, 1.0)
+    engine.receive(nak(request, NakCode.FILE_NOT_FOUND), 1.1)
+    assert isinstance(op.error, FtpNak)
+    assert op.error.retransmitted
+    assert op.retransmitted
+
+
+def test_too_long_data_is_refused_before_a_byte_is_sent() -> None:
+    with pytest.raises(PathTooLong):
+        Simple(Opcode.RENAME, bytes(240))
+    with pytest.raises(PathTooLong):
+        ListDirectory(bytes(240))
+
+
+@pytest.mark.parametrize("data", [b"", b"\1\2\3"])
+def test_an_open_ack_may_say_no_size(data: bytes) -> None:
+    op = OpenFile(Opcode.CREATE_FILE, b"/f", 9)
+    engine, request = begin(op)
+    engine.receive(ack(request, data), 0.1)
+    assert op.size is None
+    assert op.session == 9
+
+
+def test_an_open_with_session_0_proves_nothing() -> None:
+    op = OpenFile(Opcode.OPEN_FILE_RO, b"/f", 0)
+    engine, request = begin(op)
+    engine.receive(ack(request, bytes(4)), 0.1)
+    assert engine.traits.ack_carries_own_session is None
+
+
+def test_terminate() -> None:
+    op = Terminate(4)
+    engine, request = begin(op)
+    assert (request.opcode, request.session) == (Opcode.TERMINATE_SESSION, 4)
+    engine.receive(ack(request), 0.1)
+    assert op.done
+    assert not op.already_closed
+
+
+def test_terminating_what_is_closed_is_no_error() -> None:
+    op = Terminate(4)
+    engine, request = begin(op)
+    engine.receive(nak(request, NakCode.INVALID_SESSION), 0.1)
+    assert op.already_closed
+    assert op.error is None
+
+
+def test_a_failed_close_is_an_error() -> None:
+    op = Terminate(4)
+    engine, request = begin(op)
+    engine.receive(nak(request, NakCode.FAIL_ERRNO, 28), 0.1)
+    assert isinstance(op.error, FtpNak)
+
+
+def test_the_first_error_counts() -> None:
+    op = Simple(Opcode.NONE)
+    first, second = FtpNak(0, 1), FtpNak(0, 2)
+    op.fail(first)
+    op.fail(second)
+    assert op.error is first
+
+
+# --- ListDirectory
+
+
+class Lister:
+    """Answers the pages of one sweep."""
+
+    def __init__(self, *, with_time: bool = False) -> None:
+        self.op = ListDirectory(b"/d", with_time)
+        self.engine = Engine(random.Random(1), Flow())
+        self.engine.start(self.op, 0.0)
+        self.offsets: list[int] = []
+
+    def ask(self) -> Payload:
+        (request,) = sent(self.engine, 0.0)
+        assert request.data == b"/d"
+        self.offsets.append(request.offset)
+        return request
+
+    def page(self, data: bytes, *, offset: int | None = None) -> None:
+        self.engine.receive(ack(self.ask(), data, offset=offset), 0.0)
+
+    def end(self, *codes: int) -> None:
+        self.engine.receive(nak(self.ask(), *codes), 0.0)
+
+    @property
+    def names(self) -> list[bytes]:
+        return [entry.name for entry in self.op.entries]
+
+
+def test_pages_are_counted_by_their_non_empty_strings() -> None:
+    lister = Lister()
+    lister.page(b"S\0S\0Fa\t1\0\0Db\0\0")
+    lister.page(b"Fc\t3", offset=0)
+    lister.end(NakCode.EOF)
+    assert lister.offsets == [0, 4, 5]
+    assert lister.op.entries == [
+        DirEntry(b"a", EntryKind.FILE, 1),
+        DirEntry(b"b", EntryKind.DIRECTORY),
+        DirEntry(b"c", EntryKind.FILE, 3),
+    ]
+    assert lister.op.complete
+    assert lister.op.done
+    assert lister.op.error is None
+
+
+def test_an_empty_directory() -> None:
+    lister = Lister()
+    lister.end(NakCode.EOF)
+    assert lister.op.done
+    assert lister.op.entries == []
+    assert lister.op.error is None
+
+
+def test_opcode_16() -> None:
+    lister = Lister(with_time=True)
+    lister.page(b"Fa\t1\t1700000000\0Dd\0")
+    lister.engine.receive(eof(lister.ask()), 0.0)
+    assert lister.engine.stats.by_opcode == {Opcode.LIST_DIRECTORY_WITH_TIME: 2}
+    assert lister.op.entries[0].mtime == 1700000000
+
+
+def test_repeats_are_dropped_and_bad_names_counted() -> None:
+    lister = Lister()
+    lister.page(b"Fa\t1\0Fa\t1\0Fx/y\t1\0D.\0")
+    lister.page(b"Fa\t1\0Fb\t1\0")
+    lister.end(NakCode.EOF)
+    assert lister.names == [b"a", b"b"]
+    assert lister.op.hidden == 1
+    assert lister.offsets == [0, 4, 6]
+
+
+def test_eight_ends_a_sweep_only_behind_a_page() -> None:
+    lister = Lister()
+    lister.page(b"Fa\t1\0")
+    lister.end(NakCode.FILE_EXISTS)
+    assert lister.op.error is None
+    lister = Lister()
+    lister.end(NakCode.FILE_EXISTS)
+    assert isinstance(lister.op.error, FtpNak)
+
+
+def test_an_entry_that_fits_no_page_is_stepped_over() -> None:
+    lister = Lister()
+    lister.page(b"Fa\t1\0")
+    lister.page(b"")
+    lister.page(b"Fb\t1\0")
+    for _ in range(4):
+        lister.page(b"")
+    assert lister.offsets == [0, 1, 2, 3, 4, 5, 6]
+    assert lister.names == [b"a", b"b"]
+    assert lister.op.done
+    assert lister.op.complete
+
+
+def test_other_refusals_are_errors() -> None:
+    lister = Lister()
+    lister.page(b"Fa\t1\0")
+    lister.end(NakCode.FAIL_ERRNO, 5)
+    assert isinstance(lister.op.error, FtpNak)
+
+
+def test_a_server_that_ignores_the_offset_is_left() -> None:
+    lister = Lister()
+    while not lister.op.done:
+        lister.page(b"Fa\t1\0Fb\t1\0")
+    assert not lister.op.complete
+    assert lister.names == [b"a", b"b"]
+    assert lister.engine.stats.requests < 50
+
+
+def test_stale_pages_in_between_are_tolerated() -> None:
+    lister = Lister()
+    for index in range(60):
+        lister.page(b"Fa\t1\0" if index % 2 else b"F%d\t1\0" % index)
+    lister.end(NakCode.EOF)
+    assert lister.op.complete
+
+
+def test_endless_skip_marks_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("mavftpfs.protocol.operations.MAX_PAGES", 50)
+    lister = Lister()
+    while not lister.op.done:
+        lister.page(b"S\0S\0")
+    assert not lister.op.complete
+    assert lister.engine.stats.requests == 50
+
+
+def test_a_million_entries_end() -> None:
+    lister = Lister()
+    count = 0
+    while not lister.op.done:
+        lister.page(b"".join(b"F%d\0" % (count + index) for index in range(25)))
+        count += 25
+    assert not lister.op.complete
+    assert len(lister.op.entries) == MAX_ENTRIES

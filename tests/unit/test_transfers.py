@@ -1,0 +1,464 @@
+"""Reading wanted ranges of a file, step by step."""
+
+from __future__ import annotations
+
+import random
+
+import pytest
+
+from mavftpfs.protocol.engine import Engine
+from mavftpfs.protocol.flow import Flow
+from mavftpfs.protocol.operations import Simple
+from mavftpfs.protocol.payload import NakCode, Opcode, Payload
+from mavftpfs.protocol.requests import Priority
+from mavftpfs.protocol.transfers import ReadTransfer, Strategy
+from mavftpfs.shared.errors import FileChanged, FtpNak, LocalProtocolError, MavftpfsError, SessionLost
+from mavftpfs.shared.extents import ExtentSet
+from mavftpfs.shared.traits import Traits
+from tests.support.replies import ack, burst_nak, chunk, nak, packet, sent
+from tests.support.virtual import MemorySink
+
+CONTENT = random.Random(8).randbytes(239 * 40 + 17)
+SIZE = len(CONTENT)
+
+
+class Reader:
+    """An engine with one transfer over CONTENT."""
+
+    def __init__(
+        self,
+        *,
+        strategy: Strategy = "window",
+        size: int = SIZE,
+        block: int = 239,
+        traits: Traits | None = None,
+        limit: int = 4,
+    ) -> None:
+        self.engine = Engine(random.Random(1), Flow(limit=limit), traits=traits)
+        self.sink = MemorySink(size)
+        self.transfer = ReadTransfer(0, size, self.sink, block, strategy)
+        self.engine.start(self.transfer, 0.0)
+        self.now = 0.0
+
+    def sent(self) -> list[Payload]:
+        return sent(self.engine, self.now)
+
+    def answer(self, request: Payload) -> None:
+        self.engine.receive(chunk(request, CONTENT), self.now)
+
+    def finish(self) -> list[Payload]:
+        """Answer everything, in order; return what was asked."""
+        asked: list[Payload] = []
+        while out := self.sent():
+            for request in out:
+                self.now += 0.01
+                self.answer(request)
+            asked += out
+        return asked
+
+    def pass_quiet(self) -> None:
+        deadline = self.engine.next_deadline()
+        assert deadline is not None
+        self.now = deadline
+        self.engine.on_deadline(self.now)
+
+
+def ranges(requests: list[Payload]) -> list[tuple[int, int]]:
+    return [(request.offset, request.offset + request.size) for request in requests]
+
+
+# --- wants
+
+
+def test_the_last_request_is_clamped_to_the_size() -> None:
+    reader = Reader(size=500)
+    reader.transfer.want(0, 10_000, True)
+    assert ranges(reader.finish()) == [(0, 239), (239, 478), (478, 500)]
+    assert bytes(reader.sink.data) == CONTENT[:500]
+    assert reader.transfer.idle
+    assert reader.transfer.received_bytes == 500
+
+
+def test_nothing_is_asked_beyond_the_end_or_twice() -> None:
+    reader = Reader()
+    reader.transfer.want(SIZE, SIZE + 100, True)
+    assert reader.transfer.idle
+    reader.transfer.want(0, 478, True)
+    reader.sent()
+    reader.transfer.want(0, 478, True)
+    assert reader.sent() == []
+    assert reader.transfer.wants == ExtentSet([(0, 478)])
+
+
+def test_what_the_sink_holds_is_not_asked() -> None:
+    reader = Reader()
+    reader.sink.on_data(100, CONTENT[100:200])
+    reader.transfer.want(0, 300, True)
+    assert ranges(reader.sent()) == [(0, 100), (200, 300)]
+
+
+def test_demand_goes_before_readahead_and_promotes_it() -> None:
+    reader = Reader(limit=1)
+    reader.transfer.want(0, 1000, False)
+    assert reader.transfer.priority == Priority.READAHEAD
+    reader.transfer.want(700, 900, True)
+    assert reader.engine._ops[0].priority == Priority.DEMAND
+    reader.transfer.want(600, 950, False)
+    assert ranges(reader.finish()) == [(700, 900), (0, 239), (239, 478), (478, 700), (900, 1000)]
+    assert reader.sink.repeats == 0
+
+
+def test_readahead_can_be_dropped() -> None:
+    reader = Reader(limit=1)
+    reader.transfer.want(0, 1000, False)
+    (request,) = reader.sent()
+    reader.transfer.drop_readahead()
+    reader.answer(request)
+    assert reader.sent() == []
+    assert reader.transfer.idle
+    assert reader.sink.held == ExtentSet([(0, 239)])
+
+
+@pytest.mark.parametrize("block", [0, 240])
+def test_chunk_sizes(block: int) -> None:
+    with pytest.raises(LocalProtocolError):
+        ReadTransfer(0, 1, MemorySink(1), block)
+
+
+# --- replies to ReadFile
+
+
+def test_a_short_reply_is_asked_for_again() -> None:
+    reader = Reader(limit=1)
+    reader.transfer.want(0, 239, True)
+    (request,) = reader.sent()
+    reader.engine.receive(ack(request, CONTENT[:100]), 0.1)
+    (rest,) = reader.sent()
+    assert ranges([rest]) == [(100, 239)]
+    reader.answer(rest)
+    assert bytes(reader.sink.data[:239]) == CONTENT[:239]
+
+
+def test_a_server_with_small_replies_is_asked_for_less() -> None:
+    reader = Reader(limit=1)
+    reader.transfer.want(0, 239 * 8, True)
+    sizes = []
+    while out := reader.sent():
+        (request,) = out
+        sizes.append(request.size)
+        reader.engine.receive(ack(request, CONTENT[request.offset :][: min(request.size, 48)]), 0.1)
+    assert bytes(reader.sink.data[: 239 * 8]) == CONTENT[: 239 * 8]
+    assert reader.transfer.chunk == 48
+    assert set(sizes[4:-1]) == {48}
+
+
+def test_an_over_long_reply_is_clipped() -> None:
+    reader = Reader(limit=1)
+    reader.transfer.want(0, 100, True)
+    (request,) = reader.sent()
+    reader.engine.receive(ack(request, CONTENT[:239]), 0.1)
+    assert reader.sink.held == ExtentSet([(0, 100)])
+    assert reader.transfer.idle
+
+
+def test_an_empty_ack_means_that_the_file_shrank() -> None:
+    reader = Reader()
+    reader.transfer.want(0, 1000, True)
+    reader.engine.receive(ack(reader.sent()[0]), 0.1)
+    assert isinstance(reader.transfer.error, FileChanged)
+    assert reader.transfer.wants == ExtentSet([(0, 1000)])
+    assert reader.engine.take_finished() == [reader.transfer]
+
+
+def test_an_early_eof_means_a_shrunken_file_where_sessions_are_echoed() -> None:
+    reader = Reader(traits=Traits(ack_carries_own_session=True))
+    reader.transfer.want(0, 100, True)
+    reader.engine.receive(nak(reader.sent()[0], NakCode.EOF), 0.1)
+    assert isinstance(reader.transfer.error, FileChanged)
+
+
+@pytest.mark.parametrize("codes", [(4,), (10,), (1,), (8,), (2, 9), (6,)])
+def test_a_lost_session_leaves_the_wants(codes: tuple[int, ...]) -> None:
+    reader = Reader()
+    reader.transfer.want(0, 1000, True)
+    out = reader.sent()
+    reader.answer(out[0])
+    reader.engine.receive(nak(out[1], *codes), 0.1)
+    error = reader.transfer.error
+    assert isinstance(error, SessionLost)
+    assert error.by_server
+    assert reader.transfer.wants == ExtentSet([(239, 1000)])
+
+
+def test_other_refusals_are_asked_again_a_few_times() -> None:
+    reader = Reader(limit=1)
+    reader.transfer.want(0, 100, True)
+    for _ in range(3):
+        assert not reader.transfer.done
+        (request,) = reader.sent()
+        reader.engine.receive(nak(request, 2, 5), 0.1)
+    error = reader.transfer.error
+    assert isinstance(error, FtpNak)
+    assert error.server_errno == 5
+
+
+def test_rates() -> None:
+    reader = Reader(limit=1)
+    assert reader.transfer.window_rate is None
+    assert reader.transfer.burst_rate is None
+    reader.transfer.want(0, SIZE, True)
+    while out := reader.sent():
+        reader.now += 0.1
+        reader.answer(out[0])
+    assert reader.transfer.window_rate == pytest.approx(SIZE / 4.1)
+    reader.now += 100.0
+    reader.sink.held.clear()
+    reader.transfer.want(0, 239, True)
+    reader.sent()
+    reader.now += 0.1
+    reader.engine.receive(Payload(1, 0, 128, 0), reader.now)
+    assert reader.transfer.window_rate == pytest.approx(SIZE / 4.1)
+
+
+# --- bursts
+
+
+def stream(reader: Reader, request: Payload, indices: list[int], *, complete: int | None = None) -> None:
+    for index in indices:
+        start = request.offset + index * 239
+        reader.now += 0.001
+        data = CONTENT[start : start + 239]
+        reader.engine.receive(packet(request, index, data, complete=int(index == complete)), reader.now)
+
+
+def test_a_whole_file_in_one_burst() -> None:
+    reader = Reader(strategy="burst")
+    reader.transfer.want(0, SIZE, True)
+    (request,) = reader.sent()
+    assert (request.opcode, request.offset, request.size) == (Opcode.BURST_READ_FILE, 0, 239)
+    assert reader.transfer.bursting
+    assert not reader.transfer.idle
+    assert reader.sent() == []
+    stream(reader, request, list(range(41)))
+    assert bytes(reader.sink.data) == CONTENT
+    assert reader.transfer.idle
+    assert reader.transfer.burst_rate == pytest.approx(SIZE / 0.041)
+    assert reader.engine.traits.burst_size_honoured is True
+    reader.engine.receive(burst_nak(request, 41, NakCode.EOF), reader.now)
+    assert reader.engine.stats.unknown == 1
+
+
+def test_a_burst_begins_at_the_first_missing_wanted_byte_and_brings_more() -> None:
+    reader = Reader(strategy="burst")
+    reader.transfer.want(1000, 2000, True)
+    (request,) = reader.sent()
+    assert request.offset == 1000
+    stream(reader, request, list(range(10)), complete=9)
+    assert reader.sink.held == ExtentSet([(1000, 1000 + 2390)])
+    assert not reader.transfer.idle
+    reader.pass_quiet()
+    assert reader.transfer.idle
+
+
+def test_gaps_are_filled_by_reads_when_the_burst_is_over() -> None:
+    reader = Reader(strategy="burst")
+    reader.transfer.want(0, SIZE, True)
+    (request,) = reader.sent()
+    stream(reader, request, [0, 1, 4, 5, 6, 9])
+    assert reader.sent() == []
+    reader.engine.receive(burst_nak(request, 10, NakCode.EOF), reader.now)
+    out = reader.sent()
+    assert {item.opcode for item in out} == {Opcode.READ_FILE}
+    assert ranges(out) == [(478, 717), (717, 956), (1673, 1912), (1912, 2151)]
+    for item in out:
+        reader.answer(item)
+    (again,) = reader.sent()
+    assert (again.opcode, again.offset) == (Opcode.BURST_READ_FILE, 2390)
+    assert again.seq - request.seq > 4096
+    stream(reader, again, list(range(31)))
+    assert bytes(reader.sink.data) == CONTENT
+    assert reader.sink.repeats == 0
+
+
+def test_a_burst_that_goes_quiet_is_over_but_not_early() -> None:
+    reader = Reader(strategy="burst")
+    reader.transfer.want(0, SIZE, True)
+    (request,) = reader.sent()
+    stream(reader, request, [0, 1, 2])
+    heard = reader.now
+    while reader.transfer.bursting:
+        assert reader.sent() == []
+        reader.pass_quiet()
+    assert reader.now == pytest.approx(heard + 1.0)
+    (again,) = reader.sent()
+    assert again.offset == 717
+
+
+def test_the_flag_and_a_short_quiet_end_it() -> None:
+    reader = Reader(strategy="burst")
+    reader.engine._timers["data"].sample(0.05)
+    reader.transfer.want(0, SIZE, True)
+    (request,) = reader.sent()
+    stream(reader, request, [0, 1, 2], complete=2)
+    assert reader.transfer.bursting
+    reader.pass_quiet()
+    assert not reader.transfer.bursting
+    assert reader.now < 0.3
+
+
+def test_a_spurious_flag_does_not_end_it() -> None:
+    reader = Reader(strategy="burst")
+    reader.transfer.want(0, SIZE, True)
+    (request,) = reader.sent()
+    stream(reader, request, list(range(41)), complete=3)
+    assert bytes(reader.sink.data) == CONTENT
+    assert reader.engine.stats.by_opcode == {Opcode.BURST_READ_FILE: 1}
+
+
+def test_a_burst_waits_for_reads_and_reads_for_the_burst() -> None:
+    reader = Reader()
+    reader.transfer.want(0, SIZE, True)
+    out = reader.sent()
+    reader.transfer.set_strategy("burst")
+    assert reader.transfer.strategy == "burst"
+    for item in out[:-1]:
+        reader.answer(item)
+        assert reader.sent() == []
+    reader.answer(out[-1])
+    (burst,) = reader.sent()
+    assert (burst.opcode, burst.offset) == (Opcode.BURST_READ_FILE, 956)
+    reader.transfer.set_strategy("window")
+    assert reader.sent() == []
+    reader.engine.receive(burst_nak(burst, 0, NakCode.EOF), 0.2)
+    assert {item.opcode for item in reader.sent()} == {Opcode.READ_FILE}
+
+
+def test_two_bursts_without_data_are_enough() -> None:
+    reader = Reader(strategy="burst")
+    reader.transfer.want(0, SIZE, True)
+    for _ in range(2):
+        (request,) = reader.sent()
+        assert request.opcode == Opcode.BURST_READ_FILE
+        reader.pass_quiet()
+    assert reader.transfer.strategy == "window"
+    reader.finish()
+    assert bytes(reader.sink.data) == CONTENT
+
+
+@pytest.mark.parametrize("code", [1, 2, 3, 6, 7])
+def test_a_refused_burst_gives_way_to_reads(code: int) -> None:
+    reader = Reader(strategy="burst")
+    reader.transfer.want(0, SIZE, True)
+    (request,) = reader.sent()
+    reader.engine.receive(burst_nak(request, 0, code), 0.1)
+    assert reader.transfer.strategy == "window"
+    reader.finish()
+    assert bytes(reader.sink.data) == CONTENT
+
+
+@pytest.mark.parametrize("code", [4, 10])
+def test_a_burst_without_session(code: int) -> None:
+    reader = Reader(strategy="burst")
+    reader.transfer.want(0, SIZE, True)
+    reader.engine.receive(burst_nak(reader.sent()[0], 0, code), 0.1)
+    assert isinstance(reader.transfer.error, SessionLost)
+    assert reader.transfer.wants == ExtentSet([(0, SIZE)])
+    assert not reader.transfer.bursting
+
+
+@pytest.mark.parametrize("kind", ["empty", "nak"])
+def test_an_endless_stream_must_be_terminated(kind: str) -> None:
+    reader = Reader(strategy="burst")
+    reader.transfer.want(0, SIZE, True)
+    (request,) = reader.sent()
+    stream(reader, request, [0, 1])
+    for index in (2, 3):
+        reply = burst_nak(request, index, 1)
+        if kind == "empty":
+            reply = packet(request, index, b"")._replace(offset=478)
+        reader.engine.receive(reply, reader.now)
+    assert isinstance(reader.transfer.error, SessionLost)
+    assert reader.transfer.wants == ExtentSet([(478, SIZE)])
+
+
+def test_px4_sends_239_whatever_was_asked() -> None:
+    reader = Reader(strategy="burst", block=110)
+    reader.transfer.want(0, SIZE, True)
+    (request,) = reader.sent()
+    assert request.size == 110
+    stream(reader, request, list(range(41)))
+    assert bytes(reader.sink.data) == CONTENT
+    assert reader.engine.traits.burst_size_honoured is False
+
+
+def test_one_short_packet_says_nothing_about_sizes() -> None:
+    reader = Reader(strategy="burst", size=100)
+    reader.transfer.want(0, 100, True)
+    (request,) = reader.sent()
+    reader.engine.receive(packet(request, 0, CONTENT[:100]), 0.1)
+    assert reader.transfer.idle
+    assert reader.engine.traits.burst_size_honoured is None
+
+
+@pytest.mark.parametrize("echoes", [None, True, False])
+def test_a_long_burst_is_kept_alive_where_bursts_do_not_count(echoes: bool | None) -> None:
+    reader = Reader(
+        strategy="burst", traits=Traits(ack_carries_own_session=echoes, answers_during_burst=True)
+    )
+    reader.transfer.want(0, SIZE, True)
+    (request,) = reader.sent()
+    sent_at: list[float] = []
+    for index in range(41):
+        reader.now += 0.25
+        reader.engine.on_deadline(reader.now)
+        for extra in reader.sent():
+            assert (extra.opcode, extra.session, extra.size) == (Opcode.NONE, 0, 0)
+            sent_at.append(reader.now)
+            if len(sent_at) == 1:
+                reader.engine.receive(ack(extra), reader.now)
+        data = CONTENT[index * 239 : index * 239 + 239]
+        reader.engine.receive(packet(request, index, data)._replace(session=0), reader.now)
+    assert bytes(reader.sink.data) == CONTENT
+    assert sent_at == ([3.0, 6.0, 9.0] if echoes is False else [])
+    reader.now += 10.0
+    reader.engine.on_deadline(reader.now)
+    assert reader.engine.in_flight == 0
+    assert reader.sent() == []
+
+
+def test_a_keep_alive_that_finds_no_room_does_not_spin() -> None:
+    reader = Reader(strategy="burst", limit=1, traits=Traits(ack_carries_own_session=False))
+    reader.transfer.want(0, SIZE, True)
+    (request,) = reader.sent()
+    reader.engine.start(Simple(Opcode.NONE), 0.0)
+    reader.sent()
+    for index in range(8):
+        reader.now += 0.5
+        stream(reader, request, [index])
+    while (deadline := reader.engine.next_deadline()) is not None and deadline <= reader.now:
+        reader.engine.on_deadline(reader.now)
+        reader.sent()
+    assert reader.transfer.bursting
+
+
+def test_packets_after_the_transfer_ended_are_dropped() -> None:
+    reader = Reader(strategy="burst")
+    reader.transfer.want(0, SIZE, True)
+    (request,) = reader.sent()
+    reader.engine.receive(burst_nak(request, 0, NakCode.EOF), 0.1)
+    assert not reader.transfer.on_burst(packet(request, 0, CONTENT[:239]), 0.2)
+    assert reader.sink.held.empty
+
+
+def test_a_timer_without_a_burst_is_harmless() -> None:
+    reader = Reader()
+    reader.transfer.on_timer(5.0)
+    assert reader.transfer.timer > 1e9
+
+
+def test_failing_twice_keeps_the_first_error() -> None:
+    reader = Reader()
+    first: MavftpfsError = SessionLost("first")
+    reader.transfer.fail(first)
+    reader.transfer.fail(FileChanged("second"))
+    assert reader.transfer.error is first
