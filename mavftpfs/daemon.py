@@ -123,9 +123,10 @@ def log_to_file(path: str, level: int) -> None:
 def log_in_background(fallback: Path, level: int, *, socket: str = SYSLOG_SOCKET) -> None:
     """Log to syslog, or where there is none to a small file that is kept in turns."""
     form = f"mavftpfs[{os.getpid()}]: %(levelname)s %(name)s: %(message)s"
-    try:
-        handler: logging.Handler = logging.handlers.SysLogHandler(socket)
-    except OSError:
+    handler: logging.Handler
+    if Path(socket).is_socket():  # the handler itself says nothing about a missing one
+        handler = logging.handlers.SysLogHandler(socket)
+    else:
         fallback.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         handler = logging.handlers.RotatingFileHandler(fallback, maxBytes=_LOG_SIZE, backupCount=1)
         form = f"%(asctime)s {form}"

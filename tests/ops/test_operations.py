@@ -1,0 +1,487 @@
+"""fuse.operations without a kernel: attributes, lookup counts, errnos, deadlines."""
+
+from __future__ import annotations
+
+import errno
+import inspect
+import json
+import logging
+import os
+import stat
+from collections.abc import Callable, Coroutine
+from typing import Any, cast
+
+import pyfuse3
+import pytest
+import trio
+import trio.testing
+from pyfuse3 import FUSEError, RequestContext
+
+from mavftpfs.fuse.inodes import ROOT_INO
+from mavftpfs.fuse.operations import (
+    UNKNOWN_SPACE,
+    XATTR_CRC32,
+    XATTR_STATUS,
+    Operations,
+    Presentation,
+    Space,
+)
+from mavftpfs.shared.errors import Armed, FtpNak, NotFound, PathTooLong, RequestTimeout
+from tests.ops.faketree import MTIME, FakeTree
+
+CTX = cast(RequestContext, None)
+TOKEN = cast(pyfuse3.ReaddirToken, None)
+LOOK = Presentation(uid=1000, gid=100, file_mode=0o444, directory_mode=0o555, op_deadline=30.0)
+
+
+def some_tree() -> FakeTree:
+    return FakeTree({b"/a.txt": b"hello\n", b"/log/1.ulg": bytes(range(256)) * 4}, {b"/empty"})
+
+
+def operations(tree: FakeTree | None = None, **more: Any) -> Operations:
+    return Operations(tree or some_tree(), LOOK, **more)
+
+
+async def failure(call: Coroutine[Any, Any, object]) -> int:
+    """Return the errno a handler ends with."""
+    with pytest.raises(FUSEError) as caught:
+        await call
+    return caught.value.errno
+
+
+async def ino_of(ops: Operations, *names: bytes) -> int:
+    ino = ROOT_INO
+    for name in names:
+        ino = (await ops.lookup(ino, name, CTX)).st_ino
+    return ino
+
+
+class Listing:
+    """Stands in for pyfuse3.readdir_reply: takes `room` entries a call, as a kernel buffer does."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, room: int = 1000) -> None:
+        self.taken: list[tuple[bytes, int, int]] = []
+        self.room = self.left = room
+        monkeypatch.setattr(pyfuse3, "readdir_reply", self.reply)
+
+    def reply(self, token: object, name: bytes, attr: pyfuse3.EntryAttributes, next_id: int) -> bool:
+        if not self.left:
+            return False
+        self.left -= 1
+        self.taken.append((name, attr.st_ino, next_id))
+        return True
+
+    async def read(self, ops: Operations, fh: int, start: int) -> int:
+        """One readdir call; returns the offset to go on from."""
+        self.left = self.room
+        before = len(self.taken)
+        await ops.readdir(fh, start, TOKEN)
+        return self.taken[-1][2] if len(self.taken) > before else -1
+
+    @property
+    def names(self) -> list[bytes]:
+        return [name for name, _, _ in self.taken]
+
+
+# -- attributes and lookup counts -----------------------------------------------------------------
+
+
+async def test_a_file_s_attributes() -> None:
+    ops = operations()
+    entry = await ops.lookup(ROOT_INO, b"a.txt", CTX)
+    assert entry.st_mode == stat.S_IFREG | 0o444
+    assert (entry.st_uid, entry.st_gid, entry.st_nlink) == (1000, 100, 1)
+    assert (entry.st_size, entry.st_blocks) == (6, 1)
+    assert entry.st_mtime_ns == entry.st_ctime_ns == MTIME * 10**9
+    assert entry.entry_timeout == entry.attr_timeout == 1.0
+    again = await ops.getattr(entry.st_ino, CTX)
+    assert (again.st_ino, again.generation, again.st_size) == (entry.st_ino, entry.generation, 6)
+
+
+async def test_a_directory_s_attributes() -> None:
+    entry = await operations().getattr(ROOT_INO, CTX)
+    assert entry.st_mode == stat.S_IFDIR | 0o555
+    assert entry.st_ino == ROOT_INO
+
+
+async def test_lookup_counts_and_forget_takes_back() -> None:
+    ops = operations()
+    ino = await ino_of(ops, b"log", b"1.ulg")
+    assert await ino_of(ops, b"log", b"1.ulg") == ino
+    assert len(ops.inodes) == 3
+    await ops.forget([(ino, 1), (ino, 1)])
+    assert ops.inodes.get(ino) is None
+    assert await failure(ops.getattr(ino, CTX)) == errno.ESTALE
+
+
+async def test_getattr_does_not_count() -> None:
+    ops = operations()
+    ino = await ino_of(ops, b"a.txt")
+    await ops.getattr(ino, CTX)
+    await ops.forget([(ino, 1)])
+    assert len(ops.inodes) == 1
+
+
+async def test_a_missing_name_is_cached_by_the_kernel_and_uses_no_inode() -> None:
+    ops = operations()
+    entry = await ops.lookup(ROOT_INO, b"nope", CTX)
+    assert (entry.st_ino, entry.entry_timeout) == (0, 2.0)
+    assert len(ops.inodes) == 1
+
+
+async def test_dot_and_dot_dot() -> None:
+    ops = operations()
+    log_ino = await ino_of(ops, b"log")
+    assert await ino_of(ops, b"log", b".") == log_ino
+    assert await ino_of(ops, b"log", b"..") == ROOT_INO
+    assert await ino_of(ops, b"..") == ROOT_INO
+
+
+async def test_an_inode_forgotten_during_getattr_leaves_nothing_behind() -> None:
+    tree = some_tree()
+    ops = operations(tree)
+    ino = await ino_of(ops, b"a.txt")
+    tree.on_call = lambda name, path: ops.inodes.forget(ino, 1)
+    assert (await ops.getattr(ino, CTX)).st_ino == ino
+    ops.inodes.check_invariants()
+    assert len(ops.inodes) == 1
+
+
+async def test_a_parent_renamed_during_lookup_gives_the_name_its_new_path() -> None:
+    tree = some_tree()
+    ops = operations(tree)
+    parent = await ino_of(ops, b"log")
+
+    def rename(name: str, path: bytes) -> None:
+        ops.inodes.rename(b"/log", b"/moved")
+
+    tree.on_call = rename
+    entry = await ops.lookup(parent, b"1.ulg", CTX)
+    assert ops.inodes.known(b"/moved/1.ulg") == entry.st_ino
+    ops.inodes.check_invariants()
+
+
+# -- directories ----------------------------------------------------------------------------------
+
+
+async def test_readdir_gives_attributes_and_counts_what_was_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+    ops, listing = operations(), Listing(monkeypatch)
+    fh = await ops.opendir(ROOT_INO, CTX)
+    await listing.read(ops, fh, 0)
+    assert listing.names == [b"a.txt", b"empty", b"log"]
+    for _, ino, _ in listing.taken:
+        inode = ops.inodes.get(ino)
+        assert inode is not None
+        assert inode.lookups == 1
+    await ops.releasedir(fh)
+    assert await failure(ops.readdir(fh, 0, TOKEN)) == errno.EBADF
+
+
+@pytest.mark.parametrize("room", [1, 2, 3, 7])
+async def test_readdir_in_portions_has_every_name_once(monkeypatch: pytest.MonkeyPatch, room: int) -> None:
+    tree = FakeTree({b"/f%02d" % index: b"" for index in range(20)})
+    ops, listing = operations(tree), Listing(monkeypatch, room)
+    fh = await ops.opendir(ROOT_INO, CTX)
+    offset = 0
+    while offset >= 0:
+        offset = await listing.read(ops, fh, offset)
+        ops.inodes.check_invariants()
+    assert listing.names == sorted(path[1:] for path in tree.files)
+    assert len(ops.inodes) == 21
+
+
+async def test_readdir_offsets_are_stable_while_the_directory_changes(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    tree = FakeTree({b"/f%02d" % index: b"" for index in range(10)})
+    ops, listing = operations(tree), Listing(monkeypatch, 5)
+    fh = await ops.opendir(ROOT_INO, CTX)
+    offset = await listing.read(ops, fh, 0)
+    del tree.files[b"/f00"], tree.files[b"/f07"]
+    tree.files[b"/f03x"] = b""
+    await listing.read(ops, fh, offset)
+    assert listing.names == [b"f%02d" % index for index in range(10)]
+    listing.taken.clear()
+    await listing.read(ops, fh, 0)
+    assert listing.names == [b"f01", b"f02", b"f03", b"f03x", b"f04"]
+
+
+# -- files ----------------------------------------------------------------------------------------
+
+
+async def test_open_read_release() -> None:
+    tree = some_tree()
+    ops = operations(tree)
+    info = await ops.open(await ino_of(ops, b"log", b"1.ulg"), os.O_RDONLY, CTX)
+    assert bytes(await ops.read(info.fh, 10, 100)) == tree.files[b"/log/1.ulg"][10:110]
+    assert bytes(await ops.read(info.fh, 1000, 100)) == tree.files[b"/log/1.ulg"][1000:]
+    assert bytes(await ops.read(info.fh, 1024, 100)) == b""
+    assert bytes(await ops.read(info.fh, 5000, 100)) == b""
+    await ops.flush(info.fh)
+    await ops.fsync(info.fh, False)
+    await ops.release(info.fh)
+    assert tree.opened[0].closed == 1
+    assert await failure(ops.read(info.fh, 0, 1)) == errno.EBADF
+    assert len(ops.files) == 0
+
+
+@pytest.mark.parametrize(("direct_io", "keep_cache"), [(True, False), (False, True), (False, False)])
+async def test_the_kernel_s_cache_is_as_the_tree_says(direct_io: bool, keep_cache: bool) -> None:
+    tree = some_tree()
+    tree.direct_io, tree.keep_cache = direct_io, keep_cache
+    ops = operations(tree)
+    info = await ops.open(await ino_of(ops, b"a.txt"), os.O_RDONLY, CTX)
+    assert (info.direct_io, info.keep_cache) == (direct_io, keep_cache)
+
+
+@pytest.mark.parametrize(
+    "flags", [os.O_WRONLY, os.O_RDWR, os.O_RDONLY | os.O_TRUNC, os.O_WRONLY | os.O_APPEND]
+)
+async def test_opening_for_anything_but_reading_is_erofs(flags: int) -> None:
+    tree = some_tree()
+    ops = operations(tree)
+    assert await failure(ops.open(await ino_of(ops, b"a.txt"), flags, CTX)) == errno.EROFS
+    assert tree.opened == []
+
+
+@pytest.mark.parametrize("short", [0, 1, 5])
+async def test_a_short_reply_in_mid_file_is_an_error(short: int, caplog: pytest.LogCaptureFixture) -> None:
+    tree = some_tree()
+    ops = operations(tree)
+    info = await ops.open(await ino_of(ops, b"a.txt"), os.O_RDONLY, CTX)
+    tree.short_read = short
+    assert await failure(ops.read(info.fh, 0, 100)) == errno.EIO
+    assert "bug" in caplog.text
+
+
+async def test_a_size_the_kernel_does_not_know_is_told_before_open_returns() -> None:
+    told: list[int] = []
+
+    async def refresh(ino: int) -> None:
+        told.append(ino)
+
+    tree = some_tree()
+    ops = operations(tree, refresh=refresh)
+    ino = await ino_of(ops, b"a.txt")
+    await ops.open(ino, os.O_RDONLY, CTX)
+    assert told == []
+    tree.files[b"/a.txt"] += b"more"
+    await ops.open(ino, os.O_RDONLY, CTX)
+    assert told == [ino]
+
+
+# -- the file system ------------------------------------------------------------------------------
+
+
+async def test_statfs_never_asks_the_tree() -> None:
+    tree = some_tree()
+    tree.error = AssertionError("asked")
+    data = await operations(tree).statfs(CTX)
+    assert data.f_blocks * data.f_frsize == UNKNOWN_SPACE
+    known = await operations(tree, space=lambda: Space(1 << 30, 1 << 20)).statfs(CTX)
+    assert known.f_blocks * known.f_frsize == 1 << 30
+    assert known.f_bavail * known.f_frsize == known.f_bfree * known.f_frsize == 1 << 20
+    assert tree.calls == []
+
+
+async def test_checksum_of_a_file_only() -> None:
+    ops = operations(FakeTree({b"/d/nine": b"123456789"}))
+    ino = await ino_of(ops, b"d", b"nine")
+    assert await ops.getxattr(ino, XATTR_CRC32, CTX) == b"2dfd2d88"
+    assert await ops.listxattr(ino, CTX) == []
+    assert await failure(ops.getxattr(await ino_of(ops, b"d"), XATTR_CRC32, CTX)) == errno.ENODATA
+
+
+async def test_checksum_has_leading_zeros() -> None:
+    ops = operations(FakeTree({b"/zeros": bytes(100)}))
+    assert await ops.getxattr(await ino_of(ops, b"zeros"), XATTR_CRC32, CTX) == b"00000000"
+
+
+async def test_checksum_while_armed_is_eagain() -> None:
+    tree = some_tree()
+    ops = operations(tree)
+    ino = await ino_of(ops, b"a.txt")
+
+    def arm(name: str, path: bytes) -> None:
+        if name == "crc32":
+            raise Armed("armed")
+
+    tree.on_call = arm
+    assert await failure(ops.getxattr(ino, XATTR_CRC32, CTX)) == errno.EAGAIN
+
+
+@pytest.mark.parametrize("name", [b"security.capability", b"system.posix_acl_access", b"user.x"])
+async def test_unknown_attributes_never_ask_the_tree(name: bytes) -> None:
+    tree = some_tree()
+    ops = operations(tree)
+    ino = await ino_of(ops, b"a.txt")
+    tree.calls.clear()
+    assert await failure(ops.getxattr(ino, name, CTX)) == errno.ENODATA
+    assert await failure(ops.getxattr(ino, XATTR_STATUS, CTX)) == errno.ENODATA
+    assert tree.calls == []
+
+
+async def test_status_is_on_the_root() -> None:
+    ops = operations(status=lambda: {"rate": 5, "path": b"/x"})
+    assert await ops.listxattr(ROOT_INO, CTX) == [XATTR_STATUS]
+    assert json.loads(await ops.getxattr(ROOT_INO, XATTR_STATUS, CTX))["rate"] == 5
+
+
+# -- what would change the tree -------------------------------------------------------------------
+
+REFUSED = [
+    "setattr",
+    "create",
+    "mknod",
+    "mkdir",
+    "unlink",
+    "rmdir",
+    "symlink",
+    "rename",
+    "link",
+    "write",
+    "setxattr",
+    "removexattr",
+]
+
+
+@pytest.mark.parametrize("name", REFUSED)
+async def test_whatever_changes_the_tree_is_erofs(name: str) -> None:
+    tree = some_tree()
+    method = getattr(operations(tree), name)
+    expected = list(inspect.signature(getattr(pyfuse3.Operations, name)).parameters)[1:]
+    assert await failure(method(*[None] * len(expected))) == errno.EROFS
+    assert tree.calls == []
+
+
+def test_every_handler_is_ours_or_deliberately_the_library_s() -> None:
+    left = {
+        name
+        for name, value in vars(pyfuse3.Operations).items()
+        if inspect.iscoroutinefunction(value) and getattr(Operations, name) is value
+    }
+    assert left == {"poll"}, "poll's ENOSYS has the kernel answer by itself"
+
+
+# -- errors and deadlines -------------------------------------------------------------------------
+
+Call = Callable[[Operations, int, int], Coroutine[Any, Any, object]]
+CALLS: dict[str, Call] = {
+    "lookup": lambda ops, ino, fh: ops.lookup(ROOT_INO, b"a.txt", CTX),
+    "getattr": lambda ops, ino, fh: ops.getattr(ino, CTX),
+    "readdir": lambda ops, ino, fh: ops.readdir(ops.directories.add(_root()), 0, TOKEN),
+    "open": lambda ops, ino, fh: ops.open(ino, os.O_RDONLY, CTX),
+    "read": lambda ops, ino, fh: ops.read(fh, 0, 6),
+    "getxattr": lambda ops, ino, fh: ops.getxattr(ino, XATTR_CRC32, CTX),
+}
+
+
+def _root() -> Any:
+    from mavftpfs.fuse.handles import DirectoryHandle
+
+    return DirectoryHandle(ROOT_INO)
+
+
+async def prepared(tree: FakeTree) -> tuple[Operations, int, int]:
+    ops = operations(tree)
+    ino = await ino_of(ops, b"a.txt")
+    return ops, ino, (await ops.open(ino, os.O_RDONLY, CTX)).fh
+
+
+@pytest.mark.parametrize("call", CALLS.values(), ids=CALLS)
+@pytest.mark.parametrize(
+    ("error", "expected"),
+    [
+        (RequestTimeout("x"), errno.ETIMEDOUT),
+        (PathTooLong("x"), errno.ENAMETOOLONG),
+        (FtpNak(4, 9), errno.EACCES),
+        (FUSEError(errno.EXDEV), errno.EXDEV),
+    ],
+    ids=str,
+)
+async def test_the_tree_s_errors_become_errnos(call: Call, error: Exception, expected: int) -> None:
+    tree = some_tree()
+    ops, ino, fh = await prepared(tree)
+    tree.error = error
+    assert await failure(call(ops, ino, fh)) == expected
+    ops.inodes.check_invariants()
+
+
+@pytest.mark.parametrize("call", CALLS.values(), ids=CALLS)
+@pytest.mark.parametrize("bug", [ValueError("x"), ExceptionGroup("x", [KeyError("y")])], ids=repr)
+async def test_a_bug_is_eio_and_logged_with_its_traceback(
+    call: Call, bug: Exception, caplog: pytest.LogCaptureFixture
+) -> None:
+    tree = some_tree()
+    ops, ino, fh = await prepared(tree)
+    tree.error = bug
+    assert await failure(call(ops, ino, fh)) == errno.EIO
+    records = [record for record in caplog.records if record.levelno == logging.ERROR]
+    assert len(records) == 1
+    assert records[0].exc_info is not None
+
+
+async def test_not_found_below_a_lookup_is_negative_but_else_enoent() -> None:
+    tree = some_tree()
+    ops, ino, _ = await prepared(tree)
+    tree.error = NotFound("x")
+    assert (await ops.lookup(ROOT_INO, b"a.txt", CTX)).st_ino == 0
+    assert await failure(ops.getattr(ino, CTX)) == errno.ENOENT
+
+
+@pytest.mark.parametrize("name", CALLS)
+async def test_every_handler_ends_in_time(name: str, autojump_clock: trio.testing.MockClock) -> None:
+    tree = some_tree()
+    ops, ino, fh = await prepared(tree)
+    tree.delays = dict.fromkeys(("stat", "list", "open", "read", "crc32"), 10_000.0)
+    started = trio.current_time()
+    assert await failure(CALLS[name](ops, ino, fh)) == errno.ETIMEDOUT
+    limit = 160.0 if name == "getxattr" else 34.0
+    assert 30.0 < trio.current_time() - started < limit
+    ops.inodes.check_invariants()
+
+
+async def test_a_big_read_on_a_slow_radio_gets_the_time_it_needs(
+    autojump_clock: trio.testing.MockClock,
+) -> None:
+    """128 KiB at 1.2 kB/s are 110 s; that the link makes progress is the tree's to judge."""
+    tree = FakeTree({b"/a.txt": bytes(131072)})
+    ops, _, fh = await prepared(tree)
+    tree.delays = {"read": 110.0}
+    assert len(await ops.read(fh, 0, 131072)) == 131072
+    tree.delays = {"read": 10_000.0}
+    assert await failure(ops.read(fh, 0, 131072)) == errno.ETIMEDOUT
+
+
+async def test_a_checksum_gets_its_own_budget(autojump_clock: trio.testing.MockClock) -> None:
+    tree = some_tree()
+    ops, ino, _ = await prepared(tree)
+    tree.delays = {"crc32": 119.0}
+    assert len(await ops.getxattr(ino, XATTR_CRC32, CTX)) == 8
+
+
+@pytest.mark.parametrize("name", CALLS)
+async def test_cancellation_passes(name: str, autojump_clock: trio.testing.MockClock) -> None:
+    tree = some_tree()
+    ops, ino, fh = await prepared(tree)
+    tree.delays = dict.fromkeys(("stat", "list", "open", "read", "crc32"), 20.0)
+    with trio.move_on_after(1) as scope:
+        await CALLS[name](ops, ino, fh)
+    assert scope.cancelled_caught
+    ops.inodes.check_invariants()
+
+
+async def test_a_hundred_and_twenty_blocked_opens_do_not_stop_statfs(
+    autojump_clock: trio.testing.MockClock,
+) -> None:
+    tree = some_tree()
+    ops, ino, _ = await prepared(tree)
+    tree.delays = {"open": 20.0}
+    async with trio.open_nursery() as nursery:
+        for _ in range(120):
+            nursery.start_soon(ops.open, ino, os.O_RDONLY, CTX)
+        await trio.testing.wait_all_tasks_blocked()
+        before = trio.current_time()
+        await ops.statfs(CTX)
+        assert trio.current_time() == before
+    assert len(ops.files) == 121

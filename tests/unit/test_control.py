@@ -1,0 +1,179 @@
+"""control: sockets, their places, and the line protocol, over real Unix sockets."""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+import stat
+from collections.abc import AsyncIterator, Mapping
+from contextlib import asynccontextmanager
+from functools import partial
+from pathlib import Path
+
+import pytest
+import trio
+
+from mavftpfs import control
+from mavftpfs.control import Command, ControlError, ControlServer, NobodyThere, Reply, ask
+from mavftpfs.shared.errors import UsageError
+
+
+@asynccontextmanager
+async def serving(path: Path, commands: Mapping[str, Command]) -> AsyncIterator[ControlServer]:
+    server = ControlServer(path, commands)
+    async with trio.open_nursery() as nursery:
+        await nursery.start(server.run)
+        yield server
+        server.close()
+        with trio.fail_after(20):
+            await server.closed.wait()
+
+
+async def ask_from_outside(path: Path, request: Reply, timeout: float = 20.0) -> Reply:
+    return await trio.to_thread.run_sync(partial(ask, path, request, timeout=timeout))
+
+
+async def echo(request: Reply) -> Reply:
+    return {"heard": request.get("word")}
+
+
+async def refuse(request: Reply) -> Reply:
+    raise UsageError("in use")
+
+
+async def crash(request: Reply) -> Reply:
+    raise ValueError("a bug")
+
+
+async def test_request_and_reply(tmp_path: Path) -> None:
+    path = tmp_path / "s.sock"
+    async with serving(path, {"echo": echo}):
+        assert stat.S_IMODE(path.stat().st_mode) == 0o600
+        assert (await ask_from_outside(path, {"command": "echo", "word": "hi"}))["heard"] == "hi"
+    assert not path.exists()
+
+
+@pytest.mark.parametrize(("command", "reason"), [("refuse", "in use"), ("crash", "internal"), ("x", "not a")])
+async def test_refusals_name_the_reason(
+    tmp_path: Path, command: str, reason: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = tmp_path / "s.sock"
+    async with serving(path, {"refuse": refuse, "crash": crash}):
+        with pytest.raises(ControlError, match=reason):
+            await ask_from_outside(path, {"command": command})
+    assert bool(caplog.records) == (command == "crash")
+
+
+@pytest.mark.parametrize(
+    "line", [b"\n", b"{}\n", b"[]\n", b"[1]\n", b'{"command": []}\n', b"\xff\xfe\n", b""]
+)
+async def test_garbage_is_answered_and_harmless(tmp_path: Path, line: bytes) -> None:
+    path = tmp_path / "s.sock"
+    async with serving(path, {"echo": echo}):
+        stream = await trio.open_unix_socket(path)
+        await stream.send_all(line)
+        await stream.send_eof()
+        answer = b""
+        while data := await stream.receive_some():
+            answer += data
+        await stream.aclose()
+        assert json.loads(answer)["ok"] is False
+        assert (await ask_from_outside(path, {"command": "echo"}))["ok"]
+
+
+async def test_a_client_that_leaves_disturbs_nobody(tmp_path: Path) -> None:
+    path = tmp_path / "s.sock"
+    async with serving(path, {"echo": echo}):
+        for _ in range(control.MAX_CLIENTS * 2):
+            stream = await trio.open_unix_socket(path)
+            await stream.send_all(b'{"command": "echo"}\n')
+            await stream.aclose()
+        assert (await ask_from_outside(path, {"command": "echo"}))["ok"]
+
+
+async def test_a_reply_in_the_making_is_still_sent_after_close(tmp_path: Path) -> None:
+    path, finished = tmp_path / "s.sock", trio.Event()
+    replies: list[Reply] = []
+
+    async def wait(request: Reply) -> Reply:
+        server.close()
+        await finished.wait()
+        return {"exit_code": 4}
+
+    async def client() -> None:
+        replies.append(await ask_from_outside(path, {"command": "umount"}))
+
+    async with serving(path, {"umount": wait}) as server, trio.open_nursery() as nursery:
+        nursery.start_soon(client)
+        await trio.sleep(0.05)
+        assert not server.closed.is_set()
+        finished.set()
+    assert replies == [{"ok": True, "exit_code": 4}]
+
+
+async def test_the_socket_of_a_killed_mount_is_replaced(tmp_path: Path) -> None:
+    path = tmp_path / "s.sock"
+    with socket.socket(socket.AF_UNIX) as dead:
+        dead.bind(str(path))
+    with pytest.raises(NobodyThere):
+        ask(path, {"command": "echo"}, timeout=5)
+    async with serving(path, {"echo": echo}):
+        assert (await ask_from_outside(path, {"command": "echo"}))["ok"]
+
+
+def test_a_mute_process_is_not_taken_for_a_dead_one(tmp_path: Path) -> None:
+    path = tmp_path / "s.sock"
+    with socket.socket(socket.AF_UNIX) as mute:
+        mute.bind(str(path))
+        mute.listen()
+        with pytest.raises(ControlError) as caught:
+            ask(path, {"command": "echo"}, timeout=0.05)
+    assert not isinstance(caught.value, NobodyThere)
+
+
+# -- places ---------------------------------------------------------------------------------------
+
+
+def test_all_places_of_a_user_are_searched() -> None:
+    found = control.socket_directories({"XDG_RUNTIME_DIR": "/run/user/7"}, 7, "/home/x")
+    assert found == [Path("/run/user/7/mavftpfs"), Path("/home/x/.cache/mavftpfs")]
+    found = control.socket_directories({}, 7, "/home/x")
+    assert found == [Path("/run/user/7/mavftpfs"), Path("/home/x/.cache/mavftpfs")]
+
+
+def test_a_private_directory_is_made(tmp_path: Path) -> None:
+    chosen = control.usable_directory([tmp_path / "missing" / "deep" / "x", tmp_path / "run" / "mavftpfs"])
+    assert chosen == tmp_path / "run" / "mavftpfs"
+    assert stat.S_IMODE(chosen.stat().st_mode) == 0o700
+    assert control.usable_directory([chosen]) == chosen
+
+
+def test_a_directory_that_others_may_enter_or_own_is_not_used(tmp_path: Path) -> None:
+    open_to_all, link = tmp_path / "open", tmp_path / "link"
+    open_to_all.mkdir()
+    open_to_all.chmod(0o755)
+    link.symlink_to(tmp_path)
+    too_long = tmp_path / ("x" * 100)
+    with pytest.raises(ControlError, match="open"):
+        control.usable_directory([open_to_all, link, too_long])
+
+
+def test_find_and_list(tmp_path: Path) -> None:
+    one, two = tmp_path / "one", tmp_path / "two"
+    one.mkdir()
+    two.mkdir()
+    path = two / control.socket_name("/mnt/drone")
+    with socket.socket(socket.AF_UNIX) as alive:
+        alive.bind(str(path))
+        (one / "x.sock").write_text("not a socket")
+        assert control.find_socket("/mnt/drone", [one, two]) == path
+        assert list(control.all_sockets([one, two, tmp_path / "none"])) == [path]
+        with pytest.raises(NobodyThere, match="/mnt/other"):
+            control.find_socket("/mnt/other", [one, two])
+
+
+def test_names_differ_by_mountpoint_and_take_any_bytes() -> None:
+    names = {control.socket_name(path) for path in ("/a", "/b", "/ü", os.fsdecode(b"/\xff"))}
+    assert len(names) == 4
+    assert all(len(name) == len(control.socket_name("")) for name in names)

@@ -1,0 +1,135 @@
+"""daemon: what the parent is told, and what the child lets go of. Each fork is in a process of its own."""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+from pathlib import Path
+
+import pytest
+
+from mavftpfs import daemon
+
+
+def run(work: str, tmp_path: Path, timeout: float = 30.0) -> subprocess.CompletedProcess[str]:
+    """Run `in_background(work)` in a fresh process; the body of `work` may use `report`, `here` and os."""
+    code = f"""
+import os, pathlib, signal, sys, time
+from mavftpfs.daemon import in_background
+here = pathlib.Path({str(tmp_path)!r})
+def work(report):
+{textwrap.indent(textwrap.dedent(work), "    ")}
+sys.exit(in_background(work))
+"""
+    argv = [sys.executable, "-c", code]
+    return subprocess.run(argv, capture_output=True, text=True, timeout=timeout, check=False, cwd=tmp_path)
+
+
+def wait_for(path: Path) -> str:
+    deadline = time.monotonic() + 20
+    while not path.exists() or not path.read_text():
+        assert time.monotonic() < deadline, f"{path} never came"
+        time.sleep(0.01)
+    return path.read_text()
+
+
+def test_success_frees_the_parent_and_detaches_the_child(tmp_path: Path) -> None:
+    work = """
+        report(0, "")
+        report(3, "later words count for nothing")
+        links = [os.readlink(f"/proc/self/fd/{fd}") for fd in (0, 1, 2)]
+        facts = (os.getcwd(), os.getsid(0) == os.getpid(), links)
+        (here / "facts.tmp").write_text(repr(facts))
+        (here / "facts.tmp").rename(here / "facts")
+        return 0
+    """
+    done = run(work, tmp_path)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+    assert wait_for(tmp_path / "facts") == repr(("/", True, ["/dev/null"] * 3))
+
+
+def test_failure_is_the_parent_s_exit_code_and_line(tmp_path: Path) -> None:
+    done = run('report(2, "no vehicle\\non that link")\nreturn 2', tmp_path)
+    assert (done.returncode, done.stderr) == (2, "mavftpfs: no vehicle on that link\n")
+
+
+def test_a_child_that_returns_without_a_word_gives_its_code(tmp_path: Path) -> None:
+    done = run("return 4", tmp_path)
+    assert (done.returncode, done.stderr) == (4, "")
+
+
+@pytest.mark.parametrize(
+    ("work", "words"),
+    [
+        ("raise ValueError('a bug')", "a bug"),
+        ("os.kill(os.getpid(), signal.SIGKILL)", "signal 9"),
+        ("os._exit(5)", "exit code 5"),
+    ],
+)
+def test_a_child_that_dies_is_an_error_with_a_reason(tmp_path: Path, work: str, words: str) -> None:
+    done = run(work, tmp_path)
+    assert done.returncode == 3
+    assert words in done.stderr.splitlines()[-1]
+
+
+def test_interrupting_the_parent_ends_the_child(tmp_path: Path) -> None:
+    code = f"""
+import pathlib, sys, time
+from mavftpfs.daemon import in_background
+def work(report):
+    pathlib.Path({str(tmp_path / "pid")!r}).write_text(str(__import__("os").getpid()))
+    time.sleep(60)
+sys.exit(in_background(work))
+"""
+    parent = subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.PIPE)
+    child = int(wait_for(tmp_path / "pid"))
+    parent.send_signal(signal.SIGINT)
+    parent.communicate(timeout=20)
+    assert parent.returncode == 130
+    with pytest.raises(ProcessLookupError):
+        os.kill(child, 0)
+
+
+@pytest.fixture
+def restored_logging() -> object:
+    """Put the root logger back as it was."""
+    root = logging.getLogger()
+    handlers, level = root.handlers[:], root.level
+    own_level = logging.getLogger("mavftpfs").level
+    yield None
+    for handler in root.handlers[:]:
+        if handler not in handlers:
+            root.removeHandler(handler)
+            handler.close()
+    for handler in handlers:
+        if handler not in root.handlers:
+            root.addHandler(handler)
+    root.setLevel(level)
+    logging.getLogger("mavftpfs").setLevel(own_level)
+
+
+@pytest.mark.usefixtures("restored_logging")
+def test_without_syslog_the_log_goes_to_a_small_private_file(tmp_path: Path) -> None:
+    path = tmp_path / "state" / "mavftpfs.log"
+    daemon.log_in_background(path, logging.INFO, socket=str(tmp_path / "nolog"))
+    logging.getLogger("mavftpfs.mount").info("hello")
+    assert "hello" in path.read_text()
+    assert f"[{os.getpid()}]" in path.read_text()
+
+
+@pytest.mark.usefixtures("restored_logging")
+def test_a_log_file_is_appended_to(tmp_path: Path) -> None:
+    path = tmp_path / "log"
+    path.write_text("before\n")
+    daemon.log_to_file(str(path), logging.INFO)
+    logging.getLogger("mavftpfs").info("after")
+    logging.getLogger("mavftpfs").debug("unseen")
+    text = path.read_text()
+    assert text.startswith("before\n")
+    assert "after" in text
+    assert "unseen" not in text

@@ -1,0 +1,91 @@
+"""kernelnews: the kernel is told from a thread, about inodes it knows."""
+
+from __future__ import annotations
+
+import errno
+import threading
+from collections.abc import Callable
+
+import pytest
+import trio
+import trio.testing
+
+from mavftpfs.fuse.inodes import InodeTable
+from mavftpfs.kernelnews import Invalidator
+
+
+class Kernel:
+    """Records calls; may refuse or hang."""
+
+    def __init__(self) -> None:
+        self.calls: list[tuple[int, bool]] = []
+        self.threads: set[int] = set()
+        self.error: OSError | None = None
+        self.gate: threading.Event | None = None
+
+    def notify(self, ino: int, attr_only: bool) -> None:
+        self.calls.append((ino, attr_only))
+        self.threads.add(threading.get_ident())
+        if self.gate is not None:
+            self.gate.wait(20)
+        if self.error is not None:
+            raise self.error
+
+
+async def idle(condition: Callable[[], bool]) -> None:
+    """Wait for something that threads do."""
+    with trio.fail_after(20):
+        while not condition():  # noqa: ASYNC110 (threads set no trio.Event)
+            await trio.sleep(0.001)
+
+
+async def test_changed_files_are_told_once_each_from_a_thread() -> None:
+    table, kernel = InodeTable(), Kernel()
+    known = table.lookup(b"/a").ino
+    invalidator = Invalidator(table, kernel.notify)
+    invalidator.on_changed(b"/a")
+    invalidator.on_changed(b"/a")
+    invalidator.on_changed(b"/unknown")
+    async with trio.open_nursery() as nursery:
+        nursery.start_soon(invalidator.run)
+        await idle(lambda: bool(kernel.calls) and not invalidator.busy)
+        nursery.cancel_scope.cancel()
+    assert kernel.calls == [(known, False)]
+    assert threading.get_ident() not in kernel.threads
+
+
+async def test_attributes_are_forgotten_when_the_call_is_back() -> None:
+    kernel = Kernel()
+    await Invalidator(InodeTable(), kernel.notify).forget_attributes(7)
+    assert kernel.calls == [(7, True)]
+
+
+@pytest.mark.parametrize(("number", "logged"), [(errno.ENOENT, False), (errno.EPERM, True)])
+async def test_a_refusal_is_logged_unless_the_kernel_had_forgotten(
+    number: int, logged: bool, caplog: pytest.LogCaptureFixture
+) -> None:
+    kernel = Kernel()
+    kernel.error = OSError(number, "no")
+    await Invalidator(InodeTable(), kernel.notify).forget_attributes(7)
+    assert bool(caplog.records) == logged
+
+
+async def test_busy_while_a_thread_is_in_the_kernel_even_if_nobody_waits() -> None:
+    kernel = Kernel()
+    kernel.gate = threading.Event()
+    invalidator = Invalidator(InodeTable(), kernel.notify)
+    with trio.move_on_after(0.05):
+        await invalidator.forget_attributes(7)
+    assert invalidator.busy
+    kernel.gate.set()
+    await idle(lambda: not invalidator.busy)
+
+
+async def test_a_call_cancelled_before_its_thread_is_not_busy() -> None:
+    kernel = Kernel()
+    invalidator = Invalidator(InodeTable(), kernel.notify)
+    with trio.CancelScope() as scope:
+        scope.cancel()
+        await invalidator.forget_attributes(7)
+    assert not invalidator.busy
+    assert kernel.calls == []

@@ -1,0 +1,127 @@
+"""mountpoint: checks that end in one helpful line, and the kernel's mount table."""
+
+from __future__ import annotations
+
+import errno
+import os
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from mavftpfs.exits import MountFailed
+from mavftpfs.mountpoint import (
+    canonical,
+    check_fuse,
+    check_mountpoint,
+    is_ours,
+    mounted_types,
+    stderr_of,
+    unmount,
+)
+
+
+def table(tmp_path: Path, *lines: str) -> str:
+    path = tmp_path / "mountinfo"
+    path.write_text("".join(f"{line}\n" for line in lines))
+    return str(path)
+
+
+LINE = "36 35 98:0 / {} rw,noatime shared:1 - {} udpin:0 rw,user_id=0"
+
+
+def test_the_table_is_read_with_its_escapes_and_the_last_mount_wins(tmp_path: Path) -> None:
+    path = table(
+        tmp_path,
+        LINE.format("/mnt/my\\040drone\\134x", "fuse.mavftp"),
+        LINE.format("/mnt/a", "autofs"),
+        LINE.format("/mnt/a", "fuse.mavftp"),
+        LINE.format("/mnt/b", "fuse.mavftp"),
+        LINE.format("/mnt/b", "ext4"),
+        "garbage",
+    )
+    assert mounted_types(path)["/mnt/my drone\\x"] == "fuse.mavftp"
+    assert is_ours("/mnt/a", table=path)
+    assert not is_ours("/mnt/b", table=path)
+    assert not is_ours("/mnt/c", table=path)
+
+
+def test_the_real_table_knows_the_root() -> None:
+    assert "/proc" in mounted_types()
+
+
+def test_a_good_mountpoint(tmp_path: Path) -> None:
+    check_mountpoint(str(tmp_path))
+
+
+@pytest.mark.parametrize(("name", "reason"), [("missing", "mkdir -p"), ("file", "not a directory")])
+def test_a_bad_mountpoint(tmp_path: Path, name: str, reason: str) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(MountFailed, match=reason):
+        check_mountpoint(str(tmp_path / name))
+
+
+@pytest.mark.parametrize(
+    ("number", "reason"), [(errno.ENOTCONN, "fusermount3 -u"), (errno.EACCES, "Permission denied")]
+)
+def test_what_stat_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int, reason: str) -> None:
+    def fail(path: str) -> os.stat_result:
+        raise OSError(number, "x")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "stat", fail)
+        with pytest.raises(MountFailed, match=reason):
+            check_mountpoint(str(tmp_path), table=os.devnull)
+
+
+def test_a_mount_of_ours_is_not_covered_by_another(tmp_path: Path) -> None:
+    path = table(tmp_path, LINE.format(tmp_path, "fuse.mavftp"))
+    with pytest.raises(MountFailed, match="already mounted"):
+        check_mountpoint(str(tmp_path), table=path)
+
+
+def test_no_fuse_device(tmp_path: Path) -> None:
+    with pytest.raises(MountFailed, match="modprobe fuse"):
+        check_fuse(str(tmp_path / "fuse"))
+
+
+def test_no_fusermount_matters_to_users_only(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    device = tmp_path / "fuse"
+    device.touch()
+    monkeypatch.setenv("PATH", str(tmp_path))
+    check_fuse(str(device), uid=0)
+    with pytest.raises(MountFailed, match="fusermount3"):
+        check_fuse(str(device), uid=1000)
+
+
+def test_canonical_follows_links(tmp_path: Path) -> None:
+    (tmp_path / "real" / "mnt").mkdir(parents=True)
+    (tmp_path / "link").symlink_to("real")
+    (tmp_path / "real" / "last").symlink_to("mnt")
+    assert canonical(f"{tmp_path}/link/mnt/") == f"{tmp_path}/real/mnt"
+    assert canonical(f"{tmp_path}/link/last") == f"{tmp_path}/real/mnt"
+    assert canonical(f"{tmp_path}/link/new") == f"{tmp_path}/real/new"
+
+
+def test_stderr_is_caught_from_children_and_given_back(capfd: pytest.CaptureFixture[str]) -> None:
+    with stderr_of() as said:
+        subprocess.run(["sh", "-c", "echo fuse: bad thing >&2; echo second >&2"], check=True)
+        assert said() == "bad thing"
+    os.write(2, b"after\n")
+    assert capfd.readouterr().err == "after\n"
+
+
+def test_unmounting_what_is_not_mounted_says_why(tmp_path: Path) -> None:
+    with pytest.raises(MountFailed, match=str(tmp_path)):
+        unmount(str(tmp_path))
+
+
+def test_unmounting_what_is_busy_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    fake = tmp_path / "fusermount3"
+    fake.write_text(
+        "#!/bin/sh\necho 'fusermount3: failed to unmount /x: Device or resource busy' >&2\nexit 1\n"
+    )
+    fake.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
+    with pytest.raises(MountFailed, match="in use"):
+        unmount("/x")
