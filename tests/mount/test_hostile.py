@@ -73,6 +73,11 @@ def test_noise_and_forged_replies_change_nothing(field: Field) -> None:
         assert mount.read_bytes(mount.path / "names" / name) == GOOD
 
 
+def test_bytes_that_another_client_may_have_mixed_up_are_an_error(field: Field) -> None:
+    mount = field.mount(field.hostile("rival").source, *QUICK)
+    assert mount.errno_of("open(sys.argv[1], 'rb').read()", mount.path / "fine.bin") == "EIO"
+
+
 def test_a_vehicle_that_never_answers_ftp_is_exit_2(field: Field) -> None:
     vehicle = field.hostile("mute")
     mount = field.prepare(vehicle.source, "connect_timeout=3")

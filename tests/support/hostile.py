@@ -3,7 +3,8 @@
     python -m tests.support.hostile MODE PORT      # speaks from a free port to 127.0.0.1:PORT until SIGTERM
 
 MODE `files` serves the listings and files below; `mute` sends heartbeats and never answers FTP; `noise`
-serves like `files` and surrounds every answer with garbage and forged replies.
+serves like `files` and surrounds every answer with garbage, forged replies and another client's traffic;
+`rival` lets another client's replies be heard and computes no CRC32.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from collections.abc import Callable, Iterator
 
 from mavftpfs.link.framing import Framer
 from mavftpfs.link.messages import Address, FtpFrame
+from mavftpfs.protocol.crc import crc32
 from mavftpfs.protocol.payload import NakCode, Opcode, Payload, decode_request
 
 HOST = "127.0.0.1"
@@ -65,8 +67,9 @@ FINE = random.Random("fine").randbytes(5000)
 class Server:
     """Answers requests; one file may be open, its session id is 0."""
 
-    def __init__(self) -> None:
+    def __init__(self, *, computes_crc: bool = True) -> None:
         self.path = b""
+        self.computes_crc = computes_crc
 
     def answer(self, request: Payload) -> Payload | None:
         """Return the answer to a request, or None for silence."""
@@ -77,6 +80,8 @@ class Server:
             return self.open(request, path)
         if request.opcode == Opcode.READ_FILE:
             return self.read(request)
+        if request.opcode == Opcode.CALC_FILE_CRC32 and self.computes_crc:
+            return ack(request, crc32(content(path)).to_bytes(4, "little"))
         if request.opcode in (Opcode.NONE, Opcode.TERMINATE_SESSION, Opcode.RESET_SESSIONS):
             return ack(request, b"")
         return nak(request, NakCode.UNKNOWN_COMMAND)
@@ -102,20 +107,13 @@ class Server:
         self.path = path
         if path.startswith(b"/nak/open"):
             return nak(request, int(path[len(b"/nak/open") :]))
-        size = len(self.content())
-        return ack(request, size.to_bytes(4, "little"))
-
-    def content(self) -> bytes:
-        """Return what the open file would hold."""
-        if self.path == b"/fine.bin":
-            return FINE
-        return bytes(BROKEN_SIZE) if self.path.startswith(b"/broken/") else GOOD
+        return ack(request, len(content(path)).to_bytes(4, "little"))
 
     def read(self, request: Payload) -> Payload | None:
         """Serve a chunk, as broken as the file's name says."""
         if self.path.startswith(b"/nak/read"):
             return nak(request, int(self.path[len(b"/nak/read") :]))
-        chunk = self.content()[request.offset : request.offset + request.size]
+        chunk = content(self.path)[request.offset : request.offset + request.size]
         name = self.path.rpartition(b"/")[2].decode(errors="replace")
         if name == "silent.bin":
             return None
@@ -128,6 +126,13 @@ class Server:
         if not chunk or (name == "short.bin" and request.offset >= 500):
             return nak(request, NakCode.EOF)
         return ack(request, chunk)
+
+
+def content(path: bytes) -> bytes:
+    """Return what a file would hold."""
+    if path == b"/fine.bin":
+        return FINE
+    return bytes(BROKEN_SIZE) if path.startswith(b"/broken/") else GOOD
 
 
 def ack(request: Payload, data: bytes) -> Payload:
@@ -181,7 +186,7 @@ def serve(sock: socket.socket, framer: Framer, react: Callable[[FtpFrame], Itera
 def main() -> int:
     """Run as a process until SIGTERM."""
     mode, port = sys.argv[1], int(sys.argv[2])
-    server, rng, framer = Server(), random.Random(3), Framer(US, stream=False)
+    server, rng, framer = Server(computes_crc=mode != "rival"), random.Random(3), Framer(US, stream=False)
 
     def react(frame: FtpFrame) -> Iterator[bytes]:
         answer = None if mode == "mute" else server.answer(decode_request(frame.payload))
@@ -190,6 +195,8 @@ def main() -> int:
         wire = framer.encode_ftp(frame.source, answer.encode())
         if mode == "noise":
             yield from noise(rng, frame, framer, wire)
+        elif mode == "rival":
+            yield framer.encode_ftp(Address(255, 190), answer.encode())
         yield wire
 
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
