@@ -7,6 +7,7 @@ on, None while it is idle.
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import random
 from collections import deque
@@ -93,12 +94,12 @@ class ArduPilot(Firmware):
             if slot.last_sent and now - slot.last_sent >= limit:
                 self._close_quietly(slot)
 
-    @staticmethod
-    def _close_quietly(slot: Session) -> None:
-        try:
+    def _close_quietly(self, slot: Session) -> None:
+        """Close and ignore the result, as the firmware does; generations B and C then free the slot."""
+        with contextlib.suppress(OSError):
             slot.close()
-        except OSError:
-            return  # a result the firmware throws away
+        if self.profile.sessions > 1:
+            slot.last_sent = 0.0
 
     # -- the worker --------------------------------------------------------------------------
 

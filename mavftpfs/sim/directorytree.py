@@ -128,6 +128,10 @@ class _RealFile:
         """See TreeFile."""
         return os.fstat(self._handle).st_size
 
+    def resize(self, size: int) -> None:
+        """See TreeFile."""
+        os.ftruncate(self._handle, size)
+
     def close(self) -> None:
         """See TreeFile."""
         if self._handle >= 0:

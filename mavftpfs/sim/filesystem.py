@@ -51,6 +51,10 @@ class TreeFile(Protocol):
         """Return the present size."""
         ...
 
+    def resize(self, size: int) -> None:
+        """Cut or extend (with zeros) the file."""
+        ...
+
     def close(self) -> None:
         """Make what was written durable. May be called twice."""
         ...

@@ -311,5 +311,9 @@ class _MemoryFile:
         """See TreeFile."""
         return len(self._data)
 
+    def resize(self, size: int) -> None:
+        """See TreeFile."""
+        self._tree._resize(self._node, size)
+
     def close(self) -> None:
         """See TreeFile."""

@@ -6,6 +6,7 @@ every 10 ms.
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import random
 from collections import deque
@@ -159,14 +160,7 @@ class Px4(Firmware):
     # -- replies -----------------------------------------------------------------------------
 
     def _refuse(self, code: int) -> bytes:
-        """Return a NAK's data; once errno is EEXIST every NAK says so (mavlink_ftp.cpp, _process_request)."""
-        if self._errno == errno.EEXIST:
-            return bytes([NakCode.FILE_EXISTS])
-        if code == _FAIL_ERRNO:
-            if self._errno == errno.ENOENT:
-                return bytes([NakCode.FILE_NOT_FOUND])
-            return bytes([_FAIL_ERRNO, self._errno & 0xFF])
-        return bytes([code])
+        return px4ops.nak_data(code, self._errno)
 
     def _failed(self, exc: OSError) -> bytes:
         if not isinstance(exc, StaleErrno) and exc.errno is not None:
@@ -191,13 +185,13 @@ class Px4(Firmware):
         self._transmit(target, wire, now)
 
     def _transmit(self, target: Address, wire: bytes, now: float) -> None:
-        if self.tx_room is not None and self.room() < frame_size(wire):
-            self.dropped_replies += 1
-            return
         due = now
         if self._has_cost or self._extra_cost:
             due = self._busy_until = now + self.cost(wire[5])
-        self.emit(target, wire, due, self.now)
+        if self.tx_room is not None and self.room() < frame_size(wire):
+            self.dropped_replies += 1
+        else:
+            self.emit(target, wire, due, self.now)
 
     def _replay(self, now: float) -> None:
         """Send 254 bytes out of a cache of 19: what follows the data is stray memory."""
@@ -245,10 +239,8 @@ class Px4(Firmware):
         opened, self._file = self._file, None
         self._stream = None
         if opened is not None:
-            try:
+            with contextlib.suppress(OSError):  # PX4 does not look
                 opened.close()
-            except OSError:
-                return  # PX4 does not look at what close() says
 
     def _close_idle(self) -> None:
         self._close()
@@ -349,8 +341,10 @@ class Px4(Firmware):
         if request.session != 0 and self._file is None:
             raise Refusal(NakCode.INVALID_SESSION)
         self._stream = _Stream(request.source, request.offset, request.seq + 1)
-        elapsed = self.now - (self._started or 0.0)
-        self._tick = max(self._tick, int(elapsed / self.profile.tick) + 1)
+        start, period = self._started or 0.0, self.profile.tick
+        self._tick = max(self._tick, int((self._last_request - start) / period) + 1)
+        while start + self._tick * period <= self._last_request:
+            self._tick += 1  # rounding
         return b""
 
     def _send(self, now: float) -> None:

@@ -71,6 +71,17 @@ def handlers(server: Server) -> dict[int, Callable[[Request], bytes]]:
     return bound
 
 
+def nak_data(code: int, number: int) -> bytes:
+    """Return a NAK's data; once errno is EEXIST every NAK says so (mavlink_ftp.cpp, _process_request)."""
+    if number == errno.EEXIST:
+        return bytes([NakCode.FILE_EXISTS])
+    if code != NakCode.FAIL_ERRNO:
+        return bytes([code])
+    if number == errno.ENOENT:
+        return bytes([NakCode.FILE_NOT_FOUND])
+    return bytes([NakCode.FAIL_ERRNO, number & 0xFF])
+
+
 def path_of(server: Server, request: Request) -> bytes:
     """Return the request's path, cut silently where the work buffer ends."""
     return c_string(request.data[: min(request.size, MAX_DATA - 1)])[: server.profile.path_limit]

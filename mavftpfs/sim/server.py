@@ -74,8 +74,12 @@ class FtpServer:
         return self._firmware.next_deadline()
 
     def reboot(self, now: float) -> None:
-        """Lose every session, queue and reply, as a vehicle that restarts does; files stay."""
+        """Lose every session, queue and reply, as a vehicle that restarts does.
+
+        Files stay, but for what FAT storage learns only when a file is closed.
+        """
         self._firmware.crashed = False
+        self._storage.lose_power()
         if self._storage.virtual is not None:
             self._storage.virtual.reboot()
         self._firmware.reboot(now)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import errno
 import random
+import weakref
 from typing import Protocol
 
 from mavftpfs.protocol.crc import crc32
@@ -62,6 +63,7 @@ class Storage:
         if virtual is None and profile.virtual_trees:
             virtual = VirtualTrees(exact=profile.exact_virtual_sizes)
         self.virtual = virtual
+        self._writing: weakref.WeakSet[_FatFile] = weakref.WeakSet()
 
     def is_virtual(self, path: bytes) -> bool:
         """Whether `path` lies in an `@` tree."""
@@ -91,9 +93,17 @@ class Storage:
         if create:
             self._check_name(path)
         real = self._tree.open(self._resolve(path), write=write, create=create, truncate=truncate)
-        if write and self.kind is profiles.Storage.FATFS:
-            return _FatFsFile(real, self._rng)
-        return real
+        if not (write and self._fat):
+            return real
+        opened = _FatFile(real, self.kind is profiles.Storage.FATFS, self._rng)
+        self._writing.add(opened)
+        return opened
+
+    def lose_power(self) -> None:
+        """Forget what was written to files that are still open, where the storage does that."""
+        for opened in self._writing:
+            opened.lose()
+        self._writing.clear()
 
     def crc(self, path: bytes) -> tuple[int, int]:
         """Return the CRC32 of a file and how many bytes went into it."""
@@ -210,18 +220,25 @@ class Storage:
         return next((other for other in names if other.lower() == name.lower()), name)
 
 
-class _FatFsFile:
-    """A FatFs file open for writing: full cards are EIO, gaps hold what the card held."""
+class _FatFile:
+    """A FAT file open for writing: its directory entry learns the size when it is closed.
 
-    def __init__(self, real: TreeFile, rng: random.Random) -> None:
+    On FatFs a full card is EIO, a write of nothing too, and a gap holds whatever the card held.
+    """
+
+    def __init__(self, real: TreeFile, fatfs: bool, rng: random.Random) -> None:
         self._real = real
+        self._fatfs = fatfs
         self._rng = rng
+        self._durable = real.size()
+        self._open = True
         self.read = real.read
         self.size = real.size
-        self.close = real.close
 
     def write(self, offset: int, data: bytes) -> int:
         """See OpenFile."""
+        if not self._fatfs:
+            return self._real.write(offset, data)
         if not data:
             raise fail(errno.EIO)
         try:
@@ -231,3 +248,13 @@ class _FatFsFile:
             return self._real.write(offset, data)
         except OSError as exc:
             raise fail(errno.EIO if exc.errno == errno.ENOSPC else exc.errno or errno.EIO) from exc
+
+    def close(self) -> None:
+        """See OpenFile."""
+        self._open = False
+        self._real.close()
+
+    def lose(self) -> None:
+        """The power goes: what was appended since the file was opened is gone."""
+        if self._open and self._real.size() > self._durable:
+            self._real.resize(self._durable)

@@ -1,8 +1,8 @@
 """The simulated servers answer what real ones answered.
 
 Every request of a recording is handed to the matching profile at its recorded time, and the replies are
-compared field by field, all but stray bytes behind `size`. Differences stand in DIFFERENCES with their reasons;
-the table must be complete, and an entry that no longer occurs is an error. At present there are none.
+compared field by field, all but stray bytes behind `size`. Differences stand in DIFFERENCES with their
+reasons; the table must be complete, and an entry that no longer occurs is an error. Now there are none.
 """
 
 from __future__ import annotations

@@ -1,0 +1,225 @@
+"""The trees that simulated servers serve: one suite for both, and what only one can do."""
+
+from __future__ import annotations
+
+import errno
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from mavftpfs.sim.tree import DirectoryTree, Kind, MemoryTree, Tree
+
+
+@pytest.fixture(params=["memory", "directory"])
+def tree(request: pytest.FixtureRequest, tmp_path: Path) -> Tree:
+    made: Tree = MemoryTree() if request.param == "memory" else DirectoryTree(tmp_path)
+    made.mkdir(b"/dir")
+    put(made, b"/file", b"0123456789")
+    put(made, b"/dir/inner", b"x")
+    return made
+
+
+def put(tree: Tree, path: bytes, data: bytes) -> None:
+    opened = tree.open(path, write=True, create=True, truncate=True)
+    opened.write(0, data)
+    opened.close()
+
+
+def get(tree: Tree, path: bytes) -> bytes:
+    opened = tree.open(path)
+    try:
+        return opened.read(0, opened.size())
+    finally:
+        opened.close()
+
+
+def failure(action: Callable[[], object]) -> int | None:
+    try:
+        action()
+    except OSError as exc:
+        return exc.errno
+    pytest.fail("no OSError")
+
+
+def test_listing_shows_dots_and_kinds(tree: Tree) -> None:
+    found = {entry.name: entry.stat for entry in tree.entries(b"/")}
+    assert set(found) == {b".", b"..", b"dir", b"file"}
+    assert found[b"file"].kind is Kind.FILE
+    assert found[b"file"].size == 10
+    assert found[b"dir"].kind is Kind.DIRECTORY
+
+
+@pytest.mark.parametrize("path", [b"file", b"/file", b"//./file", b"/dir/../file", b"/../../file"])
+def test_paths_are_forgiving_but_stay_below_the_root(tree: Tree, path: bytes) -> None:
+    assert get(tree, path) == b"0123456789"
+
+
+def test_reads_and_writes_anywhere(tree: Tree) -> None:
+    opened = tree.open(b"/file", write=True)
+    assert opened.write(12, b"ab") == 2
+    assert opened.write(1, b"XY") == 2
+    assert opened.read(0, 100) == b"0XY3456789\0\0ab"
+    assert opened.read(100, 5) == b""
+    opened.resize(3)
+    opened.close()
+    opened.close()
+    assert tree.stat(b"/file").size == 3
+
+
+def test_truncate_cuts_and_extends(tree: Tree) -> None:
+    tree.truncate(b"/file", 2)
+    tree.truncate(b"/file", 4)
+    assert get(tree, b"/file") == b"01\0\0"
+
+
+def test_open_can_create_and_truncate(tree: Tree) -> None:
+    tree.open(b"/new", write=True, create=True).close()
+    assert get(tree, b"/new") == b""
+    tree.open(b"/file", write=True, create=True).close()
+    assert get(tree, b"/file") == b"0123456789"
+    tree.open(b"/file", write=True, truncate=True).close()
+    assert get(tree, b"/file") == b""
+
+
+def test_rename_moves_and_replaces(tree: Tree) -> None:
+    put(tree, b"/other", b"other")
+    tree.rename(b"/file", b"/other")
+    assert get(tree, b"/other") == b"0123456789"
+    assert failure(lambda: tree.stat(b"/file")) == errno.ENOENT
+    tree.rename(b"/dir", b"/moved")
+    assert get(tree, b"/moved/inner") == b"x"
+
+
+def test_removed_file_stays_readable_while_open(tree: Tree) -> None:
+    opened = tree.open(b"/file")
+    tree.remove(b"/file")
+    assert opened.read(2, 3) == b"234"
+    opened.close()
+    assert failure(lambda: tree.open(b"/file")) == errno.ENOENT
+
+
+@pytest.mark.parametrize(
+    ("call", "number"),
+    [
+        (lambda tree: tree.entries(b"/file"), errno.ENOTDIR),
+        (lambda tree: tree.entries(b"/none"), errno.ENOENT),
+        (lambda tree: tree.stat(b"/none"), errno.ENOENT),
+        (lambda tree: tree.stat(b"/file/x"), errno.ENOTDIR),
+        (lambda tree: tree.open(b"/none"), errno.ENOENT),
+        (lambda tree: tree.open(b"/dir"), errno.EISDIR),
+        (lambda tree: tree.open(b"/none/x", write=True, create=True), errno.ENOENT),
+        (lambda tree: tree.truncate(b"/dir", 0), errno.EISDIR),
+        (lambda tree: tree.remove(b"/dir"), errno.EISDIR),
+        (lambda tree: tree.remove(b"/none"), errno.ENOENT),
+        (lambda tree: tree.rmdir(b"/file"), errno.ENOTDIR),
+        (lambda tree: tree.rmdir(b"/dir"), errno.ENOTEMPTY),
+        (lambda tree: tree.rmdir(b"/"), errno.EBUSY),
+        (lambda tree: tree.mkdir(b"/dir"), errno.EEXIST),
+        (lambda tree: tree.mkdir(b"/file"), errno.EEXIST),
+        (lambda tree: tree.mkdir(b"/"), errno.EEXIST),
+        (lambda tree: tree.mkdir(b"/none/x"), errno.ENOENT),
+        (lambda tree: tree.rename(b"/none", b"/x"), errno.ENOENT),
+        (lambda tree: tree.rename(b"/file", b"/dir"), errno.EISDIR),
+        (lambda tree: tree.rename(b"/dir", b"/file"), errno.ENOTDIR),
+        (lambda tree: tree.rename(b"/dir", b"/dir/sub"), errno.EINVAL),
+        (lambda tree: tree.stat(b"/" + b"n" * 256), errno.ENAMETOOLONG),
+        (lambda tree: tree.stat(b"/a\0b"), errno.EINVAL),
+        (lambda tree: tree.open(b"/file").write(0, b"x"), errno.EBADF),
+    ],
+)
+def test_failures_carry_the_real_errno(tree: Tree, call: Callable[[Tree], object], number: int) -> None:
+    assert failure(lambda: call(tree)) == number
+
+
+def test_rmdir_of_an_empty_directory(tree: Tree) -> None:
+    tree.remove(b"/dir/inner")
+    tree.rmdir(b"/dir")
+    assert failure(lambda: tree.stat(b"/dir")) == errno.ENOENT
+
+
+def test_directory_tree_refuses_ways_out(tmp_path: Path) -> None:
+    (tmp_path / "served").mkdir()
+    (tmp_path / "secret").write_bytes(b"secret")
+    os.symlink(tmp_path / "secret", tmp_path / "served" / "link")
+    os.symlink("inside", tmp_path / "served" / "good")
+    (tmp_path / "served" / "inside").write_bytes(b"inside")
+    tree = DirectoryTree(tmp_path / "served")
+    assert failure(lambda: tree.open(b"/link")) == errno.EACCES
+    assert failure(lambda: tree.stat(b"/../secret")) == errno.ENOENT
+    assert get(tree, b"/good") == b"inside"
+    kinds = {entry.name: entry.stat.kind for entry in tree.entries(b"/")}
+    assert kinds[b"link"] is Kind.SYMLINK
+    tree.remove(b"/link")
+    assert (tmp_path / "secret").exists()
+
+
+def test_directory_tree_does_not_block_on_a_fifo(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "fifo")
+    assert failure(lambda: DirectoryTree(tmp_path).open(b"/fifo")) == errno.ENXIO
+
+
+def test_directory_tree_needs_a_directory(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    assert failure(lambda: DirectoryTree(tmp_path / "file")) == errno.ENOTDIR
+
+
+def test_memory_tree_follows_symlinks() -> None:
+    tree = MemoryTree()
+    tree.add(b"/a/b/file", b"data")
+    tree.add_symlink(b"/a/to_b", b"b")
+    tree.add_symlink(b"/absolute", b"/a/b/file")
+    tree.add_symlink(b"/loop", b"loop")
+    tree.add_symlink(b"/dangling", b"nowhere")
+    assert get(tree, b"/a/to_b/file") == b"data"
+    assert get(tree, b"/a/to_b/../b/file") == b"data"
+    assert get(tree, b"/absolute") == b"data"
+    assert failure(lambda: tree.stat(b"/loop")) == errno.ELOOP
+    assert failure(lambda: tree.stat(b"/dangling")) == errno.ENOENT
+    assert {entry.stat.kind for entry in tree.entries(b"/")} == {Kind.DIRECTORY, Kind.SYMLINK}
+
+
+def test_memory_tree_capacity_is_shared_and_given_back() -> None:
+    tree = MemoryTree(capacity=10)
+    tree.add(b"/a", b"123456")
+    opened = tree.open(b"/b", write=True, create=True)
+    assert opened.write(0, b"xxxxxx") == 4
+    assert failure(lambda: opened.write(4, b"y")) == errno.ENOSPC
+    assert failure(lambda: tree.truncate(b"/a", 7)) == errno.ENOSPC
+    tree.remove(b"/a")
+    assert opened.write(4, b"yyyyyy") == 6
+    assert tree.used == 10
+    opened.resize(1)
+    assert tree.used == 1
+
+
+def test_memory_tree_keeps_hostile_sizes_out() -> None:
+    tree = MemoryTree()
+    tree.add(b"/a")
+    opened = tree.open(b"/a", write=True)
+    assert failure(lambda: opened.write(2**32 - 1, b"x")) == errno.EFBIG
+    assert failure(lambda: tree.truncate(b"/a", 2**32 - 1)) == errno.EFBIG
+
+
+def test_memory_tree_tells_times_and_order() -> None:
+    times = iter(range(1, 100))
+    tree = MemoryTree(clock=lambda: float(next(times)))
+    tree.add(b"/old", mtime=5)
+    tree.add(b"/file", b"x")
+    before = tree.stat(b"/file").mtime
+    opened = tree.open(b"/file", write=True)
+    opened.write(0, b"y")
+    assert tree.stat(b"/file").mtime > before
+    assert tree.stat(b"/old").mtime == 5
+    tree.set_order(b"/", [b"..", b"later", b"file"])
+    assert [entry.name for entry in tree.entries(b"/")] == [b"..", b"file", b".", b"old"]
+    tree.add(b"/later")
+    assert [entry.name for entry in tree.entries(b"/")] == [b"..", b"later", b"file", b".", b"old"]
+
+
+def test_memory_tree_has_things_that_are_no_files() -> None:
+    tree = MemoryTree()
+    tree.add_other(b"/fifo")
+    assert tree.stat(b"/fifo").kind is Kind.OTHER
+    assert failure(lambda: tree.open(b"/fifo")) == errno.ENXIO
