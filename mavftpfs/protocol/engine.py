@@ -197,7 +197,7 @@ class Engine:
         flow = self.flow
         flow.on_reply(now, rtt, request.order, self._ledger.order)
         while (lost := self._ledger.next_loss()) is not None:
-            flow.on_loss()
+            flow.on_loss(lost.order)
             self._ledger.lose(lost)
         op = request.op
         op.progress_at = now
@@ -381,7 +381,7 @@ class Engine:
         op = request.op
         if now - request.first_sent >= self._patience(op) and op is not self._ledger.ghost:
             self._time_out(op)
-        self.flow.on_loss()
+        self.flow.on_loss(request.order)
         self._ledger.lose(request)
 
     def _time_out(self, op: Operation) -> None:

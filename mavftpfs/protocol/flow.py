@@ -16,6 +16,8 @@ from __future__ import annotations
 from collections import deque
 from math import inf
 
+from mavftpfs.protocol.easing import Easing
+
 INITIAL = 4
 DEFAULT_CAP = 2048
 SERIAL_CAP = 16
@@ -26,7 +28,7 @@ _FAST_PATH_SECONDS = 0.010
 _FAST_PATH_WINDOW = 96
 _QUEUE_SECONDS = 0.005
 _ROUNDS_REMEMBERED = 10
-_PLATEAU_ROUNDS = 3
+_PLATEAU_ROUNDS = 2
 _BASE_LIFETIME = 30.0
 _DRAIN_ROUNDS = 2
 
@@ -44,6 +46,7 @@ class Flow:
         "_cap",
         "_collapsed",
         "_draining",
+        "_easing",
         "_limit",
         "_losses",
         "_plateau",
@@ -70,6 +73,7 @@ class Flow:
         self._base_rtt = inf
         self._base_at = 0.0
         self._draining = 0
+        self._easing = Easing()
         self._brake = 1.0
         self._plateau = 0
         self._collapsed = 0
@@ -97,6 +101,7 @@ class Flow:
     def on_reply(self, now: float, rtt: float | None, order: int, next_order: int) -> None:
         """A request was answered. order: of its transmission; next_order: what the next one will get."""
         self._replies += 1
+        self._easing.count(order, lost=False)
         if rtt is not None and rtt < self._round_least:
             self._round_least = rtt
         if self._collapsed:
@@ -104,9 +109,10 @@ class Flow:
         if order >= self._round_end:
             self._end_round(now, next_order)
 
-    def on_loss(self) -> None:
-        """A transmission is taken to be lost."""
+    def on_loss(self, order: int) -> None:
+        """The transmission numbered `order` is taken to be lost."""
         self._losses += 1
+        self._easing.count(order, lost=True)
 
     def on_silence(self) -> None:
         """Nothing at all was heard for a retransmission timeout: probe with two until something is."""
@@ -116,14 +122,14 @@ class Flow:
 
     def _end_round(self, now: float, next_order: int) -> None:
         if self._round_end >= 0:
-            self._learn(now)
+            self._learn(now, next_order)
         self._round_end = next_order
         self._round_start = now
         self._round_least = inf
         self._replies = self._losses = 0
         self._app_limited = False
 
-    def _learn(self, now: float) -> None:
+    def _learn(self, now: float, next_order: int) -> None:
         total = self._replies + self._losses
         self.loss += (self._losses / total - self.loss) * 0.2
         self._learn_base(now)
@@ -137,9 +143,10 @@ class Flow:
             return
         self._learn_congestion()
         if self._starting and not self._leaves_start(grown):
-            self.window = min(self._cap, self.window * 2)
+            if grown:
+                self.window = min(self._cap, self.window * 2)
         else:
-            self._approach(self._target())
+            self._approach(self._easing.next_window(self._target(), self.loss, next_order))
 
     def _learn_base(self, now: float) -> None:
         """Keep the least round trip; one not seen again for long is measured anew with a drained queue."""
@@ -186,4 +193,5 @@ class Flow:
             # One at a time, and back where most of a round was lost: what the far end's buffer survived.
             step = -1 if self._losses > self._replies else 1
             target = min(target, self.window + step)
-        self.window = max(1, min(self._cap, round(target)))
+        least = 1 if self._serial else INITIAL  # so few are no load, and fewer find losses slowly
+        self.window = min(self._cap, max(least, round(target)))

@@ -9,9 +9,9 @@ link would otherwise cost 1 s, and there is always half a round trip of slack ab
 from __future__ import annotations
 
 INITIAL_RTO = 1.0
-MAX_RTO = 8.0
+LONGEST_BACK_OFF = 3.0
 _FREE_SILENCES = 2
-_MAX_DOUBLINGS = 6
+_MAX_DOUBLINGS = 7
 
 
 class RttEstimator:
@@ -34,11 +34,15 @@ class RttEstimator:
 
     @property
     def rto(self) -> float:
-        """How long to wait for a reply before it is asked for again; backed off, at most MAX_RTO."""
+        """How long to wait for a reply before it is asked again.
+
+        Backed off to at most LONGEST_BACK_OFF: a link that comes back should not wait longer for us.
+        """
         rto = self.unfloored if self.unfloored > self._floor else self._floor
-        if self._silences > _FREE_SILENCES:
-            rto *= 1 << min(self._silences - _FREE_SILENCES, _MAX_DOUBLINGS)
-        return min(rto, max(MAX_RTO, self._floor))
+        doublings = self._silences - _FREE_SILENCES
+        if doublings > 0 and rto < LONGEST_BACK_OFF:
+            rto = min(rto * (1 << min(doublings, _MAX_DOUBLINGS)), LONGEST_BACK_OFF)
+        return rto
 
     def sample(self, rtt: float) -> None:
         """Take one round trip that provably belongs to one transmission; ends a back-off."""

@@ -27,7 +27,7 @@ class Path:
         for index in range(window):
             self.now += took / window
             if index < lost:
-                self.flow.on_loss()
+                self.flow.on_loss(first + index)
             else:
                 self.flow.on_reply(self.now, took, first + index, self.order)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from mavftpfs.protocol.rtt import INITIAL_RTO, MAX_RTO, RttEstimator
+from mavftpfs.protocol.rtt import INITIAL_RTO, LONGEST_BACK_OFF, RttEstimator
 
 
 def test_before_the_first_sample() -> None:
@@ -50,7 +50,7 @@ def test_back_off_from_the_third_silence_on_up_to_a_cap_and_until_a_sample() -> 
         timer.on_silence()
         waits.append(timer.rto)
     assert waits[:4] == pytest.approx([0.3, 0.3, 0.6, 1.2])
-    assert waits[-1] == MAX_RTO
+    assert waits[-1] == LONGEST_BACK_OFF
     timer.sample(0.1)
     assert timer.rto < 0.3
 

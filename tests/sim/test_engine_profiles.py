@@ -1,0 +1,258 @@
+"""The engine against every simulated server over a modelled link, on virtual time."""
+
+from __future__ import annotations
+
+import random
+
+import pytest
+
+from mavftpfs.protocol.crc import crc32
+from mavftpfs.protocol.operations import ListDirectory, OpenFile, Simple, Terminate
+from mavftpfs.protocol.payload import NakCode, Opcode
+from mavftpfs.protocol.transfers import ReadToEof, ReadTransfer, Strategy
+from mavftpfs.shared.errors import FtpNak, SessionLost
+from mavftpfs.sim.linkmodel import Direction, LinkSettings
+from mavftpfs.sim.memorytree import MemoryTree
+from mavftpfs.sim.profiles import PROFILES, Family
+from mavftpfs.sim.server import FtpServer
+from tests.support.virtual import MemorySink, VirtualLink
+
+CHUNK = 239
+BAD = LinkSettings(delay=0.02, loss=0.2, duplicate=0.02, reorder=0.05)
+SIZES = (0, 1, 5, 238, 239, 240, 478, 4096, 35_850, 40_152, 119_500, 131_073)
+NAMES = sorted(PROFILES)
+STRATEGIES: tuple[Strategy, ...] = ("window", "burst")
+
+
+class Rig:
+    """One server with its tree, and an engine over a link to it."""
+
+    def __init__(self, profile: str, settings: LinkSettings | None = None, *, seed: int = 1) -> None:
+        self.tree = MemoryTree()
+        self.profile = PROFILES[profile]
+        self.server = FtpServer(self.tree, self.profile, rng=random.Random(seed))
+        self.link = VirtualLink(self.server, settings, seed=seed)
+        if settings is not None and settings.rate is not None:
+            self.server.tx_room = lambda: self.link.model.room(Direction.TO_CLIENT)
+        self.session = 0
+
+    @property
+    def is_ardupilot(self) -> bool:
+        return self.profile.family is Family.ARDUPILOT
+
+    def open(self, path: bytes) -> int:
+        """Open a file, insisting: a lost ACK leaves it open over there (servers.md 14.10)."""
+        engine = self.link.engine
+        for _ in range(10):
+            op = OpenFile(Opcode.OPEN_FILE_RO, path, engine.home_session)
+            self.link.run(op)
+            if op.error is None:
+                self.session = engine.session = op.session
+                assert op.size is not None
+                return op.size
+            assert isinstance(op.error, FtpNak), op.error
+            assert op.error.retransmitted, op.error
+            self.link.run(Terminate(engine.home_session if self.is_ardupilot else 0))
+        raise AssertionError("never opened")
+
+    def close(self) -> None:
+        op = Terminate(self.session)
+        self.link.run(op)
+        if isinstance(op.error, FtpNak):  # sticky EEXIST, or a repeated Terminate
+            assert op.error.retransmitted
+        else:
+            assert op.error is None, op.error
+        self.link.engine.session = self.link.engine.home_session
+
+    def read(self, path: bytes, strategy: Strategy, *, chunk: int = CHUNK) -> bytes:
+        size = self.open(path)
+        sink = MemorySink(size)
+        transfer = ReadTransfer(self.session, size, sink, chunk, strategy)
+        self.link.engine.start(transfer, self.link.now)
+        transfer.want(0, size, True)
+        self.link.run_until(lambda: transfer.idle or transfer.done, 3600.0)
+        assert transfer.error is None, transfer.error
+        self.link.engine.cancel(transfer, self.link.now)
+        self.close()
+        assert sink.held.covers(0, size)
+        return bytes(sink.data)
+
+    def nothing_is_open(self) -> bool:
+        """Whether another client can open a file at once."""
+        self.link.model.settings = LinkSettings()
+        engine = self.link.engine
+        op = OpenFile(Opcode.OPEN_FILE_RO, b"/big", (engine.home_session % 200) + 1)
+        self.link.run(op)
+        if op.error is None:
+            self.link.run(Terminate(op.session))
+        return op.error is None
+
+
+@pytest.mark.parametrize("strategy", STRATEGIES)
+@pytest.mark.parametrize("name", NAMES)
+def test_every_size_comes_whole(name: str, strategy: Strategy) -> None:
+    rig = Rig(name, LinkSettings(delay=0.005))
+    for size in SIZES:
+        rig.tree.add(b"/s%d" % size, random.Random(size).randbytes(size))
+    for size in SIZES:
+        assert rig.read(b"/s%d" % size, strategy) == random.Random(size).randbytes(size)
+
+
+@pytest.mark.parametrize("chunk", [1, 80, 110])
+@pytest.mark.parametrize("name", NAMES)
+def test_other_chunk_sizes(name: str, chunk: int) -> None:
+    rig = Rig(name, LinkSettings(delay=0.005))
+    content = random.Random(2).randbytes(chunk * 30 + 7)
+    rig.tree.add(b"/f", content)
+    for strategy in STRATEGIES:
+        assert rig.read(b"/f", strategy, chunk=chunk) == content
+    if chunk > 1:  # else everything fits one packet of PX4's, which tells no size
+        assert rig.link.engine.traits.burst_size_honoured is (rig.profile.family is not Family.PX4)
+
+
+@pytest.mark.parametrize("strategy", STRATEGIES)
+@pytest.mark.parametrize("name", NAMES)
+def test_a_megabyte_over_a_bad_link(name: str, strategy: Strategy) -> None:
+    size = 1_000_000
+    content = random.Random(5).randbytes(size)
+    rig = Rig(name, BAD)
+    rig.tree.add(b"/big", content)
+    assert rig.read(b"/big", strategy) == content
+    stats = rig.link.engine.stats
+    asked = stats.by_opcode.get(Opcode.READ_FILE, 0) + stats.by_opcode.get(Opcode.BURST_READ_FILE, 0)
+    assert asked <= 1.5 * (-(-size // CHUNK)) / (1 - BAD.loss) ** 2
+    assert rig.nothing_is_open()
+
+
+@pytest.mark.parametrize("rate", [5_760.0, 57_600.0])
+@pytest.mark.parametrize("name", NAMES)
+def test_a_radio_is_used(name: str, rate: float) -> None:
+    """Half a minute's worth of a file, at 5 % loss; ArduPilot is bound by its queue, not by the radio."""
+    size = int(rate * (4 if rig_is_slow(name) else 30))
+    content = random.Random(6).randbytes(size)
+    rig = Rig(name, LinkSettings(rate=rate, delay=0.02, loss=0.05))
+    rig.tree.add(b"/big", content)
+    started = rig.link.now
+    assert rig.read(b"/big", "window") == content
+    limit = rate * 239 / 266 * 0.95
+    if rig_is_slow(name):
+        limit = min(limit, 4 * 239 / 0.08)
+    assert size / (rig.link.now - started) > 0.8 * limit
+
+
+def rig_is_slow(name: str) -> bool:
+    return PROFILES[name].family is Family.ARDUPILOT
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_listings_over_a_bad_link(name: str) -> None:
+    rig = Rig(name, BAD)
+    names = {b"file %03d.bin" % index for index in range(150)}
+    for each in sorted(names):
+        rig.tree.add(b"/d/" + each, b"x" * int(each[5:8]))
+    rig.tree.add_directory(b"/d/sub")
+    op = ListDirectory(b"/d")
+    rig.link.run(op)
+    assert op.error is None
+    assert op.complete
+    found = {entry.name: entry for entry in op.entries}
+    assert set(found) == names | {b"sub"}
+    assert all(found[each].size == int(each[5:8]) for each in names)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_metadata_beside_a_transfer(name: str) -> None:
+    """A listing is answered while a file is read, before the file is through."""
+    rig = Rig(name, LinkSettings(rate=57_600.0, delay=0.02, loss=0.02))
+    content = random.Random(7).randbytes(100_000)
+    rig.tree.add(b"/big", content)
+    size = rig.open(b"/big")
+    sink = MemorySink(size)
+    transfer = ReadTransfer(rig.session, size, sink)
+    rig.link.engine.start(transfer, rig.link.now)
+    transfer.want(0, size, True)
+    rig.link.run_until(lambda: sink.held.total > 10_000)
+    for _ in range(5):
+        op = ListDirectory(b"/")
+        started = rig.link.now
+        rig.link.run(op)
+        assert op.error is None
+        assert rig.link.now - started < 4.0
+    assert not transfer.idle
+    rig.link.run_until(lambda: transfer.idle or transfer.done)
+    assert bytes(sink.data) == content
+    rig.link.engine.cancel(transfer, rig.link.now)
+    rig.close()
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_reading_to_eof_over_a_bad_link(name: str) -> None:
+    """Where a read may cross the end, the bytes are right; where it may not (MAVSDK), that is an error."""
+    content = random.Random(9).randbytes(10_000)
+    rig = Rig(name, BAD)
+    rig.tree.add(b"/f", content)
+    rig.open(b"/f")
+    op = ReadToEof(rig.session, CHUNK, 20_000)
+    rig.link.run(op)
+    if rig.profile.family is Family.MAVSDK:
+        assert isinstance(op.error, SessionLost)
+    else:
+        assert op.error is None
+        assert op.data == content
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_side_effects_happen_once(name: str) -> None:
+    """A mkdir whose reply is lost is either replayed, or refused in a way that says "perhaps done"."""
+    rig = Rig(name, LinkSettings(delay=0.02, loss=0.3), seed=3)
+    root = b"/fs/microsd/" if rig.profile.writable_root else b"/"
+    rig.tree.add_directory(root)
+    for index in range(20):
+        path = root + b"dir%d" % index
+        op = Simple(Opcode.CREATE_DIRECTORY, path)
+        rig.link.run(op)
+        if op.error is not None:
+            assert isinstance(op.error, FtpNak)
+            assert op.error.retransmitted
+            assert op.error.code == NakCode.FILE_EXISTS
+        assert rig.tree.stat(path)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_checksum(name: str) -> None:
+    content = random.Random(4).randbytes(50_000)
+    rig = Rig(name, LinkSettings(delay=0.02))
+    rig.tree.add(b"/f", content)
+    op = Simple(Opcode.CALC_FILE_CRC32, b"/f", patience=120.0)
+    rig.link.run(op)
+    assert op.reply.data == crc32(content).to_bytes(4, "little")
+
+
+@pytest.mark.parametrize("strategy", STRATEGIES)
+@pytest.mark.parametrize("name", NAMES)
+def test_a_cut_link_comes_back(name: str, strategy: Strategy) -> None:
+    """Five seconds of nothing in the middle: the same transfer goes on."""
+    rig = Rig(name, LinkSettings(rate=57_600.0, delay=0.02, cuts=((100.5, 105.5),)))
+    content = random.Random(7).randbytes(60_000)
+    rig.tree.add(b"/big", content)
+    assert rig.read(b"/big", strategy) == content
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_small_reads_here_and_there(name: str) -> None:
+    rig = Rig(name, BAD, seed=11)
+    content = random.Random(7).randbytes(100_000)
+    rig.tree.add(b"/big", content)
+    size = rig.open(b"/big")
+    sink = MemorySink(size)
+    transfer = ReadTransfer(rig.session, size, sink)
+    rig.link.engine.start(transfer, rig.link.now)
+    rng = random.Random(1)
+    for _ in range(10):
+        start = rng.randrange(size)
+        stop = min(size, start + rng.randrange(1, 3000))
+        transfer.want(start, stop, True)
+        rig.link.run_until(lambda: transfer.idle or transfer.done)
+        assert transfer.error is None
+        assert bytes(sink.data[start:stop]) == content[start:stop]
+        assert sink.held.covers(start, stop)
