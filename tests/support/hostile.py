@@ -202,6 +202,7 @@ def main() -> int:
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
         sock.connect((HOST, port))
+        print("ready", flush=True)
         serve(sock, framer, react)
     return 0
 

@@ -10,6 +10,7 @@ import signal
 import socket
 import subprocess
 import sys
+import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Protocol
@@ -161,11 +162,20 @@ class UdpVehicle:
         """End vehicle and link, whatever state they are in, then judge what they logged."""
         process, self.process = self.process, None
         proxy, self.proxy = self.proxy, None
+        if process is not None:
+            self.await_ready(process)
         codes = [child.stop() for child in (process, proxy) if child is not None]
         if process is not None:
             assert_clean(process.name, process.text(), self.allowed_log)
             self.check_end(process)
         assert not any(codes), f"exit codes {codes} of {process and process.text()} {proxy and proxy.text()}"
+
+    def await_ready(self, process: Process) -> None:
+        """Wait for its first words: before these it does not know how to end in order."""
+        deadline = time.monotonic() + STOP_TIMEOUT
+        while process.running and not process.output.read_text() and time.monotonic() < deadline:
+            process.resume()
+            time.sleep(0.02)
 
     def check_end(self, process: Process) -> None:
         """Judge the vehicle's last words."""
