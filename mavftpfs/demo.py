@@ -278,14 +278,12 @@ def show_link(tour: Tour) -> None:
     if result.returncode:
         raise DemoFailed(f"status ended with {result.returncode}: {result.stderr.decode().strip()}")
     status = json.loads(result.stdout)
-    requests: dict[str, int] = find_fact(status, "requests")
     table = Table(show_header=False)
-    table.add_row("requests answered", str(sum(requests.values())))
-    table.add_row(
-        "sent again, because they or their answers were lost", str(find_fact(status, "retransmissions"))
-    )
+    table.add_row("requests sent", f"{find_fact(status, 'requests'):,}")
+    table.add_row("of these again, because something was lost", f"{find_fact(status, 'retransmissions'):,}")
     table.add_row("there and back, measured", f"{1000 * find_fact(status, 'rtt'):.0f} ms")
-    table.add_row("bytes received over the air", f"{find_fact(status, 'received_bytes'):,}")
+    table.add_row("received over the air", f"{find_fact(status, 'received_bytes'):,} bytes")
+    table.add_row("reading rate at the last file", f"{find_fact(status, 'rate') / 1000:.1f} kB/s")
     tour.say("What the radio did meanwhile (from [bold]mavftpfs status drone[/]):")
     tour.console.print(table, highlight=False)
 
