@@ -17,6 +17,7 @@ import logging
 import struct
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 from typing import BinaryIO, Protocol, Self
@@ -85,7 +86,9 @@ class _File:
                 self._flushed_at = now
         except OSError as exc:
             self._complain(exc)
-            self.close()
+            file, self._file = self._file, None
+            with suppress(OSError):  # what is buffered cannot be written either; close() closes all the same
+                file.close()
 
     def _complain(self, problem: OSError) -> None:
         _log.warning("no further trace in %s: %s", self._path, problem.strerror)

@@ -136,6 +136,8 @@ def _parse_host_port(text: str, source: str, kind: LinkKind) -> tuple[str, int]:
             raise UsageError(
                 f"SOURCE {source!r}: write IPv6 in brackets, for example {kind.value}:[::1]:{default}"
             )
+    if host.isdigit() and not port_text:
+        raise UsageError(f"SOURCE {source!r}: a host comes before the port; write for example {example}")
     if not host and not listens:
         raise UsageError(f"SOURCE {source!r} names no host; write for example {example}")
     port = _number(port_text) if port_text else default

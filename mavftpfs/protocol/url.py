@@ -58,7 +58,7 @@ def parse_url(text: str) -> MftpUrl:
     if _BAD_ESCAPE.search(rest):
         raise UsageError(f"{text!r}: '%' must be followed by two hex digits (%25 is a percent sign)")
     try:
-        path = normalise(unquote_to_bytes(rest))
+        path = normalise(unquote_to_bytes(rest.encode("utf-8", "surrogateescape")))
     except LocalProtocolError as exc:
         raise UsageError(f"{text!r}: {exc}") from exc
     return MftpUrl(component, path)

@@ -1,0 +1,108 @@
+"""The fast path for message 110 against pymavlink, on chosen cases (tests/property has the rest)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+from pymavlink.dialects.v20 import ardupilotmega as dialect
+
+from mavftpfs.link.fastframe import FtpFrameCodec, frame_crc
+from mavftpfs.link.messages import Address, FtpFrame, Message
+
+US = Address(254, 191)
+EXTRA = 84
+
+FULL = bytes(range(1, 252))
+PAYLOADS = [
+    FULL,
+    bytes(251),
+    bytes(250) + b"\1",
+    b"\1" + bytes(250),
+    FULL[:27] + bytes(224),
+    FULL[:26] + bytes(225),
+    FULL[:12] + bytes(239),
+    bytes(100) + FULL[:51] + bytes(100),
+]
+TARGETS = [Address(1, 1), Address(0, 0), Address(1, 0), Address(0, 1), Address(255, 255)]
+
+
+def reference(seq: int, target: Address, payload: bytes) -> bytes:
+    mav = dialect.MAVLink(None, *US)
+    mav.seq = seq
+    frame: bytes = mav.file_transfer_protocol_encode(0, *target, list(payload)).pack(mav)
+    return frame
+
+
+@pytest.mark.parametrize("payload", PAYLOADS)
+@pytest.mark.parametrize("target", TARGETS)
+def test_encodes_as_pymavlink(payload: bytes, target: Address) -> None:
+    codec = FtpFrameCodec(US, EXTRA)
+    for seq in (0, 1, 255):
+        assert codec.encode(seq, target, payload) == reference(seq, target, payload)
+
+
+@pytest.mark.parametrize("payload", PAYLOADS)
+def test_decodes_what_pymavlink_made(payload: bytes) -> None:
+    out: list[Message] = []
+    frame = reference(9, Address(1, 2), payload)
+    assert FtpFrameCodec(US, EXTRA).decode_run(frame, 0, out) == len(frame)
+    assert out == [FtpFrame(US, Address(1, 2), payload)]
+
+
+def test_a_frame_trimmed_into_its_target_is_left_to_pymavlink() -> None:
+    out: list[Message] = []
+    for target in (Address(0, 0), Address(1, 0)):
+        assert FtpFrameCodec(US, EXTRA).decode_run(reference(9, target, bytes(251)), 0, out) == 0
+    assert out == []
+
+
+def test_run_of_frames_stops_where_it_ends() -> None:
+    codec = FtpFrameCodec(US, EXTRA)
+    frames = [codec.encode(n, Address(1, 1), bytes([n]) * 251) for n in range(5)]
+    data = b"junk" + b"".join(frames) + b"\xfd\x09"
+    out: list[Message] = []
+    assert codec.decode_run(data, 4, out) == len(data) - 2
+    assert [m.payload[0] for m in out if isinstance(m, FtpFrame)] == [0, 1, 2, 3, 4]
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda f: f[:-1],
+        lambda f: f[:-1] + bytes([f[-1] ^ 1]),
+        lambda f: f[:40] + bytes([f[40] ^ 128]) + f[41:],
+        lambda f: b"\xfe" + f[1:],
+        lambda f: f[:2] + b"\1" + f[3:],
+        lambda f: f[:7] + b"\x6f" + f[8:],
+        lambda f: f[:9] + b"\1" + f[10:],
+        lambda f: b"",
+    ],
+    ids=["cut", "crc", "content", "magic", "flags", "id", "id high", "nothing"],
+)
+def test_leaves_everything_else_alone(damage: Callable[[bytes], bytes]) -> None:
+    out: list[Message] = []
+    frame = damage(reference(1, Address(1, 1), FULL))
+    assert FtpFrameCodec(US, EXTRA).decode_run(frame, 0, out) == 0
+    assert out == []
+
+
+def test_a_wrong_extra_byte_is_a_wrong_crc() -> None:
+    out: list[Message] = []
+    assert FtpFrameCodec(US, 85).decode_run(reference(1, Address(1, 1), FULL), 0, out) == 0
+
+
+def test_a_flood_of_senders_does_not_grow_the_cache() -> None:
+    codec = FtpFrameCodec(US, EXTRA)
+    for system in range(256):
+        for component in range(0, 256, 16):
+            sender = FtpFrameCodec(Address(system, component), EXTRA)
+            out: list[Message] = []
+            codec.decode_run(sender.encode(0, Address(1, 1), FULL), 0, out)
+            assert out[0].source == (system, component)
+    assert len(codec._addresses) <= 1024
+
+
+def test_frame_crc_is_pymavlinks() -> None:
+    frame = reference(3, Address(1, 1), FULL)
+    assert frame_crc(frame[1:-2], EXTRA) == int.from_bytes(frame[-2:], "little")

@@ -1,0 +1,407 @@
+"""The framer: values of each message, signing, damage, limits. Pymavlink is the independent other end."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from pymavlink.dialects.v20 import ardupilotmega as dialect
+
+from mavftpfs.link.framing import Framer
+from mavftpfs.link.messages import (
+    Address,
+    AutopilotVersion,
+    CommandLong,
+    FtpFrame,
+    Heartbeat,
+    Message,
+    Other,
+    RadioStatus,
+    StatusText,
+    StorageInformation,
+    SystemTime,
+)
+from mavftpfs.shared.errors import LocalProtocolError, UsageError
+
+US = Address(254, 191)
+DRONE = Address(1, 1)
+KEY = bytes(range(32))
+PAYLOAD = bytes(range(1, 252))
+
+
+def drone() -> Any:
+    return dialect.MAVLink(None, *DRONE)
+
+
+def pack(message: Any, mav: Any = None, **how: bool) -> bytes:
+    mav = mav or drone()
+    frame: bytes = message.pack(mav, **how)
+    mav.seq = (mav.seq + 1) % 256
+    return frame
+
+
+def ftp(payload: bytes = PAYLOAD, mav: Any = None, **how: bool) -> bytes:
+    return pack(drone().file_transfer_protocol_encode(0, *US, list(payload)), mav, **how)
+
+
+def heartbeat(mav: Any = None, **how: bool) -> bytes:
+    return pack(drone().heartbeat_encode(2, 12, 0x81, 0, 4), mav, **how)
+
+
+HEARTBEAT = Heartbeat(DRONE, 2, 12, 0x81, 4)
+FTP = FtpFrame(DRONE, US, PAYLOAD)
+
+MESSAGES: list[tuple[Any, Message]] = [
+    (drone().heartbeat_encode(2, 3, 0x51, 7, 3), Heartbeat(DRONE, 2, 3, 0x51, 3)),
+    (drone().file_transfer_protocol_encode(0, 254, 191, list(PAYLOAD)), FTP),
+    (drone().system_time_encode(5_000_000_000_000, 1234), SystemTime(DRONE, 5_000_000_000_000, 1234)),
+    (
+        drone().command_long_encode(1, 2, 512, 0, 148, 0.5, 0, 0, 0, 0, -1),
+        CommandLong(DRONE, Address(1, 2), 512, (148.0, 0.5, 0.0, 0.0, 0.0, 0.0, -1.0)),
+    ),
+    (drone().radio_status_encode(200, 190, 87, 1, 2, 33, 4), RadioStatus(DRONE, 200, 190, 87, 33)),
+    (drone().radio_encode(200, 190, 87, 1, 2, 33, 4), RadioStatus(DRONE, 200, 190, 87, 33)),
+    (drone().statustext_encode(4, b"low battery"), StatusText(DRONE, 4, "low battery")),
+    (
+        drone().autopilot_version_encode(
+            0x20, 7, 1, 2, 3, list(b"12345678"), [0] * 8, [0] * 8, 4, 5, 99, list(range(18))
+        ),
+        AutopilotVersion(DRONE, 0x20, 7, b"12345678", 99, bytes(range(18))),
+    ),
+    (
+        drone().storage_information_encode(5, 1, 2, 2, 1024.0, 24.0, 1000.0, 0.0, 0.0),
+        StorageInformation(DRONE, 1, 2, 2, 1024.0, 24.0, 1000.0),
+    ),
+    (drone().attitude_encode(1, 0, 0, 0, 0, 0, 0), Other(DRONE, 30)),
+]
+
+
+@pytest.mark.parametrize(
+    ("message", "value", "old"),
+    [(m, v, old) for m, v in MESSAGES for old in (False, True) if not (old and m.get_msgId() > 255)],
+)
+def test_reads_what_pymavlink_writes(message: Any, value: Message, old: bool) -> None:
+    framer = Framer(US, stream=True)
+    assert framer.feed(pack(message, force_mavlink1=old)) == [value]
+    assert framer.stats.frames == 1
+    assert framer.stats.other == (1 if isinstance(value, Other) else 0)
+
+
+BUILT: list[tuple[Callable[[Framer], bytes], str, dict[str, Any]]] = [
+    (
+        lambda f: f.encode_heartbeat(18),
+        "HEARTBEAT",
+        {"type": 18, "autopilot": 8, "base_mode": 0, "system_status": 4},
+    ),
+    (
+        lambda f: f.encode_request_message(DRONE, 261),
+        "COMMAND_LONG",
+        {"target_system": 1, "target_component": 1, "command": 512, "param1": 261.0},
+    ),
+    (lambda f: f.encode_request_capabilities(DRONE), "COMMAND_LONG", {"command": 520, "param1": 1.0}),
+    (lambda f: f.encode_command_ack(512, 0, DRONE), "COMMAND_ACK", {"command": 512, "result": 0}),
+    (
+        lambda f: f.encode_autopilot_version(0x20, 7, b"12345678", 99),
+        "AUTOPILOT_VERSION",
+        {"capabilities": 0x20, "flight_sw_version": 7, "flight_custom_version": list(b"12345678"), "uid": 99},
+    ),
+    (
+        lambda f: f.encode_storage_information(5, 1000.0, 250.0),
+        "STORAGE_INFORMATION",
+        {"total_capacity": 1000.0, "used_capacity": 250.0, "available_capacity": 750.0, "status": 2},
+    ),
+    (lambda f: f.encode_system_time(6, 7), "SYSTEM_TIME", {"time_unix_usec": 6, "time_boot_ms": 7}),
+    (lambda f: f.encode_radio_status(1, 2, 90, 4), "RADIO_STATUS", {"rssi": 1, "txbuf": 90, "rxerrors": 4}),
+    (lambda f: f.encode_statustext(3, "x" * 60), "STATUSTEXT", {"severity": 3, "text": "x" * 50}),
+    (lambda f: f.encode_ftp(DRONE, PAYLOAD), "FILE_TRANSFER_PROTOCOL", {"payload": list(PAYLOAD)}),
+]
+
+
+@pytest.mark.parametrize(
+    ("build", "name", "fields"), BUILT, ids=[f"{n}-{i}" for i, (_, n, _) in enumerate(BUILT)]
+)
+@pytest.mark.parametrize("key", [None, KEY], ids=["plain", "signed"])
+def test_pymavlink_reads_what_we_write(
+    build: Callable[[Framer], bytes], name: str, fields: dict[str, Any], key: bytes | None
+) -> None:
+    framer = Framer(US, stream=True, signing_key=key)
+    mav = drone()
+    mav.signing.secret_key = key
+    for seq in (0, 1):
+        message = mav.decode(bytearray(build(framer)))
+        assert message.get_type() == name
+        assert (message.get_srcSystem(), message.get_srcComponent(), message.get_seq()) == (*US, seq)
+        assert {field: getattr(message, field) for field in fields} == fields
+
+
+def test_telemetry_is_a_mix_of_valid_messages() -> None:
+    framer, mav = Framer(US, stream=True), drone()
+    names = [mav.decode(bytearray(framer.encode_telemetry(n, 1000))).get_type() for n in range(6)]
+    assert len(set(names)) == 5
+    assert names[0] == names[5]
+
+
+def test_seq_counts_through_all_messages_and_wraps() -> None:
+    framer = Framer(US, stream=True)
+    seqs = []
+    for _ in range(200):
+        seqs += [framer.encode_ftp(DRONE, PAYLOAD)[4], framer.encode_heartbeat(18)[4]]
+    assert seqs == [n % 256 for n in range(400)]
+
+
+def test_source_may_change() -> None:
+    framer = Framer(US, stream=True)
+    framer.source = Address(254, 192)
+    assert framer.source == (254, 192)
+    assert tuple(framer.encode_ftp(DRONE, PAYLOAD)[5:7]) == (254, 192)
+    assert tuple(framer.encode_heartbeat(18)[5:7]) == (254, 192)
+
+
+@pytest.mark.parametrize("size", [0, 250, 252])
+def test_refuses_a_payload_of_the_wrong_size(size: int) -> None:
+    with pytest.raises(LocalProtocolError):
+        Framer(US, stream=True).encode_ftp(DRONE, bytes(size))
+
+
+@pytest.mark.parametrize("size", [0, 31, 33])
+def test_refuses_a_key_of_the_wrong_size(size: int) -> None:
+    with pytest.raises(UsageError, match="32 bytes"):
+        Framer(US, stream=True, signing_key=bytes(size))
+
+
+# ---------------------------------------------------------------------- the shape of a payload
+
+
+@pytest.mark.parametrize("kept", [0, 1, 12, 250, 251])
+@pytest.mark.parametrize("old", [False, True], ids=["v2", "v1"])
+def test_trimmed_zeros_come_back(kept: int, old: bool) -> None:
+    payload = PAYLOAD[:kept] + bytes(251 - kept)
+    assert Framer(US, stream=False).feed(ftp(payload, force_mavlink1=old)) == [FtpFrame(DRONE, US, payload)]
+
+
+def test_replies_to_nobody_are_trimmed_into_the_header() -> None:
+    mav = drone()
+    frame = pack(mav.file_transfer_protocol_encode(0, 0, 0, [0] * 251), mav)
+    assert frame[1] == 1
+    assert Framer(US, stream=True).feed(frame) == [FtpFrame(DRONE, Address(0, 0), bytes(251))]
+
+
+def with_payload(message_id: int, payload: bytes, extra: int) -> bytes:
+    header = struct.pack("<BBBBBBBHB", 0xFD, len(payload), 0, 0, 0, *DRONE, message_id, 0)
+    crc = dialect.x25crc(header[1:] + payload + bytes([extra])).crc
+    return header + payload + struct.pack("<H", crc)
+
+
+def test_a_longer_payload_of_a_later_dialect_is_cut() -> None:
+    frame = with_payload(110, b"\0\xfe\xbf" + PAYLOAD + b"\7", 84)
+    assert Framer(US, stream=True).feed(frame) == [FTP]
+
+
+def test_target_network_does_not_matter() -> None:
+    frame = with_payload(110, b"\5\xfe\xbf" + PAYLOAD, 84)
+    assert Framer(US, stream=True).feed(frame) == [FTP]
+
+
+# ---------------------------------------------------------------------- damage
+
+
+def test_damaged_frame_is_counted_and_the_next_one_survives() -> None:
+    frame = bytearray(ftp())
+    frame[100] ^= 0x10
+    framer = Framer(US, stream=True)
+    assert framer.feed(bytes(frame) + heartbeat() + ftp()) == [HEARTBEAT, FTP]
+    assert (framer.stats.bad_crc, framer.stats.garbage_bytes) == (1, 0)
+
+
+def test_lost_bytes_cost_one_frame() -> None:
+    data = ftp()[:100] + ftp() + ftp()
+    framer = Framer(US, stream=True)
+    assert framer.feed(data) == [FTP, FTP]
+    assert framer.stats.garbage_bytes == 100
+
+
+def test_a_recorded_flight_inside_a_damaged_frame_stays_inside() -> None:
+    recorded = heartbeat() * 8
+    frame = bytearray(ftp((recorded + bytes(251))[:251]))
+    frame[5] ^= 0xFF
+    framer = Framer(US, stream=True)
+    assert framer.feed(bytes(frame) + heartbeat()) == [HEARTBEAT]
+    assert framer.stats.bad_crc == 1
+
+
+def test_a_damaged_last_frame_waits_for_what_follows() -> None:
+    frame = bytearray(ftp())
+    frame[100] ^= 0x10
+    framer = Framer(US, stream=True)
+    assert framer.feed(bytes(frame)) == []
+    assert framer.stats.bad_crc == 0
+    assert framer.feed(heartbeat()) == [HEARTBEAT]
+    assert framer.stats.bad_crc == 1
+
+
+def test_datagram_ends_its_frames() -> None:
+    frame = bytearray(ftp())
+    frame[100] ^= 0x10
+    framer = Framer(US, stream=False)
+    assert framer.feed(bytes(frame)) == []
+    assert framer.stats.bad_crc == 1
+    assert framer._tail == b""
+
+
+def test_frame_cut_at_the_end_of_a_datagram_does_not_hold_up_the_next() -> None:
+    framer = Framer(US, stream=False)
+    assert framer.feed(ftp()[:50]) == []
+    assert framer.feed(heartbeat()) == [HEARTBEAT]
+    assert framer.stats.garbage_bytes == 50
+
+
+def test_frame_split_over_datagrams_by_a_bridge_is_joined() -> None:
+    framer = Framer(US, stream=False)
+    frame = ftp()
+    assert framer.feed(heartbeat() + frame[:99]) == [HEARTBEAT]
+    assert framer.feed(frame[99:] + heartbeat()) == [FTP, HEARTBEAT]
+    assert framer.stats.garbage_bytes == 0
+
+
+@pytest.mark.parametrize(
+    "garbage", [b"\0", b"hello world" * 50, b"\xfd\xff", b"\xfe\x01\x02", b"\xfd\x00\x02"]
+)
+def test_garbage_between_frames(garbage: bytes) -> None:
+    framer = Framer(US, stream=True)
+    found = framer.feed(garbage + ftp() * 3 + garbage + heartbeat() + ftp() * 2)
+    found += framer.feed(heartbeat() * 20)
+    assert found[-20:] == [HEARTBEAT] * 20
+    assert FTP in found
+
+
+def test_unknown_incompatible_flags_are_refused() -> None:
+    frame = bytearray(ftp())
+    frame[2] = 0x02
+    framer = Framer(US, stream=True)
+    assert framer.feed(bytes(frame) + heartbeat())[-1] == HEARTBEAT
+
+
+def test_message_unknown_to_the_dialect_is_other_if_a_frame_follows() -> None:
+    framer = Framer(US, stream=True)
+    assert framer.feed(with_payload(60_001, b"private", 77)) == []
+    assert framer.feed(heartbeat()) == [Other(DRONE, 60_001), HEARTBEAT]
+
+
+def test_reset_forgets_half_a_frame() -> None:
+    framer = Framer(US, stream=True)
+    framer.feed(ftp()[:60])
+    framer.reset()
+    assert framer.feed(ftp()) == [FTP]
+    assert framer.stats.garbage_bytes == 60
+
+
+def test_what_waits_is_at_most_a_frame() -> None:
+    framer = Framer(US, stream=True)
+    for chunk in (b"\xfd" * 100_000, bytes(100_000), b"\xfd\xff\x01\x00" * 10_000, b"\xfe" * 7777):
+        framer.feed(chunk)
+        assert len(framer._tail) <= 280
+
+
+def test_messages_whose_fields_make_no_sense_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    framer = Framer(US, stream=True)
+
+    def refuse(*_: object) -> None:
+        raise dialect.MAVError("no")
+
+    monkeypatch.setattr(framer._decoder, "decode", refuse)
+    assert framer.feed(heartbeat() + ftp()) == [FTP]
+    assert framer.stats.unreadable == 1
+
+
+# ---------------------------------------------------------------------- hooks
+
+
+def test_on_frame_sees_each_frame_once_in_both_directions() -> None:
+    framer, seen = Framer(US, stream=True), list[bytes]()
+    framer.on_frame = seen.append
+    ours = [framer.encode_ftp(DRONE, PAYLOAD), framer.encode_heartbeat(18)]
+    theirs = [ftp(), ftp(bytes(251)), heartbeat(), pack(drone().attitude_encode(1, 0, 0, 0, 0, 0, 0)), ftp()]
+    framer.feed(b"garbage".join(theirs))
+    assert seen == ours + theirs
+
+
+# ---------------------------------------------------------------------- signing
+
+
+def signer(timestamp: int = 1000, key: bytes = KEY, link_id: int = 0) -> Any:
+    mav = drone()
+    mav.signing.secret_key = key
+    mav.signing.sign_outgoing = True
+    mav.signing.timestamp = timestamp
+    mav.signing.link_id = link_id
+    return mav
+
+
+def test_signed_frames_are_accepted_without_a_key() -> None:
+    assert Framer(US, stream=True).feed(ftp(mav=signer()) + heartbeat(signer())) == [FTP, HEARTBEAT]
+
+
+def test_with_a_key_only_right_signatures_pass() -> None:
+    framer = Framer(US, stream=True, signing_key=KEY)
+    mav = signer()
+    good = ftp(mav=mav) + heartbeat(mav)
+    bad = ftp() + heartbeat() + heartbeat(force_mavlink1=True) + heartbeat(signer(key=bytes(32)))
+    assert framer.feed(good + bad + heartbeat(mav)) == [FTP, HEARTBEAT, HEARTBEAT]
+    assert framer.stats.bad_signature == 4
+
+
+def test_a_radios_own_report_needs_no_signature() -> None:
+    framer = Framer(US, stream=True, signing_key=KEY)
+    report = pack(drone().radio_status_encode(1, 2, 3, 4, 5, 6, 7))
+    assert framer.feed(report) == [RadioStatus(DRONE, 1, 2, 3, 6)]
+
+
+def test_replayed_frames_are_refused() -> None:
+    framer = Framer(US, stream=True, signing_key=KEY)
+    frame = heartbeat(signer())
+    assert framer.feed(frame) == [HEARTBEAT]
+    assert framer.feed(frame + heartbeat(signer(timestamp=999))) == []
+    assert framer.stats.bad_signature == 2
+
+
+def test_a_new_stream_may_be_a_minute_old_but_not_older() -> None:
+    minute = 6_000_000
+    now = 10 * minute
+    framer = Framer(US, stream=True, signing_key=KEY, signing_clock=lambda: now)
+    assert framer.feed(heartbeat(signer(now - minute - 1, link_id=1))) == []
+    assert framer.feed(heartbeat(signer(now - minute, link_id=2))) == [HEARTBEAT]
+
+
+def test_a_forged_timestamp_locks_nobody_out() -> None:
+    framer = Framer(US, stream=True, signing_key=KEY)
+    forged = bytearray(heartbeat(signer()))
+    forged[-12:-6] = b"\xff" * 6
+    assert framer.feed(bytes(forged)) == []
+    assert framer.feed(heartbeat(signer())) == [HEARTBEAT]
+
+
+def test_our_timestamps_follow_the_clock_and_what_we_heard() -> None:
+    clock = 5000
+    framer = Framer(US, stream=True, signing_key=KEY, signing_clock=lambda: clock)
+
+    def timestamp(frame: bytes) -> int:
+        return int.from_bytes(frame[-12:-6], "little")
+
+    assert [timestamp(framer.encode_heartbeat(18)) for _ in range(3)] == [5000, 5001, 5002]
+    framer.feed(heartbeat(signer(9000)))
+    assert timestamp(framer.encode_ftp(DRONE, PAYLOAD)) == 9000
+    clock = 20_000
+    assert timestamp(framer.encode_heartbeat(18)) == 20_000
+
+
+def test_streams_are_bounded() -> None:
+    framer = Framer(US, stream=True, signing_key=KEY)
+    accepted = 0
+    for component in range(2):
+        for link_id in range(200):
+            mav = signer(link_id=link_id)
+            mav.srcComponent = component
+            accepted += len(framer.feed(heartbeat(mav)))
+    assert accepted == 256

@@ -1,0 +1,135 @@
+"""Traces: what is written, and that a full disk breaks nothing."""
+
+from __future__ import annotations
+
+import json
+import logging
+import struct
+from pathlib import Path
+
+import pytest
+from pymavlink import mavutil
+
+from mavftpfs.link.framing import Framer
+from mavftpfs.link.messages import Address
+from mavftpfs.protocol.payload import NakCode, Opcode, Payload, request
+from mavftpfs.shared.errors import UsageError
+from mavftpfs.trace import REPLY, REQUEST, JsonTrace, Tee, TextTrace, TlogWriter, describe, text_line
+
+READ = request(7, Opcode.READ_FILE, session=3, offset=478, size=100).encode()
+OPEN = request(8, Opcode.OPEN_FILE_RO, data=b"/fs/microsd/a.bin").encode()
+DATA = Payload(8, 3, Opcode.ACK, 4, Opcode.BURST_READ_FILE, 1, 478, b"abcd").encode()
+NAK = Payload(9, 0, Opcode.NAK, 2, Opcode.OPEN_FILE_RO, 0, 0, bytes([NakCode.FAIL_ERRNO, 28])).encode()
+ODD = Payload(9, 0, 77, 239, 99, 0, 0, b"x" * 239).encode()
+
+
+def test_json_lines(tmp_path: Path) -> None:
+    with JsonTrace(tmp_path / "trace", data_limit=3) as trace:
+        trace.payload(1.5, REQUEST, READ, "retransmit")
+        trace.payload(2.25, REPLY, DATA)
+        trace.payload(3.0, REQUEST, OPEN)
+        trace.payload(4.0, REPLY, b"short")
+    lines = [json.loads(line) for line in (tmp_path / "trace").read_text().splitlines()]
+    common = {"session": 3, "offset": 478}
+    assert lines == [
+        {
+            "t": 1.5,
+            "dir": "request",
+            "seq": 7,
+            "opcode": "READ_FILE",
+            "size": 100,
+            "data": "",
+            "note": "retransmit",
+            **common,
+        },
+        {
+            "t": 2.25,
+            "dir": "reply",
+            "seq": 8,
+            "opcode": "ACK",
+            "size": 4,
+            "req_opcode": "BURST_READ_FILE",
+            "burst_complete": 1,
+            "data": b"abc".hex(),
+            **common,
+        },
+        {
+            "t": 3.0,
+            "dir": "request",
+            "seq": 8,
+            "session": 0,
+            "opcode": "OPEN_FILE_RO",
+            "size": 17,
+            "offset": 0,
+            "data": b"/fs".hex(),
+        },
+        {"t": 4.0, "dir": "reply", "malformed": b"short".hex()},
+    ]
+
+
+def test_json_holds_all_data_unless_told_otherwise() -> None:
+    assert describe(REPLY, ODD)["data"] == (b"x" * 239).hex()
+    assert describe(REPLY, ODD)["opcode"] == "77"
+    assert describe(REPLY, ODD)["req_opcode"] == "99"
+
+
+@pytest.mark.parametrize(
+    ("direction", "wire", "line"),
+    [
+        (REQUEST, READ, "-> READ_FILE seq 7 session 3 offset 478 size 100"),
+        (REQUEST, OPEN, "-> OPEN_FILE_RO seq 8 session 0 offset 0 size 17 b'/fs/microsd/a.bi'..."),
+        (REPLY, DATA, "<- BURST_READ_FILE ACK seq 8 session 3 offset 478 size 4 complete b'abcd'"),
+        (REPLY, NAK, "<- OPEN_FILE_RO NAK FAIL_ERRNO seq 9 session 0 offset 0 size 2 b'\\x1c'"),
+        (REPLY, b"", "reply of 0 bytes, malformed"),
+    ],
+)
+def test_text(direction: str, wire: bytes, line: str) -> None:
+    assert text_line(direction, wire) == line
+
+
+def test_text_trace_and_tee() -> None:
+    lines: list[str] = []
+    sink = TextTrace(lines.append)
+    Tee([sink, sink]).payload(1.0, REQUEST, READ, "dup")
+    assert lines == ["1.000000 -> READ_FILE seq 7 session 3 offset 478 size 100 (dup)"] * 2
+
+
+def test_tlog_is_readable_by_pymavlink(tmp_path: Path) -> None:
+    path = tmp_path / "flight.tlog"
+    framer = Framer(Address(254, 191), stream=True)
+    times = iter([1000.5, 1001.5])
+    with TlogWriter(path, wall_clock=lambda: next(times)) as log:
+        framer.on_frame = log.frame
+        frames = [framer.encode_ftp(Address(1, 1), READ), framer.encode_heartbeat(18)]
+    assert path.read_bytes() == b"".join(
+        struct.pack(">Q", int(t * 1e6)) + f for t, f in zip([1000.5, 1001.5], frames, strict=True)
+    )
+    reader = mavutil.mavlink_connection(str(path), dialect="ardupilotmega")
+    try:
+        found = [reader.recv_msg() for _ in range(3)]
+    finally:
+        reader.close()
+    assert [m and m.get_type() for m in found] == ["FILE_TRANSFER_PROTOCOL", "HEARTBEAT", None]
+    assert bytes(found[0].payload) == READ
+
+
+@pytest.mark.parametrize("sink", [JsonTrace, TlogWriter])
+def test_a_file_that_cannot_be_made_is_the_users_error(
+    sink: type[JsonTrace | TlogWriter], tmp_path: Path
+) -> None:
+    with pytest.raises(UsageError, match="No such file or directory"):
+        sink(tmp_path / "nowhere" / "trace")
+
+
+def test_a_full_disk_is_said_once_and_breaks_nothing(caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level(logging.WARNING), JsonTrace("/dev/full") as trace:
+        for n in range(3000):
+            trace.payload(float(n), REPLY, DATA)
+    assert caplog.messages == ["no further trace in /dev/full: No space left on device"]
+
+
+def test_a_trace_shows_up_while_it_is_written(tmp_path: Path) -> None:
+    with JsonTrace(tmp_path / "trace") as trace:
+        trace.payload(10.0, REPLY, DATA)
+        trace.payload(11.5, REPLY, DATA)
+        assert len((tmp_path / "trace").read_text().splitlines()) == 2

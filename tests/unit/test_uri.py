@@ -1,0 +1,103 @@
+"""SOURCE in both spellings."""
+
+from __future__ import annotations
+
+import pytest
+
+from mavftpfs.link.uri import LinkKind, LinkSpec, parse_source
+from mavftpfs.shared.errors import UsageError
+
+K = LinkKind
+
+GOOD = [
+    ("udpin:0.0.0.0:14550", LinkSpec(K.UDP_IN, "0.0.0.0", 14550)),
+    ("udp:0.0.0.0:14550", LinkSpec(K.UDP_IN, "0.0.0.0", 14550)),
+    ("udpin::14551", LinkSpec(K.UDP_IN, "0.0.0.0", 14551)),
+    ("udpin://0.0.0.0:14550", LinkSpec(K.UDP_IN, "0.0.0.0", 14550)),
+    ("udpin://0.0.0.0:14550/", LinkSpec(K.UDP_IN, "0.0.0.0", 14550)),
+    ("UDPIN:127.0.0.1", LinkSpec(K.UDP_IN, "127.0.0.1", 14550)),
+    ("udpout:drone.local:14555", LinkSpec(K.UDP_OUT, "drone.local", 14555)),
+    ("udpout://10.0.0.1:14555", LinkSpec(K.UDP_OUT, "10.0.0.1", 14555)),
+    ("tcp:127.0.0.1:5760", LinkSpec(K.TCP_OUT, "127.0.0.1", 5760)),
+    ("tcp:127.0.0.1", LinkSpec(K.TCP_OUT, "127.0.0.1", 5760)),
+    ("tcp://127.0.0.1:5760", LinkSpec(K.TCP_OUT, "127.0.0.1", 5760)),
+    ("tcpout://127.0.0.1:5760", LinkSpec(K.TCP_OUT, "127.0.0.1", 5760)),
+    ("tcpin:0.0.0.0:5760", LinkSpec(K.TCP_IN, "0.0.0.0", 5760)),
+    ("tcpin://[::]:5760", LinkSpec(K.TCP_IN, "::", 5760)),
+    ("udpout:[fe80::1]:14550", LinkSpec(K.UDP_OUT, "fe80::1", 14550)),
+    ("udpin:[::1]", LinkSpec(K.UDP_IN, "::1", 14550)),
+    ("/dev/ttyACM0", LinkSpec(K.SERIAL, device="/dev/ttyACM0", baud=57600)),
+    ("/dev/ttyUSB0,921600", LinkSpec(K.SERIAL, device="/dev/ttyUSB0", baud=921600)),
+    ("/dev/serial/by-path/pci-0:1.0", LinkSpec(K.SERIAL, device="/dev/serial/by-path/pci-0:1.0")),
+    ("serial:///dev/ttyUSB0:57600", LinkSpec(K.SERIAL, device="/dev/ttyUSB0", baud=57600)),
+    ("serial:///dev/ttyUSB0", LinkSpec(K.SERIAL, device="/dev/ttyUSB0")),
+    ("serial:/dev/ttyUSB0:115200", LinkSpec(K.SERIAL, device="/dev/ttyUSB0", baud=115200)),
+    ("serial:///dev/ttyUSB0,115200", LinkSpec(K.SERIAL, device="/dev/ttyUSB0", baud=115200)),
+]
+
+
+@pytest.mark.parametrize(("text", "spec"), GOOD)
+def test_spellings(text: str, spec: LinkSpec) -> None:
+    assert parse_source(text) == spec
+
+
+@pytest.mark.parametrize(("text", "spec"), GOOD)
+@pytest.mark.parametrize(
+    ("tail", "subtree"), [("#/fs/microsd", b"/fs/microsd"), ("#/a//b/./", b"/a/b"), ("#@SYS", b"/@SYS")]
+)
+def test_subtree(text: str, spec: LinkSpec, tail: str, subtree: bytes) -> None:
+    parsed = parse_source(text + tail)
+    assert parsed.subtree == subtree
+    assert (parsed.kind, parsed.host, parsed.port, parsed.device) == (
+        spec.kind,
+        spec.host,
+        spec.port,
+        spec.device,
+    )
+
+
+@pytest.mark.parametrize("spec", [spec for _, spec in GOOD])
+def test_description_parses_to_the_same(spec: LinkSpec) -> None:
+    assert parse_source(spec.description) == spec
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("", "empty"),
+        ("#/fs", "empty"),
+        ("ttyACM0", "neither a device path nor a link"),
+        ("carrier-pigeon:3", "unknown kind of link 'carrier-pigeon'"),
+        ("udpout:", "names no host"),
+        ("udpout::14550", "names no host"),
+        ("udpin:14550", "a host comes before the port"),
+        ("tcp:", "names no host"),
+        ("udpin:0.0.0.0:port", "'port' is no port"),
+        ("udpin:0.0.0.0:65536", "'65536' is no port"),
+        ("udpin:0.0.0.0:-1", "'-1' is no port"),
+        ("udpin:0.0.0.0:²", "is no port"),
+        ("tcp:127.0.0.1:0", "'0' is no port"),
+        ("udpin:::1:14550", "IPv6 in brackets"),
+        ("udpin:[::1:14550", "bracket not closed"),
+        ("udpin:[::1]14550", "bracket not closed"),
+        ("/dev/ttyUSB0,fast", "'fast' is no baud rate"),
+        ("/dev/ttyUSB0,0", "'0' is no baud rate"),
+        ("/dev/ttyUSB0,", "'' is no baud rate"),
+        ("serial:///dev/ttyUSB0:x", "'x' is no baud rate"),
+        ("serial:ttyUSB0", "neither a device path nor a link"),
+        ("udpin:0.0.0.0:14550#fs", "must begin with '/'"),
+        ("udpin:0.0.0.0:14550#", "must begin with '/'"),
+        ("udpin:0.0.0.0:14550#/a/../b", "may not hold '..'"),
+    ],
+)
+def test_errors_say_what_is_wrong_and_what_is_right(text: str, says: str) -> None:
+    with pytest.raises(UsageError) as caught:
+        parse_source(text)
+    message = str(caught.value)
+    assert says in message
+    assert "\n" not in message
+    assert "for example" in message
+
+
+def test_a_subtree_may_hold_any_bytes() -> None:
+    assert parse_source("udpin:0.0.0.0:1#/caf\udce9").subtree == b"/caf\xe9"
