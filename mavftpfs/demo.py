@@ -8,7 +8,6 @@ also after Ctrl-C or an error. Exit code 0 only if every byte that arrived is th
 from __future__ import annotations
 
 import hashlib
-import json
 import os
 import random
 import shutil
@@ -29,12 +28,16 @@ from rich.panel import Panel
 from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TransferSpeedColumn
 from rich.table import Table
 
+from mavftpfs import control
+
 HOST = "127.0.0.1"
 PROFILE = "px4"
 RADIO = ("--rate", "40000", "--delay", "0.05", "--jitter", "0.01", "--loss", "0.08", "--seed", "1")
 RADIO_WORDS = "40 kB/s, 100 ms there and back, 8 of 100 packets lost in each direction"
 
 LOG_SIZE = 300_000
+FILE_SHARE = 239 / 266
+"""Bytes of a file in each byte received: a frame of 266 carries 239."""
 STEP_TIMEOUT = 60.0
 """Seconds after which any step of the tour counts as failed."""
 END_TIMEOUT = 15.0
@@ -242,18 +245,21 @@ def copy_log(tour: Tour) -> None:
     )
     words = ("cp", f"drone/{LOG}", "flight.ulg")
     tour.show_command(*words)
-    copy = tour.folder / "flight.ulg"
-    start = time.monotonic()
     columns = (TextColumn("  flight.ulg"), BarColumn(), DownloadColumn(), TransferSpeedColumn())
+    before = find_fact(ask_status(tour), "received_bytes")
+    deadline = time.monotonic() + STEP_TIMEOUT
     with Progress(*columns, console=tour.console) as progress, running(words, tour.folder) as child:
         bar = progress.add_task("", total=LOG_SIZE)
-        while child.poll() is None and time.monotonic() < start + STEP_TIMEOUT:
-            progress.update(bar, completed=copy.stat().st_size if copy.exists() else 0)
+        while child.poll() is None and time.monotonic() < deadline:
+            # Not the copy's size: cp asks for 256 KiB at a time, so the bar would jump.
+            received = (find_fact(ask_status(tour), "received_bytes") - before) * FILE_SHARE
+            progress.update(bar, completed=min(received, LOG_SIZE))
             time.sleep(0.1)
-        progress.update(bar, completed=copy.stat().st_size if copy.exists() else 0)
+        if child.returncode == 0:
+            progress.update(bar, completed=LOG_SIZE)
     if child.returncode != 0:
         raise DemoFailed(f"cp ended with {child.returncode}")
-    compare_checksums(tour, copy)
+    compare_checksums(tour, tour.folder / "flight.ulg")
 
 
 def compare_checksums(tour: Tour, copy: Path) -> None:
@@ -273,11 +279,7 @@ def compare_checksums(tour: Tour, copy: Path) -> None:
 
 def show_link(tour: Tour) -> None:
     """Say what the link did meanwhile, by the mount's own account."""
-    words = [sys.executable, "-m", "mavftpfs", "status", str(tour.drone), "--json"]
-    result = subprocess.run(words, capture_output=True, timeout=STEP_TIMEOUT, check=False)
-    if result.returncode:
-        raise DemoFailed(f"status ended with {result.returncode}: {result.stderr.decode().strip()}")
-    status = json.loads(result.stdout)
+    status = ask_status(tour)
     table = Table(show_header=False)
     table.add_row("requests sent", f"{find_fact(status, 'requests'):,}")
     table.add_row("of these again, because something was lost", f"{find_fact(status, 'retransmissions'):,}")
@@ -286,6 +288,15 @@ def show_link(tour: Tour) -> None:
     table.add_row("reading rate at the last file", f"{find_fact(status, 'rate') / 1000:.1f} kB/s")
     tour.say("What the radio did meanwhile (from [bold]mavftpfs status drone[/]):")
     tour.console.print(table, highlight=False)
+
+
+def ask_status(tour: Tour) -> dict[str, Any]:
+    """Return what `mavftpfs status` would show."""
+    try:
+        path = control.find_socket(str(tour.drone), control.own_directories())
+        return control.ask(path, {"command": "status"}, timeout=STEP_TIMEOUT)
+    except control.ControlError as error:
+        raise DemoFailed(f"no status: {error}") from error
 
 
 def find_fact(facts: Any, name: str) -> Any:
