@@ -25,13 +25,15 @@ class Stat:
     """What is known of one path.
 
     size: bytes, 0 <= size < 2**63. mtime: seconds UTC, never unknown. valid_for: seconds the kernel
-    may keep these attributes; 0 means ask again.
+    may keep these attributes; 0 means ask again. mtime_nsec: nanoseconds to add to mtime, not 0 only
+    where a user set it.
     """
 
     kind: EntryKind
     size: int
     mtime: int
     valid_for: float
+    mtime_nsec: int = 0
 
 
 def tidy(entry: DirEntry) -> DirEntry:

@@ -21,6 +21,7 @@ from mavftpfs.cache.blocks import BlockCache, FileBlocks
 from mavftpfs.cache.flights import Flights
 from mavftpfs.cache.options import MIB
 from mavftpfs.cache.readahead import Pace, Readahead
+from mavftpfs.cache.readonly import ReadOnlyHandle
 from mavftpfs.cache.remote import RemoteStore
 from mavftpfs.cache.versions import Fetcher, Version
 from mavftpfs.shared.errors import FileChanged, LocalProtocolError, NotADirectory, NotFound
@@ -106,7 +107,7 @@ class Files:
         """Return whether a version is known to be what the vehicle holds now."""
         if version.dead is not None or version.recheck:
             return False
-        newer = listed_at >= version.proven_at
+        newer = listed_at > version.proven_at
         if newer and _became_another(version, entry):
             self._kill(version)
             return False
@@ -198,6 +199,7 @@ class Files:
             return
         del self._open_versions[version]
         version.close_reader()
+        version.blocks.on_failed(LocalProtocolError(f"{version.path!r} was closed while it was read"))
         if version.blocks.suspicion is not None:
             version.blocks.drop_unproven()
             self._distrust(version)
@@ -217,7 +219,7 @@ class Files:
         del self._current[version.path]
 
 
-class FileHandle:
+class FileHandle(ReadOnlyHandle):
     """One open() of a regular file (see cache.tree.OpenFile)."""
 
     direct_io = False

@@ -8,6 +8,7 @@ from __future__ import annotations
 from typing import Protocol
 
 from mavftpfs.shared.model import Listing
+from mavftpfs.shared.traits import WriteTraits
 
 
 class ReadSink(Protocol):
@@ -90,4 +91,104 @@ class RemoteStore(Protocol):
         Raises:
             Armed: not asked in flight. FtpNak, RequestTimeout, VehicleLost.
         """
+        ...
+
+
+class UploadSource(Protocol):
+    """Where an upload's bytes come from (a draft). All methods are synchronous and must not block."""
+
+    def next_chunk(self, limit: int) -> tuple[int, bytes] | None:
+        """Return (offset, at most `limit` bytes), lowest offset first, now in flight; None = nothing for now.
+
+        A byte that is in flight is not returned again before on_acked or on_unsent said what became of it.
+        """
+        ...
+
+    def on_acked(self, offset: int, count: int) -> None:
+        """These bytes were ACKed as written."""
+        ...
+
+    def on_unsent(self, offset: int, count: int) -> None:
+        """These bytes were not written, and no request that carries them is under way any more."""
+        ...
+
+    def on_checkpoint(self) -> None:
+        """Terminate was ACKed: what was ACKed before is proven written (not yet verified)."""
+        ...
+
+    def on_rollback(self, everything: bool) -> None:
+        """The session was lost: what was ACKed since the checkpoint is to be sent again, or everything is
+        because the file was emptied by reopening it."""
+        ...
+
+
+class Upload(Protocol):
+    """A remote file being written; survives reopening of the server's session."""
+
+    def wake(self) -> None:
+        """The source has more."""
+        ...
+
+    async def finish(self) -> None:
+        """Return when everything the source has is ACKed and Terminate is ACKed.
+
+        It may be called again: after an error to go on where it stopped, after success if the source got more.
+
+        Raises:
+            FtpNak, RequestTimeout, VehicleLost, SessionBusy, Armed.
+        """
+        ...
+
+    async def abort(self) -> None:
+        """Terminate, best effort, and ask the source for nothing more. Raises nothing; may be called twice."""
+        ...
+
+
+class WriteStore(Protocol):
+    """How the caches change the vehicle's files.
+
+    Nothing here checks types or targets: who calls did. A refusal or silence after a retransmission may mean
+    that the first request worked (FtpNak.retransmitted, RequestTimeout); who calls finds out by listing.
+    All raise FtpNak, RequestTimeout, VehicleLost, SessionBusy, PathTooLong and, while armed, Armed.
+    """
+
+    @property
+    def traits(self) -> WriteTraits:
+        """What the server was seen to do; a new object after a reboot."""
+        ...
+
+    async def open_upload(self, path: bytes, source: UploadSource, *, create: bool) -> Upload:
+        """Open a file for writing: CreateFile (empties it), else OpenFileWO (only where wo_truncates is False)."""
+        ...
+
+    async def create_empty(self, path: bytes) -> None:
+        """Make a file, or empty it: CreateFile + Terminate."""
+        ...
+
+    async def truncate(self, path: bytes, size: int) -> None:
+        """TruncateFile; silence and a refusal as unknown set traits.truncate_works to False."""
+        ...
+
+    async def remove(self, path: bytes) -> None:
+        """Remove what is known to be a file."""
+        ...
+
+    async def make_directory(self, path: bytes) -> None:
+        """Make a directory."""
+        ...
+
+    async def remove_directory(self, path: bytes) -> None:
+        """Remove what is known to be an empty directory."""
+        ...
+
+    async def rename(self, old: bytes, new: bytes) -> None:
+        """Rename; both paths together must fit one request (238 bytes)."""
+        ...
+
+    async def stat_size(self, path: bytes) -> int:
+        """Return a file's size by a fresh OpenFileRO + Terminate."""
+        ...
+
+    async def probe_open_for_write(self, directory: bytes) -> None:
+        """Find out by a temporary of our own in `directory` what OpenFileWO does, and fill the traits."""
         ...

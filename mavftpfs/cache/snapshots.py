@@ -6,6 +6,7 @@ from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from mavftpfs.cache.readonly import ReadOnlyHandle
 from mavftpfs.shared.errors import LocalProtocolError
 
 MAX_SIZES = 4096
@@ -62,7 +63,7 @@ class Snapshots:
             self.bytes_cached -= len(snapshot.data)
 
 
-class SnapshotHandle:
+class SnapshotHandle(ReadOnlyHandle):
     """One open() of an `@` file (see cache.tree.OpenFile)."""
 
     direct_io = True

@@ -11,6 +11,7 @@ from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from typing import Protocol
 
 import trio
@@ -22,10 +23,11 @@ from mavftpfs.cache.directories import Directories, Found
 from mavftpfs.cache.files import Files
 from mavftpfs.cache.flights import Flights
 from mavftpfs.cache.options import CacheOptions
-from mavftpfs.cache.remote import RemoteStore
+from mavftpfs.cache.remote import RemoteStore, WriteStore
 from mavftpfs.cache.virtual import VirtualTrees, is_snapshot
-from mavftpfs.shared.errors import FtpNak, IsADirectory, VehicleLost
-from mavftpfs.shared.model import ROOT, DirEntry, EntryKind, join, normalise
+from mavftpfs.cache.writeback import Writeback
+from mavftpfs.shared.errors import FtpNak, IsADirectory, ReadOnly, VehicleLost
+from mavftpfs.shared.model import ROOT, DirEntry, EntryKind, is_virtual, join, normalise
 
 __all__ = ["OpenFile", "Stat", "Tree"]
 
@@ -35,8 +37,9 @@ MAX_CHECKSUMS = 1024
 class OpenFile(Protocol):
     """One open() of a file.
 
-    size: bytes, fixed for the life of the handle. direct_io: the kernel must not cache its pages.
-    keep_cache: pages the kernel holds from the last open are still right.
+    size: bytes; of a file being written it follows what was written, else it is fixed for the life of the
+    handle. direct_io: the kernel must not cache its pages. keep_cache: pages the kernel holds from the last
+    open are still right. writable: write, truncate, flush and fsync do something.
     """
 
     @property
@@ -48,6 +51,9 @@ class OpenFile(Protocol):
     @property
     def keep_cache(self) -> bool: ...
 
+    @property
+    def writable(self) -> bool: ...
+
     async def read(self, offset: int, size: int) -> bytes | memoryview:
         """Return `size` bytes at `offset`, fewer only at the end of the handle's size.
 
@@ -56,8 +62,48 @@ class OpenFile(Protocol):
         """
         ...
 
+    async def write(self, offset: int, data: bytes | memoryview) -> int:
+        """Take all of `data` and return its length; waits while too much is not on the vehicle yet.
+
+        Raises:
+            NoSpace, Armed, FileTooLarge, RequestTimeout: nothing was taken.
+        """
+        ...
+
+    async def truncate(self, size: int) -> None:
+        """Cut or extend the file, locally; delivered like written bytes.
+
+        Raises:
+            NoSpace, Armed, RequestTimeout.
+        """
+        ...
+
+    async def flush(self) -> None:
+        """One descriptor was closed: deliver what was written, unless that is nothing but an emptied file.
+
+        Raises:
+            The reason why bytes are still undelivered; as long as they are, at every call.
+        """
+        ...
+
+    async def fsync(self) -> None:
+        """Return when everything written is on the card, checked (promise 2).
+
+        Raises:
+            As flush.
+        """
+        ...
+
+    async def release(self) -> None:
+        """The last descriptor was closed: deliver, and close whatever delivery said. Releasing twice is harmless.
+
+        Raises:
+            As flush; what could not be delivered is kept.
+        """
+        ...
+
     def close(self) -> None:
-        """Release the handle; the last one of a file drops its readahead. Closing twice is harmless."""
+        """Close without delivering (what was not delivered is kept and delivered later)."""
         ...
 
 
@@ -83,10 +129,12 @@ class Tree:
         clock: Callable[[], float],
         invalidate: Callable[[bytes], None],
         nursery: trio.Nursery | None = None,
+        writer: WriteStore | None = None,
     ) -> None:
         """`invalidate(path)`: the kernel's pages and attributes of a path are wrong; must not block.
 
-        With a nursery, listings and snapshots under way survive the cancellation of who asked for them.
+        With a nursery, listings and snapshots under way survive the cancellation of who asked for them, and
+        written bytes go to the vehicle while the program still writes. Without a writer all is read-only.
         """
         self._store = store
         self._options = options
@@ -116,6 +164,7 @@ class Tree:
         self._checksums: OrderedDict[bytes, _Checksum] = OrderedDict()
         self._summing: Flights[bytes, int] = Flights()
         self._rebooted_at = float("-inf")
+        self._writing: Writeback | None = None
 
     # --- asking
 
@@ -162,15 +211,20 @@ class Tree:
                 founds[name] = Found(DirEntry(name, EntryKind.DIRECTORY), directory)
         return [(name, self._listed_stat(join(remote, name), found)) for name, found in founds.items()]
 
-    async def open(self, path: bytes) -> OpenFile:
-        """Open a file for reading.
+    async def open(self, path: bytes, *, write: bool = False, truncate: bool = False) -> OpenFile:
+        """Open a file; with `truncate` it is empty for everybody from now on, here at once, there later.
 
         Raises:
-            NotFound, NotADirectory, IsADirectory; else as RemoteStore.open_reader and read_whole.
+            NotFound, NotADirectory, IsADirectory, ReadOnly, Armed, FileBusy; else as RemoteStore.open_reader
+            and read_whole.
         """
         remote = self._remote(path)
+        if write or truncate:
+            return await self._writable(remote).open(remote, truncate=truncate)
         if is_snapshot(remote):
             return await self._virtual.open(remote)
+        if self._writing is not None:
+            return await self._writing.open_reader(remote)
         found = await self._find_file(remote)
         return await self._files.open(remote, found.entry, found.directory.listed_at)
 
@@ -190,6 +244,101 @@ class Tree:
         if known is not None and self._still_holds(known, found):
             return known.value
         return await self._summing.run(remote, partial(self._ask_crc32, remote, found))
+
+    # --- changing (all raise ReadOnly on a tree without a writer, and below `@` directories)
+
+    async def create(self, path: bytes, *, exclusive: bool) -> OpenFile:
+        """Make a file, or open (not empty) the one that is there, for writing.
+
+        Raises:
+            AlreadyExists (exclusive), NotFound (its directory), NotADirectory, IsADirectory, Armed, PathTooLong.
+        """
+        remote = self._remote(path)
+        return await self._writable(remote).create(remote, exclusive=exclusive)
+
+    async def truncate(self, path: bytes, size: int) -> None:
+        """Cut or extend a file; done on the vehicle, unless somebody has it open for writing.
+
+        Raises:
+            NotFound, IsADirectory, Armed, FileBusy, FileTooLarge, NotSupported.
+        """
+        remote = self._remote(path)
+        await self._writable(remote).truncate(remote, size)
+
+    async def set_times(self, path: bytes, mtime_ns: int) -> None:
+        """Show this mtime (nanoseconds since 1970 UTC) until the file changes; no server can keep it.
+
+        Raises:
+            NotFound, NotADirectory.
+        """
+        remote = self._remote(path)
+        await self.stat(path)
+        self._writable(remote).set_times(remote, mtime_ns)
+
+    async def mkdir(self, path: bytes) -> None:
+        """Make a directory.
+
+        Raises:
+            AlreadyExists, NotFound, NotADirectory, Armed, PathTooLong.
+        """
+        remote = self._remote(path)
+        await self._writable(remote).mkdir(remote)
+
+    async def rmdir(self, path: bytes) -> None:
+        """Remove an empty directory.
+
+        Raises:
+            NotFound, NotADirectory, DirectoryNotEmpty, Armed.
+        """
+        remote = self._remote(path)
+        await self._writable(remote).rmdir(remote)
+
+    async def unlink(self, path: bytes) -> None:
+        """Remove a file; who has it open goes on reading it.
+
+        Raises:
+            NotFound, IsADirectory, Armed, FileBusy.
+        """
+        remote = self._remote(path)
+        await self._writable(remote).unlink(remote)
+
+    async def rename(self, old: bytes, new: bytes, *, noreplace: bool = False) -> None:
+        """Rename a file or directory, over what is there if the rules of rename(2) allow it.
+
+        Raises:
+            NotFound, NotADirectory, IsADirectory, DirectoryNotEmpty, AlreadyExists (noreplace), InvalidMove,
+            CrossDevice, PathTooLong, Armed, FileBusy.
+        """
+        source, target = self._remote(old), self._remote(new)
+        self._writable(source)
+        await self._writable(target).rename(source, target, noreplace=noreplace)
+
+    def undelivered(self) -> list[bytes]:
+        """Return the paths of files of which the vehicle does not provably have every byte."""
+        if self._writing is None:
+            return []
+        return [self._below(remote) for remote in self._writing.undelivered()]
+
+    async def drain(self, timeout: float) -> list[bytes]:
+        """Deliver everything, trying again for at most `timeout` seconds; return what remains, as undelivered."""
+        if self._writing is not None:
+            await self._writing.drain(timeout)
+        return self.undelivered()
+
+    def recover_to(self, directory: Path) -> list[Path]:
+        """Copy what could not be delivered into a directory, which is made, with a manifest.json.
+
+        Returns the files written, [] if there was nothing. Blocks: for the end of a mount.
+
+        Raises:
+            OSError.
+        """
+        return [] if self._writing is None else self._writing.recover_to(directory)
+
+    def armed_changed(self, armed: bool) -> None:
+        """The vehicle was armed or disarmed: unless when_armed=ok, nothing is changed in flight (promise 9)."""
+        if self._writing is not None:
+            self._writing.armed_changed(armed)
 
     # --- news and housekeeping
 
@@ -239,9 +388,17 @@ class Tree:
     def _remote(self, path: bytes) -> bytes:
         return normalise(self._options.root + b"/" + path)
 
+    def _below(self, remote: bytes) -> bytes:
+        """Return the mount's name for a path of the vehicle."""
+        return remote if self._options.root == ROOT else remote[len(self._options.root) :] or ROOT
+
+    def _writable(self, remote: bytes) -> Writeback:
+        if self._writing is None or is_virtual(remote):
+            raise ReadOnly(f"{remote!r} is only read")
+        return self._writing
+
     def _invalidate(self, remote: bytes) -> None:
-        below = remote if self._options.root == ROOT else remote[len(self._options.root) :]
-        self._tell_kernel(below)
+        self._tell_kernel(self._below(remote))
 
     def _listed_stat(self, remote: bytes, found: Found) -> Stat:
         if is_snapshot(remote):

@@ -20,6 +20,7 @@ from mavftpfs.shared.errors import (
     DataUnproven,
     FileChanged,
     FtpNak,
+    LocalProtocolError,
     MavftpfsError,
     RemoteProtocolError,
 )
@@ -137,7 +138,7 @@ class Fetcher:
             await self._opening.run(version, partial(self._open, version, version.size))
         version.require_alive()
         if version.reader is None:  # the last handle was closed meanwhile
-            raise FileChanged(f"{version.path!r} was closed while it was read")
+            raise LocalProtocolError(f"{version.path!r} was closed while it was read")
         return version.reader
 
     async def _open(self, version: Version, expected: int | None) -> Reader:
@@ -146,7 +147,7 @@ class Fetcher:
         reader = await self._store.open_reader(version.path, version.blocks, expected_size=expected)
         if version.handles == 0:
             reader.close()
-            raise FileChanged(f"{version.path!r} was closed while it was read")
+            raise LocalProtocolError(f"{version.path!r} was closed while it was read")
         if reader.size < version.size:
             reader.close()
             self._on_changed(version)

@@ -1,0 +1,448 @@
+"""Blocks of files: presence, budget, waiters, deadlines, and provisional bytes."""
+
+from __future__ import annotations
+
+import pytest
+import trio
+import trio.testing
+from trio.testing import MockClock
+
+from mavftpfs.cache.blocks import BLOCK_SIZE, BlockCache, FileBlocks, Gaps
+from mavftpfs.protocol.crc import crc32
+from mavftpfs.shared.errors import RequestTimeout, VehicleLost
+
+KIB = 1024
+PATIENCE = 30.0
+
+
+def make_cache(budget: int = 1024 * KIB) -> BlockCache:
+    return BlockCache(budget, clock=trio.current_time, patience=PATIENCE)
+
+
+def content(size: int, seed: int = 7) -> bytes:
+    return bytes((i * seed + (i >> 8)) & 0xFF for i in range(size))
+
+
+def deliver(blocks: FileBlocks, offset: int, data: bytes, *, batch: bool = True) -> None:
+    blocks.on_data(offset, data)
+    if batch:
+        blocks.on_batch()
+    blocks.check_invariants()
+
+
+def nothing(gaps: Gaps) -> None:
+    pass
+
+
+class Reading:
+    """A read under way in a nursery."""
+
+    def __init__(self, blocks: FileBlocks, start: int, stop: int) -> None:
+        self.blocks = blocks
+        self.range = (start, stop)
+        self.wanted: list[Gaps] = []
+        self.results: list[bytes | None] = []
+        self.errors: list[Exception] = []
+        self.took = 0.0
+        self.scope = trio.CancelScope()
+
+    async def run(self) -> None:
+        began = trio.current_time()
+        with self.scope:
+            try:
+                data = await self.blocks.read(*self.range, self.wanted.append)
+                self.results.append(None if data is None else bytes(data))
+            except Exception as error:
+                self.errors.append(error)
+        self.took = trio.current_time() - began
+
+
+async def start_read(nursery: trio.Nursery, blocks: FileBlocks, start: int, stop: int) -> Reading:
+    reading = Reading(blocks, start, stop)
+    nursery.start_soon(reading.run)
+    await trio.testing.wait_all_tasks_blocked()
+    return reading
+
+
+# --- presence
+
+
+async def test_bytes_come_back_from_any_split(autojump_clock: MockClock) -> None:
+    data = content(3 * BLOCK_SIZE + 100)
+    blocks = FileBlocks(make_cache(), len(data))
+    for start in range(0, len(data), 239):
+        deliver(blocks, start, data[start : start + 239])
+    assert blocks.complete
+    for start, stop in [
+        (0, 1),
+        (BLOCK_SIZE - 1, BLOCK_SIZE + 1),
+        (5, len(data)),
+        (BLOCK_SIZE, 2 * BLOCK_SIZE),
+    ]:
+        view = blocks.get(start, stop)
+        assert view is not None
+        assert bytes(view) == data[start:stop]
+
+
+async def test_a_read_within_a_block_is_a_view_that_cannot_be_written(autojump_clock: MockClock) -> None:
+    blocks = FileBlocks(make_cache(), 100)
+    deliver(blocks, 0, content(100))
+    view = blocks.get(10, 20)
+    assert isinstance(view, memoryview)
+    assert view.readonly
+
+
+async def test_what_is_present_is_never_overwritten(autojump_clock: MockClock) -> None:
+    blocks = FileBlocks(make_cache(), 1000)
+    deliver(blocks, 100, b"A" * 100)
+    deliver(blocks, 50, b"B" * 200)
+    assert bytes(blocks.get(50, 250) or b"") == b"B" * 50 + b"A" * 100 + b"B" * 50
+
+
+async def test_what_lies_beyond_the_opened_size_is_dropped(autojump_clock: MockClock) -> None:
+    blocks = FileBlocks(make_cache(), 100)
+    deliver(blocks, 90, b"x" * 50)
+    deliver(blocks, 100, b"x" * 50)
+    deliver(blocks, 5000, b"x" * 50)
+    assert blocks.missing(0, 1000) == [(0, 90)]
+
+
+async def test_a_hole_is_not_readable(autojump_clock: MockClock) -> None:
+    blocks = FileBlocks(make_cache(), 1000)
+    deliver(blocks, 0, b"x" * 100)
+    deliver(blocks, 101, b"x" * 100)
+    assert blocks.get(0, 201) is None
+    assert blocks.get(0, 100) is not None
+    assert not blocks.complete
+
+
+async def test_an_empty_file_is_complete_and_empty(autojump_clock: MockClock) -> None:
+    blocks = FileBlocks(make_cache(), 0)
+    assert blocks.complete
+    assert blocks.empty
+
+
+# --- budget
+
+
+async def test_least_recently_read_blocks_go_first(autojump_clock: MockClock) -> None:
+    cache = make_cache(4 * BLOCK_SIZE)
+    first, second = FileBlocks(cache, 3 * BLOCK_SIZE), FileBlocks(cache, 2 * BLOCK_SIZE)
+    deliver(first, 0, content(3 * BLOCK_SIZE))
+    deliver(second, 0, content(BLOCK_SIZE))
+    assert first.get(0, 1) is not None
+    deliver(second, BLOCK_SIZE, content(BLOCK_SIZE))
+    assert first.missing(0, 3 * BLOCK_SIZE) == [(BLOCK_SIZE, 2 * BLOCK_SIZE)]
+    assert cache.bytes_cached == 4 * BLOCK_SIZE
+    assert cache.evictions == 1
+    cache.check_invariants()
+
+
+async def test_memory_stays_within_the_budget_for_a_file_ten_times_the_cache(
+    autojump_clock: MockClock,
+) -> None:
+    cache = make_cache(4 * BLOCK_SIZE)
+    blocks = FileBlocks(cache, 40 * BLOCK_SIZE)
+    for index in range(40):
+        deliver(blocks, index * BLOCK_SIZE, content(BLOCK_SIZE, index))
+        cache.check_invariants()
+        assert bytes(blocks.get(index * BLOCK_SIZE, (index + 1) * BLOCK_SIZE) or b"") == content(
+            BLOCK_SIZE, index
+        )
+    assert cache.bytes_cached == 4 * BLOCK_SIZE
+
+
+async def test_small_files_cost_their_size(autojump_clock: MockClock) -> None:
+    cache = make_cache()
+    blocks = FileBlocks(cache, 100)
+    deliver(blocks, 0, b"x")
+    assert cache.bytes_cached == 100
+    blocks.clear()
+    assert cache.bytes_cached == 0
+    assert blocks.empty
+
+
+async def test_blocks_with_waiters_are_not_evicted(nursery: trio.Nursery, autojump_clock: MockClock) -> None:
+    cache = make_cache(4 * BLOCK_SIZE)
+    waited = FileBlocks(cache, 2 * BLOCK_SIZE)
+    deliver(waited, 0, content(BLOCK_SIZE))
+    reading = await start_read(nursery, waited, 0, 2 * BLOCK_SIZE)
+    other = FileBlocks(cache, 10 * BLOCK_SIZE)
+    for index in range(10):
+        deliver(other, index * BLOCK_SIZE, content(BLOCK_SIZE))
+    waited.clear()
+    deliver(waited, BLOCK_SIZE, content(BLOCK_SIZE))
+    await trio.testing.wait_all_tasks_blocked()
+    assert reading.results == [content(BLOCK_SIZE) * 2]
+    cache.check_invariants()
+    waited.clear()
+    assert waited.empty
+
+
+async def test_evicted_bytes_are_not_proven_any_more(autojump_clock: MockClock) -> None:
+    blocks = FileBlocks(make_cache(), 2 * BLOCK_SIZE)
+    deliver(blocks, 0, content(2 * BLOCK_SIZE))
+    blocks.begin_reading()
+    blocks.evict(0)
+    deliver(blocks, 0, b"\0" * BLOCK_SIZE)
+    blocks.on_suspect("test")
+    assert blocks.get(0, 1) is None
+    assert blocks.get(BLOCK_SIZE, BLOCK_SIZE + 1) is not None
+
+
+# --- waiting
+
+
+async def test_a_reader_asks_for_what_is_missing_and_gets_it(
+    nursery: trio.Nursery, autojump_clock: MockClock
+) -> None:
+    blocks = FileBlocks(make_cache(), 1000)
+    data = content(1000)
+    deliver(blocks, 300, data[300:400])
+    reading = await start_read(nursery, blocks, 200, 600)
+    assert reading.wanted == [[(200, 300), (400, 600)]]
+    deliver(blocks, 200, data[200:300])
+    await trio.testing.wait_all_tasks_blocked()
+    assert reading.results == []
+    deliver(blocks, 400, data[400:600])
+    await trio.testing.wait_all_tasks_blocked()
+    assert reading.results == [data[200:600]]
+
+
+async def test_what_is_present_costs_no_wait(autojump_clock: MockClock) -> None:
+    blocks = FileBlocks(make_cache(), 10)
+    deliver(blocks, 0, content(10))
+    assert bytes(await blocks.read(0, 10, nothing) or b"") == content(10)
+
+
+async def test_readers_wake_once_per_batch(nursery: trio.Nursery, autojump_clock: MockClock) -> None:
+    blocks = FileBlocks(make_cache(), 1000)
+    reading = await start_read(nursery, blocks, 0, 1000)
+    deliver(blocks, 0, content(1000), batch=False)
+    await trio.testing.wait_all_tasks_blocked()
+    assert reading.results == []
+    blocks.on_batch()
+    await trio.testing.wait_all_tasks_blocked()
+    assert reading.results == [content(1000)]
+
+
+async def test_no_progress_for_patience_is_a_timeout(
+    nursery: trio.Nursery, autojump_clock: MockClock
+) -> None:
+    blocks = FileBlocks(make_cache(), 1000)
+    reading = await start_read(nursery, blocks, 0, 1000)
+    await trio.sleep(20)
+    deliver(blocks, 0, content(10))
+    await trio.sleep(100)
+    assert [type(error) for error in reading.errors] == [RequestTimeout]
+    assert reading.took == pytest.approx(20 + PATIENCE)
+
+
+async def test_only_bytes_of_the_own_range_are_progress(
+    nursery: trio.Nursery, autojump_clock: MockClock
+) -> None:
+    blocks = FileBlocks(make_cache(), 1000)
+    mine = await start_read(nursery, blocks, 0, 100)
+    for step in range(60):
+        await trio.sleep(1)
+        deliver(blocks, 100 + step, b"x")
+        deliver(blocks, 100, b"x")
+    assert [type(error) for error in mine.errors] == [RequestTimeout]
+    assert mine.took == pytest.approx(PATIENCE)
+
+
+async def test_slow_but_steady_is_no_timeout(nursery: trio.Nursery, autojump_clock: MockClock) -> None:
+    blocks = FileBlocks(make_cache(), 10)
+    reading = await start_read(nursery, blocks, 0, 10)
+    for offset in range(10):
+        await trio.sleep(29)
+        deliver(blocks, offset, content(10)[offset : offset + 1])
+    await trio.testing.wait_all_tasks_blocked()
+    assert reading.results == [content(10)]
+
+
+async def test_failure_reaches_those_who_wait_and_no_later_read(
+    nursery: trio.Nursery, autojump_clock: MockClock
+) -> None:
+    blocks = FileBlocks(make_cache(), 100)
+    readings = [await start_read(nursery, blocks, 0, 50), await start_read(nursery, blocks, 0, 100)]
+    deliver(blocks, 0, content(50))
+    blocks.on_failed(VehicleLost("gone"))
+    await trio.testing.wait_all_tasks_blocked()
+    assert readings[0].results == [content(50)]
+    assert [str(error) for error in readings[1].errors] == ["gone"]
+    again = await start_read(nursery, blocks, 0, 100)
+    assert again.wanted == [[(50, 100)]]
+    deliver(blocks, 50, content(100)[50:])
+    await trio.testing.wait_all_tasks_blocked()
+    assert again.results == [content(100)]
+
+
+async def test_a_cancelled_read_leaves_nothing_behind(
+    nursery: trio.Nursery, autojump_clock: MockClock
+) -> None:
+    cache = make_cache(4 * BLOCK_SIZE)
+    blocks = FileBlocks(cache, 100)
+    reading = await start_read(nursery, blocks, 0, 100)
+    reading.scope.cancel()
+    await trio.testing.wait_all_tasks_blocked()
+    assert not blocks.pinned(0)
+    assert cache.room.used == 0
+    deliver(blocks, 0, content(100))
+    assert blocks.complete
+
+
+# --- room
+
+
+async def test_waiting_readers_cannot_pin_more_than_half(
+    nursery: trio.Nursery, autojump_clock: MockClock
+) -> None:
+    cache = make_cache(8 * BLOCK_SIZE)
+    blocks = FileBlocks(cache, 20 * BLOCK_SIZE)
+    readings = [
+        await start_read(nursery, blocks, i * 2 * BLOCK_SIZE, (i * 2 + 2) * BLOCK_SIZE) for i in range(4)
+    ]
+    assert [len(reading.wanted) for reading in readings] == [1, 1, 0, 0]
+    deliver(blocks, 0, content(2 * BLOCK_SIZE))
+    await trio.testing.wait_all_tasks_blocked()
+    assert [len(reading.wanted) for reading in readings] == [1, 1, 1, 0]
+    readings[1].scope.cancel()
+    await trio.testing.wait_all_tasks_blocked()
+    assert [len(reading.wanted) for reading in readings] == [1, 1, 1, 1]
+
+
+async def test_a_read_larger_than_the_room_goes_alone(
+    nursery: trio.Nursery, autojump_clock: MockClock
+) -> None:
+    cache = make_cache(4 * BLOCK_SIZE)
+    blocks = FileBlocks(cache, 20 * BLOCK_SIZE)
+    large = await start_read(nursery, blocks, 0, 3 * BLOCK_SIZE)
+    small = await start_read(nursery, blocks, 10 * BLOCK_SIZE, 10 * BLOCK_SIZE + 1)
+    assert (len(large.wanted), len(small.wanted)) == (1, 0)
+
+
+async def test_first_come_first_served(nursery: trio.Nursery, autojump_clock: MockClock) -> None:
+    cache = make_cache(4 * BLOCK_SIZE)
+    blocks = FileBlocks(cache, 20 * BLOCK_SIZE)
+    first = await start_read(nursery, blocks, 0, BLOCK_SIZE)
+    large = await start_read(nursery, blocks, 0, 2 * BLOCK_SIZE)
+    small = await start_read(nursery, blocks, 3 * BLOCK_SIZE, 4 * BLOCK_SIZE)
+    assert (len(large.wanted), len(small.wanted)) == (0, 0)
+    large.scope.cancel()
+    await trio.testing.wait_all_tasks_blocked()
+    assert len(small.wanted) == 1
+    first.scope.cancel()
+    await trio.testing.wait_all_tasks_blocked()
+    assert cache.room.used == BLOCK_SIZE
+
+
+async def test_no_room_for_too_long_is_a_timeout(nursery: trio.Nursery, autojump_clock: MockClock) -> None:
+    cache = make_cache(2 * BLOCK_SIZE)
+    blocks = FileBlocks(cache, 20 * BLOCK_SIZE)
+    first = await start_read(nursery, blocks, 0, 100)
+    second = await start_read(nursery, blocks, BLOCK_SIZE, BLOCK_SIZE + 1)
+    for offset in range(20):
+        deliver(blocks, offset, b"x")
+        await trio.sleep(5)
+    assert [type(error) for error in second.errors] == [RequestTimeout]
+    assert second.wanted == []
+    assert first.errors == []
+
+
+async def test_a_reader_cancelled_just_when_it_was_admitted_gives_the_room_back(
+    nursery: trio.Nursery, autojump_clock: MockClock
+) -> None:
+    cache = make_cache(2 * BLOCK_SIZE)
+    blocks = FileBlocks(cache, 20 * BLOCK_SIZE)
+    first = await start_read(nursery, blocks, 0, 100)
+    second = await start_read(nursery, blocks, BLOCK_SIZE, BLOCK_SIZE + 1)
+    cache.room.leave(BLOCK_SIZE)  # admits the second, which has not run yet
+    second.scope.cancel()
+    await trio.testing.wait_all_tasks_blocked()
+    assert cache.room.used == 0
+    await cache.room.enter(BLOCK_SIZE)
+    first.scope.cancel()
+
+
+# --- provisional bytes
+
+
+async def test_suspect_bytes_are_not_returned_but_older_ones_are(autojump_clock: MockClock) -> None:
+    blocks = FileBlocks(make_cache(), 100)
+    deliver(blocks, 0, content(50))
+    blocks.begin_reading()
+    deliver(blocks, 50, content(100)[50:])
+    blocks.on_suspect("first")
+    blocks.on_suspect("second")
+    assert blocks.suspicion == "first"
+    assert bytes(blocks.get(0, 50) or b"") == content(50)
+    assert blocks.get(49, 51) is None
+    assert not blocks.complete
+    assert await blocks.read(0, 100, nothing) is None
+
+
+async def test_accepting_makes_them_good(autojump_clock: MockClock) -> None:
+    blocks = FileBlocks(make_cache(), 100)
+    deliver(blocks, 0, content(100))
+    blocks.on_suspect("test")
+    blocks.accept()
+    assert blocks.complete
+    blocks.on_suspect("again")
+    assert blocks.complete
+
+
+async def test_dropping_keeps_only_what_was_proven(autojump_clock: MockClock) -> None:
+    cache = make_cache()
+    blocks = FileBlocks(cache, 3 * BLOCK_SIZE)
+    deliver(blocks, 0, content(10))
+    blocks.begin_reading()
+    deliver(blocks, 10, content(2 * BLOCK_SIZE))
+    old = blocks.get(0, 20)
+    assert old is not None
+    before = bytes(old)
+    blocks.on_suspect("test")
+    blocks.drop_unproven()
+    assert blocks.suspicion is None
+    assert blocks.missing(0, 3 * BLOCK_SIZE) == [(10, 3 * BLOCK_SIZE)]
+    assert cache.bytes_cached == BLOCK_SIZE
+    deliver(blocks, 10, b"\xff" * 20)
+    assert bytes(old) == before
+    assert bytes(blocks.get(0, 30) or b"") == content(10) + b"\xff" * 20
+    cache.check_invariants()
+
+
+async def test_dropping_wakes_those_who_wait(nursery: trio.Nursery, autojump_clock: MockClock) -> None:
+    blocks = FileBlocks(make_cache(), 100)
+    reading = await start_read(nursery, blocks, 0, 100)
+    blocks.on_suspect("test")
+    blocks.drop_unproven()
+    await trio.testing.wait_all_tasks_blocked()
+    assert reading.results == [None]
+
+
+async def test_a_reader_opened_under_suspicion_proves_nothing(autojump_clock: MockClock) -> None:
+    blocks = FileBlocks(make_cache(), 100)
+    deliver(blocks, 0, content(100))
+    blocks.on_suspect("test")
+    blocks.begin_reading()
+    assert not blocks.complete
+
+
+async def test_crc32_is_the_servers(autojump_clock: MockClock) -> None:
+    data = content(2 * BLOCK_SIZE + 5)
+    blocks = FileBlocks(make_cache(), len(data))
+    deliver(blocks, BLOCK_SIZE, data[BLOCK_SIZE:])
+    deliver(blocks, 0, data[:BLOCK_SIZE])
+    assert await blocks.crc32() == crc32(data)
+
+
+async def test_the_rate_is_measured_from_what_arrives(autojump_clock: MockClock) -> None:
+    cache = make_cache()
+    blocks = FileBlocks(cache, 10_000)
+    for step in range(20):
+        deliver(blocks, step * 100, b"x" * 100)
+        deliver(blocks, step * 100, b"x" * 100)  # known bytes are no traffic worth counting
+        await trio.sleep(0.1)
+    assert cache.meter.rate == pytest.approx(1000)
+    assert cache.pace(1).limit == pytest.approx(3000, abs=2)

@@ -1,0 +1,702 @@
+"""Open files: what is kept, what is asked again, what an old handle sees, and doubtful bytes."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator
+
+import pytest
+import trio
+import trio.testing
+from trio.testing import MockClock
+
+from mavftpfs.cache.blocks import BLOCK_SIZE, BlockCache, FileBlocks
+from mavftpfs.cache.files import MAX_CLOSED
+from mavftpfs.cache.tree import Tree
+from mavftpfs.cache.versions import MAX_RESTARTS
+from mavftpfs.protocol.payload import Opcode
+from mavftpfs.shared.errors import (
+    DataUnproven,
+    FileChanged,
+    FtpNak,
+    IsADirectory,
+    LocalProtocolError,
+    NotFound,
+    RequestTimeout,
+    VehicleLost,
+)
+from tests.support.fake_store import FakeStore, make_tree, read_file
+
+KIB = 1024
+MIB = 1024 * KIB
+LOG = b"/logs/a.bin"
+
+
+def content(size: int, seed: int = 7) -> bytes:
+    return bytes((i * seed + (i >> 8) * 3) & 0xFF for i in range(size))
+
+
+DATA = content(300_000)
+
+
+@pytest.fixture
+async def store(nursery: trio.Nursery) -> AsyncIterator[FakeStore]:
+    store = FakeStore(nursery)
+    store.chunk = 16 * KIB
+    store.add(LOG, DATA, 1_700_000_000)
+    yield store
+    assert store.crimes == []
+
+
+@pytest.fixture
+def tree(store: FakeStore) -> Tree:
+    return make_tree(store)
+
+
+# --- reading
+
+
+async def test_reading_gives_the_bytes(store: FakeStore, tree: Tree, autojump_clock: MockClock) -> None:
+    assert await read_file(tree, LOG) == DATA
+    assert store.count("open") == 1
+
+
+async def test_reads_are_short_only_at_the_end(tree: Tree, autojump_clock: MockClock) -> None:
+    handle = await tree.open(LOG)
+    assert handle.size == len(DATA)
+    assert await handle.read(len(DATA) - 10, 100) == DATA[-10:]
+    assert await handle.read(len(DATA), 100) == b""
+    assert await handle.read(10**12, 100) == b""
+    assert await handle.read(5, 0) == b""
+    assert not handle.direct_io
+    handle.close()
+
+
+async def test_a_read_larger_than_the_cache_is_served_in_pieces(
+    store: FakeStore, autojump_clock: MockClock
+) -> None:
+    big = content(5 * MIB)
+    store.add(b"/big", big)
+    tree = make_tree(store, cache_size=MIB)
+    handle = await tree.open(b"/big")
+    assert await handle.read(0, len(big)) == big
+    handle.close()
+    assert int(str(tree.status()["bytes_cached"])) <= MIB
+
+
+async def test_a_second_reader_of_the_file_shares_blocks_and_session(
+    store: FakeStore, tree: Tree, autojump_clock: MockClock
+) -> None:
+    first, second = await tree.open(LOG), await tree.open(LOG)
+    async with trio.open_nursery() as readers:
+        readers.start_soon(first.read, 0, len(DATA))
+        readers.start_soon(second.read, 0, len(DATA))
+    assert store.count("reader") == store.count("open") == 1
+    first.close()
+    assert not store.readers[0].closed
+    second.close()
+    second.close()
+    assert store.readers[0].closed
+    assert store.readers[0].drops == 1
+    with pytest.raises(LocalProtocolError):
+        await second.read(0, 1)
+    assert tree.status()["open_files"] == 0
+
+
+async def test_two_opens_at_once_are_one_request(
+    store: FakeStore, tree: Tree, autojump_clock: MockClock
+) -> None:
+    store.open_delay = 1
+    sizes = []
+
+    async def open_and_note() -> None:
+        sizes.append((await tree.open(LOG)).size)
+
+    async with trio.open_nursery() as openers:
+        openers.start_soon(open_and_note)
+        openers.start_soon(open_and_note)
+    assert sizes == [len(DATA)] * 2
+    assert store.count("open") == 1
+    assert tree.status()["open_files"] == 2
+
+
+async def test_a_cancelled_open_lets_the_other_one_go_on(
+    store: FakeStore, tree: Tree, autojump_clock: MockClock
+) -> None:
+    store.open_delay = 10
+    await tree.stat(LOG)
+    sizes = []
+
+    async def open_and_note() -> None:
+        sizes.append((await tree.open(LOG)).size)
+
+    async with trio.open_nursery() as openers:
+        with trio.move_on_after(5):
+            async with trio.open_nursery() as inner:
+                inner.start_soon(tree.open, LOG)
+                await trio.testing.wait_all_tasks_blocked()
+                openers.start_soon(open_and_note)
+                await trio.sleep_forever()
+    assert sizes == [len(DATA)]
+    assert tree.status()["open_files"] == 1
+
+
+async def test_sequential_reads_fetch_ahead_and_release_drops_it(
+    store: FakeStore, tree: Tree, autojump_clock: MockClock
+) -> None:
+    store.add(b"/big", content(8 * MIB))
+    handle = await tree.open(b"/big")
+    for at in range(0, 512 * KIB, 128 * KIB):
+        await handle.read(at, 128 * KIB)
+    reader = store.readers[0]
+    assert not reader.ahead.empty
+    await handle.read(7 * MIB, 4 * KIB)
+    assert reader.drops == 1
+    await handle.read(512 * KIB, 4 * KIB)
+    assert reader.drops == 1
+    handle.close()
+    assert reader.ahead.empty
+
+
+async def test_hits_extend_the_readahead(store: FakeStore, tree: Tree, autojump_clock: MockClock) -> None:
+    store.add(b"/big", content(8 * MIB))
+    handle = await tree.open(b"/big")
+    await handle.read(0, 128 * KIB)
+    await handle.read(128 * KIB, 128 * KIB)
+    await trio.sleep(60)
+    asked = store.readers[0].demand.total
+    await handle.read(256 * KIB, 128 * KIB)
+    assert not store.readers[0].ahead.empty
+    assert asked == 0
+    assert tree.status()["misses"] == 2
+    assert tree.status()["hits"] == 1
+
+
+async def test_an_error_reaches_the_reader_and_the_next_read_tries_again(
+    store: FakeStore, tree: Tree, autojump_clock: MockClock
+) -> None:
+    store.fail_chunks = [VehicleLost("gone")]
+    handle = await tree.open(LOG)
+    with pytest.raises(VehicleLost):
+        await handle.read(0, 100)
+    assert await handle.read(0, 100) == DATA[:100]
+
+
+async def test_a_stalled_read_times_out_and_recovers(
+    store: FakeStore, tree: Tree, autojump_clock: MockClock
+) -> None:
+    handle = await tree.open(LOG)
+    store.stalled = True
+    began = trio.current_time()
+    with pytest.raises(RequestTimeout):
+        await handle.read(0, 100)
+    assert trio.current_time() - began == pytest.approx(30, abs=1)
+    store.stalled = False
+    assert await handle.read(0, 100) == DATA[:100]
+
+
+async def test_a_cancelled_read_leaves_a_consistent_file(
+    store: FakeStore, tree: Tree, autojump_clock: MockClock
+) -> None:
+    store.chunk_delay = 1
+    handle = await tree.open(LOG)
+    with trio.move_on_after(2.5):
+        await handle.read(0, 128 * KIB)
+    store.chunk_delay = 0.001
+    assert await handle.read(0, len(DATA)) == DATA
+
+
+async def test_a_directory_is_not_opened(tree: Tree, autojump_clock: MockClock) -> None:
+    with pytest.raises(IsADirectory):
+        await tree.open(b"/logs")
+    with pytest.raises(IsADirectory):
+        await tree.open(b"/")
+    with pytest.raises(NotFound):
+        await tree.open(b"/logs/none")
+
+
+async def test_a_refused_open_leaves_nothing(store: FakeStore, tree: Tree, autojump_clock: MockClock) -> None:
+    store.fail["reader", LOG] = [FtpNak(Opcode.OPEN_FILE_RO, 2, 13)]
+    with pytest.raises(FtpNak):
+        await tree.open(LOG)
+    assert tree.status()["open_files"] == 0
+    assert await read_file(tree, LOG) == DATA
+
+
+# --- close-to-open
+
+
+async def test_a_second_cat_asks_nothing(store: FakeStore, tree: Tree, autojump_clock: MockClock) -> None:
+    await read_file(tree, LOG)
+    before = list(store.calls)
+    handle = await tree.open(LOG)
+    assert handle.keep_cache
+    assert await handle.read(0, len(DATA)) == DATA
+    assert store.calls == before
+
+
+async def test_the_first_open_does_not_keep_the_kernels_pages(tree: Tree, autojump_clock: MockClock) -> None:
+    assert not (await tree.open(LOG)).keep_cache
+
+
+async def test_equal_size_and_mtime_prove_the_cache_for_ever(
+    store: FakeStore, tree: Tree, autojump_clock: MockClock
+) -> None:
+    await read_file(tree, LOG)
+    await trio.sleep(1000)
+    handle = await tree.open(LOG)
+    assert handle.keep_cache
+    assert await handle.read(0, len(DATA)) == DATA
+    assert store.count("open") == 1
+    assert store.count("list", b"/logs") == 2
+
+
+async def test_without_mtime_the_proof_lasts_dir_timeout(
+    store: FakeStore, tree: Tree, autojump_clock: MockClock
+) -> None:
+    store.add(LOG, DATA)
+    await read_file(tree, LOG)
+    await trio.sleep(19)
+    (await tree.open(LOG)).close()
+    assert store.count("open") == 1
+    await trio.sleep(1.5)
+    store.files[LOG].data = DATA[::-1]
+    handle = await tree.open(LOG)
+    assert not handle.keep_cache
+    assert await handle.read(0, len(DATA)) == DATA[::-1]
+    assert store.count("open") == 2
+
+
+async def test_a_changed_mtime_starts_a_new_version(
+    store: FakeStore, tree: Tree, autojump_clock: MockClock
+) -> None:
+    old = await tree.open(LOG)
+    await old.read(0, 100)
+    store.add(LOG, DATA[::-1], 1_700_000_001)
+    await trio.sleep(21)
+    new = await tree.open(LOG)
+    assert store.invalidated == [LOG]
+    assert not new.keep_cache
+    assert await new.read(0, len(DATA)) == DATA[::-1]
+    for _ in range(2):
+        with pytest.raises(FileChanged):
+            await old.read(0, 100)
+    old.close()
+    assert await new.read(5, 5) == DATA[::-1][5:10]
+
+
+async def test_a_waiting_read_of_a_changed_file_ends(
+    store: FakeStore, tree: Tree, autojump_clock: MockClock
+) -> None:
+    old = await tree.open(LOG)
+    store.stalled = True
+    errors = []
+
+    async def read() -> None:
+        try:
+            await old.read(0, 100)
+        except FileChanged as error:
+            errors.append(error)
+
+    async with trio.open_nursery() as readers:
+        readers.start_soon(read)
+        await trio.sleep(21)
+        store.add(LOG, DATA[::-1], 1_700_000_001)
+        await tree.open(LOG)
+    assert len(errors) == 1
+
+
+async def test_a_smaller_file_is_another_one(store: FakeStore, tree: Tree, autojump_clock: MockClock) -> None:
+    store.add(LOG, DATA)
+    old = await tree.open(LOG)
+    await old.read(0, 100)
+    store.add(LOG, b"short")
+    await trio.sleep(21)
+    new = await tree.open(LOG)
+    assert await new.read(0, 100) == b"short"
+    with pytest.raises(FileChanged):
+        await old.read(0, 100)
+
+
+async def test_a_smaller_ack_is_another_file_even_if_the_listing_is_old(
+    store: FakeStore, autojump_clock: MockClock
+) -> None:
+    tree = make_tree(store, dir_timeout=5)
+    store.list_delay = 2  # the listing stays fresh for 100 s, the proof for 5
+    store.add(LOG, DATA)
+    old = await tree.open(LOG)
+    await old.read(0, 100)
+    store.add(LOG, b"short")
+    await trio.sleep(6)
+    new = await tree.open(LOG)
+    assert new.size == 5
+    assert (await tree.stat(LOG)).size == 5
+    with pytest.raises(FileChanged):
+        await old.read(0, 100)
+
+
+async def test_a_grown_file_is_served_at_its_opened_size(
+    store: FakeStore, tree: Tree, autojump_clock: MockClock
+) -> None:
+    store.add(LOG, DATA)
+    old = await tree.open(LOG)
+    await old.read(0, 100)
+    store.add(LOG, DATA + b"more")
+    await trio.sleep(21)
+    new = await tree.open(LOG)
+    assert (old.size, new.size) == (len(DATA), len(DATA) + 4)
+    assert await new.read(len(DATA), 100) == b"more"
+    assert await old.read(0, 10**6) == DATA
+    assert await old.read(len(DATA), 100) == b""
+    old.close()
+    new.close()
+    assert all(reader.closed for reader in store.readers)
+
+
+async def test_the_ack_beats_the_listing(store: FakeStore, tree: Tree, autojump_clock: MockClock) -> None:
+    await tree.stat(LOG)
+    store.add(LOG, DATA + b"more", 1_700_000_009)
+    handle = await tree.open(LOG)
+    assert handle.size == len(DATA) + 4
+    assert (await tree.stat(LOG)).size == len(DATA) + 4
+    assert store.invalidated == [LOG]
+    assert await handle.read(len(DATA), 10) == b"more"
+    handle.close()
+    again = await tree.open(LOG)
+    assert again.keep_cache
+
+
+async def test_a_stale_mtime_is_not_credited_to_the_size_in_the_ack(
+    store: FakeStore, tree: Tree, autojump_clock: MockClock
+) -> None:
+    await tree.stat(LOG)
+    store.add(LOG, DATA + b"more", 1_700_000_009)
+    old = await tree.open(LOG)
+    await trio.sleep(21)
+    (await tree.open(LOG)).close()
+    assert await old.read(0, 10) == DATA[:10]
+
+
+async def test_a_partly_cached_file_is_opened_again_only_when_bytes_are_wanted(
+    store: FakeStore, tree: Tree, autojump_clock: MockClock
+) -> None:
+    store.add(b"/big", content(MIB), 5)
+    handle = await tree.open(b"/big")
+    await handle.read(0, 4 * KIB)
+    handle.close()
+    handle = await tree.open(b"/big")
+    assert store.count("open", b"/big") == 1
+    await handle.read(512 * KIB, 4 * KIB)
+    assert store.count("open", b"/big") == 2
+
+
+async def test_a_file_that_shrank_before_it_was_opened_again(
+    store: FakeStore, tree: Tree, autojump_clock: MockClock
+) -> None:
+    store.add(b"/big", content(MIB), 5)
+    handle = await tree.open(b"/big")
+    await handle.read(0, 4 * KIB)
+    handle.close()
+    handle = await tree.open(b"/big")
+    store.add(b"/big", b"short", 6)
+    with pytest.raises(FileChanged):
+        await handle.read(512 * KIB, 4 * KIB)
+    with pytest.raises(FileChanged):
+        await handle.read(0, 4)
+    assert b"/big" in store.invalidated
+    handle.close()
+    assert await read_file(tree, b"/big") == b"short"
+
+
+async def test_closed_files_are_bounded(store: FakeStore, tree: Tree, autojump_clock: MockClock) -> None:
+    for i in range(MAX_CLOSED + 3):
+        store.add(b"/many/%d" % i, b"x", 5)
+    for i in range(MAX_CLOSED + 3):
+        (await tree.open(b"/many/%d" % i)).close()
+    assert (await tree.open(b"/many/%d" % (MAX_CLOSED + 2))).keep_cache
+    assert not (await tree.open(b"/many/1")).keep_cache
+
+
+# --- reboot
+
+
+async def test_after_a_reboot_open_files_are_compared_first(
+    store: FakeStore, tree: Tree, autojump_clock: MockClock
+) -> None:
+    same, other = await tree.open(LOG), None
+    store.add(b"/other", DATA, 5)
+    tree.forget_caches()
+    other = await tree.open(b"/other")
+    await same.read(0, 1000)
+    await other.read(0, 1000)
+    store.add(b"/other", DATA, 6)
+    tree.rebooted()
+    assert await same.read(0, 1000) == DATA[:1000]
+    with pytest.raises(FileChanged):
+        await other.read(0, 1000)
+
+
+async def test_a_file_that_is_gone_after_a_reboot(
+    store: FakeStore, tree: Tree, autojump_clock: MockClock
+) -> None:
+    handle = await tree.open(LOG)
+    await handle.read(0, 1000)
+    store.remove(LOG)
+    tree.rebooted()
+    with pytest.raises(FileChanged):
+        await handle.read(0, 1000)
+
+
+async def test_a_reboot_with_the_link_still_down_proves_nothing(
+    store: FakeStore, tree: Tree, autojump_clock: MockClock
+) -> None:
+    handle = await tree.open(LOG)
+    await handle.read(0, 1000)
+    await trio.sleep(1)
+    tree.rebooted()
+    store.lost = True
+    tree.link_lost()
+    with pytest.raises(VehicleLost):
+        await handle.read(0, 1000)
+    store.lost = False
+    tree.link_back()
+    assert await handle.read(0, 1000) == DATA[:1000]
+
+
+async def test_after_a_reboot_recency_is_no_proof(
+    store: FakeStore, tree: Tree, autojump_clock: MockClock
+) -> None:
+    store.add(LOG, DATA)
+    await read_file(tree, LOG)
+    tree.rebooted()
+    handle = await tree.open(LOG)
+    assert not handle.keep_cache
+    assert store.count("open") == 2
+    handle.close()
+
+
+async def test_a_handle_open_over_a_reboot_is_not_shared_with_new_opens(
+    store: FakeStore, tree: Tree, autojump_clock: MockClock
+) -> None:
+    old = await tree.open(LOG)
+    await old.read(0, len(DATA))
+    tree.rebooted()
+    new = await tree.open(LOG)
+    assert not new.keep_cache
+    old.close()
+    new.close()
+
+
+async def test_closing_after_a_reboot_forgets_the_file(
+    store: FakeStore, tree: Tree, autojump_clock: MockClock
+) -> None:
+    handle = await tree.open(LOG)
+    await handle.read(0, len(DATA))
+    tree.rebooted()
+    handle.close()
+    assert tree.status()["bytes_cached"] == 0
+
+
+# --- doubtful bytes (promise 1)
+
+
+def spoil(path: bytes, offset: int, data: bytes) -> bytes:
+    return bytes(byte ^ 0xFF for byte in data)
+
+
+async def test_suspected_but_right_bytes_are_served_after_a_checksum(
+    store: FakeStore, tree: Tree, autojump_clock: MockClock
+) -> None:
+    store.suspect_chunks = 1
+    handle = await tree.open(LOG)
+    assert await handle.read(0, 100) == DATA[:100]
+    assert store.count("crc") == 1
+    assert store.count("open") == 2
+    assert await handle.read(0, len(DATA)) == DATA
+    assert store.count("crc") == 1
+    assert store.invalidated == []
+
+
+async def test_wrong_bytes_are_fetched_again(store: FakeStore, tree: Tree, autojump_clock: MockClock) -> None:
+    store.suspect_chunks, store.spoil = 2, spoil
+    handle = await tree.open(LOG)
+    assert await handle.read(0, 40_000) == DATA[:40_000]
+    assert await handle.read(0, len(DATA)) == DATA
+    assert store.invalidated == [LOG]
+
+
+async def test_bytes_that_stay_suspect_are_an_error(
+    store: FakeStore, tree: Tree, autojump_clock: MockClock
+) -> None:
+    store.suspect_chunks, store.spoil = 10**6, spoil
+    handle = await tree.open(LOG)
+    with pytest.raises(DataUnproven):
+        await handle.read(0, 100)
+    assert tree.status()["reads_unproven"] == 1
+    store.suspect_chunks = 0
+    assert await handle.read(0, len(DATA)) == DATA
+
+
+@pytest.mark.parametrize("why", ["armed", "refused", "too large", "too slow"])
+async def test_what_cannot_be_checked_is_dropped_and_read_once_more(
+    store: FakeStore, why: str, autojump_clock: MockClock
+) -> None:
+    tree = make_tree(store, cache_size=MIB)
+    path, data = LOG, DATA
+    if why == "armed":
+        store.armed = True
+    elif why == "refused":
+        store.fail["crc", LOG] = [FtpNak(Opcode.CALC_FILE_CRC32, 7), FtpNak(Opcode.CALC_FILE_CRC32, 7)]
+    elif why == "too large":
+        path, data = b"/big", content(MIB)
+        store.add(path, data)
+    else:
+        store.chunk, store.chunk_delay = 100, 0.1
+    handle = await tree.open(path)
+    if why == "too slow":
+        await handle.read(0, 1000)
+    store.suspect_chunks, store.spoil = 1, spoil
+    assert await handle.read(200_000, 100) == data[200_000:200_100]
+    assert store.count("open", path) == 2
+    store.suspect_chunks = 10**6
+    with pytest.raises(DataUnproven):
+        await handle.read(100_000, 100)
+
+
+async def test_a_lost_link_while_checking_is_the_readers_error(
+    store: FakeStore, tree: Tree, autojump_clock: MockClock
+) -> None:
+    store.suspect_chunks = 1
+    store.fail["crc", LOG] = [VehicleLost("gone")]
+    handle = await tree.open(LOG)
+    with pytest.raises(VehicleLost):
+        await handle.read(0, 100)
+    assert await handle.read(0, 100) == DATA[:100]
+    assert store.count("crc") == 2
+
+
+async def test_a_file_that_grew_while_it_was_checked_is_read_again(
+    store: FakeStore, tree: Tree, autojump_clock: MockClock
+) -> None:
+    store.suspect_chunks = 1
+    handle = await tree.open(LOG)
+    store.add(LOG, DATA + b"more", 1_700_000_009)
+    assert await handle.read(0, 100) == DATA[:100]
+    assert store.invalidated == [LOG]
+
+
+async def test_a_file_that_shrank_while_it_was_checked_is_another_one(
+    store: FakeStore, tree: Tree, autojump_clock: MockClock
+) -> None:
+    store.crc_delay = 1
+    store.suspect_chunks = 100
+    handle = await tree.open(LOG)
+    await_shrink = trio.Event()
+
+    async def shrink() -> None:
+        await trio.sleep(0.5)
+        store.add(LOG, b"short")
+        await_shrink.set()
+
+    async with trio.open_nursery() as tasks:
+        tasks.start_soon(shrink)
+        with pytest.raises(FileChanged):
+            await handle.read(0, len(DATA))
+    assert await_shrink.is_set()
+
+
+async def test_readers_share_the_check(store: FakeStore, tree: Tree, autojump_clock: MockClock) -> None:
+    store.suspect_chunks = 3
+    store.crc_delay = 5
+    results = []
+
+    async def read(at: int) -> None:
+        handle = await tree.open(LOG)
+        results.append(await handle.read(at, 1000) == DATA[at : at + 1000])
+
+    async with trio.open_nursery() as readers:
+        for at in range(0, 300_000, 50_000):
+            readers.start_soon(read, at)
+    assert results == [True] * 6
+    assert store.count("crc") == 1
+
+
+async def test_readers_share_the_bad_news_too(store: FakeStore, autojump_clock: MockClock) -> None:
+    tree = make_tree(store, cache_size=MIB)
+    data = content(2 * MIB)
+    store.add(b"/big", data)
+    store.suspect_chunks, store.spoil = 2, spoil
+    results = []
+
+    async def read(at: int) -> None:
+        handle = await tree.open(b"/big")
+        results.append(await handle.read(at, 50_000) == data[at : at + 50_000])
+
+    async with trio.open_nursery() as readers:
+        for at in range(0, 300_000, 100_000):
+            readers.start_soon(read, at)
+    assert results == [True] * 3
+
+
+async def test_doubtful_bytes_do_not_survive_the_last_close(
+    store: FakeStore, tree: Tree, autojump_clock: MockClock
+) -> None:
+    handle = await tree.open(LOG)
+    await handle.read(0, 100)
+    await trio.sleep(10)
+    store.readers[0].sink.on_suspect("late news")
+    handle.close()
+    assert store.invalidated == [LOG]
+    handle = await tree.open(LOG)
+    assert not handle.keep_cache
+    assert await handle.read(0, 100) == DATA[:100]
+    assert store.count("crc") == 0
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.002])
+async def test_closing_the_last_handle_under_a_read_ends_it(
+    store: FakeStore, tree: Tree, autojump_clock: MockClock, delay: float
+) -> None:
+    (await tree.open(LOG)).close()
+    handle = await tree.open(LOG)
+    store.chunk_delay = 1
+    errors = []
+
+    async def read() -> None:
+        try:
+            await handle.read(0, 100)
+        except LocalProtocolError as error:
+            errors.append(error)
+
+    began = trio.current_time()
+    async with trio.open_nursery() as readers:
+        readers.start_soon(read)
+        if delay:
+            await trio.sleep(delay)
+        else:  # while the reader is being opened
+            while not store.count("reader") == 2:
+                await trio.lowlevel.checkpoint()
+        handle.close()
+    assert len(errors) == 1
+    assert trio.current_time() < began + 1
+    assert all(reader.closed for reader in store.readers)
+    assert await read_file(tree, LOG) == DATA
+
+
+async def test_endless_interference_by_other_readers_ends(autojump_clock: MockClock) -> None:
+    """Other readers of the file keep dropping bytes under this one."""
+
+    class Restless(FileBlocks):
+        tries = 0
+
+        async def read(self, *_: object) -> None:
+            self.tries += 1
+
+    store = FakeStore()
+    store.add(LOG, DATA)
+    tree = make_tree(store)
+    handle = await tree.open(LOG)
+    restless = Restless(BlockCache(MIB, clock=trio.current_time, patience=30), len(DATA))
+    handle._version.blocks = restless  # type: ignore[attr-defined]
+    with pytest.raises(DataUnproven):
+        await handle.read(0, BLOCK_SIZE)
+    assert restless.tries == MAX_RESTARTS

@@ -1,0 +1,160 @@
+"""Which reads open a window ahead, how it grows, and what bounds it."""
+
+from __future__ import annotations
+
+import pytest
+
+from mavftpfs.cache.readahead import (
+    FIRST_WINDOW,
+    MAX_WINDOW,
+    NOTHING,
+    SMALL_FILE,
+    Pace,
+    Plan,
+    RateMeter,
+    Readahead,
+)
+
+KIB = 1024
+BIG = 100 * 1024 * KIB
+
+
+def read(ahead: Readahead, start: int, size: int = 128 * KIB, limit: int = MAX_WINDOW) -> Plan:
+    return ahead.on_read(start, start + size, limit=limit, small=SMALL_FILE)
+
+
+def test_the_second_sequential_read_opens_a_window() -> None:
+    ahead = Readahead(BIG)
+    assert read(ahead, 0) == NOTHING
+    assert read(ahead, 128 * KIB) == Plan(256 * KIB, 256 * KIB + FIRST_WINDOW)
+
+
+def test_the_window_doubles_as_it_is_used_up() -> None:
+    ahead = Readahead(BIG)
+    asked = [read(ahead, i * 128 * KIB).stop for i in range(200)]
+    window = max(stop - (i + 1) * 128 * KIB for i, stop in enumerate(asked) if stop)
+    assert window == MAX_WINDOW
+    sizes = [stop - (i + 1) * 128 * KIB for i, stop in enumerate(asked) if stop]
+    assert sizes[:4] == [FIRST_WINDOW, 2 * FIRST_WINDOW, 2 * FIRST_WINDOW, 4 * FIRST_WINDOW]
+
+
+def test_what_was_asked_is_not_asked_again_and_small_steps_wait() -> None:
+    ahead = Readahead(BIG)
+    covered = 0
+    plans = 0
+    for start in range(0, 4 * 1024 * KIB, 4 * KIB):
+        plan = read(ahead, start, 4 * KIB)
+        if plan != NOTHING:
+            assert plan.start == max(covered, start + 4 * KIB)
+            covered = plan.stop
+            plans += 1
+    assert plans < 25
+
+
+def test_the_window_never_passes_the_end() -> None:
+    ahead = Readahead(300 * KIB)
+    read(ahead, 0)
+    assert read(ahead, 128 * KIB) == Plan(256 * KIB, 300 * KIB)
+    assert ahead.on_read(256 * KIB, 300 * KIB, limit=MAX_WINDOW, small=SMALL_FILE) == NOTHING
+
+
+def test_the_last_bytes_are_asked_even_if_they_are_few() -> None:
+    ahead = Readahead(385 * KIB)
+    read(ahead, 0)
+    assert read(ahead, 128 * KIB).stop == 384 * KIB
+    assert read(ahead, 256 * KIB, 4 * KIB) == Plan(384 * KIB, 385 * KIB)
+
+
+def test_a_seek_closes_the_window_and_says_so_once() -> None:
+    ahead = Readahead(BIG)
+    read(ahead, 0)
+    read(ahead, 128 * KIB)
+    assert read(ahead, 50 * 1024 * KIB) == Plan(seeked=True)
+    assert read(ahead, 10 * 1024 * KIB) == NOTHING
+    again = 10 * 1024 * KIB + 128 * KIB
+    assert read(ahead, again) == Plan(again + 128 * KIB, again + 128 * KIB + FIRST_WINDOW)
+
+
+def test_random_reads_ask_nothing() -> None:
+    ahead = Readahead(BIG)
+    offsets = [7, 900, 3, 500, 77, 20, 600]
+    assert [read(ahead, offset * 1024 * KIB, 4 * KIB) for offset in offsets] == [NOTHING] * 7
+
+
+def test_the_kernel_may_swap_two_reads() -> None:
+    ahead = Readahead(BIG)
+    read(ahead, 0)
+    later, earlier = read(ahead, 256 * KIB), read(ahead, 128 * KIB)
+    assert later == Plan(384 * KIB, 512 * KIB)
+    assert earlier == NOTHING
+    assert read(ahead, 384 * KIB).start == 512 * KIB
+
+
+def test_a_stride_wider_than_a_read_is_random() -> None:
+    ahead = Readahead(BIG)
+    read(ahead, 0, 4 * KIB)
+    assert read(ahead, 9 * KIB, 4 * KIB) == NOTHING
+    assert read(ahead, 4 * KIB + 9 * KIB, 4 * KIB) != NOTHING
+
+
+def test_a_small_file_is_wanted_whole_at_the_first_read_from_its_start() -> None:
+    assert read(Readahead(SMALL_FILE), 0, 4 * KIB) == Plan(4 * KIB, SMALL_FILE)
+    assert read(Readahead(SMALL_FILE + 1), 0, 4 * KIB) == NOTHING
+    assert read(Readahead(SMALL_FILE), 4 * KIB, 4 * KIB) == NOTHING
+    small = Readahead(SMALL_FILE)
+    read(small, 0, 4 * KIB)
+    assert read(small, 4 * KIB, 4 * KIB) == NOTHING
+
+
+def test_a_slow_link_gets_a_small_window() -> None:
+    ahead = Readahead(BIG)
+    read(ahead, 0, 16 * KIB, limit=9000)
+    assert read(ahead, 16 * KIB, 16 * KIB, limit=9000) == Plan(32 * KIB, 32 * KIB + 9000)
+    assert read(ahead, 32 * KIB, 16 * KIB, limit=0) == NOTHING
+    assert read(ahead, 48 * KIB, 16 * KIB, limit=-1) == NOTHING
+
+
+@pytest.mark.parametrize(
+    ("streams", "rate", "limit", "small"),
+    [
+        (0, None, MAX_WINDOW, SMALL_FILE),
+        (1, None, MAX_WINDOW, SMALL_FILE),
+        (7, None, 4 * 1024 * KIB, SMALL_FILE),
+        (1, 3000.0, 9000, SMALL_FILE),
+        (1, 1_000_000.0, 3_000_000, 2_000_000),
+        (1, 1e12, MAX_WINDOW, MAX_WINDOW),
+    ],
+)
+def test_pace(streams: int, rate: float | None, limit: int, small: int) -> None:
+    pace = Pace(64 * 1024 * KIB, streams, rate)
+    assert (pace.limit, pace.small) == (limit, small)
+
+
+def test_all_windows_fit_half_of_the_cache() -> None:
+    assert all(n * Pace(1024 * KIB, n, None).limit <= 512 * KIB for n in range(1, 50))
+
+
+def test_the_rate_counts_only_the_time_between_bytes_that_follow_each_other() -> None:
+    meter = RateMeter()
+    assert meter.rate is None
+    for second in (0, 100, 200):
+        meter.on_bytes(10**9, second)  # what came after a pause says nothing about the link
+        for step in range(1, 11):
+            meter.on_bytes(1000, second + step / 10)
+    assert meter.rate == pytest.approx(10_000)
+
+
+def test_the_rate_follows_the_link() -> None:
+    meter = RateMeter()
+    for step in range(100):
+        meter.on_bytes(1000, step / 10)
+    for step in range(100, 400):
+        meter.on_bytes(100, step / 10)
+    assert meter.rate == pytest.approx(1000, rel=0.1)
+
+
+def test_a_glimpse_is_not_a_rate() -> None:
+    meter = RateMeter()
+    meter.on_bytes(1000, 0.0)
+    meter.on_bytes(1000, 0.1)
+    assert meter.rate is None
