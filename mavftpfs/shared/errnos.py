@@ -106,6 +106,16 @@ _BY_CLASS: dict[type[BaseException], int] = {
     errors.DataUnproven: errno.EIO,
     errors.SessionBusy: errno.EBUSY,
     errors.Armed: errno.EROFS,
+    errors.ReadOnly: errno.EROFS,
+    errors.AlreadyExists: errno.EEXIST,
+    errors.DirectoryNotEmpty: errno.ENOTEMPTY,
+    errors.InvalidMove: errno.EINVAL,
+    errors.CrossDevice: errno.EXDEV,
+    errors.FileBusy: errno.EBUSY,
+    errors.NotSupported: errno.EOPNOTSUPP,
+    errors.FileTooLarge: errno.EFBIG,
+    errors.NoSpace: errno.ENOSPC,
+    errors.VerificationFailed: errno.EIO,
 }
 
 

@@ -86,6 +86,46 @@ class Armed(MavftpfsError):
     """The vehicle is armed (or was never heard), and what was asked is not done in flight."""
 
 
+class ReadOnly(MavftpfsError):
+    """What was asked would change a tree, or a part of it, that is only read (EROFS)."""
+
+
+class AlreadyExists(MavftpfsError):
+    """The name is taken (EEXIST)."""
+
+
+class DirectoryNotEmpty(MavftpfsError):
+    """The directory still has entries (ENOTEMPTY)."""
+
+
+class InvalidMove(MavftpfsError):
+    """A directory cannot become a part of itself (EINVAL)."""
+
+
+class CrossDevice(MavftpfsError):
+    """This server cannot rename: copy and delete instead, as mv does (EXDEV)."""
+
+
+class FileBusy(MavftpfsError):
+    """Somebody on the vehicle is writing the file (EBUSY)."""
+
+
+class NotSupported(MavftpfsError):
+    """This server offers no safe way to do it (EOPNOTSUPP)."""
+
+
+class FileTooLarge(MavftpfsError):
+    """A partial change would need more of the file to be copied than rmw_max allows (EFBIG)."""
+
+
+class NoSpace(MavftpfsError):
+    """The local store for what the vehicle does not have yet is full (ENOSPC)."""
+
+
+class VerificationFailed(MavftpfsError):
+    """What is on the card is not what was written, and sending it again did not help (EIO)."""
+
+
 class FtpNak(MavftpfsError):
     """The server refused a request.
 
