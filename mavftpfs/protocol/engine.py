@@ -187,14 +187,15 @@ class Engine:
         stats.naks += reply.opcode == _NAK
         self._heard_at = now
         rtt: float | None = None
+        flow = self.flow
         if not self._ledger.settle(request, reply.seq):
             stats.spurious += 1
-        elif self._bursts.heard_at >= request.sent_at:
+            flow.on_spurious()
+        if self._bursts.heard_at >= request.sent_at:
             self._bursts.on_answer(request, self.traits, self.timeout(request.manner.family))
         elif request.single:
             rtt = now - request.sent_at
             self._timers[request.manner.family].sample(rtt)
-        flow = self.flow
         flow.on_reply(now, rtt, request.order, self._ledger.order)
         while (lost := self._ledger.next_loss()) is not None:
             flow.on_loss(lost.order)

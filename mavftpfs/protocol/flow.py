@@ -31,6 +31,8 @@ _ROUNDS_REMEMBERED = 10
 _PLATEAU_ROUNDS = 2
 _BASE_LIFETIME = 30.0
 _DRAIN_ROUNDS = 2
+_TELLING_LOSSES = 8
+_TELLING_ROUND = 16
 
 
 class Flow:
@@ -38,6 +40,8 @@ class Flow:
     grow by one. limit: the most that may ever be in flight, None for the default."""
 
     __slots__ = (
+        "_all",
+        "_all_losses",
         "_app_limited",
         "_base_at",
         "_base_rtt",
@@ -47,6 +51,7 @@ class Flow:
         "_collapsed",
         "_draining",
         "_easing",
+        "_goal",
         "_limit",
         "_losses",
         "_plateau",
@@ -82,6 +87,9 @@ class Flow:
         self._round_least = inf
         self._replies = 0
         self._losses = 0
+        self._goal = 0
+        self._all = 0
+        self._all_losses = 0
         self._app_limited = False
 
     @property
@@ -93,6 +101,7 @@ class Flow:
         """Never have more in flight than the server queues; None if it is not known to be limited."""
         self._cap = self._limit if limit is None else max(1, min(limit, self._limit))
         self.window = min(self.window, self._cap)
+        self._goal = min(self._goal, self._cap)
 
     def on_starved(self) -> None:
         """There was room in the window and nothing to send: this round's rate says little."""
@@ -101,6 +110,8 @@ class Flow:
     def on_reply(self, now: float, rtt: float | None, order: int, next_order: int) -> None:
         """A request was answered. order: of its transmission; next_order: what the next one will get."""
         self._replies += 1
+        if self.window < self._goal:
+            self.window += 1  # two new requests for each answer: doubling without a flood
         self._easing.count(order, lost=False)
         if rtt is not None and rtt < self._round_least:
             self._round_least = rtt
@@ -114,10 +125,15 @@ class Flow:
         self._losses += 1
         self._easing.count(order, lost=True)
 
+    def on_spurious(self) -> None:
+        """What was taken to be lost was answered after all."""
+        self._losses = max(0, self._losses - 1)
+
     def on_silence(self) -> None:
         """Nothing at all was heard for a retransmission timeout: probe with two until something is."""
         if not self._collapsed:
             self._collapsed = max(1, self.window // 2)
+            self._goal = 0
             self.window = min(2, self.window)
 
     def _end_round(self, now: float, next_order: int) -> None:
@@ -130,22 +146,29 @@ class Flow:
         self._app_limited = False
 
     def _learn(self, now: float, next_order: int) -> None:
+        overflowed = self._overflowed()
         total = self._replies + self._losses
         self.loss += (self._losses / total - self.loss) * 0.2
         self._learn_base(now)
         took = now - self._round_start
         rate = self._replies / took if took > 0 else 0.0
+        # What the window was doubled for shows two rounds later.
+        grown = len(self._rates) < 2 or rate > 1.25 * self._rates[-2]
         if rate > self._best_rate or not self._app_limited:
             self._rates.append(rate)
-        grown = rate > 1.25 * self._best_rate
         self._best_rate = max(self._rates, default=0.0)
         if self._app_limited:
             return
         self._learn_congestion()
-        if self._starting and not self._leaves_start(grown):
-            if grown:
-                self.window = min(self._cap, self.window * 2)
+        if self._starting and overflowed:
+            self._starting = False
+            self._goal = 0
+            self._easing.ceiling = max(INITIAL, _GAIN * self._best_rate * self._base_rtt + _SLACK)
+            self._approach(self._easing.ceiling)
+        elif self._starting and not self._leaves_start(grown):
+            self._goal = min(self._cap, self.window * 2) if grown else 0
         else:
+            self._goal = 0
             self._approach(self._easing.next_window(self._target(), self.loss, next_order))
 
     def _learn_base(self, now: float) -> None:
@@ -175,10 +198,19 @@ class Flow:
         return factor * self._base_rtt + _QUEUE_SECONDS < self._round_least < inf
 
     def _leaves_start(self, grown: bool) -> bool:
-        self._plateau = 0 if grown else self._plateau + 1
+        few = self._replies + self._losses < _TELLING_ROUND
+        self._plateau = 0 if grown or few else self._plateau + 1
         if self._plateau >= _PLATEAU_ROUNDS or self.window >= self._cap or self._queued(1.25):
             self._starting = False
         return not self._starting
+
+    def _overflowed(self) -> bool:
+        """Whether this round lost so much more than all before it that its window must be to blame."""
+        total, lost = self._replies + self._losses, self._losses
+        before = self._all_losses / self._all if self._all else 1.0
+        self._all += total
+        self._all_losses += lost
+        return lost >= _TELLING_LOSSES and lost > (2 * before + 0.1) * total
 
     def _target(self) -> float:
         rate, base = self._best_rate, self._base_rtt

@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections import OrderedDict
 
 from mavftpfs.protocol.payload import Payload
-from mavftpfs.protocol.requests import Operation, Request
+from mavftpfs.protocol.requests import Operation, Request, Transmission
 from mavftpfs.shared.errors import LocalProtocolError
 
 LAST_SEQ = 65534
@@ -96,19 +96,21 @@ class Ledger:
 
     def number(self, request: Request) -> None:
         """Give a request that goes out (again) its seq and order number."""
-        request.order = self.order
-        self.order += 1
         if request.sends == 0:
             request.seq = self.take_seq()
         elif request.manner.same_seq and not request.fresh_seq:
             request.single = False
         else:
             if request.aliases is None:
-                request.aliases = []
-            request.aliases.append(request.seq + 1)
+                request.aliases = {}
+            past = Transmission(request.order, request.sent_at, request.single, request.outrun)
+            request.aliases[request.seq + 1] = past
             request.seq = self.take_seq()
             request.single = True
             request.fresh_seq = False
+        request.order = self.order
+        request.outrun = False
+        self.order += 1
 
     def enter(self, request: Request) -> None:
         """Note that a numbered request is on its way."""
@@ -122,16 +124,22 @@ class Ledger:
     # --- coming in
 
     def settle(self, request: Request, seq: int) -> bool:
-        """Take out a request answered under `seq`; return False if that was an alias."""
-        current = seq == request.seq + 1
-        if not current or not request.flying:
-            # What was taken to be lost is answered after all: the path reorders more than we thought.
-            self.reorder = min(self.reorder * 2, _MAX_REORDER)
-        elif request.order > self._newest_answered:
-            self._newest_answered = request.order
-            if request.sends > 1 and self.reorder > _MIN_REORDER:
-                self.reorder -= 1
+        """Take out a request answered under `seq`; return False if that was an alias.
+
+        Its order, sent_at and single are those of the answered transmission from then on.
+        """
+        outrun = request.outrun
         self.forget(request)
+        current = seq == request.seq + 1
+        if not current and request.aliases is not None:
+            request.order, request.sent_at, request.single, outrun = request.aliases[seq]
+        if outrun:
+            # What later answers seemed to prove lost is answered after all: the path reorders.
+            self.reorder = min(self.reorder * 2, _MAX_REORDER)
+        elif current and request.sends > 1 and self.reorder > _MIN_REORDER:
+            self.reorder -= 1
+        if request.order > self._newest_answered:
+            self._newest_answered = request.order
         return current
 
     def forget(self, request: Request) -> None:
@@ -152,7 +160,9 @@ class Ledger:
         if ordered:
             order = next(iter(ordered))
             if order <= self._newest_answered - self.reorder:
-                return ordered[order]
+                request = ordered[order]
+                request.outrun = True
+                return request
         return None
 
     def lose(self, request: Request) -> None:

@@ -66,8 +66,22 @@ def manner_of(opcode: int) -> Manner:
     return _MANNERS.get(opcode, _PATH)  # type: ignore[call-overload,no-any-return]
 
 
+class Transmission(NamedTuple):
+    """An earlier transmission: its order and time, whether its seq was sent once only, and whether later
+    answers had seemed to prove it lost."""
+
+    order: int
+    sent_at: float
+    single: bool
+    outrun: bool
+
+
 class Request:
-    """What is asked, and what became of it so far. `follows` means: carries the engine's session."""
+    """What is asked, and what became of it so far.
+
+    follows: carries the engine's session. aliases: earlier transmissions by the seq of their replies.
+    seq, order, sent_at, single, outrun: of the present transmission (see Transmission).
+    """
 
     __slots__ = (
         "aliases",
@@ -81,6 +95,7 @@ class Request:
         "op",
         "opcode",
         "order",
+        "outrun",
         "replays",
         "sends",
         "sent_at",
@@ -117,12 +132,13 @@ class Request:
         self.size = size
         self.data = data
         self.follows = follows
-        self.aliases: list[int] | None = None
+        self.aliases: dict[int, Transmission] | None = None
         self.flying = False
         self.fresh_seq = False
         self.sends = 0
         self.replays = 0
         self.single = True
+        self.outrun = False
 
     def encode(self) -> bytes:
         """Return the 251 wire bytes under the present seq.

@@ -310,7 +310,7 @@ def test_reads_go_out_again_under_new_seqs_and_old_answers_still_count() -> None
     engine.receive(chunk(second, b"b" * 100), 1.2)
     assert bytes(sink.data) == b"a" * 100
     assert transfer.idle
-    assert engine.rtt is None
+    assert engine.rtt == pytest.approx(1.1)
 
 
 def test_later_answers_prove_a_loss() -> None:
@@ -356,9 +356,38 @@ def test_reordering_is_learnt_and_forgotten() -> None:
     again = sent(engine, 5.0)
     assert again[0].offset == out[0].offset
     engine.receive(chunk(out[0], bytes(SIZE)), 5.1)
-    assert (engine._ledger.reorder, engine.stats.spurious) == (12, 1)
+    assert (engine._ledger.reorder, engine.stats.spurious) == (6, 1)
     engine.receive(chunk(again[1], bytes(SIZE)), 5.1)
-    assert engine._ledger.reorder == 11
+    assert engine._ledger.reorder == 5
+
+
+def test_a_resend_that_was_too_early_doubles_the_patience_with_reordering() -> None:
+    engine = make(limit=4)
+    reading(engine)
+    out = sent(engine, 0.0)
+    engine.receive(chunk(out[3], bytes(SIZE)), 0.1)
+    (again, _) = sent(engine, 0.1)
+    assert again.offset == out[0].offset
+    engine.receive(chunk(out[0], bytes(SIZE)), 0.15)
+    assert engine._ledger.reorder == 6
+    assert engine.stats.spurious == 1
+
+
+def test_a_server_that_became_slow_is_waited_for() -> None:
+    """Answers that come after a resend tell the true round trip: no storm of needless resends."""
+    engine = make(limit=4)
+    reading(engine, 239 * 2000)
+    queue: list[tuple[float, Payload]] = []
+    now = 0.0
+    for step in range(2000):
+        now = 0.01 * step
+        delay = 0.02 if now < 2.0 else 0.3
+        queue += [(now + delay, request) for request in sent(engine, now)]
+        while queue and queue[0][0] <= now:
+            engine.receive(chunk(queue.pop(0)[1], bytes(239 * 2000)), now)
+        engine.on_deadline(now)
+    assert engine.stats.spurious < 20
+    assert engine.timeout("data") > 0.3
 
 
 def test_the_last_chunk_does_not_wait_for_a_second() -> None:

@@ -1,0 +1,204 @@
+"""Writing an open file by a window of WriteFile requests. Layer: protocol; pure.
+
+The source gives chunks in ascending order and hears what became of each: ACKed, or not sent after all.
+A lost request goes out again with the same bytes at the same offset, so executing it twice changes nothing.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import Protocol
+
+from mavftpfs.protocol.payload import MAX_DATA, NakCode, Opcode, Payload
+from mavftpfs.protocol.requests import WRITE_MANNER, Operation, Priority, Request, nak_of
+from mavftpfs.shared.errors import (
+    FtpNak,
+    LocalProtocolError,
+    MavftpfsError,
+    RemoteProtocolError,
+    SessionLost,
+)
+
+__all__ = ["ChunkSource", "WriteTransfer"]
+
+MAX_OFFSET = 1 << 32
+"""Offsets are 32 bits on the wire; the end of a file must fit too (servers.md 14.27)."""
+
+_COUNT_SIZE = 4
+_BARREN_TOLERATED = 3
+_EBADF = 9
+_SESSION_CODES = frozenset((NakCode.FAIL, NakCode.INVALID_SESSION, NakCode.FILE_NOT_FOUND))
+"""Refusals of a write that mean "no file is open": MAVSDK says 1, PX4 4, ArduPilot 10 (servers.md 1). On
+MAVSDK 1 may be a full card, too: who reopens and fails at the same place again knows."""
+
+
+class ChunkSource(Protocol):
+    """Where the bytes come from."""
+
+    def next_chunk(self, limit: int) -> tuple[int, bytes] | None:
+        """Return (offset, 1..limit bytes), now in flight, or None if there is nothing for now."""
+        ...
+
+    def on_acked(self, offset: int, count: int) -> None:
+        """These bytes were written."""
+        ...
+
+    def on_unsent(self, offset: int, count: int) -> None:
+        """These bytes will not be ACKed by this transfer."""
+        ...
+
+
+class WriteTransfer(Operation):
+    """Writes what a source has for as long as its owner likes.
+
+    Args:
+        session: id of the file open for writing. chunk: most bytes of a request, 1..239.
+        in_flight: the most requests unanswered at once, None as the engine's window allows; 1 = strict order.
+
+    Attributes:
+        acked_bytes: written so far. failed_at: offset of the request that was refused, if that ended it.
+
+    Fails with SessionLost (from the FtpNak that showed it), FtpNak or RequestTimeout; what was not ACKed was
+    then given back by on_unsent, ascending.
+    """
+
+    rank = Priority.WRITE
+
+    def __init__(
+        self, session: int, source: ChunkSource, chunk: int = MAX_DATA, *, in_flight: int | None = None
+    ) -> None:
+        super().__init__()
+        if not 1 <= chunk <= MAX_DATA:
+            raise LocalProtocolError(f"a chunk of {chunk} bytes is not within 1..{MAX_DATA}")
+        self.session = session
+        self.chunk = chunk
+        self.acked_bytes = 0
+        self.failed_at: int | None = None
+        self._source = source
+        self._in_flight = in_flight
+        self._rest: deque[tuple[int, bytes]] = deque()
+        self._unanswered: dict[Request, None] = {}
+        self._paused = False
+        self._starved = False
+        self._barren = 0
+
+    # --- what the owner says and sees
+
+    def wake(self) -> None:
+        """The source has more."""
+        self._starved = False
+
+    def pause(self) -> None:
+        """Send nothing new; what is on its way is still waited for."""
+        self._paused = True
+
+    def resume(self) -> None:
+        """Go on."""
+        self._paused = False
+
+    def stop(self) -> None:
+        """End now: give back what was not ACKed. Its late effects are those of a repetition."""
+        if not self.done:
+            self._give_back()
+            self.finish()
+
+    @property
+    def drained(self) -> bool:
+        """Whether nothing is on its way."""
+        return not self._unanswered
+
+    @property
+    def starved(self) -> bool:
+        """Whether the source had nothing when it was last asked, and everything it gave was ACKed."""
+        return self._starved and not self._rest and not self._unanswered
+
+    @property
+    def idle(self) -> bool:
+        """Whether nothing is wanted of the server."""
+        return not self._unanswered and (self._paused or (self._starved and not self._rest))
+
+    # --- requests
+
+    def next_request(self, now: float) -> Request | None:
+        """Return the next WriteFile."""
+        if self._paused or (self._in_flight is not None and len(self._unanswered) >= self._in_flight):
+            return None
+        piece = self._rest.popleft() if self._rest else self._pull()
+        if piece is None:
+            return None
+        offset, data = piece
+        request = Request(self, Opcode.WRITE_FILE, WRITE_MANNER, self.session, offset, len(data), data)
+        self._unanswered[request] = None
+        return request
+
+    def _pull(self) -> tuple[int, bytes] | None:
+        if self._starved or self.done:
+            return None
+        piece = self._source.next_chunk(self.chunk)
+        if piece is None:
+            self._starved = True
+            return None
+        offset, data = piece
+        if not 1 <= len(data) <= self.chunk or not 0 <= offset <= MAX_OFFSET - len(data):
+            self._rest.append(piece)
+            self.fail(LocalProtocolError(f"{len(data)} bytes at {offset} do not fit a WriteFile request"))
+            return None
+        return piece
+
+    # --- replies
+
+    def on_reply(self, request: Request, reply: Payload, now: float) -> None:
+        """Tell the source what was written, or end with what a refusal means."""
+        if reply.opcode == Opcode.NAK:
+            self.failed_at = request.offset
+            self.fail(self._meaning(nak_of(request, reply)))
+            return
+        del self._unanswered[request]
+        count = self._written(request, reply.data)
+        if count:
+            self._barren = 0
+            self.acked_bytes += count
+            self._source.on_acked(request.offset, count)
+        if count < request.size:
+            self._on_short(request, count)
+
+    def _written(self, request: Request, data: bytes) -> int:
+        """Return how many bytes an ACK stands for (servers.md 8: only PX4 says, and may write less)."""
+        traits = self.port.traits
+        if len(data) != _COUNT_SIZE:
+            if traits.write_ack_counts is None:
+                traits.write_ack_counts = False
+            return request.size
+        traits.write_ack_counts = True
+        count = int.from_bytes(data, "little")
+        # More than was sent: an answer to something else. Nothing is proven, so it goes again.
+        return count if count <= request.size else 0
+
+    def _on_short(self, request: Request, count: int) -> None:
+        self._rest.append((request.offset + count, request.data[count:]))
+        if count == 0:
+            self._barren += 1
+        if self._barren > _BARREN_TOLERATED:
+            self.failed_at = request.offset
+            self.fail(RemoteProtocolError(f"the vehicle ACKs writes at {request.offset} and writes nothing"))
+
+    def _meaning(self, nak: FtpNak) -> MavftpfsError:
+        if nak.code in _SESSION_CODES or nak.server_errno == _EBADF:
+            lost = SessionLost(str(nak), by_server=True)
+            lost.__cause__ = nak
+            return lost
+        return nak
+
+    def fail(self, error: MavftpfsError) -> None:
+        """End; what was not ACKed goes back to the source."""
+        if not self.done:
+            self._give_back()
+        super().fail(error)
+
+    def _give_back(self) -> None:
+        pieces = [(request.offset, request.size) for request in self._unanswered]
+        pieces += [(offset, len(data)) for offset, data in self._rest]
+        self._unanswered.clear()
+        self._rest.clear()
+        for offset, count in sorted(pieces):
+            self._source.on_unsent(offset, count)
