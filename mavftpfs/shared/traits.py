@@ -36,3 +36,25 @@ class Traits:
         self.ack_carries_own_session = echoed
         if echoed and self.queue_limit is None:
             self.queue_limit = SHARED_QUEUE_WINDOW
+
+
+@dataclass(slots=True)
+class WriteTraits:
+    """What one server was seen to do when written to; dropped when the vehicle reboots.
+
+    Attributes:
+        wo_truncates: OpenFileWO empties the file (servers.md 8). Filled by the session's probe.
+        wo_creates: OpenFileWO makes a missing file. Filled by the session's probe.
+        truncate_works: TruncateFile is answered, and safe (False on PX4 on NuttX, whose copy-back can
+            destroy the file). Filled by the session.
+        rename_works: a rename succeeded (False: LittleFS has none). Filled by the cache.
+        rename_replaces: a rename onto an existing file succeeded (False: FAT refuses it). Filled by the cache.
+        folds_case: two spellings of a name open the same file. Filled by the cache.
+    """
+
+    wo_truncates: bool | None = None
+    wo_creates: bool | None = None
+    truncate_works: bool | None = None
+    rename_works: bool | None = None
+    rename_replaces: bool | None = None
+    folds_case: bool | None = None
