@@ -91,7 +91,7 @@ class ArduPilot(Firmware):
         if limit is None or self._wake is not None:
             return
         for slot in self._slots:
-            if slot.last_sent and now - slot.last_sent >= limit:
+            if slot.last_sent and now >= slot.last_sent + limit:
                 self._close_quietly(slot)
 
     def _close_quietly(self, slot: Session) -> None:

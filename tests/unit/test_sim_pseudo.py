@@ -1,0 +1,163 @@
+"""ArduPilot's virtual trees as simulated: what they list, claim, refuse and contain (servers.md 11)."""
+
+from __future__ import annotations
+
+import errno
+import struct
+
+import pytest
+
+from mavftpfs.protocol.crc import crc32
+from mavftpfs.protocol.payload import NakCode, Opcode
+from mavftpfs.sim.pseudo import VirtualTrees, pack_parameters, param, unpack_parameters
+from tests.support.sim_client import Client, ack, nak
+
+PARAM = b"@PARAM/param.pck"
+NOT_FOUND = bytes([NakCode.FILE_NOT_FOUND])
+
+
+def download(c: Client, path: bytes, block: int) -> bytes:
+    """Read a file to its EOF NAK in blocks."""
+    c.open(path, session=1)
+    data = b""
+    while True:
+        reply = c.ask(Opcode.READ_FILE, session=1, offset=len(data), size=block)
+        if reply.opcode == Opcode.NAK:
+            assert reply.data == bytes([NakCode.EOF])
+            break
+        data += reply.data
+    ack(c.ask(Opcode.TERMINATE_SESSION, session=1))
+    return data
+
+
+def test_sys_claims_100000_bytes_and_most_files_cannot_be_opened() -> None:
+    c = Client("ardupilot")
+    page = c.listing(b"@SYS")
+    assert page == c.listing(b"/@SYS/")
+    assert page.startswith(b"Fthreads.txt\t100000\0\0Ftasks.txt\t100000\0\0")
+    assert page.endswith(b"Fstorage.bin\t16384\0\0")
+    assert struct.unpack("<I", ack(c.open(b"@SYS/tasks.txt"))) == (100_000,)
+    assert ack(c.ask(Opcode.READ_FILE, size=239)) == b"TasksV2\n"
+    ack(c.ask(Opcode.TERMINATE_SESSION))
+    assert nak(c.ask(Opcode.OPEN_FILE_RO, b"@SYS/threads.txt")) == NOT_FOUND
+    assert nak(c.ask(Opcode.OPEN_FILE_RO, b"@SYS/none")) == NOT_FOUND
+    assert nak(c.ask(Opcode.OPEN_FILE_WO, b"@SYS/tasks.txt")) == bytes([NakCode.FAIL_ERRNO, errno.EROFS])
+
+
+def test_param_and_mission_cannot_be_listed_but_opened() -> None:
+    c = Client("ardupilot")
+    assert nak(c.ask(Opcode.LIST_DIRECTORY, b"@PARAM")) == NOT_FOUND
+    assert nak(c.ask(Opcode.LIST_DIRECTORY, b"@MISSION")) == NOT_FOUND
+    assert struct.unpack("<I", ack(c.open(b"@MISSION/mission.dat"))) == (2**20,)
+
+
+@pytest.mark.parametrize("block", [1, 7, 80, 110, 239])
+def test_parameters_survive_every_block_size(block: int) -> None:
+    virtual = VirtualTrees()
+    c = Client("ardupilot", virtual=virtual)
+    packed = download(c, PARAM, block)
+    assert packed == pack_parameters(virtual.params, block)
+    assert unpack_parameters(packed) == virtual.params
+
+
+def test_a_changed_block_size_is_einval_also_for_the_last_block() -> None:
+    c = Client("ardupilot")
+    c.open(PARAM, session=1)
+    ack(c.ask(Opcode.READ_FILE, session=1, size=239))
+    refused = c.ask(Opcode.READ_FILE, session=1, size=100, offset=239)
+    assert nak(refused) == bytes([NakCode.FAIL_ERRNO, errno.EINVAL])
+    refused = c.ask_all(Opcode.BURST_READ_FILE, session=1, size=80, offset=239)[0]
+    assert nak(refused) == bytes([NakCode.FAIL_ERRNO, errno.EINVAL])
+    ack(c.ask(Opcode.READ_FILE, session=1, size=239, offset=239))
+
+
+def test_the_claimed_parameter_size_and_the_checksum_match_no_download() -> None:
+    virtual = VirtualTrees()
+    c = Client("ardupilot", virtual=virtual)
+    claimed = struct.unpack("<I", ack(c.open(PARAM)))[0]
+    assert claimed == 12 * len(virtual.params)
+    ack(c.ask(Opcode.TERMINATE_SESSION))
+    checksum = struct.unpack("<I", ack(c.ask(Opcode.CALC_FILE_CRC32, PARAM)))[0]
+    assert checksum == crc32(pack_parameters(virtual.params, 64))
+    assert checksum != crc32(pack_parameters(virtual.params, 239))
+
+
+def test_parameters_can_be_asked_for_in_part() -> None:
+    virtual = VirtualTrees()
+    c = Client("ardupilot", virtual=virtual)
+    part = download(c, PARAM + b"?start=3&count=2", 239)
+    assert unpack_parameters(part) == virtual.params[3:5]
+
+
+def test_only_parameter_files_parse() -> None:
+    with pytest.raises(ValueError, match="no parameter file"):
+        unpack_parameters(b"\0" * 10)
+    with pytest.raises(ValueError, match="no parameter file"):
+        unpack_parameters(b"\x1b")
+
+
+def test_packing_shares_prefixes() -> None:
+    params = [param("SERVO1_MIN", 2, 1000), param("SERVO1_MAX", 2, 2000), param("X", 4, 0.5)]
+    packed = pack_parameters(params, 239)
+    assert unpack_parameters(packed) == params
+    assert b"AX" in packed
+    assert packed.count(b"SERVO") == 1
+
+
+def test_romfs_has_directories_and_leaks_slots() -> None:
+    c = Client("ardupilot")
+    assert c.listing(b"@ROMFS").endswith(b"Dmodels\0\0")
+    assert c.listing(b"@ROMFS/models") == b"Fquad.json\t14\0\0"
+    assert len(download(c, b"@ROMFS/models/quad.json", 239)) == 14
+    for _ in range(4):
+        assert nak(c.ask(Opcode.LIST_DIRECTORY, b"@ROMFS/none")) == NOT_FOUND
+    assert nak(c.ask(Opcode.LIST_DIRECTORY, b"@ROMFS")) == bytes([NakCode.FAIL_ERRNO, errno.ENFILE])
+    c.server.reboot(c.now)
+    assert c.listing(b"@ROMFS")
+
+
+def test_four_handles_at_a_time() -> None:
+    c = Client("ardupilot5")
+    for session in range(4):
+        c.open(PARAM, session=session)
+    refused = c.ask(Opcode.OPEN_FILE_RO, PARAM, session=9)
+    assert nak(refused) == bytes([NakCode.FAIL_ERRNO, errno.ENFILE])
+    ack(c.ask(Opcode.TERMINATE_SESSION, session=0))
+    c.open(PARAM, session=9)
+
+
+def upload(profile: str, path: bytes, data: bytes) -> tuple[Client, VirtualTrees, int]:
+    virtual = VirtualTrees()
+    c = Client(profile, virtual=virtual)
+    c.open(path, Opcode.CREATE_FILE, session=1)
+    ack(c.ask(Opcode.WRITE_FILE, data, session=1))
+    return c, virtual, c.ask(Opcode.TERMINATE_SESSION, session=1).opcode
+
+
+def test_an_upload_is_judged_when_it_is_closed() -> None:
+    good = struct.pack("<HHH", 0x671B, 0, 6)
+    bad = struct.pack("<HHH", 0x671B, 0, 7)
+    for profile, refusal in (("ardupilot", Opcode.ACK), ("ardupilot5", Opcode.NAK)):
+        _, virtual, opcode = upload(profile, PARAM, good)
+        assert (virtual.uploads, opcode) == ({PARAM: good}, Opcode.ACK)
+        _, virtual, opcode = upload(profile, PARAM, bad)
+        assert (virtual.uploads, opcode) == ({}, refusal)
+    mission = struct.pack("<HHHHH", 0x763D, 0, 0, 0, 1) + bytes(38)
+    assert upload("ardupilot5", b"@MISSION/mission.dat", mission)[2] == Opcode.ACK
+    assert upload("ardupilot5", b"@MISSION/mission.dat", mission[:-1])[2] == Opcode.NAK
+    assert upload("ardupilot5", b"@MISSION/mission.dat", b"")[2] == Opcode.NAK
+
+
+@pytest.mark.parametrize("opcode", [Opcode.CREATE_DIRECTORY, Opcode.REMOVE_FILE, Opcode.REMOVE_DIRECTORY])
+def test_nothing_else_can_be_changed(opcode: int) -> None:
+    refused = bytes([NakCode.FAIL_ERRNO, errno.EROFS])
+    c = Client("ardupilot")
+    assert nak(c.ask(opcode, b"@SYS/x")) == refused
+    assert nak(c.ask(Opcode.RENAME, b"@SYS/tasks.txt\0/x")) == refused
+    assert nak(c.ask(Opcode.RENAME, b"/fs\0@SYS/x")) == refused
+
+
+def test_there_are_no_virtual_trees_elsewhere() -> None:
+    assert nak(Client("px4").ask(Opcode.LIST_DIRECTORY, b"@SYS")) == NOT_FOUND
+    assert nak(Client("mavsdk").ask(Opcode.OPEN_FILE_RO, PARAM)) == NOT_FOUND
+    assert nak(Client("px4-2026").ask(Opcode.LIST_DIRECTORY, b"@SYS")) == NOT_FOUND

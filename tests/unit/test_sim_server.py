@@ -1,0 +1,229 @@
+"""What holds for every simulated server: above all that it never raises. And the textbook one."""
+
+from __future__ import annotations
+
+import random
+import struct
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mavftpfs.link.messages import Address
+from mavftpfs.protocol.payload import NakCode, Opcode, decode_reply, request
+from mavftpfs.sim.profiles import PROFILES
+from mavftpfs.sim.server import FtpServer
+from mavftpfs.sim.tree import DirectoryTree, MemoryTree
+from tests.support.sim_client import CLIENT, OTHER, Client, ack, nak, small_tree
+
+A = b"/fs/microsd/a.bin"
+PATHS = [
+    A,
+    b"/fs/microsd/five",
+    b"/fs/microsd/empty",
+    b"/fs/microsd/dir",
+    b"/fs/microsd/new",
+    b"/",
+    b"",
+    b"/none",
+    b"@SYS/tasks.txt",
+    b"@SYS",
+    b"@ROMFS/none",
+    b"@PARAM/param.pck",
+    b"@PARAM/param.pck?start=1&count=x",
+    b"@MISSION/mission.dat",
+    b"/..",
+    b"n" * 239,
+]
+
+
+def test_the_profiles_that_the_design_names_exist() -> None:
+    named = {"spec", "px4", "px4-nuttx", "ardupilot", "ardupilot5", "littlefs", "mavsdk"}
+    assert named <= set(PROFILES)
+    assert all(profile.name == name for name, profile in PROFILES.items())
+
+
+REQUESTS = st.builds(
+    lambda seq, opcode, session, offset, size, data: request(
+        seq, opcode, session=session, offset=offset, data=data, size=len(data) if size is None else size
+    ).encode(),
+    st.integers(0, 65535) | st.integers(0, 3),
+    st.integers(0, 20) | st.integers(0, 255),
+    st.integers(0, 2) | st.integers(0, 255),
+    st.integers(0, 2000) | st.integers(0, 2**32 - 1),
+    st.none() | st.integers(0, 255),
+    st.sampled_from(PATHS)
+    | st.tuples(st.sampled_from(PATHS[:9]), st.sampled_from(PATHS[:9])).map(b"\0".join)
+    | st.binary(max_size=239),
+)
+EVENTS = st.lists(
+    st.tuples(
+        REQUESTS | st.binary(min_size=251, max_size=251) | st.binary(max_size=300),
+        st.sampled_from([CLIENT, OTHER, Address(0, 0)]),
+        st.sampled_from([0.0, 0.001, 0.02, 0.5, 2.5, 4.0, 12.0]),
+    ),
+    max_size=40,
+)
+
+
+def drive(server: FtpServer, events: list[tuple[bytes, Address, float]]) -> list[tuple[Address, bytes]]:
+    """Hand everything over, waking at every deadline."""
+    now, sent = 0.0, []
+    for wire, source, pause in events:
+        server.handle(wire, source, now)
+        stop = now + pause
+        for _ in range(100_000):
+            due = server.next_deadline()
+            if due is None or due > stop:
+                break
+            now = max(now, due)
+            sent += server.outgoing(now)
+        else:
+            pytest.fail("the server has something to do at every instant")
+        now = stop
+        sent += server.outgoing(now)
+    return sent
+
+
+@pytest.mark.parametrize("name", sorted(PROFILES))
+@settings(max_examples=60, deadline=None)
+@given(events=EVENTS)
+def test_no_bytes_make_a_server_raise(name: str, events: list[tuple[bytes, Address, float]]) -> None:
+    def fresh() -> FtpServer:
+        return FtpServer(small_tree(), PROFILES[name], rng=random.Random(3))
+
+    server = fresh()
+    sent = drive(server, events)
+    for _, wire in sent:
+        assert len(wire) == 251
+        assert decode_reply(wire).opcode in (Opcode.ACK, Opcode.NAK)
+    assert sum(server.requests.values()) + server.malformed == len(events)
+    assert drive(fresh(), events) == sent, "the same again"
+    server.reboot(1e6)
+    assert server.open_sessions == 0
+    assert server.outgoing(1e6) == []
+
+
+@pytest.mark.parametrize("name", sorted(PROFILES))
+def test_a_real_directory_can_be_served(name: str, tmp_path: Path) -> None:
+    (tmp_path / "fs" / "microsd").mkdir(parents=True)
+    (tmp_path / "fs" / "microsd" / "a.bin").write_bytes(b"hello world")
+    c = Client(name, tree=None)
+    c.server = FtpServer(DirectoryTree(tmp_path), PROFILES[name], rng=random.Random(1))
+    opened = c.ask(Opcode.OPEN_FILE_RO, A, session=1, wait=1.0)
+    assert ack(opened) == struct.pack("<I", 11)
+    read = c.ask(Opcode.READ_FILE, session=opened.session, size=5, offset=6, wait=1.0)
+    assert ack(read) == b"world"
+    ack(c.ask(Opcode.TERMINATE_SESSION, session=opened.session, wait=1.0))
+    created = c.ask(Opcode.CREATE_FILE, b"/fs/microsd/b", session=1, wait=1.0)
+    ack(created)
+    ack(c.ask(Opcode.WRITE_FILE, b"data", session=created.session, wait=1.0))
+    ack(c.ask(Opcode.TERMINATE_SESSION, session=created.session, wait=1.0))
+    assert (tmp_path / "fs" / "microsd" / "b").read_bytes() == b"data"
+
+
+@pytest.mark.parametrize("name", ["px4", "mavsdk", "spec"])
+def test_reads_and_writes_are_answered_at_once(name: str) -> None:
+    tree = MemoryTree()
+    c = Client(name, tree)
+    session = c.open(b"/big", Opcode.CREATE_FILE).session
+    for i in range(100):
+        ack(c.ask(Opcode.WRITE_FILE, bytes([i]) * 239, session=session, offset=239 * i, wait=0.0))
+    ack(c.ask(Opcode.TERMINATE_SESSION, session=session, wait=0.0))
+    session = c.open(b"/big").session
+    for i in range(100):
+        read = c.ask(Opcode.READ_FILE, session=session, offset=239 * i, size=239, wait=0.0)
+        assert ack(read) == bytes([i]) * 239
+
+
+def test_counters_and_malformed_requests() -> None:
+    c = Client("px4")
+    c.ask(Opcode.NONE)
+    c.ask(Opcode.NONE)
+    c.server.handle(b"short", CLIENT, c.now)
+    assert c.server.requests == {Opcode.NONE: 2}
+    assert c.server.malformed == 1
+
+
+def test_a_deadline_is_never_missed() -> None:
+    """Waking only at next_deadline loses nothing against polling."""
+    for name in ("px4", "ardupilot", "mavsdk", "spec"):
+        tree = MemoryTree()
+        tree.add(A, bytes(50_000))
+        polled, woken = Client(name, tree), Client(name, tree)
+        results = []
+        for c in (polled, woken):
+            session = c.ask(Opcode.OPEN_FILE_RO, A, session=1).session
+            c.send(Opcode.BURST_READ_FILE, session=session, size=239)
+            got = []
+            if c is woken:
+                got = c.receive_raw(3.0)
+            else:
+                for _ in range(3000):
+                    c.now += 0.001
+                    got += [wire for _, wire in c.server.outgoing(c.now)]
+            results.append(got)
+        assert results[0] == results[1]
+        assert len(results[0]) > 99
+
+
+# -- the textbook server -------------------------------------------------------------------------
+
+
+def test_the_textbook_server_has_several_sessions_with_ids_of_its_own() -> None:
+    c = Client("spec")
+    ids = [c.open(A, session=50).session for _ in range(4)]
+    assert len(set(ids)) == 4
+    assert 0 not in ids
+    assert nak(c.ask(Opcode.OPEN_FILE_RO, A)) == bytes([NakCode.NO_SESSIONS_AVAILABLE])
+    ack(c.ask(Opcode.TERMINATE_SESSION, session=ids[1]))
+    assert nak(c.ask(Opcode.READ_FILE, session=ids[1], size=1)) == bytes([NakCode.INVALID_SESSION])
+    assert ack(c.ask(Opcode.READ_FILE, session=ids[2], size=2)) == b"\0\1"
+    ack(c.ask(Opcode.RESET_SESSIONS))
+    assert c.server.open_sessions == 0
+
+
+def test_the_textbook_server_replays_to_the_same_client_only() -> None:
+    c = Client("spec")
+    first = c.ask(Opcode.CREATE_DIRECTORY, b"/x")
+    assert c.ask(Opcode.CREATE_DIRECTORY, b"/x", seq=c.seq) == first
+    c.source = OTHER
+    assert nak(c.ask(Opcode.CREATE_DIRECTORY, b"/x", seq=c.seq)) == bytes([NakCode.FILE_EXISTS])
+
+
+def test_the_textbook_server_bursts() -> None:
+    tree = MemoryTree()
+    tree.add(A, bytes(range(250)) * 100)
+    c = Client("spec", tree)
+    session = c.open(A).session
+    got, offset = b"", 0
+    while True:
+        replies = c.ask_all(Opcode.BURST_READ_FILE, session=session, offset=offset, size=100, wait=1.0)
+        assert [b.seq - a.seq for a, b in pairwise(replies)] == [1] * (len(replies) - 1)
+        assert [p.burst_complete for p in replies] == [0] * (len(replies) - 1) + [1]
+        got += b"".join(p.data for p in replies if p.opcode == Opcode.ACK)
+        offset = len(got)
+        if replies[-1].opcode == Opcode.NAK:
+            break
+    assert replies[-1].data == bytes([NakCode.EOF])
+    assert got == tree.data(A)
+
+
+def test_the_textbook_server_does_the_rest() -> None:
+    c = Client("spec")
+    page = c.listing(b"/fs/microsd", opcode=Opcode.LIST_DIRECTORY_WITH_TIME)
+    assert page.startswith(b"Fa.bin\t1024\t1700000000\0")
+    assert c.listing(b"/fs/microsd", 3) == b"Ddir\0"
+    assert nak(c.ask(Opcode.LIST_DIRECTORY, b"/fs/microsd", offset=4)) == bytes([NakCode.EOF])
+    ack(c.ask(Opcode.TRUNCATE_FILE, A, offset=3))
+    ack(c.ask(Opcode.RENAME, A + b"\0/b"))
+    assert isinstance(c.tree, MemoryTree)
+    assert c.tree.data(b"/b") == b"\0\1\2"
+    ack(c.ask(Opcode.REMOVE_FILE, b"/b"))
+    ack(c.ask(Opcode.REMOVE_DIRECTORY, b"/fs/microsd/dir"))
+    assert nak(c.ask(Opcode.REMOVE_DIRECTORY, b"/fs")) == bytes([NakCode.FAIL_ERRNO, 39])
+    assert nak(c.ask(77)) == bytes([NakCode.UNKNOWN_COMMAND])
+    session = c.open(b"/fs/microsd/five").session
+    assert nak(c.ask(Opcode.WRITE_FILE, b"x", session=session)) == bytes([NakCode.FAIL])
