@@ -28,10 +28,10 @@ class Field:
         self._stack = ExitStack()
 
     def sim(
-        self, root: Path, profile: str = "px4", options: Sequence[str] = (), bad_link: Sequence[str] = ()
+        self, root: Path, profile: str = "px4", options: Sequence[str] = (), *, link: str | None = None
     ) -> SimVehicle:
         """Start a simulated vehicle."""
-        return self._started(SimVehicle(root, self._subfolder(), profile, options, bad_link=bad_link))
+        return self._started(SimVehicle(root, self._subfolder(), profile, options, link=link))
 
     def mavsdk(self, root: Path, bad_link: Sequence[str] = ()) -> MavsdkVehicle:
         """Start the MAVSDK library's server."""

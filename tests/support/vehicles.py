@@ -148,6 +148,11 @@ class UdpVehicle:
             self.process.kill()
             self.process = None
 
+    def send_signal(self, number: signal.Signals) -> None:
+        """Send a signal to the vehicle's process."""
+        assert self.process is not None
+        self.process.send_signal(number)
+
     def pause(self) -> None:
         """Let the vehicle fall silent without ending, as behind a dead link."""
         assert self.process is not None
@@ -222,17 +227,29 @@ class SimVehicle(UdpVehicle):
         profile: str,
         options: Sequence[str] = (),
         *,
-        bad_link: Sequence[str] = (),
+        link: str | None = None,
     ) -> None:
-        super().__init__(root, folder, bad_link=bad_link)
+        super().__init__(root, folder)
+        self.link = link
         self.name = f"sim-{profile}"
         self.profile = profile
         self.options = options
         self.left_alone = False
         """Set where a mount was killed, so that nobody could close its session."""
 
+    @property
+    def source(self) -> str:
+        """SOURCE for mavftpfs: with a link of its own, what the vehicle says in its first line."""
+        if self.link is None:
+            return super().source
+        assert self.process is not None
+        self.await_ready(self.process)
+        words = self.process.output.read_text().split()
+        assert words[:1] == ["mavftpfs"], self.process.text()
+        return words[1]
+
     def argv(self) -> list[str]:
-        link = f"udpout:{HOST}:{self.vehicle_port}"
+        link = self.link or f"udpout:{HOST}:{self.vehicle_port}"
         base = [sys.executable, "-m", "mavftpfs", "sim", str(self.root)]
         return [*base, "--profile", self.profile, "--link", link, *self.options]
 

@@ -1,0 +1,97 @@
+"""Every kind of link, both ways round, clean and bad: the same bytes."""
+
+from __future__ import annotations
+
+import signal
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from tests.mount.conftest import Field
+from tests.support.mounts import Mount, wait_until
+from tests.support.trees import content
+from tests.support.vehicles import HOST, free_udp_port
+
+BAD = (
+    "--loss",
+    "0.1",
+    "--dup",
+    "0.05",
+    "--reorder",
+    "0.05",
+    "--corrupt",
+    "0.02",
+    "--delay",
+    "0.01",
+    "--seed",
+    "5",
+)
+RADIO = ("--rate", "60000", "--duplex", "half", "--delay", "0.02", "--burst-loss", "0.03", "--seed", "6")
+
+
+def free_port_link(kind: str) -> str:
+    """Return a link of the vehicle on a free port (a pty needs none)."""
+    return kind if kind == "pty" else f"{kind}:{HOST}:{free_udp_port()}"
+
+
+def compare(mount: Mount, expected: Path) -> None:
+    """Compare the whole tree byte for byte."""
+    argv = (sys.executable, "-m", "tests.support.trees", "compare", expected, mount.path)
+    mount.run(*argv, timeout=240)
+
+
+@pytest.mark.parametrize("flaws", [(), BAD], ids=["clean", "bad"])
+@pytest.mark.parametrize("kind", ["udpout", "udpin", "tcpin", "pty"])
+def test_each_kind_of_link(field: Field, small_tree: Path, kind: str, flaws: tuple[str, ...]) -> None:
+    vehicle = field.sim(small_tree, "px4", flaws, link=free_port_link(kind))
+    compare(field.mount(vehicle.source), small_tree)
+
+
+def test_a_link_that_listens_for_tcp(field: Field, small_tree: Path) -> None:
+    port = free_udp_port()
+    field.sim(small_tree, "spec", link=f"tcp:{HOST}:{port}")
+    compare(field.mount(f"tcpin:{HOST}:{port}"), small_tree)
+
+
+@pytest.mark.parametrize("profile", ["px4", "px4-nuttx", "ardupilot", "mavsdk"])
+def test_a_slow_half_duplex_radio(field: Field, tmp_path: Path, profile: str) -> None:
+    card = field.local("card")
+    (card / "log.bin").write_bytes(content(profile, 150_000))
+    mount = field.mount(field.sim(card, profile, RADIO).source)
+    mount.run("cp", mount.path / "log.bin", tmp_path / "copy", timeout=120)
+    assert (tmp_path / "copy").read_bytes() == content(profile, 150_000)
+
+
+@pytest.mark.parametrize("kind", ["udpout", "tcpin"])
+@pytest.mark.parametrize("what", ["cut", "reboot"])
+def test_a_cut_or_a_reboot_in_mid_copy(field: Field, tmp_path: Path, kind: str, what: str) -> None:
+    card = field.local("card")
+    data = content("cut", 600_000)
+    (card / "log.bin").write_bytes(data)
+    vehicle = field.sim(card, "px4", ("--rate", "150000"), link=free_port_link(kind))
+    mount = field.mount(vehicle.source)
+    with mount.started("cp", mount.path / "log.bin", tmp_path / "copy") as copy:
+        time.sleep(1.0)
+        vehicle.send_signal(signal.SIGUSR2 if what == "cut" else signal.SIGHUP)
+        time.sleep(3.0)
+        if what == "cut":
+            vehicle.send_signal(signal.SIGUSR2)
+        _, errors = copy.communicate(timeout=120)
+    assert (copy.returncode, errors) == (0, "")
+    assert (tmp_path / "copy").read_bytes() == data
+
+
+def test_tcp_comes_back_after_the_vehicle_did(field: Field, small_tree: Path) -> None:
+    vehicle = field.sim(small_tree, link=free_port_link("tcpin"))
+    mount = field.mount(vehicle.source, "op_deadline=5")
+    assert mount.run("cat", mount.path / "deep/at0.txt").stdout == "level 0\n"
+    vehicle.kill()
+    vehicle.start()
+
+    def back() -> bool:
+        return mount.run("cat", mount.path / "deep/d0/at1.txt", code=None).stdout == "level 1\n"
+
+    wait_until("files are readable again", back, 60)
+    compare(mount, small_tree)
