@@ -1,0 +1,513 @@
+"""The simulated vehicle on real links, on the command line, and in memory on a mock clock."""
+
+from __future__ import annotations
+
+import argparse
+import random
+import signal
+import subprocess
+import sys
+from collections.abc import AsyncIterator, Iterator
+from contextlib import asynccontextmanager, contextmanager
+from pathlib import Path
+from typing import IO
+
+import pytest
+import trio
+import trio.testing
+
+from mavftpfs.link.base import Link
+from mavftpfs.link.framing import Framer
+from mavftpfs.link.messages import Address, FtpFrame, Heartbeat, Message
+from mavftpfs.link.opening import open_link
+from mavftpfs.link.uri import parse_source
+from mavftpfs.protocol.payload import MAX_DATA, Opcode, Payload, decode_reply, request
+from mavftpfs.shared.errors import LinkClosed, UsageError
+from mavftpfs.sim import command
+from mavftpfs.sim.endpoints import Endpoint, client_source, open_endpoint
+from mavftpfs.sim.linkmodel import Direction, Duplex, LinkModel, LinkSettings
+from mavftpfs.sim.memory import MemoryLink
+from mavftpfs.sim.profiles import PROFILES
+from mavftpfs.sim.tree import MemoryTree
+from mavftpfs.sim.vehicle import SimVehicle
+
+US = Address(254, 191)
+DRONE = Address(1, 1)
+CONTENT = random.Random("content").randbytes(50_000)
+
+
+def vehicle(profile: str = "px4", *, stream: bool = False, telemetry: float = 0.0) -> SimVehicle:
+    tree = MemoryTree()
+    tree.add(b"/log.bin", CONTENT)
+    return SimVehicle(tree, PROFILES[profile], rng=random.Random(1), stream=stream, telemetry=telemetry)
+
+
+class Client:
+    """A plain client: one request at a time, or a window of reads."""
+
+    def __init__(self, link: Link) -> None:
+        self.link = link
+        self.framer = Framer(US, stream=link.is_stream)
+        self.seq = 100
+        self.heard: list[Message] = []
+        self.reopened = 0
+
+    async def messages(self) -> list[Message]:
+        """Return what the next batch brings."""
+        chunks = await self.link.receive()
+        if not chunks:
+            self.reopened += 1
+            self.framer.reset()
+        found = [message for chunk in chunks for message in self.framer.feed(chunk)]
+        self.heard += found
+        return found
+
+    async def beat(self) -> Heartbeat:
+        """Wait for a heartbeat."""
+        while True:
+            for message in await self.messages():
+                if isinstance(message, Heartbeat):
+                    return message
+
+    def send(self, wanted: Payload) -> None:
+        self.link.send_nowait([self.framer.encode_ftp(DRONE, wanted.encode())])
+
+    async def ask(self, opcode: Opcode, data: bytes = b"", **fields: int) -> Payload:
+        """Ask until an answer comes, every second with the same seq."""
+        self.seq = (self.seq + 7) & 0xFFFF
+        while True:
+            self.send(request(self.seq, opcode, data=data, **fields))
+            with trio.move_on_after(1):
+                while True:
+                    for message in await self.messages():
+                        if isinstance(message, FtpFrame):
+                            reply = decode_reply(message.payload)
+                            if reply.seq == (self.seq + 1) & 0xFFFF and reply.req_opcode == opcode:
+                                return reply
+
+    async def read_file(self, path: bytes) -> bytes:
+        """Open and read a file, one chunk after the other."""
+        opened = await self.ask(Opcode.OPEN_FILE_RO, path)
+        assert opened.opcode == Opcode.ACK
+        size, data = int.from_bytes(opened.data, "little"), b""
+        while len(data) < size:
+            count = min(MAX_DATA, size - len(data))
+            reply = await self.ask(Opcode.READ_FILE, offset=len(data), size=count)
+            assert reply.offset == len(data)
+            data += reply.data
+        await self.ask(Opcode.TERMINATE_SESSION)
+        return data
+
+
+@asynccontextmanager
+async def serving(
+    link_text: str, model: LinkModel | None = None, profile: str = "px4"
+) -> AsyncIterator[tuple[Endpoint, Client]]:
+    """Serve a vehicle on a real link, with a client at the other end."""
+    with trio.fail_after(60):
+        async with open_endpoint(link_text) as link, trio.open_nursery() as nursery:
+            endpoint = Endpoint(vehicle(profile, stream=link.is_stream), link, model)
+            nursery.start_soon(endpoint.run)
+            async with open_link(parse_source(client_source(link))) as client_link:
+                client = Client(client_link)
+                client_link.send_nowait([client.framer.encode_heartbeat(18)])
+                yield endpoint, client
+            nursery.cancel_scope.cancel()
+
+
+# ---------------------------------------------------------------------- real links
+
+LINKS = ["udpin:127.0.0.1:0", "tcpin:127.0.0.1:0", "pty"]
+
+
+@pytest.mark.parametrize("link", LINKS)
+async def test_serves_over_a_real_link(link: str) -> None:
+    async with serving(link) as (_, client):
+        assert (await client.beat()).source == DRONE
+        assert await client.read_file(b"/log.bin") == CONTENT
+        assert client.framer.stats.bad_crc == client.framer.stats.garbage_bytes == 0
+
+
+@pytest.mark.parametrize("kind", ["udpout", "tcp"])
+async def test_pushes_to_a_listening_client(kind: str) -> None:
+    listen = {"udpout": "udpin", "tcp": "tcpin"}[kind]
+    with trio.fail_after(30):
+        async with open_link(parse_source(f"{listen}:127.0.0.1:0")) as client_link:
+            port = parse_source(client_link.description).port
+            async with open_endpoint(f"{kind}:127.0.0.1:{port}") as link, trio.open_nursery() as nursery:
+                assert client_source(link) == client_link.description
+                endpoint = Endpoint(vehicle(stream=link.is_stream), link)
+                nursery.start_soon(endpoint.run)
+                client = Client(client_link)
+                await client.beat()
+                assert await client.read_file(b"/log.bin") == CONTENT
+                nursery.cancel_scope.cancel()
+
+
+@pytest.mark.parametrize("link", LINKS)
+async def test_a_burst_arrives_whole(link: str) -> None:
+    async with serving(link) as (_, client):
+        await client.ask(Opcode.OPEN_FILE_RO, b"/log.bin")
+        client.send(request(5000, Opcode.BURST_READ_FILE, size=MAX_DATA))
+        data = bytearray(len(CONTENT))
+        got = 0
+        while got < 34_000:
+            for message in await client.messages():
+                if isinstance(message, FtpFrame):
+                    reply = decode_reply(message.payload)
+                    data[reply.offset : reply.offset + reply.size] = reply.data
+                    got += reply.size
+        assert data[:got] == CONTENT[:got]
+
+
+async def test_a_model_in_between_loses_damages_and_doubles() -> None:
+    settings = LinkSettings(rate=200_000, delay=0.002, loss=0.05, corrupt=0.02, duplicate=0.02)
+    model = LinkModel(random.Random(3), settings)
+    async with serving("udpin:127.0.0.1:0", model) as (_, client):
+        for _ in range(60):
+            client.send(request(1, Opcode.NONE))
+        for _ in range(3):
+            await client.beat()
+        counters = model.counters(Direction.TO_VEHICLE)
+        assert counters.pushed == 61
+        assert 0 < counters.lost < 30
+        assert counters.delivered > 30
+
+
+async def test_frames_of_one_datagram_meet_the_model_one_by_one() -> None:
+    model = LinkModel(random.Random(3), LinkSettings(loss=0.5))
+    async with serving("udpin:127.0.0.1:0", model) as (_, client):
+        frames = [client.framer.encode_ftp(DRONE, request(n, Opcode.NONE).encode()) for n in range(40)]
+        client.link.send_nowait(frames)
+        await client.beat()
+        await client.beat()
+        assert model.counters(Direction.TO_VEHICLE).pushed == 41
+        assert 5 < model.counters(Direction.TO_VEHICLE).lost < 36
+
+
+@pytest.mark.parametrize("shaped", [False, True])
+async def test_cut_and_mended(shaped: bool) -> None:
+    model = LinkModel(random.Random(3), LinkSettings(delay=0.001)) if shaped else None
+    async with serving("udpin:127.0.0.1:0", model) as (endpoint, client):
+        await client.beat()
+        assert endpoint.toggle_cut()
+        with trio.move_on_after(0.1):  # what was under way
+            while True:
+                await client.messages()
+        client.send(request(1, Opcode.NONE))
+        with trio.move_on_after(1.5) as scope:
+            await client.messages()
+        assert scope.cancelled_caught
+        assert not endpoint.toggle_cut()
+        await client.beat()
+        assert (await client.ask(Opcode.NONE)).opcode == Opcode.ACK
+
+
+async def test_arming_is_heard_at_once() -> None:
+    async with serving("udpin:127.0.0.1:0") as (endpoint, client):
+        assert not (await client.beat()).armed
+        assert endpoint.toggle_armed()
+        assert (await client.beat()).armed
+        assert not endpoint.toggle_armed()
+        assert not (await client.beat()).armed
+
+
+async def test_a_slow_stream_paces_the_burst() -> None:
+    """PX4 sends what its transmit buffer takes; a pty holds 4 KiB."""
+    async with serving("pty") as (endpoint, client):
+        await client.ask(Opcode.OPEN_FILE_RO, b"/log.bin")
+        client.send(request(5000, Opcode.BURST_READ_FILE, size=MAX_DATA))
+        await trio.sleep(0.3)
+        assert endpoint.link.backlog <= PROFILES["px4"].tx_buffer
+        assert endpoint.link.stats.dropped_sends == 0
+
+
+async def test_a_second_client_of_a_pty_finds_the_vehicle() -> None:
+    async with serving("pty") as (endpoint, client):
+        await client.beat()
+        await client.link.aclose()
+        async with open_link(parse_source(endpoint.link.description)) as link:
+            second = Client(link)
+            await second.beat()
+            assert (await second.ask(Opcode.NONE)).opcode == Opcode.ACK
+
+
+# ---------------------------------------------------------------------- the command
+
+
+def arguments(*words: str) -> argparse.Namespace:
+    parser = argparse.ArgumentParser("sim")
+    command.add_arguments(parser)
+    return parser.parse_args(words)
+
+
+MODEL_WORDS = """
+    --rate 5760 --queue 1000 --duplex half --delay .1 --jitter .2 --loss .3 --burst-loss .4 --dup .5
+    --corrupt .6 --reorder .7 --seed 8 --armed --telemetry 500 --profile mavsdk
+"""
+
+
+def test_arguments_reach_the_model() -> None:
+    args = arguments("DIR", *MODEL_WORDS.split())
+    assert command.link_settings(args) == LinkSettings(
+        rate=5760, queue=1000, duplex=Duplex.HALF, delay=0.1, jitter=0.2, loss=0.3, burst_loss=0.4,
+        duplicate=0.5, corrupt=0.6, reorder=0.7,
+    )  # fmt: skip
+    assert (args.seed, args.armed, args.telemetry, args.profile) == (8, True, 500.0, "mavsdk")
+
+
+@pytest.mark.parametrize(
+    "words",
+    ["--loss 1.5", "--loss -1", "--loss nan", "--rate 0", "--queue x", "--delay -1", "--profile mine"],
+)
+def test_nonsense_is_refused(words: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        arguments("DIR", *words.split())
+    assert words.split()[0] in capsys.readouterr().err
+
+
+def test_a_missing_directory_is_the_users_error(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="cannot serve"):
+        command.run(arguments(str(tmp_path / "nowhere")))
+
+
+def test_a_bad_link_is_the_users_error(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="write for example"):
+        command.run(arguments(str(tmp_path), "--link", "smoke:signals"))
+    with pytest.raises(LinkClosed, match="is not an address"):
+        command.run(arguments(str(tmp_path), "--link", "udpin:198.51.100.1:1"))
+
+
+RUNNER = """
+import argparse, sys
+from mavftpfs.sim import command
+parser = argparse.ArgumentParser("sim")
+command.add_arguments(parser)
+sys.exit(command.run(parser.parse_args()))
+"""
+
+
+@contextmanager
+def running(*words: str) -> Iterator[subprocess.Popen[str]]:
+    """Run the command in a process of its own."""
+    child = subprocess.Popen(
+        [sys.executable, "-W", "error", "-c", RUNNER, *words],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+    try:
+        yield child
+    finally:
+        child.kill()
+        child.communicate(timeout=20)
+
+
+def line(stream: IO[str] | None) -> str:
+    assert stream is not None
+    return stream.readline().rstrip("\n")
+
+
+def test_says_where_to_connect_reacts_to_signals_and_ends_cleanly(tmp_path: Path) -> None:
+    with running(str(tmp_path), "--link", "udpout:127.0.0.1:14999") as child:
+        assert line(child.stdout) == "mavftpfs udpin:127.0.0.1:14999 MOUNTPOINT"
+        for number, says in (
+            (signal.SIGUSR1, "armed"),
+            (signal.SIGUSR1, "disarmed"),
+            (signal.SIGUSR2, "link cut"),
+            (signal.SIGUSR2, "link mended"),
+            (signal.SIGHUP, "rebooted"),
+        ):
+            child.send_signal(number)
+            assert line(child.stdout) == says
+        child.send_signal(signal.SIGTERM)
+        assert line(child.stdout) == "ended after 0 FTP requests, open sessions: 0"
+        assert child.wait(20) == 0
+
+
+@pytest.mark.parametrize("extra", [[], ["--rate", "100000", "--delay", "0.001"]], ids=["direct", "modelled"])
+@pytest.mark.parametrize("link", ["udpin:127.0.0.1:0", "tcpin:127.0.0.1:0", "pty"])
+async def test_a_directory_is_served_by_the_process(tmp_path: Path, link: str, extra: list[str]) -> None:
+    (tmp_path / "log.bin").write_bytes(CONTENT[:5000])
+    with running(str(tmp_path), "--link", link, *extra) as child, trio.fail_after(60):
+        words = (await trio.to_thread.run_sync(line, child.stdout)).split()
+        assert words[0::2] == ["mavftpfs", "MOUNTPOINT"]
+        async with open_link(parse_source(words[1])) as client_link:
+            client = Client(client_link)
+            client_link.send_nowait([client.framer.encode_heartbeat(18)])
+            await client.beat()
+            assert await client.read_file(b"/log.bin") == CONTENT[:5000]
+        child.send_signal(signal.SIGINT)
+        assert await trio.to_thread.run_sync(child.wait, 20) == 0
+
+
+# ---------------------------------------------------------------------- in memory
+
+
+def run_virtual(main: object, *args: object) -> float:
+    """Run on a mock clock; return the virtual seconds it took."""
+    clock = trio.testing.MockClock(autojump_threshold=0)
+    start = clock.current_time()
+    trio.run(main, *args, clock=clock)  # type: ignore[arg-type]
+    return clock.current_time() - start
+
+
+RADIO = LinkSettings(rate=5760, queue=4096, duplex=Duplex.HALF, delay=0.05, loss=0.02, corrupt=0.01)
+
+
+async def read_in_memory(stream: bool, settings: LinkSettings | None, seed: int) -> tuple[Client, MemoryLink]:
+    model = None if settings is None else LinkModel(random.Random(seed), settings)
+    link = MemoryLink(vehicle(stream=stream, telemetry=300), model, stream=stream, rng=random.Random(seed))
+    client = Client(link)
+    await client.beat()
+    assert await client.read_file(b"/log.bin") == CONTENT
+    return client, link
+
+
+@pytest.mark.parametrize("stream", [False, True])
+@pytest.mark.parametrize("settings", [None, RADIO], ids=["clean", "radio"])
+def test_reads_over_memory(stream: bool, settings: LinkSettings | None) -> None:
+    took = run_virtual(read_in_memory, stream, settings, 1)
+    if settings is None:
+        assert took < 5
+    else:
+        assert took > 50_000 / 5760
+
+
+def test_the_same_seed_gives_the_same_story() -> None:
+    def story(seed: int) -> tuple[float, list[Message]]:
+        heard: list[Message] = []
+
+        async def main() -> None:
+            client, _ = await read_in_memory(True, RADIO, seed)
+            heard.extend(client.heard)
+
+        return run_virtual(main), heard
+
+    assert story(1) == story(1)
+    assert story(1) != story(2)
+
+
+def test_an_hour_of_heartbeats_passes_at_once() -> None:
+    async def main() -> int:
+        client = Client(MemoryLink(vehicle(), LinkModel(random.Random(1), RADIO)))
+        with trio.move_on_after(3600):
+            while True:
+                await client.messages()
+        return sum(isinstance(m, Heartbeat) for m in client.heard)
+
+    beats = trio.run(main, clock=trio.testing.MockClock(autojump_threshold=0))
+    assert 3300 < beats <= 3601
+
+
+def test_what_happened_while_nobody_looked_happened_in_time() -> None:
+    """The vehicle does not wait for the client to receive."""
+
+    async def main() -> None:
+        link = MemoryLink(vehicle())
+        client = Client(link)
+        await client.beat()
+        await trio.sleep(10.5)
+        client.send(request(7, Opcode.NONE))
+        await client.messages()
+        assert sum(isinstance(m, Heartbeat) for m in client.heard) == 11
+
+    run_virtual(main)
+
+
+@pytest.mark.parametrize("modelled", [False, True])
+@pytest.mark.parametrize("stream", [False, True])
+def test_memory_link_cut_and_restored(modelled: bool, stream: bool) -> None:
+    async def main() -> None:
+        model = LinkModel(random.Random(1), LinkSettings(delay=0.5)) if modelled else None
+        link = MemoryLink(vehicle(stream=stream), model, stream=stream)
+        client = Client(link)
+        await client.beat()
+        client.send(request(7, Opcode.NONE))
+        await trio.sleep(0.1)
+        link.cut()  # the modelled request is still under way
+        client.send(request(8, Opcode.NONE))
+        with trio.move_on_after(30):
+            while True:
+                await client.messages()
+        await trio.sleep(1)
+        assert link.vehicle.server.requests.total() == (0 if modelled else 1)
+        link.restore()
+        heard = await client.messages()
+        assert (client.reopened, heard) == (1, []) if stream else client.reopened == 0
+        assert (await client.ask(Opcode.NONE)).opcode == Opcode.ACK
+        assert link.stats.reopened == client.reopened
+
+    run_virtual(main)
+
+
+async def receive_for_ever(link: Link) -> None:
+    while True:
+        await link.receive()
+
+
+def test_memory_link_closes() -> None:
+    async def main() -> None:
+        link = MemoryLink(vehicle())
+        async with trio.open_nursery() as nursery:
+
+            async def receive() -> None:
+                with pytest.raises(LinkClosed):
+                    await receive_for_ever(link)
+
+            nursery.start_soon(receive)
+            await trio.sleep(3)
+            await link.aclose()
+
+    run_virtual(main)
+
+
+def test_memory_link_wakes_for_a_change_from_outside() -> None:
+    async def main() -> None:
+        link = MemoryLink(vehicle())
+        client = Client(link)
+        await client.beat()
+        async with trio.open_nursery() as nursery:
+
+            async def arm() -> None:
+                await trio.sleep(0.25)
+                link.vehicle.arm()
+                link.kick()
+
+            nursery.start_soon(arm)
+            while not (await client.beat()).armed:
+                pass
+            assert trio.current_time() % 1 == pytest.approx(0.25)
+
+    run_virtual(main)
+
+
+def test_the_models_room_paces_the_vehicle() -> None:
+    async def main() -> None:
+        model = LinkModel(random.Random(1), LinkSettings(rate=5760, queue=4096))
+        link = MemoryLink(vehicle(), model)
+        client = Client(link)
+        await client.ask(Opcode.OPEN_FILE_RO, b"/log.bin")
+        client.send(request(5000, Opcode.BURST_READ_FILE, size=MAX_DATA))
+        with trio.move_on_after(5):
+            while True:
+                await client.messages()
+        counters = model.counters(Direction.TO_CLIENT)
+        assert counters.delivered_bytes > 5 * 5760 * 0.9
+        assert counters.dropped == 0
+
+    run_virtual(main)
+
+
+def test_a_vehicle_that_never_rests_fails_the_test_instead_of_hanging_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("mavftpfs.sim.memory._MAX_STEPS", 100)
+
+    async def main() -> None:
+        link = MemoryLink(vehicle())
+        monkeypatch.setattr(type(link.vehicle), "next_deadline", lambda self: 0.0)
+        with pytest.raises(AssertionError, match="one instant"):
+            await link.receive()
+
+    run_virtual(main)

@@ -1,0 +1,563 @@
+"""Links over real sockets and ptys. The other end is pymavlink's mavutil or a bare descriptor."""
+
+from __future__ import annotations
+
+import os
+import socket
+import tty
+from collections.abc import AsyncIterator, Callable, Iterator
+from contextlib import asynccontextmanager, closing, contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+import trio
+import trio.testing
+from pymavlink import mavutil
+
+from mavftpfs.link.base import Link, PinsPeer
+from mavftpfs.link.framing import Framer
+from mavftpfs.link.messages import Address, FtpFrame, Heartbeat, Message
+from mavftpfs.link.opening import open_link
+from mavftpfs.link.outbox import MAX_DATAGRAM
+from mavftpfs.link.stream import StreamLink
+from mavftpfs.link.tcp import open_tcp
+from mavftpfs.link.udp import MAX_CHUNKS, UdpLink
+from mavftpfs.link.uri import parse_source
+from mavftpfs.shared.errors import LinkClosed
+
+US = Address(254, 191)
+DRONE = Address(1, 1)
+PAYLOAD = bytes(range(1, 252))
+HOST = "127.0.0.1"
+
+
+@asynccontextmanager
+async def opened(source: str) -> AsyncIterator[Link]:
+    """Open a link; the test ends within seconds whatever happens."""
+    with trio.fail_after(20):
+        async with open_link(parse_source(source)) as link:
+            yield link
+
+
+@asynccontextmanager
+async def udpin() -> AsyncIterator[tuple[UdpLink, int]]:
+    async with opened(f"udpin:{HOST}:0") as link:
+        assert isinstance(link, UdpLink)
+        yield link, link.local_address[1]
+
+
+@contextmanager
+def udp_socket(host: str = HOST, port: int = 0) -> Iterator[socket.socket]:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+        sock.bind((host, port))
+        sock.settimeout(5)
+        yield sock
+
+
+@asynccontextmanager
+async def pymavlink(device: str, **options: Any) -> AsyncIterator[Any]:
+    """Open pymavlink's own connection, as system 1, component 1."""
+    options = {"source_system": 1, "source_component": 1, "dialect": "ardupilotmega", **options}
+    with closing(
+        await trio.to_thread.run_sync(lambda: mavutil.mavlink_connection(device, **options))
+    ) as connection:
+        yield connection
+
+
+async def hear(connection: Any, kind: str) -> Any:
+    """Return the next message of a kind that pymavlink receives."""
+    message = await trio.to_thread.run_sync(
+        lambda: connection.recv_match(type=kind, blocking=True, timeout=5)
+    )
+    assert message is not None
+    return message
+
+
+async def read(link: Link, framer: Framer, wanted: Callable[[Message], bool]) -> Message:
+    """Receive until a message is the wanted one."""
+    with trio.fail_after(10):
+        while True:
+            for chunk in await link.receive():
+                for message in framer.feed(chunk):
+                    if wanted(message):
+                        return message
+
+
+def is_ftp(message: Message) -> bool:
+    return isinstance(message, FtpFrame)
+
+
+async def read_bytes(link: Link, size: int) -> bytes:
+    data = b""
+    with trio.fail_after(10):
+        while len(data) < size:
+            data += b"".join(await link.receive())
+    return data
+
+
+async def converse(link: Link, other: Any) -> None:
+    """Exchange heartbeats and FTP messages with pymavlink, both ways."""
+    framer = Framer(US, stream=link.is_stream)
+    other.mav.heartbeat_send(2, 12, 0, 0, 4)
+    assert await read(link, framer, lambda m: isinstance(m, Heartbeat)) == Heartbeat(DRONE, 2, 12, 0, 4)
+    frames = [framer.encode_heartbeat(18)]
+    frames += [framer.encode_ftp(DRONE, bytes([n]) * 251) for n in range(1, 21)]
+    link.send_nowait(frames)
+    assert (await hear(other, "HEARTBEAT")).type == 18
+    for n in range(1, 21):
+        message = await hear(other, "FILE_TRANSFER_PROTOCOL")
+        assert bytes(message.payload) == bytes([n]) * 251
+    other.mav.file_transfer_protocol_send(0, *US, list(PAYLOAD))
+    assert await read(link, framer, is_ftp) == FtpFrame(DRONE, US, PAYLOAD)
+    assert framer.stats.bad_crc == framer.stats.garbage_bytes == 0
+
+
+# ---------------------------------------------------------------------- with pymavlink
+
+
+async def test_udpin_and_pymavlink() -> None:
+    async with udpin() as (link, port), pymavlink(f"udpout:{HOST}:{port}") as other:
+        await converse(link, other)
+
+
+async def test_udpout_and_pymavlink() -> None:
+    async with pymavlink(f"udpin:{HOST}:0") as other:
+        port = other.port.getsockname()[1]
+        async with opened(f"udpout:{HOST}:{port}") as link:
+            link.send_nowait([Framer(US, stream=False).encode_heartbeat(18)])
+            assert (await hear(other, "HEARTBEAT")).get_srcSystem() == 254
+            await converse(link, other)
+
+
+async def test_tcpin_and_pymavlink() -> None:
+    async with opened(f"tcpin:{HOST}:0") as link:
+        port = parse_source(link.description).port
+        async with pymavlink(f"tcp:{HOST}:{port}") as other:
+            await converse(link, other)
+
+
+async def test_serial_and_pymavlink() -> None:
+    async with opened_pty() as (link, master):
+        # pymavlink gets the other end of the cable through a pty of its own.
+        other_master, other_slave = os.openpty()
+        tty.setraw(other_slave)
+        async with pymavlink(os.ttyname(other_slave), baud=57600) as other, trio.open_nursery() as nursery:
+            nursery.start_soon(cable, master, other_master)
+            nursery.start_soon(cable, other_master, master)
+            await converse(link, other)
+            nursery.cancel_scope.cancel()
+        os.close(other_master)
+        os.close(other_slave)
+
+
+async def cable(source: int, sink: int) -> None:
+    """Carry bytes from one pty master to another."""
+    while True:
+        await trio.lowlevel.wait_readable(source)
+        data = os.read(source, 4096)
+        while data:
+            await trio.lowlevel.wait_writable(sink)
+            data = data[os.write(sink, data) :]
+
+
+# ---------------------------------------------------------------------- UDP
+
+
+async def test_frames_are_packed_below_the_limit() -> None:
+    async with udpin() as (link, port):
+        with udp_socket() as peer:
+            peer.sendto(b"hello", (HOST, port))
+            await link.receive()
+            frames = [bytes([n]) * 266 for n in range(12)]
+            link.send_nowait(frames)
+            datagrams = [peer.recv(65535) for _ in range(3)]
+        assert b"".join(datagrams) == b"".join(frames)
+        assert [len(d) for d in datagrams] == [5 * 266, 5 * 266, 2 * 266]
+        assert max(map(len, datagrams)) <= MAX_DATAGRAM
+        assert (link.stats.sent_chunks, link.stats.sent_bytes) == (3, 12 * 266)
+
+
+async def test_a_drain_is_bounded_and_loses_nothing() -> None:
+    async with udpin() as (link, port):
+        with udp_socket() as peer:
+            for n in range(100):
+                peer.sendto(n.to_bytes(2, "big"), (HOST, port))
+        first = await link.receive()
+        assert [int.from_bytes(c, "big") for c in first] == list(range(100))
+    assert MAX_CHUNKS == 256
+
+
+async def test_a_flood_starves_nobody() -> None:
+    """Whoever receives without end still lets other tasks run after each batch."""
+    ran = 0
+
+    async def bystander() -> None:
+        nonlocal ran
+        while True:
+            ran += 1
+            await trio.lowlevel.checkpoint()
+
+    async with udpin() as (link, port), trio.open_nursery() as nursery:
+        with udp_socket() as peer:
+            nursery.start_soon(bystander)
+            for turn in range(50):
+                peer.sendto(b"x", (HOST, port))
+                assert await link.receive() == [b"x"]
+                assert ran >= turn
+            nursery.cancel_scope.cancel()
+
+
+async def test_cancelling_receive_loses_nothing() -> None:
+    async with udpin() as (link, port):
+        got: list[bytes] = []
+        with udp_socket() as peer:
+            for n in range(200):
+                peer.sendto(n.to_bytes(2, "big"), (HOST, port))
+                with trio.CancelScope() as scope:
+                    if n % 2:
+                        scope.cancel()
+                    got += await link.receive()
+            with trio.move_on_after(0.2):
+                while True:
+                    got += await link.receive()
+        assert [int.from_bytes(c, "big") for c in got] == list(range(200))
+
+
+async def test_answers_the_latest_sender_until_the_vehicle_is_pinned() -> None:
+    async with udpin() as (link, port):
+        assert isinstance(link, PinsPeer)
+        with udp_socket() as vehicle, udp_socket() as stranger:
+            vehicle.sendto(b"beat", (HOST, port))
+            stranger.sendto(b"noise", (HOST, port))
+            assert await read_bytes(link, 9) == b"beatnoise"
+            link.send_nowait([b"to the latest"])
+            assert stranger.recv(100) == b"to the latest"
+
+            vehicle.sendto(b"beat", (HOST, port))
+            stranger.sendto(b"noise", (HOST, port))
+            await trio.sleep(0.05)
+            assert await link.receive() == [b"beat", b"noise"]
+            link.pin_peer(0)
+            link.pin_peer(7)  # nobody
+            link.send_nowait([b"to the pinned"])
+            assert vehicle.recv(100) == b"to the pinned"
+
+            stranger.sendto(b"noise", (HOST, port))
+            assert await link.receive() == [b"noise"]
+            link.send_nowait([b"still"])
+            assert vehicle.recv(100) == b"still"
+
+            link.pin_peer(0)  # the vehicle's heartbeat came from there: it moved
+            link.send_nowait([b"moved"])
+            assert stranger.recv(100) == b"moved"
+
+
+async def test_sends_before_anybody_was_heard_are_dropped() -> None:
+    async with udpin() as (link, _):
+        link.send_nowait([b"x" * 900, b"y" * 900])
+        assert link.stats.dropped_sends == 2
+        assert link.backlog == 0
+
+
+async def test_udpout_keeps_one_port_and_does_not_mind_a_closed_one() -> None:
+    with udp_socket() as vehicle:
+        port = vehicle.getsockname()[1]
+    async with opened(f"udpout:{HOST}:{port}") as link:
+        for _ in range(3):  # each is answered by ICMP "port unreachable"
+            link.send_nowait([b"anybody?"])
+            with trio.move_on_after(0.05):
+                await link.receive()
+                pytest.fail("there is nobody")
+        assert isinstance(link, UdpLink)
+        with udp_socket(port=port) as vehicle:
+            link.send_nowait([b"hello"])
+            data, sender = vehicle.recvfrom(100)
+            assert (data, sender[1]) == (b"hello", link.local_address[1])
+            vehicle.sendto(b"welcome", sender)
+            assert await link.receive() == [b"welcome"]
+        assert link.stats.dropped_sends == 0
+
+
+async def test_udpout_listens_to_its_host_only() -> None:
+    with udp_socket() as vehicle, udp_socket("127.0.0.2") as stranger:
+        async with opened(f"udpout:{HOST}:{vehicle.getsockname()[1]}") as link:
+            link.send_nowait([b"hello"])
+            _, sender = vehicle.recvfrom(100)
+            stranger.sendto(b"evil", sender)
+            vehicle.sendto(b"good", sender)
+            assert await link.receive() == [b"good"]
+            assert not isinstance(link, StreamLink)
+
+
+async def test_ipv6() -> None:
+    with socket.socket(socket.AF_INET6, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.bind(("::1", 0))
+        except OSError:  # a computer without IPv6: then the link has to say so
+            with pytest.raises(LinkClosed, match="not an address of this computer"):
+                async with opened("udpin:[::1]:0"):
+                    pytest.fail("it opened")
+            return
+    async with opened("udpin:[::1]:0") as link, opened(link.description.replace("udpin", "udpout")) as other:
+        other.send_nowait([b"six"])
+        assert await link.receive() == [b"six"]
+        link.send_nowait([b"back"])
+        assert await other.receive() == [b"back"]
+
+
+# ---------------------------------------------------------------------- closing and failing
+
+
+@pytest.mark.parametrize("source", [f"udpin:{HOST}:0", f"tcpin:{HOST}:0"])
+async def test_closing_wakes_the_receiver(source: str) -> None:
+    async with opened(source) as link, trio.open_nursery() as nursery:
+
+        async def receive() -> None:
+            with pytest.raises(LinkClosed):
+                await link.receive()
+
+        nursery.start_soon(receive)
+        await trio.testing.wait_all_tasks_blocked()
+        await link.aclose()
+        await link.aclose()
+        link.send_nowait([b"into the void"])
+
+
+@pytest.mark.parametrize(
+    ("source", "says"),
+    [
+        ("udpin:198.51.100.1:14550", "is not an address of this computer"),
+        ("tcpin:198.51.100.1:5760", "is not an address of this computer"),
+        ("/dev/ttyNOPE7", "there is no /dev/ttyNOPE7; is the vehicle plugged in?"),
+        (f"tcp:{HOST}:1", "nothing listens on port 1"),
+        ("tcp:no-such-host.invalid:1", "no-such-host.invalid"),
+        ("udpout:no-such-host.invalid:1", "host 'no-such-host.invalid' is unknown"),
+        ("/dev/null", "/dev/null"),
+    ],
+)
+async def test_what_cannot_be_opened_says_why_in_a_line(source: str, says: str) -> None:
+    with pytest.raises(LinkClosed) as caught:
+        async with opened(source):
+            pytest.fail("it opened")
+    assert says in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("kind", ["udpin", "tcpin"])
+async def test_busy_port(kind: str) -> None:
+    async with opened(f"{kind}:{HOST}:0") as link:
+        with pytest.raises(LinkClosed, match="is in use by another program"):
+            async with opened(link.description):
+                pytest.fail("it opened")
+
+
+async def test_busy_serial_port() -> None:
+    async with opened_pty() as (link, _):
+        with pytest.raises(LinkClosed, match="is in use by another program"):
+            async with opened(link.description):
+                pytest.fail("it opened")
+
+
+@pytest.mark.parametrize("source", [f"udpin:{HOST}:0", f"tcpin:{HOST}:0"])
+async def test_an_error_of_the_body_comes_out_as_itself(source: str) -> None:
+    with pytest.raises(KeyError):
+        async with opened(source):
+            raise KeyError("body")
+
+
+# ---------------------------------------------------------------------- TCP
+
+
+async def accept(listener: socket.socket) -> socket.socket:
+    with trio.fail_after(10):
+        await trio.lowlevel.wait_readable(listener)
+        peer, _ = listener.accept()
+        peer.setblocking(True)
+        peer.settimeout(5)
+        return peer
+
+
+def listening(port: int = 0) -> socket.socket:
+    listener = socket.create_server((HOST, port))
+    listener.setblocking(False)
+    return listener
+
+
+async def test_tcp_connects_again_and_says_so() -> None:
+    with listening() as listener:
+        port = listener.getsockname()[1]
+        async with opened(f"tcp:{HOST}:{port}") as link:
+            with await accept(listener) as peer:
+                peer.sendall(b"one")
+                assert await link.receive() == [b"one"]
+            listener.close()
+            with trio.move_on_after(0.1):
+                await link.receive()
+                pytest.fail("nothing was sent")
+            link.send_nowait([b"lost"])
+            assert link.stats.dropped_sends == 1
+            with listening(port) as again:
+                async with trio.open_nursery() as nursery:
+                    chunks: list[list[bytes]] = []
+
+                    async def receive() -> None:
+                        chunks.append(await link.receive())
+
+                    nursery.start_soon(receive)
+                    peer = await accept(again)
+                with peer:
+                    assert chunks == [[]]
+                    peer.sendall(b"two")
+                    assert await link.receive() == [b"two"]
+                    link.send_nowait([b"back"])
+                    assert peer.recv(100) == b"back"
+            assert link.stats.reopened == 1
+
+
+async def test_a_patient_tcp_link_waits_for_its_first_peer() -> None:
+    with listening() as listener:
+        port = listener.getsockname()[1]
+    with trio.fail_after(10):
+        async with open_tcp(parse_source(f"tcp:{HOST}:{port}"), patient=True) as link:
+            await trio.sleep(0.1)
+            with listening(port) as listener, await accept(listener) as peer:
+                peer.sendall(b"hello")
+                assert await link.receive() == [b"hello"]
+                assert link.stats.reopened == 0
+
+
+async def test_tcpin_serves_one_peer_and_then_the_next() -> None:
+    async with opened(f"tcpin:{HOST}:0") as link:
+        address = (HOST, parse_source(link.description).port)
+        link.send_nowait([b"nobody there"])
+        assert link.stats.dropped_sends == 1
+        first = socket.create_connection(address)
+        first.sendall(b"first")
+        assert await link.receive() == [b"first"]
+        with socket.create_connection(address) as second:
+            second.settimeout(5)
+            second.sendall(b"second")
+            with trio.move_on_after(0.1):
+                await link.receive()
+                pytest.fail("the first peer is still there")
+            first.close()
+            assert await link.receive() == []
+            assert await link.receive() == [b"second"]
+            link.send_nowait([b"hello second"])
+            assert second.recv(100) == b"hello second"
+
+
+async def test_tcpin_leaves_a_silent_peer_for_a_new_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("mavftpfs.link.tcp.PEER_PATIENCE", 0.2)
+    async with opened(f"tcpin:{HOST}:0") as link:
+        address = (HOST, parse_source(link.description).port)
+        with socket.create_connection(address) as dead, socket.create_connection(address) as fresh:
+            dead.sendall(b"x")
+            assert await link.receive() == [b"x"]
+            fresh.sendall(b"y")
+            assert await link.receive() == []
+            assert await link.receive() == [b"y"]
+
+
+async def test_a_slow_peer_costs_whole_frames_never_parts() -> None:
+    framer = Framer(US, stream=True)
+    async with opened(f"tcpin:{HOST}:0") as link:
+        with socket.socket() as peer:
+            peer.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+            peer.connect((HOST, parse_source(link.description).port))
+            peer.sendall(b"x")
+            await link.receive()
+            built = 0
+            while link.stats.dropped_sends < 50:
+                link.send_nowait([framer.encode_ftp(DRONE, PAYLOAD) for _ in range(7)])
+                built += 7
+                assert link.backlog <= 64 * 1024 + 7 * 266
+                assert built < 100_000
+            peer.setblocking(False)
+            other = Framer(DRONE, stream=True)
+            received = 0
+            with trio.fail_after(10):
+                while received < built - link.stats.dropped_sends:
+                    await trio.lowlevel.wait_readable(peer)
+                    received += len(other.feed(peer.recv(65536)))
+            assert link.backlog == 0
+            link.send_nowait([framer.encode_heartbeat(18)])
+            await trio.lowlevel.wait_readable(peer)
+            assert [type(m) for m in other.feed(peer.recv(65536))] == [Heartbeat]
+            assert other.stats.bad_crc == other.stats.garbage_bytes == 0
+
+
+# ---------------------------------------------------------------------- serial
+
+
+@asynccontextmanager
+async def opened_pty() -> AsyncIterator[tuple[StreamLink, int]]:
+    """Open a link on a new pty; also returns the other end."""
+    master, slave = os.openpty()
+    tty.setraw(slave)
+    os.set_blocking(master, False)
+    try:
+        async with opened(f"{os.ttyname(slave)},115200") as link:
+            assert isinstance(link, StreamLink)
+            yield link, master
+    finally:
+        os.close(master)
+        os.close(slave)
+
+
+async def test_serial_carries_every_byte_both_ways() -> None:
+    data = bytes(range(256)) * 4
+    async with opened_pty() as (link, master):
+        assert link.is_serial
+        assert link.is_stream
+        os.write(master, data)
+        assert await read_bytes(link, len(data)) == data
+        link.send_nowait([data])
+        got = b""
+        while len(got) < len(data):
+            await trio.lowlevel.wait_readable(master)
+            got += os.read(master, 4096)
+        assert got == data
+
+
+async def test_serial_waits_without_spinning() -> None:
+    """A read of nothing must not look like the end (pyserial's VMIN 0 would)."""
+    async with opened_pty() as (link, _):
+        with trio.move_on_after(0.1):
+            await link.receive()
+            pytest.fail("nothing was sent")
+        assert link.connected
+
+
+async def test_serial_that_nobody_reads_is_bounded() -> None:
+    async with opened_pty() as (link, _):
+        for _ in range(500):
+            link.send_nowait([bytes(266)])
+        assert link.backlog <= 115_200 // 10
+        assert link.stats.dropped_sends > 0
+
+
+async def test_serial_comes_back_when_the_device_does(tmp_path: Path) -> None:
+    device = tmp_path / "ttyDRONE"
+    master, slave = os.openpty()
+    device.symlink_to(os.ttyname(slave))
+    async with opened(f"{device},57600") as link:
+        os.write(master, b"before")
+        assert await read_bytes(link, 6) == b"before"
+        device.unlink()
+        os.close(slave)
+        os.close(master)  # unplugged
+        with trio.move_on_after(0.4):
+            await link.receive()
+            pytest.fail("it is gone")
+        link.send_nowait([b"lost"])
+        assert link.stats.dropped_sends == 1
+        master, slave = os.openpty()
+        device.symlink_to(os.ttyname(slave))  # plugged in again, under another number
+        assert await link.receive() == []
+        os.write(master, b"after")
+        assert await read_bytes(link, 5) == b"after"
+        assert link.stats.reopened == 1
+        os.close(slave)
+        os.close(master)

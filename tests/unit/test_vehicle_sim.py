@@ -1,0 +1,253 @@
+"""The simulated vehicle around its FTP server."""
+
+from __future__ import annotations
+
+import random
+from typing import TypeVar
+
+import pytest
+
+from mavftpfs.link.framing import Framer
+from mavftpfs.link.messages import (
+    Address,
+    AutopilotVersion,
+    CommandLong,
+    FtpFrame,
+    Heartbeat,
+    Message,
+    Other,
+    StatusText,
+    StorageInformation,
+    SystemTime,
+)
+from mavftpfs.protocol.payload import Opcode, decode_reply, request
+from mavftpfs.sim.profiles import PROFILES
+from mavftpfs.sim.tree import MemoryTree
+from mavftpfs.sim.vehicle import SimVehicle
+
+T = TypeVar("T")
+US = Address(254, 191)
+DRONE = Address(1, 1)
+LIST = request(5, Opcode.LIST_DIRECTORY, data=b"/").encode()
+
+
+class Client:
+    """The other end: talks to one vehicle, on hand-made time."""
+
+    def __init__(self, profile: str = "spec", **options: object) -> None:
+        self.vehicle = SimVehicle(
+            MemoryTree(),
+            PROFILES[profile],
+            rng=random.Random(1),
+            **options,  # type: ignore[arg-type]
+        )
+        self.framer = Framer(US, stream=False)
+        self.now = 100.0
+
+    def hear(self, seconds: float = 0.0) -> list[Message]:
+        """Return all that the vehicle says until so much later."""
+        found: list[Message] = []
+        end = self.now + seconds
+        for _ in range(100_000):
+            due = self.vehicle.next_deadline()
+            if due > end:
+                self.now = end
+                return found
+            self.now = max(self.now, due)
+            for frame in self.vehicle.outgoing(self.now):
+                found += self.framer.feed(frame)
+        raise AssertionError("the vehicle never comes to rest")
+
+    def tell(self, frame: bytes) -> None:
+        self.vehicle.receive(frame, self.now)
+
+    def ftp(self, target: Address = DRONE) -> list[FtpFrame]:
+        """Ask for a listing and return the FTP frames that come back within a second."""
+        self.tell(self.framer.encode_ftp(target, LIST))
+        return [m for m in self.hear(0.9) if isinstance(m, FtpFrame)]
+
+
+def of(kind: type[T], messages: list[Message]) -> list[T]:
+    return [m for m in messages if isinstance(m, kind)]
+
+
+def test_beats_once_a_second_with_its_boot_time() -> None:
+    client = Client("px4")
+    heard = client.hear(10.0)
+    beats = of(Heartbeat, heard)
+    assert beats == [Heartbeat(DRONE, 2, 12, 0x41, 3)] * 11
+    assert [m.time_boot_ms for m in of(SystemTime, heard)] == [n * 1000 for n in range(11)]
+
+
+@pytest.mark.parametrize(("profile", "autopilot"), [("px4", 12), ("ardupilot", 3), ("mavsdk", 0)])
+def test_autopilot_is_the_profiles(profile: str, autopilot: int) -> None:
+    assert of(Heartbeat, Client(profile).hear())[0].autopilot == autopilot
+
+
+def test_arming_shows_at_once_and_in_each_beat() -> None:
+    client = Client()
+    assert [b.armed for b in of(Heartbeat, client.hear(1.5))] == [False, False]
+    client.vehicle.arm()
+    assert [b.armed for b in of(Heartbeat, client.hear(1.1))] == [True, True]
+    client.vehicle.disarm()
+    assert [b.armed for b in of(Heartbeat, client.hear())] == [False]
+    assert of(Heartbeat, Client(armed=True).hear())[0].armed
+
+
+@pytest.mark.parametrize(
+    ("profile", "flag"), [("px4", 0x20), ("ardupilot5", 0x20), ("spec", 0x20), ("mavsdk", 0)]
+)
+def test_version_is_told_on_request_with_the_profiles_flag(profile: str, flag: int) -> None:
+    client = Client(profile)
+    assert of(AutopilotVersion, client.hear(3)) == []
+    client.tell(client.framer.encode_request_message(DRONE, 148))
+    client.tell(client.framer.encode_request_capabilities(DRONE))
+    versions = of(AutopilotVersion, client.hear())
+    assert [v.capabilities & 0x20 for v in versions] == [flag, flag]
+    assert versions[0] == versions[1]
+
+
+def test_storage_is_told_on_request() -> None:
+    client = Client()
+    client.tell(client.framer.encode_request_message(DRONE, 261))
+    (storage,) = of(StorageInformation, client.hear())
+    assert storage.total_capacity > 0
+    assert storage.used_capacity + storage.available_capacity == storage.total_capacity
+
+
+@pytest.mark.parametrize("command", [(512, 33.0), (512, float("nan")), (400, 1.0)])
+def test_other_commands_are_refused(command: tuple[int, float]) -> None:
+    client = Client()
+    client.hear()
+    client.tell(client.framer.encode_command(DRONE, command[0], (command[1],)))
+    assert client.hear() == [Other(DRONE, 77)]
+
+
+@pytest.mark.parametrize(
+    ("profile", "target", "answers"),
+    [
+        ("px4", Address(1, 1), True),
+        ("px4", Address(1, 0), True),
+        ("px4", Address(0, 0), True),
+        ("px4", Address(0, 1), True),
+        ("px4", Address(1, 100), False),
+        ("px4", Address(2, 1), False),
+        ("ardupilot", Address(1, 100), True),
+        ("ardupilot", Address(2, 1), False),
+        ("mavsdk", Address(1, 100), False),
+    ],
+)
+def test_answers_requests_meant_for_it(profile: str, target: Address, answers: bool) -> None:
+    client = Client(profile)
+    replies = client.ftp(target)
+    assert [(r.source, r.target) for r in replies] == ([(DRONE, US)] if answers else [])
+    if answers:
+        assert decode_reply(replies[0].payload).req_opcode == Opcode.LIST_DIRECTORY
+
+
+def test_commands_for_others_are_not_its_business() -> None:
+    client = Client()
+    client.hear()
+    client.tell(client.framer.encode_request_message(Address(2, 1), 148))
+    assert client.hear() == []
+
+
+@pytest.mark.parametrize("rate", [200.0, 3000.0])
+def test_telemetry_keeps_its_rate(rate: float) -> None:
+    client = Client(telemetry=rate)
+    client.hear()
+    sizes = 0
+    for _ in range(60):
+        deadline = client.now + 1
+        while (due := client.vehicle.next_deadline()) <= deadline:
+            client.now = due
+            sizes += sum(len(f) for f in client.vehicle.outgoing(due) if f[7] not in (0, 2))
+    assert sizes / 60 == pytest.approx(rate, rel=0.05)
+
+
+def test_ardupilot_slows_its_telemetry_during_ftp() -> None:
+    def counts(profile: str) -> tuple[int, int]:
+        client = Client(profile, telemetry=2000.0)
+        client.hear()
+        quiet = len(of(Other, client.hear(5)))
+        busy = 0
+        for _ in range(10):
+            client.tell(client.framer.encode_ftp(DRONE, LIST))
+            busy += len(of(Other, client.hear(0.5)))
+        return quiet, busy
+
+    quiet, busy = counts("ardupilot")
+    assert busy < quiet / 3
+    quiet, busy = counts("px4")
+    assert busy == pytest.approx(quiet, rel=0.1)
+
+
+def test_nothing_is_made_up_for_after_a_pause() -> None:
+    client = Client(telemetry=2000.0)
+    client.hear(1)
+    client.now += 3600
+    assert len(client.vehicle.outgoing(client.now)) < 60
+
+
+def test_reboot_loses_time_arming_and_sessions_but_no_files() -> None:
+    client = Client("px4", armed=True)
+    client.vehicle.server.tree.open(b"/a", write=True, create=True).close()
+    client.tell(client.framer.encode_ftp(DRONE, request(1, Opcode.OPEN_FILE_RO, data=b"/a").encode()))
+    client.hear(5)
+    assert client.vehicle.server.open_sessions == 1
+    client.vehicle.reboot(client.now, downtime=3.0)
+    client.tell(client.framer.encode_ftp(DRONE, LIST))
+    assert client.hear(2.9) == []
+    heard = client.hear(0.2)
+    assert of(SystemTime, heard)[0].time_boot_ms == 3000
+    assert not of(Heartbeat, heard)[0].armed
+    assert client.vehicle.server.open_sessions == 0
+    assert len(client.ftp()) == 1
+    assert client.vehicle.server.tree.stat(b"/a").size == 0
+
+
+def test_another_ground_station_is_heard_with_its_answers() -> None:
+    client = Client()
+    client.hear()
+    gcs = Address(255, 190)
+    client.vehicle.foreign_request(LIST, gcs, client.now)
+    heard = of(FtpFrame, client.hear(0.5))
+    assert [(f.source, f.target) for f in heard] == [(gcs, DRONE), (DRONE, gcs)]
+    client.vehicle.foreign_request(LIST, gcs, client.now, audible=False)
+    assert [(f.source, f.target) for f in of(FtpFrame, client.hear(0.5))] == [(DRONE, gcs)]
+
+
+def test_says_what_it_is_told() -> None:
+    client = Client()
+    client.hear()
+    client.vehicle.say(4, "hello")
+    assert client.hear() == [StatusText(DRONE, 4, "hello")]
+
+
+def test_remembers_who_was_heard() -> None:
+    client = Client()
+    client.tell(client.framer.encode_heartbeat(18))
+    assert list(client.vehicle.heard) == [US]
+
+
+def test_signed_vehicle_ignores_the_unsigned() -> None:
+    key = bytes(32)
+    client = Client(signing_key=key)
+    assert client.ftp() == []
+    client.framer = Framer(US, stream=False, signing_key=key)
+    assert len(client.ftp()) == 1
+
+
+def test_stream_is_joined() -> None:
+    client = Client()
+    client.vehicle.set_stream(True)
+    frame = client.framer.encode_ftp(DRONE, LIST)
+    for at in range(len(frame)):
+        client.tell(frame[at : at + 1])
+    assert len(of(FtpFrame, client.hear(0.5))) == 1
+
+
+def test_command_values_survive() -> None:
+    client = Client()
+    frame = client.framer.encode_command(DRONE, 512, (1.0, 2.0))
+    assert Framer(DRONE, stream=False).feed(frame) == [CommandLong(US, DRONE, 512, (1.0, 2.0, 0, 0, 0, 0, 0))]
