@@ -125,6 +125,11 @@ class Px4(Firmware):
         start = self._started or 0.0
         return max(start + self._tick * self.profile.tick, self._busy_until)
 
+    def _tick_after(self, now: float) -> int:
+        start, period = self._started or 0.0, self.profile.tick
+        tick = int((now - start) / period) + 1
+        return tick + 1 if start + tick * period <= now else tick  # rounding
+
     def _execute(self, wire: bytes, source: Address, now: float) -> None:
         seq, session, opcode, size, _, _, offset = HEADER.unpack_from(wire)
         if now - self._last_request > _BUFFER_LIFE:
@@ -341,15 +346,12 @@ class Px4(Firmware):
         if request.session != 0 and self._file is None:
             raise Refusal(NakCode.INVALID_SESSION)
         self._stream = _Stream(request.source, request.offset, request.seq + 1)
-        start, period = self._started or 0.0, self.profile.tick
-        self._tick = max(self._tick, int((self._last_request - start) / period) + 1)
-        while start + self._tick * period <= self._last_request:
-            self._tick += 1  # rounding
+        self._tick = max(self._tick, self._tick_after(self._last_request))
         return b""
 
     def _send(self, now: float) -> None:
         """Send as many burst packets as the transmit buffer takes in this tick."""
-        self._tick += 1
+        self._tick = self._tick_after(now)
         room = min(self.room(), self.profile.tx_buffer)
         alone = room < 2 * FULL_FRAME
         while room >= FULL_FRAME and self._stream is not None:

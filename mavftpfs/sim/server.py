@@ -37,6 +37,7 @@ class FtpServer:
     tree: what it serves. profile: whose behaviour it has. rng: its stray memory and its bad luck.
     tx_room: tells how many bytes the link's transmit buffer still takes (PX4 and ArduPilot pace by it);
     None = as much as the profile's own buffer. requests: counts by opcode, of all that were handed in.
+    disabled: True = no request is answered (ArduPilot's BRD_OPTIONS can do that).
     """
 
     def __init__(
@@ -53,6 +54,7 @@ class FtpServer:
         self.address = address
         self.requests: Counter[int] = Counter()
         self.malformed = 0
+        self.disabled = False
         self._storage = Storage(tree, profile, rng, virtual)
         self._firmware = _FIRMWARES[profile.family](self._storage, profile, rng)
 
@@ -62,7 +64,7 @@ class FtpServer:
             self.malformed += 1
             return
         self.requests[wire[3]] += 1
-        if not self._firmware.crashed:
+        if not self.disabled and not self._firmware.crashed:
             self._firmware.handle(wire, source, now)
 
     def outgoing(self, now: float) -> list[tuple[Address, bytes]]:

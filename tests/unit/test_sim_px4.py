@@ -508,6 +508,20 @@ def test_a_slow_card_loses_what_does_not_fit_the_receive_buffer() -> None:
     assert [p.offset for p in answered] == list(range(len(answered)))
 
 
+def test_a_busy_server_skips_ticks_and_does_not_make_up_for_them() -> None:
+    tree = MemoryTree()
+    tree.add(A, bytes(60_000))
+    c = Client("px4-nuttx", tree, stall_chance=0.0)
+    c.open(A)
+    c.receive(0.003)
+    c.send(Opcode.BURST_READ_FILE, size=239)
+    c.send(Opcode.CALC_FILE_CRC32, A)
+    assert c.receive(0.09) == []
+    crc, *packets = c.receive(0.02)
+    assert crc.req_opcode == Opcode.CALC_FILE_CRC32
+    assert 10 <= len(packets) <= 15
+
+
 def test_a_checksum_takes_time_and_what_follows_waits() -> None:
     tree = MemoryTree()
     tree.add(A, b"123456789" * 20_000)

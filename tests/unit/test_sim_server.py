@@ -145,6 +145,9 @@ def test_counters_and_malformed_requests() -> None:
     c.server.handle(b"short", CLIENT, c.now)
     assert c.server.requests == {Opcode.NONE: 2}
     assert c.server.malformed == 1
+    c.server.disabled = True
+    assert c.ask_all(Opcode.NONE, wait=60.0) == []
+    assert c.server.requests == {Opcode.NONE: 3}
 
 
 def test_a_deadline_is_never_missed() -> None:
