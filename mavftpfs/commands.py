@@ -6,9 +6,9 @@ import argparse
 import json
 import logging
 import os
+import select
 import signal
 import sys
-import time
 from collections.abc import Callable, Coroutine, Mapping
 from dataclasses import replace
 from functools import partial
@@ -136,13 +136,15 @@ def umount(args: argparse.Namespace) -> int:
 
 def _wait_for_end(pid: int) -> None:
     """Wait until a process is gone, so that the link is free when `umount` returns."""
-    deadline = time.monotonic() + END_PATIENCE
-    while time.monotonic() < deadline:
-        try:
-            os.kill(pid, 0)
-        except OSError:
-            return
-        time.sleep(0.02)
+    try:
+        process = os.pidfd_open(pid)
+    except ProcessLookupError:
+        return
+    try:
+        # Readable when it ended, also while nobody has reaped it.
+        select.select([process], [], [], END_PATIENCE)
+    finally:
+        os.close(process)
 
 
 def status(args: argparse.Namespace) -> int:
@@ -189,12 +191,18 @@ def _ask_status(path: Path) -> Mapping[str, Any]:
 ResultT = TypeVar("ResultT")
 
 
-def _run(args: argparse.Namespace, function: Callable[[Target], Coroutine[Any, Any, ResultT]]) -> ResultT:
+def _run(
+    args: argparse.Namespace,
+    function: Callable[[Target], Coroutine[Any, Any, ResultT]],
+    component: int | None = None,
+) -> ResultT:
     """Run a one-shot command; Ctrl-C ends it in order, so that the vehicle's session is closed."""
     from mavftpfs.compose import open_sinks
     from mavftpfs.oneshot import Target
 
     options, spec = connection_of(args)
+    if component is not None:
+        options = replace(options, target_component=component)
     daemon.log_to_stderr(logging.DEBUG if args.debug else logging.WARNING)
     with open_sinks(options, debug=args.debug) as sinks:
         return trio.run(until_interrupted, partial(function, Target(spec, options, sinks)))
@@ -233,8 +241,8 @@ def ls(args: argparse.Namespace) -> int:
     """List directories."""
     from mavftpfs import oneshot, report
 
-    paths = [oneshot.parse_path(text) for text in args.paths or ["/"]]
-    entries = _run(args, lambda target: oneshot.list_paths(target, paths))
+    paths, component = oneshot.parse_paths(args.paths or ["/"])
+    entries = _run(args, lambda target: oneshot.list_paths(target, paths), component)
     if args.json:
         print(json.dumps(entries, indent=2))
     else:
@@ -246,7 +254,7 @@ def get(args: argparse.Namespace) -> int:
     """Fetch files."""
     from mavftpfs import oneshot, report
 
-    paths = [oneshot.parse_path(text) for text in args.paths]
+    paths, component = oneshot.parse_paths(args.paths)
     local = Path(args.to)
 
     def tell(fetched: oneshot.Fetched) -> None:
@@ -257,6 +265,7 @@ def get(args: argparse.Namespace) -> int:
         _run(
             args,
             lambda target: oneshot.get_paths(target, paths, local, meter, tell, recursive=args.recursive),
+            component,
         )
     return ExitCode.OK
 
@@ -265,12 +274,12 @@ def crc(args: argparse.Namespace) -> int:
     """Print checksums the vehicle computed, as cksum's relatives do: number, two blanks, name."""
     from mavftpfs import oneshot, report
 
-    paths = [oneshot.parse_path(text) for text in args.paths]
+    paths, component = oneshot.parse_paths(args.paths)
 
     def tell(path: bytes, number: int) -> None:
         print(f"{number:08x}  {report.printable(os.fsdecode(path))}")
 
-    _run(args, lambda target: oneshot.checksum_paths(target, paths, tell))
+    _run(args, lambda target: oneshot.checksum_paths(target, paths, tell), component)
     return ExitCode.OK
 
 

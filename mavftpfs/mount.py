@@ -180,6 +180,8 @@ class _Life:
         lazy = bool(request.get("lazy"))
         action = partial(unmount, self.request.mountpoint, lazy=lazy)
         await trio.to_thread.run_sync(action, abandon_on_cancel=True)
+        if lazy:
+            self._stop_gently()  # the kernel lets go only when the last user does, which may be never
         await self.finished.wait()
         return {"exit_code": int(self.code), "pid": os.getpid()}
 
@@ -208,11 +210,15 @@ class _Life:
     def _on_signal(self) -> None:
         if self._signals > 2:
             self._end_at_once()
-        elif self._signals == 1 and self._loop_scope is not None:
-            pyfuse3.terminate()
-            self._loop_scope.deadline = trio.current_time() + GRACE
         elif self._signals == 2 or not self.mounted:
             self.scope.cancel()
+        else:
+            self._stop_gently()
+
+    def _stop_gently(self) -> None:
+        if self._loop_scope is not None:
+            pyfuse3.terminate()
+            self._loop_scope.deadline = trio.current_time() + GRACE
 
     def _end_at_once(self) -> None:
         if self.mounted:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import AbstractAsyncContextManager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -19,14 +19,17 @@ from mavftpfs.link.messages import MAV_TYPE_GCS, Address, Heartbeat
 from mavftpfs.link.opening import open_link
 from mavftpfs.link.uri import LinkSpec
 from mavftpfs.protocol.crc import crc32
+from mavftpfs.protocol.url import MftpUrl, is_url, parse_url
 from mavftpfs.session.connection import connected
 from mavftpfs.shared.errors import (
     Armed,
     DataUnproven,
     FtpNak,
     IsADirectory,
+    LocalProtocolError,
     MavftpfsError,
     RequestTimeout,
+    UsageError,
     VehicleLost,
 )
 from mavftpfs.shared.model import EntryKind, is_virtual, join, normalise, split
@@ -286,13 +289,27 @@ _AUTOPILOTS = {3: "ArduPilot", 12: "PX4", 0: "generic autopilot"}
 """MAV_AUTOPILOT values people meet."""
 
 
-def parse_path(text: str) -> bytes:
-    """Return the normalised path of a plain remote path.
+def parse_paths(texts: Sequence[str]) -> tuple[list[bytes], int | None]:
+    """Return the normalised remote paths, and the component that mftp:// URLs among them name.
 
     Raises:
-        LocalProtocolError: it holds `..` or NUL.
+        UsageError: `..` or NUL, a malformed URL, or two components at once.
     """
-    return normalise(os.fsencode(text))
+    paths, components = [], set()
+    for text in texts:
+        url = parse_url(text) if is_url(text) else MftpUrl(None, _plain_path(text))
+        paths.append(url.path)
+        components |= {url.component} - {None}
+    if len(components) > 1:
+        raise UsageError("the URLs name several components; ask one at a time")
+    return paths, components.pop() if components else None
+
+
+def _plain_path(text: str) -> bytes:
+    try:
+        return normalise(os.fsencode(text))
+    except LocalProtocolError as exc:
+        raise UsageError(str(exc)) from exc
 
 
 def _text(path: bytes) -> str:

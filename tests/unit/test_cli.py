@@ -1,0 +1,350 @@
+"""cli and commands: words, exit codes, one line of complaint. Nothing here needs a vehicle."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import pytest
+import trio
+
+from mavftpfs import cli, commands, compose, control, daemon
+from mavftpfs.exits import ExitCode, MountFailed, NoFtp, exit_code_for
+from mavftpfs.fuse.options import MountOptions
+from mavftpfs.shared import errors
+from mavftpfs.shared.errors import LinkClosed, MavftpfsError, UsageError, VehicleLost
+
+SOURCE = "udpin:127.0.0.1:0"
+
+
+def complaint(capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, str]:
+    """Run a command that must fail with one line on stderr and nothing on stdout."""
+    code = cli.main(words)
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    lines = captured.err.splitlines()
+    assert len(lines) == 1, captured.err
+    assert lines[0].startswith("mavftpfs: ")
+    return code, lines[0]
+
+
+# -- exit codes -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("error", "code"),
+    [
+        (UsageError("x"), 1),
+        (errors.NotFound("x"), 1),
+        (VehicleLost("x"), 2),
+        (LinkClosed("x"), 2),
+        (NoFtp("x"), 2),
+        (errors.RequestTimeout("x"), 2),
+        (MountFailed("x"), 3),
+        (control.NobodyThere("x"), 3),
+        (MavftpfsError("x"), 2),
+    ],
+)
+def test_exit_codes(error: MavftpfsError, code: int) -> None:
+    assert exit_code_for(error) == code
+
+
+def test_the_documented_numbers() -> None:
+    numbers = [ExitCode.OK, ExitCode.USAGE, ExitCode.NO_VEHICLE, ExitCode.MOUNT_FAILED, ExitCode.UNDELIVERED]
+    assert numbers == [0, 1, 2, 3, 4]
+
+
+# -- words ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("words", "named"),
+    [
+        ((SOURCE,), "MOUNTPOINT"),
+        ((SOURCE, "/mnt", "extra"), "extra"),
+        ((SOURCE, "/mnt", "-o", "frobnicate"), "frobnicate"),
+        ((SOURCE, "/mnt", "-o"), "-o"),
+        (("mount", SOURCE), "MOUNTPOINT"),
+        (("mount", SOURCE, "/mnt", "-o", "max_read=1"), "max_read"),
+        (("warp:9", "/mnt"), "warp"),
+        ((f"{SOURCE}#/a", "/mnt", "-o", "root=/b"), "root="),
+        (("umount",), "MOUNTPOINT"),
+        (("get", SOURCE), "PATH"),
+        (("get", SOURCE, "/a/../b"), ".."),
+        (("get", SOURCE, "mftp://comp=1:/a", "mftp://comp=2:/a"), "components"),
+        (("ls", SOURCE, "mftp://comp=300:/a"), "300"),
+        (("ls", SOURCE, "/", "-o", "uid=x"), "uid"),
+        (("status", "a", "b"), "b"),
+        (("crc", SOURCE, "/x", "-o", "signing_key=/nonexistent/key"), "/nonexistent/key"),
+        (("ls", SOURCE, "/", "-o", "trace=/nonexistent/t"), "/nonexistent/t"),
+    ],
+)
+def test_usage_errors_are_one_line_and_exit_1(
+    capsys: pytest.CaptureFixture[str], words: tuple[str, ...], named: str
+) -> None:
+    code, line = complaint(capsys, *words)
+    assert code == 1
+    assert named in line
+
+
+def test_no_words_shows_help(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main([]) == 1
+    assert "SOURCE MOUNTPOINT" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "words", [["--help"], ["mount", "-h"], ["get", "-h"], ["sim", "-h"], ["demo", "-h"], ["status", "-h"]]
+)
+def test_help_is_exit_0(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as caught:
+        cli.main(words)
+    assert caught.value.code == 0
+    assert "usage: mavftpfs" in capsys.readouterr().out
+
+
+def test_version(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as caught:
+        cli.main(["-V"])
+    assert caught.value.code == 0
+    assert capsys.readouterr().out.startswith("mavftpfs 0.")
+
+
+def test_what_mount_8_calls_is_parsed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    seen: list[tuple[Any, ...]] = []
+
+    def serve(*args: Any) -> int:
+        seen.append(args)
+        return 0
+
+    monkeypatch.setattr(commands, "_serve", serve)
+    monkeypatch.setattr(daemon, "in_background", lambda work: work(None))
+    words = [f"{SOURCE}#/fs/microsd", str(tmp_path), "-o", "rw,dev,suid,_netdev", "-o", "uid=7"]
+    for command in ([], ["mount"]):
+        assert cli.main([*command, *words]) == 0
+        _, options, spec, mountpoint, _ = seen.pop()
+        assert (options.root, options.uid, options.kernel_words) == (b"/fs/microsd", 7, ("dev", "suid"))
+        assert options.read_only, "the kernel is told so while there is no write side"
+        assert mountpoint == str(tmp_path)
+        assert spec.port == 0
+
+
+def test_baud_and_relative_paths(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    args = argparse.Namespace(source="/dev/ttyX", options=["baud=921600,log_file=a/b.log"])
+    options, spec = commands.connection_of(args)
+    assert spec.baud == 921600
+    monkeypatch.chdir(tmp_path)
+    assert commands.absolute_paths(options).log_file == str(tmp_path / "a" / "b.log")
+
+
+def test_a_bug_is_one_line_without_d(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fail(args: argparse.Namespace) -> tuple[MountOptions, Any]:
+        raise ValueError("surprise")
+
+    monkeypatch.setattr(commands, "connection_of", fail)
+    code, line = complaint(capsys, SOURCE, "/mnt")
+    assert code == ExitCode.BUG
+    assert "surprise" in line
+    with pytest.raises(ValueError, match="surprise"):
+        cli.main([SOURCE, "/mnt", "-d"])
+
+
+@pytest.mark.parametrize("command", ["put", "rm", "mkdir", "rmdir", "mv"])
+def test_what_writes_is_not_offered_before_it_exists(
+    command: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code, line = complaint(capsys, command, SOURCE, "/x", "/y")
+    assert code == 1
+    assert SOURCE in line or "unrecognized" in line
+
+
+def test_a_reader_that_leaves_is_no_error(tmp_path: Path) -> None:
+    code = (
+        "import sys; from mavftpfs import cli, commands\n"
+        "def crowd(args):\n    [print('x' * 1000) for _ in range(1000)]\n"
+        "cli._COMMANDS['ls'] = (cli._ls_parser, crowd)\n"
+        "sys.exit(cli.main(['ls', 'udpin:127.0.0.1:0']))"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    ) as child:
+        assert child.stdout is not None
+        child.stdout.readline()
+        child.stdout.close()
+        assert child.stderr is not None
+        assert child.stderr.read() == b""
+        assert child.wait(20) == 0
+
+
+# -- one-shot runs --------------------------------------------------------------------------------
+
+
+def test_an_interrupted_command_cleans_up() -> None:
+    steps: list[str] = []
+
+    async def work() -> None:
+        try:
+            os.kill(os.getpid(), signal.SIGINT)
+            await trio.sleep(60)
+        finally:
+            steps.append("cleaned")
+
+    with pytest.raises(KeyboardInterrupt):
+        trio.run(commands.until_interrupted, work)
+    assert steps == ["cleaned"]
+
+
+def test_errors_of_a_command_are_not_wrapped() -> None:
+    async def work() -> None:
+        async with trio.open_nursery():
+            await trio.lowlevel.checkpoint()
+        raise VehicleLost("gone")
+
+    with pytest.raises(VehicleLost, match="gone"):
+        trio.run(commands.until_interrupted, work)
+
+
+# -- status and umount ----------------------------------------------------------------------------
+
+
+class FakeMount(threading.Thread):
+    """A mount's process as the control socket shows it: answers each client with one reply."""
+
+    def __init__(self, path: Path, replies: Mapping[str, Mapping[str, Any]]) -> None:
+        super().__init__(daemon=True)
+        self.replies = replies
+        self.requests: list[dict[str, Any]] = []
+        self.listener = socket.socket(socket.AF_UNIX)
+        self.listener.bind(str(path))
+        self.listener.listen()
+
+    def run(self) -> None:
+        while True:
+            try:
+                client, _ = self.listener.accept()
+            except OSError:
+                return
+            with client, client.makefile("rb") as lines:
+                self.requests.append(json.loads(lines.readline()))
+                reply = self.replies[self.requests[-1]["command"]]
+                client.sendall(json.dumps(reply).encode() + b"\n")
+
+    def stop(self) -> None:
+        self.listener.shutdown(socket.SHUT_RDWR)
+        self.join(20)
+        self.listener.close()
+
+
+@pytest.fixture
+def sockets(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The only directory in which control sockets are looked for."""
+    directory = tmp_path / "run"
+    directory.mkdir()
+    monkeypatch.setattr(control, "own_directories", lambda: [directory])
+    return directory
+
+
+@pytest.fixture
+def fake_mount(sockets: Path, tmp_path: Path) -> Iterator[FakeMount]:
+    """A mount on tmp_path/mnt whose process has ended by the time it says so."""
+    ended = subprocess.Popen(["true"])
+    ended.wait()
+    facts = {"mountpoint": str(tmp_path / "mnt"), "source": SOURCE, "connection": {"rtt": 0.02}}
+    replies: dict[str, dict[str, Any]] = {
+        "status": {"ok": True, "status": facts},
+        "umount": {"ok": True, "exit_code": 4, "pid": ended.pid},
+    }
+    mount = FakeMount(sockets / control.socket_name(str(tmp_path / "mnt")), replies)
+    mount.start()
+    yield mount
+    mount.stop()
+
+
+def test_status_json(fake_mount: FakeMount, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["status", str(tmp_path / "mnt"), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["connection"] == {"rtt": 0.02}
+    assert cli.main(["status", "--json"]) == 0
+    assert [facts["source"] for facts in json.loads(capsys.readouterr().out)] == [SOURCE]
+
+
+def test_status_as_a_table(fake_mount: FakeMount, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["status"]) == 0
+    out = capsys.readouterr().out
+    assert SOURCE in out
+    assert "20 ms" in out
+
+
+def test_status_of_nothing(sockets: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    code, line = complaint(capsys, "status", str(tmp_path / "mnt"))
+    assert code == 3
+    assert str(tmp_path / "mnt") in line
+    assert cli.main(["status"]) == 0
+    assert "no vehicle" in capsys.readouterr().out
+
+
+def test_a_dead_mount_s_socket_is_swept(sockets: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = sockets / "dead.sock"
+    with socket.socket(socket.AF_UNIX) as dead:
+        dead.bind(str(path))
+    assert cli.main(["status", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out) == []
+    assert not path.exists()
+
+
+def test_umount_gives_the_mount_s_exit_code(fake_mount: FakeMount, tmp_path: Path) -> None:
+    assert cli.main(["umount", "-l", str(tmp_path / "mnt")]) == 4
+    assert fake_mount.requests == [{"command": "umount", "lazy": True}]
+
+
+def test_umount_that_is_refused(
+    fake_mount: FakeMount, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    fake_mount.replies = {"umount": {"ok": False, "error": "it is in use"}}
+    code, line = complaint(capsys, "umount", str(tmp_path / "mnt"))
+    assert code == 3
+    assert "in use" in line
+
+
+def test_umount_of_what_is_not_mounted(
+    sockets: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code, line = complaint(capsys, "umount", str(tmp_path))
+    assert code == 3
+    assert str(tmp_path) in line
+
+
+# -- signing keys ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("content", "key"),
+    [
+        (bytes(range(32)), bytes(range(32))),
+        (bytes(range(32)).hex().encode() + b"\n", bytes(range(32))),
+        (
+            b"correct horse\n",
+            bytes.fromhex("4104d36f8da2c254349f85836793ebe029e0c957063a34c91c2e9203187b5631"),
+        ),
+    ],
+)
+def test_signing_keys(tmp_path: Path, content: bytes, key: bytes) -> None:
+    path = tmp_path / "key"
+    path.write_bytes(content)
+    assert compose.read_key(str(path)) == key
+
+
+def test_an_empty_key_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "key"
+    path.write_text("\n")
+    with pytest.raises(UsageError, match="empty"):
+        compose.read_key(str(path))
