@@ -29,8 +29,7 @@ _FAST_PATH_WINDOW = 96
 _QUEUE_SECONDS = 0.005
 _ROUNDS_REMEMBERED = 10
 _PLATEAU_ROUNDS = 2
-_BASE_LIFETIME = 30.0
-_DRAIN_ROUNDS = 2
+_NARROW = 0.6
 _TELLING_LOSSES = 8
 _TELLING_ROUND = 16
 
@@ -43,13 +42,11 @@ class Flow:
         "_all",
         "_all_losses",
         "_app_limited",
-        "_base_at",
         "_base_rtt",
         "_best_rate",
         "_brake",
         "_cap",
         "_collapsed",
-        "_draining",
         "_easing",
         "_goal",
         "_limit",
@@ -62,6 +59,8 @@ class Flow:
         "_round_start",
         "_serial",
         "_starting",
+        "_wide_least",
+        "_wide_window",
         "loss",
         "window",
     )
@@ -76,8 +75,8 @@ class Flow:
         self._rates: deque[float] = deque(maxlen=_ROUNDS_REMEMBERED)
         self._best_rate = 0.0
         self._base_rtt = inf
-        self._base_at = 0.0
-        self._draining = 0
+        self._wide_window = 0
+        self._wide_least = inf
         self._easing = Easing()
         self._brake = 1.0
         self._plateau = 0
@@ -149,7 +148,7 @@ class Flow:
         overflowed = self._overflowed()
         total = self._replies + self._losses
         self.loss += (self._losses / total - self.loss) * 0.2
-        self._learn_base(now)
+        self._learn_base()
         took = now - self._round_start
         rate = self._replies / took if took > 0 else 0.0
         # What the window was doubled for shows two rounds later.
@@ -171,21 +170,21 @@ class Flow:
             self._goal = 0
             self._approach(self._easing.next_window(self._target(), self.loss, next_order))
 
-    def _learn_base(self, now: float) -> None:
-        """Keep the least round trip; one not seen again for long is measured anew with a drained queue."""
+    def _learn_base(self) -> None:
+        """Keep the least round trip, until a much narrower window proves that it is gone."""
         least = self._round_least
-        if least == inf:
-            return
         if least <= 1.1 * self._base_rtt:
             self._base_rtt = min(least, self._base_rtt)
-            self._base_at = now
-            self._draining = 0
-        elif self._draining:
-            self._draining -= 1
-            if not self._draining:
-                self._base_rtt, self._base_at = least, now
-        elif now - self._base_at > _BASE_LIFETIME:
-            self._draining = _DRAIN_ROUNDS
+            self._wide_window = 0
+        elif least == inf:
+            return
+        elif self.window > self._wide_window:
+            self._wide_window, self._wide_least = self.window, least
+        elif self.window <= _NARROW * self._wide_window:
+            # A queue of ours would have become shorter.
+            if least > 0.9 * self._wide_least:
+                self._base_rtt = least
+            self._wide_window = 0
 
     def _learn_congestion(self) -> None:
         if self._losses and self._queued(2.0):
@@ -217,8 +216,7 @@ class Flow:
         if base == inf or rate == 0.0:
             return INITIAL
         held = _GAIN * rate * base / max(0.3, 1.0 - self.loss) + _SLACK
-        wanted = self._brake * max(held, min(rate * _FAST_PATH_SECONDS, _FAST_PATH_WINDOW))
-        return wanted / 2 if self._draining else wanted
+        return self._brake * max(held, min(rate * _FAST_PATH_SECONDS, _FAST_PATH_WINDOW))
 
     def _approach(self, target: float) -> None:
         if self._serial:

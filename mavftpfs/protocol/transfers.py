@@ -111,6 +111,10 @@ class ReadTransfer(Operation):
     def drop_readahead(self) -> None:
         """Forget wants that nobody waits for; what is on its way still arrives."""
         self._ahead.clear()
+        gaps, self._gaps = self._gaps, ExtentSet()
+        for start, stop in gaps:
+            for part_start, part_stop in self._demand.intersection(start, stop):
+                self._gaps.add(part_start, part_stop)
 
     def set_strategy(self, strategy: Strategy) -> None:
         """Go on by this strategy from the next safe point, which is the end of a running burst."""
@@ -157,8 +161,10 @@ class ReadTransfer(Operation):
         """Return the next ReadFile, the BurstReadFile that is due, or a keep-alive during a burst."""
         if self._burst is not None:
             return self._next_keep_alive(now)
-        if not self._gaps.empty:
-            return self._next_gap(now)
+        gap = self._gaps.take_first(self.chunk)
+        if gap is not None:
+            self._forget_want(*gap)
+            return self._ask(*gap, now)
         if self.strategy == "burst":
             return self._next_burst()
         return self._next_read(now)
@@ -166,13 +172,6 @@ class ReadTransfer(Operation):
     def _next_read(self, now: float) -> Request | None:
         piece = self._demand.take_first(self.chunk) or self._ahead.take_first(self.chunk)
         return None if piece is None else self._ask(piece[0], piece[1], now)
-
-    def _next_gap(self, now: float) -> Request | None:
-        piece = self._gaps.take_first(self.chunk)
-        if piece is None:
-            return None
-        self._forget_want(*piece)
-        return self._ask(piece[0], piece[1], now)
 
     def _forget_want(self, start: int, stop: int) -> None:
         self._demand.discard(start, stop)

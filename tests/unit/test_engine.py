@@ -8,6 +8,7 @@ import pytest
 
 from mavftpfs.protocol.engine import BURST_JUMP, Engine
 from mavftpfs.protocol.flow import Flow
+from mavftpfs.protocol.ledger import Ghost
 from mavftpfs.protocol.operations import ListDirectory, OpenFile, Operation, Simple
 from mavftpfs.protocol.payload import NakCode, Opcode, Payload
 from mavftpfs.protocol.transfers import ReadTransfer
@@ -233,10 +234,10 @@ def test_a_session_that_changes_all_the_time_ends_somewhere() -> None:
         out = sent(engine, 0.0)
         if not out:
             break
-        engine.session = (count % 200) + 1
+        engine.session = count + 2
         engine.receive(nak(out[0], NakCode.INVALID_SESSION), 0.0)
     assert isinstance(op.error, FtpNak)
-    assert engine.stats.requests < 12
+    assert engine.stats.requests == 9
 
 
 def test_a_late_refusal_under_an_old_session_does_not_repeat_twice() -> None:
@@ -432,6 +433,18 @@ def test_silence_narrows_the_window_until_something_is_heard() -> None:
     assert engine.flow.window == 2
 
 
+def test_progress_and_patience_may_end_at_the_same_moment() -> None:
+    engine = make(limit=1)
+    transfer, _ = reading(engine)
+    now = 0.0
+    while not transfer.done:
+        now += 0.5
+        sent(engine, now)
+        engine.on_deadline(now)
+    assert engine.stats.timeouts == 1
+    assert engine.take_finished() == [transfer]
+
+
 def test_one_chunk_that_is_never_answered_fails_the_transfer() -> None:
     engine = make(limit=4)
     transfer, _ = reading(engine, 239 * 100_000)
@@ -530,6 +543,35 @@ def test_cancelling_forgets_what_was_to_be_sent_again() -> None:
     engine.cancel(op, 1.0)
     assert sent(engine, 1.0) == []
     assert engine.in_flight == 0
+
+
+def test_each_operation_gets_its_own_lost_requests_back() -> None:
+    engine = make()
+    first, second = mkdir(), mkdir()
+    engine.start(first, 0.0)
+    (lost,) = sent(engine, 0.0)
+    engine.on_deadline(1.0)
+    engine.start(second, 1.0)
+    engine.flow.window = 1
+    assert [request.seq for request in sent(engine, 1.0)] == [lost.seq, lost.seq + 1]
+    engine.on_deadline(40.0)
+    assert {type(op.error) for op in engine.take_finished()} == {RequestTimeout}
+
+
+def test_a_request_behind_others_finds_nothing_of_its_own_to_repeat() -> None:
+    engine = make(limit=1)
+    transfer, _ = reading(engine)
+    sent(engine, 0.0)
+    engine.on_deadline(1.0)
+    engine.start(mkdir(), 1.0)
+    assert [request.opcode for request in sent(engine, 1.0)] == [Opcode.CREATE_DIRECTORY]
+    engine.cancel(transfer, 1.0)
+    assert engine.in_flight == 1
+
+
+def test_a_ghost_asks_for_nothing() -> None:
+    with pytest.raises(LocalProtocolError):
+        Ghost().next_request(0.0)
 
 
 def test_an_operation_runs_once() -> None:

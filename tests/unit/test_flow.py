@@ -140,7 +140,7 @@ def test_silence_probes_with_two_until_something_is_heard() -> None:
     assert flow.window <= 4
 
 
-def test_a_longer_way_is_noticed_by_draining_the_queue() -> None:
+def test_a_longer_way_is_noticed() -> None:
     flow = Flow()
     path = Path(flow, rate=1000.0, base=0.05)
     path.rounds(30)

@@ -82,6 +82,16 @@ def test_a_refusal_after_a_retransmission_says_so() -> None:
     assert op.retransmitted
 
 
+def test_a_request_too_big_for_the_wire_is_our_fault() -> None:
+    op = Simple(Opcode.NONE)
+    request = op.next_request(0.0)
+    assert request is not None
+    request.seq = 1
+    request.data = bytes(240)
+    with pytest.raises(LocalProtocolError):
+        request.encode()
+
+
 def test_too_long_data_is_refused_before_a_byte_is_sent() -> None:
     with pytest.raises(PathTooLong):
         Simple(Opcode.RENAME, bytes(240))

@@ -72,6 +72,26 @@ def test_nothing_is_asked_far_behind_the_end() -> None:
     assert reading.op.data == b"x" * 30
 
 
+def test_a_lost_block_is_waited_for_behind_the_end() -> None:
+    content = random.Random(1).randbytes(250)
+    reading = Reading()
+    for offset in (100, 200, 300):
+        reading.engine.receive(chunk(reading.out[offset], content), 0.0)
+    again = sent(reading.engine, 0.0)
+    assert [request.offset for request in again] == [0]
+    reading.engine.receive(chunk(again[0], content), 0.0)
+    assert reading.op.data == content
+
+
+def test_nothing_is_asked_behind_a_known_end() -> None:
+    content = random.Random(1).randbytes(300)
+    reading = Reading()
+    for offset in (300, 0, 100, 200):
+        reading.answer(offset, content)
+        assert max(reading.out) == 300
+    assert reading.op.data == content
+
+
 def test_an_empty_ack_is_an_end() -> None:
     reading = Reading()
     reading.answer(0, b"x" * 100)

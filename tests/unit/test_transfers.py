@@ -119,6 +119,26 @@ def test_readahead_can_be_dropped() -> None:
     assert reader.sink.held == ExtentSet([(0, 239)])
 
 
+def test_gaps_nobody_waits_for_any_more_are_dropped() -> None:
+    reader = Reader(strategy="burst", limit=1)
+    reader.transfer.want(0, 478, True)
+    reader.transfer.want(478, 956, False)
+    (request,) = reader.sent()
+    stream(reader, request, [4])
+    reader.engine.receive(burst_nak(request, 5, NakCode.EOF), reader.now)
+    reader.transfer.drop_readahead()
+    assert ranges(reader.finish()) == [(0, 239), (239, 478)]
+    assert reader.transfer.idle
+
+
+def test_readahead_that_is_wanted_twice_is_asked_once() -> None:
+    reader = Reader(limit=1)
+    reader.transfer.want(0, 239, True)
+    reader.transfer.want(0, 478, False)
+    assert reader.transfer.wants == ExtentSet([(0, 478)])
+    assert ranges(reader.finish()) == [(0, 239), (239, 478)]
+
+
 @pytest.mark.parametrize("block", [0, 240])
 def test_chunk_sizes(block: int) -> None:
     with pytest.raises(LocalProtocolError):
@@ -150,6 +170,16 @@ def test_a_server_with_small_replies_is_asked_for_less() -> None:
     assert bytes(reader.sink.data[: 239 * 8]) == CONTENT[: 239 * 8]
     assert reader.transfer.chunk == 48
     assert set(sizes[4:-1]) == {48}
+
+
+def test_a_short_reply_to_a_short_request_teaches_nothing() -> None:
+    reader = Reader(limit=1, size=100)
+    reader.transfer.want(0, 100, True)
+    for _ in range(10):
+        (request,) = reader.sent()
+        reader.engine.receive(ack(request, CONTENT[request.offset :][:10]), 0.1)
+    assert bytes(reader.sink.data) == CONTENT[:100]
+    assert reader.transfer.chunk == 239
 
 
 def test_an_over_long_reply_is_clipped() -> None:
