@@ -132,7 +132,7 @@ class Upload(Protocol):
     async def finish(self) -> None:
         """Return when everything the source has is ACKed and Terminate is ACKed.
 
-        It may be called again: after an error to go on where it stopped, after success if the source got more.
+        It may be called again: after an error to go on where it stopped, after success if there is more.
 
         Raises:
             FtpNak, RequestTimeout, VehicleLost, SessionBusy, Armed.
@@ -140,7 +140,7 @@ class Upload(Protocol):
         ...
 
     async def abort(self) -> None:
-        """Terminate, best effort, and ask the source for nothing more. Raises nothing; may be called twice."""
+        """Terminate, best effort, and ask the source for nothing more. Raises nothing, twice too."""
         ...
 
 
@@ -158,7 +158,7 @@ class WriteStore(Protocol):
         ...
 
     async def open_upload(self, path: bytes, source: UploadSource, *, create: bool) -> Upload:
-        """Open a file for writing: CreateFile (empties it), else OpenFileWO (only where wo_truncates is False)."""
+        """Open a file: by CreateFile (empties it), else OpenFileWO (only where wo_truncates is False)."""
         ...
 
     async def create_empty(self, path: bytes) -> None:

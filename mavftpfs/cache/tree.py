@@ -8,11 +8,10 @@ modules behind it name them as the vehicle does.
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Protocol
 
 import trio
 
@@ -22,6 +21,7 @@ from mavftpfs.cache.dentries import Dentries
 from mavftpfs.cache.directories import Directories, Found
 from mavftpfs.cache.files import Files
 from mavftpfs.cache.flights import Flights
+from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.options import CacheOptions
 from mavftpfs.cache.remote import RemoteStore, WriteStore
 from mavftpfs.cache.virtual import VirtualTrees, is_snapshot
@@ -32,79 +32,6 @@ from mavftpfs.shared.model import ROOT, DirEntry, EntryKind, is_virtual, join, n
 __all__ = ["OpenFile", "Stat", "Tree"]
 
 MAX_CHECKSUMS = 1024
-
-
-class OpenFile(Protocol):
-    """One open() of a file.
-
-    size: bytes; of a file being written it follows what was written, else it is fixed for the life of the
-    handle. direct_io: the kernel must not cache its pages. keep_cache: pages the kernel holds from the last
-    open are still right. writable: write, truncate, flush and fsync do something.
-    """
-
-    @property
-    def size(self) -> int: ...
-
-    @property
-    def direct_io(self) -> bool: ...
-
-    @property
-    def keep_cache(self) -> bool: ...
-
-    @property
-    def writable(self) -> bool: ...
-
-    async def read(self, offset: int, size: int) -> bytes | memoryview:
-        """Return `size` bytes at `offset`, fewer only at the end of the handle's size.
-
-        Raises:
-            FileChanged, DataUnproven, RequestTimeout, VehicleLost, FtpNak.
-        """
-        ...
-
-    async def write(self, offset: int, data: bytes | memoryview) -> int:
-        """Take all of `data` and return its length; waits while too much is not on the vehicle yet.
-
-        Raises:
-            NoSpace, Armed, FileTooLarge, RequestTimeout: nothing was taken.
-        """
-        ...
-
-    async def truncate(self, size: int) -> None:
-        """Cut or extend the file, locally; delivered like written bytes.
-
-        Raises:
-            NoSpace, Armed, RequestTimeout.
-        """
-        ...
-
-    async def flush(self) -> None:
-        """One descriptor was closed: deliver what was written, unless that is nothing but an emptied file.
-
-        Raises:
-            The reason why bytes are still undelivered; as long as they are, at every call.
-        """
-        ...
-
-    async def fsync(self) -> None:
-        """Return when everything written is on the card, checked (promise 2).
-
-        Raises:
-            As flush.
-        """
-        ...
-
-    async def release(self) -> None:
-        """The last descriptor was closed: deliver, and close whatever delivery said. Releasing twice is harmless.
-
-        Raises:
-            As flush; what could not be delivered is kept.
-        """
-        ...
-
-    def close(self) -> None:
-        """Close without delivering (what was not delivered is kept and delivered later)."""
-        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -251,7 +178,8 @@ class Tree:
         """Make a file, or open (not empty) the one that is there, for writing.
 
         Raises:
-            AlreadyExists (exclusive), NotFound (its directory), NotADirectory, IsADirectory, Armed, PathTooLong.
+            AlreadyExists (exclusive), NotFound (its directory), NotADirectory, IsADirectory, Armed,
+                PathTooLong.
         """
         remote = self._remote(path)
         return await self._writable(remote).create(remote, exclusive=exclusive)
@@ -313,19 +241,19 @@ class Tree:
         self._writable(source)
         await self._writable(target).rename(source, target, noreplace=noreplace)
 
-    def undelivered(self) -> list[bytes]:
+    def undelivered(self) -> Sequence[bytes]:
         """Return the paths of files of which the vehicle does not provably have every byte."""
         if self._writing is None:
             return []
         return [self._below(remote) for remote in self._writing.undelivered()]
 
-    async def drain(self, timeout: float) -> list[bytes]:
-        """Deliver everything, trying again for at most `timeout` seconds; return what remains, as undelivered."""
+    async def drain(self, timeout: float) -> Sequence[bytes]:
+        """Deliver everything, trying again for at most `timeout` seconds; return what remains."""
         if self._writing is not None:
             await self._writing.drain(timeout)
         return self.undelivered()
 
-    def recover_to(self, directory: Path) -> list[Path]:
+    def recover_to(self, directory: Path) -> Sequence[Path]:
         """Copy what could not be delivered into a directory, which is made, with a manifest.json.
 
         Returns the files written, [] if there was nothing. Blocks: for the end of a mount.
@@ -336,7 +264,7 @@ class Tree:
         return [] if self._writing is None else self._writing.recover_to(directory)
 
     def armed_changed(self, armed: bool) -> None:
-        """The vehicle was armed or disarmed: unless when_armed=ok, nothing is changed in flight (promise 9)."""
+        """The vehicle was armed or disarmed: nothing is changed in flight unless when_armed=ok."""
         if self._writing is not None:
             self._writing.armed_changed(armed)
 

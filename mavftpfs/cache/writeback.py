@@ -6,10 +6,9 @@ Paths are the vehicle's, normalised.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
-if TYPE_CHECKING:
-    from mavftpfs.cache.tree import OpenFile
+from mavftpfs.cache.openfile import OpenFile
 
 
 class Writeback(Protocol):

@@ -48,7 +48,7 @@ class WriteTraits:
         truncate_works: TruncateFile is answered, and safe (False on PX4 on NuttX, whose copy-back can
             destroy the file). Filled by the session.
         rename_works: a rename succeeded (False: LittleFS has none). Filled by the cache.
-        rename_replaces: a rename onto an existing file succeeded (False: FAT refuses it). Filled by the cache.
+        rename_replaces: a rename onto an existing file worked (False: FAT refuses it). Filled by the cache.
         folds_case: two spellings of a name open the same file. Filled by the cache.
     """
 
