@@ -111,6 +111,30 @@ def test_serial_grows_by_one_and_goes_back_where_most_is_lost() -> None:
     assert flow.window < high
 
 
+def test_a_start_that_overflows_a_buffer_ends() -> None:
+    flow = Flow()
+    path = Path(flow, rate=1e6, base=0.1)
+    while flow.window < 100:
+        path.round()
+    wide = flow.window
+    path.rounds(2, lost=40)
+    assert flow.window < wide
+    path.rounds(4)
+    assert flow.window <= wide
+
+
+def test_a_queue_that_shrinks_with_the_window_is_no_longer_way() -> None:
+    flow = Flow()
+    path = Path(flow, rate=1000.0, base=0.05)
+    path.rounds(20)
+    path.rate = 100.0
+    path.rounds(60)
+    assert flow.window < 15
+    path.rate = 1000.0
+    path.rounds(40)
+    assert 50 <= flow.window < 80
+
+
 def test_a_starved_round_proves_nothing() -> None:
     flow = Flow()
     path = Path(flow, rate=1000.0, base=0.1)
