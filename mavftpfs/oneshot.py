@@ -197,7 +197,7 @@ class _Getter:
             return "size (the vehicle did not answer the checksum request)"
         if theirs != crc:
             raise DataUnproven(
-                f"{_text(remote)}: {size} bytes came as {crc:08x}, the vehicle has {theirs:08x}"
+                f"{_text(remote)}: {size} bytes came with CRC32 {crc:08x}, the vehicle has {theirs:08x}"
             )
         return "size and CRC32"
 
