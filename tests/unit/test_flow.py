@@ -173,6 +173,19 @@ def test_a_longer_way_is_noticed() -> None:
     assert flow.window >= 200
 
 
+@pytest.mark.parametrize("limit", [4, None])
+def test_rounds_without_a_round_trip_change_little(limit: int | None) -> None:
+    flow = Flow(limit=limit)
+    path = Path(flow, rate=1000.0, base=0.1)
+    if limit is None:
+        path.rounds(20)
+    before = flow.window
+    for order in range(path.order, path.order + 200):
+        path.now += 1.0 / 1000.0
+        flow.on_reply(path.now, None, order, order + flow.window)
+    assert flow.window == pytest.approx(before, abs=0.1 * before)
+
+
 def test_rounds_in_no_time_or_without_round_trips_are_survived() -> None:
     flow = Flow()
     for order in range(10):
