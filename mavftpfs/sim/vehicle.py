@@ -200,9 +200,8 @@ class SimVehicle:
             frame = self.framer.encode_telemetry(self._telemetry_step, self._boot_ms(now))
             self._telemetry_step += 1
             frames.append(frame)
-            # Nothing is made up for after a pause: an autopilot skips what it could not send.
-            self._next_telemetry = max(self._next_telemetry, now - HEARTBEAT_PERIOD) + len(frame) / rate
-        self._next_telemetry = now
+            self._next_telemetry = max(self._next_telemetry, self._booted_at or 0.0) + len(frame) / rate
+        self._next_telemetry = now  # nothing more is made up for: an autopilot skips what it could not send
 
     def _on_command(self, command: CommandLong, now: float) -> None:
         self.commands += 1

@@ -492,13 +492,13 @@ async def test_a_slow_peer_costs_whole_frames_never_parts() -> None:
 
 
 @asynccontextmanager
-async def opened_pty() -> AsyncIterator[tuple[StreamLink, int]]:
+async def opened_pty(baud: int = 115200) -> AsyncIterator[tuple[StreamLink, int]]:
     """Open a link on a new pty; also returns the other end."""
     master, slave = os.openpty()
     tty.setraw(slave)
     os.set_blocking(master, False)
     try:
-        async with opened(f"{os.ttyname(slave)},115200") as link:
+        async with opened(f"{os.ttyname(slave)},{baud}") as link:
             assert isinstance(link, StreamLink)
             yield link, master
     finally:
@@ -536,6 +536,21 @@ async def test_serial_that_nobody_reads_is_bounded() -> None:
             link.send_nowait([bytes(266)])
         assert link.backlog <= 115_200 // 10
         assert link.stats.dropped_sends > 0
+
+
+async def test_a_frame_that_was_begun_is_finished() -> None:
+    """Whatever the limit on what waits: a hole in a stream costs the next frame too."""
+    frames = [bytes([n]) * 1000 for n in range(20)]
+    async with opened_pty(9600) as (link, master):
+        link.send_nowait(frames)
+        assert link.backlog > 4096
+        link.send_nowait([b"too much"])
+        got = b""
+        while len(got) < 20_000:
+            await trio.lowlevel.wait_readable(master)
+            got += os.read(master, 700)
+        assert got == b"".join(frames)
+        assert (link.backlog, link.stats.dropped_sends) == (0, 1)
 
 
 async def test_serial_comes_back_when_the_device_does(tmp_path: Path) -> None:

@@ -147,8 +147,9 @@ def test_seq_counts_through_all_messages_and_wraps() -> None:
     framer = Framer(US, stream=True)
     seqs = []
     for _ in range(200):
-        seqs += [framer.encode_ftp(DRONE, PAYLOAD)[4], framer.encode_heartbeat(18)[4]]
-    assert seqs == [n % 256 for n in range(400)]
+        seqs += [framer.encode_ftp(DRONE, PAYLOAD)[4] for _ in range(2)]
+        seqs += [framer.encode_heartbeat(18)[4]]
+    assert seqs == [n % 256 for n in range(600)]
 
 
 def test_source_may_change() -> None:
@@ -188,8 +189,8 @@ def test_replies_to_nobody_are_trimmed_into_the_header() -> None:
     assert Framer(US, stream=True).feed(frame) == [FtpFrame(DRONE, Address(0, 0), bytes(251))]
 
 
-def with_payload(message_id: int, payload: bytes, extra: int) -> bytes:
-    header = struct.pack("<BBBBBBBHB", 0xFD, len(payload), 0, 0, 0, *DRONE, message_id, 0)
+def with_payload(message_id: int, payload: bytes, extra: int, flags: int = 0) -> bytes:
+    header = struct.pack("<BBBBBBBHB", 0xFD, len(payload), flags, 0, 0, *DRONE, message_id, 0)
     crc = dialect.x25crc(header[1:] + payload + bytes([extra])).crc
     return header + payload + struct.pack("<H", crc)
 
@@ -277,10 +278,21 @@ def test_garbage_between_frames(garbage: bytes) -> None:
 
 
 def test_unknown_incompatible_flags_are_refused() -> None:
-    frame = bytearray(ftp())
-    frame[2] = 0x02
+    frame = with_payload(110, b"\0\xfe\xbf" + PAYLOAD, 84, flags=0x02)
     framer = Framer(US, stream=True)
-    assert framer.feed(bytes(frame) + heartbeat())[-1] == HEARTBEAT
+    assert framer.feed(frame + heartbeat()) == [HEARTBEAT]
+
+
+def test_a_frame_that_says_it_is_signed_waits_for_its_signature() -> None:
+    frame = with_payload(110, b"\0\xfe\xbf" + PAYLOAD, 84, flags=0x01)
+    framer = Framer(US, stream=True)
+    assert framer.feed(frame) == []
+    assert framer.feed(bytes(13) + heartbeat()) == [FTP, HEARTBEAT]
+
+
+def test_an_impossible_message_id_holds_nothing_up() -> None:
+    framer = Framer(US, stream=True)
+    assert framer.feed(b"\xfd\xff\0\0\0\1\1\0\0\1" + ftp()) == [FTP]
 
 
 def test_message_unknown_to_the_dialect_is_other_if_a_frame_follows() -> None:

@@ -197,8 +197,10 @@ def test_reboot_loses_time_arming_and_sessions_but_no_files() -> None:
     assert client.vehicle.server.open_sessions == 1
     client.vehicle.reboot(client.now, downtime=3.0)
     client.tell(client.framer.encode_ftp(DRONE, LIST))
+    assert client.vehicle.outgoing(client.now) == []
     assert client.hear(2.9) == []
     heard = client.hear(0.2)
+    assert of(FtpFrame, heard) == []
     assert of(SystemTime, heard)[0].time_boot_ms == 3000
     assert not of(Heartbeat, heard)[0].armed
     assert client.vehicle.server.open_sessions == 0
