@@ -12,6 +12,9 @@ byte further. Skipping whole matters: the payload may be a piece of a recorded f
 heartbeats must not be taken for live ones. The verdict depends on the bytes alone, never on how they
 were split. What waits for its rest is at most one frame.
 
+A damaged length makes the search wait for up to 280 bytes, which on a link with nothing but heartbeats takes
+many seconds. So whoever feeds a stream says when it fell silent (`give_up`): frames come in one piece.
+
 A datagram ends what it holds; a frame cut at its end is kept in case a serial bridge split it, and dropped
 when the next datagram begins with a frame of its own.
 """
@@ -121,6 +124,25 @@ class Framer:
         """Forget a half-received frame: the stream was reopened."""
         self.stats.garbage_bytes += len(self._tail)
         self._tail = b""
+
+    @property
+    def waiting(self) -> bool:
+        """Whether a stream ended in what may be the beginning of a frame."""
+        return self.stream and bool(self._tail)
+
+    def give_up(self) -> list[Message]:
+        """The stream fell silent in mid-frame: there was none; return what is found behind its beginning."""
+        out: list[Message] = []
+        self.stream = False  # as at the end of a datagram: nothing more decides
+        try:
+            while self._tail:
+                position = self._scan(self._tail, out)
+                skipped = self._skip(position, min(position + 1, len(self._tail)))
+                self._tail = self._tail[skipped:]
+        finally:
+            self.stream = True
+        self.stats.frames += len(out)
+        return out
 
     def _join(self, data: bytes) -> bytes:
         if not self.stream and data[:1] in (b"\xfd", b"\xfe"):

@@ -21,6 +21,10 @@ from mavftpfs.protocol.payload import decode_reply
 from mavftpfs.session.vehicle import Vehicle
 from mavftpfs.shared.errors import RemoteProtocolError, RequestTimeout
 
+QUIET = 0.5
+"""Seconds of silence in mid-frame after which a stream's unfinished frame is not waited for. TCP may pause
+for a retransmission, serial ports do not pause inside a frame."""
+
 BACKLOG_LIMIT = 16 * 1024
 """Bytes the link may hold unsent before the engine is asked for more: nothing overtakes what waits there."""
 
@@ -53,6 +57,7 @@ class Driver:
         self.vehicle = vehicle
         self.bad_payloads = 0
         self.last_reply_at = clock()
+        self._heard_at = clock()
         self.on_batch = on_batch
         self._clock = clock
         self._trace = trace
@@ -71,6 +76,9 @@ class Driver:
             now = self._clock()
             if scope.cancelled_caught:
                 self.engine.on_deadline(now)
+                if now >= self._quiet_at:
+                    self._handle(self.framer.give_up(), now)
+                    self.on_batch(now)
             else:
                 self._take(chunks, now)
             self._settle(now)
@@ -116,13 +124,21 @@ class Driver:
         if not chunks:
             self.framer.reset()
             return
+        self._heard_at = now
         for chunk in chunks:
-            for message in self.framer.feed(chunk):
-                if type(message) is FtpFrame and self.vehicle.is_reply_to_us(message):
-                    self._on_reply(message.payload, now)
-                else:
-                    self._on_other(message, now)
+            self._handle(self.framer.feed(chunk), now)
         self.on_batch(now)
+
+    def _handle(self, messages: list[Message], now: float) -> None:
+        for message in messages:
+            if type(message) is FtpFrame and self.vehicle.is_reply_to_us(message):
+                self._on_reply(message.payload, now)
+            else:
+                self._on_other(message, now)
+
+    @property
+    def _quiet_at(self) -> float:
+        return self._heard_at + QUIET if self.framer.waiting else float("inf")
 
     def _on_reply(self, wire: bytes, now: float) -> None:
         if self._trace is not None:
@@ -162,5 +178,5 @@ class Driver:
         deadline = self.engine.next_deadline()
         if self.link.backlog >= BACKLOG_LIMIT:
             soon = self._clock() + 0.01  # nobody tells us that the link drained
-            return soon if deadline is None else min(deadline, soon)
-        return float("inf") if deadline is None else deadline
+            deadline = soon if deadline is None else min(deadline, soon)
+        return self._quiet_at if deadline is None else min(deadline, self._quiet_at)
