@@ -252,21 +252,14 @@ class FileBlocks:
         """Return [start, stop) if it is held and not provisional. 0 <= start < stop <= size."""
         return self._view(start, stop) if self._usable(start, stop) else None
 
-    async def read(self, start: int, stop: int, want: Callable[[Gaps], None]) -> bytes | memoryview | None:
-        """Return [start, stop), asking `want` for what is missing; None if it came provisional or was lost.
+    async def fill(self, start: int, stop: int, want: Callable[[Gaps], None]) -> None:
+        """Ask `want` for what is missing of [start, stop), which must be held, and wait for it.
+
+        `get` may find nothing afterwards: the bytes came provisional, or were dropped. `want` is called
+        before anything is awaited.
 
         Raises:
             RequestTimeout: none of the missing bytes came for `patience` seconds. Else what on_failed got.
-        """
-        async with self.held(start, stop):
-            await self.fill(start, stop, want)
-            return self.get(start, stop)
-
-    async def fill(self, start: int, stop: int, want: Callable[[Gaps], None]) -> None:
-        """Wait until [start, stop), which must be held, is present or was dropped.
-
-        Raises:
-            As read.
         """
         gaps = self.missing(start, stop)
         if not gaps:

@@ -1,7 +1,7 @@
 """Open regular files: close-to-open consistency over cached blocks. Layer: cache.
 
 At open it is decided whether what is cached of the path is still the vehicle's file:
-- size and mtime of a listing are known and equal the version's, or
+- size and mtime of a fresh listing are known and equal the version's, or
 - the version was proven (by an open ACK, a CRC32 or a listing) less than `dir_timeout` ago and no later
   listing says otherwise: it is kept, and nothing is asked;
 - else the file is opened on the vehicle and a new version starts with the size in the ACK, because equal
@@ -67,13 +67,13 @@ class Files:
 
     # --- opening
 
-    async def open(self, path: bytes, entry: DirEntry, listed_at: float) -> FileHandle:
-        """Open a path that a listing (begun at `listed_at`) shows as the file `entry`.
+    async def open(self, path: bytes, entry: DirEntry, listed_at: float, *, fresh: bool) -> FileHandle:
+        """Open a path that a listing (begun at `listed_at`, perhaps not `fresh` any more) shows as `entry`.
 
         Raises:
             As RemoteStore.open_reader.
         """
-        work = partial(self._open_version, path, entry, listed_at)
+        work = partial(self._open_version, path, entry, listed_at, fresh)
         version, kept = await self._opening.run(path, work)
         keep_cache = kept and version.shown
         version.handles += 1
@@ -95,15 +95,17 @@ class Files:
         reader.close()
         return reader.size
 
-    async def _open_version(self, path: bytes, entry: DirEntry, listed_at: float) -> tuple[Version, bool]:
+    async def _open_version(
+        self, path: bytes, entry: DirEntry, listed_at: float, fresh: bool
+    ) -> tuple[Version, bool]:
         """Return the version to serve, and whether it is the one that was served before."""
         version = self._current.get(path)
-        if version is not None and self._still_right(version, entry, listed_at):
+        if version is not None and self._still_right(version, entry, listed_at, fresh):
             self._current.move_to_end(path)
             return version, True
         return await self._start_version(path, entry), False
 
-    def _still_right(self, version: Version, entry: DirEntry, listed_at: float) -> bool:
+    def _still_right(self, version: Version, entry: DirEntry, listed_at: float, fresh: bool) -> bool:
         """Return whether a version is known to be what the vehicle holds now."""
         if version.dead is not None or version.recheck:
             return False
@@ -112,7 +114,7 @@ class Files:
             self._kill(version)
             return False
         same_size = entry.size in (None, version.size)
-        if entry.size == version.size and entry.mtime is not None and entry.mtime == version.mtime:
+        if fresh and entry.size == version.size and entry.mtime is not None and entry.mtime == version.mtime:
             version.proven_at = max(version.proven_at, listed_at)
             return True
         recent = self._clock() - version.proven_at < self._dir_timeout

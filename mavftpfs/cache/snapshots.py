@@ -45,7 +45,7 @@ class Snapshots:
         self._sizes.pop(path, None)
         self._sizes[path] = len(snapshot.data)
         if len(self._sizes) > MAX_SIZES:
-            self._sizes.popitem(last=False)
+            self._drop(self._sizes.popitem(last=False)[0])
         self._snapshots[path] = snapshot
         self.bytes_cached += len(snapshot.data)
         while self.bytes_cached > self._budget:

@@ -153,7 +153,8 @@ class Tree:
         if self._writing is not None:
             return await self._writing.open_reader(remote)
         found = await self._find_file(remote)
-        return await self._files.open(remote, found.entry, found.directory.listed_at)
+        fresh = self._clock() < found.directory.fresh_until
+        return await self._files.open(remote, found.entry, found.directory.listed_at, fresh=fresh)
 
     async def crc32(self, path: bytes) -> int:
         """Return the vehicle's CRC32 of a file (start value 0, no final xor), remembered by size and mtime.

@@ -121,25 +121,30 @@ class Fetcher:
         raise DataUnproven(f"bytes of {version.path!r} may be another file's, and could not be proven")
 
     async def _read(self, version: Version, start: int, stop: int, plan: Plan) -> bytes | memoryview | None:
-        reader = await self.reader(version)
+        """Return [start, stop), None if it came provisional or was dropped."""
+        blocks = version.blocks
         try:
-            return await version.blocks.read(start, stop, partial(_want, reader, plan))
+            async with blocks.held(start, stop):
+                if blocks.missing(start, stop):
+                    reader = await self.reader(version)
+                    await blocks.fill(start, stop, partial(_want, reader, plan))
+                return blocks.get(start, stop)
         except FileChanged:
             self._on_changed(version)
             raise
 
     async def reader(self, version: Version) -> Reader:
-        """Return the version's reader, opening it if need be.
+        """Return the version's reader, opening it if need be; it is good until the caller awaits again.
 
         Raises:
             FileChanged: the file is smaller now. Else as RemoteStore.open_reader.
         """
-        if version.reader is None:
+        for _ in range(MAX_RESTARTS):
+            version.require_alive()
+            if version.reader is not None:
+                return version.reader
             await self._opening.run(version, partial(self._open, version, version.size))
-        version.require_alive()
-        if version.reader is None:  # the last handle was closed meanwhile
-            raise LocalProtocolError(f"{version.path!r} was closed while it was read")
-        return version.reader
+        raise DataUnproven(f"{version.path!r} is doubted again and again")
 
     async def _open(self, version: Version, expected: int | None) -> Reader:
         version.close_reader()

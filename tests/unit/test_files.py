@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import random
 from collections.abc import AsyncIterator
 
 import pytest
@@ -32,7 +33,7 @@ LOG = b"/logs/a.bin"
 
 
 def content(size: int, seed: int = 7) -> bytes:
-    return bytes((i * seed + (i >> 8) * 3) & 0xFF for i in range(size))
+    return random.Random(seed).randbytes(size)
 
 
 DATA = content(300_000)
@@ -673,7 +674,7 @@ async def test_closing_the_last_handle_under_a_read_ends_it(
         if delay:
             await trio.sleep(delay)
         else:  # while the reader is being opened
-            while not store.count("reader") == 2:
+            while store.count("reader") != 2:
                 await trio.lowlevel.checkpoint()
         handle.close()
     assert len(errors) == 1
@@ -688,7 +689,7 @@ async def test_endless_interference_by_other_readers_ends(autojump_clock: MockCl
     class Restless(FileBlocks):
         tries = 0
 
-        async def read(self, *_: object) -> None:
+        async def fill(self, *_: object) -> None:
             self.tries += 1
 
     store = FakeStore()

@@ -1,0 +1,485 @@
+"""The `@` trees: what appears where, true sizes, snapshots, and how much traffic servers without them see."""
+
+from __future__ import annotations
+
+import pytest
+import trio
+import trio.testing
+from trio.testing import MockClock
+
+from mavftpfs.cache.snapshots import MAX_SIZES, Snapshot, Snapshots
+from mavftpfs.cache.tree import Tree
+from mavftpfs.protocol.crc import crc32
+from mavftpfs.protocol.payload import NakCode, Opcode
+from mavftpfs.shared.errors import (
+    DataUnproven,
+    FtpNak,
+    IsADirectory,
+    LocalProtocolError,
+    NotADirectory,
+    NotFound,
+    RequestTimeout,
+    VehicleLost,
+)
+from mavftpfs.shared.model import EntryKind
+from tests.support.fake_store import FakeStore, make_tree, read_file
+
+LIE = 100_000
+PARAM = b"/@PARAM/param.pck"
+UARTS = b"/@SYS/uarts.txt"
+
+
+def hide_unlistable(store: FakeStore) -> FakeStore:
+    store.unlisted |= {b"/@PARAM", b"/@MISSION"}
+    return store
+
+
+@pytest.fixture
+def store(nursery: trio.Nursery) -> FakeStore:
+    """ArduPilot."""
+    store = hide_unlistable(FakeStore(nursery))
+    store.add(b"/APM/logs/1.BIN", b"log")
+    store.add(UARTS, b"SERIAL0 on", claims=LIE)
+    store.add(b"/@SYS/tasks.txt", b"TasksV2\n", claims=LIE)
+    store.add(b"/@SYS/storage.bin", b"s" * 16384)
+    store.add(b"/@ROMFS/defaults.parm", b"d" * 50)
+    store.add(PARAM, b"p" * 14882)
+    for name in (b"mission", b"fence", b"rally"):
+        store.add(b"/@MISSION/" + name + b".dat", b"m" * 20)
+    return store
+
+
+@pytest.fixture
+def px4(nursery: trio.Nursery) -> FakeStore:
+    """A server that announces nothing."""
+    store = hide_unlistable(FakeStore(nursery))
+    store.add(b"/fs/a", b"a")
+    return store
+
+
+@pytest.fixture
+def tree(store: FakeStore) -> Tree:
+    return make_tree(store)
+
+
+async def names(tree: Tree, path: bytes) -> set[bytes]:
+    return {name for name, _ in await tree.list(path)}
+
+
+def refuse(store: FakeStore, path: bytes, code: int = NakCode.FILE_NOT_FOUND, times: int = 99) -> None:
+    store.fail["whole", path] = [FtpNak(Opcode.OPEN_FILE_RO, code)] * times
+
+
+# --- what appears
+
+
+async def test_unlistable_trees_appear_beside_announced_ones(tree: Tree, autojump_clock: MockClock) -> None:
+    assert await names(tree, b"/") == {b"APM", b"@SYS", b"@ROMFS", b"@PARAM", b"@MISSION"}
+    assert await names(tree, b"/@PARAM") == {b"param.pck"}
+    assert await names(tree, b"/@MISSION") == {b"mission.dat", b"fence.dat", b"rally.dat"}
+    assert (await tree.stat(b"/@PARAM")).kind is EntryKind.DIRECTORY
+    assert (await tree.stat(b"/@PARAM")).valid_for == 1.0
+    assert dict(await tree.list(b"/"))[b"@MISSION"].kind is EntryKind.DIRECTORY
+
+
+async def test_what_cannot_be_listed_is_not_listed(
+    store: FakeStore, tree: Tree, autojump_clock: MockClock
+) -> None:
+    await tree.list(b"/")
+    await tree.list(b"/@PARAM")
+    await tree.stat(b"/@MISSION/fence.dat")
+    await read_file(tree, PARAM)
+    assert {path for call, path in store.calls if call == "list"} == {b"/", b"."}
+
+
+async def test_a_server_without_trees_sees_one_probe_and_only_if_somebody_asks(
+    px4: FakeStore, autojump_clock: MockClock
+) -> None:
+    tree = make_tree(px4)
+    assert await names(tree, b"/") == {b"fs"}
+    assert px4.calls == [("list", b"/")]
+    for path in (b"/@MISSION", b"/@MISSION/mission.dat", b"/@PARAM", PARAM, b"/@PARAM/x", b"/@SYS", UARTS):
+        with pytest.raises(NotFound):
+            await tree.stat(path)
+    with pytest.raises(NotFound):
+        await tree.list(b"/@PARAM")
+    with pytest.raises(NotFound):
+        await tree.open(PARAM)
+    assert px4.calls == [("list", b"/"), ("whole", PARAM)]
+    assert tree.negative_valid_for(b"/@PARAM") == 2.0
+    px4.add(PARAM, b"new firmware")
+    tree.rebooted()
+    assert (await tree.stat(PARAM)).size == 12
+
+
+async def test_param_that_opens_makes_the_trees_appear(px4: FakeStore, autojump_clock: MockClock) -> None:
+    px4.add(PARAM, b"p" * 99)
+    tree = make_tree(px4)
+    assert await names(tree, b"/") == {b"fs"}
+    assert (await tree.stat(b"/@PARAM")).kind is EntryKind.DIRECTORY
+    assert await names(tree, b"/") == {b"fs", b"@PARAM", b"@MISSION"}
+    assert await names(tree, b"/@PARAM") == {b"param.pck"}
+    assert await names(tree, b"/@MISSION") == set()
+    assert px4.count("whole", PARAM) == 1
+
+
+async def test_a_probe_that_got_no_answer_is_no_answer(px4: FakeStore, autojump_clock: MockClock) -> None:
+    px4.add(PARAM, b"p" * 99)
+    px4.fail["whole", PARAM] = [RequestTimeout("silence")]
+    tree = make_tree(px4)
+    with pytest.raises(RequestTimeout):
+        await tree.stat(b"/@PARAM")
+    assert (await tree.stat(PARAM)).size == 99
+
+
+async def test_other_refusals_of_the_probe_count_too(px4: FakeStore, autojump_clock: MockClock) -> None:
+    px4.fail["whole", PARAM] = [FtpNak(Opcode.READ_FILE, NakCode.FAIL)]
+    tree = make_tree(px4)
+    for _ in range(2):
+        with pytest.raises(NotFound):
+            await tree.stat(b"/@PARAM")
+    assert px4.count("whole") == 1
+
+
+async def test_the_mount_of_an_at_tree(store: FakeStore, autojump_clock: MockClock) -> None:
+    assert await names(make_tree(store, root=b"/@SYS"), b"/") == {b"uarts.txt", b"tasks.txt", b"storage.bin"}
+    params = make_tree(store, root=b"/@PARAM")
+    assert await names(params, b"/") == {b"param.pck"}
+    assert await read_file(params, b"/param.pck") == b"p" * 14882
+
+
+# --- true sizes
+
+
+async def test_stat_open_and_read_agree(store: FakeStore, tree: Tree, autojump_clock: MockClock) -> None:
+    stat = await tree.stat(UARTS)
+    assert (stat.size, stat.valid_for) == (10, 1.0)
+    store.files[UARTS].data = b"meanwhile it became longer"
+    handle = await tree.open(UARTS)
+    assert (handle.size, handle.direct_io, handle.keep_cache) == (10, True, False)
+    assert await handle.read(0, 4096) == b"SERIAL0 on"
+    assert await handle.read(8, 4096) == b"on"
+    assert await handle.read(10, 4096) == b""
+    assert store.count("whole", UARTS) == 1
+    assert tree.status()["open_files"] == 1
+    handle.close()
+    handle.close()
+    assert tree.status()["open_files"] == 0
+    with pytest.raises(LocalProtocolError):
+        await handle.read(0, 1)
+
+
+async def test_a_snapshot_lasts_dir_timeout_and_an_open_gets_some_grace(
+    store: FakeStore, tree: Tree, autojump_clock: MockClock
+) -> None:
+    await tree.stat(UARTS)
+    await trio.sleep(19.9)
+    assert (await tree.stat(UARTS)).valid_for == pytest.approx(0.1)
+    await trio.sleep(0.2)
+    store.files[UARTS].data = b"longer than before"
+    handle = await tree.open(UARTS)
+    assert handle.size == 10
+    assert store.invalidated == []
+    assert (await tree.stat(UARTS)).size == 18
+    assert store.invalidated == [UARTS]
+    await trio.sleep(31)
+    await tree.open(UARTS)
+    assert store.count("whole", UARTS) == 3
+    assert await handle.read(0, 99) == b"SERIAL0 on"
+
+
+async def test_an_expensive_snapshot_is_kept_longer(
+    store: FakeStore, tree: Tree, autojump_clock: MockClock
+) -> None:
+    store.whole_delay = 5
+    await tree.stat(PARAM)
+    await trio.sleep(49)
+    await tree.stat(PARAM)
+    assert store.count("whole", PARAM) == 1
+    await trio.sleep(2)
+    await tree.stat(PARAM)
+    assert store.count("whole", PARAM) == 2
+
+
+async def test_the_true_size_is_shown_from_then_on(
+    store: FakeStore, tree: Tree, autojump_clock: MockClock
+) -> None:
+    await tree.stat(UARTS)
+    await trio.sleep(100)
+    listed = dict(await tree.list(b"/@SYS"))[b"uarts.txt"]
+    assert (listed.size, listed.valid_for) == (10, 0.0)
+    assert store.count("whole", UARTS) == 1
+
+
+async def test_readers_at_once_share_the_reading(
+    store: FakeStore, tree: Tree, autojump_clock: MockClock
+) -> None:
+    store.whole_delay = 1
+    async with trio.open_nursery() as readers:
+        for _ in range(4):
+            readers.start_soon(tree.stat, UARTS)
+            readers.start_soon(tree.open, UARTS)
+    assert store.count("whole", UARTS) == 1
+
+
+async def test_romfs_is_an_ordinary_tree_read_whole(
+    store: FakeStore, tree: Tree, autojump_clock: MockClock
+) -> None:
+    path = b"/@ROMFS/defaults.parm"
+    assert dict(await tree.list(b"/@ROMFS"))[b"defaults.parm"] == await tree.stat(path)
+    assert (await tree.stat(path)).size == 50
+    assert (await tree.stat(path)).valid_for == 1.0
+    assert store.count("whole") == 0
+    handle = await tree.open(path)
+    assert handle.direct_io
+    assert await handle.read(0, 99) == b"d" * 50
+    assert store.count("reader") == 0
+
+
+async def test_log_alias_is_read_by_blocks(store: FakeStore, tree: Tree, autojump_clock: MockClock) -> None:
+    store.add(b"/@MAV_LOG/1.BIN", b"log" * 1000)
+    assert await read_file(tree, b"/@MAV_LOG/1.BIN") == b"log" * 1000
+    assert store.count("whole") == 0
+
+
+async def test_a_large_file_is_not_read_to_answer_stat(
+    store: FakeStore, tree: Tree, autojump_clock: MockClock
+) -> None:
+    store.add(b"/@SYS/crash_dump.bin", b"c" * 200_000)
+    assert b"crash_dump.bin" in await names(tree, b"/@SYS")
+    assert (await tree.stat(b"/@SYS/crash_dump.bin")).size == 200_000
+    assert store.count("whole", b"/@SYS/crash_dump.bin") == 0
+    assert len(await read_file(tree, b"/@SYS/crash_dump.bin")) == 200_000
+
+
+async def test_a_file_beyond_the_limit_is_an_error_to_open_but_not_to_stat(
+    store: FakeStore, autojump_clock: MockClock
+) -> None:
+    tree = make_tree(store, at_file_limit=5)
+    stat = await tree.stat(UARTS)
+    assert (stat.size, stat.valid_for) == (LIE, 0.0)
+    with pytest.raises(DataUnproven):
+        await tree.open(UARTS)
+    assert b"uarts.txt" in await names(tree, b"/@SYS")
+
+
+async def test_checksum_of_what_a_reader_gets(
+    store: FakeStore, tree: Tree, autojump_clock: MockClock
+) -> None:
+    assert await tree.crc32(PARAM) == crc32(b"p" * 14882)
+    assert store.count("crc") == 0
+    assert tree.status()["open_files"] == 0
+
+
+# --- queries and odd names
+
+
+async def test_names_with_a_query_are_probed(store: FakeStore, tree: Tree, autojump_clock: MockClock) -> None:
+    query = PARAM + b"?withdefaults=1"
+    store.add(query, b"with defaults")
+    assert (await tree.stat(query)).size == 13
+    assert await read_file(tree, query) == b"with defaults"
+    assert store.count("whole") == 1
+    assert await names(tree, b"/@PARAM") == {b"param.pck"}
+
+
+async def test_absent_names_are_remembered_for_a_while(
+    store: FakeStore, tree: Tree, autojump_clock: MockClock
+) -> None:
+    for _ in range(2):
+        with pytest.raises(NotFound):
+            await tree.stat(b"/@PARAM/none")
+    assert store.count("whole") == 1
+    assert tree.negative_valid_for(b"/@PARAM/none") == 2.0
+    await trio.sleep(21)
+    store.add(b"/@PARAM/none", b"now")
+    assert (await tree.stat(b"/@PARAM/none")).size == 3
+
+
+async def test_names_that_cannot_be_cost_nothing(
+    store: FakeStore, tree: Tree, autojump_clock: MockClock
+) -> None:
+    for path in (b"/@PARAM/.hidden", b"/@PARAM/param.pck/x", b"/@MISSION/.Trash-1000"):
+        with pytest.raises(NotFound):
+            await tree.stat(path)
+    with pytest.raises(NotADirectory):
+        await tree.list(PARAM)
+    with pytest.raises(NotADirectory):
+        await tree.list(UARTS)
+    with pytest.raises(IsADirectory):
+        await tree.open(b"/@SYS")
+    with pytest.raises(IsADirectory):
+        await tree.open(b"/@PARAM")
+    with pytest.raises(NotFound):
+        await tree.stat(b"/@SYS/none")
+    assert store.count("whole") == 0
+    assert store.crimes == []
+
+
+# --- files that are listed but do not open
+
+
+async def test_what_is_listed_but_not_found_is_hidden(
+    store: FakeStore, tree: Tree, autojump_clock: MockClock
+) -> None:
+    refuse(store, UARTS)
+    assert await names(tree, b"/@SYS") == {b"tasks.txt", b"storage.bin"}
+    with pytest.raises(NotFound):
+        await tree.stat(UARTS)
+    with pytest.raises(NotFound):
+        await tree.open(UARTS)
+    assert tree.negative_valid_for(UARTS) == 2.0
+    await trio.sleep(1000)
+    assert await names(tree, b"/@SYS") == {b"tasks.txt", b"storage.bin"}
+    assert store.count("whole", UARTS) == 1
+    tree.rebooted()
+    store.fail.clear()
+    assert b"uarts.txt" in await names(tree, b"/@SYS")
+
+
+async def test_listing_reads_each_small_file_once(
+    store: FakeStore, tree: Tree, autojump_clock: MockClock
+) -> None:
+    sizes = {name: stat.size for name, stat in await tree.list(b"/@SYS")}
+    assert sizes == {b"uarts.txt": 10, b"tasks.txt": 8, b"storage.bin": 16384}
+    await tree.list(b"/@SYS")
+    await tree.stat(UARTS)
+    await tree.open(UARTS)
+    assert store.count("whole") == 3
+
+
+async def test_not_found_while_reading_is_a_lost_session(
+    store: FakeStore, tree: Tree, autojump_clock: MockClock
+) -> None:
+    store.fail["whole", UARTS] = [FtpNak(Opcode.READ_FILE, NakCode.FILE_NOT_FOUND)]
+    with pytest.raises(FtpNak):
+        await tree.open(UARTS)
+    assert (await tree.stat(UARTS)).size == 10
+
+
+async def test_other_refusals_do_not_hide(store: FakeStore, tree: Tree, autojump_clock: MockClock) -> None:
+    refuse(store, UARTS, NakCode.FAIL)
+    listed = dict(await tree.list(b"/@SYS"))[b"uarts.txt"]
+    assert (listed.size, listed.valid_for) == (LIE, 0.0)
+    await tree.list(b"/@SYS")
+    assert store.count("whole", UARTS) == 1
+    assert (await tree.stat(UARTS)).size == LIE
+    with pytest.raises(FtpNak):
+        await tree.open(UARTS)
+
+
+async def test_refused_missions_are_not_shown_for_a_while(
+    store: FakeStore, tree: Tree, autojump_clock: MockClock
+) -> None:
+    refuse(store, b"/@MISSION/rally.dat", NakCode.FAIL, times=1)
+    assert await names(tree, b"/@MISSION") == {b"mission.dat", b"fence.dat"}
+    assert await names(tree, b"/@MISSION") == {b"mission.dat", b"fence.dat"}
+    await trio.sleep(21)
+    assert b"rally.dat" in await names(tree, b"/@MISSION")
+
+
+async def test_subdirectories_are_shown_and_not_read(
+    store: FakeStore, tree: Tree, autojump_clock: MockClock
+) -> None:
+    store.add(b"/@SYS/deep/x.txt", b"x", claims=LIE)
+    assert dict(await tree.list(b"/@SYS"))[b"deep"].kind is EntryKind.DIRECTORY
+    assert (await tree.stat(b"/@SYS/deep")).kind is EntryKind.DIRECTORY
+    assert (await tree.stat(b"/@SYS/deep/x.txt")).size == 1
+
+
+# --- slow and lost links
+
+
+@pytest.mark.parametrize("background", [False, True])
+async def test_on_a_radio_listing_does_not_wait_for_all_files(
+    store: FakeStore, nursery: trio.Nursery, autojump_clock: MockClock, background: bool
+) -> None:
+    tree = make_tree(store, nursery=nursery if background else None)
+    store.whole_delay = 2
+    began = trio.current_time()
+    first = dict(await tree.list(b"/@SYS"))
+    assert trio.current_time() - began == pytest.approx(3)
+    assert {name: stat.size for name, stat in first.items()} == {
+        b"uarts.txt": 10,
+        b"tasks.txt": LIE,
+        b"storage.bin": 16384,
+    }
+    assert first[b"tasks.txt"].valid_for == 0.0
+    await trio.sleep(10)
+    second = dict(await tree.list(b"/@SYS"))
+    assert second[b"tasks.txt"].size == (8 if background else LIE)
+    assert (await tree.stat(b"/@SYS/tasks.txt")).size == 8
+
+
+@pytest.mark.parametrize("error", [VehicleLost("gone"), RequestTimeout("silence")])
+async def test_a_bad_link_ends_the_probing(
+    store: FakeStore, tree: Tree, autojump_clock: MockClock, error: Exception
+) -> None:
+    await tree.stat(b"/@SYS")
+    store.fail["whole", UARTS] = [error]
+    listed = dict(await tree.list(b"/@SYS"))
+    assert listed[b"uarts.txt"].size == LIE
+    assert store.count("whole") == 1
+    assert dict(await tree.list(b"/@SYS"))[b"uarts.txt"].size == 10
+
+
+async def test_while_lost_the_last_size_is_shown_and_opens_fail(
+    store: FakeStore, tree: Tree, autojump_clock: MockClock
+) -> None:
+    await tree.stat(UARTS)
+    await trio.sleep(100)
+    store.lost = True
+    assert (await tree.stat(UARTS)).size == 10
+    tree.link_lost()
+    assert (await tree.stat(UARTS)).valid_for == 0.0
+    with pytest.raises(VehicleLost):
+        await tree.open(UARTS)
+    with pytest.raises(VehicleLost):
+        await tree.open(PARAM)
+
+
+async def test_an_unlistable_file_never_read_has_no_size_to_fall_back_to(
+    store: FakeStore, tree: Tree, autojump_clock: MockClock
+) -> None:
+    await tree.list(b"/")
+    store.fail["whole", PARAM] = [VehicleLost("gone"), VehicleLost("gone")]
+    with pytest.raises(VehicleLost):
+        await tree.stat(PARAM)
+    listed = dict(await tree.list(b"/@PARAM"))[b"param.pck"]
+    assert (listed.size, listed.valid_for) == (0, 0.0)
+    assert (await tree.stat(PARAM)).size == 14882
+
+
+# --- the store of snapshots
+
+
+def test_snapshots_stay_within_their_budget() -> None:
+    snapshots = Snapshots(100)
+    for i in range(5):
+        snapshots.put(b"%d" % i, Snapshot(b"x" * 40, 10))
+    assert [snapshots.get(b"%d" % i, 0) is not None for i in range(5)] == [False, False, False, True, True]
+    assert snapshots.bytes_cached == 80
+    snapshots.put(b"4", Snapshot(b"y" * 60, 10))
+    assert snapshots.bytes_cached == 100
+    snapshots.put(b"big", Snapshot(b"z" * 101, 10))
+    assert snapshots.get(b"big", 0) is None
+    assert (snapshots.size_of(b"big"), snapshots.size_of(b"0")) == (101, 40)
+    assert snapshots.bytes_cached == 0
+    snapshots.clear()
+    assert snapshots.size_of(b"big") is None
+
+
+def test_a_snapshot_is_good_until_it_is_not() -> None:
+    snapshots = Snapshots(100)
+    snapshots.put(b"a", Snapshot(b"x", 10))
+    assert snapshots.get(b"a", 9.9) is not None
+    assert snapshots.get(b"a", 10) is None
+
+
+def test_remembered_sizes_are_bounded() -> None:
+    snapshots = Snapshots(100)
+    for i in range(MAX_SIZES + 1):
+        snapshots.put(b"%d" % i, Snapshot(b"", 10))
+    assert snapshots.size_of(b"0") is None
+    assert snapshots.get(b"0", 0) is None
+    assert snapshots.size_of(b"1") == 0
