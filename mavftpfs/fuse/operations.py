@@ -51,7 +51,8 @@ UNKNOWN_SPACE = 1000 << 30
 
 P = ParamSpec("P")
 T = TypeVar("T")
-Handler = Callable[Concatenate["Operations", P], Coroutine[Any, Any, T]]
+S = TypeVar("S", bound="Operations")
+Handler = Callable[Concatenate[S, P], Coroutine[Any, Any, T]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,10 +82,10 @@ async def _no_refresh(ino: int) -> None:
     """For callers without a kernel."""
 
 
-def handler(method: Handler[P, T]) -> Handler[P, T]:
+def handler(method: Handler[S, P, T]) -> Handler[S, P, T]:
     """Guard a handler: let only FUSEError out, within the time that `Operations.budget` allows."""
 
-    async def guarded(self: Operations, /, *args: P.args, **kwargs: P.kwargs) -> T:
+    async def guarded(self: S, /, *args: P.args, **kwargs: P.kwargs) -> T:
         with trio.move_on_after(self.budget(method.__name__, args)):
             try:
                 return await method(self, *args, **kwargs)

@@ -57,7 +57,7 @@ IMPURE_MODULES = {"sim.endpoints", "sim.memory", "sim.command"}
 IMPURE_IMPORTS = {"trio", "time", "socket", "logging", "pyfuse3"}
 
 SOLE_IMPORTERS = {
-    "pyfuse3": {"fuse.operations", "mount"},
+    "pyfuse3": {"fuse.operations", "fuse.writing", "mount"},
     "pymavlink": {"link.framing"},
     "serial": {"link.serial"},
     "rich": {"cli", "demo", "report"},

@@ -1,0 +1,63 @@
+"""What programs set and no vehicle stores: modes, owners, exact times. Layer: fuse; pure.
+
+Kept by path for the life of the mount (the kernel forgets inodes at will), so that `cp -p`, `rsync -a`,
+`tar` and `touch` see what they set. A time is shown while the tree shows the same second, because the tree
+knows when a file changed.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from dataclasses import dataclass
+
+MAX_KEPT = 100_000
+NANO = 1_000_000_000
+
+
+@dataclass(slots=True)
+class Kept:
+    """None = not set. mode: permission bits; times in nanoseconds since 1970 UTC."""
+
+    mode: int | None = None
+    uid: int | None = None
+    gid: int | None = None
+    atime_ns: int | None = None
+    mtime_ns: int | None = None
+
+    def shown_mtime_ns(self, listed: int) -> int:
+        """Return the time to show where the tree shows `listed` (seconds)."""
+        if self.mtime_ns is not None and self.mtime_ns // NANO == listed:
+            return self.mtime_ns
+        return listed * NANO
+
+
+class Keeping:
+    """Kept attributes of a bounded number of paths; the oldest are forgotten first."""
+
+    def __init__(self, limit: int = MAX_KEPT) -> None:
+        self._limit = limit
+        self._kept: OrderedDict[bytes, Kept] = OrderedDict()
+
+    def get(self, path: bytes) -> Kept | None:
+        """Return what was set on a path, or None."""
+        return self._kept.get(path)
+
+    def at(self, path: bytes) -> Kept:
+        """Return what was set on a path, to be changed."""
+        kept = self._kept.get(path)
+        if kept is None:
+            kept = self._kept[path] = Kept()
+            if len(self._kept) > self._limit:
+                self._kept.popitem(last=False)
+        return kept
+
+    def drop(self, path: bytes) -> None:
+        """The path is gone."""
+        self._kept.pop(path, None)
+
+    def move(self, old: bytes, new: bytes) -> None:
+        """The path, and everything below it, has another name."""
+        self.drop(new)
+        prefix = old + b"/"
+        for path in [known for known in self._kept if known == old or known.startswith(prefix)]:
+            self._kept[new + path[len(old) :]] = self._kept.pop(path)

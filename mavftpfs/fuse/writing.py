@@ -1,0 +1,282 @@
+"""The handlers of a mount that may be changed. Layer: fuse.
+
+flush is called for every closed descriptor, whoever wrote (pyfuse3 tells no owner), so it asks the handle:
+one that was opened for reading has nothing to say. release cannot report; what it finds undelivered stays
+with the tree.
+"""
+
+from __future__ import annotations
+
+import errno
+import logging
+import os
+import stat as stat_bits
+from collections.abc import Sequence
+from typing import Any, NoReturn, cast
+
+import pyfuse3
+from pyfuse3 import EntryAttributes, FileInfo, FUSEError, RequestContext, SetattrFields
+
+from mavftpfs.cache.attributes import Stat
+from mavftpfs.fuse.handles import FileHandle, WritableFile, WritableTree
+from mavftpfs.fuse.inodes import Inode
+from mavftpfs.fuse.keeping import NANO, Keeping
+from mavftpfs.fuse.operations import Operations, Presentation, handler
+from mavftpfs.shared.errors import MavftpfsError
+from mavftpfs.shared.model import EntryKind
+
+log = logging.getLogger("mavftpfs.fuse")
+
+DELIVERY_BUDGET = 4 * 3600.0
+"""Seconds for what moves bytes: the tree ends it by itself when there is no progress, so this only keeps
+a trickle from lasting for ever."""
+
+NAMESPACE_BUDGET = 240.0
+"""Seconds for a change of names: it may have to finish a delivery, and to look whether it was done."""
+
+_DELIVERING = frozenset({"write", "flush", "fsync", "release", "setattr", "open"})
+_NAMING = frozenset({"create", "mknod", "mkdir", "rmdir", "unlink", "rename"})
+
+
+def _writable(handle: FileHandle) -> WritableFile | None:
+    """Return the file of a handle that was opened for writing, else None."""
+    file = cast(WritableFile, handle.file)
+    return file if file.writable else None
+
+
+class WritingOperations(Operations):
+    """Operations plus everything that changes the tree."""
+
+    _tree: WritableTree
+
+    def __init__(self, tree: WritableTree, presentation: Presentation, **others: Any) -> None:
+        super().__init__(tree, presentation, **others)
+        self._keeping = Keeping()
+
+    def budget(self, name: str, args: Sequence[Any]) -> float:
+        """Return the seconds a handler may take."""
+        if name in _DELIVERING:
+            return DELIVERY_BUDGET
+        if name in _NAMING:
+            return NAMESPACE_BUDGET
+        return super().budget(name, args)
+
+    # -- files ------------------------------------------------------------------------------------
+
+    @handler
+    async def open(self, inode: int, flags: int, ctx: RequestContext) -> FileInfo:
+        """Open a file; O_TRUNC comes in the flags and no setattr follows it."""
+        writing = flags & os.O_ACCMODE != os.O_RDONLY or bool(flags & os.O_TRUNC)
+        known = self._inode(inode)
+        path = self._path(inode)
+        file = await self._tree.open(path, write=writing, truncate=bool(flags & os.O_TRUNC))
+        fh = self.files.add(FileHandle(inode, file, flags))
+        if known.told_size not in (None, file.size) and not flags & os.O_TRUNC:
+            await self._refresh(inode)
+        return FileInfo(fh=fh, direct_io=file.direct_io, keep_cache=file.keep_cache)
+
+    @handler
+    async def create(
+        self, parent_inode: int, name: bytes, mode: int, flags: int, ctx: RequestContext
+    ) -> tuple[FileInfo, EntryAttributes]:
+        """Create a file and open it."""
+        path = self._child(parent_inode, name)
+        file = await self._tree.create(path, exclusive=bool(flags & os.O_EXCL))
+        if flags & os.O_TRUNC and file.size:
+            await file.truncate(0)
+        self._keeping.at(path).mode = stat_bits.S_IMODE(mode)
+        inode = self.inodes.lookup(path)
+        fh = self.files.add(FileHandle(inode.ino, file, flags))
+        found = Stat(EntryKind.FILE, file.size, (await self._tree.stat(path)).mtime, 0.0)
+        info = FileInfo(fh=fh, direct_io=file.direct_io, keep_cache=file.keep_cache)
+        return info, self._attributes(inode, found)
+
+    @handler
+    async def write(self, fh: int, off: int, buf: bytes) -> int:
+        """Take bytes; what is taken is kept until it is proven to be on the card."""
+        handle = self._file(fh)
+        file = _writable(handle)
+        if file is None:
+            raise FUSEError(errno.EBADF)
+        if handle.flags & os.O_APPEND:
+            off = file.size  # the kernel's idea of the size may be older than ours
+        return await file.write(off, buf)
+
+    @handler
+    async def flush(self, fh: int) -> None:
+        """A descriptor was closed: 0 means that everything written is on the card, checked."""
+        file = _writable(self._file(fh))
+        if file is not None:
+            await file.flush()
+
+    @handler
+    async def fsync(self, fh: int, datasync: bool) -> None:
+        """0 means that everything written is on the card, checked."""
+        file = _writable(self._file(fh))
+        if file is not None:
+            await file.fsync()
+
+    @handler
+    async def release(self, fh: int) -> None:
+        """The last descriptor was closed; nobody hears errors any more, but the tree keeps the bytes."""
+        handle = self.files.remove(fh)
+        if handle is None:
+            return
+        file = _writable(handle)
+        try:
+            if file is not None:
+                await file.release()
+        except MavftpfsError as exc:
+            log.warning("a closed file is not delivered yet: %s", exc)
+        finally:
+            handle.file.close()
+
+    # -- attributes -------------------------------------------------------------------------------
+
+    @handler
+    async def getattr(self, inode: int, ctx: RequestContext) -> EntryAttributes:
+        """Return attributes by number, also of a file that has no name any more."""
+        return await self._attributes_of(inode)
+
+    @handler
+    async def setattr(
+        self, inode: int, attr: EntryAttributes, fields: SetattrFields, fh: int | None, ctx: RequestContext
+    ) -> EntryAttributes:
+        """Cut or extend a file; keep modes, owners and times, which no server stores."""
+        if fields.update_size:
+            await self._resize(inode, attr.st_size, fh)
+        path = self._inode(inode).path
+        if path is not None:
+            await self._keep(path, attr, fields)
+        return await self._attributes_of(inode)
+
+    async def _resize(self, ino: int, size: int, fh: int | None) -> None:
+        handle = self.files.get(fh) if fh is not None else None
+        file = None if handle is None else _writable(handle)
+        if file is not None:
+            await file.truncate(size)
+        else:
+            await self._tree.truncate(self._path(ino), size)
+
+    async def _keep(self, path: bytes, attr: EntryAttributes, fields: SetattrFields) -> None:
+        kept = self._keeping.at(path)
+        if fields.update_mode:
+            kept.mode = stat_bits.S_IMODE(attr.st_mode)
+        if fields.update_uid:
+            kept.uid = attr.st_uid
+        if fields.update_gid:
+            kept.gid = attr.st_gid
+        if fields.update_atime:
+            kept.atime_ns = attr.st_atime_ns
+        if fields.update_mtime:
+            kept.mtime_ns = attr.st_mtime_ns
+            await self._tree.set_times(path, attr.st_mtime_ns)
+
+    # -- names ------------------------------------------------------------------------------------
+
+    @handler
+    async def mknod(
+        self, parent_inode: int, name: bytes, mode: int, rdev: int, ctx: RequestContext
+    ) -> EntryAttributes:
+        """Make an empty regular file; there are no devices on a card."""
+        if not stat_bits.S_ISREG(mode):
+            raise FUSEError(errno.EPERM)
+        path = self._child(parent_inode, name)
+        file = await self._tree.create(path, exclusive=True)
+        try:
+            await file.release()
+        finally:
+            file.close()
+        return await self._new_entry(path, mode)
+
+    @handler
+    async def mkdir(self, parent_inode: int, name: bytes, mode: int, ctx: RequestContext) -> EntryAttributes:
+        """Make a directory."""
+        path = self._child(parent_inode, name)
+        await self._tree.mkdir(path)
+        return await self._new_entry(path, mode)
+
+    @handler
+    async def rmdir(self, parent_inode: int, name: bytes, ctx: RequestContext) -> None:
+        """Remove an empty directory."""
+        path = self._child(parent_inode, name)
+        await self._tree.rmdir(path)
+        self._gone(path)
+
+    @handler
+    async def unlink(self, parent_inode: int, name: bytes, ctx: RequestContext) -> None:
+        """Remove a file; who has it open keeps it."""
+        path = self._child(parent_inode, name)
+        await self._tree.unlink(path)
+        self._gone(path)
+
+    @handler
+    async def rename(
+        self,
+        parent_inode_old: int,
+        name_old: bytes,
+        parent_inode_new: int,
+        name_new: bytes,
+        flags: int,
+        ctx: RequestContext,
+    ) -> None:
+        """Move a name, and everything below it."""
+        if flags & ~pyfuse3.RENAME_NOREPLACE:
+            raise FUSEError(errno.EINVAL)  # EXCHANGE
+        old = self._child(parent_inode_old, name_old)
+        new = self._child(parent_inode_new, name_new)
+        await self._tree.rename(old, new, noreplace=bool(flags & pyfuse3.RENAME_NOREPLACE))
+        self.inodes.rename(old, new)
+        self._keeping.move(old, new)
+
+    async def _not_on_a_card(self, *_: object) -> NoReturn:
+        raise FUSEError(errno.EPERM)
+
+    async def _no_attribute(self, *_: object) -> NoReturn:
+        raise FUSEError(errno.ENOTSUP)
+
+    _never: Any = _not_on_a_card
+    _unset: Any = _no_attribute
+    symlink = link = _never
+    setxattr = removexattr = _unset
+
+    # -- helpers ----------------------------------------------------------------------------------
+
+    def _gone(self, path: bytes) -> None:
+        self.inodes.unlink(path)
+        self._keeping.drop(path)
+
+    async def _new_entry(self, path: bytes, mode: int) -> EntryAttributes:
+        self._keeping.at(path).mode = stat_bits.S_IMODE(mode)
+        found = await self._tree.stat(path)
+        return self._attributes(self.inodes.lookup(path), found)
+
+    async def _attributes_of(self, ino: int) -> EntryAttributes:
+        inode = self._inode(ino)
+        if inode.path is not None:
+            return self._attributes(inode, await self._tree.stat(inode.path))
+        for handle in self.files:
+            if handle.ino == ino:
+                entry = self._attributes(inode, Stat(EntryKind.FILE, handle.file.size, 0, 0.0))
+                entry.st_nlink = 0
+                return entry
+        raise FUSEError(errno.ESTALE)
+
+    def _attributes(self, inode: Inode, found: Any) -> EntryAttributes:
+        entry = super()._attributes(inode, found)
+        kept = None if inode.path is None else self._keeping.get(inode.path)
+        if kept is None:
+            return entry
+        if kept.mode is not None:
+            entry.st_mode = stat_bits.S_IFMT(entry.st_mode) | kept.mode
+        if kept.uid is not None:
+            entry.st_uid = kept.uid
+        if kept.gid is not None:
+            entry.st_gid = kept.gid
+        entry.st_mtime_ns = entry.st_ctime_ns = kept.shown_mtime_ns(found.mtime)
+        if found.kind is EntryKind.DIRECTORY and kept.mtime_ns is not None:
+            entry.st_mtime_ns = kept.mtime_ns
+        entry.st_atime_ns = entry.st_mtime_ns if kept.atime_ns is None else kept.atime_ns
+        if kept.mtime_ns is not None and kept.mtime_ns // NANO != found.mtime:
+            kept.atime_ns = None  # the file changed since
+        return entry
