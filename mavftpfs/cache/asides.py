@@ -1,0 +1,286 @@
+"""Names that a replacement leaves on the card while it is under way, and how to clean up. Layer: cache; pure.
+
+A reserved name is `.mavftpfs-OOOOkSSS` or `.mavftpfs-OOOOkSSS-NAME`: OOOO is the token of the mount that made
+it, SSS counts, and the kind k is
+  t  new content for NAME, perhaps incomplete;
+  o  the old NAME, moved aside only after the new content was verified;
+  m  NAME itself, on its way to another spelling; never removed;
+  d  a file that was unlinked while somebody read it;
+  p  a *sidecar*: a small file whose content is the path that t, o or m of the same number belong to. It is
+     written first and removed last, and only where NAME does not fit: rename carries both paths in one
+     request of 238 bytes, so long paths use the short form, in the nearest directory above that fits.
+
+What an interruption leaves, and what `repair` does with it (new, old and target have the same number):
+  target there                  remove new, then old, then the sidecar
+  target missing, old and new   rename new to target (it was verified before old was moved), remove old
+  target missing, old only      rename old to target
+  target missing, new only      rename new to `recovered-tSSS-NAME`: a power cut inside a server that
+                                unlinks before it renames leaves that (NuttX), and nobody can tell whether it
+                                is complete
+  target missing, moved         rename it to target; if the target is there as well: `recovered-mSSS-NAME`
+  sidecar alone, deleted        remove
+Nothing is touched while its owner may be alive: see `Staleness`.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Collection, Iterable, Mapping
+from dataclasses import dataclass
+from enum import Enum
+from random import Random
+
+from mavftpfs.shared.errors import PathTooLong
+from mavftpfs.shared.model import MAX_WIRE_PATH, ROOT, DirEntry, EntryKind, join, split, wire_path
+
+PREFIX = b".mavftpfs-"
+RENAME_ROOM = 238
+"""Bytes of both paths of a rename and the NUL between them (servers.md 9)."""
+
+MAX_NAME = 255
+STALE_AFTER = 600.0
+"""Seconds a stranger's reserved name must have stayed the same before it counts as left behind."""
+
+_ALPHABET = b"abcdefghijklmnopqrstuvwxyz234567"  # one spelling on cards that fold case
+_RESERVED = re.compile(rb"\.mavftpfs-([a-z2-7]{4})([tomdp])([a-z2-7]{3})(?:-(.+))?", re.DOTALL)
+_SERIALS = 32**3
+_OWNER_LENGTH, _SERIAL_LENGTH = 4, 3
+
+
+class Kind(Enum):
+    """What a reserved name stands for."""
+
+    NEW = b"t"
+    OLD = b"o"
+    MOVED = b"m"
+    DELETED = b"d"
+    SIDECAR = b"p"
+
+
+@dataclass(frozen=True, slots=True)
+class Reserved:
+    """A reserved name's parts; target: the name it belongs to, None in the short form."""
+
+    owner: bytes
+    kind: Kind
+    serial: bytes
+    target: bytes | None = None
+
+    @property
+    def name(self) -> bytes:
+        """The directory entry's name."""
+        short = PREFIX + self.owner + self.kind.value + self.serial
+        return short if self.target is None else short + b"-" + self.target
+
+
+@dataclass(frozen=True, slots=True)
+class Places:
+    """Where one replacement keeps its files; sidecar: only where the names do not say the target."""
+
+    new: bytes
+    old: bytes
+    moved: bytes
+    sidecar: bytes | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Action:
+    """One step of a repair, on names of the listed directory or whole paths: remove, or rename to `to`."""
+
+    path: bytes
+    to: bytes | None = None
+
+
+def is_reserved(name: bytes) -> bool:
+    """Return whether a name is hidden from programs."""
+    return name.startswith(PREFIX)
+
+
+def parse(name: bytes) -> Reserved | None:
+    """Return the parts of a reserved name, None for any other name."""
+    match = _RESERVED.fullmatch(name)
+    if match is None:
+        return None
+    owner, kind, serial, target = match.groups()
+    return Reserved(owner, Kind(kind), serial, target)
+
+
+def new_owner(rng: Random) -> bytes:
+    """Return a token for a mount."""
+    return _spell(rng.randrange(32**_OWNER_LENGTH), _OWNER_LENGTH)
+
+
+def fits_rename(old: bytes, new: bytes) -> bool:
+    """Return whether one request carries both paths."""
+    return len(wire_path(old)) + 1 + len(wire_path(new)) <= RENAME_ROOM
+
+
+class Namer:
+    """Makes reserved names of one mount that never repeat in its life."""
+
+    def __init__(self, owner: bytes, root: bytes, rng: Random) -> None:
+        """`root`: nothing is put above this directory."""
+        self.owner = owner
+        self._root = root
+        self._serial = rng.randrange(_SERIALS)
+
+    def places(self, target: bytes, source: bytes | None = None) -> Places:
+        """Return where to keep what replaces `target`, or what is moved there from `source`.
+
+        Raises:
+            PathTooLong: no directory above is short enough, or the target itself does not fit a request.
+        """
+        wire_path(target)
+        self._serial = (self._serial + 1) % _SERIALS
+        serial = _spell(self._serial, _SERIAL_LENGTH)
+        parent, name = split(target)
+        ends = (target,) if source is None else (target, source)
+        named = self._places(parent, serial, name)
+        if len(split(named.new)[1]) <= MAX_NAME and _all_fit(named, ends):
+            return named
+        while True:
+            short = self._places(parent, serial, None)
+            if _all_fit(short, ends):
+                return short
+            if parent in (ROOT, self._root):
+                raise PathTooLong(f"{target!r} is too long to be replaced by renaming")
+            parent = split(parent)[0]
+
+    def hidden(self, path: bytes) -> bytes:
+        """Return a name for a file that is unlinked while it is read.
+
+        Raises:
+            PathTooLong.
+        """
+        places = self.places(path)
+        directory, name = split(places.moved)
+        reserved = parse(name)
+        assert reserved is not None
+        return join(directory, Reserved(reserved.owner, Kind.DELETED, reserved.serial).name)
+
+    def _places(self, directory: bytes, serial: bytes, name: bytes | None) -> Places:
+        def place(kind: Kind) -> bytes:
+            target = None if kind is Kind.SIDECAR else name
+            return join(directory, Reserved(self.owner, kind, serial, target).name)
+
+        sidecar = place(Kind.SIDECAR) if name is None else None
+        return Places(place(Kind.NEW), place(Kind.OLD), place(Kind.MOVED), sidecar)
+
+
+class Staleness:
+    """Tells since when a name was seen unchanged; bounded. Times are `now` of any monotonic clock."""
+
+    MAX = 1024
+
+    def __init__(self) -> None:
+        self._seen: dict[bytes, tuple[int | None, float]] = {}
+
+    def is_stale(self, path: bytes, size: int | None, now: float) -> bool:
+        """Note a sighting; return whether it was the same for STALE_AFTER seconds."""
+        known = self._seen.get(path)
+        if known is None or known[0] != size:
+            self._seen.pop(path, None)
+            self._seen[path] = (size, now)
+            if len(self._seen) > self.MAX:
+                del self._seen[next(iter(self._seen))]
+            return False
+        return now - known[1] >= STALE_AFTER
+
+    def forget(self, path: bytes) -> None:
+        """The name is gone."""
+        self._seen.pop(path, None)
+
+
+@dataclass(frozen=True, slots=True)
+class Group:
+    """What one replacement left in a directory: the paths by kind, and the target's path if known."""
+
+    paths: Mapping[Kind, bytes]
+    serial: bytes
+    target: bytes | None
+
+
+def leftovers(
+    directory: bytes, entries: Iterable[DirEntry], is_dead: Callable[[bytes, bytes, DirEntry], bool]
+) -> list[Group]:
+    """Return what interrupted work left in a listing.
+
+    is_dead(path, owner, entry): whether nobody works with that name any more. A group is left alone unless
+    all of it is dead. Directories are ours only as `m`.
+    """
+    found: dict[tuple[bytes, bytes], dict[Kind, tuple[bytes, DirEntry, bytes | None]]] = {}
+    for entry in entries:
+        name = parse(entry.name)
+        if name is None or (entry.kind is EntryKind.DIRECTORY and name.kind is not Kind.MOVED):
+            continue
+        group = found.setdefault((name.owner, name.serial), {})
+        group[name.kind] = (join(directory, entry.name), entry, name.target)
+    groups = []
+    for (owner, serial), parts in sorted(found.items()):
+        # Every part is asked about, so that each one's age is noted.
+        dead = [is_dead(path, owner, entry) for path, entry, _ in parts.values()]
+        if not all(dead):
+            continue
+        targets = {target for _, _, target in parts.values() if target is not None}
+        target = join(directory, targets.pop()) if len(targets) == 1 else None
+        groups.append(Group({kind: path for kind, (path, _, _) in parts.items()}, serial, target))
+    return groups
+
+
+def repair(group: Group, *, target_exists: bool) -> list[Action]:
+    """Return the steps that undo or complete an interrupted replacement, in order; any may be the last one done.
+
+    `target_exists` is asked for groups with a target. Without one (the sidecar is missing or unreadable) what
+    is the only copy of something is renamed to where a person finds it.
+    """
+    paths = dict(group.paths)
+    sidecar, deleted = paths.pop(Kind.SIDECAR, None), paths.pop(Kind.DELETED, None)
+    actions = [] if deleted is None else [Action(deleted)]
+    new, old, moved = (paths.get(kind) for kind in (Kind.NEW, Kind.OLD, Kind.MOVED))
+    if moved is not None:
+        missing = group.target is not None and not target_exists
+        actions.append(Action(moved, group.target if missing else _recovered(group, moved)))
+    if group.target is None:
+        actions += _without_target(group, new, old)
+    elif target_exists:
+        actions += [Action(path) for path in (new, old) if path is not None]
+    elif old is not None:
+        actions.append(Action(old if new is None else new, group.target))
+        actions += [] if new is None else [Action(old)]
+    elif new is not None:
+        actions.append(Action(new, _recovered(group, new)))
+    return actions if sidecar is None else [*actions, Action(sidecar)]
+
+
+def _without_target(group: Group, new: bytes | None, old: bytes | None) -> list[Action]:
+    """The short form is used only after its sidecar was written: a `t` alone is litter, an `o` never."""
+    if old is not None:
+        rest = [] if new is None else [Action(new, _recovered(group, new))]
+        return [Action(old, _recovered(group, old)), *rest]
+    return [] if new is None else [Action(new)]
+
+
+def _recovered(group: Group, path: bytes) -> bytes:
+    name = parse(split(path)[1])
+    assert name is not None
+    target = b"" if group.target is None else b"-" + split(group.target)[1]
+    tail = name.kind.value + group.serial + target
+    directory = split(path)[0]
+    room = min(MAX_NAME, MAX_WIRE_PATH - len(directory) - 1, RENAME_ROOM - len(path) - len(directory) - 2)
+    return join(directory, (b"recovered-" + tail)[: max(room, 14)])
+
+
+def _all_fit(places: Places, ends: Collection[bytes]) -> bool:
+    """Return whether every rename between the places and the ends fits a request."""
+    inner = (places.new, places.old, places.moved)
+    if max(len(path) for path in inner) > MAX_WIRE_PATH:
+        return False
+    return all(fits_rename(path, end) for path in inner for end in ends)
+
+
+def _spell(number: int, length: int) -> bytes:
+    letters = bytearray()
+    for _ in range(length):
+        number, digit = divmod(number, len(_ALPHABET))
+        letters.append(_ALPHABET[digit])
+    return bytes(letters)

@@ -1,0 +1,91 @@
+"""How a draft gets to the vehicle. Layer: cache; pure.
+
+The choice rests on what the server was seen to do, never on its name. A file that is there is changed in
+place only where that does what a local disk does; else a complete new one takes its place.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+from mavftpfs.cache.draft import Draft
+from mavftpfs.shared.errors import FileTooLarge, NotSupported
+from mavftpfs.shared.traits import WriteTraits
+
+
+class Plan(Enum):
+    """One way of delivering.
+
+    NOTHING: the vehicle has it. CREATE_EMPTY: CreateFile on the real name, no data. NEW: CreateFile on the
+    real name, which is free. REPLACE: a temporary name, verified, renamed. FILL: fetch what only the
+    vehicle has, then plan again. IN_PLACE: OpenFileWO, and only what changed. PROBE: find out whether
+    OpenFileWO empties files, then plan again. TRUNCATE: TruncateFile. REWRITE: CreateFile on the real name,
+    over what is there (`inplace`).
+    """
+
+    NOTHING = "nothing"
+    CREATE_EMPTY = "create empty"
+    NEW = "new"
+    REPLACE = "replace"
+    FILL = "fill"
+    IN_PLACE = "in place"
+    PROBE = "probe"
+    TRUNCATE = "truncate"
+    REWRITE = "rewrite"
+
+
+SENDING = frozenset({Plan.NEW, Plan.REPLACE, Plan.IN_PLACE, Plan.REWRITE})
+"""Plans that send bytes."""
+
+
+@dataclass(frozen=True, slots=True)
+class Rules:
+    """What the user allows. rmw_max: the largest file in bytes that is sent whole for a partial change."""
+
+    rmw_max: int
+    inplace: bool = False
+
+
+def choose(draft: Draft, traits: WriteTraits, rules: Rules) -> Plan:
+    """Return the next step for a draft.
+
+    Raises:
+        NotSupported: the file cannot be replaced, and `inplace` was not given.
+        FileTooLarge: the change would need more of the file to be sent than rmw_max.
+    """
+    if draft.clean:
+        return Plan.NOTHING
+    if draft.size == 0:
+        return Plan.CREATE_EMPTY
+    if draft.remote_size is None:
+        return Plan.NEW
+    if draft.fresh:
+        return _replacement(traits, rules)
+    return _partial(draft, draft.remote_size, traits, rules)
+
+
+def _partial(draft: Draft, remote_size: int, traits: WriteTraits, rules: Rules) -> Plan:
+    """Part of the file on the vehicle is to stay."""
+    if draft.size < remote_size:
+        if draft.changed.empty and traits.truncate_works is not False:
+            return Plan.TRUNCATE
+        return _rewriting(draft, traits, rules)
+    if traits.wo_truncates is None:
+        return Plan.PROBE
+    return _rewriting(draft, traits, rules) if traits.wo_truncates else Plan.IN_PLACE
+
+
+def _rewriting(draft: Draft, traits: WriteTraits, rules: Rules) -> Plan:
+    """Send the whole file although part of it is there."""
+    if draft.size > rules.rmw_max:
+        raise FileTooLarge(f"changing a part of {draft.size} bytes means sending them all; see rmw_max")
+    return _replacement(traits, rules) if draft.whole else Plan.FILL
+
+
+def _replacement(traits: WriteTraits, rules: Rules) -> Plan:
+    if traits.rename_works is not False:
+        return Plan.REPLACE
+    if rules.inplace:
+        return Plan.REWRITE
+    raise NotSupported("this server cannot rename, so a file cannot be replaced safely; see inplace")

@@ -1,0 +1,142 @@
+"""Which bytes of a draft the vehicle has. Layer: cache; pure. Implements cache.remote.UploadSource.
+
+A byte is dirty, in flight, acked or proven (a Terminate was ACKed after it). It may be written again while
+it is in flight; then it is dirty *and* in flight, and is not handed out before the older copy was accounted
+for: two copies under way at once may reach the card in the wrong order.
+
+One `Sending` serves one attempt at one remote file. A new attempt gets a new one, so whatever a late
+upload still says of the old attempt changes nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+
+from mavftpfs.shared.extents import ExtentSet
+
+AHEAD = 64 * 1024
+"""Bytes fetched from the spool at once, since chunks are small."""
+
+
+class Sending:
+    """One attempt to send `extents` of a draft whose bytes `read(start, stop)` returns.
+
+    Attributes:
+        unacked: bytes not ACKed yet.
+        reached: one past the highest byte that may have been written to the remote file.
+        whole: the attempt began with an empty remote file, so a rollback of everything means all of it.
+        emptied: the remote file was emptied under us though its old bytes were to stay.
+    """
+
+    def __init__(
+        self, read: Callable[[int, int], bytes], extents: Iterable[tuple[int, int]], *, whole: bool
+    ) -> None:
+        self._read = read
+        self.whole = whole
+        self.emptied = False
+        self.reached = 0
+        self._dirty = ExtentSet(extents)
+        self._in_flight = ExtentSet()
+        self._acked = ExtentSet()
+        self._proven = ExtentSet()
+        self._ahead = (0, b"")
+
+    @property
+    def unacked(self) -> int:
+        """Bytes that are dirty or in flight."""
+        again = sum(
+            stop - start for a, b in self._in_flight for start, stop in self._dirty.intersection(a, b)
+        )
+        return self._dirty.total + self._in_flight.total - again
+
+    # --- the program's side
+
+    def on_write(self, start: int, stop: int) -> None:
+        """The draft's bytes [start, stop) changed: they go (again)."""
+        self._dirty.add(start, stop)
+        self._acked.discard(start, stop)
+        self._proven.discard(start, stop)
+        self._ahead = (0, b"")
+
+    def on_cut(self, size: int) -> None:
+        """The draft ends at `size` now; what was sent beyond it shows in `reached`."""
+        for extents in (self._dirty, self._in_flight, self._acked, self._proven):
+            extents.discard(size, max(extents.end, size))
+        self._ahead = (0, b"")
+
+    # --- the upload's side
+
+    def next_chunk(self, limit: int) -> tuple[int, bytes] | None:
+        """See cache.remote.UploadSource."""
+        found = self._next_extent(limit)
+        if found is None:
+            return None
+        start, stop = found
+        data = self._bytes(start, stop)
+        self._dirty.discard(start, stop)
+        self._in_flight.add(start, stop)
+        self.reached = max(self.reached, stop)
+        return start, data
+
+    def on_acked(self, offset: int, count: int) -> None:
+        """See cache.remote.UploadSource."""
+        for start, stop in self._in_flight.intersection(offset, offset + count):
+            self._in_flight.discard(start, stop)
+            for a, b in self._dirty.missing(start, stop):
+                self._acked.add(a, b)
+
+    def on_unsent(self, offset: int, count: int) -> None:
+        """See cache.remote.UploadSource."""
+        for start, stop in self._in_flight.intersection(offset, offset + count):
+            self._in_flight.discard(start, stop)
+            self._dirty.add(start, stop)
+
+    def on_checkpoint(self) -> None:
+        """See cache.remote.UploadSource."""
+        self._move(self._acked, self._proven)
+
+    def on_rollback(self, everything: bool) -> None:
+        """See cache.remote.UploadSource."""
+        self._move(self._in_flight, self._dirty)
+        self._move(self._acked, self._dirty)
+        if everything:
+            self._move(self._proven, self._dirty)
+            self.emptied |= not self.whole
+            if self.whole:
+                self.reached = 0
+
+    def check_invariants(self) -> None:
+        """Raise AssertionError if the books are wrong (for tests)."""
+        for one, other in (
+            (self._dirty, self._acked),
+            (self._dirty, self._proven),
+            (self._in_flight, self._acked),
+            (self._in_flight, self._proven),
+            (self._acked, self._proven),
+        ):
+            assert not any(other.overlaps(start, stop) for start, stop in one)
+
+    # --- inside
+
+    def _next_extent(self, limit: int) -> tuple[int, int] | None:
+        first = self._dirty.first()
+        if first is None:
+            return None
+        if self._in_flight.empty or not self._in_flight.overlaps(*first):
+            return first[0], min(first[1], first[0] + limit)
+        for start, stop in self._dirty:
+            for a, b in self._in_flight.missing(start, stop):
+                return a, min(b, a + limit)
+        return None
+
+    def _bytes(self, start: int, stop: int) -> bytes:
+        at, data = self._ahead
+        if not at <= start <= stop <= at + len(data):
+            extent = next(iter(self._dirty.intersection(start, start + AHEAD)))
+            at, data = self._ahead = (start, self._read(start, max(stop, extent[1])))
+        return data[start - at : stop - at]
+
+    def _move(self, source: ExtentSet, target: ExtentSet) -> None:
+        for start, stop in source:
+            target.add(start, stop)
+        source.clear()

@@ -1,0 +1,326 @@
+"""Where bytes wait that are not proven to be on the vehicle. Layer: cache.
+
+Up to `memory_max` bytes over all files lie in memory; beyond that a file's bytes move to a file of their own
+in a 0700 directory, at the same offsets, up to `spool_max` over all. Nothing leaves before its draft is told
+that the vehicle has it. `persist` also writes down what the bytes are (fsynced), so that the next mount of
+the vehicle finds them after a kill -9: `SpoolDirectory.rescue` moves what a dead mount left to a recovery
+directory. It is never written to a vehicle by itself: nobody knows what happened to the file since.
+
+Local files are written in the event loop: they go to the page cache, in pieces of at most a megabyte.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import logging
+import os
+import shutil
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from random import Random
+from typing import Any
+
+from mavftpfs.cache.asides import new_owner
+from mavftpfs.shared.errors import NoSpace
+from mavftpfs.shared.extents import ExtentSet
+
+log = logging.getLogger("mavftpfs.cache")
+
+PAGE = 64 * 1024
+SLOTS = 64
+"""Mounts of one vehicle by one user at the same time."""
+
+
+class SpoolDirectory:
+    """A directory on disk that one mount at a time uses; `owner` marks the mount's names on the vehicle.
+
+    Attributes:
+        dead_owners: tokens of mounts that ended here; what they left on the vehicle is nobody's.
+    """
+
+    def __init__(self, base: Path, rng: Random) -> None:
+        """Claim a free slot below `base`.
+
+        Raises:
+            OSError: it cannot be made, or every slot is taken.
+        """
+        base.mkdir(mode=0o700, parents=True, exist_ok=True)
+        self._locks: dict[Path, int] = {}
+        self.dead_owners: frozenset[bytes] = frozenset()
+        free = [slot for slot in (base / f"slot{number}" for number in range(SLOTS)) if self._lock(slot)]
+        if not free:
+            raise OSError(f"all {SLOTS} slots of {base} are in use")
+        self.path = free[0]
+        self.owner = self._token(self.path, rng)
+        self.dead_owners = frozenset(self._token(slot, rng) for slot in free)
+        self._abandoned = free
+
+    def rescue(self, recovery: Path) -> list[Path]:
+        """Move what dead mounts left to `recovery`; return the files, and let go of their slots.
+
+        Raises:
+            OSError.
+        """
+        found = []
+        for slot in self._abandoned:
+            for data in sorted(slot.glob("*.data")):
+                found.append(_move(data, recovery))
+            if slot != self.path:
+                self._unlock(slot)
+        self._abandoned = []
+        return found
+
+    def close(self) -> None:
+        """Let go of the directory."""
+        for slot in list(self._locks):
+            self._unlock(slot)
+
+    def _lock(self, slot: Path) -> bool:
+        if self._locks and not slot.exists():
+            return False  # one new slot is enough
+        slot.mkdir(mode=0o700, exist_ok=True)
+        descriptor = os.open(slot / "owner", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            os.close(descriptor)
+            return False
+        self._locks[slot] = descriptor
+        return True
+
+    def _unlock(self, slot: Path) -> None:
+        os.close(self._locks.pop(slot))
+
+    def _token(self, slot: Path, rng: Random) -> bytes:
+        """Return the slot's token, made at its first use."""
+        descriptor = self._locks[slot]
+        token = os.pread(descriptor, 16, 0).strip()
+        if not token:
+            token = new_owner(rng)
+            os.pwrite(descriptor, token, 0)
+        return token
+
+
+class Spool:
+    """The budget that all drafts share."""
+
+    def __init__(
+        self, *, memory_max: Callable[[], int], spool_max: int, directory: Path | None = None
+    ) -> None:
+        """`memory_max()` bytes in memory, `spool_max` on disk; without a directory one is made when needed."""
+        self._memory_max = memory_max
+        self._spool_max = spool_max
+        self._directory = directory
+        self._temporary: Path | None = None
+        self._number = 0
+        self.in_memory = 0
+        self.on_disk = 0
+
+    @property
+    def bytes_held(self) -> int:
+        """Bytes in memory and on disk."""
+        return self.in_memory + self.on_disk
+
+    def content(self) -> SpoolContent:
+        """Return room for one file."""
+        return SpoolContent(self)
+
+    def fits_memory(self, more: int) -> bool:
+        """Return whether `more` bytes may be kept in memory."""
+        return self.in_memory + more <= self._memory_max()
+
+    def require_disk(self, more: int) -> None:
+        """Raise NoSpace unless `more` bytes may go to disk."""
+        if self.on_disk + more > self._spool_max:
+            raise NoSpace(f"{self.on_disk} bytes wait for the vehicle, spool_max is {self._spool_max}")
+
+    def new_file(self) -> Path:
+        """Return the path of a file that is not there yet."""
+        self._number += 1
+        return self._place() / f"{self._number:06}.data"
+
+    def close(self) -> None:
+        """Remove the directory, if it was made here."""
+        if self._temporary is not None:
+            shutil.rmtree(self._temporary, ignore_errors=True)
+
+    def _place(self) -> Path:
+        if self._directory is None:
+            self._directory = self._temporary = Path(tempfile.mkdtemp(prefix="mavftpfs-"))
+        return self._directory
+
+
+class SpoolContent:
+    """The held bytes of one draft; implements cache.draft.Content."""
+
+    def __init__(self, spool: Spool) -> None:
+        self._spool = spool
+        self._pages: dict[int, bytearray] = {}
+        self._file: int | None = None
+        self._path: Path | None = None
+        self._stored = ExtentSet()
+
+    def put(self, offset: int, data: bytes | memoryview) -> None:
+        """Keep bytes.
+
+        Raises:
+            NoSpace: the budget is used up, or the local disk is full; nothing was kept.
+        """
+        if self._file is None:
+            new = self._new_pages(offset, offset + len(data))
+            if self._spool.fits_memory(new * PAGE):
+                self._put_pages(offset, memoryview(data))
+                return
+            self._spill()
+        self._put_file(offset, data)
+
+    def get(self, start: int, stop: int) -> bytes:
+        """Return bytes that were put."""
+        if self._file is not None:
+            data = os.pread(self._file, stop - start, start)
+            if len(data) != stop - start:
+                raise OSError(f"{self._path} lost bytes that were in it")
+            return data
+        parts = []
+        while start < stop:
+            base = start // PAGE * PAGE
+            end = min(stop, base + PAGE)
+            parts.append(memoryview(self._pages[base // PAGE])[start - base : end - base])
+            start = end
+        return b"".join(parts)
+
+    def cut(self, size: int) -> None:
+        """Forget what lies at and beyond `size`."""
+        if self._file is not None:
+            self._count_stored(size, max(size, self._stored.end), present=False)
+            os.ftruncate(self._file, min(size, os.fstat(self._file).st_size))
+            return
+        for index in [i for i in self._pages if i * PAGE >= size]:
+            del self._pages[index]
+            self._spool.in_memory -= PAGE
+
+    def persist(self, facts: dict[str, Any]) -> None:
+        """Have bytes and `facts` (JSON) survive the end of this process.
+
+        Raises:
+            NoSpace, OSError.
+        """
+        self._spill()
+        assert self._file is not None
+        assert self._path is not None
+        os.ftruncate(self._file, facts["size"])
+        os.fsync(self._file)
+        _write_durably(self._path.with_suffix(".json"), json.dumps(facts, indent=1).encode())
+
+    def close(self) -> None:
+        """The vehicle has it: forget the bytes."""
+        self.cut(0)
+        if self._file is not None and self._path is not None:
+            os.close(self._file)
+            self._file = None
+            self._path.unlink(missing_ok=True)
+            self._path.with_suffix(".json").unlink(missing_ok=True)
+
+    # --- inside
+
+    def _new_pages(self, start: int, stop: int) -> int:
+        return sum(1 for i in range(start // PAGE, -(-stop // PAGE)) if i not in self._pages)
+
+    def _put_pages(self, offset: int, data: memoryview) -> None:
+        while data:
+            index, at = divmod(offset, PAGE)
+            page = self._pages.get(index)
+            if page is None:
+                page = self._pages[index] = bytearray(PAGE)
+                self._spool.in_memory += PAGE
+            count = min(len(data), PAGE - at)
+            page[at : at + count] = data[:count]
+            data = data[count:]
+            offset += count
+
+    def _spill(self) -> None:
+        """Move from memory to disk."""
+        if self._file is not None:
+            return
+        self._spool.require_disk(len(self._pages) * PAGE)
+        try:
+            path = self._spool.new_file()
+            self._file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
+        except OSError as exc:
+            raise NoSpace(f"no local file for what waits for the vehicle: {exc}") from exc
+        self._path = path
+        pages, self._pages = self._pages, {}
+        self._spool.in_memory -= len(pages) * PAGE
+        for index, page in pages.items():
+            self._put_file(index * PAGE, page)
+
+    def _put_file(self, offset: int, data: bytes | bytearray | memoryview) -> None:
+        assert self._file is not None
+        stop = offset + len(data)
+        more = sum(b - a for a, b in self._stored.missing(offset, stop))
+        self._spool.require_disk(more)
+        left = memoryview(data)
+        try:
+            while left:
+                written = os.pwrite(self._file, left, stop - len(left))
+                left = left[written:]
+        except OSError as exc:
+            raise NoSpace(f"cannot keep bytes in {self._path}: {exc}") from exc
+        self._count_stored(offset, stop, present=True)
+
+    def _count_stored(self, start: int, stop: int, *, present: bool) -> None:
+        before = self._stored.total
+        if present:
+            self._stored.add(start, stop)
+        else:
+            self._stored.discard(start, stop)
+        self._spool.on_disk += self._stored.total - before
+
+
+def _write_durably(path: Path, data: bytes) -> None:
+    """Replace a small file so that a crash leaves the old or the new one."""
+    draft = path.with_suffix(".new")
+    with draft.open("wb") as file:
+        file.write(data)
+        file.flush()
+        os.fsync(file.fileno())
+    draft.replace(path)
+    directory = os.open(path.parent, os.O_RDONLY)
+    try:
+        os.fsync(directory)
+    finally:
+        os.close(directory)
+
+
+def _move(data: Path, recovery: Path) -> Path:
+    """Move a spooled file and its description to the recovery directory; return its new path."""
+    recovery.mkdir(mode=0o700, parents=True, exist_ok=True)
+    facts = data.with_suffix(".json")
+    target = free_name(recovery, _name_for(facts, data))
+    shutil.move(data, target)
+    if facts.exists():
+        shutil.move(facts, target.with_name(target.name + ".json"))
+    return target
+
+
+def _name_for(facts: Path, data: Path) -> str:
+    """Return a name that tells where the bytes belong, as far as that was written down."""
+    try:
+        path = str(json.loads(facts.read_text())["path"])
+    except (OSError, ValueError, KeyError, TypeError) as exc:
+        log.warning("%s: what it belongs to was not written down: %s", data, exc)
+        return data.name
+    return path.strip("/").replace("/", "__") or data.name
+
+
+def free_name(directory: Path, name: str) -> Path:
+    """Return a path in `directory` that does not exist, made from at most 200 bytes of `name`."""
+    short = os.fsdecode(os.fsencode(name)[-200:])
+    number = 0
+    while True:
+        path = directory / (short if not number else f"{short}.{number}")
+        if not path.exists():
+            return path
+        number += 1
