@@ -122,6 +122,7 @@ class _Life:
         self.control: ControlServer | None = None
         self._loop_scope: trio.CancelScope | None = None
         self._signals = 0
+        self._stop_asked = False
         self._started = time.time()
 
     def fail(self, error: MavftpfsError) -> None:
@@ -143,11 +144,11 @@ class _Life:
                 inodes=inodes,
                 refresh=invalidator.forget_attributes,
                 space=content.space,
-                status=lambda: self.status(content),
+                status=lambda: self.status(content, operations),
             )
             with kernel_mount(operations, self.request, invalidator):
                 self.mounted = True
-                await self._start_control(content, nursery)
+                await self._start_control(lambda: self.status(content, operations), nursery)
                 await self._serve(invalidator)
 
     async def _serve(self, invalidator: Invalidator) -> None:
@@ -155,18 +156,19 @@ class _Life:
             nursery.start_soon(invalidator.run)
             self.report(0, "")
             with trio.CancelScope() as self._loop_scope:
-                await fuse_loop()
+                if not self._stop_asked:
+                    await fuse_loop()
             self._loop_scope = None
             nursery.cancel_scope.cancel()
 
     # -- control ----------------------------------------------------------------------------------
 
-    async def _start_control(self, content: Content, nursery: trio.Nursery) -> None:
+    async def _start_control(self, facts: Callable[[], dict[str, Any]], nursery: trio.Nursery) -> None:
         if self.request.control is None:
             return
 
         async def status(_: Reply) -> Reply:
-            return {"status": self.status(content)}
+            return {"status": facts()}
 
         server = ControlServer(self.request.control, {"status": status, "umount": self._umount})
         try:
@@ -185,7 +187,7 @@ class _Life:
         await self.finished.wait()
         return {"exit_code": int(self.code), "pid": os.getpid()}
 
-    def status(self, content: Content) -> dict[str, Any]:
+    def status(self, content: Content, operations: Operations) -> dict[str, Any]:
         """Return facts for people and scripts; JSON-able."""
         return {
             "mountpoint": self.request.mountpoint,
@@ -194,6 +196,7 @@ class _Life:
             "version": mavftpfs.__version__,
             "uptime": round(time.time() - self._started, 1),
             **content.status(),
+            "kernel": operations.counts(),
         }
 
     # -- signals ----------------------------------------------------------------------------------
@@ -216,6 +219,7 @@ class _Life:
             self._stop_gently()
 
     def _stop_gently(self) -> None:
+        self._stop_asked = True
         if self._loop_scope is not None:
             pyfuse3.terminate()
             self._loop_scope.deadline = trio.current_time() + GRACE

@@ -137,6 +137,15 @@ class Operations(pyfuse3.Operations):
             return CRC_BUDGET + self._look.op_deadline + DEADLINE_MARGIN
         return self._look.op_deadline + DEADLINE_MARGIN
 
+    def counts(self) -> dict[str, int]:
+        """Return how much the kernel holds of ours; excess forgets are a bug, here or there."""
+        return {
+            "inodes": len(self.inodes),
+            "open_files": len(self.files),
+            "open_directories": len(self.directories),
+            "excess_forgets": self.inodes.excess_forgets,
+        }
+
     # -- names and attributes ---------------------------------------------------------------------
 
     @handler

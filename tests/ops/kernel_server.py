@@ -1,0 +1,80 @@
+"""Mounts a FakeTree for the mount tests: python -m tests.ops.kernel_server MOUNTPOINT CONTROL_SOCKET.
+
+Takes one JSON object a line on stdin and answers each with one on stdout: {"do": "write", "path", "text"},
+{"do": "invalidate", "path"}, and {"do": "calls"}, which gives the calls since the last time.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import sys
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+import trio
+
+from mavftpfs.fuse.options import MountOptions
+from mavftpfs.link.uri import parse_source
+from mavftpfs.mount import Content, MountRequest, serve_mount
+from tests.ops.faketree import FakeTree
+
+VALID_FOR = 1000.0
+"""So long that only being told makes the kernel ask again."""
+
+
+class Server:
+    """The tree and the commands that change it."""
+
+    def __init__(self) -> None:
+        many = {b"/many/%04d" % number: b"x" * number for number in range(1500)}
+        self.tree = FakeTree({b"/a": b"one", b"/big": bytes(range(256)) * 4096, **many}, valid_for=VALID_FOR)
+
+    @asynccontextmanager
+    async def attach(self, invalidate: Callable[[bytes], None]) -> AsyncIterator[Content]:
+        """Be mount's content."""
+        async with trio.open_nursery() as nursery:
+            nursery.start_soon(self.listen, invalidate)
+            yield Content(self.tree)
+            nursery.cancel_scope.cancel()
+
+    async def listen(self, invalidate: Callable[[bytes], None]) -> None:
+        """Do what stdin says."""
+        while line := await trio.to_thread.run_sync(sys.stdin.readline, abandon_on_cancel=True):
+            print(json.dumps(self.obey(json.loads(line), invalidate)), flush=True)
+
+    def obey(self, order: dict[str, Any], invalidate: Callable[[bytes], None]) -> dict[str, Any]:
+        """Carry one command out."""
+        path = order.get("path", "").encode()
+        match order["do"]:
+            case "write":
+                self.tree.files[path] = order["text"].encode()
+            case "invalidate":
+                invalidate(path)
+            case "calls":
+                names = [name for name, _ in self.tree.calls]
+                self.tree.calls.clear()
+                return {"calls": names}
+        return {}
+
+
+def main() -> int:
+    """Mount until unmounted."""
+    logging.basicConfig(level=logging.WARNING)
+    source = "udpin:127.0.0.1:1"
+    mountpoint, control = sys.argv[1:]
+    request = MountRequest(
+        source, parse_source(source), mountpoint, MountOptions(read_only=True), control=Path(control)
+    )
+    return trio.run(serve_mount, request, Server().attach, report)
+
+
+def report(code: int, message: str) -> None:
+    """Say that it is mounted, or why not."""
+    print(json.dumps({"code": code, "message": message}), flush=True)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
