@@ -24,6 +24,7 @@ class Simple(Operation):
         size: header field; None means len(data).
         side_effect: repeat under the same seq first, because a second execution would be another act.
         patience: seconds until RequestTimeout, None for the engine's deadline.
+        server_time: seconds that the server may work at it; a repetition waits for so long.
 
     Attributes:
         reply: the ACK, once done without error.
@@ -43,6 +44,7 @@ class Simple(Operation):
         size: int | None = None,
         side_effect: bool | None = None,
         patience: float | None = None,
+        server_time: float | None = None,
     ) -> None:
         super().__init__()
         if len(data) > MAX_DATA:
@@ -53,6 +55,8 @@ class Simple(Operation):
         manner = manner_of(opcode)
         if side_effect is not None:
             manner = manner._replace(same_seq=side_effect)
+        if server_time is not None:
+            manner = manner._replace(family="work", patient_after=1, patience=server_time)
         count = len(data) if size is None else size
         self._request: Request | None = Request(
             self, opcode, manner, session or 0, offset, count, data, follows=session is None

@@ -53,6 +53,7 @@ class ConnectOptions:
     read_mode: ReadMode = "auto"
     chunk: int | None = None
     window: int | None = None
+    when_armed: Literal["ro", "ok"] = "ro"
 
 
 @dataclass(slots=True)
@@ -128,6 +129,7 @@ class Connection:
         self._first_heartbeat.set()
         if self.was_lost:
             self.was_lost = False
+            self.scheduler.on_link_back()
             self._tell("back")
 
     def _tell(self, news: str) -> None:
@@ -224,7 +226,15 @@ def _build(
     engine = Engine(rng, Flow(serial=link.is_serial, limit=options.window), op_deadline=options.op_deadline)
     driver = Driver(link, framer, engine, vehicle, clock=clock, trace=trace)
     steering = ReadSteering(engine, options.read_mode, options.chunk)
-    scheduler = Scheduler(driver, engine, vehicle, steering, clock=clock)
+    scheduler = Scheduler(
+        driver,
+        engine,
+        vehicle,
+        steering,
+        clock=clock,
+        op_deadline=options.op_deadline,
+        when_armed_ok=options.when_armed == "ok",
+    )
     store = Store(scheduler, vehicle, clock=clock, op_deadline=options.op_deadline)
     connection = Connection(store, vehicle, scheduler, engine, driver, link, options, clock)
     driver.on_batch = scheduler.on_batch
@@ -239,7 +249,12 @@ def _build(
     vehicle.on_foreign = lambda: scheduler.on_suspect("another FTP client is active")
     vehicle.on_heartbeat = connection._on_heartbeat
     vehicle.on_double = lambda: _move_away(connection)
-    vehicle.on_armed = lambda armed: connection._tell("armed" if armed else "disarmed")
+
+    def on_armed(armed: bool) -> None:
+        scheduler.armed_changed(armed)
+        connection._tell("armed" if armed else "disarmed")
+
+    vehicle.on_armed = on_armed
     return connection
 
 

@@ -30,6 +30,9 @@ SILENCE_PX4 = 10.5
 TERMINATE_LIMIT = 5.0
 """Seconds to wait for a Terminate before the session is treated as doubtful."""
 
+_SURELY_OPEN = 8.0
+"""Seconds in which no server closes an idle session (PX4 does after 10)."""
+
 
 @dataclass(frozen=True, slots=True)
 class OpenSession:
@@ -39,6 +42,7 @@ class OpenSession:
     id: int
     size: int | None
     opened_at: float
+    writing: bool = False
 
 
 class SessionOpener:
@@ -53,12 +57,18 @@ class SessionOpener:
         self._gate = gate
         self._clock = clock
         self._doubtful: int | None = None
+        self._doubtful_path: bytes | None = None
         self._server_assigns: bool | None = None
         self.resets = 0
         self.quiet_periods = 0
 
-    async def open(self, path: bytes) -> OpenSession:
-        """Open a file read-only.
+    @property
+    def doubtful_path(self) -> bytes | None:
+        """The file that may still be open over there by our doing, None if there is none."""
+        return None if self._doubtful is None else self._doubtful_path
+
+    async def open(self, path: bytes, opcode: Opcode = Opcode.OPEN_FILE_RO) -> OpenSession:
+        """Open a file: OpenFileRO, OpenFileWO or CreateFile.
 
         Raises:
             FtpNak: the server refused. SessionBusy: its session stayed taken. RequestTimeout.
@@ -69,7 +79,7 @@ class SessionOpener:
         last: FtpNak | None = None
         while True:
             try:
-                return await self._open_once(path)
+                return await self._open_once(path, opcode)
             except FtpNak as nak:
                 last = nak
                 if not self._looks_taken(nak):
@@ -82,27 +92,33 @@ class SessionOpener:
                     raise last
                 raise SessionBusy("the vehicle's only FTP session is in use by another client")
 
-    async def close(self, session: OpenSession) -> bool:
-        """Terminate and check the answer; return False if the server had already closed it.
+    async def close(self, session: OpenSession, limit: float = TERMINATE_LIMIT) -> bool:
+        """Terminate and check the answer; return False if the server had closed it before, by itself.
+
+        A session that is not there counts as closed by us if we had to ask twice, within a time in which no
+        server closes an idle one: the first request did it. limit: seconds to wait for an answer.
 
         Raises:
             FtpNak: closing failed over there. RequestTimeout: no answer; the next open tries again first.
         """
         self._engine.session = self._engine.home_session
         operation = Terminate(session.id)
-        self._doubtful = session.id
+        self._doubt(session.id, session.path)
+        asked_at = self._clock()
         try:
-            with trio.fail_after(TERMINATE_LIMIT):
+            with trio.fail_after(limit):
                 await self._run(operation)
         except trio.TooSlowError:
             raise RequestTimeout("no answer to TerminateSession") from None
         except FtpNak as nak:
             self._doubtful = None
-            if nak.code != NakCode.INVALID_SESSION:
+            if nak.code != NakCode.FILE_EXISTS:  # PX4's sticky errno for "no such session"
                 raise
-            return False
+            operation.already_closed = True
         self._doubtful = None
-        return not operation.already_closed
+        if not operation.already_closed:
+            return True
+        return operation.retransmitted and self._clock() - asked_at < _SURELY_OPEN
 
     async def close_doubtful(self) -> None:
         """Close what may still be ours, on leaving.
@@ -114,7 +130,7 @@ class SessionOpener:
 
     def abandon(self, session: OpenSession) -> None:
         """Stop believing in a session after silence or a reboot; the next open closes it first."""
-        self._doubtful = session.id
+        self._doubt(session.id, session.path)
         self._engine.session = self._engine.home_session
 
     def forget(self) -> None:
@@ -123,17 +139,21 @@ class SessionOpener:
         self._server_assigns = None
         self._engine.session = self._engine.home_session
 
-    async def _open_once(self, path: bytes) -> OpenSession:
+    def _doubt(self, session: int, path: bytes) -> None:
+        self._doubtful = session
+        self._doubtful_path = path
+
+    async def _open_once(self, path: bytes, opcode: Opcode) -> OpenSession:
         asked = self._engine.home_session
-        operation = OpenFile(Opcode.OPEN_FILE_RO, wire_path(path), asked)
-        self._doubtful = asked if self._server_assigns is not True else 0
-        await self._run(
-            operation
-        )  # a time-out or cancellation leaves it doubtful: the open may have been executed
+        operation = OpenFile(opcode, wire_path(path), asked)
+        self._doubt(asked if self._server_assigns is not True else 0, path)
+        # A time-out or cancellation leaves it doubtful: the open may have been executed.
+        await self._run(operation)
         self._doubtful = None
         self._server_assigns = operation.session != asked
         self._engine.session = operation.session
-        return OpenSession(path, operation.session, operation.size, self._clock())
+        writing = opcode != Opcode.OPEN_FILE_RO
+        return OpenSession(path, operation.session, operation.size, self._clock(), writing)
 
     def _looks_taken(self, nak: FtpNak) -> bool:
         """8 may hide any other code on PX4 (sticky EEXIST), and makes no sense as an answer to an open."""
@@ -173,7 +193,11 @@ class SessionOpener:
         doubtful, self._doubtful = self._doubtful, None
         if doubtful is None or (doubtful == 0 and self._vehicle.foreign_client(self._clock())):
             return False
-        return await self._tolerate(lambda: self._run(Terminate(doubtful)))
+        try:
+            return await self._tolerate(lambda: self._run(Terminate(doubtful)))
+        except BaseException:
+            self._doubtful = doubtful  # not answered: as doubtful as before
+            raise
 
     async def _tolerate(self, step: Callable[[], Awaitable[None]]) -> bool:
         """Run a remedy whose refusal changes nothing; a time-out is the caller's news."""

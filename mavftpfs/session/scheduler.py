@@ -1,59 +1,55 @@
 """Who may use the one server session, and when. Layer: session.
 
-One task (`serve`) opens, reads and closes; streams and whole reads only say what they want and wake it.
-Metadata requests do not need the session: they run beside it and carry its id (servers.md 1, ArduPilot).
+One task (`serve`) opens, reads, writes and closes; streams, uploads and jobs only say what they want and
+wake it. Metadata requests do not need the session: they run beside it and carry its id (servers.md 1).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Awaitable, Callable
+from contextlib import AbstractAsyncContextManager
 from itertools import count
 
 import trio
 
-from mavftpfs.cache.remote import ReadSink
+from mavftpfs.cache.remote import ReadSink, UploadSource
 from mavftpfs.protocol.engine import Engine
 from mavftpfs.protocol.operations import Operation
-from mavftpfs.protocol.transfers import ReadToEof, ReadTransfer
+from mavftpfs.protocol.payload import Opcode
+from mavftpfs.protocol.transfers import ReadToEof
 from mavftpfs.session.driver import Driver
 from mavftpfs.session.gate import Gate
+from mavftpfs.session.holder import SessionHolder
+from mavftpfs.session.jobs import SessionJob
 from mavftpfs.session.opening import OpenSession, SessionOpener
-from mavftpfs.session.policy import LIGHT_USE, should_switch
+from mavftpfs.session.policy import LIGHT_USE
+from mavftpfs.session.reading import Reading
 from mavftpfs.session.readmode import ReadSteering
 from mavftpfs.session.stream import FileStream
+from mavftpfs.session.upload import QueuedUpload
+from mavftpfs.session.uploading import Uploading
 from mavftpfs.session.vehicle import Vehicle
-from mavftpfs.shared.errors import FileChanged, MavftpfsError, SessionLost, VehicleLost
+from mavftpfs.shared.errors import MavftpfsError, RequestTimeout, VehicleLost
+from mavftpfs.shared.traits import WriteTraits
 
 IDLE_CLOSE = 1.5
 """Seconds a file stays open on the server without being read. Below the 2 s after which PX4 frees its
 buffers and the 3 s after which ArduPilot gives the session away: so a session is never doubtful."""
 
-STALL = 2.0
-"""Seconds without any reply during a read after which the server's session is no longer believed in."""
-
-FIRST_WANT = 0.05
-"""Seconds an opened file is kept open for its first read although another file waits."""
-
-REOPENS = 5
-"""How often one want may lose its session without a byte of progress before it fails."""
+_DOUBT_RETRY = 5.0
+_User = SessionJob | FileStream | QueuedUpload
 
 
-@dataclass(eq=False)
-class WholeRead:
-    """An `@` file to be read to its end in one go."""
-
-    path: bytes
-    limit: int
-    ticket: int
-    finished: trio.Event = field(default_factory=trio.Event)
-    data: bytes = b""
-    error: MavftpfsError | None = None
-    cancelled: bool = False
+async def _do_nothing(session: OpenSession) -> None:
+    """The open and the Terminate are all."""
 
 
 class Scheduler:
-    """Serialises all use of the server session."""
+    """Serialises all use of the server session.
+
+    op_deadline: seconds after which who waits for the session is told that it is not to be had.
+    when_armed_ok: write in flight, too.
+    """
 
     def __init__(
         self,
@@ -63,34 +59,78 @@ class Scheduler:
         steering: ReadSteering,
         *,
         clock: Callable[[], float],
+        op_deadline: float = 30.0,
+        when_armed_ok: bool = False,
     ) -> None:
         self.gate = Gate()
         self.opener = SessionOpener(driver, engine, vehicle, self.gate, clock)
-        self.session: OpenSession | None = None
-        self.switches = 0
+        self.write_traits = WriteTraits()
+        self.op_deadline = op_deadline
+        self._holder = SessionHolder(self.opener)
         self._driver = driver
-        self._engine = engine
         self._vehicle = vehicle
         self._steering = steering
         self._clock = clock
-        self._wake = trio.Event()
         self._tickets = count(1)
         self._streams: set[FileStream] = set()
-        self._wholes: list[WholeRead] = []
-        self._active: FileStream | None = None
-        self._transfer: ReadTransfer | None = None
-        self._seen_bytes = 0
-        self._closing = False
+        self._jobs: list[SessionJob] = []
+        self._reading = Reading(
+            self._holder,
+            driver,
+            engine,
+            self.gate,
+            steering,
+            clock=clock,
+            rival=self._rival_use,
+            require_link=self.require_link,
+        )
+        self._uploading = Uploading(
+            self._holder,
+            driver,
+            engine,
+            vehicle,
+            self.gate,
+            clock=clock,
+            traits=lambda: self.write_traits,
+            rival=self._rival_use,
+            expire_waiters=self._expire_waiters,
+            op_deadline=op_deadline,
+            chunk=steering.chunk,
+            when_armed_ok=when_armed_ok,
+        )
+
+    @property
+    def session(self) -> OpenSession | None:
+        """What is open on the server."""
+        return self._holder.session
+
+    @property
+    def switches(self) -> int:
+        """How often one file made room for another."""
+        return self._holder.switches
+
+    @property
+    def uploads(self) -> list[QueuedUpload]:
+        """The uploads that were neither completed nor aborted by their owners."""
+        return list(self._uploading.uploads)
 
     # --- what others ask for
 
-    async def metadata(self, operation: Operation) -> None:
-        """Run an operation that needs no session of its own.
+    async def metadata(self, operation: Operation, *, disturbs: bool = True) -> None:
+        """Run an operation that needs no session of its own; `disturbs`: it carries a path to be looked up,
+        which some servers take amiss while a file is written.
 
         Raises:
             VehicleLost, or what the operation fails with.
         """
         self.require_link()
+        if not disturbs:
+            await self._run_beside(operation)
+            return
+        async with self._uploading.turns.path_operation():
+            await self._run_beside(operation)
+
+    async def _run_beside(self, operation: Operation) -> None:
         async with self.gate.passing():
             await self._driver.run(operation)
 
@@ -104,58 +144,108 @@ class Scheduler:
 
     async def read_whole(self, path: bytes, limit: int) -> bytes:
         """Read a file to EOF whatever its size claims."""
+        data = b""
+
+        async def read(session: OpenSession) -> None:
+            nonlocal data
+            operation = ReadToEof(session.id, self._steering.chunk, limit)
+            await self._run_beside(operation)
+            data = operation.data
+
+        await self.use_session(path, Opcode.OPEN_FILE_RO, read)
+        return data
+
+    async def use_session(
+        self,
+        path: bytes,
+        opcode: Opcode,
+        action: Callable[[OpenSession], Awaitable[None]] = _do_nothing,
+    ) -> OpenSession:
+        """Open a file, do something, terminate; returns what the open ACK said.
+
+        Raises:
+            VehicleLost, RequestTimeout, or what opening, the action or closing fail with.
+        """
         self.require_link()
-        job = WholeRead(path, limit, next(self._tickets))
-        self._wholes.append(job)
-        self._wake.set()
+        job = SessionJob(path, opcode, action, next(self._tickets), self._clock())
+        self._jobs.append(job)
+        self._holder.wake()
         try:
             await job.finished.wait()
         finally:
-            job.cancelled = True
-            if job in self._wholes:
-                self._wholes.remove(job)
-            self._wake.set()
+            if job in self._jobs:
+                self._jobs.remove(job)
+            self._holder.wake()
         if job.error is not None:
             raise job.error
-        return job.data
+        assert job.session is not None
+        return job.session
+
+    def open_upload(self, path: bytes, source: UploadSource, *, create: bool) -> QueuedUpload:
+        """Queue an upload."""
+        return self._uploading.add(path, source, create=create, ticket=next(self._tickets))
+
+    def claim(self, path: bytes, *, below: bool = False) -> AbstractAsyncContextManager[None]:
+        """Keep our own session off a path that is about to change, or off all below it.
+
+        Raises:
+            RequestTimeout: what was open there could not be closed.
+        """
+        return self._holder.claim(path, below=below, limit=self.op_deadline)
+
+    def moved(self, old: bytes, new: bytes) -> None:
+        """A file or directory was renamed: who reads or writes it, or below it, goes on under the new path."""
+        prefix = old + b"/"
+        users: list[FileStream | QueuedUpload] = [*self._streams, *self._uploading.uploads]
+        for user in users:
+            if user.path == old:
+                user.path = new
+            elif user.path.startswith(prefix):
+                user.path = new + user.path[len(old) :]
+
+    def gone(self, path: bytes) -> None:
+        """The file of this name was removed or replaced: what its readers still want cannot be had."""
+        for stream in list(self._streams):
+            if stream.path == path:
+                stream.orphan()
 
     def require_link(self) -> None:
         """Raise VehicleLost while the vehicle is silent (promise 4: fail at once)."""
         if self._vehicle.lost(self._clock()):
             raise VehicleLost("the vehicle is silent; waiting for its heartbeat")
 
+    def check_may_write(self) -> None:
+        """Raise Armed or VehicleLost (promises 4 and 9)."""
+        self._uploading.check_may_write()
+
     # --- news
 
     def on_batch(self, now: float) -> None:
         """A batch of replies was processed: pass data on, once."""
-        transfer, stream = self._transfer, self._active
-        if transfer is None or stream is None:
-            return
-        if transfer.received_bytes != self._seen_bytes:
-            self._seen_bytes = transfer.received_bytes
-            stream.last_data_at = now
-            stream.clean_failures = 0
-            stream.sink.on_batch()
-        if transfer.idle or transfer.done:
-            self._wake.set()
+        self._reading.on_batch(now)
+        self._uploading.on_batch()
 
     def on_suspect(self, reason: str, within: float = 10.0) -> None:
         """Another FTP client was heard: what was read lately is provisional."""
         now = self._clock()
         for stream in self._streams:
-            if stream is self._active or (stream.last_data_at or -1e9) > now - within:
+            if stream is self._reading.active or (stream.last_data_at or -1e9) > now - within:
                 stream.sink.on_suspect(reason)
 
     def on_reboot(self) -> None:
-        """The vehicle restarted: nothing is open any more."""
-        self.session = None
-        self.opener.forget()
-        if self._transfer is not None:
-            self._driver.cancel(self._transfer)
-        self._wake.set()
+        """The vehicle restarted, perhaps as another one: nothing is open, nothing is known of it."""
+        self.write_traits = WriteTraits()
+        self._holder.forget()
+        self._reading.on_reboot()
+        self._uploading.on_reboot()
 
-    def _on_news(self) -> None:
-        self._wake.set()
+    def armed_changed(self, armed: bool) -> None:
+        """On arming uploads are terminated and held; on disarming they go on (promise 9)."""
+        self._uploading.on_armed()
+
+    def on_link_back(self) -> None:
+        """Heartbeats are heard again."""
+        self._holder.wake()
 
     # --- the one task
 
@@ -163,201 +253,115 @@ class Scheduler:
         """Run until cancelled."""
         while True:
             await trio.lowlevel.checkpoint()
-            job = self._next()
+            await self._holder.honour_claims()
+            user = self._next()
             try:
-                if job is None:
+                if user is None:
                     await self._idle()
-                elif isinstance(job, WholeRead):
-                    await self._serve_whole(job)
+                elif isinstance(user, SessionJob):
+                    await self._serve_job(user)
+                elif isinstance(user, QueuedUpload):
+                    await self._uploading.serve(user)
+                    user.ticket = next(self._tickets)
                 else:
-                    await self._serve_stream(job)
+                    await self._reading.serve(user)
+                    user.ticket = None
+                    self._take_ticket(user)
             except MavftpfsError:
                 # Closing the previous file failed; whoever wants something is asked again by _next.
-                self.session = None
+                self._holder.abandon()
 
     async def close(self) -> None:
         """Terminate the session, best effort; the caller bounds the wait and cancels `serve` first."""
         if self.session is not None:
-            await self._close_session()
+            await self._holder.close()
         else:
             await self.opener.close_doubtful()
 
     def _on_want(self, stream: FileStream) -> None:
         if stream.closed:
             self._streams.discard(stream)
-        elif stream.ticket is None and stream.has_demand:
-            stream.ticket = next(self._tickets)
-        self._wake.set()
+        elif stream.ticket is None:
+            self._take_ticket(stream)
+        self._holder.wake()
 
-    def _next(self) -> WholeRead | FileStream | None:
-        """Demand before readahead, who used little lately before who used much, then who asked first."""
+    def _take_ticket(self, stream: FileStream) -> None:
+        if stream.has_demand:
+            stream.ticket = next(self._tickets)
+            stream.asked_at = self._clock()
+
+    def _next(self) -> _User | None:
+        """Demand before readahead, who used little lately before who used much (among those: readers before
+        writers), then who asked first."""
         now = self._clock()
-        demands: list[tuple[bool, int, WholeRead | FileStream]] = [
-            (False, job.ticket, job) for job in self._wholes
+        waiting: list[tuple[tuple[bool, bool, int], _User]] = [
+            ((False, False, job.ticket), job) for job in self._jobs if not self._claimed(job.path)
         ]
         readahead: FileStream | None = None
         for stream in self._streams:
+            if self._claimed(stream.path):
+                continue
             if stream.has_demand:
-                demands.append((stream.use.recent(now) >= LIGHT_USE, stream.ticket or 0, stream))
+                heavy = stream.use.recent(now) >= LIGHT_USE
+                waiting.append(((heavy, False, stream.ticket or 0), stream))
             elif stream.has_ahead and (readahead is None or self._is_open(stream)):
                 readahead = stream
-        if demands:
-            return min(demands, key=lambda item: item[:2])[2]
+        for upload in self._uploading.due(now):
+            if not self._claimed(upload.path):
+                heavy = upload.use.recent(now) >= LIGHT_USE
+                waiting.append(((heavy, not heavy, upload.ticket), upload))
+        if waiting:
+            return min(waiting, key=lambda item: item[0])[1]
         return readahead
 
+    def _claimed(self, path: bytes) -> bool:
+        return self._holder.claimed(path)
+
     def _is_open(self, stream: FileStream) -> bool:
-        return self.session is not None and self.session.path == stream.path
+        session = self.session
+        return session is not None and session.path == stream.path and not session.writing
+
+    def _rival_use(self, user: object) -> float | None:
+        """Return how much the lightest of those who wait for the session used of it lately."""
+        if self._jobs:
+            return 0.0
+        now = self._clock()
+        others = [stream.use for stream in self._streams if stream is not user and stream.has_demand]
+        others += [upload.use for upload in self._uploading.due(now) if upload is not user]
+        return min((use.recent(now) for use in others), default=None)
+
+    def _expire_waiters(self) -> None:
+        """Somebody holds the session and cannot be interrupted: do not let others wait for ever."""
+        oldest = self._clock() - self.op_deadline
+        error = RequestTimeout("the vehicle's only session is taken by an upload that cannot be interrupted")
+        for stream in list(self._streams):
+            if stream.has_demand and stream.ticket is not None and stream.asked_at < oldest:
+                stream.fail(error)
+        for job in [job for job in self._jobs if job.asked_at < oldest]:
+            self._jobs.remove(job)
+            job.fail(error)
 
     async def _idle(self) -> None:
-        if self.session is None:
-            await self._sleep(float("inf"))
-        elif not await self._sleep(IDLE_CLOSE) and self._next() is None:
-            await self._close_session()
+        now = self._clock()
+        until_upload = max(0.0, self._uploading.next_time(now) - now)
+        if self.session is not None:
+            if not await self._holder.sleep(min(IDLE_CLOSE, until_upload)) and self._next() is None:
+                await self._holder.close()
+        elif self.opener.doubtful_path is not None and not self._vehicle.lost(now):
+            # An open or a Terminate that was never answered: leave no orphan over there.
+            if not await self._holder.sleep(min(_DOUBT_RETRY, until_upload)):
+                await self._holder.close_doubtful()
+        else:
+            await self._holder.sleep(until_upload)
 
-    async def _sleep(self, seconds: float) -> bool:
-        """Wait for news; return False if there was none."""
-        with trio.move_on_after(seconds):
-            await self._wake.wait()
-            self._wake = trio.Event()
-            return True
-        return False
-
-    async def _close_session(self) -> None:
-        session, self.session = self.session, None
-        if session is not None:
-            await self.opener.close(session)
-
-    # --- whole reads
-
-    async def _serve_whole(self, job: WholeRead) -> None:
-        self._wholes.remove(job)
+    async def _serve_job(self, job: SessionJob) -> None:
+        self._jobs.remove(job)
         try:
-            await self._close_session()
-            self.session = await self.opener.open(job.path)
-            read = ReadToEof(self.session.id, self._steering.chunk, job.limit)
-            async with self.gate.passing():
-                await self._driver.run(read)
-            job.data = read.data
-            await self._close_session()
+            job.session = await self._holder.open(job.path, job.opcode)
+            await job.action(job.session)
+            await self._holder.close()
         except MavftpfsError as error:
             job.error = error
-            if self.session is not None:
-                await self._close_quietly()
+            await self._holder.close_quietly()
         finally:
             job.finished.set()
-
-    async def _close_quietly(self) -> None:
-        """Close after a failure that is already being reported."""
-        try:
-            await self._close_session()
-        except MavftpfsError:
-            self.session = None
-
-    # --- streams
-
-    async def _serve_stream(self, stream: FileStream) -> None:
-        try:
-            self.require_link()
-            if await self._ensure_open(stream):
-                await self._await_first_want(stream)
-            if stream.has_demand or stream.has_ahead:
-                async with self.gate.passing():
-                    await self._read(stream)
-        except SessionLost as error:
-            await self._on_session_lost(stream, error)
-        except MavftpfsError as error:
-            stream.fail(error)
-        stream.ticket = next(self._tickets) if stream.has_demand else None
-
-    async def _ensure_open(self, stream: FileStream) -> bool:
-        """Have the stream's file open; return whether its opener was waiting for that."""
-        session = self.session
-        awaited = stream.wants_open
-        if session is None or session.path != stream.path or awaited:
-            if session is not None:
-                await self._close_session()
-                self.switches += 1
-            session = self.session = await self.opener.open(stream.path)
-        if session.size is not None:
-            try:
-                stream.on_opened(session.size)
-            except FileChanged:
-                await self._close_quietly()
-                raise
-        return awaited
-
-    async def _await_first_want(self, stream: FileStream) -> None:
-        """Give whoever opened a file a moment to ask for its bytes, before another file takes its turn."""
-        with trio.move_on_after(FIRST_WANT):
-            while not (stream.has_demand or stream.has_ahead or stream.closed):
-                await self._sleep(FIRST_WANT)
-
-    async def _read(self, stream: FileStream) -> None:
-        session = self.session
-        assert session is not None
-        transfer = ReadTransfer(session.id, stream.size, stream.sink, self._steering.chunk)
-        started = self._clock()
-        self._active, self._transfer, self._seen_bytes = stream, transfer, 0
-        stream.attach(transfer)
-        self._driver.start(transfer, self._on_news)
-        try:
-            while self._go_on(stream, transfer, started):
-                self._steering.steer(
-                    transfer, stream.contiguous_want(), others_waiting=self._rival(stream) is not None
-                )
-                await self._sleep(self._patience())
-                if self._stalled(transfer):
-                    raise SessionLost("no answer for a while during a read", by_server=False)
-        finally:
-            self._active = self._transfer = None
-            if transfer.idle:
-                stream.on_idle()
-            stream.detach()
-            self._driver.cancel(transfer)
-            self._steering.learn(transfer)
-            now = self._clock()
-            stream.use.add(now - started, now)
-        if transfer.error is not None:
-            raise transfer.error
-
-    def _go_on(self, stream: FileStream, transfer: ReadTransfer, started: float) -> bool:
-        if transfer.done or transfer.idle or stream.closed or self.session is None:
-            return False
-        rival = self._rival(stream)
-        if rival is None:
-            return True
-        now = self._clock()
-        return not should_switch(
-            current_has_demand=stream.has_demand,
-            current_slice=now - started,
-            current_use=stream.use.recent(now),
-            waiting_use=rival.use.recent(now) if isinstance(rival, FileStream) else 0.0,
-            rtt=self._engine.rtt,
-        )
-
-    def _rival(self, stream: FileStream) -> WholeRead | FileStream | None:
-        """Return somebody else who waits with demand, the lightest user first."""
-        if self._wholes:
-            return self._wholes[0]
-        now = self._clock()
-        rivals = [other for other in self._streams if other is not stream and other.has_demand]
-        return min(rivals, key=lambda other: other.use.recent(now), default=None)
-
-    def _patience(self) -> float:
-        return 0.25 if len(self._streams) > 1 or self._wholes else STALL / 2
-
-    def _stalled(self, transfer: ReadTransfer) -> bool:
-        limit = max(STALL, 4.0 * (self._engine.rtt or 0.0))
-        quiet_since = max(self._driver.last_reply_at, transfer.started_at)
-        return not transfer.idle and self._clock() - quiet_since > limit
-
-    async def _on_session_lost(self, stream: FileStream, error: SessionLost) -> None:
-        """Reopen and go on at the same offset (promise 5); what the lost session read is provisional."""
-        session, self.session = self.session, None
-        if session is not None:
-            self.opener.abandon(session)
-        if error.by_server:
-            stream.sink.on_suspect(str(error))
-        stream.clean_failures += 1
-        if stream.clean_failures > REOPENS:
-            stream.fail(error)

@@ -12,6 +12,7 @@ from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.session.scheduler import Scheduler
 from mavftpfs.session.stream import FileStream
 from mavftpfs.session.vehicle import Vehicle
+from mavftpfs.session.writestore import COPY_RATE, WriteStore
 from mavftpfs.shared.errors import Armed, FtpNak, RemoteProtocolError, RequestTimeout
 from mavftpfs.shared.model import DirEntry, Listing, wire_path
 
@@ -25,9 +26,12 @@ look the same once."""
 CRC_PATIENCE = 120.0
 """Seconds a vehicle may need for a checksum (design promise 2)."""
 
+CRC_TIME = 5.0
+"""Seconds before a checksum is asked for again where the file's size is not known."""
 
-class Store:
-    """Reads, lists and checks remote files."""
+
+class Store(WriteStore):
+    """Reads, lists and checks remote files; WriteStore changes them."""
 
     def __init__(
         self,
@@ -37,7 +41,7 @@ class Store:
         clock: Callable[[], float],
         op_deadline: float = 30.0,
     ) -> None:
-        self._scheduler = scheduler
+        super().__init__(scheduler, self.list_directory)
         self._op_deadline = op_deadline
         self._vehicle = vehicle
         self._clock = clock
@@ -85,12 +89,15 @@ class Store:
         wire_path(path)
         return await self._scheduler.read_whole(path, limit)
 
-    async def crc32(self, path: bytes) -> int:
-        """Ask for a checksum (see RemoteStore)."""
+    async def crc32(self, path: bytes, *, size: int | None = None) -> int:
+        """Ask for a checksum (see RemoteStore); size: of the file, if known: the question is not repeated
+        before so much can have been read."""
         if self._vehicle.armed:
             raise Armed("checksums are not asked for in flight")
-        operation = Simple(Opcode.CALC_FILE_CRC32, wire_path(path), patience=CRC_PATIENCE)
-        await self._scheduler.metadata(operation)
+        server_time = CRC_TIME if size is None else size / COPY_RATE
+        wire = wire_path(path)
+        operation = Simple(Opcode.CALC_FILE_CRC32, wire, patience=CRC_PATIENCE, server_time=server_time)
+        await self._scheduler.metadata(operation, disturbs=False)
         data = operation.reply.data
         if len(data) < 4:
             raise RemoteProtocolError("the vehicle's checksum reply holds no checksum")

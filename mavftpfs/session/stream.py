@@ -28,6 +28,7 @@ class FileStream:
         self.closed = False
         self.use = Service()
         self.ticket: int | None = None
+        self.asked_at = 0.0
         self.wants_open = size is None
         self.last_data_at: float | None = None
         self.clean_failures = 0
@@ -37,6 +38,7 @@ class FileStream:
         self._wake = wake
         self._opened = trio.Event()
         self._open_error: MavftpfsError | None = None
+        self._orphaned = False
         self._transfer: ReadTransfer | None = None
 
     # --- the cache's side
@@ -50,6 +52,9 @@ class FileStream:
         """Ask for bytes of [start, stop), clamped to the size."""
         stop = min(stop, self.size)
         if start >= stop or self.closed:
+            return
+        if self._orphaned:
+            self.sink.on_failed(self._gone())
             return
         (self._demand if demand else self._ahead).add(start, stop)
         if self._transfer is not None:
@@ -136,6 +141,15 @@ class FileStream:
             self._opened.set()
         else:
             self.sink.on_failed(error)
+
+    def orphan(self) -> None:
+        """The file is gone from its path: nothing more of it can be had, and of its successor nothing may."""
+        self._orphaned = True
+        if self.has_demand:
+            self.fail(self._gone())
+
+    def _gone(self) -> FileChanged:
+        return FileChanged(f"{self.path!r} was removed or replaced")
 
     def contiguous_want(self) -> int:
         """Return the length of the first wanted run, demand and readahead taken together."""

@@ -1,0 +1,141 @@
+"""Finding out on a temporary of our own what a server does when it is written to. Layer: session.
+
+Only at first need, never in flight (design section 4). What is not answered stays unknown.
+"""
+
+from __future__ import annotations
+
+from mavftpfs.protocol.operations import Simple
+from mavftpfs.protocol.payload import NakCode, Opcode
+from mavftpfs.session.opening import OpenSession
+from mavftpfs.session.scheduler import Scheduler
+from mavftpfs.session.sideeffects import SideEffects
+from mavftpfs.shared.errors import FtpNak, RequestTimeout
+from mavftpfs.shared.model import join, wire_path
+from mavftpfs.shared.traits import WriteTraits
+
+PROBE_NAME = b".mavftpfs-probdaaa"
+"""Reserved, and of the kind that is removed when it is found left behind."""
+
+SECOND_NAME = b".mavftpfs-probdaab"
+
+CONTENT = b"abc"
+
+SILENCE = 6.0
+"""Seconds after which TruncateFile of three bytes counts as not answered."""
+
+_UNKNOWN = frozenset((NakCode.FAIL, NakCode.UNKNOWN_COMMAND))
+
+
+async def probe_writing(scheduler: Scheduler, effects: SideEffects, directory: bytes) -> None:
+    """Fill the traits that are unknown, and leave nothing behind.
+
+    Raises:
+        FtpNak: the directory cannot be written. RequestTimeout, VehicleLost, SessionBusy, Armed.
+    """
+    await _Probe(scheduler, effects, directory).run()
+
+
+class _Probe:
+    def __init__(self, scheduler: Scheduler, effects: SideEffects, directory: bytes) -> None:
+        self._scheduler = scheduler
+        self._effects = effects
+        self._path = join(directory, PROBE_NAME)
+        self._second = join(directory, SECOND_NAME)
+
+    @property
+    def _traits(self) -> WriteTraits:
+        return self._scheduler.write_traits
+
+    async def run(self) -> None:
+        """The steps, each with what the one before left."""
+        await self._sweep_up()
+        try:
+            if self._traits.wo_creates is None:
+                await self._open_missing()
+            await self._scheduler.use_session(self._path, Opcode.CREATE_FILE, self._write)
+            if self._traits.wo_truncates is None:
+                await self._open_existing()
+            if self._traits.truncate_works is None:
+                await self._truncate()
+            if self._traits.rename_works is None:
+                await self._rename()
+        finally:
+            await self._sweep_up()
+
+    async def _sweep_up(self) -> None:
+        for path in (self._path, self._second):
+            entry, _ = await self._effects.find(path)
+            if entry is not None:
+                await self._effects.remove(path)
+
+    async def _open_missing(self) -> None:
+        try:
+            await self._scheduler.use_session(self._path, Opcode.OPEN_FILE_WO)
+        except FtpNak as nak:
+            if nak.code == NakCode.FILE_NOT_FOUND:
+                self._traits.wo_creates = False
+            return
+        entry, _ = await self._effects.find(self._path)
+        self._traits.wo_creates = entry is not None
+
+    async def _write(self, session: OpenSession) -> None:
+        operation = Simple(Opcode.WRITE_FILE, CONTENT, session=session.id)
+        await self._scheduler.metadata(operation, disturbs=False)
+
+    async def _open_existing(self) -> None:
+        try:
+            await self._scheduler.use_session(self._path, Opcode.OPEN_FILE_WO)
+        except FtpNak:
+            return
+        size = await self._size()
+        if size in (0, len(CONTENT)):
+            self._traits.wo_truncates = size == 0
+
+    async def _truncate(self) -> None:
+        """PX4 on NuttX truncates through a copy that can destroy the file: its storage lies below /fs."""
+        if self._path.startswith(b"/fs/"):
+            self._traits.truncate_works = False
+            return
+        size = await self._size()
+        if size == 0:  # emptied by OpenFileWO: fill it again
+            await self._scheduler.use_session(self._path, Opcode.CREATE_FILE, self._write)
+        wire = wire_path(self._path)
+        operation = Simple(Opcode.TRUNCATE_FILE, wire, offset=1, patience=SILENCE, server_time=0.5)
+        try:
+            await self._scheduler.metadata(operation)
+        except FtpNak as nak:
+            if nak.code in _UNKNOWN:
+                self._traits.truncate_works = False
+            return
+        except RequestTimeout:
+            if await self._size() is not None:
+                self._traits.truncate_works = False
+            return
+        self._traits.truncate_works = await self._size() == 1
+
+    async def _rename(self) -> None:
+        """To a free name, and then onto a file."""
+        try:
+            await self._effects.rename(self._path, self._second)
+        except FtpNak:
+            self._traits.rename_works = False
+            return
+        self._traits.rename_works = True
+        if self._traits.rename_replaces is not None:
+            return
+        await self._scheduler.use_session(self._path, Opcode.CREATE_FILE)
+        try:
+            await self._effects.rename(self._path, self._second)
+        except FtpNak:
+            self._traits.rename_replaces = False
+        else:
+            self._traits.rename_replaces = True
+
+    async def _size(self) -> int | None:
+        entry, _ = await self._effects.find(self._path)
+        if entry is None:
+            return None
+        if entry.size is not None:
+            return entry.size
+        return (await self._scheduler.use_session(self._path, Opcode.OPEN_FILE_RO)).size

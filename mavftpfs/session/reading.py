@@ -1,0 +1,169 @@
+"""Serves a reader with the server session until it has what it wants, or should make room. Layer: session."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import trio
+
+from mavftpfs.protocol.engine import Engine
+from mavftpfs.protocol.transfers import ReadTransfer
+from mavftpfs.session.driver import Driver
+from mavftpfs.session.gate import Gate
+from mavftpfs.session.holder import SessionHolder
+from mavftpfs.session.policy import should_switch
+from mavftpfs.session.readmode import ReadSteering
+from mavftpfs.session.stream import FileStream
+from mavftpfs.shared.errors import FileChanged, MavftpfsError, SessionLost
+
+STALL = 2.0
+"""Seconds without any reply during a read after which the server's session is no longer believed in."""
+
+FIRST_WANT = 0.05
+"""Seconds an opened file is kept open for its first read although another file waits."""
+
+REOPENS = 5
+"""How often one want may lose its session without a byte of progress before it fails."""
+
+_OFTEN = 0.25
+
+
+class Reading:
+    """Runs read transfers.
+
+    rival: how much of the session whoever else waits for it had lately, None if nobody waits.
+    """
+
+    def __init__(
+        self,
+        holder: SessionHolder,
+        driver: Driver,
+        engine: Engine,
+        gate: Gate,
+        steering: ReadSteering,
+        *,
+        clock: Callable[[], float],
+        rival: Callable[[object], float | None],
+        require_link: Callable[[], None],
+    ) -> None:
+        self.active: FileStream | None = None
+        self._holder = holder
+        self._driver = driver
+        self._engine = engine
+        self._gate = gate
+        self._steering = steering
+        self._clock = clock
+        self._rival = rival
+        self._require_link = require_link
+        self._transfer: ReadTransfer | None = None
+        self._seen_bytes = 0
+
+    def on_batch(self, now: float) -> None:
+        """A batch of replies was processed: pass data on, once."""
+        transfer, stream = self._transfer, self.active
+        if transfer is None or stream is None:
+            return
+        if transfer.received_bytes != self._seen_bytes:
+            self._seen_bytes = transfer.received_bytes
+            stream.last_data_at = now
+            stream.clean_failures = 0
+            stream.sink.on_batch()
+        if transfer.idle or transfer.done:
+            self._holder.wake()
+
+    def on_reboot(self) -> None:
+        """Whatever is under way gets no more answers."""
+        if self._transfer is not None:
+            self._driver.cancel(self._transfer)
+
+    async def serve(self, stream: FileStream) -> None:
+        """Read for a stream. Its errors are told to the stream."""
+        try:
+            self._require_link()
+            if await self._ensure_open(stream):
+                await self._await_first_want(stream)
+            if stream.has_demand or stream.has_ahead:
+                async with self._gate.passing():
+                    await self._read(stream)
+        except SessionLost as error:
+            self._on_session_lost(stream, error)
+        except MavftpfsError as error:
+            stream.fail(error)
+
+    async def _ensure_open(self, stream: FileStream) -> bool:
+        """Have the stream's file open; return whether its opener was waiting for that."""
+        session = self._holder.session
+        awaited = stream.wants_open
+        if session is None or session.path != stream.path or session.writing or awaited:
+            session = await self._holder.open(stream.path)
+        if session.size is not None:
+            try:
+                stream.on_opened(session.size)
+            except FileChanged:
+                await self._holder.close_quietly()
+                raise
+        return awaited
+
+    async def _await_first_want(self, stream: FileStream) -> None:
+        """Give whoever opened a file a moment to ask for its bytes, before another file takes its turn."""
+        with trio.move_on_after(FIRST_WANT):
+            while not (stream.has_demand or stream.has_ahead or stream.closed):
+                await self._holder.sleep(FIRST_WANT)
+
+    async def _read(self, stream: FileStream) -> None:
+        session = self._holder.session
+        assert session is not None
+        transfer = ReadTransfer(session.id, stream.size, stream.sink, self._steering.chunk)
+        started = self._clock()
+        self.active, self._transfer, self._seen_bytes = stream, transfer, 0
+        stream.attach(transfer)
+        self._driver.start(transfer, self._holder.wake)
+        try:
+            while self._go_on(stream, transfer, started):
+                others = self._rival(stream) is not None
+                self._steering.steer(transfer, stream.contiguous_want(), others_waiting=others)
+                await self._holder.sleep(_OFTEN if others else STALL / 2)
+                if self._stalled(transfer):
+                    raise SessionLost("no answer for a while during a read", by_server=False)
+        finally:
+            self.active = self._transfer = None
+            if transfer.idle:
+                stream.on_idle()
+            stream.detach()
+            self._driver.cancel(transfer)
+            self._steering.learn(transfer)
+            now = self._clock()
+            stream.use.add(now - started, now)
+        if transfer.error is not None:
+            raise transfer.error
+
+    def _go_on(self, stream: FileStream, transfer: ReadTransfer, started: float) -> bool:
+        if transfer.done or transfer.idle or stream.closed or self._holder.session is None:
+            return False
+        if self._holder.claimed(stream.path):
+            return False
+        waiting_use = self._rival(stream)
+        if waiting_use is None:
+            return True
+        now = self._clock()
+        return not should_switch(
+            current_has_demand=stream.has_demand,
+            current_slice=now - started,
+            current_use=stream.use.recent(now),
+            waiting_use=waiting_use,
+            rtt=self._engine.rtt,
+        )
+
+    def _stalled(self, transfer: ReadTransfer) -> bool:
+        limit = max(STALL, 4.0 * (self._engine.rtt or 0.0))
+        quiet_since = max(self._driver.last_reply_at, transfer.started_at)
+        return not transfer.idle and self._clock() - quiet_since > limit
+
+    def _on_session_lost(self, stream: FileStream, error: SessionLost) -> None:
+        """Reopen and go on at the same offset (promise 5); what the lost session read is provisional."""
+        self._holder.abandon()
+        if error.by_server:
+            stream.sink.on_suspect(str(error))
+        stream.clean_failures += 1
+        if stream.clean_failures > REOPENS:
+            stream.fail(error)

@@ -1,0 +1,182 @@
+"""Requests that change the card's names: done once, or it is found out. Layer: session.
+
+A request whose reply may have been lost can be executed twice, and the second answer is then a refusal
+(servers.md 14.4). Such a refusal, and a silence, are never interpreted: a listing tells what became of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import asynccontextmanager
+from enum import Enum
+
+import trio
+
+from mavftpfs.protocol.operations import Simple
+from mavftpfs.protocol.payload import NakCode, Opcode
+from mavftpfs.session.scheduler import Scheduler
+from mavftpfs.shared.errors import FtpNak, MavftpfsError, PathTooLong, RequestTimeout
+from mavftpfs.shared.model import ROOT, DirEntry, EntryKind, Listing, split, wire_path
+
+RENAME_LIMIT = 238
+"""Bytes that both paths of a rename and the NUL between them may have (servers.md 9)."""
+
+VERIFY_LIMIT = 10.0
+"""Seconds to spend on finding out what became of a request that was not answered."""
+
+_DOT = b"."
+
+
+class Outcome(Enum):
+    """What a listing tells about a request."""
+
+    DONE = "done"
+    UNDONE = "undone"
+    CONFLICT = "conflict"
+    UNKNOWN = "unknown"
+
+
+Lister = Callable[[bytes], Awaitable[Listing]]
+Verdict = Callable[[], Awaitable[Outcome]]
+
+
+class SideEffects:
+    """Removes, makes and renames. All methods raise FtpNak, RequestTimeout, VehicleLost, PathTooLong, Armed.
+
+    RequestTimeout means: unknown, or known not to have happened. list_directory: sweeps a directory.
+    """
+
+    def __init__(self, scheduler: Scheduler, list_directory: Lister) -> None:
+        self._scheduler = scheduler
+        self._list_directory = list_directory
+
+    async def remove(self, path: bytes) -> None:
+        """Remove what is known to be a file."""
+        wire = wire_path(path)
+        async with self._changing(path):
+            await self._perform(lambda: Simple(Opcode.REMOVE_FILE, wire), lambda: self._is_absent(path))
+            self._scheduler.gone(path)
+
+    async def remove_directory(self, path: bytes) -> None:
+        """Remove what is known to be an empty directory."""
+        wire = wire_path(path)
+        async with self._changing(path, below=True):
+            await self._perform(lambda: Simple(Opcode.REMOVE_DIRECTORY, wire), lambda: self._is_absent(path))
+
+    async def make_directory(self, path: bytes) -> None:
+        """Make a directory."""
+        wire = wire_path(path)
+        async with self._changing(path):
+            await self._perform(
+                lambda: Simple(Opcode.CREATE_DIRECTORY, wire), lambda: self._is_new_directory(path)
+            )
+
+    async def rename(self, old: bytes, new: bytes) -> None:
+        """Rename; who reads the old path goes on under the new one."""
+        data = wire_path(old) + b"\0" + wire_path(new)
+        if len(data) > RENAME_LIMIT:
+            raise PathTooLong(f"both paths of a rename have {len(data)} bytes, more than {RENAME_LIMIT}")
+        async with self._changing(old, below=True), self._changing(new):
+            await self._perform(lambda: Simple(Opcode.RENAME, data), lambda: self._is_renamed(old, new))
+            self._scheduler.gone(new)
+            self._scheduler.moved(old, new)
+
+    async def perform(self, path: bytes, make: Callable[[], Simple], verify: Verdict) -> None:
+        """Run another request that changes `path`; verify tells from a listing what became of it."""
+        async with self._changing(path):
+            await self._perform(make, verify)
+
+    async def find(self, path: bytes) -> tuple[DirEntry | None, bool]:
+        """Return a name's entry by a fresh listing of its parent, and whether the listing is complete."""
+        parent, name = split(path)
+        listing = await self._list_directory(parent)
+        entries = listing.entries
+        if parent == ROOT and not any(entry.kind is EntryKind.FILE for entry in entries):
+            # ArduPilot's SITL hides the files of the root in "/" and shows them in "." (servers.md 6).
+            entries += await self._entries_of_dot()
+        found = next((entry for entry in entries if entry.name == name), None)
+        return found, listing.complete
+
+    # --- one request
+
+    @asynccontextmanager
+    async def _changing(self, path: bytes, *, below: bool = False) -> AsyncIterator[None]:
+        """Check that writing is allowed now, and keep our own session off the path."""
+        self._scheduler.check_may_write()
+        async with self._scheduler.claim(path, below=below):
+            yield
+
+    async def _perform(self, make: Callable[[], Simple], verify: Verdict) -> None:
+        """Run a request; verify it if its answer may not be the answer to its first execution."""
+        for last in (False, True):
+            operation = make()
+            try:
+                await self._scheduler.metadata(operation)
+            except FtpNak as nak:
+                # PX4 says 8 to everything after one "file exists", until a listing comes to its end.
+                if not nak.retransmitted and nak.code != NakCode.FILE_EXISTS:
+                    raise
+                if await self._settle(nak, verify, last=last):
+                    return
+            except RequestTimeout as silence:
+                if await self._after_silence(verify) is not Outcome.DONE:
+                    raise silence
+                return
+            else:
+                return
+
+    async def _settle(self, nak: FtpNak, verify: Verdict, *, last: bool) -> bool:
+        """Return True if the request was carried out after all, False to try it once more; else raise."""
+        outcome = await self._verdict(nak, verify)
+        if outcome is Outcome.DONE and nak.retransmitted:
+            return True
+        if outcome is Outcome.UNDONE and not last:
+            return False
+        raise nak
+
+    async def _verdict(self, nak: FtpNak, verify: Verdict) -> Outcome:
+        try:
+            return await verify()
+        except FtpNak:
+            raise nak from None  # there is not even a parent to list
+
+    async def _after_silence(self, verify: Verdict) -> Outcome:
+        with trio.move_on_after(VERIFY_LIMIT):
+            try:
+                return await verify()
+            except MavftpfsError:
+                return Outcome.UNKNOWN
+        return Outcome.UNKNOWN
+
+    # --- what listings tell
+
+    async def _is_absent(self, path: bytes) -> Outcome:
+        entry, complete = await self.find(path)
+        if entry is not None:
+            return Outcome.UNDONE
+        return Outcome.DONE if complete else Outcome.UNKNOWN
+
+    async def _is_new_directory(self, path: bytes) -> Outcome:
+        """A directory that is there and empty may be the one we made; with entries it is somebody else's."""
+        entry, complete = await self.find(path)
+        if entry is None:
+            return Outcome.UNDONE if complete else Outcome.UNKNOWN
+        if entry.kind is not EntryKind.DIRECTORY:
+            return Outcome.CONFLICT
+        listing = await self._list_directory(path)
+        return Outcome.CONFLICT if listing.entries else Outcome.DONE
+
+    async def _is_renamed(self, old: bytes, new: bytes) -> Outcome:
+        old_entry, complete = await self.find(old)
+        new_entry, new_complete = await self.find(new)
+        if old_entry is not None:
+            return Outcome.CONFLICT if new_entry is not None else Outcome.UNDONE
+        if new_entry is not None and complete:
+            return Outcome.DONE
+        return Outcome.CONFLICT if complete and new_complete else Outcome.UNKNOWN
+
+    async def _entries_of_dot(self) -> tuple[DirEntry, ...]:
+        try:
+            return (await self._list_directory(_DOT)).entries
+        except FtpNak:
+            return ()

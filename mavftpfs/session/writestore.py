@@ -1,0 +1,118 @@
+"""How the caches change the vehicle's files. Layer: session; implements cache.remote.WriteStore."""
+
+from __future__ import annotations
+
+from mavftpfs.cache.remote import UploadSource
+from mavftpfs.protocol.operations import Simple
+from mavftpfs.protocol.payload import NakCode, Opcode
+from mavftpfs.session.probing import probe_writing
+from mavftpfs.session.scheduler import Scheduler
+from mavftpfs.session.sideeffects import Lister, Outcome, SideEffects
+from mavftpfs.session.upload import QueuedUpload
+from mavftpfs.shared.errors import FtpNak, MavftpfsError, RemoteProtocolError, RequestTimeout
+from mavftpfs.shared.model import wire_path
+from mavftpfs.shared.traits import WriteTraits
+
+TRUNCATE_PATIENCE = 120.0
+"""Seconds a vehicle may need to cut a file (design promise 2)."""
+
+COPY_RATE = 100_000.0
+"""Bytes per second that the slowest card copies or checksums; a repetition waits for so long."""
+
+_UNKNOWN_OPCODE = frozenset((NakCode.FAIL, NakCode.UNKNOWN_COMMAND))
+
+
+class WriteStore:
+    """Uploads and side effects."""
+
+    def __init__(self, scheduler: Scheduler, list_directory: Lister) -> None:
+        self._scheduler = scheduler
+        self._effects = SideEffects(scheduler, list_directory)
+
+    @property
+    def traits(self) -> WriteTraits:
+        """See cache.remote.WriteStore."""
+        return self._scheduler.write_traits
+
+    async def open_upload(self, path: bytes, source: UploadSource, *, create: bool) -> QueuedUpload:
+        """Queue an upload; nothing is sent before the source has something or finish is called."""
+        wire_path(path)
+        self._scheduler.check_may_write()
+        return self._scheduler.open_upload(path, source, create=create)
+
+    async def create_empty(self, path: bytes) -> None:
+        """Make a file, or empty it; done twice it is the same."""
+        wire_path(path)
+        self._scheduler.check_may_write()
+        await self._scheduler.use_session(path, Opcode.CREATE_FILE)
+
+    async def remove(self, path: bytes) -> None:
+        """See cache.remote.WriteStore."""
+        await self._effects.remove(path)
+
+    async def make_directory(self, path: bytes) -> None:
+        """See cache.remote.WriteStore."""
+        await self._effects.make_directory(path)
+
+    async def remove_directory(self, path: bytes) -> None:
+        """See cache.remote.WriteStore."""
+        await self._effects.remove_directory(path)
+
+    async def rename(self, old: bytes, new: bytes) -> None:
+        """See cache.remote.WriteStore."""
+        await self._effects.rename(old, new)
+        self.traits.rename_works = True
+
+    async def stat_size(self, path: bytes) -> int:
+        """See cache.remote.WriteStore."""
+        wire_path(path)
+        session = await self._scheduler.use_session(path, Opcode.OPEN_FILE_RO)
+        if session.size is None:
+            raise RemoteProtocolError("the vehicle's open reply holds no size")
+        return session.size
+
+    async def truncate(self, path: bytes, size: int) -> None:
+        """See cache.remote.WriteStore. A file whose size is the wanted one already counts as done."""
+        wire = wire_path(path)
+        traits = self.traits
+        if traits.truncate_works is False:
+            raise FtpNak(Opcode.TRUNCATE_FILE, NakCode.UNKNOWN_COMMAND)
+
+        def make() -> Simple:
+            return Simple(
+                Opcode.TRUNCATE_FILE,
+                wire,
+                offset=size,
+                patience=TRUNCATE_PATIENCE,
+                server_time=2 * size / COPY_RATE,
+            )
+
+        async def verify() -> Outcome:
+            entry, _ = await self._effects.find(path)
+            return Outcome.DONE if entry is not None and entry.size == size else Outcome.UNDONE
+
+        try:
+            await self._effects.perform(path, make, verify)
+        except FtpNak as nak:
+            if nak.code in _UNKNOWN_OPCODE and traits.truncate_works is None:
+                traits.truncate_works = False
+            raise
+        except RequestTimeout:
+            if traits.truncate_works is None and await self._is_listed(path):
+                traits.truncate_works = False
+            raise
+        if traits.truncate_works is None and not path.startswith(b"/fs/"):
+            traits.truncate_works = True
+
+    async def probe_open_for_write(self, directory: bytes) -> None:
+        """See cache.remote.WriteStore."""
+        self._scheduler.check_may_write()
+        await probe_writing(self._scheduler, self._effects, directory)
+
+    async def _is_listed(self, path: bytes) -> bool:
+        """Whether the vehicle answers a listing, so that its silence was about the request."""
+        try:
+            await self._effects.find(path)
+        except MavftpfsError:
+            return False
+        return True
