@@ -118,6 +118,12 @@ def tree(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
+def tiny_tree(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Something of everything, for slow and bad links; nobody may change it."""
+    return build_tree(tmp_path_factory.mktemp("tiny_tree"), sizes=(0, 1, 239, 478, 35850), many=5)
+
+
+@pytest.fixture(scope="session")
 def small_tree(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The reference tree without large files; nobody may change it."""
     return build_tree(tmp_path_factory.mktemp("small_tree"), sizes=SMALL_SIZES, many=30)

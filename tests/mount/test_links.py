@@ -44,9 +44,9 @@ def compare(mount: Mount, expected: Path) -> None:
 
 @pytest.mark.parametrize("flaws", [(), BAD], ids=["clean", "bad"])
 @pytest.mark.parametrize("kind", ["udpout", "udpin", "tcpin", "pty"])
-def test_each_kind_of_link(field: Field, small_tree: Path, kind: str, flaws: tuple[str, ...]) -> None:
-    vehicle = field.sim(small_tree, "px4", flaws, link=free_port_link(kind))
-    compare(field.mount(vehicle.source), small_tree)
+def test_each_kind_of_link(field: Field, tiny_tree: Path, kind: str, flaws: tuple[str, ...]) -> None:
+    vehicle = field.sim(tiny_tree, "px4", flaws, link=free_port_link(kind))
+    compare(field.mount(vehicle.source), tiny_tree)
 
 
 def test_a_link_that_listens_for_tcp(field: Field, small_tree: Path) -> None:
@@ -58,10 +58,10 @@ def test_a_link_that_listens_for_tcp(field: Field, small_tree: Path) -> None:
 @pytest.mark.parametrize("profile", ["px4", "px4-nuttx", "ardupilot", "mavsdk"])
 def test_a_slow_half_duplex_radio(field: Field, tmp_path: Path, profile: str) -> None:
     card = field.local("card")
-    (card / "log.bin").write_bytes(content(profile, 150_000))
+    (card / "log.bin").write_bytes(content(profile, 80_000))
     mount = field.mount(field.sim(card, profile, RADIO).source)
     mount.run("cp", mount.path / "log.bin", tmp_path / "copy", timeout=120)
-    assert (tmp_path / "copy").read_bytes() == content(profile, 150_000)
+    assert (tmp_path / "copy").read_bytes() == content(profile, 80_000)
 
 
 @pytest.mark.parametrize("kind", ["udpout", "tcpin"])
