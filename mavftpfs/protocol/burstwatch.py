@@ -49,7 +49,7 @@ class BurstWatch:
 
         timeout: what an answer takes at most without a burst, in seconds.
         """
-        if traits.answers_during_burst is not None or request.sends > 1 or request.order < self._order:
+        if traits.answers_during_burst is not None or not request.single or request.order < self._order:
             return
         if self.op is not None and self.op.bursting:
             self._proof_wanted = _PACKETS_TO_BELIEVE

@@ -145,6 +145,7 @@ def test_endless_refusals() -> None:
     burst.take(control(1, Opcode.NAK, b"\x01"), 0.1)
     assert not burst.over
     assert not burst.endless
+    assert burst.quiet_deadline() < 0.1 + 2 * RTO
     burst.take(control(2, Opcode.NAK, b"\x01"), 0.1)
     assert burst.endless
 
@@ -156,6 +157,7 @@ def test_endless_empty_packets() -> None:
     burst.take(data(2), 0.1)
     assert not burst.endless
     burst.take(control(3, Opcode.ACK, offset=239), 0.1)
+    assert not burst.endless
     burst.take(control(4, Opcode.ACK, offset=239), 0.1)
     assert burst.endless
 

@@ -433,6 +433,23 @@ def test_silence_narrows_the_window_until_something_is_heard() -> None:
     assert engine.flow.window == 2
 
 
+def test_slow_progress_is_progress() -> None:
+    engine = make(limit=1)
+    op = ListDirectory(b"/")
+    engine.start(op, 0.0)
+    for page in range(8):
+        now = 20.0 * page
+        (request,) = sent(engine, now)
+        engine.receive(ack(request, b"F%d\0" % page), now + 20.0)
+        engine.on_deadline(now + 20.0)
+    sent(engine, 160.0)
+    assert not op.done
+    engine.on_deadline(189.0)
+    assert not op.done
+    engine.on_deadline(190.0)
+    assert isinstance(op.error, RequestTimeout)
+
+
 def test_progress_and_patience_may_end_at_the_same_moment() -> None:
     engine = make(limit=1)
     transfer, _ = reading(engine)
@@ -649,6 +666,22 @@ def test_a_server_that_answers_between_packets_is_noticed() -> None:
     engine.receive(packet(burst, 6, bytes(239)), 1.5)
     engine.receive(ack(request), 1.5)
     assert engine.traits.answers_during_burst is True
+
+
+def test_an_answer_that_may_be_to_the_first_of_two_equal_requests_proves_nothing() -> None:
+    engine = make()
+    _, burst = bursting(engine)
+    op = mkdir()
+    engine.start(op, 0.0)
+    (request,) = sent(engine, 0.0)
+    engine.on_deadline(1.0)
+    assert sent(engine, 1.0) == [request]
+    engine.receive(packet(burst, 0, bytes(239)), 1.1)
+    engine.receive(ack(request), 1.1)
+    for index in range(1, 8):
+        engine.receive(packet(burst, index, bytes(239)), 1.2)
+    assert op.done
+    assert engine.traits.answers_during_burst is None
 
 
 def test_packets_of_an_abandoned_burst_hold_timers_and_land_nowhere() -> None:

@@ -76,9 +76,13 @@ def test_loss_with_a_standing_queue_brakes_and_comes_back() -> None:
 
 def test_a_queue_ends_the_start() -> None:
     flow = Flow()
-    path = Path(flow, rate=50.0, base=0.1)
-    path.rounds(4)
-    assert flow.window < 20
+    path = Path(flow, rate=200.0, base=0.1)
+    widest = 0
+    for _ in range(20):
+        path.round()
+        widest = max(widest, flow.window)
+    assert widest <= 64
+    assert 20 <= flow.window <= 40
 
 
 def test_limits() -> None:

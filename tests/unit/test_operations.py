@@ -259,7 +259,7 @@ def test_a_server_that_ignores_the_offset_is_left() -> None:
 
 def test_stale_pages_in_between_are_tolerated() -> None:
     lister = Lister()
-    for index in range(60):
+    for index in range(120):
         lister.page(b"Fa\t1\0" if index % 2 else b"F%d\t1\0" % index)
     lister.end(NakCode.EOF)
     assert lister.op.complete
