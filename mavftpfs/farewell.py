@@ -67,8 +67,7 @@ async def say_goodbye(holder: Holder, source: str) -> str:
     try:
         await deliver(holder)
     finally:
-        with trio.CancelScope(shield=True):
-            message = keep_the_rest(holder, lambda: recovery_directory(os.environ, source, time.time()))
-            if message:
-                log.error("%s", message)
+        message = keep_the_rest(holder, lambda: recovery_directory(os.environ, source, time.time()))
+        if message:
+            log.error("%s", message)
     return message
