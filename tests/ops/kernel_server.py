@@ -12,7 +12,7 @@ import sys
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import trio
 
@@ -37,7 +37,7 @@ class Server:
         """Be mount's content."""
         async with trio.open_nursery() as nursery:
             nursery.start_soon(self.listen, invalidate)
-            yield Content(self.tree)
+            yield Content(cast(Any, self.tree))  # read-only, whatever a mount can hold
             nursery.cancel_scope.cancel()
 
     async def listen(self, invalidate: Callable[[bytes], None]) -> None:
