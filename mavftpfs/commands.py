@@ -131,6 +131,8 @@ def umount(args: argparse.Namespace) -> int:
         unmount(mountpoint, lazy=args.lazy)
         return ExitCode.OK
     _wait_for_end(int(reply["pid"]))
+    if reply.get("message"):
+        print(f"mavftpfs: {reply['message']}", file=sys.stderr)
     return int(reply["exit_code"])
 
 

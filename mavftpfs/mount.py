@@ -16,7 +16,7 @@ from contextlib import AbstractAsyncContextManager, asynccontextmanager, context
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import pyfuse3
 import trio
@@ -25,10 +25,12 @@ import mavftpfs
 from mavftpfs.compose import NO_SINKS, Sinks, attached
 from mavftpfs.control import ControlServer, Reply
 from mavftpfs.exits import ExitCode, MountFailed, exit_code_for
-from mavftpfs.fuse.handles import FileTree
+from mavftpfs.farewell import Holder, say_goodbye
+from mavftpfs.fuse.handles import WritableTree
 from mavftpfs.fuse.inodes import InodeTable
 from mavftpfs.fuse.operations import Operations, Presentation, Space
 from mavftpfs.fuse.options import MountOptions, fuse_words
+from mavftpfs.fuse.writing import WritingOperations
 from mavftpfs.kernelnews import Invalidator
 from mavftpfs.link.uri import LinkSpec
 from mavftpfs.mountpoint import stderr_of, unmount
@@ -62,11 +64,15 @@ class MountRequest:
     sinks: Sinks = NO_SINKS
 
 
+class MountedTree(WritableTree, Holder, Protocol):
+    """What a mount needs of cache.tree.Tree."""
+
+
 @dataclass(frozen=True, slots=True)
 class Content:
     """What is behind a mount."""
 
-    tree: FileTree
+    tree: MountedTree
     status: Callable[[], dict[str, Any]] = dict
     space: Callable[[], Space | None] = lambda: None
 
@@ -119,6 +125,7 @@ class _Life:
         self.scope = trio.CancelScope()
         self.mounted = False
         self.finished = trio.Event()
+        self.farewell = ""
         self.control: ControlServer | None = None
         self._loop_scope: trio.CancelScope | None = None
         self._signals = 0
@@ -138,7 +145,8 @@ class _Life:
         inodes = InodeTable()
         invalidator = Invalidator(inodes, pyfuse3.invalidate_inode)
         async with attach(invalidator.on_changed) as content:
-            operations = Operations(
+            kind = Operations if self.request.options.read_only else WritingOperations
+            operations: Operations = kind(
                 content.tree,
                 presentation(self.request.options),
                 inodes=inodes,
@@ -146,10 +154,19 @@ class _Life:
                 space=content.space,
                 status=lambda: self.status(content, operations),
             )
-            with kernel_mount(operations, self.request, invalidator):
-                self.mounted = True
-                await self._start_control(lambda: self.status(content, operations), nursery)
-                await self._serve(invalidator)
+            try:
+                with kernel_mount(operations, self.request, invalidator):
+                    self.mounted = True
+                    await self._start_control(lambda: self.status(content, operations), nursery)
+                    await self._serve(invalidator)
+            finally:
+                await self._leave(content)
+
+    async def _leave(self, content: Content) -> None:
+        """Deliver what programs wrote, or keep it; a second signal ends the delivery, not the keeping."""
+        self.farewell = await say_goodbye(content.tree, self.request.source)
+        if self.farewell:
+            self.code = ExitCode.UNDELIVERED
 
     async def _serve(self, invalidator: Invalidator) -> None:
         async with trio.open_nursery() as nursery:
@@ -185,7 +202,7 @@ class _Life:
         if lazy:
             self._stop_gently()  # the kernel lets go only when the last user does, which may be never
         await self.finished.wait()
-        return {"exit_code": int(self.code), "pid": os.getpid()}
+        return {"exit_code": int(self.code), "pid": os.getpid(), "message": self.farewell}
 
     def status(self, content: Content, operations: Operations) -> dict[str, Any]:
         """Return facts for people and scripts; JSON-able."""

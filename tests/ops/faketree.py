@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import os
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import trio
 
 from mavftpfs.cache.tree import Stat
 from mavftpfs.protocol.crc import crc32
-from mavftpfs.shared.errors import IsADirectory, NotADirectory, NotFound
+from mavftpfs.shared.errors import AlreadyExists, IsADirectory, NotADirectory, NotFound
 from mavftpfs.shared.model import ROOT, EntryKind, split
 
 MTIME = 1_700_000_000
@@ -24,10 +26,33 @@ class FakeFile:
     direct_io: bool = False
     keep_cache: bool = False
     closed: int = 0
+    writable: bool = False
+    path: bytes = b""
 
     @property
     def size(self) -> int:
         return len(self.content)
+
+    async def write(self, offset: int, data: bytes) -> int:
+        await self.tree.pause("write", self.path)
+        held = self.content.ljust(offset, b"\0")
+        self.content = held[:offset] + data + held[offset + len(data) :]
+        return len(data)
+
+    async def truncate(self, size: int) -> None:
+        await self.tree.pause("ftruncate", self.path)
+        self.content = self.content[:size].ljust(size, b"\0")
+
+    async def flush(self) -> None:
+        await self.tree.pause("flush", self.path)
+        self.tree.files[self.path] = self.content
+
+    async def fsync(self) -> None:
+        await self.tree.pause("fsync", self.path)
+        self.tree.files[self.path] = self.content
+
+    async def release(self) -> None:
+        await self.tree.pause("release", self.path)
 
     async def read(self, offset: int, size: int) -> bytes | memoryview:
         await self.tree.pause("read")
@@ -52,6 +77,8 @@ class FakeTree:
     direct_io: bool = False
     keep_cache: bool = False
     opened: list[FakeFile] = field(default_factory=list)
+    times: dict[bytes, int] = field(default_factory=dict)
+    left: list[bytes] = field(default_factory=list)
     on_call: Callable[[str, bytes], None] = lambda name, path: None
 
     async def pause(self, name: str, path: bytes = b"") -> None:
@@ -77,7 +104,7 @@ class FakeTree:
     def stat_now(self, path: bytes) -> Stat:
         kind = self.kind_of(path)
         size = len(self.files[path]) if kind is EntryKind.FILE else 0
-        return Stat(kind, size, MTIME, self.valid_for)
+        return Stat(kind, size, self.times.get(path, MTIME), self.valid_for)
 
     async def stat(self, path: bytes) -> Stat:
         await self.pause("stat", path)
@@ -95,13 +122,62 @@ class FakeTree:
         names = sorted({other[len(prefix) :].split(b"/")[0] for other in below} - {b""})
         return [(name, self.stat_now(prefix + name)) for name in names]
 
-    async def open(self, path: bytes) -> FakeFile:
+    async def open(self, path: bytes, *, write: bool = False, truncate: bool = False) -> FakeFile:
         await self.pause("open", path)
         if self.kind_of(path) is not EntryKind.FILE:
             raise IsADirectory(f"{path!r} is a directory")
-        file = FakeFile(self, self.files[path], self.direct_io, self.keep_cache)
+        content = b"" if truncate else self.files[path]
+        file = FakeFile(self, content, self.direct_io, self.keep_cache, writable=write, path=path)
         self.opened.append(file)
         return file
+
+    async def create(self, path: bytes, *, exclusive: bool) -> FakeFile:
+        await self.pause("create", path)
+        if exclusive and path in self.files:
+            raise AlreadyExists(f"{path!r} is there")
+        self.files.setdefault(path, b"")
+        return await self.open(path, write=True)
+
+    async def truncate(self, path: bytes, size: int) -> None:
+        await self.pause("truncate", path)
+        self.files[path] = self.files[path][:size].ljust(size, b"\0")
+
+    async def set_times(self, path: bytes, mtime_ns: int) -> None:
+        await self.pause("set_times", path)
+        self.times[path] = mtime_ns // 10**9
+
+    async def mkdir(self, path: bytes) -> None:
+        await self.pause("mkdir", path)
+        self.directories.add(path)
+
+    async def rmdir(self, path: bytes) -> None:
+        await self.pause("rmdir", path)
+        self.directories.discard(path)
+
+    async def unlink(self, path: bytes) -> None:
+        await self.pause("unlink", path)
+        del self.files[path]
+
+    async def rename(self, old: bytes, new: bytes, *, noreplace: bool = False) -> None:
+        await self.pause("rename", old)
+        if noreplace and new in self.files:
+            raise AlreadyExists(f"{new!r} is there")
+        self.files = {
+            new + path[len(old) :] if path == old or path.startswith(old + b"/") else path: data
+            for path, data in self.files.items()
+            if path != new
+        }
+
+    def undelivered(self) -> Sequence[bytes]:
+        return self.left
+
+    async def drain(self, timeout: float) -> Sequence[bytes]:
+        await self.pause("drain")
+        return self.left
+
+    def recover_to(self, directory: Path) -> Sequence[Path]:
+        self.calls.append(("recover_to", os.fsencode(directory)))
+        return [directory / os.fsdecode(path.lstrip(b"/")) for path in self.left]
 
     async def crc32(self, path: bytes) -> int:
         await self.pause("crc32", path)

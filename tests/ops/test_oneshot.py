@@ -26,7 +26,7 @@ class SpoiltTree(FakeTree):
     forgotten = 0
     crc_error: Exception | None = None
 
-    async def open(self, path: bytes) -> FakeFile:
+    async def open(self, path: bytes, *, write: bool = False, truncate: bool = False) -> FakeFile:
         file = await super().open(path)
         if self.bad:
             self.bad -= 1

@@ -1,0 +1,216 @@
+"""fuse.writing without a kernel: what each call asks of the tree, what is kept, which errors come back."""
+
+from __future__ import annotations
+
+import errno
+import os
+import stat
+from typing import Any, cast
+
+import pyfuse3
+import pytest
+from pyfuse3 import EntryAttributes, RequestContext, SetattrFields
+
+from mavftpfs.fuse.inodes import ROOT_INO
+from mavftpfs.fuse.operations import Presentation
+from mavftpfs.fuse.writing import WritingOperations
+from mavftpfs.shared.errors import Armed, DirectoryNotEmpty, NoSpace, RequestTimeout
+from tests.ops.faketree import MTIME, FakeTree
+from tests.ops.test_operations import failure, ino_of
+
+CTX = cast(RequestContext, None)
+LOOK = Presentation(uid=1000, gid=100, file_mode=0o644, directory_mode=0o755, op_deadline=30.0)
+NANO = 1_000_000_000
+
+
+def some_tree() -> FakeTree:
+    return FakeTree({b"/a.txt": b"hello\n", b"/log/1.ulg": b"x" * 100}, {b"/empty"})
+
+
+def operations(tree: FakeTree | None = None, **more: Any) -> WritingOperations:
+    return WritingOperations(tree or some_tree(), LOOK, **more)
+
+
+class Fields:
+    """Stands in for pyfuse3.SetattrFields, which only the library can make."""
+
+    def __init__(self, *names: str) -> None:
+        for name in ("size", "mode", "uid", "gid", "atime", "mtime", "ctime"):
+            setattr(self, f"update_{name}", name in names)
+
+
+def fields(*names: str) -> SetattrFields:
+    return cast(SetattrFields, Fields(*names))
+
+
+def attributes(**values: int) -> EntryAttributes:
+    entry = EntryAttributes()
+    for name, value in values.items():
+        setattr(entry, name, value)
+    return entry
+
+
+async def test_create_write_flush_and_release_reach_the_tree_in_order() -> None:
+    tree = some_tree()
+    ops = operations(tree)
+    info, entry = await ops.create(ROOT_INO, b"new", stat.S_IFREG | 0o600, os.O_WRONLY, CTX)
+    assert stat.S_IMODE(entry.st_mode) == 0o600
+    assert await ops.write(info.fh, 0, b"abc") == 3
+    assert (await ops.getattr(entry.st_ino, CTX)).st_nlink == 1
+    await ops.flush(info.fh)
+    assert tree.files[b"/new"] == b"abc"
+    await ops.fsync(info.fh, False)
+    await ops.release(info.fh)
+    names = [name for name, path in tree.calls if path == b"/new" and name != "stat"]
+    assert names == ["create", "open", "write", "flush", "fsync", "release"]
+    assert tree.opened[0].closed == 1
+
+
+async def test_a_read_handle_is_never_flushed_and_cannot_write() -> None:
+    tree = some_tree()
+    ops = operations(tree)
+    info = await ops.open(await ino_of(ops, b"a.txt"), os.O_RDONLY, CTX)
+    await ops.flush(info.fh)
+    await ops.fsync(info.fh, True)
+    assert await failure(ops.write(info.fh, 0, b"x")) == errno.EBADF
+    await ops.release(info.fh)
+    assert {name for name, _ in tree.calls} <= {"stat", "open"}
+
+
+async def test_truncation_comes_in_the_open_flags_and_append_follows_our_size() -> None:
+    tree = some_tree()
+    ops = operations(tree)
+    ino = await ino_of(ops, b"a.txt")
+    info = await ops.open(ino, os.O_WRONLY | os.O_TRUNC, CTX)
+    await ops.flush(info.fh)
+    assert tree.files[b"/a.txt"] == b""
+    info = await ops.open(ino, os.O_WRONLY | os.O_APPEND, CTX)
+    await ops.write(info.fh, 0, b"one")
+    await ops.write(info.fh, 0, b"two")
+    await ops.flush(info.fh)
+    assert tree.files[b"/a.txt"] == b"onetwo"
+
+
+async def test_what_a_failing_delivery_says_reaches_flush_and_fsync_but_release_only_logs() -> None:
+    tree = some_tree()
+    ops = operations(tree)
+    info = await ops.open(await ino_of(ops, b"a.txt"), os.O_RDWR, CTX)
+    tree.error = NoSpace("the card is full")
+    assert await failure(ops.flush(info.fh)) == errno.ENOSPC
+    assert await failure(ops.fsync(info.fh, False)) == errno.ENOSPC
+    await ops.release(info.fh)
+    assert tree.opened[0].closed == 1
+
+
+@pytest.mark.parametrize(
+    ("error", "number"),
+    [(Armed("armed"), errno.EROFS), (RequestTimeout("silence"), errno.ETIMEDOUT)],
+)
+async def test_every_change_passes_the_trees_refusal_on(error: Exception, number: int) -> None:
+    tree = some_tree()
+    ops = operations(tree)
+    ino = await ino_of(ops, b"a.txt")
+    tree.error = error
+    calls = [
+        ops.create(ROOT_INO, b"n", 0o644, os.O_WRONLY, CTX),
+        ops.open(ino, os.O_WRONLY, CTX),
+        ops.mkdir(ROOT_INO, b"d", 0o755, CTX),
+        ops.rmdir(ROOT_INO, b"empty", CTX),
+        ops.unlink(ROOT_INO, b"a.txt", CTX),
+        ops.rename(ROOT_INO, b"a.txt", ROOT_INO, b"b", 0, CTX),
+        ops.mknod(ROOT_INO, b"m", stat.S_IFREG | 0o644, 0, CTX),
+        ops.setattr(ino, attributes(st_size=1), fields("size"), None, CTX),
+    ]
+    assert [await failure(call) for call in calls] == [number] * len(calls)
+    assert ops.inodes.known(b"/a.txt") == ino
+
+
+async def test_modes_owners_and_times_are_kept_and_follow_a_rename() -> None:
+    ops = operations()
+    ino = await ino_of(ops, b"a.txt")
+    wanted = attributes(
+        st_mode=0o100751, st_uid=7, st_gid=8, st_atime_ns=5 * NANO + 1, st_mtime_ns=6 * NANO + 2
+    )
+    await ops.setattr(ino, wanted, fields("mode", "uid", "gid", "atime", "mtime"), None, CTX)
+    await ops.forget([(ino, 1)])
+    ino = await ino_of(ops, b"a.txt")
+    await ops.rename(ROOT_INO, b"a.txt", ROOT_INO, b"b.txt", 0, CTX)
+    tree = cast(FakeTree, ops._tree)
+    tree.times[b"/b.txt"] = tree.times.pop(b"/a.txt")
+    entry = await ops.getattr(ino, CTX)
+    assert stat.S_IMODE(entry.st_mode) == 0o751
+    assert (entry.st_uid, entry.st_gid) == (7, 8)
+    assert (entry.st_atime_ns, entry.st_mtime_ns) == (5 * NANO + 1, 6 * NANO + 2)
+    tree.times[b"/b.txt"] = 99  # changed on the vehicle
+    assert (await ops.getattr(ino, CTX)).st_mtime_ns == 99 * NANO
+
+
+async def test_a_removed_name_forgets_what_was_kept() -> None:
+    tree = some_tree()
+    ops = operations(tree)
+    ino = await ino_of(ops, b"a.txt")
+    await ops.setattr(ino, attributes(st_mode=0o100700), fields("mode"), None, CTX)
+    await ops.unlink(ROOT_INO, b"a.txt", CTX)
+    tree.files[b"/a.txt"] = b"another"
+    entry = await ops.lookup(ROOT_INO, b"a.txt", CTX)
+    assert entry.st_ino != ino
+    assert stat.S_IMODE(entry.st_mode) == 0o644
+    assert entry.st_mtime_ns == MTIME * NANO
+
+
+async def test_an_open_file_without_a_name_still_has_attributes_and_can_be_cut() -> None:
+    ops = operations()
+    ino = await ino_of(ops, b"a.txt")
+    info = await ops.open(ino, os.O_RDWR, CTX)
+    await ops.unlink(ROOT_INO, b"a.txt", CTX)
+    entry = await ops.setattr(ino, attributes(st_size=2), fields("size"), info.fh, CTX)
+    assert (entry.st_size, entry.st_nlink) == (2, 0)
+    await ops.release(info.fh)
+    assert await failure(ops.getattr(ino, CTX)) == errno.ESTALE
+
+
+async def test_rename_moves_what_the_kernel_knows_below_a_directory() -> None:
+    ops = operations()
+    ino = await ino_of(ops, b"log", b"1.ulg")
+    await ops.rename(ROOT_INO, b"log", ROOT_INO, b"old", 0, CTX)
+    assert ops.inodes.known(b"/old/1.ulg") == ino
+    assert (await ops.getattr(ino, CTX)).st_size == 100
+    ops.inodes.check_invariants()
+
+
+async def test_rename_flags() -> None:
+    ops = operations()
+    call = ops.rename(ROOT_INO, b"a.txt", ROOT_INO, b"b", pyfuse3.RENAME_EXCHANGE, CTX)
+    assert await failure(call) == errno.EINVAL
+    tree = cast(FakeTree, ops._tree)
+    tree.files[b"/b"] = b""
+    call = ops.rename(ROOT_INO, b"a.txt", ROOT_INO, b"b", pyfuse3.RENAME_NOREPLACE, CTX)
+    assert await failure(call) == errno.EEXIST
+
+
+async def test_what_no_card_has_is_refused() -> None:
+    ops = operations()
+    ino = await ino_of(ops, b"a.txt")
+    assert await failure(ops.symlink(ROOT_INO, b"s", b"t", CTX)) == errno.EPERM
+    assert await failure(ops.link(ino, ROOT_INO, b"l", CTX)) == errno.EPERM
+    assert await failure(ops.mknod(ROOT_INO, b"f", stat.S_IFIFO | 0o644, 0, CTX)) == errno.EPERM
+    assert await failure(ops.setxattr(ino, b"user.x", b"y", CTX)) == errno.ENOTSUP
+    assert await failure(ops.removexattr(ino, b"user.x", CTX)) == errno.ENOTSUP
+
+
+async def test_mknod_and_mkdir_answer_with_the_mode_that_was_asked_for() -> None:
+    ops = operations()
+    entry = await ops.mknod(ROOT_INO, b"f", stat.S_IFREG | 0o640, 0, CTX)
+    assert entry.st_mode == stat.S_IFREG | 0o640
+    entry = await ops.mkdir(ROOT_INO, b"d", 0o710, CTX)
+    assert entry.st_mode == stat.S_IFDIR | 0o710
+
+
+async def test_a_full_directory_stays() -> None:
+    tree = some_tree()
+    ops = operations(tree)
+    ino = await ino_of(ops, b"log")
+    tree.error = DirectoryNotEmpty("/log is not empty")
+    assert await failure(ops.rmdir(ROOT_INO, b"log", CTX)) == errno.ENOTEMPTY
+    tree.error = None
+    assert ops.inodes.known(b"/log") == ino
