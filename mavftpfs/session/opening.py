@@ -194,10 +194,18 @@ class SessionOpener:
         if doubtful is None or (doubtful == 0 and self._vehicle.foreign_client(self._clock())):
             return False
         try:
-            return await self._tolerate(lambda: self._run(Terminate(doubtful)))
+            return await self._tolerate(lambda: self._terminate(doubtful))
         except BaseException:
             self._doubtful = doubtful  # not answered: as doubtful as before
             raise
+
+    async def _terminate(self, session: int) -> None:
+        """Terminate by the id we asked for, and by 0 where the server may have given us that instead."""
+        operation = Terminate(session)
+        await self._run(operation)
+        unknown = self._server_assigns is None and not self._vehicle.foreign_client(self._clock())
+        if operation.already_closed and session != 0 and unknown:
+            await self._run(Terminate(0))
 
     async def _tolerate(self, step: Callable[[], Awaitable[None]]) -> bool:
         """Run a remedy whose refusal changes nothing; a time-out is the caller's news."""

@@ -2,15 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import trio
 
-from mavftpfs.protocol.engine import Engine
 from mavftpfs.protocol.transfers import ReadTransfer
-from mavftpfs.session.driver import Driver
-from mavftpfs.session.gate import Gate
-from mavftpfs.session.holder import SessionHolder
+from mavftpfs.session.kit import Kit, Queue
 from mavftpfs.session.policy import should_switch
 from mavftpfs.session.readmode import ReadSteering
 from mavftpfs.session.stream import FileStream
@@ -29,32 +24,17 @@ _OFTEN = 0.25
 
 
 class Reading:
-    """Runs read transfers.
+    """Runs read transfers."""
 
-    rival: how much of the session whoever else waits for it had lately, None if nobody waits.
-    """
-
-    def __init__(
-        self,
-        holder: SessionHolder,
-        driver: Driver,
-        engine: Engine,
-        gate: Gate,
-        steering: ReadSteering,
-        *,
-        clock: Callable[[], float],
-        rival: Callable[[object], float | None],
-        require_link: Callable[[], None],
-    ) -> None:
+    def __init__(self, kit: Kit, queue: Queue, steering: ReadSteering) -> None:
         self.active: FileStream | None = None
-        self._holder = holder
-        self._driver = driver
-        self._engine = engine
-        self._gate = gate
+        self._holder = kit.holder
+        self._driver = kit.driver
+        self._engine = kit.engine
+        self._gate = kit.gate
+        self._clock = kit.clock
+        self._queue = queue
         self._steering = steering
-        self._clock = clock
-        self._rival = rival
-        self._require_link = require_link
         self._transfer: ReadTransfer | None = None
         self._seen_bytes = 0
 
@@ -79,7 +59,7 @@ class Reading:
     async def serve(self, stream: FileStream) -> None:
         """Read for a stream. Its errors are told to the stream."""
         try:
-            self._require_link()
+            self._queue.require_link()
             if await self._ensure_open(stream):
                 await self._await_first_want(stream)
             if stream.has_demand or stream.has_ahead:
@@ -120,7 +100,7 @@ class Reading:
         self._driver.start(transfer, self._holder.wake)
         try:
             while self._go_on(stream, transfer, started):
-                others = self._rival(stream) is not None
+                others = self._queue.rival_use(stream) is not None
                 self._steering.steer(transfer, stream.contiguous_want(), others_waiting=others)
                 await self._holder.sleep(_OFTEN if others else STALL / 2)
                 if self._stalled(transfer):
@@ -142,7 +122,7 @@ class Reading:
             return False
         if self._holder.claimed(stream.path):
             return False
-        waiting_use = self._rival(stream)
+        waiting_use = self._queue.rival_use(stream)
         if waiting_use is None:
             return True
         now = self._clock()

@@ -21,6 +21,7 @@ from mavftpfs.session.driver import Driver
 from mavftpfs.session.gate import Gate
 from mavftpfs.session.holder import SessionHolder
 from mavftpfs.session.jobs import SessionJob
+from mavftpfs.session.kit import Kit
 from mavftpfs.session.opening import OpenSession, SessionOpener
 from mavftpfs.session.policy import LIGHT_USE
 from mavftpfs.session.reading import Reading
@@ -74,29 +75,10 @@ class Scheduler:
         self._tickets = count(1)
         self._streams: set[FileStream] = set()
         self._jobs: list[SessionJob] = []
-        self._reading = Reading(
-            self._holder,
-            driver,
-            engine,
-            self.gate,
-            steering,
-            clock=clock,
-            rival=self._rival_use,
-            require_link=self.require_link,
-        )
+        kit = Kit(self._holder, driver, engine, vehicle, self.gate, clock)
+        self._reading = Reading(kit, self, steering)
         self._uploading = Uploading(
-            self._holder,
-            driver,
-            engine,
-            vehicle,
-            self.gate,
-            clock=clock,
-            traits=lambda: self.write_traits,
-            rival=self._rival_use,
-            expire_waiters=self._expire_waiters,
-            op_deadline=op_deadline,
-            chunk=steering.chunk,
-            when_armed_ok=when_armed_ok,
+            kit, self, op_deadline=op_deadline, chunk=steering.chunk, when_armed_ok=when_armed_ok
         )
 
     @property
@@ -194,7 +176,7 @@ class Scheduler:
         return self._holder.claim(path, below=below, limit=self.op_deadline)
 
     def moved(self, old: bytes, new: bytes) -> None:
-        """A file or directory was renamed: who reads or writes it, or below it, goes on under the new path."""
+        """A file or directory was renamed: who reads or writes it, or in it, goes on under the new path."""
         prefix = old + b"/"
         users: list[FileStream | QueuedUpload] = [*self._streams, *self._uploading.uploads]
         for user in users:
@@ -223,7 +205,7 @@ class Scheduler:
     def on_batch(self, now: float) -> None:
         """A batch of replies was processed: pass data on, once."""
         self._reading.on_batch(now)
-        self._uploading.on_batch()
+        self._uploading.writer.on_batch()
 
     def on_suspect(self, reason: str, within: float = 10.0) -> None:
         """Another FTP client was heard: what was read lately is provisional."""
@@ -237,7 +219,7 @@ class Scheduler:
         self.write_traits = WriteTraits()
         self._holder.forget()
         self._reading.on_reboot()
-        self._uploading.on_reboot()
+        self._uploading.writer.on_reboot()
 
     def armed_changed(self, armed: bool) -> None:
         """On arming uploads are terminated and held; on disarming they go on (promise 9)."""
@@ -321,7 +303,7 @@ class Scheduler:
         session = self.session
         return session is not None and session.path == stream.path and not session.writing
 
-    def _rival_use(self, user: object) -> float | None:
+    def rival_use(self, user: object) -> float | None:
         """Return how much the lightest of those who wait for the session used of it lately."""
         if self._jobs:
             return 0.0
@@ -330,7 +312,7 @@ class Scheduler:
         others += [upload.use for upload in self._uploading.due(now) if upload is not user]
         return min((use.recent(now) for use in others), default=None)
 
-    def _expire_waiters(self) -> None:
+    def expire_waiters(self) -> None:
         """Somebody holds the session and cannot be interrupted: do not let others wait for ever."""
         oldest = self._clock() - self.op_deadline
         error = RequestTimeout("the vehicle's only session is taken by an upload that cannot be interrupted")

@@ -1,0 +1,280 @@
+"""Drives the write transfer of one upload until there is a reason to let go of the session. Layer: session.
+
+Where OpenFileWO was seen to keep a file's content an upload can be interrupted at any time: drain the window,
+Terminate, and later OpenFileWO. Elsewhere that would begin the file anew, so the upload keeps the session
+until its source has nothing more (design section 4).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from enum import Enum
+
+from mavftpfs.protocol.operations import Simple
+from mavftpfs.protocol.payload import NakCode, Opcode
+from mavftpfs.protocol.writing import WriteTransfer
+from mavftpfs.session.kit import Kit, Queue
+from mavftpfs.session.opening import OpenSession
+from mavftpfs.session.policy import should_switch
+from mavftpfs.session.turns import Turns
+from mavftpfs.session.upload import QueuedUpload
+from mavftpfs.shared.errors import FtpNak, MavftpfsError, SessionLost
+from mavftpfs.shared.model import ROOT, split, wire_path
+
+STARVE = 1.5
+"""Seconds an upload keeps the session with nothing to send: below the 2 s after which PX4 frees buffers."""
+
+BRIEF_STARVE = 0.05
+"""The same where it can be interrupted and somebody else waits."""
+
+STALL = 2.0
+"""Seconds without a reply after which a session that can be resumed is closed and opened anew."""
+
+CHECKPOINT_EVERY = 60.0
+"""Seconds after which an upload is terminated and resumed: what a lost session can cost."""
+
+_TURN = 0.5
+_OFTEN = 0.25
+_SELDOM = 1.0
+_BEYOND_ANY_LISTING = 100_000
+_REFUSED_ARM = frozenset((NakCode.FILE_PROTECTED, NakCode.FILE_EXISTS))
+
+
+class Stop(Enum):
+    """Why an upload lets go of the session."""
+
+    FINISHED = "finished"
+    STARVED = "starved"
+    YIELD = "yield"
+    DOUBT = "doubt"
+    ARMED = "armed"
+    ABORTED = "aborted"
+
+
+_ABRUPT = frozenset((Stop.DOUBT, Stop.ARMED, Stop.ABORTED))
+
+
+class Writer:
+    """Runs write transfers.
+
+    chunk: most bytes of a request. may_write: whether the vehicle may be written to now.
+
+    Attributes:
+        current: the upload being run. rearms: how often PX4's scratch buffer had to be set right.
+    """
+
+    def __init__(self, kit: Kit, queue: Queue, chunk: int, may_write: Callable[[], bool]) -> None:
+        self.turns = Turns(kit.holder.wake)
+        self.rearms = 0
+        self.current: QueuedUpload | None = None
+        self._holder = kit.holder
+        self._driver = kit.driver
+        self._engine = kit.engine
+        self._vehicle = kit.vehicle
+        self._gate = kit.gate
+        self._clock = kit.clock
+        self._queue = queue
+        self._chunk = chunk
+        self._may_write = may_write
+        self._disarmed_by_paths = False
+        self._transfer: WriteTransfer | None = None
+        self._starved_at: float | None = None
+
+    # --- news
+
+    def on_more(self, upload: QueuedUpload) -> None:
+        """The source of an upload has more, or somebody waits for its end."""
+        if upload is self.current and self._transfer is not None:
+            self._starved_at = None
+            self._transfer.wake()
+            self._driver.kick()
+
+    def on_batch(self) -> None:
+        """A batch of replies was processed."""
+        transfer = self._transfer
+        if transfer is not None and (transfer.idle or transfer.done):
+            self._holder.wake()
+
+    def on_reboot(self) -> None:
+        """Perhaps other firmware runs now; nothing under way gets an answer."""
+        self._disarmed_by_paths = False
+        if self._transfer is not None:
+            self._driver.cancel(self._transfer)
+
+    @property
+    def resumable(self) -> bool:
+        """Whether a file that was closed can be written on (WriteTraits.wo_truncates is False)."""
+        return self._queue.write_traits.wo_truncates is False
+
+    # --- writing
+
+    async def run(self, upload: QueuedUpload, session: OpenSession) -> Stop:
+        """Write until there is a reason to stop; nothing is in flight then, and the session is still open.
+
+        Raises:
+            SessionLost, FtpNak, RequestTimeout, RemoteProtocolError: what the transfer failed with.
+        """
+        self.current = upload
+        try:
+            return await self._write(upload, session)
+        finally:
+            self.current = None
+
+    async def _write(self, upload: QueuedUpload, session: OpenSession) -> Stop:
+        rearms = 0
+        while True:
+            transfer = WriteTransfer(session.id, upload.feed, self._chunk)
+            stop = await self._drive(upload, session, transfer)
+            if transfer.acked_bytes and rearms:
+                self._disarmed_by_paths = True
+                rearms = 0
+            error = transfer.error
+            if stop is not None and error is None:
+                return stop
+            assert error is not None
+            if not _is_disarmed(error) or rearms > 0:
+                self._note_refusal(upload, transfer.failed_at, error)
+                raise error
+            rearms += 1
+            await self._rearm(upload.path)
+
+    async def _drive(
+        self, upload: QueuedUpload, session: OpenSession, transfer: WriteTransfer
+    ) -> Stop | None:
+        """Run a transfer until there is a reason to let go, or it failed (None)."""
+        self._transfer, self._starved_at = transfer, None
+        self.turns.set_writing(self._disarmed_by_paths)
+        self._driver.start(transfer, self._holder.wake)
+        try:
+            async with self._gate.passing():
+                return await self._watch(upload, session, transfer)
+        finally:
+            self._transfer = None
+            self.turns.set_writing(False)
+            transfer.stop()
+            self._driver.cancel(transfer)
+
+    async def _watch(
+        self, upload: QueuedUpload, session: OpenSession, transfer: WriteTransfer
+    ) -> Stop | None:
+        stop: Stop | None = None
+        while not transfer.done:
+            if self._holder.session is not session:
+                raise SessionLost("the vehicle restarted", by_server=True)
+            stop = stop or self._reason_to_stop(upload, session, transfer)
+            if self._in_doubt(transfer):
+                stop = Stop.DOUBT
+            if stop is not None:
+                transfer.pause()
+                if transfer.drained or stop in _ABRUPT:
+                    upload.mark()
+                    return stop
+            elif self._disarmed_by_paths and self.turns.wanted:
+                await self._give_turn(upload, transfer)
+            elif transfer.paused:
+                self._go_on(transfer)
+            self._queue.expire_waiters()
+            await self._holder.sleep(self._nap(upload, transfer))
+        return None
+
+    def _nap(self, upload: QueuedUpload, transfer: WriteTransfer) -> float:
+        """How long nothing needs to be looked at, unless there is news."""
+        pressed = self._queue.rival_use(upload) is not None
+        if transfer.starved:
+            return BRIEF_STARVE if pressed and self.resumable else _OFTEN
+        return _OFTEN if pressed else _SELDOM
+
+    def _reason_to_stop(
+        self, upload: QueuedUpload, session: OpenSession, transfer: WriteTransfer
+    ) -> Stop | None:
+        now = self._clock()
+        if upload.aborted:
+            return Stop.ABORTED
+        if not self._may_write():
+            return Stop.ARMED
+        if self._holder.claimed(upload.path):
+            return Stop.YIELD
+        waiting_use = self._queue.rival_use(upload)
+        if transfer.starved:
+            return self._reason_of_starved(upload, now, pressed=waiting_use is not None)
+        self._starved_at = None
+        if self.resumable and self._is_turn_over(upload, now - session.opened_at, waiting_use):
+            return Stop.YIELD
+        return None
+
+    def _reason_of_starved(self, upload: QueuedUpload, now: float, *, pressed: bool) -> Stop | None:
+        if upload.finishing:
+            return Stop.FINISHED
+        if self._starved_at is None:
+            self._starved_at = now
+        patience = BRIEF_STARVE if pressed and self.resumable else STARVE
+        return Stop.STARVED if now - self._starved_at >= patience else None
+
+    def _is_turn_over(self, upload: QueuedUpload, slice_: float, waiting_use: float | None) -> bool:
+        if waiting_use is None:
+            return slice_ >= CHECKPOINT_EVERY
+        return should_switch(
+            current_has_demand=True,
+            current_slice=slice_,
+            current_use=upload.use.recent(self._clock()),
+            waiting_use=waiting_use,
+            rtt=self._engine.rtt,
+        )
+
+    def _in_doubt(self, transfer: WriteTransfer) -> bool:
+        """Whether it was silent for so long that the session may be somebody else's (servers.md 14.9).
+
+        Where closing would cost the whole file, only if there is somebody else; the server tells the rest.
+        """
+        now = self._clock()
+        limit = max(STALL, 4.0 * (self._engine.rtt or 0.0))
+        if transfer.idle or now - max(self._driver.last_reply_at, transfer.progress_at) <= limit:
+            return False
+        return self.resumable or self._vehicle.foreign_client(now)
+
+    def _note_refusal(self, upload: QueuedUpload, offset: int | None, error: MavftpfsError) -> None:
+        """A refusal that means a lost session may mean a full card, too: the same place twice is enough."""
+        nak = error.__cause__
+        if isinstance(nak, FtpNak) and nak.code == NakCode.FAIL:
+            if offset is not None and offset == upload.refused_at:
+                raise nak
+            upload.refused_at = offset
+
+    # --- path operations beside it
+
+    async def _give_turn(self, upload: QueuedUpload, transfer: WriteTransfer) -> None:
+        """Drain, let path operations pass, arm again, go on."""
+        transfer.pause()
+        if not transfer.drained:
+            return
+        await self.turns.give(max(_TURN, 4.0 * (self._engine.rtt or 0.0)))
+        await self._rearm(upload.path)
+        self._go_on(transfer)
+
+    def _go_on(self, transfer: WriteTransfer) -> None:
+        transfer.resume()
+        self._driver.kick()
+
+    async def _rearm(self, path: bytes) -> None:
+        """List the storage's root, whose trailing slash fits PX4's whitelist; also clears a sticky errno.
+
+        One request from beyond the end suffices; whatever it answers, the next write tells.
+        """
+        self.rearms += 1
+        wire = wire_path(storage_root(path)).rstrip(b"/") + b"/"
+        try:
+            await self._driver.run(Simple(Opcode.LIST_DIRECTORY, wire, offset=_BEYOND_ANY_LISTING))
+        except FtpNak:
+            return
+
+
+def storage_root(path: bytes) -> bytes:
+    """Return where the storage of a path is mounted: /fs/NAME on NuttX, else the parent directory."""
+    parts = path.split(b"/")
+    if len(parts) > 3 and parts[1] == b"fs":
+        return b"/".join(parts[:3])
+    return split(path)[0] or ROOT
+
+
+def _is_disarmed(error: MavftpfsError) -> bool:
+    return isinstance(error, FtpNak) and error.opcode == Opcode.WRITE_FILE and error.code in _REFUSED_ARM

@@ -1,0 +1,438 @@
+"""Uploads that are interrupted: by the link, the vehicle, other clients, a full card, arming."""
+
+from __future__ import annotations
+
+import random
+
+import pytest
+import trio
+from trio.testing import MockClock
+
+from mavftpfs.link.messages import Address
+from mavftpfs.protocol.payload import Opcode, request
+from mavftpfs.session.connection import Connection, ConnectOptions
+from mavftpfs.session.upload import QueuedUpload
+from mavftpfs.shared.errnos import errno_for
+from mavftpfs.shared.errors import Armed, FtpNak, MavftpfsError, RequestTimeout, VehicleLost
+from mavftpfs.sim.linkmodel import LinkSettings
+from mavftpfs.sim.profiles import PROFILES
+from tests.support.faults import Faults
+from tests.support.sources import MemorySource
+from tests.support.worlds import GOOD_LINK, ROOTS, World, read_file
+
+EVERY_PROFILE = sorted(PROFILES)
+PLAIN = LinkSettings(rate=20_000.0, delay=0.02)
+QUICK = ConnectOptions(op_deadline=5.0)
+
+
+@pytest.fixture
+def autojump() -> MockClock:
+    return MockClock(autojump_threshold=0)
+
+
+def content(size: int, seed: int = 0) -> bytes:
+    return random.Random(seed).randbytes(size)
+
+
+def path(profile: str, name: str) -> bytes:
+    return ROOTS.get(profile, b"") + b"/d/" + name.encode()
+
+
+def world(profile: str, settings: LinkSettings = GOOD_LINK, **files: bytes) -> World:
+    made = World(profile, settings)
+    made.tree.add_directory(path(profile, "")[:-1])
+    for name, data in files.items():
+        made.tree.add(path(profile, name), data)
+    return made
+
+
+async def probe(connection: Connection, profile: str) -> None:
+    await connection.store.probe_open_for_write(path(profile, "")[:-1])
+
+
+async def start(
+    connection: Connection, profile: str, source: MemorySource, name: str = "new"
+) -> QueuedUpload:
+    return await connection.store.open_upload(path(profile, name), source, create=True)
+
+
+@pytest.mark.parametrize("profile", EVERY_PROFILE)
+async def test_interrupted_at_every_request(profile: str, autojump: MockClock) -> None:
+    """The caller is told the truth, and going on delivers: whichever request was the last to get through."""
+    data = content(600)
+    for count in range(8):
+        here = world(profile)
+        faults = Faults(here)
+        async with here.connection(QUICK) as connection:
+            source = MemorySource(data)
+            faults.cut_after(count)
+            upload = await start(connection, profile, source)
+            if count <= 5:  # create, three writes, terminate; the last one's reply is lost with it
+                with pytest.raises(MavftpfsError):
+                    await upload.finish()
+            else:
+                await upload.finish()
+                assert source.all_proven
+            faults.cut_after(None)
+            await upload.finish()
+            assert source.all_proven
+        assert here.tree.data(path(profile, "new")) == data
+        # The textbook's server gives ids that cannot be guessed when the reply with the id is lost.
+        assert here.vehicle.server.open_sessions == int(profile == "spec" and count == 1)
+
+
+@pytest.mark.parametrize("profile", EVERY_PROFILE)
+@pytest.mark.parametrize("opcode", [Opcode.CREATE_FILE, Opcode.WRITE_FILE, Opcode.TERMINATE_SESSION])
+async def test_one_lost_reply_costs_no_error_and_leaves_no_orphan(
+    profile: str, opcode: Opcode, autojump: MockClock
+) -> None:
+    data = content(3000)
+    here = world(profile, PLAIN)
+    faults = Faults(here)
+    async with here.connection() as connection:
+        faults.lose_reply_to(opcode)
+        source = MemorySource(data)
+        upload = await start(connection, profile, source)
+        await upload.finish()
+        assert source.all_proven
+        await trio.sleep(0.5)
+        assert here.vehicle.server.open_sessions == 0
+    assert here.tree.data(path(profile, "new")) == data
+
+
+# The textbook's server gives ids that cannot be guessed, and never forgets.
+@pytest.mark.parametrize("profile", [profile for profile in EVERY_PROFILE if profile != "spec"])
+async def test_an_open_nobody_waits_for_any_more_is_closed(profile: str, autojump: MockClock) -> None:
+    here = world(profile)
+    faults = Faults(here)
+    async with here.connection(QUICK) as connection:
+        faults.cut_after(1)
+        upload = await start(connection, profile, MemorySource(b"hello"))
+        with pytest.raises(RequestTimeout):
+            await upload.finish()
+        await upload.abort()
+        assert here.vehicle.server.open_sessions == 1
+        faults.cut_after(None)
+        await trio.sleep(9)
+        assert here.vehicle.server.open_sessions == 0
+
+
+@pytest.mark.parametrize("profile", EVERY_PROFILE)
+@pytest.mark.parametrize("probed", [False, True], ids=["unknown", "probed"])
+@pytest.mark.parametrize("length", [3.0, 14.0])
+async def test_a_cut_in_mid_upload_is_bridged(
+    profile: str, probed: bool, length: float, autojump: MockClock
+) -> None:
+    data = content(60_000)
+    here = world(profile, PLAIN)
+    async with here.connection() as connection:
+        if probed:
+            await probe(connection, profile)
+        source = MemorySource(data)
+        upload = await start(connection, profile, source)
+        async with trio.open_nursery() as nursery:
+            nursery.start_soon(upload.finish)
+            await trio.sleep(1.5)
+            here.link.cut()
+            await trio.sleep(length)
+            here.link.restore()
+        assert source.all_proven
+    assert here.tree.data(path(profile, "new")) == data
+    assert here.vehicle.server.open_sessions == 0
+
+
+@pytest.mark.parametrize("profile", EVERY_PROFILE)
+@pytest.mark.parametrize("probed", [False, True], ids=["unknown", "probed"])
+async def test_a_reboot_in_mid_upload_is_bridged(profile: str, probed: bool, autojump: MockClock) -> None:
+    data = content(80_000)
+    here = world(profile, PLAIN)
+    async with here.connection() as connection:
+        if probed:
+            await probe(connection, profile)
+        await trio.sleep(5)
+        source = MemorySource(data)
+        upload = await start(connection, profile, source)
+        async with trio.open_nursery() as nursery:
+            nursery.start_soon(upload.finish)
+            await trio.sleep(1.5)
+            here.vehicle.reboot(trio.current_time(), downtime=4.0)
+            here.link.kick()
+        assert source.all_proven
+        assert True in source.rollbacks
+        assert connection.store.traits.wo_truncates is None
+    assert here.tree.data(path(profile, "new")) == data
+
+
+@pytest.mark.parametrize("profile", EVERY_PROFILE)
+@pytest.mark.parametrize("probed", [False, True], ids=["unknown", "probed"])
+async def test_a_session_taken_away_is_got_back(profile: str, probed: bool, autojump: MockClock) -> None:
+    """Another ground station terminates whatever it finds, as MAVSDK and QGroundControl do."""
+    data = content(60_000)
+    here = world(profile, PLAIN)
+    async with here.connection() as connection:
+        if probed:
+            await probe(connection, profile)
+        source = MemorySource(data)
+        upload = await start(connection, profile, source)
+        async with trio.open_nursery() as nursery:
+            nursery.start_soon(upload.finish)
+            await trio.sleep(1.5)
+            session = connection.scheduler.session
+            assert session is not None
+            wire = request(77, Opcode.TERMINATE_SESSION, session=session.id).encode()
+            stranger = here.vehicle.server
+            for source_address in (Address(255, 190), connection.vehicle.own):
+                stranger.handle(wire, source_address, trio.current_time())
+            here.link.kick()
+        assert source.all_proven
+    assert here.tree.data(path(profile, "new")) == data
+
+
+@pytest.mark.parametrize("profile", EVERY_PROFILE)
+async def test_a_full_card_is_told(profile: str, autojump: MockClock) -> None:
+    here = world(profile, PLAIN)
+    here.tree.capacity = 5_000
+    async with here.connection() as connection:
+        source = MemorySource(content(9_000))
+        upload = await start(connection, profile, source)
+        silent = PROFILES[profile].short_write_acks  # partly written and ACKed: the size tells, later
+        with pytest.raises(FtpNak) as refusal:
+            await upload.finish()
+        assert refusal.value.opcode == Opcode.WRITE_FILE
+        assert errno_for(refusal.value) in (5, 28)
+        assert not source.all_proven
+        assert source.proven.end <= 5_000 + (238 if silent else 0) + 239
+        here.tree.capacity = None
+        await upload.finish()
+        assert source.all_proven or profile.startswith("mavsdk")
+        await upload.abort()
+    assert here.vehicle.server.open_sessions == 0
+
+
+@pytest.mark.parametrize("profile", EVERY_PROFILE)
+async def test_arming_ends_it_and_disarming_lets_it_go_on(profile: str, autojump: MockClock) -> None:
+    data = content(60_000)
+    here = world(profile, PLAIN)
+    async with here.connection() as connection:
+        source = MemorySource(data)
+        upload = await start(connection, profile, source)
+        async with trio.open_nursery() as nursery:
+
+            async def finish() -> None:
+                with pytest.raises(Armed):
+                    await upload.finish()
+
+            nursery.start_soon(finish)
+            await trio.sleep(1.5)
+            here.vehicle.arm()
+            here.link.kick()
+        await trio.sleep(0.5)
+        assert here.vehicle.server.open_sessions == 0
+        with pytest.raises(Armed):
+            await upload.finish()
+        with pytest.raises(Armed):
+            await connection.store.remove(path(profile, "new"))
+        with pytest.raises(Armed):
+            await start(connection, profile, MemorySource(b"x"), "other")
+        written = len(here.tree.data(path(profile, "new")))
+        await trio.sleep(20)
+        assert len(here.tree.data(path(profile, "new"))) == written
+        here.vehicle.disarm()
+        here.link.kick()
+        await trio.sleep(20)  # by itself
+        assert source.acked.total + source.proven.total == len(data)
+        await upload.finish()
+        assert source.all_proven
+    assert here.tree.data(path(profile, "new")) == data
+
+
+async def test_when_armed_ok_writes_in_flight(autojump: MockClock) -> None:
+    here = world("px4")
+    here.vehicle.arm()
+    async with here.connection(ConnectOptions(when_armed="ok")) as connection:
+        upload = await start(connection, "px4", MemorySource(b"hello"))
+        await upload.finish()
+    assert here.tree.data(b"/d/new") == b"hello"
+
+
+async def test_a_silent_vehicle_is_told_at_once_and_the_rest_goes_by_itself(autojump: MockClock) -> None:
+    data = content(60_000)
+    here = world("px4", PLAIN)
+    async with here.connection() as connection:
+        source = MemorySource(data)
+        upload = await start(connection, "px4", source)
+        await trio.sleep(1)
+        here.link.cut()
+        began = trio.current_time()
+        with pytest.raises(RequestTimeout):
+            await upload.finish()
+        assert 25 < trio.current_time() - began < 75
+        with pytest.raises(VehicleLost):
+            await upload.finish()
+        here.link.restore()
+        await trio.sleep(30)
+        assert source.all_proven
+    assert here.tree.data(b"/d/new") == data
+
+
+@pytest.mark.parametrize("profile", EVERY_PROFILE)
+@pytest.mark.parametrize("probed", [False, True], ids=["unknown", "probed"])
+async def test_a_program_that_writes_now_and_then(profile: str, probed: bool, autojump: MockClock) -> None:
+    """The session is not held while there is nothing to send, and nothing is lost by that."""
+    here = world(profile, PLAIN)
+    async with here.connection() as connection:
+        if probed:
+            await probe(connection, profile)
+        source = MemorySource()
+        upload = await start(connection, profile, source)
+        for step in range(6):
+            source.add(content(1000, step))
+            upload.wake()
+            await trio.sleep(12)
+            assert here.vehicle.server.open_sessions == 0
+        await upload.finish()
+        assert source.all_proven
+        if PROFILES[profile].write_only_truncates or not probed:
+            assert source.rollbacks != []
+        else:
+            assert source.rollbacks == []
+    assert here.tree.data(path(profile, "new")) == bytes(source.content)
+
+
+@pytest.mark.parametrize("profile", ["mavsdk", "px4"])
+async def test_what_cannot_be_interrupted_keeps_readers_waiting_until_their_deadline(
+    profile: str, autojump: MockClock
+) -> None:
+    data = content(200_000)
+    here = world(profile, LinkSettings(rate=5_000.0, delay=0.02), old=b"hello")
+    async with here.connection() as connection:
+        source = MemorySource(data)
+        upload = await start(connection, profile, source)
+        async with trio.open_nursery() as nursery:
+            nursery.start_soon(upload.finish)
+            await trio.sleep(1.5)
+            began = trio.current_time()
+            with pytest.raises(RequestTimeout):
+                await read_file(connection, path(profile, "old"))
+            assert trio.current_time() - began == pytest.approx(30.0, abs=2.0)
+            began = trio.current_time()
+            await connection.store.list_directory(path(profile, "")[:-1])
+            assert trio.current_time() - began < 5
+        assert source.rollbacks == []
+    assert here.tree.data(path(profile, "new")) == data
+
+
+async def test_what_can_be_interrupted_makes_room_at_once(autojump: MockClock) -> None:
+    data = content(60_000)
+    here = world("px4", LinkSettings(rate=5_000.0, delay=0.05), old=b"hello")
+    async with here.connection() as connection:
+        await probe(connection, "px4")
+        source = MemorySource(data)
+        upload = await start(connection, "px4", source)
+        async with trio.open_nursery() as nursery:
+            nursery.start_soon(upload.finish)
+            await trio.sleep(5)
+            began = trio.current_time()
+            assert await read_file(connection, b"/d/old") == b"hello"
+            assert trio.current_time() - began < 3
+        assert source.rollbacks == []
+        assert source.all_proven
+    assert here.tree.data(b"/d/new") == data
+
+
+async def test_path_operations_beside_an_upload_on_nuttx(autojump: MockClock) -> None:
+    """Listing outside the card's whitelist makes PX4 refuse the next write (servers.md 8)."""
+    data = content(60_000)
+    here = world("px4-nuttx", PLAIN)
+    here.tree.add(b"/etc/init.d/rcS", b"#")
+    faults = Faults(here)
+    async with here.connection() as connection:
+        source = MemorySource(data)
+        upload = await start(connection, "px4-nuttx", source)
+        async with trio.open_nursery() as nursery:
+            nursery.start_soon(upload.finish)
+            await trio.sleep(0.5)
+            for _ in range(8):
+                await connection.store.list_directory(b"/etc/init.d")
+                await trio.sleep(0.3)
+        assert source.all_proven
+        assert source.rollbacks == []
+        refused = faults.refused.count(Opcode.WRITE_FILE)
+        assert 1 <= refused < 30  # the first window only: after that, each knows its turn
+        assert connection.scheduler._uploading.writer.rearms >= 5
+    assert here.tree.data(path("px4-nuttx", "new")) == data
+
+
+async def test_a_write_after_silence_on_nuttx(autojump: MockClock) -> None:
+    """After 2 s without requests the scratch buffer is gone; the upload survives a short cut."""
+    data = content(60_000)
+    here = world("px4-nuttx", PLAIN)
+    async with here.connection() as connection:
+        source = MemorySource(data)
+        upload = await start(connection, "px4-nuttx", source)
+        async with trio.open_nursery() as nursery:
+            nursery.start_soon(upload.finish)
+            await trio.sleep(1.5)
+            here.link.cut()
+            await trio.sleep(4)
+            here.link.restore()
+        assert source.rollbacks == []
+        assert connection.scheduler._uploading.writer.rearms == 1
+    assert here.tree.data(path("px4-nuttx", "new")) == data
+
+
+async def test_outside_the_whitelist_stays_refused(autojump: MockClock) -> None:
+    here = world("px4-nuttx")
+    here.tree.add_directory(b"/etc")
+    async with here.connection() as connection:
+        upload = await connection.store.open_upload(b"/etc/new", MemorySource(b"hello"), create=True)
+        with pytest.raises(FtpNak) as refusal:
+            await upload.finish()
+        assert (refusal.value.opcode, refusal.value.code) == (Opcode.WRITE_FILE, 9)
+        await upload.abort()
+    assert here.vehicle.server.open_sessions == 0
+
+
+@pytest.mark.parametrize("profile", EVERY_PROFILE)
+async def test_abort_leaves_nothing_open_and_asks_for_nothing(profile: str, autojump: MockClock) -> None:
+    here = world(profile, PLAIN)
+    async with here.connection() as connection:
+        source = MemorySource(content(60_000))
+        upload = await start(connection, profile, source)
+        await trio.sleep(1)
+        await upload.abort()
+        await upload.abort()
+        assert source.in_flight.empty
+        assert here.vehicle.server.open_sessions == 0
+        left = source.dirty.total
+        await trio.sleep(5)
+        assert source.dirty.total == left
+        assert connection.scheduler.uploads == []
+
+
+async def test_an_error_at_close_is_the_callers(autojump: MockClock) -> None:
+    """ArduPilot with five sessions reports at Terminate that the card did not take the data."""
+    here = world("ardupilot5", PLAIN)
+    faults = Faults(here)
+    async with here.connection() as connection:
+        source = MemorySource(content(3000))
+        upload = await start(connection, "ardupilot5", source)
+
+        def break_close() -> None:
+            slot = next(slot for slot in here.vehicle.server._firmware._slots if slot.file is not None)  # type: ignore[attr-defined]
+            opened = slot.file
+
+            def close() -> None:
+                type(opened).close(opened)
+                raise OSError(5, "flush failed")
+
+            opened.close = close
+
+        faults.at(Opcode.TERMINATE_SESSION, break_close)
+        with pytest.raises(FtpNak) as refusal:
+            await upload.finish()
+        assert refusal.value.opcode == Opcode.TERMINATE_SESSION
+        assert not source.all_proven
+        await upload.finish()
+        assert source.all_proven
+    assert here.tree.data(b"/d/new") == bytes(source.content)

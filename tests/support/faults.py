@@ -1,0 +1,73 @@
+"""Faults at exact places: the link breaks after the Nth request, or one certain reply is lost."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from mavftpfs.link.messages import Address
+from mavftpfs.protocol.payload import Opcode
+from tests.support.worlds import World
+
+_OPCODE, _REQ_OPCODE = 3, 5
+
+
+class Faults:
+    """Stands between a world's vehicle and its FTP server.
+
+    Attributes:
+        requests: opcodes that reached the server so far. refused: opcodes of requests that were NAKed.
+    """
+
+    def __init__(self, world: World) -> None:
+        self.requests: list[int] = []
+        self.refused: list[int] = []
+        self._world = world
+        self._cut_after: int | None = None
+        self._lose: list[int] = []
+        self._deaf: set[int] = set()
+        self._hooks: list[tuple[int, Callable[[], None]]] = []
+        server = world.vehicle.server
+        self._handle, self._outgoing = server.handle, server.outgoing
+        server.handle = self._on_request  # type: ignore[method-assign]
+        server.outgoing = self._on_replies  # type: ignore[method-assign]
+
+    def cut_after(self, count: int | None) -> None:
+        """Let `count` requests through and nothing after them, either way; None ends that."""
+        self._cut_after = None if count is None else len(self.requests) + count
+
+    def lose_reply_to(self, opcode: Opcode) -> None:
+        """Lose the next reply to a request of this kind."""
+        self._lose.append(int(opcode))
+
+    def ignore(self, opcode: Opcode) -> None:
+        """Have requests of this kind neither executed nor answered."""
+        self._deaf.add(int(opcode))
+
+    def at(self, opcode: Opcode, action: Callable[[], None]) -> None:
+        """Do something before the next request of this kind is executed."""
+        self._hooks.append((int(opcode), action))
+
+    def _on_request(self, wire: bytes, source: Address, now: float) -> None:
+        if self._is_cut() or wire[_OPCODE] in self._deaf:
+            return
+        self.requests.append(wire[_OPCODE])
+        for hook in [hook for hook in self._hooks if hook[0] == wire[_OPCODE]]:
+            self._hooks.remove(hook)
+            hook[1]()
+        self._handle(wire, source, now)
+
+    def _on_replies(self, now: float) -> list[tuple[Address, bytes]]:
+        replies = self._outgoing(now)
+        self.refused += [wire[_REQ_OPCODE] for _, wire in replies if wire[3] == Opcode.NAK]
+        return [reply for reply in replies if not self._is_lost(reply[1])]
+
+    def _is_lost(self, wire: bytes) -> bool:
+        if self._is_cut():
+            return True
+        if wire[_REQ_OPCODE] in self._lose:
+            self._lose.remove(wire[_REQ_OPCODE])
+            return True
+        return False
+
+    def _is_cut(self) -> bool:
+        return self._cut_after is not None and len(self.requests) >= self._cut_after
