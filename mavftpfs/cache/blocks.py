@@ -148,7 +148,6 @@ class FileBlocks:
         self._pins: dict[int, int] = {}
         self._waiters: list[_Waiter] = []
         self._arrived = 0
-        self.drops = 0
 
     def __contains__(self, index: int) -> bool:
         """Return whether the block is held."""
@@ -176,6 +175,11 @@ class FileBlocks:
         for start, end in self._present.missing(offset, stop):
             self._write(start, end, memoryview(data)[start - offset : end - offset])
             self._arrived += end - start
+
+    def preload(self, offset: int, data: bytes | memoryview) -> None:
+        """Keep bytes that did not come over the link."""
+        for start, end in self._present.missing(offset, min(offset + len(data), self.size)):
+            self._write(start, end, memoryview(data)[start - offset : end - offset])
 
     def on_batch(self) -> None:
         """Wake those whose range is complete; give those whose range grew more time."""
@@ -216,7 +220,6 @@ class FileBlocks:
 
     def drop_unproven(self) -> None:
         """Forget provisional bytes; whoever waits starts anew."""
-        self.drops += 1
         self.suspicion = None
         self._present = self._proven.copy()
         for index in list(self._blocks):

@@ -368,11 +368,12 @@ async def test_a_reader_cancelled_just_when_it_was_admitted_gives_the_room_back(
     blocks = FileBlocks(cache, 20 * BLOCK_SIZE)
     first = await start_read(nursery, blocks, 0, 100)
     second = await start_read(nursery, blocks, BLOCK_SIZE, BLOCK_SIZE + 1)
-    cache.room.leave(BLOCK_SIZE)  # admits the second, which has not run yet
     second.scope.cancel()
+    cache.room.leave(BLOCK_SIZE)  # admits the second, which does not yet know that it was cancelled
+    assert cache.room.used == BLOCK_SIZE
     await trio.testing.wait_all_tasks_blocked()
     assert cache.room.used == 0
-    await cache.room.enter(BLOCK_SIZE)
+    await cache.room.enter(BLOCK_SIZE)  # what the first one holds
     first.scope.cancel()
 
 
@@ -398,6 +399,7 @@ async def test_accepting_makes_them_good(autojump_clock: MockClock) -> None:
     deliver(blocks, 0, content(100))
     blocks.on_suspect("test")
     blocks.accept()
+    assert blocks.suspicion is None
     assert blocks.complete
     blocks.on_suspect("again")
     assert blocks.complete

@@ -186,10 +186,13 @@ def test_forget_takes_all_below_and_nothing_beside() -> None:
 
 def test_probed_absences_are_bounded() -> None:
     dentries = make()
-    for i in range(MAX_ABSENT + 1):
+    for i in range(MAX_ABSENT):
         dentries.note_absent(b"/d/%d" % i, 100)
-    assert dentries.absent_until(b"/d/0", 1) == 1
-    assert dentries.absent_until(b"/d/1", 1) == 100
+    dentries.note_absent(b"/d/0", 200)
+    dentries.note_absent(b"/d/new", 100)
+    assert dentries.absent_until(b"/d/0", 1) == 200
+    assert dentries.absent_until(b"/d/1", 1) == 1
+    assert dentries.absent_until(b"/d/2", 1) == 100
 
 
 # --- our own changes
@@ -270,9 +273,11 @@ def test_rename_of_a_directory_forgets_both_subtrees() -> None:
 def test_rename_of_something_unknown_makes_the_target_directory_doubtful() -> None:
     dentries = make()
     put(dentries, b"/e", file(b"b"))
+    put(dentries, b"/e/b", file(b"c"))
     dentries.note_absent(b"/e/b", 50)
     dentries.note_renamed(b"/d/a", b"/e/b")
     assert dentries.fresh(b"/e", 0) is None
+    assert dentries.known(b"/e/b") is None
     assert dentries.absent_until(b"/e/b", 1) == 1
 
 
@@ -337,6 +342,7 @@ def test_two_sweeps_of_a_directory_both_learn_of_changes() -> None:
     dentries.abandon(first)
     dentries.note_created(b"/b", file(b"b"))
     assert set(dentries.finish(second, Listing((), 0), 1).entries) == {b"a", b"b"}
+    assert b"b" not in first.changes
 
 
 # --- mtimes
