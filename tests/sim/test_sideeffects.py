@@ -1,0 +1,307 @@
+"""Requests that change names, against every profile: done once, or the caller is told."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Awaitable, Callable
+
+import pytest
+import trio
+from trio.testing import MockClock
+
+from mavftpfs.protocol.operations import Simple
+from mavftpfs.protocol.payload import Opcode
+from mavftpfs.session.connection import Connection, ConnectOptions
+from mavftpfs.session.store import Store
+from mavftpfs.shared.errors import FileChanged, FtpNak, PathTooLong, RequestTimeout
+from mavftpfs.sim.filesystem import Kind
+from mavftpfs.sim.linkmodel import LinkSettings
+from mavftpfs.sim.profiles import PROFILES, Storage
+from tests.support.faults import Faults
+from tests.support.sources import MemorySource
+from tests.support.worlds import GOOD_LINK, ROOTS, MemorySink, World, read_file
+
+EVERY_PROFILE = sorted(PROFILES)
+RENAMING = [name for name in EVERY_PROFILE if PROFILES[name].storage is not Storage.LITTLEFS]
+TRUNCATING = [name for name in EVERY_PROFILE if PROFILES[name].truncate_file and name != "px4-nuttx"]
+BAD = LinkSettings(rate=60_000.0, delay=0.02, loss=0.25)
+
+
+@pytest.fixture
+def autojump() -> MockClock:
+    return MockClock(autojump_threshold=0)
+
+
+def path(profile: str, name: str) -> bytes:
+    return ROOTS.get(profile, b"") + b"/d/" + name.encode()
+
+
+def world(profile: str, settings: LinkSettings = GOOD_LINK, **files: bytes) -> World:
+    made = World(profile, settings)
+    made.tree.add_directory(path(profile, "")[:-1])
+    for name, data in files.items():
+        made.tree.add(path(profile, name), data)
+    return made
+
+
+def names(here: World) -> list[bytes]:
+    found = [entry.name for entry in here.tree.entries(path(here.profile, ""))]
+    return sorted(name for name in found if name not in (b".", b".."))
+
+
+@pytest.mark.parametrize("profile", EVERY_PROFILE)
+@pytest.mark.parametrize("seed", range(3))
+async def test_each_works_over_a_link_that_loses_much(profile: str, seed: int, autojump: MockClock) -> None:
+    here = World(profile, BAD, seed=seed)
+    here.tree.add(path(profile, "old"), b"content")
+    renames = profile in RENAMING
+    async with here.connection(ConnectOptions(op_deadline=60.0)) as connection:
+        store = connection.store
+        await store.make_directory(path(profile, "sub"))
+        await store.create_empty(path(profile, "empty"))
+        assert await store.stat_size(path(profile, "old")) == 7
+        if renames:
+            await store.rename(path(profile, "old"), path(profile, "sub/new"))
+            await store.rename(path(profile, "sub"), path(profile, "moved"))
+            assert here.tree.data(path(profile, "moved/new")) == b"content"
+            await store.remove(path(profile, "moved/new"))
+            await store.remove_directory(path(profile, "moved"))
+        else:
+            await store.remove(path(profile, "old"))
+            await store.remove_directory(path(profile, "sub"))
+        assert names(here) == [b"empty"]
+        await store.remove(path(profile, "empty"))
+        assert names(here) == []
+        await trio.sleep(5)
+        assert here.vehicle.server.open_sessions == 0
+
+
+Act = Callable[[Store, str], Awaitable[None]]
+
+ACTS: dict[str, tuple[Opcode, Act, list[bytes]]] = {
+    "mkdir": (
+        Opcode.CREATE_DIRECTORY,
+        lambda store, profile: store.make_directory(path(profile, "new")),
+        [b"dir", b"file", b"new"],
+    ),
+    "remove": (Opcode.REMOVE_FILE, lambda store, profile: store.remove(path(profile, "file")), [b"dir"]),
+    "rmdir": (
+        Opcode.REMOVE_DIRECTORY,
+        lambda store, profile: store.remove_directory(path(profile, "dir")),
+        [b"file"],
+    ),
+    "rename": (
+        Opcode.RENAME,
+        lambda store, profile: store.rename(path(profile, "file"), path(profile, "new")),
+        [b"dir", b"new"],
+    ),
+    "create": (
+        Opcode.CREATE_FILE,
+        lambda store, profile: store.create_empty(path(profile, "new")),
+        [b"dir", b"file", b"new"],
+    ),
+}
+
+
+@pytest.mark.parametrize("profile", EVERY_PROFILE)
+@pytest.mark.parametrize("act", sorted(ACTS))
+async def test_a_lost_reply_is_found_out(profile: str, act: str, autojump: MockClock) -> None:
+    """The second execution is refused (where nothing replays): the listing tells that the first worked."""
+    opcode, run, expected = ACTS[act]
+    if act == "rename" and profile not in RENAMING:
+        return
+    here = world(profile, file=b"content")
+    here.tree.add_directory(path(profile, "dir"))
+    faults = Faults(here)
+    async with here.connection() as connection:
+        faults.lose_reply_to(opcode)
+        async with trio.open_nursery() as nursery:  # another request in between ends the replay
+            nursery.start_soon(run, connection.store, profile)
+            await trio.sleep(0.05)
+            await connection.store.list_directory(path(profile, "")[:-1])
+        assert names(here) == expected
+    # The textbook's server gives ids that cannot be guessed when the reply with the id is lost.
+    assert here.vehicle.server.open_sessions == int(profile == "spec" and act == "create")
+
+
+@pytest.mark.parametrize("profile", EVERY_PROFILE)
+async def test_refusals_are_refusals(profile: str, autojump: MockClock) -> None:
+    here = world(profile, file=b"content")
+    here.tree.add(path(profile, "dir/inner"), b"x")
+    async with here.connection() as connection:
+        store = connection.store
+        for attempt in (
+            lambda: store.remove(path(profile, "missing")),
+            lambda: store.remove_directory(path(profile, "dir")),
+            lambda: store.make_directory(path(profile, "dir")),
+            lambda: store.make_directory(path(profile, "no/such")),
+            lambda: store.rename(path(profile, "missing"), path(profile, "other")),
+            lambda: store.create_empty(path(profile, "no/such")),
+            lambda: store.stat_size(path(profile, "missing")),
+        ):
+            with pytest.raises(FtpNak):
+                await attempt()
+        assert names(here) == [b"dir", b"file"]
+    assert here.vehicle.server.open_sessions == 0
+
+
+@pytest.mark.parametrize("profile", EVERY_PROFILE)
+async def test_an_existing_directory_is_not_taken_for_ours(profile: str, autojump: MockClock) -> None:
+    """Its reply lost, mkdir of what was there before must still be refused."""
+    here = world(profile)
+    here.tree.add(path(profile, "dir/inner"), b"x")
+    faults = Faults(here)
+    async with here.connection() as connection:
+        faults.lose_reply_to(Opcode.CREATE_DIRECTORY)
+        with pytest.raises(FtpNak) as refusal:
+            await connection.store.make_directory(path(profile, "dir"))
+        assert refusal.value.code == 8
+
+
+@pytest.mark.parametrize("profile", ["px4", "px4-nuttx", "px4-2026"])
+async def test_a_sticky_file_exists_hides_no_other_refusal(profile: str, autojump: MockClock) -> None:
+    here = world(profile, file=b"content")
+    here.tree.add_directory(path(profile, "dir"))
+    faults = Faults(here)
+
+    async def spoil(connection: Connection) -> None:
+        with pytest.raises(FtpNak):
+            await connection.scheduler.metadata(Simple(Opcode.CREATE_DIRECTORY, path(profile, "dir")))
+
+    async with here.connection() as connection:
+        await spoil(connection)
+        with pytest.raises(FtpNak) as refusal:
+            await connection.store.remove(path(profile, "missing"))
+        assert refusal.value.code == 10
+        await spoil(connection)
+        await connection.store.remove(path(profile, "file"))
+        await spoil(connection)
+        source = MemorySource(b"hello")
+        upload = await connection.store.open_upload(path(profile, "new"), source, create=True)
+        await upload.finish()
+        await spoil(connection)
+        faults.lose_reply_to(Opcode.TERMINATE_SESSION)
+        source.add(b" world")
+        upload.wake()
+        await upload.finish()
+        assert here.tree.data(path(profile, "new")) == b"hello world"
+
+
+@pytest.mark.parametrize("profile", EVERY_PROFILE)
+async def test_silence_is_unknown_unless_the_listing_tells(profile: str, autojump: MockClock) -> None:
+    here = world(profile, file=b"content")
+    faults = Faults(here)
+    async with here.connection() as connection:
+        faults.ignore(Opcode.REMOVE_FILE)
+        with pytest.raises(RequestTimeout):
+            await connection.store.remove(path(profile, "file"))
+        assert names(here) == [b"file"]
+        for _ in range(20):
+            faults.lose_reply_to(Opcode.CREATE_DIRECTORY)
+        await connection.store.make_directory(path(profile, "dir"))
+
+
+@pytest.mark.parametrize("profile", EVERY_PROFILE)
+async def test_our_own_session_is_closed_before_a_path_changes(profile: str, autojump: MockClock) -> None:
+    here = world(profile, LinkSettings(rate=20_000.0, delay=0.02), file=bytes(60_000), other=b"x")
+    faults = Faults(here)
+    open_then: list[list[bytes]] = []
+    async with here.connection() as connection:
+        sink = MemorySink(60_000)
+        reader = await connection.store.open_reader(path(profile, "file"), sink)
+        reader.want(0, 60_000, demand=True)
+        await sink.wait_for(0, 1000)
+        faults.at(Opcode.REMOVE_FILE, lambda: open_then.append(here.vehicle.server.open_paths))
+        await connection.store.remove(path(profile, "file"))
+        assert open_then == [[]]
+        with pytest.raises(FileChanged):
+            await sink.wait_for(0, 60_000)
+        reader.want(0, 60_000, demand=True)
+        with pytest.raises(FileChanged):
+            await sink.wait_for(0, 60_000)
+        assert await read_file(connection, path(profile, "other")) == b"x"
+
+
+@pytest.mark.parametrize("profile", RENAMING)
+async def test_readers_follow_a_rename(profile: str, autojump: MockClock) -> None:
+    data = random.Random(1).randbytes(40_000)
+    here = world(profile, LinkSettings(rate=20_000.0, delay=0.02))
+    here.tree.add(path(profile, "dir/file"), data)
+    faults = Faults(here)
+    open_then: list[list[bytes]] = []
+    async with here.connection() as connection:
+        sink = MemorySink(40_000)
+        reader = await connection.store.open_reader(path(profile, "dir/file"), sink)
+        reader.want(0, 40_000, demand=True)
+        await sink.wait_for(0, 1000)
+        faults.at(Opcode.RENAME, lambda: open_then.append(here.vehicle.server.open_paths))
+        await connection.store.rename(path(profile, "dir"), path(profile, "moved"))
+        assert open_then == [[]]
+        assert await sink.wait_for(0, 40_000) == data
+    assert here.tree.stat(path(profile, "moved/file")).kind is Kind.FILE
+
+
+@pytest.mark.parametrize("probed", [False, True], ids=["unknown", "probed"])
+@pytest.mark.parametrize("profile", EVERY_PROFILE)
+async def test_an_upload_makes_room_for_a_change_of_its_path(
+    profile: str, probed: bool, autojump: MockClock
+) -> None:
+    here = world(profile, LinkSettings(rate=20_000.0, delay=0.02))
+    faults = Faults(here)
+    open_then: list[list[bytes]] = []
+    async with here.connection() as connection:
+        if probed:
+            await connection.store.probe_open_for_write(path(profile, "")[:-1])
+        source = MemorySource(bytes(40_000))
+        upload = await connection.store.open_upload(path(profile, "file"), source, create=True)
+        await trio.sleep(1)
+        faults.at(Opcode.REMOVE_FILE, lambda: open_then.append(here.vehicle.server.open_paths))
+        await connection.store.remove(path(profile, "file"))
+        assert open_then == [[]]
+        await upload.abort()
+    assert here.vehicle.server.open_sessions == 0
+
+
+@pytest.mark.parametrize("profile", TRUNCATING)
+async def test_truncate_cuts_and_extends(profile: str, autojump: MockClock) -> None:
+    here = world(profile, LinkSettings(rate=60_000.0, delay=0.02, loss=0.1), file=b"content")
+    async with here.connection() as connection:
+        await connection.store.truncate(path(profile, "file"), 3)
+        assert here.tree.data(path(profile, "file")) == b"con"
+        await connection.store.truncate(path(profile, "file"), 5)
+        assert here.tree.data(path(profile, "file")) == b"con\0\0"
+        assert connection.store.traits.truncate_works is True
+
+
+@pytest.mark.parametrize("profile", [name for name in EVERY_PROFILE if not PROFILES[name].truncate_file])
+async def test_a_server_without_truncate_is_known_afterwards(profile: str, autojump: MockClock) -> None:
+    here = world(profile, file=b"content")
+    faults = Faults(here)
+    async with here.connection() as connection:
+        with pytest.raises((FtpNak, RequestTimeout)):
+            await connection.store.truncate(path(profile, "file"), 3)
+        assert connection.store.traits.truncate_works is False
+        count = len(faults.requests)
+        with pytest.raises(FtpNak):
+            await connection.store.truncate(path(profile, "file"), 3)
+        assert len(faults.requests) == count
+
+
+async def test_a_tiny_checksum_is_asked_for_again_soon(autojump: MockClock) -> None:
+    here = world("px4", file=b"content")
+    faults = Faults(here)
+    async with here.connection() as connection:
+        faults.lose_reply_to(Opcode.CALC_FILE_CRC32)
+        began = trio.current_time()
+        await connection.store.crc32(b"/d/file", size=7)
+        assert trio.current_time() - began < 4
+        assert faults.requests.count(Opcode.CALC_FILE_CRC32) == 2
+
+
+async def test_too_long_a_rename_is_refused_before_a_byte_is_sent(autojump: MockClock) -> None:
+    here = world("px4")
+    faults = Faults(here)
+    async with here.connection() as connection:
+        with pytest.raises(PathTooLong):
+            await connection.store.rename(b"/d/" + b"a" * 116, b"/d/" + b"b" * 117)
+    assert faults.requests == []
