@@ -7,7 +7,8 @@ At open it is decided whether what is cached of the path is still the vehicle's 
 - else the file is opened on the vehicle and a new version starts with the size in the ACK, because equal
   sizes without an mtime prove nothing.
 Old handles of a file that turned out smaller, or of the same size with another mtime, get FileChanged; of
-one that is larger they go on at the size they opened: logs grow.
+one that is larger they go on at the size they opened: logs grow. The kernel has one page cache for all
+handles of a path, so a new version bypasses it (direct_io) while handles of an older one are open.
 """
 
 from __future__ import annotations
@@ -80,7 +81,8 @@ class Files:
         version.shown = True
         self.open_count += 1
         self._open_versions[version] = None
-        return FileHandle(self, version, keep_cache=keep_cache)
+        direct_io = any(other.path == path and other is not version for other in self._open_versions)
+        return FileHandle(self, version, keep_cache=keep_cache, direct_io=direct_io)
 
     async def learn_size(self, path: bytes) -> int:
         """Return the size that an open ACK tells, for listings that tell none.
@@ -147,6 +149,12 @@ class Files:
     def pace(self) -> Pace:
         """Return the bounds for readahead now."""
         return self._cache.pace(len(self._open_versions))
+
+    def on_read(self, version: Version) -> None:
+        """The kernel gets bytes of a version: if it is an old one, they are wrong for the current one."""
+        current = self._current.get(version.path)
+        if current is not None and current is not version:
+            current.shown = False
 
     # --- the file changed
 
@@ -224,15 +232,14 @@ class Files:
 class FileHandle(ReadOnlyHandle):
     """One open() of a regular file (see cache.tree.OpenFile)."""
 
-    direct_io = False
-
-    def __init__(self, files: Files, version: Version, *, keep_cache: bool) -> None:
+    def __init__(self, files: Files, version: Version, *, keep_cache: bool, direct_io: bool) -> None:
         self._files = files
         self._version = version
         self._readahead = Readahead(version.size)
         self._closed = False
         self.size = version.size
         self.keep_cache = keep_cache
+        self.direct_io = direct_io
 
     async def read(self, offset: int, size: int) -> bytes | memoryview:
         """Return `size` bytes at `offset`, fewer only at the end of the opened size.
@@ -260,6 +267,7 @@ class FileHandle(ReadOnlyHandle):
 
     async def _read_piece(self, start: int, stop: int) -> bytes | memoryview:
         files, version = self._files, self._version
+        files.on_read(version)
         pace = files.pace()
         plan = self._readahead.on_read(start, stop, limit=pace.limit, small=pace.small)
         if plan.seeked and version.reader is not None:

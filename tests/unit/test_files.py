@@ -353,6 +353,25 @@ async def test_a_grown_file_is_served_at_its_opened_size(
     assert all(reader.closed for reader in store.readers)
 
 
+async def test_versions_do_not_meet_in_the_kernels_page_cache(
+    store: FakeStore, tree: Tree, autojump_clock: MockClock
+) -> None:
+    old = await tree.open(LOG)
+    assert not old.direct_io
+    store.add(LOG, DATA + b"more", 1_700_000_009)
+    await trio.sleep(21)
+    new = await tree.open(LOG)
+    assert new.direct_io
+    new.close()
+    assert (await tree.open(LOG)).keep_cache
+    await old.read(0, 100)
+    old.close()
+    newest = await tree.open(LOG)
+    assert not newest.direct_io
+    assert not newest.keep_cache
+    assert (await tree.open(LOG)).keep_cache
+
+
 async def test_the_ack_beats_the_listing(store: FakeStore, tree: Tree, autojump_clock: MockClock) -> None:
     await tree.stat(LOG)
     store.add(LOG, DATA + b"more", 1_700_000_009)
