@@ -1,0 +1,328 @@
+"""WriteTransfer: step by step against replies written by hand, and whole under adversarial links."""
+
+from __future__ import annotations
+
+import random
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mavftpfs.protocol.engine import Engine
+from mavftpfs.protocol.flow import Flow
+from mavftpfs.protocol.operations import OpenFile, Simple, Terminate
+from mavftpfs.protocol.payload import Opcode
+from mavftpfs.protocol.writing import MAX_OFFSET, WriteTransfer
+from mavftpfs.shared.errors import (
+    FtpNak,
+    LocalProtocolError,
+    MavftpfsError,
+    RemoteProtocolError,
+    RequestTimeout,
+    SessionLost,
+)
+from mavftpfs.shared.traits import Traits
+from mavftpfs.sim.linkmodel import LinkSettings
+from mavftpfs.sim.memorytree import MemoryTree
+from mavftpfs.sim.profiles import PROFILES
+from mavftpfs.sim.server import FtpServer
+from tests.support.replies import ack, nak, sent
+from tests.support.sources import MemorySource
+from tests.support.virtual import VirtualLink
+
+CONTENT = random.Random(5).randbytes(239 * 6 + 11)
+
+
+def make(limit: int | None = None) -> Engine:
+    return Engine(random.Random(3), Flow(limit=limit))
+
+
+def writing(
+    engine: Engine, content: bytes = CONTENT, *, in_flight: int | None = None
+) -> tuple[WriteTransfer, MemorySource]:
+    source = MemorySource(content)
+    transfer = WriteTransfer(0, source, in_flight=in_flight)
+    engine.start(transfer, 0.0)
+    return transfer, source
+
+
+def count(number: int) -> bytes:
+    return number.to_bytes(4, "little")
+
+
+def test_chunks_go_out_ascending_and_full() -> None:
+    engine = make()
+    transfer, source = writing(engine)
+    first = sent(engine, 0.0)
+    assert [(one.opcode, one.offset, one.size) for one in first] == [
+        (Opcode.WRITE_FILE, offset, 239) for offset in (0, 239, 478, 717)
+    ]
+    assert b"".join(one.data for one in first) == CONTENT[: 4 * 239]
+    for one in first:
+        engine.receive(ack(one), 0.1)
+    rest = sent(engine, 0.1)
+    assert [(one.offset, one.size) for one in rest] == [(956, 239), (1195, 239), (1434, 11)]
+    for one in rest:
+        engine.receive(ack(one), 0.2)
+    assert sent(engine, 0.2) == []
+    assert transfer.starved
+    assert transfer.idle
+    assert not transfer.done
+    assert source.acked.covers(0, len(CONTENT))
+    assert transfer.acked_bytes == len(CONTENT)
+    assert engine.next_deadline() is None
+
+
+def test_more_goes_out_after_a_wake_only() -> None:
+    engine = make()
+    transfer, source = writing(engine, b"")
+    assert sent(engine, 0.0) == []
+    source.add(b"more")
+    assert sent(engine, 0.1) == []
+    transfer.wake()
+    assert [one.data for one in sent(engine, 0.2)] == [b"more"]
+
+
+def test_a_short_write_sends_the_rest() -> None:
+    engine = make()
+    transfer, source = writing(engine, CONTENT[:239])
+    [first] = sent(engine, 0.0)
+    engine.receive(ack(first, count(100)), 0.1)
+    assert source.acked.total == 100
+    assert not transfer.starved
+    [rest] = sent(engine, 0.1)
+    assert (rest.offset, rest.data) == (100, CONTENT[100:239])
+    engine.receive(ack(rest, count(139)), 0.2)
+    assert source.acked.covers(0, 239)
+    assert engine.traits.write_ack_counts is True
+
+
+def test_an_ack_without_a_count_is_for_all() -> None:
+    engine = make()
+    _, source = writing(engine, b"hello")
+    [first] = sent(engine, 0.0)
+    engine.receive(ack(first), 0.1)
+    assert source.acked.covers(0, 5)
+    assert engine.traits.write_ack_counts is False
+
+
+@pytest.mark.parametrize("number", [0, 240, 2**32 - 1])
+def test_acks_that_prove_nothing_end_it_after_a_few(number: int) -> None:
+    engine = make()
+    transfer, source = writing(engine, CONTENT[:239])
+    now = 0.0
+    for _ in range(4):
+        [again] = sent(engine, now)
+        assert again.offset == 0
+        now += 0.1
+        engine.receive(ack(again, count(number)), now)
+    assert isinstance(transfer.error, RemoteProtocolError)
+    assert source.dirty.covers(0, 239)
+
+
+@pytest.mark.parametrize("codes", [(1,), (4,), (10,), (2, 9)])
+def test_a_lost_session_gives_everything_back(codes: tuple[int, ...]) -> None:
+    engine = make()
+    transfer, source = writing(engine)
+    requests = sent(engine, 0.0)
+    engine.receive(ack(requests[0]), 0.1)
+    engine.receive(nak(requests[2], *codes), 0.1)
+    assert isinstance(transfer.error, SessionLost)
+    assert transfer.error.by_server
+    assert isinstance(transfer.error.__cause__, FtpNak)
+    assert transfer.failed_at == 478
+    assert source.in_flight.empty
+    assert list(source.dirty) == [(239, len(CONTENT))]
+    engine.receive(ack(requests[1]), 0.2)  # too late: nobody takes it for this file any more
+    assert source.acked.total == 239
+
+
+@pytest.mark.parametrize("codes", [(2, 28), (2, 5), (9,), (8,), (3,)])
+def test_other_refusals_are_the_callers(codes: tuple[int, ...]) -> None:
+    engine = make()
+    transfer, source = writing(engine)
+    requests = sent(engine, 0.0)
+    engine.receive(nak(requests[0], *codes), 0.1)
+    assert isinstance(transfer.error, FtpNak)
+    assert (transfer.error.opcode, transfer.error.code) == (Opcode.WRITE_FILE, codes[0])
+    assert transfer.failed_at == 0
+    assert source.dirty.covers(0, len(CONTENT))
+
+
+def test_pause_drains_and_resume_goes_on() -> None:
+    engine = make()
+    transfer, _ = writing(engine)
+    requests = sent(engine, 0.0)
+    transfer.pause()
+    assert transfer.paused
+    for one in requests:
+        assert not transfer.drained
+        engine.receive(ack(one), 0.1)
+    assert transfer.drained
+    assert transfer.idle
+    assert sent(engine, 0.1) == []
+    assert engine.next_deadline() is None
+    transfer.resume()
+    assert len(sent(engine, 40.0)) == 3
+    engine.on_deadline(45.0)
+    assert not transfer.done  # the pause was no silence
+
+
+def test_stop_gives_back_and_ends() -> None:
+    engine = make()
+    transfer, source = writing(engine)
+    sent(engine, 0.0)
+    transfer.stop()
+    assert transfer.done
+    assert transfer.error is None
+    assert source.dirty.covers(0, len(CONTENT))
+    transfer.stop()
+
+
+def test_strict_order_has_one_in_flight() -> None:
+    engine = make()
+    transfer, _ = writing(engine, in_flight=1)
+    [first] = sent(engine, 0.0)
+    assert sent(engine, 0.0) == []
+    engine.receive(ack(first), 0.1)
+    [second] = sent(engine, 0.1)
+    assert second.offset == 239
+    assert not transfer.starved
+
+
+def test_never_more_than_the_server_queues() -> None:
+    engine = Engine(random.Random(3), Flow(), traits=Traits(ack_carries_own_session=True, queue_limit=4))
+    source = MemorySource(bytes(239 * 200))
+    transfer = WriteTransfer(7, source)
+    engine.start(transfer, 0.0)
+    now, flying = 0.0, sent(engine, 0.0)
+    for _ in range(100):
+        assert len(flying) <= 4
+        now += 0.05
+        engine.receive(ack(flying.pop(0)), now)
+        flying += sent(engine, now)
+
+
+def test_a_lost_request_goes_again_with_the_same_bytes() -> None:
+    engine = make()
+    writing(engine, CONTENT[:239])
+    [first] = sent(engine, 0.0)
+    deadline = engine.next_deadline()
+    assert deadline is not None
+    engine.on_deadline(deadline)
+    [second] = sent(engine, deadline)
+    assert (second.offset, second.data) == (first.offset, first.data)
+    assert second.seq != first.seq
+
+
+def test_silence_times_out_and_gives_back() -> None:
+    engine = make()
+    transfer, source = writing(engine, CONTENT[:239])
+    now = 0.0
+    while not transfer.done:
+        sent(engine, now)
+        deadline = engine.next_deadline()
+        assert deadline is not None
+        now = deadline
+        engine.on_deadline(now)
+    assert isinstance(transfer.error, RequestTimeout)
+    assert 29 < now < 40
+    assert source.dirty.covers(0, 239)
+
+
+@pytest.mark.parametrize("piece", [(0, b""), (0, bytes(240)), (-1, b"x"), (MAX_OFFSET - 1, b"xy")])
+def test_a_chunk_that_does_not_fit_is_refused_without_a_raise(piece: tuple[int, bytes]) -> None:
+    class Broken(MemorySource):
+        def next_chunk(self, limit: int) -> tuple[int, bytes] | None:
+            return piece
+
+        def on_unsent(self, offset: int, number: int) -> None:
+            assert (offset, number) == (piece[0], len(piece[1]))
+
+    engine = make()
+    transfer = WriteTransfer(0, Broken())
+    engine.start(transfer, 0.0)
+    assert sent(engine, 0.0) == []
+    assert isinstance(transfer.error, LocalProtocolError)
+
+
+def test_a_chunk_size_out_of_range_is_a_bug() -> None:
+    for chunk in (0, 240):
+        with pytest.raises(LocalProtocolError):
+            WriteTransfer(0, MemorySource(), chunk)
+
+
+def test_reading_goes_before_writing_and_metadata_before_both() -> None:
+    engine = make(limit=1)
+    writing(engine)
+    listing = Simple(Opcode.CREATE_DIRECTORY, b"/d")
+    engine.start(listing, 0.0)
+    assert [one.opcode for one in sent(engine, 0.0)] == [Opcode.CREATE_DIRECTORY]
+
+
+# --- under adversarial links, against every server
+
+
+@pytest.mark.parametrize("profile", sorted(PROFILES))
+@settings(max_examples=12, deadline=None)
+@given(
+    seed=st.integers(0, 2**16),
+    size=st.integers(0, 6000),
+    chunk=st.sampled_from([1, 50, 200, 238, 239]),
+    loss=st.sampled_from([0.0, 0.05, 0.2, 0.4]),
+    duplicate=st.sampled_from([0.0, 0.1]),
+    reorder=st.sampled_from([0.0, 0.1]),
+    in_flight=st.sampled_from([None, 1, 3]),
+    cut_short=st.sampled_from([None, 0.3, 2.0]),
+)
+def test_what_is_acked_is_on_the_card(
+    profile: str,
+    seed: int,
+    size: int,
+    chunk: int,
+    loss: float,
+    duplicate: float,
+    reorder: float,
+    in_flight: int | None,
+    cut_short: float | None,
+) -> None:
+    content = random.Random(seed).randbytes(size if chunk > 1 else size % 300)
+    tree = MemoryTree()
+    path = b"/fs/microsd/f"
+    tree.add_directory(b"/fs/microsd")
+    server = FtpServer(tree, PROFILES[profile], rng=random.Random(seed))
+    line = LinkSettings(rate=100_000.0, delay=0.01, loss=loss, duplicate=duplicate, reorder=reorder)
+    link = VirtualLink(server, line, seed=seed)
+    opened = OpenFile(Opcode.CREATE_FILE, path, link.engine.home_session)
+    link.run(opened)
+    if opened.error is not None:  # its ACK was lost and the repetition refused: not what is tested here
+        return
+    link.engine.session = opened.session
+    source = MemorySource(content)
+    transfer = WriteTransfer(opened.session, source, chunk, in_flight=in_flight)
+    link.engine.start(transfer, link.now)
+    if cut_short is not None:
+        end = link.now + cut_short
+        link.run_until(lambda: transfer.starved or transfer.done or link.now >= end)
+    else:
+        link.run_until(lambda: transfer.starved or transfer.done)
+    if profile == "px4-nuttx" and isinstance(transfer.error, FtpNak) and transfer.error.code == 9:
+        assert source.in_flight.empty  # after 2 s without requests; the session layer knows what to do
+        return
+    assert transfer.error is None
+    if cut_short is None:
+        assert source.acked.total == len(content)
+    transfer.stop()
+    link.engine.cancel(transfer, link.now)
+    assert source.in_flight.empty
+    assert source.acked.total + source.dirty.total == len(content)
+    close(link, opened.session)
+    stored = tree.data(path)
+    for start, stop in source.acked:
+        assert stored[start:stop] == content[start:stop]
+
+
+def close(link: VirtualLink, session: int) -> None:
+    terminate = Terminate(session)
+    link.run(terminate)
+    assert terminate.error is None or isinstance(terminate.error, MavftpfsError)
