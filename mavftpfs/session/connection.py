@@ -240,6 +240,7 @@ def _build(
     driver.on_batch = scheduler.on_batch
 
     def on_reboot() -> None:
+        engine.forget_server()
         scheduler.on_reboot()
         store.forget_traits()
         steering.forget()

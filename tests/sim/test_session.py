@@ -126,6 +126,23 @@ async def test_a_reboot_in_mid_read_is_bridged(profile: str, autojump: MockClock
 
 
 @pytest.mark.parametrize("profile", EVERY_PROFILE)
+async def test_a_reboot_forgets_what_was_seen_of_the_server(profile: str, autojump: MockClock) -> None:
+    here = world(profile, small=b"hello")
+    async with here.connection() as connection:
+        await trio.sleep(8)
+        await connection.store.list_directory(path(profile, "")[:-1])
+        assert await read_file(connection, path(profile, "small")) == b"hello"
+        assert connection.engine.traits.ack_carries_own_session is not None
+        here.vehicle.reboot(trio.current_time(), downtime=1.0)
+        here.link.kick()
+        await trio.sleep(3)
+        assert connection.vehicle.reboots == 1
+        assert connection.engine.traits.ack_carries_own_session is None
+        assert connection.store.lists_times is None
+        assert await read_file(connection, path(profile, "small")) == b"hello"
+
+
+@pytest.mark.parametrize("profile", EVERY_PROFILE)
 async def test_a_session_left_by_a_killed_client_is_got_over(profile: str, autojump: MockClock) -> None:
     data = content(50_000)
     here = world(profile, LinkSettings(rate=100_000.0, delay=0.02), big=data)
