@@ -203,8 +203,10 @@ async def test_cut_and_mended(shaped: bool) -> None:
         assert (await client.ask(Opcode.NONE)).opcode == Opcode.ACK
 
 
-async def test_arming_is_heard_at_once() -> None:
+async def test_arming_is_heard_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     async with serving("udpin:127.0.0.1:0") as (endpoint, client):
+        assert not (await client.beat()).armed
+        monkeypatch.setattr("mavftpfs.sim.vehicle.HEARTBEAT_PERIOD", 1000.0)
         assert not (await client.beat()).armed
         assert endpoint.toggle_armed()
         assert (await client.beat()).armed
@@ -220,6 +222,19 @@ async def test_a_slow_stream_paces_the_burst() -> None:
         await trio.sleep(0.3)
         assert endpoint.link.backlog <= PROFILES["px4"].tx_buffer
         assert endpoint.link.stats.dropped_sends == 0
+
+
+async def test_a_pty_without_a_client_echoes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("mavftpfs.sim.vehicle.HEARTBEAT_PERIOD", 0.01)
+    async with open_endpoint("pty") as link, trio.open_nursery() as nursery:
+        nursery.start_soon(Endpoint(vehicle(stream=True), link).run)
+        for _ in range(1000):
+            await trio.sleep(0.01)
+            if link.stats.sent_chunks >= 5:
+                break
+        assert link.stats.sent_chunks >= 5
+        assert link.stats.received_bytes == 0
+        nursery.cancel_scope.cancel()
 
 
 async def test_a_second_client_of_a_pty_finds_the_vehicle() -> None:
@@ -339,6 +354,22 @@ async def test_a_directory_is_served_by_the_process(tmp_path: Path, link: str, e
             assert await client.read_file(b"/log.bin") == CONTENT[:5000]
         child.send_signal(signal.SIGINT)
         assert await trio.to_thread.run_sync(child.wait, 20) == 0
+
+
+async def test_the_process_joins_the_pieces_of_a_stream(tmp_path: Path) -> None:
+    """Cut where a datagram's reader would think that a new frame begins."""
+    frame = Framer(US, stream=True).encode_ftp(DRONE, request(7, Opcode.NONE, data=b"\xfd" * 20).encode())
+    middle = frame.index(b"\xfd", 1)
+    with running(str(tmp_path), "--link", "tcpin:127.0.0.1:0") as child, trio.fail_after(20):
+        words = (await trio.to_thread.run_sync(line, child.stdout)).split()
+        async with open_link(parse_source(words[1])) as client_link:
+            client = Client(client_link)
+            await client.beat()
+            client_link.send_nowait([frame[:middle]])
+            await trio.sleep(0.1)
+            client_link.send_nowait([frame[middle:]])
+            while not any(isinstance(message, FtpFrame) for message in client.heard):
+                await client.messages()
 
 
 # ---------------------------------------------------------------------- in memory

@@ -292,7 +292,7 @@ def test_a_frame_that_says_it_is_signed_waits_for_its_signature() -> None:
 
 def test_an_impossible_message_id_holds_nothing_up() -> None:
     framer = Framer(US, stream=True)
-    assert framer.feed(b"\xfd\xff\0\0\0\1\1\0\0\1" + ftp()) == [FTP]
+    assert framer.feed(b"\xfd\xff\0\0\0\1\1\0\0\1" + heartbeat()) == [HEARTBEAT]
 
 
 def test_message_unknown_to_the_dialect_is_other_if_a_frame_follows() -> None:

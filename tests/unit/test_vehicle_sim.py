@@ -186,7 +186,7 @@ def test_nothing_is_made_up_for_after_a_pause() -> None:
     client = Client(telemetry=2000.0)
     client.hear(1)
     client.now += 3600
-    assert len(client.vehicle.outgoing(client.now)) < 60
+    assert sum(len(client.vehicle.outgoing(client.now)) for _ in range(20)) < 60 + 20
 
 
 def test_reboot_loses_time_arming_and_sessions_but_no_files() -> None:
