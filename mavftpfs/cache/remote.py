@@ -147,8 +147,8 @@ class Upload(Protocol):
 class WriteStore(Protocol):
     """How the caches change the vehicle's files.
 
-    Nothing here checks types or targets: who calls did. A refusal or silence after a retransmission may mean
-    that the first request worked (FtpNak.retransmitted, RequestTimeout); who calls finds out by listing.
+    Nothing here checks types or targets: who calls did. A refusal after a retransmission, which may mean that
+    the first request worked, is verified by listing. RequestTimeout means: not known to have happened.
     All raise FtpNak, RequestTimeout, VehicleLost, SessionBusy, PathTooLong and, while armed, Armed.
     """
 

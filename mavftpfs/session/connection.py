@@ -5,7 +5,7 @@ from __future__ import annotations
 import random
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
 import trio
@@ -109,6 +109,8 @@ class Connection:
             "requests": stats.requests,
             "retransmissions": stats.retransmissions,
             "lists_times": self.store.lists_times,
+            "write_traits": asdict(self.store.traits),
+            "uploads": [upload.status() for upload in self.scheduler.uploads],
             "link": {
                 "received_bytes": self.link.stats.received_bytes,
                 "sent_bytes": self.link.stats.sent_bytes,

@@ -181,6 +181,17 @@ class QueuedUpload:
             self.refused_at = None
         self.retry_at = 0.0
 
+    def status(self) -> dict[str, object]:
+        """Return facts for people and scripts; JSON-able."""
+        return {
+            "path": self.path.decode("utf-8", "replace"),
+            "running": self.running,
+            "reached": self.feed.reached,
+            "unproven": self.feed.unproven,
+            "clean": self.clean,
+            "error": None if self.error is None else str(self.error),
+        }
+
     # --- the session's side
 
     @property
