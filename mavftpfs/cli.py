@@ -10,6 +10,7 @@ import argparse
 import os
 import sys
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import NoReturn
 
 import mavftpfs
@@ -155,6 +156,40 @@ def _get_parser(name: str) -> Parser:
     return parser
 
 
+def _put_parser(name: str) -> Parser:
+    parser = _source_parser(name, "Put local files on the vehicle, and verify them by size and CRC32.")
+    parser.add_argument("locals", metavar="LOCAL", nargs="+", type=Path, help="a local file or directory")
+    parser.add_argument(
+        "path", metavar="PATH", help="a directory of the vehicle, or the new name of one LOCAL; or mftp://"
+    )
+    parser.add_argument("-r", dest="recursive", action="store_true", help="directories too")
+    return parser
+
+
+def _rm_parser(name: str) -> Parser:
+    parser = _paths_parser(name, "Remove files of the vehicle.")
+    parser.add_argument("-r", dest="recursive", action="store_true", help="directories too, with all below")
+    return parser
+
+
+def _mkdir_parser(name: str) -> Parser:
+    parser = _paths_parser(name, "Make directories on the vehicle.")
+    parser.add_argument(
+        "-p", dest="parents", action="store_true", help="those above too; existing ones are fine"
+    )
+    return parser
+
+
+def _rmdir_parser(name: str) -> Parser:
+    return _paths_parser(name, "Remove empty directories of the vehicle.")
+
+
+def _mv_parser(name: str) -> Parser:
+    parser = _paths_parser(name, "Rename a file or directory of the vehicle, or move several to a directory.")
+    parser.add_argument("target", metavar="NEW", help="a directory of the vehicle, or the new name")
+    return parser
+
+
 def _crc_parser(name: str) -> Parser:
     return _paths_parser(name, "Have the vehicle compute the CRC32 of files.")
 
@@ -205,6 +240,11 @@ _COMMANDS: dict[str, tuple[Callable[[str], Parser], Run]] = {
     "scan": (_scan_parser, commands.scan),
     "ls": (_ls_parser, commands.ls),
     "get": (_get_parser, commands.get),
+    "put": (_put_parser, commands.put),
+    "rm": (_rm_parser, commands.rm),
+    "mkdir": (_mkdir_parser, commands.mkdir),
+    "rmdir": (_rmdir_parser, commands.rmdir),
+    "mv": (_mv_parser, commands.mv),
     "crc": (_crc_parser, commands.crc),
     "sim": (_sim_parser, _sim),
     "demo": (_demo_parser, _demo),

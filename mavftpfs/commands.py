@@ -272,6 +272,66 @@ def get(args: argparse.Namespace) -> int:
     return ExitCode.OK
 
 
+def put(args: argparse.Namespace) -> int:
+    """Put files on the vehicle."""
+    from mavftpfs import oneshot, oneshot_writing, report
+
+    (path,), component = oneshot.parse_paths([args.path])
+
+    def tell(sent: oneshot_writing.Sent) -> None:
+        print(f"{report.printable(os.fsdecode(sent.remote))}: {report.readable_size(sent.size)}, delivered")
+
+    with report.transfer_meter() as meter:
+        _run(
+            args,
+            lambda target: oneshot_writing.put_paths(
+                target, args.locals, path, meter, tell, recursive=args.recursive
+            ),
+            component,
+        )
+    return ExitCode.OK
+
+
+def rm(args: argparse.Namespace) -> int:
+    """Remove files."""
+    from mavftpfs import oneshot, oneshot_writing
+
+    paths, component = oneshot.parse_paths(args.paths)
+    _run(
+        args, lambda target: oneshot_writing.remove_paths(target, paths, recursive=args.recursive), component
+    )
+    return ExitCode.OK
+
+
+def mkdir(args: argparse.Namespace) -> int:
+    """Make directories."""
+    from mavftpfs import oneshot, oneshot_writing
+
+    paths, component = oneshot.parse_paths(args.paths)
+    _run(
+        args, lambda target: oneshot_writing.make_directories(target, paths, parents=args.parents), component
+    )
+    return ExitCode.OK
+
+
+def rmdir(args: argparse.Namespace) -> int:
+    """Remove empty directories."""
+    from mavftpfs import oneshot, oneshot_writing
+
+    paths, component = oneshot.parse_paths(args.paths)
+    _run(args, lambda target: oneshot_writing.remove_directories(target, paths), component)
+    return ExitCode.OK
+
+
+def mv(args: argparse.Namespace) -> int:
+    """Rename or move."""
+    from mavftpfs import oneshot, oneshot_writing
+
+    (*paths, to), component = oneshot.parse_paths([*args.paths, args.target])
+    _run(args, lambda target: oneshot_writing.move_paths(target, paths, to), component)
+    return ExitCode.OK
+
+
 def crc(args: argparse.Namespace) -> int:
     """Print checksums the vehicle computed, as cksum's relatives do: number, two blanks, name."""
     from mavftpfs import oneshot, report

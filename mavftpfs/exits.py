@@ -5,11 +5,20 @@ from __future__ import annotations
 from enum import IntEnum
 
 from mavftpfs.shared.errors import (
+    AlreadyExists,
+    Armed,
+    CrossDevice,
+    DirectoryNotEmpty,
+    FileBusy,
+    InvalidMove,
     IsADirectory,
     LinkError,
+    LocalProtocolError,
     MavftpfsError,
     NotADirectory,
     NotFound,
+    NotSupported,
+    ReadOnly,
     RequestTimeout,
     UsageError,
 )
@@ -35,11 +44,20 @@ class NoFtp(MavftpfsError):
     """A vehicle is there, but its files are not."""
 
 
+class NotDelivered(MavftpfsError):
+    """Bytes that were to be written are not provably on the vehicle."""
+
+
+_NOT_POSSIBLE = (
+    UsageError,
+    *(NotFound, NotADirectory, IsADirectory, AlreadyExists, DirectoryNotEmpty, InvalidMove, CrossDevice),
+    *(ReadOnly, Armed, FileBusy, NotSupported, LocalProtocolError),
+)
+"""The vehicle is there, but what was asked cannot be done with the files as they are."""
+
 _CODES: tuple[tuple[type[MavftpfsError], ExitCode], ...] = (
-    (UsageError, ExitCode.USAGE),
-    (NotFound, ExitCode.USAGE),
-    (NotADirectory, ExitCode.USAGE),
-    (IsADirectory, ExitCode.USAGE),
+    *((cls, ExitCode.USAGE) for cls in _NOT_POSSIBLE),
+    (NotDelivered, ExitCode.UNDELIVERED),
     (MountFailed, ExitCode.MOUNT_FAILED),
     (NoFtp, ExitCode.NO_VEHICLE),
     (LinkError, ExitCode.NO_VEHICLE),

@@ -1,0 +1,289 @@
+"""oneshot_writing: put, rm, mkdir, rmdir and mv, on a tree in memory."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import pytest
+
+from mavftpfs import oneshot_writing
+from mavftpfs.exits import ExitCode, NotDelivered, exit_code_for
+from mavftpfs.oneshot import Target
+from mavftpfs.oneshot_writing import Sent
+from mavftpfs.report import SilentMeter
+from mavftpfs.shared.errors import (
+    AlreadyExists,
+    CrossDevice,
+    DirectoryNotEmpty,
+    IsADirectory,
+    MavftpfsError,
+    NotADirectory,
+    NotFound,
+    RequestTimeout,
+    UsageError,
+)
+from mavftpfs.shared.model import EntryKind, split
+from tests.ops.faketree import FakeTree
+
+BIG = bytes(range(251)) * 2000
+
+
+class Card(FakeTree):
+    """A tree with the refusals of mkdir and rmdir; can be unable to rename."""
+
+    renames = True
+
+    async def mkdir(self, path: bytes) -> None:
+        try:
+            self.kind_of(path)
+        except NotFound:
+            if self.kind_of(split(path)[0]) is EntryKind.DIRECTORY:
+                await super().mkdir(path)
+                return
+        raise AlreadyExists(f"{path!r} is there")
+
+    async def rmdir(self, path: bytes) -> None:
+        if await self.list(path):
+            raise DirectoryNotEmpty(f"{path!r} is not empty")
+        await super().rmdir(path)
+
+    async def rename(self, old: bytes, new: bytes, *, noreplace: bool = False) -> None:
+        if not self.renames:
+            raise CrossDevice("this server cannot rename")
+        await super().rename(old, new, noreplace=noreplace)
+
+
+@dataclass
+class FakeTarget:
+    """A vehicle that is always there; counts how often it was called up."""
+
+    tree: Card
+    attached_times: int = 0
+
+    @asynccontextmanager
+    async def attached(self) -> AsyncIterator[Any]:
+        self.attached_times += 1
+        yield SimpleNamespace(tree=self.tree)
+
+
+def target_of(tree: Card) -> Target:
+    return cast(Target, FakeTarget(tree))
+
+
+@pytest.fixture
+def local(tmp_path: Path) -> Path:
+    """A directory with something of everything."""
+    root = tmp_path / "d"
+    (root / "e" / "f").mkdir(parents=True)
+    (root / "a").write_bytes(BIG)
+    (root / "e" / "none").write_bytes(b"")
+    with open(os.fsencode(root / "e") + b"/\xff", "wb") as file:
+        file.write(b"3")
+    return root
+
+
+async def put(tree: Card, *locals_: Path, to: bytes, recursive: bool = False) -> list[Sent]:
+    told: list[Sent] = []
+    await oneshot_writing.put_paths(
+        target_of(tree), locals_, to, SilentMeter(), told.append, recursive=recursive
+    )
+    assert all(file.closed for file in tree.opened)
+    return told
+
+
+async def test_a_file_under_a_new_name(local: Path) -> None:
+    tree = Card({b"/x": b"1"})
+    assert await put(tree, local / "a", to=b"/new") == [Sent(b"/new", len(BIG))]
+    assert tree.files == {b"/x": b"1", b"/new": BIG}
+
+
+async def test_a_file_over_another_is_flushed_whole(local: Path) -> None:
+    tree = Card({b"/x": BIG + b"longer"})
+    await put(tree, local / "a", to=b"/x")
+    assert tree.files == {b"/x": BIG}
+    assert ("flush", b"/x") in tree.calls
+
+
+async def test_an_empty_file_is_made(local: Path) -> None:
+    tree = Card({b"/x": b"1"})
+    assert await put(tree, local / "e" / "none", to=b"/x") == [Sent(b"/x", 0)]
+    assert tree.files == {b"/x": b""}
+
+
+async def test_several_files_go_into_a_directory(local: Path) -> None:
+    tree = Card({}, {b"/d"})
+    await put(tree, local / "a", local / "e" / "none", to=b"/d")
+    assert tree.files == {b"/d/a": BIG, b"/d/none": b""}
+
+
+@pytest.mark.parametrize(("to", "place"), [(b"/there", b"/there/d"), (b"/new", b"/new")])
+async def test_a_directory_with_all_below(local: Path, to: bytes, place: bytes) -> None:
+    tree = Card({}, {b"/there"})
+    told = await put(tree, local, to=to, recursive=True)
+    expected = {place + b"/a": BIG, place + b"/e/none": b"", place + b"/e/\xff": b"3"}
+    assert tree.files == expected
+    assert place + b"/e/f" in tree.directories
+    assert {sent.remote for sent in told} == expected.keys()
+
+
+async def test_a_directory_that_is_there_is_filled(local: Path) -> None:
+    tree = Card({b"/d/old": b"1"}, {b"/d/e"})
+    await put(tree, local, to=b"/", recursive=True)
+    assert tree.files[b"/d/old"] == b"1"
+    assert tree.files[b"/d/a"] == BIG
+
+
+async def test_a_file_in_the_way_of_a_directory(local: Path) -> None:
+    with pytest.raises(AlreadyExists):
+        await put(Card({b"/d": b"1"}, {b"/there"}), local, to=b"/d", recursive=True)
+
+
+@pytest.mark.parametrize("what", ["directory", "missing", "fifo", "link to a directory"])
+async def test_what_cannot_be_put_is_said_before_anything_is_sent(
+    local: Path, tmp_path: Path, what: str
+) -> None:
+    place = local
+    match what:
+        case "missing":
+            place = tmp_path / "nothing"
+        case "fifo":
+            os.mkfifo(place := tmp_path / "fifo")
+        case "link to a directory":
+            (local / "e" / "link").symlink_to(local)
+    target = FakeTarget(Card({}, {b"/to"}))
+    with pytest.raises(UsageError) as caught:
+        await oneshot_writing.put_paths(
+            cast(Target, target),
+            [local / "a", place],
+            b"/to",
+            SilentMeter(),
+            lambda sent: None,
+            recursive=what == "link to a directory",
+        )
+    assert "directory" in str(caught.value) or "not there" in str(caught.value)
+    assert target.attached_times == 0
+
+
+async def test_several_files_need_a_directory(local: Path) -> None:
+    tree = Card({b"/x": b"1"})
+    for to in (b"/x", b"/new"):
+        with pytest.raises(NotADirectory):
+            await put(tree, local / "a", local / "e" / "none", to=to)
+    assert tree.files == {b"/x": b"1"}
+
+
+@pytest.mark.parametrize("call", ["create", "write", "flush"])
+async def test_what_does_not_arrive_is_undelivered(local: Path, call: str) -> None:
+    tree = Card({}, {b"/d"})
+
+    def refuse(name: str, path: bytes) -> None:
+        if name == call and path.endswith(b"\xff"):
+            raise RequestTimeout("no answer")
+
+    tree.on_call = refuse
+    with pytest.raises(NotDelivered, match=r"xff was not delivered: no answer; 2 file\(s\)") as caught:
+        await put(tree, local, to=b"/d", recursive=True)
+    assert exit_code_for(caught.value) is ExitCode.UNDELIVERED
+    assert all(file.closed for file in tree.opened)
+
+
+# -- names ----------------------------------------------------------------------------------------
+
+
+async def mkdir(tree: Card, *paths: bytes, parents: bool = False) -> None:
+    await oneshot_writing.make_directories(target_of(tree), paths, parents=parents)
+
+
+async def test_mkdir() -> None:
+    tree = Card({b"/f": b""})
+    await mkdir(tree, b"/a", b"/a/b")
+    assert tree.directories == {b"/a", b"/a/b"}
+    for path, error in ((b"/a", AlreadyExists), (b"/x/y", NotFound), (b"/f/x", NotADirectory)):
+        with pytest.raises(error):
+            await mkdir(tree, path)
+
+
+async def test_mkdir_with_parents() -> None:
+    tree = Card({b"/f": b""}, {b"/a"})
+    await mkdir(tree, b"/a/b/c", b"/a", b"/", parents=True)
+    assert tree.directories == {b"/a", b"/a/b", b"/a/b/c"}
+    with pytest.raises(AlreadyExists):
+        await mkdir(tree, b"/f", parents=True)
+
+
+async def test_rmdir() -> None:
+    tree = Card({b"/full/f": b""}, {b"/empty"})
+    await oneshot_writing.remove_directories(target_of(tree), [b"/empty"])
+    assert tree.directories == set()
+    with pytest.raises(DirectoryNotEmpty):
+        await oneshot_writing.remove_directories(target_of(tree), [b"/full"])
+
+
+async def rm(tree: Card, *paths: bytes, recursive: bool = False) -> None:
+    await oneshot_writing.remove_paths(target_of(tree), paths, recursive=recursive)
+
+
+async def test_rm_of_files_and_of_all_below() -> None:
+    tree = Card({b"/a": b"", b"/d/x": b"", b"/d/e/y": b"", b"/keep": b""}, {b"/d", b"/d/e", b"/d/e/f"})
+    await rm(tree, b"/a")
+    await rm(tree, b"/d", recursive=True)
+    assert (tree.files, tree.directories) == ({b"/keep": b""}, set())
+
+
+@pytest.mark.parametrize(
+    ("paths", "recursive", "error"),
+    [
+        ([b"/a", b"/d"], False, IsADirectory),
+        ([b"/a", b"/nothing"], True, NotFound),
+        ([b"/a", b"/"], True, UsageError),
+    ],
+)
+async def test_rm_looks_before_it_removes(
+    paths: list[bytes], recursive: bool, error: type[MavftpfsError]
+) -> None:
+    tree = Card({b"/a": b"", b"/d/x": b""})
+    with pytest.raises(error):
+        await rm(tree, *paths, recursive=recursive)
+    assert tree.files == {b"/a": b"", b"/d/x": b""}
+
+
+async def mv(tree: Card, *paths: bytes, to: bytes) -> None:
+    await oneshot_writing.move_paths(target_of(tree), paths, to)
+
+
+async def test_mv_to_a_name_and_into_a_directory() -> None:
+    tree = Card({b"/a": b"1", b"/b": b"2", b"/c": b"3"}, {b"/d"})
+    await mv(tree, b"/a", to=b"/x")
+    await mv(tree, b"/b", b"/c", to=b"/d")
+    assert tree.files == {b"/x": b"1", b"/d/b": b"2", b"/d/c": b"3"}
+    with pytest.raises(NotADirectory):
+        await mv(tree, b"/x", b"/d", to=b"/nothing")
+
+
+async def test_mv_copies_where_the_server_cannot_rename() -> None:
+    tree = Card({b"/d/a": BIG, b"/d/e/b": b"", b"/x": b"1"}, {b"/d", b"/d/e"})
+    tree.renames = False
+    await mv(tree, b"/d", to=b"/new")
+    assert tree.files == {b"/new/a": BIG, b"/new/e/b": b"", b"/x": b"1"}
+    assert b"/d" not in tree.directories
+    assert all(file.closed for file in tree.opened)
+
+
+async def test_mv_keeps_the_old_file_until_the_new_one_is_there() -> None:
+    tree = Card({b"/a": BIG})
+    tree.renames = False
+
+    def refuse(name: str, path: bytes) -> None:
+        if name == "flush":
+            raise RequestTimeout("no answer")
+
+    tree.on_call = refuse
+    with pytest.raises(RequestTimeout):
+        await mv(tree, b"/a", to=b"/new")
+    assert tree.files[b"/a"] == BIG
