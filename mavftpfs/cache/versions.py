@@ -165,8 +165,6 @@ class Fetcher:
         return await self._settling.run(version, partial(self._settle_once, version))
 
     async def _settle_once(self, version: Version) -> bool:
-        if version.blocks.suspicion is None:
-            return True
         if await self._agrees(version):
             version.close_reader()  # it may be under suspicion by now; nobody waits on it, all is held
             version.blocks.accept()

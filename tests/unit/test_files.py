@@ -267,6 +267,22 @@ async def test_without_mtime_the_proof_lasts_dir_timeout(
     assert store.count("open") == 2
 
 
+@pytest.mark.parametrize("grown", [False, True])
+async def test_a_newer_listing_can_end_a_recent_proof(
+    store: FakeStore, tree: Tree, autojump_clock: MockClock, grown: bool
+) -> None:
+    store.add(LOG, DATA)
+    await read_file(tree, LOG)
+    await trio.sleep(5)
+    tree._dentries.expire_all(trio.current_time())
+    if grown:
+        store.add(LOG, DATA + b"more")
+    handle = await tree.open(LOG)
+    assert handle.keep_cache is not grown
+    assert handle.size == len(store.files[LOG].data)
+    assert store.count("open") == (2 if grown else 1)
+
+
 async def test_a_changed_mtime_starts_a_new_version(
     store: FakeStore, tree: Tree, autojump_clock: MockClock
 ) -> None:
@@ -348,7 +364,9 @@ async def test_a_grown_file_is_served_at_its_opened_size(
     assert await new.read(len(DATA), 100) == b"more"
     assert await old.read(0, 10**6) == DATA
     assert await old.read(len(DATA), 100) == b""
+    held = int(str(tree.status()["bytes_cached"]))
     old.close()
+    assert int(str(tree.status()["bytes_cached"])) == held - len(DATA)
     new.close()
     assert all(reader.closed for reader in store.readers)
 
@@ -453,6 +471,10 @@ async def test_after_a_reboot_open_files_are_compared_first(
     assert await same.read(0, 1000) == DATA[:1000]
     with pytest.raises(FileChanged):
         await other.read(0, 1000)
+    await trio.sleep(25)
+    asked = len(store.calls)
+    await same.read(0, 1000)
+    assert len(store.calls) == asked
 
 
 async def test_a_file_that_is_gone_after_a_reboot(
@@ -655,6 +677,35 @@ async def test_readers_share_the_bad_news_too(store: FakeStore, autojump_clock: 
         for at in range(0, 300_000, 100_000):
             readers.start_soon(read, at)
     assert results == [True] * 3
+
+
+async def test_bytes_of_an_earlier_reader_are_not_in_doubt(
+    store: FakeStore, tree: Tree, autojump_clock: MockClock
+) -> None:
+    store.armed = True
+    first = await tree.open(LOG)
+    await first.read(0, 1000)
+    first.close()
+    handle = await tree.open(LOG)
+    store.suspect_chunks = 10**6
+    with pytest.raises(DataUnproven):
+        await handle.read(200_000, 1000)
+    store.stalled = True
+    assert await handle.read(0, 1000) == DATA[:1000]
+
+
+async def test_a_checksum_that_agrees_proves_the_version_anew(
+    store: FakeStore, tree: Tree, autojump_clock: MockClock
+) -> None:
+    store.add(LOG, DATA)
+    handle = await tree.open(LOG)
+    await trio.sleep(15)
+    store.suspect_chunks = 1
+    await handle.read(0, 1000)
+    assert all(reader.closed for reader in store.readers)
+    handle.close()
+    await trio.sleep(15)
+    assert (await tree.open(LOG)).keep_cache
 
 
 async def test_doubtful_bytes_do_not_survive_the_last_close(
