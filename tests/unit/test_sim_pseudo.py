@@ -157,6 +157,13 @@ def test_nothing_else_can_be_changed(opcode: int) -> None:
     assert nak(c.ask(Opcode.RENAME, b"/fs\0@SYS/x")) == refused
 
 
+def test_virtual_files_cannot_be_truncated() -> None:
+    c = Client("px4-2026")
+    nak(c.ask(Opcode.TRUNCATE_FILE, PARAM, offset=3))
+    ack(c.ask(Opcode.LIST_DIRECTORY, b"/"))
+    assert nak(c.ask(Opcode.REMOVE_FILE, PARAM)) == bytes([NakCode.FAIL_ERRNO, errno.EROFS])
+
+
 def test_there_are_no_virtual_trees_elsewhere() -> None:
     assert nak(Client("px4").ask(Opcode.LIST_DIRECTORY, b"@SYS")) == NOT_FOUND
     assert nak(Client("mavsdk").ask(Opcode.OPEN_FILE_RO, PARAM)) == NOT_FOUND

@@ -112,6 +112,32 @@ def test_reboot_forgets_sessions_slot_and_errno() -> None:
     assert nak(c.ask(Opcode.TERMINATE_SESSION, seq=c.seq)) == bytes([NakCode.INVALID_SESSION])
 
 
+def test_reboot_forgets_what_waited_and_starts_its_ticks_anew() -> None:
+    c = client("px4-nuttx", stall_chance=1.0)
+    c.open(A)
+    for _ in range(100):
+        c.send(Opcode.READ_FILE, size=100)
+    dropped = c.server.dropped_requests
+    assert dropped > 0
+    c.now += 0.005
+    c.server.reboot(c.now)
+    assert c.receive(60.0) == []
+    ack(c.ask(Opcode.NONE))
+    for _ in range(dropped):
+        c.send(Opcode.NONE)
+    assert c.server.dropped_requests == dropped, "the receive buffer is empty again"
+    c.receive(1.0)
+    assert nak(c.ask(Opcode.BURST_READ_FILE)) == bytes([NakCode.EOF]), "and no file has a size"
+
+
+def test_closed_files_are_closed_and_their_errors_ignored() -> None:
+    c = client("px4-2026")
+    for _ in range(6):
+        c.open(b"@PARAM/param.pck", Opcode.CREATE_FILE)
+        ack(c.ask(Opcode.WRITE_FILE, b"rubbish"))
+        ack(c.ask(Opcode.TERMINATE_SESSION))
+
+
 # -- the replay slot -----------------------------------------------------------------------------
 
 
@@ -135,6 +161,10 @@ def test_the_slot_looks_at_nothing_but_seq() -> None:
     assert target == Address(255, 190)
     assert isinstance(c.tree, MemoryTree)
     assert c.tree.data(A)
+    nak(c.ask(Opcode.RENAME, b"/none\0/there"))
+    c.source = Address(1, 2)
+    c.send(Opcode.NONE, seq=c.seq)
+    assert c.server.outgoing(c.now)[0][0] == OTHER, "a repeat goes to whom the first went"
 
 
 def test_large_replies_clear_the_slot() -> None:
@@ -349,6 +379,16 @@ def test_a_burst_with_no_file_open() -> None:
     assert nak(c.ask(Opcode.BURST_READ_FILE)) == bytes([NakCode.FAIL_ERRNO, 0])
 
 
+def test_replies_that_wait_use_up_the_room() -> None:
+    c = burst_client(1000)
+    c.server.tx_room = lambda: 300
+    for i in range(3):
+        c.send(Opcode.READ_FILE, size=100, offset=i)
+    assert len(c.receive(0.01)) == 2
+    assert c.server.dropped_replies == 1
+    assert len(c.ask_all(Opcode.READ_FILE, size=100)) == 1
+
+
 def test_replies_without_room_are_lost() -> None:
     c = burst_client(1000)
     c.server.tx_room = lambda: 20
@@ -446,6 +486,17 @@ def test_nuttx_renames_into_directories_and_over_files() -> None:
     assert c.tree.data(DIR + b"/five") == b"\x05"
     ack(c.ask(Opcode.RENAME, DIR + b"/five\0" + A))
     assert c.tree.data(A) == b"\x05"
+
+
+def test_nuttx_renames_nothing_over_nothing() -> None:
+    c = prompt()
+    refused = nak(c.ask(Opcode.RENAME, b"/fs/microsd/none\0" + A))
+    assert refused == bytes([NakCode.FILE_NOT_FOUND])
+    assert c.tree.stat(A).size == 1024, "the target was not unlinked first"
+    for data in (FIVE + b"\0/fs/microsd/a:b", FIVE + b"\0/fs/microsd/a?"):
+        assert nak(c.ask(Opcode.RENAME, data)) == bytes([NakCode.FAIL_ERRNO, errno.EINVAL])
+    refused = nak(c.ask(Opcode.CREATE_DIRECTORY, b"/fs/microsd/a*"))
+    assert refused == bytes([NakCode.FAIL_ERRNO, errno.EINVAL])
 
 
 def test_nuttx_mkdir_below_a_missing_directory_is_eio() -> None:

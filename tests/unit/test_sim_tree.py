@@ -223,3 +223,36 @@ def test_memory_tree_has_things_that_are_no_files() -> None:
     tree.add_other(b"/fifo")
     assert tree.stat(b"/fifo").kind is Kind.OTHER
     assert failure(lambda: tree.open(b"/fifo")) == errno.ENXIO
+
+
+def test_memory_tree_tells_directory_times() -> None:
+    times = iter(range(1, 100))
+    tree = MemoryTree(clock=lambda: float(next(times)))
+    tree.add_directory(b"/dated", mtime=77)
+    assert tree.stat(b"/dated").mtime == 77
+    tree.add_directory(b"/dir")
+    before = tree.stat(b"/dir").mtime
+    tree.add(b"/dir/file")
+    after = tree.stat(b"/dir").mtime
+    assert after > before
+    tree.remove(b"/dir/file")
+    assert tree.stat(b"/dir").mtime > after
+    assert [entry.name for entry in tree.entries(b"/dir")] == [b".", b".."]
+
+
+def test_directory_tree_closes_its_files(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "fifo")
+    tree = DirectoryTree(tmp_path)
+    before = len(os.listdir("/proc/self/fd"))
+    put(tree, b"/file", b"x")
+    assert failure(lambda: tree.open(b"/fifo")) == errno.ENXIO
+    assert len(os.listdir("/proc/self/fd")) == before
+
+
+def test_renamed_file_still_counts_against_the_capacity() -> None:
+    tree = MemoryTree(capacity=10)
+    tree.add(b"/a", b"123456")
+    tree.rename(b"/a", b"/b")
+    opened = tree.open(b"/b", write=True)
+    assert opened.write(6, b"xxxxxx") == 4
+    assert tree.used == 10
