@@ -143,7 +143,7 @@ class _Putter:
             while data := source.read(READ_SIZE):
                 offset += await file.write(offset, data)
                 advance(len(data))
-            await file.flush()
+            await file.fsync()
         finally:
             file.close()
         return offset
@@ -278,7 +278,7 @@ async def _copy(tree: Tree, old: bytes, new: bytes) -> None:
             offset = 0
             while offset < source.size:
                 offset += await file.write(offset, bytes(await source.read(offset, READ_SIZE)))
-            await file.flush()
+            await file.fsync()
         finally:
             file.close()
     finally:

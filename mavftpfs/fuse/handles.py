@@ -10,7 +10,8 @@ from mavftpfs.shared.model import EntryKind
 
 
 class Stat(Protocol):
-    """What the tree says of one path. size in bytes, mtime in seconds UTC, valid_for in seconds."""
+    """What the tree says of one path. size in bytes, mtime in seconds UTC and mtime_nsec to add to them,
+    valid_for in seconds."""
 
     @property
     def kind(self) -> EntryKind: ...
@@ -18,6 +19,8 @@ class Stat(Protocol):
     def size(self) -> int: ...
     @property
     def mtime(self) -> int: ...
+    @property
+    def mtime_nsec(self) -> int: ...
     @property
     def valid_for(self) -> float: ...
 

@@ -354,5 +354,6 @@ class Operations(pyfuse3.Operations):
         entry.st_size = found.size
         entry.st_blksize = BLOCK_SIZE
         entry.st_blocks = -(-found.size // STAT_BLOCK)
-        entry.st_atime_ns = entry.st_mtime_ns = entry.st_ctime_ns = found.mtime * 1_000_000_000
+        mtime_ns = found.mtime * 1_000_000_000 + found.mtime_nsec
+        entry.st_atime_ns = entry.st_mtime_ns = entry.st_ctime_ns = mtime_ns
         return entry

@@ -122,14 +122,13 @@ class WritingOperations(Operations):
         handle = self.files.remove(fh)
         if handle is None:
             return
-        file = _writable(handle)
+        file = cast(WritableFile, handle.file)
         try:
-            if file is not None:
-                await file.release()
+            await file.release()  # also of a reader: the last one of an unlinked file has it removed
         except MavftpfsError as exc:
-            log.warning("a closed file is not delivered yet: %s", exc)
+            log.warning("a closed file is not finished on the vehicle yet: %s", exc)
         finally:
-            handle.file.close()
+            file.close()
 
     # -- attributes -------------------------------------------------------------------------------
 
@@ -273,7 +272,8 @@ class WritingOperations(Operations):
             entry.st_uid = kept.uid
         if kept.gid is not None:
             entry.st_gid = kept.gid
-        entry.st_mtime_ns = entry.st_ctime_ns = kept.shown_mtime_ns(found.mtime)
+        if not found.mtime_nsec:  # else the tree knows it to the nanosecond
+            entry.st_mtime_ns = entry.st_ctime_ns = kept.shown_mtime_ns(found.mtime)
         if found.kind is EntryKind.DIRECTORY and kept.mtime_ns is not None:
             entry.st_mtime_ns = kept.mtime_ns
         entry.st_atime_ns = entry.st_mtime_ns if kept.atime_ns is None else kept.atime_ns

@@ -78,6 +78,7 @@ class FakeTree:
     keep_cache: bool = False
     opened: list[FakeFile] = field(default_factory=list)
     times: dict[bytes, int] = field(default_factory=dict)
+    nanoseconds: int = 0
     left: list[bytes] = field(default_factory=list)
     on_call: Callable[[str, bytes], None] = lambda name, path: None
 
@@ -104,7 +105,7 @@ class FakeTree:
     def stat_now(self, path: bytes) -> Stat:
         kind = self.kind_of(path)
         size = len(self.files[path]) if kind is EntryKind.FILE else 0
-        return Stat(kind, size, self.times.get(path, MTIME), self.valid_for)
+        return Stat(kind, size, self.times.get(path, MTIME), self.valid_for, self.nanoseconds)
 
     async def stat(self, path: bytes) -> Stat:
         await self.pause("stat", path)

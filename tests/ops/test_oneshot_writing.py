@@ -103,11 +103,11 @@ async def test_a_file_under_a_new_name(local: Path) -> None:
     assert tree.files == {b"/x": b"1", b"/new": BIG}
 
 
-async def test_a_file_over_another_is_flushed_whole(local: Path) -> None:
+async def test_a_file_over_another_is_synced_whole(local: Path) -> None:
     tree = Card({b"/x": BIG + b"longer"})
     await put(tree, local / "a", to=b"/x")
     assert tree.files == {b"/x": BIG}
-    assert ("flush", b"/x") in tree.calls
+    assert ("fsync", b"/x") in tree.calls
 
 
 async def test_an_empty_file_is_made(local: Path) -> None:
@@ -178,7 +178,7 @@ async def test_several_files_need_a_directory(local: Path) -> None:
     assert tree.files == {b"/x": b"1"}
 
 
-@pytest.mark.parametrize("call", ["create", "write", "flush"])
+@pytest.mark.parametrize("call", ["create", "write", "fsync"])
 async def test_what_does_not_arrive_is_undelivered(local: Path, call: str) -> None:
     tree = Card({}, {b"/d"})
 
@@ -280,7 +280,7 @@ async def test_mv_keeps_the_old_file_until_the_new_one_is_there() -> None:
     tree.renames = False
 
     def refuse(name: str, path: bytes) -> None:
-        if name == "flush":
+        if name == "fsync":
             raise RequestTimeout("no answer")
 
     tree.on_call = refuse

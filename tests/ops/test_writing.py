@@ -74,7 +74,17 @@ async def test_a_read_handle_is_never_flushed_and_cannot_write() -> None:
     await ops.fsync(info.fh, True)
     assert await failure(ops.write(info.fh, 0, b"x")) == errno.EBADF
     await ops.release(info.fh)
-    assert {name for name, _ in tree.calls} <= {"stat", "open"}
+    assert {name for name, _ in tree.calls} <= {"stat", "open", "release"}
+
+
+async def test_an_unlinked_file_that_is_only_read_is_released_too() -> None:
+    tree = some_tree()
+    ops = operations(tree)
+    info = await ops.open(await ino_of(ops, b"a.txt"), os.O_RDONLY, CTX)
+    await ops.unlink(ROOT_INO, b"a.txt", CTX)
+    await ops.release(info.fh)
+    assert ("release", b"/a.txt") in tree.calls
+    assert tree.opened[0].closed == 1
 
 
 async def test_truncation_comes_in_the_open_flags_and_append_follows_our_size() -> None:
@@ -143,6 +153,8 @@ async def test_modes_owners_and_times_are_kept_and_follow_a_rename() -> None:
     assert (entry.st_atime_ns, entry.st_mtime_ns) == (5 * NANO + 1, 6 * NANO + 2)
     tree.times[b"/b.txt"] = 99  # changed on the vehicle
     assert (await ops.getattr(ino, CTX)).st_mtime_ns == 99 * NANO
+    tree.nanoseconds = 7
+    assert (await ops.getattr(ino, CTX)).st_mtime_ns == 99 * NANO + 7
 
 
 async def test_a_removed_name_forgets_what_was_kept() -> None:
