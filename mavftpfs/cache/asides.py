@@ -228,7 +228,7 @@ def leftovers(
 
 
 def repair(group: Group, *, target_exists: bool) -> list[Action]:
-    """Return the steps that undo or complete an interrupted replacement, in order; any may be the last one done.
+    """Return the steps that undo or complete an interrupted replacement; any may be the last one done.
 
     `target_exists` is asked for groups with a target. Without one (the sidecar is missing or unreadable) what
     is the only copy of something is renamed to where a person finds it.

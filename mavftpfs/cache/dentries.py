@@ -21,6 +21,9 @@ from mavftpfs.shared.model import DirEntry, Listing, split, usable_name
 COST_FACTOR = 50
 """A listing that took T seconds is fresh for at least COST_FACTOR * T: it costs at most 2 % of the link."""
 
+STILL_GROWING = 30.0
+"""A file that was seen to grow is taken to be open on the vehicle for so many seconds."""
+
 MAX_ABSENT = 4096
 """How many single absences (found by probing, not by a listing) are remembered."""
 
@@ -30,6 +33,7 @@ class Directory:
     """A remembered listing.
 
     entries: by name, as listed. sizes: what opening told about an entry since, which beats the listing.
+    growing: when a file was last seen to be larger than before, though we did not write it.
     listed_at: when the sweep began; fresh_until: after that it proves nothing.
     complete: whether a name that is not in it is absent.
     """
@@ -39,6 +43,7 @@ class Directory:
     fresh_until: float
     complete: bool
     sizes: dict[bytes, int] = field(default_factory=dict)
+    growing: dict[bytes, float] = field(default_factory=dict)
 
     def size_of(self, name: bytes) -> int | None:
         """Return the best known size of a listed name in bytes, None if nothing told it."""
@@ -128,6 +133,7 @@ class Dentries:
         life = max(self._dir_timeout, COST_FACTOR * listing.took)
         doubtful = sweep.reshaped or sweep.void
         directory = Directory(entries, sweep.began, now if doubtful else now + life, complete)
+        directory.growing = self._growing(sweep, directory, now)
         if not sweep.void:
             self._store(sweep.path, directory)
         return directory
@@ -160,12 +166,21 @@ class Dentries:
 
     # --- what is learnt besides
 
-    def learn_size(self, path: bytes, size: int) -> None:
-        """An open told the size: it beats the listing until the next one. No change of ours."""
+    def learn_size(self, path: bytes, size: int, now: float | None = None) -> None:
+        """An open told the size (`now`): it beats the listing until the next one. No change of ours."""
         parent, name = split(path)
         directory = self._directories.get(parent)
         if directory is not None and name in directory.entries:
+            before = directory.size_of(name)
             directory.sizes[name] = size
+            if now is not None and before is not None and size > before:
+                directory.growing[name] = now
+
+    def is_growing(self, path: bytes, now: float) -> bool:
+        """Return whether somebody on the vehicle seems to write the file."""
+        parent, name = split(path)
+        directory = self._directories.get(parent)
+        return directory is not None and now - directory.growing.get(name, float("-inf")) < STILL_GROWING
 
     def note_absent(self, path: bytes, until: float) -> None:
         """A probe found that the path does not exist."""
@@ -227,6 +242,7 @@ class Dentries:
             self._weight -= directory.weight
             _put(directory.entries, name, entry)
             directory.sizes.pop(name, None)
+            directory.growing.pop(name, None)
             self._weight += directory.weight
 
     def _doubt(self, path: bytes) -> None:
@@ -236,6 +252,18 @@ class Dentries:
         directory = self._directories.get(path)
         if directory is not None:
             directory.fresh_until = float("-inf")
+
+    def _growing(self, sweep: Sweep, new: Directory, now: float) -> dict[bytes, float]:
+        """Return which files grew since the last listing without us, or did a short while ago."""
+        old = self._directories.get(sweep.path)
+        if old is None:
+            return {}
+        growing = {name: at for name, at in old.growing.items() if now - at < STILL_GROWING}
+        for name in old.entries.keys() & new.entries.keys():
+            before, after = old.size_of(name), new.size_of(name)
+            if before is not None and after is not None and after > before:
+                growing[name] = now
+        return {name: at for name, at in growing.items() if name not in sweep.changes}
 
     def _store(self, path: bytes, directory: Directory) -> None:
         old = self._directories.pop(path, None)

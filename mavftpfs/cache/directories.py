@@ -6,7 +6,7 @@ Only a path that its parent's listing shows as a directory is listed: listing a 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from functools import partial
 
@@ -60,6 +60,7 @@ class Directories:
         self._flights: Flights[bytes, Directory] = Flights(nursery)
         self._root_proven = root == ROOT
         self._dot_shows_files: bool | None = None
+        self.on_swept: Callable[[bytes, Directory], Awaitable[None]] | None = None
         self.lost = False
         self.sweeps = 0
         self.served_stale = 0
@@ -97,12 +98,29 @@ class Directories:
             return stale
         try:
             await self._require_directory(path)
-            return await self._flights.run(path, partial(self._sweep, path))
+            directory = await self._flights.run(path, partial(self._sweep, path))
         except VehicleLost:
             if stale is None:
                 raise
             self.served_stale += 1
             return stale
+        if self.on_swept is not None:
+            await self.on_swept(path, directory)
+        return directory
+
+    async def ask(self, path: bytes) -> Directory:
+        """Return a directory's listing asked for just now.
+
+        Raises:
+            As get; VehicleLost instead of an old listing.
+        """
+        asked = self._clock()
+        self._dentries.expire(path, asked)
+        for _ in range(SWEEP_TRIES):
+            directory = await self.get(path)
+            if directory.listed_at >= asked:
+                return directory
+        raise VehicleLost("the vehicle does not answer")
 
     def rebooted(self) -> None:
         """What was learnt of the server's ways may no longer hold."""

@@ -67,7 +67,14 @@ class Draft:
     @property
     def clean(self) -> bool:
         """Whether the vehicle has it all."""
-        return self._changed.empty and self.size == self.remote_size
+        return self._changed.empty and self.size == self.remote_end
+
+    @property
+    def remote_end(self) -> int | None:
+        """The size of the file on the vehicle, None if there is none; it may have grown under an attempt."""
+        if self.remote_size is None or self.sending is None or self.sending.whole:
+            return self.remote_size
+        return max(self.remote_size, self.sending.reached)
 
     @property
     def fresh(self) -> bool:
@@ -172,12 +179,14 @@ class Draft:
 
     def begin(self, *, whole: bool) -> Sending:
         """Start an attempt: at an empty remote file (`whole`), or at the base with what changed of it."""
+        self.begin_again()
         extents = [(0, self.size)] if whole else list(self._changed)
         self.sending = Sending(self.local_bytes, extents, whole=whole)
         return self.sending
 
     def begin_again(self) -> None:
         """The attempt is given up."""
+        self.remote_size = self.remote_end
         self.sending = None
 
     def delivered(self) -> None:

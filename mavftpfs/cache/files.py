@@ -14,7 +14,7 @@ handles of a path, so a new version bypasses it (direct_io) while handles of an 
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Iterable
 from functools import partial
 from itertools import islice
 
@@ -198,6 +198,45 @@ class Files:
         version.recheck = False
         if _became_another(version, entry):
             self._kill(version)
+
+    # --- we changed the file ourselves
+
+    def cached(self, path: bytes) -> FileBlocks | None:
+        """Return what is cached of a path's present version."""
+        version = self._current.get(path)
+        return None if version is None or version.dead is not None else version.blocks
+
+    def on_written(self, path: bytes) -> None:
+        """What was cached of the path is no longer the file; who has it open opens it anew."""
+        version = self._current.pop(path, None)
+        if version is not None:
+            version.dead = FileChanged(f"{path!r} was written")
+            version.close_reader()
+            version.blocks.on_failed(version.dead)
+            version.blocks.clear()
+
+    def adopt(self, path: bytes, size: int, pieces: Iterable[tuple[int, bytes]]) -> None:
+        """Take over the content of a file we wrote: (offset, bytes) of all of it, proven on the vehicle."""
+        self.on_written(path)
+        blocks = FileBlocks(self._cache, size)
+        for offset, data in pieces:
+            blocks.preload(offset, data)
+        self._replace(path, Version(path, None, blocks, self._clock(), shown=True))
+
+    def on_renamed(self, old: bytes, new: bytes) -> None:
+        """A file, or a directory with all below it, has another path now; open files follow."""
+        self.on_removed(new)
+        moved = [path for path in self._current if path == old or path.startswith(old + b"/")]
+        for path in moved:
+            version = self._current.pop(path)
+            version.close_reader()
+            version.path = new + path[len(old) :]
+            self._current[version.path] = version
+
+    def on_removed(self, path: bytes) -> None:
+        """A file, or an empty directory, is gone."""
+        for known in [p for p in self._current if p == path or p.startswith(path + b"/")]:
+            self.on_written(known)
 
     # --- closing
 

@@ -14,6 +14,10 @@ MIN_CACHE_SIZE = MIB
 """Below this, a few of the kernel's read requests would not fit beside each other."""
 
 
+DEFAULT_LOCAL = (".*.sw?", "4913", ".~lock*", ".Trash-*", "._*")
+"""What editors and file managers leave beside the files they work on."""
+
+
 @dataclass(frozen=True, slots=True)
 class CacheOptions:
     """Times in seconds, sizes in bytes.
@@ -26,6 +30,13 @@ class CacheOptions:
     at_stat_limit: an `@SYS` file listed as larger than this is not read to answer a stat.
     probe_time: how long listing an `@` directory may spend on finding out which entries open.
     op_deadline: a read ends when none of its bytes came for so long.
+    dirty_max: written bytes that may wait in memory, and un-ACKed before writers wait; None = about ten
+    seconds of the measured rate. spool_max: bytes that may wait on the local disk.
+    rmw_max: the largest file that is sent whole for a change of a part of it.
+    verify: auto, size, crc (an unanswered CRC32 is an error) or none; verify_max: largest file whose CRC32 is
+    asked. write_armed: change things in flight too. force: change files that somebody else writes.
+    inplace: overwrite files where they cannot be replaced. local: patterns of names that never reach the
+    vehicle; local_max: bytes they may take.
 
     Raises:
         UsageError: a value is out of range.
@@ -42,11 +53,21 @@ class CacheOptions:
     at_stat_limit: int = 128 * KIB
     probe_time: float = 3.0
     op_deadline: float = 30.0
+    dirty_max: int | None = None
+    spool_max: int = 1024 * MIB
+    rmw_max: int = 64 * MIB
+    verify: str = "auto"
+    verify_max: int = 4 * MIB
+    write_armed: bool = False
+    force: bool = False
+    inplace: bool = False
+    local: tuple[str, ...] = DEFAULT_LOCAL
+    local_max: int = 16 * MIB
 
     def __post_init__(self) -> None:
         for field in fields(self):
             value = getattr(self, field.name)
-            if not isinstance(value, bytes) and not value >= 0:
+            if isinstance(value, int | float) and not value >= 0:
                 raise UsageError(f"{field.name} may not be negative")
         if self.cache_size < MIN_CACHE_SIZE:
             raise UsageError(f"cache_size may not be less than {MIN_CACHE_SIZE} bytes")

@@ -58,11 +58,12 @@ def choose(draft: Draft, traits: WriteTraits, rules: Rules) -> Plan:
         return Plan.NOTHING
     if draft.size == 0:
         return Plan.CREATE_EMPTY
-    if draft.remote_size is None:
+    remote_size = draft.remote_end
+    if remote_size is None:
         return Plan.NEW
     if draft.fresh:
         return _replacement(traits, rules)
-    return _partial(draft, draft.remote_size, traits, rules)
+    return _partial(draft, remote_size, traits, rules)
 
 
 def _partial(draft: Draft, remote_size: int, traits: WriteTraits, rules: Rules) -> Plan:
@@ -80,7 +81,8 @@ def _rewriting(draft: Draft, traits: WriteTraits, rules: Rules) -> Plan:
     """Send the whole file although part of it is there."""
     if draft.size > rules.rmw_max:
         raise FileTooLarge(f"changing a part of {draft.size} bytes means sending them all; see rmw_max")
-    return _replacement(traits, rules) if draft.whole else Plan.FILL
+    replacement = _replacement(traits, rules)
+    return replacement if draft.whole else Plan.FILL
 
 
 def _replacement(traits: WriteTraits, rules: Rules) -> Plan:

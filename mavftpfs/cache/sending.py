@@ -25,6 +25,7 @@ class Sending:
         unacked: bytes not ACKed yet.
         reached: one past the highest byte that may have been written to the remote file.
         whole: the attempt began with an empty remote file, so a rollback of everything means all of it.
+        progress: told how many bytes were ACKed.
         emptied: the remote file was emptied under us though its old bytes were to stay.
     """
 
@@ -34,6 +35,7 @@ class Sending:
         self._read = read
         self.whole = whole
         self.emptied = False
+        self.progress: Callable[[int], None] | None = None
         self.reached = 0
         self._dirty = ExtentSet(extents)
         self._in_flight = ExtentSet()
@@ -80,6 +82,8 @@ class Sending:
 
     def on_acked(self, offset: int, count: int) -> None:
         """See cache.remote.UploadSource."""
+        if self.progress is not None:
+            self.progress(count)
         for start, stop in self._in_flight.intersection(offset, offset + count):
             self._in_flight.discard(start, stop)
             for a, b in self._dirty.missing(start, stop):

@@ -109,7 +109,7 @@ class Spool:
     def __init__(
         self, *, memory_max: Callable[[], int], spool_max: int, directory: Path | None = None
     ) -> None:
-        """`memory_max()` bytes in memory, `spool_max` on disk; without a directory one is made when needed."""
+        """`memory_max()` bytes in memory, `spool_max` on disk, in `directory` or one made when needed."""
         self._memory_max = memory_max
         self._spool_max = spool_max
         self._directory = directory

@@ -7,16 +7,17 @@ modules behind it name them as the vehicle does.
 
 from __future__ import annotations
 
-from collections import OrderedDict
+import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from random import Random
 
 import trio
 
 from mavftpfs.cache.attributes import UNKNOWN_MTIME, Stat, shown_mtime
 from mavftpfs.cache.blocks import BlockCache
+from mavftpfs.cache.checksums import Checksums
 from mavftpfs.cache.dentries import Dentries
 from mavftpfs.cache.directories import Directories, Found
 from mavftpfs.cache.files import Files
@@ -24,22 +25,14 @@ from mavftpfs.cache.flights import Flights
 from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.options import CacheOptions
 from mavftpfs.cache.remote import RemoteStore, WriteStore
+from mavftpfs.cache.spool import SpoolDirectory
 from mavftpfs.cache.virtual import VirtualTrees, is_snapshot
 from mavftpfs.cache.writeback import Writeback
+from mavftpfs.cache.writing import make_writeback
 from mavftpfs.shared.errors import FtpNak, IsADirectory, ReadOnly, VehicleLost
 from mavftpfs.shared.model import ROOT, DirEntry, EntryKind, is_virtual, join, normalise
 
 __all__ = ["OpenFile", "Stat", "Tree"]
-
-MAX_CHECKSUMS = 1024
-
-
-@dataclass(frozen=True, slots=True)
-class _Checksum:
-    size: int
-    mtime: int | None
-    value: int
-    asked_at: float
 
 
 class Tree:
@@ -57,11 +50,15 @@ class Tree:
         invalidate: Callable[[bytes], None],
         nursery: trio.Nursery | None = None,
         writer: WriteStore | None = None,
+        spool: SpoolDirectory | None = None,
+        wall: Callable[[], float] = time.time,
+        rng: Random | None = None,
     ) -> None:
         """`invalidate(path)`: the kernel's pages and attributes of a path are wrong; must not block.
 
         With a nursery, listings and snapshots under way survive the cancellation of who asked for them, and
         written bytes go to the vehicle while the program still writes. Without a writer all is read-only.
+        `spool` keeps what is not delivered; `wall`: seconds since 1970; `rng` numbers our temporary names.
         """
         self._store = store
         self._options = options
@@ -88,10 +85,24 @@ class Tree:
             nursery=nursery,
         )
         self._learning: Flights[bytes, int] = Flights()
-        self._checksums: OrderedDict[bytes, _Checksum] = OrderedDict()
-        self._summing: Flights[bytes, int] = Flights()
+        self._checksums = Checksums(store, clock=clock, lifetime=options.dir_timeout)
         self._rebooted_at = float("-inf")
         self._writing: Writeback | None = None
+        if writer is not None:
+            self._writing = make_writeback(
+                store=store,
+                writer=writer,
+                directories=self._directories,
+                dentries=self._dentries,
+                files=self._files,
+                options=options,
+                clock=clock,
+                wall=wall,
+                rng=rng or Random(),
+                nursery=nursery,
+                spool_directory=spool,
+                on_changed=self._checksums.forget_below,
+            )
 
     # --- asking
 
@@ -106,6 +117,11 @@ class Tree:
             return Stat(EntryKind.DIRECTORY, 0, UNKNOWN_MTIME, self._options.attr_timeout)
         if is_snapshot(remote):
             return await self._virtual.stat(remote)
+        if self._writing is not None:
+            remote = self._writing.overlay.spelled(remote)
+            ours = self._writing.overlay.stat(remote)
+            if ours is not None:
+                return ours
         found = await self._directories.find(remote)
         if found.entry.kind is EntryKind.FILE and found.size is None:
             await self._learning.run(remote, partial(self._learn_size, remote))
@@ -131,12 +147,18 @@ class Tree:
         remote = self._remote(path)
         if is_snapshot(remote):
             return await self._virtual.list(remote)
+        ours = None if self._writing is None else self._writing.overlay.list_local(remote)
+        if ours is not None:
+            return list(ours.items())
         directory = await self._directories.get(remote)
         founds = {name: Found(entry, directory) for name, entry in directory.entries.items()}
         if remote == ROOT:
             for name in self._virtual.shown_in_root(directory.entries):
                 founds[name] = Found(DirEntry(name, EntryKind.DIRECTORY), directory)
-        return [(name, self._listed_stat(join(remote, name), found)) for name, found in founds.items()]
+        shown = {name: self._listed_stat(join(remote, name), found) for name, found in founds.items()}
+        if self._writing is not None:
+            shown = self._writing.overlay.overlay(remote, shown)
+        return list(shown.items())
 
     async def open(self, path: bytes, *, write: bool = False, truncate: bool = False) -> OpenFile:
         """Open a file; with `truncate` it is empty for everybody from now on, here at once, there later.
@@ -167,11 +189,11 @@ class Tree:
         remote = self._remote(path)
         if is_snapshot(remote):
             return await self._virtual.crc32(remote)
+        ours = None if self._writing is None else self._writing.crc32(remote)
+        if ours is not None:
+            return ours
         found = await self._find_file(remote)
-        known = self._checksums.get(remote)
-        if known is not None and self._still_holds(known, found):
-            return known.value
-        return await self._summing.run(remote, partial(self._ask_crc32, remote, found))
+        return await self._checksums.get(remote, found)
 
     # --- changing (all raise ReadOnly on a tree without a writer, and below `@` directories)
 
@@ -202,7 +224,7 @@ class Tree:
         """
         remote = self._remote(path)
         await self.stat(path)
-        self._writable(remote).set_times(remote, mtime_ns)
+        self._writable(remote).overlay.set_times(remote, mtime_ns)
 
     async def mkdir(self, path: bytes) -> None:
         """Make a directory.
@@ -211,7 +233,7 @@ class Tree:
             AlreadyExists, NotFound, NotADirectory, Armed, PathTooLong.
         """
         remote = self._remote(path)
-        await self._writable(remote).mkdir(remote)
+        await self._writable(remote).changes.mkdir(remote)
 
     async def rmdir(self, path: bytes) -> None:
         """Remove an empty directory.
@@ -220,7 +242,7 @@ class Tree:
             NotFound, NotADirectory, DirectoryNotEmpty, Armed.
         """
         remote = self._remote(path)
-        await self._writable(remote).rmdir(remote)
+        await self._writable(remote).changes.rmdir(remote)
 
     async def unlink(self, path: bytes) -> None:
         """Remove a file; who has it open goes on reading it.
@@ -229,7 +251,7 @@ class Tree:
             NotFound, IsADirectory, Armed, FileBusy.
         """
         remote = self._remote(path)
-        await self._writable(remote).unlink(remote)
+        await self._writable(remote).changes.unlink(remote)
 
     async def rename(self, old: bytes, new: bytes, *, noreplace: bool = False) -> None:
         """Rename a file or directory, over what is there if the rules of rename(2) allow it.
@@ -240,7 +262,7 @@ class Tree:
         """
         source, target = self._remote(old), self._remote(new)
         self._writable(source)
-        await self._writable(target).rename(source, target, noreplace=noreplace)
+        await self._writable(target).changes.rename(source, target, noreplace=noreplace)
 
     def undelivered(self) -> Sequence[bytes]:
         """Return the paths of files of which the vehicle does not provably have every byte."""
@@ -282,6 +304,7 @@ class Tree:
         """Return counters; bytes_... in bytes, rate in bytes per second or None."""
         files, blocks = self._files, self._blocks
         return {
+            **({} if self._writing is None else self._writing.status()),
             "hits": files.hits,
             "misses": files.misses,
             "bytes_cached": blocks.bytes_cached + self._virtual.snapshots.bytes_cached,
@@ -302,6 +325,8 @@ class Tree:
     def link_back(self) -> None:
         """Heartbeats are back."""
         self._directories.lost = False
+        if self._writing is not None:
+            self._writing.retry()
 
     def rebooted(self) -> None:
         """The vehicle restarted: what was known of it must be asked again."""
@@ -311,6 +336,8 @@ class Tree:
         self._virtual.rebooted()
         self._files.rebooted()
         self._checksums.clear()
+        if self._writing is not None:
+            self._writing.retry()
 
     # --- inside
 
@@ -336,6 +363,10 @@ class Tree:
         unknown = found.entry.kind is EntryKind.FILE and found.size is None
         valid_for = 0.0 if unknown else max(0.0, min(self._options.attr_timeout, left))
         size = 0 if found.entry.kind is EntryKind.DIRECTORY else found.size or 0
+        if self._writing is not None:
+            user_set = self._writing.overlay.shown_time(remote, size, found.entry.mtime)
+            if user_set is not None:
+                return Stat(found.entry.kind, size, user_set[0], valid_for, user_set[1])
         return Stat(found.entry.kind, size, shown_mtime(remote, found.entry.mtime), valid_for)
 
     async def _find_file(self, remote: bytes) -> Found:
@@ -364,22 +395,5 @@ class Tree:
 
     def _on_size(self, remote: bytes, size: int) -> None:
         """An open told another size than the listing: what the kernel was told is wrong."""
-        self._dentries.learn_size(remote, size)
+        self._dentries.learn_size(remote, size, self._clock())
         self._invalidate(remote)
-
-    def _still_holds(self, known: _Checksum, found: Found) -> bool:
-        if known.size != found.size:
-            return False
-        if known.mtime is not None and known.mtime == found.entry.mtime:
-            return True
-        same = known.mtime == found.entry.mtime
-        return same and self._clock() - known.asked_at < self._options.dir_timeout
-
-    async def _ask_crc32(self, remote: bytes, found: Found) -> int:
-        value = await self._store.crc32(remote)
-        if found.size is not None:
-            self._checksums.pop(remote, None)
-            self._checksums[remote] = _Checksum(found.size, found.entry.mtime, value, self._clock())
-        if len(self._checksums) > MAX_CHECKSUMS:
-            self._checksums.popitem(last=False)
-        return value

@@ -1,29 +1,352 @@
 """Everything that differs from the vehicle's listings and blocks because of us. Layer: cache.
 
-Paths are the vehicle's, normalised.
+The tree asks here first: what is local, open, or not delivered yet is answered from drafts; the rest is the
+vehicle's. Paths are the vehicle's, normalised; those below `@` never come here for a change.
 """
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
-from typing import Protocol
 
+import trio
+
+from mavftpfs.cache.base import open_base
+from mavftpfs.cache.changes import Changes
+from mavftpfs.cache.cleaning import Cleaner
+from mavftpfs.cache.context import Context
+from mavftpfs.cache.delivery import Deliverer
+from mavftpfs.cache.draft import Draft
+from mavftpfs.cache.namespace import Namespace
+from mavftpfs.cache.nodes import Node
 from mavftpfs.cache.openfile import OpenFile
+from mavftpfs.cache.overlay import Overlay
+from mavftpfs.cache.recovery import recover
+from mavftpfs.cache.spool import Spool
+from mavftpfs.cache.sure import Sure
+from mavftpfs.cache.throttle import Throttle
+from mavftpfs.cache.writefile import ReadFile, WriteFile
+from mavftpfs.shared.errors import (
+    AlreadyExists,
+    FileTooLarge,
+    IsADirectory,
+    MavftpfsError,
+    NotFound,
+    RequestTimeout,
+)
+from mavftpfs.shared.model import EntryKind, wire_path
+
+log = logging.getLogger("mavftpfs.cache")
+
+MAX_FILE = 2**32 - 1
+"""The protocol's offsets have 32 bits; ArduPilot's servers refuse from 2 GiB on (servers.md 8)."""
+
+RETRY_PAUSE = 1.0
+STEP = 64 * 1024
+
+ADOPTED_PART = 4
+"""A delivered file of up to this part of the block cache is kept in it."""
 
 
-class Writeback(Protocol):
-    """The writing half of the tree (see cache.tree.Tree for what each call does)."""
+class Writeback:
+    """The writing half of the tree (see cache.tree.Tree for what each call does).
 
-    async def open_reader(self, path: bytes) -> OpenFile: ...
-    async def open(self, path: bytes, *, truncate: bool) -> OpenFile: ...
-    async def create(self, path: bytes, *, exclusive: bool) -> OpenFile: ...
-    async def truncate(self, path: bytes, size: int) -> None: ...
-    def set_times(self, path: bytes, mtime_ns: int) -> None: ...
-    async def mkdir(self, path: bytes) -> None: ...
-    async def rmdir(self, path: bytes) -> None: ...
-    async def unlink(self, path: bytes) -> None: ...
-    async def rename(self, old: bytes, new: bytes, *, noreplace: bool) -> None: ...
-    def undelivered(self) -> list[bytes]: ...
-    async def drain(self, timeout: float) -> None: ...
-    def recover_to(self, directory: Path) -> list[Path]: ...
-    def armed_changed(self, armed: bool) -> None: ...
+    Attributes:
+        overlay: what programs see that no listing shows. changes: mkdir, rmdir, unlink and rename.
+    """
+
+    def __init__(self, context: Context, spool: Spool, throttle: Throttle, cleaner: Cleaner) -> None:
+        self._context = context
+        self._spool = spool
+        self._throttle = throttle
+        self._cleaner = cleaner
+        sure = Sure(context)
+        self._deliverer = Deliverer(context, sure, throttle)
+        self.overlay = Overlay(context)
+        self._namespace = Namespace(
+            context,
+            sure,
+            self._deliverer,
+            new_content=spool.content,
+            on_renamed=self.overlay.on_renamed,
+        )
+        self._local = self.overlay.local
+        self.changes = Changes(
+            context, self.overlay, self._namespace, open_reader=self.open_reader, put=self._put
+        )
+
+    # --- opening
+
+    async def open_reader(self, path: bytes) -> OpenFile:
+        """Open a file for reading."""
+        path = self.overlay.spelled(path)
+        self.overlay.stat(path)  # raises NotFound for names that are hidden
+        if self._local.owns(path):
+            return self._local.open(path, write=False)
+        node = self._context.nodes.get(path)
+        handle = None
+        if node is None or node.draft is None:
+            handle = await open_base(self._context, path)
+        return ReadFile(self, self._context, self._context.nodes.need(path), handle)
+
+    async def open(self, path: bytes, *, truncate: bool) -> OpenFile:
+        """Open a file for writing."""
+        path = self.overlay.spelled(path)
+        if self._local.owns(path):
+            return self._local.open(path, write=True, truncate=truncate)
+        self._context.require_disarmed()
+        file = WriteFile(self, self._context, await self._need_draft(path, truncate=truncate))
+        if truncate:
+            try:
+                await file.truncate(0)
+            except BaseException:
+                file.close()
+                raise
+        return file
+
+    async def create(self, path: bytes, *, exclusive: bool) -> OpenFile:
+        """Make a file, or open the one that is there."""
+        path = self.overlay.spelled(path)
+        if self._local.owns(path):
+            await self.changes.require_parent(path)
+            return self._local.create(path, exclusive=exclusive)
+        self._context.require_disarmed()
+        self.overlay.require_free(path)
+        wire_path(path)
+        entry = await self._namespace.entry(path)
+        other = None if entry is not None else await self._namespace.other_spelling(path)
+        if entry is not None or other is not None:
+            if exclusive:
+                raise AlreadyExists(f"{path!r} exists")
+            return await self.open(other or path, truncate=False)
+        node = self._context.nodes.need(path)
+        if node.draft is None:
+            self._new_draft(node, None)
+        return WriteFile(self, self._context, node)
+
+    async def _need_draft(self, path: bytes, *, truncate: bool) -> Node:
+        """Return the node of a file that exists, with a draft."""
+        context, base, size = self._context, None, None
+        node = context.nodes.get(path)
+        if node is None or node.draft is None:
+            self.overlay.require_free(path)
+            entry = await self._namespace.listed(path)
+            if entry is None:
+                raise NotFound(f"{path!r} does not exist")
+            if entry.kind is not EntryKind.FILE:
+                raise IsADirectory(f"{path!r} is a directory")
+            if truncate:
+                size = entry.size if entry.size is not None else await context.files.learn_size(path)
+            else:
+                base = await open_base(context, path)  # its ACK tells the size better than a listing
+                size = base.size
+            try:
+                context.require_idle(path)
+            except MavftpfsError:
+                if base is not None:
+                    base.close()
+                raise
+            node = context.nodes.need(path)
+        if node.draft is None:
+            self._new_draft(node, size)
+            node.base, base = base, node.base
+        if base is not None:
+            base.close()
+        return node
+
+    def _new_draft(self, node: Node, size: int | None) -> None:
+        node.content = self._spool.content()
+        node.draft = Draft(node.content, size)
+
+    def crc32(self, path: bytes) -> int | None:
+        """Return the checksum of what the vehicle does not have yet, None if it can be asked."""
+        node = self._context.nodes.get(self.overlay.spelled(path))
+        draft = None if node is None or not node.undelivered else node.draft
+        return None if draft is None or not draft.whole else draft.crc32()
+
+    # --- what handles ask
+
+    async def write(self, node: Node, offset: int, data: bytes | memoryview) -> int:
+        """Take bytes into a draft; see OpenFile.write."""
+        if offset + len(data) > MAX_FILE:
+            raise FileTooLarge(f"no vehicle takes files of more than {MAX_FILE} bytes")
+        await self._may_write(node)
+        assert node.draft is not None
+        node.draft.write(offset, data)
+        self._on_written(node)
+        return len(data)
+
+    async def truncate_node(self, node: Node, size: int) -> None:
+        """Cut or extend a draft; see OpenFile.truncate."""
+        if size > MAX_FILE:
+            raise FileTooLarge(f"no vehicle takes files of more than {MAX_FILE} bytes")
+        await self._may_write(node)
+        assert node.draft is not None
+        if size != node.draft.size:
+            node.draft.truncate(size)
+            self._on_written(node)
+
+    async def deliver(self, node: Node) -> None:
+        """Have the vehicle hold the file; see Deliverer.deliver."""
+        await self._deliverer.deliver(node)
+
+    async def close(self, node: Node) -> None:
+        """A handle was closed."""
+        if node.removed and not node.handles:
+            await self._namespace.release(node)
+
+    def drop_handle(self, node: Node, *, writing: bool) -> None:
+        """A handle is about to be closed."""
+        node.handles -= 1
+        node.writers -= writing
+        if not node.handles and not node.removed:
+            self._settle(node)
+
+    async def _may_write(self, node: Node) -> None:
+        """Wait until a delivery under way is over and not too much is un-ACKed."""
+        idle_since = self._context.clock()
+        while True:
+            self._context.require_disarmed()
+            await node.quiet.wait()
+            if not self._throttle.is_full(node):
+                return
+            if await self._throttle.wait():
+                idle_since = self._context.clock()
+                continue
+            await self.deliver(node)  # says what is wrong, if anything is
+            if self._context.clock() - idle_since > self._context.options.op_deadline:
+                raise RequestTimeout(f"nothing of {node.path!r} was taken by the vehicle")
+
+    def _on_written(self, node: Node) -> None:
+        if not node.removed:
+            self.overlay.on_written(node.path)
+            self._deliverer.kick(node)
+
+    def _settle(self, node: Node) -> None:
+        """Nobody has the file open: if the vehicle has it, its content is ordinary cache."""
+        draft, context = node.draft, self._context
+        if draft is None or not draft.clean or node.lock.locked():
+            context.nodes.maybe_forget(node)
+            return
+        fits = 0 < draft.size <= context.options.cache_size // ADOPTED_PART
+        recent = context.clock() - node.delivered_at < context.options.dir_timeout
+        if fits and recent and draft.whole:
+            starts = range(0, draft.size, STEP)
+            pieces = ((at, draft.local_bytes(at, min(at + STEP, draft.size))) for at in starts)
+            context.files.adopt(node.path, draft.size, pieces)
+        context.nodes.maybe_forget(node)
+
+    # --- names
+
+    async def truncate(self, path: bytes, size: int) -> None:
+        """See Tree.truncate."""
+        path = self.overlay.spelled(path)
+        if self._local.owns(path):
+            await self._local.open(path, write=True).truncate(size)
+            return
+        self._context.require_disarmed()
+        node = await self._need_draft(path, truncate=size == 0)
+        if node.writers:
+            await self.truncate_node(node, size)
+            return
+        file = WriteFile(self, self._context, node)
+        had = node.undelivered
+        try:
+            await file.truncate(size)
+            await file.release()
+        except BaseException:
+            file.close()
+            if not had and not node.writers:
+                await self._forget_draft(node)
+            raise
+
+    async def _put(self, path: bytes, data: bytes, exclusive: bool) -> None:
+        """Write and deliver a whole file; if that fails, nothing of it is kept."""
+        file = await self.create(path, exclusive=exclusive)
+        node = self._context.nodes.get(path)
+        try:
+            await file.truncate(0)
+            await file.write(0, data)
+            await file.release()
+        except BaseException:
+            file.close()
+            if node is not None and not node.handles:
+                await self._forget_draft(node)
+            raise
+
+    async def _forget_draft(self, node: Node) -> None:
+        """What was to be written is not wanted any more, since its caller got an error."""
+        async with node.lock:
+            await self._deliverer.abandon(node)
+            node.drop_draft()
+        self._context.nodes.maybe_forget(node)
+
+    # --- the mount's life
+
+    def undelivered(self) -> list[bytes]:
+        """See Tree.undelivered."""
+        return [node.path for node in self._context.nodes if node.undelivered]
+
+    async def drain(self, timeout: float) -> None:
+        """See Tree.drain."""
+        with trio.move_on_after(timeout):
+            await self._deliver_all(writers_too=True)
+            while self.undelivered():
+                await trio.sleep(RETRY_PAUSE)
+                await self._deliver_all(writers_too=True)
+
+    def recover_to(self, directory: Path) -> list[Path]:
+        """See Tree.recover_to."""
+        lost = [node for node in self._context.nodes if node.undelivered]
+        return recover(lost, directory, self._context.wall)
+
+    def armed_changed(self, armed: bool) -> None:
+        """See Tree.armed_changed."""
+        context = self._context
+        if armed == context.armed:
+            return
+        context.armed = armed
+        if not context.options.write_armed:
+            log.warning("armed: nothing is written" if armed else "disarmed: writing again")
+        self._throttle.let_go()
+        self.retry()
+
+    def retry(self) -> None:
+        """The vehicle is back, or may be written again: deliver what nobody has open any more."""
+        if self._context.nursery is not None and self.undelivered():
+            self._context.nursery.start_soon(self._retry)
+
+    def status(self) -> dict[str, object]:
+        """Return counters; bytes_... in bytes."""
+        nodes, verifier = list(self._context.nodes), self._deliverer.verifier
+        errors = {n.path: str(n.error) for n in nodes if n.error is not None}
+        return {
+            "bytes_held": self._spool.bytes_held,
+            "bytes_held_on_disk": self._spool.on_disk,
+            "bytes_local": self._local.used,
+            "dirty_max": self._throttle.limit,
+            "write_rate": self._throttle.meter.rate,
+            "files_undelivered": len(self.undelivered()),
+            "errors": {path.decode(errors="replace"): text for path, text in errors.items()},
+            "files_delivered": self._deliverer.delivered,
+            "verified_by_crc": verifier.by_crc,
+            "verified_by_size": verifier.by_size,
+            "checksums_unanswered": verifier.unanswered,
+            "leftovers_mended": self._cleaner.mended,
+            "armed": self._context.armed,
+        }
+
+    async def _retry(self) -> None:
+        await self._deliver_all(writers_too=False)
+
+    async def _deliver_all(self, *, writers_too: bool) -> None:
+        """Try to deliver everything once."""
+        for node in self._context.nodes:
+            if not node.undelivered or (node.writers and not writers_too):
+                continue
+            try:
+                await self._deliverer.deliver(node)
+            except MavftpfsError as error:
+                log.info("%r is still not delivered: %s", node.path, error)
+            else:
+                self._context.nodes.maybe_forget(node)

@@ -8,10 +8,11 @@ import trio.testing
 from trio.testing import MockClock
 
 from mavftpfs.cache.attributes import UNKNOWN_MTIME
+from mavftpfs.cache.checksums import MAX_CHECKSUMS
 from mavftpfs.cache.directories import SWEEP_TRIES
 from mavftpfs.cache.flights import Flights
 from mavftpfs.cache.options import MIN_CACHE_SIZE, CacheOptions
-from mavftpfs.cache.tree import MAX_CHECKSUMS, Stat, Tree
+from mavftpfs.cache.tree import Stat, Tree
 from mavftpfs.protocol.crc import crc32
 from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.shared.errors import (

@@ -1,0 +1,55 @@
+"""Reads of a file's old content below a draft. Layer: cache."""
+
+from __future__ import annotations
+
+from mavftpfs.cache.context import Context
+from mavftpfs.cache.files import FileHandle
+from mavftpfs.cache.nodes import Node
+from mavftpfs.shared.errors import FileChanged, IsADirectory
+from mavftpfs.shared.model import EntryKind
+
+STEP = 128 * 1024
+
+
+async def open_base(context: Context, path: bytes) -> FileHandle:
+    """Open a file of the vehicle.
+
+    Raises:
+        NotFound, NotADirectory, IsADirectory; else as RemoteStore.open_reader.
+    """
+    found = await context.directories.find(path)
+    if found.entry.kind is not EntryKind.FILE:
+        raise IsADirectory(f"{path!r} is a directory")
+    fresh = context.clock() < found.directory.fresh_until
+    return await context.files.open(path, found.entry, found.directory.listed_at, fresh=fresh)
+
+
+async def read_base(context: Context, node: Node, start: int, stop: int) -> bytes | memoryview:
+    """Return bytes of the vehicle's file that a node's draft lies over.
+
+    Raises:
+        FileChanged: it is another file by now. Else as open_base and FileHandle.read.
+    """
+    if node.base is None:
+        handle = await open_base(context, node.path)
+        if node.base is None:
+            node.base = handle
+        else:
+            handle.close()
+    if node.draft is not None and node.base.size < stop:
+        raise FileChanged(f"{node.path!r} became shorter on the vehicle")
+    return await node.base.read(start, stop - start)
+
+
+async def fill(context: Context, node: Node) -> None:
+    """Fetch what only the vehicle has, so that the draft is whole.
+
+    Raises:
+        NoSpace; else as read_base.
+    """
+    draft = node.draft
+    assert draft is not None
+    for start, stop in draft.missing_base():
+        for at in range(start, stop, STEP):
+            end = min(at + STEP, stop)
+            draft.fill(at, await read_base(context, node, at, end))

@@ -1,0 +1,77 @@
+"""What the parts of the writing half share. Layer: cache."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import trio
+
+from mavftpfs.cache.asides import Namer
+from mavftpfs.cache.dentries import Dentries
+from mavftpfs.cache.directories import Directories
+from mavftpfs.cache.files import Files
+from mavftpfs.cache.nodes import Node, Nodes
+from mavftpfs.cache.options import CacheOptions
+from mavftpfs.cache.remote import RemoteStore, WriteStore
+from mavftpfs.shared.errors import Armed, FileBusy
+
+
+@dataclass(slots=True)
+class Context:
+    """The vehicle, what is remembered of it, and what was written.
+
+    clock: seconds, monotonic; wall: seconds since 1970. on_changed(path): a path, and what lies below it,
+    was changed by us. live: reserved paths in use right now; hidden: unlinked files by their reserved path.
+    armed: nothing may be changed.
+    """
+
+    store: RemoteStore
+    writer: WriteStore
+    directories: Directories
+    dentries: Dentries
+    files: Files
+    options: CacheOptions
+    clock: Callable[[], float]
+    wall: Callable[[], float]
+    on_changed: Callable[[bytes], None]
+    nursery: trio.Nursery | None
+    namer: Namer
+    nodes: Nodes = field(default_factory=Nodes)
+    live: set[bytes] = field(default_factory=set)
+    hidden: dict[bytes, Node] = field(default_factory=dict)
+    armed: bool = False
+
+    def require_disarmed(self) -> None:
+        """Raise Armed if nothing may be changed now."""
+        if self.armed and not self.options.write_armed:
+            raise Armed("the vehicle is armed: nothing is written in flight (when_armed=ro)")
+
+    def hide(self, node: Node, path: bytes) -> None:
+        """An unlinked file's node is called `path`, a reserved name, from now on."""
+        self.hidden.pop(node.path, None)
+        node.path, node.hidden = path, True
+        self.hidden[path] = node
+        self.live.add(path)
+
+    def forget_hidden(self, node: Node) -> None:
+        """An unlinked file is gone for good, or is left to the next listing."""
+        node.hidden = False
+        self.hidden.pop(node.path, None)
+        self.live.discard(node.path)
+
+    def follow_rename(self, old: bytes, new: bytes) -> None:
+        """The vehicle renamed a file, or a directory with all below it."""
+        self.files.on_renamed(old, new)
+        self.nodes.rename(old, new)
+        for path in [p for p in self.hidden if p.startswith(old + b"/")]:
+            node = self.hidden[path]
+            self.live.discard(path)
+            self.hide(node, new + path[len(old) :])
+        self.on_changed(old)
+        self.on_changed(new)
+
+    def require_idle(self, path: bytes) -> None:
+        """Raise FileBusy if somebody on the vehicle seems to write the file."""
+        if not self.options.force and self.dentries.is_growing(path, self.clock()):
+            raise FileBusy(f"{path!r} grows: somebody on the vehicle is writing it")

@@ -1,0 +1,336 @@
+"""Brings drafts to the vehicle, and knows that they are there. Layer: cache.
+
+`deliver` returns when the vehicle has the file, checked (promise 2), or raises why not; what was not
+delivered stays held, and the next call goes on. While it runs the file is not written (`Node.quiet`), so
+what is verified is what was sent. Uploads begin earlier, in the background, where that is of use.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from dataclasses import astuple
+
+import trio
+
+from mavftpfs.cache import base
+from mavftpfs.cache.context import Context
+from mavftpfs.cache.draft import Draft
+from mavftpfs.cache.nodes import Attempt, Node
+from mavftpfs.cache.plan import SENDING, Plan, Rules, choose
+from mavftpfs.cache.replacing import Present, Replacer
+from mavftpfs.cache.sure import Sure
+from mavftpfs.cache.throttle import Throttle
+from mavftpfs.cache.verify import Verifier
+from mavftpfs.shared.errors import (
+    Armed,
+    FtpNak,
+    LinkError,
+    MavftpfsError,
+    NoSpace,
+    NotSupported,
+    RemoteProtocolError,
+    RequestTimeout,
+    SessionBusy,
+    VerificationFailed,
+)
+from mavftpfs.shared.model import DirEntry, EntryKind, split
+
+log = logging.getLogger("mavftpfs.cache")
+
+MAX_STEPS = 8
+"""Plans tried in one delivery: each but the last one learnt something of the server or fetched the base."""
+
+FINISHES = 3
+START_AT = 64 * 1024
+"""A background upload begins when so many bytes wait; fewer wait for the close."""
+
+_PASSING = (RequestTimeout, LinkError, SessionBusy, Armed)
+"""Errors after which the upload goes on where it stopped."""
+
+
+class Deliverer:
+    """Executes plans."""
+
+    def __init__(self, context: Context, sure: Sure, throttle: Throttle) -> None:
+        self._context = context
+        self._throttle = throttle
+        self._rules = Rules(context.options.rmw_max, inplace=context.options.inplace)
+        self.replacer = Replacer(context, sure)
+        self.verifier = Verifier(context, sure)
+        self.delivered = 0
+
+    async def deliver(self, node: Node) -> None:
+        """Have the vehicle hold the node's file, checked.
+
+        Raises:
+            The reason why not: as WriteStore; VerificationFailed, NotSupported, FileTooLarge, FileChanged.
+        """
+        async with node.lock:
+            await self.deliver_locked(node)
+
+    async def deliver_locked(self, node: Node) -> None:
+        """Do the same for who holds the node's lock.
+
+        Raises:
+            As deliver.
+        """
+        if not node.undelivered:
+            return
+        node.quiet = trio.Event()
+        try:
+            self._context.require_disarmed()
+            await self._deliver(node)
+            node.error = None
+            node.background = True
+        except MavftpfsError as error:
+            self._note_failure(node, error)
+            raise
+        finally:
+            node.quiet.set()
+            self._throttle.let_go()
+
+    def kick(self, node: Node) -> None:
+        """The draft got more: send it, or begin to, if that can be done beside the program."""
+        if node.attempt is not None:
+            if not node.attempt.committing:
+                node.attempt.upload.wake()
+        elif self._may_start(node) and self._context.nursery is not None:
+            node.starting = True
+            self._context.nursery.start_soon(self._start, node)
+
+    async def abandon(self, node: Node) -> None:
+        """Give up the present attempt; what it left under reserved names goes now or at the next listing."""
+        attempt, node.attempt = node.attempt, None
+        if attempt is None:
+            return
+        await attempt.upload.abort()
+        if node.draft is not None:
+            node.draft.begin_again()
+        if attempt.places is not None:
+            try:
+                if not attempt.committing:
+                    await self.replacer.clean(attempt.places, new=True)
+            finally:
+                self.replacer.release(attempt.places)
+
+    # --- planning
+
+    async def _deliver(self, node: Node) -> None:
+        mismatches = 0
+        for _ in range(MAX_STEPS):
+            draft = _draft(node)
+            plan = choose(draft, self._context.writer.traits, self._rules)
+            if plan is Plan.NOTHING:
+                await self.abandon(node)
+                return
+            known = astuple(self._context.writer.traits)
+            try:
+                await self._step(node, plan)
+            except VerificationFailed as error:
+                mismatches += 1
+                await self.abandon(node)
+                if mismatches > 1:
+                    raise
+                log.warning("%s; sending it again", error)
+            except MavftpfsError as error:
+                learnt = astuple(self._context.writer.traits) != known
+                if not isinstance(error, _PASSING):
+                    await self.abandon(node)
+                if not learnt or isinstance(error, LinkError | Armed):
+                    raise
+                log.debug("%r: %s; trying another way", node.path, error)
+        raise VerificationFailed(f"no way of writing {node.path!r} led to an end")
+
+    async def _step(self, node: Node, plan: Plan) -> None:
+        if plan in SENDING:
+            await self._send(node, plan)
+        elif plan is Plan.PROBE:
+            await self._probe(node)
+        elif plan is Plan.FILL:
+            await base.fill(self._context, node)
+        else:
+            await self.abandon(node)
+            await self._act(node, plan)
+
+    async def _act(self, node: Node, plan: Plan) -> None:
+        """Do what takes one request."""
+        draft = _draft(node)
+        if plan is Plan.CREATE_EMPTY:
+            await self._context.writer.create_empty(node.path)
+        else:
+            await self._context.writer.truncate(node.path, draft.size)
+        await self.verifier.check(node.path, draft)
+        self._on_delivered(node, draft)
+
+    async def _probe(self, node: Node) -> None:
+        """Find out what OpenFileWO does; if even that fails, take it to empty files."""
+        traits = self._context.writer.traits
+        try:
+            await self._context.writer.probe_open_for_write(split(node.path)[0])
+        except FtpNak as nak:
+            log.debug("the probe of OpenFileWO was refused: %s", nak)
+        if self._context.writer.traits.wo_truncates is None:
+            traits.wo_truncates = True
+
+    # --- sending
+
+    async def _send(self, node: Node, plan: Plan) -> None:
+        attempt = await self._attempt(node, plan)
+        draft = _draft(node)
+        if not attempt.committing:
+            await self._finish(attempt)
+            await self.verifier.check(attempt.path, draft)
+            await attempt.upload.abort()
+        if attempt.places is not None:
+            await self._commit(node, attempt)
+        node.attempt = None
+        self._on_delivered(node, draft)
+
+    async def _attempt(self, node: Node, plan: Plan) -> Attempt:
+        """Return the attempt under way if it still fits, else a new one."""
+        draft = _draft(node)
+        attempt = node.attempt
+        if attempt is not None and _still_fits(attempt, plan, draft):
+            return attempt
+        await self.abandon(node)
+        path, places = node.path, None
+        if plan is Plan.REPLACE:
+            places = self._context.namer.places(node.path)
+            path = places.new
+        if plan is Plan.REWRITE:
+            draft.remote_removed()
+        if plan is Plan.NEW:
+            self._context.dentries.note_created(path, DirEntry(split(path)[1], EntryKind.FILE, 0))
+        if places is not None:
+            self.replacer.reserve(places)
+        try:
+            if places is not None:
+                await self.replacer.write_sidecar(places, node.path)
+            sending = draft.begin(whole=plan is not Plan.IN_PLACE)
+            sending.progress = self._throttle.on_acked
+            writer = self._context.writer
+            upload = await writer.open_upload(path, sending, create=plan is not Plan.IN_PLACE)
+        except BaseException:
+            if places is not None:
+                self.replacer.release(places)
+            raise
+        node.attempt = Attempt(plan, path, sending, upload, places)
+        return node.attempt
+
+    async def _finish(self, attempt: Attempt) -> None:
+        for _ in range(FINISHES):
+            attempt.upload.wake()
+            await attempt.upload.finish()
+            if not attempt.sending.unacked:
+                return
+        raise RemoteProtocolError(f"{attempt.path!r} was said to be finished, and was not")
+
+    async def _commit(self, node: Node, attempt: Attempt) -> None:
+        """Rename; if that was begun before, find out first how far it came."""
+        assert attempt.places is not None
+        if attempt.committing:
+            present = await self.replacer.observe(attempt.places, node.path)
+        else:
+            present = Present(new=True, old=False, target=True)
+        attempt.committing = True
+        try:
+            await self.replacer.replace(attempt.path, node.path, attempt.places, present)
+        except NotSupported:
+            attempt.committing = False  # nothing was moved
+            raise
+        self.replacer.release(attempt.places)
+
+    # --- in the background
+
+    def _may_start(self, node: Node) -> bool:
+        context, draft = self._context, node.draft
+        if draft is None or not node.background or node.starting or node.error is not None:
+            return False
+        blocked = context.armed and not context.options.write_armed
+        return draft.unacked >= START_AT and node.undelivered and not blocked
+
+    async def _start(self, node: Node) -> None:
+        """Begin an upload while the program still writes; whatever fails is tried again by the close."""
+        try:
+            async with node.lock:
+                if node.attempt is None and node.undelivered:
+                    await self._start_locked(node)
+        except MavftpfsError as error:
+            node.background = False
+            log.info("%r is not sent before it is closed: %s", node.path, error)
+        finally:
+            node.starting = False
+
+    async def _start_locked(self, node: Node) -> None:
+        plan = choose(_draft(node), self._context.writer.traits, self._rules)
+        if plan is Plan.PROBE:
+            await self._probe(node)
+            plan = choose(_draft(node), self._context.writer.traits, self._rules)
+        if plan in SENDING and plan is not Plan.REWRITE:
+            (await self._attempt(node, plan)).upload.wake()
+        else:
+            node.background = False
+
+    # --- after
+
+    def _on_delivered(self, node: Node, draft: Draft) -> None:
+        """The vehicle has it: listings, blocks and checksums follow."""
+        context = self._context
+        known = context.dentries.known(split(node.path)[0])
+        entry = DirEntry(split(node.path)[1], EntryKind.FILE, draft.size)
+        if known is not None and entry.name in known.entries:
+            context.dentries.note_resized(node.path, draft.size)
+        else:
+            context.dentries.note_created(node.path, entry)
+        draft.delivered()
+        node.generation += 1
+        node.delivered_at = context.clock()
+        node.close_base()
+        context.files.on_written(node.path)
+        context.on_changed(node.path)
+        self.delivered += 1
+
+    def _note_failure(self, node: Node, error: MavftpfsError) -> None:
+        """Latch the error, and keep the bytes where the end of this process does not lose them."""
+        node.error = error
+        draft, content = node.draft, node.content
+        log.warning("%r is not delivered: %s", node.path, error)
+        if draft is None or content is None:
+            return
+        try:
+            content.persist(describe(node, draft, self._context.wall))
+        except (NoSpace, OSError) as trouble:
+            log.warning("%r is kept in memory only: %s", node.path, trouble)
+
+
+def describe(node: Node, draft: Draft, wall: Callable[[], float]) -> dict[str, object]:
+    """Return what a spooled file is, for people and JSON; `held` are the extents whose bytes are known."""
+    return {
+        "path": node.path.decode(errors="surrogateescape"),
+        "size": draft.size,
+        "whole": draft.whole,
+        "held": list(draft.held),
+        "changed": list(draft.changed),
+        "size_on_vehicle": draft.remote_size,
+        "error": None if node.error is None else str(node.error),
+        "at": wall(),
+    }
+
+
+def _draft(node: Node) -> Draft:
+    assert node.draft is not None
+    return node.draft
+
+
+def _still_fits(attempt: Attempt, plan: Plan, draft: Draft) -> bool:
+    """Return whether going on with an attempt ends with the draft's content on the vehicle."""
+    sending = attempt.sending
+    if attempt.committing and sending.unacked:
+        return False
+    return (
+        attempt.plan is plan
+        and draft.sending is sending
+        and not sending.emptied
+        and sending.reached <= draft.size
+    )

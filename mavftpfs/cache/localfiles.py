@@ -1,0 +1,290 @@
+"""Names that never reach the vehicle: swap files, locks, trash. Layer: cache.
+
+Editors and file managers put such files beside the ones they work on, by names that the `local=` patterns
+know. They live in memory, bounded, and are seen by this mount only. What lies below a directory of such a
+name is local as well.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from fnmatch import translate
+from re import compile as compile_pattern
+
+from mavftpfs.cache.attributes import Stat
+from mavftpfs.cache.times import shown
+from mavftpfs.shared.errors import (
+    AlreadyExists,
+    DirectoryNotEmpty,
+    IsADirectory,
+    LocalProtocolError,
+    NoSpace,
+    NotADirectory,
+    NotFound,
+)
+from mavftpfs.shared.model import EntryKind, join, split
+
+MAX_ENTRIES = 10_000
+
+
+@dataclass(slots=True, eq=False)
+class LocalEntry:
+    """A file (data is its content) or a directory (data is None)."""
+
+    data: bytearray | None
+    mtime_ns: int
+
+    @property
+    def kind(self) -> EntryKind:
+        """File or directory."""
+        return EntryKind.DIRECTORY if self.data is None else EntryKind.FILE
+
+
+class LocalFiles:
+    """All local names of a mount, by path."""
+
+    def __init__(self, patterns: tuple[str, ...], limit: int, now_ns: Callable[[], int]) -> None:
+        """`limit`: bytes of all content."""
+        self._patterns = [compile_pattern(translate(p).encode("utf-8", "surrogateescape")) for p in patterns]
+        self._limit = limit
+        self._now_ns = now_ns
+        self._entries: dict[bytes, LocalEntry] = {}
+        self._used = 0
+
+    @property
+    def used(self) -> int:
+        """Bytes of content."""
+        return self._used
+
+    def owns(self, path: bytes) -> bool:
+        """Return whether a path is local, whether it exists or not."""
+        return any(pattern.match(part) for part in path.split(b"/") for pattern in self._patterns)
+
+    def find(self, path: bytes) -> LocalEntry:
+        """Return what a path is.
+
+        Raises:
+            NotFound.
+        """
+        entry = self._entries.get(path)
+        if entry is None:
+            raise NotFound(f"{path!r} does not exist")
+        return entry
+
+    def stat(self, path: bytes) -> Stat:
+        """Return attributes.
+
+        Raises:
+            NotFound.
+        """
+        entry = self.find(path)
+        seconds, nanoseconds = shown(entry.mtime_ns)
+        return Stat(entry.kind, len(entry.data or b""), seconds, 0.0, nanoseconds)
+
+    def names(self, directory: bytes) -> list[bytes]:
+        """Return the local names in a directory, which may be the vehicle's."""
+        return [name for parent, name in map(split, self._entries) if parent == directory]
+
+    def open(self, path: bytes, *, write: bool, truncate: bool = False) -> LocalHandle:
+        """Open a file.
+
+        Raises:
+            NotFound, IsADirectory.
+        """
+        entry = self.find(path)
+        if entry.data is None:
+            raise IsADirectory(f"{path!r} is a directory")
+        if truncate:
+            self.resize(entry, 0)
+        return LocalHandle(self, entry, writable=write)
+
+    def create(self, path: bytes, *, exclusive: bool) -> LocalHandle:
+        """Make a file, or open the one that is there; the directory it is put in was checked.
+
+        Raises:
+            AlreadyExists, IsADirectory, NoSpace.
+        """
+        if path not in self._entries:
+            self._add(path, LocalEntry(bytearray(), self._now_ns()))
+        elif exclusive:
+            raise AlreadyExists(f"{path!r} exists")
+        return self.open(path, write=True)
+
+    def put(self, path: bytes, data: bytes) -> None:
+        """Make a file with a content, replacing one that is there.
+
+        Raises:
+            NoSpace, IsADirectory.
+        """
+        old = self._entries.get(path)
+        if old is not None and old.data is None:
+            raise IsADirectory(f"{path!r} is a directory")
+        self.require_room(len(data) - (0 if old is None or old.data is None else len(old.data)))
+        if old is not None:
+            self.unlink(path)
+        self._add(path, LocalEntry(bytearray(data), self._now_ns()))
+        self._used += len(data)
+
+    def mkdir(self, path: bytes) -> None:
+        """Make a directory.
+
+        Raises:
+            AlreadyExists, NoSpace.
+        """
+        if path in self._entries:
+            raise AlreadyExists(f"{path!r} exists")
+        self._add(path, LocalEntry(None, self._now_ns()))
+
+    def unlink(self, path: bytes) -> None:
+        """Remove a file; handles keep it.
+
+        Raises:
+            NotFound, IsADirectory.
+        """
+        entry = self.find(path)
+        if entry.data is None:
+            raise IsADirectory(f"{path!r} is a directory")
+        self._used -= len(entry.data)
+        del self._entries[path]
+
+    def rmdir(self, path: bytes) -> None:
+        """Remove an empty directory.
+
+        Raises:
+            NotFound, NotADirectory, DirectoryNotEmpty.
+        """
+        if self.find(path).data is not None:
+            raise NotADirectory(f"{path!r} is not a directory")
+        if self.names(path):
+            raise DirectoryNotEmpty(f"{path!r} is not empty")
+        del self._entries[path]
+
+    def rename(self, old: bytes, new: bytes) -> None:
+        """Rename within the local names, over a file or an empty directory of the same kind.
+
+        Raises:
+            NotFound, IsADirectory, NotADirectory, DirectoryNotEmpty.
+        """
+        entry, target = self.find(old), self._entries.get(new)
+        if target is entry:
+            return
+        if target is not None:
+            if entry.data is None:
+                self.rmdir(new)
+            else:
+                self.unlink(new)
+        self.move_below(old, new)
+
+    def move_below(self, old: bytes, new: bytes) -> None:
+        """The directory `old` is called `new` now, whosever it is."""
+        for path in [p for p in self._entries if p == old or p.startswith(old + b"/")]:
+            self._entries[new + path[len(old) :]] = self._entries.pop(path)
+
+    def forget_below(self, directory: bytes) -> None:
+        """The vehicle's directory is gone, and what was local in it."""
+        for path in [p for p in self._entries if p.startswith(join(directory, b""))]:
+            self._used -= len(self._entries.pop(path).data or b"")
+
+    def set_times(self, path: bytes, mtime_ns: int) -> None:
+        """Set the mtime.
+
+        Raises:
+            NotFound.
+        """
+        self.find(path).mtime_ns = mtime_ns
+
+    def resize(self, entry: LocalEntry, size: int) -> None:
+        """Cut a file or extend it with zeros.
+
+        Raises:
+            NoSpace.
+        """
+        assert entry.data is not None
+        more = size - len(entry.data)
+        self.require_room(more)
+        if more > 0:
+            entry.data.extend(bytes(more))
+        else:
+            del entry.data[size:]
+        if any(known is entry for known in self._entries.values()):
+            self._used += more
+        entry.mtime_ns = self._now_ns()
+
+    def require_room(self, more: int) -> None:
+        """Raise NoSpace unless `more` bytes fit."""
+        if more > 0 and self._used + more > self._limit:
+            raise NoSpace(f"local files may take {self._limit} bytes in all")
+
+    def touch(self, entry: LocalEntry) -> None:
+        """A file was written."""
+        entry.mtime_ns = self._now_ns()
+
+    def _add(self, path: bytes, entry: LocalEntry) -> None:
+        if len(self._entries) >= MAX_ENTRIES:
+            raise NoSpace(f"there may be {MAX_ENTRIES} local files")
+        self._entries[path] = entry
+
+
+class LocalHandle:
+    """One open() of a local file (see cache.openfile.OpenFile)."""
+
+    direct_io = False
+    keep_cache = False
+
+    def __init__(self, files: LocalFiles, entry: LocalEntry, *, writable: bool) -> None:
+        self._files = files
+        self._entry = entry
+        self.writable = writable
+
+    @property
+    def size(self) -> int:
+        """Bytes."""
+        return len(self._data)
+
+    @property
+    def mtime_ns(self) -> int:
+        """Nanoseconds since 1970."""
+        return self._entry.mtime_ns
+
+    async def read(self, offset: int, size: int) -> bytes:
+        """Return bytes, fewer only at the end."""
+        return bytes(self._data[offset : offset + size])
+
+    async def write(self, offset: int, data: bytes | memoryview) -> int:
+        """Write.
+
+        Raises:
+            NoSpace.
+        """
+        if offset + len(data) > self.size:
+            self._files.resize(self._entry, offset + len(data))
+        self._data[offset : offset + len(data)] = data
+        self._files.touch(self._entry)
+        return len(data)
+
+    async def truncate(self, size: int) -> None:
+        """Cut or extend.
+
+        Raises:
+            NoSpace.
+        """
+        self._files.resize(self._entry, size)
+
+    async def flush(self) -> None:
+        """Do nothing: there is nowhere to deliver it."""
+
+    async def fsync(self) -> None:
+        """Do nothing: it does not outlive the mount anyway."""
+
+    async def release(self) -> None:
+        """Close."""
+
+    def close(self) -> None:
+        """Close."""
+
+    @property
+    def _data(self) -> bytearray:
+        if self._entry.data is None:
+            raise LocalProtocolError("a directory has no content")
+        return self._entry.data

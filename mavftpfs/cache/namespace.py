@@ -1,0 +1,372 @@
+"""mkdir, rmdir, unlink and rename on the vehicle as rename(2) and its kin have it. Layer: cache.
+
+Servers check little: some remove files by rmdir, move into directories by rename, or truncate another
+spelling of a name (servers.md 9). So types and targets are looked up in listings first. One change runs at a
+time; what a draft below a path has undelivered is delivered before the path changes.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from contextlib import AsyncExitStack
+
+import trio
+
+from mavftpfs.cache.asides import Places, fits_rename, is_reserved, parse
+from mavftpfs.cache.context import Context
+from mavftpfs.cache.delivery import Deliverer
+from mavftpfs.cache.draft import Draft
+from mavftpfs.cache.nodes import Node
+from mavftpfs.cache.replacing import Present
+from mavftpfs.cache.spool import SpoolContent
+from mavftpfs.cache.sure import Sure
+from mavftpfs.shared.errors import (
+    AlreadyExists,
+    CrossDevice,
+    DirectoryNotEmpty,
+    FtpNak,
+    InvalidMove,
+    IsADirectory,
+    NotADirectory,
+    NotFound,
+    NotSupported,
+)
+from mavftpfs.shared.model import DirEntry, EntryKind, join, split, wire_path
+
+log = logging.getLogger("mavftpfs.cache")
+
+PIECE = 64 * 1024
+
+
+class Namespace:
+    """Changes of names on the vehicle. Paths are the vehicle's, not local, not below `@`."""
+
+    def __init__(
+        self,
+        context: Context,
+        sure: Sure,
+        deliverer: Deliverer,
+        *,
+        new_content: Callable[[], SpoolContent],
+        on_renamed: Callable[[bytes, bytes], None],
+    ) -> None:
+        """`new_content()`: room for a draft; `on_renamed(old, new)`: the vehicle's path has another name."""
+        self._context = context
+        self._sure = sure
+        self._deliverer = deliverer
+        self._new_content = new_content
+        self._on_renamed = on_renamed
+        self._lock = trio.Lock()
+
+    # --- looking
+
+    async def entry(self, path: bytes) -> DirEntry | None:
+        """Return what a path is, drafts included; None if it does not exist though its directory does.
+
+        Raises:
+            NotFound, NotADirectory: its directory. Else as RemoteStore.list_directory.
+        """
+        node = self._context.nodes.get(path)
+        if node is not None and node.draft is not None:
+            return DirEntry(split(path)[1], EntryKind.FILE, node.draft.size)
+        return await self.listed(path)
+
+    async def listed(self, path: bytes) -> DirEntry | None:
+        """Return what the vehicle has there; asks it whether another spelling is the same file.
+
+        Raises:
+            As entry.
+        """
+        parent, name = split(path)
+        entries = (await self._context.directories.get(parent)).entries
+        if name in entries:
+            return entries[name]
+        return None
+
+    async def check_new(self, path: bytes) -> None:
+        """Raise AlreadyExists if creating a name that no listing shows would hit another spelling of it.
+
+        CreateFile of `README` empties `readme` where the card folds case (servers.md 9).
+        """
+        wire_path(path)
+        other = await self.other_spelling(path)
+        if other is not None:
+            raise AlreadyExists(f"{path!r} is {other!r} on this card, which does not tell case apart")
+
+    async def other_spelling(self, path: bytes) -> bytes | None:
+        """Return the listed spelling of the file or directory that a path not listed itself would open."""
+        parent, name = split(path)
+        entries = (await self._context.directories.get(parent)).entries
+        folded = name.lower()
+        others = [n for n in entries if n != name and n.lower() == folded and not is_reserved(n)]
+        if not others or name in entries:
+            return None
+        traits = self._context.writer.traits
+        if traits.folds_case is None:
+            await self._learn_folding(path, entries[others[0]])
+        return join(parent, others[0]) if traits.folds_case is not False else None
+
+    async def _learn_folding(self, path: bytes, other: DirEntry) -> None:
+        if other.kind is not EntryKind.FILE:
+            return  # nothing safe to ask: opening or listing a directory by another name may hurt
+        try:
+            await self._context.writer.stat_size(path)
+        except FtpNak:
+            self._context.writer.traits.folds_case = False
+        else:
+            self._context.writer.traits.folds_case = True
+
+    # --- changing
+
+    async def mkdir(self, path: bytes) -> None:
+        """See Tree.mkdir."""
+        async with self._lock:
+            if await self.entry(path) is not None:
+                raise AlreadyExists(f"{path!r} exists")
+            await self.check_new(path)
+            await self._sure.make_directory(path)
+            self._context.on_changed(path)
+
+    async def rmdir(self, path: bytes) -> None:
+        """See Tree.rmdir."""
+        async with self._lock:
+            entry = await self._need(path)
+            if entry.kind is not EntryKind.DIRECTORY:
+                raise NotADirectory(f"{path!r} is not a directory")
+            if self._context.nodes.below(path):
+                raise DirectoryNotEmpty(f"{path!r} is not empty")
+            listing = await self._context.directories.ask(path)
+            hidden = [join(path, name) for name in listing.entries if self._is_hidden_file(join(path, name))]
+            if len(hidden) < len(listing.entries):
+                raise DirectoryNotEmpty(f"{path!r} is not empty")
+            for name in hidden:
+                await self._move_up(name, split(path)[0])
+            await self._sure.remove_directory(path)
+            self._context.on_changed(path)
+
+    async def unlink(self, path: bytes) -> None:
+        """See Tree.unlink."""
+        async with self._lock:
+            entry = await self.entry(path)
+            if entry is None:
+                raise NotFound(f"{path!r} does not exist")
+            if entry.kind is not EntryKind.FILE:
+                raise IsADirectory(f"{path!r} is a directory")
+            node = self._context.nodes.get(path)
+            if node is None:
+                self._context.require_idle(path)
+                await self._remove(path)
+                return
+            await self._unlink_node(node, path)
+
+    async def rename(self, old: bytes, new: bytes, *, noreplace: bool) -> None:
+        """See Tree.rename."""
+        if new.startswith(old + b"/"):
+            raise InvalidMove(f"{old!r} cannot become a part of itself")
+        async with self._lock:
+            source = await self._need(old)
+            wire_path(new)
+            target = await self.entry(new)
+            other = None if target is not None else await self.other_spelling(new)
+            if other not in (None, old):
+                raise AlreadyExists(f"{new!r} is {other!r} on this card, which does not tell case apart")
+            if target is not None and noreplace:
+                raise AlreadyExists(f"{new!r} exists")
+            if old == new:
+                return
+            await self._require_replaceable(source, new, target)
+            await self._rename_checked(old, new, source, target, by_case=other == old)
+
+    async def release(self, node: Node) -> None:
+        """Nobody has an unlinked file open any more: remove what was hidden of it.
+
+        Raises:
+            As Sure.remove; the next listing of the directory removes it then.
+        """
+        node.drop_draft()
+        if node.hidden:
+            try:
+                await self._remove(node.path)
+            finally:
+                self._context.forget_hidden(node)
+
+    # --- inside: looking
+
+    async def _need(self, path: bytes) -> DirEntry:
+        entry = await self.entry(path)
+        if entry is None:
+            raise NotFound(f"{path!r} does not exist")
+        return entry
+
+    def _is_hidden_file(self, path: bytes) -> bool:
+        name = parse(split(path)[1])
+        return name is not None and path in self._context.live and name.owner == self._context.namer.owner
+
+    async def _require_replaceable(self, source: DirEntry, new: bytes, target: DirEntry | None) -> None:
+        """Raise what rename(2) says of a target that cannot be replaced; FUSE hands both over unchecked."""
+        if target is None:
+            return
+        if target.kind is EntryKind.DIRECTORY:
+            if source.kind is EntryKind.FILE:
+                raise IsADirectory(f"{new!r} is a directory")
+            if (await self._context.directories.ask(new)).entries or self._context.nodes.below(new):
+                raise DirectoryNotEmpty(f"{new!r} is not empty")
+        elif source.kind is EntryKind.DIRECTORY:
+            raise NotADirectory(f"{new!r} is not a directory")
+
+    # --- inside: unlinking
+
+    async def _remove(self, path: bytes) -> None:
+        await self._sure.remove(path)
+        self._context.files.on_removed(path)
+        self._context.on_changed(path)
+
+    async def _unlink_node(self, node: Node, path: bytes) -> None:
+        async with node.lock:
+            await self._deliverer.abandon(node)
+            there = await self.listed(path) is not None
+            if there and node.draft is None:
+                self._context.require_idle(path)
+            if there and node.handles and not self._keep_content(node):
+                await self._hide(node)
+            elif there:
+                await self._remove(path)
+            node.removed = True
+            self._context.nodes.detach(node)
+        if not node.handles:
+            node.drop_draft()
+
+    def _keep_content(self, node: Node) -> bool:
+        """Return whether the open file can be read on without the vehicle: hold what is cached of it."""
+        draft = node.draft
+        blocks = self._context.files.cached(node.path)
+        if draft is not None and (draft.whole or blocks is None):
+            return draft.whole
+        if blocks is None or not blocks.complete:
+            return False
+        if draft is None:
+            node.content = self._new_content()
+            draft = node.draft = Draft(node.content, blocks.size)
+        for at in range(0, draft.base_limit, PIECE):
+            data = blocks.get(at, min(at + PIECE, draft.base_limit))
+            if data is None:
+                return False
+            draft.fill(at, data)
+        return True
+
+    async def _hide(self, node: Node) -> None:
+        """Keep an unlinked file on the vehicle under a reserved name as long as somebody reads it."""
+        context, old = self._context, node.path
+        hidden = context.namer.hidden(old)
+        context.live.add(hidden)
+        try:
+            await self._sure.rename(old, hidden)
+        except FtpNak as nak:
+            context.live.discard(hidden)
+            log.info("%r is removed although it is being read: %s", old, nak)
+            await self._remove(old)
+            return
+        except BaseException:
+            context.live.discard(hidden)
+            raise
+        context.nodes.detach(node)
+        context.files.on_renamed(old, hidden)
+        context.hide(node, hidden)
+        context.on_changed(old)
+
+    async def _move_up(self, hidden: bytes, directory: bytes) -> None:
+        """Have a hidden file not block the removal of its directory."""
+        context, node = self._context, self._context.hidden.get(hidden)
+        better = context.namer.hidden(join(directory, b"x"))
+        context.live.add(better)
+        await self._sure.rename(hidden, better)
+        context.live.discard(hidden)
+        context.files.on_renamed(hidden, better)
+        if node is not None:
+            context.hide(node, better)
+
+    # --- inside: renaming
+
+    async def _rename_checked(
+        self, old: bytes, new: bytes, source: DirEntry, target: DirEntry | None, *, by_case: bool
+    ) -> None:
+        context = self._context
+        for path in (old, new):
+            if context.nodes.get(path) is None:
+                context.require_idle(path)
+        displaced = context.nodes.get(new)
+        nodes = sorted({*context.nodes.below(old), *context.nodes.below(new)}, key=lambda node: node.path)
+        async with AsyncExitStack() as locks:
+            for node in nodes:
+                await locks.enter_async_context(node.lock)
+            for node in context.nodes.below(old):
+                await self._deliverer.deliver_locked(node)
+            if displaced is not None:
+                await self._deliverer.abandon(displaced)
+            await self._rename_or_refuse(old, new, target, by_case=by_case)
+            if displaced is not None:
+                self._displace(displaced)
+            if source.kind is EntryKind.DIRECTORY:
+                context.dentries.forget(old)
+            context.follow_rename(old, new)
+            self._on_renamed(old, new)
+        if displaced is not None and not displaced.handles:
+            displaced.drop_draft()
+
+    def _displace(self, node: Node) -> None:
+        """The file that is open at a path lost its name; who has it open keeps what is held of it."""
+        if node.handles:
+            self._keep_content(node)
+        node.removed = True
+        self._context.nodes.detach(node)
+
+    async def _rename_or_refuse(
+        self, old: bytes, new: bytes, target: DirEntry | None, *, by_case: bool
+    ) -> None:
+        try:
+            await self._rename_on_vehicle(old, new, target, by_case=by_case)
+        except NotSupported as error:
+            raise CrossDevice(str(error)) from error
+
+    async def _rename_on_vehicle(
+        self, old: bytes, new: bytes, target: DirEntry | None, *, by_case: bool
+    ) -> None:
+        there = target is not None and await self.listed(new) is not None
+        if target is not None and target.kind is EntryKind.DIRECTORY:
+            await self._sure.remove_directory(new)
+            there = False
+        if not there and not by_case and fits_rename(old, new):
+            await self._rename_plainly(old, new)
+            return
+        replacer = self._deliverer.replacer
+        places = self._context.namer.places(new, old)
+        replacer.reserve(places)
+        try:
+            if not fits_rename(old, new) or by_case:
+                old = await self._step_aside(old, new, places)
+            await replacer.replace(old, new, places, Present(new=True, old=False, target=there))
+        finally:
+            replacer.release(places)
+
+    async def _rename_plainly(self, old: bytes, new: bytes) -> None:
+        traits = self._context.writer.traits
+        try:
+            await self._sure.rename(old, new)
+        except FtpNak as nak:
+            if traits.rename_works is None and await self._cannot_rename(old, new):
+                traits.rename_works = False
+                raise NotSupported("this server cannot rename") from nak
+            if traits.rename_works is False:
+                raise NotSupported("this server cannot rename") from nak
+            raise
+
+    async def _cannot_rename(self, old: bytes, new: bytes) -> bool:
+        """A first rename to a free name failed: return whether both names are as they were."""
+        return await self._sure.entry(old) is not None and await self._sure.entry(new) is None
+
+    async def _step_aside(self, old: bytes, new: bytes, places: Places) -> bytes:
+        """Move `old` to a reserved name on its way to `new`; after an interruption a listing moves it on."""
+        await self._deliverer.replacer.write_sidecar(places, new)
+        await self._rename_plainly(old, places.moved)
+        return places.moved

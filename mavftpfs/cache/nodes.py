@@ -1,0 +1,135 @@
+"""Files that are open or not delivered yet, by path. Layer: cache.
+
+A node is one file of this mount, whatever its name: handles follow it when it is renamed, and keep it when
+it is unlinked. Nodes without handles and without anything to deliver are forgotten.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import trio
+
+from mavftpfs.cache.asides import Places
+from mavftpfs.cache.draft import Draft
+from mavftpfs.cache.files import FileHandle
+from mavftpfs.cache.plan import Plan
+from mavftpfs.cache.remote import Upload
+from mavftpfs.cache.sending import Sending
+from mavftpfs.cache.spool import SpoolContent
+from mavftpfs.shared.errors import MavftpfsError
+
+
+@dataclass(slots=True, eq=False)
+class Attempt:
+    """One try to deliver a draft.
+
+    path: where its bytes go. places: the reserved names, for a replacement. committing: verified, and the
+    renames may have begun.
+    """
+
+    plan: Plan
+    path: bytes
+    sending: Sending
+    upload: Upload
+    places: Places | None = None
+    committing: bool = False
+
+
+@dataclass(slots=True, eq=False)
+class Node:
+    """One file.
+
+    path: its name, or the reserved name it was hidden under. draft: what the vehicle does not have of it;
+    content: the draft's bytes. handles: how many are open, writers: those for writing. generation: counts how
+    often its content on the vehicle was changed by us. removed: it has no name any more. hidden: it is still
+    on the vehicle under a reserved name. error: why it could not be delivered. quiet: no delivery is under
+    way, so it may be written. lock: held to deliver it and to change its path. starting: a background
+    upload is about to begin. background: whether it may begin by itself. base: reads the vehicle's file.
+    delivered_at: when the vehicle last had it all.
+    """
+
+    path: bytes
+    draft: Draft | None = None
+    content: SpoolContent | None = None
+    handles: int = 0
+    writers: int = 0
+    generation: int = 0
+    removed: bool = False
+    hidden: bool = False
+    error: MavftpfsError | None = None
+    attempt: Attempt | None = None
+    base: FileHandle | None = None
+    starting: bool = False
+    background: bool = True
+    delivered_at: float = float("-inf")
+    lock: trio.Lock = field(default_factory=trio.Lock)
+    quiet: trio.Event = field(default_factory=trio.Event)
+
+    def __post_init__(self) -> None:
+        self.quiet.set()
+
+    @property
+    def undelivered(self) -> bool:
+        """Whether the vehicle lacks something of it that it should have."""
+        return self.draft is not None and not self.removed and not self.draft.clean
+
+    def close_base(self) -> None:
+        """The vehicle's file is another one, or is not needed."""
+        base, self.base = self.base, None
+        if base is not None:
+            base.close()
+
+    def drop_draft(self) -> None:
+        """The vehicle has it all, or nobody wants it."""
+        self.close_base()
+        if self.content is not None:
+            self.content.close()
+        self.draft = self.content = self.attempt = self.error = None
+        self.background = True
+
+
+class Nodes:
+    """All nodes that have a name."""
+
+    def __init__(self) -> None:
+        self._by_path: dict[bytes, Node] = {}
+
+    def __iter__(self) -> Iterator[Node]:
+        """Yield every node; changing paths meanwhile is fine."""
+        return iter(list(self._by_path.values()))
+
+    def get(self, path: bytes) -> Node | None:
+        """Return the node of a path."""
+        return self._by_path.get(path)
+
+    def need(self, path: bytes) -> Node:
+        """Return the node of a path, new if there is none."""
+        node = self._by_path.get(path)
+        if node is None:
+            node = self._by_path[path] = Node(path)
+        return node
+
+    def below(self, path: bytes) -> list[Node]:
+        """Return the nodes at a path and below it."""
+        return [n for p, n in self._by_path.items() if p == path or p.startswith(path + b"/")]
+
+    def maybe_forget(self, node: Node) -> None:
+        """Forget a node that nobody needs."""
+        if not node.handles and not node.undelivered and not node.lock.locked():
+            node.drop_draft()
+            if self._by_path.get(node.path) is node:
+                del self._by_path[node.path]
+
+    def detach(self, node: Node) -> None:
+        """The node's path is not its name any more."""
+        if self._by_path.get(node.path) is node:
+            del self._by_path[node.path]
+
+    def rename(self, old: bytes, new: bytes) -> None:
+        """Nodes at `old` and below it have another path; `new` must have no nodes."""
+        for node in self.below(old):
+            del self._by_path[node.path]
+            node.path = new + node.path[len(old) :]
+            self._by_path[node.path] = node

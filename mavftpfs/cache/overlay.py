@@ -1,0 +1,127 @@
+"""What programs see that no listing shows: drafts, local names, times set by users. Layer: cache."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from mavftpfs.cache.asides import is_reserved
+from mavftpfs.cache.attributes import Stat, shown_mtime
+from mavftpfs.cache.context import Context
+from mavftpfs.cache.draft import Draft
+from mavftpfs.cache.localfiles import LocalFiles
+from mavftpfs.cache.nodes import Node
+from mavftpfs.cache.times import SECOND, Times, shown
+from mavftpfs.shared.errors import NotADirectory, NotFound, NotSupported
+from mavftpfs.shared.model import EntryKind, join, split
+
+
+class Overlay:
+    """Lies over the vehicle's listings. Paths are the vehicle's.
+
+    Attributes:
+        local: names that never reach the vehicle. times: mtimes that it cannot be told.
+    """
+
+    def __init__(self, context: Context) -> None:
+        self._context = context
+        options = context.options
+        self.times = Times()
+        self.local = LocalFiles(options.local, options.local_max, self.now_ns)
+
+    def spelled(self, path: bytes) -> bytes:
+        """Return the listed spelling of a path on a card that does not tell case apart."""
+        parent, name = split(path)
+        directory = self._context.dentries.known(parent)
+        if not self._context.writer.traits.folds_case or directory is None or name in directory.entries:
+            return path
+        others = [n for n in directory.entries if n.lower() == name.lower()]
+        return join(parent, others[0]) if others else path
+
+    def stat(self, path: bytes) -> Stat | None:
+        """Return what is known better here than by any listing, None if the listing decides.
+
+        Raises:
+            NotFound: a local or reserved name that is not there.
+        """
+        if is_reserved(split(path)[1]):
+            raise NotFound(f"{path!r} is a name of our own")
+        if self.local.owns(path):
+            return self.local.stat(path)
+        node = self._context.nodes.get(path)
+        if node is None or node.draft is None:
+            return None
+        seconds, nanoseconds = self._draft_time(node, node.draft)
+        return Stat(EntryKind.FILE, node.draft.size, seconds, self._context.options.attr_timeout, nanoseconds)
+
+    def shown_time(self, path: bytes, size: int, mtime: int | None) -> tuple[int, int] | None:
+        """Return the (seconds, nanoseconds) that a user set for a listed path, None if there are none."""
+        known = self.times.get(path, size, mtime)
+        return None if known is None else shown(known)
+
+    def overlay(self, directory: bytes, listed: Mapping[bytes, Stat]) -> dict[bytes, Stat]:
+        """Return a listing with our own names hidden, and with what the vehicle does not have yet."""
+        entries = {name: stat for name, stat in listed.items() if not is_reserved(name)}
+        paths = [node.path for node in self._context.nodes if node.draft is not None]
+        paths += [join(directory, name) for name in self.local.names(directory)]
+        for path in paths:
+            parent, name = split(path)
+            stat = self.stat(path) if parent == directory else None
+            if stat is not None:
+                entries[name] = stat
+        return entries
+
+    def list_local(self, path: bytes) -> dict[bytes, Stat] | None:
+        """Return the entries of a local directory, None for one of the vehicle.
+
+        Raises:
+            NotFound, NotADirectory.
+        """
+        if not self.local.owns(path):
+            return None
+        if self.local.find(path).kind is not EntryKind.DIRECTORY:
+            raise NotADirectory(f"{path!r} is not a directory")
+        return self.overlay(path, {})
+
+    # --- what changes ask
+
+    def now_ns(self) -> int:
+        """Return the time of day, nanoseconds since 1970."""
+        return int(self._context.wall() * SECOND)
+
+    def require_free(self, path: bytes) -> None:
+        """Raise NotSupported for a name of our own."""
+        if is_reserved(split(path)[1]):
+            raise NotSupported(f"names that begin like {path!r} are for replacing files")
+
+    def on_written(self, path: bytes) -> None:
+        """A file's content changed: what a user set is void, and a server that tells mtimes will tell now."""
+        directory = self._context.dentries.known(split(path)[0])
+        if directory is not None and any(entry.mtime is not None for entry in directory.entries.values()):
+            self.times.set(path, self.now_ns())
+        else:
+            self.times.forget(path)  # the same constant as in every mount
+
+    def set_times(self, path: bytes, mtime_ns: int) -> None:
+        """Show this mtime until the file changes; of a local file keep it."""
+        path = self.spelled(path)
+        if self.local.owns(path):
+            self.local.set_times(path, mtime_ns)
+        else:
+            self.times.set(path, mtime_ns)
+
+    def on_renamed(self, old: bytes, new: bytes) -> None:
+        """The vehicle's path has another name, and so has what is local below it."""
+        self.times.rename(old, new)
+        self.local.move_below(old, new)
+
+    # --- inside
+
+    def _draft_time(self, node: Node, draft: Draft) -> tuple[int, int]:
+        known = self.times.peek(node.path)
+        if known is not None:
+            return shown(known)
+        parent, name = split(node.path)
+        directory = self._context.dentries.known(parent)
+        entry = None if directory is None else directory.entries.get(name)
+        listed = entry.mtime if entry is not None and draft.clean else None
+        return shown_mtime(node.path, listed), 0

@@ -1,0 +1,194 @@
+"""Puts a verified file in another's place, in steps of which each may be the last. Layer: cache.
+
+Where the server replaces files by renaming, one request does it. Where it refuses (FAT) the old file is
+moved aside first and removed last. `asides` says what is left by an interruption and how it is mended.
+"""
+
+from __future__ import annotations
+
+import errno
+import logging
+from dataclasses import dataclass
+
+from mavftpfs.cache.asides import Places
+from mavftpfs.cache.context import Context
+from mavftpfs.cache.remote import UploadSource
+from mavftpfs.cache.sure import Sure
+from mavftpfs.shared.errnos import errno_for
+from mavftpfs.shared.errors import FtpNak, MavftpfsError, NotSupported, VerificationFailed
+from mavftpfs.shared.model import split
+
+log = logging.getLogger("mavftpfs.cache")
+
+_FILE_EXISTS = 8
+_HONEST = frozenset({errno.EACCES, errno.EROFS, errno.ENOSPC, errno.ENAMETOOLONG})
+"""Refusals that mean what they say; others do not tell whether the server renames at all."""
+
+
+@dataclass(frozen=True, slots=True)
+class Present:
+    """Which of the files of a replacement are on the vehicle."""
+
+    new: bool
+    old: bool
+    target: bool
+
+
+class Replacer:
+    """Renames over files that exist."""
+
+    def __init__(self, context: Context, sure: Sure) -> None:
+        self._context = context
+        self._sure = sure
+
+    def reserve(self, places: Places) -> None:
+        """From now on the names are in use: no listing's repair touches them."""
+        self._context.live |= self._names(places)
+
+    def release(self, places: Places) -> None:
+        """What is left under these names is for the next listing to clean up."""
+        self._context.live -= self._names(places)
+
+    async def write_sidecar(self, places: Places, target: bytes) -> None:
+        """Write down where short names belong, if the names are short.
+
+        Raises:
+            As WriteStore.open_upload.
+        """
+        if places.sidecar is None:
+            return
+        upload = await self._context.writer.open_upload(places.sidecar, _Bytes(target), create=True)
+        try:
+            upload.wake()
+            await upload.finish()
+        finally:
+            await upload.abort()
+
+    async def observe(self, places: Places, target: bytes) -> Present:
+        """Find out by listings how far an interrupted replacement came.
+
+        Raises:
+            As Sure.entry.
+        """
+        new = await self._sure.entry(places.new)
+        parents = {split(path)[0] for path in (places.new, target)}
+        old = self._known(places.old)
+        there = await self._sure.entry(target) is not None if len(parents) > 1 else self._known(target)
+        return Present(new is not None, old, there)
+
+    async def replace(self, source: bytes, target: bytes, places: Places, present: Present) -> None:
+        """Rename `source` to `target`, over the file that is there.
+
+        Raises:
+            NotSupported: the server does not rename. Else as WriteStore.rename. The old file is under its
+            name again, unless that failed too: then the next listing puts it back.
+        """
+        if present.new:
+            if not present.target:
+                await self._finish_rename(source, target, places, old=present.old)
+            elif not await self._rename_over(source, target):
+                present = Present(new=True, old=await self._move_aside(target, places.old), target=False)
+                await self._finish_rename(source, target, places, old=present.old)
+        elif not present.target:
+            raise VerificationFailed(f"{source!r} vanished before it was renamed to {target!r}")
+        await self.clean(places, old=present.old)
+
+    async def clean(self, places: Places, *, new: bool = False, old: bool = False) -> None:
+        """Remove what is not needed any more; what cannot be removed now goes at a later listing."""
+        doomed = [places.new] * new + [places.old] * old
+        if places.sidecar is not None:
+            doomed.append(places.sidecar)
+        for path in doomed:
+            try:
+                await self._sure.remove(path)
+            except MavftpfsError as error:
+                if errno_for(error) == errno.ENOENT:
+                    continue
+                log.info("%r stays until its directory is listed again: %s", path, error)
+                return
+
+    # --- inside
+
+    def _names(self, places: Places) -> set[bytes]:
+        names = {places.new, places.old, places.moved}
+        return names if places.sidecar is None else names | {places.sidecar}
+
+    def _known(self, path: bytes) -> bool:
+        parent, name = split(path)
+        directory = self._context.dentries.known(parent)
+        return directory is not None and name in directory.entries
+
+    async def _rename_over(self, source: bytes, target: bytes) -> bool:
+        """Return whether the server replaced the target."""
+        traits = self._context.writer.traits
+        if traits.rename_replaces is False:
+            return False
+        try:
+            await self._sure.rename(source, target)
+        except FtpNak as nak:
+            if errno_for(nak) in _HONEST:
+                raise
+            if nak.code == _FILE_EXISTS or errno_for(nak) == errno.EEXIST:
+                traits.rename_replaces = False
+            log.debug("the server does not rename %r over %r: %s", source, target, nak)
+            return False
+        traits.rename_replaces = True
+        return True
+
+    async def _move_aside(self, target: bytes, old: bytes) -> bool:
+        """Return whether there was something to move."""
+        traits = self._context.writer.traits
+        try:
+            await self._sure.rename(target, old)
+        except FtpNak as nak:
+            if errno_for(nak) == errno.ENOENT:
+                return False
+            if traits.rename_works or errno_for(nak) in _HONEST:
+                raise
+            traits.rename_works = False
+            raise NotSupported("this server cannot rename") from nak
+        if traits.rename_replaces is None:
+            traits.rename_replaces = False  # it renames, but did not replace a moment ago
+        return True
+
+    async def _finish_rename(self, source: bytes, target: bytes, places: Places, *, old: bool) -> None:
+        try:
+            await self._sure.rename(source, target)
+        except FtpNak:
+            if old:
+                await self._undo(places.old, target)
+            raise
+
+    async def _undo(self, old: bytes, target: bytes) -> None:
+        try:
+            await self._sure.rename(old, target)
+        except MavftpfsError as error:
+            log.warning("%r lies under %r until its directory is listed again: %s", target, old, error)
+
+
+class _Bytes(UploadSource):
+    """A few bytes to upload."""
+
+    def __init__(self, data: bytes) -> None:
+        self._data = data
+        self._at = 0
+
+    def next_chunk(self, limit: int) -> tuple[int, bytes] | None:
+        """See UploadSource."""
+        chunk = (self._at, self._data[self._at : self._at + limit])
+        self._at += len(chunk[1])
+        return chunk if chunk[1] else None
+
+    def on_acked(self, offset: int, count: int) -> None:
+        """See UploadSource."""
+
+    def on_unsent(self, offset: int, count: int) -> None:
+        """See UploadSource: all again, it is at most one path."""
+        self._at = min(self._at, offset)
+
+    def on_checkpoint(self) -> None:
+        """See UploadSource."""
+
+    def on_rollback(self, everything: bool) -> None:
+        """See UploadSource."""
+        self._at = 0

@@ -1,0 +1,64 @@
+"""Keeps programs from writing much faster than the link carries. Layer: cache.
+
+close() cannot be killed, so what a close may have to wait for is bounded: about ten seconds of the measured
+rate, shared by the uploads under way, unless dirty_max says otherwise.
+"""
+
+from __future__ import annotations
+
+import trio
+
+from mavftpfs.cache.context import Context
+from mavftpfs.cache.nodes import Node
+from mavftpfs.cache.options import KIB, MIB
+from mavftpfs.cache.readahead import RateMeter
+
+SECONDS = 10.0
+LEAST, MOST = 64 * KIB, 8 * MIB
+UNMEASURED = 256 * KIB
+"""What may wait before the first bytes were ACKed."""
+
+STALL = 5.0
+"""After so many seconds in which nothing was ACKed a writer asks why."""
+
+
+class Throttle:
+    """Knows how fast bytes are ACKed."""
+
+    def __init__(self, context: Context) -> None:
+        self._context = context
+        self._moved = trio.Event()
+        self.meter = RateMeter()
+
+    @property
+    def limit(self) -> int:
+        """Bytes that may be un-ACKed over all uploads, and held in memory."""
+        fixed = self._context.options.dirty_max
+        if fixed is not None:
+            return fixed
+        rate = self.meter.rate
+        return UNMEASURED if rate is None else min(max(int(rate * SECONDS), LEAST), MOST)
+
+    def is_full(self, node: Node) -> bool:
+        """Return whether the writers of a file have to wait."""
+        if node.attempt is None or node.attempt.committing:
+            return False
+        streams = sum(1 for other in self._context.nodes if other.attempt is not None)
+        return node.attempt.sending.unacked > max(self.limit // streams, LEAST)
+
+    async def wait(self) -> bool:
+        """Wait for anything to move; return False if nothing did for STALL seconds."""
+        with trio.move_on_after(STALL):
+            await self._moved.wait()
+            return True
+        return False
+
+    def on_acked(self, count: int) -> None:
+        """Bytes arrived."""
+        self.meter.on_bytes(count, self._context.clock())
+        self.let_go()
+
+    def let_go(self) -> None:
+        """Have those who wait look again."""
+        moved, self._moved = self._moved, trio.Event()
+        moved.set()

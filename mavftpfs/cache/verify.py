@@ -1,0 +1,84 @@
+"""Compares what is on the card with what was written (promise 2). Layer: cache.
+
+The size always; the CRC32 where the content is wholly known here and the file is not too large. Leading
+zeros do not change this CRC32 (servers.md 10), so it never stands alone. Silence or a refusal of the CRC32
+counts as verified by size, is logged once and counted, unless verify=crc.
+"""
+
+from __future__ import annotations
+
+import logging
+
+from mavftpfs.cache.context import Context
+from mavftpfs.cache.draft import Draft
+from mavftpfs.cache.sure import Sure
+from mavftpfs.shared.errors import Armed, FtpNak, MavftpfsError, RequestTimeout, VerificationFailed
+from mavftpfs.shared.model import split
+
+log = logging.getLogger("mavftpfs.cache")
+
+SMALL_LISTING = 5
+"""A directory of so few names is listed in one request, which tells more than opening the file."""
+
+
+class Verifier:
+    """Counts, too: files verified by CRC32, by size alone, and CRC32s that were not answered."""
+
+    def __init__(self, context: Context, sure: Sure) -> None:
+        self._context = context
+        self._sure = sure
+        self.by_crc = 0
+        self.by_size = 0
+        self.unanswered = 0
+
+    async def check(self, path: bytes, draft: Draft) -> None:
+        """Compare a file on the vehicle with a draft.
+
+        Raises:
+            VerificationFailed: it is another file. Else as WriteStore.stat_size.
+        """
+        if self._context.options.verify == "none":
+            return
+        size = await self._size(path)
+        if size != draft.size:
+            raise VerificationFailed(f"{path!r} has {size} bytes on the vehicle, {draft.size} were written")
+        if await self._crc_agrees(path, draft):
+            self.by_crc += 1
+        else:
+            self.by_size += 1
+
+    async def _size(self, path: bytes) -> int:
+        known = self._context.dentries.known(split(path)[0])
+        if known is not None and len(known.entries) <= SMALL_LISTING:
+            entry = await self._sure.entry(path)
+            if entry is not None and entry.size is not None:
+                return entry.size
+        return await self._context.writer.stat_size(path)
+
+    async def _crc_agrees(self, path: bytes, draft: Draft) -> bool:
+        """Return whether the CRC32 was compared.
+
+        Raises:
+            VerificationFailed: it differs, or was not answered though verify=crc.
+        """
+        options = self._context.options
+        demanded = options.verify == "crc"
+        if options.verify == "size" or not draft.whole or draft.size == 0:
+            return False
+        if draft.size > options.verify_max and not demanded:
+            return False
+        try:
+            remote = await self._context.store.crc32(path)
+        except (FtpNak, RequestTimeout, Armed) as error:
+            self._note_unanswered(path, error, demanded=demanded)
+            return False
+        if remote != draft.crc32():
+            raise VerificationFailed(f"the vehicle's checksum of {path!r} is not that of what was written")
+        return True
+
+    def _note_unanswered(self, path: bytes, error: MavftpfsError, *, demanded: bool) -> None:
+        if demanded:
+            raise VerificationFailed(f"no checksum of {path!r}: {error}") from error
+        if not isinstance(error, Armed):
+            self.unanswered += 1
+            log.warning("%r is verified by its size alone: %s", path, error)

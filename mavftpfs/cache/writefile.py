@@ -1,0 +1,190 @@
+"""Open files of a mount that can be written. Layer: cache.
+
+Every handle of a file shares its node, so that a reader sees at once what a writer wrote, whatever the
+vehicle has. A handle opened for reading keeps its own readahead and opens the vehicle's file anew after we
+changed it.
+"""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+from mavftpfs.cache.base import open_base, read_base
+from mavftpfs.cache.context import Context
+from mavftpfs.cache.draft import Draft, Where
+from mavftpfs.cache.files import FileHandle
+from mavftpfs.cache.nodes import Node
+from mavftpfs.cache.readonly import ReadOnlyHandle
+from mavftpfs.shared.errors import FileChanged, LocalProtocolError
+
+TRIES = 3
+"""How often a read starts anew because the file was delivered meanwhile."""
+
+
+class Owner(Protocol):
+    """What a handle asks of writeback.Writeback."""
+
+    async def write(self, node: Node, offset: int, data: bytes | memoryview) -> int: ...
+    async def truncate_node(self, node: Node, size: int) -> None: ...
+    async def deliver(self, node: Node) -> None: ...
+    async def close(self, node: Node) -> None: ...
+    def drop_handle(self, node: Node, *, writing: bool) -> None: ...
+
+
+class _Reading:
+    """Reads of one handle: the draft if there is one, else the vehicle's file."""
+
+    direct_io = False
+
+    def __init__(self, context: Context, node: Node, handle: FileHandle | None) -> None:
+        self._context = context
+        self._node = node
+        self._handle = handle
+        self._generation = node.generation
+        self._closed = False
+
+    @property
+    def size(self) -> int:
+        """Bytes, as programs see it now."""
+        if self._node.draft is not None:
+            return self._node.draft.size
+        return 0 if self._handle is None else self._handle.size
+
+    @property
+    def keep_cache(self) -> bool:
+        """Whether the kernel's pages are still right."""
+        return self._node.draft is None and self._handle is not None and self._handle.keep_cache
+
+    async def read(self, offset: int, size: int) -> bytes | memoryview:
+        """Return `size` bytes at `offset`, fewer only at the end of the file.
+
+        Raises:
+            FileChanged, DataUnproven, RequestTimeout, VehicleLost, FtpNak.
+        """
+        if self._closed:
+            raise LocalProtocolError("read of a closed handle")
+        for _ in range(TRIES - 1):
+            state = (self._node.generation, self._node.draft)
+            try:
+                return await self._read(offset, size)
+            except FileChanged:
+                if state == (self._node.generation, self._node.draft):
+                    raise
+        return await self._read(offset, size)
+
+    async def _read(self, offset: int, size: int) -> bytes | memoryview:
+        node = self._node
+        if node.draft is not None:
+            return await self._read_draft(node.draft, offset, offset + size)
+        if self._handle is None or self._generation != node.generation:
+            self._close_handle()
+            self._generation = node.generation
+            self._handle = await open_base(self._context, node.path)
+        return await self._handle.read(offset, size)
+
+    async def _read_draft(self, draft: Draft, start: int, stop: int) -> bytes | memoryview:
+        parts: list[bytes | memoryview] = []
+        at = start
+        while at < min(stop, draft.size):
+            # Asked anew after each await: the draft may have been written meanwhile.
+            where, a, b = draft.segments(at, stop)[0]
+            if where is Where.BASE:
+                parts.append(await read_base(self._context, self._node, a, b))
+            else:
+                parts.append(draft.local_bytes(a, b))
+            at = b
+        return parts[0] if len(parts) == 1 else b"".join(parts)
+
+    def _close_handle(self) -> None:
+        handle, self._handle = self._handle, None
+        if handle is not None:
+            handle.close()
+
+
+class ReadFile(_Reading, ReadOnlyHandle):
+    """One open() for reading (see cache.openfile.OpenFile)."""
+
+    def __init__(self, owner: Owner, context: Context, node: Node, handle: FileHandle | None) -> None:
+        super().__init__(context, node, handle)
+        self._owner = owner
+        node.handles += 1
+
+    async def release(self) -> None:
+        """Close the handle; the last one of an unlinked file has it removed."""
+        if not self._closed:
+            self.close()
+            await self._owner.close(self._node)
+
+    def close(self) -> None:
+        """Close the handle; closing twice is harmless."""
+        if not self._closed:
+            self._closed = True
+            self._close_handle()
+            self._owner.drop_handle(self._node, writing=False)
+
+
+class WriteFile(_Reading):
+    """One open() for writing (see cache.openfile.OpenFile)."""
+
+    writable = True
+
+    def __init__(self, owner: Owner, context: Context, node: Node) -> None:
+        super().__init__(context, node, None)
+        self._owner = owner
+        node.handles += 1
+        node.writers += 1
+
+    async def write(self, offset: int, data: bytes | memoryview) -> int:
+        """Take all of `data`; see OpenFile.write."""
+        self._require_open()
+        return await self._owner.write(self._node, offset, data)
+
+    async def truncate(self, size: int) -> None:
+        """Cut or extend; see OpenFile.truncate."""
+        self._require_open()
+        await self._owner.truncate_node(self._node, size)
+
+    async def flush(self) -> None:
+        """Deliver, unless all that happened is that the file was emptied: more is about to come.
+
+        A shell empties the file, closes that descriptor's twin, and only then writes.
+
+        Raises:
+            Why it is not delivered.
+        """
+        draft = self._node.draft
+        if draft is not None and draft.size > 0:
+            await self._owner.deliver(self._node)
+
+    async def fsync(self) -> None:
+        """Deliver.
+
+        Raises:
+            Why it is not delivered.
+        """
+        await self._owner.deliver(self._node)
+
+    async def release(self) -> None:
+        """Deliver and close; what could not be delivered stays held.
+
+        Raises:
+            Why it is not delivered.
+        """
+        if self._closed:
+            return
+        try:
+            await self._owner.deliver(self._node)
+        finally:
+            self.close()
+            await self._owner.close(self._node)
+
+    def close(self) -> None:
+        """Close without delivering; closing twice is harmless."""
+        if not self._closed:
+            self._closed = True
+            self._close_handle()
+            self._owner.drop_handle(self._node, writing=True)
+
+    def _require_open(self) -> None:
+        if self._closed:
+            raise LocalProtocolError("write to a closed handle")
