@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+import time
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
 from dataclasses import asdict, dataclass, field
@@ -30,6 +31,9 @@ from mavftpfs.shared.errors import MavftpfsError, VehicleLost
 
 AUTOPILOT_VERSION_ID = 148
 STORAGE_INFORMATION_ID = 261
+
+SIGNING_EPOCH = 1_420_070_400
+"""2015-01-01 UTC in seconds since 1970 (MAVLink guide, "Message Signing")."""
 
 HEARTBEAT_PERIOD = 1.0
 TERMINATE_ON_EXIT = 3.0
@@ -223,7 +227,7 @@ def _build(
     trace: PayloadTrace | None,
 ) -> Connection:
     own = Address(options.source_system, options.source_component)
-    framer = Framer(own, stream=link.is_stream, signing_key=options.signing_key)
+    framer = Framer(own, stream=link.is_stream, signing_key=options.signing_key, signing_clock=signing_now)
     vehicle = Vehicle(options.target_system, options.target_component, own)
     engine = Engine(rng, Flow(serial=link.is_serial, limit=options.window), op_deadline=options.op_deadline)
     driver = Driver(link, framer, engine, vehicle, clock=clock, trace=trace)
@@ -259,6 +263,11 @@ def _build(
 
     vehicle.on_armed = on_armed
     return connection
+
+
+def signing_now() -> int:
+    """Return the present as MAVLink 2 signing counts it: units of 10 µs since 2015-01-01 UTC."""
+    return int((time.time() - SIGNING_EPOCH) * 100_000)
 
 
 def _move_away(connection: Connection) -> None:

@@ -12,12 +12,13 @@ from typing import Protocol
 
 import trio
 
-from mavftpfs.link.base import Link
+from mavftpfs.link.base import Link, PinsPeer
 from mavftpfs.link.framing import Framer
-from mavftpfs.link.messages import Address, FtpFrame, Message
+from mavftpfs.link.messages import Address, FtpFrame, Heartbeat, Message
 from mavftpfs.protocol.engine import Engine
 from mavftpfs.protocol.operations import Operation
 from mavftpfs.protocol.payload import decode_reply
+from mavftpfs.session.notes import Remarks
 from mavftpfs.session.vehicle import Vehicle
 from mavftpfs.shared.errors import RemoteProtocolError, RequestTimeout
 
@@ -61,6 +62,8 @@ class Driver:
         self.on_batch = on_batch
         self._clock = clock
         self._trace = trace
+        self._remarks = Remarks(engine.stats)
+        self._pins = link if isinstance(link, PinsPeer) else None
         self._scope: trio.CancelScope | None = None
         self._waiting: dict[Operation, Callable[[], None]] = {}
 
@@ -125,34 +128,41 @@ class Driver:
             self.framer.reset()
             return
         self._heard_at = now
-        for chunk in chunks:
-            self._handle(self.framer.feed(chunk), now)
+        for index, chunk in enumerate(chunks):
+            self._handle(self.framer.feed(chunk), now, index)
         self.on_batch(now)
 
-    def _handle(self, messages: list[Message], now: float) -> None:
+    def _handle(self, messages: list[Message], now: float, index: int = -1) -> None:
         for message in messages:
             if type(message) is FtpFrame and self.vehicle.is_reply_to_us(message):
                 self._on_reply(message.payload, now)
             else:
-                self._on_other(message, now)
+                self._on_other(message, now, index)
 
     @property
     def _quiet_at(self) -> float:
         return self._heard_at + QUIET if self.framer.waiting else float("inf")
 
     def _on_reply(self, wire: bytes, now: float) -> None:
-        if self._trace is not None:
-            self._trace.payload(now, "reply", wire)
         try:
             reply = decode_reply(wire)
         except RemoteProtocolError:
             self.bad_payloads += 1
+            if self._trace is not None:
+                self._trace.payload(now, "reply", wire, "malformed")
             return
         self.last_reply_at = now
+        if self._trace is None:
+            self.engine.receive(reply, now)
+            return
+        self._remarks.before_reply()
         self.engine.receive(reply, now)
+        self._trace.payload(now, "reply", wire, self._remarks.after_reply(reply))
 
-    def _on_other(self, message: Message, now: float) -> None:
+    def _on_other(self, message: Message, now: float, index: int) -> None:
         self.vehicle.on_message(message, now)
+        if type(message) is Heartbeat and message.source == self.vehicle.address and self._pins is not None:
+            self._pins.pin_peer(index)
 
     def _settle(self, now: float) -> None:
         target = self.vehicle.address
@@ -170,7 +180,7 @@ class Driver:
             return
         if self._trace is not None:
             for wire in payloads:
-                self._trace.payload(now, "request", wire)
+                self._trace.payload(now, "request", wire, self._remarks.on_request(wire))
         encode = self.framer.encode_ftp
         self.link.send_nowait([encode(target, wire) for wire in payloads])
 

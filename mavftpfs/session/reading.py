@@ -47,7 +47,7 @@ class Reading:
             self._seen_bytes = transfer.received_bytes
             stream.last_data_at = now
             stream.clean_failures = 0
-            stream.sink.on_batch()
+            stream.on_batch()
         if transfer.idle or transfer.done:
             self._holder.wake()
 
@@ -93,7 +93,7 @@ class Reading:
     async def _read(self, stream: FileStream) -> None:
         session = self._holder.session
         assert session is not None
-        transfer = ReadTransfer(session.id, stream.size, stream.sink, self._steering.chunk)
+        transfer = ReadTransfer(session.id, stream.size, stream, self._steering.chunk)
         started = self._clock()
         self.active, self._transfer, self._seen_bytes = stream, transfer, 0
         stream.attach(transfer)
@@ -143,7 +143,7 @@ class Reading:
         """Reopen and go on at the same offset (promise 5); what the lost session read is provisional."""
         self._holder.abandon()
         if error.by_server:
-            stream.sink.on_suspect(str(error))
+            stream.on_suspect(str(error))
         stream.clean_failures += 1
         if stream.clean_failures > REOPENS:
             stream.fail(error)

@@ -212,7 +212,7 @@ class Scheduler:
         now = self._clock()
         for stream in self._streams:
             if stream is self._reading.active or (stream.last_data_at or -1e9) > now - within:
-                stream.sink.on_suspect(reason)
+                stream.on_suspect(reason)
 
     def on_reboot(self) -> None:
         """The vehicle restarted, perhaps as another one: nothing is open, nothing is known of it."""

@@ -24,7 +24,7 @@ class FileStream:
         self, path: bytes, sink: ReadSink, size: int | None, wake: Callable[[FileStream], None]
     ) -> None:
         self.path = path
-        self.sink = sink
+        self._sink = sink
         self.closed = False
         self.use = Service()
         self.ticket: int | None = None
@@ -54,9 +54,11 @@ class FileStream:
         if start >= stop or self.closed:
             return
         if self._orphaned:
-            self.sink.on_failed(self._gone())
+            self._sink.on_failed(self._gone())
             return
-        (self._demand if demand else self._ahead).add(start, stop)
+        wanted = self._demand if demand else self._ahead
+        for gap_start, gap_stop in self._sink.missing(start, stop):
+            wanted.add(gap_start, gap_stop)
         if self._transfer is not None:
             self._transfer.want(start, stop, demand)
         self._wake(self)
@@ -82,12 +84,12 @@ class FileStream:
         """Whether somebody waits for this file."""
         if self.closed:
             return False
-        return self.wants_open or not self._unmet(self._demand).empty
+        return self.wants_open or not self._demand.empty
 
     @property
     def has_ahead(self) -> bool:
         """Whether readahead is wanted."""
-        return not self.closed and not self._unmet(self._ahead).empty
+        return not self.closed and not self._ahead.empty
 
     async def wait_opened(self) -> None:
         """Wait for the first open's outcome; raise its error."""
@@ -113,18 +115,37 @@ class FileStream:
     def attach(self, transfer: ReadTransfer) -> None:
         """Hand what is wanted to a transfer; later wants go to it directly."""
         self._transfer = transfer
-        self._demand = self._unmet(self._demand)
-        self._ahead = self._unmet(self._ahead)
         for start, stop in self._demand:
             transfer.want(start, stop, True)
         for start, stop in self._ahead:
             transfer.want(start, stop, False)
 
+    # Being the transfer's sink, the stream keeps what is on its way when it is closed from its own sink.
+
+    def missing(self, start: int, stop: int) -> list[tuple[int, int]]:
+        """Return the parts of [start, stop) that the cache does not hold."""
+        return self._sink.missing(start, stop)
+
+    def on_data(self, offset: int, data: bytes) -> None:
+        """Pass bytes on."""
+        if not self.closed:
+            self._sink.on_data(offset, data)
+
+    def on_batch(self) -> None:
+        """A batch of data ended. What came is wanted no more, even if the cache soon drops it again."""
+        if not self.closed:
+            self._demand = self._unmet(self._demand)
+            self._ahead = self._unmet(self._ahead)
+            self._sink.on_batch()
+
+    def on_suspect(self, reason: str) -> None:
+        """What was read lately is provisional."""
+        if not self.closed:
+            self._sink.on_suspect(reason)
+
     def detach(self) -> None:
         """Take back what the transfer did not deliver."""
         self._transfer = None
-        self._demand = self._unmet(self._demand)
-        self._ahead = self._unmet(self._ahead)
 
     def on_idle(self) -> None:
         """Everything wanted has come."""
@@ -140,7 +161,7 @@ class FileStream:
             self._open_error = error
             self._opened.set()
         else:
-            self.sink.on_failed(error)
+            self._sink.on_failed(error)
 
     def orphan(self) -> None:
         """The file is gone from its path: nothing more of it can be had, and of its successor nothing may."""
@@ -153,8 +174,8 @@ class FileStream:
 
     def contiguous_want(self) -> int:
         """Return the length of the first wanted run, demand and readahead taken together."""
-        both = self._unmet(self._demand)
-        for start, stop in self._unmet(self._ahead):
+        both = self._demand.copy()
+        for start, stop in self._ahead:
             both.add(start, stop)
         first = both.first()
         return 0 if first is None else first[1] - first[0]
@@ -162,6 +183,6 @@ class FileStream:
     def _unmet(self, wanted: ExtentSet) -> ExtentSet:
         unmet = ExtentSet()
         for start, stop in wanted:
-            for gap_start, gap_stop in self.sink.missing(start, stop):
+            for gap_start, gap_stop in self._sink.missing(start, stop):
                 unmet.add(gap_start, gap_stop)
         return unmet

@@ -1,0 +1,119 @@
+"""A connection's surroundings: who is answered, signing, what a trace says, neighbours with our address."""
+
+from __future__ import annotations
+
+import random
+
+import pytest
+import trio
+from trio.testing import MockClock
+
+from mavftpfs.link.framing import Framer
+from mavftpfs.link.messages import MAV_AUTOPILOT_INVALID, Address
+from mavftpfs.link.opening import open_link
+from mavftpfs.link.uri import parse_source
+from mavftpfs.protocol.payload import decode_request
+from mavftpfs.session.connection import ConnectOptions, connected
+from mavftpfs.shared.errors import VehicleLost
+from mavftpfs.sim.linkmodel import LinkModel, LinkSettings
+from mavftpfs.sim.memory import MemoryLink
+from mavftpfs.sim.memorytree import MemoryTree
+from mavftpfs.sim.profiles import PROFILES
+from mavftpfs.sim.vehicle import SimVehicle
+from tests.support.worlds import World, read_file
+
+KEY = bytes(range(32))
+DATA = random.Random(5).randbytes(30_000)
+
+
+@pytest.fixture
+def autojump() -> MockClock:
+    return MockClock(autojump_threshold=0)
+
+
+class Collected:
+    def __init__(self) -> None:
+        self.lines: list[tuple[str, int, str]] = []
+
+    def payload(self, now: float, direction: str, wire: bytes, note: str = "") -> None:
+        self.lines.append((direction, decode_request(wire).seq, note))
+
+
+async def test_the_trace_tells_what_was_repeated_and_what_was_not_believed(autojump: MockClock) -> None:
+    here = World("px4", LinkSettings(rate=50_000.0, delay=0.02, loss=0.1, duplicate=0.1))
+    here.tree.add(b"/f", DATA)
+    trace = Collected()
+    async with connected(here.link, ConnectOptions(), rng=random.Random(1), trace=trace) as connection:
+        await connection.ready(10)
+        assert await read_file(connection, b"/f") == DATA
+        repeated = [line for line in trace.lines if line[0] == "request" and "retransmit" in line[2]]
+        doubted = [line for line in trace.lines if line[0] == "reply" and line[2]]
+        assert len(repeated) == connection.engine.stats.retransmissions > 5
+        assert len(doubted) == connection.engine.stats.unknown > 3
+
+
+async def test_signing_both_ways(autojump: MockClock) -> None:
+    tree = MemoryTree()
+    tree.add(b"/f", DATA)
+    vehicle = SimVehicle(tree, PROFILES["px4"], rng=random.Random(1), signing_key=KEY)
+    link = MemoryLink(vehicle, LinkModel(random.Random(2), LinkSettings(delay=0.01, loss=0.05)))
+    async with connected(link, ConnectOptions(signing_key=KEY), rng=random.Random(3)) as connection:
+        await connection.ready(10)
+        # A vehicle without a clock is refused until it has heard the time in our frames.
+        refused = connection.driver.framer.stats.bad_signature
+        assert await read_file(connection, b"/f") == DATA
+        assert connection.driver.framer.stats.bad_signature == refused
+    # Restarted, we must not begin with older timestamps than the vehicle heard from us.
+    async with connected(link, ConnectOptions(signing_key=KEY), rng=random.Random(4)) as connection:
+        await connection.ready(10)
+        assert await read_file(connection, b"/f") == DATA
+    async with connected(link, ConnectOptions(signing_key=bytes(32)), rng=random.Random(5)) as connection:
+        with pytest.raises(VehicleLost):
+            await connection.ready(5)
+
+
+async def test_a_neighbour_with_our_address_makes_us_move(autojump: MockClock) -> None:
+    here = World("ardupilot", LinkSettings(delay=0.01))
+    here.tree.add(b"/f", DATA)
+    async with here.connection() as connection:
+        own = connection.vehicle.own
+        neighbour = Framer(own, stream=False).encode_heartbeat(18, MAV_AUTOPILOT_INVALID)
+        for message in connection.driver.framer.feed(neighbour):
+            connection.vehicle.on_message(message, trio.current_time())
+        assert connection.vehicle.own != own
+        assert connection.vehicle.own.system == own.system
+        assert await read_file(connection, b"/f") == DATA
+
+
+async def test_a_second_talker_on_the_port_does_not_get_our_requests() -> None:
+    """QGroundControl or a script on the same port: we go on answering the vehicle's address."""
+    tree = MemoryTree()
+    tree.add(b"/f", DATA)
+    vehicle = SimVehicle(tree, PROFILES["px4"], rng=random.Random(1))
+    talker = Framer(Address(255, 190), stream=False)
+    with trio.fail_after(60):
+        async with open_link(parse_source("udpin:127.0.0.1:0")) as link, trio.open_nursery() as nursery:
+            port = parse_source(link.description).port
+            assert port is not None
+            nursery.start_soon(_serve, vehicle, port)
+            async with connected(link, ConnectOptions()) as connection:
+                await connection.ready(20)
+                chatter = trio.socket.socket(type=trio.socket.SOCK_DGRAM)
+                with chatter:
+                    for _ in range(20):
+                        await chatter.sendto(talker.encode_heartbeat(6, 8), ("127.0.0.1", port))
+                    await trio.sleep(0.05)
+                    assert await read_file(connection, b"/f") == DATA
+            nursery.cancel_scope.cancel()
+
+
+async def _serve(vehicle: SimVehicle, port: int) -> None:
+    sock = trio.socket.socket(type=trio.socket.SOCK_DGRAM)
+    with sock:
+        await sock.connect(("127.0.0.1", port))
+        while True:
+            now = trio.current_time()
+            for frame in vehicle.outgoing(now):
+                await sock.send(frame)
+            with trio.move_on_at(min(vehicle.next_deadline(), now + 0.2)):
+                vehicle.receive(await sock.recv(4096), trio.current_time())

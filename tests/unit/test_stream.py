@@ -1,0 +1,48 @@
+"""The session's reader: what is wanted, and when it is not any more."""
+
+from __future__ import annotations
+
+from mavftpfs.session.stream import FileStream
+from tests.support.worlds import MemorySink
+
+
+def make(size: int = 1000) -> tuple[FileStream, MemorySink]:
+    sink = MemorySink(size)
+    return FileStream(b"/f", sink, size, lambda stream: None), sink
+
+
+def test_what_was_delivered_is_not_wanted_again_when_the_cache_drops_it() -> None:
+    stream, sink = make()
+    stream.want(0, 600, demand=True)
+    stream.want(600, 900, demand=False)
+    stream.on_data(0, bytes(600))
+    stream.on_batch()
+    sink.have.clear()  # evicted
+    assert not stream.has_demand
+    assert stream.has_ahead
+    stream.on_data(600, bytes(300))
+    stream.on_batch()
+    sink.have.clear()
+    assert not stream.has_ahead
+    assert stream.contiguous_want() == 0
+
+
+def test_only_what_the_cache_lacks_is_wanted() -> None:
+    stream, sink = make()
+    sink.on_data(100, bytes(100))
+    stream.want(100, 200, demand=True)
+    assert not stream.has_demand
+    stream.want(0, 300, demand=True)
+    assert stream.contiguous_want() == 100
+
+
+def test_a_closed_stream_passes_nothing_on() -> None:
+    stream, sink = make()
+    stream.want(0, 100, demand=True)
+    stream.close()
+    stream.on_data(0, bytes(100))
+    stream.on_suspect("late")
+    stream.want(0, 100, demand=True)
+    assert sink.have.empty
+    assert not sink.suspicions
+    assert not stream.has_demand
