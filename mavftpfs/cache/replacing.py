@@ -141,7 +141,7 @@ class Replacer:
         try:
             await self._sure.rename(target, old)
         except FtpNak as nak:
-            if errno_for(nak) == errno.ENOENT:
+            if errno_for(nak) == errno.ENOENT and await self._sure.entry(target) is None:
                 return False
             if traits.rename_works or errno_for(nak) in _HONEST:
                 raise

@@ -1,0 +1,404 @@
+"""A vehicle that can be written, in memory: FakeStore with cache.remote.WriteStore, of any kind of server.
+
+`Kind` says how it behaves. Failures are put on requests by number: every request of the writing side, and
+every chunk of an upload, counts as one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from random import Random
+from typing import Any
+
+import trio
+
+from mavftpfs.cache.options import CacheOptions
+from mavftpfs.cache.remote import ReadSink, UploadSource
+from mavftpfs.cache.spool import SpoolDirectory
+from mavftpfs.cache.tree import Tree
+from mavftpfs.protocol.payload import NakCode, Opcode
+from mavftpfs.shared.errors import AlreadyExists, Armed, FtpNak, MavftpfsError, RequestTimeout, VehicleLost
+from mavftpfs.shared.model import ROOT, join, split, wire_path
+from mavftpfs.shared.traits import WriteTraits
+from tests.support.fake_store import FakeFile, FakeReader, FakeStore
+
+CHUNK = 239
+
+
+@dataclass(frozen=True, slots=True)
+class Kind:
+    """How a server behaves.
+
+    replaces: rename over a file works (else FileExists, as FAT). moves_into: rename onto a directory moves
+    into it, as NuttX. renames: there is a rename at all. wo_truncates: OpenFileWO empties. truncates:
+    TruncateFile works (None: silence). folds_case: names are found in any case.
+    """
+
+    replaces: bool = True
+    moves_into: bool = False
+    renames: bool = True
+    wo_truncates: bool = False
+    truncates: bool | None = True
+    folds_case: bool = False
+
+
+KINDS = {
+    "posix": Kind(),
+    "nuttx": Kind(moves_into=True, truncates=False),
+    "fat": Kind(replaces=False, folds_case=True, truncates=False),
+    "littlefs": Kind(renames=False, truncates=False),
+    "mavsdk": Kind(wo_truncates=True, truncates=None),
+}
+
+
+class Frozen(VehicleLost):
+    """The vehicle lost power: nothing changes any more."""
+
+
+class FakeWriter(FakeStore):
+    """Files in memory that can be changed.
+
+    Attributes:
+        requests: how many changing requests were executed or failed.
+        log: what they were. fail_at: number -> error raised instead of executing it. lose_reply_at: executed,
+        but answered by silence. freeze_at: from this number on nothing is executed (power lost).
+        capacity: bytes of all files; beyond that WriteFile is refused.
+        spoil_uploads: how many more uploads arrive with a wrong byte. writable_armed: refuse while `armed`.
+    """
+
+    def __init__(self, kind: Kind | None = None, nursery: trio.Nursery | None = None) -> None:
+        super().__init__(nursery)
+        self.kind = kind or Kind()
+        self.traits = WriteTraits()
+        self.requests = 0
+        self.log: list[tuple[str, ...]] = []
+        self.fail_at: dict[int, MavftpfsError] = {}
+        self.lose_reply_at: set[int] = set()
+        self.freeze_at: int | None = None
+        self.capacity: int | None = None
+        self.spoil_uploads = 0
+        self.write_delay = 0.0
+        self.uploads: list[FakeUpload] = []
+        self.probes = 0
+
+    # --- what requests go through
+
+    async def request(self, *what: object) -> bool:
+        """Count a request; raise if it is to fail; return whether its reply gets lost."""
+        await trio.lowlevel.checkpoint()
+        if self.write_delay:
+            await trio.sleep(self.write_delay)
+        self.require_link()
+        if self.armed:
+            raise Armed("armed")
+        self.requests += 1
+        if self.freeze_at is not None and self.requests > self.freeze_at:
+            self.requests -= 1
+            raise Frozen("the power is gone")
+        self.log.append(tuple(str(part) for part in what))
+        error = self.fail_at.pop(self.requests, None)
+        if error is not None:
+            raise error
+        return self.requests in self.lose_reply_at
+
+    def require_link(self) -> None:
+        super().require_link()
+        if self.freeze_at is not None and self.requests >= self.freeze_at:
+            raise Frozen("the power is gone")
+
+    def revive(self) -> None:
+        """The power is back."""
+        self.freeze_at = None
+        self.fail_at.clear()
+        self.lose_reply_at.clear()
+
+    def real(self, path: bytes) -> bytes:
+        """Return the stored spelling of a path."""
+        if path in self.files or path in self.directories or not self.kind.folds_case:
+            return path
+        for known in [*self.files, *self.directories]:
+            if known.lower() == path.lower():
+                return known
+        return path
+
+    @property
+    def used(self) -> int:
+        """Bytes of all files."""
+        return sum(len(file.data) for file in self.files.values())
+
+    # --- WriteStore
+
+    async def open_upload(self, path: bytes, source: UploadSource, *, create: bool) -> FakeUpload:
+        wire_path(path)
+        upload = FakeUpload(self, path, source, create=create)
+        self.uploads.append(upload)
+        return upload
+
+    async def create_empty(self, path: bytes) -> None:
+        wire_path(path)
+        lost = await self.request("create", path)
+        self._create(path)
+        _maybe_lose(lost)
+
+    async def truncate(self, path: bytes, size: int) -> None:
+        lost = await self.request("truncate", path, size)
+        if self.kind.truncates is None:
+            self.traits.truncate_works = False
+            raise RequestTimeout("silence")
+        if not self.kind.truncates:
+            self.traits.truncate_works = False
+            raise FtpNak(Opcode.TRUNCATE_FILE, NakCode.UNKNOWN_COMMAND)
+        self.traits.truncate_works = True
+        file = self._file(path, Opcode.TRUNCATE_FILE)
+        file.data = file.data[:size].ljust(size, b"\0")
+        _maybe_lose(lost)
+
+    async def remove(self, path: bytes) -> None:  # type: ignore[override]  # FakeStore's sets the scene
+        lost = await self.request("remove", path)
+        path = self.real(path)
+        if path in self.directories:
+            self.crimes.append(f"RemoveFile of the directory {path!r}")
+        self._file(path, Opcode.REMOVE_FILE)
+        del self.files[path]
+        _maybe_lose(lost)
+
+    async def make_directory(self, path: bytes) -> None:
+        lost = await self.request("mkdir", path)
+        path = self.real(path)
+        if path in self.directories or path in self.files:
+            raise FtpNak(Opcode.CREATE_DIRECTORY, NakCode.FILE_EXISTS)
+        self._require_parent(path, Opcode.CREATE_DIRECTORY)
+        self.directories.add(path)
+        _maybe_lose(lost)
+
+    async def remove_directory(self, path: bytes) -> None:
+        lost = await self.request("rmdir", path)
+        path = self.real(path)
+        if path in self.files:
+            self.crimes.append(f"RemoveDirectory of the file {path!r}")
+        if path not in self.directories:
+            raise FtpNak(Opcode.REMOVE_DIRECTORY, NakCode.FILE_NOT_FOUND)
+        if any(split(p)[0] == path and p != ROOT for p in [*self.files, *self.directories]):
+            self.crimes.append(f"RemoveDirectory of the full {path!r}")
+            raise FtpNak(Opcode.REMOVE_DIRECTORY, NakCode.FAIL)
+        self.directories.discard(path)
+        _maybe_lose(lost)
+
+    async def rename(self, old: bytes, new: bytes) -> None:
+        assert len(wire_path(old)) + 1 + len(wire_path(new)) <= 238, "does not fit a request"
+        lost = await self.request("rename", old, new)
+        if not self.kind.renames:
+            raise FtpNak(Opcode.RENAME, NakCode.FAIL_ERRNO, 2)
+        self._rename(self.real(old), new)
+        _maybe_lose(lost)
+
+    async def stat_size(self, path: bytes) -> int:
+        await trio.lowlevel.checkpoint()
+        self.require_link()
+        self.log.append(("stat", str(path)))
+        return len(self._file(path, Opcode.OPEN_FILE_RO).data)
+
+    async def probe_open_for_write(self, directory: bytes) -> None:
+        await self.request("probe", directory)
+        self.probes += 1
+        self.traits.wo_truncates = self.kind.wo_truncates
+
+    # --- inside
+
+    def _file(self, path: bytes, opcode: Opcode) -> FakeFile:
+        file = self.files.get(self.real(path))
+        if file is None:
+            raise FtpNak(opcode, NakCode.FILE_NOT_FOUND)
+        return file
+
+    def _require_parent(self, path: bytes, opcode: Opcode) -> None:
+        if split(path)[0] not in self.directories:
+            raise FtpNak(opcode, NakCode.FILE_NOT_FOUND)
+
+    def _create(self, path: bytes) -> None:
+        path = self.real(path)
+        if path in self.directories:
+            self.crimes.append(f"CreateFile on the directory {path!r}")
+            raise FtpNak(Opcode.CREATE_FILE, NakCode.FAIL)
+        self._require_parent(path, Opcode.CREATE_FILE)
+        self.files[path] = FakeFile(b"")
+
+    def _rename(self, old: bytes, new: bytes) -> None:
+        if old not in self.files and old not in self.directories:
+            raise FtpNak(Opcode.RENAME, NakCode.FILE_NOT_FOUND)
+        there = self.real(new)
+        if there in self.directories:
+            if not self.kind.moves_into:
+                raise FtpNak(Opcode.RENAME, NakCode.FILE_EXISTS)
+            self.crimes.append(f"{old!r} moved into {new!r}")
+            new = join(new, split(old)[1])
+        elif there in self.files and there != old:
+            if not self.kind.replaces:
+                raise FtpNak(Opcode.RENAME, NakCode.FILE_EXISTS)
+            del self.files[there]
+        elif there == old and there != new and not self.kind.replaces:
+            raise FtpNak(Opcode.RENAME, NakCode.FILE_EXISTS)  # FatFs sees the name itself
+        self._require_parent(new, Opcode.RENAME)
+        self._move(old, new)
+
+    def _move(self, old: bytes, new: bytes) -> None:
+        def moved(path: bytes) -> bytes:
+            return new + path[len(old) :] if path == old or path.startswith(old + b"/") else path
+
+        self.files = {moved(path): file for path, file in self.files.items()}
+        self.directories = {moved(path) for path in self.directories}
+
+    async def crc32(self, path: bytes) -> int:
+        return await super().crc32(self.real(path))
+
+    async def open_reader(
+        self, path: bytes, sink: ReadSink, *, expected_size: int | None = None
+    ) -> FakeReader:
+        return await super().open_reader(self.real(path), sink, expected_size=expected_size)
+
+
+def make_writable(
+    store: FakeWriter, *, spool: SpoolDirectory | None = None, seed: int = 1, **options: Any
+) -> Tree:
+    """Return a tree that writes to a store, with the store's nursery; seeded."""
+    return Tree(
+        store,
+        CacheOptions(**options),
+        clock=trio.current_time,
+        invalidate=store.invalidated.append,
+        nursery=store.nursery,
+        writer=store,
+        spool=spool,
+        wall=lambda: 1_700_000_000.0,
+        rng=Random(seed),
+    )
+
+
+async def write_file(tree: Tree, path: bytes, data: bytes, step: int = 128 * 1024) -> None:
+    """Make or replace a file, as `cp` does: every error shows."""
+    try:
+        file = await tree.create(path, exclusive=True)
+    except AlreadyExists:
+        file = await tree.open(path, write=True, truncate=True)
+    try:
+        for at in range(0, len(data), step):
+            await file.write(at, data[at : at + step])
+        await file.flush()
+        await file.release()
+    finally:
+        file.close()
+
+
+def _maybe_lose(lost: bool) -> None:
+    if lost:
+        raise RequestTimeout("the reply was lost")
+
+
+class FakeUpload:
+    """Sends chunk by chunk, each one request; in the background too if the store has a nursery."""
+
+    def __init__(self, store: FakeWriter, path: bytes, source: UploadSource, *, create: bool) -> None:
+        self.path = path
+        self.aborted = False
+        self._store = store
+        self._source = source
+        self._create = create
+        self._open = False
+        self._opened_before = False
+        self._sending = trio.Lock()
+        self._background = False
+        self._error: MavftpfsError | None = None
+
+    def wake(self) -> None:
+        """See Upload."""
+        assert not self.aborted
+        if self._store.nursery is not None and not self._background and self._error is None:
+            self._background = True
+            self._store.nursery.start_soon(self._run)
+
+    async def finish(self) -> None:
+        """See Upload."""
+        assert not self.aborted
+        self._error = None
+        async with self._sending:
+            await self._send_all()
+            if not self._opened_before and not self._open:
+                await self._open_file()
+            if self._open:
+                await self._terminate()
+
+    async def abort(self) -> None:
+        """See Upload."""
+        self.aborted = True
+        self._open = False
+        await trio.lowlevel.checkpoint()
+
+    async def _run(self) -> None:
+        try:
+            async with self._sending:
+                await self._send_all()
+        except MavftpfsError as error:
+            self._error = error
+        finally:
+            self._background = False
+
+    async def _send_all(self) -> None:
+        while not self.aborted:
+            chunk = self._source.next_chunk(CHUNK)
+            if chunk is None:
+                return
+            if not self._open:
+                self._source.on_unsent(chunk[0], len(chunk[1]))  # opening may have it start from 0 again
+                await self._open_file()
+                continue
+            await self._write_chunk(*chunk)
+
+    async def _write_chunk(self, offset: int, data: bytes) -> None:
+        try:
+            await self._write(offset, data)
+        except BaseException as error:
+            self._source.on_unsent(offset, len(data))
+            if not isinstance(error, FtpNak):
+                self._lose()
+            raise
+
+    def _lose(self) -> None:
+        self._open = False
+        self._source.on_rollback(self._create and self._store.kind.wo_truncates)
+
+    async def _open_file(self) -> None:
+        store = self._store
+        reopened = self._opened_before and not store.kind.wo_truncates
+        await store.request("open", self.path, "create" if self._create and not reopened else "write")
+        if self._create and not reopened:
+            store._create(self.path)
+            if self._opened_before:
+                self._source.on_rollback(True)
+        elif store.kind.wo_truncates:
+            store.crimes.append(f"OpenFileWO emptied {self.path!r}")
+        else:
+            store._file(self.path, Opcode.OPEN_FILE_WO)
+        self._open = self._opened_before = True
+
+    async def _write(self, offset: int, data: bytes) -> None:
+        store = self._store
+        lost = await store.request("write", self.path, offset, len(data))
+        file = store._file(self.path, Opcode.WRITE_FILE)
+        if offset > len(file.data):
+            store.crimes.append(f"a gap in {self.path!r}")
+        if store.spoil_uploads:
+            store.spoil_uploads -= 1
+            data = bytes([data[0] ^ 1]) + data[1:]
+        new = file.data[:offset] + data + file.data[offset + len(data) :]
+        if store.capacity is not None and store.used - len(file.data) + len(new) > store.capacity:
+            raise FtpNak(Opcode.WRITE_FILE, NakCode.FAIL_ERRNO, 28)
+        file.data = new
+        file.mtime = None
+        _maybe_lose(lost)
+        self._source.on_acked(offset, len(data))
+
+    async def _terminate(self) -> None:
+        lost = await self._store.request("terminate", self.path)
+        self._open = False
+        _maybe_lose(lost)
+        self._source.on_checkpoint()

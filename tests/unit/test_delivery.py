@@ -1,0 +1,551 @@
+"""Delivering drafts: plans on every kind of server, verification, errors, and interruption anywhere."""
+
+from __future__ import annotations
+
+import errno
+from collections.abc import AsyncIterator, Awaitable, Callable
+from pathlib import Path
+from random import Random
+
+import pytest
+import trio
+
+from mavftpfs.cache.asides import is_reserved
+from mavftpfs.cache.openfile import OpenFile
+from mavftpfs.cache.spool import SpoolDirectory
+from mavftpfs.cache.tree import Tree
+from mavftpfs.protocol.payload import NakCode, Opcode
+from mavftpfs.shared.errnos import errno_for
+from mavftpfs.shared.errors import (
+    Armed,
+    FileTooLarge,
+    FtpNak,
+    MavftpfsError,
+    NotSupported,
+    PathTooLong,
+    RequestTimeout,
+    VehicleLost,
+    VerificationFailed,
+)
+from mavftpfs.shared.model import split
+from tests.support.fake_store import read_file
+from tests.support.fake_writer import KINDS, FakeWriter, Kind, make_writable, write_file
+
+OLD = bytes(range(256)) * 4
+NEW = b"new content " * 100
+FILE = b"/card/dir/file.txt"
+
+
+@pytest.fixture
+async def store(nursery: trio.Nursery, autojump_clock: object) -> AsyncIterator[FakeWriter]:
+    store = FakeWriter(KINDS["posix"], nursery)
+    store.add(FILE, OLD)
+    yield store
+    assert store.crimes == []
+    nursery.cancel_scope.cancel()
+
+
+@pytest.fixture(params=sorted(KINDS))
+async def any_store(
+    request: pytest.FixtureRequest, nursery: trio.Nursery, autojump_clock: object
+) -> AsyncIterator[FakeWriter]:
+    store = FakeWriter(KINDS[request.param], nursery)
+    store.add(FILE, OLD)
+    yield store
+    assert store.crimes == []
+    nursery.cancel_scope.cancel()
+
+
+def litter(store: FakeWriter) -> list[bytes]:
+    return [path for path in store.files if is_reserved(split(path)[1])]
+
+
+async def change(tree: Tree, path: bytes, offset: int, data: bytes) -> None:
+    """Overwrite a part, as `dd conv=notrunc` does."""
+    file = await tree.open(path, write=True)
+    try:
+        await file.write(offset, data)
+        await file.flush()
+        await file.release()
+    finally:
+        file.close()
+
+
+# --- each kind of server
+
+
+async def test_a_new_file_is_created_under_its_name(any_store: FakeWriter) -> None:
+    tree = make_writable(any_store)
+    await write_file(tree, b"/card/new", NEW)
+    assert any_store.files[b"/card/new"].data == NEW
+    assert not [entry for entry in any_store.log if entry[0] == "rename"]
+    assert any_store.count("crc", b"/card/new") == 1
+    assert await read_file(tree, b"/card/new") == NEW
+
+
+async def test_an_empty_file_is_created(any_store: FakeWriter) -> None:
+    tree = make_writable(any_store)
+    file = await tree.create(b"/card/empty", exclusive=True)
+    await file.flush()
+    assert any_store.requests == 0
+    await file.release()
+    assert any_store.files[b"/card/empty"].data == b""
+    assert any_store.requests == 1
+
+
+async def test_a_file_is_replaced_whole(any_store: FakeWriter) -> None:
+    tree = make_writable(any_store)
+    if any_store.kind.renames:
+        await write_file(tree, FILE, NEW)
+        assert any_store.files[FILE].data == NEW
+    else:
+        with pytest.raises(NotSupported):
+            await write_file(tree, FILE, NEW)
+        assert any_store.files[FILE].data == OLD
+        assert await read_file(tree, FILE) == NEW, "what was accepted is kept and shown"
+    assert litter(any_store) == []
+
+
+async def test_a_second_replacement_knows_the_server(any_store: FakeWriter) -> None:
+    tree = make_writable(any_store)
+    if not any_store.kind.renames:
+        return
+    await write_file(tree, FILE, NEW)
+    any_store.log.clear()
+    await write_file(tree, FILE, OLD)
+    renames = [entry for entry in any_store.log if entry[0] == "rename"]
+    assert len(renames) == (1 if any_store.kind.replaces else 2)
+
+
+async def test_inplace_overwrites_where_nothing_else_goes(nursery: trio.Nursery) -> None:
+    store = FakeWriter(KINDS["littlefs"], nursery)
+    store.add(FILE, OLD)
+    tree = make_writable(store, inplace=True)
+    await write_file(tree, FILE, NEW)
+    assert store.files[FILE].data == NEW
+    assert litter(store) == []
+
+
+async def test_a_part_is_changed(any_store: FakeWriter) -> None:
+    tree = make_writable(any_store)
+    await change(tree, FILE, 100, b"changed")
+    assert any_store.files[FILE].data == OLD[:100] + b"changed" + OLD[107:]
+    replaced = any(entry[0] == "rename" for entry in any_store.log)
+    assert replaced == any_store.kind.wo_truncates
+    assert any_store.probes == 1
+
+
+async def test_appending(any_store: FakeWriter) -> None:
+    tree = make_writable(any_store)
+    for number in range(3):
+        await change(tree, FILE, len(OLD) + number, b"%d" % number)
+    assert any_store.files[FILE].data == OLD + b"012"
+    assert any_store.probes == 1
+
+
+async def test_truncating(any_store: FakeWriter) -> None:
+    tree = make_writable(any_store)
+    for size in (700, 300, 1100, 0):
+        before = any_store.files[FILE].data
+        if any_store.kind.renames or size == 0 or size >= len(before):
+            await tree.truncate(FILE, size)
+            assert any_store.files[FILE].data == before[:size].ljust(size, b"\0")
+        else:
+            with pytest.raises(NotSupported):
+                await tree.truncate(FILE, size)
+            assert any_store.files[FILE].data == before
+        assert (await tree.stat(FILE)).size == len(any_store.files[FILE].data)
+        assert await read_file(tree, FILE) == any_store.files[FILE].data
+    assert tree.undelivered() == []
+
+
+async def test_a_partial_change_of_a_large_file_is_refused_where_it_would_be_sent_whole(
+    nursery: trio.Nursery,
+) -> None:
+    store = FakeWriter(KINDS["mavsdk"], nursery)
+    store.add(FILE, OLD)
+    tree = make_writable(store, rmw_max=1000)
+    with pytest.raises(FileTooLarge):
+        await change(tree, FILE, 5, b"x")
+    assert store.files[FILE].data == OLD
+
+
+# --- verification
+
+
+async def test_a_mismatch_is_sent_once_more(any_store: FakeWriter) -> None:
+    any_store.spoil_uploads = 1
+    tree = make_writable(any_store)
+    await write_file(tree, b"/card/new", NEW)
+    assert any_store.files[b"/card/new"].data == NEW
+    assert any_store.count("crc") == 2
+
+
+async def test_a_second_mismatch_is_an_error_and_the_old_file_stays(store: FakeWriter) -> None:
+    store.spoil_uploads = 1000
+    tree = make_writable(store)
+    with pytest.raises(VerificationFailed):
+        await write_file(tree, FILE, NEW)
+    assert store.files[FILE].data == OLD
+    assert litter(store) == []
+    store.spoil_uploads = 0
+    assert await tree.drain(10) == []
+    assert store.files[FILE].data == NEW
+
+
+async def test_an_unanswered_checksum_counts_as_verified_by_size(store: FakeWriter) -> None:
+    store.fail["crc", b"/card/new"] = [RequestTimeout("silence")]
+    tree = make_writable(store)
+    await write_file(tree, b"/card/new", NEW)
+    assert tree.status()["checksums_unanswered"] == 1
+    assert tree.status()["verified_by_size"] == 1
+
+
+async def test_verify_crc_demands_an_answer(store: FakeWriter) -> None:
+    store.fail["crc", b"/card/new"] = [RequestTimeout("silence")] * 2
+    tree = make_writable(store, verify="crc")
+    with pytest.raises(VerificationFailed):
+        await write_file(tree, b"/card/new", NEW)
+    await tree.drain(10)
+    assert store.files[b"/card/new"].data == NEW
+
+
+@pytest.mark.parametrize(("verify", "asked"), [("size", 0), ("none", 0), ("auto", 0), ("crc", 1)])
+async def test_what_is_too_large_or_not_wanted_is_not_summed(
+    store: FakeWriter, verify: str, asked: int
+) -> None:
+    tree = make_writable(store, verify=verify, verify_max=100)
+    await write_file(tree, b"/card/new", NEW)
+    assert store.count("crc") == asked
+    stats = [entry for entry in store.log if entry[0] == "stat"]
+    assert verify != "none" or (not stats and store.count("list") == 2)
+
+
+# --- errors
+
+
+async def test_an_error_is_told_at_every_close_until_the_bytes_are_there(store: FakeWriter) -> None:
+    tree = make_writable(store)
+    file = await tree.create(b"/card/new", exclusive=True)
+    await file.write(0, NEW)
+    store.lost = True
+    for ask in (file.flush, file.fsync, file.flush):
+        with pytest.raises(VehicleLost):
+            await ask()
+    assert tree.undelivered() == [b"/card/new"]
+    reader = await tree.open(b"/card/new")
+    await reader.flush()
+    await reader.release()
+    with pytest.raises(VehicleLost):
+        await file.flush()
+    store.lost = False
+    await file.flush()
+    await file.release()
+    assert store.files[b"/card/new"].data == NEW
+    assert tree.undelivered() == []
+    assert tree.status()["errors"] == {}
+    assert tree.status()["bytes_held"] == 0
+
+
+async def test_a_full_card_leaves_the_old_file(store: FakeWriter) -> None:
+    store.capacity = len(OLD) + 500
+    tree = make_writable(store)
+    with pytest.raises(FtpNak) as caught:
+        await write_file(tree, FILE, NEW)
+    assert errno_for(caught.value) == errno.ENOSPC
+    assert store.files[FILE].data == OLD
+    assert litter(store) == []
+    assert tree.undelivered() == [FILE]
+    assert await read_file(tree, FILE) == NEW
+    await tree.unlink(FILE)
+    assert tree.undelivered() == []
+    assert FILE not in store.files
+
+
+async def test_a_background_failure_that_a_retry_repaired_is_not_told(store: FakeWriter) -> None:
+    tree = make_writable(store)
+    store.fail_at[3] = RequestTimeout("once")
+    data = NEW * 200
+    file = await tree.create(b"/card/new", exclusive=True)
+    await file.write(0, data)
+    await trio.sleep(1)
+    assert store.requests == 3
+    await file.flush()
+    await file.release()
+    assert store.files[b"/card/new"].data == data
+
+
+async def test_bytes_travel_while_the_program_still_writes(store: FakeWriter) -> None:
+    tree = make_writable(store)
+    file = await tree.create(b"/card/new", exclusive=True)
+    await file.write(0, bytes(100_000))
+    await trio.sleep(1)
+    assert len(store.files[b"/card/new"].data) == 100_000
+    await file.write(50_000, b"again")
+    await file.release()
+    data = store.files[b"/card/new"].data
+    assert data == bytes(50_000) + b"again" + bytes(49_995)
+
+
+async def test_writers_wait_for_a_slow_link(store: FakeWriter) -> None:
+    store.write_delay = 0.01
+    tree = make_writable(store, dirty_max=100_000)
+    file = await tree.create(b"/card/new", exclusive=True)
+    most = 0
+    for at in range(0, 1_000_000, 50_000):
+        await file.write(at, bytes(50_000))
+        most = max(most, 50_000 + at - len(store.files[b"/card/new"].data if at > 100_000 else b""))
+    assert most < 250_000
+    await file.release()
+    assert tree.status()["bytes_held"] == 0
+
+
+async def write_pieces(file: OpenFile, count: int, size: int) -> None:
+    for number in range(count):
+        await file.write(number * size, bytes(size))
+
+
+async def test_a_writer_is_told_why_nothing_moves(store: FakeWriter) -> None:
+    tree = make_writable(store, dirty_max=65536)
+    file = await tree.create(b"/card/new", exclusive=True)
+    store.fail_at[5] = FtpNak(Opcode.WRITE_FILE, NakCode.FAIL_ERRNO, errno.ENOSPC)
+    store.capacity = 2000
+    with pytest.raises(FtpNak):
+        await write_pieces(file, 10, 10**5)
+    file.close()
+
+
+async def test_armed_means_an_error_at_once_and_delivery_after(store: FakeWriter) -> None:
+    tree = make_writable(store)
+    file = await tree.create(b"/card/new", exclusive=True)
+    await file.write(0, NEW)
+    store.armed = True
+    tree.armed_changed(True)
+    before = trio.current_time()
+    asks: list[Callable[[], Awaitable[object]]] = [
+        file.flush,
+        file.fsync,
+        lambda: file.write(0, b"x"),
+        lambda: file.truncate(1),
+        lambda: tree.create(b"/card/x", exclusive=False),
+        lambda: tree.open(FILE, write=True),
+        lambda: tree.open(FILE, write=True, truncate=True),
+        lambda: tree.truncate(FILE, 0),
+        lambda: tree.mkdir(b"/card/y"),
+        lambda: tree.rmdir(b"/card/dir"),
+        lambda: tree.unlink(FILE),
+        lambda: tree.rename(FILE, b"/card/z"),
+    ]
+    for ask in asks:
+        with pytest.raises(Armed):
+            await ask()
+    with pytest.raises(Armed):
+        await file.release()
+    assert trio.current_time() == before
+    assert store.requests == 0
+    store.armed = False
+    tree.armed_changed(False)
+    await trio.sleep(1)
+    assert store.files[b"/card/new"].data == NEW
+    assert tree.undelivered() == []
+
+
+async def test_when_armed_ok_writes_on(store: FakeWriter) -> None:
+    tree = make_writable(store, write_armed=True)
+    tree.armed_changed(True)
+    await write_file(tree, FILE, NEW)
+    assert store.files[FILE].data == NEW
+
+
+# --- paths
+
+
+@pytest.mark.parametrize("length", [100, 118, 119, 200])
+@pytest.mark.parametrize("kind", ["posix", "fat"])
+async def test_long_paths_are_replaced(nursery: trio.Nursery, kind: str, length: int) -> None:
+    store = FakeWriter(KINDS[kind], nursery)
+    path = long_path(length)
+    store.add(path, OLD)
+    tree = make_writable(store)
+    await write_file(tree, path, NEW)
+    assert store.files[path].data == NEW
+    assert litter(store) == []
+    assert store.crimes == []
+
+
+def long_path(length: int) -> bytes:
+    parts = b"/card" + b"/a-rather-long-name" * 20
+    return parts[: length - 1].rstrip(b"/") + b"x" * (length - len(parts[: length - 1].rstrip(b"/")))
+
+
+async def test_too_long_a_path_is_refused_before_a_byte_is_sent(store: FakeWriter) -> None:
+    tree = make_writable(store)
+    store.add_directory(b"/card" + b"/a-rather-long-name" * 8)
+    requests = store.requests
+    with pytest.raises(PathTooLong):
+        await tree.create(b"/card" + b"/a-rather-long-name" * 8 + b"/" + b"n" * 72, exclusive=True)
+    assert store.requests == requests
+
+
+async def test_nothing_above_is_short_enough(nursery: trio.Nursery) -> None:
+    root = b"/" + b"r" * 60
+    store = FakeWriter(KINDS["posix"], nursery)
+    path = root + b"/" + b"n" * 139
+    store.add(path, OLD)
+    tree = make_writable(store, root=root)
+    with pytest.raises(PathTooLong):
+        await write_file(tree, path[len(root) :], NEW)
+    assert store.files[path].data == OLD
+    assert store.requests == 0
+
+
+# --- interruption anywhere
+
+Job = Callable[[Tree], Awaitable[None]]
+
+JOBS: dict[str, tuple[Job, set[bytes | None]]] = {
+    "replace": (lambda tree: write_file(tree, FILE, NEW), {OLD, NEW}),
+    "part": (
+        lambda tree: change(tree, FILE, 100, NEW),
+        {OLD[:100] + NEW[:n] + OLD[100 + n :] for n in range(0, len(NEW) + 1)},
+    ),
+    "truncate": (lambda tree: tree.truncate(FILE, 500), {OLD, OLD[:500]}),
+    "empty": (lambda tree: tree.truncate(FILE, 0), {OLD, b""}),
+    "rename over": (lambda tree: tree.rename(b"/card/other", FILE), {OLD, NEW}),
+    "rename case": (lambda tree: tree.rename(FILE, b"/card/dir/FILE.TXT"), {OLD, None}),
+    "unlink": (lambda tree: tree.unlink(FILE), {OLD, None}),
+}
+
+
+async def attempt(job: Job, tree: Tree) -> bool:
+    """Return whether the caller saw success."""
+    try:
+        await job(tree)
+    except MavftpfsError:
+        return False
+    return True
+
+
+async def count_requests(kind: Kind, name: str, path: bytes) -> tuple[int, dict[bytes, bytes], bool]:
+    async with trio.open_nursery() as nursery:
+        store = scene(kind, nursery, path)
+        good = await attempt(JOBS[name][0], make_writable(store))
+        nursery.cancel_scope.cancel()
+    return store.requests, {p: f.data for p, f in store.files.items()}, good
+
+
+def scene(kind: Kind, nursery: trio.Nursery, path: bytes = FILE) -> FakeWriter:
+    store = FakeWriter(kind, nursery)
+    store.add(path, OLD)
+    store.add(b"/card/other", NEW)
+    return store
+
+
+@pytest.mark.parametrize("name", sorted(JOBS))
+@pytest.mark.parametrize("kind", sorted(KINDS))
+async def test_power_lost_after_any_request(
+    autojump_clock: object, tmp_path: Path, kind: str, name: str
+) -> None:
+    """What is on the card then is allowed, and the next mount leaves it complete and tidy."""
+    job, allowed = JOBS[name]
+    total, final, good = await count_requests(KINDS[kind], name, FILE)
+    for number in range(total + 1):
+        async with trio.open_nursery() as nursery:
+            store = scene(KINDS[kind], nursery)
+            spool = SpoolDirectory(tmp_path / f"{number}", Random(number))
+            store.freeze_at = number
+            done = await attempt(job, make_writable(store, spool=spool))
+            assert not done or number == total
+            spool.close()
+            store.revive()
+            await check_mended(store, tmp_path / f"{number}", allowed)
+            if done:
+                assert {p: f.data for p, f in store.files.items()} == final
+            nursery.cancel_scope.cancel()
+        assert store.crimes == []
+    assert good or not KINDS[kind].renames
+
+
+async def check_mended(store: FakeWriter, directory: Path, allowed: set[bytes | None]) -> None:
+    """Mount anew and list everything: no litter, and each file is one of those it may be."""
+    spool = SpoolDirectory(directory, Random(99))
+    tree = make_writable(store, spool=spool, seed=2)
+    await tree.list(b"/card")
+    await tree.list(b"/card/dir")
+    await tree.list(b"/card")
+    assert litter(store) == []
+    file = store.files.get(FILE)
+    assert (None if file is None else file.data) in allowed
+    contents = [f.data for f in store.files.values()]
+    assert OLD in contents or NEW in contents or file is not None or None in allowed
+    other = store.files.get(b"/card/other")
+    assert other is None or other.data == NEW
+    spool.close()
+
+
+@pytest.mark.parametrize("name", sorted(JOBS))
+@pytest.mark.parametrize("kind", sorted(KINDS))
+@pytest.mark.parametrize("fault", ["lost reply", "silence", "refused"])
+async def test_one_fault_at_any_request(
+    autojump_clock: object, tmp_path: Path, kind: str, name: str, fault: str
+) -> None:
+    """The caller got an error or the truth; draining delivers what is held; no litter stays."""
+    job, allowed = JOBS[name]
+    total, final, good = await count_requests(KINDS[kind], name, FILE)
+    for number in range(1, total + 1):
+        async with trio.open_nursery() as nursery:
+            store = scene(KINDS[kind], nursery)
+            put_fault(store, number, fault)
+            tree = make_writable(store)
+            done = await attempt(job, tree)
+            if done:
+                assert {p: f.data for p, f in store.files.items() if not is_reserved(split(p)[1])} == final
+            if good:
+                assert await tree.drain(100) == []
+            tree.forget_caches()
+            await tree.list(b"/card/dir")
+            assert litter(store) == []
+            file = store.files.get(FILE)
+            assert (None if file is None else file.data) in allowed
+            nursery.cancel_scope.cancel()
+        assert store.crimes == []
+
+
+def put_fault(store: FakeWriter, number: int, fault: str) -> None:
+    if fault == "lost reply":
+        store.lose_reply_at.add(number)
+    elif fault == "silence":
+        store.fail_at[number] = RequestTimeout("silence")
+    else:
+        store.fail_at[number] = FtpNak(Opcode.NONE, NakCode.FAIL_ERRNO, errno.EACCES)
+
+
+@pytest.mark.parametrize("kind", ["posix", "fat"])
+async def test_power_lost_while_a_long_path_is_replaced(
+    autojump_clock: object, tmp_path: Path, kind: str
+) -> None:
+    """The short names do not say where they belong; a sidecar does."""
+    path = long_path(180)
+    number = 0
+    while True:
+        async with trio.open_nursery() as nursery:
+            store = FakeWriter(KINDS[kind], nursery)
+            store.add(path, OLD)
+            spool = SpoolDirectory(tmp_path / f"{number}", Random(number))
+            store.freeze_at = number
+            done = await attempt(lambda tree: write_file(tree, path, NEW), make_writable(store, spool=spool))
+            spool.close()
+            store.revive()
+            again = SpoolDirectory(tmp_path / f"{number}", Random(99))
+            tree = make_writable(store, spool=again, seed=2)
+            directory = split(path)[0]
+            while directory != b"/":
+                await tree.list(directory)
+                directory = split(directory)[0]
+            again.close()
+            assert litter(store) == []
+            assert store.files[path].data in (OLD, NEW)
+            nursery.cancel_scope.cancel()
+        if done:
+            return
+        number += 1
