@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from mavftpfs.protocol.listing import parse_page
 from mavftpfs.protocol.payload import MAX_DATA, NakCode, Opcode, Payload
 from mavftpfs.protocol.requests import Operation, Priority, Request, manner_of, nak_of
@@ -148,6 +150,7 @@ class ListDirectory(Operation):
         entries: what was listed, each name once, `.` and `..` left out.
         complete: False when a cap ended the sweep: absence of a name then proves nothing.
         hidden: names that cannot be shown (with a slash, a tab, or unparsable).
+        on_page: called for each page.
     """
 
     def __init__(self, path: bytes, with_time: bool = False) -> None:
@@ -157,6 +160,7 @@ class ListDirectory(Operation):
         self.entries: list[DirEntry] = []
         self.complete = True
         self.hidden = 0
+        self.on_page: Callable[[], None] = lambda: None
         self._path = path
         self._with_time = with_time
         self._opcode = Opcode.LIST_DIRECTORY_WITH_TIME if with_time else Opcode.LIST_DIRECTORY
@@ -183,6 +187,7 @@ class ListDirectory(Operation):
             return
         self._asked = False
         self._pages += 1
+        self.on_page()
         page = parse_page(reply.data, with_time=self._with_time)
         if page.strings == 0:
             self._on_empty_page()

@@ -9,7 +9,7 @@ from mavftpfs.session.kit import Kit, Queue
 from mavftpfs.session.policy import should_switch
 from mavftpfs.session.readmode import ReadSteering
 from mavftpfs.session.stream import FileStream
-from mavftpfs.shared.errors import FileChanged, MavftpfsError, SessionLost
+from mavftpfs.shared.errors import FileChanged, MavftpfsError, RemoteProtocolError, SessionLost
 
 STALL = 2.0
 """Seconds without any reply during a read after which the server's session is no longer believed in."""
@@ -76,12 +76,13 @@ class Reading:
         awaited = stream.wants_open
         if session is None or session.path != stream.path or session.writing or awaited:
             session = await self._holder.open(stream.path)
-        if session.size is not None:
-            try:
-                stream.on_opened(session.size)
-            except FileChanged:
-                await self._holder.close_quietly()
-                raise
+        try:
+            if session.size is None:
+                raise RemoteProtocolError("the vehicle's open reply holds no size")
+            stream.on_opened(session.size)
+        except (FileChanged, RemoteProtocolError):
+            await self._holder.close_quietly()
+            raise
         return awaited
 
     async def _await_first_want(self, stream: FileStream) -> None:
@@ -92,7 +93,8 @@ class Reading:
 
     async def _read(self, stream: FileStream) -> None:
         session = self._holder.session
-        assert session is not None
+        if session is None:  # the vehicle restarted since it was opened
+            return
         transfer = ReadTransfer(session.id, stream.size, stream, self._steering.chunk)
         started = self._clock()
         self.active, self._transfer, self._seen_bytes = stream, transfer, 0

@@ -339,6 +339,7 @@ class Scheduler:
     async def _serve_job(self, job: SessionJob) -> None:
         self._jobs.remove(job)
         try:
+            self.require_link()  # it may have died while others had the session
             job.session = await self._holder.open(job.path, job.opcode)
             await job.action(job.session)
             await self._holder.close()

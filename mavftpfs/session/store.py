@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import trio
 
@@ -63,7 +64,7 @@ class Store(WriteStore):
         wire = wire_path(path)
         started = self._clock()
         if self._lists_times is False:
-            operation = await self._sweep(wire, with_time=False)
+            operation = await self._sweep(wire)
         else:
             operation = await self._sweep_asking_times(wire)
         entries: tuple[DirEntry, ...] = tuple(operation.entries)
@@ -103,31 +104,42 @@ class Store(WriteStore):
             raise RemoteProtocolError("the vehicle's checksum reply holds no checksum")
         return int.from_bytes(data[:4], "little")
 
-    async def _sweep(self, wire: bytes, *, with_time: bool, patience: float | None = None) -> ListDirectory:
-        operation = ListDirectory(wire, with_time)
+    def _on_times(self, scope: trio.CancelScope) -> None:
+        """Opcode 16 was answered: the rest of the listing may take as long as it takes."""
+        self._lists_times = True
+        scope.deadline = float("inf")
+
+    async def _sweep(self, wire: bytes, *, patience: float | None = None) -> ListDirectory:
+        operation = ListDirectory(wire)
         operation.patience = patience
         await self._scheduler.metadata(operation)
         return operation
 
     async def _sweep_asking_times(self, wire: bytes) -> ListDirectory:
         """Try opcode 16; a refusal or a silence counts only if opcode 3 then answers (design section 4)."""
-        sure = self._lists_times is True
         began = self._clock()
         refused = False
+        limit = float("inf") if self._lists_times else TIME_PROBE_LIMIT
         try:
-            with trio.move_on_after(float("inf") if sure else TIME_PROBE_LIMIT):
-                operation = await self._sweep(wire, with_time=True)
+            with trio.move_on_after(limit) as scope:
+                operation = ListDirectory(wire, with_time=True)
+                operation.on_page = partial(self._on_times, scope)
+                await self._scheduler.metadata(operation)
                 self._lists_times = True
                 return operation
         except FtpNak as nak:
-            if sure or nak.code not in (NakCode.FAIL, NakCode.UNKNOWN_COMMAND, NakCode.FILE_EXISTS):
+            if self._lists_times or nak.code not in (
+                NakCode.FAIL,
+                NakCode.UNKNOWN_COMMAND,
+                NakCode.FILE_EXISTS,
+            ):
                 raise
             refused = True
         except RequestTimeout:
-            if sure:
+            if self._lists_times:
                 raise
         left = max(1.0, self._op_deadline - (self._clock() - began))
-        operation = await self._sweep(wire, with_time=False, patience=left)
+        operation = await self._sweep(wire, patience=left)
         self._time_silences += 1
         if refused or self._time_silences >= TIME_SILENCES:
             self._lists_times = False

@@ -1,0 +1,103 @@
+"""Reading through the session where the server, the link or the moment is unkind. Virtual time."""
+
+from __future__ import annotations
+
+import random
+
+import pytest
+import trio
+from trio.testing import MockClock
+
+from mavftpfs.protocol.payload import Opcode, Payload
+from mavftpfs.session.connection import Connection
+from mavftpfs.shared.errors import MavftpfsError, RemoteProtocolError, RequestTimeout, VehicleLost
+from mavftpfs.sim.linkmodel import LinkSettings
+from tests.support.worlds import MemorySink, World, read_file
+
+
+@pytest.fixture
+def autojump() -> MockClock:
+    return MockClock(autojump_threshold=0)
+
+
+async def test_a_reboot_between_open_and_first_read_is_bridged(autojump: MockClock) -> None:
+    here = World("px4", LinkSettings(delay=0.02))
+    here.tree.add(b"/f", b"hello")
+    async with here.connection() as connection:
+        sink = MemorySink(5)
+        reader = await connection.store.open_reader(b"/f", sink)
+        connection.vehicle.on_reboot()
+        reader.want(0, 5, demand=True)
+        assert await sink.wait_for(0, 5) == b"hello"
+
+
+async def test_an_open_reply_without_a_size_is_an_error_at_once(autojump: MockClock) -> None:
+    here = World("px4", LinkSettings(delay=0.02))
+    here.tree.add(b"/f", b"hello")
+    async with here.connection() as connection:
+        _hide_sizes(connection)
+        began = trio.current_time()
+        with pytest.raises(RemoteProtocolError):
+            await read_file(connection, b"/f")
+        assert trio.current_time() - began < 2.0
+        assert connection.engine.stats.by_opcode[Opcode.OPEN_FILE_RO] == 1
+        await trio.sleep(3)
+        assert here.vehicle.server.open_sessions == 0
+
+
+def _hide_sizes(connection: Connection) -> None:
+    receive = connection.engine.receive
+
+    def hiding(reply: Payload, now: float) -> None:
+        receive(reply._replace(size=0, data=b"") if reply.req_opcode == Opcode.OPEN_FILE_RO else reply, now)
+
+    connection.engine.receive = hiding  # type: ignore[method-assign]
+
+
+async def test_who_queues_for_the_session_when_the_link_dies_does_not_wait_in_turn(
+    autojump: MockClock,
+) -> None:
+    here = World("ardupilot", LinkSettings(delay=0.02))
+    async with here.connection() as connection:
+        here.link.cut()
+        errors: list[MavftpfsError] = []
+
+        async def read() -> None:
+            with pytest.raises(MavftpfsError) as caught:
+                await connection.store.read_whole(b"/@SYS/uarts.txt", 1000)
+            errors.append(caught.value)
+
+        began = trio.current_time()
+        async with trio.open_nursery() as nursery:
+            for _ in range(5):
+                nursery.start_soon(read)
+        assert trio.current_time() - began < 40.0
+        assert [type(error) for error in errors] == [RequestTimeout, *[VehicleLost] * 4]
+
+
+async def test_a_long_listing_with_times_is_not_taken_for_silence(autojump: MockClock) -> None:
+    here = World("mavsdk", LinkSettings(rate=5760.0, delay=0.1))
+    for index in range(200):
+        here.tree.add(b"/d/file%03d" % index, b"x")
+    async with here.connection() as connection:
+        began = trio.current_time()
+        listing = await connection.store.list_directory(b"/d")
+        assert trio.current_time() - began > 3.0
+        assert len(listing.entries) == 200
+        assert all(entry.mtime is not None for entry in listing.entries)
+        assert connection.store.lists_times is True
+        assert Opcode.LIST_DIRECTORY not in connection.engine.stats.by_opcode
+
+
+async def test_bursts_of_exact_multiples_end(autojump: MockClock) -> None:
+    """500 packets are where ArduPilot stops a burst, and nothing says whether the file ends there, too."""
+    data = random.Random(1).randbytes(2 * 500 * 239)
+    here = World("ardupilot", LinkSettings(delay=0.02, loss=0.02))
+    here.tree.add(b"/f", data)
+    here.tree.add(b"/g", data[: 500 * 239])
+    async with here.connection() as connection:
+        connection.scheduler._steering.mode = "burst"
+        assert await read_file(connection, b"/f") == data
+        assert await read_file(connection, b"/g") == data[: 500 * 239]
+        assert connection.engine.stats.by_opcode[Opcode.BURST_READ_FILE] >= 3
+    assert here.vehicle.server.open_sessions == 0
