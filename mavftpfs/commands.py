@@ -42,8 +42,7 @@ _PATH_OPTIONS = ("cache_dir", "signing_key", "log_file", "trace", "tlog")
 def mount(args: argparse.Namespace) -> int:
     """Mount; in the background unless told otherwise."""
     options, spec = connection_of(args)
-    # Until there is a write side, the kernel is told that nothing here can be written.
-    options = absolute_paths(replace(options, read_only=True))
+    options = absolute_paths(options)
     mountpoint = canonical(args.mountpoint)
     check_fuse()
     check_mountpoint(mountpoint)

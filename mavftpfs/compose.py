@@ -6,9 +6,11 @@ import errno
 import hashlib
 import sys
 from collections.abc import AsyncIterator, Callable, Iterator
-from contextlib import ExitStack, asynccontextmanager, contextmanager
+from contextlib import ExitStack, asynccontextmanager, contextmanager, nullcontext
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from random import SystemRandom
 from typing import Any, Literal, cast
 
 import trio
@@ -16,6 +18,7 @@ import trio
 from mavftpfs.cache.options import CacheOptions
 from mavftpfs.cache.tree import Tree
 from mavftpfs.exits import NoFtp
+from mavftpfs.farewell import rescue, spool_for
 from mavftpfs.fuse.operations import Space
 from mavftpfs.fuse.options import MountOptions
 from mavftpfs.link.opening import open_link
@@ -32,10 +35,11 @@ KEY_SIZE = 32
 
 @dataclass(frozen=True, slots=True)
 class Attached:
-    """A vehicle whose root was listed."""
+    """A vehicle whose root was listed. notice: what a person should know of earlier mounts, or ""."""
 
     connection: Connection
     tree: Tree
+    notice: str = ""
 
     def status(self) -> dict[str, Any]:
         """Return facts about the connection and the caches; JSON-able."""
@@ -86,8 +90,14 @@ async def attached(
     invalidate: Callable[[bytes], None] = lambda path: None,
     sinks: Sinks = NO_SINKS,
     list_root: bool = True,
+    writing: bool = False,
+    rescue_for: str | None = None,
 ) -> AsyncIterator[Attached]:
     """Connect, wait for the first heartbeat and the first listing, and keep it up for the length of the body.
+
+    writing: the tree may be changed, if the options do not forbid it; what it holds then lies in a spool that
+    survives the process. rescue_for: what earlier mounts left there is moved to a recovery directory that is
+    named after this SOURCE.
 
     Raises:
         LinkClosed, VehicleLost, NoFtp: within connect_timeout, with the reason.
@@ -95,14 +105,42 @@ async def attached(
     """
     deadline = trio.current_time() + options.connect_timeout
     settings = connect_options(options)
+    writing = writing and not options.read_only
     async with open_link(spec) as link, connected(link, settings, trace=sinks.payload) as connection:
         connection.driver.framer.on_frame = sinks.frame
         await connection.ready(options.connect_timeout)
-        tree = Tree(connection.store, cache_options(options), clock=trio.current_time, invalidate=invalidate)
-        _subscribe(connection, tree)
-        if list_root:
-            await _list_root(connection, tree, deadline, options)
-        yield Attached(connection, tree)
+        async with _nursery() as nursery:
+            with spool_for(connection.vehicle.address) if writing else nullcontext() as spool:
+                notice = "" if spool is None or rescue_for is None else rescue(spool, rescue_for)
+                tree = Tree(
+                    connection.store,
+                    cache_options(options),
+                    clock=trio.current_time,
+                    invalidate=invalidate,
+                    nursery=nursery,
+                    writer=connection.store if writing else None,
+                    spool=spool,
+                    rng=SystemRandom(),
+                )
+                _subscribe(connection, tree)
+                if list_root:
+                    await _list_root(connection, tree, deadline, options)
+                yield Attached(connection, tree, notice)
+
+
+@asynccontextmanager
+async def _nursery() -> AsyncIterator[trio.Nursery]:
+    """Give a nursery whose tasks end with the body, and which does not wrap the body's errors in a group."""
+    failure: Exception | None = None
+    async with trio.open_nursery() as nursery:
+        try:
+            yield nursery
+        except Exception as error:  # raised again outside
+            failure = error
+        finally:
+            nursery.cancel_scope.cancel()
+    if failure is not None:
+        raise failure
 
 
 async def _list_root(connection: Connection, tree: Tree, deadline: float, options: MountOptions) -> None:
@@ -137,13 +175,20 @@ def _flag(connection: Connection) -> str:
 
 
 def _subscribe(connection: Connection, tree: Tree) -> None:
-    reactions = {"reboot": tree.rebooted, "back": tree.link_back, "lost": tree.link_lost}
+    reactions: dict[str, Callable[[], None]] = {
+        "reboot": tree.rebooted,
+        "back": tree.link_back,
+        "lost": tree.link_lost,
+        "armed": partial(tree.armed_changed, True),
+        "disarmed": partial(tree.armed_changed, False),
+    }
 
     def on_news(news: str) -> None:
         if news in reactions:
             reactions[news]()
 
     connection.subscribe(on_news)
+    tree.armed_changed(connection.vehicle.armed)
 
 
 def connect_options(options: MountOptions) -> ConnectOptions:
@@ -164,6 +209,7 @@ def connect_options(options: MountOptions) -> ConnectOptions:
         read_mode=cast(Literal["auto", "burst", "window"], options.read_mode),
         chunk=options.chunk,
         window=options.window,
+        when_armed=cast(Literal["ro", "ok"], options.when_armed),
     )
 
 
@@ -176,6 +222,15 @@ def cache_options(options: MountOptions) -> CacheOptions:
         negative_timeout=options.negative_timeout,
         cache_size=options.cache_size,
         op_deadline=options.op_deadline,
+        dirty_max=options.dirty_max,
+        spool_max=options.spool_max,
+        rmw_max=options.rmw_max,
+        verify=options.verify,
+        verify_max=options.verify_max,
+        write_armed=options.when_armed == "ok",
+        force=options.force,
+        inplace=options.inplace,
+        local=options.local,
     )
 
 

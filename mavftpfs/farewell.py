@@ -1,4 +1,4 @@
-"""The end of a mount that was written to: deliver, or keep what could not be delivered. Layer: top."""
+"""What outlives a mount that was written to: the spool, and what could not be delivered. Layer: top."""
 
 from __future__ import annotations
 
@@ -6,9 +6,14 @@ import logging
 import os
 import re
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
+from random import SystemRandom
 from typing import Protocol
+
+from mavftpfs.cache.spool import SpoolDirectory
+from mavftpfs.link.messages import Address
 
 log = logging.getLogger("mavftpfs.mount")
 
@@ -61,13 +66,56 @@ def keep_the_rest(holder: Holder, choose: Callable[[], Path]) -> str:
     return f"{len(left)} file(s) did not reach the vehicle; they are kept in {directory}"
 
 
-async def say_goodbye(holder: Holder, source: str) -> str:
-    """Deliver or keep; returns "" or the line to show with exit code 4. Keeps also when cancelled."""
-    message = ""
+async def say_goodbye(holder: Holder, source: str, tell: Callable[[str], None]) -> None:
+    """Deliver or keep; `tell` gets the line that goes with exit code 4. Keeps also when cancelled."""
     try:
         await deliver(holder)
     finally:
         message = keep_the_rest(holder, lambda: recovery_directory(os.environ, source, time.time()))
         if message:
             log.error("%s", message)
+            tell(message)
+
+
+# -- what an earlier mount left ---------------------------------------------------------------------
+
+
+def spool_base(environment: Mapping[str, str], vehicle: Address | None) -> Path:
+    """Return where the mounts of one vehicle keep what they hold: by its address, whatever the link."""
+    name = "unknown" if vehicle is None else f"{vehicle.system}-{vehicle.component}"
+    return state_directory(environment) / "mavftpfs" / "spool" / name
+
+
+@contextmanager
+def spool_for(vehicle: Address | None) -> Iterator[SpoolDirectory | None]:
+    """Claim a spool directory for the length of the body; None if this user can have none."""
+    base = spool_base(os.environ, vehicle)
+    try:
+        base.parent.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        base.parent.mkdir(mode=0o700, exist_ok=True)
+        spool = SpoolDirectory(base, SystemRandom())
+    except OSError as exc:
+        log.warning("what waits for the vehicle will not survive this process: %s: %s", base, exc)
+        yield None
+        return
+    try:
+        yield spool
+    finally:
+        spool.close()
+
+
+def rescue(spool: SpoolDirectory, source: str) -> str:
+    """Move what a killed mount of this vehicle left to a recovery directory; return a line on it, or ""."""
+    directory = recovery_directory(os.environ, source, time.time())
+    try:
+        found = spool.rescue(directory)
+    except OSError as exc:
+        message = f"an earlier mount left files that did not reach the vehicle in {spool.path.parent}: {exc}"
+    else:
+        if not found:
+            return ""
+        message = (
+            f"{len(found)} file(s) of an earlier mount did not reach the vehicle; they are in {directory}"
+        )
+    log.warning("%s", message)
     return message

@@ -49,7 +49,7 @@ LAST_REPLIES = 3.0
 """Seconds to hand waiting control clients their reply at the end."""
 
 Report = Callable[[int, str], None]
-"""Takes (exit code, one line): (0, "") once the mount is up, else why there will be none."""
+"""Takes (exit code, one line): 0 and perhaps a notice once the mount is up, else why there will be none."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,11 +70,12 @@ class MountedTree(WritableTree, Holder, Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Content:
-    """What is behind a mount."""
+    """What is behind a mount. notice: a line for whoever mounts, or ""."""
 
     tree: MountedTree
     status: Callable[[], dict[str, Any]] = dict
     space: Callable[[], Space | None] = lambda: None
+    notice: str = ""
 
 
 Attach = Callable[[Callable[[bytes], None]], AbstractAsyncContextManager[Content]]
@@ -86,9 +87,16 @@ def run_mount(request: MountRequest, report: Report) -> int:
 
     @asynccontextmanager
     async def attach(invalidate: Callable[[bytes], None]) -> AsyncIterator[Content]:
-        vehicle = attached(request.spec, request.options, invalidate=invalidate, sinks=request.sinks)
+        vehicle = attached(
+            request.spec,
+            request.options,
+            invalidate=invalidate,
+            sinks=request.sinks,
+            writing=True,
+            rescue_for=request.source,
+        )
         async with vehicle as up:
-            yield Content(up.tree, up.status, up.space)
+            yield Content(up.tree, up.status, up.space, up.notice)
 
     return trio.run(serve_mount, request, attach, report)
 
@@ -158,20 +166,22 @@ class _Life:
                 with kernel_mount(operations, self.request, invalidator):
                     self.mounted = True
                     await self._start_control(lambda: self.status(content, operations), nursery)
-                    await self._serve(invalidator)
+                    await self._serve(invalidator, content.notice)
             finally:
                 await self._leave(content)
 
     async def _leave(self, content: Content) -> None:
         """Deliver what programs wrote, or keep it; a second signal ends the delivery, not the keeping."""
-        self.farewell = await say_goodbye(content.tree, self.request.source)
-        if self.farewell:
-            self.code = ExitCode.UNDELIVERED
+        await say_goodbye(content.tree, self.request.source, self._on_undelivered)
 
-    async def _serve(self, invalidator: Invalidator) -> None:
+    def _on_undelivered(self, line: str) -> None:
+        self.farewell = line
+        self.code = ExitCode.UNDELIVERED
+
+    async def _serve(self, invalidator: Invalidator, notice: str) -> None:
         async with trio.open_nursery() as nursery:
             nursery.start_soon(invalidator.run)
-            self.report(0, "")
+            self.report(0, notice)
             with trio.CancelScope() as self._loop_scope:
                 if not self._stop_asked:
                     await fuse_loop()

@@ -63,9 +63,9 @@ class Target:
     options: MountOptions
     sinks: Sinks = NO_SINKS
 
-    def attached(self) -> AbstractAsyncContextManager[Attached]:
+    def attached(self, *, writing: bool = False) -> AbstractAsyncContextManager[Attached]:
         """Return the connection; what the commands ask for is its first listing."""
-        return attached(self.spec, self.options, sinks=self.sinks, list_root=False)
+        return attached(self.spec, self.options, sinks=self.sinks, list_root=False, writing=writing)
 
 
 Entry = dict[str, Any]

@@ -99,7 +99,7 @@ async def put_paths(
         NotDelivered: a file did not get to the vehicle; what was told before is there.
     """
     batches = [(local, collect(local, recursive=recursive)) for local in locals_]
-    async with target.attached() as vehicle:
+    async with target.attached(writing=True) as vehicle:
         into = await _is_directory(vehicle.tree, path)
         if not into and len(batches) > 1:
             raise NotADirectory(f"{_text(path)} is no directory, so only one thing can be put there")
@@ -182,7 +182,7 @@ async def make_directory(tree: Tree, path: bytes, *, may_exist: bool) -> None:
 
 async def make_directories(target: Target, paths: Sequence[bytes], *, parents: bool) -> None:
     """Make directories; with `parents` also those above them, and what is there already is fine."""
-    async with target.attached() as vehicle:
+    async with target.attached(writing=True) as vehicle:
         for path in paths:
             for above in ancestors(path) if parents else ():
                 if not await _is_directory(vehicle.tree, above):
@@ -201,7 +201,7 @@ def ancestors(path: bytes) -> list[bytes]:
 
 async def remove_directories(target: Target, paths: Sequence[bytes]) -> None:
     """Remove empty directories."""
-    async with target.attached() as vehicle:
+    async with target.attached(writing=True) as vehicle:
         for path in paths:
             await vehicle.tree.rmdir(path)
 
@@ -215,7 +215,7 @@ async def remove_paths(target: Target, paths: Sequence[bytes], *, recursive: boo
     """
     if ROOT in paths:
         raise UsageError("the root itself is not removed; name what is in it")
-    async with target.attached() as vehicle:
+    async with target.attached(writing=True) as vehicle:
         found = [(path, await vehicle.tree.stat(path)) for path in paths]
         for path, stat in found:
             if stat.kind is EntryKind.DIRECTORY and not recursive:
@@ -245,7 +245,7 @@ async def move_paths(target: Target, paths: Sequence[bytes], to: bytes) -> None:
     Raises:
         NotADirectory: several things, and `to` is no directory. Else as Tree.rename.
     """
-    async with target.attached() as vehicle:
+    async with target.attached(writing=True) as vehicle:
         into = await _is_directory(vehicle.tree, to)
         if not into and len(paths) > 1:
             raise NotADirectory(f"{_text(to)} is no directory, so only one thing can be moved there")

@@ -67,7 +67,8 @@ class FakeTarget:
     attached_times: int = 0
 
     @asynccontextmanager
-    async def attached(self) -> AsyncIterator[Any]:
+    async def attached(self, *, writing: bool) -> AsyncIterator[Any]:
+        assert writing
         self.attached_times += 1
         yield SimpleNamespace(tree=self.tree)
 
