@@ -78,6 +78,28 @@ def test_opening_for_reading_leaves_a_lone_writer_alone() -> None:
     assert c.server.open_paths == [A]
 
 
+@pytest.mark.parametrize("opcode", [Opcode.CREATE_FILE, Opcode.OPEN_FILE_WO])
+def test_opening_for_writing_again_closes_both_streams(opcode: int) -> None:
+    c = Client("mavsdk")
+    c.open(A)
+    c.open(FIVE, Opcode.CREATE_FILE)
+    ack(c.ask(Opcode.WRITE_FILE, b"kept"))
+    c.open(b"/fs/microsd/empty", opcode)
+    assert c.server.open_paths == [b"/fs/microsd/empty"]
+    assert isinstance(c.tree, MemoryTree)
+    assert c.tree.data(FIVE) == b"kept"
+
+
+def test_reboot_forgets_streams_sizes_and_work() -> None:
+    c = Client("mavsdk", crc_rate=1.0)
+    c.open(A)
+    c.send(Opcode.BURST_READ_FILE, size=239)
+    c.send(Opcode.CALC_FILE_CRC32, A)
+    c.server.reboot(c.now)
+    assert c.receive(1.0) == []
+    assert nak(c.ask(Opcode.READ_FILE, size=1)) == EOF, "no file has a size"
+
+
 def test_a_wrong_session_closes_everything() -> None:
     c = Client("mavsdk")
     c.open(A)
