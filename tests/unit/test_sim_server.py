@@ -151,8 +151,9 @@ def test_counters_and_malformed_requests() -> None:
     assert c.server.requests == {Opcode.NONE: 3}
 
 
+@pytest.mark.parametrize("checksum", [True, False])
 @pytest.mark.parametrize("name", ["px4", "px4-nuttx", "ardupilot", "mavsdk", "spec"])
-def test_a_deadline_is_never_missed(name: str) -> None:
+def test_a_deadline_is_never_missed(name: str, checksum: bool) -> None:
     """Waking only at next_deadline gets what polling gets, and not later."""
     results = []
     for polling in (True, False):
@@ -160,12 +161,13 @@ def test_a_deadline_is_never_missed(name: str) -> None:
         tree.add(A, bytes(30_000))
         c = Client(name, tree, crc_rate=100_000.0)
         session = c.ask(Opcode.OPEN_FILE_RO, A, session=1).session
-        c.send(Opcode.CALC_FILE_CRC32, A, session=session)
+        if checksum:
+            c.send(Opcode.CALC_FILE_CRC32, A, session=session)
         c.send(Opcode.BURST_READ_FILE, session=session, size=239)
         results.append(list(polled(c.server, c.now) if polling else woken(c.server, c.now)))
     by_polling, by_waking = results
     assert [wire for _, wire in by_polling] == [wire for _, wire in by_waking]
-    assert len(by_waking) > 100
+    assert len(by_waking) >= 100
     assert all(woke <= seen for (seen, _), (woke, _) in zip(by_polling, by_waking, strict=True))
 
 
@@ -215,6 +217,7 @@ def test_the_textbook_server_bursts() -> None:
         replies = c.ask_all(Opcode.BURST_READ_FILE, session=session, offset=offset, size=100, wait=1.0)
         assert [b.seq - a.seq for a, b in pairwise(replies)] == [1] * (len(replies) - 1)
         assert [p.burst_complete for p in replies] == [0] * (len(replies) - 1) + [1]
+        assert len(replies) == 100 or (replies[-1].opcode == Opcode.NAK and len(replies) == 51)
         got += b"".join(p.data for p in replies if p.opcode == Opcode.ACK)
         offset = len(got)
         if replies[-1].opcode == Opcode.NAK:
