@@ -32,6 +32,9 @@ FOREIGN_MEMORY = 10.0
 
 _OPCODE_INDEX = 3
 _REBOOT_SLACK_MS = 2000
+_MISSING_MS = 20_000
+"""Less boot time than half of what passed, and this beyond it, is a restart that nobody saw: a full queue
+delays a message less, and simulators may run slower than the clock."""
 
 
 @dataclass(slots=True)
@@ -60,13 +63,15 @@ class Vehicle:
     foreign_at: float | None = None
     reboots: int = 0
     heard: dict[Address, Heartbeat] = field(default_factory=dict)
+    _armed: bool | None = None
     _boot_ms: int | None = None
+    _boot_heard_at: float = 0.0
     _timed_out: bool = False
 
     @property
     def armed(self) -> bool:
         """Whether to treat the vehicle as armed; never heard counts as armed (promise 9)."""
-        return self.heartbeat is None or self.heartbeat.armed
+        return self._armed is not False
 
     @property
     def ftp_flag(self) -> bool | None:
@@ -109,7 +114,7 @@ class Vehicle:
             case StorageInformation():
                 self._on_storage(message)
             case SystemTime() if message.source == self.address:
-                self._on_boot_time(message.time_boot_ms)
+                self._on_boot_time(message.time_boot_ms, now)
             case StatusText():
                 self.last_text = message
 
@@ -121,15 +126,19 @@ class Vehicle:
             self.heard[heartbeat.source] = heartbeat
         if self.address is None and self._is_wanted(heartbeat):
             self.address = self._target_of(heartbeat)
+        if heartbeat.is_autopilot and self.address and heartbeat.source.system == self.address.system:
+            self._on_armed(heartbeat.armed)
         if not self._proves_life(heartbeat.source):
             return
-        was_armed = None if self.heartbeat is None else self.heartbeat.armed
         self.heartbeat_at = now
         self._timed_out = False
         self.heartbeat = heartbeat
-        if was_armed != heartbeat.armed:
-            self.on_armed(heartbeat.armed)
         self.on_heartbeat()
+
+    def _on_armed(self, armed: bool) -> None:
+        if armed is not self._armed:
+            self._armed = armed
+            self.on_armed(armed)
 
     def _is_wanted(self, heartbeat: Heartbeat) -> bool:
         if self.wanted_system and heartbeat.source.system != self.wanted_system:
@@ -167,9 +176,11 @@ class Vehicle:
         if self.storage is None or message.storage_id <= self.storage.storage_id:
             self.storage = message
 
-    def _on_boot_time(self, boot_ms: int) -> None:
-        before = self._boot_ms
-        self._boot_ms = boot_ms
-        if before is not None and boot_ms + _REBOOT_SLACK_MS < before:
+    def _on_boot_time(self, boot_ms: int, now: float) -> None:
+        before, elapsed_ms = self._boot_ms, (now - self._boot_heard_at) * 1000
+        self._boot_ms, self._boot_heard_at = boot_ms, now
+        if before is None:
+            return
+        if boot_ms + _REBOOT_SLACK_MS < before or boot_ms - before < elapsed_ms / 2 - _MISSING_MS:
             self.reboots += 1
             self.on_reboot()

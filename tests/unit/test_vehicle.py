@@ -77,6 +77,22 @@ def test_arming_is_told_once_each_way() -> None:
     assert news == [False, True, False]
 
 
+def test_a_component_cannot_disarm_the_autopilot() -> None:
+    news: list[bool] = []
+    companion = Address(1, 100)
+    vehicle = listener(system=1, component=100)
+    vehicle.on_armed = news.append
+    vehicle.on_message(heartbeat(companion, autopilot=MAV_AUTOPILOT_INVALID), 0.0)
+    assert vehicle.armed  # the autopilot was never heard
+    vehicle.on_message(heartbeat(PILOT, armed=True), 1.0)
+    vehicle.on_message(heartbeat(companion, autopilot=MAV_AUTOPILOT_INVALID), 2.0)
+    vehicle.on_message(heartbeat(Address(2, 1)), 2.0)
+    assert vehicle.armed
+    vehicle.on_message(heartbeat(PILOT), 3.0)
+    assert not vehicle.armed
+    assert news == [True, False]
+
+
 def test_ftp_of_others_is_foreign_and_our_own_replies_are_not() -> None:
     vehicle = listener()
     vehicle.on_message(heartbeat(PILOT), 0.0)
@@ -102,6 +118,18 @@ def test_boot_time_going_back_is_a_reboot_and_reordering_is_not() -> None:
         vehicle.on_message(SystemTime(PILOT, 0, boot_ms), 0.0)
     assert reboots == [1]
     vehicle.on_message(SystemTime(Address(8, 1), 0, 10), 0.0)
+    assert reboots == [1]
+
+
+def test_a_reboot_during_a_long_outage_is_seen_by_the_time_that_is_missing() -> None:
+    reboots: list[int] = []
+    vehicle = listener()
+    vehicle.on_reboot = lambda: reboots.append(1)
+    vehicle.on_message(heartbeat(PILOT), 0.0)
+    for now, boot_ms in ((10.0, 20_000), (25.0, 21_000), (26.0, 36_000), (626.0, 636_000)):
+        vehicle.on_message(SystemTime(PILOT, 0, boot_ms), now)
+    assert reboots == []
+    vehicle.on_message(SystemTime(PILOT, 0, 700_000), 1226.0)
     assert reboots == [1]
 
 
