@@ -70,9 +70,9 @@ class Cleaner:
         if group.target is None and sidecar is not None:
             target = await self._read_sidecar(directory, sidecar)
             group = Group(group.paths, group.serial, target)
-        if group.target is not None and self._context.nodes.get(group.target) is not None:
-            return  # somebody here is about to write it: a later listing will show what came of it
         exists = group.target is not None and await self._exists(group.target)
+        if group.target is not None and not exists and self._context.nodes.get(group.target) is not None:
+            return  # it is about to be written here: a later listing shows what came of it
         for action in repair(group, target_exists=exists):
             self._staleness.forget(action.path)
             if action.to is None:

@@ -24,7 +24,6 @@ from mavftpfs.cache.throttle import Throttle
 from mavftpfs.cache.verify import Verifier
 from mavftpfs.shared.errors import (
     Armed,
-    FtpNak,
     LinkError,
     MavftpfsError,
     NoSpace,
@@ -164,13 +163,10 @@ class Deliverer:
         self._on_delivered(node, draft)
 
     async def _probe(self, node: Node) -> None:
-        """Find out what OpenFileWO does; if even that fails, take it to empty files."""
+        """Find out what OpenFileWO does; what does not show itself is taken to empty files."""
+        await self._context.writer.probe_open_for_write(split(node.path)[0])
         traits = self._context.writer.traits
-        try:
-            await self._context.writer.probe_open_for_write(split(node.path)[0])
-        except FtpNak as nak:
-            log.debug("the probe of OpenFileWO was refused: %s", nak)
-        if self._context.writer.traits.wo_truncates is None:
+        if traits.wo_truncates is None:
             traits.wo_truncates = True
 
     # --- sending

@@ -128,7 +128,7 @@ class Replacer:
         except FtpNak as nak:
             if errno_for(nak) in _HONEST:
                 raise
-            if nak.code == _FILE_EXISTS or errno_for(nak) == errno.EEXIST:
+            if nak.code == _FILE_EXISTS:  # an errno may be a stale one
                 traits.rename_replaces = False
             log.debug("the server does not rename %r over %r: %s", source, target, nak)
             return False
@@ -143,7 +143,8 @@ class Replacer:
         except FtpNak as nak:
             if errno_for(nak) == errno.ENOENT and await self._sure.entry(target) is None:
                 return False
-            if traits.rename_works or errno_for(nak) in _HONEST:
+            renames = traits.rename_works or traits.rename_replaces is False
+            if renames or errno_for(nak) in _HONEST:
                 raise
             traits.rename_works = False
             raise NotSupported("this server cannot rename") from nak

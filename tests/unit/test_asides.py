@@ -1,0 +1,202 @@
+"""Reserved names: their form, where they fit, and what is done with what an interruption left."""
+
+from __future__ import annotations
+
+from random import Random
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mavftpfs.cache.asides import (
+    RENAME_ROOM,
+    STALE_AFTER,
+    Action,
+    Group,
+    Kind,
+    Namer,
+    Reserved,
+    Staleness,
+    fits_rename,
+    is_reserved,
+    leftovers,
+    new_owner,
+    parse,
+    repair,
+)
+from mavftpfs.shared.errors import PathTooLong
+from mavftpfs.shared.model import DirEntry, EntryKind, split, usable_name
+
+names = st.binary(min_size=1, max_size=60).filter(usable_name)
+
+
+@given(kind=st.sampled_from(Kind), target=st.none() | names, seed=st.integers())
+def test_names_read_back(kind: Kind, target: bytes | None, seed: int) -> None:
+    reserved = Reserved(new_owner(Random(seed)), kind, b"abc", target)
+    assert parse(reserved.name) == reserved
+    assert is_reserved(reserved.name)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        b"file",
+        b".mavftpfs-",
+        b".mavftpfs-abcdtab",
+        b".mavftpfs-ABCDtabc",
+        b".mavftpfs-abcdxabc",
+        b"x.mavftpfs-abcdtabc",
+    ],
+)
+def test_other_names_are_not_ours(name: bytes) -> None:
+    assert parse(name) is None
+
+
+@given(st.lists(st.integers(1, 60), min_size=1, max_size=8), st.integers())
+def test_places_fit_every_request_or_are_refused(lengths: list[int], seed: int) -> None:
+    path = b"".join(b"/" + b"p" * length for length in lengths)
+    try:
+        places = Namer(b"abcd", b"/", Random(seed)).places(path)
+    except PathTooLong:
+        assert len(path) > 200
+        return
+    for place in (places.new, places.old, places.moved):
+        assert fits_rename(place, path)
+        assert len(place) <= 200
+        assert path.startswith(split(place)[0])
+    assert (places.sidecar is None) == (split(places.new)[1].endswith(b"-" + split(path)[1]))
+
+
+def test_names_do_not_repeat() -> None:
+    namer = Namer(b"abcd", b"/", Random(5))
+    assert len({namer.places(b"/a/b").new for _ in range(5000)}) == 5000
+
+
+def test_nothing_is_put_above_the_root() -> None:
+    root = b"/" + b"r" * 60
+    with pytest.raises(PathTooLong):
+        Namer(b"abcd", root, Random(5)).places(root + b"/" + b"n" * 138)
+
+
+NEW, OLD, MOVED, SIDECAR, DELETED = (
+    b"/d/" + kind.value for kind in (Kind.NEW, Kind.OLD, Kind.MOVED, Kind.SIDECAR, Kind.DELETED)
+)
+TARGET = b"/d/file"
+
+
+def named(
+    kind: Kind, target: bytes | None = b"file", owner: bytes = b"abcd", serial: bytes = b"sss"
+) -> DirEntry:
+    return DirEntry(Reserved(owner, kind, serial, target).name, EntryKind.FILE, 5)
+
+
+def mended(
+    kinds: list[Kind], *, target_exists: bool, target: bytes | None = b"file"
+) -> list[tuple[bytes, bytes | None]]:
+    """Return the kinds and what becomes of them: None = removed."""
+    entries = [named(kind, None if kind is Kind.SIDECAR else target) for kind in kinds]
+    (group,) = leftovers(b"/d", entries, lambda *_: True)
+    if Kind.SIDECAR in kinds:
+        group = Group(group.paths, group.serial, TARGET)
+    kind_of = {path: kind.value for kind, path in group.paths.items()}
+    return [(kind_of[action.path], action.to) for action in repair(group, target_exists=target_exists)]
+
+
+def test_repair() -> None:
+    assert mended([Kind.NEW], target_exists=True) == [(b"t", None)]
+    assert mended([Kind.NEW, Kind.OLD], target_exists=True) == [(b"t", None), (b"o", None)]
+    assert mended([Kind.OLD], target_exists=True) == [(b"o", None)]
+    assert mended([Kind.NEW, Kind.OLD], target_exists=False) == [(b"t", TARGET), (b"o", None)]
+    assert mended([Kind.OLD], target_exists=False) == [(b"o", TARGET)]
+    assert mended([Kind.NEW], target_exists=False) == [(b"t", b"/d/recovered-tsss-file")]
+    assert mended([Kind.MOVED], target_exists=False) == [(b"m", TARGET)]
+    assert mended([Kind.MOVED], target_exists=True) == [(b"m", b"/d/recovered-msss-file")]
+    assert mended([Kind.DELETED], target_exists=True, target=None) == [(b"d", None)]
+
+
+def test_repair_with_a_sidecar_removes_it_last() -> None:
+    kinds = [Kind.NEW, Kind.OLD, Kind.SIDECAR]
+    assert mended(kinds, target_exists=False, target=None) == [(b"t", TARGET), (b"o", None), (b"p", None)]
+    assert mended([Kind.SIDECAR], target_exists=True, target=None) == [(b"p", None)]
+
+
+def test_repair_without_a_target_loses_no_only_copy() -> None:
+    def group(*kinds: Kind) -> Group:
+        return Group({kind: b"/d/" + Reserved(b"abcd", kind, b"sss").name for kind in kinds}, b"sss", None)
+
+    assert [a.to for a in repair(group(Kind.NEW), target_exists=False)] == [None]
+    assert [a.to for a in repair(group(Kind.OLD), target_exists=False)] == [b"/d/recovered-osss"]
+    assert [a.to for a in repair(group(Kind.MOVED), target_exists=False)] == [b"/d/recovered-msss"]
+    assert [a.to for a in repair(group(Kind.OLD, Kind.NEW), target_exists=False)] == [
+        b"/d/recovered-osss",
+        b"/d/recovered-tsss",
+    ]
+
+
+@pytest.mark.parametrize("replaces", [True, False])
+@pytest.mark.parametrize("stop", range(6))
+@pytest.mark.parametrize("stop_repair", range(4))
+def test_a_replacement_interrupted_anywhere_and_its_repair_too(
+    replaces: bool, stop: int, stop_repair: int
+) -> None:
+    """Whatever was done of the steps, listings and repairs end with one complete file and no litter."""
+    new, old = (Reserved(b"abcd", kind, b"sss", b"file").name for kind in (Kind.NEW, Kind.OLD))
+    names = {b"file": "old"}
+    if stop > 0:
+        names[new] = "new"
+    moves = [(new, b"file")] if replaces else [(b"file", old), (new, b"file")]
+    for source, target in moves[: max(0, stop - 1)]:
+        names[target] = names.pop(source)
+    if stop > len(moves) + 1:
+        names.pop(old, None)
+    for limit in (stop_repair, 9):
+        entries = [DirEntry(name, EntryKind.FILE, 3) for name in names]
+        for group in leftovers(b"/", entries, lambda *_: True):
+            for action in repair(group, target_exists=b"file" in names)[:limit]:
+                content = names.pop(action.path[1:])
+                if action.to is not None:
+                    names[action.to[1:]] = content
+    assert list(names) == [b"file"]
+    assert names[b"file"] in ("old", "new")
+
+
+def test_what_is_not_ours_is_not_touched() -> None:
+    entries = [
+        DirEntry(b"file", EntryKind.FILE),
+        DirEntry(b".mavftpfs-strange", EntryKind.FILE),
+        DirEntry(named(Kind.NEW).name, EntryKind.DIRECTORY),
+        DirEntry(b".mavftpfs-abcdtabc", EntryKind.DIRECTORY),
+    ]
+    assert leftovers(b"/d", entries, lambda *_: True) == []
+
+
+def test_a_group_of_which_a_part_is_alive_is_left_alone() -> None:
+    entries = [named(Kind.NEW), named(Kind.OLD), named(Kind.NEW, serial=b"zzz")]
+    alive = b"/d/" + entries[1].name
+    (group,) = leftovers(b"/d", entries, lambda path, owner, entry: path != alive)
+    assert group.serial == b"zzz"
+
+
+def test_strangers_names_go_stale_slowly() -> None:
+    watch = Staleness()
+    assert not watch.is_stale(b"/x", 5, 0.0)
+    assert not watch.is_stale(b"/x", 5, STALE_AFTER - 1)
+    assert watch.is_stale(b"/x", 5, STALE_AFTER)
+    assert not watch.is_stale(b"/x", 6, STALE_AFTER + 1), "it grows: somebody is at it"
+    assert not watch.is_stale(b"/x", 6, STALE_AFTER + 2)
+    watch.forget(b"/x")
+    assert not watch.is_stale(b"/x", 6, 10 * STALE_AFTER)
+    for number in range(3 * Staleness.MAX):
+        watch.is_stale(b"/%d" % number, 1, 0.0)
+    assert not watch.is_stale(b"/x", 6, 20 * STALE_AFTER), "what is remembered is bounded"
+
+
+def test_recovered_names_fit_a_rename() -> None:
+    directory = b"/" + b"d" * 40
+    name = Reserved(b"abcd", Kind.MOVED, b"sss", b"n" * 60).name
+    (action,) = repair(
+        Group({Kind.MOVED: directory + b"/" + name}, b"sss", directory + b"/" + b"n" * 60), target_exists=True
+    )
+    assert isinstance(action, Action)
+    assert action.to is not None
+    assert len(action.path) + 1 + len(action.to) <= RENAME_ROOM
