@@ -25,11 +25,14 @@ from mavftpfs.cache.readahead import Pace, Readahead
 from mavftpfs.cache.readonly import ReadOnlyHandle
 from mavftpfs.cache.remote import RemoteStore
 from mavftpfs.cache.versions import Fetcher, Version
-from mavftpfs.shared.errors import FileChanged, LocalProtocolError, NotADirectory, NotFound
+from mavftpfs.shared.errors import FileChanged, FileTooLarge, LocalProtocolError, NotADirectory, NotFound
 from mavftpfs.shared.model import DirEntry
 
 MAX_CLOSED = 4096
 """How many files that nobody has open are remembered with their blocks."""
+
+WRAP = 1 << 32
+"""Open replies tell sizes modulo this, and no request reaches beyond it; MAVSDK lists true sizes."""
 
 MAX_PIECE = MIB
 """A read is served in pieces of at most so many bytes (or a quarter of the cache)."""
@@ -125,6 +128,9 @@ class Files:
     async def _start_version(self, path: bytes, entry: DirEntry) -> Version:
         blocks = FileBlocks(self._cache)
         reader = await self._store.open_reader(path, blocks)
+        if entry.size is not None and entry.size >= WRAP and entry.size % WRAP == reader.size:
+            reader.close()
+            raise FileTooLarge(f"{path!r} has {entry.size} bytes, more than an open reply can tell")
         blocks.size = reader.size
         old = self._current.get(path)
         if old is not None and old.size > reader.size:
