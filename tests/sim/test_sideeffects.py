@@ -252,12 +252,13 @@ async def test_an_upload_makes_room_for_a_change_of_its_path(
     async with here.connection() as connection:
         if probed:
             await connection.store.probe_open_for_write(path(profile, "")[:-1])
-        source = MemorySource(bytes(40_000))
+        source = MemorySource(bytes(300_000))
         upload = await connection.store.open_upload(path(profile, "file"), source, create=True)
         await trio.sleep(1)
         faults.at(Opcode.REMOVE_FILE, lambda: open_then.append(here.vehicle.server.open_paths))
         await connection.store.remove(path(profile, "file"))
         assert open_then == [[]]
+        assert not source.dirty.empty  # it did not wait for the upload's end
         await upload.abort()
     assert here.vehicle.server.open_sessions == 0
 
