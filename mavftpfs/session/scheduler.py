@@ -30,7 +30,7 @@ from mavftpfs.session.stream import FileStream
 from mavftpfs.session.upload import QueuedUpload
 from mavftpfs.session.uploading import Uploading
 from mavftpfs.session.vehicle import Vehicle
-from mavftpfs.shared.errors import MavftpfsError, RequestTimeout, VehicleLost
+from mavftpfs.shared.errors import DataUnproven, MavftpfsError, RequestTimeout, SessionLost, VehicleLost
 from mavftpfs.shared.traits import WriteTraits
 
 IDLE_CLOSE = 1.5
@@ -125,16 +125,27 @@ class Scheduler:
         return stream
 
     async def read_whole(self, path: bytes, limit: int) -> bytes:
-        """Read a file to EOF whatever its size claims."""
+        """Read a file to EOF whatever its size claims; once more if the session was lost.
+
+        Raises:
+            DataUnproven: another FTP client was heard meanwhile: the bytes may be another file's. Else as
+                use_session.
+        """
         data = b""
 
         async def read(session: OpenSession) -> None:
             nonlocal data
+            foreign_at = self._vehicle.foreign_at
             operation = ReadToEof(session.id, self._steering.chunk, limit)
             await self._run_beside(operation)
+            if self._vehicle.foreign_at != foreign_at:
+                raise DataUnproven(f"another FTP client was active while {path!r} was read")
             data = operation.data
 
-        await self.use_session(path, Opcode.OPEN_FILE_RO, read)
+        try:
+            await self.use_session(path, Opcode.OPEN_FILE_RO, read)
+        except SessionLost:
+            await self.use_session(path, Opcode.OPEN_FILE_RO, read)
         return data
 
     async def use_session(

@@ -8,9 +8,16 @@ import pytest
 import trio
 from trio.testing import MockClock
 
-from mavftpfs.protocol.payload import Opcode, Payload
+from mavftpfs.link.messages import Address, FtpFrame
+from mavftpfs.protocol.payload import Opcode, Payload, request
 from mavftpfs.session.connection import Connection
-from mavftpfs.shared.errors import MavftpfsError, RemoteProtocolError, RequestTimeout, VehicleLost
+from mavftpfs.shared.errors import (
+    DataUnproven,
+    MavftpfsError,
+    RemoteProtocolError,
+    RequestTimeout,
+    VehicleLost,
+)
 from mavftpfs.sim.linkmodel import LinkSettings
 from tests.support.worlds import MemorySink, World, read_file
 
@@ -101,3 +108,45 @@ async def test_bursts_of_exact_multiples_end(autojump: MockClock) -> None:
         assert await read_file(connection, b"/g") == data[: 500 * 239]
         assert connection.engine.stats.by_opcode[Opcode.BURST_READ_FILE] >= 3
     assert here.vehicle.server.open_sessions == 0
+
+
+@pytest.mark.parametrize("profile", ["px4", "ardupilot"])
+async def test_a_whole_read_beside_another_client_is_not_believed(profile: str, autojump: MockClock) -> None:
+    """Servers share session ids, and of an `@` file no checksum can prove the bytes."""
+    here = World(profile, LinkSettings(rate=5000.0, delay=0.02))
+    data = random.Random(2).randbytes(20_000)
+    here.tree.add(b"/f", data)
+    async with here.connection() as connection, trio.open_nursery() as nursery:
+
+        async def interfere() -> None:
+            await trio.sleep(2.0)
+            vehicle = connection.vehicle
+            assert vehicle.address is not None
+            reply = Payload(9, 0, Opcode.ACK, 0, Opcode.READ_FILE).encode()
+            vehicle.on_message(FtpFrame(vehicle.address, Address(255, 190), reply), trio.current_time())
+
+        nursery.start_soon(interfere)
+        with pytest.raises(DataUnproven):
+            await connection.store.read_whole(b"/f", 100_000)
+        assert await connection.store.read_whole(b"/f", 100_000) == data
+
+
+@pytest.mark.parametrize("profile", ["px4", "ardupilot"])
+async def test_a_whole_read_survives_a_lost_session(profile: str, autojump: MockClock) -> None:
+    here = World(profile, LinkSettings(rate=5000.0, delay=0.02))
+    data = random.Random(2).randbytes(20_000)
+    here.tree.add(b"/f", data)
+    async with here.connection() as connection, trio.open_nursery() as nursery:
+
+        async def close_it() -> None:
+            await trio.sleep(2.0)
+            session = connection.scheduler.session
+            assert session is not None
+            wire = request(777, Opcode.TERMINATE_SESSION, session=session.id).encode()
+            frame = connection.driver.framer.encode_ftp(Address(1, 1), wire)
+            here.vehicle.receive(frame, trio.current_time())
+            here.link.kick()
+
+        nursery.start_soon(close_it)
+        assert await connection.store.read_whole(b"/f", 100_000) == data
+        assert connection.engine.stats.by_opcode[Opcode.OPEN_FILE_RO] == 2
