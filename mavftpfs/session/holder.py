@@ -65,10 +65,12 @@ class SessionHolder:
         """Close what is open and open another file.
 
         Raises:
-            What SessionOpener.open and close raise.
+            What SessionOpener.open raises, and close of a file that was written to. That a file which was
+            only read could not be closed is no news to whoever opens the next: the opener tries again.
         """
         if self.session is not None:
-            await self.close()
+            close = self.close if self.session.writing else self.close_quietly
+            await close()
             self.switches += 1
         self._opening = path
         try:

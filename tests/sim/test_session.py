@@ -158,6 +158,21 @@ async def test_a_session_left_by_a_killed_client_is_got_over(profile: str, autoj
         assert await read_file(connection, path(profile, "big")) == data
 
 
+async def test_a_close_that_goes_unheard_does_not_fail_the_next_open(autojump: MockClock) -> None:
+    here = world("px4", LinkSettings(delay=0.01), first=b"one", second=b"two")
+    async with here.connection() as connection:
+        assert await read_file(connection, path("px4", "first")) == b"one"
+        here.link.cut()
+
+        async def mend() -> None:
+            await trio.sleep(8)
+            here.link.restore()
+
+        async with trio.open_nursery() as nursery:
+            nursery.start_soon(mend)
+            assert await read_file(connection, path("px4", "second")) == b"two"
+
+
 async def test_silence_fails_one_request_and_then_all_at_once(autojump: MockClock) -> None:
     here = world("px4", small=b"hello")
     async with here.connection() as connection:
