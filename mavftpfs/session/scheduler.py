@@ -319,7 +319,8 @@ class Scheduler:
         if self._jobs:
             return 0.0
         now = self._clock()
-        others = [stream.use for stream in self._streams if stream is not user and stream.has_demand]
+        waiting = [stream for stream in self._streams if stream is not user and stream.has_demand]
+        others = [stream.use for stream in waiting if not self._claimed(stream.path)]
         others += [upload.use for upload in self._uploading.due(now) if upload is not user]
         return min((use.recent(now) for use in others), default=None)
 

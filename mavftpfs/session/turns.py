@@ -26,7 +26,7 @@ class Turns:
     @property
     def wanted(self) -> bool:
         """Whether a path operation waits for its turn."""
-        return self._waiting > 0
+        return self._writing and self._waiting > 0
 
     def set_writing(self, writing: bool) -> None:
         """Begin or end to keep path operations out."""

@@ -119,9 +119,11 @@ class Writer:
             return await self._write(upload, session)
         finally:
             self.current = None
+            self.turns.set_writing(False)
 
     async def _write(self, upload: QueuedUpload, session: OpenSession) -> Stop:
         rearms = 0
+        self.turns.set_writing(self._disarmed_by_paths)
         while True:
             transfer = WriteTransfer(session.id, upload.feed, self._chunk)
             stop = await self._drive(upload, session, transfer)
@@ -136,6 +138,9 @@ class Writer:
                 self._note_refusal(upload, transfer.failed_at, error)
                 raise error
             rearms += 1
+            # From now on path operations take turns with this upload: first those that are under way end.
+            self.turns.set_writing(True)
+            await self.turns.give(0.0)
             await self._rearm(upload.path)
 
     async def _drive(
@@ -143,14 +148,12 @@ class Writer:
     ) -> Stop | None:
         """Run a transfer until there is a reason to let go, or it failed (None)."""
         self._transfer, self._starved_at = transfer, None
-        self.turns.set_writing(self._disarmed_by_paths)
         self._driver.start(transfer, self._holder.wake)
         try:
             async with self._gate.passing():
                 return await self._watch(upload, session, transfer)
         finally:
             self._transfer = None
-            self.turns.set_writing(False)
             transfer.stop()
             self._driver.cancel(transfer)
 
@@ -169,7 +172,7 @@ class Writer:
                 if transfer.drained or stop in _ABRUPT:
                     upload.mark()
                     return stop
-            elif self._disarmed_by_paths and self.turns.wanted:
+            elif self.turns.wanted:
                 await self._give_turn(upload, transfer)
             elif transfer.paused:
                 self._go_on(transfer)
