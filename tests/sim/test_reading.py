@@ -8,6 +8,7 @@ import pytest
 import trio
 from trio.testing import MockClock
 
+from mavftpfs.link.framing import Framer
 from mavftpfs.link.messages import Address, FtpFrame
 from mavftpfs.protocol.payload import Opcode, Payload, request
 from mavftpfs.session.connection import Connection
@@ -150,3 +151,27 @@ async def test_a_whole_read_survives_a_lost_session(profile: str, autojump: Mock
         nursery.start_soon(close_it)
         assert await connection.store.read_whole(b"/f", 100_000) == data
         assert connection.engine.stats.by_opcode[Opcode.OPEN_FILE_RO] == 2
+
+
+@pytest.mark.parametrize("trouble", ["another client is heard", "the session is closed"])
+async def test_what_is_read_meanwhile_is_under_suspicion(trouble: str, autojump: MockClock) -> None:
+    here = World("px4", LinkSettings(rate=20_000.0, delay=0.02))
+    data = random.Random(2).randbytes(60_000)
+    here.tree.add(b"/f", data)
+    async with here.connection() as connection:
+        sink = MemorySink(60_000)
+        reader = await connection.store.open_reader(b"/f", sink)
+        reader.want(0, 60_000, demand=True)
+        await sink.wait_for(0, 10_000)
+        assert sink.suspicions == []
+        session = connection.scheduler.session
+        assert session is not None
+        source = Address(255, 190) if trouble == "another client is heard" else connection.vehicle.own
+        opcode = Opcode.NONE if source.system == 255 else Opcode.TERMINATE_SESSION
+        wire = request(777, opcode, session=session.id).encode()
+        here.vehicle.receive(
+            Framer(source, stream=False).encode_ftp(Address(1, 1), wire), trio.current_time()
+        )
+        here.link.kick()
+        assert await sink.wait_for(0, 60_000) == data
+        assert sink.suspicions != []
