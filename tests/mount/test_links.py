@@ -28,10 +28,6 @@ BAD = (
     "--seed",
     "5",
 )
-STREAMS = ("tcpin", "pty")
-BAD_STREAM = tuple(word for word in BAD if word not in ("--corrupt", "0.02"))
-"""Without damage: on a stream the vehicle's parser, like a real one, may then wait for up to 280 bytes."""
-
 RADIO = ("--rate", "60000", "--duplex", "half", "--delay", "0.02", "--burst-loss", "0.03", "--seed", "6")
 
 
@@ -49,8 +45,7 @@ def compare(mount: Mount, expected: Path) -> None:
 @pytest.mark.parametrize("quality", ["clean", "bad"])
 @pytest.mark.parametrize("kind", ["udpout", "udpin", "tcpin", "pty"])
 def test_each_kind_of_link(field: Field, tiny_tree: Path, kind: str, quality: str) -> None:
-    bad = BAD_STREAM if kind in STREAMS else BAD
-    flaws = bad if quality == "bad" else ()
+    flaws = BAD if quality == "bad" else ()
     vehicle = field.sim(tiny_tree, "px4", flaws, link=free_port_link(kind))
     compare(field.mount(vehicle.source), tiny_tree)
 
