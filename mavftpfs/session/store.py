@@ -120,13 +120,13 @@ class Store(WriteStore):
         began = self._clock()
         refused = False
         limit = float("inf") if self._lists_times else TIME_PROBE_LIMIT
+        asking = ListDirectory(wire, with_time=True)
         try:
             with trio.move_on_after(limit) as scope:
-                operation = ListDirectory(wire, with_time=True)
-                operation.on_page = partial(self._on_times, scope)
-                await self._scheduler.metadata(operation)
+                asking.on_page = partial(self._on_times, scope)
+                await self._scheduler.metadata(asking)
                 self._lists_times = True
-                return operation
+                return asking
         except FtpNak as nak:
             if self._lists_times or nak.code not in (
                 NakCode.FAIL,
@@ -140,7 +140,7 @@ class Store(WriteStore):
                 raise
         left = max(1.0, self._op_deadline - (self._clock() - began))
         operation = await self._sweep(wire, patience=left)
-        self._time_silences += 1
+        self._time_silences += asking.sent  # it may have had to wait for its turn all the time
         if refused or self._time_silences >= TIME_SILENCES:
             self._lists_times = False
         return operation

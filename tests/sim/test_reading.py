@@ -175,3 +175,22 @@ async def test_what_is_read_meanwhile_is_under_suspicion(trouble: str, autojump:
         here.link.kick()
         assert await sink.wait_for(0, 60_000) == data
         assert sink.suspicions != []
+
+
+async def test_times_that_could_not_be_asked_for_are_not_refused(autojump: MockClock) -> None:
+    """While a stale session is waited out nobody may speak: that is our silence, not the server's."""
+    here = World("ardupilot5", LinkSettings(delay=0.02))
+    here.tree.add(b"/d/f", b"x")
+    async with here.connection() as connection, trio.open_nursery() as nursery:
+
+        async def keep_quiet() -> None:
+            async with connection.scheduler.gate.held_shut():
+                await trio.sleep(3.5)
+
+        for _ in range(3):
+            nursery.start_soon(keep_quiet)
+            await trio.sleep(0.01)
+            await connection.store.list_directory(b"/d")
+        assert connection.store.lists_times is None
+        await connection.store.list_directory(b"/d")
+        assert connection.store.lists_times is True
