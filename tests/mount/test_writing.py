@@ -1,0 +1,230 @@
+"""Programs that write, on a real mount of every kind of server, compared with a local directory.
+
+Each vehicle is mounted once. After each step the card must be what the local directory is: what a program
+was told is done lies on the card, no temporary name of ours with it.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from tests.mount.conftest import Field
+from tests.support.mounts import wait_until
+from tests.support.twins import Twins
+from tests.support.vehicles import UdpVehicle
+
+SERVERS: dict[str, tuple[str, tuple[str, ...]]] = {
+    "px4": ("", ()),
+    "px4-nuttx": ("fs/microsd", ()),
+    "ardupilot": ("APM", ()),
+    "ardupilot5": ("APM", ()),
+    "littlefs": ("APM", ("inplace",)),
+    "mavsdk": ("", ()),
+    "mavsdk-server": ("", ()),
+}
+"""Where each may be written, and the options it needs for that."""
+
+FAT = ("px4-nuttx", "ardupilot5")
+NOT_ON_FAT = re.compile(rb'[?"*:<>|\\]')
+
+NO_RENAME = ("littlefs",)
+"""Servers that cannot rename: programs that replace a file by rename cannot work there."""
+
+
+def make_twins(field: Field, kind: str, *options: str) -> tuple[Twins, UdpVehicle]:
+    """Start a vehicle with an empty card and mount it."""
+    folder, needed = SERVERS[kind]
+    root = field.local("card")
+    card = root / folder
+    card.mkdir(parents=True, exist_ok=True)
+    vehicle: UdpVehicle = field.mavsdk(root) if kind == "mavsdk-server" else field.sim(root, kind)
+    mount = field.mount(vehicle.source, *needed, *options)
+    return Twins(mount, mount.path / folder, card, field.local("twin")), vehicle
+
+
+@pytest.fixture(scope="module", params=SERVERS)
+def kind(request: pytest.FixtureRequest) -> str:
+    """The server's name."""
+    name: str = request.param
+    return name
+
+
+@pytest.fixture(scope="module")
+def twins(kind: str, module_field: Field) -> Twins:
+    """The server, mounted."""
+    return make_twins(module_field, kind)[0]
+
+
+@pytest.fixture(scope="module")
+def brought(kind: str, tiny_tree: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The tree that is copied to the vehicle, without names that its card cannot hold."""
+    if kind not in FAT:
+        return tiny_tree
+    copy = tmp_path_factory.mktemp("brought")
+    shutil.copytree(tiny_tree, copy, dirs_exist_ok=True)
+    for name in os.listdir(os.fsencode(copy / "names")):
+        if NOT_ON_FAT.search(name):
+            os.unlink(os.path.join(os.fsencode(copy / "names"), name))
+    return copy
+
+
+def test_cp_and_tar_bring_a_tree(twins: Twins, brought: Path, tmp_path: Path) -> None:
+    archive = tmp_path / "tree.tar"
+    subprocess.run(["tar", "-cf", archive, "-C", brought, "sizes", "names", "deep"], check=True, timeout=60)
+    twins.both('cp -r "$1" copied; mkdir out; tar -xf "$2" -C out', brought, archive)
+    twins.both('cp -r "$1"/sizes/. copied/sizes; rm -r out', brought)  # over what is there
+
+
+def test_rsync_twice_transfers_once(twins: Twins, brought: Path, kind: str) -> None:
+    in_place = "--inplace" if kind in NO_RENAME else "--no-inplace"
+    script = 'rsync -a "$2" --itemize-changes "$1"/ synced/'
+    assert "35850.bin" in twins.both(script, brought, in_place)
+    assert twins.both(script, brought, in_place) == ""
+
+
+EDITS = {
+    "make": "seq 1 3000 > lines; mkdir -p d/e; echo x > d/x; echo y > d/e/y; cp lines big; cp d/x Upper",
+    "append": "echo more >> lines; printf '' >> lines; echo again >> lines; tail -c 20 lines",
+    "replace": "seq 5 50 > lines; cat lines",
+    "empty": "touch new; : > d/x; cp /dev/null none; stat -c '%n %s' new d/x none",
+    "touch": "touch -d '2020-02-02 02:02:02.5' big d; stat -c '%n %y' big d; touch big",
+    "dd": "dd if=big of=odd bs=241 count=37 skip=3 status=none;"
+    "dd if=big of=odd bs=239 seek=5 count=2 conv=notrunc status=none;"
+    "dd if=big of=odd bs=1000 seek=40 count=1 conv=notrunc,fsync status=none;"
+    "cmp <(tail -c 1000 odd) <(head -c 1000 big)",
+    "truncate": "truncate -s 1000 big; truncate -s +5000 big; truncate -s 0 Upper; truncate -s 77 Upper;"
+    "cksum big Upper",
+    "sparse": "truncate -s 40000 hole; printf end >> hole; cp --sparse=always hole sparse; cmp hole sparse",
+    "chmod": "chmod 600 big; stat -c %a big; chmod 755 d; stat -c %a d; chown 0:0 big",
+    "swap files": "echo s > .big.swp; cat .big.swp; mv .big.swp .big.swo; rm .big.swo",
+    "delete": "touch d/a.tmp d/e/b.tmp; find . -name '*.tmp' -delete; rm -r odd copied synced; ls -A d",
+}
+MOVES = {
+    "rename": "mv d/e/y d/y2; mv d f; mv big f/; mv lines f/e/; ls f f/e",
+    "rename over": "seq 1 9 > one; seq 1 7 > two; mv two one; cat one; mv f/e g; mkdir h; mv -T h f/h; ls f",
+    "sed -i": "seq 1 2000 > s; sed -i 's/7/seven/' s; head -8 s; cksum s",
+}
+PROGRAMS = Path(__file__).parents[1] / "support" / "programs"
+
+
+def python(name: str, *args: str) -> str:
+    """Return a shell command that runs one of the programs."""
+    return " ".join([sys.executable, str(PROGRAMS / name), *args])
+
+
+@pytest.mark.parametrize("step", EDITS)
+def test_small_edits(twins: Twins, step: str) -> None:
+    twins.both(EDITS[step])
+
+
+@pytest.mark.parametrize("step", MOVES)
+def test_names(twins: Twins, step: str, kind: str) -> None:
+    if kind in NO_RENAME and step == "sed -i":
+        code = "import os, sys; os.rename(sys.argv[1] + '/Upper', sys.argv[1] + '/other')"
+        assert twins.mount.errno_of(code, twins.shown) == "EXDEV"
+        return
+    twins.both(MOVES[step])
+
+
+def test_vim_and_nano_save(twins: Twins, tmp_path: Path) -> None:
+    twins.both("seq 1 300 > vim.txt; vim -es -u NONE -i NONE -c '%s/5/five/' -c 'wq' vim.txt; cat vim.txt")
+    script = tmp_path / "nano"
+    session = f"nano-{twins.mount.path.parts[-2]}-{time.monotonic_ns()}"
+    script.write_text(f"cd {twins.shown}; nano --ignorercfiles nano.txt")
+    tmux = ("tmux", "-L", session)
+    try:
+        subprocess.run([*tmux, "new-session", "-d", "sh", str(script)], check=True, timeout=20)
+        wait_until("nano is there", lambda: "nano.txt" in screen(tmux), 20)
+        subprocess.run([*tmux, "send-keys", "from nano", "C-o", "Enter"], check=True, timeout=20)
+        wait_until("nano has saved", lambda: "Wrote" in screen(tmux), 30)
+        assert (twins.card / "nano.txt").read_text() == "from nano\n"
+        subprocess.run([*tmux, "send-keys", "C-x"], check=True, timeout=20)
+    finally:
+        subprocess.run([*tmux, "kill-server"], check=False, timeout=20, capture_output=True)
+    (twins.twin / "nano.txt").write_text("from nano\n")
+    twins.compare()
+
+
+def screen(tmux: tuple[str, ...]) -> str:
+    """Return what the terminal shows."""
+    return subprocess.run(
+        [*tmux, "capture-pane", "-p"], capture_output=True, text=True, timeout=20, check=False
+    ).stdout
+
+
+GIT = """
+git init -q --template= -b main repo; cd repo; seq 1 500 > file; git add file
+git -c gc.auto=0 commit -q -m first; echo more >> file; git -c gc.auto=0 commit -q -a -m second
+git fsck --no-progress; git status --short; git log --format='%H %s'
+rm -r .git/index .git/config .git/logs
+"""
+"""At the end without what holds inode numbers, times, and what git finds out about the disk."""
+
+
+def test_git(twins: Twins, kind: str) -> None:
+    if kind in NO_RENAME:
+        return  # every lock file of git is renamed
+    assert "second" in twins.both(GIT)
+
+
+def test_calls(twins: Twins, kind: str) -> None:
+    twins.both(python("calls.py", *(["without-names"] if kind in NO_RENAME else [])))
+    assert twins.mount.errno_of("os.symlink('a', sys.argv[1] + '/b')", twins.shown) == "EPERM"
+
+
+@pytest.mark.parametrize("kind", ["px4", "ardupilot5", "mavsdk-server"], scope="module", indirect=True)
+def test_open_flags(twins: Twins) -> None:
+    printed = twins.both(python("flags.py"))
+    assert len(printed.splitlines()) == 3 * 12 * 3
+
+
+def test_many_writers_at_once(twins: Twins, brought: Path) -> None:
+    assert twins.both(python("crowd.py")) == "[]\n"
+    script = 'cp -r "$1"/sizes a & first=$!; cp -r "$1"/names b; wait $first; cp -r b c & cksum a/*.bin; wait'
+    twins.both(script, brought)
+
+
+def test_put_mv_and_rm_without_a_mount(kind: str, field: Field, tiny_tree: Path) -> None:
+    folder, needed = SERVERS[kind]
+    root = field.local("card")
+    (root / folder).mkdir(parents=True, exist_ok=True)
+    vehicle: UdpVehicle = field.mavsdk(root) if kind == "mavsdk-server" else field.sim(root, kind)
+    base = f"/{folder}" if folder else ""
+    options = ("-o", ",".join(needed)) if needed else ()
+    local = field.local("twin")
+
+    def mavftpfs(command: str, *words: str | Path) -> str:
+        argv = [sys.executable, "-m", "mavftpfs", command, *options]
+        done = subprocess.run(
+            [*argv, *map(str, words)],
+            capture_output=True,
+            text=True,
+            errors="replace",
+            timeout=120,
+            check=False,
+        )
+        assert done.returncode == 0, done.stderr
+        return done.stdout
+
+    source = vehicle.source
+    said = mavftpfs("put", "-r", source, tiny_tree / "sizes", tiny_tree / "README.txt", f"{base}/")
+    assert said.count("delivered") == len(list((tiny_tree / "sizes").iterdir())) + 1
+    mavftpfs("mkdir", "-p", source, f"{base}/new/deep")
+    mavftpfs("mv", source, f"{base}/README.txt", f"mftp://{base}/new/deep")
+    mavftpfs("rm", "-r", source, f"{base}/sizes/1.bin", f"{base}/sizes/239.bin")
+    shutil.copytree(tiny_tree / "sizes", local / "sizes")
+    (local / "new/deep").mkdir(parents=True)
+    shutil.copy(tiny_tree / "README.txt", local / "new/deep/README.txt")
+    for name in ("1.bin", "239.bin"):
+        (local / "sizes" / name).unlink()
+    subprocess.run(["diff", "-r", local, root / folder], check=True, timeout=30)
+    mavftpfs("rm", "-r", source, f"{base}/new", f"{base}/sizes")
+    assert list((root / folder).iterdir()) == []
