@@ -112,8 +112,9 @@ async def test_an_open_nobody_waits_for_any_more_is_closed(profile: str, autojum
             await upload.finish()
         await upload.abort()
         assert here.vehicle.server.open_sessions == 1
+        await trio.sleep(12)  # the first try to close it is not answered either
         faults.cut_after(None)
-        await trio.sleep(9)
+        await trio.sleep(12)
         assert here.vehicle.server.open_sessions == 0
 
 
@@ -228,10 +229,19 @@ async def test_arming_ends_it_and_disarming_lets_it_go_on(profile: str, autojump
                 with pytest.raises(Armed):
                     await upload.finish()
 
+            async def finish_other() -> None:
+                other = await start(connection, profile, MemorySource(content(60_000)), "third")
+                with pytest.raises(Armed):
+                    await other.finish()
+                await other.abort()
+
             nursery.start_soon(finish)
+            nursery.start_soon(finish_other)
             await trio.sleep(1.5)
             here.vehicle.arm()
             here.link.kick()
+            began = trio.current_time()
+        assert trio.current_time() - began < 1
         await trio.sleep(0.5)
         assert here.vehicle.server.open_sessions == 0
         with pytest.raises(Armed):
@@ -249,6 +259,14 @@ async def test_arming_ends_it_and_disarming_lets_it_go_on(profile: str, autojump
         assert source.acked.total + source.proven.total == len(data)
         await upload.finish()
         assert source.all_proven
+        here.vehicle.arm()
+        here.link.kick()
+        await trio.sleep(0.5)
+        source.add(b"more")
+        with pytest.raises(Armed):
+            await upload.finish()
+        await upload.abort()
+        assert source.in_flight.empty
     assert here.tree.data(path(profile, "new")) == data
 
 
@@ -672,3 +690,64 @@ async def test_a_crowd_of_listings_beside_an_upload_on_nuttx(seed: int, autojump
         assert source.rollbacks == []
         assert listed > 10
     assert here.tree.data(path("px4-nuttx", "new")) == data
+
+
+def steal(here: World) -> None:
+    """Terminate the session of a PX4 as if by another client; nobody hears it."""
+    wire = request(77, Opcode.TERMINATE_SESSION, session=0).encode()
+    here.vehicle.server.handle(wire, Address(255, 190), trio.current_time())
+
+
+@pytest.mark.parametrize("probed", [False, True], ids=["unknown", "probed"])
+async def test_a_session_that_is_gone_at_the_end_proves_nothing(probed: bool, autojump: MockClock) -> None:
+    here = world("px4", PLAIN)
+    faults = Faults(here)
+    async with here.connection() as connection:
+        if probed:
+            await probe(connection, "px4")
+        source = MemorySource(content(3000))
+        upload = await start(connection, "px4", source)
+        faults.at(Opcode.TERMINATE_SESSION, lambda: steal(here))
+        await upload.finish()
+        assert source.rollbacks == [True]
+        assert source.checkpoints == 1
+        assert source.all_proven
+
+
+async def test_only_what_was_not_proven_goes_again(autojump: MockClock) -> None:
+    here = world("px4", PLAIN)
+    faults = Faults(here)
+    async with here.connection() as connection:
+        await probe(connection, "px4")
+        source = MemorySource(content(20_000))
+        upload = await start(connection, "px4", source)
+        await upload.finish()
+        source.add(content(40_000, 1))
+        upload.wake()
+        faults.requests.clear()
+        async with trio.open_nursery() as nursery:
+            nursery.start_soon(upload.finish)
+            await trio.sleep(1.5)
+            steal(here)
+        assert source.rollbacks == [False]
+        assert source.all_proven
+        assert faults.requests.count(Opcode.CREATE_FILE) == 0
+    assert here.tree.data(b"/d/new") == bytes(source.content)
+
+
+async def test_a_trickle_does_not_send_the_file_each_time(autojump: MockClock) -> None:
+    here = world("mavsdk", PLAIN)
+    faults = Faults(here)
+    async with here.connection() as connection:
+        source = MemorySource()
+        upload = await start(connection, "mavsdk", source)
+        for _ in range(40):
+            source.add(b"line of a log\n")
+            upload.wake()
+            await trio.sleep(2)
+        assert 3 <= faults.requests.count(Opcode.CREATE_FILE) <= 12
+        began = trio.current_time()
+        await upload.finish()
+        assert trio.current_time() - began < 1
+        assert source.all_proven
+    assert here.tree.data(b"/d/new") == bytes(source.content)
