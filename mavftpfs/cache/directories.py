@@ -59,7 +59,7 @@ class Directories:
         self._clock = clock
         self._flights: Flights[bytes, Directory] = Flights(nursery)
         self._root_proven = root == ROOT
-        self._dot_shows_files: bool | None = None
+        self._dot_refused = False
         self.on_swept: Callable[[bytes, Directory], Awaitable[None]] | None = None
         self.lost = False
         self.sweeps = 0
@@ -125,7 +125,7 @@ class Directories:
     def rebooted(self) -> None:
         """What was learnt of the server's ways may no longer hold."""
         self._root_proven = self._root == ROOT
-        self._dot_shows_files = None
+        self._dot_refused = False
 
     async def _require_directory(self, path: bytes) -> None:
         if path == self._root:
@@ -186,7 +186,7 @@ class Directories:
 
     async def _list(self, path: bytes) -> Listing:
         listing = await self._store.list_directory(path)
-        if path == ROOT and self._dot_shows_files is not False and _hides_files(listing):
+        if path == ROOT and not self._dot_refused and _hides_files(listing):
             return await self._with_dot(listing)
         return listing
 
@@ -195,11 +195,10 @@ class Directories:
         try:
             dot = await self._store.list_directory(DOT)
         except FtpNak:
-            self._dot_shows_files = False
+            self._dot_refused = True
             return listing
-        self._dot_shows_files = any(entry.kind is EntryKind.FILE for entry in dot.entries)
-        if not self._dot_shows_files:
-            return listing
+        if not any(entry.kind is EntryKind.FILE for entry in dot.entries):
+            return listing  # proves nothing: the first file may come later, and must not seem to be gone
         shown = {entry.name for entry in listing.entries}
         more = tuple(entry for entry in dot.entries if entry.name not in shown)
         return Listing(

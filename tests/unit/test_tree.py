@@ -394,13 +394,28 @@ async def test_dot_shows_what_root_hides(store: FakeStore, tree: Tree, autojump_
     assert store.count("list", b".") == 2
 
 
-@pytest.mark.parametrize("dot", [None, {}])
-async def test_dot_is_not_asked_twice_in_vain(
-    store: FakeStore, tree: Tree, autojump_clock: MockClock, dot: dict[bytes, FakeFile] | None
+async def test_the_first_file_of_a_hidden_root_is_found(
+    store: FakeStore, tree: Tree, autojump_clock: MockClock
 ) -> None:
     store.add(b"/@ROMFS/x", b"x")
     store.remove(b"/top")
-    store.dot = dot
+    store.dot = {}
+    assert b"late" not in dict(await tree.list(b"/"))
+    store.add(b"/late", b"l")
+    store.unlisted |= {b"/late"}
+    store.dot = {b"late": store.files[b"/late"]}
+    await trio.sleep(21)
+    assert dict(await tree.list(b"/"))[b"late"].size == 1
+    await trio.sleep(21)
+    assert await read_file(tree, b"/late") == b"l"
+
+
+async def test_dot_is_not_asked_twice_if_refused(
+    store: FakeStore, tree: Tree, autojump_clock: MockClock
+) -> None:
+    store.add(b"/@ROMFS/x", b"x")
+    store.remove(b"/top")
+    store.dot = None
     await tree.list(b"/")
     await trio.sleep(21)
     await tree.list(b"/")
