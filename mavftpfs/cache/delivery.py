@@ -44,7 +44,7 @@ FINISHES = 3
 START_AT = 64 * 1024
 """A background upload begins when so many bytes wait; fewer wait for the close."""
 
-_PASSING = (RequestTimeout, LinkError, SessionBusy, Armed)
+PASSING = (RequestTimeout, LinkError, SessionBusy, Armed)
 """Errors after which the upload goes on where it stopped."""
 
 
@@ -134,7 +134,7 @@ class Deliverer:
                 log.warning("%s; sending it again", error)
             except MavftpfsError as error:
                 learnt = astuple(self._context.writer.traits) != known
-                if not isinstance(error, _PASSING):
+                if not isinstance(error, PASSING):
                     await self.abandon(node)
                 if not learnt or isinstance(error, LinkError | Armed):
                     raise
@@ -289,9 +289,10 @@ class Deliverer:
 
     def _note_failure(self, node: Node, error: MavftpfsError) -> None:
         """Latch the error, and keep the bytes where the end of this process does not lose them."""
-        node.error = error
+        known, node.error = node.error, error
         draft, content = node.draft, node.content
-        log.warning("%r is not delivered: %s", node.path, error)
+        level = logging.DEBUG if isinstance(error, Armed) or str(known) == str(error) else logging.WARNING
+        log.log(level, "%r is not delivered: %s", node.path, error)  # once: each close tries again
         if draft is None or content is None:
             return
         try:

@@ -161,6 +161,7 @@ class SpoolContent:
         self._file: int | None = None
         self._path: Path | None = None
         self._stored = ExtentSet()
+        self._persisted = False
 
     def put(self, offset: int, data: bytes | memoryview) -> None:
         """Keep bytes.
@@ -168,6 +169,7 @@ class SpoolContent:
         Raises:
             NoSpace: the budget is used up, or the local disk is full; nothing was kept.
         """
+        self._persisted = False
         if self._file is None:
             new = self._new_pages(offset, offset + len(data))
             if self._spool.fits_memory(new * PAGE):
@@ -193,6 +195,7 @@ class SpoolContent:
 
     def cut(self, size: int) -> None:
         """Forget what lies at and beyond `size`."""
+        self._persisted = False
         if self._file is not None:
             self._count_stored(size, max(size, self._stored.end), present=False)
             os.ftruncate(self._file, min(size, os.fstat(self._file).st_size))
@@ -202,17 +205,20 @@ class SpoolContent:
             self._spool.in_memory -= PAGE
 
     def persist(self, facts: dict[str, Any]) -> None:
-        """Have bytes and `facts` (JSON) survive the end of this process.
+        """Have bytes and `facts` (JSON) survive the end of this process; once until more is put or cut.
 
         Raises:
             NoSpace, OSError.
         """
+        if self._persisted:
+            return
         self._spill()
         assert self._file is not None
         assert self._path is not None
         os.ftruncate(self._file, facts["size"])
         os.fsync(self._file)
         _write_durably(self._path.with_suffix(".json"), json.dumps(facts, indent=1).encode())
+        self._persisted = True
 
     def close(self) -> None:
         """The vehicle has it: forget the bytes."""

@@ -181,7 +181,9 @@ async def test_a_mismatch_is_sent_once_more(any_store: FakeWriter) -> None:
     assert any_store.count("crc") == 2
 
 
-async def test_a_second_mismatch_is_an_error_and_the_old_file_stays(store: FakeWriter) -> None:
+async def test_a_second_mismatch_is_an_error_and_the_old_file_stays(
+    autojump_clock: object, store: FakeWriter
+) -> None:
     store.spoil_uploads = 1000
     tree = make_writable(store)
     with pytest.raises(VerificationFailed):
@@ -201,7 +203,7 @@ async def test_an_unanswered_checksum_counts_as_verified_by_size(store: FakeWrit
     assert tree.status()["verified_by_size"] == 1
 
 
-async def test_verify_crc_demands_an_answer(store: FakeWriter) -> None:
+async def test_verify_crc_demands_an_answer(autojump_clock: object, store: FakeWriter) -> None:
     store.fail["crc", b"/card/new"] = [RequestTimeout("silence")] * 2
     tree = make_writable(store, verify="crc")
     with pytest.raises(VerificationFailed):
@@ -224,7 +226,9 @@ async def test_what_is_too_large_or_not_wanted_is_not_summed(
 # --- errors
 
 
-async def test_an_error_is_told_at_every_close_until_the_bytes_are_there(store: FakeWriter) -> None:
+async def test_an_error_is_told_at_every_close_until_the_bytes_are_there(
+    autojump_clock: object, store: FakeWriter
+) -> None:
     tree = make_writable(store)
     file = await tree.create(b"/card/new", exclusive=True)
     await file.write(0, NEW)
@@ -247,7 +251,7 @@ async def test_an_error_is_told_at_every_close_until_the_bytes_are_there(store: 
     assert tree.status()["bytes_held"] == 0
 
 
-async def test_a_full_card_leaves_the_old_file(store: FakeWriter) -> None:
+async def test_a_full_card_leaves_the_old_file(autojump_clock: object, store: FakeWriter) -> None:
     store.capacity = len(OLD) + 500
     tree = make_writable(store)
     with pytest.raises(FtpNak) as caught:
@@ -262,7 +266,9 @@ async def test_a_full_card_leaves_the_old_file(store: FakeWriter) -> None:
     assert FILE not in store.files
 
 
-async def test_a_background_failure_that_a_retry_repaired_is_not_told(store: FakeWriter) -> None:
+async def test_a_background_failure_that_a_retry_repaired_is_not_told(
+    autojump_clock: object, store: FakeWriter
+) -> None:
     tree = make_writable(store)
     store.fail_at[3] = RequestTimeout("once")
     data = NEW * 200
@@ -275,7 +281,7 @@ async def test_a_background_failure_that_a_retry_repaired_is_not_told(store: Fak
     assert store.files[b"/card/new"].data == data
 
 
-async def test_bytes_travel_while_the_program_still_writes(store: FakeWriter) -> None:
+async def test_bytes_travel_while_the_program_still_writes(autojump_clock: object, store: FakeWriter) -> None:
     tree = make_writable(store)
     file = await tree.create(b"/card/new", exclusive=True)
     await file.write(0, bytes(100_000))
@@ -287,7 +293,7 @@ async def test_bytes_travel_while_the_program_still_writes(store: FakeWriter) ->
     assert data == bytes(50_000) + b"again" + bytes(49_995)
 
 
-async def test_writers_wait_for_a_slow_link(store: FakeWriter) -> None:
+async def test_writers_wait_for_a_slow_link(autojump_clock: object, store: FakeWriter) -> None:
     store.write_delay = 0.01
     tree = make_writable(store, dirty_max=100_000)
     file = await tree.create(b"/card/new", exclusive=True)
@@ -306,7 +312,7 @@ async def write_pieces(file: OpenFile, count: int, size: int) -> None:
         await file.write(number * size, bytes(size))
 
 
-async def test_a_writer_is_told_why_nothing_moves(store: FakeWriter) -> None:
+async def test_a_writer_is_told_why_nothing_moves(autojump_clock: object, store: FakeWriter) -> None:
     tree = make_writable(store, dirty_max=65536)
     file = await tree.create(b"/card/new", exclusive=True)
     store.fail_at[5] = FtpNak(Opcode.WRITE_FILE, NakCode.FAIL_ERRNO, errno.ENOSPC)
@@ -316,7 +322,9 @@ async def test_a_writer_is_told_why_nothing_moves(store: FakeWriter) -> None:
     file.close()
 
 
-async def test_armed_means_an_error_at_once_and_delivery_after(store: FakeWriter) -> None:
+async def test_armed_means_an_error_at_once_and_delivery_after(
+    autojump_clock: object, store: FakeWriter
+) -> None:
     tree = make_writable(store)
     file = await tree.create(b"/card/new", exclusive=True)
     await file.write(0, NEW)
@@ -500,7 +508,7 @@ async def test_one_fault_at_any_request(
             done = await attempt(job, tree)
             if done:
                 assert {p: f.data for p, f in store.files.items() if not is_reserved(split(p)[1])} == final
-            remaining = await tree.drain(100)
+            remaining = await tree.drain(100 if good else 2)
             assert remaining == [] or not good
             tree.forget_caches()
             await tree.list(b"/card/dir")

@@ -1,0 +1,164 @@
+"""Names that never reach the vehicle."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator
+
+import pytest
+import trio
+
+from mavftpfs.cache.tree import Tree
+from mavftpfs.shared.errors import (
+    AlreadyExists,
+    CrossDevice,
+    DirectoryNotEmpty,
+    IsADirectory,
+    NoSpace,
+    NotADirectory,
+    NotFound,
+)
+from mavftpfs.shared.model import EntryKind
+from tests.support.fake_store import read_file
+from tests.support.fake_writer import KINDS, FakeWriter, make_writable, write_file
+
+FILE = b"/scripts/hover.lua"
+SWAP = b"/scripts/.hover.lua.swp"
+TRASH = b"/.Trash-1000"
+
+
+@pytest.fixture
+async def store(nursery: trio.Nursery, autojump_clock: object) -> AsyncIterator[FakeWriter]:
+    store = FakeWriter(KINDS["fat"], nursery)
+    store.add(FILE, b"-- old")
+    yield store
+    assert store.crimes == []
+    nursery.cancel_scope.cancel()
+
+
+@pytest.fixture
+def tree(store: FakeWriter) -> Tree:
+    return make_writable(store)
+
+
+@pytest.mark.parametrize("name", [b".x.swp", b".x.swo", b"4913", b".~lock.a.odt#", b"._x", b".Trash-0"])
+async def test_default_patterns(store: FakeWriter, tree: Tree, name: bytes) -> None:
+    await write_file(tree, b"/scripts/" + name, b"data")
+    assert await read_file(tree, b"/scripts/" + name) == b"data"
+    assert [n for n, _ in await tree.list(b"/scripts")] == [b"hover.lua", name]
+    assert store.requests == 0
+    await tree.unlink(b"/scripts/" + name)
+    with pytest.raises(NotFound):
+        await tree.stat(b"/scripts/" + name)
+
+
+async def test_names_that_look_alike_are_the_vehicles(store: FakeWriter, tree: Tree) -> None:
+    for name in (b"x.swp", b"49131", b"lock", b".swp"):
+        await write_file(tree, b"/scripts/" + name, b"data")
+        assert b"/scripts/" + name in store.files
+
+
+async def test_vim_saves(store: FakeWriter, tree: Tree) -> None:
+    """Swap file, a probe called 4913, a backup by renaming, the new file, backup removed."""
+    swap = await tree.create(SWAP, exclusive=True)
+    await swap.write(4096, b"b0VIM")
+    assert await swap.read(0, 4) == bytes(4)
+    await write_file(tree, b"/scripts/4913", b"")
+    await tree.unlink(b"/scripts/4913")
+    await tree.rename(FILE, FILE + b"~")
+    await write_file(tree, FILE, b"-- new")
+    await tree.unlink(FILE + b"~")
+    await swap.fsync()
+    await swap.release()
+    await tree.unlink(SWAP)
+    assert {path: file.data for path, file in store.files.items()} == {FILE: b"-- new"}
+    assert tree.status()["bytes_local"] == 0
+
+
+async def test_a_local_name_becomes_the_vehicles(store: FakeWriter, tree: Tree) -> None:
+    await write_file(tree, SWAP, b"rescued")
+    with pytest.raises(AlreadyExists):
+        await tree.rename(SWAP, FILE, noreplace=True)
+    await tree.rename(SWAP, FILE)
+    assert store.files[FILE].data == b"rescued"
+    with pytest.raises(NotFound):
+        await tree.stat(SWAP)
+
+
+async def test_a_failed_move_to_the_vehicle_moves_nothing(store: FakeWriter, tree: Tree) -> None:
+    await write_file(tree, SWAP, bytes(500))
+    store.capacity = 100
+    with pytest.raises(Exception, match="errno 28"):
+        await tree.rename(SWAP, b"/scripts/new")
+    assert await read_file(tree, SWAP) == bytes(500)
+    assert tree.undelivered() == []
+
+
+async def test_trash(store: FakeWriter, tree: Tree) -> None:
+    with pytest.raises(NotFound):
+        await tree.mkdir(TRASH + b"/files")
+    await tree.mkdir(TRASH)
+    await tree.mkdir(TRASH + b"/files")
+    with pytest.raises(AlreadyExists):
+        await tree.mkdir(TRASH)
+    assert (await tree.stat(TRASH)).kind is EntryKind.DIRECTORY
+    await tree.rename(FILE, TRASH + b"/files/hover.lua")
+    assert store.files == {}
+    assert [name for name, _ in await tree.list(TRASH + b"/files")] == [b"hover.lua"]
+    with pytest.raises(DirectoryNotEmpty):
+        await tree.rmdir(TRASH)
+    await tree.rename(TRASH + b"/files/hover.lua", FILE)
+    assert store.files[FILE].data == b"-- old"
+    with pytest.raises(CrossDevice):
+        await tree.rename(b"/scripts", TRASH + b"/scripts")
+    await write_file(tree, SWAP, b"")
+    with pytest.raises(NotADirectory):
+        await tree.list(SWAP)
+
+
+async def test_local_renames_obey_the_rules(tree: Tree) -> None:
+    await write_file(tree, SWAP, b"one")
+    await write_file(tree, b"/scripts/._a", b"two")
+    with pytest.raises(AlreadyExists):
+        await tree.rename(SWAP, b"/scripts/._a", noreplace=True)
+    await tree.rename(SWAP, b"/scripts/._a")
+    assert await read_file(tree, b"/scripts/._a") == b"one"
+    await tree.mkdir(TRASH)
+    with pytest.raises(IsADirectory):
+        await tree.rename(b"/scripts/._a", TRASH)
+    with pytest.raises(NotADirectory):
+        await tree.rename(TRASH, b"/scripts/._a")
+    with pytest.raises(NotFound):
+        await tree.rename(b"/scripts/._a", b"/none/._a")
+    await tree.rename(TRASH, b"/.Trash-1")
+    assert (await tree.stat(b"/.Trash-1")).kind is EntryKind.DIRECTORY
+    with pytest.raises(IsADirectory):
+        await tree.open(b"/.Trash-1")
+
+
+async def test_a_directory_with_local_names_is_not_empty_and_takes_them_along(
+    store: FakeWriter, tree: Tree
+) -> None:
+    await write_file(tree, SWAP, b"swap")
+    await tree.unlink(FILE)
+    with pytest.raises(DirectoryNotEmpty):
+        await tree.rmdir(b"/scripts")
+    await tree.rename(b"/scripts", b"/programs")
+    assert await read_file(tree, b"/programs/.hover.lua.swp") == b"swap"
+    await tree.unlink(b"/programs/.hover.lua.swp")
+    await tree.rmdir(b"/programs")
+    assert store.directories == {b"/"}
+
+
+async def test_they_are_bounded(store: FakeWriter) -> None:
+    tree = make_writable(store, local_max=1000)
+    swap = await tree.create(SWAP, exclusive=True)
+    await swap.write(0, bytes(1000))
+    with pytest.raises(NoSpace):
+        await swap.write(1000, b"x")
+    with pytest.raises(NoSpace):
+        await tree.rename(FILE, b"/scripts/._x")
+    await swap.truncate(0)
+    await tree.set_times(SWAP, 7 * 10**9 + 5)
+    assert ((await tree.stat(SWAP)).mtime, (await tree.stat(SWAP)).mtime_nsec) == (7, 5)
+    await tree.rename(FILE, b"/scripts/._x")
+    assert store.files == {}

@@ -1,0 +1,245 @@
+"""mkdir, rmdir, unlink, rename: the rules of the system calls on servers that have none."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator
+
+import pytest
+import trio
+
+from mavftpfs.cache.asides import STALE_AFTER, Kind, Reserved, is_reserved
+from mavftpfs.shared.errors import (
+    AlreadyExists,
+    CrossDevice,
+    DirectoryNotEmpty,
+    InvalidMove,
+    IsADirectory,
+    NotADirectory,
+    NotFound,
+    PathTooLong,
+)
+from mavftpfs.shared.model import split
+from tests.support.fake_store import read_file
+from tests.support.fake_writer import KINDS, FakeWriter, make_writable, write_file
+
+
+@pytest.fixture(params=sorted(KINDS))
+async def store(
+    request: pytest.FixtureRequest, nursery: trio.Nursery, autojump_clock: object
+) -> AsyncIterator[FakeWriter]:
+    store = scene(FakeWriter(KINDS[request.param], nursery))
+    yield store
+    assert store.crimes == []
+    nursery.cancel_scope.cancel()
+
+
+@pytest.fixture
+async def fat(nursery: trio.Nursery, autojump_clock: object) -> AsyncIterator[FakeWriter]:
+    store = scene(FakeWriter(KINDS["fat"], nursery))
+    yield store
+    assert store.crimes == []
+    nursery.cancel_scope.cancel()
+
+
+def scene(store: FakeWriter) -> FakeWriter:
+    store.add(b"/d/a", b"A")
+    store.add(b"/d/b", b"B")
+    store.add_directory(b"/d/empty")
+    store.add(b"/d/full/x", b"X")
+    return store
+
+
+def shape(store: FakeWriter) -> dict[bytes, bytes]:
+    return {path: file.data for path, file in store.files.items()}
+
+
+async def test_directories(store: FakeWriter) -> None:
+    tree = make_writable(store)
+    await tree.mkdir(b"/d/new")
+    assert b"/d/new" in store.directories
+    for path in (b"/d/new", b"/d/a"):
+        with pytest.raises(AlreadyExists):
+            await tree.mkdir(path)
+    with pytest.raises(NotFound):
+        await tree.mkdir(b"/none/new")
+    await tree.rmdir(b"/d/new")
+    assert b"/d/new" not in store.directories
+    with pytest.raises(NotFound):
+        await tree.rmdir(b"/d/new")
+    with pytest.raises(NotADirectory):
+        await tree.rmdir(b"/d/a")
+    with pytest.raises(DirectoryNotEmpty):
+        await tree.rmdir(b"/d/full")
+    with pytest.raises(IsADirectory):
+        await tree.unlink(b"/d/empty")
+    with pytest.raises(NotFound):
+        await tree.unlink(b"/d/none")
+    await tree.unlink(b"/d/a")
+    assert b"/d/a" not in store.files
+
+
+async def test_a_directory_with_an_undelivered_file_is_not_empty(store: FakeWriter) -> None:
+    tree = make_writable(store)
+    file = await tree.create(b"/d/empty/new", exclusive=True)
+    with pytest.raises(DirectoryNotEmpty):
+        await tree.rmdir(b"/d/empty")
+    await tree.unlink(b"/d/empty/new")
+    await file.release()
+    await tree.rmdir(b"/d/empty")
+
+
+async def test_a_directory_filled_behind_our_back_is_not_removed(store: FakeWriter) -> None:
+    tree = make_writable(store)
+    await tree.list(b"/d/empty")
+    store.add(b"/d/empty/new", b"")
+    with pytest.raises(DirectoryNotEmpty):
+        await tree.rmdir(b"/d/empty")
+
+
+async def test_renames(store: FakeWriter) -> None:
+    tree = make_writable(store)
+    if not store.kind.renames:
+        for old, new in ((b"/d/a", b"/d/c"), (b"/d/a", b"/d/b"), (b"/d/full", b"/d/other")):
+            with pytest.raises(CrossDevice):
+                await tree.rename(old, new)
+        assert shape(store) == {b"/d/a": b"A", b"/d/b": b"B", b"/d/full/x": b"X"}
+        return
+    await tree.rename(b"/d/a", b"/d/c")
+    await tree.rename(b"/d/c", b"/d/b")
+    assert shape(store) == {b"/d/b": b"A", b"/d/full/x": b"X"}
+    await tree.rename(b"/d/full", b"/d/empty")
+    assert shape(store) == {b"/d/b": b"A", b"/d/empty/x": b"X"}
+    assert await read_file(tree, b"/d/empty/x") == b"X"
+    with pytest.raises(NotFound):
+        await tree.list(b"/d/full")
+    await tree.rename(b"/d/b", b"/d/b")
+
+
+async def test_renames_that_are_refused(store: FakeWriter) -> None:
+    tree = make_writable(store)
+    for old, new, error in (
+        (b"/d/none", b"/d/x", NotFound),
+        (b"/d/a", b"/none/x", NotFound),
+        (b"/d/a", b"/d/b/x", NotADirectory),
+        (b"/d/a", b"/d/empty", IsADirectory),
+        (b"/d/empty", b"/d/a", NotADirectory),
+        (b"/d/empty", b"/d/full", DirectoryNotEmpty),
+        (b"/d/full", b"/d/full/x/y", InvalidMove),
+        (b"/d/full", b"/d/full/y", InvalidMove),
+    ):
+        with pytest.raises(error):
+            await tree.rename(old, new)
+    with pytest.raises(AlreadyExists):
+        await tree.rename(b"/d/a", b"/d/b", noreplace=True)
+    with pytest.raises(PathTooLong):
+        await tree.rename(b"/d/a", b"/d/" + b"x" * 230)
+    assert store.requests == 0
+
+
+async def test_noreplace_onto_a_free_name(fat: FakeWriter) -> None:
+    tree = make_writable(fat)
+    await tree.rename(b"/d/a", b"/d/new", noreplace=True)
+    assert fat.files[b"/d/new"].data == b"A"
+
+
+async def test_long_paths_are_renamed_in_two_steps(fat: FakeWriter) -> None:
+    tree = make_writable(fat)
+    long = b"/d/" + b"n" * 140
+    await write_file(tree, long + b"1", b"1")
+    await tree.rename(long + b"1", long + b"2")
+    assert fat.files[long + b"2"].data == b"1"
+    await write_file(tree, long + b"3", b"3")
+    await tree.rename(long + b"2", long + b"3")
+    assert fat.files[long + b"3"].data == b"1"
+    assert not [path for path in fat.files if is_reserved(split(path)[1])]
+
+
+# --- case
+
+
+async def test_another_spelling_is_the_same_file_where_the_card_says_so(fat: FakeWriter) -> None:
+    tree = make_writable(fat)
+    with pytest.raises(AlreadyExists):
+        await tree.create(b"/d/A", exclusive=True)
+    assert fat.traits.folds_case
+    assert (await tree.stat(b"/d/A")).size == 1
+    await write_file(tree, b"/d/A", b"more")
+    assert fat.files[b"/d/a"].data == b"more"
+    assert await read_file(tree, b"/d/A") == b"more"
+    with pytest.raises(AlreadyExists):
+        await tree.mkdir(b"/d/EMPTY")
+    await tree.unlink(b"/d/A")
+    assert b"/d/a" not in fat.files
+
+
+async def test_two_spellings_are_two_files_elsewhere(nursery: trio.Nursery) -> None:
+    store = scene(FakeWriter(KINDS["posix"], nursery))
+    tree = make_writable(store)
+    await write_file(tree, b"/d/A", b"other")
+    assert store.traits.folds_case is False
+    assert (store.files[b"/d/a"].data, store.files[b"/d/A"].data) == (b"A", b"other")
+
+
+async def test_only_the_case_of_a_name_changes(store: FakeWriter) -> None:
+    tree = make_writable(store)
+    if store.kind.renames:
+        await tree.rename(b"/d/a", b"/d/A")
+        await tree.rename(b"/d/full", b"/d/FULL")
+        tree.forget_caches()
+        assert shape(store) == {b"/d/A": b"A", b"/d/b": b"B", b"/d/FULL/x": b"X"}
+        assert {name for name, _ in await tree.list(b"/d")} == {b"A", b"b", b"FULL", b"empty"}
+
+
+# --- what others left
+
+
+def leave(store: FakeWriter, kind: Kind, owner: bytes, name: bytes, data: bytes) -> bytes:
+    path = b"/d/" + Reserved(owner, kind, b"abc", name).name
+    store.add(path, data)
+    return path
+
+
+async def test_strangers_temporaries_are_hidden_and_left_alone_for_long(
+    autojump_clock: object, fat: FakeWriter
+) -> None:
+    tree = make_writable(fat, dir_timeout=1)
+    temporary = leave(fat, Kind.NEW, b"zzzz", b"a", b"half")
+    assert {name for name, _ in await tree.list(b"/d")} == {b"a", b"b", b"empty", b"full"}
+    fat.files[temporary].data += b"way"  # it is alive
+    await trio.sleep(STALE_AFTER)
+    await tree.list(b"/d")
+    assert temporary in fat.files
+    await trio.sleep(STALE_AFTER)
+    await tree.list(b"/d")
+    assert temporary not in fat.files
+    assert fat.files[b"/d/a"].data == b"A"
+
+
+async def test_a_strangers_old_file_comes_back_in_the_end(autojump_clock: object, fat: FakeWriter) -> None:
+    tree = make_writable(fat, dir_timeout=1)
+    leave(fat, Kind.OLD, b"zzzz", b"gone", b"old")
+    await tree.list(b"/d")
+    await trio.sleep(STALE_AFTER)
+    assert b"gone" in {name for name, _ in await tree.list(b"/d")}
+    assert fat.files[b"/d/gone"].data == b"old"
+
+
+async def test_nothing_is_cleaned_up_in_flight(autojump_clock: object, fat: FakeWriter) -> None:
+    tree = make_writable(fat, dir_timeout=0)
+    leave(fat, Kind.NEW, b"zzzz", b"a", b"half")
+    tree.armed_changed(True)
+    await tree.list(b"/d")
+    await trio.sleep(2 * STALE_AFTER)
+    await tree.list(b"/d")
+    assert fat.requests == 0
+
+
+async def test_cleaning_up_that_fails_does_not_fail_the_listing(
+    autojump_clock: object, fat: FakeWriter
+) -> None:
+    tree = make_writable(fat, dir_timeout=1)
+    leave(fat, Kind.NEW, b"zzzz", b"a", b"half")
+    await tree.list(b"/d")
+    await trio.sleep(STALE_AFTER)
+    fat.fail_at[1] = PathTooLong("no")
+    assert len(await tree.list(b"/d")) == 4

@@ -1,0 +1,390 @@
+"""Open files that are written: who sees what, what a close delivers, and files that lose their name."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator
+
+import pytest
+import trio
+
+from mavftpfs.cache.asides import is_reserved
+from mavftpfs.cache.tree import Tree
+from mavftpfs.shared.errors import (
+    AlreadyExists,
+    FileBusy,
+    FileTooLarge,
+    IsADirectory,
+    LocalProtocolError,
+    NoSpace,
+    NotADirectory,
+    NotFound,
+    NotSupported,
+    ReadOnly,
+)
+from mavftpfs.shared.model import EntryKind, split
+from tests.support.fake_store import make_tree, read_file
+from tests.support.fake_writer import KINDS, FakeWriter, make_writable, write_file
+
+DATA = bytes(range(256)) * 300
+FILE = b"/card/dir/file.bin"
+
+
+@pytest.fixture
+async def store(nursery: trio.Nursery, autojump_clock: object) -> AsyncIterator[FakeWriter]:
+    store = FakeWriter(KINDS["posix"], nursery)
+    store.add(FILE, DATA)
+    yield store
+    assert store.crimes == []
+    nursery.cancel_scope.cancel()
+
+
+@pytest.fixture
+def tree(store: FakeWriter) -> Tree:
+    return make_writable(store)
+
+
+async def test_readers_see_what_is_written_at_once(store: FakeWriter, tree: Tree) -> None:
+    early = await tree.open(FILE)
+    assert await early.read(0, 4) == DATA[:4]
+    writer = await tree.open(FILE, write=True)
+    await writer.write(2, b"NEW")
+    late = await tree.open(FILE)
+    assert store.requests == 0
+    for handle in (early, late, writer):
+        assert await handle.read(0, 8) == DATA[:2] + b"NEW" + DATA[5:8]
+        assert handle.size == len(DATA)
+    await writer.write(len(DATA) + 10, b"end")
+    assert await early.read(len(DATA) - 1, 100) == DATA[-1:] + bytes(10) + b"end"
+    assert (await tree.stat(FILE)).size == len(DATA) + 13
+    await writer.release()
+    expected = DATA[:2] + b"NEW" + DATA[5:] + bytes(10) + b"end"
+    assert store.files[FILE].data == expected
+    assert await early.read(0, 10**6) == expected
+    for handle in (early, late):
+        await handle.release()
+    assert await read_file(tree, FILE) == expected
+
+
+async def test_the_shells_redirection_is_one_delivery(store: FakeWriter, tree: Tree) -> None:
+    """open(O_TRUNC), dup2, close, write, close: flush comes before the first byte."""
+    file = await tree.open(FILE, write=True, truncate=True)
+    await file.flush()
+    assert store.requests == 0
+    assert file.size == 0
+    assert (await tree.stat(FILE)).size == 0
+    await file.write(0, b"echo\n")
+    await file.flush()
+    renames = [entry for entry in store.log if entry[0] == "rename"]
+    assert len(renames) == 1
+    requests = store.requests
+    await file.release()
+    assert store.requests == requests
+    assert store.files[FILE].data == b"echo\n"
+
+
+async def test_emptying_is_delivered_by_release_and_by_fsync(store: FakeWriter, tree: Tree) -> None:
+    file = await tree.open(FILE, write=True, truncate=True)
+    await file.release()
+    assert store.files[FILE].data == b""
+    await write_file(tree, FILE, b"again")
+    file = await tree.open(FILE, write=True)
+    await file.truncate(0)
+    await file.fsync()
+    assert store.files[FILE].data == b""
+    await file.release()
+
+
+async def test_reading_what_was_just_written_asks_nothing(store: FakeWriter, tree: Tree) -> None:
+    await write_file(tree, b"/card/new", DATA)
+    before = len(store.calls)
+    assert await read_file(tree, b"/card/new") == DATA
+    assert len(store.calls) == before
+
+
+async def test_the_second_change_of_an_open_file_starts_from_the_first(store: FakeWriter, tree: Tree) -> None:
+    file = await tree.open(FILE, write=True)
+    expected = bytearray(DATA)
+    for at in (10, 20, 30):
+        await file.write(at, b"!")
+        expected[at] = ord("!")
+        await file.fsync()
+        assert store.files[FILE].data == bytes(expected)
+    await file.release()
+
+
+async def test_creating(store: FakeWriter, tree: Tree) -> None:
+    with pytest.raises(AlreadyExists):
+        await tree.create(FILE, exclusive=True)
+    file = await tree.create(FILE, exclusive=False)
+    assert file.size == len(DATA)
+    await file.release()
+    with pytest.raises(NotFound):
+        await tree.create(b"/card/none/x", exclusive=False)
+    with pytest.raises(NotADirectory):
+        await tree.create(FILE + b"/x", exclusive=False)
+    with pytest.raises(IsADirectory):
+        await tree.create(b"/card/dir", exclusive=False)
+    with pytest.raises(NotSupported):
+        await tree.create(b"/card/.mavftpfs-abcdtabc-x", exclusive=False)
+    assert store.requests == 0
+
+
+async def test_a_new_file_is_seen_before_it_is_delivered(store: FakeWriter, tree: Tree) -> None:
+    file = await tree.create(b"/card/new", exclusive=True)
+    await file.write(0, b"123")
+    assert dict(await tree.list(b"/card"))[b"new"].size == 3
+    assert (await tree.stat(b"/card/new")).kind is EntryKind.FILE
+    with pytest.raises(AlreadyExists):
+        await tree.create(b"/card/new", exclusive=True)
+    assert await read_file(tree, b"/card/new") == b"123"
+    assert b"/card/new" not in store.files
+    await file.release()
+    tree.forget_caches()
+    assert dict(await tree.list(b"/card"))[b"new"].size == 3
+
+
+async def test_two_writers_share_the_file(store: FakeWriter, tree: Tree) -> None:
+    one = await tree.create(b"/card/new", exclusive=True)
+    two = await tree.open(b"/card/new", write=True)
+    await one.write(0, b"one")
+    await two.write(3, b"two")
+    await one.release()
+    assert store.files[b"/card/new"].data == b"onetwo"
+    await two.write(3, b"TWO")
+    await two.release()
+    assert store.files[b"/card/new"].data == b"oneTWO"
+
+
+async def test_a_write_waits_while_the_file_is_being_delivered(
+    autojump_clock: object, store: FakeWriter, tree: Tree
+) -> None:
+    store.write_delay = 1
+    one = await tree.create(b"/card/new", exclusive=True)
+    two = await tree.open(b"/card/new", write=True)
+    await one.write(0, b"one")
+    async with trio.open_nursery() as both:
+        both.start_soon(one.release)
+        await trio.sleep(0.5)
+        await two.write(0, b"ONE")
+        assert store.files[b"/card/new"].data == b"one"
+    await two.release()
+    assert store.files[b"/card/new"].data == b"ONE"
+
+
+async def test_handles_are_closed_once(tree: Tree) -> None:
+    file = await tree.open(FILE, write=True)
+    await file.release()
+    await file.release()
+    file.close()
+    with pytest.raises(LocalProtocolError):
+        await file.write(0, b"x")
+    with pytest.raises(LocalProtocolError):
+        await file.read(0, 1)
+    reader = await tree.open(FILE)
+    await reader.release()
+    await reader.release()
+    with pytest.raises(LocalProtocolError):
+        await reader.write(0, b"x")
+
+
+async def test_no_file_is_larger_than_the_protocol_can_say(tree: Tree) -> None:
+    file = await tree.open(FILE, write=True)
+    with pytest.raises(FileTooLarge):
+        await file.write(2**32 - 1, b"x")
+    with pytest.raises(FileTooLarge):
+        await file.truncate(2**32)
+    await file.release()
+
+
+async def test_a_full_spool_refuses_and_keeps_what_it_took(store: FakeWriter) -> None:
+    tree = make_writable(store, dirty_max=65536, spool_max=200_000)
+    store.lost = True
+    file = await tree.create(b"/card/dir/new", exclusive=True) if not store.lost else None
+    store.lost = False
+    file = await tree.create(b"/card/dir/new", exclusive=True)
+    await file.write(0, bytes(60_000))
+    with pytest.raises(NoSpace):
+        await file.write(100_000, bytes(200_000))
+    await file.release()
+    assert store.files[b"/card/dir/new"].data == bytes(60_000)
+
+
+async def test_a_tree_without_a_writer_and_virtual_trees_are_read_only(store: FakeWriter) -> None:
+    reading = make_tree(store)
+    for ask in (reading.mkdir(b"/x"), reading.open(FILE, write=True), reading.unlink(FILE)):
+        with pytest.raises(ReadOnly):
+            await ask
+    writing = make_writable(store)
+    with pytest.raises(ReadOnly):
+        await writing.create(b"/@SYS/x", exclusive=False)
+    with pytest.raises(ReadOnly):
+        await writing.rename(FILE, b"/@SYS/x")
+
+
+async def test_a_growing_file_is_busy(autojump_clock: object, store: FakeWriter) -> None:
+    tree = make_writable(store, dir_timeout=1)
+    await tree.stat(FILE)
+    store.files[FILE].data += b"more"
+    await trio.sleep(2)
+    await tree.stat(FILE)
+    for ask in (
+        lambda: tree.open(FILE, write=True),
+        lambda: tree.open(FILE, write=True, truncate=True),
+        lambda: tree.unlink(FILE),
+        lambda: tree.rename(FILE, b"/card/x"),
+        lambda: tree.truncate(FILE, 0),
+    ):
+        with pytest.raises(FileBusy):
+            await ask()
+    await trio.sleep(60)
+    await tree.truncate(FILE, 0)
+    assert store.files[FILE].data == b""
+
+
+async def test_growth_shows_when_a_file_is_opened_too_and_force_goes_on(store: FakeWriter) -> None:
+    tree, forced = make_writable(store), make_writable(store, force=True)
+    for each in (tree, forced):
+        await each.stat(FILE)
+    store.files[FILE].data += b"more"
+    with pytest.raises(FileBusy):
+        await tree.open(FILE, write=True)
+    file = await forced.open(FILE, write=True)
+    assert file.size == len(DATA) + 4
+    await file.release()
+
+
+# --- times
+
+
+async def test_times_are_kept_until_the_file_changes(store: FakeWriter, tree: Tree) -> None:
+    file = await tree.open(FILE, write=True, truncate=True)
+    await file.write(0, b"data")
+    await tree.set_times(FILE, 1_234_567_890_123_456_789)
+    await file.release()
+    for _ in range(2):
+        stat = await tree.stat(FILE)
+        assert (stat.mtime, stat.mtime_nsec) == (1_234_567_890, 123_456_789)
+        tree.forget_caches()
+    store.files[FILE].mtime = 1_600_000_000  # a server that tells mtimes has its own idea
+    tree.forget_caches()
+    assert (await tree.stat(FILE)).mtime == 1_234_567_890
+    store.files[FILE].mtime = 1_600_000_001
+    tree.forget_caches()
+    assert (await tree.stat(FILE)).mtime == 1_600_000_001
+
+
+async def test_times_follow_a_rename_and_end_with_another_size(store: FakeWriter, tree: Tree) -> None:
+    await write_file(tree, b"/card/.file.tmp", b"data")
+    await tree.set_times(b"/card/.file.tmp", 5 * 10**9)
+    await tree.rename(b"/card/.file.tmp", FILE)
+    assert (await tree.stat(FILE)).mtime == 5
+    store.files[FILE].data += b"x"
+    tree.forget_caches()
+    assert (await tree.stat(FILE)).mtime != 5
+
+
+async def test_writing_ends_a_set_time(tree: Tree) -> None:
+    await tree.set_times(FILE, 5 * 10**9)
+    await tree.truncate(FILE, 10)
+    assert (await tree.stat(FILE)).mtime != 5
+
+
+async def test_where_mtimes_are_listed_a_written_file_shows_the_time_of_day(
+    store: FakeWriter, tree: Tree
+) -> None:
+    store.files[FILE].mtime = 1_500_000_000
+    await write_file(tree, FILE, b"data")
+    assert (await tree.stat(FILE)).mtime == 1_700_000_000
+
+
+# --- files without a name
+
+
+async def test_an_unlinked_file_that_is_written_is_never_delivered(store: FakeWriter, tree: Tree) -> None:
+    file = await tree.create(b"/card/tmp", exclusive=True)
+    await file.write(0, DATA)
+    await tree.unlink(b"/card/tmp")
+    await file.write(0, b"more")
+    assert await file.read(0, 8) == b"more" + DATA[4:8]
+    await file.flush()
+    await file.release()
+    assert sorted(store.files) == [FILE]
+    assert tree.undelivered() == []
+    assert tree.status()["bytes_held"] == 0
+
+
+async def test_a_cached_file_is_removed_at_once_and_read_on(store: FakeWriter, tree: Tree) -> None:
+    file = await tree.open(FILE)
+    await file.read(0, len(DATA))
+    await tree.unlink(FILE)
+    assert store.files == {}
+    assert await file.read(0, len(DATA)) == DATA
+    await file.release()
+    assert tree.status()["bytes_held"] == 0
+
+
+async def test_a_file_partly_cached_is_hidden_until_it_is_closed(store: FakeWriter, tree: Tree) -> None:
+    store.files[FILE].data = DATA * 10
+    file = await tree.open(FILE)
+    assert await file.read(0, 10) == DATA[:10]
+    await tree.unlink(FILE)
+    (hidden,) = store.files
+    assert is_reserved(split(hidden)[1])
+    assert await tree.list(b"/card/dir") == []
+    with pytest.raises(NotFound):
+        await tree.stat(hidden)
+    assert await file.read(0, len(DATA) * 10) == DATA * 10
+    await tree.rmdir(b"/card/dir")
+    assert b"/card/dir" not in store.directories
+    assert await file.read(len(DATA), 5) == DATA[:5]
+    await file.release()
+    assert store.files == {}
+
+
+async def test_a_hidden_file_follows_its_directory(store: FakeWriter, tree: Tree) -> None:
+    store.files[FILE].data = DATA * 10
+    file = await tree.open(FILE)
+    await tree.unlink(FILE)
+    await tree.rename(b"/card/dir", b"/card/other")
+    assert await file.read(0, len(DATA) * 10) == DATA * 10
+    await file.release()
+    assert store.files == {}
+
+
+async def test_an_open_file_is_renamed(store: FakeWriter, tree: Tree) -> None:
+    reader = await tree.open(FILE)
+    writer = await tree.open(FILE, write=True)
+    await writer.write(0, b"first")
+    await tree.rename(FILE, b"/card/moved")
+    assert store.files[b"/card/moved"].data == b"first" + DATA[5:]
+    await writer.write(5, b"second")
+    assert await reader.read(0, 11) == b"firstsecond"
+    await writer.release()
+    await reader.release()
+    assert store.files == {b"/card/moved": store.files[b"/card/moved"]}
+    assert store.files[b"/card/moved"].data == b"firstsecond" + DATA[11:]
+
+
+async def test_open_files_below_a_renamed_directory_follow(store: FakeWriter, tree: Tree) -> None:
+    writer = await tree.create(b"/card/dir/new", exclusive=True)
+    await writer.write(0, b"abc")
+    reader = await tree.open(FILE)
+    await tree.rename(b"/card/dir", b"/card/there")
+    assert await reader.read(0, len(DATA)) == DATA
+    await writer.write(3, b"def")
+    await writer.release()
+    assert store.files[b"/card/there/new"].data == b"abcdef"
+    assert (await tree.stat(b"/card/there/new")).size == 6
+    with pytest.raises(NotFound):
+        await tree.stat(b"/card/dir/new")
+
+
+async def test_who_has_a_replaced_file_open_keeps_what_was_written(store: FakeWriter, tree: Tree) -> None:
+    await write_file(tree, b"/card/tmp", b"newer")
+    old = await tree.create(b"/card/dir/x", exclusive=True)
+    await old.write(0, b"old")
+    await tree.rename(b"/card/tmp", b"/card/dir/x")
+    assert await old.read(0, 9) == b"old"
+    assert await read_file(tree, b"/card/dir/x") == b"newer"
+    await old.release()
+    assert store.files[b"/card/dir/x"].data == b"newer"
