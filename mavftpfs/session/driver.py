@@ -14,7 +14,7 @@ import trio
 
 from mavftpfs.link.base import Link, PinsPeer
 from mavftpfs.link.framing import Framer
-from mavftpfs.link.messages import Address, FtpFrame, Heartbeat, Message
+from mavftpfs.link.messages import Address, FtpFrame, Message
 from mavftpfs.protocol.engine import Engine
 from mavftpfs.protocol.operations import Operation
 from mavftpfs.protocol.payload import decode_reply
@@ -99,8 +99,6 @@ class Driver:
         finally:
             self.cancel(operation)
         if operation.error is not None:
-            if isinstance(operation.error, RequestTimeout):
-                self.vehicle.note_timeout()
             raise operation.error
 
     def start(self, operation: Operation, on_finished: Callable[[], None]) -> None:
@@ -161,7 +159,8 @@ class Driver:
 
     def _on_other(self, message: Message, now: float, index: int) -> None:
         self.vehicle.on_message(message, now)
-        if type(message) is Heartbeat and message.source == self.vehicle.address and self._pins is not None:
+        # Of a target without heartbeats of its own the vehicle takes its system's autopilot's.
+        if self._pins is not None and message is self.vehicle.heartbeat:
             self._pins.pin_peer(index)
 
     def _settle(self, now: float) -> None:
@@ -170,6 +169,8 @@ class Driver:
             self._send(target, self.engine.outgoing(now), now)
         for operation in self.engine.take_finished():
             on_finished = self._waiting.pop(operation, None)
+            if isinstance(operation.error, RequestTimeout):
+                self.vehicle.note_timeout()
             if on_finished is not None:
                 on_finished()
         if self._scope is not None:

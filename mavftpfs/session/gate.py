@@ -38,13 +38,21 @@ class Gate:
             self._notify()
 
     @asynccontextmanager
-    async def held_shut(self) -> AsyncIterator[None]:
-        """Let nobody in, wait until everybody is out, and stay shut for the body."""
+    async def held_shut(self, patience: float) -> AsyncIterator[bool]:
+        """Let nobody in, and stay shut for the body once everybody is out.
+
+        Yields False, with the gate open, if somebody was still inside after `patience` seconds: a sweep of a
+        huge directory must not keep everybody else out until it ends.
+        """
         self._shut = True
         try:
-            while self._inside:
-                await self._changed.wait()
-            yield
+            with trio.move_on_after(patience):
+                while self._inside:
+                    await self._changed.wait()
+            if self._inside:
+                self._shut = False
+                self._notify()
+            yield self._shut
         finally:
             self._shut = False
             self._notify()

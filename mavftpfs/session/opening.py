@@ -27,6 +27,11 @@ SILENCE_ARDUPILOT = 3.5
 SILENCE_PX4 = 10.5
 """PX4 closes a session 10 s after the last request of anybody on the link."""
 
+GATE_PATIENCE = 5.0
+"""Seconds to wait for requests under way before falling silent."""
+
+_MAX_FAILING = 256
+
 TERMINATE_LIMIT = 5.0
 """Seconds to wait for a Terminate before the session is treated as doubtful."""
 
@@ -59,6 +64,7 @@ class SessionOpener:
         self._doubtful: int | None = None
         self._doubtful_path: bytes | None = None
         self._server_assigns: bool | None = None
+        self._failing: dict[bytes, None] = {}
         self.resets = 0
         self.quiet_periods = 0
 
@@ -82,13 +88,14 @@ class SessionOpener:
                 return await self._open_once(path, opcode)
             except FtpNak as nak:
                 last = nak
-                if not self._looks_taken(nak):
+                if not self._looks_taken(nak, path):
                     raise
             while remedies:
                 if await remedies.pop(0)(last):
                     break
             else:
                 if last.code == NakCode.FAIL:
+                    self._remember_failing(path)
                     raise last
                 raise SessionBusy("the vehicle's only FTP session is in use by another client")
 
@@ -109,6 +116,7 @@ class SessionOpener:
             with trio.fail_after(limit):
                 await self._run(operation)
         except trio.TooSlowError:
+            self._vehicle.note_timeout()
             raise RequestTimeout("no answer to TerminateSession") from None
         except FtpNak as nak:
             self._doubtful = None
@@ -155,12 +163,20 @@ class SessionOpener:
         writing = opcode != Opcode.OPEN_FILE_RO
         return OpenSession(path, operation.session, operation.size, self._clock(), writing)
 
-    def _looks_taken(self, nak: FtpNak) -> bool:
+    def _remember_failing(self, path: bytes) -> None:
+        """Silence did not help: what fails is this file, and nobody waits for it again."""
+        self._failing[path] = None
+        if len(self._failing) > _MAX_FAILING:
+            del self._failing[next(iter(self._failing))]
+
+    def _looks_taken(self, nak: FtpNak, path: bytes) -> bool:
         """8 may hide any other code on PX4 (sticky EEXIST), and makes no sense as an answer to an open."""
         if nak.code in (NakCode.NO_SESSIONS_AVAILABLE, NakCode.INVALID_SESSION, NakCode.FILE_EXISTS):
             return True
-        self._doubtful = None
-        return nak.code == NakCode.FAIL and self._server_assigns is not True
+        plain = nak.code != NakCode.FAIL or self._server_assigns is True or path in self._failing
+        if plain or not nak.retransmitted:  # else the first one may have been executed: ArduPilot's NAK 1
+            self._doubtful = None
+        return not plain
 
     async def _close_own(self, nak: FtpNak) -> bool:
         """Terminate what may be ours: an open of ours whose ACK was lost, or (8) clear the sticky errno."""
@@ -176,13 +192,14 @@ class SessionOpener:
             if nak.code in (NakCode.NO_SESSIONS_AVAILABLE, NakCode.FILE_EXISTS)
             else SILENCE_ARDUPILOT
         )
-        self.quiet_periods += 1
-        async with self._gate.held_shut():
-            await trio.sleep(seconds)
-        return True
+        async with self._gate.held_shut(GATE_PATIENCE) as silent:
+            if silent:
+                self.quiet_periods += 1
+                await trio.sleep(seconds)
+        return silent
 
     async def _reset(self, nak: FtpNak) -> bool:
-        if self._vehicle.foreign_client(self._clock()):
+        if nak.code == NakCode.FAIL or self._vehicle.foreign_client(self._clock()):
             return False
         self.resets += 1
         reset = Simple(Opcode.RESET_SESSIONS, b"", session=self._engine.home_session, side_effect=True)

@@ -99,11 +99,11 @@ class Reading:
         started = self._clock()
         self.active, self._transfer, self._seen_bytes = stream, transfer, 0
         stream.attach(transfer)
+        self._steer(transfer, stream)
         self._driver.start(transfer, self._holder.wake)
         try:
             while self._go_on(stream, transfer, started):
-                others = self._queue.rival_use(stream) is not None
-                self._steering.steer(transfer, stream.contiguous_want(), others_waiting=others)
+                others = self._steer(transfer, stream)
                 await self._holder.sleep(_OFTEN if others else STALL / 2)
                 if self._stalled(transfer):
                     raise SessionLost("no answer for a while during a read", by_server=False)
@@ -118,6 +118,12 @@ class Reading:
             stream.use.add(now - started, now)
         if transfer.error is not None:
             raise transfer.error
+
+    def _steer(self, transfer: ReadTransfer, stream: FileStream) -> bool:
+        """Choose how to read from here on; return whether somebody else waits."""
+        others = self._queue.rival_use(stream) is not None
+        self._steering.steer(transfer, stream.contiguous_want(), others_waiting=others)
+        return others
 
     def _go_on(self, stream: FileStream, transfer: ReadTransfer, started: float) -> bool:
         if transfer.done or transfer.idle or stream.closed or self._holder.session is None:

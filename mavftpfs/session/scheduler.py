@@ -72,6 +72,7 @@ class Scheduler:
         self._vehicle = vehicle
         self._steering = steering
         self._clock = clock
+        self._used_at = clock()
         self._tickets = count(1)
         self._streams: set[FileStream] = set()
         self._jobs: list[SessionJob] = []
@@ -251,7 +252,8 @@ class Scheduler:
             try:
                 if user is None:
                     await self._idle()
-                elif isinstance(user, SessionJob):
+                    continue
+                if isinstance(user, SessionJob):
                     await self._serve_job(user)
                 elif isinstance(user, QueuedUpload):
                     await self._uploading.serve(user)
@@ -263,6 +265,7 @@ class Scheduler:
             except MavftpfsError:
                 # Closing the previous file failed; whoever wants something is asked again by _next.
                 self._holder.abandon()
+            self._used_at = self._clock()
 
     async def close(self) -> None:
         """Terminate the session, best effort; the caller bounds the wait and cancels `serve` first."""
@@ -339,7 +342,9 @@ class Scheduler:
         now = self._clock()
         until_upload = max(0.0, self._uploading.next_time(now) - now)
         if self.session is not None:
-            if not await self._holder.sleep(min(IDLE_CLOSE, until_upload)) and self._next() is None:
+            # Counted from the last use, not from the last news: there may always be news.
+            left = max(0.0, self._used_at + IDLE_CLOSE - now)
+            if not await self._holder.sleep(min(left, until_upload)) and self._next() is None:
                 await self._holder.close()
         elif self.opener.doubtful_path is not None and not self._vehicle.lost(now):
             # An open or a Terminate that was never answered: leave no orphan over there.

@@ -184,7 +184,7 @@ async def test_times_that_could_not_be_asked_for_are_not_refused(autojump: MockC
     async with here.connection() as connection, trio.open_nursery() as nursery:
 
         async def keep_quiet() -> None:
-            async with connection.scheduler.gate.held_shut():
+            async with connection.scheduler.gate.held_shut(30.0):
                 await trio.sleep(3.5)
 
         for _ in range(3):

@@ -1,0 +1,89 @@
+"""The remedies for an open that is refused, against a scripted server."""
+
+from __future__ import annotations
+
+import random
+from typing import cast
+
+import pytest
+import trio
+from trio.testing import MockClock
+
+from mavftpfs.link.messages import Address
+from mavftpfs.protocol.engine import Engine
+from mavftpfs.protocol.flow import Flow
+from mavftpfs.protocol.operations import OpenFile, Operation, Simple
+from mavftpfs.protocol.payload import NakCode, Opcode
+from mavftpfs.session.driver import Driver
+from mavftpfs.session.gate import Gate
+from mavftpfs.session.opening import SILENCE_ARDUPILOT, SILENCE_PX4, SessionOpener
+from mavftpfs.session.vehicle import Vehicle
+from mavftpfs.shared.errors import FtpNak, SessionBusy
+
+
+class Refusing:
+    """Stands in for the driver: refuses every open with one code, acknowledges the rest."""
+
+    def __init__(self, code: int) -> None:
+        self.code = code
+        self.retransmitted = False
+        self.log: list[tuple[float, Opcode]] = []
+
+    async def run(self, operation: Operation) -> None:
+        await trio.lowlevel.checkpoint()
+        opcode = operation.opcode if isinstance(operation, Simple) else Opcode.LIST_DIRECTORY
+        self.log.append((trio.current_time(), Opcode(opcode)))
+        if isinstance(operation, OpenFile):
+            raise FtpNak(operation.opcode, self.code, retransmitted=self.retransmitted)
+
+
+def opener(code: int) -> tuple[SessionOpener, Refusing, Vehicle]:
+    engine = Engine(random.Random(1), Flow())
+    vehicle = Vehicle(0, 0, Address(254, 191))
+    driver = Refusing(code)
+    made = SessionOpener(cast(Driver, driver), engine, vehicle, Gate(), trio.current_time)
+    return made, driver, vehicle
+
+
+async def test_a_taken_session_is_waited_out_in_silence_then_reset_then_given_up(
+    autojump_clock: MockClock,
+) -> None:
+    made, driver, _ = opener(NakCode.NO_SESSIONS_AVAILABLE)
+    with pytest.raises(SessionBusy):
+        await made.open(b"/f")
+    opcodes = [opcode for _, opcode in driver.log]
+    assert opcodes == [Opcode.OPEN_FILE_RO] * 2 + [Opcode.RESET_SESSIONS, Opcode.OPEN_FILE_RO]
+    assert driver.log[1][0] - driver.log[0][0] == pytest.approx(SILENCE_PX4)
+
+
+async def test_sessions_are_not_reset_while_another_client_is_heard(autojump_clock: MockClock) -> None:
+    made, driver, vehicle = opener(NakCode.INVALID_SESSION)
+    vehicle.foreign_at = trio.current_time() + SILENCE_ARDUPILOT
+    with pytest.raises(SessionBusy):
+        await made.open(b"/f")
+    assert made.resets == 0
+    assert driver.log[-1][0] - driver.log[0][0] == pytest.approx(SILENCE_ARDUPILOT)
+
+
+async def test_a_file_that_fails_plainly_costs_one_silence_and_no_reset(autojump_clock: MockClock) -> None:
+    made, driver, _ = opener(NakCode.FAIL)
+    for _ in range(3):
+        with pytest.raises(FtpNak):
+            await made.open(b"/f")
+    assert made.quiet_periods == 1
+    assert made.resets == 0
+    assert len([1 for _, opcode in driver.log if opcode is Opcode.OPEN_FILE_RO]) == 4
+    with pytest.raises(FtpNak):
+        await made.open(b"/another")
+    assert made.quiet_periods == 2
+
+
+async def test_an_open_that_may_have_worked_the_first_time_is_terminated_before_anything_else(
+    autojump_clock: MockClock,
+) -> None:
+    made, driver, _ = opener(NakCode.FAIL)
+    driver.retransmitted = True
+    with pytest.raises(FtpNak):
+        await made.open(b"/f")
+    assert driver.log[1][1] is Opcode.TERMINATE_SESSION
+    assert driver.log[1][0] == driver.log[0][0]
