@@ -148,7 +148,7 @@ class ListDirectory(Operation):
 
     Attributes:
         entries: what was listed, each name once, `.` and `..` left out.
-        complete: False when a cap ended the sweep: absence of a name then proves nothing.
+        complete: False when a cap or empty pages ended the sweep: absence of a name then proves nothing.
         hidden: names that cannot be shown (with a slash, a tab, or unparsable).
         on_page: called for each page.
     """
@@ -229,6 +229,8 @@ class ListDirectory(Operation):
         self._empty_pages += 1
         self._offset += 1
         if self._empty_pages >= _MAX_EMPTY_PAGES:
+            # So many neighbours whose names fit no page look the same: behind them there may be more.
+            self.complete = self._pages == self._empty_pages
             self.finish()
 
     def _cut_short(self) -> None:

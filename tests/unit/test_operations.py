@@ -238,7 +238,25 @@ def test_an_entry_that_fits_no_page_is_stepped_over() -> None:
     assert lister.offsets == [0, 1, 2, 3, 4, 5, 6]
     assert lister.names == [b"a", b"b"]
     assert lister.op.done
+
+
+def test_empty_pages_behind_others_prove_no_end() -> None:
+    """Four neighbours whose entries fit no page look like the end of an old PX4's listing."""
+    lister = Lister()
+    lister.page(b"Fa\t1\0")
+    for _ in range(4):
+        lister.page(b"")
+    assert lister.op.done
+    assert not lister.op.complete
+
+
+def test_empty_pages_alone_are_an_empty_directory() -> None:
+    lister = Lister()
+    for _ in range(4):
+        lister.page(b"")
+    assert lister.op.done
     assert lister.op.complete
+    assert lister.op.entries == []
 
 
 def test_other_refusals_are_errors() -> None:
