@@ -128,12 +128,14 @@ async def test_a_lost_reply_is_found_out(profile: str, act: str, autojump: MockC
 async def test_refusals_are_refusals(profile: str, autojump: MockClock) -> None:
     here = world(profile, file=b"content")
     here.tree.add(path(profile, "dir/inner"), b"x")
+    here.tree.add_directory(path(profile, "empty"))
     async with here.connection() as connection:
         store = connection.store
         for attempt in (
             lambda: store.remove(path(profile, "missing")),
             lambda: store.remove_directory(path(profile, "dir")),
             lambda: store.make_directory(path(profile, "dir")),
+            lambda: store.make_directory(path(profile, "empty")),
             lambda: store.make_directory(path(profile, "no/such")),
             lambda: store.rename(path(profile, "missing"), path(profile, "other")),
             lambda: store.create_empty(path(profile, "no/such")),
@@ -141,7 +143,7 @@ async def test_refusals_are_refusals(profile: str, autojump: MockClock) -> None:
         ):
             with pytest.raises(FtpNak):
                 await attempt()
-        assert names(here) == [b"dir", b"file"]
+        assert names(here) == [b"dir", b"empty", b"file"]
     assert here.vehicle.server.open_sessions == 0
 
 
@@ -306,3 +308,34 @@ async def test_too_long_a_rename_is_refused_before_a_byte_is_sent(autojump: Mock
         with pytest.raises(PathTooLong):
             await connection.store.rename(b"/d/" + b"a" * 116, b"/d/" + b"b" * 117)
     assert faults.requests == []
+
+
+async def test_a_sticky_file_exists_does_not_hide_the_whitelist(autojump: MockClock) -> None:
+    here = world("px4-nuttx")
+    here.tree.add(b"/etc/rc", b"#")
+    here.tree.add_directory(path("px4-nuttx", "dir"))
+    async with here.connection() as connection:
+        with pytest.raises(FtpNak):
+            await connection.scheduler.metadata(Simple(Opcode.CREATE_DIRECTORY, path("px4-nuttx", "dir")))
+        with pytest.raises(FtpNak) as refusal:
+            await connection.store.remove(b"/etc/rc")
+        assert refusal.value.code == 9
+
+
+@pytest.mark.parametrize("profile", [name for name in EVERY_PROFILE if name != "spec"])
+async def test_what_may_still_be_open_is_closed_first_too(profile: str, autojump: MockClock) -> None:
+    """A CreateFile whose ACK never came may have opened the file that is then removed."""
+    here = world(profile)
+    faults = Faults(here)
+    open_then: list[list[bytes]] = []
+    async with here.connection(ConnectOptions(op_deadline=5.0)) as connection:
+        faults.cut_after(1)
+        upload = await connection.store.open_upload(path(profile, "new"), MemorySource(b"x"), create=True)
+        with pytest.raises(RequestTimeout):
+            await upload.finish()
+        await upload.abort()
+        faults.cut_after(None)
+        assert here.vehicle.server.open_sessions == 1
+        faults.at(Opcode.REMOVE_FILE, lambda: open_then.append(here.vehicle.server.open_paths))
+        await connection.store.remove(path(profile, "new"))
+        assert open_then == [[]]

@@ -9,6 +9,7 @@ import trio
 from trio.testing import MockClock
 
 from mavftpfs.link.messages import Address
+from mavftpfs.protocol.operations import Simple
 from mavftpfs.protocol.payload import Opcode, request
 from mavftpfs.session.connection import Connection, ConnectOptions
 from mavftpfs.session.upload import QueuedUpload
@@ -714,6 +715,44 @@ async def test_a_session_that_is_gone_at_the_end_proves_nothing(probed: bool, au
         assert source.all_proven
 
 
+async def test_a_sticky_errno_at_the_end_is_no_refusal(autojump: MockClock) -> None:
+    """PX4 says "file exists" to a Terminate without session after a mkdir of what was there."""
+    here = world("px4", PLAIN)
+    here.tree.add_directory(b"/d/there")
+    faults = Faults(here)
+    async with here.connection() as connection:
+        source = MemorySource(content(20_000))
+        upload = await start(connection, "px4", source)
+        await trio.sleep(0.3)
+        with pytest.raises(FtpNak):
+            await connection.scheduler.metadata(Simple(Opcode.CREATE_DIRECTORY, b"/d/there"))
+        faults.at(Opcode.TERMINATE_SESSION, lambda: steal(here))
+        await upload.finish()
+        assert source.rollbacks == [True]
+        assert source.all_proven
+
+
+async def test_a_terminate_done_twice_is_done(autojump: MockClock) -> None:
+    """The first one's reply is lost, and a listing in between ends PX4's replay: NAK 4 to the second."""
+    here = world("px4", PLAIN)
+    faults = Faults(here)
+    async with here.connection() as connection:
+        source = MemorySource(content(3000))
+        upload = await start(connection, "px4", source)
+        faults.lose_reply_to(Opcode.TERMINATE_SESSION)
+
+        async def list_soon() -> None:
+            await trio.sleep(0.01)
+            await connection.store.list_directory(b"/d")
+
+        async with trio.open_nursery() as nursery:
+            faults.at(Opcode.TERMINATE_SESSION, lambda: nursery.start_soon(list_soon))
+            await upload.finish()
+        assert Opcode.TERMINATE_SESSION in faults.refused
+        assert source.rollbacks == []
+        assert source.all_proven
+
+
 async def test_only_what_was_not_proven_goes_again(autojump: MockClock) -> None:
     here = world("px4", PLAIN)
     faults = Faults(here)
@@ -751,3 +790,43 @@ async def test_a_trickle_does_not_send_the_file_each_time(autojump: MockClock) -
         assert trio.current_time() - began < 1
         assert source.all_proven
     assert here.tree.data(b"/d/new") == bytes(source.content)
+
+
+@pytest.mark.parametrize("profile", EVERY_PROFILE)
+async def test_leaving_in_mid_upload_terminates(profile: str, autojump: MockClock) -> None:
+    here = world(profile, PLAIN)
+    async with here.connection() as connection:
+        upload = await start(connection, profile, MemorySource(content(60_000)))
+        with trio.move_on_after(1) as impatience:
+            await upload.finish()
+        assert impatience.cancelled_caught
+        assert here.vehicle.server.open_sessions == 1
+    assert here.vehicle.server.open_sessions == 0
+
+
+@pytest.mark.parametrize("profile", EVERY_PROFILE)
+async def test_who_stops_waiting_does_not_stop_the_upload(profile: str, autojump: MockClock) -> None:
+    data = content(40_000)
+    here = world(profile, PLAIN)
+    async with here.connection() as connection:
+        source = MemorySource(data)
+        upload = await start(connection, profile, source)
+        with trio.move_on_after(1):
+            await upload.finish()
+        await trio.sleep(20)
+        assert source.all_proven
+        assert here.vehicle.server.open_sessions == 0
+    assert here.tree.data(path(profile, "new")) == data
+
+
+async def test_the_status_names_uploads(autojump: MockClock) -> None:
+    here = world("px4", PLAIN)
+    async with here.connection() as connection:
+        upload = await start(connection, "px4", MemorySource(content(60_000)))
+        await trio.sleep(1)
+        [shown] = connection.status()["uploads"]
+        assert shown["path"] == "/d/new"
+        assert shown["running"] is True
+        assert 0 < shown["unproven"] == shown["reached"]
+        await upload.abort()
+        assert connection.status()["uploads"] == []
