@@ -29,8 +29,8 @@ from mavftpfs.shared.traits import Traits
 __all__ = ["Engine", "EngineStats"]
 
 OP_DEADLINE = 30.0
-BURST_JUMP = 4096
 _MAX_REPLAYS = 8
+_MAX_SIDE_EFFECT_REPLAYS = 2
 _LONGEST_WAIT = 5.0
 _INVALID_SESSION = bytes((NakCode.INVALID_SESSION,))
 _BURST = int(Opcode.BURST_READ_FILE)
@@ -217,7 +217,9 @@ class Engine:
         """A replay of some earlier reply under this seq: this seq will never be answered (servers.md 2)."""
         self.stats.stale += 1
         request.replays += 1
-        if request.replays <= _MAX_REPLAYS and request.flying:
+        # It may not be a replay but the rest of an abandoned burst: each new seq may be one more execution.
+        limit = _MAX_SIDE_EFFECT_REPLAYS if request.manner.same_seq else _MAX_REPLAYS
+        if request.replays <= limit and request.flying:
             self.note(f"stale replay for seq {request.seq}: asking again under a new one")
             request.fresh_seq = True
             self._ledger.lose(request)
@@ -254,8 +256,7 @@ class Engine:
     def _begin_burst(self, request: Request, now: float) -> None:
         self._bursts.begin(request)
         # Whatever the burst's packets use as seq must not be a seq of ours (servers.md 2, collision).
-        self._ledger.jump(BURST_JUMP)
-        request.op.on_burst_sent(request, now)
+        self._ledger.jump(request.op.on_burst_sent(request, now))
 
     # --- what goes out
 

@@ -18,6 +18,10 @@ from mavftpfs.shared.errors import LocalProtocolError
 LAST_SEQ = 65534
 """65535 is never used: it defeats the servers' duplicate test (servers.md 2)."""
 
+BURST_JUMP = 4096
+FURTHEST_JUMP = LAST_SEQ + 1 - 2 * BURST_JUMP
+"""Further on come the seqs just used, whose late replies may still be about."""
+
 _MIN_REORDER = 3
 _MAX_REORDER = 64
 _MOST_QUICK_SENDS = 8
@@ -90,8 +94,10 @@ class Ledger:
         self._seq = seq + 1
         return seq
 
-    def jump(self, distance: int) -> None:
-        """Leave out `distance` seqs, which a server may use by itself in a burst (servers.md 14.3)."""
+    def jump(self, packets: int) -> None:
+        """Leave out the seqs that a server may use by itself in a burst of so many packets, and as many more:
+        the rest of it may come long after it was given up (servers.md 14.3)."""
+        distance = min(max(BURST_JUMP, 2 * packets), FURTHEST_JUMP)
         self._seq = (self._seq + distance) % (LAST_SEQ + 1)
 
     def number(self, request: Request) -> None:

@@ -250,8 +250,9 @@ class Operation:
         """Take the believed ACK or NAK to `request`."""
         raise NotImplementedError
 
-    def on_burst_sent(self, request: Request, now: float) -> None:
-        """A BurstReadFile of this operation went out under request.seq."""
+    def on_burst_sent(self, request: Request, now: float) -> int:
+        """A BurstReadFile of this operation went out under request.seq; return how many packets may come."""
+        return 0
 
     def on_burst(self, reply: Payload, now: float) -> bool:
         """Take a packet with req_opcode BurstReadFile; return False if it is not of the running burst."""

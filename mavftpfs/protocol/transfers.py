@@ -263,13 +263,14 @@ class ReadTransfer(Operation):
 
     # --- bursts
 
-    def on_burst_sent(self, request: Request, now: float) -> None:
-        """Begin to follow the burst."""
+    def on_burst_sent(self, request: Request, now: float) -> int:
+        """Begin to follow the burst; return how many packets it may bring (MAVSDK: all the rest)."""
         rto = self.port.timeout("data")
         self._burst = Burst(request.seq, request.offset, self.size, self.chunk, now, rto)
         echoes = self.port.traits.ack_carries_own_session
         self._keep_alive_at = now + KEEP_ALIVE if echoes is False else inf
         self._arm(now)
+        return (self.size - request.offset) // request.size + 2
 
     def on_burst(self, reply: Payload, now: float) -> bool:
         """Place a packet of the running burst."""
