@@ -41,6 +41,8 @@ TERMINATE_ON_EXIT = 3.0
 
 _INFO_TRIES = 4
 _INFO_PERIOD = 2.0
+_OLD_WAY_FROM = 2
+"""The try from which AUTOPILOT_VERSION is also asked for in the way that older firmware understands."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,6 +128,9 @@ class Connection:
 
     def _heard(self) -> str:
         heard = sorted(self.vehicle.heard)
+        bad_signatures = self.driver.framer.stats.bad_signature
+        if not heard and bad_signatures:
+            return f": heard only {bad_signatures} frames with no or a bad signature; check signing_key"
         if not heard:
             return ": no heartbeat heard at all; check SOURCE, cable, baud rate and port"
         names = ", ".join(f"{system}/{component}" for system, component in heard)
@@ -304,7 +309,7 @@ async def _ask_about_vehicle(connection: Connection) -> None:
     """Ask for AUTOPILOT_VERSION and STORAGE_INFORMATION a few times; neither is needed to work."""
     vehicle, driver = connection.vehicle, connection.driver
     await connection._first_heartbeat.wait()
-    for _ in range(_INFO_TRIES):
+    for attempt in range(_INFO_TRIES):
         wanted = []
         if vehicle.version is None:
             wanted.append(AUTOPILOT_VERSION_ID)
@@ -315,4 +320,6 @@ async def _ask_about_vehicle(connection: Connection) -> None:
                 driver.send(driver.framer.encode_request_message(vehicle.address, message_id))
         if not wanted:
             return
+        if attempt >= _OLD_WAY_FROM and vehicle.version is None and vehicle.address is not None:
+            driver.send(driver.framer.encode_request_capabilities(vehicle.address))
         await trio.sleep(_INFO_PERIOD)

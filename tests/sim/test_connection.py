@@ -8,8 +8,8 @@ import pytest
 import trio
 from trio.testing import MockClock
 
-from mavftpfs.link.framing import Framer
-from mavftpfs.link.messages import MAV_AUTOPILOT_INVALID, Address
+from mavftpfs.link.framing import MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES, MAV_CMD_REQUEST_MESSAGE, Framer
+from mavftpfs.link.messages import MAV_AUTOPILOT_INVALID, Address, CommandLong
 from mavftpfs.link.opening import open_link
 from mavftpfs.link.uri import parse_source
 from mavftpfs.protocol.payload import decode_request
@@ -70,8 +70,31 @@ async def test_signing_both_ways(autojump: MockClock) -> None:
         await connection.ready(10)
         assert await read_file(connection, b"/f") == DATA
     async with connected(link, ConnectOptions(signing_key=bytes(32)), rng=random.Random(5)) as connection:
-        with pytest.raises(VehicleLost):
+        with pytest.raises(VehicleLost, match="bad signature; check signing_key"):
             await connection.ready(5)
+
+
+class OldFirmware(SimVehicle):
+    """Knows no MAV_CMD_REQUEST_MESSAGE."""
+
+    asked: list[int]
+
+    def _on_command(self, command: CommandLong, now: float) -> None:
+        self.asked = [*getattr(self, "asked", []), command.command]
+        if command.command != MAV_CMD_REQUEST_MESSAGE:
+            super()._on_command(command, now)
+
+
+async def test_old_firmware_is_asked_for_its_capabilities_in_the_old_way(autojump: MockClock) -> None:
+    vehicle = OldFirmware(MemoryTree(), PROFILES["px4"], rng=random.Random(1))
+    link = MemoryLink(vehicle, LinkModel(random.Random(2), LinkSettings(delay=0.01)))
+    async with connected(link, ConnectOptions(), rng=random.Random(3)) as connection:
+        await connection.ready(10)
+        await trio.sleep(3)
+        assert MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES not in vehicle.asked
+        await trio.sleep(10)
+        assert connection.vehicle.ftp_flag is True
+        assert vehicle.asked.count(MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES) == 1
 
 
 async def test_a_neighbour_with_our_address_makes_us_move(autojump: MockClock) -> None:
