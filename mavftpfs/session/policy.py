@@ -19,6 +19,12 @@ MIN_QUANTUM = 1.0
 
 MAX_QUANTUM = 4.0
 
+STARVING = 3.0
+"""Seconds of waiting after which a bulk reader is not passed over any more."""
+
+RELIEF = 0.5
+"""Seconds of service that ends starving."""
+
 WORTH_A_BURST = 32 * 1024
 """Bytes of sequential want below which a burst gains nothing over a window of reads."""
 
@@ -91,6 +97,12 @@ class Service:
         return self.seconds * faded
 
 
+def is_starving(waited: float) -> bool:
+    """Return whether who waited so long (seconds) goes before newcomers: one small file after another must
+    slow a copy down, not stop it."""
+    return waited >= STARVING
+
+
 def should_switch(
     *,
     current_has_demand: bool,
@@ -98,14 +110,17 @@ def should_switch(
     current_use: float,
     waiting_use: float,
     rtt: float | None,
+    current_waited: float = 0.0,
 ) -> bool:
     """Return whether the session should pass to a file that waits with demand.
 
     A file that used little lately (an editor, `head`) goes before one that used much, at once; equals
-    alternate by quantum.
+    alternate by quantum. Who had to wait long (current_waited) keeps what it got for a while.
     """
     if not current_has_demand:
         return True
+    if is_starving(current_waited) and current_slice < RELIEF:
+        return False
     if waiting_use < LIGHT_USE and max(current_use, current_slice) >= LIGHT_USE:
         return True
     return current_slice >= quantum(rtt)

@@ -140,6 +140,7 @@ class Reading:
             current_use=stream.use.recent(now),
             waiting_use=waiting_use,
             rtt=self._engine.rtt,
+            current_waited=started - stream.asked_at,
         )
 
     def _stalled(self, transfer: ReadTransfer) -> bool:

@@ -23,7 +23,7 @@ from mavftpfs.session.holder import SessionHolder
 from mavftpfs.session.jobs import SessionJob
 from mavftpfs.session.kit import Kit
 from mavftpfs.session.opening import OpenSession, SessionOpener
-from mavftpfs.session.policy import LIGHT_USE
+from mavftpfs.session.policy import LIGHT_USE, is_starving
 from mavftpfs.session.reading import Reading
 from mavftpfs.session.readmode import ReadSteering
 from mavftpfs.session.stream import FileStream
@@ -298,7 +298,7 @@ class Scheduler:
             if self._claimed(stream.path):
                 continue
             if stream.has_demand:
-                heavy = stream.use.recent(now) >= LIGHT_USE
+                heavy = stream.use.recent(now) >= LIGHT_USE and not is_starving(now - stream.asked_at)
                 waiting.append(((heavy, False, stream.ticket or 0), stream))
             elif stream.has_ahead and (readahead is None or self._is_open(stream)):
                 readahead = stream

@@ -100,6 +100,28 @@ async def test_a_small_read_overtakes_a_bulk_copy(profile: str, autojump: MockCl
         nursery.cancel_scope.cancel()
 
 
+@pytest.mark.parametrize("profile", ["px4", "ardupilot"])
+async def test_one_small_file_after_another_does_not_stop_a_copy(profile: str, autojump: MockClock) -> None:
+    small = {f"s{index}": bytes([index]) * 100 for index in range(200)}
+    here = world(profile, LinkSettings(rate=60_000.0, delay=0.015), big=content(2_000_000), **small)
+    async with here.connection() as connection, trio.open_nursery() as nursery:
+        sink = MemorySink(2_000_000)
+        reader = await connection.store.open_reader(path(profile, "big"), sink)
+        reader.want(0, 2_000_000, demand=True)
+        await trio.sleep(2)
+
+        async def read_small() -> None:
+            for name, data in small.items():
+                assert await read_file(connection, path(profile, name)) == data
+
+        began, before = trio.current_time(), sink.have.total
+        with trio.move_on_after(30):
+            await read_small()
+        copied = (sink.have.total - before) / (trio.current_time() - began)
+        assert copied > {"px4": 4_000, "ardupilot": 1_800}[profile]  # half of it without the rule
+        nursery.cancel_scope.cancel()
+
+
 @pytest.mark.parametrize("profile", EVERY_PROFILE)
 async def test_a_cut_in_mid_read_is_bridged(profile: str, autojump: MockClock) -> None:
     data = content(100_000)

@@ -9,6 +9,8 @@ import pytest
 from mavftpfs.session.policy import (
     MAX_QUANTUM,
     MIN_QUANTUM,
+    RELIEF,
+    STARVING,
     USE_MEMORY,
     ReadFacts,
     Service,
@@ -67,6 +69,22 @@ def test_service_fades() -> None:
     assert service.recent(100.0 + 2 * USE_MEMORY) == 0.0
     service.add(1.0, now=100.0 + USE_MEMORY / 2)
     assert service.seconds == pytest.approx(2.0)
+
+
+def test_who_waited_long_keeps_the_session_for_a_while() -> None:
+    def switch(waited: float, slice_: float) -> bool:
+        return should_switch(
+            current_has_demand=True,
+            current_slice=slice_,
+            current_use=5.0,
+            waiting_use=0.0,
+            rtt=0.02,
+            current_waited=waited,
+        )
+
+    assert switch(waited=STARVING - 0.1, slice_=0.1)
+    assert not switch(waited=STARVING, slice_=0.1)
+    assert switch(waited=STARVING, slice_=RELIEF)
 
 
 @pytest.mark.parametrize(
