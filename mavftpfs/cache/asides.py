@@ -17,7 +17,8 @@ What an interruption leaves, and what `repair` does with it (new, old and target
   target missing, new only      rename new to `recovered-tSSS-NAME`: a power cut inside a server that
                                 unlinks before it renames leaves that (NuttX), and nobody can tell whether it
                                 is complete
-  target missing, moved         rename it to target; if the target is there as well: `recovered-mSSS-NAME`
+  target missing, moved         rename it to target, then remove old; if the target is there as well:
+                                `recovered-mSSS-NAME`
   sidecar alone, deleted        remove
 Nothing is touched while its owner may be alive: see `Staleness`.
 """
@@ -240,6 +241,7 @@ def repair(group: Group, *, target_exists: bool) -> list[Action]:
     if moved is not None:
         missing = group.target is not None and not target_exists
         actions.append(Action(moved, group.target if missing else _recovered(group, moved)))
+        target_exists = target_exists or missing  # from now on, so `old` must not take its place
     if group.target is None:
         actions += _without_target(group, new, old)
     elif target_exists:

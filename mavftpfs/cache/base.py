@@ -31,6 +31,7 @@ async def read_base(context: Context, node: Node, start: int, stop: int) -> byte
         FileChanged: it is another file by now. Else as open_base and FileHandle.read.
     """
     if node.base is None:
+        node.require_reachable()
         handle = await open_base(context, node.path)
         if node.base is None:
             node.base = handle

@@ -6,6 +6,7 @@ are touched only after they were seen unchanged for a long while.
 
 from __future__ import annotations
 
+import errno
 import logging
 
 from mavftpfs.cache.asides import (
@@ -22,6 +23,7 @@ from mavftpfs.cache.base import open_base
 from mavftpfs.cache.context import Context
 from mavftpfs.cache.dentries import Directory
 from mavftpfs.cache.sure import Sure
+from mavftpfs.shared.errnos import errno_for
 from mavftpfs.shared.errors import FtpNak, LocalProtocolError, MavftpfsError, NotADirectory, NotFound
 from mavftpfs.shared.model import DirEntry, join, normalise, split
 
@@ -58,6 +60,28 @@ class Cleaner:
         finally:
             self._busy.discard(path)
 
+    async def purge(self, path: bytes) -> None:
+        """A path is about to lose its name: have nothing of an earlier replacement bring it back.
+
+        Raises:
+            As Sure.remove: then the name has to stay.
+        """
+        parent, name = split(path)
+        directory = self._context.dentries.known(parent)
+        doomed = [aside for aside, target in self._context.garbage.items() if target == path]
+        for entry in [] if directory is None else list(directory.entries):
+            reserved, aside = parse(entry), join(parent, entry)
+            ours = reserved is not None and reserved.target == name and reserved.owner in self._dead_owners
+            if ours and aside not in self._context.live and aside not in doomed:
+                doomed.append(aside)
+        for aside in doomed:
+            try:
+                await self._sure.remove(aside)
+            except FtpNak as nak:
+                if errno_for(nak) != errno.ENOENT:
+                    raise
+            self._context.garbage.pop(aside, None)
+
     def _is_dead(self, path: bytes, owner: bytes, entry: DirEntry) -> bool:
         if path in self._context.live:
             return False
@@ -77,6 +101,7 @@ class Cleaner:
             self._staleness.forget(action.path)
             if action.to is None:
                 await self._sure.remove(action.path)
+                self._context.garbage.pop(action.path, None)
             else:
                 log.warning("%r was left by an interruption: renaming it to %r", action.path, action.to)
                 await self._sure.rename(action.path, action.to)

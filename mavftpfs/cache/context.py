@@ -23,6 +23,7 @@ class Context:
 
     clock: seconds, monotonic; wall: seconds since 1970. on_changed(path): a path, and what lies below it,
     was changed by us. live: reserved paths in use right now; hidden: unlinked files by their reserved path.
+    garbage: reserved paths that could not be removed yet -> the path they belong to.
     armed: nothing may be changed.
     """
 
@@ -40,6 +41,7 @@ class Context:
     nodes: Nodes = field(default_factory=Nodes)
     live: set[bytes] = field(default_factory=set)
     hidden: dict[bytes, Node] = field(default_factory=dict)
+    garbage: dict[bytes, bytes] = field(default_factory=dict)
     armed: bool = False
 
     def require_disarmed(self) -> None:

@@ -106,10 +106,12 @@ class Deliverer:
         await attempt.upload.abort()
         if node.draft is not None:
             node.draft.begin_again()
+        if attempt.path == node.path:
+            self._context.dentries.note_unsized(node.path)
         if attempt.places is not None:
             try:
                 if not attempt.committing:
-                    await self.replacer.clean(attempt.places, new=True)
+                    await self.replacer.clean(node.path, attempt.places, new=True)
             finally:
                 self.replacer.release(attempt.places)
 
@@ -207,6 +209,8 @@ class Deliverer:
             sending.progress = self._throttle.on_acked
             writer = self._context.writer
             upload = await writer.open_upload(path, sending, create=plan is not Plan.IN_PLACE)
+            if places is None:
+                self._context.dentries.note_unsized(path)
         except BaseException:
             if places is not None:
                 self.replacer.release(places)

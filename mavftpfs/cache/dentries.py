@@ -221,6 +221,12 @@ class Dentries:
         else:
             self._doubt(split(path)[0])
 
+    def note_unsized(self, path: bytes) -> None:
+        """We are writing a file, or gave up: its size is unknown, and growth says nothing of others."""
+        entry = self._entry(path)
+        if entry is not None:
+            self._change(path, replace(entry, size=None, mtime=None), reshapes=False)
+
     # --- inside
 
     def _entry(self, path: bytes) -> DirEntry | None:

@@ -101,6 +101,11 @@ class Draft:
         """What the spool has (a copy)."""
         return self._held.copy()
 
+    @property
+    def touched(self) -> bool:
+        """Whether an attempt under way has changed a part of the vehicle's file."""
+        return self.sending is not None and not self.sending.whole and self.sending.reached > 0
+
     def missing_base(self) -> list[tuple[int, int]]:
         """Return the ranges of which only the vehicle has the bytes."""
         return self._held.missing(0, min(self.base_limit, self.size))

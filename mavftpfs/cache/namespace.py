@@ -7,8 +7,9 @@ time; what a draft below a path has undelivered is delivered before the path cha
 
 from __future__ import annotations
 
+import errno
 import logging
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from contextlib import AsyncExitStack
 
 import trio
@@ -21,6 +22,7 @@ from mavftpfs.cache.nodes import Node
 from mavftpfs.cache.replacing import Present
 from mavftpfs.cache.spool import SpoolContent
 from mavftpfs.cache.sure import Sure
+from mavftpfs.shared.errnos import errno_for
 from mavftpfs.shared.errors import (
     AlreadyExists,
     CrossDevice,
@@ -48,13 +50,16 @@ class Namespace:
         sure: Sure,
         deliverer: Deliverer,
         *,
+        purge: Callable[[bytes], Awaitable[None]],
         new_content: Callable[[], SpoolContent],
         on_renamed: Callable[[bytes, bytes], None],
     ) -> None:
-        """`new_content()`: room for a draft; `on_renamed(old, new)`: the vehicle's path has another name."""
+        """`purge(path)` removes what would bring a path back (Cleaner); `new_content()`: room for a draft;
+        `on_renamed(old, new)`: the vehicle's path has another name."""
         self._context = context
         self._sure = sure
         self._deliverer = deliverer
+        self._purge = purge
         self._new_content = new_content
         self._on_renamed = on_renamed
         self._lock = trio.Lock()
@@ -218,9 +223,19 @@ class Namespace:
     # --- inside: unlinking
 
     async def _remove(self, path: bytes) -> None:
+        await self._purge(path)
         await self._sure.remove(path)
         self._context.files.on_removed(path)
         self._context.on_changed(path)
+
+    async def _remove_perhaps(self, path: bytes) -> None:
+        """Remove a file that we were about to make: CreateFile may not have come to it."""
+        try:
+            await self._remove(path)
+        except FtpNak as nak:
+            if errno_for(nak) != errno.ENOENT:
+                raise
+            self._context.dentries.note_removed(path)
 
     async def _unlink_node(self, node: Node, path: bytes) -> None:
         async with node.lock:
@@ -231,7 +246,7 @@ class Namespace:
             if there and node.handles and not self._keep_content(node):
                 await self._hide(node)
             elif there:
-                await self._remove(path)
+                await self._remove_perhaps(path)
             node.removed = True
             self._context.nodes.detach(node)
         if not node.handles:
@@ -259,6 +274,7 @@ class Namespace:
         """Keep an unlinked file on the vehicle under a reserved name as long as somebody reads it."""
         context, old = self._context, node.path
         hidden = context.namer.hidden(old)
+        await self._purge(old)
         context.live.add(hidden)
         try:
             await self._sure.rename(old, hidden)
@@ -304,6 +320,7 @@ class Namespace:
                 await self._deliverer.deliver_locked(node)
             if displaced is not None:
                 await self._deliverer.abandon(displaced)
+            await self._purge(old)
             await self._rename_or_refuse(old, new, target, by_case=by_case)
             if displaced is not None:
                 self._displace(displaced)
@@ -311,8 +328,8 @@ class Namespace:
                 context.dentries.forget(old)
             context.follow_rename(old, new)
             self._on_renamed(old, new)
-        if displaced is not None and not displaced.handles:
-            displaced.drop_draft()
+        for node in nodes:
+            context.nodes.maybe_forget(node)  # a close that found it locked could not
 
     def _displace(self, node: Node) -> None:
         """The file that is open at a path lost its name; who has it open keeps what is held of it."""

@@ -18,7 +18,7 @@ from mavftpfs.cache.plan import Plan
 from mavftpfs.cache.remote import Upload
 from mavftpfs.cache.sending import Sending
 from mavftpfs.cache.spool import SpoolContent
-from mavftpfs.shared.errors import MavftpfsError
+from mavftpfs.shared.errors import FileChanged, MavftpfsError
 
 
 @dataclass(slots=True, eq=False)
@@ -74,6 +74,11 @@ class Node:
     def undelivered(self) -> bool:
         """Whether the vehicle lacks something of it that it should have."""
         return self.draft is not None and not self.removed and not self.draft.clean
+
+    def require_reachable(self) -> None:
+        """Raise FileChanged if its path may be another file's: it was replaced or removed, not hidden."""
+        if self.removed and not self.hidden:
+            raise FileChanged(f"what was {self.path!r} is not on the vehicle any more")
 
     def close_base(self) -> None:
         """The vehicle's file is another one, or is not needed."""

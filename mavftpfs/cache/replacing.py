@@ -91,9 +91,9 @@ class Replacer:
                 await self._finish_rename(source, target, places, old=present.old)
         elif not present.target:
             raise VerificationFailed(f"{source!r} vanished before it was renamed to {target!r}")
-        await self.clean(places, old=present.old)
+        await self.clean(target, places, old=present.old)
 
-    async def clean(self, places: Places, *, new: bool = False, old: bool = False) -> None:
+    async def clean(self, target: bytes, places: Places, *, new: bool = False, old: bool = False) -> None:
         """Remove what is not needed any more; what cannot be removed now goes at a later listing."""
         doomed = [places.new] * new + [places.old] * old
         if places.sidecar is not None:
@@ -105,6 +105,7 @@ class Replacer:
                 if errno_for(error) == errno.ENOENT:
                     continue
                 log.info("%r stays until its directory is listed again: %s", path, error)
+                self._context.garbage.update(dict.fromkeys(doomed, target))
                 return
 
     # --- inside

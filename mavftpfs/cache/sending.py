@@ -39,6 +39,7 @@ class Sending:
         self.reached = 0
         self._dirty = ExtentSet(extents)
         self._in_flight = ExtentSet()
+        self._void = ExtentSet()  # in flight, but cut off since: nothing may overtake it
         self._acked = ExtentSet()
         self._proven = ExtentSet()
         self._ahead = (0, b"")
@@ -62,6 +63,8 @@ class Sending:
 
     def on_cut(self, size: int) -> None:
         """The draft ends at `size` now; what was sent beyond it shows in `reached`."""
+        for start, stop in self._in_flight.intersection(size, max(size, self._in_flight.end)):
+            self._void.add(start, stop)
         for extents in (self._dirty, self._in_flight, self._acked, self._proven):
             extents.discard(size, max(extents.end, size))
         self._ahead = (0, b"")
@@ -84,6 +87,7 @@ class Sending:
         """See cache.remote.UploadSource."""
         if self.progress is not None:
             self.progress(count)
+        self._void.discard(offset, offset + count)
         for start, stop in self._in_flight.intersection(offset, offset + count):
             self._in_flight.discard(start, stop)
             for a, b in self._dirty.missing(start, stop):
@@ -91,6 +95,7 @@ class Sending:
 
     def on_unsent(self, offset: int, count: int) -> None:
         """See cache.remote.UploadSource."""
+        self._void.discard(offset, offset + count)
         for start, stop in self._in_flight.intersection(offset, offset + count):
             self._in_flight.discard(start, stop)
             self._dirty.add(start, stop)
@@ -101,6 +106,7 @@ class Sending:
 
     def on_rollback(self, everything: bool) -> None:
         """See cache.remote.UploadSource."""
+        self._void.clear()
         self._move(self._in_flight, self._dirty)
         self._move(self._acked, self._dirty)
         if everything:
@@ -126,11 +132,13 @@ class Sending:
         first = self._dirty.first()
         if first is None:
             return None
-        if self._in_flight.empty or not self._in_flight.overlaps(*first):
+        under_way = (self._in_flight, self._void)
+        if not any(extents.overlaps(*first) for extents in under_way):
             return first[0], min(first[1], first[0] + limit)
         for start, stop in self._dirty:
             for a, b in self._in_flight.missing(start, stop):
-                return a, min(b, a + limit)
+                for c, d in self._void.missing(a, b):
+                    return c, min(d, c + limit)
         return None
 
     def _bytes(self, start: int, stop: int) -> bytes:

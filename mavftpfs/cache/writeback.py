@@ -15,7 +15,7 @@ from mavftpfs.cache.base import open_base
 from mavftpfs.cache.changes import Changes
 from mavftpfs.cache.cleaning import Cleaner
 from mavftpfs.cache.context import Context
-from mavftpfs.cache.delivery import Deliverer
+from mavftpfs.cache.delivery import PASSING, Deliverer
 from mavftpfs.cache.draft import Draft
 from mavftpfs.cache.namespace import Namespace
 from mavftpfs.cache.nodes import Node
@@ -42,6 +42,9 @@ MAX_FILE = 2**32 - 1
 """The protocol's offsets have 32 bits; ArduPilot's servers refuse from 2 GiB on (servers.md 8)."""
 
 RETRY_PAUSE = 1.0
+REFUSALS = 3
+"""After so many rounds in which the vehicle answered and refused all that is left, the end is not put off."""
+
 STEP = 64 * 1024
 
 ADOPTED_PART = 4
@@ -67,6 +70,7 @@ class Writeback:
             context,
             sure,
             self._deliverer,
+            purge=cleaner.purge,
             new_content=spool.content,
             on_renamed=self.overlay.on_renamed,
         )
@@ -256,8 +260,9 @@ class Writeback:
             await file.release()
         except BaseException:
             file.close()
-            if not had and not node.writers:
-                await self._forget_draft(node)
+            unchanged = node.draft is None or not node.draft.touched
+            if not had and not node.writers and unchanged:
+                await self._forget_draft(node)  # else it is completed later
             raise
 
     async def _put(self, path: bytes, data: bytes, exclusive: bool) -> None:
@@ -289,16 +294,25 @@ class Writeback:
 
     async def drain(self, timeout: float) -> None:
         """See Tree.drain."""
+        refused = 0
         with trio.move_on_after(timeout):
             await self._deliver_all(writers_too=True)
-            while self.undelivered():
+            while self.undelivered() and refused < REFUSALS:
                 await trio.sleep(RETRY_PAUSE)
                 await self._deliver_all(writers_too=True)
+                refused = refused + 1 if self._only_refused() else 0
+
+    def _only_refused(self) -> bool:
+        """Whether the vehicle answers, and takes nothing of what is left."""
+        return not any(isinstance(n.error, PASSING) for n in self._context.nodes if n.undelivered)
 
     def recover_to(self, directory: Path) -> list[Path]:
         """See Tree.recover_to."""
         lost = [node for node in self._context.nodes if node.undelivered]
-        return recover(lost, directory, self._context.wall)
+        written = recover(lost, directory, self._context.wall)
+        for node in lost:
+            node.drop_draft()  # the spool need not offer it again
+        return written
 
     def armed_changed(self, armed: bool) -> None:
         """See Tree.armed_changed."""
@@ -327,6 +341,7 @@ class Writeback:
             "dirty_max": self._throttle.limit,
             "write_rate": self._throttle.meter.rate,
             "files_undelivered": len(self.undelivered()),
+            "transfers": self._transfers(),
             "errors": {path.decode(errors="replace"): text for path, text in errors.items()},
             "files_delivered": self._deliverer.delivered,
             "verified_by_crc": verifier.by_crc,
@@ -335,6 +350,24 @@ class Writeback:
             "leftovers_mended": self._cleaner.mended,
             "armed": self._context.armed,
         }
+
+    def _transfers(self) -> list[dict[str, object]]:
+        """Return what is not delivered, what is on its way first; eta: seconds at the measured rate."""
+        waiting = [node for node in self._context.nodes if node.undelivered]
+        rate, before, found = self._throttle.meter.rate, 0, []
+        for node in sorted(waiting, key=lambda node: node.attempt is None):
+            assert node.draft is not None
+            before += node.draft.unacked
+            found.append(
+                {
+                    "path": node.path.decode(errors="replace"),
+                    "size": node.draft.size,
+                    "bytes_left": node.draft.unacked,
+                    "sending": node.attempt is not None,
+                    "eta": round(before / rate, 1) if rate else None,
+                }
+            )
+        return found
 
     async def _retry(self) -> None:
         await self._deliver_all(writers_too=False)
@@ -347,6 +380,6 @@ class Writeback:
             try:
                 await self._deliverer.deliver(node)
             except MavftpfsError as error:
-                log.info("%r is still not delivered: %s", node.path, error)
+                log.debug("%r is still not delivered: %s", node.path, error)
             else:
                 self._context.nodes.maybe_forget(node)

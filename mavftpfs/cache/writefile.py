@@ -79,6 +79,7 @@ class _Reading:
         if self._handle is None or self._generation != node.generation:
             self._close_handle()
             self._generation = node.generation
+            node.require_reachable()
             self._handle = await open_base(self._context, node.path)
         return await self._handle.read(offset, size)
 
