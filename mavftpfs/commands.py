@@ -205,6 +205,8 @@ def _run(
     if component is not None:
         options = replace(options, target_component=component)
     daemon.log_to_stderr(logging.DEBUG if args.debug else logging.WARNING)
+    if not args.debug:  # whatever the caches warn of is raised, too, and errors are one line
+        logging.getLogger("mavftpfs.cache").setLevel(logging.ERROR)
     with open_sinks(options, debug=args.debug) as sinks:
         return trio.run(until_interrupted, partial(function, Target(spec, options, sinks)))
 

@@ -130,9 +130,20 @@ def describe(key: str, value: Any) -> str:
         return f"{value * 1000:.0f} ms" if value < 1 else f"{value:.1f} s"
     if isinstance(value, int) and "bytes" in key:
         return readable_size(value)
+    if key == "transfers" and value:
+        return "; ".join(map(_transfer, value))
     if isinstance(value, list | tuple):
         return ", ".join(map(str, value)) or "none"
     return "none" if value == {} else str(value)
+
+
+def _transfer(facts: Mapping[str, Any]) -> str:
+    """Return how one file gets on."""
+    done = facts["size"] - facts["bytes_left"]
+    share = f"{max(done, 0) * 100 // facts['size']} %" if facts["size"] else "empty"
+    state = "sending" if facts["sending"] else "waiting"
+    eta = "" if facts["eta"] is None else f", {facts['eta']:.0f} s left"
+    return f"{facts['path']} {state}, {share} of {readable_size(facts['size'])}{eta}"
 
 
 def readable_size(count: float) -> str:

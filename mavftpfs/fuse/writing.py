@@ -126,7 +126,7 @@ class WritingOperations(Operations):
         try:
             await file.release()  # also of a reader: the last one of an unlinked file has it removed
         except MavftpfsError as exc:
-            log.warning("a closed file is not finished on the vehicle yet: %s", exc)
+            log.debug("a closed file is not finished on the vehicle yet: %s", exc)  # the tree said it once
         finally:
             file.close()
 

@@ -1,0 +1,282 @@
+"""Arming, lost vehicles, kills and unmounts while something was written: what was confirmed is on the card,
+what was not is an error and is kept."""
+
+from __future__ import annotations
+
+import json
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from tests.mount.conftest import Field
+from tests.support.mounts import Mount, abort_mount, mounted_at, wait_until
+from tests.support.trees import content
+from tests.support.vehicles import SimVehicle
+
+QUICK = ("op_deadline=4",)
+RECOVERED = re.compile(r"did not reach the vehicle; they are (?:kept )?in (.+)")
+
+WRITER = """
+import errno, os, sys, time
+number = os.open(sys.argv[1], os.O_WRONLY | os.O_CREAT)
+block, taken = 16384, 0
+def attempt(name, call):
+    try:
+        call(); print(name, "ok", flush=True); return True
+    except OSError as error:
+        print(name, errno.errorcode[error.errno], flush=True); return False
+data = bytes(range(256)) * (block // 256)
+for part in range(int(sys.argv[2])):
+    if not attempt("write", lambda: os.write(number, data)):
+        break
+    taken += block
+attempt("fsync", lambda: os.fsync(number))
+attempt("close", lambda: os.close(number))
+print("taken", taken, flush=True)
+"""
+"""Writes blocks and says what each call said."""
+
+BLOCK = bytes(range(256)) * 64
+
+
+def start_writer(mount: Mount, name: str, blocks: int) -> subprocess.Popen[str]:
+    """Start writing a file; returns when a few blocks were taken."""
+    argv = [sys.executable, "-c", WRITER, str(mount.path / name), str(blocks)]
+    writer = subprocess.Popen(argv, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert writer.stdout is not None
+    for _ in range(4):
+        assert writer.stdout.readline() == "write ok\n"
+    return writer
+
+
+def said(writer: subprocess.Popen[str], mount: Mount) -> dict[str, list[str]]:
+    """Wait for a writer and return what each kind of call said, and how much was taken."""
+    try:
+        out, errors = writer.communicate(timeout=60)
+    except subprocess.TimeoutExpired:
+        abort_mount(mount.path)
+        writer.communicate(timeout=20)
+        raise AssertionError(f"the writer hung\n{mount.alive_or_ended().text()}") from None
+    assert writer.returncode == 0, errors
+    found: dict[str, list[str]] = {"write": ["ok"] * 4}
+    for line in out.splitlines():
+        name, result = line.split()
+        found.setdefault(name, []).append(result)
+    return found
+
+
+@pytest.mark.parametrize("profile", ["px4", "ardupilot"])
+def test_arming_in_mid_copy_refuses_and_disarming_delivers(field: Field, profile: str) -> None:
+    card = field.local("card")
+    (card / "APM").mkdir()
+    (card / "APM" / "old.txt").write_text("old\n")
+    vehicle = field.sim(card, profile, ("--rate", "60000"))
+    mount = field.mount(vehicle.source, "dirty_max=64K")
+    writer = start_writer(mount, "APM/flight.bin", 100)
+    vehicle.send_signal(signal.SIGUSR1)
+    results = said(writer, mount)
+    assert set(results["write"][:-1]) == {"ok"}
+    assert results["write"][-1] == "EROFS"
+    assert (results["fsync"], results["close"]) == (["EROFS"], ["EROFS"])
+    taken = int(results["taken"][0])
+    assert 0 < taken < 100 * len(BLOCK)
+    for code in CHANGES:
+        assert mount.errno_of(code, mount.path / "APM") == "EROFS", code
+    assert mount.run("cat", mount.path / "APM/old.txt").stdout == "old\n"
+    assert (card / "APM" / "old.txt").read_text() == "old\n"
+    status = json.loads(mount.run(sys.executable, "-m", "mavftpfs", "status", mount.path, "--json").stdout)
+    assert status["connection"]["armed"] is True
+    assert status["cache"]["files_undelivered"] == 1
+    (transfer,) = status["cache"]["transfers"]
+    assert (transfer["path"], transfer["size"]) == ("/APM/flight.bin", taken)
+    assert 0 < transfer["bytes_left"] <= taken
+    assert "flight.bin" in mount.run(sys.executable, "-m", "mavftpfs", "status", mount.path).stdout
+    vehicle.send_signal(signal.SIGUSR1)
+    expected = BLOCK * (taken // len(BLOCK))
+    place = card / "APM" / "flight.bin"
+    wait_until("what was held is delivered", lambda: place.read_bytes() == expected, 60)
+    mount.run("sh", "-c", f"echo new > {mount.path}/APM/new.txt")
+    assert (card / "APM" / "new.txt").read_text() == "new\n"
+    assert [line for line in mount.alive().text().splitlines() if "armed" in line] == [
+        "mavftpfs: armed: nothing is written",
+        "mavftpfs: disarmed: writing again",
+    ]
+
+
+CHANGES = (
+    "open(sys.argv[1] + '/x', 'w')",
+    "open(sys.argv[1] + '/old.txt', 'a')",
+    "os.truncate(sys.argv[1] + '/old.txt', 0)",
+    "os.mkdir(sys.argv[1] + '/d')",
+    "os.unlink(sys.argv[1] + '/old.txt')",
+    "os.rename(sys.argv[1] + '/old.txt', sys.argv[1] + '/x')",
+)
+
+
+def test_when_armed_ok_writes_in_flight(field: Field) -> None:
+    card = field.local("card")
+    mount = field.mount(field.sim(card, "px4", ("--armed",)).source, "when_armed=ok")
+    mount.run(
+        "sh", "-c", f"echo hello > {mount.path}/a; mkdir {mount.path}/d; mv {mount.path}/a {mount.path}/d/"
+    )
+    assert (card / "d" / "a").read_text() == "hello\n"
+
+
+def write_to_nobody(mount: Mount, vehicle: SimVehicle, data: Path) -> None:
+    """Have a copy fail because the vehicle fell silent."""
+    mount.run("sh", "-c", f"echo confirmed > {mount.path}/confirmed")
+    vehicle.pause()
+    result = mount.run("cp", data, mount.path / "lost.bin", code=None)
+    assert result.returncode == 1
+    assert "timed out" in result.stderr or "Input/output error" in result.stderr
+    assert mount.errno_of("open(sys.argv[1], 'ab').close()", mount.path / "confirmed") in ("ETIMEDOUT", "")
+
+
+@pytest.fixture
+def data(tmp_path: Path) -> Path:
+    """A file to be written."""
+    path = tmp_path / "data.bin"
+    path.write_bytes(content("data", 150_000))
+    return path
+
+
+def recovered(text: str) -> Path:
+    """Return the directory that a message names."""
+    match = RECOVERED.search(text)
+    assert match is not None, text
+    return Path(match[1].strip())
+
+
+def test_unmounting_with_undelivered_data_keeps_it(field: Field, data: Path) -> None:
+    card = field.local("card")
+    vehicle = field.sim(card)
+    mount = field.mount(vehicle.source, *QUICK)
+    write_to_nobody(mount, vehicle, data)
+    process, mount.process = mount.alive(), None
+    process.send_signal(signal.SIGTERM)
+    wait_until("it delivers before it ends", lambda: "delivering" in process.text(), 20)
+    process.send_signal(signal.SIGTERM)
+    assert process.wait(30) == 4
+    assert not mounted_at(mount.path)
+    place = recovered(process.text())
+    assert (place / "lost.bin").read_bytes() == data.read_bytes()
+    assert place.stat().st_mode & 0o777 == 0o700
+    assert json.loads((place / "manifest.json").read_text())[0]["path"] == "/lost.bin"
+    vehicle.resume()
+    vehicle.left_alone = True
+    again = field.mount(vehicle.source, *QUICK)
+    assert "earlier mount" not in again.alive().text(), "what was recovered is not offered twice"
+    assert (card / "confirmed").read_text() == "confirmed\n"
+
+
+def test_what_the_vehicle_refuses_does_not_put_off_the_end(field: Field, data: Path) -> None:
+    card = field.local("card")
+    mount = field.mount(field.sim(card, "ardupilot5").source)
+    result = mount.run("cp", data, mount.path / "no?such*name", code=None)
+    assert (result.returncode, "Invalid argument" in result.stderr) == (1, True)
+    assert mount.errno_of("open(sys.argv[1], 'r+b').close()", mount.path / "no?such*name") == "EINVAL"
+    process, mount.process = mount.alive(), None
+    process.send_signal(signal.SIGTERM)
+    assert process.wait(30) == 4
+    assert (recovered(process.text()) / "no?such*name").read_bytes() == data.read_bytes()
+    assert process.text().count("is not delivered") == 1
+    assert list(card.iterdir()) == []
+
+
+def test_unmounting_waits_for_a_vehicle_that_comes_back(field: Field, data: Path) -> None:
+    card = field.local("card")
+    vehicle = field.sim(card)
+    mount = field.mount(vehicle.source, *QUICK)
+    write_to_nobody(mount, vehicle, data)
+    argv = [sys.executable, "-m", "mavftpfs", "umount", str(mount.path)]
+    with mount.started(*argv) as child:
+        wait_until("it delivers before it ends", lambda: "delivering" in mount.alive_or_ended().text(), 20)
+        vehicle.resume()
+        _, errors = child.communicate(timeout=60)
+    assert (child.returncode, errors) == (0, "")
+    assert (card / "lost.bin").read_bytes() == data.read_bytes()
+    assert sorted(path.name for path in card.iterdir()) == ["confirmed", "lost.bin"]
+
+
+def test_a_killed_daemon_loses_only_what_was_not_confirmed(field: Field, data: Path) -> None:
+    card = field.local("card")
+    (card / "replaced.bin").write_bytes(b"old" * 1000)
+    vehicle = field.sim(card, "px4", ("--rate", "100000"))
+    vehicle.left_alone = True
+    mount = field.mount(vehicle.source, *QUICK)
+    write_to_nobody(mount, vehicle, data)
+    vehicle.resume()
+    wait_until("heartbeats are back", lambda: readable(mount), 30)
+    code = (
+        "import os, sys, time\n"
+        "f = open(sys.argv[1], 'r+b', 0); f.truncate(0); f.write(b'n' * 300000)\n"
+        "print('written', flush=True); time.sleep(60)"
+    )
+    with mount.started(sys.executable, "-c", code, mount.path / "replaced.bin") as child:
+        assert child.stdout is not None
+        vehicle.pause()
+        process, mount.process = mount.alive(), None
+        process.kill()
+        abort_mount(mount.path)
+    vehicle.resume()
+    again = field.mount(vehicle.source, *QUICK)
+    assert (card / "confirmed").read_text() == "confirmed\n"
+    assert again.read_bytes(again.path / "replaced.bin") in (b"old" * 1000, b"n" * 300000)
+    place = recovered(again.alive().text())
+    found = {path.name: path for path in place.iterdir()}
+    assert found["lost.bin"].read_bytes() == data.read_bytes()
+    assert json.loads(found["lost.bin.json"].read_text())["path"] == "/lost.bin"
+    again.run("ls", "-A", again.path)
+    wait_until(
+        "no litter", lambda: {p.name for p in card.iterdir()} <= {"confirmed", "replaced.bin", "lost.bin"}, 20
+    )
+
+
+def readable(mount: Mount) -> bool:
+    """Return whether the vehicle answers."""
+    return mount.run("cat", mount.path / "confirmed", code=None).stdout == "confirmed\n"
+
+
+def test_the_background_parent_names_what_an_earlier_mount_left(
+    field: Field, data: Path, state_home: Path
+) -> None:
+    card = field.local("card")
+    vehicle = field.sim(card)
+    vehicle.left_alone = True
+    mount = field.mount(vehicle.source, *QUICK)
+    write_to_nobody(mount, vehicle, data)
+    process, mount.process = mount.alive(), None
+    process.kill()
+    abort_mount(mount.path)
+    vehicle.resume()
+    time.sleep(0.1)
+    argv = [sys.executable, "-m", "mavftpfs", vehicle.source, str(mount.path)]
+    try:
+        done = subprocess.run(argv, capture_output=True, text=True, timeout=60, check=False)
+        assert done.returncode == 0, done.stderr
+        place = recovered(done.stderr)
+        assert state_home in place.parents
+        assert (place / "lost.bin").read_bytes() == data.read_bytes()
+        status = json.loads(
+            mount.run(sys.executable, "-m", "mavftpfs", "status", mount.path, "--json").stdout
+        )
+        assert status["cache"]["files_undelivered"] == 0
+        mount.run(sys.executable, "-m", "mavftpfs", "umount", mount.path)
+    finally:
+        abort_mount(mount.path)
+
+
+def test_a_put_that_does_not_arrive_is_exit_4(field: Field, data: Path) -> None:
+    card = field.local("card")
+    vehicle = field.sim(card, "px4", ("--armed",))
+    argv = [sys.executable, "-m", "mavftpfs", "put", vehicle.source, str(data), "/"]
+    done = subprocess.run(argv, capture_output=True, text=True, timeout=60, check=False)
+    assert (done.returncode, done.stdout) == (4, "")
+    assert len(done.stderr.splitlines()) == 1
+    assert "armed" in done.stderr
+    assert list(card.iterdir()) == []

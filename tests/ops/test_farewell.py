@@ -1,0 +1,136 @@
+"""farewell: what is said and kept at the end of a mount, and what an earlier one left."""
+
+from __future__ import annotations
+
+import os
+import random
+import stat
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+import trio
+import trio.testing
+
+from mavftpfs import farewell
+from mavftpfs.cache.spool import SpoolDirectory
+from mavftpfs.link.messages import Address
+from tests.ops.faketree import FakeTree
+
+
+@pytest.fixture(autouse=True)
+def state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The user's state directory."""
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    return tmp_path
+
+
+class Patient(FakeTree):
+    """Delivers what is left when it is drained, if it `can`."""
+
+    can = True
+
+    async def drain(self, timeout: float) -> Sequence[bytes]:
+        await self.pause("drain")
+        if self.can:
+            self.left = []
+        return self.left
+
+
+async def end_of(tree: FakeTree) -> list[str]:
+    said: list[str] = []
+    await farewell.say_goodbye(tree, "udpin:0.0.0.0:14550", said.append)
+    return said
+
+
+async def test_a_tree_that_holds_nothing_is_left_without_a_word() -> None:
+    tree = FakeTree()
+    assert await end_of(tree) == []
+    assert tree.calls == []
+
+
+async def test_what_is_held_is_delivered_first() -> None:
+    tree = Patient(left=[b"/a"])
+    assert await end_of(tree) == []
+    assert [name for name, _ in tree.calls] == ["drain"]
+
+
+async def test_what_cannot_be_delivered_is_kept_and_said(state: Path) -> None:
+    tree = Patient(left=[b"/a", b"/b"])
+    tree.can = False
+    (line,) = await end_of(tree)
+    name, directory = tree.calls[-1]
+    assert name == "recover_to"
+    assert line == f"2 file(s) did not reach the vehicle; they are kept in {os.fsdecode(directory)}"
+    assert Path(os.fsdecode(directory)).parent == state / "mavftpfs" / "recovered"
+    assert os.fsdecode(directory).endswith("-udpin_0.0.0.0_14550")
+
+
+async def test_a_second_signal_ends_the_delivery_and_not_the_keeping() -> None:
+    tree = Patient(left=[b"/a"], delays={"drain": 1e9})
+    said: list[str] = []
+    with trio.CancelScope() as scope:
+        async with trio.open_nursery() as nursery:
+            nursery.start_soon(farewell.say_goodbye, tree, "x", said.append)
+            await trio.testing.wait_all_tasks_blocked()
+            scope.cancel()
+    assert scope.cancelled_caught
+    assert len(said) == 1
+    assert tree.calls[-1][0] == "recover_to"
+
+
+async def test_a_recovery_directory_that_cannot_be_made_is_said() -> None:
+    class Full(FakeTree):
+        def recover_to(self, directory: Path) -> Sequence[Path]:
+            raise OSError(28, "No space left on device")
+
+    (line,) = await end_of(Full(left=[b"/a"]))
+    assert "1 file(s) did not reach the vehicle" in line
+    assert "No space left" in line
+
+
+def test_without_a_sane_state_home_it_is_below_home(monkeypatch: pytest.MonkeyPatch) -> None:
+    for value in ({}, {"XDG_STATE_HOME": "relative"}):
+        assert farewell.state_directory(value) == Path.home() / ".local" / "state"
+
+
+def test_a_spool_is_private_and_by_vehicle(state: Path) -> None:
+    with farewell.spool_for(Address(1, 2)) as one, farewell.spool_for(Address(1, 2)) as two:
+        assert one is not None
+        assert two is not None
+        assert one.path != two.path
+        assert one.path.parent == two.path.parent == state / "mavftpfs" / "spool" / "1-2"
+        for path in (one.path, one.path.parent, one.path.parent.parent, state / "mavftpfs"):
+            assert stat.S_IMODE(path.stat().st_mode) == 0o700
+    with farewell.spool_for(None) as unknown:
+        assert unknown is not None
+        assert unknown.path.parent.name == "unknown"
+
+
+def test_a_user_without_a_place_for_it_has_no_spool(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_STATE_HOME", "/proc/nothing")
+    with farewell.spool_for(Address(1, 1)) as spool:
+        assert spool is None
+
+
+def test_what_a_dead_mount_left_is_named_once(state: Path) -> None:
+    base = state / "base"
+    dead = SpoolDirectory(base, random.Random(1))
+    (dead.path / "000001.data").write_bytes(b"held")
+    dead.close()
+    spool = SpoolDirectory(base, random.Random(2))
+    line = farewell.rescue(spool, "tcp:x:1")
+    assert line.startswith("1 file(s) of an earlier mount did not reach the vehicle; they are in ")
+    assert [path.read_bytes() for path in Path(line.rpartition(" in ")[2]).iterdir()] == [b"held"]
+    assert farewell.rescue(spool, "tcp:x:1") == ""
+    spool.close()
+
+
+def test_what_cannot_be_moved_is_said(state: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(self: SpoolDirectory, recovery: Path) -> list[Path]:
+        raise OSError("the disk is full")
+
+    spool = SpoolDirectory(state / "base", random.Random(1))
+    monkeypatch.setattr(SpoolDirectory, "rescue", fail)
+    assert "the disk is full" in farewell.rescue(spool, "x")
+    spool.close()
