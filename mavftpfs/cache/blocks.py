@@ -8,7 +8,8 @@ Proven and provisional bytes (promise 1). Servers share session ids between clie
 replies can carry another file. When the session layer notices that this may have happened (`on_suspect`),
 every byte that came since the current reader was opened is provisional, and so is what still comes, until
 `accept` (size and CRC32 agreed) or `drop_unproven`. Provisional bytes are never returned. Bytes returned
-before the suspicion arose cannot be taken back.
+before the suspicion arose cannot be taken back; but as long as all of them are held (`intact`), a CRC32 of
+the file still tells whether they are its bytes.
 """
 
 from __future__ import annotations
@@ -145,9 +146,11 @@ class FileBlocks:
         self._blocks: dict[int, bytearray] = {}
         self._present = ExtentSet()
         self._proven = ExtentSet()  # INVARIANT: a subset of _present
+        self._given = ExtentSet()
         self._pins: dict[int, int] = {}
         self._waiters: list[_Waiter] = []
         self._arrived = 0
+        self.intact = True
 
     def __contains__(self, index: int) -> bool:
         """Return whether the block is held."""
@@ -162,6 +165,11 @@ class FileBlocks:
     def complete(self) -> bool:
         """Whether every byte is held, none of them provisional."""
         return self._usable(0, self.size)
+
+    @property
+    def given(self) -> bool:
+        """Whether a program got any of the bytes."""
+        return not self._given.empty
 
     # --- the sink
 
@@ -218,10 +226,20 @@ class FileBlocks:
         self.suspicion = None
         self._proven = self._present.copy()
 
+    def on_given(self, start: int, stop: int) -> None:
+        """A program, or the kernel for it, got [start, stop)."""
+        self._given.add(start, stop)
+
+    def start_over(self) -> None:
+        """Forget every byte, proven or not; whoever waits starts anew."""
+        self._proven.clear()
+        self.drop_unproven()
+
     def drop_unproven(self) -> None:
         """Forget provisional bytes; whoever waits starts anew."""
         self.suspicion = None
         self._present = self._proven.copy()
+        self.intact = self.intact and all(self._present.covers(*extent) for extent in self._given)
         for index in list(self._blocks):
             if self._present.overlaps(*self._extent(index)):
                 self._blocks[index] = bytearray(self._blocks[index])  # a view of the old one may be in use
@@ -246,6 +264,7 @@ class FileBlocks:
         """Forget a block."""
         self._forget_block(index)
         start, stop = self._extent(index)
+        self.intact = self.intact and not self._given.overlaps(start, stop)
         self._present.discard(start, stop)
         self._proven.discard(start, stop)
 

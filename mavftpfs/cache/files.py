@@ -9,6 +9,13 @@ At open it is decided whether what is cached of the path is still the vehicle's 
 Old handles of a file that turned out smaller, or of the same size with another mtime, get FileChanged; of
 one that is larger they go on at the size they opened: logs grow. The kernel has one page cache for all
 handles of a path, so a new version bypasses it (direct_io) while handles of an older one are open.
+
+While a vehicle restarts its card may be written elsewhere, or be another one. A file that is open meanwhile
+is compared before more of it is given out, also what a read under way brought:
+- size and mtime are known and equal: it goes on;
+- nothing of it was given out yet: what is held is forgotten, and all is read from what is there now;
+- else, if the size is the same, the vehicle's CRC32 must be that of the bytes held and the rest; if it is
+  not, or cannot be had (armed, refused, too large), or the file is larger, old handles get FileChanged.
 """
 
 from __future__ import annotations
@@ -24,8 +31,15 @@ from mavftpfs.cache.options import MIB
 from mavftpfs.cache.readahead import Pace, Readahead
 from mavftpfs.cache.readonly import ReadOnlyHandle
 from mavftpfs.cache.remote import RemoteStore
-from mavftpfs.cache.versions import Fetcher, Version
-from mavftpfs.shared.errors import FileChanged, FileTooLarge, LocalProtocolError, NotADirectory, NotFound
+from mavftpfs.cache.versions import MAX_RESTARTS, Fetcher, Version
+from mavftpfs.shared.errors import (
+    DataUnproven,
+    FileChanged,
+    FileTooLarge,
+    LocalProtocolError,
+    NotADirectory,
+    NotFound,
+)
 from mavftpfs.shared.model import DirEntry
 
 MAX_CLOSED = 4096
@@ -183,26 +197,35 @@ class Files:
         for version in self._current.values():
             version.proven_at = float("-inf")
         for version in self._open_versions:
-            version.recheck = True
+            version.boot += 1
 
     async def recheck(self, version: Version) -> None:
-        """Compare an open version with a fresh listing.
+        """Compare an open version with what the vehicle holds, if that restarted since.
 
         Raises:
-            FileChanged. Else as RemoteStore.list_directory.
+            FileChanged: it is not provably the same. Else as RemoteStore.list_directory and crc32.
         """
         if version.recheck:
             await self._rechecking.run(version, partial(self._recheck_once, version))
         version.require_alive()
 
     async def _recheck_once(self, version: Version) -> None:
+        boot = version.boot
         try:
             entry = await self._facts(version.path)
         except (NotFound, NotADirectory):
             self._kill(version)
             return
-        version.recheck = False
         if _became_another(version, entry):
+            self._kill(version)
+        elif _is_the_same(version, entry):
+            version.proven_boot = boot
+        elif not version.blocks.given:
+            version.close_reader()
+            version.blocks.start_over()
+            version.mtime = entry.mtime if entry.size == version.size else None
+            version.proven_boot = boot
+        elif entry.size not in (None, version.size) or not await self.fetcher.prove(version):
             self._kill(version)
 
     # --- we changed the file ourselves
@@ -227,6 +250,7 @@ class Files:
         blocks = FileBlocks(self._cache, size)
         for offset, data in pieces:
             blocks.preload(offset, data)
+        blocks.on_given(0, size)
         self._replace(path, Version(path, None, blocks, self._clock(), shown=True))
 
     def on_renamed(self, old: bytes, new: bytes) -> None:
@@ -297,7 +321,17 @@ class FileHandle(ReadOnlyHandle):
         stop = min(offset + size, self.size)
         if offset >= stop:
             return b""
-        await self._files.recheck(self._version)
+        version = self._version
+        for _ in range(MAX_RESTARTS):
+            await self._files.recheck(version)
+            boot = version.boot
+            data = await self._read_range(offset, stop)
+            if boot == version.boot and not version.recheck:
+                version.blocks.on_given(offset, stop)
+                return data
+        raise DataUnproven(f"the vehicle restarts again and again while {version.path!r} is read")
+
+    async def _read_range(self, offset: int, stop: int) -> bytes | memoryview:
         if stop - offset <= self._files.piece:
             return await self._read_piece(offset, stop)
         step = self._files.piece
@@ -325,6 +359,12 @@ class FileHandle(ReadOnlyHandle):
         if version.reader is not None and plan.start < plan.stop:
             version.reader.want(plan.start, plan.stop, demand=False)
         return data
+
+
+def _is_the_same(version: Version, entry: DirEntry) -> bool:
+    """Return whether a listing after a restart shows the very file."""
+    known = entry.size is not None and entry.mtime is not None
+    return known and (entry.size, entry.mtime) == (version.size, version.mtime)
 
 
 def _became_another(version: Version, entry: DirEntry) -> bool:

@@ -23,6 +23,7 @@ from mavftpfs.shared.errors import (
     LocalProtocolError,
     MavftpfsError,
     RemoteProtocolError,
+    RequestTimeout,
 )
 
 MAX_RESTARTS = 8
@@ -39,7 +40,8 @@ class Version:
 
     mtime: None if not known to belong to this size. proven_at: when it was last known to be what the
     vehicle holds. handles: how many are open. shown: whether the kernel may hold pages of it and all of
-    them are good. recheck: the vehicle restarted since, so ask before the next read.
+    them are good. boot: how often the vehicle restarted while it was open. proven_boot: the one of these
+    after which it was proven to be the same file still.
     """
 
     path: bytes
@@ -49,13 +51,19 @@ class Version:
     reader: Reader | None = None
     handles: int = 0
     shown: bool = False
-    recheck: bool = False
+    boot: int = 0
+    proven_boot: int = 0
     dead: MavftpfsError | None = None
 
     @property
     def size(self) -> int:
         """Size in bytes by the open ACK."""
         return self.blocks.size
+
+    @property
+    def recheck(self) -> bool:
+        """Whether the vehicle restarted since it was proven, so that the file may be another one."""
+        return self.boot != self.proven_boot
 
     def require_alive(self) -> None:
         """Raise FileChanged if the file became another one."""
@@ -83,6 +91,9 @@ class Fetcher:
     4. If the new reader is suspected too, it is settled once more; a read that would have to drop bytes a
        second time ends with DataUnproven (EIO). The next read starts from the beginning.
     A time-out or a lost link while settling is the reader's error and leaves the bytes provisional.
+
+    After a restart of the vehicle the same check decides, where the listing cannot, whether the file is
+    still the one of which bytes were given out (cache.files); it decides only if all of these are held.
     """
 
     def __init__(
@@ -160,12 +171,23 @@ class Fetcher:
         version.reader = reader
         return reader
 
+    async def prove(self, version: Version) -> bool:
+        """Return whether what was given out and is held of a version is what the vehicle holds.
+
+        Raises:
+            As `fetch`.
+        """
+        return version.blocks.intact and await self._settle(version) and version.blocks.intact
+
     async def _settle(self, version: Version) -> bool:
         """Return True if every byte held is proven now, False if provisional ones were dropped."""
         return await self._settling.run(version, partial(self._settle_once, version))
 
     async def _settle_once(self, version: Version) -> bool:
+        boot, intact = version.boot, version.blocks.intact
         if await self._agrees(version):
+            if intact and version.blocks.intact:
+                version.proven_boot = boot
             version.close_reader()  # it may be under suspicion by now; nobody waits on it, all is held
             version.blocks.accept()
             version.proven_at = self._cache.clock()
@@ -183,6 +205,10 @@ class Fetcher:
             remote = await self._store.crc32(version.path)
         except (Armed, FtpNak, RemoteProtocolError):
             return False
+        except RequestTimeout:
+            if not version.recheck:
+                raise
+            return False  # after a restart nothing else can prove it, and asking takes minutes
         async with version.blocks.held(0, version.size):
             reader = await self.reader(version)
             await version.blocks.fill(0, version.size, partial(_want, reader, NOTHING))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import random
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 
 import pytest
 import trio
@@ -549,6 +549,183 @@ async def test_closing_after_a_reboot_forgets_the_file(
     tree.rebooted()
     handle.close()
     assert tree.status()["bytes_cached"] == 0
+
+
+OTHER = content(300_000, seed=8)
+AT = 100_000
+"""Up to here a program has read when the vehicle restarts."""
+
+
+async def over_a_reboot(store: FakeStore, tree: Tree, change: Callable[[], None]) -> bytes:
+    """Read on over a restart in mid-read, after which `change` was made; return what came after AT."""
+    handle = await tree.open(LOG)
+    assert await handle.read(0, AT) == DATA[:AT]
+    parts = []
+
+    async def read_on() -> None:
+        parts.extend([bytes(await handle.read(at, 10_000)) for at in range(AT, handle.size, 10_000)])
+
+    try:
+        store.chunk_delay, store.chunk = 0.5, 4 * KIB
+        async with trio.open_nursery() as readers:
+            readers.start_soon(read_on)
+            await trio.sleep(0.7)
+            change()
+            await trio.sleep(2)
+            tree.rebooted()
+    finally:
+        handle.close()
+    return b"".join(parts)
+
+
+@pytest.mark.parametrize(
+    ("mtime", "other", "later"),
+    [
+        (None, OTHER, None),
+        (None, OTHER + content(60_000), None),
+        (5, OTHER + content(60_000), 6),
+        (None, OTHER, 6),
+        (5, OTHER, None),
+        (None, DATA + b"more", None),
+    ],
+)
+async def test_two_files_are_not_mixed_over_a_reboot(
+    store: FakeStore,
+    tree: Tree,
+    autojump_clock: MockClock,
+    mtime: int | None,
+    other: bytes,
+    later: int | None,
+) -> None:
+    store.add(LOG, DATA, mtime)
+
+    def replace() -> None:
+        store.add(LOG, other, later)
+
+    with pytest.RaisesGroup(FileChanged):
+        await over_a_reboot(store, tree, replace)
+    assert LOG in store.invalidated
+    assert await read_file(tree, LOG) == other
+
+
+async def test_the_same_file_without_a_time_is_proven_after_a_reboot(
+    store: FakeStore, tree: Tree, autojump_clock: MockClock
+) -> None:
+    store.add(LOG, DATA)
+    assert await over_a_reboot(store, tree, store.calls.clear) == DATA[AT:]
+    assert store.count("crc") == 1
+    assert store.count("list") == 2
+    assert store.count("open") == 1
+
+
+@pytest.mark.parametrize("why", ["armed", "refused", "silent", "too large", "evicted", "dropped"])
+async def test_what_cannot_be_proven_after_a_reboot_ends(
+    store: FakeStore, autojump_clock: MockClock, why: str
+) -> None:
+    tree = make_tree(store, cache_size=MIB)
+    data = DATA + content(MIB) if why == "too large" else DATA
+    store.add(LOG, data)
+    store.add(b"/big", content(2 * MIB))
+    handle = await tree.open(LOG)
+    await handle.read(0, AT)
+    if why == "armed":
+        store.armed = True
+    elif why == "refused":
+        store.fail["crc", LOG] = [FtpNak(Opcode.CALC_FILE_CRC32, 7)]
+    elif why == "silent":
+        store.fail["crc", LOG] = [RequestTimeout("no answer")]
+    elif why == "evicted":
+        await read_file(tree, b"/big")
+        await handle.read(0, AT)
+    elif why == "dropped":
+        store.armed = True
+        store.readers[0].sink.on_suspect("another client")
+        await handle.read(AT, 1000)
+        await handle.read(0, AT)
+        store.armed = False
+    tree.rebooted()
+    for _ in range(2):
+        with pytest.raises(FileChanged):
+            await handle.read(200_000, 1000)
+    handle.close()
+    store.armed = False
+    assert await read_file(tree, LOG) == data
+
+
+async def test_a_file_of_which_nothing_was_read_is_read_from_what_is_there_after_a_reboot(
+    store: FakeStore, tree: Tree, autojump_clock: MockClock
+) -> None:
+    store.add(LOG, DATA)
+    handle = await tree.open(LOG)
+    store.chunk_delay, store.chunk = 0.5, 4 * KIB
+    got = []
+
+    async def read() -> None:
+        got.append(bytes(await handle.read(0, 20_000)))
+
+    async with trio.open_nursery() as readers:
+        readers.start_soon(read)
+        await trio.sleep(1.2)
+        store.add(LOG, OTHER + b"more")
+        tree.rebooted()
+    assert got == [OTHER[:20_000]]
+    assert await handle.read(20_000, 300_000) == OTHER[20_000:]
+    assert store.count("crc") == 0
+    handle.close()
+
+
+async def test_what_the_kernel_may_hold_of_a_file_we_wrote_counts_as_read(
+    store: FakeStore, tree: Tree, autojump_clock: MockClock
+) -> None:
+    store.add(LOG, DATA)
+    tree._files.adopt(LOG, len(DATA), [(0, DATA)])
+    handle = await tree.open(LOG)
+    store.add(LOG, OTHER)
+    tree.rebooted()
+    with pytest.raises(FileChanged):
+        await handle.read(0, 100)
+    handle.close()
+
+
+@pytest.mark.parametrize("changed", [False, True])
+async def test_a_reboot_while_the_one_before_is_looked_into(
+    store: FakeStore, tree: Tree, autojump_clock: MockClock, changed: bool
+) -> None:
+    store.add(LOG, DATA)
+    store.crc_delay = 5
+    handle = await tree.open(LOG)
+    await handle.read(0, AT)
+    tree.rebooted()
+    got = []
+
+    async def read() -> None:
+        try:
+            got.append(bytes(await handle.read(AT, 1000)))
+        except FileChanged:
+            got.append(b"")
+
+    async with trio.open_nursery() as readers:
+        readers.start_soon(read)
+        await trio.sleep(3)
+        if changed:
+            store.add(LOG, OTHER)
+        tree.rebooted()
+    assert got == [b"" if changed else DATA[AT : AT + 1000]]
+    assert store.count("crc") == (1 if changed else 2)
+    handle.close()
+
+
+async def test_a_vehicle_that_restarts_at_every_read_gives_an_error(
+    store: FakeStore, tree: Tree, autojump_clock: MockClock
+) -> None:
+    handle = await tree.open(LOG)
+    store.during_list = lambda path: tree.rebooted()
+    tree.rebooted()
+    with pytest.raises((DataUnproven, VehicleLost)):
+        await handle.read(0, 100)
+    store.during_list = None
+    assert await handle.read(0, 100) == DATA[:100]
+    handle.close()
 
 
 # --- doubtful bytes (promise 1)
