@@ -223,11 +223,8 @@ class SpoolContent:
     def close(self) -> None:
         """The vehicle has it: forget the bytes."""
         self.cut(0)
-        if self._file is not None and self._path is not None:
-            os.close(self._file)
-            self._file = None
-            self._path.unlink(missing_ok=True)
-            self._path.with_suffix(".json").unlink(missing_ok=True)
+        if self._file is not None:
+            self._drop_file()
 
     # --- inside
 
@@ -257,10 +254,23 @@ class SpoolContent:
         except OSError as exc:
             raise NoSpace(f"no local file for what waits for the vehicle: {exc}") from exc
         self._path = path
-        pages, self._pages = self._pages, {}
-        self._spool.in_memory -= len(pages) * PAGE
-        for index, page in pages.items():
-            self._put_file(index * PAGE, page)
+        try:
+            for index, page in self._pages.items():
+                self._put_file(index * PAGE, page)
+        except NoSpace:  # nothing may leave memory before all of it is on disk
+            self._drop_file()
+            raise
+        self._spool.in_memory -= len(self._pages) * PAGE
+        self._pages = {}
+
+    def _drop_file(self) -> None:
+        assert self._file is not None
+        assert self._path is not None
+        self._count_stored(0, self._stored.end, present=False)
+        os.close(self._file)
+        self._file = None
+        self._path.unlink(missing_ok=True)
+        self._path.with_suffix(".json").unlink(missing_ok=True)
 
     def _put_file(self, offset: int, data: bytes | bytearray | memoryview) -> None:
         assert self._file is not None

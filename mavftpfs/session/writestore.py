@@ -75,6 +75,8 @@ class WriteStore:
         """See cache.remote.WriteStore. A file whose size is the wanted one already counts as done."""
         wire = wire_path(path)
         traits = self.traits
+        if traits.truncate_works is None and path.startswith(b"/fs/"):
+            traits.truncate_works = False  # PX4 on NuttX: its copy-back can destroy the file
         if traits.truncate_works is False:
             raise FtpNak(Opcode.TRUNCATE_FILE, NakCode.UNKNOWN_COMMAND)
 
@@ -101,7 +103,7 @@ class WriteStore:
             if traits.truncate_works is None and await self._is_listed(path):
                 traits.truncate_works = False
             raise
-        if traits.truncate_works is None and not path.startswith(b"/fs/"):
+        if traits.truncate_works is None:
             traits.truncate_works = True
 
     async def probe_open_for_write(self, directory: bytes) -> None:

@@ -290,6 +290,16 @@ async def test_a_server_without_truncate_is_known_afterwards(profile: str, autoj
         assert len(faults.requests) == count
 
 
+async def test_a_file_is_never_cut_where_that_can_destroy_it(autojump: MockClock) -> None:
+    here = world("px4-nuttx", file=b"content")
+    faults = Faults(here)
+    async with here.connection() as connection:
+        with pytest.raises(FtpNak):
+            await connection.store.truncate(path("px4-nuttx", "file"), 3)
+        assert connection.store.traits.truncate_works is False
+    assert Opcode.TRUNCATE_FILE not in faults.requests
+
+
 async def test_a_tiny_checksum_is_asked_for_again_soon(autojump: MockClock) -> None:
     here = world("px4", file=b"content")
     faults = Faults(here)

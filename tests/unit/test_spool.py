@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 from pathlib import Path
@@ -51,6 +52,33 @@ def test_a_full_spool_takes_nothing_and_loses_nothing(tmp_path: Path) -> None:
     content.cut(100)
     assert spool.on_disk == 100
     content.put(100, bytes(900))
+
+
+def test_a_disk_that_fills_up_on_the_way_leaves_the_bytes_in_memory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    spool = spool_of(tmp_path)
+    content = spool.content()
+    data = bytes(range(256)) * 1024
+    content.put(0, data)
+    really, calls = os.pwrite, iter(range(100))
+
+    def pwrite(descriptor: int, piece: bytes, offset: int) -> int:
+        if next(calls) > 0:
+            raise OSError(errno.ENOSPC, "full")
+        return really(descriptor, piece, offset)
+
+    monkeypatch.setattr(os, "pwrite", pwrite)
+    with pytest.raises(NoSpace):
+        content.put(len(data), b"more")
+    with pytest.raises(NoSpace):
+        content.persist({"size": len(data)})
+    assert content.get(0, len(data)) == data
+    assert (spool.in_memory, spool.on_disk) == (4 * PAGE, 0)
+    assert list(tmp_path.iterdir()) == []
+    monkeypatch.undo()
+    content.put(len(data), b"more")
+    assert content.get(0, len(data) + 4) == data + b"more"
 
 
 def test_no_directory_means_one_that_does_not_stay(tmp_path: Path) -> None:

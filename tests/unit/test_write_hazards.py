@@ -1,0 +1,125 @@
+"""Rare coincidences that once lost or mixed up bytes: each test is one of them."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator
+from random import Random
+
+import pytest
+import trio
+
+from mavftpfs.cache.asides import Group, Kind, repair
+from mavftpfs.cache.tree import Tree
+from mavftpfs.protocol.payload import NakCode, Opcode
+from mavftpfs.shared.errors import FileChanged, FtpNak
+from tests.support.fake_writer import KINDS, FakeWriter, make_writable, write_file
+from tests.unit.test_draft import draft_over
+
+OLD = bytes(range(256)) * 4
+FILE = b"/card/dir/file.txt"
+FULL = FtpNak(Opcode.CREATE_FILE, NakCode.FAIL_ERRNO, 28)
+
+
+@pytest.fixture
+async def store(nursery: trio.Nursery, autojump_clock: object) -> AsyncIterator[FakeWriter]:
+    store = FakeWriter(KINDS["posix"], nursery)
+    store.add(FILE, OLD)
+    yield store
+    assert store.crimes == []
+    nursery.cancel_scope.cancel()
+
+
+@pytest.fixture
+def tree(store: FakeWriter) -> Tree:
+    return make_writable(store)
+
+
+async def test_who_has_a_replaced_file_open_never_reads_its_successor(store: FakeWriter, tree: Tree) -> None:
+    store.add(b"/card/dir/other", b"Z" * len(OLD))
+    file = await tree.open(FILE, write=True)
+    await file.write(0, b"ours")
+    await file.flush()
+    await tree.rename(b"/card/dir/other", FILE)
+    assert bytes(await file.read(0, 4)) == b"ours"
+    with pytest.raises(FileChanged):
+        await file.read(0, len(OLD))
+    file.close()
+
+
+def test_bytes_written_after_a_cut_do_not_overtake_those_cut_off_in_flight() -> None:
+    draft = draft_over(None)
+    draft.write(0, b"o" * 400)
+    sending = draft.begin(whole=True)
+    assert [chunk and chunk[0] for chunk in (sending.next_chunk(200), sending.next_chunk(200))] == [0, 200]
+    draft.truncate(250)
+    draft.write(250, b"n" * 150)
+    assert sending.next_chunk(200) is None, "two copies under way could land in the wrong order"
+    sending.on_acked(200, 200)
+    assert sending.next_chunk(200) == (250, b"n" * 150)
+    sending.on_acked(0, 200)
+    sending.on_acked(250, 150)
+    assert sending.unacked == 0
+
+
+def test_bytes_written_after_a_cut_go_out_once_the_older_ones_are_given_up() -> None:
+    for lost in (True, False):
+        draft = draft_over(None)
+        draft.write(0, b"o" * 100)
+        sending = draft.begin(whole=True)
+        sending.next_chunk(100)
+        draft.truncate(0)
+        draft.write(0, b"n" * 100)
+        if lost:
+            sending.on_rollback(everything=True)
+        else:
+            sending.on_unsent(0, 100)
+        assert sending.next_chunk(100) == (0, b"n" * 100)
+
+
+def test_what_was_on_its_way_is_not_replaced_by_the_old_file() -> None:
+    parts = {Kind.MOVED: b"/d/m", Kind.OLD: b"/d/o", Kind.SIDECAR: b"/d/p"}
+    actions = repair(Group(parts, b"sss", b"/d/x/target"), target_exists=False)
+    assert [(a.path, a.to) for a in actions] == [
+        (b"/d/m", b"/d/x/target"),
+        (b"/d/o", None),
+        (b"/d/p", None),
+    ]
+
+
+async def test_a_file_that_could_not_be_made_can_be_removed(store: FakeWriter, tree: Tree) -> None:
+    file = await tree.create(b"/card/dir/new", exclusive=True)
+    await file.write(0, b"abc")
+    store.fail_at = {1: FULL, 2: FULL}
+    with pytest.raises(FtpNak):
+        await file.flush()
+    with pytest.raises(FtpNak):
+        await file.release()
+    await tree.unlink(b"/card/dir/new")
+    assert tree.undelivered() == []
+    assert b"new" not in [name for name, _ in await tree.list(b"/card/dir")]
+
+
+async def test_a_file_renamed_while_it_is_closed_is_forgotten(
+    autojump_clock: object, store: FakeWriter, tree: Tree
+) -> None:
+    store.write_delay = 0.01
+    file = await tree.create(b"/card/dir/a", exclusive=True)
+    await file.write(0, b"ours")
+    async with trio.open_nursery() as nursery:
+        nursery.start_soon(file.release)
+        await trio.sleep(0.005)
+        nursery.start_soon(lambda: tree.rename(b"/card/dir/a", b"/card/dir/b"))
+    assert tree.status()["bytes_held"] == 0
+    store.add(b"/card/dir/b", b"theirs, longer")
+    await trio.sleep(100)
+    assert (await tree.stat(b"/card/dir/b")).size == len(b"theirs, longer")
+
+
+async def test_an_unlinked_file_made_anew_is_another_one(store: FakeWriter, tree: Tree) -> None:
+    store.kind = KINDS["littlefs"]  # nothing can be hidden by renaming
+    file = await tree.open(FILE)
+    await tree.unlink(FILE)
+    await write_file(tree, FILE, bytes(Random(1).randbytes(len(OLD))))
+    with pytest.raises(FileChanged):
+        await file.read(0, len(OLD))
+    file.close()
