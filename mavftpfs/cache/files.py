@@ -119,6 +119,8 @@ class Files:
     ) -> tuple[Version, bool]:
         """Return the version to serve, and whether it is the one that was served before."""
         version = self._current.get(path)
+        if version is not None and not version.handles:
+            self._drop_doubtful(version)
         if version is not None and self._still_right(version, entry, listed_at, fresh):
             self._current.move_to_end(path)
             return version, True
@@ -191,6 +193,12 @@ class Files:
         """Bytes of it were dropped as doubtful: the kernel may hold copies."""
         version.shown = False
         self._invalidate(version.path)
+
+    def _drop_doubtful(self, version: Version) -> None:
+        """Nobody has it open who could settle a suspicion."""
+        if version.blocks.suspicion is not None:
+            version.blocks.drop_unproven()
+            self._distrust(version)
 
     def rebooted(self) -> None:
         """Nothing is proven any more; open files are compared with a listing before their next read."""
@@ -279,9 +287,7 @@ class Files:
         del self._open_versions[version]
         version.close_reader()
         version.blocks.on_failed(LocalProtocolError(f"{version.path!r} was closed while it was read"))
-        if version.blocks.suspicion is not None:
-            version.blocks.drop_unproven()
-            self._distrust(version)
+        self._drop_doubtful(version)
         if self._current.get(version.path) is not version:
             version.blocks.clear()
         elif version.dead is not None or version.recheck:

@@ -28,7 +28,8 @@ class ReadSink(Protocol):
 
     def on_suspect(self, reason: str) -> None:
         """A session anomaly or a foreign FTP client was noticed while this file was read: all bytes
-        that came since the reader was opened are provisional (promise 1)."""
+        that came since the reader was opened are provisional (promise 1). This alone may be heard of a
+        reader that was closed, for some seconds: a rival is noticed late."""
         ...
 
     def on_failed(self, error: Exception) -> None:
@@ -70,7 +71,7 @@ class RemoteStore(Protocol):
 
     async def open_reader(self, path: bytes, sink: ReadSink, *, expected_size: int | None = None) -> Reader:
         """Open a regular file that is known to be one; `expected_size` avoids the open where it is already
-        the current one. The sink is called from the session's tasks until Reader.close.
+        the current one. The sink is called from the session's tasks until Reader.close (see on_suspect).
 
         Raises:
             FtpNak, RequestTimeout, VehicleLost, SessionBusy, PathTooLong.

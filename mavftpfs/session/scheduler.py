@@ -6,6 +6,7 @@ wake it. Metadata requests do not need the session: they run beside it and carry
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Awaitable, Callable
 from contextlib import AbstractAsyncContextManager
 from itertools import count
@@ -36,6 +37,10 @@ from mavftpfs.shared.traits import WriteTraits
 IDLE_CLOSE = 1.5
 """Seconds a file stays open on the server without being read. Below the 2 s after which PX4 frees its
 buffers and the 3 s after which ArduPilot gives the session away: so a session is never doubtful."""
+
+SUSPECT_WITHIN = 10.0
+"""Seconds before another FTP client is heard in which it may have been at work already: servers answer it
+on its own link, and a router may pass on only some of that."""
 
 _DOUBT_RETRY = 5.0
 _User = SessionJob | FileStream | QueuedUpload
@@ -75,6 +80,7 @@ class Scheduler:
         self._used_at = clock()
         self._tickets = count(1)
         self._streams: set[FileStream] = set()
+        self._closed: deque[FileStream] = deque()  # for as long as their bytes may yet come under suspicion
         self._jobs: list[SessionJob] = []
         kit = Kit(self._holder, driver, engine, vehicle, self.gate, clock)
         self._reading = Reading(kit, self, steering)
@@ -219,12 +225,20 @@ class Scheduler:
         self._reading.on_batch(now)
         self._uploading.writer.on_batch()
 
-    def on_suspect(self, reason: str, within: float = 10.0) -> None:
-        """Another FTP client was heard: what was read lately is provisional."""
-        now = self._clock()
-        for stream in self._streams:
-            if stream is self._reading.active or (stream.last_data_at or -1e9) > now - within:
+    def on_suspect(self, reason: str) -> None:
+        """Another FTP client was heard: what was read lately is provisional, also of files closed since."""
+        self._forget_closed()
+        for stream in [*self._streams, *self._closed]:
+            if stream is self._reading.active or self._is_recent(stream):
                 stream.on_suspect(reason)
+
+    def _is_recent(self, stream: FileStream) -> bool:
+        return stream.last_data_at is not None and stream.last_data_at > self._clock() - SUSPECT_WITHIN
+
+    def _forget_closed(self) -> None:
+        """Forget the oldest of the closed streams, whose bytes are beyond suspicion."""
+        while self._closed and not self._is_recent(self._closed[0]):
+            self._closed.popleft()
 
     def on_reboot(self) -> None:
         """The vehicle restarted, perhaps as another one: nothing is open, nothing is known of it."""
@@ -276,10 +290,17 @@ class Scheduler:
 
     def _on_want(self, stream: FileStream) -> None:
         if stream.closed:
-            self._streams.discard(stream)
+            self._on_closed(stream)
         elif stream.ticket is None:
             self._take_ticket(stream)
         self._holder.wake()
+
+    def _on_closed(self, stream: FileStream) -> None:
+        self._forget_closed()
+        if stream in self._streams:
+            self._streams.remove(stream)
+            if self._is_recent(stream):
+                self._closed.append(stream)
 
     def _take_ticket(self, stream: FileStream) -> None:
         if stream.has_demand:

@@ -139,9 +139,8 @@ class FileStream:
             self._sink.on_batch()
 
     def on_suspect(self, reason: str) -> None:
-        """What was read lately is provisional."""
-        if not self.closed:
-            self._sink.on_suspect(reason)
+        """What was read lately is provisional, even if it was closed since."""
+        self._sink.on_suspect(reason)
 
     def detach(self) -> None:
         """Take back what the transfer did not deliver."""

@@ -177,6 +177,32 @@ async def test_what_is_read_meanwhile_is_under_suspicion(trouble: str, autojump:
         assert sink.suspicions != []
 
 
+@pytest.mark.parametrize(("pause", "doubted"), [(2.0, True), (11.0, False)])
+async def test_what_was_read_shortly_before_is_under_suspicion_though_closed(
+    pause: float, doubted: bool, autojump: MockClock
+) -> None:
+    here = World("px4", LinkSettings(delay=0.02))
+    here.tree.add(b"/f", b"hello")
+    async with here.connection() as connection:
+        sink = MemorySink(5)
+        reader = await connection.store.open_reader(b"/f", sink)
+        reader.want(0, 5, demand=True)
+        await sink.wait_for(0, 5)
+        reader.close()
+        await trio.sleep(pause)
+        here.vehicle.foreign_request(
+            request(777, Opcode.NONE).encode(), Address(255, 190), trio.current_time()
+        )
+        here.link.kick()
+        await trio.sleep(0.5)
+        assert connection.vehicle.foreign_at is not None
+        assert bool(sink.suspicions) is doubted
+        await trio.sleep(11)
+        connection.scheduler.on_suspect("once more")
+        assert len(sink.suspicions) <= 2  # it was heard twice: question and answer
+        assert not connection.scheduler._closed
+
+
 async def test_times_that_could_not_be_asked_for_are_not_refused(autojump: MockClock) -> None:
     """While a stale session is waited out nobody may speak: that is our silence, not the server's."""
     here = World("ardupilot5", LinkSettings(delay=0.02))

@@ -913,6 +913,22 @@ async def test_doubtful_bytes_do_not_survive_the_last_close(
     assert store.count("crc") == 0
 
 
+async def test_a_suspicion_after_the_last_close_counts(
+    store: FakeStore, tree: Tree, autojump_clock: MockClock
+) -> None:
+    handle = await tree.open(LOG)
+    await handle.read(0, 100)
+    handle.close()
+    for reader in store.readers:
+        reader.sink.on_suspect("another client")
+    handle = await tree.open(LOG)
+    assert not handle.keep_cache
+    assert store.invalidated == [LOG]
+    assert await handle.read(0, 100) == DATA[:100]
+    assert store.count("open") == 2
+    handle.close()
+
+
 @pytest.mark.parametrize("delay", [0.0, 0.002])
 async def test_closing_the_last_handle_under_a_read_ends_it(
     store: FakeStore, tree: Tree, autojump_clock: MockClock, delay: float

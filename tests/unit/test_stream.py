@@ -36,13 +36,18 @@ def test_only_what_the_cache_lacks_is_wanted() -> None:
     assert stream.contiguous_want() == 100
 
 
-def test_a_closed_stream_passes_nothing_on() -> None:
+def test_a_suspicion_reaches_what_a_closed_stream_brought() -> None:
+    stream, sink = make()
+    stream.close()
+    stream.on_suspect("late")
+    assert sink.suspicions == ["late"]
+
+
+def test_a_closed_stream_passes_no_data_on() -> None:
     stream, sink = make()
     stream.want(0, 100, demand=True)
     stream.close()
     stream.on_data(0, bytes(100))
-    stream.on_suspect("late")
     stream.want(0, 100, demand=True)
     assert sink.have.empty
-    assert not sink.suspicions
     assert not stream.has_demand
