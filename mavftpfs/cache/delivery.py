@@ -24,6 +24,7 @@ from mavftpfs.cache.throttle import Throttle
 from mavftpfs.cache.verify import Verifier
 from mavftpfs.shared.errors import (
     Armed,
+    FileChanged,
     LinkError,
     MavftpfsError,
     NoSpace,
@@ -192,6 +193,8 @@ class Deliverer:
         if attempt is not None and _still_fits(attempt, plan, draft):
             return attempt
         await self.abandon(node)
+        if not draft.fresh:
+            await self._require_base(node.path, draft)
         path, places = node.path, None
         if plan is Plan.REPLACE:
             places = self._context.namer.places(node.path)
@@ -217,6 +220,14 @@ class Deliverer:
             raise
         node.attempt = Attempt(plan, path, sending, upload, places)
         return node.attempt
+
+    async def _require_base(self, path: bytes, draft: Draft) -> None:
+        """Raise FileChanged if a file of which a part is to stay grew or shrank on the vehicle."""
+        size, most = await self.verifier.size(path), draft.remote_end
+        if most is not None and not draft.base_limit <= size <= most:
+            raise FileChanged(
+                f"{path!r} has {size} bytes on the vehicle now, {most} when it was changed here"
+            )
 
     async def _finish(self, attempt: Attempt) -> None:
         for _ in range(FINISHES):

@@ -39,7 +39,7 @@ class Verifier:
         """
         if self._context.options.verify == "none":
             return
-        size = await self._size(path)
+        size = await self.size(path)
         if size != draft.size:
             raise VerificationFailed(f"{path!r} has {size} bytes on the vehicle, {draft.size} were written")
         if await self._crc_agrees(path, draft):
@@ -47,7 +47,12 @@ class Verifier:
         else:
             self.by_size += 1
 
-    async def _size(self, path: bytes) -> int:
+    async def size(self, path: bytes) -> int:
+        """Return the size of a file on the vehicle, asked just now, whichever way is cheaper.
+
+        Raises:
+            As WriteStore.stat_size.
+        """
         known = self._context.dentries.known(split(path)[0])
         if known is not None and len(known.entries) <= SMALL_LISTING:
             entry = await self._sure.entry(path)

@@ -212,6 +212,8 @@ class Writeback:
         while True:
             self._context.require_disarmed()
             await node.quiet.wait()
+            if not node.quiet.is_set():
+                continue  # the next delivery began while we woke up
             if not self._throttle.is_full(node):
                 return
             if await self._throttle.wait():

@@ -154,7 +154,7 @@ class WriteFile(_Reading):
             Why it is not delivered.
         """
         draft = self._node.draft
-        if draft is not None and draft.size > 0:
+        if draft is not None and (draft.size > 0 or self._node.error is not None):
             await self._owner.deliver(self._node)
 
     async def fsync(self) -> None:

@@ -123,3 +123,48 @@ async def test_an_unlinked_file_made_anew_is_another_one(store: FakeWriter, tree
     with pytest.raises(FileChanged):
         await file.read(0, len(OLD))
     file.close()
+
+
+async def test_a_write_in_the_moment_a_delivery_begins_is_not_forgotten(
+    store: FakeWriter, tree: Tree
+) -> None:
+    file = await tree.open(FILE, write=True)
+    for number in range(30):  # which of the two comes first is left to chance
+        mark = b"%04d" % number
+        await file.truncate(900 - number)
+        async with trio.open_nursery() as nursery:
+            nursery.start_soon(file.flush)
+            nursery.start_soon(file.write, 10, mark)
+        await file.flush()
+        assert store.files[FILE].data[10:14] == mark
+    file.close()
+
+
+@pytest.mark.parametrize("truncating", [False, True])
+@pytest.mark.parametrize("now", [OLD + b"grown on the vehicle", OLD[:10]])
+async def test_a_part_is_not_written_into_a_file_that_changed(
+    store: FakeWriter, tree: Tree, now: bytes, truncating: bool
+) -> None:
+    store.kind = KINDS["mavsdk" if truncating else "posix"]
+    file = await tree.open(FILE, write=True)
+    await file.read(0, len(OLD))
+    await file.write(len(OLD), b"appended")
+    store.add(FILE, now)
+    for _ in range(2):
+        with pytest.raises(FileChanged):
+            await file.flush()
+    file.close()
+    assert store.files[FILE].data == now
+    assert tree.undelivered() == [FILE]
+
+
+async def test_an_error_of_an_empty_file_is_told_at_the_close_too(store: FakeWriter, tree: Tree) -> None:
+    file = await tree.create(b"/card/dir/empty", exclusive=True)
+    store.fail_at = {1: FULL, 2: FULL}
+    with pytest.raises(FtpNak):
+        await file.fsync()
+    with pytest.raises(FtpNak):
+        await file.flush()
+    await file.flush()
+    assert store.files[b"/card/dir/empty"].data == b""
+    file.close()
