@@ -32,6 +32,9 @@ PAGE = 64 * 1024
 SLOTS = 64
 """Mounts of one vehicle by one user at the same time."""
 
+TOKENS = 256
+"""Mounts one after the other whose leftovers on the vehicle are known for ours."""
+
 
 class SpoolDirectory:
     """A directory on disk that one mount at a time uses; `owner` marks the mount's names on the vehicle.
@@ -53,8 +56,8 @@ class SpoolDirectory:
         if not free:
             raise OSError(f"all {SLOTS} slots of {base} are in use")
         self.path = free[0]
-        self.owner = self._token(self.path, rng)
-        self.dead_owners = frozenset(self._token(slot, rng) for slot in free)
+        self.dead_owners = frozenset(token for slot in free for token in self._tokens(slot))
+        self.owner = self._new_token(self.path, rng)
         self._abandoned = free
 
     def rescue(self, recovery: Path) -> list[Path]:
@@ -93,13 +96,17 @@ class SpoolDirectory:
     def _unlock(self, slot: Path) -> None:
         os.close(self._locks.pop(slot))
 
-    def _token(self, slot: Path, rng: Random) -> bytes:
-        """Return the slot's token, made at its first use."""
-        descriptor = self._locks[slot]
-        token = os.pread(descriptor, 16, 0).strip()
-        if not token:
+    def _tokens(self, slot: Path) -> list[bytes]:
+        """Return the tokens of the slot's mounts, the latest first."""
+        return os.pread(self._locks[slot], 8 * TOKENS, 0).split()
+
+    def _new_token(self, slot: Path, rng: Random) -> bytes:
+        """Each mount has its own: other mounts that began before know the older ones for dead."""
+        token = new_owner(rng)
+        while token in self.dead_owners:
             token = new_owner(rng)
-            os.pwrite(descriptor, token, 0)
+        kept = [token, *self._tokens(slot)][:TOKENS]
+        os.pwrite(self._locks[slot], b"\n".join(kept) + b"\n", 0)
         return token
 
 

@@ -108,7 +108,7 @@ def test_what_a_killed_mount_left_is_moved_to_recovery(tmp_path: Path) -> None:
     claimed.close()  # as the kernel does for a killed process
 
     again = SpoolDirectory(tmp_path / "spool", Random(2))
-    assert again.owner == claimed.owner
+    assert again.owner not in again.dead_owners
     assert claimed.owner in again.dead_owners
     saved = again.rescue(tmp_path / "recovered")
     assert [path.name for path in saved] == ["card__a__b.txt"]
@@ -145,6 +145,24 @@ def test_two_mounts_do_not_share_and_a_live_one_is_left_alone(tmp_path: Path) ->
     third = SpoolDirectory(tmp_path, Random(3))
     assert third.path == first.path
     assert {path.read_bytes() for path in third.rescue(tmp_path / "r")} == {b"live", b"dead"}
+    third.close()
+
+
+def test_who_takes_a_slot_that_another_mount_knows_for_dead_is_alive(tmp_path: Path) -> None:
+    early = [SpoolDirectory(tmp_path, Random(n)) for n in (1, 2)]
+    for each in early:
+        each.close()
+    first = SpoolDirectory(tmp_path, Random(3))
+    assert {each.owner for each in early} <= first.dead_owners
+    first.rescue(tmp_path / "r")
+    second = SpoolDirectory(tmp_path, Random(2))
+    assert second.path == early[1].path
+    assert second.owner not in first.dead_owners
+    assert first.owner not in second.dead_owners
+    for each in (first, second):
+        each.close()
+    third = SpoolDirectory(tmp_path, Random(4))
+    assert {each.owner for each in (*early, first, second)} <= third.dead_owners
     third.close()
 
 
