@@ -119,8 +119,12 @@ class Cleaner:
         """Return the target a sidecar names, None if it does not name one below its directory."""
         try:
             handle = await open_base(self._context, path)
-        except (FtpNak, NotFound):
+        except NotFound:
             return None
+        except FtpNak as nak:
+            if errno_for(nak) == errno.ENOENT:
+                return None
+            raise  # it may say something another time; without it the only copy could count as litter
         try:
             text = bytes(await handle.read(0, min(handle.size, RENAME_ROOM)))
             plausible = normalise(text) == text and text.startswith(join(directory, b""))

@@ -140,7 +140,8 @@ class Writeback:
             if entry.kind is not EntryKind.FILE:
                 raise IsADirectory(f"{path!r} is a directory")
             if truncate:
-                size = entry.size if entry.size is not None else await context.files.learn_size(path)
+                # A size of 0 would mean that there is nothing to do: it has to be true, not remembered.
+                size = entry.size or await context.files.learn_size(path)
             else:
                 base = await open_base(context, path)  # its ACK tells the size better than a listing
                 size = base.size
@@ -283,10 +284,16 @@ class Writeback:
 
     async def _forget_draft(self, node: Node) -> None:
         """What was to be written is not wanted any more, since its caller got an error."""
+        made = node.draft is not None and node.draft.remote_size is None
         async with node.lock:
             await self._deliverer.abandon(node)
             node.drop_draft()
         self._context.nodes.maybe_forget(node)
+        if made:
+            try:
+                await self._namespace.remove_perhaps(node.path)
+            except MavftpfsError as error:
+                log.info("a part of %r may have stayed on the vehicle: %s", node.path, error)
 
     # --- the mount's life
 

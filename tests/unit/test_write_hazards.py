@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import errno
 from collections.abc import AsyncIterator
 from random import Random
 
 import pytest
 import trio
 
-from mavftpfs.cache.asides import Group, Kind, repair
+from mavftpfs.cache.asides import STALE_AFTER, Group, Kind, Reserved, repair
 from mavftpfs.cache.tree import Tree
 from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.shared.errors import FileChanged, FtpNak
+from tests.support.fake_store import FakeReader
 from tests.support.fake_writer import KINDS, FakeWriter, make_writable, write_file
 from tests.unit.test_draft import draft_over
 
@@ -168,3 +170,36 @@ async def test_an_error_of_an_empty_file_is_told_at_the_close_too(store: FakeWri
     await file.flush()
     assert store.files[b"/card/dir/empty"].data == b""
     file.close()
+
+
+async def test_emptying_does_not_trust_a_remembered_size_of_nothing(store: FakeWriter, tree: Tree) -> None:
+    store.add(b"/card/dir/log", b"")
+    await tree.stat(b"/card/dir/log")
+    store.add(b"/card/dir/log", b"grown")
+    file = await tree.open(b"/card/dir/log", write=True, truncate=True)
+    await file.fsync()
+    file.close()
+    assert store.files[b"/card/dir/log"].data == b""
+
+
+async def test_an_only_copy_stays_while_its_sidecar_cannot_be_opened(
+    autojump_clock: object, store: FakeWriter, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tree = make_writable(store, dir_timeout=1)
+    copy, sidecar = (b"/card/" + Reserved(b"zzzz", kind, b"abc").name for kind in (Kind.NEW, Kind.SIDECAR))
+    store.add(copy, b"the only copy")
+    store.add(sidecar, b"/card/dir/gone")
+    await tree.list(b"/card")
+    await trio.sleep(STALE_AFTER)
+
+    async def refuse(*_: object, **__: object) -> FakeReader:
+        raise FtpNak(Opcode.OPEN_FILE_RO, NakCode.FAIL_ERRNO, errno.ENFILE)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(store, "open_reader", refuse)
+        await tree.list(b"/card")
+    assert store.files[copy].data == b"the only copy"
+    await trio.sleep(10)
+    await tree.list(b"/card")
+    assert store.files[b"/card/recovered-tabc-gone"].data == b"the only copy"
+    assert sidecar not in store.files
