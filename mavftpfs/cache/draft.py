@@ -61,6 +61,7 @@ class Draft:
         self.sending: Sending | None = None
         self._held = ExtentSet()
         self._changed = ExtentSet()
+        self._touched = False
 
     # --- what it is
 
@@ -103,8 +104,9 @@ class Draft:
 
     @property
     def touched(self) -> bool:
-        """Whether an attempt under way has changed a part of the vehicle's file."""
-        return self.sending is not None and not self.sending.whole and self.sending.reached > 0
+        """Whether an unfinished attempt has changed a part of the vehicle's file."""
+        under_way = self.sending is not None and not self.sending.whole and self.sending.reached > 0
+        return self._touched or under_way
 
     def missing_base(self) -> list[tuple[int, int]]:
         """Return the ranges of which only the vehicle has the bytes."""
@@ -192,6 +194,7 @@ class Draft:
     def begin_again(self) -> None:
         """The attempt is given up."""
         self.remote_size = self.remote_end
+        self._touched = self.touched
         self.sending = None
 
     def delivered(self) -> None:
@@ -199,9 +202,11 @@ class Draft:
         self._changed.clear()
         self.remote_size = self.base_limit = self.size
         self.sending = None
+        self._touched = False
 
     def remote_removed(self) -> None:
-        """There is no such file on the vehicle any more; the draft must be whole."""
+        """The vehicle's file is about to be overwritten: nothing of it counts; the draft must be whole."""
+        self._touched = True
         self.base_limit = 0
         self.remote_size = None
         self._changed = ExtentSet([(0, self.size)])

@@ -228,7 +228,7 @@ class Namespace:
         self._context.files.on_removed(path)
         self._context.on_changed(path)
 
-    async def _remove_perhaps(self, path: bytes) -> None:
+    async def remove_perhaps(self, path: bytes) -> None:
         """Remove a file that we were about to make: CreateFile may not have come to it."""
         try:
             await self._remove(path)
@@ -246,7 +246,7 @@ class Namespace:
             if there and node.handles and not self._keep_content(node):
                 await self._hide(node)
             elif there:
-                await self._remove_perhaps(path)
+                await self.remove_perhaps(path)
             node.removed = True
             self._context.nodes.detach(node)
         if not node.handles:

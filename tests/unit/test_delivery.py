@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import json
 from collections.abc import AsyncIterator, Awaitable, Callable
 from pathlib import Path
 from random import Random
@@ -364,6 +365,71 @@ async def test_when_armed_ok_writes_on(store: FakeWriter) -> None:
     tree.armed_changed(True)
     await write_file(tree, FILE, NEW)
     assert store.files[FILE].data == NEW
+
+
+async def test_a_partial_truncation_is_completed_later(autojump_clock: object, store: FakeWriter) -> None:
+    store.fail_at[4] = FtpNak(Opcode.WRITE_FILE, NakCode.FAIL_ERRNO, errno.EIO)
+    tree = make_writable(store)
+    with pytest.raises(FtpNak):
+        await tree.truncate(FILE, len(OLD) + 400)
+    assert len(store.files[FILE].data) == len(OLD) + 239
+    assert await tree.drain(10) == []
+    assert store.files[FILE].data == OLD + bytes(400)
+
+
+# --- the end of a mount
+
+
+async def test_what_a_close_did_not_confirm_outlives_the_process(store: FakeWriter, tmp_path: Path) -> None:
+    spool = SpoolDirectory(tmp_path / "spool", Random(1))
+    tree = make_writable(store, spool=spool)
+    file = await tree.create(b"/card/new", exclusive=True)
+    await file.write(0, NEW)
+    store.lost = True
+    with pytest.raises(VehicleLost):
+        await file.release()
+    spool.close()  # kill -9
+    again = SpoolDirectory(tmp_path / "spool", Random(2))
+    (saved,) = again.rescue(tmp_path / "recovered")
+    assert saved.read_bytes() == NEW
+    facts = json.loads(saved.with_name(saved.name + ".json").read_text())
+    assert (facts["path"], facts["size"], facts["whole"]) == ("/card/new", len(NEW), True)
+    again.close()
+
+
+async def test_what_was_confirmed_is_not_kept(store: FakeWriter, tmp_path: Path) -> None:
+    spool = SpoolDirectory(tmp_path / "spool", Random(1))
+    tree = make_writable(store, spool=spool, dirty_max=65536)
+    await write_file(tree, b"/card/new", bytes(300_000))
+    assert [path.name for path in spool.path.iterdir()] == ["owner"]
+    spool.close()
+
+
+async def test_what_cannot_be_delivered_is_copied_with_a_manifest(
+    autojump_clock: object, store: FakeWriter, tmp_path: Path
+) -> None:
+    tree = make_writable(store)
+    new = await tree.create(b"/card/dir/new", exclusive=True)
+    await new.write(0, NEW)
+    part = await tree.open(FILE, write=True)
+    await part.write(500, b"part")
+    store.lost = True
+    assert sorted(await tree.drain(5)) == [FILE, b"/card/dir/new"]
+    files = tree.recover_to(tmp_path / "rescued")
+    contents = {path.name: path.read_bytes() for path in files}
+    assert contents["card__dir__new"] == NEW
+    assert contents["card__dir__file.txt"][500:504] == b"part"
+    manifest = {
+        entry["file"]: entry for entry in json.loads((tmp_path / "rescued/manifest.json").read_text())
+    }
+    assert manifest["card__dir__new"]["whole"]
+    assert manifest["card__dir__file.txt"]["changed"] == [[500, 504]]
+    assert not manifest["card__dir__file.txt"]["whole"]
+
+
+async def test_nothing_to_recover_leaves_no_directory(store: FakeWriter, tmp_path: Path) -> None:
+    assert make_writable(store).recover_to(tmp_path / "rescued") == []
+    assert not (tmp_path / "rescued").exists()
 
 
 # --- paths

@@ -91,6 +91,7 @@ async def test_a_failed_move_to_the_vehicle_moves_nothing(store: FakeWriter, tre
         await tree.rename(SWAP, b"/scripts/new")
     assert await read_file(tree, SWAP) == bytes(500)
     assert tree.undelivered() == []
+    assert sorted(store.files) == [FILE]
 
 
 async def test_trash(store: FakeWriter, tree: Tree) -> None:
