@@ -126,6 +126,19 @@ def test_trace_holds_every_payload_decoded(field: Field, small_tree: Path, tmp_p
     assert answered & {"READ_FILE", "BURST_READ_FILE"}
 
 
+@pytest.mark.parametrize("profile", ["px4", "ardupilot"])
+def test_bursts_give_the_same_bytes(field: Field, tree: Path, tmp_path: Path, profile: str) -> None:
+    trace = tmp_path / "trace"
+    options = ("read_mode=burst", f"trace={trace}")
+    mount = field.mount(field.sim(tree, profile, ("--loss", "0.02", "--seed", "3")).source, *options)
+    for size in (0, 1, 239, 478, 40152, 119500, 131073):
+        assert mount.read_bytes(mount.path / f"sizes/{size}.bin") == (tree / f"sizes/{size}.bin").read_bytes()
+    assert mount.unmount() == 0
+    records = [json.loads(line) for line in trace.read_text().splitlines()]
+    streamed = [r for r in records if r["dir"] == "reply" and r.get("req_opcode") == "BURST_READ_FILE"]
+    assert len(streamed) > (119500 + 131073) // 239
+
+
 def test_log_file(field: Field, small_tree: Path, tmp_path: Path) -> None:
     log = tmp_path / "log"
     mount = field.mount(field.sim(small_tree).source, f"log_file={log}")

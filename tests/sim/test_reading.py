@@ -8,10 +8,12 @@ import pytest
 import trio
 from trio.testing import MockClock
 
+from mavftpfs.cache.options import CacheOptions
+from mavftpfs.cache.tree import Tree
 from mavftpfs.link.framing import Framer
 from mavftpfs.link.messages import Address, FtpFrame
 from mavftpfs.protocol.payload import Opcode, Payload, request
-from mavftpfs.session.connection import Connection
+from mavftpfs.session.connection import Connection, ConnectOptions
 from mavftpfs.shared.errors import (
     DataUnproven,
     MavftpfsError,
@@ -220,3 +222,32 @@ async def test_times_that_could_not_be_asked_for_are_not_refused(autojump: MockC
         assert connection.store.lists_times is None
         await connection.store.list_directory(b"/d")
         assert connection.store.lists_times is True
+
+
+@pytest.mark.parametrize("profile", ["px4", "ardupilot"])
+async def test_bursts_through_the_caches(profile: str, autojump: MockClock) -> None:
+    """Whole, in the middle, behind what is there, and two files in turns, over a bad link."""
+    here = World(profile, LinkSettings(rate=200_000.0, delay=0.02, loss=0.02, duplicate=0.01, reorder=0.02))
+    files = {b"/f": random.Random(3).randbytes(500_000), b"/g": random.Random(4).randbytes(239 * 500)}
+    for path, data in files.items():
+        here.tree.add(path, data)
+    async with here.connection(ConnectOptions(read_mode="burst")) as connection:
+        options = CacheOptions(cache_size=1 << 20)
+        tree = Tree(connection.store, options, clock=trio.current_time, invalidate=lambda changed: None)
+        opened = {path: await tree.open(path) for path in files}
+
+        async def read_all(path: bytes, start: int) -> None:
+            for offset in range(start, len(files[path]), 131_072):
+                data = await opened[path].read(offset, 131_072)
+                assert bytes(data) == files[path][offset : offset + 131_072]
+
+        assert bytes(await opened[b"/f"].read(250_001, 10)) == files[b"/f"][250_001:250_011]
+        async with trio.open_nursery() as nursery:
+            nursery.start_soon(read_all, b"/f", 1)
+            nursery.start_soon(read_all, b"/g", 0)
+        for file in opened.values():
+            await file.release()
+        stats = connection.engine.stats
+        assert stats.by_opcode[Opcode.BURST_READ_FILE] >= 5
+        assert stats.by_opcode[Opcode.READ_FILE] < 500_000 / 239 / 2
+    assert here.vehicle.server.open_sessions == 0

@@ -1,0 +1,132 @@
+"""Files beyond 2 GiB through caches and session: right bytes or an error. Virtual time."""
+
+from __future__ import annotations
+
+from struct import pack
+
+import pytest
+import trio
+from trio.testing import MockClock
+
+from mavftpfs.cache.openfile import OpenFile
+from mavftpfs.cache.options import CacheOptions
+from mavftpfs.cache.tree import Tree
+from mavftpfs.session.connection import Connection
+from mavftpfs.shared.errors import FtpNak
+from mavftpfs.sim.filesystem import Entry, Kind, Stat, TreeFile
+from mavftpfs.sim.linkmodel import LinkSettings
+from mavftpfs.sim.memorytree import DEFAULT_MTIME, MemoryTree
+from tests.support.worlds import ROOTS, World
+
+GIB = 1 << 30
+SIZE = 4 * GIB - 5
+"""The largest sizes that fit the 32 bits of an open's reply."""
+
+STAT = Stat(Kind.FILE, SIZE, DEFAULT_MTIME)
+WIDTH = 8
+
+READS = (
+    (0, 1000),
+    (2 * GIB - 3000, 1000),
+    (2 * GIB - 300, 777),
+    (2 * GIB, 1000),
+    (3 * GIB + 1, 5),
+    (SIZE - 1000, 1000),
+    (SIZE - 3, 100),
+)
+"""(offset, count) in no order of use: far jumps, both sides of the sign bit and the end."""
+
+
+@pytest.fixture
+def autojump() -> MockClock:
+    return MockClock(autojump_threshold=0)
+
+
+def expected(offset: int, count: int) -> bytes:
+    """Return what the huge file holds there: each eight bytes say where they are."""
+    stop = min(offset + count, SIZE)
+    first = offset // WIDTH
+    words = b"".join(pack(">Q", word * 0x9E3779B1) for word in range(first, stop // WIDTH + 1))
+    return words[offset - first * WIDTH : stop - first * WIDTH]
+
+
+class HugeFile:
+    """An open file that is computed, not stored; implements TreeFile for reading."""
+
+    def read(self, offset: int, size: int) -> bytes:
+        return expected(offset, size) if offset < SIZE else b""
+
+    def write(self, offset: int, data: bytes) -> int:
+        raise AssertionError("nobody writes here")
+
+    def size(self) -> int:
+        return SIZE
+
+    def resize(self, size: int) -> None:
+        raise AssertionError("nobody writes here")
+
+    def close(self) -> None:
+        pass
+
+
+class HugeTree(MemoryTree):
+    """Every file is of nearly 4 GiB."""
+
+    def entries(self, path: bytes) -> list[Entry]:
+        return [
+            entry if entry.stat.kind is Kind.DIRECTORY else Entry(entry.name, STAT)
+            for entry in super().entries(path)
+        ]
+
+    def stat(self, path: bytes) -> Stat:
+        found = super().stat(path)
+        return found if found.kind is Kind.DIRECTORY else STAT
+
+    def open(
+        self, path: bytes, *, write: bool = False, create: bool = False, truncate: bool = False
+    ) -> TreeFile:
+        return super().open(path, write=True, create=True) if write else HugeFile()
+
+
+def huge(profile: str) -> tuple[World, bytes]:
+    here = World(profile, LinkSettings(delay=0.01), tree=HugeTree())
+    path = ROOTS.get(profile, b"") + b"/d/huge"
+    here.tree.add(path)
+    return here, path
+
+
+async def opened(connection: Connection, path: bytes) -> OpenFile:
+    options = CacheOptions(cache_size=1 << 20)
+    tree = Tree(connection.store, options, clock=trio.current_time, invalidate=lambda changed: None)
+    assert (await tree.stat(path)).size == SIZE
+    file = await tree.open(path)
+    assert file.size == SIZE
+    return file
+
+
+@pytest.mark.parametrize("profile", ["px4", "px4-nuttx", "mavsdk", "spec"])
+@pytest.mark.parametrize("seed", range(3))
+async def test_any_place_of_a_huge_file_can_be_read(profile: str, seed: int, autojump: MockClock) -> None:
+    here, path = huge(profile)
+    async with here.connection() as connection:
+        file = await opened(connection, path)
+        for offset, count in (*READS[seed:], *READS[:seed]):
+            assert bytes(await file.read(offset, count)) == expected(offset, count)
+        assert bytes(await file.read(SIZE, 10)) == b""
+        await file.release()
+
+
+@pytest.mark.parametrize("profile", ["ardupilot", "ardupilot5"])
+async def test_what_ardupilot_cannot_reach_is_an_error(profile: str, autojump: MockClock) -> None:
+    """Offsets are signed 32 bits over there (AP_Filesystem::lseek)."""
+    here, path = huge(profile)
+    async with here.connection() as connection:
+        file = await opened(connection, path)
+        for offset, count in READS:
+            if offset + count <= 2 * GIB:
+                assert bytes(await file.read(offset, count)) == expected(offset, count)
+            else:
+                with pytest.raises(FtpNak):
+                    await file.read(offset, count)
+        assert bytes(await file.read(4096, 1000)) == expected(4096, 1000)
+        await file.release()
