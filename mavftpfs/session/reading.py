@@ -17,10 +17,15 @@ STALL = 2.0
 FIRST_WANT = 0.05
 """Seconds an opened file is kept open for its first read although another file waits."""
 
+BOOT_NEWS = 2.5
+"""Seconds to wait after a reopen for the vehicle to tell its boot time; less than the 3 s after which
+ArduPilot gives an idle session away."""
+
 REOPENS = 5
 """How often one want may lose its session without a byte of progress before it fails."""
 
 _OFTEN = 0.25
+_BOOT_POLL = 0.05
 
 
 class Reading:
@@ -33,10 +38,12 @@ class Reading:
         self._engine = kit.engine
         self._gate = kit.gate
         self._clock = kit.clock
+        self._vehicle = kit.vehicle
         self._queue = queue
         self._steering = steering
         self._transfer: ReadTransfer | None = None
         self._seen_bytes = 0
+        self._boot_unheard: float | None = None
 
     def on_batch(self, now: float) -> None:
         """A batch of replies was processed: pass data on, once."""
@@ -76,6 +83,8 @@ class Reading:
         awaited = stream.wants_open
         if session is None or session.path != stream.path or session.writing or awaited:
             session = await self._holder.open(stream.path)
+            if not awaited:
+                await self._await_boot_news()
         try:
             if session.size is None:
                 raise RemoteProtocolError("the vehicle's open reply holds no size")
@@ -84,6 +93,20 @@ class Reading:
             await self._holder.close_quietly()
             raise
         return awaited
+
+    async def _await_boot_news(self) -> None:
+        """Let the caches hear of a restart before they get bytes of what may be another file by now.
+
+        A vehicle that stopped telling its boot time is waited for once.
+        """
+        vehicle = self._vehicle
+        heard_at = vehicle.boot_heard_at
+        if heard_at == self._boot_unheard:
+            return
+        with trio.move_on_after(BOOT_NEWS):
+            while vehicle.restart_possible(self._clock()):
+                await self._holder.sleep(_BOOT_POLL)
+        self._boot_unheard = heard_at if vehicle.boot_heard_at == heard_at else None
 
     async def _await_first_want(self, stream: FileStream) -> None:
         """Give whoever opened a file a moment to ask for its bytes, before another file takes its turn."""

@@ -27,6 +27,10 @@ from mavftpfs.protocol.payload import Opcode
 SILENCE_LIMIT = 5.0
 """Seconds without heartbeats after which one timed-out request means that the vehicle is lost."""
 
+BOOT_NEWS_AGE = 2.5
+"""Seconds since the vehicle told its boot time, which it does every second, after which it may have restarted
+without our knowing. No autopilot restarts faster."""
+
 FOREIGN_MEMORY = 10.0
 """Seconds for which an FTP client that was heard counts as present."""
 
@@ -65,7 +69,7 @@ class Vehicle:
     heard: dict[Address, Heartbeat] = field(default_factory=dict)
     _armed: bool | None = None
     _boot_ms: int | None = None
-    _boot_heard_at: float = 0.0
+    boot_heard_at: float = 0.0
     _timed_out: bool = False
 
     @property
@@ -89,6 +93,10 @@ class Vehicle:
     def foreign_client(self, now: float) -> bool:
         """Return whether another FTP client of this vehicle was heard lately."""
         return self.foreign_at is not None and now - self.foreign_at < FOREIGN_MEMORY
+
+    def restart_possible(self, now: float) -> bool:
+        """Return whether a restart may have gone unnoticed: the boot time was told before, but not lately."""
+        return self._boot_ms is not None and now - self.boot_heard_at > BOOT_NEWS_AGE
 
     def note_timeout(self) -> None:
         """A request to the vehicle went unanswered to its deadline."""
@@ -177,8 +185,8 @@ class Vehicle:
             self.storage = message
 
     def _on_boot_time(self, boot_ms: int, now: float) -> None:
-        before, elapsed_ms = self._boot_ms, (now - self._boot_heard_at) * 1000
-        self._boot_ms, self._boot_heard_at = boot_ms, now
+        before, elapsed_ms = self._boot_ms, (now - self.boot_heard_at) * 1000
+        self._boot_ms, self.boot_heard_at = boot_ms, now
         if before is None:
             return
         if boot_ms + _REBOOT_SLACK_MS < before or boot_ms - before < elapsed_ms / 2 - _MISSING_MS:

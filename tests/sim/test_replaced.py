@@ -9,7 +9,7 @@ import trio
 from trio.testing import MockClock
 
 from mavftpfs.cache.options import CacheOptions
-from mavftpfs.cache.tree import Tree
+from mavftpfs.cache.tree import OpenFile, Tree
 from mavftpfs.session.connection import Connection
 from mavftpfs.shared.errors import FileChanged
 from mavftpfs.sim.linkmodel import LinkSettings
@@ -33,13 +33,48 @@ def mounted(connection: Connection) -> Tree:
     return tree
 
 
+async def read_through(handle: OpenFile) -> bytes:
+    """Read from the beginning to the end."""
+    return b"".join([bytes(await handle.read(at, STEP)) for at in range(0, handle.size, STEP)])
+
+
 async def copy(tree: Tree, path: bytes) -> bytes:
     """Open, read to the end and close, as cp does."""
     handle = await tree.open(path)
     try:
-        return b"".join([bytes(await handle.read(at, STEP)) for at in range(0, handle.size, STEP)])
+        return await read_through(handle)
     finally:
         handle.close()
+
+
+@pytest.mark.parametrize("profile", ["px4", "ardupilot", "mavsdk-old"])
+async def test_the_end_of_a_copy_waits_for_the_news_of_a_reboot(profile: str, autojump: MockClock) -> None:
+    """A vehicle may answer before it tells its boot time, and what is left may come in between."""
+    here = World(profile, LinkSettings(rate=20_000.0, delay=0.02))
+    path = ROOTS.get(profile, b"") + b"/big"
+    here.tree.add(path, OLD, 1_700_000_000)
+    async with here.connection() as connection, trio.open_nursery() as nursery:
+        tree = mounted(connection)
+        await trio.sleep(10)
+        handle = await tree.open(path)
+        blocks = handle._version.blocks  # type: ignore[attr-defined]
+
+        async def reboot() -> None:
+            for _ in range(10_000):
+                if sum(stop - start for start, stop in blocks.missing(0, handle.size)) <= 8_000:
+                    break
+                await trio.sleep(0.02)
+            now = trio.current_time()
+            here.vehicle.reboot(now, downtime=2.7)
+            here.vehicle._next_beat = now + 4.2
+            here.tree.add(path, NEW[: len(OLD)], 1_700_000_100)
+            here.link.kick()
+
+        nursery.start_soon(reboot)
+        with pytest.raises(FileChanged):
+            await read_through(handle)
+        handle.close()
+        assert connection.vehicle.reboots == 1
 
 
 @pytest.mark.parametrize("size", [0, 200_000, 260_000])
