@@ -125,7 +125,11 @@ async def attached(
                 _subscribe(connection, tree)
                 if list_root:
                     await _list_root(connection, tree, deadline, options)
-                yield Attached(connection, tree, notice)
+                try:
+                    yield Attached(connection, tree, notice)
+                finally:
+                    if spool is not None and not tree.undelivered():
+                        spool.discard()
 
 
 @asynccontextmanager

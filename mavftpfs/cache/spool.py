@@ -59,6 +59,7 @@ class SpoolDirectory:
         self.dead_owners = frozenset(token for slot in free for token in self._tokens(slot))
         self.owner = self._new_token(self.path, rng)
         self._abandoned = free
+        self._left = frozenset(_data_in(self.path))
 
     def rescue(self, recovery: Path) -> list[Path]:
         """Move what dead mounts left to `recovery`; return the files, and let go of their slots.
@@ -68,12 +69,19 @@ class SpoolDirectory:
         """
         found = []
         for slot in self._abandoned:
-            for data in sorted(slot.glob("*.data")):
+            for data in _data_in(slot):
                 found.append(_move(data, recovery))
             if slot != self.path:
                 self._unlock(slot)
         self._abandoned = []
+        self._left = frozenset()
         return found
+
+    def discard(self) -> None:
+        """Remove what this mount put here: the vehicle has it, though a program may not have closed it."""
+        for data in _data_in(self.path):
+            if data not in self._left:
+                _remove(data)
 
     def close(self) -> None:
         """Let go of the directory."""
@@ -145,8 +153,11 @@ class Spool:
 
     def new_file(self) -> Path:
         """Return the path of a file that is not there yet."""
-        self._number += 1
-        return self._place() / f"{self._number:06}.data"
+        while True:  # a dead mount may have left some
+            self._number += 1
+            path = self._place() / f"{self._number:06}.data"
+            if not path.exists():
+                return path
 
     def close(self) -> None:
         """Remove the directory, if it was made here."""
@@ -276,8 +287,7 @@ class SpoolContent:
         self._count_stored(0, self._stored.end, present=False)
         os.close(self._file)
         self._file = None
-        self._path.unlink(missing_ok=True)
-        self._path.with_suffix(".json").unlink(missing_ok=True)
+        _remove(self._path)
 
     def _put_file(self, offset: int, data: bytes | bytearray | memoryview) -> None:
         assert self._file is not None
@@ -300,6 +310,16 @@ class SpoolContent:
         else:
             self._stored.discard(start, stop)
         self._spool.on_disk += self._stored.total - before
+
+
+def _data_in(slot: Path) -> list[Path]:
+    return sorted(slot.glob("*.data"))
+
+
+def _remove(data: Path) -> None:
+    """Remove a spooled file and its description."""
+    data.unlink(missing_ok=True)
+    data.with_suffix(".json").unlink(missing_ok=True)
 
 
 def _write_durably(path: Path, data: bytes) -> None:

@@ -405,6 +405,18 @@ async def test_what_was_confirmed_is_not_kept(store: FakeWriter, tmp_path: Path)
     spool.close()
 
 
+async def test_what_is_still_open_when_the_mount_ends_is_not_kept(store: FakeWriter, tmp_path: Path) -> None:
+    """A kernel that lost its mount closes nothing: the next mount must not offer what was delivered."""
+    spool = SpoolDirectory(tmp_path / "spool", Random(1))
+    tree = make_writable(store, spool=spool, dirty_max=65536)
+    file = await tree.create(b"/card/new", exclusive=True)
+    await file.write(0, bytes(300_000))
+    assert await tree.drain(10) == []
+    spool.discard()
+    assert [path.name for path in spool.path.iterdir()] == ["owner"]
+    spool.close()
+
+
 async def test_what_cannot_be_delivered_is_copied_with_a_manifest(
     autojump_clock: object, store: FakeWriter, tmp_path: Path
 ) -> None:

@@ -41,6 +41,22 @@ def test_pages_are_joined(tmp_path: Path) -> None:
     assert content.get(PAGE - 2, PAGE + 2) == b"abcd"
 
 
+def test_what_a_dead_mount_left_is_neither_reused_nor_discarded(tmp_path: Path) -> None:
+    slot = tmp_path / "slot0"
+    slot.mkdir()
+    (slot / "000001.data").write_bytes(b"of a dead mount")
+    directory = SpoolDirectory(tmp_path, Random(1))
+    spool = spool_of(directory.path, memory=0)
+    content = spool.content()
+    content.put(0, b"mine")
+    content.persist({"size": 4})
+    assert content.get(0, 4) == b"mine"
+    directory.discard()
+    assert {path.name for path in slot.iterdir()} == {"000001.data", "owner"}
+    assert (slot / "000001.data").read_bytes() == b"of a dead mount"
+    directory.close()
+
+
 def test_a_full_spool_takes_nothing_and_loses_nothing(tmp_path: Path) -> None:
     spool = spool_of(tmp_path, memory=0, disk=1000)
     content = spool.content()
