@@ -36,8 +36,11 @@ SIGNING_EPOCH = 1_420_070_400
 """2015-01-01 UTC in seconds since 1970 (MAVLink guide, "Message Signing")."""
 
 HEARTBEAT_PERIOD = 1.0
-TERMINATE_ON_EXIT = 3.0
+TERMINATE_ON_EXIT = 5.0
 """Seconds to spend on closing the server's session when we leave."""
+
+TERMINATE_IF_LOST = 1.0
+"""The same if the vehicle is silent anyway."""
 
 _INFO_TRIES = 4
 _INFO_PERIOD = 2.0
@@ -172,7 +175,8 @@ async def connected(
         except Exception as error:  # raised again outside, so that it is not wrapped in a group
             failure = error
         finally:
-            with trio.CancelScope(deadline=trio.current_time() + TERMINATE_ON_EXIT, shield=True):
+            limit = TERMINATE_IF_LOST if connection.vehicle.lost(clock()) else TERMINATE_ON_EXIT
+            with trio.CancelScope(deadline=trio.current_time() + limit, shield=True):
                 serving.scope.cancel()
                 await serving.ended.wait()
                 await _leave(connection.scheduler)
