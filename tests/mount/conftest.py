@@ -81,14 +81,6 @@ class Field:
 LINES = pytest.StashKey[list[str]]()
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Keep the tests that go on from each other's files, on one mount per kind of server, in one process."""
-    for item in items:
-        parameters = getattr(item, "callspec", None)
-        if parameters is not None and item.path.name == "test_writing.py" and "kind" in parameters.params:
-            item.add_marker(pytest.mark.xdist_group(f"writing-{parameters.params['kind']}"))
-
-
 @pytest.fixture
 def report_line(request: pytest.FixtureRequest) -> Callable[[str], None]:
     """Take a line that is shown at the end of the run: a measurement, which no test may assert."""
