@@ -139,6 +139,9 @@ class Mount:
                 except subprocess.TimeoutExpired:
                     abort_mount(self.path)
                     child.communicate(timeout=20)
+            for pipe in (child.stdout, child.stderr):
+                if pipe is not None:
+                    pipe.close()  # nobody asked a child that ended by itself what it said
 
     def python(self, code: str, *args: str | Path, timeout: float = COMMAND_TIMEOUT) -> str:
         """Run a Python snippet as its own process and return its stdout; it must exit 0."""
