@@ -1,8 +1,8 @@
-"""The share of a link that reading reaches, on virtual time: python -m tests.bench.goodput [--json FILE].
+"""The share of a link that reading and writing reach, on virtual time: python -m tests.bench.goodput --help.
 
 Deterministic: a simulated vehicle with its real queue and timing, a modelled link, no clock but the model's.
-The limit is that of design: (rate - telemetry) * 239/266 * (1 - loss), and at most the server's ceiling.
-Bytes are compared in every run.
+Writing is timed from open to close through the caches, with verify=size; reading from open to the last byte
+through the session. Bytes are compared in every run.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import json
 import random
 import sys
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from itertools import product
 from pathlib import Path
 
@@ -21,107 +21,130 @@ from rich.console import Console
 from rich.table import Table
 from trio.testing import MockClock
 
+from mavftpfs.cache.options import CacheOptions
+from mavftpfs.cache.tree import Tree
 from mavftpfs.protocol.payload import MAX_DATA
+from mavftpfs.session.connection import Connection
+from mavftpfs.sim.linkmodel import Direction as LinkDirection
 from mavftpfs.sim.linkmodel import LinkSettings
+from tests.bench.cases import Case, Direction, Result
 from tests.support.worlds import ROOTS, MemorySink, World
 
-FRAME = 266
-"""Bytes of a MAVLink 2 frame that carries 239 bytes of data."""
-
-ARDUPILOT_BURST = MAX_DATA / 0.0056
-ARDUPILOT_WINDOW = 4
-ARDUPILOT_POLL = 0.010
 PATIENCE = 20
 """How many times the ideal duration a run may take."""
 
-
-@dataclass(frozen=True, slots=True)
-class Case:
-    """One measurement's conditions. rate in bytes/s, rtt in seconds, loss 0..1 each way."""
-
-    profile: str
-    rate: float
-    rtt: float
-    loss: float
-
-    @property
-    def limit(self) -> float:
-        """Bytes per second that could be read at best."""
-        limit = self.rate * MAX_DATA / FRAME * (1 - self.loss)
-        if self.profile.startswith(("ardupilot", "littlefs")):
-            window = ARDUPILOT_WINDOW * MAX_DATA / (self.rtt + ARDUPILOT_POLL)
-            burst = min(ARDUPILOT_BURST, self.rate / 3)
-            limit = min(limit, max(window, burst))
-        return limit
+PIECE = 128 * 1024
+"""Bytes that a program writes at once."""
 
 
-@dataclass(frozen=True, slots=True)
-class Result:
-    """share: goodput over the limit. requests: per chunk of data."""
-
-    case: Case
-    share: float
-    requests: float
-
-
-def measure(case: Case, seconds: float) -> Result:
-    """Read for about `seconds` of link time.
+def measure(case: Case, seconds: float, *, queue: int | None = None) -> Result:
+    """Read or write for about `seconds` of link time; queue: bytes that wait for the link's transmitter.
 
     Raises:
         AssertionError: the bytes differ.
         trio.TooSlowError: it took PATIENCE times the ideal.
     """
-    settings = LinkSettings(
-        rate=case.rate, delay=case.rtt / 2, loss=case.loss, queue=int(max(4096, case.rate / 2))
-    )
-    world = World(case.profile, settings)
-    size = int(case.limit * seconds)
-    data = random.Random(1).randbytes(size)
-    path = ROOTS.get(case.profile, b"") + b"/d/log.bin"
-    world.tree.add(path, data)
+    room = int(max(4096, case.rate / 2)) if queue is None else queue
+    world = World(case.profile, LinkSettings(rate=case.rate, delay=case.rtt / 2, loss=case.loss, queue=room))
+    data = random.Random(1).randbytes(int(case.limit * seconds))
+    transfer = _read if case.direction == "read" else _write
 
-    async def read() -> Result:
+    async def run() -> Result:
         async with world.connection() as connection:
-            began = trio.current_time()
-            sink = MemorySink(size)
-            reader = await connection.store.open_reader(path, sink)
-            reader.want(0, size, demand=True)
             with trio.fail_after(seconds * PATIENCE):
-                assert await sink.wait_for(0, size) == data
-            took = trio.current_time() - began
-            return Result(case, size / took / case.limit, connection.engine.stats.requests * MAX_DATA / size)
+                took = await transfer(world, connection, data)
+        requests = connection.engine.stats.requests * MAX_DATA / len(data)
+        dropped = sum(world.model.counters(direction).dropped for direction in LinkDirection)
+        return Result(case, len(data) / took / case.limit, requests, dropped)
 
-    return trio.run(read, clock=MockClock(autojump_threshold=0))
+    return trio.run(run, clock=MockClock(autojump_threshold=0))
+
+
+async def _read(world: World, connection: Connection, data: bytes) -> float:
+    """Return how many seconds it took to read the file."""
+    path = _directory(world) + b"/log.bin"
+    world.tree.add(path, data)
+    began = trio.current_time()
+    sink = MemorySink(len(data))
+    reader = await connection.store.open_reader(path, sink)
+    reader.want(0, len(data), demand=True)
+    assert await sink.wait_for(0, len(data)) == data
+    return trio.current_time() - began
+
+
+async def _write(world: World, connection: Connection, data: bytes) -> float:
+    """Return how many seconds it took from the open of a new file to the return of its close."""
+    world.tree.add_directory(_directory(world))
+    path = _directory(world) + b"/log.bin"
+    async with trio.open_nursery() as nursery:
+        tree = Tree(
+            connection.store,
+            CacheOptions(verify="size"),
+            clock=trio.current_time,
+            invalidate=lambda path: None,
+            nursery=nursery,
+            writer=connection.store,
+            rng=random.Random(3),
+        )
+        assert path not in dict(await tree.list(_directory(world)))  # as a lookup does before the open
+        began = trio.current_time()
+        file = await tree.create(path, exclusive=False)
+        for at in range(0, len(data), PIECE):
+            await file.write(at, data[at : at + PIECE])
+        await file.flush()
+        took = trio.current_time() - began
+        assert world.tree.data(path) == data
+        await file.release()
+        nursery.cancel_scope.cancel()
+    return took
+
+
+def _directory(world: World) -> bytes:
+    return ROOTS.get(world.profile, b"") + b"/d"
 
 
 def cases(arguments: argparse.Namespace) -> Iterator[Case]:
     """Yield every combination asked for."""
-    for profile, rate, rtt, loss in product(
-        arguments.profiles, arguments.rates, arguments.rtts, arguments.losses
+    both: tuple[Direction, ...] = ("read", "write")
+    directions = both if arguments.direction == "both" else (arguments.direction,)
+    for profile, rate, rtt, loss, direction in product(
+        arguments.profiles, arguments.rates, arguments.rtts, arguments.losses, directions
     ):
-        yield Case(profile, rate, rtt, loss)
+        yield Case(profile, rate, rtt, loss, direction)
 
 
 def show(results: list[Result]) -> None:
     """Print a table."""
-    table = Table("profile", "bytes/s", "RTT s", "loss", "share of limit", "requests/chunk")
+    table = Table(
+        "", "profile", "bytes/s", "RTT s", "loss", "share of limit", "target", "requests/chunk", "dropped"
+    )
     for result in results:
         case = result.case
+        target = case.target
         table.add_row(
+            case.direction,
             case.profile,
             f"{case.rate:g}",
             f"{case.rtt:g}",
             f"{case.loss:g}",
-            f"{result.share:.2f}",
+            f"{result.share:.3f}",
+            "" if target is None else f"{target:.2f}{' ' if result.share >= target else '!'}",
             f"{result.requests:.2f}",
+            f"{result.dropped}",
         )
     Console().print(table)
 
 
+def as_json(results: list[Result]) -> list[dict[str, object]]:
+    """Return everything that is known of each run."""
+    return [asdict(result) | {"limit": result.case.limit, "target": result.case.target} for result in results]
+
+
 def main() -> int:
     """Measure and print."""
-    parser = argparse.ArgumentParser(prog="scripts/bench", description="reading: share of the link's limit")
-    profiles = ["px4", "px4-nuttx", "ardupilot", "mavsdk"]
+    parser = argparse.ArgumentParser(prog="scripts/bench", description="share of the link's limit")
+    profiles = ["px4", "px4-nuttx", "ardupilot", "ardupilot5", "littlefs", "mavsdk"]
+    parser.add_argument("--direction", choices=["read", "write", "both"], default="both")
     parser.add_argument("--profiles", nargs="+", default=profiles)
     parser.add_argument("--rates", nargs="+", type=float, default=[5760.0, 100_000.0])
     parser.add_argument("--rtts", nargs="+", type=float, default=[0.01, 0.1, 0.3])
@@ -132,7 +155,7 @@ def main() -> int:
     results = [measure(case, arguments.seconds) for case in cases(arguments)]
     show(results)
     if arguments.json is not None:
-        arguments.json.write_text(json.dumps([asdict(result) for result in results], indent=1))
+        arguments.json.write_text(json.dumps(as_json(results), indent=1))
     return 0
 
 

@@ -1,0 +1,63 @@
+"""What is measured: conditions, and the limit that design section 5 sets for them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from mavftpfs.protocol.payload import MAX_DATA
+
+Direction = Literal["read", "write"]
+
+FRAME = 266
+"""Bytes of a MAVLink 2 frame that carries 239 bytes of data."""
+
+ARDUPILOT_BURST = MAX_DATA / 0.0056
+ARDUPILOT_WINDOW = 5
+"""Requests that an ArduPilot queues, all of which are ours while no other client is heard."""
+
+ARDUPILOT_POLL = 0.010
+
+TARGETS = {
+    "read": {0.0: 0.97, 0.01: 0.93, 0.05: 0.85, 0.1: 0.75},
+    "write": {0.0: 0.95, 0.01: 0.90, 0.05: 0.80, 0.1: 0.70},
+}
+"""Share of the limit to reach, by direction and loss (design section 5)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """One measurement's conditions. rate in bytes/s, rtt in seconds, loss 0..1 each way."""
+
+    profile: str
+    rate: float
+    rtt: float
+    loss: float
+    direction: Direction = "read"
+
+    @property
+    def limit(self) -> float:
+        """Bytes per second that could be read or written at best."""
+        limit = self.rate * MAX_DATA / FRAME * (1 - self.loss)
+        if self.profile.startswith(("ardupilot", "littlefs")):
+            ceiling = ARDUPILOT_WINDOW * MAX_DATA / (self.rtt + ARDUPILOT_POLL)
+            if self.direction == "read":
+                ceiling = max(ceiling, min(ARDUPILOT_BURST, self.rate / 3))
+            limit = min(limit, ceiling)
+        return limit
+
+    @property
+    def target(self) -> float | None:
+        """The share of the limit to reach, None where design names none."""
+        return TARGETS[self.direction].get(self.loss)
+
+
+@dataclass(frozen=True, slots=True)
+class Result:
+    """share: goodput over the limit. requests: per chunk of data. dropped: frames that found the link's queue
+    full, both ways."""
+
+    case: Case
+    share: float
+    requests: float
+    dropped: int

@@ -1,0 +1,308 @@
+"""What each part of the hot path costs for a chunk, by replaying a transfer through one part at a time.
+
+One thread, no waiting, the best of several rounds: so the figures vary little from run to run, and their
+shares hardly at all. Batches are as long as WINDOW; what the loop around them costs is measured elsewhere.
+"""
+
+from __future__ import annotations
+
+import random
+import socket
+import time
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
+
+import trio
+from trio.testing import MockClock
+
+from mavftpfs.cache.blocks import BlockCache, FileBlocks
+from mavftpfs.cache.draft import Draft
+from mavftpfs.cache.spool import Spool
+from mavftpfs.link.framing import Framer
+from mavftpfs.link.messages import Address
+from mavftpfs.link.udp import UdpLink
+from mavftpfs.protocol.engine import Engine
+from mavftpfs.protocol.flow import Flow
+from mavftpfs.protocol.payload import MAX_DATA, Opcode, Payload, decode_reply, decode_request
+from mavftpfs.protocol.transfers import ReadTransfer
+from mavftpfs.protocol.writing import WriteTransfer
+from mavftpfs.session.upload import Feed
+
+WINDOW = 64
+CHUNKS = 8192
+ROUNDS = 5
+US = 1e6
+_SIZE = CHUNKS * MAX_DATA
+_CLIENT, _VEHICLE = Address(254, 191), Address(1, 1)
+_PER_DATAGRAM = 5
+
+
+class Meter:
+    """Sums the CPU time of what runs inside `on`."""
+
+    def __init__(self) -> None:
+        self.seconds = 0.0
+
+    @contextmanager
+    def on(self) -> Iterator[None]:
+        """Count the body."""
+        began = time.thread_time()
+        yield
+        self.seconds += time.thread_time() - began
+
+
+Part = Callable[[Meter], None]
+
+
+def cost(part: Part) -> float:
+    """Return the microseconds per chunk of a part, which handles CHUNKS of them; the best of ROUNDS."""
+    best = float("inf")
+    for _ in range(ROUNDS):
+        meter = Meter()
+        part(meter)
+        best = min(best, meter.seconds)
+    return best / CHUNKS * US
+
+
+def read_parts() -> dict[str, float]:
+    """Return the microseconds per chunk of each part of reading."""
+    replies = [_read_reply(n, n * MAX_DATA) for n in range(CHUNKS)]
+    requests = [_read_request(n, n * MAX_DATA) for n in range(CHUNKS)]
+    return {
+        "receive (system call)": cost(_receiving(replies)),
+        "find and check frames": cost(_decoding(replies)),
+        "fields of the payload": cost(_fields(replies)),
+        "engine and transfer": cost(_engine_reading),
+        "placing in the cache": cost(_placing),
+        "build frames": cost(_encoding(requests)),
+        "send (system call)": cost(_sending(requests)),
+    }
+
+
+def write_parts() -> dict[str, float]:
+    """Return the microseconds per chunk of each part of writing."""
+    replies = [_write_reply(n, n * MAX_DATA) for n in range(CHUNKS)]
+    requests = [_write_request(n, n * MAX_DATA) for n in range(CHUNKS)]
+    return {
+        "receive (system call)": cost(_receiving(replies)),
+        "find and check frames": cost(_decoding(replies)),
+        "fields of the payload": cost(_fields(replies)),
+        "engine and transfer": cost(_engine_writing),
+        "taking from the spool": cost(_drafting),
+        "build frames": cost(_encoding(requests)),
+        "send (system call)": cost(_sending(requests)),
+    }
+
+
+# --- payloads
+
+_DATA = random.Random(1).randbytes(MAX_DATA)
+
+
+def _read_request(seq: int, offset: int) -> bytes:
+    return Payload(seq, 0, Opcode.READ_FILE, MAX_DATA, offset=offset).encode()
+
+
+def _read_reply(seq: int, offset: int) -> bytes:
+    return Payload(seq + 1, 0, Opcode.ACK, MAX_DATA, Opcode.READ_FILE, 0, offset, _DATA).encode()
+
+
+def _write_request(seq: int, offset: int) -> bytes:
+    return Payload(seq, 0, Opcode.WRITE_FILE, MAX_DATA, offset=offset, data=_DATA).encode()
+
+
+def _write_reply(seq: int, offset: int) -> bytes:
+    count = MAX_DATA.to_bytes(4, "little")
+    return Payload(seq + 1, 0, Opcode.ACK, 4, Opcode.WRITE_FILE, 0, offset, count).encode()
+
+
+# --- the wire
+
+
+def _frames(payloads: list[bytes], source: Address, target: Address) -> list[bytes]:
+    framer = Framer(source, stream=False)
+    return [framer.encode_ftp(target, payload) for payload in payloads]
+
+
+def _datagrams(payloads: list[bytes]) -> list[bytes]:
+    frames = _frames(payloads, _VEHICLE, _CLIENT)
+    return [b"".join(frames[at : at + _PER_DATAGRAM]) for at in range(0, len(frames), _PER_DATAGRAM)]
+
+
+def _decoding(payloads: list[bytes]) -> Part:
+    datagrams = _datagrams(payloads)
+
+    def run(meter: Meter) -> None:
+        framer = Framer(_CLIENT, stream=False)
+        with meter.on():
+            for datagram in datagrams:
+                framer.feed(datagram)
+
+    return run
+
+
+def _fields(payloads: list[bytes]) -> Part:
+    def run(meter: Meter) -> None:
+        with meter.on():
+            for payload in payloads:
+                decode_reply(payload)
+
+    return run
+
+
+def _encoding(payloads: list[bytes]) -> Part:
+    def run(meter: Meter) -> None:
+        encode = Framer(_CLIENT, stream=False).encode_ftp
+        with meter.on():
+            for at in range(0, CHUNKS, WINDOW):
+                _ = [encode(_VEHICLE, payload) for payload in payloads[at : at + WINDOW]]
+
+    return run
+
+
+@contextmanager
+def _sockets() -> Iterator[tuple[socket.socket, socket.socket]]:
+    with (
+        closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as near,
+        closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as far,
+    ):
+        for sock in (near, far):
+            sock.setblocking(False)
+            sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 20)
+            sock.bind(("127.0.0.1", 0))
+        yield near, far
+
+
+def _sending(payloads: list[bytes]) -> Part:
+    frames = _frames(payloads, _CLIENT, _VEHICLE)
+
+    def run(meter: Meter) -> None:
+        with _sockets() as (near, far):
+            link = UdpLink(near, "bench", far.getsockname())
+            for at in range(0, CHUNKS, WINDOW):
+                with meter.on():
+                    link.send_nowait(frames[at : at + WINDOW])
+                _empty(far)
+
+    return run
+
+
+def _receiving(payloads: list[bytes]) -> Part:
+    datagrams = _datagrams(payloads)
+
+    def run(meter: Meter) -> None:
+        with _sockets() as (near, far):
+            link = UdpLink(near, "bench", far.getsockname())
+            for at in range(0, len(datagrams), WINDOW // _PER_DATAGRAM):
+                for datagram in datagrams[at : at + WINDOW // _PER_DATAGRAM]:
+                    far.sendto(datagram, near.getsockname())
+                with meter.on():
+                    link._drain()
+
+    return run
+
+
+def _empty(sock: socket.socket) -> None:
+    try:
+        while True:
+            sock.recv(65535)
+    except BlockingIOError:
+        return
+
+
+# --- engine and caches
+
+
+class _NullSink:
+    """Wants everything and keeps nothing."""
+
+    def missing(self, start: int, stop: int) -> list[tuple[int, int]]:
+        return [(start, stop)]
+
+    def on_data(self, offset: int, data: bytes) -> None:
+        return
+
+
+class _EndlessSource:
+    """Has a file's worth of the same chunk."""
+
+    def __init__(self) -> None:
+        self._next = 0
+
+    def next_chunk(self, limit: int) -> tuple[int, bytes] | None:
+        at = self._next
+        if at >= _SIZE:
+            return None
+        self._next = at + MAX_DATA
+        return at, _DATA
+
+    def on_acked(self, offset: int, count: int) -> None:
+        return
+
+    def on_unsent(self, offset: int, count: int) -> None:
+        raise AssertionError("nothing fails here")
+
+
+def _engine_reading(meter: Meter) -> None:
+    transfer = ReadTransfer(0, _SIZE, _NullSink())
+    transfer.want(0, _SIZE, True)
+    _run_engine(meter, transfer, _DATA)
+    assert transfer.received_bytes == _SIZE
+
+
+def _engine_writing(meter: Meter) -> None:
+    transfer = WriteTransfer(0, _EndlessSource())
+    _run_engine(meter, transfer, MAX_DATA.to_bytes(4, "little"))
+    assert transfer.acked_bytes == _SIZE
+
+
+def _run_engine(meter: Meter, transfer: ReadTransfer | WriteTransfer, data: bytes) -> None:
+    engine = Engine(random.Random(1), Flow(limit=WINDOW))
+    engine.start(transfer, 0.0)
+    now = 0.0
+    while not transfer.idle:
+        now += 0.001
+        with meter.on():
+            wires = engine.outgoing(now)
+        replies = [_answer(decode_request(wire), data) for wire in wires]
+        with meter.on():
+            for reply in replies:
+                engine.receive(reply, now)
+            engine.take_finished()
+
+
+def _answer(request: Payload, data: bytes) -> Payload:
+    return Payload(
+        request.seq + 1 & 0xFFFF, 0, Opcode.ACK, len(data), request.opcode, 0, request.offset, data
+    )
+
+
+def _placing(meter: Meter) -> None:
+    cache = BlockCache(2 * _SIZE, clock=lambda: 0.0, patience=1.0)
+    blocks = FileBlocks(cache, _SIZE)
+    with meter.on():
+        for at in range(0, _SIZE, MAX_DATA):
+            blocks.on_data(at, _DATA)
+
+
+def _drafting(meter: Meter) -> None:
+    async def run() -> None:
+        spool = Spool(memory_max=lambda: 2 * _SIZE, spool_max=0)
+        draft = Draft(spool.content(), None)
+        draft.write(0, bytes(_SIZE))
+        feed = Feed(draft.begin(whole=True), MAX_DATA)
+        with meter.on():
+            for _ in range(0, CHUNKS, WINDOW):
+                taken = [feed.next_chunk(MAX_DATA) for _ in range(WINDOW)]
+                for piece in taken:
+                    assert piece is not None
+                    feed.on_acked(piece[0], MAX_DATA)
+
+    trio.run(run, clock=MockClock())
+
+
+if __name__ == "__main__":
+    for name, parts in (("read", read_parts()), ("write", write_parts())):
+        print(name, round(sum(parts.values()), 2))
+        for k, v in parts.items():
+            print(f"   {v:6.2f}  {k}")
