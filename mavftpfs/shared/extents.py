@@ -74,17 +74,25 @@ class ExtentSet:
         """Add [start, stop), merging with what it touches; an empty range changes nothing."""
         if start >= stop:
             return
-        first = bisect_left(self._stops, start)
-        last = bisect_right(self._starts, stop)
+        starts, stops = self._starts, self._stops
+        if starts and starts[-1] <= start <= stops[-1]:  # how a file grows, chunk by chunk
+            if stop > stops[-1]:
+                stops[-1] = stop
+            return
+        first = bisect_left(stops, start)
+        last = bisect_right(starts, stop)
         if first < last:
-            start = min(start, self._starts[first])
-            stop = max(stop, self._stops[last - 1])
-        self._starts[first:last] = [start]
-        self._stops[first:last] = [stop]
+            start = min(start, starts[first])
+            stop = max(stop, stops[last - 1])
+        starts[first:last] = [start]
+        stops[first:last] = [stop]
 
     def discard(self, start: int, stop: int) -> None:
         """Remove [start, stop) where present."""
-        if start >= stop:
+        if start >= stop or not self._starts:
+            return
+        if start <= self._starts[0] and stop < self._stops[0]:  # how a file is sent, chunk by chunk
+            self._starts[0] = max(stop, self._starts[0])
             return
         first = bisect_right(self._stops, start)
         last = bisect_left(self._starts, stop)
@@ -122,6 +130,8 @@ class ExtentSet:
 
     def missing(self, start: int, stop: int) -> list[tuple[int, int]]:
         """Return the ranges of [start, stop) that are not in the set, ascending."""
+        if not self._stops or start >= self._stops[-1]:
+            return [(start, stop)] if start < stop else []
         gaps: list[tuple[int, int]] = []
         index = bisect_right(self._stops, start)
         while start < stop and index < len(self._starts) and self._starts[index] < stop:

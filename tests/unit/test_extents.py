@@ -1,6 +1,8 @@
-"""Sets of byte ranges, example by example; tests/property holds them against a set of ints."""
+"""Sets of byte ranges, example by example, and held against a set of ints."""
 
 from __future__ import annotations
+
+import random
 
 import pytest
 
@@ -68,3 +70,33 @@ def test_truth_and_hash_are_refused() -> None:
         bool(ExtentSet())
     with pytest.raises(TypeError):
         hash(ExtentSet())
+
+
+def _ranges(numbers: set[int]) -> list[tuple[int, int]]:
+    starts = sorted(number for number in numbers if number - 1 not in numbers)
+    stops = sorted(number + 1 for number in numbers if number + 1 not in numbers)
+    return list(zip(starts, stops, strict=True))
+
+
+def test_any_sequence_of_changes_leaves_what_a_plain_set_would_hold() -> None:
+    rng = random.Random(7)
+    for _ in range(300):
+        extents, numbers = ExtentSet(), set[int]()
+        for _ in range(30):
+            start = rng.randrange(40)
+            stop = start + rng.randrange(-2, 9)
+            asked = set(range(start, stop))
+            if rng.random() < 0.6:
+                extents.add(start, stop)
+                numbers |= asked
+            else:
+                extents.discard(start, stop)
+                numbers -= asked
+            assert list(extents) == _ranges(numbers)
+            low, high = sorted((rng.randrange(45), rng.randrange(45)))
+            wanted = set(range(low, high))
+            assert extents.missing(low, high) == _ranges(wanted - numbers)
+            assert extents.covers(low, high) == (wanted <= numbers)
+            assert extents.overlaps(low, high) == bool(wanted & numbers)
+            inside = {number for part in extents.intersection(low, high) for number in range(*part)}
+            assert inside == wanted & numbers
