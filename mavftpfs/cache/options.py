@@ -14,8 +14,9 @@ MIN_CACHE_SIZE = MIB
 """Below this, a few of the kernel's read requests would not fit beside each other."""
 
 
-DEFAULT_LOCAL = (".*.sw?", "4913", ".~lock*", ".Trash-*", "._*")
-"""What editors and file managers leave beside the files they work on."""
+DEFAULT_LOCAL = (".*.sw?", ".*.sw?x", "4913", ".~lock*", ".Trash-*", "._*")
+"""What editors and file managers leave beside the files they work on; vim makes `.*.sw?x` for a moment, to
+find out whether the disk cuts names short."""
 
 
 @dataclass(frozen=True, slots=True)

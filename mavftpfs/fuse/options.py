@@ -37,7 +37,7 @@ _FOR_OTHERS = {
 IGNORED_WORDS = frozenset(_NO_MEANING | _FOR_OTHERS)
 IGNORED_PREFIXES = ("x-", "X-", "comment=", "user=")
 
-DEFAULT_LOCAL = (".*.sw?", "4913", ".~lock*", ".Trash-*", "._*")
+DEFAULT_LOCAL = (".*.sw?", ".*.sw?x", "4913", ".~lock*", ".Trash-*", "._*")
 """Names that editors and file managers make for themselves; they never reach the card."""
 
 _UNITS = {"": 1, "K": 1 << 10, "M": 1 << 20, "G": 1 << 30}

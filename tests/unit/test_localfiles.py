@@ -40,7 +40,9 @@ def tree(store: FakeWriter) -> Tree:
     return make_writable(store)
 
 
-@pytest.mark.parametrize("name", [b".x.swp", b".x.swo", b"4913", b".~lock.a.odt#", b"._x", b".Trash-0"])
+@pytest.mark.parametrize(
+    "name", [b".x.swp", b".x.swo", b".x.swpx", b"4913", b".~lock.a.odt#", b"._x", b".Trash-0"]
+)
 async def test_default_patterns(store: FakeWriter, tree: Tree, name: bytes) -> None:
     await write_file(tree, b"/scripts/" + name, b"data")
     assert await read_file(tree, b"/scripts/" + name) == b"data"
