@@ -4,7 +4,7 @@
 
 What the machine and a server can do, as a yardstick: one file, no mount, no cache, no event loop, nothing of
 the product's. A reply is taken if its sequence number was asked for; nothing else is checked, and a refusal
-ends it. It is spoken to as the peers are (`tests.bench.peers`): it says `ready`, waits for a line, works, says
+ends it. It is spoken to as the peers are (`tests.bench.peers`): says `ready`, waits for a line, works, says
 `done`.
 
 A request is repeated when four later ones were answered, or after a time-out.

@@ -1,0 +1,356 @@
+"""Who takes part in `tests.bench.mount`, and how each is made to move a file.
+
+Two kinds. A *worker* is a process that says `ready` when it is connected, waits for a line, moves the file,
+says `done` or `failed WHY`, and waits for another line so that its CPU time and memory can be read. A *mount*
+is a daemon; the transfer is a `cp`. Peers live in an environment of their own, with pinned versions, in the
+user's cache directory; what cannot be had there is reported as unavailable.
+"""
+
+from __future__ import annotations
+
+import ctypes.util
+import hashlib
+import os
+import select
+import shutil
+import subprocess
+import sys
+import time
+import venv
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+from tests.bench.cases import Direction
+from tests.bench.figures import BARE, US, Outcome
+from tests.support.mounts import abort_mount, mounted_at
+from tests.support.vehicles import HOST, PROJECT, Process
+
+PINS = ("fusepy==3.0.1", "loguru==0.7.3", "mavsdk==4.1.0", "pymavlink==2.4.50")
+CONNECT_TIMEOUT = 40.0
+END_TIMEOUT = 20.0
+HERE = Path(__file__).parent
+
+
+class NotToBeHadError(Exception):
+    """A peer cannot take part; the message says why and what would help."""
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """One transfer: client port, REMOTE (a path on the vehicle), LOCAL (what to write or read here).
+
+    timeout: seconds. window: requests that the server can have in flight. folder: for logs and mount points.
+    """
+
+    port: int
+    direction: Direction
+    remote: str
+    local: Path
+    timeout: float
+    window: int
+    folder: Path
+
+
+@dataclass(frozen=True, slots=True)
+class Measured:
+    """What came of a job. seconds, cpu (seconds), memory (bytes): None if it did not end well."""
+
+    outcome: Outcome
+    seconds: float | None = None
+    cpu: float | None = None
+    memory: int | None = None
+    detail: str = ""
+
+
+class Client:
+    """One way to move a file; `name` is what tables call it."""
+
+    name: str
+    directions: tuple[Direction, ...] = ("read", "write")
+
+    def prepare(self) -> None:
+        """Make sure that it can run.
+
+        Raises:
+            NotToBeHadError: it cannot.
+        """
+
+    def run(self, job: Job) -> Measured:
+        """Do the job; everything that was started has ended on return."""
+        raise NotImplementedError
+
+
+def cpu_of(pid: int) -> float:
+    """Return the seconds of CPU, user and system, that the threads of a process used."""
+    total = 0
+    for task in Path(f"/proc/{pid}/task").iterdir():
+        total += int((task / "schedstat").read_text().split()[0])
+    return total / 1e9
+
+
+class Lines:
+    """Awaits lines of a child's output, with a limit."""
+
+    def __init__(self, pipe: int) -> None:
+        self._pipe = pipe
+        self._buffer = b""
+
+    def await_one(self, beginnings: tuple[str, ...], timeout: float) -> str | None:
+        """Return the first line with one of the beginnings; None at the end of output or of `timeout`."""
+        deadline = time.monotonic() + timeout
+        while True:
+            line, newline, rest = self._buffer.partition(b"\n")
+            if newline:
+                self._buffer = rest
+                text = line.decode(errors="replace").strip()
+                if text.startswith(beginnings):
+                    return text
+                continue
+            left = deadline - time.monotonic()
+            if left <= 0 or not select.select([self._pipe], [], [], left)[0]:
+                return None
+            piece = os.read(self._pipe, 65536)
+            if not piece:
+                return None
+            self._buffer += piece
+
+
+class Worker(Client):
+    """A client that is a process of its own, spoken to by lines."""
+
+    def __init__(
+        self, name: str, argv: Callable[[Job], list[str]], *, prepare: Callable[[], object] = lambda: None
+    ) -> None:
+        self.name = name
+        self._argv = argv
+        self._prepare = prepare
+
+    def prepare(self) -> None:
+        self._prepare()
+
+    def run(self, job: Job) -> Measured:
+        log = job.folder / "worker.log"
+        with log.open("wb") as errors:
+            child = subprocess.Popen(
+                self._argv(job), stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=errors, cwd=PROJECT
+            )
+        try:
+            measured = self._converse(child, job)
+        finally:
+            child.kill()
+            child.communicate()
+        if measured.outcome is Outcome.FAILED and not measured.detail:
+            return Measured(Outcome.FAILED, detail=_last_line(log))
+        return measured
+
+    @staticmethod
+    def _converse(child: subprocess.Popen[bytes], job: Job) -> Measured:
+        assert child.stdout is not None
+        assert child.stdin is not None
+        lines = Lines(child.stdout.fileno())
+        first = lines.await_one(("ready", "failed"), CONNECT_TIMEOUT)
+        if first != "ready":
+            return Measured(Outcome.FAILED, detail=first or "")
+        cpu = cpu_of(child.pid)
+        began = time.monotonic()
+        child.stdin.write(b"go\n")
+        child.stdin.flush()
+        answer = lines.await_one(("done", "failed"), job.timeout)
+        seconds = time.monotonic() - began
+        if answer is None:
+            return Measured(Outcome.TIMEOUT if seconds >= job.timeout else Outcome.FAILED)
+        if answer != "done":
+            return Measured(Outcome.FAILED, detail=answer.removeprefix("failed "))
+        return Measured(Outcome.OK, seconds, cpu_of(child.pid) - cpu, _peak(child.pid))
+
+
+class MountClient(Client):
+    """A mount, and `cp`."""
+
+    def __init__(
+        self,
+        name: str,
+        argv: Callable[[Job, Path], list[str]],
+        *,
+        directions: tuple[Direction, ...] = ("read", "write"),
+        prepare: Callable[[], object] = lambda: None,
+    ) -> None:
+        self.name = name
+        self.directions = directions
+        self._argv = argv
+        self._prepare = prepare
+
+    def prepare(self) -> None:
+        self._prepare()
+
+    def run(self, job: Job) -> Measured:
+        point = job.folder / "mnt"
+        point.mkdir()
+        daemon = Process("daemon", self._argv(job, point), job.folder)
+        try:
+            if not _await_mount(daemon, point):
+                return Measured(Outcome.FAILED, detail=_last_line(daemon.log) or "not mounted in time")
+            return self._copy(daemon.popen.pid, point, job)
+        finally:
+            _end(daemon, point)
+
+    @staticmethod
+    def _copy(pid: int, point: Path, job: Job) -> Measured:
+        there = point / job.remote.lstrip("/")
+        source, target = (there, job.local) if job.direction == "read" else (job.local, there)
+        cpu = cpu_of(pid)
+        code, seconds, spent, said = copy(source, target, job, point)
+        if code is None:
+            return Measured(Outcome.TIMEOUT)
+        if code != 0:
+            return Measured(Outcome.FAILED, detail=said)
+        return Measured(Outcome.OK, seconds, cpu_of(pid) - cpu + spent, _peak(pid))
+
+
+def copy(source: Path, target: Path, job: Job, point: Path) -> tuple[int | None, float, float, str]:
+    """Return exit code (None: cut off), seconds, CPU seconds and complaint of `cp`."""
+    log = job.folder / "cp.log"
+    with log.open("wb") as errors:
+        began = time.monotonic()
+        child = subprocess.Popen(["cp", source, target], stdin=subprocess.DEVNULL, stderr=errors)
+    ended = os.pidfd_open(child.pid)  # exact, where Popen.wait would poll
+    try:
+        in_time = bool(select.select([ended], [], [], job.timeout)[0])
+        seconds = time.monotonic() - began
+    finally:
+        os.close(ended)
+    if not in_time:
+        child.kill()
+        abort_mount(point)  # else it waits in the kernel
+    _, status, used = os.wait4(child.pid, 0)
+    child.returncode = os.waitstatus_to_exitcode(status)
+    return (child.returncode if in_time else None), seconds, used.ru_utime + used.ru_stime, _last_line(log)
+
+
+def _await_mount(daemon: Process, point: Path) -> bool:
+    deadline = time.monotonic() + CONNECT_TIMEOUT
+    while daemon.running and time.monotonic() < deadline:
+        if mounted_at(point):
+            return True
+        time.sleep(0.02)
+    return False
+
+
+def _end(daemon: Process, point: Path) -> None:
+    if mounted_at(point) and daemon.running:
+        subprocess.run(["fusermount3", "-u", point], capture_output=True, timeout=END_TIMEOUT, check=False)
+        with suppress(subprocess.TimeoutExpired):
+            daemon.popen.wait(END_TIMEOUT)
+    daemon.kill()
+    abort_mount(point)
+
+
+def _peak(pid: int) -> int:
+    """Return the largest resident size of a process so far, in bytes."""
+    lines = Path(f"/proc/{pid}/status").read_text().splitlines()
+    return int(next(line for line in lines if line.startswith("VmHWM:")).split()[1]) * 1024
+
+
+def _last_line(log: Path) -> str:
+    lines = log.read_text(errors="replace").strip().splitlines()
+    return lines[-1][:200] if lines else ""
+
+
+# -- the peers' environment -------------------------------------------------------------------------
+
+
+class Environment:
+    """A virtual environment with the peers, made when first needed and kept."""
+
+    def __init__(self, pins: Sequence[str] = PINS) -> None:
+        self._pins = tuple(pins)
+        version = f"{sys.version_info.major}.{sys.version_info.minor}"
+        key = hashlib.sha256("\n".join((version, *self._pins)).encode()).hexdigest()[:12]
+        cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+        self.path = cache / "mavftpfs" / f"bench-peers-{key}"
+        self._stamp = self.path / "complete"
+
+    @property
+    def python(self) -> str:
+        """Its interpreter."""
+        return str(self.path / "bin" / "python")
+
+    def prepare(self) -> None:
+        """Make it if it is not there.
+
+        Raises:
+            NotToBeHadError: the packages cannot be installed.
+        """
+        if self._stamp.exists():
+            return
+        print(
+            f"installing the peers ({', '.join(self._pins)}) in an environment of their own", file=sys.stderr
+        )
+        shutil.rmtree(self.path, ignore_errors=True)
+        venv.create(self.path, with_pip=True)
+        command = [self.python, "-m", "pip", "install", "--quiet", "--disable-pip-version-check", *self._pins]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        if done.returncode != 0:
+            reason = done.stderr.strip().splitlines()[-1:] or ["pip failed"]
+            raise NotToBeHadError(f"not installed: {reason[0][:200]}")
+        self._stamp.touch()
+
+    def prepare_fusepy(self) -> None:
+        """As `prepare`; fusepy needs FUSE 2 besides.
+
+        Raises:
+            NotToBeHadError: something is missing.
+        """
+        if ctypes.util.find_library("fuse") is None:
+            raise NotToBeHadError("needs libfuse.so.2 (Debian: libfuse2)")
+        self.prepare()
+
+    def script(self, module: str) -> str:
+        """Return the path of a file of pymavlink in it."""
+        (found,) = self.path.glob(f"lib/python*/site-packages/pymavlink/{module}.py")
+        return str(found)
+
+
+def clients(environment: Environment) -> dict[str, Client]:
+    """Return everybody who can take part, by name."""
+    python = environment.python
+
+    def peer(script: str, *more: str) -> Callable[[Job], list[str]]:
+        return lambda job: [python, str(HERE / f"{script}.py"), *_task(job), *more]
+
+    def tuned(job: Job) -> list[str]:
+        return [*peer("peer_pymavlink")(job), "--chunk", "239", "--window", str(job.window)]
+
+    def bare(job: Job) -> list[str]:
+        return [sys.executable, "-m", "tests.bench.bare", *_task(job), "--window", str(job.window)]
+
+    def ours(job: Job, point: Path) -> list[str]:
+        source = f"udpin:{HOST}:{job.port}"
+        return [sys.executable, "-m", "mavftpfs", source, str(point), "-f", "-o", "verify=size"]
+
+    def fusepy(job: Job, point: Path) -> list[str]:
+        source = f"udpin:{HOST}:{job.port}"
+        return [python, environment.script("mavftpfs"), "-m", source, "--mountpoint", str(point)]
+
+    everybody: list[Client] = [
+        Worker(BARE, bare),
+        MountClient(US, ours),
+        Worker("pymavlink mavftp", peer("peer_pymavlink"), prepare=environment.prepare),
+        Worker("pymavlink mavftp, tuned", tuned, prepare=environment.prepare),
+        MountClient("pymavlink mavftpfs", fusepy, directions=("read",), prepare=environment.prepare_fusepy),
+        Worker("MAVSDK", peer("peer_mavsdk"), prepare=environment.prepare),
+        PlainReads("MAVSDK, no burst", peer("peer_mavsdk", "--plain"), prepare=environment.prepare),
+    ]
+    return {client.name: client for client in everybody}
+
+
+class PlainReads(Worker):
+    """A choice that a client has for reading alone."""
+
+    directions: tuple[Direction, ...] = ("read",)
+
+
+def _task(job: Job) -> list[str]:
+    return [str(job.port), job.direction, job.remote, str(job.local)]
