@@ -20,9 +20,9 @@ from mavftpfs.protocol.burstwatch import BurstWatch
 from mavftpfs.protocol.flow import Flow
 from mavftpfs.protocol.ledger import LAST_SEQ, Ledger
 from mavftpfs.protocol.payload import NakCode, Opcode, Payload
-from mavftpfs.protocol.requests import FLOORS, Operation, Priority, Request
-from mavftpfs.protocol.rtt import INITIAL_RTO, RttEstimator
+from mavftpfs.protocol.requests import Operation, Priority, Request
 from mavftpfs.protocol.stats import EngineStats
+from mavftpfs.protocol.timers import Timers
 from mavftpfs.shared.errors import RequestTimeout
 from mavftpfs.shared.traits import Traits
 
@@ -31,7 +31,6 @@ __all__ = ["Engine", "EngineStats"]
 OP_DEADLINE = 30.0
 _MAX_REPLAYS = 8
 _MAX_SIDE_EFFECT_REPLAYS = 2
-_LONGEST_WAIT = 5.0
 _INVALID_SESSION = bytes((NakCode.INVALID_SESSION,))
 _BURST = int(Opcode.BURST_READ_FILE)
 _ACK = int(Opcode.ACK)
@@ -72,7 +71,7 @@ class Engine:
         self._note = note
         self._ops: list[Operation] = []
         self._finished: deque[Operation] = deque()
-        self._timers = {family: RttEstimator(floor) for family, floor in FLOORS.items()}
+        self._timers = Timers()
         self._due = inf
         self._heard_at = -inf
         self._bursts = BurstWatch()
@@ -83,8 +82,7 @@ class Engine:
     @property
     def rtt(self) -> float | None:
         """Smoothed round trip in seconds: of reads, else of any request; None before the first."""
-        known = [timer for timer in self._timers.values() if timer.known]
-        return known[0].smoothed if known else None
+        return self._timers.rtt
 
     @property
     def in_flight(self) -> int:
@@ -98,11 +96,7 @@ class Engine:
 
     def timeout(self, family: str) -> float:
         """Return the present retransmission timeout of a family of opcodes, in seconds."""
-        timer = self._timers[family]
-        if timer.known:
-            return timer.rto
-        known = (other.unfloored for other in self._timers.values() if other.known)
-        return max(min(known, default=INITIAL_RTO), FLOORS[family])
+        return self._timers.timeout(family)
 
     def note(self, text: str) -> None:
         """Tell the trace something."""
@@ -159,14 +153,16 @@ class Engine:
 
     def receive(self, reply: Payload, now: float) -> None:
         """Take a reply of our server to us; anything may be in it."""
-        req_opcode = reply.req_opcode
+        seq, session, opcode, _, req_opcode, _, offset, _ = reply
         if req_opcode == _BURST and self._on_burst(reply, now):
             return
-        request = self._ledger.find(reply.seq)
+        request = self._ledger.find(seq)
         if request is None:
             self._on_unknown(reply)
         elif req_opcode != request.opcode:
             self._on_stale(request)
+        elif opcode == _ACK and offset == request.offset and session == request.session:
+            self._believe(request, reply, now)
         elif not self._coherent(request, reply):
             self.stats.incoherent += 1
         elif reply.opcode == _NAK and self._asks_again(request, reply):
@@ -184,7 +180,8 @@ class Engine:
     def _believe(self, request: Request, reply: Payload, now: float) -> None:
         stats = self.stats
         stats.replies += 1
-        stats.naks += reply.opcode == _NAK
+        if reply.opcode == _NAK:
+            stats.naks += 1
         self._heard_at = now
         rtt: float | None = None
         flow = self.flow
@@ -195,11 +192,12 @@ class Engine:
             self._bursts.on_answer(request, self.traits, self.timeout(request.manner.family))
         elif request.single:
             rtt = now - request.sent_at
-            self._timers[request.manner.family].sample(rtt)
-        flow.on_reply(now, rtt, request.order, self._ledger.order)
-        while (lost := self._ledger.next_loss()) is not None:
+            self._timers.of[request.manner.family].sample(rtt)
+        ledger = self._ledger
+        flow.on_reply(now, rtt, request.order, ledger.order)
+        while (lost := ledger.next_loss()) is not None:
             flow.on_loss(lost.order)
-            self._ledger.lose(lost)
+            ledger.lose(lost)
         op = request.op
         op.progress_at = now
         op.on_reply(request, reply, now)
@@ -303,34 +301,37 @@ class Engine:
         by_opcode[opcode] = by_opcode.get(opcode, 0) + 1
         if request.follows:
             request.session = self.session
-        ledger = self._ledger
-        ledger.number(request)
-        if request.sends == 0:
-            request.first_sent = now
+        timer = now + self._timers.of[request.manner.family].rto
+        if request.sends or opcode == _BURST:
+            self._transmit_again(request, now)
+        else:
+            request.sent_at = request.first_sent = now
             request.op.sent = True
-        else:
-            stats.retransmissions += 1
-        request.sends += 1
-        request.sent_at = now
-        if opcode == _BURST:
-            self._begin_burst(request, now)
-        else:
-            ledger.enter(request)
-            request.timer = timer = now + self._wait(request)
+            self._ledger.launch(request)
+            request.sends = 1
+            request.timer = timer
             if timer < self._due:
                 self._due = timer
         return request.encode()
 
-    # --- timers
+    def _transmit_again(self, request: Request, now: float) -> None:
+        """Number a repeated request, or a burst, which is never repeated."""
+        self._ledger.number(request)
+        request.sent_at = now
+        if request.sends == 0:
+            request.first_sent = now
+            request.op.sent = True
+        else:
+            self.stats.retransmissions += 1
+        request.sends += 1
+        if request.opcode == _BURST:
+            self._begin_burst(request, now)
+        else:
+            self._ledger.enter(request)
+            request.timer = now + self._timers.wait(request)
+            self._due = min(self._due, request.timer)
 
-    def _wait(self, request: Request) -> float:
-        """Return how long to wait for this transmission's reply."""
-        manner = request.manner
-        wait = rto = self._timers[manner.family].rto
-        doublings = request.sends - manner.free_sends
-        if doublings > 0:
-            wait = min(rto * (1 << min(doublings, 6)), max(rto, _LONGEST_WAIT))
-        return max(wait, manner.patience) if request.sends >= manner.patient_after else wait
+    # --- timers
 
     def next_deadline(self) -> float | None:
         """Return when `on_deadline` wants to be called, or None if nothing is pending."""
@@ -366,7 +367,7 @@ class Engine:
             else:
                 self._due = min(self._due, request.timer)
         for family in silent:
-            self._timers[family].on_silence()
+            self._timers.of[family].on_silence()
         if silent:
             self.flow.on_silence()
 
@@ -376,7 +377,7 @@ class Engine:
         if not self.traits.answers_during_burst:
             # ArduPilot answers nothing else during a burst: silence proves nothing then.
             since = max(since, self._bursts.heard_at)
-        return since + self._wait(request)
+        return since + self._timers.wait(request)
 
     def _expire(self, request: Request, now: float) -> None:
         """A timer ran out: ask again, or give up the operation when this one request took too long."""

@@ -48,12 +48,14 @@ class Ledger:
     """
 
     __slots__ = (
+        "_first",
         "_flying",
         "_newest_answered",
         "_ordered",
         "_seq",
         "_table",
         "again",
+        "find",
         "ghost",
         "order",
         "reorder",
@@ -63,7 +65,10 @@ class Ledger:
         self._seq = next_seq
         self._table: dict[int, Request] = {}
         self._flying: dict[int, Request] = {}
+        self.find = self._table.get
+        """Returns the unanswered request to which a reply with a seq belongs, or None."""
         self._ordered: OrderedDict[int, Request] = OrderedDict()
+        self._first = 0  # nothing older is in `_ordered`
         self._newest_answered = -1
         self.again: list[Request] = []
         self.ghost = Ghost()
@@ -78,10 +83,6 @@ class Ledger:
     def flying(self) -> list[Request]:
         """Return the requests on their way, oldest transmission first."""
         return list(self._flying.values())
-
-    def find(self, seq: int) -> Request | None:
-        """Return the unanswered request to which a reply with `seq` belongs."""
-        return self._table.get(seq)
 
     # --- going out
 
@@ -99,6 +100,23 @@ class Ledger:
         the rest of it may come long after it was given up (servers.md 14.3)."""
         distance = min(max(BURST_JUMP, 2 * packets), FURTHEST_JUMP)
         self._seq = (self._seq + distance) % (LAST_SEQ + 1)
+
+    def launch(self, request: Request) -> None:
+        """Number a request that goes out for the first time, and note that it is on its way."""
+        table = self._table
+        seq = self._seq
+        if seq > LAST_SEQ or seq + 1 in table:
+            seq = self.take_seq()
+        else:
+            self._seq = seq + 1
+        order = self.order
+        self.order = order + 1
+        request.seq = seq
+        request.order = order
+        table[seq + 1] = self._flying[order] = request
+        request.flying = True
+        if request.manner.ordered:
+            self._ordered[order] = request
 
     def number(self, request: Request) -> None:
         """Give a request that goes out (again) its seq and order number."""
@@ -134,6 +152,14 @@ class Ledger:
 
         Its order, sent_at and single are those of the answered transmission from then on.
         """
+        if request.sends == 1 and request.flying and seq == request.seq + 1:  # nearly always
+            order = request.order
+            request.flying = False
+            del self._table[seq], self._flying[order]
+            self._ordered.pop(order, None)
+            if order > self._newest_answered:
+                self._newest_answered = order
+            return True
         outrun = request.outrun
         self.forget(request)
         current = seq == request.seq + 1
@@ -162,14 +188,18 @@ class Ledger:
 
     def next_loss(self) -> Request | None:
         """Return a request that later answers prove to be lost, or None; the caller calls `lose`."""
+        proven = self._newest_answered - self.reorder
+        if proven < self._first:
+            return None
         ordered = self._ordered
-        if ordered:
-            order = next(iter(ordered))
-            if order <= self._newest_answered - self.reorder:
-                request = ordered[order]
-                request.outrun = True
-                return request
-        return None
+        if not ordered:
+            return None
+        self._first = order = next(iter(ordered))
+        if order > proven:
+            return None
+        request = ordered[order]
+        request.outrun = True
+        return request
 
     def lose(self, request: Request) -> None:
         """This transmission will not be answered: ask again, unless nobody would want to know."""

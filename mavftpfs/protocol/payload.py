@@ -19,6 +19,7 @@ MAX_DATA = 239
 
 _HEADER = struct.Struct("<HBBBBBxI")
 _ZEROS = bytes(PAYLOAD_SIZE)
+_new = tuple.__new__  # once per chunk: a NamedTuple's own costs twice as much
 
 
 class Opcode(IntEnum):
@@ -107,11 +108,11 @@ def decode_reply(wire: bytes) -> Payload:
     Raises:
         RemoteProtocolError: wrong length, or `size` over 239.
     """
-    seq, session, opcode, size, req_opcode, burst_complete, offset = _unpack(wire)
+    fields = _unpack(wire)
+    size = fields[3]
     if size > MAX_DATA:
         raise RemoteProtocolError(f"reply says it holds {size} bytes of data, more than {MAX_DATA}")
-    data = wire[HEADER_SIZE : HEADER_SIZE + size]
-    return Payload(seq, session, opcode, size, req_opcode, burst_complete, offset, data)
+    return _new(Payload, (*fields, wire[HEADER_SIZE : HEADER_SIZE + size]))
 
 
 def decode_request(wire: bytes) -> Payload:

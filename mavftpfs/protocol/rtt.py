@@ -17,12 +17,17 @@ _MAX_DOUBLINGS = 7
 class RttEstimator:
     """Smoothed round-trip time, its variation, and the retransmission timeout; all in seconds."""
 
-    __slots__ = ("_floor", "_silences", "samples", "smoothed", "unfloored", "variation")
+    __slots__ = ("_floor", "_silences", "rto", "samples", "smoothed", "unfloored", "variation")
 
     def __init__(self, floor: float) -> None:
         self._floor = floor
         self._silences = 0
         self.unfloored = INITIAL_RTO
+        self.rto = max(INITIAL_RTO, floor)
+        """How long to wait for a reply before it is asked again.
+
+        Backed off to at most LONGEST_BACK_OFF: a link that comes back should not wait longer for us.
+        """
         self.samples = 0
         self.smoothed = 0.0
         self.variation = 0.0
@@ -32,31 +37,21 @@ class RttEstimator:
         """Whether a round trip was ever measured."""
         return self.samples > 0
 
-    @property
-    def rto(self) -> float:
-        """How long to wait for a reply before it is asked again.
-
-        Backed off to at most LONGEST_BACK_OFF: a link that comes back should not wait longer for us.
-        """
-        rto = self.unfloored if self.unfloored > self._floor else self._floor
-        doublings = self._silences - _FREE_SILENCES
-        if doublings > 0 and rto < LONGEST_BACK_OFF:
-            rto = min(rto * (1 << min(doublings, _MAX_DOUBLINGS)), LONGEST_BACK_OFF)
-        return rto
-
     def sample(self, rtt: float) -> None:
         """Take one round trip that provably belongs to one transmission; ends a back-off."""
         if self.samples:
-            self.variation += (abs(self.smoothed - rtt) - self.variation) * 0.25
-            self.smoothed += (rtt - self.smoothed) * 0.125
+            error = rtt - self.smoothed
+            self.smoothed = smoothed = self.smoothed + error * 0.125
+            self.variation += ((error if error > 0 else -error) - self.variation) * 0.25
         else:
-            self.smoothed = rtt
+            self.smoothed = smoothed = rtt
             self.variation = rtt / 2
         self.samples += 1
         self._silences = 0
         slack = 4 * self.variation
-        half = self.smoothed / 2
-        self.unfloored = self.smoothed + (slack if slack > half else half)
+        half = smoothed / 2
+        self.unfloored = rto = smoothed + (slack if slack > half else half)
+        self.rto = rto if rto > self._floor else self._floor
 
     def on_silence(self) -> None:
         """Nothing was heard for a whole timeout; from the third in a row on, each doubles it.
@@ -64,3 +59,8 @@ class RttEstimator:
         Not from the first: at 20 % loss each way a lone request goes unanswered every third time.
         """
         self._silences += 1
+        rto = max(self.unfloored, self._floor)
+        doublings = self._silences - _FREE_SILENCES
+        if doublings > 0 and rto < LONGEST_BACK_OFF:
+            rto = min(rto * (1 << min(doublings, _MAX_DOUBLINGS)), LONGEST_BACK_OFF)
+        self.rto = rto

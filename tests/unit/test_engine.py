@@ -531,7 +531,7 @@ def test_checksums_are_not_piled_up() -> None:
 def test_listings_are_not_piled_up() -> None:
     engine = make()
     for _ in range(20):
-        engine._timers["list"].sample(0.01)
+        engine._timers.of["list"].sample(0.01)
     op = ListDirectory(b"/big")
     engine.start(op, 0.0)
     now, count = 0.0, len(sent(engine, 0.0))

@@ -326,7 +326,7 @@ def test_a_burst_that_goes_quiet_is_over_but_not_early() -> None:
 
 def test_the_flag_and_a_short_quiet_end_it() -> None:
     reader = Reader(strategy="burst")
-    reader.engine._timers["data"].sample(0.05)
+    reader.engine._timers.of["data"].sample(0.05)
     reader.transfer.want(0, SIZE, True)
     (request,) = reader.sent()
     stream(reader, request, [0, 1, 2], complete=2)
