@@ -253,14 +253,14 @@ class Writeback:
             return
         self._context.require_disarmed()
         node = await self._need_draft(path, truncate=size == 0)
-        if node.writers:
-            await self.truncate_node(node, size)
-            return
-        file = WriteFile(self, self._context, node)
+        file = WriteFile(self, self._context, node)  # also beside other writers: they may end meanwhile
         had = node.undelivered
         try:
             await file.truncate(size)
-            await file.release()
+            if node.writers > 1:
+                file.close()  # the others deliver it
+            else:
+                await file.release()
         except BaseException:
             file.close()
             unchanged = node.draft is None or not node.draft.touched

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import errno
 import logging
+import mmap
 import os
 import stat as stat_bits
 from collections.abc import Sequence
@@ -44,6 +45,15 @@ def _writable(handle: FileHandle) -> WritableFile | None:
     return file if file.writable else None
 
 
+def _is_mapped_page(start: int, stop: int, told: int) -> bool:
+    """Return whether a write brings a page of a mapping instead of what a program appended.
+
+    The kernel brings pages by any handle that may write, also one with O_APPEND. They lie on page borders and
+    within the size it knows (`told`, bytes), where nothing can be appended.
+    """
+    return start < told and start % mmap.PAGESIZE == 0 and (stop == told or stop % mmap.PAGESIZE == 0)
+
+
 class WritingOperations(Operations):
     """Operations plus everything that changes the tree."""
 
@@ -71,7 +81,9 @@ class WritingOperations(Operations):
         path = self._path(inode)
         file = await self._tree.open(path, write=writing, truncate=bool(flags & os.O_TRUNC))
         fh = self.files.add(FileHandle(inode, file, flags))
-        if known.told_size not in (None, file.size) and not flags & os.O_TRUNC:
+        if flags & os.O_TRUNC:
+            known.told_size = 0
+        elif known.told_size not in (None, file.size):
             await self._refresh(inode)
         return FileInfo(fh=fh, direct_io=file.direct_io, keep_cache=file.keep_cache)
 
@@ -98,7 +110,10 @@ class WritingOperations(Operations):
         file = _writable(handle)
         if file is None:
             raise FUSEError(errno.EBADF)
-        if handle.flags & os.O_APPEND:
+        known = self._inode(handle.ino)
+        told, stop = known.told_size or 0, off + len(buf)
+        known.told_size = max(told, stop)  # the kernel counts on without asking
+        if handle.flags & os.O_APPEND and not _is_mapped_page(off, stop, told):
             off = file.size  # the kernel's idea of the size may be older than ours
         return await file.write(off, buf)
 

@@ -96,7 +96,7 @@ async def test_truncation_comes_in_the_open_flags_and_append_follows_our_size() 
     assert tree.files[b"/a.txt"] == b""
     info = await ops.open(ino, os.O_WRONLY | os.O_APPEND, CTX)
     await ops.write(info.fh, 0, b"one")
-    await ops.write(info.fh, 0, b"two")
+    await ops.write(info.fh, 3, b"two")
     await ops.flush(info.fh)
     assert tree.files[b"/a.txt"] == b"onetwo"
 
