@@ -6,7 +6,8 @@ it, SSS counts, and the kind k is
   o  the old NAME, moved aside only after the new content was verified;
   m  NAME itself, on its way to another spelling; never removed;
   d  a file that was unlinked while somebody read it;
-  p  a *sidecar*: a small file whose content is the path that t, o or m of the same number belong to. It is
+  p  a *sidecar*: a small file whose content is the path that t, o or m of the same number belong to, and,
+     behind a NUL, the one that m had before. It is
      written first and removed last, and only where NAME does not fit: rename carries both paths in one
      request of 238 bytes, so long paths use the short form, in the nearest directory above that fits.
 
@@ -17,8 +18,9 @@ What an interruption leaves, and what `repair` does with it (new, old and target
   target missing, new only      rename new to `recovered-tSSS-NAME`: a power cut inside a server that
                                 unlinks before it renames leaves that (NuttX), and nobody can tell whether it
                                 is complete
-  target missing, moved         rename it to target, then remove old; if the target is there as well:
-                                `recovered-mSSS-NAME`
+  target missing, moved         rename it to target, then remove old
+  target there, moved           rename it to where it came from, if a sidecar tells that and nothing is there
+                                by now: the move never happened. Else `recovered-mSSS-NAME`
   sidecar alone, deleted        remove
 Nothing is touched while its owner may be alive: see `Staleness`.
 """
@@ -194,11 +196,15 @@ class Staleness:
 
 @dataclass(frozen=True, slots=True)
 class Group:
-    """What one replacement left in a directory: the paths by kind, and the target's path if known."""
+    """What one replacement left in a directory: the paths by kind, and the target's path if known.
+
+    source: the path that `moved` had, if it is known and free.
+    """
 
     paths: Mapping[Kind, bytes]
     serial: bytes
     target: bytes | None
+    source: bytes | None = None
 
 
 def leftovers(
@@ -240,7 +246,8 @@ def repair(group: Group, *, target_exists: bool) -> list[Action]:
     new, old, moved = (paths.get(kind) for kind in (Kind.NEW, Kind.OLD, Kind.MOVED))
     if moved is not None:
         missing = group.target is not None and not target_exists
-        actions.append(Action(moved, group.target if missing else _recovered(group, moved)))
+        home = group.target if missing else group.source
+        actions.append(Action(moved, home or _recovered(group, moved)))
         target_exists = target_exists or missing  # from now on, so `old` must not take its place
     if group.target is None:
         actions += _without_target(group, new, old)

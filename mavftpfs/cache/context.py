@@ -24,6 +24,7 @@ class Context:
     clock: seconds, monotonic; wall: seconds since 1970. on_changed(path): a path, and what lies below it,
     was changed by us. live: reserved paths in use right now; hidden: unlinked files by their reserved path.
     garbage: reserved paths that could not be removed yet -> the path they belong to.
+    torn: paths that may be missing on the vehicle though nobody removed them -> where their files lie.
     armed: nothing may be changed.
     """
 
@@ -42,6 +43,7 @@ class Context:
     live: set[bytes] = field(default_factory=set)
     hidden: dict[bytes, Node] = field(default_factory=dict)
     garbage: dict[bytes, bytes] = field(default_factory=dict)
+    torn: dict[bytes, bytes] = field(default_factory=dict)
     armed: bool = False
 
     def require_disarmed(self) -> None:

@@ -79,7 +79,8 @@ class Deliverer:
             return
         node.quiet = trio.Event()
         try:
-            self._context.require_disarmed()
+            if node.path not in self._context.torn:  # else its name lacks a file until this is done
+                self._context.require_disarmed()
             await self._deliver(node)
             node.error = None
             node.background = True
@@ -113,6 +114,8 @@ class Deliverer:
             try:
                 if not attempt.committing:
                     await self.replacer.clean(node.path, attempt.places, new=True)
+                elif node.path in self._context.torn:
+                    self.replacer.leave(node.path, attempt.places)
             finally:
                 self.replacer.release(attempt.places)
 

@@ -30,9 +30,11 @@ from mavftpfs.shared.errors import (
     FtpNak,
     InvalidMove,
     IsADirectory,
+    LinkError,
     NotADirectory,
     NotFound,
     NotSupported,
+    RequestTimeout,
 )
 from mavftpfs.shared.model import DirEntry, EntryKind, join, split, wire_path
 
@@ -240,6 +242,8 @@ class Namespace:
     async def _unlink_node(self, node: Node, path: bytes) -> None:
         async with node.lock:
             await self._deliverer.abandon(node)
+            if path in self._context.torn:
+                await self._purge(path)
             there = await self.listed(path) is not None
             if there and node.draft is None:
                 self._context.require_idle(path)
@@ -360,9 +364,12 @@ class Namespace:
         places = self._context.namer.places(new, old)
         replacer.reserve(places)
         try:
-            if not fits_rename(old, new) or by_case:
-                old = await self._step_aside(old, new, places)
-            await replacer.replace(old, new, places, Present(new=True, old=False, target=there))
+            present = Present(new=True, old=False, target=there)
+            if fits_rename(old, new) and not by_case:
+                await replacer.replace(old, new, places, present)
+            else:
+                await self._step_aside(old, new, places)
+                await replacer.replace_by_way(old, new, places, present)
         finally:
             replacer.release(places)
 
@@ -382,8 +389,12 @@ class Namespace:
         """A first rename to a free name failed: return whether both names are as they were."""
         return await self._sure.entry(old) is not None and await self._sure.entry(new) is None
 
-    async def _step_aside(self, old: bytes, new: bytes, places: Places) -> bytes:
-        """Move `old` to a reserved name on its way to `new`; after an interruption a listing moves it on."""
-        await self._deliverer.replacer.write_sidecar(places, new)
-        await self._rename_plainly(old, places.moved)
-        return places.moved
+    async def _step_aside(self, old: bytes, new: bytes, places: Places) -> None:
+        """Move `old` to a reserved name on its way to `new`; if cut off, a listing moves it on or back."""
+        replacer = self._deliverer.replacer
+        await replacer.write_sidecar(places, new, old)
+        try:
+            await self._rename_plainly(old, places.moved)
+        except (RequestTimeout, LinkError):
+            replacer.tear(old, places.moved)
+            raise

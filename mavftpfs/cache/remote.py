@@ -182,8 +182,9 @@ class WriteStore(Protocol):
         """Remove what is known to be an empty directory."""
         ...
 
-    async def rename(self, old: bytes, new: bytes) -> None:
-        """Rename; both paths together must fit one request (238 bytes)."""
+    async def rename(self, old: bytes, new: bytes, *, completes: bool = False) -> None:
+        """Rename; both paths together must fit one request (238 bytes). completes: without it a name stays
+        missing, so it is done though the vehicle was armed meanwhile."""
         ...
 
     async def stat_size(self, path: bytes) -> int:

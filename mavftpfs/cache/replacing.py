@@ -2,20 +2,24 @@
 
 Where the server replaces files by renaming, one request does it. Where it refuses (FAT) the old file is
 moved aside first and removed last. `asides` says what is left by an interruption and how it is mended.
+
+Between these two requests the name is missing, so the second one is sent even if the vehicle was armed
+meanwhile; if it cannot be (the link is lost), the name is *torn*: programs go on seeing it, and the next
+listing, of which the first comes when the link is back, gives it its file again.
 """
 
 from __future__ import annotations
 
 import errno
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from mavftpfs.cache.asides import Places
 from mavftpfs.cache.context import Context
 from mavftpfs.cache.remote import UploadSource
 from mavftpfs.cache.sure import Sure
 from mavftpfs.shared.errnos import errno_for
-from mavftpfs.shared.errors import FtpNak, MavftpfsError, NotSupported, VerificationFailed
+from mavftpfs.shared.errors import Armed, FtpNak, MavftpfsError, NotSupported, VerificationFailed
 from mavftpfs.shared.model import split
 
 log = logging.getLogger("mavftpfs.cache")
@@ -49,15 +53,21 @@ class Replacer:
         """What is left under these names is for the next listing to clean up."""
         self._context.live -= self._names(places)
 
-    async def write_sidecar(self, places: Places, target: bytes) -> None:
-        """Write down where short names belong, if the names are short.
+    def leave(self, target: bytes, places: Places) -> None:
+        """A replacement is given up half-way: what removes the target has to remove its files, too."""
+        parts = (places.new, places.old, places.sidecar)
+        self._context.garbage.update({path: target for path in parts if path is not None})
+
+    async def write_sidecar(self, places: Places, target: bytes, source: bytes | None = None) -> None:
+        """Write down where short names belong, if the names are short; source: where `moved` came from.
 
         Raises:
             As WriteStore.open_upload.
         """
         if places.sidecar is None:
             return
-        upload = await self._context.writer.open_upload(places.sidecar, _Bytes(target), create=True)
+        text = target if source is None else target + b"\0" + source
+        upload = await self._context.writer.open_upload(places.sidecar, _Bytes(text), create=True)
         try:
             upload.wake()
             await upload.finish()
@@ -87,11 +97,43 @@ class Replacer:
             if not present.target:
                 await self._finish_rename(source, target, places, old=present.old)
             elif not await self._rename_over(source, target):
+                if source not in (places.new, places.moved):  # else it was written before
+                    await self.write_sidecar(places, target)
                 present = Present(new=True, old=await self._move_aside(target, places.old), target=False)
                 await self._finish_rename(source, target, places, old=present.old)
         elif not present.target:
             raise VerificationFailed(f"{source!r} vanished before it was renamed to {target!r}")
         await self.clean(target, places, old=present.old)
+
+    async def replace_by_way(self, source: bytes, target: bytes, places: Places, present: Present) -> None:
+        """Do the same for a file that left `source` for `places.moved`; if it fails it goes back there.
+
+        Raises:
+            As replace.
+        """
+        try:
+            await self.replace(places.moved, target, places, present)
+        except (FtpNak, Armed, NotSupported):
+            await self._undo(places.moved, source)
+            raise
+        except BaseException:
+            self.tear(source, places.moved)
+            raise
+
+    def tear(self, path: bytes, place: bytes) -> None:
+        """The file of a name may lie at `place` for now: show it on, and have both directories listed."""
+        context = self._context
+        (parent, name), (directory, reserved) = split(path), split(place)
+        for listed, known in ((parent, name), (directory, reserved)):
+            listing = context.dentries.known(listed)
+            entry = None if listing is None else listing.entries.get(known)
+            if entry is not None:
+                context.dentries.note_created(path, replace(entry, name=name))
+                break
+        context.torn[path] = place
+        for listed in (parent, directory):
+            context.dentries.expire(listed, context.clock())
+        log.warning("%r may lie under %r until the vehicle is heard again", path, place)
 
     async def clean(self, target: bytes, places: Places, *, new: bool = False, old: bool = False) -> None:
         """Remove what is not needed any more; what cannot be removed now goes at a later listing."""
@@ -149,23 +191,36 @@ class Replacer:
                 raise
             traits.rename_works = False
             raise NotSupported("this server cannot rename") from nak
+        except Armed:
+            raise  # before it was sent
+        except BaseException:
+            self.tear(target, old)
+            raise
         if traits.rename_replaces is None:
             traits.rename_replaces = False  # it renames, but did not replace a moment ago
         return True
 
     async def _finish_rename(self, source: bytes, target: bytes, places: Places, *, old: bool) -> None:
         try:
-            await self._sure.rename(source, target)
+            await self._sure.rename(source, target, completes=old)
         except FtpNak:
             if old:
                 await self._undo(places.old, target)
             raise
+        except BaseException:
+            if old:
+                self.tear(target, places.old)
+            raise
+        self._context.torn.pop(target, None)
 
-    async def _undo(self, old: bytes, target: bytes) -> None:
+    async def _undo(self, place: bytes, path: bytes) -> None:
         try:
-            await self._sure.rename(old, target)
+            await self._sure.rename(place, path, completes=True)
         except MavftpfsError as error:
-            log.warning("%r lies under %r until its directory is listed again: %s", target, old, error)
+            log.debug("%r did not get its file back: %s", path, error)
+            self.tear(path, place)
+        else:
+            self._context.torn.pop(path, None)
 
 
 class _Bytes(UploadSource):

@@ -7,6 +7,7 @@ The reply to a request may be lost although the request was done, and its repeti
 from __future__ import annotations
 
 from collections.abc import Awaitable, Callable
+from functools import partial
 
 from mavftpfs.cache.context import Context
 from mavftpfs.shared.errors import FtpNak, MavftpfsError, NotADirectory, NotFound, RequestTimeout
@@ -58,13 +59,16 @@ class Sure:
         await self._do(lambda: self._context.writer.make_directory(path), lambda: self._is_directory(path))
         self._context.dentries.note_created(path, DirEntry(split(path)[1], EntryKind.DIRECTORY))
 
-    async def rename(self, old: bytes, new: bytes) -> None:
+    async def rename(self, old: bytes, new: bytes, *, completes: bool = False) -> None:
         """Rename, on a server that replaces files perhaps over a file; both paths fit a request.
+
+        completes: see WriteStore.rename.
 
         Raises:
             As WriteStore.
         """
-        await self._do(lambda: self._context.writer.rename(old, new), lambda: self._is_moved(old, new))
+        rename = partial(self._context.writer.rename, old, new, completes=completes)
+        await self._do(rename, lambda: self._is_moved(old, new))
         self._context.writer.traits.rename_works = True
         self._context.dentries.note_renamed(old, new)
 

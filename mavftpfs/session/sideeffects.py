@@ -71,12 +71,13 @@ class SideEffects:
                 lambda: Simple(Opcode.CREATE_DIRECTORY, wire), lambda: self._is_new_directory(path)
             )
 
-    async def rename(self, old: bytes, new: bytes) -> None:
-        """Rename; who reads the old path goes on under the new one."""
+    async def rename(self, old: bytes, new: bytes, *, completes: bool = False) -> None:
+        """Rename; who reads the old path goes on under the new one. completes: in flight, too."""
         data = wire_path(old) + b"\0" + wire_path(new)
         if len(data) > RENAME_LIMIT:
             raise PathTooLong(f"both paths of a rename have {len(data)} bytes, more than {RENAME_LIMIT}")
-        async with self._changing(old, below=True), self._changing(new):
+        may = self._scheduler.require_link if completes else self._scheduler.check_may_write
+        async with self._changing(old, below=True, may=may), self._changing(new, may=may):
             await self._perform(lambda: Simple(Opcode.RENAME, data), lambda: self._is_renamed(old, new))
             self._scheduler.gone(new)
             self._scheduler.moved(old, new)
@@ -100,10 +101,14 @@ class SideEffects:
     # --- one request
 
     @asynccontextmanager
-    async def _changing(self, path: bytes, *, below: bool = False) -> AsyncIterator[None]:
-        """Check that writing is allowed now, and keep our own session off the path."""
-        self._scheduler.check_may_write()
+    async def _changing(
+        self, path: bytes, *, below: bool = False, may: Callable[[], None] | None = None
+    ) -> AsyncIterator[None]:
+        """Check that writing is allowed now (`may()` raises), and keep our own session off the path."""
+        may = may or self._scheduler.check_may_write
+        may()
         async with self._scheduler.claim(path, below=below):
+            may()  # closing our session may have taken a while
             yield
 
     async def _perform(self, make: Callable[[], Simple], verify: Verdict) -> None:

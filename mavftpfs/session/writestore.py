@@ -58,9 +58,9 @@ class WriteStore:
         """See cache.remote.WriteStore."""
         await self._effects.remove_directory(path)
 
-    async def rename(self, old: bytes, new: bytes) -> None:
+    async def rename(self, old: bytes, new: bytes, *, completes: bool = False) -> None:
         """See cache.remote.WriteStore."""
-        await self._effects.rename(old, new)
+        await self._effects.rename(old, new, completes=completes)
         self.traits.rename_works = True
 
     async def stat_size(self, path: bytes) -> int:

@@ -6,6 +6,7 @@ every chunk of an upload, counts as one.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from random import Random
 from typing import Any
@@ -63,6 +64,7 @@ class FakeWriter(FakeStore):
         log: what they were. fail_at: number -> error raised instead of executing it. lose_reply_at: executed,
         but answered by silence. freeze_at: from this number on nothing is executed (power lost).
         capacity: bytes of all files; beyond that WriteFile is refused.
+        before_request: called with what is asked, before anything is decided.
         spoil_uploads: how many more uploads arrive with a wrong byte. writable_armed: refuse while `armed`.
     """
 
@@ -80,16 +82,19 @@ class FakeWriter(FakeStore):
         self.write_delay = 0.0
         self.uploads: list[FakeUpload] = []
         self.probes = 0
+        self.before_request: Callable[..., None] | None = None
 
     # --- what requests go through
 
-    async def request(self, *what: object) -> bool:
+    async def request(self, *what: object, in_flight: bool = False) -> bool:
         """Count a request; raise if it is to fail; return whether its reply gets lost."""
         await trio.lowlevel.checkpoint()
+        if self.before_request is not None:
+            self.before_request(*what)
         if self.write_delay:
             await trio.sleep(self.write_delay)
         self.require_link()
-        if self.armed:
+        if self.armed and not in_flight:
             raise Armed("armed")
         self.requests += 1
         if self.freeze_at is not None and self.requests > self.freeze_at:
@@ -184,9 +189,9 @@ class FakeWriter(FakeStore):
         self.directories.discard(path)
         _maybe_lose(lost)
 
-    async def rename(self, old: bytes, new: bytes) -> None:
+    async def rename(self, old: bytes, new: bytes, *, completes: bool = False) -> None:
         assert len(wire_path(old)) + 1 + len(wire_path(new)) <= 238, "does not fit a request"
-        lost = await self.request("rename", old, new)
+        lost = await self.request("rename", old, new, in_flight=completes)
         if not self.kind.renames:
             raise FtpNak(Opcode.RENAME, NakCode.FAIL_ERRNO, 2)
         self._rename(self.real(old), new)

@@ -1,0 +1,330 @@
+"""A name that lost its file half-way through a replacement: it is seen on, and soon gets a file again."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator
+from pathlib import Path
+from random import Random
+
+import pytest
+import trio
+
+from mavftpfs.cache.asides import Group, Kind, is_reserved, repair
+from mavftpfs.cache.spool import SpoolDirectory
+from mavftpfs.cache.tree import Tree
+from mavftpfs.protocol.payload import NakCode, Opcode
+from mavftpfs.shared.errors import Armed, FtpNak, MavftpfsError, VehicleLost
+from mavftpfs.shared.model import split
+from tests.support.fake_store import read_file
+from tests.support.fake_writer import KINDS, FakeWriter, make_writable, write_file
+
+OLD = bytes(range(256)) * 4
+NEW = b"new content " * 100
+FILE = b"/card/dir/file.txt"
+OTHER = b"/card/dir/other"
+
+
+@pytest.fixture
+async def store(nursery: trio.Nursery, autojump_clock: object) -> AsyncIterator[FakeWriter]:
+    """A FAT card: the server does not rename over files, and is known for it."""
+    store = FakeWriter(KINDS["fat"], nursery)
+    store.traits.rename_replaces = False
+    store.add(FILE, OLD)
+    store.add(OTHER, NEW)
+    yield store
+    assert store.crimes == []
+    nursery.cancel_scope.cancel()
+
+
+@pytest.fixture
+def tree(store: FakeWriter) -> Tree:
+    return make_writable(store)
+
+
+class Trap:
+    """Does something before, or instead of, one of the renames."""
+
+    def __init__(self, store: FakeWriter, tree: Tree, number: int, what: str) -> None:
+        self._store = store
+        self._tree = tree
+        self._left = number
+        self._what = what
+        store.before_request = self
+
+    def __call__(self, *request: object) -> None:
+        if request[0] != "rename":
+            return
+        self._left -= 1
+        if self._left == 0:
+            if self._what == "lost":
+                lose(self._store, self._tree)
+            else:
+                arm(self._store, self._tree, armed=True)
+
+
+def lose(store: FakeWriter, tree: Tree) -> None:
+    store.lost = True
+    tree.link_lost()
+
+
+def arm(store: FakeWriter, tree: Tree, *, armed: bool) -> None:
+    store.armed = armed
+    tree.armed_changed(armed)
+
+
+def litter(store: FakeWriter) -> list[bytes]:
+    return [path for path in store.files if is_reserved(split(path)[1])]
+
+
+def come_back(store: FakeWriter, tree: Tree) -> None:
+    store.lost = False
+    tree.link_back()
+
+
+# --- armed
+
+
+@pytest.mark.parametrize("number", [1, 2])
+async def test_a_replacement_leaves_no_gap_when_the_vehicle_is_armed(
+    store: FakeWriter, tree: Tree, number: int
+) -> None:
+    Trap(store, tree, number, "armed")
+    try:
+        await write_file(tree, FILE, NEW)
+        assert number == 2, "the first rename is not begun in flight"
+    except Armed:
+        assert number == 1
+    assert store.files[FILE].data == (OLD if number == 1 else NEW)
+    arm(store, tree, armed=False)
+    await trio.sleep(1)
+    tree.forget_caches()
+    await tree.list(b"/card/dir")
+    assert store.files[FILE].data == NEW
+    assert litter(store) == []
+
+
+@pytest.mark.parametrize("number", [1, 2])
+async def test_a_move_over_a_file_leaves_no_gap_when_the_vehicle_is_armed(
+    store: FakeWriter, tree: Tree, number: int
+) -> None:
+    Trap(store, tree, number, "armed")
+    try:
+        await tree.rename(OTHER, FILE)
+        assert number == 2
+    except Armed:
+        assert number == 1
+    assert store.files[FILE].data == (OLD if number == 1 else NEW)
+    assert (OTHER in store.files) == (number == 1)
+
+
+async def test_a_refused_finish_is_undone_in_flight(store: FakeWriter, tree: Tree) -> None:
+    def refuse(*request: object) -> None:
+        if request[0] == "rename" and store.files.get(FILE) is None:
+            arm(store, tree, armed=True)
+            store.before_request = None
+            raise FtpNak(Opcode.RENAME, NakCode.FAIL_ERRNO, 5)
+
+    store.before_request = refuse
+    with pytest.raises(Armed):  # what it tried next
+        await write_file(tree, FILE, NEW)
+    assert store.files[FILE].data == OLD
+
+
+@pytest.mark.parametrize("armed", [False, True])
+async def test_a_gap_that_a_lost_link_left_is_closed_though_armed(
+    store: FakeWriter, tree: Tree, armed: bool
+) -> None:
+    Trap(store, tree, 2, "lost")
+    with pytest.raises(VehicleLost):
+        await write_file(tree, FILE, NEW)
+    assert FILE not in store.files
+    assert await read_file(tree, FILE) == NEW, "the draft is shown meanwhile"
+    if armed:
+        arm(store, tree, armed=True)
+    come_back(store, tree)
+    await trio.sleep(1)
+    assert store.files[FILE].data == NEW
+    assert tree.undelivered() == []
+
+
+# --- the link is lost between the two renames
+
+
+async def test_a_gap_is_closed_although_the_program_has_the_file_open(store: FakeWriter, tree: Tree) -> None:
+    file = await tree.open(FILE, write=True, truncate=True)
+    await file.write(0, NEW)
+    Trap(store, tree, 2, "lost")
+    with pytest.raises(VehicleLost):
+        await file.fsync()
+    come_back(store, tree)
+    await trio.sleep(1)
+    assert store.files[FILE].data == NEW
+    file.close()
+
+
+@pytest.mark.parametrize("number", [1, 2])
+async def test_a_move_over_a_file_that_was_cut_off_is_undone(
+    store: FakeWriter, tree: Tree, number: int
+) -> None:
+    await tree.list(b"/card/dir")
+    Trap(store, tree, number, "lost")
+    with pytest.raises(VehicleLost):
+        await tree.rename(OTHER, FILE)
+    assert (FILE in store.files) == (number == 1)
+    shown = dict(await tree.list(b"/card/dir"))
+    assert {b"file.txt", b"other"} == set(shown)
+    assert shown[b"file.txt"].size == len(OLD)
+    assert (await tree.stat(FILE)).size == len(OLD)
+    with pytest.raises(VehicleLost):  # not: no such file
+        await tree.open(FILE)
+    come_back(store, tree)
+    await trio.sleep(0.1)
+    assert store.files[FILE].data == OLD
+    assert store.files[OTHER].data == NEW
+    assert litter(store) == []
+    assert await read_file(tree, FILE) == OLD
+
+
+async def test_who_opens_a_torn_name_gets_its_file(store: FakeWriter, tree: Tree) -> None:
+    """Before the news that the link is back, too: the listing that comes first mends it."""
+    await tree.list(b"/card/dir")
+    Trap(store, tree, 2, "lost")
+    with pytest.raises(VehicleLost):
+        await tree.rename(OTHER, FILE)
+    store.lost = False
+    tree._directories.lost = False
+    assert await read_file(tree, FILE) == OLD
+
+
+async def test_a_torn_name_that_is_being_read_is_mended(store: FakeWriter, tree: Tree) -> None:
+    reader = await tree.open(FILE)
+    Trap(store, tree, 2, "lost")
+    with pytest.raises(VehicleLost):
+        await tree.rename(OTHER, FILE)
+    come_back(store, tree)
+    await trio.sleep(0.1)
+    assert store.files[FILE].data == OLD
+    assert bytes(await reader.read(0, len(OLD))) == OLD
+    reader.close()
+
+
+async def test_removing_a_torn_file_removes_it(store: FakeWriter, tree: Tree) -> None:
+    Trap(store, tree, 2, "lost")
+    with pytest.raises(VehicleLost):
+        await write_file(tree, FILE, NEW)
+    store.lost = False
+    tree._directories.lost = False
+    await tree.unlink(FILE)
+    tree.forget_caches()
+    assert [name for name, _ in await tree.list(b"/card/dir")] == [b"other"]
+    assert litter(store) == []
+
+
+async def test_a_draft_written_on_after_the_gap_does_not_keep_it_open(store: FakeWriter, tree: Tree) -> None:
+    file = await tree.open(FILE, write=True, truncate=True)
+    await file.write(0, NEW)
+    Trap(store, tree, 2, "lost")
+    with pytest.raises(VehicleLost):
+        await file.fsync()
+    await file.write(0, b"more")
+    arm(store, tree, armed=True)
+    come_back(store, tree)
+    await trio.sleep(1)
+    await tree.list(b"/card/dir")
+    assert store.files[FILE].data in (OLD, NEW)
+    arm(store, tree, armed=False)
+    await file.fsync()
+    assert store.files[FILE].data == b"more" + NEW[4:]
+    file.close()
+
+
+# --- moves in two steps
+
+
+def deep(length: int, end: bytes) -> bytes:
+    """A path of so many bytes in one of two directories below /card."""
+    return b"/card/" + end + b"d" * (length - 8 - len(end)) + b"/" + end
+
+
+LONG_OLD, LONG_NEW = deep(125, b"a"), deep(125, b"b")
+"""Too long for one rename."""
+
+LONG_FITTING = deep(115, b"a"), deep(115, b"b")
+"""One rename takes them, but not by the names that tell where they belong."""
+
+
+async def listed(store: FakeWriter, tree: Tree) -> None:
+    tree.forget_caches()
+    for directory in [*store.directories, *store.directories]:
+        await tree.list(directory)
+
+
+@pytest.mark.parametrize("paths", [(LONG_OLD, LONG_NEW), LONG_FITTING])
+@pytest.mark.parametrize("kind", ["posix", "fat"])
+async def test_power_lost_in_a_long_move_over_a_file(
+    autojump_clock: object, tmp_path: Path, kind: str, paths: tuple[bytes, bytes]
+) -> None:
+    """Both files are under their names again, or the move is done: nothing is `recovered-`."""
+    old, new = paths
+    number, done = 0, False
+    while not done:
+        async with trio.open_nursery() as nursery:
+            store = FakeWriter(KINDS[kind], nursery)
+            store.add(old, NEW)
+            store.add(new, OLD)
+            spool = SpoolDirectory(tmp_path / f"{number}", Random(number))
+            store.freeze_at = number
+            try:
+                await make_writable(store, spool=spool).rename(old, new)
+                done = True
+            except MavftpfsError:
+                pass
+            spool.close()
+            store.revive()
+            again = SpoolDirectory(tmp_path / f"{number}", Random(99))
+            await listed(store, make_writable(store, spool=again, seed=2))
+            again.close()
+            files = {path: file.data for path, file in store.files.items()}
+            assert files in ({old: NEW, new: OLD}, {new: NEW}), number
+            assert store.crimes == []
+            nursery.cancel_scope.cancel()
+        number += 1
+
+
+@pytest.mark.parametrize("what", ["lost", "armed"])
+@pytest.mark.parametrize("number", [1, 2, 3])
+async def test_a_long_move_that_was_stopped_is_undone(
+    store: FakeWriter, tree: Tree, number: int, what: str
+) -> None:
+    store.add(LONG_OLD, NEW)
+    store.add(LONG_NEW, OLD)
+    for path in (LONG_OLD, LONG_NEW):
+        await tree.list(split(path)[0])
+    Trap(store, tree, number, what)
+    try:
+        await tree.rename(LONG_OLD, LONG_NEW)
+        assert (number, what) == (3, "armed"), "the last step is allowed in flight"
+    except (VehicleLost, Armed):
+        assert (await tree.stat(LONG_OLD)).size == len(NEW)
+        assert (await tree.stat(LONG_NEW)).size == len(OLD)
+    if what == "lost":
+        come_back(store, tree)
+        await trio.sleep(0.1)
+    else:
+        assert store.files[LONG_NEW].data == (NEW if number == 3 else OLD)
+        assert number == 3 or store.files[LONG_OLD].data == NEW
+        arm(store, tree, armed=False)
+    await listed(store, tree)
+    files = {path: file.data for path, file in store.files.items() if path in (LONG_OLD, LONG_NEW)}
+    assert files in ({LONG_OLD: NEW, LONG_NEW: OLD}, {LONG_NEW: NEW})
+    assert litter(store) == []
+
+
+def test_what_was_moved_goes_back_only_to_a_free_name() -> None:
+    parts = {Kind.MOVED: b"/d/.mavftpfs-abcdmsss", Kind.SIDECAR: b"/d/p"}
+    back = repair(Group(parts, b"sss", b"/d/x", b"/d/source"), target_exists=True)
+    assert [(a.path, a.to) for a in back] == [(parts[Kind.MOVED], b"/d/source"), (b"/d/p", None)]
+    on = repair(Group(parts, b"sss", b"/d/x", b"/d/source"), target_exists=False)
+    assert on[0].to == b"/d/x"
+    taken = repair(Group(parts, b"sss", b"/d/x"), target_exists=True)
+    assert taken[0].to == b"/d/recovered-msss-x"
