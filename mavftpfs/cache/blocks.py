@@ -15,7 +15,7 @@ the file still tells whether they are its bytes.
 from __future__ import annotations
 
 import zlib
-from collections import OrderedDict, deque
+from collections import OrderedDict
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
@@ -23,51 +23,13 @@ from dataclasses import dataclass
 import trio
 
 from mavftpfs.cache.readahead import Pace, RateMeter
+from mavftpfs.cache.room import Room
 from mavftpfs.shared.errors import RequestTimeout
 from mavftpfs.shared.extents import ExtentSet
 
 BLOCK_SIZE = 64 * 1024
 
 Gaps = list[tuple[int, int]]
-
-
-class _Room:
-    """First come, first served admission of pinned bytes, so that waiting readers cannot fill the memory."""
-
-    def __init__(self, limit: int) -> None:
-        self._limit = limit
-        self._queue: deque[tuple[int, trio.Event]] = deque()
-        self.used = 0
-
-    async def enter(self, count: int) -> None:
-        """Wait for `count` bytes; one that is larger than the limit goes alone."""
-        if not self._queue and self._fits(count):
-            self.used += count
-            return
-        ticket = (count, trio.Event())
-        self._queue.append(ticket)
-        try:
-            await ticket[1].wait()
-        except BaseException:
-            if ticket[1].is_set():
-                self.leave(count)
-            else:
-                self._queue.remove(ticket)
-                self._admit()
-            raise
-
-    def leave(self, count: int) -> None:
-        self.used -= count
-        self._admit()
-
-    def _admit(self) -> None:
-        while self._queue and self._fits(self._queue[0][0]):
-            count, event = self._queue.popleft()
-            self.used += count
-            event.set()
-
-    def _fits(self, count: int) -> bool:
-        return self.used == 0 or self.used + count <= self._limit
 
 
 class BlockCache:
@@ -79,7 +41,7 @@ class BlockCache:
         self.clock = clock
         self.patience = patience
         self.meter = RateMeter()
-        self.room = _Room(budget // 2)
+        self.room = Room(budget // 2)
         self.bytes_cached = 0
         self.evictions = 0
         self._blocks: OrderedDict[tuple[FileBlocks, int], int] = OrderedDict()
@@ -179,7 +141,16 @@ class FileBlocks:
 
     def on_data(self, offset: int, data: bytes | memoryview) -> None:
         """Keep what is not held yet; what lies beyond the opened size is dropped."""
-        stop = min(offset + len(data), self.size)
+        count = len(data)
+        block = self._blocks.get(offset // BLOCK_SIZE)
+        at = offset % BLOCK_SIZE
+        if block is not None and at + count <= len(block) and self._present.end <= offset:
+            # The usual chunk of a file that is read from front to back.
+            block[at : at + count] = data
+            self._present.add(offset, offset + count)
+            self._arrived += count
+            return
+        stop = min(offset + count, self.size)
         for start, end in self._present.missing(offset, stop):
             self._write(start, end, memoryview(data)[start - offset : end - offset])
             self._arrived += end - start
