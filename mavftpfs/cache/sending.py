@@ -43,10 +43,16 @@ class Sending:
         self._acked = ExtentSet()
         self._proven = ExtentSet()
         self._ahead = (0, b"")
+        self._clear = 0  # nothing under way lies in the lowest dirty extent, if that begins below
+        self._run = (
+            0,
+            0,
+        )  # ACKed in a row, and not entered yet: ACKs come one by one, a hundred thousand a second
 
     @property
     def unacked(self) -> int:
         """Bytes that are dirty or in flight."""
+        self._enter_run()
         again = sum(
             stop - start for a, b in self._in_flight for start, stop in self._dirty.intersection(a, b)
         )
@@ -56,13 +62,19 @@ class Sending:
 
     def on_write(self, start: int, stop: int) -> None:
         """The draft's bytes [start, stop) changed: they go (again)."""
+        self._enter_run()
+        self._clear = 0
         self._dirty.add(start, stop)
         self._acked.discard(start, stop)
         self._proven.discard(start, stop)
-        self._ahead = (0, b"")
+        at, data = self._ahead
+        if start < at + len(data) and at < stop:
+            self._ahead = (0, b"")
 
     def on_cut(self, size: int) -> None:
         """The draft ends at `size` now; what was sent beyond it shows in `reached`."""
+        self._enter_run()
+        self._clear = 0
         for start, stop in self._in_flight.intersection(size, max(size, self._in_flight.end)):
             self._void.add(start, stop)
         for extents in (self._dirty, self._in_flight, self._acked, self._proven):
@@ -73,28 +85,40 @@ class Sending:
 
     def next_chunk(self, limit: int) -> tuple[int, bytes] | None:
         """See cache.remote.UploadSource."""
-        found = self._next_extent(limit)
-        if found is None:
+        found = self._dirty.first()
+        if found is None or self.emptied:  # what is written behind lost bytes leaves a hole
             return None
         start, stop = found
+        if self._run[1] > start:
+            self._enter_run()  # an ACK of these bytes was not for the copy that goes now
+        if start < self._clear:
+            stop = min(stop, start + limit)
+        elif (found := self._next_extent(limit)) is None:
+            return None
+        else:
+            start, stop = found
         data = self._bytes(start, stop)
         self._dirty.discard(start, stop)
         self._in_flight.add(start, stop)
-        self.reached = max(self.reached, stop)
+        if stop > self.reached:
+            self.reached = stop
         return start, data
 
     def on_acked(self, offset: int, count: int) -> None:
         """See cache.remote.UploadSource."""
+        begin, end = self._run
+        if offset == end:
+            self._run = (begin, end + count)
+        else:
+            self._enter_run()
+            self._run = (offset, offset + count)
         if self.progress is not None:
             self.progress(count)
-        self._void.discard(offset, offset + count)
-        for start, stop in self._in_flight.intersection(offset, offset + count):
-            self._in_flight.discard(start, stop)
-            for a, b in self._dirty.missing(start, stop):
-                self._acked.add(a, b)
 
     def on_unsent(self, offset: int, count: int) -> None:
         """See cache.remote.UploadSource."""
+        self._enter_run()
+        self._clear = 0
         self._void.discard(offset, offset + count)
         for start, stop in self._in_flight.intersection(offset, offset + count):
             self._in_flight.discard(start, stop)
@@ -102,10 +126,13 @@ class Sending:
 
     def on_checkpoint(self) -> None:
         """See cache.remote.UploadSource."""
+        self._enter_run()
         self._move(self._acked, self._proven)
 
     def on_rollback(self, everything: bool) -> None:
         """See cache.remote.UploadSource."""
+        self._enter_run()
+        self._clear = 0
         self._void.clear()
         self._move(self._in_flight, self._dirty)
         self._move(self._acked, self._dirty)
@@ -128,12 +155,25 @@ class Sending:
 
     # --- inside
 
+    def _enter_run(self) -> None:
+        offset, end = self._run
+        if offset == end:
+            return
+        self._run = (0, 0)
+        self._void.discard(offset, end)
+        for start, stop in self._in_flight.intersection(offset, end):
+            self._in_flight.discard(start, stop)
+            for a, b in self._dirty.missing(start, stop):
+                self._acked.add(a, b)
+
     def _next_extent(self, limit: int) -> tuple[int, int] | None:
+        self._enter_run()
         first = self._dirty.first()
         if first is None:
             return None
         under_way = (self._in_flight, self._void)
         if not any(extents.overlaps(*first) for extents in under_way):
+            self._clear = first[1]
             return first[0], min(first[1], first[0] + limit)
         for start, stop in self._dirty:
             for a, b in self._in_flight.missing(start, stop):

@@ -28,6 +28,7 @@ class Throttle:
     def __init__(self, context: Context) -> None:
         self._context = context
         self._moved = trio.Event()
+        self._waiting = 0
         self.meter = RateMeter()
 
     @property
@@ -48,10 +49,14 @@ class Throttle:
 
     async def wait(self) -> bool:
         """Wait for anything to move; return False if nothing did for STALL seconds."""
-        with trio.move_on_after(STALL):
-            await self._moved.wait()
-            return True
-        return False
+        self._waiting += 1
+        try:
+            with trio.move_on_after(STALL):
+                await self._moved.wait()
+                return True
+            return False
+        finally:
+            self._waiting -= 1
 
     def on_acked(self, count: int) -> None:
         """Bytes arrived."""
@@ -60,5 +65,6 @@ class Throttle:
 
     def let_go(self) -> None:
         """Have those who wait look again."""
-        moved, self._moved = self._moved, trio.Event()
-        moved.set()
+        if self._waiting:  # an event for each ACK of a fast link would cost more than the ACK
+            moved, self._moved = self._moved, trio.Event()
+            moved.set()

@@ -152,6 +152,16 @@ def test_a_late_upload_of_an_earlier_attempt_changes_nothing() -> None:
     assert late.unacked == 3
 
 
+def test_an_ack_of_bytes_that_are_not_under_way_is_not_one_of_the_copy_that_goes_next() -> None:
+    draft = draft_over(None)
+    draft.write(0, bytes(40))
+    sending = draft.begin(whole=True)
+    sending.next_chunk(10)
+    sending.on_acked(10, 10)
+    assert sending.next_chunk(10) == (10, bytes(10))
+    assert sending.unacked == 40
+
+
 def test_bytes_fetched_ahead_are_not_stale() -> None:
     draft = draft_over(None)
     draft.write(0, bytes(AHEAD * 2))
