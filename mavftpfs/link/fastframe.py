@@ -15,6 +15,7 @@ component, 251 bytes.
 from __future__ import annotations
 
 import struct
+from collections.abc import Iterable
 
 from fastcrc import crc16
 
@@ -24,16 +25,20 @@ FTP_MESSAGE_ID = 110
 FTP_PAYLOAD_SIZE = 251
 
 _MAGIC = 0xFD
-_OVERHEAD = 12  # header and CRC
+_BEFORE_CRC = 10
 _FULL = 254  # payload of 110 before trimming
 _SHORTEST = 15  # with the three target bytes
 _ZEROS = bytes(224)
-_MAX_ADDRESSES = 1024
+_SHORT = FTP_PAYLOAD_SIZE - len(_ZEROS)
+_MAX_ROUTES = 1024
 
-_head = struct.Struct("<BBHBBBIBB").pack
+# all before the content but the magic byte: payload size, both flags, seq, and the route
+_head = struct.Struct("<BHB8s").pack
+_route = struct.Struct("<BBIBB").pack
 _pack_crc = struct.Struct("<H").pack
-# magic, payload size, both flags, source ids, message id and target network in one, target ids
-_fields = struct.Struct("<BBHx2sI2s").unpack_from
+# magic, payload size, both flags, and the route: source ids, message id, target network, target ids
+_fields = struct.Struct("<BBHx8s").unpack_from
+_FTP_ROUTE = FTP_MESSAGE_ID.to_bytes(4, "little")
 _crc = crc16.mcrf4xx
 _new = tuple.__new__
 
@@ -43,10 +48,10 @@ def frame_crc(body: bytes, extra: int) -> int:
     return _crc(body + bytes((extra,)))
 
 
-def _trimmed_head(head: bytes) -> bytes:
+def _empty_body(seq: int, route: bytes) -> bytes:
     # An all-zero payload: trimming reaches into the target ids, but the first byte always stays.
-    ids = head[10:].rstrip(b"\0") or b"\0"
-    return bytes((_MAGIC, len(ids))) + head[2:10] + ids
+    ids = route[5:].rstrip(b"\0") or b"\0"
+    return bytes((len(ids), 0, 0, seq)) + route[:5] + ids
 
 
 class FtpFrameCodec:
@@ -55,18 +60,20 @@ class FtpFrameCodec:
     def __init__(self, source: Address, crc_extra: int) -> None:
         self.source = source
         self._extra = bytes((crc_extra,))
-        self._addresses: dict[bytes, Address] = {}
+        self._routes: dict[bytes, tuple[Address, Address]] = {}
 
-    def encode(self, seq: int, target: Address, payload: bytes) -> bytes:
-        """Return the frame with the frame sequence number `seq` (0..255); payload: 251 bytes."""
-        if payload.endswith(_ZEROS):  # most requests; strip is slow over a long tail
-            payload = payload[: -len(_ZEROS)]
-        content = payload.rstrip(b"\0")
-        system, component = self.source
-        size = len(content) + 3
-        head = _head(_MAGIC, size, 0, seq, system, component, FTP_MESSAGE_ID, target[0], target[1])
-        body = head + content if content else _trimmed_head(head)
-        return body + _pack_crc(_crc(body[1:] + self._extra))
+    def encode(self, seq: int, target: Address, payloads: Iterable[bytes]) -> list[bytes]:
+        """Return the frames; seq: frame sequence number (0..255) of the first; payloads: 251 bytes each."""
+        route = _route(*self.source, FTP_MESSAGE_ID, *target)
+        extra = self._extra
+        frames = []
+        for payload in payloads:
+            # Most requests end in zeros, and strip is slow over a long tail.
+            content = (payload[:_SHORT] if payload.endswith(_ZEROS) else payload).rstrip(b"\0")
+            body = _head(len(content) + 3, 0, seq, route) + content if content else _empty_body(seq, route)
+            frames.append(b"\xfd" + body + _pack_crc(_crc(body + extra)))
+            seq = (seq + 1) & 0xFF
+        return frames
 
     def decode_run(self, data: bytes, start: int, out: list[Message]) -> int:
         """Append the unbroken run of whole, valid frames at `start` to `out`; return where it ends.
@@ -75,28 +82,30 @@ class FtpFrameCodec:
         a bad CRC, a payload shorter than the target ids or longer than 254, the end of the data.
         """
         extra = self._extra
-        addresses = self._addresses
-        last = len(data) - _SHORTEST
+        routes = self._routes
+        end = len(data)
         # Indices rather than a parser object: this loop runs once per chunk of every transfer.
-        while start <= last:
-            magic, size, flags, source, message_id, target = _fields(data, start)
-            stop = start + size + _OVERHEAD
-            if message_id != FTP_MESSAGE_ID or magic != _MAGIC or flags or not 3 <= size <= _FULL:
+        while start + _SHORTEST <= end:
+            magic, size, flags, route = _fields(data, start)
+            at_crc = start + size + _BEFORE_CRC
+            addresses = routes.get(route) or self._learn(route)
+            if addresses is None or magic != _MAGIC or flags or not 3 <= size <= _FULL or at_crc + 2 > end:
                 break
-            crc = data[stop - 2 : stop]  # short, hence unequal, where the frame is not whole
-            if _pack_crc(_crc(data[start + 1 : stop - 2] + extra)) != crc:
+            body = data[start + 1 : at_crc]
+            if _crc(body + extra) != data[at_crc] | data[at_crc + 1] << 8:
                 break
-            payload = data[start + 13 : stop - 2]
+            payload = body[12:]
             if size != _FULL:
                 payload = payload.ljust(FTP_PAYLOAD_SIZE, b"\0")
-            sender = addresses.get(source) or self._learn(source)
-            receiver = addresses.get(target) or self._learn(target)
-            out.append(_new(FtpFrame, (sender, receiver, payload)))
-            start = stop
+            out.append(_new(FtpFrame, (*addresses, payload)))
+            start = at_crc + 2
         return start
 
-    def _learn(self, pair: bytes) -> Address:
-        if len(self._addresses) >= _MAX_ADDRESSES:
-            self._addresses.clear()  # a flood of invented senders must not grow the cache
-        self._addresses[pair] = Address(*pair)
-        return self._addresses[pair]
+    def _learn(self, route: bytes) -> tuple[Address, Address] | None:
+        """Return source and target of a route, None if it is not one of our message."""
+        if route[2:6] != _FTP_ROUTE:
+            return None
+        if len(self._routes) >= _MAX_ROUTES:
+            self._routes.clear()  # a flood of invented senders must not grow the cache
+        self._routes[route] = addresses = Address(route[0], route[1]), Address(route[6], route[7])
+        return addresses

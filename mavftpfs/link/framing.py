@@ -246,18 +246,26 @@ class Framer:
         Raises:
             LocalProtocolError: the payload is not 251 bytes.
         """
-        if len(payload) != FTP_PAYLOAD_SIZE:
-            raise LocalProtocolError(f"FTP payload of {len(payload)} bytes, {FTP_PAYLOAD_SIZE} needed")
+        return self.encode_ftp_run(target, [payload])[0]
+
+    def encode_ftp_run(self, target: Address, payloads: Sequence[bytes]) -> list[bytes]:
+        """Return the frames of several payloads, in order; otherwise as encode_ftp."""
+        for payload in payloads:
+            if len(payload) != FTP_PAYLOAD_SIZE:
+                raise LocalProtocolError(f"FTP payload of {len(payload)} bytes, {FTP_PAYLOAD_SIZE} needed")
         if self._check is not None:
-            return self._pack(
-                dialect.MAVLink_file_transfer_protocol_message(0, target[0], target[1], list(payload))
-            )
-        seq = self._sender.seq
-        self._sender.seq = (seq + 1) & 0xFF
-        frame = self._codec.encode(seq, target, payload)
+            return [self._pack(self._ftp_message(target, payload)) for payload in payloads]
+        sender = self._sender
+        frames = self._codec.encode(sender.seq, target, payloads)
+        sender.seq = (sender.seq + len(frames)) & 0xFF
         if self.on_frame is not None:
-            self.on_frame(frame)
-        return frame
+            for frame in frames:
+                self.on_frame(frame)
+        return frames
+
+    @staticmethod
+    def _ftp_message(target: Address, payload: bytes) -> Any:
+        return dialect.MAVLink_file_transfer_protocol_message(0, target[0], target[1], list(payload))
 
     def encode_heartbeat(
         self,

@@ -26,6 +26,9 @@ QUIET = 0.5
 """Seconds of silence in mid-frame after which a stream's unfinished frame is not waited for. TCP may pause
 for a retransmission, serial ports do not pause inside a frame."""
 
+REFILL_EVERY = 8
+"""Chunks of input after which room in the window is used at once: the server works meanwhile."""
+
 BACKLOG_LIMIT = 16 * 1024
 """Bytes the link may hold unsent before the engine is asked for more: nothing overtakes what waits there."""
 
@@ -126,36 +129,42 @@ class Driver:
             self.framer.reset()
             return
         self._heard_at = now
+        feed = self.framer.feed
         for index, chunk in enumerate(chunks):
-            self._handle(self.framer.feed(chunk), now, index)
+            self._handle(feed(chunk), now, index)
+            if index % REFILL_EVERY == REFILL_EVERY - 1:
+                self._refill(now)
         self.on_batch(now)
 
     def _handle(self, messages: list[Message], now: float, index: int = -1) -> None:
+        vehicle, receive = self.vehicle, self.engine.receive
         for message in messages:
-            if type(message) is FtpFrame and self.vehicle.is_reply_to_us(message):
-                self._on_reply(message.payload, now)
-            else:
+            if type(message) is not FtpFrame or not vehicle.is_reply_to_us(message):
                 self._on_other(message, now, index)
+            elif self._trace is not None:
+                self._on_traced_reply(message.payload, now, self._trace)
+            else:
+                try:
+                    receive(decode_reply(message.payload), now)
+                    self.last_reply_at = now
+                except RemoteProtocolError:
+                    self.bad_payloads += 1
 
     @property
     def _quiet_at(self) -> float:
         return self._heard_at + QUIET if self.framer.waiting else float("inf")
 
-    def _on_reply(self, wire: bytes, now: float) -> None:
+    def _on_traced_reply(self, wire: bytes, now: float, trace: PayloadTrace) -> None:
         try:
             reply = decode_reply(wire)
         except RemoteProtocolError:
             self.bad_payloads += 1
-            if self._trace is not None:
-                self._trace.payload(now, "reply", wire, "malformed")
+            trace.payload(now, "reply", wire, "malformed")
             return
         self.last_reply_at = now
-        if self._trace is None:
-            self.engine.receive(reply, now)
-            return
         self._remarks.before_reply()
         self.engine.receive(reply, now)
-        self._trace.payload(now, "reply", wire, self._remarks.after_reply(reply))
+        trace.payload(now, "reply", wire, self._remarks.after_reply(reply))
 
     def _on_other(self, message: Message, now: float, index: int) -> None:
         self.vehicle.on_message(message, now)
@@ -163,10 +172,13 @@ class Driver:
         if self._pins is not None and message is self.vehicle.heartbeat:
             self._pins.pin_peer(index)
 
-    def _settle(self, now: float) -> None:
+    def _refill(self, now: float) -> None:
         target = self.vehicle.address
         if target is not None and self.link.backlog < BACKLOG_LIMIT:
             self._send(target, self.engine.outgoing(now), now)
+
+    def _settle(self, now: float) -> None:
+        self._refill(now)
         for operation in self.engine.take_finished():
             on_finished = self._waiting.pop(operation, None)
             if isinstance(operation.error, RequestTimeout):
@@ -182,8 +194,7 @@ class Driver:
         if self._trace is not None:
             for wire in payloads:
                 self._trace.payload(now, "request", wire, self._remarks.on_request(wire))
-        encode = self.framer.encode_ftp
-        self.link.send_nowait([encode(target, wire) for wire in payloads])
+        self.link.send_nowait(self.framer.encode_ftp_run(target, payloads))
 
     def _next_deadline(self) -> float:
         deadline = self.engine.next_deadline()

@@ -104,7 +104,8 @@ class Vehicle:
 
     def is_reply_to_us(self, frame: FtpFrame) -> bool:
         """Return whether an FTP message is from our vehicle to us."""
-        return frame.target == self.own and frame.source == self.address
+        source, target, _ = frame
+        return target == self.own and source == self.address
 
     def on_message(self, message: Message, now: float) -> None:
         """Learn from any message except FTP replies to us."""

@@ -152,10 +152,10 @@ def _fields(payloads: list[bytes]) -> Part:
 
 def _encoding(payloads: list[bytes]) -> Part:
     def run(meter: Meter) -> None:
-        encode = Framer(_CLIENT, stream=False).encode_ftp
+        framer = Framer(_CLIENT, stream=False)
         with meter.on():
             for at in range(0, CHUNKS, WINDOW):
-                _ = [encode(_VEHICLE, payload) for payload in payloads[at : at + WINDOW]]
+                framer.encode_ftp_run(_VEHICLE, payloads[at : at + WINDOW])
 
     return run
 

@@ -42,13 +42,14 @@ def reference_frame(source: Address, target: Address, payload: bytes, **how: Any
     return frame
 
 
-@given(addresses, addresses, st.integers(0, 255), payloads)
+@given(addresses, addresses, st.integers(0, 255), st.lists(payloads, max_size=4))
 def test_fast_encoding_is_pymavlinks_byte_for_byte(
-    source: Address, target: Address, seq: int, payload: bytes
+    source: Address, target: Address, seq: int, several: list[bytes]
 ) -> None:
-    assert FtpFrameCodec(source, EXTRA).encode(seq, target, payload) == reference_frame(
-        source, target, payload, seq=seq
-    )
+    assert FtpFrameCodec(source, EXTRA).encode(seq, target, several) == [
+        reference_frame(source, target, payload, seq=(seq + index) & 0xFF)
+        for index, payload in enumerate(several)
+    ]
 
 
 @given(addresses, addresses, st.integers(0, 255), payloads)

@@ -39,7 +39,7 @@ def reference(seq: int, target: Address, payload: bytes) -> bytes:
 def test_encodes_as_pymavlink(payload: bytes, target: Address) -> None:
     codec = FtpFrameCodec(US, EXTRA)
     for seq in (0, 1, 255):
-        assert codec.encode(seq, target, payload) == reference(seq, target, payload)
+        assert codec.encode(seq, target, [payload]) == [reference(seq, target, payload)]
 
 
 @pytest.mark.parametrize("payload", PAYLOADS)
@@ -59,7 +59,7 @@ def test_a_frame_trimmed_into_its_target_is_left_to_pymavlink() -> None:
 
 def test_run_of_frames_stops_where_it_ends() -> None:
     codec = FtpFrameCodec(US, EXTRA)
-    frames = [codec.encode(n, Address(1, 1), bytes([n]) * 251) for n in range(5)]
+    frames = codec.encode(0, Address(1, 1), [bytes([n]) * 251 for n in range(5)])
     data = b"junk" + b"".join(frames) + b"\xfd\x09"
     out: list[Message] = []
     assert codec.decode_run(data, 4, out) == len(data) - 2
@@ -98,9 +98,9 @@ def test_a_flood_of_senders_does_not_grow_the_cache() -> None:
         for component in range(0, 256, 16):
             sender = FtpFrameCodec(Address(system, component), EXTRA)
             out: list[Message] = []
-            codec.decode_run(sender.encode(0, Address(1, 1), FULL), 0, out)
+            codec.decode_run(sender.encode(0, Address(1, 1), [FULL])[0], 0, out)
             assert out[0].source == (system, component)
-    assert len(codec._addresses) <= 1024
+    assert len(codec._routes) <= 1024
 
 
 def test_frame_crc_is_pymavlinks() -> None:
