@@ -23,15 +23,19 @@ class Content(Protocol):
     """Keeps bytes by offset (cache.spool.SpoolContent)."""
 
     def put(self, offset: int, data: bytes | memoryview) -> None:
-        """Keep them. Raises NoSpace, having kept none."""
+        """Keep them. Raises NoSpace or SpoolFailed, having kept none."""
         ...
 
     def get(self, start: int, stop: int) -> bytes:
-        """Return bytes that were put."""
+        """Return bytes that were put. Raises SpoolFailed."""
         ...
 
     def cut(self, size: int) -> None:
-        """Forget what lies at and beyond `size`."""
+        """Forget what lies at and beyond `size`. Raises NoSpace or SpoolFailed, having forgotten nothing."""
+        ...
+
+    def settle(self) -> None:
+        """The vehicle has all of it."""
         ...
 
 
@@ -62,6 +66,7 @@ class Draft:
         self._held = ExtentSet()
         self._changed = ExtentSet()
         self._touched = False
+        self._ruined = False
 
     # --- what it is
 
@@ -108,6 +113,11 @@ class Draft:
         under_way = self.sending is not None and not self.sending.whole and self.sending.reached > 0
         return self._touched or under_way
 
+    @property
+    def ruined(self) -> bool:
+        """Whether an attempt found the vehicle's file without what was to stay of it: it may have holes."""
+        return self._ruined or (self.sending is not None and self.sending.emptied)
+
     def missing_base(self) -> list[tuple[int, int]]:
         """Return the ranges of which only the vehicle has the bytes."""
         return self._held.missing(0, min(self.base_limit, self.size))
@@ -128,7 +138,11 @@ class Draft:
         return found
 
     def local_bytes(self, start: int, stop: int) -> bytes:
-        """Return [start, stop), no byte of which may be the base's."""
+        """Return [start, stop), no byte of which may be the base's.
+
+        Raises:
+            SpoolFailed.
+        """
         parts = []
         for where, a, b in self.segments(start, stop):
             assert where is not Where.BASE
@@ -136,7 +150,11 @@ class Draft:
         return parts[0] if len(parts) == 1 else b"".join(parts)
 
     def crc32(self) -> int:
-        """Return the CRC32 as the vehicle computes it (servers.md 10) of a whole draft."""
+        """Return the CRC32 as the vehicle computes it (servers.md 10) of a whole draft.
+
+        Raises:
+            SpoolFailed.
+        """
         value = 0xFFFFFFFF
         for at in range(0, self.size, STEP):
             value = zlib.crc32(self.local_bytes(at, min(at + STEP, self.size)), value)
@@ -148,7 +166,7 @@ class Draft:
         """Replace bytes; a gap behind the present end becomes zeros.
 
         Raises:
-            NoSpace: nothing changed.
+            NoSpace, SpoolFailed: nothing changed.
         """
         stop = offset + len(data)
         if offset == stop:
@@ -159,11 +177,15 @@ class Draft:
         self.size = max(self.size, stop)
 
     def truncate(self, size: int) -> None:
-        """Cut, or extend with zeros."""
+        """Cut, or extend with zeros.
+
+        Raises:
+            NoSpace, SpoolFailed: nothing changed.
+        """
         if size < self.size:
+            self._content.cut(size)
             for extents in (self._held, self._changed):
                 extents.discard(size, max(size, extents.end))
-            self._content.cut(size)
             self.base_limit = min(self.base_limit, size)
             if self.sending is not None:
                 self.sending.on_cut(size)
@@ -195,6 +217,7 @@ class Draft:
         """The attempt is given up."""
         self.remote_size = self.remote_end
         self._touched = self.touched
+        self._ruined = self.ruined
         self.sending = None
 
     def delivered(self) -> None:
@@ -202,11 +225,13 @@ class Draft:
         self._changed.clear()
         self.remote_size = self.base_limit = self.size
         self.sending = None
-        self._touched = False
+        self._touched = self._ruined = False
+        self._content.settle()
 
     def remote_removed(self) -> None:
         """The vehicle's file is about to be overwritten: nothing of it counts; the draft must be whole."""
         self._touched = True
+        self._ruined = False
         self.base_limit = 0
         self.remote_size = None
         self._changed = ExtentSet([(0, self.size)])

@@ -53,11 +53,11 @@ class Namespace:
         deliverer: Deliverer,
         *,
         purge: Callable[[bytes], Awaitable[None]],
-        new_content: Callable[[], SpoolContent],
+        new_content: Callable[[Node], SpoolContent],
         on_renamed: Callable[[bytes, bytes], None],
     ) -> None:
-        """`purge(path)` removes what would bring a path back (Cleaner); `new_content()`: room for a draft;
-        `on_renamed(old, new)`: the vehicle's path has another name."""
+        """`purge(path)` removes what would bring a path back (Cleaner); `new_content(node)`: room for
+        a draft; `on_renamed(old, new)`: the vehicle's path has another name."""
         self._context = context
         self._sure = sure
         self._deliverer = deliverer
@@ -251,7 +251,7 @@ class Namespace:
                 await self._hide(node)
             elif there:
                 await self.remove_perhaps(path)
-            node.removed = True
+            node.lose_name()
             self._context.nodes.detach(node)
         if not node.handles:
             node.drop_draft()
@@ -265,7 +265,7 @@ class Namespace:
         if blocks is None or not blocks.complete:
             return False
         if draft is None:
-            node.content = self._new_content()
+            node.content = self._new_content(node)
             draft = node.draft = Draft(node.content, blocks.size)
         for at in range(0, draft.base_limit, PIECE):
             data = blocks.get(at, min(at + PIECE, draft.base_limit))
@@ -339,7 +339,7 @@ class Namespace:
         """The file that is open at a path lost its name; who has it open keeps what is held of it."""
         if node.handles:
             self._keep_content(node)
-        node.removed = True
+        node.lose_name()
         self._context.nodes.detach(node)
 
     async def _rename_or_refuse(

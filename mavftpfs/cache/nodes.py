@@ -86,6 +86,16 @@ class Node:
         if base is not None:
             base.close()
 
+    def spool_name(self) -> str | None:
+        """Return what the local disk is told of it: its path, or None if nobody would miss it."""
+        return None if self.removed else self.path.decode(errors="surrogateescape")
+
+    def lose_name(self) -> None:
+        """It has no name any more; only who has it open needs its bytes."""
+        self.removed = True
+        if self.content is not None:
+            self.content.restate()
+
     def drop_draft(self) -> None:
         """The vehicle has it all, or nobody wants it."""
         self.close_base()
@@ -138,3 +148,5 @@ class Nodes:
             del self._by_path[node.path]
             node.path = new + node.path[len(old) :]
             self._by_path[node.path] = node
+            if node.content is not None:
+                node.content.restate()

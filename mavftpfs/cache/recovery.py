@@ -9,7 +9,7 @@ from pathlib import Path
 from mavftpfs.cache.delivery import describe
 from mavftpfs.cache.draft import Draft
 from mavftpfs.cache.nodes import Node
-from mavftpfs.cache.spool import free_name
+from mavftpfs.cache.rescuing import free_name
 
 PIECE = 1024 * 1024
 MANIFEST = "manifest.json"

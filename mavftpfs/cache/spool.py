@@ -2,28 +2,31 @@
 
 Up to `memory_max` bytes over all files lie in memory; beyond that a file's bytes move to a file of their own
 in a 0700 directory, at the same offsets, up to `spool_max` over all. Nothing leaves before its draft is told
-that the vehicle has it. `persist` also writes down what the bytes are (fsynced), so that the next mount of
-the vehicle finds them after a kill -9: `SpoolDirectory.rescue` moves what a dead mount left to a recovery
-directory. It is never written to a vehicle by itself: nobody knows what happened to the file since.
+that the vehicle has it. A file's name is written down when it goes to disk, and `persist` writes down all
+that is known of it (fsynced), so that the next mount of the vehicle finds it after a kill -9:
+`SpoolDirectory.rescue` moves what a dead mount left to a recovery directory. It is never written to a vehicle
+by itself: nobody knows what happened to the file since.
+
+A local disk that fails is an error of the file whose bytes it had (SpoolFailed), never of the mount.
 
 Local files are written in the event loop: they go to the page cache, in pieces of at most a megabyte.
 """
 
 from __future__ import annotations
 
+import contextlib
 import fcntl
-import json
 import logging
 import os
-import shutil
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from random import Random
 from typing import Any
 
+from mavftpfs.cache import rescuing
 from mavftpfs.cache.asides import new_owner
-from mavftpfs.shared.errors import NoSpace
+from mavftpfs.shared.errors import NoSpace, SpoolFailed
 from mavftpfs.shared.extents import ExtentSet
 
 log = logging.getLogger("mavftpfs.cache")
@@ -59,29 +62,35 @@ class SpoolDirectory:
         self.dead_owners = frozenset(token for slot in free for token in self._tokens(slot))
         self.owner = self._new_token(self.path, rng)
         self._abandoned = free
-        self._left = frozenset(_data_in(self.path))
+        self._left = frozenset(rescuing.data_in(self.path))
 
     def rescue(self, recovery: Path) -> list[Path]:
         """Move what dead mounts left to `recovery`; return the files, and let go of their slots.
 
+        What cannot be moved stays where a later mount finds it.
+
         Raises:
-            OSError.
+            OSError: there was something, and nothing of it could be moved.
         """
-        found = []
+        found: list[Path] = []
+        failed: list[OSError] = []
         for slot in self._abandoned:
-            for data in _data_in(slot):
-                found.append(_move(data, recovery))
+            moved, stuck = rescuing.rescue(slot, recovery)
+            found += moved
+            failed += stuck
             if slot != self.path:
                 self._unlock(slot)
         self._abandoned = []
-        self._left = frozenset()
+        self._left = frozenset(rescuing.data_in(self.path))
+        if failed and not found:
+            raise failed[0]
         return found
 
     def discard(self) -> None:
         """Remove what this mount put here: the vehicle has it, though a program may not have closed it."""
-        for data in _data_in(self.path):
+        for data in rescuing.data_in(self.path):
             if data not in self._left:
-                _remove(data)
+                rescuing.remove(data)
 
     def close(self) -> None:
         """Let go of the directory."""
@@ -138,9 +147,9 @@ class Spool:
         """Bytes in memory and on disk."""
         return self.in_memory + self.on_disk
 
-    def content(self) -> SpoolContent:
-        """Return room for one file."""
-        return SpoolContent(self)
+    def content(self, name: Callable[[], str | None] | None = None) -> SpoolContent:
+        """Return room for one file; `name()`: its path on the vehicle, None once nobody wants it any more."""
+        return SpoolContent(self, name or (lambda: ""))
 
     def fits_memory(self, more: int) -> bool:
         """Return whether `more` bytes may be kept in memory."""
@@ -159,10 +168,12 @@ class Spool:
             if not path.exists():
                 return path
 
-    def close(self) -> None:
-        """Remove the directory, if it was made here."""
+    def file_gone(self) -> None:
+        """A file was removed: a directory that was made here goes with its last one."""
         if self._temporary is not None:
-            shutil.rmtree(self._temporary, ignore_errors=True)
+            with contextlib.suppress(OSError):  # another file is in it
+                self._temporary.rmdir()
+                self._directory = self._temporary = None
 
     def _place(self) -> Path:
         if self._directory is None:
@@ -173,36 +184,41 @@ class Spool:
 class SpoolContent:
     """The held bytes of one draft; implements cache.draft.Content."""
 
-    def __init__(self, spool: Spool) -> None:
+    def __init__(self, spool: Spool, name: Callable[[], str | None]) -> None:
         self._spool = spool
+        self._name = name
         self._pages: dict[int, bytearray] = {}
         self._file: int | None = None
         self._path: Path | None = None
         self._stored = ExtentSet()
         self._persisted = False
+        self._settled = False
 
     def put(self, offset: int, data: bytes | memoryview) -> None:
         """Keep bytes.
 
         Raises:
-            NoSpace: the budget is used up, or the local disk is full; nothing was kept.
+            NoSpace: the budget is used up, or the local disk is full. SpoolFailed: the local disk fails.
+                What was kept before is as it was.
         """
-        self._persisted = False
         if self._file is None:
             new = self._new_pages(offset, offset + len(data))
             if self._spool.fits_memory(new * PAGE):
                 self._put_pages(offset, memoryview(data))
+                self._changed()
                 return
             self._spill()
+        self._changed()
         self._put_file(offset, data)
 
     def get(self, start: int, stop: int) -> bytes:
-        """Return bytes that were put."""
+        """Return bytes that were put.
+
+        Raises:
+            SpoolFailed: the local disk does not give them back.
+        """
         if self._file is not None:
-            data = os.pread(self._file, stop - start, start)
-            if len(data) != stop - start:
-                raise OSError(f"{self._path} lost bytes that were in it")
-            return data
+            return self._get_file(self._file, start, stop)
         parts = []
         while start < stop:
             base = start // PAGE * PAGE
@@ -212,21 +228,46 @@ class SpoolContent:
         return b"".join(parts)
 
     def cut(self, size: int) -> None:
-        """Forget what lies at and beyond `size`."""
-        self._persisted = False
+        """Forget what lies at and beyond `size`; if it is extended again, zeros are there.
+
+        Raises:
+            NoSpace, SpoolFailed: nothing changed.
+        """
+        self._changed()
         if self._file is not None:
+            try:
+                os.ftruncate(self._file, min(size, os.fstat(self._file).st_size))
+            except OSError as exc:
+                raise SpoolFailed(f"cannot cut {self._path}: {exc}") from exc
             self._count_stored(size, max(size, self._stored.end), present=False)
-            os.ftruncate(self._file, min(size, os.fstat(self._file).st_size))
             return
         for index in [i for i in self._pages if i * PAGE >= size]:
             del self._pages[index]
             self._spool.in_memory -= PAGE
+        last = self._pages.get(size // PAGE)
+        if last is not None:
+            last[size % PAGE :] = bytes(PAGE - size % PAGE)
+
+    def settle(self) -> None:
+        """The vehicle has all of it: until more is put the next mount need not offer it."""
+        self._settled = True
+        self.restate()
+
+    def restate(self) -> None:
+        """Its name changed, or nobody wants it any more: write that down; a failure is only logged."""
+        if self._path is None:
+            return
+        self._persisted = False
+        try:
+            self._write_name(self._path)
+        except OSError as exc:
+            log.warning("what %s is cannot be written down: %s", self._path, exc)
 
     def persist(self, facts: dict[str, Any]) -> None:
         """Have bytes and `facts` (JSON) survive the end of this process; once until more is put or cut.
 
         Raises:
-            NoSpace, OSError.
+            NoSpace, SpoolFailed, OSError.
         """
         if self._persisted:
             return
@@ -235,16 +276,34 @@ class SpoolContent:
         assert self._path is not None
         os.ftruncate(self._file, facts["size"])
         os.fsync(self._file)
-        _write_durably(self._path.with_suffix(".json"), json.dumps(facts, indent=1).encode())
+        rescuing.write_facts(self._path, facts, durable=True)
         self._persisted = True
 
     def close(self) -> None:
-        """The vehicle has it: forget the bytes."""
-        self.cut(0)
+        """The vehicle has it, or nobody wants it: forget the bytes. Raises nothing."""
+        self._spool.in_memory -= len(self._pages) * PAGE
+        self._pages = {}
         if self._file is not None:
             self._drop_file()
 
     # --- inside
+
+    def _changed(self) -> None:
+        """Something of it is the vehicle's no longer: what is written down must not be less than true."""
+        known = not self._settled and not self._persisted
+        self._settled = self._persisted = False
+        if self._path is None or known:
+            return
+        try:
+            self._write_name(self._path)
+        except OSError as exc:
+            raise rescuing.trouble(exc, self._path) from exc
+
+    def _write_name(self, data: Path) -> None:
+        name = self._name()
+        facts = {"path": name, "unfinished": True} if name and not self._settled else {"needed": False}
+        if name != "":
+            rescuing.write_facts(data, facts, durable=False)
 
     def _new_pages(self, start: int, stop: int) -> int:
         return sum(1 for i in range(start // PAGE, -(-stop // PAGE)) if i not in self._pages)
@@ -266,16 +325,20 @@ class SpoolContent:
         if self._file is not None:
             return
         self._spool.require_disk(len(self._pages) * PAGE)
+        path: Path | None = None
         try:
             path = self._spool.new_file()
+            self._write_name(path)
             self._file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
         except OSError as exc:
+            if path is not None:
+                self._forget_file(path)
             raise NoSpace(f"no local file for what waits for the vehicle: {exc}") from exc
         self._path = path
         try:
             for index, page in self._pages.items():
                 self._put_file(index * PAGE, page)
-        except NoSpace:  # nothing may leave memory before all of it is on disk
+        except (NoSpace, SpoolFailed):  # nothing may leave memory before all of it is on disk
             self._drop_file()
             raise
         self._spool.in_memory -= len(self._pages) * PAGE
@@ -285,23 +348,43 @@ class SpoolContent:
         assert self._file is not None
         assert self._path is not None
         self._count_stored(0, self._stored.end, present=False)
-        os.close(self._file)
-        self._file = None
-        _remove(self._path)
+        try:
+            os.close(self._file)
+        except OSError as exc:
+            log.warning("closing %s: %s", self._path, exc)  # nobody needs its bytes any more
+        self._forget_file(self._path)
+        self._file = self._path = None
+
+    def _forget_file(self, path: Path) -> None:
+        rescuing.remove(path)
+        self._spool.file_gone()
+
+    def _get_file(self, file: int, start: int, stop: int) -> bytes:
+        try:
+            data = os.pread(file, stop - start, start)
+        except OSError as exc:
+            raise SpoolFailed(f"cannot read {self._path}: {exc}") from exc
+        if len(data) != stop - start:
+            raise SpoolFailed(f"{self._path} lost bytes that were in it")
+        return data
 
     def _put_file(self, offset: int, data: bytes | bytearray | memoryview) -> None:
-        assert self._file is not None
-        stop = offset + len(data)
-        more = sum(b - a for a, b in self._stored.missing(offset, stop))
-        self._spool.require_disk(more)
-        left = memoryview(data)
+        """Write what is new before what replaces something: a full disk refuses the former."""
+        whole, stop = memoryview(data), offset + len(data)
+        new = self._stored.missing(offset, stop)
+        self._spool.require_disk(sum(b - a for a, b in new))
         try:
-            while left:
-                written = os.pwrite(self._file, left, stop - len(left))
-                left = left[written:]
+            for a, b in [*new, *self._stored.intersection(offset, stop)]:
+                self._write(whole[a - offset : b - offset], a)
         except OSError as exc:
-            raise NoSpace(f"cannot keep bytes in {self._path}: {exc}") from exc
+            raise rescuing.trouble(exc, self._path) from exc
         self._count_stored(offset, stop, present=True)
+
+    def _write(self, data: memoryview, at: int) -> None:
+        assert self._file is not None
+        while data:
+            written = os.pwrite(self._file, data, at)
+            data, at = data[written:], at + written
 
     def _count_stored(self, start: int, stop: int, *, present: bool) -> None:
         before = self._stored.total
@@ -310,60 +393,3 @@ class SpoolContent:
         else:
             self._stored.discard(start, stop)
         self._spool.on_disk += self._stored.total - before
-
-
-def _data_in(slot: Path) -> list[Path]:
-    return sorted(slot.glob("*.data"))
-
-
-def _remove(data: Path) -> None:
-    """Remove a spooled file and its description."""
-    data.unlink(missing_ok=True)
-    data.with_suffix(".json").unlink(missing_ok=True)
-
-
-def _write_durably(path: Path, data: bytes) -> None:
-    """Replace a small file so that a crash leaves the old or the new one."""
-    draft = path.with_suffix(".new")
-    with draft.open("wb") as file:
-        file.write(data)
-        file.flush()
-        os.fsync(file.fileno())
-    draft.replace(path)
-    directory = os.open(path.parent, os.O_RDONLY)
-    try:
-        os.fsync(directory)
-    finally:
-        os.close(directory)
-
-
-def _move(data: Path, recovery: Path) -> Path:
-    """Move a spooled file and its description to the recovery directory; return its new path."""
-    recovery.mkdir(mode=0o700, parents=True, exist_ok=True)
-    facts = data.with_suffix(".json")
-    target = free_name(recovery, _name_for(facts, data))
-    shutil.move(data, target)
-    if facts.exists():
-        shutil.move(facts, target.with_name(target.name + ".json"))
-    return target
-
-
-def _name_for(facts: Path, data: Path) -> str:
-    """Return a name that tells where the bytes belong, as far as that was written down."""
-    try:
-        path = str(json.loads(facts.read_text())["path"])
-    except (OSError, ValueError, KeyError, TypeError) as exc:
-        log.warning("%s: what it belongs to was not written down: %s", data, exc)
-        return data.name
-    return path.strip("/").replace("/", "__") or data.name
-
-
-def free_name(directory: Path, name: str) -> Path:
-    """Return a path in `directory` that does not exist, made from at most 200 bytes of `name`."""
-    short = os.fsdecode(os.fsencode(name)[-200:])
-    number = 0
-    while True:
-        path = directory / (short if not number else f"{short}.{number}")
-        if not path.exists():
-            return path
-        number += 1

@@ -22,7 +22,7 @@ from mavftpfs.cache.nodes import Node
 from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.overlay import Overlay
 from mavftpfs.cache.recovery import recover
-from mavftpfs.cache.spool import Spool
+from mavftpfs.cache.spool import Spool, SpoolContent
 from mavftpfs.cache.sure import Sure
 from mavftpfs.cache.throttle import Throttle
 from mavftpfs.cache.writefile import ReadFile, WriteFile
@@ -71,7 +71,7 @@ class Writeback:
             sure,
             self._deliverer,
             purge=cleaner.purge,
-            new_content=spool.content,
+            new_content=self._new_content,
             on_renamed=self.overlay.on_renamed,
         )
         self._local = self.overlay.local
@@ -160,8 +160,11 @@ class Writeback:
         return node
 
     def _new_draft(self, node: Node, size: int | None) -> None:
-        node.content = self._spool.content()
+        node.content = self._new_content(node)
         node.draft = Draft(node.content, size)
+
+    def _new_content(self, node: Node) -> SpoolContent:
+        return self._spool.content(node.spool_name)
 
     def crc32(self, path: bytes) -> int | None:
         """Return the checksum of what the vehicle does not have yet, None if it can be asked."""
@@ -336,7 +339,7 @@ class Writeback:
 
     def retry(self) -> None:
         """The vehicle is back, or may be written again: deliver what nobody has open any more."""
-        if self._context.nursery is not None and self.undelivered():
+        if self._context.nursery is not None and (self._context.torn or self.undelivered()):
             self._context.nursery.start_soon(self._retry)
 
     def status(self) -> dict[str, object]:
@@ -379,12 +382,14 @@ class Writeback:
         return found
 
     async def _retry(self) -> None:
+        await self._cleaner.mend_torn()
         await self._deliver_all(writers_too=False)
 
     async def _deliver_all(self, *, writers_too: bool) -> None:
         """Try to deliver everything once."""
         for node in self._context.nodes:
-            if not node.undelivered or (node.writers and not writers_too):
+            unfinished = node.path in self._context.torn
+            if not node.undelivered or (node.writers and not writers_too and not unfinished):
                 continue
             try:
                 await self._deliverer.deliver(node)

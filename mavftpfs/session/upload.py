@@ -17,15 +17,22 @@ _LONGEST_HOLD = 8.0
 class Feed:
     """Hands a source's chunks on and remembers what was proven of them; chunk: most bytes of one.
 
+    A source that fails (the local disk that has its bytes) says so only to whoever waits for the upload,
+    never to the engine, which serves everybody.
+
     Attributes:
+        failure: why the source gave nothing when the engine asked.
         proven: a Terminate was ACKed, so that the remote file holds at least what was ACKed before it.
-        unproven: bytes ACKed since then. reached: end of the highest ACKed byte of this file.
+        unproven: bytes ACKed since then. reached: end of the highest ACKed byte of this file; once the
+            session was lost, of the highest proven one.
     """
 
     def __init__(self, source: UploadSource, chunk: int) -> None:
+        self.failure: MavftpfsError | None = None
         self.proven = False
         self.unproven = 0
         self.reached = 0
+        self._proven_to = 0
         self._source = source
         self._chunk = chunk
         self._held: tuple[int, bytes] | None = None
@@ -33,7 +40,11 @@ class Feed:
         self._furthest_before = 0
 
     def has_more(self) -> bool:
-        """Whether the source has something to send now."""
+        """Whether the source has something to send now.
+
+        Raises:
+            MavftpfsError: it fails.
+        """
         if self._held is None:
             self._held = self._source.next_chunk(self._chunk)
         return self._held is not None
@@ -41,7 +52,19 @@ class Feed:
     def next_chunk(self, limit: int) -> tuple[int, bytes] | None:
         """See protocol.writing.ChunkSource."""
         held, self._held = self._held, None
-        return self._source.next_chunk(limit) if held is None else held
+        if held is not None:
+            return held
+        try:
+            return self._source.next_chunk(limit)
+        except MavftpfsError as error:
+            self.failure = error
+            return None
+
+    def require_source(self) -> None:
+        """Raise why the source gave nothing, once: it may do better next time."""
+        failure, self.failure = self.failure, None
+        if failure is not None:
+            raise failure
 
     def on_acked(self, offset: int, count: int) -> None:
         """See protocol.writing.ChunkSource."""
@@ -64,6 +87,7 @@ class Feed:
         """Terminate was ACKed."""
         self.proven = True
         self.unproven = 0
+        self._proven_to = self.reached
         self._source.on_checkpoint()
 
     def roll_back(self, *, everything: bool) -> None:
@@ -71,7 +95,8 @@ class Feed:
         self.put_back()
         if everything:
             self.proven = False
-            self.reached = 0
+            self._proven_to = 0
+        self.reached = self._proven_to
         self.unproven = 0
         self._source.on_rollback(everything)
 
@@ -104,7 +129,8 @@ class QueuedUpload:
         error: why the last attempt failed, None while it goes well. Failures of the link are tried again in
             the background; refusals only when finish is called.
         running: the scheduler's task is at it. clean: everything given so far is ACKed and terminated.
-        retry_at: not to be touched before.
+        retry_at: not to be touched before. least: bytes the file has to have when it is opened to be written
+            on. opened: it was opened for that before.
     """
 
     def __init__(
@@ -113,6 +139,8 @@ class QueuedUpload:
         self.path = path
         self.feed = feed
         self.create = create
+        self.least = 0
+        self.opened = False
         self.ticket = ticket
         self.asked_at = asked_at
         self.use = Service()

@@ -18,6 +18,7 @@ from mavftpfs.shared.errors import (
     ProtocolError,
     RequestTimeout,
     SessionLost,
+    SpoolFailed,
     VehicleLost,
 )
 
@@ -49,6 +50,7 @@ class Uploading:
         self._op_deadline = op_deadline
         self._chunk = chunk
         self._when_armed_ok = when_armed_ok
+        self._wo_tells_no_size = False
 
     @property
     def turns(self) -> Turns:
@@ -148,15 +150,29 @@ class Uploading:
         if not upload.create and not self.writer.resumable:
             raise LocalProtocolError("how the vehicle opens a file for writing is not known (any more)")
         if self.writer.resumable and (feed.proven or not upload.create):
-            session = await self._holder.open(upload.path, Opcode.OPEN_FILE_WO)
-            if session.size is not None and session.size < feed.reached:
-                feed.roll_back(everything=True)
-                await self._holder.close()
-                raise SessionLost(f"the file has {session.size} bytes, not {feed.reached}", by_server=True)
-            return session
+            return await self._reopen(upload, max(feed.reached, upload.least))
         if feed.proven or feed.unproven:
             feed.roll_back(everything=True)
         return await self._holder.open(upload.path, Opcode.CREATE_FILE)
+
+    async def _reopen(self, upload: QueuedUpload, least: int) -> OpenSession:
+        """Open a file that is to keep what it has, unless it has less than `least` bytes: then what was to
+        stay is gone, and what is written behind it would leave a hole."""
+        size: int | None = None
+        if self._wo_tells_no_size and upload.opened:
+            size = (await self._holder.open(upload.path, Opcode.OPEN_FILE_RO)).size
+        session = await self._holder.open(upload.path, Opcode.OPEN_FILE_WO)
+        upload.opened = True
+        self._wo_tells_no_size = session.size is None
+        size = session.size if size is None else size
+        if size is None or size >= least:
+            return session
+        upload.feed.roll_back(everything=True)
+        await self._holder.close()
+        problem = f"{upload.path!r} has {size} bytes now, not {least}"
+        if upload.create:
+            raise SessionLost(problem, by_server=True)
+        raise FileChanged(problem)
 
     # --- letting go
 
@@ -173,6 +189,7 @@ class Uploading:
         if not ours:
             raise SessionLost("the vehicle had closed the session before", by_server=True)
         feed.check_point()
+        feed.require_source()
         if stop is Stop.ARMED:
             upload.fail(Armed("the vehicle was armed"), self._clock())
         elif stop in (Stop.FINISHED, Stop.STARVED):
@@ -180,6 +197,11 @@ class Uploading:
             upload.complete(more=more)
             if not self.writer.resumable and not upload.finishing:
                 upload.hold_restart(self._clock())
+
+    def _is_open(self, upload: QueuedUpload) -> bool:
+        """Whether the session is this upload's: it may have failed before it got it."""
+        session = self._holder.session
+        return session is not None and session.writing and session.path == upload.path
 
     def _roll_back(self, upload: QueuedUpload) -> None:
         keep = not upload.create or (self.writer.resumable and upload.feed.proven)
@@ -207,13 +229,13 @@ class Uploading:
 
     async def _on_error(self, upload: QueuedUpload, error: MavftpfsError) -> None:
         """Close what can be closed, roll back what is not proven, and tell whoever waits."""
-        refused = isinstance(error, FtpNak | ProtocolError | FileChanged)
+        refused = isinstance(error, FtpNak | ProtocolError | FileChanged | SpoolFailed)
         if isinstance(error, RequestTimeout):
             self._vehicle.note_timeout()
         if not refused or isinstance(error, RequestTimeout):
             self._holder.abandon()
             self._roll_back(upload)
-        elif self._holder.session is not None and await self._holder.close_quietly():
+        elif self._is_open(upload) and await self._holder.close_quietly():
             upload.feed.check_point()
         else:
             self._roll_back(upload)

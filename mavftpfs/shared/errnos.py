@@ -116,6 +116,7 @@ _BY_CLASS: dict[type[BaseException], int] = {
     errors.NotSupported: errno.EOPNOTSUPP,
     errors.FileTooLarge: errno.EFBIG,
     errors.NoSpace: errno.ENOSPC,
+    errors.SpoolFailed: errno.EIO,
     errors.VerificationFailed: errno.EIO,
     errors.ReadOnly: errno.EROFS,
     errors.AlreadyExists: errno.EEXIST,

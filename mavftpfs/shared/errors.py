@@ -122,6 +122,10 @@ class NoSpace(MavftpfsError):
     """The local store for what the vehicle does not have yet is full (ENOSPC)."""
 
 
+class SpoolFailed(MavftpfsError):
+    """The local disk fails that holds what the vehicle does not have yet (EIO)."""
+
+
 class VerificationFailed(MavftpfsError):
     """What is on the card is not what was written, and sending it again did not help (EIO)."""
 

@@ -14,7 +14,7 @@ from mavftpfs.protocol.payload import Opcode, request
 from mavftpfs.session.connection import Connection, ConnectOptions
 from mavftpfs.session.upload import QueuedUpload
 from mavftpfs.shared.errnos import errno_for
-from mavftpfs.shared.errors import Armed, FtpNak, MavftpfsError, RequestTimeout, VehicleLost
+from mavftpfs.shared.errors import Armed, FtpNak, MavftpfsError, RequestTimeout, SpoolFailed, VehicleLost
 from mavftpfs.sim.linkmodel import LinkSettings
 from mavftpfs.sim.profiles import PROFILES
 from tests.support.faults import Faults
@@ -214,6 +214,43 @@ async def test_a_full_card_is_told(profile: str, autojump: MockClock) -> None:
         await upload.finish()
         assert source.all_proven or profile.startswith("mavsdk")
         await upload.abort()
+    assert here.vehicle.server.open_sessions == 0
+
+
+class FailingSource(MemorySource):
+    """Bytes on a local disk that does not give back those from `bad` on."""
+
+    bad: int | None = None
+
+    def next_chunk(self, limit: int) -> tuple[int, bytes] | None:
+        first = self.dirty.first()
+        if self.bad is not None and first is not None and first[0] >= self.bad:
+            raise SpoolFailed("the local disk fails")
+        return super().next_chunk(limit)
+
+
+@pytest.mark.parametrize("bad", [0, 5_000])
+@pytest.mark.parametrize("profile", EVERY_PROFILE)
+async def test_a_local_disk_that_fails_ends_one_upload_and_nothing_else(
+    profile: str, bad: int, autojump: MockClock
+) -> None:
+    here = world(profile, PLAIN, other=b"of another file")
+    async with here.connection() as connection:
+        source = FailingSource(content(9_000))
+        source.bad = bad
+        upload = await start(connection, profile, source)
+        await read_file(connection, path(profile, "other"))  # leaves its session open
+        for _ in range(2):
+            with pytest.raises(SpoolFailed):
+                await upload.finish()
+            assert not source.acked.total + source.in_flight.total
+            assert source.proven.end <= bad
+        assert await read_file(connection, path(profile, "other")) == b"of another file"
+        source.bad = None
+        await upload.finish()
+        assert source.all_proven
+        await upload.abort()
+    assert here.tree.data(path(profile, "new")) == bytes(source.content)
     assert here.vehicle.server.open_sessions == 0
 
 

@@ -27,6 +27,9 @@ class Bytes:
     def cut(self, size: int) -> None:
         self.data[size:] = b"\xee" * max(0, len(self.data) - size)
 
+    def settle(self) -> None:
+        pass
+
 
 def draft_over(base: bytes | None) -> Draft:
     return Draft(Bytes(), None if base is None else len(base))

@@ -5,13 +5,15 @@ from __future__ import annotations
 import errno
 import json
 import os
+import shutil
+from collections.abc import Callable
 from pathlib import Path
 from random import Random
 
 import pytest
 
-from mavftpfs.cache.spool import PAGE, SLOTS, Spool, SpoolDirectory
-from mavftpfs.shared.errors import NoSpace
+from mavftpfs.cache.spool import PAGE, SLOTS, Spool, SpoolContent, SpoolDirectory
+from mavftpfs.shared.errors import NoSpace, SpoolFailed
 
 
 def spool_of(tmp_path: Path, memory: int = 4 * PAGE, disk: int = 100 * PAGE) -> Spool:
@@ -104,8 +106,11 @@ def test_no_directory_means_one_that_does_not_stay(tmp_path: Path) -> None:
     place = spool.new_file().parent
     assert os.stat(place).st_mode & 0o777 == 0o700
     content.close()
-    spool.close()
     assert not place.exists()
+    content = spool.content()
+    content.put(0, b"abc")
+    assert content.get(0, 3) == b"abc", "a directory of its own is made anew"
+    content.close()
 
 
 def test_a_directory_that_cannot_be_used_is_no_space(tmp_path: Path) -> None:
@@ -188,3 +193,203 @@ def test_there_are_enough_slots_and_not_more(tmp_path: Path) -> None:
         SpoolDirectory(tmp_path, Random(0))
     for each in claimed:
         each.close()
+
+
+# --- a process that is killed while a program writes
+
+
+def spilled(tmp_path: Path, name: str | None = "/card/log.bin") -> tuple[SpoolDirectory, SpoolContent]:
+    """A file of which so much was written that it went to disk."""
+    directory = SpoolDirectory(tmp_path / "spool", Random(1))
+    content = Spool(memory_max=lambda: 0, spool_max=1 << 20, directory=directory.path).content(lambda: name)
+    content.put(0, b"so far")
+    return directory, content
+
+
+def rescued(directory: SpoolDirectory, tmp_path: Path) -> dict[str, bytes]:
+    """What the next mount offers, without the descriptions."""
+    directory.close()  # as the kernel does for a killed process
+    again = SpoolDirectory(tmp_path / "spool", Random(2))
+    found = again.rescue(tmp_path / "recovered")
+    assert [path.name for path in again.path.iterdir()] == ["owner"]
+    again.close()
+    return {path.name: path.read_bytes() for path in found}
+
+
+def test_the_name_is_written_down_before_the_first_byte(tmp_path: Path) -> None:
+    directory, _ = spilled(tmp_path)
+    assert rescued(directory, tmp_path) == {"card__log.bin": b"so far"}
+    facts = json.loads((tmp_path / "recovered/card__log.bin.json").read_text())
+    assert facts == {"path": "/card/log.bin", "unfinished": True}
+
+
+def test_killed_between_the_name_and_the_first_byte(tmp_path: Path) -> None:
+    directory, content = spilled(tmp_path)
+    content.cut(0)
+    assert rescued(directory, tmp_path) == {}
+    assert not (tmp_path / "recovered").exists()
+
+
+def test_what_the_vehicle_has_is_not_offered_until_more_is_written(tmp_path: Path) -> None:
+    directory, content = spilled(tmp_path)
+    content.settle()
+    content.put(6, b", and more")
+    assert rescued(directory, tmp_path) == {"card__log.bin": b"so far, and more"}
+
+
+def test_what_the_vehicle_has_is_removed_by_the_next_mount(tmp_path: Path) -> None:
+    directory, content = spilled(tmp_path)
+    content.persist({"path": "/card/log.bin", "size": 6})
+    content.settle()
+    assert rescued(directory, tmp_path) == {}
+
+
+def test_what_nobody_wants_any_more_is_not_offered(tmp_path: Path) -> None:
+    directory, _ = spilled(tmp_path, None)
+    assert rescued(directory, tmp_path) == {}
+
+
+def test_more_than_was_written_down_says_so(tmp_path: Path) -> None:
+    """What a failed close wrote down is not the whole truth once more was written."""
+    directory, content = spilled(tmp_path)
+    content.persist({"path": "/card/log.bin", "size": 6})
+    content.put(6, b"!")
+    assert rescued(directory, tmp_path) == {"card__log.bin": b"so far!"}
+    assert "size" not in json.loads((tmp_path / "recovered/card__log.bin.json").read_text())
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        b"",
+        b'{"path": "/ca',
+        b"[1]",
+        b"null",
+        b'{"path": 7}',
+        b"\xff\xfe",
+        b'{"path": "\\ud800"}',
+        b"[" * 9999,
+        b'{"path": "a\\u0000b"}',
+        b'{"path": "/.."}',
+        b'{"path": "/"}',
+    ],
+)
+def test_no_text_that_is_left_behind_breaks_the_next_mount(tmp_path: Path, text: bytes) -> None:
+    slot = SpoolDirectory(tmp_path / "spool", Random(1))
+    (slot.path / "000001.data").write_bytes(b"bytes")
+    (slot.path / "000001.json").write_bytes(text)
+    (slot.path / "000001.new").write_bytes(b'{"pa')
+    (slot.path / "000002.json").write_bytes(b"of nothing")
+    assert list(rescued(slot, tmp_path).values()) == [b"bytes"]
+    assert all(path.parent == tmp_path / "recovered" for path in (tmp_path / "recovered").iterdir())
+
+
+def test_one_file_that_cannot_be_moved_keeps_no_other_one_back(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    slot = SpoolDirectory(tmp_path / "spool", Random(1))
+    for number in (1, 2, 3):
+        (slot.path / f"00000{number}.data").write_bytes(b"%d" % number)
+    slot.close()
+    really = shutil.move
+
+    def move(source: Path, target: Path) -> object:
+        if source.name == "000002.data":
+            target.write_bytes(b"part of a copy")
+            raise OSError(errno.ENOSPC, "full")
+        return really(source, target)
+
+    monkeypatch.setattr(shutil, "move", move)
+    again = SpoolDirectory(tmp_path / "spool", Random(2))
+    assert [path.read_bytes() for path in again.rescue(tmp_path / "r")] == [b"1", b"3"]
+    assert sorted(path.name for path in (tmp_path / "r").iterdir()) == ["000001.data", "000003.data"]
+    content = Spool(memory_max=lambda: 0, spool_max=1000, directory=again.path).content()
+    content.put(0, b"new")
+    again.discard()
+    again.close()
+    third = SpoolDirectory(tmp_path / "spool", Random(3))
+    with pytest.raises(OSError, match="full"):
+        third.rescue(tmp_path / "r")
+    assert (third.path / "000002.data").read_bytes() == b"2"
+    third.close()
+
+
+# --- a local disk that fails
+
+
+def test_zeros_behind_a_cut_are_zeros_on_the_disk_too(tmp_path: Path) -> None:
+    content = spool_of(tmp_path).content()
+    content.put(0, b"x" * (PAGE + 9))
+    content.cut(PAGE + 5)
+    content.cut(3)
+    content.persist({"size": PAGE + 9})
+    assert content.get(0, 3) == b"xxx"
+    (data,) = tmp_path.glob("*.data")
+    assert data.read_bytes() == b"xxx".ljust(PAGE + 9, b"\0")
+
+
+def failing(*_: object) -> bytes:
+    raise OSError(errno.EIO, "bad sector")
+
+
+def test_a_disk_that_fails_is_an_error_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    spool = spool_of(tmp_path, memory=0)
+    content = spool.content(lambda: "/f")
+    content.put(0, b"abcdef")
+    acts: dict[str, Callable[[], object]] = {
+        "pread": lambda: content.get(0, 3),
+        "pwrite": lambda: content.put(0, b"x"),
+        "ftruncate": lambda: content.cut(2),
+    }
+    for name, act in acts.items():
+        with monkeypatch.context() as patch:
+            patch.setattr(os, name, failing)
+            with pytest.raises(SpoolFailed):
+                act()
+    assert content.get(0, 6) == b"abcdef"
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "pread", lambda *_: b"ab")
+        with pytest.raises(SpoolFailed):
+            content.get(0, 3)
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "unlink", failing)
+        content.close()
+    (data,) = tmp_path.glob("*.data")
+    data.unlink()
+    data.with_suffix(".json").unlink()
+    assert spool.bytes_held == 0
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_disk_that_is_full_leaves_what_was_kept_before(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    content = spool_of(tmp_path, memory=0).content(lambda: "/f")
+    content.put(0, b"abcdef")
+    really = os.pwrite
+
+    def pwrite(descriptor: int, piece: bytes, offset: int) -> int:
+        if offset + len(piece) > 6:
+            raise OSError(errno.ENOSPC, "full")
+        return really(descriptor, piece, offset)
+
+    monkeypatch.setattr(os, "pwrite", pwrite)
+    with pytest.raises(NoSpace):
+        content.put(3, b"new and longer")
+    assert content.get(0, 6) == b"abcdef"
+    content.put(3, b"DEF")
+    assert content.get(0, 6) == b"abcDEF"
+
+
+def test_a_name_that_cannot_be_written_down_is_no_space_and_nothing_stays(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    spool = spool_of(tmp_path)
+    content = spool.content(lambda: "/f")
+    content.put(0, b"in memory")
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "replace", failing)
+        with pytest.raises(NoSpace):
+            content.put(9, bytes(5 * PAGE))
+    assert content.get(0, 9) == b"in memory"
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,193 @@
+"""The local disk behind a mount: it fails, fills up, outlives a killed process, and is left clean."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import tempfile
+from collections.abc import AsyncIterator
+from pathlib import Path
+from random import Random
+
+import pytest
+import trio
+
+from mavftpfs.cache.openfile import OpenFile
+from mavftpfs.cache.spool import SpoolDirectory
+from mavftpfs.cache.tree import Tree
+from mavftpfs.shared.errnos import errno_for
+from mavftpfs.shared.errors import MavftpfsError, NoSpace, VehicleLost
+from tests.support.fake_store import read_file
+from tests.support.fake_writer import KINDS, FakeWriter, make_writable, write_file
+
+BIG = os.urandom(70_000)
+FILE = b"/card/log.bin"
+
+
+@pytest.fixture
+async def store(nursery: trio.Nursery, autojump_clock: object) -> AsyncIterator[FakeWriter]:
+    store = FakeWriter(KINDS["posix"], nursery)
+    store.add_directory(b"/card")
+    yield store
+    assert store.crimes == []
+    nursery.cancel_scope.cancel()
+
+
+def failing(*_: object) -> bytes:
+    raise OSError(errno.EIO, "bad sector")
+
+
+async def begin(tree: Tree, store: FakeWriter) -> OpenFile:
+    """A file of which more was written than memory takes, while the vehicle is away."""
+    file = await tree.create(FILE, exclusive=True)
+    store.lost = True
+    await file.write(0, BIG)
+    return file
+
+
+async def test_a_disk_that_fails_is_the_error_of_one_file(
+    store: FakeWriter, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tree = make_writable(store, dirty_max=65536)
+    file = await begin(tree, store)
+    store.lost = False
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "pread", failing)
+        for act in (file.flush, file.fsync, file.release):
+            with pytest.raises(MavftpfsError) as told:
+                await act()
+            assert errno_for(told.value) == errno.EIO
+        with pytest.raises(MavftpfsError) as told:
+            await read_file(tree, FILE)
+        assert errno_for(told.value) == errno.EIO
+        await write_file(tree, b"/card/other", b"small")
+        assert store.files[b"/card/other"].data == b"small"
+        assert tree.undelivered() == [FILE]
+    assert await tree.drain(10) == []
+    assert store.files[FILE].data == BIG
+
+
+async def test_a_full_disk_is_told_to_the_writer_and_costs_nothing_accepted(
+    store: FakeWriter, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tree = make_writable(store, dirty_max=65536)
+    file = await begin(tree, store)
+    really = os.pwrite
+
+    def pwrite(descriptor: int, data: bytes, offset: int) -> int:
+        if offset + len(data) > len(BIG):
+            raise OSError(errno.ENOSPC, "full")
+        return really(descriptor, data, offset)
+
+    monkeypatch.setattr(os, "pwrite", pwrite)
+    with pytest.raises(NoSpace):
+        await file.write(len(BIG) - 10, b"more than fits")
+    assert file.size == len(BIG)
+    store.lost = False
+    await file.release()
+    assert store.files[FILE].data == BIG
+
+
+# --- a process that is killed
+
+
+async def killed(tree: Tree, spool: SpoolDirectory, tmp_path: Path) -> dict[str, tuple[str, bytes]]:
+    """What the next mount of the vehicle finds: file -> (path on the vehicle, bytes)."""
+    spool.close()
+    again = SpoolDirectory(tmp_path / "spool", Random(2))
+    found = again.rescue(tmp_path / "recovered")
+    again.close()
+    return {
+        path.name: (json.loads(path.with_name(path.name + ".json").read_text())["path"], path.read_bytes())
+        for path in found
+    }
+
+
+@pytest.fixture
+def spool(tmp_path: Path) -> SpoolDirectory:
+    return SpoolDirectory(tmp_path / "spool", Random(1))
+
+
+async def test_killed_before_any_close(store: FakeWriter, spool: SpoolDirectory, tmp_path: Path) -> None:
+    tree = make_writable(store, spool=spool, dirty_max=65536)
+    await begin(tree, store)
+    assert await killed(tree, spool, tmp_path) == {"card__log.bin": ("/card/log.bin", BIG)}
+
+
+async def test_killed_after_a_rename(store: FakeWriter, spool: SpoolDirectory, tmp_path: Path) -> None:
+    tree = make_writable(store, spool=spool, dirty_max=65536)
+    file = await tree.create(FILE, exclusive=True)
+    await file.write(0, BIG)
+    await tree.rename(FILE, b"/card/name", noreplace=False)
+    store.lost = True
+    await file.write(0, b"X")
+    assert await killed(tree, spool, tmp_path) == {"card__name": ("/card/name", b"X" + BIG[1:])}
+
+
+async def test_killed_after_a_rename_of_what_waits(
+    store: FakeWriter, spool: SpoolDirectory, tmp_path: Path
+) -> None:
+    tree = make_writable(store, spool=spool, dirty_max=65536)
+    file = await tree.create(FILE, exclusive=True)
+    await file.write(0, BIG)
+    await tree.rename(FILE, b"/card/name", noreplace=False)
+    assert await killed(tree, spool, tmp_path) == {}, "a rename delivers first"
+
+
+async def test_killed_after_it_was_unlinked(store: FakeWriter, spool: SpoolDirectory, tmp_path: Path) -> None:
+    tree = make_writable(store, spool=spool, dirty_max=65536)
+    file = await tree.create(FILE, exclusive=True)
+    await file.write(0, BIG)
+    await tree.unlink(FILE)
+    assert bytes(await file.read(0, len(BIG))) == BIG
+    assert await killed(tree, spool, tmp_path) == {}
+
+
+async def test_killed_after_it_was_replaced(store: FakeWriter, spool: SpoolDirectory, tmp_path: Path) -> None:
+    tree = make_writable(store, spool=spool, dirty_max=65536)
+    await write_file(tree, b"/card/new", b"new")
+    file = await tree.create(FILE, exclusive=True)
+    await file.write(0, BIG)
+    await tree.rename(b"/card/new", FILE, noreplace=False)
+    assert bytes(await file.read(0, len(BIG))) == BIG
+    assert await killed(tree, spool, tmp_path) == {}
+
+
+async def test_killed_after_fsync_and_more(store: FakeWriter, spool: SpoolDirectory, tmp_path: Path) -> None:
+    tree = make_writable(store, spool=spool, dirty_max=65536)
+    file = await tree.create(FILE, exclusive=True)
+    await file.write(0, BIG)
+    await file.fsync()
+    store.lost = True
+    await file.write(len(BIG), b"!")
+    assert await killed(tree, spool, tmp_path) == {"card__log.bin": ("/card/log.bin", BIG + b"!")}
+
+
+async def test_killed_while_a_delivered_file_is_open(
+    store: FakeWriter, spool: SpoolDirectory, tmp_path: Path
+) -> None:
+    tree = make_writable(store, spool=spool, dirty_max=65536)
+    file = await tree.create(FILE, exclusive=True)
+    await file.write(0, BIG)
+    await file.fsync()
+    assert await killed(tree, spool, tmp_path) == {}
+
+
+# --- what stays behind
+
+
+async def test_nothing_stays_in_the_directory_for_temporaries(
+    store: FakeWriter, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    tree = make_writable(store, dirty_max=65536)
+    file = await begin(tree, store)
+    assert os.listdir(tmp_path)
+    with pytest.raises(VehicleLost):
+        await file.release()
+    store.lost = False
+    await write_file(tree, b"/card/second", BIG)
+    assert await tree.drain(10) == []
+    assert os.listdir(tmp_path) == []
+    assert store.files[FILE].data == store.files[b"/card/second"].data == BIG
