@@ -30,6 +30,8 @@ async def read_base(context: Context, node: Node, start: int, stop: int) -> byte
     Raises:
         FileChanged: it is another file by now. Else as open_base and FileHandle.read.
     """
+    if node.draft is not None and node.draft.ruined:
+        raise FileChanged(f"{node.path!r} was emptied on the vehicle while it was changed here")
     if node.base is None:
         node.require_reachable()
         handle = await open_base(context, node.path)

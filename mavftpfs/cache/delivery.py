@@ -140,9 +140,10 @@ class Deliverer:
                 log.warning("%s; sending it again", error)
             except MavftpfsError as error:
                 learnt = astuple(self._context.writer.traits) != known
+                restores = draft.ruined and draft.whole and plan is Plan.IN_PLACE
                 if not isinstance(error, PASSING):
                     await self.abandon(node)
-                if not learnt or isinstance(error, LinkError | Armed):
+                if not (learnt or restores) or isinstance(error, LinkError | Armed):
                     raise
                 log.debug("%r: %s; trying another way", node.path, error)
         raise VerificationFailed(f"no way of writing {node.path!r} led to an end")
@@ -182,6 +183,8 @@ class Deliverer:
         draft = _draft(node)
         if not attempt.committing:
             await self._finish(attempt)
+            if draft.ruined and attempt.plan is Plan.IN_PLACE:
+                raise FileChanged(f"{node.path!r} was emptied on the vehicle while it was changed here")
             await self.verifier.check(attempt.path, draft)
             await attempt.upload.abort()
         if attempt.places is not None:
@@ -196,8 +199,9 @@ class Deliverer:
         if attempt is not None and _still_fits(attempt, plan, draft):
             return attempt
         await self.abandon(node)
-        if not draft.fresh:
-            await self._require_base(node.path, draft)
+        least = 0
+        if not draft.fresh and not draft.ruined:
+            least = await self._require_base(node.path, draft)
         path, places = node.path, None
         if plan is Plan.REPLACE:
             places = self._context.namer.places(node.path)
@@ -214,7 +218,10 @@ class Deliverer:
             sending = draft.begin(whole=plan is not Plan.IN_PLACE)
             sending.progress = self._throttle.on_acked
             writer = self._context.writer
-            upload = await writer.open_upload(path, sending, create=plan is not Plan.IN_PLACE)
+            if plan is Plan.IN_PLACE:
+                upload = await writer.open_upload(path, sending, create=False, least=least)
+            else:
+                upload = await writer.open_upload(path, sending, create=True)
             if places is None:
                 self._context.dentries.note_unsized(path)
         except BaseException:
@@ -224,19 +231,24 @@ class Deliverer:
         node.attempt = Attempt(plan, path, sending, upload, places)
         return node.attempt
 
-    async def _require_base(self, path: bytes, draft: Draft) -> None:
-        """Raise FileChanged if a file of which a part is to stay grew or shrank on the vehicle."""
+    async def _require_base(self, path: bytes, draft: Draft) -> int:
+        """Return the size on the vehicle of a file of which a part is to stay.
+
+        Raises:
+            FileChanged: it grew or shrank.
+        """
         size, most = await self.verifier.size(path), draft.remote_end
         if most is not None and not draft.base_limit <= size <= most:
             raise FileChanged(
                 f"{path!r} has {size} bytes on the vehicle now, {most} when it was changed here"
             )
+        return size
 
     async def _finish(self, attempt: Attempt) -> None:
         for _ in range(FINISHES):
             attempt.upload.wake()
             await attempt.upload.finish()
-            if not attempt.sending.unacked:
+            if not attempt.sending.unacked or attempt.sending.emptied:
                 return
         raise RemoteProtocolError(f"{attempt.path!r} was said to be finished, and was not")
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from enum import Enum
 
 from mavftpfs.cache.draft import Draft
-from mavftpfs.shared.errors import FileTooLarge, NotSupported
+from mavftpfs.shared.errors import FileChanged, FileTooLarge, NotSupported
 from mavftpfs.shared.traits import WriteTraits
 
 
@@ -52,6 +52,7 @@ def choose(draft: Draft, traits: WriteTraits, rules: Rules) -> Plan:
 
     Raises:
         NotSupported: the file cannot be replaced, and `inplace` was not given.
+        FileChanged: the vehicle's file lost what was to stay of it, and only the vehicle had that.
         FileTooLarge: the change would need more of the file to be sent than rmw_max.
     """
     if draft.clean:
@@ -63,6 +64,10 @@ def choose(draft: Draft, traits: WriteTraits, rules: Rules) -> Plan:
         return Plan.NEW
     if draft.fresh:
         return _replacement(traits, rules)
+    if draft.ruined:
+        if not draft.whole:
+            raise FileChanged("the file lost what was to stay of it on the vehicle while it was changed here")
+        return Plan.REWRITE if traits.rename_works is False else Plan.REPLACE  # nothing is left to be kept
     return _partial(draft, remote_size, traits, rules)
 
 

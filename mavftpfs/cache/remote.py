@@ -158,8 +158,12 @@ class WriteStore(Protocol):
         """What the server was seen to do; a new object after a reboot."""
         ...
 
-    async def open_upload(self, path: bytes, source: UploadSource, *, create: bool) -> Upload:
-        """Open a file: by CreateFile (empties it), else OpenFileWO (only where wo_truncates is False)."""
+    async def open_upload(self, path: bytes, source: UploadSource, *, create: bool, least: int = 0) -> Upload:
+        """Open a file: by CreateFile (empties it), else OpenFileWO (only where wo_truncates is False).
+
+        least: bytes the file has whenever it is opened to be written on. One that has fewer is not written:
+        the source is told on_rollback(everything=True), and finish raises FileChanged.
+        """
         ...
 
     async def create_empty(self, path: bytes) -> None:

@@ -34,11 +34,15 @@ class WriteStore:
         """See cache.remote.WriteStore."""
         return self._scheduler.write_traits
 
-    async def open_upload(self, path: bytes, source: UploadSource, *, create: bool) -> QueuedUpload:
+    async def open_upload(
+        self, path: bytes, source: UploadSource, *, create: bool, least: int = 0
+    ) -> QueuedUpload:
         """Queue an upload; nothing is sent before the source has something or finish is called."""
         wire_path(path)
         self._scheduler.check_may_write()
-        return self._scheduler.open_upload(path, source, create=create)
+        upload = self._scheduler.open_upload(path, source, create=create)
+        upload.least = least
+        return upload
 
     async def create_empty(self, path: bytes) -> None:
         """Make a file, or empty it; done twice it is the same."""

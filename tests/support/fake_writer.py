@@ -18,7 +18,15 @@ from mavftpfs.cache.remote import ReadSink, UploadSource
 from mavftpfs.cache.spool import SpoolDirectory
 from mavftpfs.cache.tree import Tree
 from mavftpfs.protocol.payload import NakCode, Opcode
-from mavftpfs.shared.errors import AlreadyExists, Armed, FtpNak, MavftpfsError, RequestTimeout, VehicleLost
+from mavftpfs.shared.errors import (
+    AlreadyExists,
+    Armed,
+    FileChanged,
+    FtpNak,
+    MavftpfsError,
+    RequestTimeout,
+    VehicleLost,
+)
 from mavftpfs.shared.model import ROOT, join, split, wire_path
 from mavftpfs.shared.traits import WriteTraits
 from tests.support.fake_store import FakeFile, FakeReader, FakeStore
@@ -133,9 +141,11 @@ class FakeWriter(FakeStore):
 
     # --- WriteStore
 
-    async def open_upload(self, path: bytes, source: UploadSource, *, create: bool) -> FakeUpload:
+    async def open_upload(
+        self, path: bytes, source: UploadSource, *, create: bool, least: int = 0
+    ) -> FakeUpload:
         wire_path(path)
-        upload = FakeUpload(self, path, source, create=create)
+        upload = FakeUpload(self, path, source, create=create, least=least)
         self.uploads.append(upload)
         return upload
 
@@ -302,12 +312,15 @@ def _maybe_lose(lost: bool) -> None:
 class FakeUpload:
     """Sends chunk by chunk, each one request; in the background too if the store has a nursery."""
 
-    def __init__(self, store: FakeWriter, path: bytes, source: UploadSource, *, create: bool) -> None:
+    def __init__(
+        self, store: FakeWriter, path: bytes, source: UploadSource, *, create: bool, least: int = 0
+    ) -> None:
         self.path = path
         self.aborted = False
         self._store = store
         self._source = source
         self._create = create
+        self._least = least
         self._open = False
         self._opened_before = False
         self._sending = trio.Lock()
@@ -381,8 +394,9 @@ class FakeUpload:
                 self._source.on_rollback(True)
         elif store.kind.wo_truncates:
             store.crimes.append(f"OpenFileWO emptied {self.path!r}")
-        else:
-            store._file(self.path, Opcode.OPEN_FILE_WO)
+        elif len(store._file(self.path, Opcode.OPEN_FILE_WO).data) < self._least:
+            self._source.on_rollback(True)
+            raise FileChanged(f"{self.path!r} shrank")
         self._open = self._opened_before = True
 
     async def _write(self, offset: int, data: bytes) -> None:
