@@ -226,6 +226,7 @@ class Draft:
         self.remote_size = self.base_limit = self.size
         self.sending = None
         self._touched = self._ruined = False
+        self._content.settle()
 
     def remote_removed(self) -> None:
         """The vehicle's file is about to be overwritten: nothing of it counts; the draft must be whole."""
