@@ -11,7 +11,7 @@ from mavftpfs.session.opening import OpenSession
 from mavftpfs.session.scheduler import Scheduler
 from mavftpfs.session.sideeffects import SideEffects
 from mavftpfs.shared.errors import FtpNak, RequestTimeout
-from mavftpfs.shared.model import join, wire_path
+from mavftpfs.shared.model import join, split, wire_path
 from mavftpfs.shared.traits import WriteTraits
 
 PROBE_NAME = b".mavftpfs-probdaaa"
@@ -54,19 +54,24 @@ class _Probe:
             if self._traits.wo_creates is None:
                 await self._open_missing()
             await self._scheduler.use_session(self._path, Opcode.CREATE_FILE, self._write)
+            size: int | None = len(CONTENT)
             if self._traits.wo_truncates is None:
-                await self._open_existing()
+                size = await self._open_existing()
             if self._traits.truncate_works is None:
-                await self._truncate()
-            if self._traits.rename_works is None:
-                await self._rename()
-        finally:
+                await self._truncate(size)
+            left = [self._path] if self._traits.rename_works is not None else await self._rename()
+        except BaseException:
             await self._sweep_up()
+            raise
+        for path in left:
+            await self._effects.remove(path)
 
     async def _sweep_up(self) -> None:
+        """One listing tells of both names."""
+        entries, _ = await self._effects.entries(split(self._path)[0])
+        names = [entry.name for entry in entries]
         for path in (self._path, self._second):
-            entry, _ = await self._effects.find(path)
-            if entry is not None:
+            if split(path)[1] in names:
                 await self._effects.remove(path)
 
     async def _open_missing(self) -> None:
@@ -83,21 +88,22 @@ class _Probe:
         operation = Simple(Opcode.WRITE_FILE, CONTENT, session=session.id)
         await self._scheduler.metadata(operation, disturbs=False)
 
-    async def _open_existing(self) -> None:
+    async def _open_existing(self) -> int | None:
+        """Return the size afterwards."""
         try:
             await self._scheduler.use_session(self._path, Opcode.OPEN_FILE_WO)
         except FtpNak:
-            return
+            return len(CONTENT)
         size = await self._size()
         if size in (0, len(CONTENT)):
             self._traits.wo_truncates = size == 0
+        return size
 
-    async def _truncate(self) -> None:
+    async def _truncate(self, size: int | None) -> None:
         """PX4 on NuttX truncates through a copy that can destroy the file: its storage lies below /fs."""
         if self._path.startswith(b"/fs/"):
             self._traits.truncate_works = False
             return
-        size = await self._size()
         if size == 0:  # emptied by OpenFileWO: fill it again
             await self._scheduler.use_session(self._path, Opcode.CREATE_FILE, self._write)
         wire = wire_path(self._path)
@@ -114,28 +120,28 @@ class _Probe:
             return
         self._traits.truncate_works = await self._size() == 1
 
-    async def _rename(self) -> None:
-        """To a free name, and then onto a file."""
+    async def _rename(self) -> list[bytes]:
+        """To a free name, and then onto a file; return what is there afterwards."""
         try:
             await self._effects.rename(self._path, self._second)
         except FtpNak:
             self._traits.rename_works = False
-            return
+            return [self._path]
         self._traits.rename_works = True
         if self._traits.rename_replaces is not None:
-            return
+            return [self._second]
         await self._scheduler.use_session(self._path, Opcode.CREATE_FILE)
         try:
             await self._effects.rename(self._path, self._second)
         except FtpNak:
             self._traits.rename_replaces = False
-        else:
-            self._traits.rename_replaces = True
+            return [self._path, self._second]
+        self._traits.rename_replaces = True
+        return [self._second]
 
     async def _size(self) -> int | None:
-        entry, _ = await self._effects.find(self._path)
-        if entry is None:
+        """Return the size of our temporary, by two requests however many files lie beside it."""
+        try:
+            return (await self._scheduler.use_session(self._path, Opcode.OPEN_FILE_RO)).size
+        except FtpNak:
             return None
-        if entry.size is not None:
-            return entry.size
-        return (await self._scheduler.use_session(self._path, Opcode.OPEN_FILE_RO)).size

@@ -90,13 +90,17 @@ class SideEffects:
     async def find(self, path: bytes) -> tuple[DirEntry | None, bool]:
         """Return a name's entry by a fresh listing of its parent, and whether the listing is complete."""
         parent, name = split(path)
-        listing = await self._list_directory(parent)
+        entries, complete = await self.entries(parent)
+        return next((entry for entry in entries if entry.name == name), None), complete
+
+    async def entries(self, directory: bytes) -> tuple[tuple[DirEntry, ...], bool]:
+        """Return what a fresh listing shows, and whether it is complete."""
+        listing = await self._list_directory(directory)
         entries = listing.entries
-        if parent == ROOT and not any(entry.kind is EntryKind.FILE for entry in entries):
+        if directory == ROOT and not any(entry.kind is EntryKind.FILE for entry in entries):
             # ArduPilot's SITL hides the files of the root in "/" and shows them in "." (servers.md 6).
             entries += await self._entries_of_dot()
-        found = next((entry for entry in entries if entry.name == name), None)
-        return found, listing.complete
+        return entries, listing.complete
 
     # --- one request
 
