@@ -186,10 +186,11 @@ class Replacer:
         except FtpNak as nak:
             if errno_for(nak) == errno.ENOENT and await self._sure.entry(target) is None:
                 return False
-            renames = traits.rename_works or traits.rename_replaces is False
+            stale = nak.code == _FILE_EXISTS  # nothing has our aside's name
+            renames = traits.rename_works or (traits.rename_replaces is False and not stale)
             if renames or errno_for(nak) in _HONEST:
                 raise
-            traits.rename_works = False
+            traits.rename_works, traits.rename_replaces = False, None
             raise NotSupported("this server cannot rename") from nak
         except Armed:
             raise  # before it was sent

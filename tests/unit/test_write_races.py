@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import pytest
 import trio
 
+from mavftpfs.protocol.payload import NakCode, Opcode
+from mavftpfs.shared.errors import FtpNak, NotSupported
 from tests.support.fake_writer import KINDS, FakeWriter, make_writable, write_file
 
 FILE = b"/d/file"
@@ -30,3 +33,27 @@ async def test_a_truncation_while_the_last_writer_is_being_released(
             assert await tree.drain(60) == []
             assert store.files[FILE].data == b"x" * 100 + b"y" * 150
             assert tree.status()["files_undelivered"] == 0
+
+
+class StaleErrno(FakeWriter):
+    """LittleFS below ArduPilot: no rename, and its refusal says what an earlier request failed of."""
+
+    async def rename(self, old: bytes, new: bytes, *, completes: bool = False) -> None:
+        await self.request("rename", old, new)
+        raise FtpNak(Opcode.RENAME, NakCode.FILE_EXISTS)
+
+
+async def test_a_stale_refusal_shows_too_that_there_is_no_rename(
+    nursery: trio.Nursery, autojump_clock: object
+) -> None:
+    store = StaleErrno(KINDS["littlefs"], nursery)
+    store.add_directory(b"/d")
+    store.add(FILE, b"old" * 100)
+    tree = make_writable(store, inplace=True)
+    await write_file(tree, FILE, b"new" * 200)
+    assert store.files[FILE].data == b"new" * 200
+    assert (store.traits.rename_works, store.traits.rename_replaces) == (False, None)
+    careful = make_writable(store)
+    with pytest.raises(NotSupported):
+        await write_file(careful, FILE, b"newer")
+    assert store.files[FILE].data == b"new" * 200
