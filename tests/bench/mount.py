@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import filecmp
+import json
 import os
 import random
 import shutil
@@ -29,7 +30,6 @@ from rich.table import Table
 from tests.bench.cases import Direction
 from tests.bench.figures import BARE, LINKS, US, LinkShape, Outcome, Row, Run, as_json, summarise
 from tests.bench.peers import PINS, Client, Environment, Job, Measured, NotToBeHadError, clients
-from tests.bench.record import Record
 from tests.support.mounts import wait_until
 from tests.support.vehicles import HOST, Process, free_udp_port
 
@@ -323,8 +323,7 @@ def parser() -> argparse.ArgumentParser:
     made.add_argument("--clients", nargs="+", help="default: all")
     made.add_argument("--repetitions", type=int, help="of each run, interleaved (default 3, quick 1)")
     made.add_argument("--quick", action="store_true", help="two cells, shorter files, one repetition")
-    made.add_argument("--json", type=Path, help="put runs and rows into this file's section `mount`")
-    made.add_argument("--date", default="", help="what to note as the date")
+    made.add_argument("--json", type=Path, help="write runs and rows here too")
     return made
 
 
@@ -343,7 +342,7 @@ def chosen_cells(args: argparse.Namespace) -> list[Cell]:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Measure, print, and write the section `mount` of the JSON file."""
+    """Measure, print, and write the JSON file."""
     args = parser().parse_args(argv)
     everybody = clients(Environment())
     unknown = sorted(set(args.clients or ()) - everybody.keys())
@@ -370,7 +369,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             "rows": [as_json(row) for row in rows],
             "runs": [as_json(run) for run in runs],
         }
-        Record(args.json).put("mount", section, args.date)
+        args.json.write_text(json.dumps(section))
     return 0
 
 

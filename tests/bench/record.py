@@ -1,6 +1,6 @@
 """The JSON file that the bench writes: one section for each part, so that parts can be measured anew alone.
 
-    {"schema": 1, "sections": {"mount": {"date": ..., "versions": {...}, ...}, "goodput": ...}}
+    {"schema": 1, "sections": {"mount": {"command": ..., "date": ..., "versions": ..., "results": ...}, ...}}
 
 Nothing in it names the machine, or a path on it.
 """
@@ -10,7 +10,6 @@ from __future__ import annotations
 import json
 import os
 import platform
-from collections.abc import Mapping
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -39,10 +38,16 @@ class Record:
         sections: dict[str, dict[str, Any]] = content["sections"]
         return sections
 
-    def put(self, name: str, section: Mapping[str, Any], date: str) -> None:
-        """Write a section, with versions and the date as the user gave it."""
+    def put(self, name: str, command: str, results: Any, date: str) -> None:
+        """Write a section: what the command found, with versions and the date as the user gave it."""
         sections = self.sections()
-        sections[name] = {"date": date, "versions": versions(), "cpus": os.cpu_count(), **section}
+        sections[name] = {
+            "command": command,
+            "cpus": os.cpu_count(),
+            "date": date,
+            "results": results,
+            "versions": versions(),
+        }
         content = {"schema": SCHEMA, "sections": sections}
         self.path.parent.mkdir(parents=True, exist_ok=True)
         self.path.write_text(json.dumps(content, indent=1, sort_keys=True) + "\n")

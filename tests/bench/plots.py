@@ -1,0 +1,220 @@
+"""Draws what README shows: scripts/bench plots [--json FILE] [--readme FILE].
+
+The pictures (SVG) go beside the JSON file, and are the same for the same file. Their colours can be read on
+white and on black; the ground is transparent. `--readme` puts the tables of `tables` between the marks there.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_svg import FigureCanvasSVG
+from matplotlib.figure import Figure
+
+from tests.bench import tables
+from tests.bench.figures import BARE, US, Outcome, Row, row_from_json
+from tests.bench.record import Record
+
+RESULTS = Path(__file__).parent / "results" / "results.json"
+
+STYLE: Any = {
+    "svg.hashsalt": "mavftpfs",
+    "svg.fonttype": "none",
+    "font.family": "sans-serif",
+    "font.size": 10,
+    "text.color": "#808890",
+    "axes.labelcolor": "#808890",
+    "axes.edgecolor": "#808890",
+    "xtick.color": "#808890",
+    "ytick.color": "#808890",
+    "axes.grid": True,
+    "grid.color": "#80889055",
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "legend.frameon": False,
+}
+COLOURS = ("#2f81f7", "#e3702d", "#3fa45b", "#a371f7", "#c9388f", "#8a8f98", "#b08800")
+MARKERS = "osD^vPX"
+
+Results = list[dict[str, Any]]
+"""What `goodput` found: case, share, target and more of each run."""
+
+
+def draw(path: Path, size: tuple[float, float], paint: Callable[[Figure], None]) -> None:
+    """Write one picture."""
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=size, layout="constrained")
+        FigureCanvasSVG(figure)
+        paint(figure)
+        figure.savefig(path, format="svg", transparent=True, metadata={"Date": None, "Creator": None})
+
+
+# -- goodput ----------------------------------------------------------------------------------------
+
+
+def middle(results: Results, key: str) -> float:
+    """Return the middle one of the values that a condition took."""
+    values = sorted({run["case"][key] for run in results})
+    return float(values[len(values) // 2])
+
+
+def share_against(results: Results, x: str, fixed: dict[str, float]) -> dict[str, list[tuple[float, float]]]:
+    """Return for each profile the points (x, share of the limit) under the fixed conditions, by x."""
+    lines: dict[str, list[tuple[float, float]]] = {}
+    for run in results:
+        case = run["case"]
+        if all(case[key] == value for key, value in fixed.items()):
+            lines.setdefault(case["profile"], []).append((case[x], run["share"]))
+    return {profile: sorted(points) for profile, points in lines.items()}
+
+
+def plot_goodput(results: Results, x: str, path: Path) -> None:
+    """Draw share of the limit against `x` (loss or rtt), reading and writing beside each other."""
+    rate = max(run["case"]["rate"] for run in results)
+    other = {"rtt": middle(results, "rtt")} if x == "loss" else {"loss": lossy(results)}
+    said = f"RTT {other['rtt'] * 1000:g} ms" if x == "loss" else f"{other['loss'] * 100:g} % loss"
+
+    def paint(figure: Figure) -> None:
+        for axes, direction in zip(figure.subplots(1, 2, sharey=True), ("read", "write"), strict=True):
+            chosen = [run for run in results if run["case"]["direction"] == direction]
+            paint_lines(axes, share_against(chosen, x, {"rate": rate, **other}), x)
+            paint_targets(axes, chosen, x, other)
+            axes.set_title(f"{direction}, {rate / 1000:g} kB/s, {said}", fontsize=10)
+        figure.axes[0].set_ylim(0, max(1.05, figure.axes[0].get_ylim()[1]))
+        figure.axes[0].set_ylabel("share of the limit")
+        figure.axes[0].legend(fontsize=9, loc="lower left")
+
+    draw(path, (8.6, 3.4), paint)
+
+
+def lossy(results: Results) -> float:
+    """Return the smallest loss that is one, else none."""
+    return float(min((run["case"]["loss"] for run in results if run["case"]["loss"] > 0), default=0.0))
+
+
+def paint_lines(axes: Axes, lines: dict[str, list[tuple[float, float]]], x: str) -> None:
+    """Draw one line for each profile."""
+    scale, label = (100, "loss each way, %") if x == "loss" else (1000, "round trip, ms")
+    for (profile, points), colour, marker in zip(lines.items(), COLOURS, MARKERS, strict=False):
+        xs, ys = [at * scale for at, _ in points], [share for _, share in points]
+        axes.plot(xs, ys, color=colour, marker=marker, markersize=5, label=profile)
+    if x == "rtt":
+        axes.set_xscale("log")
+        ticks = sorted({at * scale for points in lines.values() for at, _ in points})
+        axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
+        axes.minorticks_off()
+    axes.set_xlabel(label)
+
+
+def paint_targets(axes: Axes, results: Results, x: str, other: dict[str, float]) -> None:
+    """Draw what is to be reached."""
+    found = {
+        run["case"][x]: run["target"]
+        for run in results
+        if run["target"] is not None and all(run["case"][key] == value for key, value in other.items())
+    }
+    scale = 100 if x == "loss" else 1000
+    xs = sorted(found)
+    ys = [found[at] for at in xs]
+    axes.plot([at * scale for at in xs], ys, color="#808890", linestyle="dashed", linewidth=1, label="target")
+
+
+# -- the peers --------------------------------------------------------------------------------------
+
+
+def plot_peers(rows: Sequence[Row], path: Path) -> None:
+    """Draw what part of the link's limit (loopback: of the bare loop) each client reached."""
+    names = [name for name in dict.fromkeys(row.client for row in rows) if name != BARE]
+    names.sort(key=lambda name: name != US)
+
+    def paint(figure: Figure) -> None:
+        for axes, direction in zip(figure.subplots(1, 2, sharey=True), ("read", "write"), strict=True):
+            chosen = [row for row in rows if row.direction == direction]
+            paint_bars(axes, chosen, names)
+            axes.set_title(direction, fontsize=10)
+        figure.axes[0].invert_yaxis()
+        handles, labels = figure.axes[0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside lower center", ncols=3, fontsize=9)
+
+    conditions = len({(row.server, row.link) for row in rows})
+    draw(path, (8.6, 1.4 + 0.75 * conditions), paint)
+
+
+def paint_bars(axes: Axes, rows: Sequence[Row], names: Sequence[str]) -> None:
+    """Draw a group of bars for each server and link."""
+    groups = list(dict.fromkeys((row.server, row.link) for row in rows))
+    height = 0.84 / max(1, len(names))
+    for number, (name, colour) in enumerate(zip(names, COLOURS, strict=False)):
+        offset = (number - (len(names) - 1) / 2) * height
+        found = {(row.server, row.link): row for row in rows if row.client == name}
+        places = [place for place, group in enumerate(groups) if group in found]
+        shares = [share_of(found[group]) for group in groups if group in found]
+        at = [place + offset for place in places]
+        axes.barh(at, shares, height * 0.92, color=colour, label=name)
+        for place, group in zip(at, (group for group in groups if group in found), strict=True):
+            row = found[group]
+            axes.text(share_of(row) + 0.01, place, note_of(row), va="center", fontsize=7)
+    axes.set_yticks(
+        range(len(groups)),
+        [f"{tables.server_name(server)}\n{tables.link_name(link)}" for server, link in groups],
+    )
+    axes.set_xlim(0, 1.12)
+    axes.set_xlabel("share of the limit (loopback: of the bare loop)")
+    axes.grid(visible=False, axis="y")
+
+
+def share_of(row: Row) -> float:
+    """Return the length of a bar."""
+    share = row.of_bare if row.of_limit is None else row.of_limit
+    return share if share is not None and row.outcome is Outcome.OK else 0.0
+
+
+def note_of(row: Row) -> str:
+    """Return what stands beside a bar."""
+    if row.outcome is not Outcome.OK:
+        return {Outcome.TIMEOUT: "not in time", Outcome.CORRUPT: "wrong bytes"}.get(
+            row.outcome, str(row.outcome)
+        )
+    return f"{share_of(row):.2f}"
+
+
+# -- the command ------------------------------------------------------------------------------------
+
+
+def plot_all(sections: dict[str, dict[str, Any]], folder: Path) -> list[Path]:
+    """Draw whatever there are results for, and return what was written."""
+    written: list[Path] = []
+    if "goodput" in sections:
+        results: Results = sections["goodput"]["results"]
+        for x in ("loss", "rtt"):
+            written.append(folder / f"goodput-{x}.svg")
+            plot_goodput(results, x, written[-1])
+    if "mount" in sections:
+        written.append(folder / "peers.svg")
+        plot_peers([row_from_json(row) for row in sections["mount"]["results"]["rows"]], written[-1])
+    return written
+
+
+def main(argv: Sequence[str]) -> int:
+    """Draw, and fill in README's tables if asked to."""
+    parser = argparse.ArgumentParser(prog="scripts/bench plots", description="draw what README shows")
+    parser.add_argument("--json", type=Path, default=RESULTS, metavar="FILE", help="what --json wrote before")
+    parser.add_argument(
+        "--readme", type=Path, metavar="FILE", help="put the tables between the marks in this file"
+    )
+    args = parser.parse_args(argv)
+    sections = Record(args.json).sections()
+    if not sections:
+        print(f"nothing is recorded in {args.json}", file=sys.stderr)
+        return 1
+    for path in plot_all(sections, args.json.parent):
+        print(path)
+    if args.readme is not None:
+        args.readme.write_text(tables.filled_in(args.readme.read_text(), sections))
+    return 0

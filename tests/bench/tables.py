@@ -1,0 +1,113 @@
+"""The bench's figures as README shows them: Markdown, between marks that are kept. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+from tests.bench.figures import BARE, US, Outcome, Row, row_from_json
+
+BEGIN, END = "<!-- bench: {} -->", "<!-- bench: end -->"
+
+_SERVERS = {"px4": "PX4", "ardupilot": "ArduPilot", "mavsdk": "MAVSDK", "mavsdk-real": "MAVSDK"}
+_LINKS = {
+    "unshaped": "loopback",
+    "wifi": "Wi-Fi",
+    "wifi-1%": "Wi-Fi, 1 % loss",
+    "wifi-5%": "Wi-Fi, 5 % loss",
+    "57600": "57,600 baud",
+}
+_FAILURES = {Outcome.TIMEOUT: "not in time", Outcome.CORRUPT: "wrong bytes"}
+
+
+def server_name(server: str) -> str:
+    """Return how a server is called in print."""
+    return _SERVERS.get(server, server)
+
+
+def link_name(link: str) -> str:
+    """Return how a link is called in print."""
+    return _LINKS.get(link, link)
+
+
+def markdown(head: Sequence[str], lines: Iterable[Sequence[str]]) -> str:
+    """Return a table."""
+    rows = [head, ["---"] * len(head), *lines]
+    return "\n".join("| " + " | ".join(row) + " |" for row in rows)
+
+
+def clients_of(rows: Iterable[Row]) -> list[str]:
+    """Return the clients, ours first."""
+    return sorted(dict.fromkeys(row.client for row in rows), key=lambda name: (name != US, name == BARE))
+
+
+def peers_table(rows: Sequence[Row]) -> str:
+    """Return rates in kB/s, and of the others what part of ours that is."""
+    names = clients_of(rows)
+    found = {(row.server, row.link, row.direction, row.client): row for row in rows}
+    lines = []
+    for cell in dict.fromkeys((row.server, row.link, row.direction) for row in rows):
+        server, link, direction = cell
+        texts = [rate_text(found.get((*cell, name))) for name in names]
+        lines.append([f"{server_name(server)}, {link_name(link)}, {direction}", *texts])
+    return markdown(["kB/s (part of ours)", *names], lines)
+
+
+def rate_text(row: Row | None) -> str:
+    """Return one cell of that table."""
+    if row is None:
+        return ""
+    if row.rate is None or row.outcome is not Outcome.OK:
+        return _FAILURES.get(row.outcome, str(row.outcome))
+    rate = _digits(row.rate / 1000)
+    if row.client == US:
+        return f"**{rate}**"
+    return rate if row.of_us is None else f"{rate} ({_digits(row.of_us)})"
+
+
+def _digits(value: float) -> str:
+    """Return three digits or so."""
+    if value >= 100:
+        return f"{value:,.0f}"
+    return f"{value:.1f}" if value >= 10 else f"{value:.2f}"
+
+
+def cost_table(rows: Sequence[Row], server: str, link: str) -> str:
+    """Return CPU time and memory of each client under one pair of conditions, reading / writing."""
+    chosen = [row for row in rows if (row.server, row.link) == (server, link)]
+    lines = []
+    for name in clients_of(chosen):
+        own = {row.direction: row for row in chosen if row.client == name}
+        both = (own.get("read"), own.get("write"))
+        cpu = [None if row is None or row.cpu is None else f"{row.cpu:.3f}" for row in both]
+        chunk = [
+            None if row is None or row.per_chunk is None else f"{row.per_chunk * 1e6:.0f}" for row in both
+        ]
+        memory = [None if row is None or row.memory is None else f"{row.memory / 1e6:.0f}" for row in both]
+        lines.append([name, *(" / ".join(value or "–" for value in pair) for pair in (cpu, chunk, memory))])
+    head = ["read / write", "CPU seconds per MB", "µs per packet of 239 bytes", "peak memory, MB"]
+    return markdown(head, lines)
+
+
+def tables(sections: dict[str, dict[str, Any]]) -> dict[str, str]:
+    """Return the tables by the name of their mark."""
+    if "mount" not in sections:
+        return {}
+    rows = [row_from_json(fields) for fields in sections["mount"]["results"]["rows"]]
+    return {"peers": peers_table(rows), "cost": cost_table(rows, "px4", "unshaped")}
+
+
+def filled_in(text: str, sections: dict[str, dict[str, Any]]) -> str:
+    """Return a text with the tables between their marks.
+
+    Raises:
+        ValueError: a mark is missing.
+    """
+    for name, table in tables(sections).items():
+        begin = BEGIN.format(name)
+        before, found, rest = text.partition(begin)
+        _, ended, after = rest.partition(END)
+        if not (found and ended):
+            raise ValueError(f"no {begin} ... {END}")
+        text = f"{before}{begin}\n\n{table}\n\n{END}{after}"
+    return text

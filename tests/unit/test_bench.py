@@ -1,0 +1,233 @@
+"""The bench's own arithmetic: limits, medians, ratios, its JSON file, its pictures and README's tables."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import pytest
+
+from mavftpfs.link.framing import Framer
+from mavftpfs.link.messages import Address
+from mavftpfs.protocol.payload import Opcode, request
+from tests.bench import __main__ as entry
+from tests.bench import bare, mount, plots, tables
+from tests.bench.cases import Case
+from tests.bench.figures import BARE, LINKS, US, Outcome, Row, Run, as_json, limit, row_from_json, summarise
+from tests.bench.record import Record
+from tests.bench.shaper import frames_of
+
+PROJECT = Path(__file__).parents[2]
+TIMEOUTS = {"wifi-5%": 20.0, "unshaped": 10.0}
+
+
+def run(client: str, seconds: float | None, outcome: Outcome = Outcome.OK, **changes: Any) -> Run:
+    """A transfer of 1 MB from PX4 over the lossy link."""
+    fields = {"server": "px4", "link": "wifi-5%", "direction": "read", "size": 1_000_000, "cpu": 0.5}
+    return Run(**{**fields, "client": client, "seconds": seconds, "outcome": outcome, **changes})
+
+
+def row_of(rows: list[Row], client: str) -> Row:
+    """Return a client's row."""
+    return next(row for row in rows if row.client == client)
+
+
+def test_limit_is_what_design_says() -> None:
+    assert limit("px4", "unshaped", "read") is None
+    assert limit("px4", "wifi-5%", "read") == pytest.approx(625_000 * 239 / 266 * 0.95)
+    shape = LINKS["wifi"]
+    assert shape is not None
+    assert limit("ardupilot", "wifi", "write") == Case("ardupilot", 625_000, 0.030, 0.0, "write").limit
+
+
+def test_a_row_has_the_median_and_its_shares() -> None:
+    runs = [run(US, 2.0), run(BARE, 1.0), run(US, 4.0), run(BARE, 1.6), run(US, 2.5)]
+    ours = row_of(summarise(runs, TIMEOUTS), US)
+    assert ours.rate == pytest.approx(400_000)
+    assert ours.of_us == 1
+    assert ours.of_bare == pytest.approx(400_000 / ((1_000_000 + 625_000) / 2))
+    assert ours.of_limit == pytest.approx(400_000 / (625_000 * 239 / 266 * 0.95))
+    assert (ours.good, ours.runs, ours.at_most) == (3, 3, False)
+    assert ours.cpu == pytest.approx(0.5)
+    assert ours.per_chunk == pytest.approx(0.5 * 239 / 1e6)
+
+
+def test_sizes_may_differ_between_clients() -> None:
+    rows = summarise([run(US, 2.0, size=4_000_000), run("peer", 1.0, size=500_000)], TIMEOUTS)
+    assert row_of(rows, "peer").of_us == pytest.approx(0.25)
+
+
+def test_who_is_cut_off_has_an_upper_bound() -> None:
+    rows = summarise([run(US, 2.0), run("slow", None, Outcome.TIMEOUT, cpu=None)], TIMEOUTS)
+    slow = row_of(rows, "slow")
+    assert (slow.outcome, slow.rate, slow.at_most, slow.good) == (Outcome.TIMEOUT, 50_000, True, 0)
+    assert slow.of_us == pytest.approx(0.1)
+    assert mount.cells_of(slow)[:2] == ["< 50.0 (timeout)", "< 0.10"]
+
+
+@pytest.mark.parametrize("outcome", [Outcome.FAILED, Outcome.CORRUPT, Outcome.UNAVAILABLE])
+def test_who_fails_has_no_rate(outcome: Outcome) -> None:
+    rows = summarise([run(US, 2.0), run("bad", 1.0, outcome, detail="why")], TIMEOUTS)
+    bad = row_of(rows, "bad")
+    assert (bad.outcome, bad.rate, bad.of_us, bad.detail) == (outcome, None, None, "why")
+    assert mount.cells_of(bad)[0] == outcome
+
+
+def test_one_good_run_counts_and_the_others_are_counted() -> None:
+    rows = summarise([run("peer", None, Outcome.TIMEOUT), run("peer", 2.0)], TIMEOUTS)
+    peer = row_of(rows, "peer")
+    assert (peer.outcome, peer.rate, peer.good, peer.runs) == (Outcome.OK, 500_000, 1, 2)
+
+
+def test_nothing_is_compared_with_what_is_missing() -> None:
+    alone = row_of(summarise([run("peer", 2.0), run(US, None, Outcome.TIMEOUT)], TIMEOUTS), "peer")
+    assert (alone.of_us, alone.of_bare) == (None, None)
+
+
+def test_a_row_survives_the_file() -> None:
+    (row,) = summarise([run(US, 2.0)], TIMEOUTS)
+    again = row_from_json(json.loads(json.dumps(as_json(row))))
+    assert again.outcome is Outcome.OK
+    assert again.rate == pytest.approx(row.rate, rel=1e-3)
+    with pytest.raises(TypeError):
+        row_from_json({"outcome": "ok", "surprise": 1})
+
+
+def test_a_section_replaces_only_itself(tmp_path: Path) -> None:
+    record = Record(tmp_path / "new" / "results.json")
+    assert record.sections() == {}
+    record.put("goodput", "scripts/bench goodput", [1], "2026-01-02")
+    record.put("mount", "scripts/bench mount", {"rows": []}, "")
+    record.put("goodput", "scripts/bench goodput --quick", [2], "2026-01-03")
+    found = record.sections()
+    assert found["mount"]["results"] == {"rows": []}
+    assert found["goodput"]["results"] == [2]
+    assert found["goodput"]["date"] == "2026-01-03"
+    assert found["goodput"]["versions"].keys() >= {"python", "mavftpfs", "pymavlink"}
+
+
+def test_another_kind_of_file_is_left_alone(tmp_path: Path) -> None:
+    path = tmp_path / "mine.json"
+    path.write_text('{"precious": 1}')
+    with pytest.raises(ValueError, match="not written by this bench"):
+        Record(path).put("mount", "", {}, "")
+    assert path.read_text() == '{"precious": 1}'
+
+
+def test_the_part_comes_first_and_is_everything_by_default() -> None:
+    assert entry.split(["mount", "--quick"]) == ("mount", ["--quick"])
+    assert entry.split(["--quick"]) == ("all", ["--quick"])
+    with pytest.raises(SystemExit):
+        entry.main(["--profiles", "px4"])
+
+
+def test_each_part_is_run_and_noted(tmp_path: Path) -> None:
+    path = tmp_path / "results.json"
+    few = ["--profiles", "px4", "--rtts", "0.1", "--losses", "0", "--direction", "read", "--seconds", "2"]
+    assert entry.main(["goodput", "--quick", "--json", str(path), "--date", "2026-01-02", *few]) == 0
+    section = Record(path).sections()["goodput"]
+    (result,) = section["results"]
+    assert result["case"]["rate"] == 100_000
+    assert 0.3 < result["share"] < 1.1
+    assert section["command"] == "scripts/bench goodput --quick " + " ".join(few)
+    assert "tmp" not in path.read_text()
+
+
+def test_quick_is_within_the_default() -> None:
+    def cells(*argv: str) -> list[mount.Cell]:
+        return mount.chosen_cells(mount.parser().parse_args(argv))
+
+    quick, default = cells("--quick"), cells()
+    assert {(cell.server, cell.link) for cell in quick} < {(cell.server, cell.link) for cell in default}
+    assert max(cell.timeout for cell in quick) < max(cell.timeout for cell in default)
+    assert [cell.server for cell in cells("--servers", "mavsdk", "--links", "wifi")] == ["mavsdk"] * 2
+    assert {cell.window for cell in default if cell.server == "ardupilot"} == {4, 5}
+
+
+def test_datagrams_are_taken_apart_into_frames() -> None:
+    framer = Framer(Address(1, 1), stream=False)
+    signed = Framer(Address(1, 1), stream=False, signing_key=bytes(32), signing_clock=lambda: 1)
+    frames = [framer.encode_heartbeat(2, 12), signed.encode_heartbeat(2, 12)]
+    frames += [framer.encode_ftp(Address(255, 190), request(7, Opcode.READ_FILE, data=b"\x05").encode())]
+    old = bytes.fromhex("fe09000101000000000002030403") + bytes(3)
+    assert list(frames_of(b"".join([*frames, old]))) == [*frames, old]
+    assert list(frames_of(b"no MAVLink")) == [b"no MAVLink"]
+    assert list(frames_of(frames[0] + b"\xfd\x09")) == [frames[0], b"\xfd\x09"]
+    assert list(frames_of(b"")) == []
+
+
+@pytest.mark.parametrize("data", [b"", b"\x00", b"/log\x00", bytes(range(239))])
+def test_the_bare_loop_sends_what_the_reference_sends(data: bytes) -> None:
+    made = request(7, Opcode.WRITE_FILE, offset=478, data=data).encode()
+    reference = Framer(Address(bare.SYSTEM, bare.COMPONENT), stream=False)
+    expected = reference.encode_ftp(Address(1, 1), made)
+    assert bare.frame(bare.FTP_ID, bare.FTP_EXTRA, bytes((0, 1, 1)) + made, expected[4]) == expected
+
+
+# -- pictures and tables ----------------------------------------------------------------------------
+
+
+def sections() -> dict[str, dict[str, Any]]:
+    """Results as the file has them, made up."""
+    goodput_runs = [
+        {
+            "case": {"profile": profile, "rate": 1e5, "rtt": rtt, "loss": loss, "direction": direction},
+            "share": 0.9 - loss,
+            "target": 0.8,
+        }
+        for profile in ("px4", "ardupilot")
+        for rtt in (0.01, 0.1, 0.3)
+        for loss in (0.0, 0.01, 0.05)
+        for direction in ("read", "write")
+    ]
+    runs = [run(client, 2.0, direction=way) for client in (BARE, US, "peer") for way in ("read", "write")]
+    runs += [run(client, 2.0, link="unshaped") for client in (US, BARE)]
+    runs += [run("gone", None, outcome) for outcome in (Outcome.TIMEOUT, Outcome.FAILED)]
+    rows = [as_json(row) for row in summarise(runs, TIMEOUTS)]
+    return {"goodput": {"results": goodput_runs}, "mount": {"results": {"rows": rows}}}
+
+
+def test_lines_are_those_of_the_fixed_conditions() -> None:
+    results = [found for found in sections()["goodput"]["results"] if found["case"]["direction"] == "read"]
+    assert plots.middle(results, "rtt") == 0.1
+    assert plots.lossy(results) == 0.01
+    lines = plots.share_against(results, "loss", {"rate": 1e5, "rtt": 0.1})
+    assert lines["px4"] == [(0.0, 0.9), (0.01, 0.89), (0.05, pytest.approx(0.85))]
+
+
+def test_pictures_are_drawn_and_the_same_each_time(tmp_path: Path) -> None:
+    drawn = []
+    for name in ("one", "two"):
+        (tmp_path / name).mkdir()
+        paths = plots.plot_all(sections(), tmp_path / name)
+        drawn.append({path.name: path.read_text() for path in paths})
+    assert drawn[0] == drawn[1]
+    assert drawn[0].keys() == {"goodput-loss.svg", "goodput-rtt.svg", "peers.svg"}
+    for text in drawn[0].values():
+        assert ElementTree.fromstring(text).tag.endswith("svg")
+        assert len(text) < 60_000
+    assert {"mavftpfs", "peer", "Wi-Fi, 5 % loss", "failed"} <= set(
+        re.findall(r">([^<>]+)</", drawn[0]["peers.svg"])
+    )
+    assert "ardupilot" in drawn[0]["goodput-rtt.svg"]
+
+
+def test_plots_need_results(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert plots.main(["--json", str(tmp_path / "none.json")]) == 1
+    assert "nothing is recorded" in capsys.readouterr().err
+
+
+def test_tables_go_between_their_marks() -> None:
+    text = "a\n<!-- bench: peers -->old<!-- bench: end -->\nb\n<!-- bench: cost --><!-- bench: end -->\nc"
+    filled = tables.filled_in(text, sections())
+    assert filled == tables.filled_in(filled, sections())
+    assert "old" not in filled
+    assert filled.startswith("a\n")
+    assert filled.endswith("\nc")
+    assert "| PX4, Wi-Fi, 5 % loss, read | **500** | 500 (1.00) | failed | 500 (1.00) |" in filled
+    assert "| mavftpfs | 0.500 / – | 120 / – | – / – |" in filled
+    with pytest.raises(ValueError, match="peers"):
+        tables.filled_in("no marks", sections())
