@@ -1,0 +1,61 @@
+"""Random system calls on a real mount, over bad links, compared with a local directory call by call.
+
+What fails prints its seed and the last calls; `tests.support.programs.lockstep` runs it again, in parts.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+
+from tests.mount.conftest import Field
+from tests.support.places import FOLDERS, NO_RENAME, REAL, start_place
+from tests.support.trees import differing
+
+LOCKSTEP = Path(__file__).parents[1] / "support" / "programs" / "lockstep.py"
+FLAWS = ("--dup", "0.02", "--reorder", "0.02", "--corrupt", "0.005")
+DELAY = ("--delay", "0.011")
+"""One way. Frames are held back for less than a round trip: an older write would pass for a new one."""
+
+MAIN = ("px4", "px4-nuttx", "ardupilot", "littlefs", "mavsdk")
+SEEDS = range(1, 7)
+
+
+def run_lockstep(field: Field, kind: str, link: Sequence[str], seed: int, count: int, limit: float) -> None:
+    """Mount a vehicle with an empty card, make the calls, unmount, compare what is left."""
+    place = start_place(field, kind, (*link, "--seed", str(seed)))
+    local = field.local("twin")
+    mount = field.mount(place.vehicle.source, *place.options)
+    where = [str(mount.path / place.folder), str(local), str(place.card)]
+    more = ["--keep-names"] if kind in NO_RENAME else []
+    argv = [sys.executable, str(LOCKSTEP), *where, "--seed", str(seed), "--count", str(count), *more]
+    result = mount.run(*argv, timeout=limit, code=None)
+    said = f"{kind}, seed {seed}\n{result.stdout}\n{result.stderr}\n{mount.alive().text()[-3000:]}"
+    assert result.returncode == 0, said
+    assert mount.unmount() == 0, mount.alive_or_ended().text()
+    assert list(differing(bytes(local), bytes(place.card))) == [], said
+
+
+@pytest.mark.parametrize("kind", MAIN)
+def test_random_calls_do_what_a_local_disk_does(field: Field, kind: str) -> None:
+    run_lockstep(field, kind, (*FLAWS, *DELAY, "--loss", "0.001"), seed=1, count=150, limit=120)
+
+
+def test_random_calls_on_the_real_server(field: Field) -> None:
+    run_lockstep(field, REAL, ("--loss", "0.002", "--corrupt", "0.005"), seed=2, count=200, limit=120)
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("kind", [kind for kind in FOLDERS if kind != REAL])
+def test_thousands_of_random_calls(field: Field, kind: str, seed: int) -> None:
+    run_lockstep(field, kind, (*FLAWS, *DELAY, "--loss", "0.01"), 100 + seed, count=1500, limit=1200)
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("seed", SEEDS)
+def test_thousands_of_random_calls_on_the_real_server(field: Field, seed: int) -> None:
+    run_lockstep(field, REAL, ("--loss", "0.01", "--corrupt", "0.01"), 200 + seed, count=1500, limit=1200)
