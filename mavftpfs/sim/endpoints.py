@@ -98,9 +98,12 @@ class Endpoint:
         self._splitter.reset()
 
     def _exchange(self, chunks: list[bytes], now: float) -> None:
-        if not self.cut:
-            for chunk in chunks:
-                self.vehicle.receive(chunk, now)
+        for chunk in chunks if not self.cut else ():
+            self.vehicle.receive(chunk, now)
+            self._answer(now)  # at once, so that the client works on it while the next is served
+        self._answer(now)
+
+    def _answer(self, now: float) -> None:
         frames = self.vehicle.outgoing(now)
         if frames and not self.cut:
             self.link.send_nowait(frames)

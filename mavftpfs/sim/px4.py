@@ -22,6 +22,7 @@ from mavftpfs.sim.px4ops import Refusal
 from mavftpfs.sim.storage import OpenFile, StaleErrno, Storage
 from mavftpfs.sim.wire import ACK, FULL_FRAME, HEADER, NAK, REPLY, Request, frame_size, parse
 
+_Fields = tuple[int, int, int, int, int, int, int]
 _BUFFER_LIFE = 2.0
 _CACHED_DATA = 4
 _READ = int(Opcode.READ_FILE)
@@ -63,6 +64,7 @@ class Px4(Firmware):
         self._pending_bytes = 0
         self._extra_cost = 0.0
         self._has_cost = bool(profile.request_cost or profile.stall_chance)
+        self._idle_close = float("inf") if profile.idle_close is None else profile.idle_close
         self.scratch = b""
         self._handlers: dict[int, Callable[[Request], bytes]] = {
             Opcode.NONE: lambda request: request.data[: request.size],
@@ -81,7 +83,10 @@ class Px4(Firmware):
         """See Firmware."""
         if self._started is None:
             self._started = now
-        self.advance(now)
+        if self._stream is None and not self._pending and now < self._last_request + self._idle_close:
+            self.now = now  # nothing can be due
+        else:
+            self.advance(now)
         if self._busy_until > now:
             self._wait(wire, source)
         else:
@@ -117,9 +122,7 @@ class Px4(Firmware):
         return self._idle_deadline() if self._file is not None else None
 
     def _idle_deadline(self) -> float:
-        if self._file is None or self.profile.idle_close is None:
-            return float("inf")
-        return self._last_request + self.profile.idle_close
+        return float("inf") if self._file is None else self._last_request + self._idle_close
 
     def _next_tick(self) -> float:
         start = self._started or 0.0
@@ -131,7 +134,7 @@ class Px4(Firmware):
         return tick + 1 if start + tick * period <= now else tick  # rounding
 
     def _execute(self, wire: bytes, source: Address, now: float) -> None:
-        seq, session, opcode, size, _, _, offset = HEADER.unpack_from(wire)
+        seq, session, opcode, size, _, _, offset = fields = HEADER.unpack_from(wire)
         if now - self._last_request > _BUFFER_LIFE:
             self.scratch = b""  # freed, and allocated again uninitialised
         self._last_request = now
@@ -140,9 +143,9 @@ class Px4(Firmware):
         elif self._cached is not None and seq + 1 == self._cached_seq:
             self._replay(now)
         elif opcode == _READ and self._readable(session, offset):
-            self._fast_read(wire, source, now)
+            self._fast_read(wire, fields, source, now)
         elif opcode == _WRITE:
-            self._fast_write(wire, source, now)
+            self._fast_write(wire, fields, source, now)
         else:
             self._dispatch(parse(wire, source), wire, now)
 
@@ -285,9 +288,9 @@ class Px4(Firmware):
     def _readable(self, session: int, offset: int) -> bool:
         return session == 0 and self._file is not None and not self._writing and offset < self._file_size
 
-    def _fast_read(self, wire: bytes, source: Address, now: float) -> None:
+    def _fast_read(self, wire: bytes, fields: _Fields, source: Address, now: float) -> None:
         assert self._file is not None
-        seq, session, opcode, size, _, complete, offset = HEADER.unpack_from(wire)
+        seq, session, opcode, size, _, complete, offset = fields
         try:
             data = self._file.read(offset, size)
         except OSError as exc:
@@ -295,10 +298,10 @@ class Px4(Firmware):
             return
         self._cached = None
         packed = REPLY.pack(seq + 1 & 0xFFFF, session, ACK, len(data), opcode, complete, offset, data)
-        if len(data) <= _CACHED_DATA or self._has_cost or self.tx_room is not None:
+        if len(data) <= _CACHED_DATA or self._has_cost or self._later or self.tx_room is not None:
             self._deliver(source, packed, now)
         else:
-            self.emit(source, packed, now, self.now)
+            self._ready.append((source, packed))
 
     def refuse_read(self, request: Request) -> bytes:
         """Say why a ReadFile cannot be served."""
@@ -309,8 +312,8 @@ class Px4(Firmware):
         nuttx = bool(self.profile.writable_root)
         raise OSError(errno.EACCES if nuttx else errno.EBADF, "opened for writing")
 
-    def _fast_write(self, wire: bytes, source: Address, now: float) -> None:
-        seq, session, opcode, size, _, complete, offset = HEADER.unpack_from(wire)
+    def _fast_write(self, wire: bytes, fields: _Fields, source: Address, now: float) -> None:
+        seq, session, opcode, size, _, complete, offset = fields
         try:
             self._check_write(session)
             assert self._file is not None

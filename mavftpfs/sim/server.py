@@ -64,8 +64,9 @@ class FtpServer:
             self.malformed += 1
             return
         self.requests[wire[3]] += 1
-        if not self.disabled and not self._firmware.crashed:
-            self._firmware.handle(wire, source, now)
+        firmware = self._firmware
+        if not self.disabled and not firmware.crashed:
+            firmware.handle(wire, source, now)
 
     def outgoing(self, now: float) -> list[tuple[Address, bytes]]:
         """Return (target, 251-byte payload) of the replies due by `now`, in order."""

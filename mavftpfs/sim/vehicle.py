@@ -8,6 +8,8 @@ overheard while it talks to another ground station.
 from __future__ import annotations
 
 import random
+from itertools import groupby
+from operator import itemgetter
 
 from mavftpfs.link.framing import (
     AUTOPILOT_VERSION_ID,
@@ -111,11 +113,14 @@ class SimVehicle:
         """Take a datagram or a piece of the stream."""
         if now < self._down_until:
             return
+        handle, address = self.server.handle, self.address
         for message in self.framer.feed(data):
+            if type(message) is FtpFrame:  # a transfer is thousands of these a second
+                source, target, payload = message
+                if target == address or self._is_for_us(target):
+                    handle(payload, source, now)
+                continue
             match message:
-                case FtpFrame():
-                    if self._is_for_us(message.target):
-                        self.server.handle(message.payload, message.source, now)
                 case CommandLong():
                     if self._is_for_us(message.target):
                         self._on_command(message, now)
@@ -145,11 +150,11 @@ class SimVehicle:
         frames, self._ready = self._ready, []
         if now >= self._next_beat:
             self._beat(frames, now)
-        encode = self.framer.encode_ftp
         replies = self.server.outgoing(now)
         if replies:
             self._replied_at = now
-            frames += [encode(target, wire) for target, wire in replies]
+            for target, run in groupby(replies, key=itemgetter(0)):
+                frames += self.framer.encode_ftp_run(target, [wire for _, wire in run])
         if self.telemetry > 0:
             self._add_telemetry(frames, now)
         return frames
