@@ -282,7 +282,8 @@ class Engine:
             op.progress_at = now
         ledger = self._ledger
         # Metadata may use one slot more than bulk work: a full window must not make it wait.
-        room = self.flow.window - ledger.in_flight + (op.priority is Priority.METADATA)
+        in_flight = ledger.in_flight - (op.priority is Priority.METADATA)
+        room = self.flow.room(in_flight, now, paced=op.paced)
         while room > 0:
             request = ledger.take_again(op) if ledger.again else None
             if request is None:
@@ -302,6 +303,7 @@ class Engine:
         if request.follows:
             request.session = self.session
         timer = now + self._timers.of[request.manner.family].rto
+        self.flow.on_sent(now)
         if request.sends or opcode == _BURST:
             self._transmit_again(request, now)
         else:
@@ -335,7 +337,7 @@ class Engine:
 
     def next_deadline(self) -> float | None:
         """Return when `on_deadline` wants to be called, or None if nothing is pending."""
-        deadline = self._due if self._ledger.in_flight else inf
+        deadline = min(self._due, self.flow.next_room_at()) if self._ledger.in_flight else inf
         for op in self._ops:
             deadline = min(deadline, op.timer, op.progress_at + self._patience(op))
         return None if deadline == inf else deadline

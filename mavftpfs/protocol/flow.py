@@ -17,6 +17,7 @@ from collections import deque
 from math import inf
 
 from mavftpfs.protocol.easing import Easing
+from mavftpfs.protocol.pacing import Pacer
 
 INITIAL = 4
 DEFAULT_CAP = 2048
@@ -51,6 +52,7 @@ class Flow:
         "_goal",
         "_limit",
         "_losses",
+        "_pacer",
         "_plateau",
         "_rates",
         "_replies",
@@ -78,6 +80,7 @@ class Flow:
         self._wide_window = 0
         self._wide_least = inf
         self._easing = Easing()
+        self._pacer: Pacer | None = None
         self._brake = 1.0
         self._plateau = 0
         self._collapsed = 0
@@ -101,10 +104,33 @@ class Flow:
         self._cap = self._limit if limit is None else max(1, min(limit, self._limit))
         self.window = min(self.window, self._cap)
         self._goal = min(self._goal, self._cap)
+        if limit is None or self._cap == self._limit:
+            self._pacer = None
+        elif self._pacer is None or self._pacer.queue != self._cap:
+            self._pacer = Pacer(self._cap, self._limit)
+
+    def room(self, in_flight: int, now: float, *, paced: bool) -> int:
+        """Return how many requests may go out now. paced: also beyond what the server queues, if evenly."""
+        room = self.window - in_flight
+        if self._pacer is None:
+            return room
+        self._pacer.blocked = False
+        return self._pacer.room(in_flight, now) if paced and room <= 0 else room
+
+    def next_room_at(self) -> float:
+        """Return when there will be room without an answer; inf if that does not depend on time."""
+        return inf if self._pacer is None else self._pacer.next_at()
+
+    def on_sent(self, now: float) -> None:
+        """A request goes out."""
+        if self._pacer is not None:
+            self._pacer.on_sent(now)
 
     def on_starved(self) -> None:
         """There was room in the window and nothing to send: this round's rate says little."""
         self._app_limited = True
+        if self._pacer is not None:
+            self._pacer.on_starved()
 
     def on_reply(self, now: float, rtt: float | None, order: int, next_order: int) -> None:
         """A request was answered. order: of its transmission; next_order: what the next one will get."""
@@ -112,6 +138,8 @@ class Flow:
         if self.window < self._goal:
             self.window += 1  # two new requests for each answer: doubling without a flood
         self._easing.count(order, lost=False)
+        if self._pacer is not None:
+            self._pacer.on_reply(now, rtt, order, next_order)
         if rtt is not None and rtt < self._round_least:
             self._round_least = rtt
         if self._collapsed:
@@ -123,6 +151,8 @@ class Flow:
         """The transmission numbered `order` is taken to be lost."""
         self._losses += 1
         self._easing.count(order, lost=True)
+        if self._pacer is not None:
+            self._pacer.on_loss(order)
 
     def on_spurious(self) -> None:
         """What was taken to be lost was answered after all."""
@@ -134,6 +164,8 @@ class Flow:
             self._collapsed = max(1, self.window // 2)
             self._goal = 0
             self.window = min(2, self.window)
+        if self._pacer is not None:
+            self._pacer.on_silence()
 
     def _end_round(self, now: float, next_order: int) -> None:
         if self._round_end >= 0:

@@ -200,6 +200,8 @@ class Operation:
     """
 
     rank = Priority.METADATA
+    paced = True
+    """Whether more may be on the way than a server queues, evenly spread (see `pacing`)."""
 
     def __init__(self) -> None:
         self.done = False

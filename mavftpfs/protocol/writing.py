@@ -63,6 +63,7 @@ class WriteTransfer(Operation):
     """
 
     rank = Priority.WRITE
+    paced = False  # what a slow card cannot take would be lost, and leave holes for a while
 
     def __init__(
         self, session: int, source: ChunkSource, chunk: int = MAX_DATA, *, in_flight: int | None = None

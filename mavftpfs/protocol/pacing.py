@@ -1,0 +1,227 @@
+"""More requests on their way than the server queues. Layer: protocol; pure.
+
+Theory. ArduPilot queues five requests for everybody and drops the rest silently, but it empties that queue
+every few milliseconds (servers.md 3, 15). So what must stay small is not what is on its way but what
+arrives between two looks at the queue. Requests that are spread evenly in time may fill a long way, which
+four at a time leave empty for most of each round trip.
+
+How often the server looks is not known, so the rate is raised while that helps: each *trial* compares the
+answers per second with those of the trial before. Where a raise brings next to nothing, the server or the
+link is the limit: if more was lost than before it was the queue, of which a fifth is then left to others.
+Random loss does not matter, because it takes the same share of both.
+"""
+
+from __future__ import annotations
+
+from math import inf
+
+_FEW = 24
+_MANY = 96
+_BOLD = 2.0
+_CAREFUL = 1.25
+_WORTH = 0.5
+"""The share of a raise that must show in the answers for the raise to be kept."""
+
+_SHY = 0.8
+_UNUSUAL_LOSS = 0.04
+_ALARMING_LOSS = 0.2
+_SMOOTHING = 0.3
+_HOLD = 20.0
+_SHORT_HOLD = 2.0
+_STANDING = 1.3
+"""How much longer than the shortest round trip even the quickest of a trial takes where a queue stands."""
+
+_DEPTH = 2.0
+_SPREAD = 1.1
+
+
+class Pacer:
+    """Allows requests beyond a server's queue of `queue`, one by one, up to `limit` in all.
+
+    Attributes:
+        rate: requests per second that seem to be survived; None while nothing is known.
+        window: the most that may be in flight.
+    """
+
+    __slots__ = (
+        "_answered",
+        "_base_loss",
+        "_base_rtt",
+        "_best",
+        "_doubted",
+        "_from",
+        "_hold_until",
+        "_least_rtt",
+        "_limit",
+        "_limited",
+        "_lost",
+        "_queued",
+        "_raise",
+        "_since",
+        "_starved",
+        "_tokens",
+        "_tokens_at",
+        "blocked",
+        "queue",
+        "rate",
+        "window",
+    )
+
+    def __init__(self, queue: int, limit: int) -> None:
+        self.queue = queue
+        self._limit = limit
+        self.rate: float | None = None
+        self.window = queue
+        self.blocked = False
+        self._raise = _BOLD
+        self._best = 0.0  # answers per second of the last trial that was worth it
+        self._base_loss = 0.0
+        self._base_rtt = inf
+        self._least_rtt = inf
+        self._hold_until = -inf
+        self._doubted = False
+        self._queued = False
+        self._tokens = 0.0
+        self._tokens_at = 0.0
+        self._from = 0  # the trial: of transmissions from here on, timed from the first answer
+        self._since: float | None = None
+        self._answered = 0
+        self._lost = 0
+        self._starved = False
+        self._limited = False
+
+    # --- sending
+
+    def room(self, in_flight: int, now: float) -> int:
+        """Return how many requests may go out now although the server's queue may be full."""
+        if self.rate is None or in_flight >= self.window:
+            return 0
+        self._refill(self.rate, now)
+        tokens = max(0, int(self._tokens))
+        self.blocked = in_flight + tokens < self.window
+        self._limited = self._limited or self.blocked
+        return min(tokens, self.window - in_flight)
+
+    def next_at(self) -> float:
+        """Return when there will be room for one that has to wait for its time; inf if none has to."""
+        if self.rate is None or not self.blocked:
+            return inf
+        return self._tokens_at + (1.0 - self._tokens) / self.rate + 1e-6
+
+    def on_sent(self, now: float) -> None:
+        """Any request goes out."""
+        if self.rate is not None:
+            self._refill(self.rate, now)
+            self._tokens = max(-float(self.queue), self._tokens - 1.0)
+
+    def _refill(self, rate: float, now: float) -> None:
+        self._tokens = min(_DEPTH, self._tokens + (now - self._tokens_at) * rate)
+        self._tokens_at = now
+
+    # --- news
+
+    def on_reply(self, now: float, rtt: float | None, order: int, next_order: int) -> None:
+        """A request was answered; see Flow.on_reply."""
+        if rtt is not None and rtt < self._least_rtt:
+            self._least_rtt = rtt
+        if order < self._from:
+            return
+        if self._starved:
+            self._begin(next_order)
+        elif self._since is None:
+            self._since = now  # the first answer begins the measurement and is none of it
+        else:
+            self._answered += 1
+            if self._answered + self._lost >= self._enough() and now > self._since:
+                self._end_trial(now, self._since, next_order)
+
+    def on_loss(self, order: int) -> None:
+        """The transmission numbered `order` is taken to be lost."""
+        if order >= self._from:
+            self._lost += 1
+
+    def on_starved(self) -> None:
+        """There was room and nothing to send: a trial says little then, and begins anew."""
+        self._starved = True
+        self.blocked = False
+
+    def on_silence(self) -> None:
+        """Nothing was heard for a time-out: begin again."""
+        self.rate, self.window, self.blocked = None, self.queue, False
+        self._raise = _BOLD
+        self._hold_until = -inf
+
+    # --- trials
+
+    def _begin(self, order: int) -> None:
+        self._from = order
+        self._since = None
+        self._answered = self._lost = 0
+        self._starved = self._limited = False
+
+    def _enough(self) -> int:
+        """Return how many requests tell something: few of a doubling, many of a small raise."""
+        if self.rate is None:
+            return 3 * self.queue
+        return _FEW if self._raise == _BOLD else _MANY
+
+    def _end_trial(self, now: float, since: float, next_order: int) -> None:
+        answers = self._answered / (now - since)
+        loss = self._lost / (self._answered + self._lost)
+        self._base_rtt = min(self._least_rtt, 1.05 * self._base_rtt)
+        self._queued = self._least_rtt > _STANDING * self._base_rtt
+        self._least_rtt = inf
+        if self._base_rtt < inf:
+            self._judge(answers, loss, now)
+            self._widen(loss)
+        self._begin(next_order)
+
+    def _judge(self, answers: float, loss: float, now: float) -> None:
+        if self.rate is None:
+            self._tokens, self._tokens_at = 0.0, now
+            self._accept(answers, loss)
+            self.rate = answers / (1.0 - loss) * self._raise
+        elif now < self._hold_until:
+            self._watch(answers, loss)
+        elif self._hold_until > -inf:
+            self._hold_until = -inf  # the last trial of a hold is what the next raise is compared with
+            self._accept(answers, loss)
+            self.rate *= self._raise
+        elif answers >= (1.0 + _WORTH * (self._raise - 1.0)) * self._best:
+            self._accept(answers, loss)
+            if self._limited:
+                self.rate *= self._raise
+        elif not self._doubted:
+            self._doubted = True  # so few answers may mislead: once more
+        elif self._raise == _BOLD:
+            self.rate *= _CAREFUL / _BOLD
+            self._raise, self._doubted = _CAREFUL, False
+        else:
+            self._settle(answers, loss, now)
+
+    def _accept(self, answers: float, loss: float) -> None:
+        self._best, self._doubted = answers, False
+        self._base_loss += (loss - self._base_loss) * _SMOOTHING
+
+    def _settle(self, answers: float, loss: float, now: float) -> None:
+        best = max(answers, self._best)
+        overflowed = loss > self._base_loss + _UNUSUAL_LOSS
+        self.rate = best / (1.0 - self._base_loss) * (_SHY if overflowed else 1.0)
+        self._doubted = False
+        if overflowed or self._queued:
+            self._hold_until = now + _HOLD
+        else:  # no reason is seen why it should not be faster: chance may have spoken
+            self._hold_until = now + _SHORT_HOLD
+            self._raise = _BOLD
+
+    def _watch(self, answers: float, loss: float) -> None:
+        """While holding: somebody else may have come, or the server may have become slower."""
+        if self.rate is not None and loss > self._base_loss + _ALARMING_LOSS:
+            self.rate *= _SHY
+        else:
+            self._base_loss += (loss - self._base_loss) * _SMOOTHING
+
+    def _widen(self, loss: float) -> None:
+        if self.rate is not None:
+            held = _SPREAD * self.rate * self._base_rtt / max(0.3, 1.0 - loss)
+            self.window = min(self._limit, max(self.queue, round(held) + 2))

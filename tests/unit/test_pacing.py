@@ -1,0 +1,157 @@
+"""More requests on their way than a server queues, where it is known when the server looks."""
+
+from __future__ import annotations
+
+import random
+from math import inf
+
+import pytest
+
+from mavftpfs.protocol.flow import Flow
+from mavftpfs.protocol.pacing import Pacer
+
+QUEUE = 4
+
+
+class Server:
+    """A queue of five that is emptied every `look` seconds at the end of a way of `base` seconds there and
+    back, with random loss; the client asks whenever it may."""
+
+    def __init__(self, *, base: float, look: float = 0.010, loss: float = 0.0, slowest: float = inf) -> None:
+        self.pacer = Pacer(QUEUE, 2048)
+        self.rng = random.Random(3)
+        self.base, self.look, self.loss, self.slowest = base, look, loss, slowest
+        self.now = 0.0
+        self.order = 0
+        self.in_flight = 0
+        self.busiest = 0
+        self.answered = 0
+        self._events: list[tuple[float, int, float | None]] = []  # when, order, round trip or None: lost
+        self._free_at = 0.0
+        self._look_at, self._queued = 0.0, 0
+
+    def run(self, seconds: float) -> float:
+        """Return answers per second."""
+        end, before, began = self.now + seconds, self.answered, self.now
+        while self.now < end:
+            self._ask()
+            times = [event[0] for event in self._events[:1]] + [self.pacer.next_at()]
+            self.now = max(self.now, min(times))
+            while self._events and self._events[0][0] <= self.now:
+                self._tell(*self._events.pop(0)[1:])
+        return (self.answered - before) / (self.now - began)
+
+    def _ask(self) -> None:
+        self.pacer.blocked = False
+        while self.in_flight < QUEUE or self.pacer.room(self.in_flight, self.now) > 0:
+            self.pacer.on_sent(self.now)
+            self.in_flight += 1
+            self.busiest = max(self.busiest, self.in_flight)
+            self._travel(self.order)
+            self.order += 1
+            self._events.sort()
+
+    def _travel(self, order: int) -> None:
+        there = self.now + self.base / 2
+        if there > self._look_at:  # the first into an empty queue is answered `look` later, with the others
+            self._look_at, self._queued = there + self.look, 0
+        self._queued += 1
+        lost = self._queued > 5 or self.rng.random() < self.loss
+        self._free_at = max(self._free_at, self._look_at) + 1 / self.slowest
+        back = self._free_at + self.base / 2
+        self._events.append((back, order, None if lost else back - self.now))
+
+    def _tell(self, order: int, rtt: float | None) -> None:
+        self.in_flight -= 1
+        if rtt is None:
+            self.pacer.on_loss(order)
+        else:
+            self.answered += 1
+            self.pacer.on_reply(self.now, rtt, order, self.order)
+
+
+def test_nothing_beyond_the_queue_goes_out_before_a_rate_is_known() -> None:
+    pacer = Pacer(QUEUE, 2048)
+    assert pacer.room(QUEUE, 1.0) == 0
+    assert pacer.next_at() == inf
+
+
+@pytest.mark.parametrize("loss", [0.0, 0.1, 0.2])
+@pytest.mark.parametrize("base", [0.1, 0.3, 1.0])
+def test_a_long_way_is_filled(base: float, loss: float) -> None:
+    server = Server(base=base, loss=loss)
+    server.run(30.0)
+    assert server.run(60.0) > 0.45 * (5 / 0.010) * (1 - loss)
+
+
+def test_room_is_left_in_the_queue_for_others() -> None:
+    server = Server(base=0.3)
+    server.run(30.0)
+    assert server.run(10.0) < 0.9 * 5 / 0.010
+
+
+def test_a_slow_link_is_left_alone() -> None:
+    server = Server(base=0.010, slowest=21.6)
+    server.run(60.0)
+    assert server.busiest <= QUEUE + 2
+    assert server.pacer.window <= QUEUE + 1
+
+
+def test_silence_ends_it() -> None:
+    server = Server(base=0.3)
+    server.run(30.0)
+    server.pacer.on_silence()
+    assert server.pacer.room(QUEUE, server.now) == 0
+    assert server.pacer.window == QUEUE
+
+
+def test_a_server_that_becomes_slower_is_noticed() -> None:
+    server = Server(base=0.2)
+    server.run(30.0)
+    server.look = 0.050
+    server.run(60.0)
+    rate = server.pacer.rate
+    assert rate is not None
+    assert rate < 1.5 * 5 / 0.050
+
+
+def test_a_server_that_becomes_quicker_is_noticed() -> None:
+    server = Server(base=0.2, look=0.050)
+    server.run(30.0)
+    server.look = 0.010
+    server.run(60.0)
+    assert server.run(20.0) > 200.0
+
+
+def test_requests_go_out_one_by_one() -> None:
+    pacer = Pacer(QUEUE, 2048)
+    pacer.rate, pacer.window = 100.0, 50
+    sent = []
+    now = 0.0
+    while now < 1.0:
+        room = pacer.room(QUEUE, now)
+        assert room <= 2
+        for _ in range(room):
+            pacer.on_sent(now)
+            sent.append(now)
+        now = max(now + 1e-9, pacer.next_at())
+    assert 98 <= len(sent) <= 103
+
+
+def test_a_flow_uses_it_where_the_server_queues_little_and_for_whom_it_suits() -> None:
+    flow = Flow()
+    assert flow.room(10, 0.0, paced=True) < 0
+    flow.set_queue_limit(QUEUE)
+    for order in range(200):
+        now = order * 0.01
+        flow.on_sent(now)
+        flow.on_reply(now, 0.3, order, order + QUEUE)
+    assert flow.room(QUEUE, 3.0, paced=True) > 0
+    assert flow.next_room_at() < inf
+    assert flow.room(QUEUE, 3.0, paced=False) == 0
+    assert flow.next_room_at() == inf
+    assert flow.room(QUEUE - 1, 3.0, paced=True) == 1
+    flow.set_queue_limit(QUEUE)
+    assert flow.room(QUEUE, 3.0, paced=True) > 0
+    flow.on_silence()
+    assert flow.room(QUEUE, 3.0, paced=True) <= 0
