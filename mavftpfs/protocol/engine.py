@@ -184,16 +184,14 @@ class Engine:
             stats.naks += 1
         self._heard_at = now
         rtt: float | None = None
-        flow = self.flow
-        if not self._ledger.settle(request, reply.seq):
+        flow, ledger = self.flow, self._ledger
+        if not ledger.settle(request, reply.seq):
             stats.spurious += 1
             flow.on_spurious()
         if self._bursts.heard_at >= request.sent_at:
             self._bursts.on_answer(request, self.traits, self.timeout(request.manner.family))
         elif request.single:
-            rtt = now - request.sent_at
-            self._timers.of[request.manner.family].sample(rtt)
-        ledger = self._ledger
+            rtt = self._timers.sample(request, now)
         flow.on_reply(now, rtt, request.order, ledger.order)
         while (lost := ledger.next_loss()) is not None:
             flow.on_loss(lost.order)

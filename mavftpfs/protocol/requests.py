@@ -12,13 +12,12 @@ from math import inf
 from struct import Struct
 from typing import NamedTuple, Protocol
 
-from mavftpfs.protocol.payload import HEADER_SIZE, MAX_DATA, PAYLOAD_SIZE, NakCode, Opcode, Payload
+from mavftpfs.protocol.payload import MAX_DATA, NakCode, Opcode, Payload
 from mavftpfs.shared.errors import FtpNak, LocalProtocolError, MavftpfsError
 from mavftpfs.shared.traits import Traits
 
-_pack_header = Struct("<HBBBBBxI").pack
-_ZEROS = bytes(PAYLOAD_SIZE)
-_EMPTY_TAIL = bytes(PAYLOAD_SIZE - HEADER_SIZE)
+_pack = Struct(f"<HBBBBBxI{MAX_DATA}s").pack  # fills up with zeros
+_pack_empty = Struct(f"<HBBBBBxI{MAX_DATA}x").pack
 
 
 class Manner(NamedTuple):
@@ -147,12 +146,11 @@ class Request:
             LocalProtocolError: a field does not fit; a bug of the caller.
         """
         data = self.data
-        header = _pack_header(self.seq, self.session, self.opcode, self.size, 0, 0, self.offset)
         if not data:
-            return header + _EMPTY_TAIL
+            return _pack_empty(self.seq, self.session, self.opcode, self.size, 0, 0, self.offset)
         if len(data) > MAX_DATA:
             raise LocalProtocolError(f"{len(data)} bytes of data do not fit {MAX_DATA}")
-        return header + data + _ZEROS[HEADER_SIZE + len(data) :]
+        return _pack(self.seq, self.session, self.opcode, self.size, 0, 0, self.offset, data)
 
 
 def nak_of(request: Request, reply: Payload) -> FtpNak:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from mavftpfs.protocol.requests import FLOORS, Request
+from math import inf
+
+from mavftpfs.protocol.requests import FLOORS, Manner, Request
 from mavftpfs.protocol.rtt import INITIAL_RTO, RttEstimator
 
 _LONGEST_WAIT = 5.0
@@ -15,10 +17,12 @@ class Timers:
         of: the estimators.
     """
 
-    __slots__ = ("of",)
+    __slots__ = ("_at", "_manner", "_sent_at", "of")
 
     def __init__(self) -> None:
         self.of = {family: RttEstimator(floor) for family, floor in FLOORS.items()}
+        self._at = self._sent_at = -inf
+        self._manner: Manner | None = None
 
     @property
     def rtt(self) -> float | None:
@@ -33,6 +37,18 @@ class Timers:
             return timer.rto
         known = (other.unfloored for other in self.of.values() if other.known)
         return max(min(known, default=INITIAL_RTO), FLOORS[family])
+
+    def sample(self, request: Request, now: float) -> float:
+        """Return the round trip of a transmission that was answered, and learn from it.
+
+        What was sent in one batch and answered in one batch is one sample: a hundred equal ones would say
+        that round trips never vary.
+        """
+        sent_at = request.sent_at
+        if now != self._at or sent_at != self._sent_at or request.manner is not self._manner:
+            self._at, self._sent_at, self._manner = now, sent_at, request.manner
+            self.of[request.manner.family].sample(now - sent_at)
+        return now - sent_at
 
     def wait(self, request: Request) -> float:
         """Return how long to wait for the reply to this transmission of a request, in seconds."""

@@ -28,6 +28,7 @@ KEEP_ALIVE = 3.0
 """Seconds between harmless requests during a burst: PX4 closes a session 10 s after the last *request*."""
 
 _READ = int(Opcode.READ_FILE)
+_NAK = int(Opcode.NAK)
 _SESSION_CODES = frozenset((NakCode.INVALID_SESSION, NakCode.FILE_NOT_FOUND))
 _DOUBTFUL_CODES = frozenset((NakCode.FAIL, NakCode.FILE_EXISTS))
 _EBADF = 9
@@ -208,7 +209,7 @@ class ReadTransfer(Operation):
         del self._unanswered[request]
         self._window_seconds += now - self._window_mark
         self._window_mark = now
-        if reply.opcode == Opcode.NAK:
+        if reply.opcode == _NAK:
             self._on_nak(request, nak_of(request, reply))
             return
         data = reply.data

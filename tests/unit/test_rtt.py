@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import pytest
 
+from mavftpfs.protocol.ledger import Ghost
+from mavftpfs.protocol.requests import READ_MANNER, Request, manner_of
 from mavftpfs.protocol.rtt import INITIAL_RTO, LONGEST_BACK_OFF, RttEstimator
+from mavftpfs.protocol.timers import Timers
 
 
 def test_before_the_first_sample() -> None:
@@ -60,3 +63,18 @@ def test_a_slow_family_keeps_its_floor_above_the_cap() -> None:
     for _ in range(9):
         timer.on_silence()
     assert timer.rto == 10.0
+
+
+def test_what_went_and_came_together_is_one_sample() -> None:
+    timers = Timers()
+    requests = [Request(Ghost(), 5, READ_MANNER, 0, offset, 1) for offset in range(3)]
+    for request in requests:
+        request.sent_at = 1.0
+        assert timers.sample(request, 1.2) == pytest.approx(0.2)
+    assert timers.of["data"].samples == 1
+    assert timers.sample(requests[0], 1.3) == pytest.approx(0.3)
+    assert timers.of["data"].samples == 2
+    listing = Request(Ghost(), 3, manner_of(3), 0, 0, 1)
+    listing.sent_at = 1.0
+    timers.sample(listing, 1.3)
+    assert timers.of["list"].samples == 1
