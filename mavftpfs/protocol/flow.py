@@ -18,6 +18,7 @@ from math import inf
 
 from mavftpfs.protocol.easing import Easing
 from mavftpfs.protocol.pacing import Pacer
+from mavftpfs.protocol.stalls import Stalls
 
 INITIAL = 4
 DEFAULT_CAP = 2048
@@ -60,6 +61,7 @@ class Flow:
         "_round_least",
         "_round_start",
         "_serial",
+        "_stalls",
         "_starting",
         "_wide_least",
         "_wide_window",
@@ -81,6 +83,7 @@ class Flow:
         self._wide_least = inf
         self._easing = Easing()
         self._pacer: Pacer | None = None
+        self._stalls = Stalls()
         self._brake = 1.0
         self._plateau = 0
         self._collapsed = 0
@@ -111,11 +114,16 @@ class Flow:
 
     def room(self, in_flight: int, now: float, *, paced: bool) -> int:
         """Return how many requests may go out now. paced: also beyond what the server queues, if evenly."""
-        room = self.window - in_flight
+        room = self.window - in_flight + (self._reserve() if paced else 0)
         if self._pacer is None:
             return room
         self._pacer.blocked = False
         return self._pacer.room(in_flight, now) if paced and room <= 0 else room
+
+    def _reserve(self) -> int:
+        """Return how many more bridge the pauses of a server; none where its buffers are small."""
+        reserve = self._stalls.reserve
+        return 0 if not reserve or self._serial or self._pacer else int(reserve * self._best_rate)
 
     def next_room_at(self) -> float:
         """Return when there will be room without an answer; inf if that does not depend on time."""
@@ -129,6 +137,7 @@ class Flow:
     def on_starved(self) -> None:
         """There was room in the window and nothing to send: this round's rate says little."""
         self._app_limited = True
+        self._stalls.interrupt()
         if self._pacer is not None:
             self._pacer.on_starved()
 
@@ -138,6 +147,7 @@ class Flow:
         if self.window < self._goal:
             self.window += 1  # two new requests for each answer: doubling without a flood
         self._easing.count(order, lost=False)
+        self._stalls.on_reply(now, 0.0 if self._starting else self._best_rate)
         if self._pacer is not None:
             self._pacer.on_reply(now, rtt, order, next_order)
         if rtt is not None and rtt < self._round_least:

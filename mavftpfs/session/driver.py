@@ -199,6 +199,5 @@ class Driver:
     def _next_deadline(self) -> float:
         deadline = self.engine.next_deadline()
         if self.link.backlog >= BACKLOG_LIMIT:
-            soon = self._clock() + 0.01  # nobody tells us that the link drained
-            deadline = soon if deadline is None else min(deadline, soon)
+            deadline = self._clock() + 0.01  # nobody tells us that the link drained; before, nothing can go out
         return self._quiet_at if deadline is None else min(deadline, self._quiet_at)

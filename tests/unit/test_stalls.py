@@ -1,0 +1,73 @@
+"""Bridging the pauses of a server."""
+
+from __future__ import annotations
+
+import pytest
+
+from mavftpfs.protocol.flow import Flow
+from mavftpfs.protocol.stalls import MOST, Stalls
+
+RATE = 400.0
+
+
+def run(
+    stalls: Stalls, seconds: float, *, start: float = 0.0, every: float = 0.0, pause: float = 0.0
+) -> float:
+    """Answer at RATE, with a pause after each `every` seconds; return the time."""
+    now, since = start, start
+    while now < start + seconds:
+        now += 1 / RATE
+        if every and now - since > every:
+            now += pause
+            since = now
+        stalls.on_reply(now, RATE)
+    return now
+
+
+def test_steady_answers_need_no_reserve() -> None:
+    stalls = Stalls()
+    run(stalls, 60.0)
+    assert stalls.reserve == 0.0
+
+
+def test_pauses_that_cost_are_bridged_and_forgotten_when_they_end() -> None:
+    stalls = Stalls()
+    now = run(stalls, 20.0, every=1.0, pause=0.15)
+    assert stalls.reserve == pytest.approx(MOST)
+    run(stalls, 300.0, start=now)
+    assert stalls.reserve < 0.02
+
+
+def test_rare_pauses_are_not_worth_a_queue() -> None:
+    stalls = Stalls()
+    run(stalls, 60.0, every=20.0, pause=0.01)
+    assert stalls.reserve == 0.0
+
+
+def test_a_gap_because_nothing_was_asked_is_no_pause() -> None:
+    stalls = Stalls()
+    now = 0.0
+    for _ in range(20):
+        now = run(stalls, 1.0, start=now)
+        stalls.interrupt()
+        now += 0.5
+    assert stalls.reserve == 0.0
+
+
+def test_an_unknown_rate_proves_nothing() -> None:
+    stalls = Stalls()
+    for second in range(60):
+        stalls.on_reply(float(second), 0.0)
+    assert stalls.reserve == 0.0
+
+
+@pytest.mark.parametrize("serial", [False, True])
+def test_the_reserve_is_for_reads_where_the_buffers_are_not_known_to_be_small(serial: bool) -> None:
+    flow = Flow(serial=serial)
+    now = 0.0
+    for order in range(4000):
+        now += 1 / RATE if order % 200 else 0.15
+        flow.on_reply(now, 0.05, order, order + flow.window)
+    full = flow.window
+    assert (flow.room(full, now, paced=True) > 0) is not serial
+    assert flow.room(full, now, paced=False) == 0
