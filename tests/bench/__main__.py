@@ -24,6 +24,7 @@ from tempfile import TemporaryDirectory
 from tests.bench.record import Record
 
 MEASURED = ("goodput", "requests", "cost", "mount")
+INTERRUPTED = 130
 PARTS = (*MEASURED, "plots", "all")
 
 QUICK: dict[str, tuple[str, ...]] = {
@@ -78,7 +79,10 @@ def main(argv: Sequence[str]) -> int:
         parser.error(f"{' '.join(rest)}: name the part that this is for ({', '.join(MEASURED)})")
     record = None if known.json is None else Record(known.json)
     parts = MEASURED if part == "all" else (part,)
-    codes = [run_part(name, known.quick, record, known.date, rest) for name in parts]
+    try:
+        codes = [run_part(name, known.quick, record, known.date, rest) for name in parts]
+    except KeyboardInterrupt:
+        return INTERRUPTED
     if part == "all" and known.json is not None:
         from tests.bench import plots
 

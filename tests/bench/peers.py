@@ -70,6 +70,10 @@ class Client:
     name: str
     directions: tuple[Direction, ...] = ("read", "write")
 
+    def takes_part(self, direction: Direction, *, shaped: bool) -> bool:
+        """Whether there is something to compare, on a shaped link or the loopback."""
+        return direction in self.directions
+
     def prepare(self) -> None:
         """Make sure that it can run.
 
@@ -347,9 +351,10 @@ def clients(environment: Environment) -> dict[str, Client]:
 
 
 class PlainReads(Worker):
-    """A choice that a client has for reading alone."""
+    """One ReadFile at a time: for reading alone, and hopeless where a round trip takes time."""
 
-    directions: tuple[Direction, ...] = ("read",)
+    def takes_part(self, direction: Direction, *, shaped: bool) -> bool:
+        return direction == "read" and not shaped
 
 
 def _task(job: Job) -> list[str]:
