@@ -28,7 +28,6 @@ class Throttle:
     def __init__(self, context: Context) -> None:
         self._context = context
         self._moved = trio.Event()
-        self._waiting = 0
         self.meter = RateMeter()
 
     @property
@@ -49,14 +48,12 @@ class Throttle:
 
     async def wait(self) -> bool:
         """Wait for anything to move; return False if nothing did for STALL seconds."""
-        self._waiting += 1
-        try:
-            with trio.move_on_after(STALL):
-                await self._moved.wait()
-                return True
-            return False
-        finally:
-            self._waiting -= 1
+        if self._moved.is_set():
+            self._moved = trio.Event()
+        with trio.move_on_after(STALL):
+            await self._moved.wait()
+            return True
+        return False
 
     def on_acked(self, count: int) -> None:
         """Bytes arrived."""
@@ -65,6 +62,4 @@ class Throttle:
 
     def let_go(self) -> None:
         """Have those who wait look again."""
-        if self._waiting:  # an event for each ACK of a fast link would cost more than the ACK
-            moved, self._moved = self._moved, trio.Event()
-            moved.set()
+        self._moved.set()  # whoever waits next makes a new one: one for each ACK would cost more than the ACK

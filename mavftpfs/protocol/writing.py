@@ -24,6 +24,8 @@ __all__ = ["ChunkSource", "WriteTransfer"]
 MAX_OFFSET = 1 << 32
 """Offsets are 32 bits on the wire; the end of a file must fit too (servers.md 14.27)."""
 
+_WRITE = int(Opcode.WRITE_FILE)
+_NAK = int(Opcode.NAK)
 _COUNT_SIZE = 4
 _BARREN_TOLERATED = 3
 _EBADF = 9
@@ -133,7 +135,7 @@ class WriteTransfer(Operation):
         if piece is None:
             return None
         offset, data = piece
-        request = Request(self, Opcode.WRITE_FILE, WRITE_MANNER, self.session, offset, len(data), data)
+        request = Request(self, _WRITE, WRITE_MANNER, self.session, offset, len(data), data)
         self._unanswered[request] = None
         return request
 
@@ -155,7 +157,7 @@ class WriteTransfer(Operation):
 
     def on_reply(self, request: Request, reply: Payload, now: float) -> None:
         """Tell the source what was written, or end with what a refusal means."""
-        if reply.opcode == Opcode.NAK:
+        if reply.opcode == _NAK:
             self.failed_at = request.offset
             self.fail(self._meaning(nak_of(request, reply)))
             return

@@ -68,9 +68,12 @@ class Feed:
 
     def on_acked(self, offset: int, count: int) -> None:
         """See protocol.writing.ChunkSource."""
+        stop = offset + count
         self.unproven += count
-        self.reached = max(self.reached, offset + count)
-        self._furthest = max(self._furthest, offset + count)
+        if stop > self.reached:
+            self.reached = stop
+        if stop > self._furthest:
+            self._furthest = stop
         self._source.on_acked(offset, count)
 
     def on_unsent(self, offset: int, count: int) -> None:
