@@ -199,5 +199,6 @@ class Driver:
     def _next_deadline(self) -> float:
         deadline = self.engine.next_deadline()
         if self.link.backlog >= BACKLOG_LIMIT:
-            deadline = self._clock() + 0.01  # nobody tells us that the link drained; before, nothing can go out
+            # Nobody tells us that the link drained, and before that nothing can go out.
+            deadline = self._clock() + 0.01
         return self._quiet_at if deadline is None else min(deadline, self._quiet_at)
