@@ -259,6 +259,7 @@ class Engine:
     def outgoing(self, now: float) -> list[bytes]:
         """Return the payloads (251 bytes each) to send now, most urgent first, within the window."""
         wires: list[bytes] = []
+        self.flow.begin()
         if len(self._ops) > 1:
             self._ops.sort(key=_priority)
         starved = True

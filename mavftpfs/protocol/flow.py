@@ -2,11 +2,14 @@
 
 Theory. A window of W answered requests per round trip is a rate; beyond what the path carries, more of
 them only wait in a queue, ours and everybody else's. So the window aims at what the path holds:
-bandwidth (the best recent rate of answers) times base round trip (the least one seen), a quarter more to
-find out when the path improves, and a few requests of slack. Random loss does not shrink it, because
+bandwidth (the best recent rate of answers) times base round trip (the least one seen), up to a quarter
+more to find out when the path improves, and a few requests of slack: so few that a short queue in front of
+the slowest part holds them. Bandwidth is at most what `trains` saw, or losses in such a queue would excuse
+the window that causes them. Random loss does not shrink it, because
 loss alone changes neither product; loss *with* a standing queue (the round's least round trip well over
 the base) is congestion, and brakes by a third at most once a round. A silent time-out round falls back
-to a probe of two. Start: double each round while the rate grows by a quarter.
+to a probe of two. Start: double each round while the rate grows by a quarter; once the path's own pace is
+known, go to what it holds, at that pace.
 
 A round is the time until a request sent after the round's start is answered.
 """
@@ -19,13 +22,17 @@ from math import inf
 from mavftpfs.protocol.easing import Easing
 from mavftpfs.protocol.pacing import Pacer
 from mavftpfs.protocol.stalls import Stalls
+from mavftpfs.protocol.trains import Trains
 
+FIRST = 8
 INITIAL = 4
 DEFAULT_CAP = 2048
 SERIAL_CAP = 16
 
 _GAIN = 1.25
 _SLACK = 3
+_CURIOSITY = 6
+_LEAP = 4
 _FAST_PATH_SECONDS = 0.010
 _FAST_PATH_WINDOW = 96
 _QUEUE_SECONDS = 0.005
@@ -63,6 +70,7 @@ class Flow:
         "_serial",
         "_stalls",
         "_starting",
+        "_trains",
         "_wide_least",
         "_wide_window",
         "loss",
@@ -73,7 +81,7 @@ class Flow:
         self._serial = serial
         self._limit = max(1, limit or (SERIAL_CAP if serial else DEFAULT_CAP))
         self._cap = self._limit
-        self.window = min(1 if serial else INITIAL, self._cap)
+        self.window = min(1 if serial else FIRST, self._cap)
         self.loss = 0.0
         self._starting = not serial
         self._rates: deque[float] = deque(maxlen=_ROUNDS_REMEMBERED)
@@ -82,6 +90,7 @@ class Flow:
         self._wide_window = 0
         self._wide_least = inf
         self._easing = Easing()
+        self._trains = Trains()
         self._pacer: Pacer | None = None
         self._stalls = Stalls()
         self._brake = 1.0
@@ -112,11 +121,15 @@ class Flow:
         elif self._pacer is None or self._pacer.queue != self._cap:
             self._pacer = Pacer(self._cap, self._limit)
 
+    def begin(self) -> None:
+        """It is looked at anew who has something to send: `room` follows for each."""
+        self._trains.begin()
+
     def room(self, in_flight: int, now: float, *, paced: bool) -> int:
         """Return how many requests may go out now. paced: also beyond what the server queues, if evenly."""
         room = self.window - in_flight + (self._reserve() if paced else 0)
         if self._pacer is None:
-            return room
+            return min(room, self._trains.room(now)) if room > 0 else room
         self._pacer.blocked = False
         return self._pacer.room(in_flight, now) if paced and room <= 0 else room
 
@@ -127,10 +140,11 @@ class Flow:
 
     def next_room_at(self) -> float:
         """Return when there will be room without an answer; inf if that does not depend on time."""
-        return inf if self._pacer is None else self._pacer.next_at()
+        return self._trains.next_room_at() if self._pacer is None else self._pacer.next_at()
 
     def on_sent(self, now: float) -> None:
         """A request goes out."""
+        self._trains.on_sent()
         if self._pacer is not None:
             self._pacer.on_sent(now)
 
@@ -144,8 +158,10 @@ class Flow:
     def on_reply(self, now: float, rtt: float | None, order: int, next_order: int) -> None:
         """A request was answered. order: of its transmission; next_order: what the next one will get."""
         self._replies += 1
+        self._trains.on_reply(now)
         if self.window < self._goal:
-            self.window += 1  # two new requests for each answer: doubling without a flood
+            # Two new requests for each answer: doubling without a flood, which a known pace prevents.
+            self.window = self._goal if self._trains.proven else self.window + 1
         self._easing.count(order, lost=False)
         self._stalls.on_reply(now, 0.0 if self._starting else self._best_rate)
         if self._pacer is not None:
@@ -201,13 +217,14 @@ class Flow:
         if self._app_limited:
             return
         self._learn_congestion()
+        self._trains.end_round(self._replies, rate)
         if self._starting and overflowed:
             self._starting = False
             self._goal = 0
-            self._easing.ceiling = max(INITIAL, _GAIN * self._best_rate * self._base_rtt + _SLACK)
+            self._easing.ceiling = max(INITIAL, self._held(self._best_rate))
             self._approach(self._easing.ceiling)
         elif self._starting and not self._leaves_start(grown):
-            self._goal = min(self._cap, self.window * 2) if grown else 0
+            self._goal = self._next_goal() if grown else 0
         else:
             self._goal = 0
             self._approach(self._easing.next_window(self._target(), self.loss, next_order))
@@ -239,11 +256,24 @@ class Flow:
         return factor * self._base_rtt + _QUEUE_SECONDS < self._round_least < inf
 
     def _leaves_start(self, grown: bool) -> bool:
-        few = self._replies + self._losses < _TELLING_ROUND
+        few = self._replies + self._losses < _TELLING_ROUND and self.window + 1 < self._held(inf)
         self._plateau = 0 if grown or few else self._plateau + 1
         if self._plateau >= _PLATEAU_ROUNDS or self.window >= self._cap or self._queued(1.25):
             self._starting = False
         return not self._starting
+
+    def _next_goal(self) -> int:
+        if not self._trains.proven:
+            return min(self._cap, self.window * 2)
+        return int(min(self._cap, self.window * _LEAP, self._held(inf)))
+
+    def _held(self, rate: float) -> float:
+        """Return how many requests fill the path, with some to find out whether it holds more.
+
+        rate: of answers; infinite to go by their pace alone, as while the window may be too small.
+        """
+        held = min(rate / max(0.3, 1.0 - self.loss), self._trains.rate) * self._base_rtt
+        return held + min((_GAIN - 1.0) * held, _CURIOSITY) + _SLACK
 
     def _overflowed(self) -> bool:
         """Whether this round lost so much more than all before it that its window must be to blame."""
@@ -257,8 +287,7 @@ class Flow:
         rate, base = self._best_rate, self._base_rtt
         if base == inf or rate == 0.0:
             return INITIAL
-        held = _GAIN * rate * base / max(0.3, 1.0 - self.loss) + _SLACK
-        return self._brake * max(held, min(rate * _FAST_PATH_SECONDS, _FAST_PATH_WINDOW))
+        return self._brake * max(self._held(rate), min(rate * _FAST_PATH_SECONDS, _FAST_PATH_WINDOW))
 
     def _approach(self, target: float) -> None:
         if self._serial:

@@ -457,7 +457,7 @@ def test_on_deadline_called_early_or_with_grown_round_trips_sends_nothing() -> N
 
 
 def test_silence_narrows_the_window_until_something_is_heard() -> None:
-    engine = make()
+    engine = make(limit=4)
     reading(engine)
     out = sent(engine, 0.0)
     assert len(out) == 4

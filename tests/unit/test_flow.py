@@ -37,7 +37,7 @@ class Path:
 
 
 def test_begins_small() -> None:
-    assert Flow().window == 4
+    assert Flow().window == 8
     assert Flow(serial=True).window == 1
     assert Flow(limit=2).window == 2
     assert Flow().cap == DEFAULT_CAP
@@ -49,6 +49,21 @@ def test_grows_to_what_the_path_holds_and_not_far_beyond() -> None:
     path = Path(flow, rate=2000.0, base=0.1)
     path.rounds(40)
     assert 200 <= flow.window <= 270
+
+
+def test_goes_straight_to_what_a_path_with_a_pace_of_its_own_holds() -> None:
+    """Answers come at the path's pace although few are under way: requests left in one go."""
+    flow = Flow()
+    now, first = 0.0, 0
+    widest = 0
+    for _ in range(6):
+        window = flow.window
+        for index in range(window):
+            flow.on_reply(now + 0.3 + index / 400.0, 0.3, first + index, first + window)
+        first += window
+        now += max(0.3, window / 400.0)
+        widest = max(widest, flow.window)
+    assert 120 <= flow.window <= widest <= 132
 
 
 def test_random_loss_does_not_shrink_it() -> None:
@@ -194,5 +209,5 @@ def test_rounds_in_no_time_or_without_round_trips_are_survived() -> None:
     flow = Flow()
     for order in range(10):
         flow.on_reply(1.0, None, order, order + 1)
-    assert flow.window <= 8
+    assert flow.window <= 16
     assert flow.loss == 0.0

@@ -1,0 +1,96 @@
+"""The pace of the slowest part of the way, and keeping it. Layer: protocol; pure.
+
+Requests that leave in one go pass the slowest part at its own pace, and so do their answers: a few of them
+tell the rate of the path long before the window fills it, and whatever is lost besides. Who sends no faster
+than that fills no queue, however short it is, while the window grows to what the path holds.
+
+Where answers come in bunches (a slow reader, a modem that gathers) they seem infinitely close: then
+nothing is known, and nothing is held back.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from math import inf
+
+_LENGTH = 6
+_TELLING_ROUND = _LENGTH + 2
+_ROUNDS_REMEMBERED = 10
+_DENSE = 1.5
+_SAME = 1.1
+_GAIN = 1.1
+_DEPTH = 4.0
+_DEPTH_SECONDS = 0.004
+_PLENTY = 1 << 16
+
+
+class Trains:
+    """Watches answers, paces requests.
+
+    Attributes:
+        rate: answers per second in the densest row of them lately; infinite before the first long round, and
+            where bunches tell nothing.
+        proven: it is the path's own, and not just how we sent.
+    """
+
+    __slots__ = ("_blocked", "_densest", "_rounds", "_times", "_tokens", "_tokens_at", "proven", "rate")
+
+    def __init__(self) -> None:
+        self.rate = inf
+        self.proven = False
+        self._densest = inf
+        self._times: deque[float] = deque(maxlen=_LENGTH)
+        self._rounds: deque[float] = deque(maxlen=_ROUNDS_REMEMBERED)
+        self._blocked = False
+        self._tokens = 0.0
+        self._tokens_at = 0.0
+
+    # --- watching
+
+    def on_reply(self, now: float) -> None:
+        """A request was answered."""
+        times = self._times
+        if len(times) == _LENGTH:
+            took = now - times[0]
+            if took < self._densest:
+                self._densest = took
+        times.append(now)
+
+    def end_round(self, answers: int, average: float) -> None:
+        """A round in which there was always something to send is over; average: its answers per second."""
+        if answers >= _TELLING_ROUND:
+            before = self.rate
+            self._rounds.append(_LENGTH / self._densest if self._densest > 0 else inf)
+            self.rate = max(self._rounds)
+            dense = self.rate > _DENSE * average
+            self.proven = self.rate < inf and (dense or self.rate <= _SAME * before < inf)
+        self._densest = inf
+
+    # --- pacing
+
+    def begin(self) -> None:
+        """It is looked at anew who wants to send: nobody was held back yet."""
+        self._blocked = False
+
+    def room(self, now: float) -> int:
+        """Return how many requests may go out now."""
+        if not self.proven:
+            return _PLENTY
+        pace = _GAIN * self.rate
+        deepest = max(_DEPTH, pace * _DEPTH_SECONDS)
+        self._tokens = min(deepest, self._tokens + (now - self._tokens_at) * pace)
+        self._tokens_at = now
+        room = int(self._tokens)
+        self._blocked = room == 0
+        return room
+
+    def next_room_at(self) -> float:
+        """Return when there will be room for one more, if there is none now; else infinite."""
+        if not self._blocked or not self.proven:
+            return inf
+        return self._tokens_at + (1.0 - self._tokens) / (_GAIN * self.rate) + 1e-6
+
+    def on_sent(self) -> None:
+        """A request goes out."""
+        self._tokens = max(-_DEPTH, self._tokens - 1.0)
+        self._blocked = self._tokens < 1.0
