@@ -17,8 +17,8 @@ from rich.console import Console
 from rich.table import Table
 
 from tests.support.mounts import Mount
-from tests.support.request_cases import CASES, READING
-from tests.support.requests import OPTIONS, Case, Cost, Counting, CountedVehicle, prepare
+from tests.support.request_cases import CASES
+from tests.support.requests import OPTIONS, Case, Cost, CountedVehicle, Counting, prepare
 from tests.support.vehicles import SimVehicle
 
 PROFILES = ("px4", "px4-nuttx", "ardupilot", "ardupilot5", "mavsdk")
@@ -49,7 +49,7 @@ def show(results: dict[str, dict[str, Cost]], *, requests: bool) -> None:
     """Print a table of cases by profile."""
     table = Table("command", *results, title="MAVLink FTP requests, without keep-alives")
     for name in next(iter(results.values())):
-        table.add_row(name, *(costs[name].text() or "0" for costs in results.values()))
+        table.add_row(name, *(costs[name].text() for costs in results.values()))
     console = Console(width=None if sys.stdout.isatty() else 200)
     console.print(table)
     if requests:

@@ -14,6 +14,7 @@ from typing import TypeVar
 import pytest
 
 from tests.support.mounts import Mount
+from tests.support.requests import CountedVehicle
 from tests.support.trees import SMALL_SIZES, build_tree
 from tests.support.vehicles import HostileVehicle, MavsdkVehicle, SimVehicle, UdpVehicle
 
@@ -32,6 +33,10 @@ class Field:
     ) -> SimVehicle:
         """Start a simulated vehicle."""
         return self._started(SimVehicle(root, self._subfolder(), profile, options, link=link))
+
+    def counted_sim(self, root: Path, profile: str) -> CountedVehicle:
+        """Start a simulated vehicle that counts what it is asked."""
+        return self._started(CountedVehicle(root, self._subfolder(), profile))
 
     def mavsdk(self, root: Path, bad_link: Sequence[str] = ()) -> MavsdkVehicle:
         """Start the MAVSDK library's server."""

@@ -1,0 +1,122 @@
+"""What each command costs in requests, exactly: on a radio each is a round trip that somebody waits for.
+
+Counted by the vehicle, on a link without loss, Terminate and verification included. A number that grows is a
+regression; one that shrinks is a reason to look whether something is not checked any more.
+"""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.mount.conftest import Field
+from tests.support.request_cases import CASES, FIRST
+from tests.support.requests import OPTIONS, Case, Cost, Counting, prepare
+
+PROFILES = ("px4", "px4-nuttx", "ardupilot", "ardupilot5", "mavsdk")
+MOUNT = "mount"
+SAVE = "list 2, create 1, write 1, close 1, crc 1"
+EXACT = {
+    MOUNT: "list 3",  # one of them tries opcode 16
+    "first append": "list 6, open 3, open-wo 3, create 2, write 2, close 8, rename 2, remove 1,"
+    " truncate 1; 5 B",
+    "ls -l cold": "list 4",  # two directories; the second request of each tells that there is no more
+    "ls -l cached": "0",
+    "cat cold": "open 1, read 2, close 1; 300 B",
+    "cat warm": "0",
+    "stat known names": "0",
+    "stat unknown names": "0",
+    "find cold": "list 14",  # seven directories
+    "find cached": "0",
+    "cp 10 files from it": "open 10, read 20, close 10; 3000 B",
+    "df": "0",
+    "head of a big file": "open 1, read 69, close 1; 16384 B",  # what the kernel asks for
+    "thumbnail of a big file": "open 1, read 107, close 1; 25152 B",
+    "echo > new": f"{SAVE}; 2 B",
+    "echo > old": f"{SAVE}, rename 1; 2 B",
+    "echo >>": "list 4, open 1, open-wo 1, write 1, close 2; 2 B",  # compared before and after
+    "touch new": "list 2, create 1, close 1",
+    "touch old": "open 1, close 1",
+    "mkdir": "mkdir 1",
+    "mv": "rename 1",
+    "rm": "remove 1",
+    "rm -r": "list 2, remove 10, rmdir 1",
+    "vim save": "list 2, open 1, create 1, read 2, write 2, close 2, crc 1, rename 1; 603 B",
+    "nano save": "list 2, open 1, create 1, read 2, write 2, close 2, crc 1, rename 1; 606 B",
+    # Sizes are compared by listing as long as that is as cheap as opening.
+    "cp 10 files to it": "list 8, open 6, create 10, write 20, close 16, crc 10; 3000 B",
+    "rsync unchanged": "0",
+    # Files without mtimes look changed to git at each look: it writes its index anew.
+    "git status again": "open 1, create 1, write 1, close 2, crc 1, rename 1; 229 B",
+}
+REPLACED = "rename 2, remove 1"  # FAT does not rename over a file
+LOCK_FILE = "open 1, create 1, close 2, remove 1"
+REWRITTEN = "list 4, open 1, create 1, read 2, write 2, close 2, crc 1, rename 1; 602 B"
+ELSEWHERE = {
+    "px4-nuttx": {
+        "first append": "list 6, open 2, open-wo 3, create 2, write 2, close 7, rename 2, remove 1; 5 B",
+        "rm -r": "list 1, remove 10, rmdir 1",
+    },
+    "ardupilot": {
+        MOUNT: "list 5",  # "/" shows no files, so "." is listed too
+        "first append": "list 4, open 2, open-wo 3, create 2, write 2, close 6, rename 2, remove 1,"
+        " truncate 1; 5 B",
+    },
+    "ardupilot5": {
+        MOUNT: "list 4",
+        "first append": "list 10, open 2, open-wo 3, create 2, write 2, close 7, rename 2, remove 2,"
+        " truncate 1; 5 B",
+        "echo > old": f"{SAVE}, {REPLACED}; 2 B",
+        "rm -r": "list 1, remove 10, rmdir 1",
+        "vim save": f"list 2, open 1, create 1, read 2, write 2, close 2, crc 1, {REPLACED}; 603 B",
+        "nano save": f"list 2, open 1, create 1, read 2, write 2, close 2, crc 1, {REPLACED}; 606 B",
+        "git status again": LOCK_FILE,
+    },
+    "mavsdk": {
+        MOUNT: "list 2",
+        "first append": REWRITTEN,  # opening for writing would empty the file
+        "echo >>": REWRITTEN,
+        "rm -r": "list 1, remove 10, rmdir 1",
+        "git status again": LOCK_FILE,
+    },
+}
+"""Where a server needs something else."""
+
+
+class Counted:
+    """One mount, and what it and the first change cost."""
+
+    def __init__(self, field: Field, profile: str) -> None:
+        self.profile = profile
+        root = field.local("card")
+        prepare(root, profile, CASES)
+        vehicle = field.counted_sim(root, profile)
+        self.counting = Counting(vehicle, field.prepare(vehicle.source, *OPTIONS))
+        self.costs: dict[str, Cost] = {MOUNT: self.counting.start(), FIRST.name: self.counting.run(FIRST)}
+
+    def cost(self, case: Case) -> Cost:
+        """Return what a case costs; each runs once."""
+        if case.name not in self.costs:
+            self.costs[case.name] = self.counting.run(case)
+        return self.costs[case.name]
+
+
+@pytest.fixture(scope="module", params=PROFILES)
+def counted(request: pytest.FixtureRequest, module_field: Field) -> Counted:
+    """Each server, mounted once."""
+    return Counted(module_field, request.param)
+
+
+def check(counted: Counted, name: str, cost: Cost) -> None:
+    """Compare with the table; a keep-alive per second is bearable while a file is open, more are not."""
+    expected = ELSEWHERE.get(counted.profile, {}).get(name, EXACT[name])
+    assert cost.text() == expected, "\n".join(cost.requests[:60])
+    assert cost.keep_alives <= 2 + cost.seconds
+
+
+def test_mounting(counted: Counted) -> None:
+    check(counted, MOUNT, counted.costs[MOUNT])
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name.replace(" ", "-"))
+def test_each_command(counted: Counted, case: Case) -> None:
+    check(counted, case.name, counted.cost(case))

@@ -1,0 +1,208 @@
+"""What commands on a real mount cost: FTP requests by opcode, counted by the vehicle that got them.
+
+A `Case` is a shell script that runs in a directory of its own on the mount. `prepare` fills that directory on
+the card before anything is mounted, `before` runs on the mount uncounted, `script` is counted from its
+first request to the last one that follows of it (the Terminate of an idle file, a background delivery).
+Listings are kept for the whole run (dir_timeout), so that what is cached does not depend on the time.
+
+Keep-alive requests (opcode 0) depend on time and are counted apart. A run in which the client repeated a
+request, because the machine was too busy to answer in time, proves nothing and is made again.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from mavftpfs.control import ask, find_socket, own_directories
+from tests.support.mounts import Mount
+from tests.support.twins import PRELUDE
+from tests.support.vehicles import SimVehicle
+
+ATTEMPTS = 3
+SETTLED = 0.3
+"""Seconds without a request, with nothing open and nothing to deliver, after which a command has had its
+effects."""
+
+SETTLING = 60.0
+KEEP_ALIVE = "NONE"
+FOLDERS = {"px4-nuttx": "fs/microsd"}
+ROOM = "cases"
+"""The directory of the card in which each case has its own."""
+
+OPTIONS = ("dir_timeout=3600",)
+
+SHORT = {
+    "LIST_DIRECTORY": "list",
+    "LIST_DIRECTORY_WITH_TIME": "list",
+    "OPEN_FILE_RO": "open",
+    "OPEN_FILE_WO": "open-wo",
+    "CREATE_FILE": "create",
+    "READ_FILE": "read",
+    "BURST_READ_FILE": "burst",
+    "WRITE_FILE": "write",
+    "TERMINATE_SESSION": "close",
+    "CALC_FILE_CRC32": "crc",
+    "RENAME": "rename",
+    "REMOVE_FILE": "remove",
+    "TRUNCATE_FILE": "truncate",
+    "CREATE_DIRECTORY": "mkdir",
+    "REMOVE_DIRECTORY": "rmdir",
+    "RESET_SESSIONS": "reset",
+}
+"""Both opcodes for listing are one thing here: a server answers one of them."""
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """One command; `$1` is an empty directory on the local disk."""
+
+    name: str
+    script: str
+    before: str = ""
+    prepare: Callable[[Path], None] = lambda folder: None
+    timeout: float = 120.0
+
+
+@dataclass(slots=True)
+class Cost:
+    """What one run of a case cost. payload: bytes of file data asked for or sent."""
+
+    counts: Counter[str] = field(default_factory=Counter)
+    keep_alives: int = 0
+    payload: int = 0
+    seconds: float = 0.0
+    requests: list[str] = field(default_factory=list)
+
+    @property
+    def total(self) -> int:
+        """How many requests it were."""
+        return self.counts.total()
+
+    def text(self) -> str:
+        """Return it as words: "open 1, read 2, close 1; 300 B", or "0"."""
+        words = [f"{name} {self.counts[name]}" for name in dict.fromkeys(SHORT.values()) if self.counts[name]]
+        data = f"; {self.payload} B" if self.payload else ""
+        return ", ".join(words) + data or "0"
+
+
+class CountedVehicle(SimVehicle):
+    """`tests.support.counted_sim` as a vehicle."""
+
+    @property
+    def journal(self) -> Path:
+        """Where its requests are written down."""
+        return self.folder / "journal"
+
+    def argv(self) -> list[str]:
+        link = self.link or f"udpout:127.0.0.1:{self.vehicle_port}"
+        python = super().argv()[0]
+        program = [python, "-m", "tests.support.counted_sim"]
+        return [*program, str(self.root), self.profile, link, str(self.journal)]
+
+    def asked(self) -> int:
+        """Return how many requests came so far."""
+        try:
+            return self.journal.read_bytes().count(b"\n")
+        except FileNotFoundError:
+            return 0
+
+    def cost_since(self, mark: int) -> Cost:
+        """Return the requests that came after the first `mark`."""
+        cost = Cost()
+        for line in self.journal.read_text().splitlines()[mark:]:
+            entry = json.loads(line)
+            name = entry["opcode"]
+            if name == KEEP_ALIVE:
+                cost.keep_alives += 1
+                continue
+            cost.counts[SHORT[name]] += 1
+            if name in ("READ_FILE", "WRITE_FILE"):
+                cost.payload += entry["size"]
+            where = entry.get("path", f"{entry['offset']}+{entry['size']}")
+            cost.requests.append(f"{name} {where}")
+        return cost
+
+
+@dataclass
+class Counting:
+    """A mounted vehicle whose requests are counted."""
+
+    vehicle: CountedVehicle
+    mount: Mount
+    retransmissions: int = 0
+
+    @property
+    def folder(self) -> Path:
+        """Where on the mount files may be written."""
+        return self.mount.path / FOLDERS.get(self.vehicle.profile, "") / ROOM
+
+    def start(self) -> Cost:
+        """Mount, and return what that cost."""
+        self.mount.start()
+        self.settle()
+        return self.vehicle.cost_since(0)
+
+    def run(self, case: Case) -> Cost:
+        """Run a case in each of its directories until the client repeated nothing."""
+        for attempt in range(ATTEMPTS):
+            where = self.folder / directory(case, attempt)
+            scratch = self.mount.folder / where.name
+            scratch.mkdir()
+            self._bash(f"ls -l .. > /dev/null; {case.before}", where, scratch, case.timeout)
+            self.settle()
+            mark, repeated = self.vehicle.asked(), self._status()["connection"]["retransmissions"]
+            started = time.monotonic()
+            self._bash(case.script, where, scratch, case.timeout)
+            seconds = time.monotonic() - started
+            self.settle()
+            if self._status()["connection"]["retransmissions"] == repeated:
+                cost = self.vehicle.cost_since(mark)
+                cost.seconds = seconds
+                return cost
+        raise AssertionError(f"{case.name}: requests were repeated in each of {ATTEMPTS} runs")
+
+    def settle(self) -> None:
+        """Wait until the mount is idle: nothing open, nothing to deliver, nothing asked."""
+        deadline = time.monotonic() + SETTLING
+        seen, since = -1, time.monotonic()
+        while time.monotonic() - since < SETTLED:
+            assert time.monotonic() < deadline, f"the mount does not come to rest: {self._status()}"
+            now = self.vehicle.asked()
+            if now != seen or not self._idle():
+                seen, since = now, time.monotonic()
+            time.sleep(0.05)
+
+    def _idle(self) -> bool:
+        status = self._status()
+        connection = status["connection"]
+        waiting = status["cache"].get("files_undelivered")
+        return connection["session_open"] is None and not connection["uploads"] and not waiting
+
+    def _status(self) -> dict[str, dict[str, Any]]:
+        socket = find_socket(os.path.realpath(self.mount.path), own_directories())
+        facts: dict[str, dict[str, Any]] = ask(socket, {"command": "status"}, timeout=20)["status"]
+        return facts
+
+    def _bash(self, script: str, where: Path, scratch: Path, timeout: float) -> None:
+        self.mount.run("bash", "-c", PRELUDE + script, "bash", where, scratch, timeout=timeout)
+
+
+def directory(case: Case, attempt: int) -> str:
+    """Return the name of the directory of one attempt at a case."""
+    return f"{case.name.replace(' ', '_').replace('/', '_')}_{attempt}"
+
+
+def prepare(root: Path, profile: str, cases: Sequence[Case]) -> None:
+    """Fill a card with the directories of all cases."""
+    for case in cases:
+        for attempt in range(ATTEMPTS):
+            folder = root / FOLDERS.get(profile, "") / ROOM / directory(case, attempt)
+            folder.mkdir(parents=True)
+            case.prepare(folder)
