@@ -42,15 +42,16 @@ MAX_STEPS = 8
 """Plans tried in one delivery: each but the last one learnt something of the server or fetched the base."""
 
 FINISHES = 3
-START_AT = 64 * 1024
-"""A background upload begins when so many bytes wait; fewer wait for the close."""
-
 PASSING = (RequestTimeout, LinkError, SessionBusy, Armed)
 """Errors after which the upload goes on where it stopped."""
 
 
 class Deliverer:
-    """Executes plans."""
+    """Executes plans.
+
+    Attributes:
+        on_undelivered: called when a delivery ended without success.
+    """
 
     def __init__(self, context: Context, sure: Sure, throttle: Throttle) -> None:
         self._context = context
@@ -59,6 +60,7 @@ class Deliverer:
         self.replacer = Replacer(context, sure)
         self.verifier = Verifier(context, sure)
         self.delivered = 0
+        self.on_undelivered: Callable[[], None] = lambda: None
 
     async def deliver(self, node: Node) -> None:
         """Have the vehicle hold the node's file, checked.
@@ -90,15 +92,23 @@ class Deliverer:
         finally:
             node.quiet.set()
             self._throttle.let_go()
+            if node.undelivered:  # also if who waited for it gave up
+                self.on_undelivered()
 
-    def kick(self, node: Node) -> None:
-        """The draft got more: send it, or begin to, if that can be done beside the program."""
-        if node.attempt is not None:
-            if not node.attempt.committing:
-                node.attempt.upload.wake()
-        elif self._may_start(node) and self._context.nursery is not None:
-            node.starting = True
-            self._context.nursery.start_soon(self._start, node)
+    async def begin_locked(self, node: Node) -> bool:
+        """Begin to send a draft that may still grow; return False if that has to wait for a close.
+
+        Raises:
+            As deliver.
+        """
+        plan = choose(_draft(node), self._context.writer.traits, self._rules)
+        if plan is Plan.PROBE:
+            await self._probe(node)
+            plan = choose(_draft(node), self._context.writer.traits, self._rules)
+        if plan not in SENDING or plan is Plan.REWRITE:
+            return False
+        (await self._attempt(node, plan)).upload.wake()
+        return True
 
     async def abandon(self, node: Node) -> None:
         """Give up the present attempt; what it left under reserved names goes now or at the next listing."""
@@ -266,37 +276,6 @@ class Deliverer:
             attempt.committing = False  # nothing was moved
             raise
         self.replacer.release(attempt.places)
-
-    # --- in the background
-
-    def _may_start(self, node: Node) -> bool:
-        context, draft = self._context, node.draft
-        if draft is None or not node.background or node.starting or node.error is not None:
-            return False
-        blocked = context.armed and not context.options.write_armed
-        return draft.unacked >= START_AT and node.undelivered and not blocked
-
-    async def _start(self, node: Node) -> None:
-        """Begin an upload while the program still writes; whatever fails is tried again by the close."""
-        try:
-            async with node.lock:
-                if node.attempt is None and node.undelivered:
-                    await self._start_locked(node)
-        except MavftpfsError as error:
-            node.background = False
-            log.info("%r is not sent before it is closed: %s", node.path, error)
-        finally:
-            node.starting = False
-
-    async def _start_locked(self, node: Node) -> None:
-        plan = choose(_draft(node), self._context.writer.traits, self._rules)
-        if plan is Plan.PROBE:
-            await self._probe(node)
-            plan = choose(_draft(node), self._context.writer.traits, self._rules)
-        if plan in SENDING and plan is not Plan.REWRITE:
-            (await self._attempt(node, plan)).upload.wake()
-        else:
-            node.background = False
 
     # --- after
 

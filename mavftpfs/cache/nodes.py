@@ -46,8 +46,8 @@ class Node:
     often its content on the vehicle was changed by us. removed: it has no name any more. hidden: it is still
     on the vehicle under a reserved name. error: why it could not be delivered. quiet: no delivery is under
     way, so it may be written. lock: held to deliver it and to change its path. starting: a background
-    upload is about to begin. background: whether it may begin by itself. base: reads the vehicle's file.
-    delivered_at: when the vehicle last had it all.
+    upload is about to begin. background: whether it may begin by itself; start_after: not before.
+    base: reads the vehicle's file. delivered_at: when the vehicle last had it all.
     """
 
     path: bytes
@@ -63,6 +63,7 @@ class Node:
     base: FileHandle | None = None
     starting: bool = False
     background: bool = True
+    start_after: float = float("-inf")
     delivered_at: float = float("-inf")
     lock: trio.Lock = field(default_factory=trio.Lock)
     quiet: trio.Event = field(default_factory=trio.Event)

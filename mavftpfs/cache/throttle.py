@@ -41,10 +41,13 @@ class Throttle:
 
     def is_full(self, node: Node) -> bool:
         """Return whether the writers of a file have to wait."""
-        if node.attempt is None or node.attempt.committing:
+        draft, attempt = node.draft, node.attempt
+        if draft is None or (attempt is not None and attempt.committing):
             return False
+        if attempt is None and (not node.background or self._context.nursery is None):
+            return False  # nothing of it moves before it is closed: it waits on the local disk
         streams = sum(1 for other in self._context.nodes if other.attempt is not None)
-        return node.attempt.sending.unacked > max(self.limit // streams, LEAST)
+        return draft.unacked > max(self.limit // max(streams, 1), LEAST)
 
     async def wait(self) -> bool:
         """Wait for anything to move; return False if nothing did for STALL seconds."""

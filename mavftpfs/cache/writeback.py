@@ -11,6 +11,7 @@ from pathlib import Path
 
 import trio
 
+from mavftpfs.cache.background import Background
 from mavftpfs.cache.base import open_base
 from mavftpfs.cache.changes import Changes
 from mavftpfs.cache.cleaning import Cleaner
@@ -65,6 +66,7 @@ class Writeback:
         self._cleaner = cleaner
         sure = Sure(context)
         self._deliverer = Deliverer(context, sure, throttle)
+        self._background = Background(context, self._deliverer, throttle)
         self.overlay = Overlay(context)
         self._namespace = Namespace(
             context,
@@ -230,7 +232,7 @@ class Writeback:
     def _on_written(self, node: Node) -> None:
         if not node.removed:
             self.overlay.on_written(node.path)
-            self._deliverer.kick(node)
+            self._background.kick(node)
 
     def _settle(self, node: Node) -> None:
         """Nobody has the file open: if the vehicle has it, its content is ordinary cache."""
@@ -308,10 +310,10 @@ class Writeback:
         """See Tree.drain."""
         refused = 0
         with trio.move_on_after(timeout):
-            await self._deliver_all(writers_too=True)
+            await self._deliver_all()
             while self.undelivered() and refused < REFUSALS:
                 await trio.sleep(RETRY_PAUSE)
-                await self._deliver_all(writers_too=True)
+                await self._deliver_all()
                 refused = refused + 1 if self._only_refused() else 0
 
     def _only_refused(self) -> bool:
@@ -383,13 +385,12 @@ class Writeback:
 
     async def _retry(self) -> None:
         await self._cleaner.mend_torn()
-        await self._deliver_all(writers_too=False)
+        await self._background.link_back()
 
-    async def _deliver_all(self, *, writers_too: bool) -> None:
+    async def _deliver_all(self) -> None:
         """Try to deliver everything once."""
         for node in self._context.nodes:
-            unfinished = node.path in self._context.torn
-            if not node.undelivered or (node.writers and not writers_too and not unfinished):
+            if not node.undelivered:
                 continue
             try:
                 await self._deliverer.deliver(node)

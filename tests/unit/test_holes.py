@@ -95,7 +95,9 @@ async def test_a_file_that_regained_its_size_is_still_not_trusted(store: FakeWri
     file.close()
 
 
-async def test_an_upload_that_began_before_the_close_is_given_up_too(store: FakeWriter, tree: Tree) -> None:
+async def test_an_upload_that_began_before_the_close_is_given_up_too(
+    autojump_clock: object, store: FakeWriter, tree: Tree
+) -> None:
     file = await tree.open(FILE, write=True)
     shrink_at(store, 1, 10)
     await file.write(len(OLD), bytes(range(250)) * 400)

@@ -86,7 +86,7 @@ def come_back(store: FakeWriter, tree: Tree) -> None:
 
 @pytest.mark.parametrize("number", [1, 2])
 async def test_a_replacement_leaves_no_gap_when_the_vehicle_is_armed(
-    store: FakeWriter, tree: Tree, number: int
+    autojump_clock: object, store: FakeWriter, tree: Tree, number: int
 ) -> None:
     Trap(store, tree, number, "armed")
     try:
@@ -132,7 +132,7 @@ async def test_a_refused_finish_is_undone_in_flight(store: FakeWriter, tree: Tre
 
 @pytest.mark.parametrize("armed", [False, True])
 async def test_a_gap_that_a_lost_link_left_is_closed_though_armed(
-    store: FakeWriter, tree: Tree, armed: bool
+    autojump_clock: object, store: FakeWriter, tree: Tree, armed: bool
 ) -> None:
     Trap(store, tree, 2, "lost")
     with pytest.raises(VehicleLost):
@@ -150,7 +150,9 @@ async def test_a_gap_that_a_lost_link_left_is_closed_though_armed(
 # --- the link is lost between the two renames
 
 
-async def test_a_gap_is_closed_although_the_program_has_the_file_open(store: FakeWriter, tree: Tree) -> None:
+async def test_a_gap_is_closed_although_the_program_has_the_file_open(
+    autojump_clock: object, store: FakeWriter, tree: Tree
+) -> None:
     file = await tree.open(FILE, write=True, truncate=True)
     await file.write(0, NEW)
     Trap(store, tree, 2, "lost")
@@ -164,7 +166,7 @@ async def test_a_gap_is_closed_although_the_program_has_the_file_open(store: Fak
 
 @pytest.mark.parametrize("number", [1, 2])
 async def test_a_move_over_a_file_that_was_cut_off_is_undone(
-    store: FakeWriter, tree: Tree, number: int
+    autojump_clock: object, store: FakeWriter, tree: Tree, number: int
 ) -> None:
     await tree.list(b"/card/dir")
     Trap(store, tree, number, "lost")
@@ -196,7 +198,9 @@ async def test_who_opens_a_torn_name_gets_its_file(store: FakeWriter, tree: Tree
     assert await read_file(tree, FILE) == OLD
 
 
-async def test_a_torn_name_that_is_being_read_is_mended(store: FakeWriter, tree: Tree) -> None:
+async def test_a_torn_name_that_is_being_read_is_mended(
+    autojump_clock: object, store: FakeWriter, tree: Tree
+) -> None:
     reader = await tree.open(FILE)
     Trap(store, tree, 2, "lost")
     with pytest.raises(VehicleLost):
@@ -220,7 +224,9 @@ async def test_removing_a_torn_file_removes_it(store: FakeWriter, tree: Tree) ->
     assert litter(store) == []
 
 
-async def test_a_draft_written_on_after_the_gap_does_not_keep_it_open(store: FakeWriter, tree: Tree) -> None:
+async def test_a_draft_written_on_after_the_gap_does_not_keep_it_open(
+    autojump_clock: object, store: FakeWriter, tree: Tree
+) -> None:
     file = await tree.open(FILE, write=True, truncate=True)
     await file.write(0, NEW)
     Trap(store, tree, 2, "lost")
@@ -294,7 +300,7 @@ async def test_power_lost_in_a_long_move_over_a_file(
 @pytest.mark.parametrize("what", ["lost", "armed"])
 @pytest.mark.parametrize("number", [1, 2, 3])
 async def test_a_long_move_that_was_stopped_is_undone(
-    store: FakeWriter, tree: Tree, number: int, what: str
+    autojump_clock: object, store: FakeWriter, tree: Tree, number: int, what: str
 ) -> None:
     store.add(LONG_OLD, NEW)
     store.add(LONG_NEW, OLD)

@@ -1,0 +1,117 @@
+"""Delivers while nobody waits for it. Layer: cache.
+
+Uploads begin while the program still writes; one that cannot begin is tried again after a pause, and when the
+link is back. What a close could not deliver is tried again, too, ever more seldom, until the vehicle has it
+or refuses it: a link that fails and returns between two looks at its heartbeats is no news to anybody.
+"""
+
+from __future__ import annotations
+
+import logging
+
+import trio
+
+from mavftpfs.cache.context import Context
+from mavftpfs.cache.delivery import PASSING, Deliverer
+from mavftpfs.cache.nodes import Node
+from mavftpfs.cache.throttle import Throttle
+from mavftpfs.shared.errors import MavftpfsError
+
+log = logging.getLogger("mavftpfs.cache")
+
+START_AT = 64 * 1024
+"""A background upload begins when so many bytes wait; fewer wait for the close."""
+
+START_PAUSE = 5.0
+"""Seconds after which one that could not begin is tried again."""
+
+FIRST_PAUSE, LONGEST_PAUSE = 2.0, 30.0
+"""Seconds between two attempts to deliver what nobody has open."""
+
+
+class Background:
+    """Needs the context's nursery; without one nothing is delivered before it is asked for."""
+
+    def __init__(self, context: Context, deliverer: Deliverer, throttle: Throttle) -> None:
+        self._context = context
+        self._deliverer = deliverer
+        self._throttle = throttle
+        self._pause = FIRST_PAUSE
+        self._redelivering = False
+        deliverer.on_undelivered = self.redeliver
+
+    def kick(self, node: Node) -> None:
+        """The draft got more: send it, or begin to, if that can be done beside the program."""
+        if node.attempt is not None:
+            if not node.attempt.committing:
+                node.attempt.upload.wake()
+        elif self._may_start(node) and self._context.nursery is not None:
+            node.starting = True
+            self._context.nursery.start_soon(self._start, node)
+
+    async def link_back(self) -> None:
+        """What failed, or was refused, may work now."""
+        self._pause = FIRST_PAUSE
+        for node in self._context.nodes:
+            node.start_after = float("-inf")
+            self.kick(node)
+        await self._deliver_closed(refused_too=True)
+
+    def redeliver(self) -> None:
+        """Something was not delivered: try again by and by."""
+        if self._context.nursery is not None and not self._redelivering:
+            self._redelivering = True
+            self._pause = FIRST_PAUSE
+            self._context.nursery.start_soon(self._redeliver)
+
+    # --- inside
+
+    def _may_start(self, node: Node) -> bool:
+        context, draft = self._context, node.draft
+        if draft is None or not node.background or node.starting or not _may_pass(node):
+            return False
+        if context.clock() < node.start_after:
+            return False
+        blocked = context.armed and not context.options.write_armed
+        return draft.unacked >= START_AT and node.undelivered and not blocked
+
+    async def _start(self, node: Node) -> None:
+        """Begin an upload while the program still writes."""
+        try:
+            async with node.lock:
+                if node.attempt is None and node.undelivered:
+                    node.background = await self._deliverer.begin_locked(node)
+        except MavftpfsError as error:
+            node.start_after = self._context.clock() + START_PAUSE
+            log.info("%r is not sent just now: %s", node.path, error)
+        finally:
+            node.starting = False
+            self._throttle.let_go()
+        self._context.nodes.maybe_forget(node)
+
+    async def _redeliver(self) -> None:
+        try:
+            while any(node.undelivered and _may_pass(node) for node in self._context.nodes):
+                pause, self._pause = self._pause, min(2 * self._pause, LONGEST_PAUSE)
+                await trio.sleep(pause)
+                await self._deliver_closed()
+        finally:
+            self._redelivering = False
+
+    async def _deliver_closed(self, *, refused_too: bool = False) -> None:
+        """Try once what nobody writes any more, and what left a name without a file."""
+        for node in self._context.nodes:
+            done = not node.undelivered or (node.writers and node.path not in self._context.torn)
+            if done or not (refused_too or _may_pass(node)):
+                continue
+            try:
+                await self._deliverer.deliver(node)
+            except MavftpfsError as error:
+                log.debug("%r is still not delivered: %s", node.path, error)
+            else:
+                self._context.nodes.maybe_forget(node)
+
+
+def _may_pass(node: Node) -> bool:
+    """Return whether what kept a file from being delivered, if anything did, may be over by itself."""
+    return node.error is None or isinstance(node.error, PASSING)

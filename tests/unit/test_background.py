@@ -1,0 +1,233 @@
+"""Delivering while nobody waits: uploads that begin again, back-pressure without one, and redelivery."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator
+
+import pytest
+import trio
+
+from mavftpfs.cache.background import FIRST_PAUSE, LONGEST_PAUSE, START_PAUSE
+from mavftpfs.cache.openfile import OpenFile
+from mavftpfs.cache.tree import Tree
+from mavftpfs.protocol.payload import NakCode, Opcode
+from mavftpfs.shared.errors import FtpNak, MavftpfsError, RequestTimeout, VehicleLost
+from tests.support.fake_writer import KINDS, FakeWriter, make_writable
+
+OLD = bytes(range(256)) * 400
+FILE = b"/card/dir/file.txt"
+NEW = b"/card/new"
+KIB = 1024
+
+
+@pytest.fixture
+async def store(nursery: trio.Nursery, autojump_clock: object) -> AsyncIterator[FakeWriter]:
+    store = FakeWriter(KINDS["posix"], nursery)
+    store.add(FILE, OLD)
+    yield store
+    assert store.crimes == []
+    nursery.cancel_scope.cancel()
+
+
+@pytest.fixture
+def tree(store: FakeWriter) -> Tree:
+    return make_writable(store, dirty_max=128 * KIB)
+
+
+def refuse_opens(store: FakeWriter, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Have no upload opened while the vehicle is lost, as the session does."""
+    honest = store.open_upload
+
+    async def open_upload(*args: object, **kwargs: object) -> object:
+        store.require_link()
+        return await honest(*args, **kwargs)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(store, "open_upload", open_upload)
+
+
+async def fill(file: OpenFile, start: int, count: int) -> None:
+    for number in range(count):
+        await file.write(start + number * 32 * KIB, bytes(32 * KIB))
+
+
+# --- uploads that could not begin
+
+
+@pytest.mark.parametrize("news", [False, True])
+async def test_an_upload_that_could_not_begin_begins_later(
+    autojump_clock: object, store: FakeWriter, tree: Tree, monkeypatch: pytest.MonkeyPatch, news: bool
+) -> None:
+    refuse_opens(store, monkeypatch)
+    file = await tree.create(NEW, exclusive=True)
+    store.lost = True
+    await file.write(0, bytes(80 * KIB))
+    await trio.sleep(0.1)
+    store.lost = False
+    if news:
+        tree.link_back()
+        await trio.sleep(0.1)
+    else:
+        await file.write(80 * KIB, b"too soon")
+        await trio.sleep(0.1)
+        assert NEW not in store.files
+        await trio.sleep(START_PAUSE)
+        await file.write(80 * KIB, b"in time.")
+        await trio.sleep(0.1)
+    assert len(store.files[NEW].data) >= 80 * KIB
+    await file.release()
+
+
+async def test_a_lost_link_holds_writers_back_before_any_upload_began(
+    store: FakeWriter, tree: Tree, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    refuse_opens(store, monkeypatch)
+    file = await tree.create(NEW, exclusive=True)
+    store.lost = True
+    with pytest.raises(VehicleLost):
+        await fill(file, 0, 100)
+    taken = file.size
+    assert taken <= 128 * KIB + 32 * KIB
+    store.lost = False
+    await fill(file, taken, 20)
+    await file.release()
+    assert len(store.files[NEW].data) == taken + 20 * 32 * KIB
+
+
+async def test_what_can_only_go_at_the_close_holds_nobody_back(
+    nursery: trio.Nursery, autojump_clock: object
+) -> None:
+    """A part of a file that has to be sent whole: the local disk takes it."""
+    store = FakeWriter(KINDS["mavsdk"], nursery)
+    store.add(FILE, OLD)
+    tree = make_writable(store, dirty_max=64 * KIB)
+    file = await tree.open(FILE, write=True)
+    before = trio.current_time()
+    for at in range(0, 80 * KIB, 8 * KIB):
+        await file.write(at + 1000, b"x" * 8 * KIB)
+    assert trio.current_time() - before < 1
+    assert not [entry for entry in store.log if entry[0] == "write"]
+    await file.release()
+    assert store.files[FILE].data[1000:1008] == b"x" * 8
+    nursery.cancel_scope.cancel()
+
+
+async def test_an_error_of_the_link_does_not_end_background_uploads(
+    autojump_clock: object, store: FakeWriter, tree: Tree, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    refuse_opens(store, monkeypatch)
+    file = await tree.create(NEW, exclusive=True)
+    store.lost = True
+    await file.write(0, b"x")
+    with pytest.raises(VehicleLost):
+        await file.fsync()
+    store.lost = False
+    await file.write(0, bytes(80 * KIB))
+    await trio.sleep(0.1)
+    assert len(store.files[NEW].data) == 80 * KIB
+    await file.release()
+
+
+async def test_a_file_that_was_removed_while_its_upload_began_is_forgotten(
+    autojump_clock: object, store: FakeWriter, tree: Tree
+) -> None:
+    store.traits.rename_works = True
+    file = await tree.open(FILE, write=True, truncate=True)
+    await file.write(0, bytes(80 * KIB))
+    async with trio.open_nursery() as nursery:
+        nursery.start_soon(file.release)
+        nursery.start_soon(tree.unlink, FILE)
+    await trio.sleep(1)
+    assert list(tree._writing._context.nodes) == []  # type: ignore[union-attr]
+    assert tree.status()["bytes_held"] == 0
+
+
+# --- redelivery
+
+
+async def close_in_vain(tree: Tree) -> None:
+    file = await tree.create(NEW, exclusive=True)
+    await file.write(0, b"content")
+    with pytest.raises(MavftpfsError):
+        await file.release()
+
+
+async def test_what_a_close_did_not_deliver_is_delivered_without_news(
+    autojump_clock: object, store: FakeWriter, tree: Tree
+) -> None:
+    """The link failed and returned between two looks at it."""
+    store.fail_at[1] = RequestTimeout("silence")
+    await close_in_vain(tree)
+    assert tree.undelivered() == [NEW]
+    await trio.sleep(2 * FIRST_PAUSE)
+    assert tree.undelivered() == []
+    assert store.files[NEW].data == b"content"
+    assert list(tree._writing._context.nodes) == []  # type: ignore[union-attr]
+
+
+async def test_a_close_that_was_given_up_is_made_good(
+    autojump_clock: object, store: FakeWriter, tree: Tree
+) -> None:
+    """Whoever waits for it is cancelled: no error tells of it."""
+    store.write_delay = 1.0
+    file = await tree.create(NEW, exclusive=True)
+    await file.write(0, b"content")
+    with trio.move_on_after(0.5):
+        await file.release()
+    await trio.sleep(20)
+    assert tree.undelivered() == []
+    assert store.files[NEW].data == b"content"
+
+
+async def test_attempts_grow_seldom_and_go_on(autojump_clock: object, store: FakeWriter, tree: Tree) -> None:
+    await tree.list(b"/card")
+    asked: list[float] = []
+
+    def note(*_: object) -> None:
+        asked.append(trio.current_time())
+        store.lost = store.lost or len(asked) == 1
+
+    store.before_request = note
+    await close_in_vain(tree)
+    await trio.sleep(1000)
+    times = sorted(set(asked))
+    assert 30 < len(times) < 60
+    assert times[-1] - times[-2] == pytest.approx(LONGEST_PAUSE, abs=2)
+    store.lost = False
+    await trio.sleep(2 * LONGEST_PAUSE)
+    assert tree.undelivered() == []
+    count = len(asked)
+    await trio.sleep(1000)
+    assert len(asked) == count, "it ended"
+
+
+async def test_a_refusal_is_not_repeated_before_there_is_news(
+    autojump_clock: object, store: FakeWriter, tree: Tree
+) -> None:
+    full = FtpNak(Opcode.CREATE_FILE, NakCode.FAIL_ERRNO, 28)
+    store.fail_at = dict.fromkeys(range(1, 20), full)
+    await close_in_vain(tree)
+    requests = store.requests
+    await trio.sleep(1000)
+    assert store.requests == requests
+    store.fail_at.clear()
+    tree.link_back()
+    await trio.sleep(1)
+    assert tree.undelivered() == []
+
+
+async def test_an_open_file_is_left_to_its_program(
+    autojump_clock: object, store: FakeWriter, tree: Tree
+) -> None:
+    file = await tree.create(NEW, exclusive=True)
+    await file.write(0, b"content")
+    store.fail_at[1] = RequestTimeout("silence")
+    with pytest.raises(RequestTimeout):
+        await file.fsync()
+    await trio.sleep(100)
+    assert tree.undelivered() == [NEW]
+    store.lost = True
+    with pytest.raises(VehicleLost):
+        await file.release()
+    store.lost = False
+    await trio.sleep(2 * LONGEST_PAUSE)
+    assert tree.undelivered() == []
