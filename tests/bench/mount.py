@@ -19,7 +19,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -320,6 +320,10 @@ def parser() -> argparse.ArgumentParser:
     made.add_argument("--links", nargs="+", choices=LINKS)
     made.add_argument("--directions", nargs="+", choices=["read", "write"], default=["read", "write"])
     made.add_argument("--clients", nargs="+", help="default: all")
+    made.add_argument(
+        "--size", type=int, metavar="BYTES", help="of everybody's file, in place of a choice by link"
+    )
+    made.add_argument("--timeout", type=float, metavar="S", help="after which a run is cut off")
     made.add_argument("--repetitions", type=int, help="of each run, interleaved (default 3, quick 1)")
     made.add_argument("--quick", action="store_true", help="two cells, shorter files, one repetition")
     made.add_argument("--json", type=Path, help="write runs and rows here too")
@@ -333,11 +337,16 @@ def chosen_cells(args: argparse.Namespace) -> list[Cell]:
     if args.servers or args.links:
         servers = args.servers or dict.fromkeys(server for server, _ in pairs)
         pairs = product(servers, args.links or LINKS)
-    return [
+    chosen = [
         cell(server, link, direction, quick=args.quick)
         for server, link in pairs
         for direction in args.directions
     ]
+    if args.size:
+        chosen = [replace(cell, size=args.size, peers_size=args.size) for cell in chosen]
+    if args.timeout:
+        chosen = [replace(cell, timeout=args.timeout) for cell in chosen]
+    return chosen
 
 
 def main(argv: Sequence[str] | None = None) -> int:

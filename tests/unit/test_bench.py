@@ -144,6 +144,10 @@ def test_quick_is_within_the_default() -> None:
     assert {(cell.server, cell.link) for cell in quick} < {(cell.server, cell.link) for cell in default}
     assert max(cell.timeout for cell in quick) < max(cell.timeout for cell in default)
     assert [cell.server for cell in cells("--servers", "mavsdk", "--links", "wifi")] == ["mavsdk"] * 2
+    (own,) = cells(
+        "--servers", "px4", "--links", "wifi", "--directions", "read", "--size", "5", "--timeout", "9"
+    )
+    assert (own.size_for(US), own.size_for("peer"), own.timeout) == (5, 5, 9)
     assert {cell.window for cell in default if cell.server == "ardupilot"} == {4, 5}
 
 
