@@ -74,6 +74,10 @@ class Bare:
         self._session = 0
         self._beat_at = 0.0
 
+    def close(self) -> None:
+        """Free the port."""
+        self._sock.close()
+
     def connect(self) -> None:
         """Wait for the vehicle's heartbeat."""
         while True:
