@@ -1,31 +1,71 @@
-"""What a chunk costs: python -m tests.bench.cost [--size MB] [--json FILE] [mount | parts | memory].
+"""What a chunk of 239 bytes costs: scripts/bench cost [--size MB] [--memory MB] [--servers NAME ...].
 
-`mount`: cp from and to a real mount of the simulated PX4, over loopback, between two runs of a bare pipelined
-loop against the same server. Seconds depend on what else the machine does, so the figures to go by are the
-CPU time (user + system) of each process per chunk of 239 bytes, and the ratio to the bare loop.
-Bytes are compared in every run.
+First by part, replayed without waiting (`tests.bench.parts`): the shares hardly vary. Then whole: cp from
+and to a real mount over loopback, between two runs of a bare pipelined loop against the same server. Seconds
+depend on what else the machine does, so the figures to go by are each process's CPU time (user + system) per
+chunk, and the ratio of rates to the bare loop. With --memory, the mount's largest resident size while a file
+of so many megabytes is read through it. Bytes are compared in every run.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import random
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing, contextmanager
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+from rich.console import Console
+from rich.table import Table
+
 from mavftpfs.protocol.payload import MAX_DATA
-from tests.bench.bareloop import BareLoop
+from tests.bench.bare import Bare
+from tests.bench.parts import read_parts, write_parts
 from tests.support.mounts import Mount
-from tests.support.vehicles import Process, SimVehicle
+from tests.support.vehicles import MavsdkVehicle, Process, SimVehicle, UdpVehicle
+
+REAL_MAVSDK = "mavsdk-real"
+"""The MAVSDK library's own server; every other name is a profile of the simulator."""
+
+WINDOWS = {"px4": 64, REAL_MAVSDK: 32}
+FEW = 4
+SIZE_SHARE = {"px4": 1.0, REAL_MAVSDK: 0.25}
+"""Of --size; the others are slower still."""
+
+LEAST_SHARE = 1 / 32
+PATIENCE = 0.3
+HOLES = 8 << 20
+"""Bytes between the parts of the large file that are not zeros."""
 
 _TICK = 1.0 / os.sysconf("SC_CLK_TCK")
+_US = 1e6
+
+
+@dataclass(frozen=True, slots=True)
+class Copy:
+    """One copy. rate: bytes/s; client, server: microseconds of CPU per chunk."""
+
+    server_name: str
+    what: str
+    rate: float
+    client: float
+    server: float
+
+
+@dataclass(frozen=True, slots=True)
+class Memory:
+    """Bytes: of the file read, the mount's largest resident size, and what promise 8 allows."""
+
+    size: int
+    peak: int
+    allowed: int
 
 
 def cpu_of(process: Process) -> float:
@@ -34,91 +74,160 @@ def cpu_of(process: Process) -> float:
     return (int(fields[11]) + int(fields[12])) * _TICK
 
 
-@dataclass(frozen=True, slots=True)
-class Copy:
-    """One copy. rate: bytes/s; client, server: microseconds of CPU per chunk."""
+class Bench:
+    """One server in a directory of its own, and what was measured with it."""
 
-    what: str
-    rate: float
-    client: float
-    server: float
-
-
-@contextmanager
-def timed(what: str, size: int, server: Process, client: Process | None, into: list[Copy]) -> Iterator[None]:
-    """Measure the body, which moves `size` bytes; without a client process it is this one's CPU time."""
-    def own() -> float:
-        return time.process_time() if client is None else cpu_of(client)
-
-    before = own(), cpu_of(server), time.monotonic()
-    yield
-    after = own(), cpu_of(server), time.monotonic()
-    chunks = size / MAX_DATA
-    spent = [(b - a) for a, b in zip(before, after, strict=True)]
-    into.append(Copy(what, size / spent[2], spent[0] / chunks * 1e6, spent[1] / chunks * 1e6))
-
-
-def bare(vehicle: SimVehicle, data: bytes, into: list[Copy]) -> None:
-    """Read and write by the bare loop."""
-    assert vehicle.process is not None
-    loop = BareLoop(vehicle.client_port)
-    try:
-        loop.wait()
-        with timed("bare read", len(data), vehicle.process, None, into):
-            assert loop.read(b"/in.bin") == data
-        with timed("bare write", len(data), vehicle.process, None, into):
-            loop.write(b"/bare.bin", data)
-        assert (vehicle.root / "bare.bin").read_bytes() == data
-    finally:
-        loop.close()
-
-
-def by_mount(vehicle: SimVehicle, mount: Mount, data: bytes, scratch: Path, into: list[Copy]) -> None:
-    """Read and write by cp."""
-    assert vehicle.process is not None
-    daemon = mount.alive()
-    with timed("cp from mount", len(data), vehicle.process, daemon, into):
-        subprocess.run(["cp", mount.path / "in.bin", scratch / "out.bin"], check=True)
-    assert (scratch / "out.bin").read_bytes() == data
-    with timed("cp to mount", len(data), vehicle.process, daemon, into):
-        subprocess.run(["cp", scratch / "out.bin", mount.path / "up.bin"], check=True)
-    assert (vehicle.root / "up.bin").read_bytes() == data
-
-
-def measure(size: int, options: list[str]) -> list[Copy]:
-    """Run the bare loop, the mount and the bare loop again."""
-    found: list[Copy] = []
-    with TemporaryDirectory() as name:
-        folder = Path(name)
-        root, path = folder / "card", folder / "mnt"
-        root.mkdir()
-        path.mkdir()
+    def __init__(self, server: str, folder: Path) -> None:
+        self.server = server
+        self.found: list[Copy] = []
+        self.folder = folder
+        self.root, self.mountpoint = folder / "card", folder / "mnt"
+        self.root.mkdir()
+        self.mountpoint.mkdir()
         os.environ["XDG_STATE_HOME"] = str(folder / "state")
-        data = random.Random(1).randbytes(size)
-        (root / "in.bin").write_bytes(data)
-        vehicle = SimVehicle(root, folder, "px4")
-        vehicle.start()
+        self.vehicle: UdpVehicle
+        if server == REAL_MAVSDK:
+            self.vehicle = MavsdkVehicle(self.root, folder)
+        else:
+            self.vehicle = SimVehicle(self.root, folder, server)
+
+    @contextmanager
+    def running(self) -> Iterator[None]:
+        """Run the server for the length of the body."""
+        self.vehicle.start()
         try:
-            bare(vehicle, data, found)
-            mount = Mount(vehicle.source, path, folder, options)
-            mount.start()
-            try:
-                by_mount(vehicle, mount, data, folder, found)
-            finally:
-                mount.finish()
-            bare(vehicle, data, found)
+            yield
         finally:
-            vehicle.finish()
-    return found
+            self.vehicle.finish()
+
+    @contextmanager
+    def mounted(self, *options: str) -> Iterator[Mount]:
+        """Mount it for the length of the body."""
+        mount = Mount(self.vehicle.source, self.mountpoint, self.folder, options)
+        mount.start()
+        try:
+            yield mount
+        finally:
+            mount.finish()
+
+    @contextmanager
+    def timed(self, what: str, size: int, client: Callable[[], float]) -> Iterator[None]:
+        """Measure the body, which moves `size` bytes; `client` returns the client's CPU time."""
+        server = self.vehicle.process
+        assert server is not None
+        before = time.monotonic(), client(), cpu_of(server)
+        yield
+        after = time.monotonic(), client(), cpu_of(server)
+        seconds, *spent = (late - early for early, late in zip(before, after, strict=True))
+        per_chunk = [cpu * MAX_DATA / size * _US for cpu in spent]
+        self.found.append(Copy(self.server, what, size / seconds, *per_chunk))
+
+    def bare(self, data: bytes) -> None:
+        """Read and write by the bare loop."""
+        window = WINDOWS.get(self.server, FEW)
+        # Each by a client of its own: replies that one left behind must not meet the next.
+        with closing(Bare(self.vehicle.client_port, window, PATIENCE)) as reader:
+            reader.connect()
+            with self.timed("bare read", len(data), time.process_time):
+                assert reader.read(b"/in.bin") == data
+        with closing(Bare(self.vehicle.client_port, window, PATIENCE)) as writer:
+            writer.connect()
+            with self.timed("bare write", len(data), time.process_time):
+                writer.write(b"/bare.bin", data)
+        assert (self.root / "bare.bin").read_bytes() == data
+
+    def by_mount(self, mount: Mount, data: bytes) -> None:
+        """Read and write by cp."""
+        daemon, local = mount.alive(), self.folder / "local.bin"
+        with self.timed("cp from the mount", len(data), lambda: cpu_of(daemon)):
+            subprocess.run(["cp", mount.path / "in.bin", local], check=True)
+        assert local.read_bytes() == data
+        with self.timed("cp to the mount", len(data), lambda: cpu_of(daemon)):
+            subprocess.run(["cp", local, mount.path / "up.bin"], check=True)
+        assert (self.root / "up.bin").read_bytes() == data
+
+
+def copies(server: str, size: int) -> list[Copy]:
+    """Measure the bare loop, the mount, and the bare loop again."""
+    with TemporaryDirectory() as folder:
+        bench = Bench(server, Path(folder))
+        data = random.Random(1).randbytes(size)
+        (bench.root / "in.bin").write_bytes(data)
+        with bench.running():
+            bench.bare(data)
+            with bench.mounted() as mount:
+                bench.by_mount(mount, data)
+            bench.bare(data)
+        return bench.found
+
+
+def memory(size: int) -> Memory:
+    """Read a large file through a mount and return how much memory that took at most."""
+    cache, dirty_max = 64 << 20, 8 << 20
+    with TemporaryDirectory() as folder:
+        bench = Bench("px4", Path(folder))
+        rng = random.Random(2)
+        with (bench.root / "large.bin").open("wb") as file:
+            for at in range(0, size, HOLES):
+                file.seek(at)
+                file.write(rng.randbytes(4096))
+            file.truncate(size)
+        with bench.running(), bench.mounted(f"cache_size={cache >> 20}M") as mount:
+            subprocess.run(["cmp", mount.path / "large.bin", bench.root / "large.bin"], check=True)
+            peak = mount.alive().peak_memory()
+    return Memory(size, peak, cache + dirty_max + (60 << 20))
+
+
+def show_parts(direction: str, parts: dict[str, float]) -> None:
+    """Print what each part costs."""
+    table = Table(f"{direction}: part", "µs a chunk", "share")
+    total = sum(parts.values())
+    for part, cost in parts.items():
+        table.add_row(part, f"{cost:.2f}", f"{cost / total:.0%}")
+    table.add_row("all of these", f"{total:.2f}", "")
+    Console().print(table)
+
+
+def show_copies(found: Sequence[Copy]) -> None:
+    """Print the copies and their ratios to the bare loop."""
+    table = Table("server", "what", "MB/s", "of the bare loop", "client µs/chunk", "server µs/chunk")
+    for copy in found:
+        kind = "read" if copy.what.endswith(("read", "from the mount")) else "write"
+        peers = [c.rate for c in found if (c.server_name, c.what) == (copy.server_name, f"bare {kind}")]
+        ratio = copy.rate / (sum(peers) / len(peers))
+        figures = (f"{copy.rate / 1e6:.2f}", f"{ratio:.2f}", f"{copy.client:.1f}", f"{copy.server:.1f}")
+        table.add_row(copy.server_name, copy.what, *figures)
+    Console().print(table)
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser()
-    parser.add_argument("--size", type=float, default=16)
-    parser.add_argument("-o", action="append", default=[])
-    a = parser.parse_args()
-    for c in measure(int(a.size * 1e6), a.o):
-        print(f"{c.what:16} {c.rate / 1e6:6.1f} MB/s  client {c.client:5.2f}  server {c.server:5.2f} us/chunk")
+    """Measure and print."""
+    parser = argparse.ArgumentParser(
+        prog="scripts/bench cost", description="CPU time and memory a chunk costs"
+    )
+    parser.add_argument("--size", type=float, default=32.0, help="megabytes to copy (to slow servers less)")
+    parser.add_argument("--servers", nargs="*", default=["px4", REAL_MAVSDK, "ardupilot"])
+    parser.add_argument("--memory", type=float, default=0.0, help="megabytes to read for the memory's peak")
+    parser.add_argument("--json", type=Path, help="write the results here too")
+    arguments = parser.parse_args()
+    parts = {"read": read_parts(), "write": write_parts()}
+    for direction, costs in parts.items():
+        show_parts(direction, costs)
+    found: list[Copy] = []
+    for server in arguments.servers:
+        found += copies(server, int(arguments.size * 1e6 * SIZE_SHARE.get(server, LEAST_SHARE)))
+    if found:
+        show_copies(found)
+    peak = memory(int(arguments.memory * 1e6)) if arguments.memory else None
+    if peak is not None:
+        print(f"{peak.size} bytes read: {peak.peak} bytes of memory at most, {peak.allowed} are allowed")
+    if arguments.json is not None:
+        results = {
+            "parts": parts,
+            "copies": [asdict(copy) for copy in found],
+            "memory": None if peak is None else asdict(peak),
+        }
+        arguments.json.write_text(json.dumps(results, indent=1))
     return 0
 
 
