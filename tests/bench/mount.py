@@ -79,14 +79,14 @@ def cell(server: str, link: str, direction: Direction, *, quick: bool) -> Cell:
     shape = LINKS[link]
     slow = server.startswith(("ardupilot", "littlefs"))
     if shape is None:
-        size, peers_size = (200_000, 200_000) if slow else (16_000_000, 1_000_000)
-        timeout = 15.0
+        size, peers_size = (200_000, 200_000) if slow else (16_000_000, 800_000)
+        timeout = 10.0
     elif shape.rate < 10_000:
         size = peers_size = 60_000
         timeout = 45.0
     else:
-        size = peers_size = 100_000 if slow else 1_500_000
-        timeout = 15.0
+        size = peers_size = 100_000 if slow else 2_500_000
+        timeout = 12.0
     if quick:
         size, peers_size, timeout = size // 4, peers_size // 4, timeout / 2
     return Cell(server, link, direction, size, peers_size, timeout)
