@@ -340,13 +340,15 @@ class Scheduler:
 
     def rival_use(self, user: object) -> float | None:
         """Return how much the lightest of those who wait for the session used of it lately."""
-        if self._jobs:
+        if any(not self._claimed(job.path) for job in self._jobs):
             return 0.0
         now = self._clock()
         waiting = [stream for stream in self._streams if stream is not user and stream.has_demand]
-        others = [stream.use for stream in waiting if not self._claimed(stream.path)]
-        others += [upload.use for upload in self._uploading.due(now) if upload is not user]
-        return min((use.recent(now) for use in others), default=None)
+        rivals: list[FileStream | QueuedUpload] = [*waiting]
+        rivals += [upload for upload in self._uploading.due(now) if upload is not user]
+        # Nobody makes room for who could not use it yet, or both would be asked for ever.
+        others = [rival.use.recent(now) for rival in rivals if not self._claimed(rival.path)]
+        return min(others, default=None)
 
     def expire_waiters(self) -> None:
         """Somebody holds the session and cannot be interrupted: do not let others wait for ever."""
