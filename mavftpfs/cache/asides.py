@@ -34,7 +34,16 @@ from enum import Enum
 from random import Random
 
 from mavftpfs.shared.errors import PathTooLong
-from mavftpfs.shared.model import MAX_WIRE_PATH, ROOT, DirEntry, EntryKind, join, split, wire_path
+from mavftpfs.shared.model import (
+    MAX_WIRE_PATH,
+    ROOT,
+    DirEntry,
+    EntryKind,
+    join,
+    split,
+    storage_of,
+    wire_path,
+)
 
 PREFIX = b".mavftpfs-"
 RENAME_ROOM = 238
@@ -134,8 +143,7 @@ class Namer:
             PathTooLong: no directory above is short enough, or the target itself does not fit a request.
         """
         wire_path(target)
-        self._serial = (self._serial + 1) % _SERIALS
-        serial = _spell(self._serial, _SERIAL_LENGTH)
+        serial = self._next_serial()
         parent, name = split(target)
         ends = (target,) if source is None else (target, source)
         named = self._places(parent, serial, name)
@@ -145,9 +153,20 @@ class Namer:
             short = self._places(parent, serial, None)
             if _all_fit(short, ends):
                 return short
-            if parent in (ROOT, self._root):
-                raise PathTooLong(f"{target!r} is too long to be replaced by renaming")
-            parent = split(parent)[0]
+            parent = self._above(parent, target)
+
+    def probes(self, path: bytes) -> tuple[bytes, bytes]:
+        """Return two names for finding out what the server does to files like the one at `path`.
+
+        Raises:
+            PathTooLong.
+        """
+        parent = split(path)[0]
+        while True:
+            first, second = self._unlinked(parent), self._unlinked(parent)
+            if len(first) <= MAX_WIRE_PATH:
+                return first, second
+            parent = self._above(parent, path)
 
     def hidden(self, path: bytes) -> bytes:
         """Return a name for a file that is unlinked while it is read.
@@ -160,6 +179,20 @@ class Namer:
         reserved = parse(name)
         assert reserved is not None
         return join(directory, Reserved(reserved.owner, Kind.DELETED, reserved.serial).name)
+
+    def _next_serial(self) -> bytes:
+        self._serial = (self._serial + 1) % _SERIALS
+        return _spell(self._serial, _SERIAL_LENGTH)
+
+    def _unlinked(self, directory: bytes) -> bytes:
+        """Return a name of the kind that is removed wherever it is found left behind."""
+        return join(directory, Reserved(self.owner, Kind.DELETED, self._next_serial()).name)
+
+    def _above(self, directory: bytes, target: bytes) -> bytes:
+        """Return the next directory above, on the same storage and within the mount's root."""
+        if directory in (ROOT, self._root, storage_of(directory)):
+            raise PathTooLong(f"{target!r} is too long for temporary names beside it")
+        return split(directory)[0]
 
     def _places(self, directory: bytes, serial: bytes, name: bytes | None) -> Places:
         def place(kind: Kind) -> bytes:

@@ -25,10 +25,12 @@ from mavftpfs.cache.verify import Verifier
 from mavftpfs.shared.errors import (
     Armed,
     FileChanged,
+    FtpNak,
     LinkError,
     MavftpfsError,
     NoSpace,
     NotSupported,
+    PathTooLong,
     RemoteProtocolError,
     RequestTimeout,
     SessionBusy,
@@ -181,10 +183,25 @@ class Deliverer:
 
     async def _probe(self, node: Node) -> None:
         """Find out what OpenFileWO does; what does not show itself is taken to empty files."""
-        await self._context.writer.probe_open_for_write(split(node.path)[0])
+        try:
+            await self._probe_beside(node.path)
+        except PathTooLong as error:
+            log.info("what the vehicle does to open files stays unknown: %s", error)
         traits = self._context.writer.traits
         if traits.wo_truncates is None:
             traits.wo_truncates = True
+
+    async def _probe_beside(self, path: bytes) -> None:
+        live, names = self._context.live, self._context.namer.probes(path)
+        live.update(names)
+        try:
+            await self._context.writer.probe_open_for_write(*names)
+        except FtpNak as nak:
+            if split(names[0])[0] == split(path)[0]:
+                raise
+            log.info("nothing can be tried out in a directory above %r: %s", path, nak)
+        finally:
+            live.difference_update(names)  # what is left there by an interruption is litter from now on
 
     # --- sending
 

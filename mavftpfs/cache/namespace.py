@@ -14,10 +14,11 @@ from contextlib import AsyncExitStack
 
 import trio
 
-from mavftpfs.cache.asides import Places, fits_rename, is_reserved, parse
+from mavftpfs.cache.asides import Places, fits_rename, is_reserved
 from mavftpfs.cache.context import Context
 from mavftpfs.cache.delivery import Deliverer
 from mavftpfs.cache.draft import Draft
+from mavftpfs.cache.emptying import Emptier
 from mavftpfs.cache.nodes import Node
 from mavftpfs.cache.replacing import Present
 from mavftpfs.cache.spool import SpoolContent
@@ -26,7 +27,6 @@ from mavftpfs.shared.errnos import errno_for
 from mavftpfs.shared.errors import (
     AlreadyExists,
     CrossDevice,
-    DirectoryNotEmpty,
     FtpNak,
     InvalidMove,
     IsADirectory,
@@ -34,6 +34,7 @@ from mavftpfs.shared.errors import (
     NotADirectory,
     NotFound,
     NotSupported,
+    PathTooLong,
     RequestTimeout,
 )
 from mavftpfs.shared.model import DirEntry, EntryKind, join, split, wire_path
@@ -61,6 +62,7 @@ class Namespace:
         self._context = context
         self._sure = sure
         self._deliverer = deliverer
+        self._emptier = Emptier(context, sure)
         self._purge = purge
         self._new_content = new_content
         self._on_renamed = on_renamed
@@ -141,14 +143,7 @@ class Namespace:
             entry = await self._need(path)
             if entry.kind is not EntryKind.DIRECTORY:
                 raise NotADirectory(f"{path!r} is not a directory")
-            if self._context.nodes.below(path):
-                raise DirectoryNotEmpty(f"{path!r} is not empty")
-            listing = await self._context.directories.ask(path)
-            hidden = [join(path, name) for name in listing.entries if self._is_hidden_file(join(path, name))]
-            if len(hidden) < len(listing.entries):
-                raise DirectoryNotEmpty(f"{path!r} is not empty")
-            for name in hidden:
-                await self._move_up(name, split(path)[0])
+            await self._emptier.vacate(path)
             await self._sure.remove_directory(path)
             self._context.on_changed(path)
 
@@ -206,10 +201,6 @@ class Namespace:
             raise NotFound(f"{path!r} does not exist")
         return entry
 
-    def _is_hidden_file(self, path: bytes) -> bool:
-        name = parse(split(path)[1])
-        return name is not None and path in self._context.live and name.owner == self._context.namer.owner
-
     async def _require_replaceable(self, source: DirEntry, new: bytes, target: DirEntry | None) -> None:
         """Raise what rename(2) says of a target that cannot be replaced; FUSE hands both over unchecked."""
         if target is None:
@@ -217,8 +208,7 @@ class Namespace:
         if target.kind is EntryKind.DIRECTORY:
             if source.kind is EntryKind.FILE:
                 raise IsADirectory(f"{new!r} is a directory")
-            if (await self._context.directories.ask(new)).entries or self._context.nodes.below(new):
-                raise DirectoryNotEmpty(f"{new!r} is not empty")
+            await self._emptier.require_empty(new)
         elif source.kind is EntryKind.DIRECTORY:
             raise NotADirectory(f"{new!r} is not a directory")
 
@@ -276,15 +266,15 @@ class Namespace:
 
     async def _hide(self, node: Node) -> None:
         """Keep an unlinked file on the vehicle under a reserved name as long as somebody reads it."""
-        context, old = self._context, node.path
-        hidden = context.namer.hidden(old)
+        context, old, hidden = self._context, node.path, b""
         await self._purge(old)
-        context.live.add(hidden)
         try:
+            hidden = context.namer.hidden(old)
+            context.live.add(hidden)
             await self._sure.rename(old, hidden)
-        except FtpNak as nak:
+        except (FtpNak, PathTooLong) as error:
             context.live.discard(hidden)
-            log.info("%r is removed although it is being read: %s", old, nak)
+            log.info("%r is removed although it is being read: %s", old, error)
             await self._remove(old)
             return
         except BaseException:
@@ -294,17 +284,6 @@ class Namespace:
         context.files.on_renamed(old, hidden)
         context.hide(node, hidden)
         context.on_changed(old)
-
-    async def _move_up(self, hidden: bytes, directory: bytes) -> None:
-        """Have a hidden file not block the removal of its directory."""
-        context, node = self._context, self._context.hidden.get(hidden)
-        better = context.namer.hidden(join(directory, b"x"))
-        context.live.add(better)
-        await self._sure.rename(hidden, better)
-        context.live.discard(hidden)
-        context.files.on_renamed(hidden, better)
-        if node is not None:
-            context.hide(node, better)
 
     # --- inside: renaming
 
@@ -355,6 +334,7 @@ class Namespace:
     ) -> None:
         there = target is not None and await self.listed(new) is not None
         if target is not None and target.kind is EntryKind.DIRECTORY:
+            await self._emptier.vacate(new)
             await self._sure.remove_directory(new)
             there = False
         if not there and not by_case and fits_rename(old, new):

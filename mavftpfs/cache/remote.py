@@ -195,6 +195,9 @@ class WriteStore(Protocol):
         """Return a file's size by a fresh OpenFileRO + Terminate."""
         ...
 
-    async def probe_open_for_write(self, directory: bytes) -> None:
-        """Find out by a temporary of our own in `directory` what OpenFileWO does, and fill the traits."""
+    async def probe_open_for_write(self, first: bytes, second: bytes) -> None:
+        """Find out by temporaries of our own what OpenFileWO does, and fill the traits.
+
+        first, second: reserved paths in one directory where nothing is; they are removed at the end.
+        """
         ...

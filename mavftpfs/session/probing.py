@@ -1,6 +1,8 @@
 """Finding out on a temporary of our own what a server does when it is written to. Layer: session.
 
-Only at first need, never in flight (design section 4). What is not answered stays unknown.
+Only at first need, never in flight (design section 4). What is not answered, and what the paths are too long
+for, stays unknown. The names are the mount's own and used once, so two mounts never meet in one, and what an
+interruption leaves is removed at the next listing like any other leftover.
 """
 
 from __future__ import annotations
@@ -9,15 +11,10 @@ from mavftpfs.protocol.operations import Simple
 from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.session.opening import OpenSession
 from mavftpfs.session.scheduler import Scheduler
-from mavftpfs.session.sideeffects import SideEffects
+from mavftpfs.session.sideeffects import SideEffects, fits_rename
 from mavftpfs.shared.errors import FtpNak, RequestTimeout
-from mavftpfs.shared.model import join, split, wire_path
+from mavftpfs.shared.model import split, wire_path
 from mavftpfs.shared.traits import WriteTraits
-
-PROBE_NAME = b".mavftpfs-probdaaa"
-"""Reserved, and of the kind that is removed when it is found left behind."""
-
-SECOND_NAME = b".mavftpfs-probdaab"
 
 CONTENT = b"abc"
 
@@ -27,21 +24,21 @@ SILENCE = 6.0
 _UNKNOWN = frozenset((NakCode.FAIL, NakCode.UNKNOWN_COMMAND))
 
 
-async def probe_writing(scheduler: Scheduler, effects: SideEffects, directory: bytes) -> None:
-    """Fill the traits that are unknown, and leave nothing behind.
+async def probe_writing(scheduler: Scheduler, effects: SideEffects, first: bytes, second: bytes) -> None:
+    """Fill the traits that are unknown, by files at two free paths, and leave nothing behind.
 
     Raises:
         FtpNak: the directory cannot be written. RequestTimeout, VehicleLost, SessionBusy, Armed.
     """
-    await _Probe(scheduler, effects, directory).run()
+    await _Probe(scheduler, effects, first, second).run()
 
 
 class _Probe:
-    def __init__(self, scheduler: Scheduler, effects: SideEffects, directory: bytes) -> None:
+    def __init__(self, scheduler: Scheduler, effects: SideEffects, first: bytes, second: bytes) -> None:
         self._scheduler = scheduler
         self._effects = effects
-        self._path = join(directory, PROBE_NAME)
-        self._second = join(directory, SECOND_NAME)
+        self._path = first
+        self._second = second
 
     @property
     def _traits(self) -> WriteTraits:
@@ -49,7 +46,6 @@ class _Probe:
 
     async def run(self) -> None:
         """The steps, each with what the one before left."""
-        await self._sweep_up()
         try:
             if self._traits.wo_creates is None:
                 await self._open_missing()
@@ -59,7 +55,9 @@ class _Probe:
                 size = await self._open_existing()
             if self._traits.truncate_works is None:
                 await self._truncate(size)
-            left = [self._path] if self._traits.rename_works is not None else await self._rename()
+            left = [self._path]
+            if self._traits.rename_works is None and fits_rename(self._path, self._second):
+                left = await self._rename()
         except BaseException:
             await self._sweep_up()
             raise

@@ -27,6 +27,11 @@ VERIFY_LIMIT = 10.0
 _DOT = b"."
 
 
+def fits_rename(old: bytes, new: bytes) -> bool:
+    """Return whether one request carries both paths."""
+    return len(wire_path(old)) + 1 + len(wire_path(new)) <= RENAME_LIMIT
+
+
 class Outcome(Enum):
     """What a listing tells about a request."""
 
@@ -74,7 +79,7 @@ class SideEffects:
     async def rename(self, old: bytes, new: bytes, *, completes: bool = False) -> None:
         """Rename; who reads the old path goes on under the new one. completes: in flight, too."""
         data = wire_path(old) + b"\0" + wire_path(new)
-        if len(data) > RENAME_LIMIT:
+        if not fits_rename(old, new):
             raise PathTooLong(f"both paths of a rename have {len(data)} bytes, more than {RENAME_LIMIT}")
         may = self._scheduler.require_link if completes else self._scheduler.check_may_write
         async with self._changing(old, below=True, may=may), self._changing(new, may=may):

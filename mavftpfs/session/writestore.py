@@ -110,10 +110,12 @@ class WriteStore:
         if traits.truncate_works is None:
             traits.truncate_works = True
 
-    async def probe_open_for_write(self, directory: bytes) -> None:
+    async def probe_open_for_write(self, first: bytes, second: bytes) -> None:
         """See cache.remote.WriteStore."""
+        wire_path(first)
+        wire_path(second)
         self._scheduler.check_may_write()
-        await probe_writing(self._scheduler, self._effects, directory)
+        await probe_writing(self._scheduler, self._effects, first, second)
 
     async def _is_listed(self, path: bytes) -> bool:
         """Whether the vehicle answers a listing, so that its silence was about the request."""

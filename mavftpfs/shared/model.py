@@ -88,6 +88,18 @@ def wire_path(path: bytes) -> bytes:
     return wire
 
 
+def storage_of(directory: bytes) -> bytes:
+    """Return the top directory of the storage that a directory lies on, or what is surely not above it.
+
+    NuttX mounts each storage at /fs/NAME, and what is above is no storage at all (servers.md 6 and 13);
+    elsewhere nothing tells where one ends.
+    """
+    parts = directory.split(b"/")
+    if parts[1] != b"fs":
+        return ROOT
+    return b"/".join(parts[:3])
+
+
 def usable_name(name: bytes) -> bool:
     """Return whether a listed name may enter the tree (promise 10)."""
     return bool(name) and name not in (b".", b"..") and b"/" not in name and b"\0" not in name

@@ -46,7 +46,7 @@ async def test_a_lost_session_goes_on_only_where_the_rest_is_still_there(
     here.tree.add(path, OLD + NEW)
     faults = Faults(here)
     async with here.connection() as connection, trio.open_nursery() as nursery:
-        await connection.store.probe_open_for_write(path.rpartition(b"/")[0])
+        await connection.store.probe_open_for_write(path + b"1", path + b"2")
         source = MemorySource(NEW)
         upload = await connection.store.open_upload(path, source, create=False, least=len(OLD + NEW))
 
@@ -79,7 +79,7 @@ async def test_what_was_never_proven_may_be_missing(profile: str, autojump: Mock
     here.tree.add(path, OLD)
     faults = Faults(here)
     async with here.connection() as connection, trio.open_nursery() as nursery:
-        await connection.store.probe_open_for_write(path.rpartition(b"/")[0])
+        await connection.store.probe_open_for_write(path + b"1", path + b"2")
         source = MemorySource(OLD + NEW)
         upload = await connection.store.open_upload(path, source, create=False, least=len(OLD))
 

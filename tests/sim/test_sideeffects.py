@@ -36,6 +36,10 @@ def path(profile: str, name: str) -> bytes:
     return ROOTS.get(profile, b"") + b"/d/" + name.encode()
 
 
+def probes(profile: str) -> tuple[bytes, bytes]:
+    return path(profile, ".mavftpfs-aaaadaaa"), path(profile, ".mavftpfs-aaaadaab")
+
+
 def world(profile: str, settings: LinkSettings = GOOD_LINK, **files: bytes) -> World:
     made = World(profile, settings)
     made.tree.add_directory(path(profile, "")[:-1])
@@ -253,7 +257,7 @@ async def test_an_upload_makes_room_for_a_change_of_its_path(
     open_then: list[list[bytes]] = []
     async with here.connection() as connection:
         if probed:
-            await connection.store.probe_open_for_write(path(profile, "")[:-1])
+            await connection.store.probe_open_for_write(*probes(profile))
         source = MemorySource(bytes(300_000))
         upload = await connection.store.open_upload(path(profile, "file"), source, create=True)
         await trio.sleep(1)

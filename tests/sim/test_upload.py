@@ -33,6 +33,10 @@ def path(profile: str, name: str) -> bytes:
     return ROOTS.get(profile, b"") + b"/d/" + name.encode()
 
 
+def probes(profile: str) -> tuple[bytes, bytes]:
+    return path(profile, ".mavftpfs-aaaadaaa"), path(profile, ".mavftpfs-aaaadaab")
+
+
 def world(profile: str, settings: LinkSettings = GOOD_LINK, **files: bytes) -> World:
     made = World(profile, settings)
     made.tree.add_directory(path(profile, "")[:-1])
@@ -81,7 +85,7 @@ async def test_two_uploads_and_a_reader_at_once(profile: str, probed: bool, auto
     got: list[bytes] = []
     async with here.connection() as connection:
         if probed:
-            await connection.store.probe_open_for_write(path(profile, "")[:-1])
+            await connection.store.probe_open_for_write(*probes(profile))
         async with trio.open_nursery() as nursery:
 
             async def read() -> None:
@@ -102,7 +106,7 @@ async def test_the_probe_learns_what_the_profile_says(profile: str, autojump: Mo
     here = world(profile, LinkSettings(rate=60_000.0, delay=0.02, loss=0.05))
     facts = PROFILES[profile]
     async with here.connection() as connection:
-        await connection.store.probe_open_for_write(path(profile, "")[:-1])
+        await connection.store.probe_open_for_write(*probes(profile))
         traits = connection.store.traits
         assert traits.wo_truncates is facts.write_only_truncates
         assert traits.wo_creates is (facts.write_only_creates or facts.name == "spec")

@@ -39,6 +39,10 @@ def path(profile: str, name: str) -> bytes:
     return ROOTS.get(profile, b"") + b"/d/" + name.encode()
 
 
+def probes(profile: str) -> tuple[bytes, bytes]:
+    return path(profile, ".mavftpfs-aaaadaaa"), path(profile, ".mavftpfs-aaaadaab")
+
+
 def world(profile: str, settings: LinkSettings = GOOD_LINK, **files: bytes) -> World:
     made = World(profile, settings)
     made.tree.add_directory(path(profile, "")[:-1])
@@ -48,7 +52,7 @@ def world(profile: str, settings: LinkSettings = GOOD_LINK, **files: bytes) -> W
 
 
 async def probe(connection: Connection, profile: str) -> None:
-    await connection.store.probe_open_for_write(path(profile, "")[:-1])
+    await connection.store.probe_open_for_write(*probes(profile))
 
 
 async def start(

@@ -213,8 +213,11 @@ class FakeWriter(FakeStore):
         self.log.append(("stat", str(path)))
         return len(self._file(path, Opcode.OPEN_FILE_RO).data)
 
-    async def probe_open_for_write(self, directory: bytes) -> None:
-        await self.request("probe", directory)
+    async def probe_open_for_write(self, first: bytes, second: bytes) -> None:
+        wire_path(first)
+        wire_path(second)
+        await self.request("probe", first)
+        self._require_parent(first, Opcode.CREATE_FILE)
         self.probes += 1
         self.traits.wo_truncates = self.kind.wo_truncates
 

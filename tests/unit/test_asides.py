@@ -78,6 +78,34 @@ def test_nothing_is_put_above_the_root() -> None:
         Namer(b"abcd", root, Random(5)).places(root + b"/" + b"n" * 138)
 
 
+@pytest.mark.parametrize("storage", [b"/fs/" + b"s" * 40, b"/fs/microsd"])
+def test_nothing_is_put_above_the_storage(storage: bytes) -> None:
+    """On NuttX storages are mounted below /fs, which takes no files."""
+    namer = Namer(b"abcd", b"/", Random(5))
+    path = storage + b"/" + b"n" * (199 - len(storage))
+    if len(path) + len(storage) + 20 > 238:
+        with pytest.raises(PathTooLong):
+            namer.places(path)
+    assert split(namer.places(path[:150]).new)[0] == storage
+    deep = storage + b"/" + b"d" * (190 - len(storage)) + b"/f"
+    assert split(namer.probes(deep)[0])[0] == storage
+
+
+def test_names_for_trying_out_are_two_new_ones_near_by() -> None:
+    namer = Namer(b"abcd", b"/r", Random(5))
+    names = [namer.probes(b"/r/d/file") for _ in range(2000)]
+    assert len({name for pair in names for name in pair}) == 4000
+    assert all(split(name)[0] == b"/r/d" for pair in names for name in pair)
+    deep = b"/r/" + b"a" * 100 + b"/" + b"b" * 90 + b"/f"
+    assert {split(name)[0] for name in namer.probes(deep)} == {b"/r/" + b"a" * 100}
+    with pytest.raises(PathTooLong):
+        Namer(b"abcd", b"/" + b"r" * 185, Random(5)).probes(b"/" + b"r" * 185 + b"/f")
+    for name in names[0]:
+        reserved = parse(split(name)[1])
+        assert reserved is not None
+        assert reserved.kind is Kind.DELETED
+
+
 NEW, OLD, MOVED, SIDECAR, DELETED = (
     b"/d/" + kind.value for kind in (Kind.NEW, Kind.OLD, Kind.MOVED, Kind.SIDECAR, Kind.DELETED)
 )
