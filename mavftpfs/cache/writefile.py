@@ -67,8 +67,8 @@ class _Reading:
             state = (self._node.generation, self._node.draft)
             try:
                 return await self._read(offset, size)
-            except FileChanged:
-                if state == (self._node.generation, self._node.draft):
+            except (FileChanged, LocalProtocolError):  # the latter: what lay below was closed as delivered
+                if self._closed or state == (self._node.generation, self._node.draft):
                     raise
         return await self._read(offset, size)
 
