@@ -23,6 +23,7 @@ from mavftpfs.cache.sure import Sure
 from mavftpfs.cache.throttle import Throttle
 from mavftpfs.cache.verify import Verifier
 from mavftpfs.shared.errors import (
+    AlreadyExists,
     Armed,
     FileChanged,
     FtpNak,
@@ -119,6 +120,7 @@ class Deliverer:
             return
         await attempt.upload.abort()
         if node.draft is not None:
+            node.draft.made |= attempt.plan is Plan.NEW and attempt.upload.begun
             node.draft.begin_again()
         if attempt.path == node.path:
             self._context.dentries.note_unsized(node.path)
@@ -155,6 +157,8 @@ class Deliverer:
                 restores = draft.ruined and draft.whole and plan is Plan.IN_PLACE
                 if not isinstance(error, PASSING):
                     await self.abandon(node)
+                if isinstance(error, AlreadyExists) and await self._is_ours(node.path, draft):
+                    continue
                 if not (learnt or restores) or isinstance(error, LinkError | Armed):
                     raise
                 log.debug("%r: %s; trying another way", node.path, error)
@@ -175,11 +179,25 @@ class Deliverer:
         """Do what takes one request."""
         draft = _draft(node)
         if plan is Plan.CREATE_EMPTY:
-            await self._context.writer.create_empty(node.path)
+            await self._create_empty(node.path, draft)
         else:
             await self._context.writer.truncate(node.path, draft.size)
         await self.verifier.check(node.path, draft)
         self._on_delivered(node, draft)
+
+    async def _create_empty(self, path: bytes, draft: Draft) -> None:
+        try:
+            await self._context.writer.create_empty(path, free_at=self._free_at(path, draft))
+        except RequestTimeout:
+            draft.maybe_made = True
+            raise
+        draft.made = True
+
+    async def _is_ours(self, path: bytes, draft: Draft) -> bool:
+        """Return whether a file that appeared is the empty one we may have made; note it if so."""
+        self._context.dentries.expire(split(path)[0], self._context.clock())
+        draft.made = draft.maybe_made and await self.verifier.size(path) == 0
+        return draft.made
 
     async def _probe(self, node: Node) -> None:
         """Find out what OpenFileWO does; what does not show itself is taken to empty files."""
@@ -235,6 +253,7 @@ class Deliverer:
             path = places.new
         if plan is Plan.REWRITE:
             draft.remote_removed()
+        free_at = self._free_at(path, draft) if plan is Plan.NEW else None
         if plan is Plan.NEW:
             self._context.dentries.note_created(path, DirEntry(split(path)[1], EntryKind.FILE, 0))
         if places is not None:
@@ -248,7 +267,7 @@ class Deliverer:
             if plan is Plan.IN_PLACE:
                 upload = await writer.open_upload(path, sending, create=False, least=least)
             else:
-                upload = await writer.open_upload(path, sending, create=True)
+                upload = await writer.open_upload(path, sending, create=True, free_at=free_at)
             if places is None:
                 self._context.dentries.note_unsized(path)
         except BaseException:
@@ -257,6 +276,16 @@ class Deliverer:
             raise
         node.attempt = Attempt(plan, path, sending, upload, places)
         return node.attempt
+
+    def _free_at(self, path: bytes, draft: Draft) -> float | None:
+        """Return when a listing last showed the name of a new file to be free, None if it need not be."""
+        if draft.remote_size is not None or draft.made:
+            return None
+        parent, name = split(path)
+        known = self._context.dentries.known(parent)
+        if known is None or name in known.entries or not known.complete:
+            return float("-inf")
+        return known.listed_at
 
     async def _require_base(self, path: bytes, draft: Draft) -> int:
         """Return the size on the vehicle of a file of which a part is to stay.

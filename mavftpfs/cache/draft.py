@@ -55,6 +55,7 @@ class Draft:
         base_limit: below this, bytes that are not held are the vehicle's.
         remote_size: size of the file on the vehicle, None if there is none.
         sending: the attempt under way, None before the first and after success.
+        made: an attempt may have made the file, so that what is there is ours; maybe_made: if it is empty.
     """
 
     def __init__(self, content: Content, remote_size: int | None) -> None:
@@ -63,6 +64,7 @@ class Draft:
         self.base_limit = self.size
         self.remote_size = remote_size
         self.sending: Sending | None = None
+        self.made = self.maybe_made = False
         self._held = ExtentSet()
         self._changed = ExtentSet()
         self._touched = False
@@ -225,7 +227,7 @@ class Draft:
         self._changed.clear()
         self.remote_size = self.base_limit = self.size
         self.sending = None
-        self._touched = self._ruined = False
+        self._touched = self._ruined = self.made = self.maybe_made = False
         self._content.settle()
 
     def remote_removed(self) -> None:

@@ -10,6 +10,11 @@ from typing import Protocol
 from mavftpfs.shared.model import Listing
 from mavftpfs.shared.traits import WriteTraits
 
+FREE_FOR = 2.0
+"""Seconds for which a listing that lacks a name lets a file be made there without another look. Ten small
+files are copied into a directory by one listing where that takes no longer; else each costs one more request.
+"""
+
 
 class ReadSink(Protocol):
     """Where a reader's bytes go. All methods are synchronous and must not block."""
@@ -126,6 +131,11 @@ class UploadSource(Protocol):
 class Upload(Protocol):
     """A remote file being written; survives reopening of the server's session."""
 
+    @property
+    def begun(self) -> bool:
+        """Whether the request that makes the file may have been sent."""
+        ...
+
     def wake(self) -> None:
         """The source has more."""
         ...
@@ -136,7 +146,8 @@ class Upload(Protocol):
         It may be called again: after an error to go on where it stopped, after success if there is more.
 
         Raises:
-            FtpNak, RequestTimeout, VehicleLost, SessionBusy, Armed.
+            FtpNak, RequestTimeout, VehicleLost, SessionBusy, Armed; FileChanged and AlreadyExists as
+            WriteStore.open_upload says.
         """
         ...
 
@@ -158,16 +169,31 @@ class WriteStore(Protocol):
         """What the server was seen to do; a new object after a reboot."""
         ...
 
-    async def open_upload(self, path: bytes, source: UploadSource, *, create: bool, least: int = 0) -> Upload:
+    async def open_upload(
+        self,
+        path: bytes,
+        source: UploadSource,
+        *,
+        create: bool,
+        least: int = 0,
+        free_at: float | None = None,
+    ) -> Upload:
         """Open a file: by CreateFile (empties it), else OpenFileWO (only where wo_truncates is False).
 
         least: bytes the file has whenever it is opened to be written on. One that has fewer is not written:
         the source is told on_rollback(everything=True), and finish raises FileChanged.
+        free_at: when the name was last seen to be free (the caches' clock); if that is over FREE_FOR ago when
+        the file is about to be made, it is looked for, and finish raises AlreadyExists. None: whatever is
+        there may be emptied.
         """
         ...
 
-    async def create_empty(self, path: bytes) -> None:
-        """Make a file, or empty it: CreateFile + Terminate."""
+    async def create_empty(self, path: bytes, *, free_at: float | None = None) -> None:
+        """Make a file, or empty it: CreateFile + Terminate. free_at: as for open_upload.
+
+        Raises:
+            AlreadyExists: it was to be a new file.
+        """
         ...
 
     async def truncate(self, path: bytes, size: int) -> None:

@@ -289,9 +289,9 @@ class Writeback:
 
     async def _forget_draft(self, node: Node) -> None:
         """What was to be written is not wanted any more, since its caller got an error."""
-        made = node.draft is not None and node.draft.remote_size is None
         async with node.lock:
             await self._deliverer.abandon(node)
+            made = node.draft is not None and node.draft.made
             node.drop_draft()
         self._context.nodes.maybe_forget(node)
         if made:

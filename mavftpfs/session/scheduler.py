@@ -209,6 +209,10 @@ class Scheduler:
             if stream.path == path:
                 stream.orphan()
 
+    def seconds_since(self, when: float) -> float:
+        """Return how long ago a time of the caches' clock is."""
+        return self._clock() - when
+
     def require_link(self) -> None:
         """Raise VehicleLost while the vehicle is silent (promise 4: fail at once)."""
         if self._vehicle.lost(self._clock()):

@@ -133,7 +133,7 @@ class QueuedUpload:
             the background; refusals only when finish is called.
         running: the scheduler's task is at it. clean: everything given so far is ACKed and terminated.
         retry_at: not to be touched before. least: bytes the file has to have when it is opened to be written
-            on. opened: it was opened for that before.
+            on. opened: it was opened for that before. free_at: see WriteStore. begun: see Upload.
     """
 
     def __init__(
@@ -144,6 +144,8 @@ class QueuedUpload:
         self.create = create
         self.least = 0
         self.opened = False
+        self.free_at: float | None = None
+        self.begun = False
         self.ticket = ticket
         self.asked_at = asked_at
         self.use = Service()

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-from mavftpfs.cache.remote import UploadSource
-from mavftpfs.protocol.payload import MAX_DATA, Opcode
+import errno
+
+from mavftpfs.cache.remote import FREE_FOR, UploadSource
+from mavftpfs.protocol.payload import MAX_DATA, NakCode, Opcode
 from mavftpfs.session.kit import Kit, Queue
 from mavftpfs.session.opening import TERMINATE_LIMIT, OpenSession
 from mavftpfs.session.turns import Turns
 from mavftpfs.session.upload import Feed, QueuedUpload
 from mavftpfs.session.writing import Stop, Writer
+from mavftpfs.shared.errnos import errno_for
 from mavftpfs.shared.errors import (
+    AlreadyExists,
     Armed,
     FileChanged,
     FtpNak,
@@ -21,6 +25,9 @@ from mavftpfs.shared.errors import (
     SpoolFailed,
     VehicleLost,
 )
+
+REFUSALS = (FtpNak, ProtocolError, FileChanged, AlreadyExists, SpoolFailed)
+"""Errors that do not pass by themselves."""
 
 REOPENS = 5
 """How often the session may be lost without getting further in the file before the upload fails."""
@@ -153,7 +160,29 @@ class Uploading:
             return await self._reopen(upload, max(feed.reached, upload.least))
         if feed.proven or feed.unproven:
             feed.roll_back(everything=True)
+        if upload.free_at is not None and self._clock() - upload.free_at > FREE_FOR:
+            await self._require_free(upload.path)
+        upload.free_at, upload.begun = None, True  # what is there from now on may be ours
         return await self._holder.open(upload.path, Opcode.CREATE_FILE)
+
+    async def _require_free(self, path: bytes) -> None:
+        """Find out by one request that CreateFile empties nothing, under no other spelling either.
+
+        Raises:
+            AlreadyExists. FtpNak: it is there perhaps.
+        """
+        for last in (False, True):
+            try:
+                await self._holder.open(path, Opcode.OPEN_FILE_RO)
+            except FtpNak as nak:
+                if errno_for(nak) == errno.ENOENT:
+                    return
+                if last or nak.code != NakCode.FILE_EXISTS:
+                    raise
+                await self.writer.rearm(path)  # PX4 says so to everything after one "file exists"
+            else:
+                await self._holder.close()
+                raise AlreadyExists(f"{path!r} was made by somebody else in the meantime")
 
     async def _reopen(self, upload: QueuedUpload, least: int) -> OpenSession:
         """Open a file that is to keep what it has, unless it has less than `least` bytes: then what was to
@@ -229,7 +258,7 @@ class Uploading:
 
     async def _on_error(self, upload: QueuedUpload, error: MavftpfsError) -> None:
         """Close what can be closed, roll back what is not proven, and tell whoever waits."""
-        refused = isinstance(error, FtpNak | ProtocolError | FileChanged | SpoolFailed)
+        refused = isinstance(error, REFUSALS)
         if isinstance(error, RequestTimeout):
             self._vehicle.note_timeout()
         if not refused or isinstance(error, RequestTimeout):

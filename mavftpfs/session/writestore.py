@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from mavftpfs.cache.remote import UploadSource
+import errno
+
+from mavftpfs.cache.remote import FREE_FOR, UploadSource
 from mavftpfs.protocol.operations import Simple
 from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.session.probing import probe_writing
 from mavftpfs.session.scheduler import Scheduler
 from mavftpfs.session.sideeffects import Lister, Outcome, SideEffects
 from mavftpfs.session.upload import QueuedUpload
-from mavftpfs.shared.errors import FtpNak, MavftpfsError, RemoteProtocolError, RequestTimeout
+from mavftpfs.shared.errnos import errno_for
+from mavftpfs.shared.errors import AlreadyExists, FtpNak, MavftpfsError, RemoteProtocolError, RequestTimeout
 from mavftpfs.shared.model import wire_path
 from mavftpfs.shared.traits import WriteTraits
 
@@ -35,19 +38,28 @@ class WriteStore:
         return self._scheduler.write_traits
 
     async def open_upload(
-        self, path: bytes, source: UploadSource, *, create: bool, least: int = 0
+        self,
+        path: bytes,
+        source: UploadSource,
+        *,
+        create: bool,
+        least: int = 0,
+        free_at: float | None = None,
     ) -> QueuedUpload:
         """Queue an upload; nothing is sent before the source has something or finish is called."""
         wire_path(path)
         self._scheduler.check_may_write()
         upload = self._scheduler.open_upload(path, source, create=create)
         upload.least = least
+        upload.free_at = free_at
         return upload
 
-    async def create_empty(self, path: bytes) -> None:
+    async def create_empty(self, path: bytes, *, free_at: float | None = None) -> None:
         """Make a file, or empty it; done twice it is the same."""
         wire_path(path)
         self._scheduler.check_may_write()
+        if free_at is not None and self._scheduler.seconds_since(free_at) > FREE_FOR:
+            await self._require_free(path)
         await self._scheduler.use_session(path, Opcode.CREATE_FILE)
 
     async def remove(self, path: bytes) -> None:
@@ -116,6 +128,16 @@ class WriteStore:
         wire_path(second)
         self._scheduler.check_may_write()
         await probe_writing(self._scheduler, self._effects, first, second)
+
+    async def _require_free(self, path: bytes) -> None:
+        """Raise AlreadyExists if CreateFile would empty something, perhaps of another spelling."""
+        try:
+            await self._scheduler.use_session(path, Opcode.OPEN_FILE_RO)
+        except FtpNak as nak:
+            missing = errno_for(nak) == errno.ENOENT
+            if missing or (await self._effects.find(path))[0] is None:
+                return
+        raise AlreadyExists(f"{path!r} was made by somebody else in the meantime")
 
     async def _is_listed(self, path: bytes) -> bool:
         """Whether the vehicle answers a listing, so that its silence was about the request."""

@@ -14,7 +14,7 @@ from typing import Any
 import trio
 
 from mavftpfs.cache.options import CacheOptions
-from mavftpfs.cache.remote import ReadSink, UploadSource
+from mavftpfs.cache.remote import FREE_FOR, ReadSink, UploadSource
 from mavftpfs.cache.spool import SpoolDirectory
 from mavftpfs.cache.tree import Tree
 from mavftpfs.protocol.payload import NakCode, Opcode
@@ -73,6 +73,7 @@ class FakeWriter(FakeStore):
         but answered by silence. freeze_at: from this number on nothing is executed (power lost).
         capacity: bytes of all files; beyond that WriteFile is refused.
         before_request: called with what is asked, before anything is decided.
+        looks: how often a name was looked for before a file was made.
         spoil_uploads: how many more uploads arrive with a wrong byte. writable_armed: refuse while `armed`.
     """
 
@@ -90,7 +91,8 @@ class FakeWriter(FakeStore):
         self.write_delay = 0.0
         self.uploads: list[FakeUpload] = []
         self.probes = 0
-        self.before_request: Callable[..., None] | None = None
+        self.looks = 0
+        self.before_request: Callable[..., object] | None = None
 
     # --- what requests go through
 
@@ -119,6 +121,14 @@ class FakeWriter(FakeStore):
         if self.freeze_at is not None and self.requests >= self.freeze_at:
             raise Frozen("the power is gone")
 
+    def require_free(self, path: bytes, free_at: float | None) -> None:
+        """What CreateFile is preceded by, if that is due."""
+        if free_at is None or trio.current_time() - free_at <= FREE_FOR:
+            return
+        self.looks += 1
+        if self.real(path) in self.files:
+            raise AlreadyExists(f"{path!r} is there")
+
     def revive(self) -> None:
         """The power is back."""
         self.freeze_at = None
@@ -142,15 +152,22 @@ class FakeWriter(FakeStore):
     # --- WriteStore
 
     async def open_upload(
-        self, path: bytes, source: UploadSource, *, create: bool, least: int = 0
+        self,
+        path: bytes,
+        source: UploadSource,
+        *,
+        create: bool,
+        least: int = 0,
+        free_at: float | None = None,
     ) -> FakeUpload:
         wire_path(path)
-        upload = FakeUpload(self, path, source, create=create, least=least)
+        upload = FakeUpload(self, path, source, create=create, least=least, free_at=free_at)
         self.uploads.append(upload)
         return upload
 
-    async def create_empty(self, path: bytes) -> None:
+    async def create_empty(self, path: bytes, *, free_at: float | None = None) -> None:
         wire_path(path)
+        self.require_free(path, free_at)
         lost = await self.request("create", path)
         self._create(path)
         _maybe_lose(lost)
@@ -316,7 +333,14 @@ class FakeUpload:
     """Sends chunk by chunk, each one request; in the background too if the store has a nursery."""
 
     def __init__(
-        self, store: FakeWriter, path: bytes, source: UploadSource, *, create: bool, least: int = 0
+        self,
+        store: FakeWriter,
+        path: bytes,
+        source: UploadSource,
+        *,
+        create: bool,
+        least: int,
+        free_at: float | None,
     ) -> None:
         self.path = path
         self.aborted = False
@@ -324,6 +348,8 @@ class FakeUpload:
         self._source = source
         self._create = create
         self._least = least
+        self._free_at = free_at
+        self.begun = False
         self._open = False
         self._opened_before = False
         self._sending = trio.Lock()
@@ -389,8 +415,10 @@ class FakeUpload:
 
     async def _open_file(self) -> None:
         store = self._store
+        store.require_free(self.path, self._free_at)
         reopened = self._opened_before and not store.kind.wo_truncates
         await store.request("open", self.path, "create" if self._create and not reopened else "write")
+        self._free_at, self.begun = None, True
         if self._create and not reopened:
             store._create(self.path)
             if self._opened_before:

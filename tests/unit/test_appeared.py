@@ -1,0 +1,160 @@
+"""Files that appear on the vehicle under a name that is about to be made: none of them is emptied."""
+
+from __future__ import annotations
+
+import errno
+from collections.abc import AsyncIterator
+
+import pytest
+import trio
+
+from mavftpfs.cache.remote import FREE_FOR
+from mavftpfs.cache.tree import Tree
+from mavftpfs.protocol.payload import NakCode, Opcode
+from mavftpfs.shared.errnos import errno_for
+from mavftpfs.shared.errors import AlreadyExists, FtpNak, MavftpfsError, RequestTimeout
+from tests.support.fake_store import FakeFile
+from tests.support.fake_writer import KINDS, FakeWriter, make_writable, write_file
+
+NEW = b"/card/new"
+THEIRS = b"the vehicle's own log"
+
+
+@pytest.fixture(params=["posix", "fat", "mavsdk"])
+async def store(
+    request: pytest.FixtureRequest, nursery: trio.Nursery, autojump_clock: object
+) -> AsyncIterator[FakeWriter]:
+    store = FakeWriter(KINDS[request.param], nursery)
+    store.add_directory(b"/card")
+    yield store
+    assert store.crimes == []
+    nursery.cancel_scope.cancel()
+
+
+@pytest.fixture
+def tree(store: FakeWriter) -> Tree:
+    return make_writable(store)
+
+
+@pytest.mark.parametrize("content", [b"", b"ours"])
+@pytest.mark.parametrize("exclusive", [False, True])
+async def test_a_file_that_appeared_is_not_emptied(
+    autojump_clock: object, store: FakeWriter, tree: Tree, exclusive: bool, content: bytes
+) -> None:
+    file = await tree.create(NEW, exclusive=exclusive)
+    await file.write(0, content)
+    store.add(NEW, THEIRS)
+    await trio.sleep(FREE_FOR + 0.1)
+    for ask in (file.fsync, file.fsync, file.release):
+        with pytest.raises(AlreadyExists) as told:
+            await ask()
+        assert errno_for(told.value) == errno.EEXIST
+    assert store.files[NEW].data == THEIRS
+    assert tree.undelivered() == [NEW]
+    await trio.sleep(100)
+    assert store.files[NEW].data == THEIRS, "nor by what is tried in the background"
+    del store.files[NEW]
+    assert await tree.drain(10) == []
+    assert store.files[NEW].data == content
+
+
+async def test_another_spelling_that_appeared_is_not_emptied(
+    autojump_clock: object, nursery: trio.Nursery
+) -> None:
+    store = FakeWriter(KINDS["fat"], nursery)
+    store.add_directory(b"/card")
+    tree = make_writable(store)
+    file = await tree.create(NEW, exclusive=True)
+    await file.write(0, b"ours")
+    store.add(b"/card/NEW", THEIRS)
+    await trio.sleep(FREE_FOR + 0.1)
+    with pytest.raises(AlreadyExists):
+        await file.release()
+    assert store.files[b"/card/NEW"].data == THEIRS
+    nursery.cancel_scope.cancel()
+
+
+async def test_what_we_made_ourselves_is_gone_on_with(
+    autojump_clock: object, store: FakeWriter, tree: Tree
+) -> None:
+    """A first attempt made the file and failed; the next one may empty it."""
+    file = await tree.create(NEW, exclusive=True)
+    await file.write(0, b"ours")
+    store.fail_at[2] = FtpNak(Opcode.WRITE_FILE, NakCode.FAIL_ERRNO, errno.EIO)
+    with pytest.raises(MavftpfsError):
+        await file.fsync()
+    assert store.files[NEW].data == b""
+    await trio.sleep(100)
+    await file.release()
+    assert store.files[NEW].data == b"ours"
+
+
+async def test_what_may_be_ours_is_not_taken_for_anothers(
+    autojump_clock: object, store: FakeWriter, tree: Tree
+) -> None:
+    """The reply to CreateFile was lost."""
+    file = await tree.create(NEW, exclusive=True)
+    await file.write(0, b"ours")
+    store.fail_at[1] = RequestTimeout("silence")
+    store.before_request = lambda what, path, *_: store.files.setdefault(path, FakeFile(b"from us"))
+    with pytest.raises(RequestTimeout):
+        await file.fsync()
+    await trio.sleep(100)
+    await file.release()
+    assert store.files[NEW].data == b"ours"
+
+
+@pytest.mark.parametrize("content", [b"", b"ours"])
+@pytest.mark.parametrize("theirs", [b"", THEIRS])
+async def test_an_empty_file_that_may_be_ours(
+    autojump_clock: object, store: FakeWriter, tree: Tree, content: bytes, theirs: bytes
+) -> None:
+    """The reply to its CreateFile was lost: an empty file is ours, one with content is not."""
+    file = await tree.create(NEW, exclusive=True)
+    store.lose_reply_at = {1}
+    with pytest.raises(RequestTimeout):
+        await file.fsync()
+    await file.write(0, content)
+    await trio.sleep(100)
+    store.add(NEW, theirs)
+    if theirs:
+        with pytest.raises(AlreadyExists):
+            await file.release()
+    else:
+        await file.release()
+    assert store.files[NEW].data == (theirs or content)
+
+
+async def test_a_move_into_the_mount_does_not_remove_what_appeared(
+    autojump_clock: object, nursery: trio.Nursery
+) -> None:
+    """A failed attempt is cleaned up only if it may have made something."""
+    store = FakeWriter(KINDS["posix"], nursery)
+    store.add_directory(b"/card")
+    tree = make_writable(store)
+    await tree.list(b"/card")
+    local = await tree.create(b"/card/.new.swp", exclusive=True)
+    await local.write(0, b"ours")
+    await local.release()
+    await trio.sleep(FREE_FOR + 0.1)
+    store.add(NEW, THEIRS)
+    with pytest.raises(AlreadyExists):
+        await tree.rename(b"/card/.new.swp", NEW)
+    assert store.files[NEW].data == THEIRS
+    nursery.cancel_scope.cancel()
+
+
+async def test_a_copy_of_small_files_lists_once(
+    autojump_clock: object, store: FakeWriter, tree: Tree
+) -> None:
+    for number in range(10):  # so many that sizes are asked otherwise
+        store.add(b"/card/there%d" % number, b"x")
+    await tree.list(b"/card")
+    listings = store.count("list", b"/card")
+    for number in range(10):
+        await write_file(tree, b"/card/small%d" % number, b"content")
+    assert store.count("list", b"/card") == listings
+    assert store.looks == 0
+    await trio.sleep(FREE_FOR + 0.1)
+    await write_file(tree, b"/card/late", b"content")
+    assert store.looks == 1
