@@ -29,6 +29,8 @@ PARTS = (*MEASURED, "plots", "all")
 
 QUICK: dict[str, tuple[str, ...]] = {
     "goodput": ("--seconds", "10", "--profiles", "px4", "ardupilot", "mavsdk", "--rates", "100000"),
+    "requests": ("--profile", "px4"),
+    "cost": ("--size", "8", "--servers", "px4"),
     "mount": ("--quick",),
 }
 """What --quick means to a part; options given by the user come later and win."""
