@@ -5,7 +5,7 @@ from __future__ import annotations
 import errno
 
 from mavftpfs.cache.remote import FREE_FOR, UploadSource
-from mavftpfs.protocol.payload import MAX_DATA, NakCode, Opcode
+from mavftpfs.protocol.payload import MAX_DATA, Opcode
 from mavftpfs.session.kit import Kit, Queue
 from mavftpfs.session.opening import TERMINATE_LIMIT, OpenSession
 from mavftpfs.session.turns import Turns
@@ -171,18 +171,14 @@ class Uploading:
         Raises:
             AlreadyExists. FtpNak: it is there perhaps.
         """
-        for last in (False, True):
-            try:
-                await self._holder.open(path, Opcode.OPEN_FILE_RO)
-            except FtpNak as nak:
-                if errno_for(nak) == errno.ENOENT:
-                    return
-                if last or nak.code != NakCode.FILE_EXISTS:
-                    raise
-                await self.writer.rearm(path)  # PX4 says so to everything after one "file exists"
-            else:
-                await self._holder.close()
-                raise AlreadyExists(f"{path!r} was made by somebody else in the meantime")
+        try:
+            await self._holder.open(path, Opcode.OPEN_FILE_RO)
+        except FtpNak as nak:
+            if errno_for(nak) != errno.ENOENT:
+                raise
+        else:
+            await self._holder.close()
+            raise AlreadyExists(f"{path!r} was made by somebody else in the meantime")
 
     async def _reopen(self, upload: QueuedUpload, least: int) -> OpenSession:
         """Open a file that is to keep what it has, unless it has less than `least` bytes: then what was to

@@ -134,10 +134,10 @@ class WriteStore:
         try:
             await self._scheduler.use_session(path, Opcode.OPEN_FILE_RO)
         except FtpNak as nak:
-            missing = errno_for(nak) == errno.ENOENT
-            if missing or (await self._effects.find(path))[0] is None:
-                return
-        raise AlreadyExists(f"{path!r} was made by somebody else in the meantime")
+            if errno_for(nak) != errno.ENOENT:
+                raise
+        else:
+            raise AlreadyExists(f"{path!r} was made by somebody else in the meantime")
 
     async def _is_listed(self, path: bytes) -> bool:
         """Whether the vehicle answers a listing, so that its silence was about the request."""

@@ -141,7 +141,7 @@ class Writer:
             # From now on path operations take turns with this upload: first those that are under way end.
             self.turns.set_writing(True)
             await self.turns.give(0.0)
-            await self.rearm(upload.path)
+            await self._rearm(upload.path)
 
     async def _drive(
         self, upload: QueuedUpload, session: OpenSession, transfer: WriteTransfer
@@ -251,14 +251,14 @@ class Writer:
         if not transfer.drained:
             return
         await self.turns.give(max(_TURN, 4.0 * (self._engine.rtt or 0.0)))
-        await self.rearm(upload.path)
+        await self._rearm(upload.path)
         self._go_on(transfer)
 
     def _go_on(self, transfer: WriteTransfer) -> None:
         transfer.resume()
         self._driver.kick()
 
-    async def rearm(self, path: bytes) -> None:
+    async def _rearm(self, path: bytes) -> None:
         """List the storage's root, whose trailing slash fits PX4's whitelist; also clears a sticky errno.
 
         One request from beyond the end suffices; whatever it answers, the next write tells.
