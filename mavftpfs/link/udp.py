@@ -8,7 +8,10 @@ connected, so that ICMP "port unreachable" of a vehicle that reboots is not an e
 
 from __future__ import annotations
 
+import errno
 import socket
+import struct
+import sys
 from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import replace
@@ -29,6 +32,11 @@ MAX_CHUNKS = 256
 _SOCKET_BUFFER = 1 << 20
 _OUTBOX_LIMIT = 64 * 1024
 _LARGEST = 65535
+_UDP_SEGMENT = 103
+"""linux/udp.h: one call sends many datagrams. A call for each is a tenth of what a chunk costs."""
+
+_MOST_SEGMENTS = 40
+_NO_SEGMENTS = frozenset((errno.EIO, errno.EINVAL, errno.EMSGSIZE, errno.EOPNOTSUPP, errno.ENOPROTOOPT))
 
 _SockAddr = tuple[Any, ...]
 
@@ -55,6 +63,7 @@ class UdpLink:
         self._outbox = Outbox(_OUTBOX_LIMIT)
         self._work = trio.Event()
         self._closed = False
+        self._segments = sys.platform == "linux"
 
     @property
     def backlog(self) -> int:
@@ -90,7 +99,10 @@ class UdpLink:
 
     def send_nowait(self, frames: Sequence[bytes]) -> None:
         """Send frames, packed into datagrams below 1400 bytes; drop and count what cannot go."""
-        for datagram in pack(frames):
+        datagrams: Sequence[bytes] = list(pack(frames))
+        if self._segments and len(datagrams) > 1 and not self._closed:
+            datagrams = self._send_together(datagrams)
+        for datagram in datagrams:
             if self._peer is None or self._closed:
                 self.stats.dropped_sends += 1
             elif self._outbox.size or not self._send(datagram):
@@ -150,6 +162,24 @@ class UdpLink:
                 self._peer = senders[-1]
         return chunks
 
+    def _send_together(self, datagrams: Sequence[bytes]) -> Sequence[bytes]:
+        """Hand runs of equal datagrams to the kernel in one call each; return what has to go one by one."""
+        while self._peer is not None and not self._outbox.size:
+            run = equal_run(datagrams)
+            if run < 2:
+                break
+            size = len(datagrams[0])
+            try:
+                self._sock.sendmsg(datagrams[:run], _segment_size(size), 0, self._peer)
+            except OSError as error:
+                # Not every way out can cut them (checksums, MTU); anything else is found out one by one.
+                self._segments = error.errno not in _NO_SEGMENTS
+                break
+            self.stats.sent_chunks += run
+            self.stats.sent_bytes += sum(map(len, datagrams[:run]))
+            datagrams = datagrams[run:]
+        return datagrams
+
     def _send(self, datagram: bytes) -> bool:
         """Return False if the kernel has no room; anything else that goes wrong is a lost datagram."""
         try:
@@ -162,6 +192,22 @@ class UdpLink:
         self.stats.sent_chunks += 1
         self.stats.sent_bytes += len(datagram)
         return True
+
+
+def equal_run(datagrams: Sequence[bytes]) -> int:
+    """Return how many of the first datagrams may go in one call: all of one size, the last may be shorter."""
+    if not datagrams:
+        return 0
+    size, run = len(datagrams[0]), 1
+    while run < min(len(datagrams), _MOST_SEGMENTS):
+        if len(datagrams[run]) != size:
+            return run + (len(datagrams[run]) < size)
+        run += 1
+    return run
+
+
+def _segment_size(size: int) -> list[tuple[int, int, bytes]]:
+    return [(socket.IPPROTO_UDP, _UDP_SEGMENT, struct.pack("=H", size))]
 
 
 @asynccontextmanager
