@@ -62,7 +62,7 @@ class Checksums:
         return same and self._clock() - known.asked_at < self._lifetime
 
     async def _ask(self, path: bytes, found: Found) -> int:
-        value = await self._store.crc32(path)
+        value = await self._store.crc32(path, size=found.size)
         if found.size is not None:
             self._known.pop(path, None)
             self._known[path] = _Checksum(found.size, found.entry.mtime, value, self._clock())

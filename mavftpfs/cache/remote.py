@@ -91,8 +91,9 @@ class RemoteStore(Protocol):
         """
         ...
 
-    async def crc32(self, path: bytes) -> int:
-        """Ask the vehicle for a file's CRC32 (init 0, no final xor).
+    async def crc32(self, path: bytes, *, size: int | None = None) -> int:
+        """Ask the vehicle for a file's CRC32 (init 0, no final xor). size: in bytes, if known: it tells how
+        long the vehicle may need, before which the question is not repeated.
 
         Raises:
             Armed: not asked in flight. FtpNak, RequestTimeout, VehicleLost.

@@ -346,7 +346,7 @@ class Writeback:
 
     def status(self) -> dict[str, object]:
         """Return counters; bytes_... in bytes."""
-        nodes, verifier = list(self._context.nodes), self._deliverer.verifier
+        nodes = list(self._context.nodes)
         errors = {n.path: str(n.error) for n in nodes if n.error is not None}
         return {
             "bytes_held": self._spool.bytes_held,
@@ -358,9 +358,7 @@ class Writeback:
             "transfers": self._transfers(),
             "errors": {path.decode(errors="replace"): text for path, text in errors.items()},
             "files_delivered": self._deliverer.delivered,
-            "verified_by_crc": verifier.by_crc,
-            "verified_by_size": verifier.by_size,
-            "checksums_unanswered": verifier.unanswered,
+            **self._deliverer.verifier.status(),
             "leftovers_mended": self._cleaner.mended,
             "armed": self._context.armed,
         }

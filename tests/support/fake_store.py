@@ -77,6 +77,7 @@ class FakeStore:
         self.open_delay = 0.0
         self.whole_delay = 0.0
         self.crc_delay = 0.0
+        self.crc_sizes: list[int | None] = []
         self.chunk = 4096
         self.chunk_delay = 0.001
         self.fail: dict[tuple[str, bytes], list[Exception]] = {}
@@ -155,8 +156,9 @@ class FakeStore:
             raise DataUnproven("too long")
         return data
 
-    async def crc32(self, path: bytes) -> int:
+    async def crc32(self, path: bytes, *, size: int | None = None) -> int:
         await self._begin("crc", path, Opcode.CALC_FILE_CRC32)
+        self.crc_sizes.append(size)
         if self.armed:
             raise Armed("flying")
         await trio.sleep(self.crc_delay)

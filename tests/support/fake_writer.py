@@ -283,8 +283,8 @@ class FakeWriter(FakeStore):
         self.files = {moved(path): file for path, file in self.files.items()}
         self.directories = {moved(path) for path in self.directories}
 
-    async def crc32(self, path: bytes) -> int:
-        return await super().crc32(self.real(path))
+    async def crc32(self, path: bytes, *, size: int | None = None) -> int:
+        return await super().crc32(self.real(path), size=size)
 
     async def open_reader(
         self, path: bytes, sink: ReadSink, *, expected_size: int | None = None

@@ -1,0 +1,137 @@
+"""What is compared after a delivery, by the option verify= and by what is known of the content."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator
+
+import pytest
+import trio
+
+from mavftpfs.cache.readback import PIECE, TRIES, agrees
+from mavftpfs.cache.tree import Tree
+from mavftpfs.shared.errors import DataUnproven, FtpNak, RequestTimeout, VerificationFailed
+from tests.support.fake_writer import KINDS, FakeWriter, make_writable, write_file
+
+OLD = bytes(range(256)) * 400
+FILE = b"/card/dir/file.txt"
+PART = (100, b"changed")
+
+
+@pytest.fixture
+async def store(nursery: trio.Nursery, autojump_clock: object) -> AsyncIterator[FakeWriter]:
+    store = FakeWriter(KINDS["posix"], nursery)
+    store.traits.wo_truncates = False
+    store.add(FILE, OLD)
+    yield store
+    assert store.crimes == []
+    nursery.cancel_scope.cancel()
+
+
+async def change(tree: Tree, *parts: tuple[int, bytes]) -> None:
+    file = await tree.open(FILE, write=True)
+    try:
+        for offset, data in parts:
+            await file.write(offset, data)
+        await file.release()
+    finally:
+        file.close()
+
+
+async def test_a_checksum_is_given_the_time_that_the_size_needs(store: FakeWriter) -> None:
+    tree = make_writable(store)
+    await write_file(tree, FILE, b"x" * 5000)
+    assert store.crc_sizes == [5000]
+
+
+async def test_a_part_that_arrived_wrong_is_found_where_checksums_are_demanded(store: FakeWriter) -> None:
+    store.spoil_uploads = 1
+    tree = make_writable(store, verify="crc")
+    await change(tree, PART, (len(OLD), b"appended"))
+    assert store.files[FILE].data == OLD[:100] + b"changed" + OLD[107:] + b"appended"
+    assert store.count("crc") == 0
+    assert tree.status()["verified_by_reading"] == 1
+    assert tree.status()["verified_by_size"] == 0
+
+
+async def test_a_part_that_arrives_wrong_twice_is_an_error(store: FakeWriter) -> None:
+    store.spoil_uploads = 2
+    tree = make_writable(store, verify="crc")
+    with pytest.raises(VerificationFailed):
+        await change(tree, PART)
+    assert tree.undelivered() == [FILE]
+
+
+async def test_all_of_a_large_change_is_compared(store: FakeWriter) -> None:
+    """Each piece of it, from its first to its last byte."""
+    data = OLD[::-1][: PIECE + 1000]
+    for spoilt in (0, PIECE // 239, (PIECE + 999) // 239):
+        store.add(FILE, OLD)
+        tree = make_writable(store, verify="crc")
+        uploaded = 0
+
+        def watch(what: object, *_: object, bad: int = spoilt) -> None:
+            nonlocal uploaded
+            if what == "write":
+                store.spoil_uploads = int(uploaded == bad)
+                uploaded += 1
+
+        store.before_request = watch
+        await change(tree, (500, data))
+        assert store.files[FILE].data == OLD[:500] + data + OLD[500 + len(data) :]
+        assert uploaded > len(data) // 239 + 1, "it was sent again"
+
+
+@pytest.mark.parametrize("verify", ["auto", "size", "none"])
+async def test_nothing_is_read_back_unasked(store: FakeWriter, verify: str) -> None:
+    tree = make_writable(store, verify=verify)
+    await change(tree, PART)
+    opened = store.count("reader")
+    assert tree.status()["verified_by_reading"] == 0
+    assert opened == 1, "for the program"
+
+
+async def test_a_whole_content_is_summed_though_it_was_changed_in_place(store: FakeWriter) -> None:
+    tree = make_writable(store, verify="crc")
+    await change(tree, (0, OLD[::-1]))
+    assert store.count("crc") == 1
+    assert tree.status()["verified_by_crc"] == 1
+
+
+async def test_a_cut_is_verified_by_its_size(store: FakeWriter) -> None:
+    tree = make_writable(store, verify="crc")
+    await tree.truncate(FILE, 700)
+    assert store.files[FILE].data == OLD[:700]
+
+
+# --- reading back
+
+
+async def ask(store: FakeWriter, *extents: tuple[int, int]) -> bool:
+    return await agrees(store, FILE, extents, lambda a, b: OLD[a:b], patience=5.0)
+
+
+async def test_reading_back(store: FakeWriter) -> None:
+    assert await ask(store, (0, 10), (300, len(OLD)))
+    assert not await ask(store, (len(OLD) - 1, len(OLD) + 1)), "shorter"
+    store.files[FILE].data = OLD[:-1] + b"!"
+    assert not await ask(store, (0, len(OLD)))
+    assert await ask(store, (0, len(OLD) - 1))
+    assert all(reader.closed for reader in store.readers)
+
+
+async def test_reading_back_is_bounded(autojump_clock: object, store: FakeWriter) -> None:
+    store.stalled = True
+    with pytest.raises(RequestTimeout):
+        await ask(store, (0, 10))
+    store.stalled = False
+    store.fail_chunks = [FtpNak(4, 1)]
+    with pytest.raises(FtpNak):
+        await ask(store, (0, 10))
+
+
+async def test_bytes_under_suspicion_prove_nothing(store: FakeWriter) -> None:
+    store.suspect_chunks = 1
+    assert await ask(store, (0, 10))
+    store.suspect_chunks = TRIES
+    with pytest.raises(DataUnproven):
+        await ask(store, (0, 10))
