@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Generic, Protocol, TypeVar
 
@@ -36,6 +37,16 @@ class OpenFile(Protocol):
     def keep_cache(self) -> bool: ...
     async def read(self, offset: int, size: int) -> bytes | memoryview: ...
     def close(self) -> None: ...
+
+
+@contextmanager
+def closed_on_failure(file: OpenFile) -> Iterator[None]:
+    """Close a file whose opening fails after all: the kernel sends no release for it."""
+    try:
+        yield
+    except BaseException:
+        file.close()
+        raise
 
 
 class WritableFile(OpenFile, Protocol):

@@ -23,7 +23,14 @@ import pyfuse3
 import trio
 from pyfuse3 import EntryAttributes, FileInfo, FUSEError, RequestContext, StatvfsData
 
-from mavftpfs.fuse.handles import DirectoryHandle, FileHandle, FileTree, HandleTable, Stat
+from mavftpfs.fuse.handles import (
+    DirectoryHandle,
+    FileHandle,
+    FileTree,
+    HandleTable,
+    Stat,
+    closed_on_failure,
+)
 from mavftpfs.fuse.inodes import ROOT_INO, Inode, InodeTable
 from mavftpfs.shared.errnos import errno_for
 from mavftpfs.shared.errors import Armed, MavftpfsError, NotFound
@@ -224,10 +231,11 @@ class Operations(pyfuse3.Operations):
             raise FUSEError(errno.EROFS)
         known = self._inode(inode)
         file = await self._tree.open(self._path(inode))
-        fh = self.files.add(FileHandle(inode, file))
         if known.told_size not in (None, file.size):
             # Else the kernel ends reads at the size it remembers for up to attr_timeout.
-            await self._refresh(inode)
+            with closed_on_failure(file):
+                await self._refresh(inode)
+        fh = self.files.add(FileHandle(inode, file))
         return FileInfo(fh=fh, direct_io=file.direct_io, keep_cache=file.keep_cache)
 
     @handler

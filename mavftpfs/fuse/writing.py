@@ -19,7 +19,7 @@ import pyfuse3
 from pyfuse3 import EntryAttributes, FileInfo, FUSEError, RequestContext, SetattrFields
 
 from mavftpfs.cache.attributes import Stat
-from mavftpfs.fuse.handles import FileHandle, WritableFile, WritableTree
+from mavftpfs.fuse.handles import FileHandle, WritableFile, WritableTree, closed_on_failure
 from mavftpfs.fuse.inodes import Inode
 from mavftpfs.fuse.keeping import NANO, Keeping
 from mavftpfs.fuse.operations import Operations, Presentation, handler
@@ -80,11 +80,12 @@ class WritingOperations(Operations):
         known = self._inode(inode)
         path = self._path(inode)
         file = await self._tree.open(path, write=writing, truncate=bool(flags & os.O_TRUNC))
-        fh = self.files.add(FileHandle(inode, file, flags))
         if flags & os.O_TRUNC:
             known.told_size = 0
         elif known.told_size not in (None, file.size):
-            await self._refresh(inode)
+            with closed_on_failure(file):
+                await self._refresh(inode)
+        fh = self.files.add(FileHandle(inode, file, flags))
         return FileInfo(fh=fh, direct_io=file.direct_io, keep_cache=file.keep_cache)
 
     @handler
@@ -94,12 +95,13 @@ class WritingOperations(Operations):
         """Create a file and open it."""
         path = self._child(parent_inode, name)
         file = await self._tree.create(path, exclusive=bool(flags & os.O_EXCL))
-        if flags & os.O_TRUNC and file.size:
-            await file.truncate(0)
+        with closed_on_failure(file):
+            if flags & os.O_TRUNC and file.size:
+                await file.truncate(0)
+            found = Stat(EntryKind.FILE, file.size, (await self._tree.stat(path)).mtime, 0.0)
         self._keeping.at(path).mode = stat_bits.S_IMODE(mode)
         inode = self.inodes.lookup(path)
         fh = self.files.add(FileHandle(inode.ino, file, flags))
-        found = Stat(EntryKind.FILE, file.size, (await self._tree.stat(path)).mtime, 0.0)
         info = FileInfo(fh=fh, direct_io=file.direct_io, keep_cache=file.keep_cache)
         return info, self._attributes(inode, found)
 

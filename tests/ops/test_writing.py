@@ -12,10 +12,10 @@ import pytest
 from pyfuse3 import EntryAttributes, RequestContext, SetattrFields
 
 from mavftpfs.fuse.inodes import ROOT_INO
-from mavftpfs.fuse.operations import Presentation
+from mavftpfs.fuse.operations import Operations, Presentation
 from mavftpfs.fuse.writing import WritingOperations
 from mavftpfs.shared.errors import Armed, DirectoryNotEmpty, NoSpace, RequestTimeout
-from tests.ops.faketree import MTIME, FakeTree
+from tests.ops.faketree import MTIME, FakeFile, FakeTree
 from tests.ops.test_operations import failure, ino_of
 
 CTX = cast(RequestContext, None)
@@ -226,3 +226,27 @@ async def test_a_full_directory_stays() -> None:
     assert await failure(ops.rmdir(ROOT_INO, b"log", CTX)) == errno.ENOTEMPTY
     tree.error = None
     assert ops.inodes.known(b"/log") == ino
+
+
+async def _fails(*_: object) -> None:
+    raise RequestTimeout("silence")
+
+
+async def test_an_open_that_fails_after_all_leaves_nothing_open(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The kernel sends no release for it, and a writer that stays blocks the file for ever."""
+    tree = some_tree()
+    ops = operations(tree, refresh=_fails)
+    ino = await ino_of(ops, b"a.txt")
+    for name, flags, owner, broken in (
+        (b"a.txt", os.O_WRONLY | os.O_TRUNC, FakeFile, "truncate"),
+        (b"new", os.O_WRONLY, FakeTree, "stat"),
+    ):
+        with monkeypatch.context() as patch:
+            patch.setattr(owner, broken, _fails)
+            assert await failure(ops.create(ROOT_INO, name, 0o600, flags, CTX)) == errno.ETIMEDOUT
+    tree.files[b"/a.txt"] = b"longer than the kernel was told"
+    assert await failure(ops.open(ino, os.O_RDWR, CTX)) == errno.ETIMEDOUT
+    reading = Operations(tree, LOOK, refresh=_fails, inodes=ops.inodes)
+    assert await failure(reading.open(ino, os.O_RDONLY, CTX)) == errno.ETIMEDOUT
+    assert [file.closed for file in tree.opened] == [1, 1, 1, 1]
+    assert not list(ops.files) + list(reading.files)
