@@ -10,16 +10,18 @@ import pytest
 import trio
 from trio.testing import MockClock
 
+from mavftpfs.cache.asides import is_reserved
 from mavftpfs.cache.options import CacheOptions
 from mavftpfs.cache.tree import Tree
 from mavftpfs.link.messages import Address
 from mavftpfs.protocol.payload import Opcode
-from mavftpfs.shared.errors import PathTooLong
+from mavftpfs.shared.errors import MavftpfsError, PathTooLong
 from mavftpfs.shared.model import join, split
 from mavftpfs.sim.profiles import PROFILES
 from mavftpfs.sim.tree import Kind
 from tests.support.fake_store import read_file
 from tests.support.fake_writer import write_file
+from tests.support.faults import Faults
 from tests.support.worlds import ROOTS, World
 
 RENAMING = sorted(name for name in PROFILES if name != "littlefs")
@@ -176,3 +178,25 @@ async def test_230_bytes_are_refused_before_anything_is_changed(profile: str, au
         assert tree.undelivered() == []
     assert not CHANGING & {opcode for opcode, _ in requests}
     assert here.tree.data(path) == OLD
+
+
+@pytest.mark.parametrize("profile", ["px4", "mavsdk", "ardupilot"])
+async def test_what_is_tried_out_may_be_interrupted_anywhere(profile: str, autojump: MockClock) -> None:
+    """The next listing by the same mount removes what was left; a directory with it can be removed."""
+    path = long_path(profile, 60)
+    for number in range(1, 16, 2):
+        here = World(profile)
+        here.tree.add(path, OLD)
+        faults = Faults(here)
+        async with mounted(here) as tree:
+            await tree.list(split(path)[0])
+            file = await tree.open(path, write=True)
+            await file.write(file.size, b"more")
+            faults.cut_after(number)
+            with pytest.raises(MavftpfsError):
+                await file.flush()
+            faults.cut_after(None)
+            await tree.unlink(path)
+            await file.release()
+            await tree.rmdir(split(path)[0])
+        assert not [p for p in everything(here) if is_reserved(split(p)[1])]

@@ -439,7 +439,7 @@ class FakeUpload:
         if store.spoil_uploads:
             store.spoil_uploads -= 1
             data = bytes([data[0] ^ 1]) + data[1:]
-        new = file.data[:offset] + data + file.data[offset + len(data) :]
+        new = file.data[:offset].ljust(offset, b"\0") + data + file.data[offset + len(data) :]
         if store.capacity is not None and store.used - len(file.data) + len(new) > store.capacity:
             raise FtpNak(Opcode.WRITE_FILE, NakCode.FAIL_ERRNO, 28)
         file.data = new
