@@ -70,7 +70,7 @@ def test_owner_and_masks(field: Field, small_tree: Path) -> None:
 @pytest.fixture
 def open_place() -> Iterator[Path]:
     """A directory that other users can reach, unlike pytest's own."""
-    path = Path(tempfile.mkdtemp(prefix="mavftpfs-test-"))
+    path = Path(tempfile.mkdtemp(prefix="mavftpfs-test-", dir="/var/tmp"))
     path.chmod(0o755)
     yield path
     shutil.rmtree(path)

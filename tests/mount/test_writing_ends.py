@@ -4,6 +4,7 @@ what was not is an error and is kept."""
 from __future__ import annotations
 
 import json
+import os
 import re
 import signal
 import subprocess
@@ -235,6 +236,46 @@ def test_a_killed_daemon_loses_only_what_was_not_confirmed(field: Field, data: P
     wait_until(
         "no litter", lambda: {p.name for p in card.iterdir()} <= {"confirmed", "replaced.bin", "lost.bin"}, 20
     )
+
+
+def test_a_killed_daemon_leaves_what_was_being_written_under_its_name(field: Field, data: Path) -> None:
+    """Before any close: more than memory takes lies on the local disk, and its name beside it."""
+    vehicle = field.sim(field.local("card"), "px4", ("--rate", "50000"))
+    vehicle.left_alone = True
+    mount = field.mount(vehicle.source, *QUICK, "dirty_max=64K")
+    code = (
+        "import sys, time\n"
+        "f = open(sys.argv[1], 'xb', 0); f.write(b'n' * 100_000)\n"
+        "print('written', flush=True); time.sleep(60)"
+    )
+    with mount.started(sys.executable, "-c", code, mount.path / "log.bin") as child:
+        assert child.stdout is not None
+        assert child.stdout.readline()
+        process, mount.process = mount.alive(), None
+        process.kill()
+        abort_mount(mount.path)
+    place = recovered(field.mount(vehicle.source, *QUICK).alive().text())
+    found = {path.name: path for path in place.iterdir()}
+    assert found["log.bin"].read_bytes() == b"n" * 100_000
+    assert json.loads(found["log.bin.json"].read_text()) == {"path": "/log.bin", "unfinished": True}
+
+
+def test_a_mount_that_wrote_leaves_nothing_behind(
+    field: Field, data: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    state, temporaries = field.local("state"), field.local("t")
+    monkeypatch.setenv("XDG_STATE_HOME", str(state))
+    monkeypatch.setenv("TMPDIR", str(temporaries))
+    card = field.local("card")
+    mount = field.mount(field.sim(card).source, "dirty_max=64K")
+    mount.run("cp", data, mount.path / "one.bin")
+    mount.run("cp", data, mount.path / "one.bin")
+    mount.run("truncate", "-s", "10", mount.path / "one.bin")
+    mount.run("rm", mount.path / "one.bin")
+    assert mount.unmount() == 0
+    assert os.listdir(temporaries) == []
+    assert [path for path in state.rglob("*") if path.is_file() and path.name != "owner"] == []
+    assert os.listdir(card) == []
 
 
 def readable(mount: Mount) -> bool:
