@@ -35,6 +35,7 @@ _CURIOSITY = 6
 _LEAP = 4
 _FAST_PATH_SECONDS = 0.010
 _FAST_PATH_WINDOW = 96
+_MOST_RESERVE = 512
 _QUEUE_SECONDS = 0.005
 _ROUNDS_REMEMBERED = 10
 _PLATEAU_ROUNDS = 2
@@ -136,7 +137,12 @@ class Flow:
     def _reserve(self) -> int:
         """Return how many more bridge the pauses of a server; none where its buffers are small."""
         reserve = self._stalls.reserve
-        return 0 if not reserve or self._serial or self._pacer else int(reserve * self._best_rate)
+        return 0 if not reserve or self._serial or self._pacer else self._bounded(reserve * self._best_rate)
+
+    def _bounded(self, reserve: float) -> int:
+        """Never beyond the limit; and on a fast path a pause is ours or a busy computer's, and thousands of
+        requests for 0.15 s would only overflow the sockets at both ends."""
+        return max(0, min(int(reserve), _MOST_RESERVE, self._cap - self.window))
 
     def next_room_at(self) -> float:
         """Return when there will be room without an answer; inf if that does not depend on time."""
