@@ -8,6 +8,7 @@ or refuses it: a link that fails and returns between two looks at its heartbeats
 from __future__ import annotations
 
 import logging
+from collections.abc import Awaitable, Callable
 
 import trio
 
@@ -32,13 +33,23 @@ FIRST_PAUSE, LONGEST_PAUSE = 2.0, 30.0
 class Background:
     """Needs the context's nursery; without one nothing is delivered before it is asked for."""
 
-    def __init__(self, context: Context, deliverer: Deliverer, throttle: Throttle) -> None:
+    def __init__(
+        self,
+        context: Context,
+        deliverer: Deliverer,
+        throttle: Throttle,
+        *,
+        mend: Callable[[], Awaitable[None]],
+    ) -> None:
+        """`mend()` gives torn names their files (Cleaner)."""
         self._context = context
+        self._mend = mend
         self._deliverer = deliverer
         self._throttle = throttle
         self._pause = FIRST_PAUSE
         self._redelivering = False
         deliverer.on_undelivered = self.redeliver
+        deliverer.replacer.on_torn = self.redeliver
 
     def kick(self, node: Node) -> None:
         """The draft got more: send it, or begin to, if that can be done beside the program."""
@@ -52,13 +63,14 @@ class Background:
     async def link_back(self) -> None:
         """What failed, or was refused, may work now."""
         self._pause = FIRST_PAUSE
+        await self._mend()
         for node in self._context.nodes:
             node.start_after = float("-inf")
             self.kick(node)
         await self._deliver_closed(refused_too=True)
 
     def redeliver(self) -> None:
-        """Something was not delivered: try again by and by."""
+        """Something was not delivered, or left a name without a file: try again by and by."""
         if self._context.nursery is not None and not self._redelivering:
             self._redelivering = True
             self._pause = FIRST_PAUSE
@@ -91,9 +103,10 @@ class Background:
 
     async def _redeliver(self) -> None:
         try:
-            while any(node.undelivered and _may_pass(node) for node in self._context.nodes):
+            while self._context.torn or any(n.undelivered and _may_pass(n) for n in self._context.nodes):
                 pause, self._pause = self._pause, min(2 * self._pause, LONGEST_PAUSE)
                 await trio.sleep(pause)
+                await self._mend()
                 await self._deliver_closed()
         finally:
             self._redelivering = False

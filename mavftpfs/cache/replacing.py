@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import errno
 import logging
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 from mavftpfs.cache.asides import Places
@@ -39,11 +40,16 @@ class Present:
 
 
 class Replacer:
-    """Renames over files that exist."""
+    """Renames over files that exist.
+
+    Attributes:
+        on_torn: called when a name may lack its file.
+    """
 
     def __init__(self, context: Context, sure: Sure) -> None:
         self._context = context
         self._sure = sure
+        self.on_torn: Callable[[], None] = lambda: None
 
     def reserve(self, places: Places) -> None:
         """From now on the names are in use: no listing's repair touches them."""
@@ -131,6 +137,7 @@ class Replacer:
                 context.dentries.note_created(path, replace(entry, name=name))
                 break
         context.torn[path] = place
+        self.on_torn()
         for listed in (parent, directory):
             context.dentries.expire(listed, context.clock())
         log.warning("%r may lie under %r until the vehicle is heard again", path, place)

@@ -66,7 +66,7 @@ class Writeback:
         self._cleaner = cleaner
         sure = Sure(context)
         self._deliverer = Deliverer(context, sure, throttle)
-        self._background = Background(context, self._deliverer, throttle)
+        self._background = Background(context, self._deliverer, throttle, mend=cleaner.mend_torn)
         self.overlay = Overlay(context)
         self._namespace = Namespace(
             context,
@@ -342,7 +342,7 @@ class Writeback:
     def retry(self) -> None:
         """The vehicle is back, or may be written again: deliver what nobody has open any more."""
         if self._context.nursery is not None and (self._context.torn or self.undelivered()):
-            self._context.nursery.start_soon(self._retry)
+            self._context.nursery.start_soon(self._background.link_back)
 
     def status(self) -> dict[str, object]:
         """Return counters; bytes_... in bytes."""
@@ -380,10 +380,6 @@ class Writeback:
                 }
             )
         return found
-
-    async def _retry(self) -> None:
-        await self._cleaner.mend_torn()
-        await self._background.link_back()
 
     async def _deliver_all(self) -> None:
         """Try to deliver everything once."""

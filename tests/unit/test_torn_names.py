@@ -10,10 +10,11 @@ import pytest
 import trio
 
 from mavftpfs.cache.asides import Group, Kind, is_reserved, repair
+from mavftpfs.cache.background import FIRST_PAUSE
 from mavftpfs.cache.spool import SpoolDirectory
 from mavftpfs.cache.tree import Tree
 from mavftpfs.protocol.payload import NakCode, Opcode
-from mavftpfs.shared.errors import Armed, FtpNak, MavftpfsError, VehicleLost
+from mavftpfs.shared.errors import Armed, FtpNak, MavftpfsError, RequestTimeout, VehicleLost
 from mavftpfs.shared.model import split
 from tests.support.fake_store import read_file
 from tests.support.fake_writer import KINDS, FakeWriter, make_writable, write_file
@@ -210,6 +211,29 @@ async def test_a_torn_name_that_is_being_read_is_mended(
     assert store.files[FILE].data == OLD
     assert bytes(await reader.read(0, len(OLD))) == OLD
     reader.close()
+
+
+async def test_a_torn_name_that_nobody_asks_for_is_mended_without_news(
+    autojump_clock: object, store: FakeWriter, tree: Tree
+) -> None:
+    left = 2
+
+    def fall_silent(*request: object) -> None:
+        nonlocal left
+        left -= request[0] == "rename"
+        if left == 0:
+            store.before_request = None
+            raise RequestTimeout("silence")
+
+    store.before_request = fall_silent
+    with pytest.raises(RequestTimeout):
+        await tree.rename(OTHER, FILE)
+    assert FILE not in store.files
+    await trio.sleep(2 * FIRST_PAUSE)
+    assert store.files[FILE].data == OLD
+    listings = store.count("list")
+    await trio.sleep(1000)
+    assert store.count("list") == listings
 
 
 async def test_removing_a_torn_file_removes_it(store: FakeWriter, tree: Tree) -> None:
