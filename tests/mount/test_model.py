@@ -45,7 +45,7 @@ def test_random_calls_do_what_a_local_disk_does(field: Field, kind: str) -> None
 
 
 def test_random_calls_on_the_real_server(field: Field) -> None:
-    run_lockstep(field, REAL, ("--loss", "0.002", "--corrupt", "0.005"), seed=2, count=200, limit=120)
+    run_lockstep(field, REAL, ("--loss", "0.002"), seed=2, count=200, limit=120)
 
 
 @pytest.mark.soak
@@ -58,4 +58,4 @@ def test_thousands_of_random_calls(field: Field, kind: str, seed: int) -> None:
 @pytest.mark.soak
 @pytest.mark.parametrize("seed", SEEDS)
 def test_thousands_of_random_calls_on_the_real_server(field: Field, seed: int) -> None:
-    run_lockstep(field, REAL, ("--loss", "0.01", "--corrupt", "0.01"), 200 + seed, count=1500, limit=1200)
+    run_lockstep(field, REAL, ("--loss", "0.01"), 200 + seed, count=1500, limit=1200)
