@@ -60,6 +60,8 @@ class UdpLink:
         self._only_host = None if peer is None else peer[0]
         self._pinned = False
         self._senders: list[_SockAddr] = []
+        # Received into, then copied: a bytes object of the largest size for each would riddle the heap.
+        self._buffer = memoryview(bytearray(_LARGEST))
         self._outbox = Outbox(_OUTBOX_LIMIT)
         self._work = trio.Event()
         self._closed = False
@@ -141,18 +143,18 @@ class UdpLink:
 
     def _drain(self) -> list[bytes]:
         """Take what is there. Errors of the socket are other people's ICMP messages: go on."""
-        receive = self._sock.recvfrom
+        receive, buffer = self._sock.recvfrom_into, self._buffer
         chunks: list[bytes] = []
         senders: list[_SockAddr] = []
         for _ in range(MAX_CHUNKS):
             try:
-                data, sender = receive(_LARGEST)
+                count, sender = receive(buffer)
             except BlockingIOError:
                 break
             except OSError:
                 continue
             if self._only_host is None or sender[0] == self._only_host:
-                chunks.append(data)
+                chunks.append(bytes(buffer[:count]))
                 senders.append(sender)
         if chunks:
             self._senders = senders

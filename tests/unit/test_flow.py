@@ -14,10 +14,8 @@ def test_a_pause_on_a_fast_path_lets_no_thousands_loose() -> None:
     path = Path(flow, rate=50_000.0, base=0.001)
     for _ in range(40):
         path.round()
-    for _ in range(30):  # two seconds with a pause of 0.1 s in each: somebody else's process runs
-        path.now += 0.1
-        for _ in range(4):
-            path.round()
+    flow._stalls.reserve = 0.15  # as after many pauses of a card, or of a busy computer
+    flow._trains.proven = False  # answers come in bunches there
     room = flow.room(0, path.now, paced=True)
     assert flow.window < room <= flow.window + 512
     assert Flow(limit=8).room(0, 0.0, paced=True) <= 8
