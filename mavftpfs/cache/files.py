@@ -27,6 +27,7 @@ from itertools import islice
 
 from mavftpfs.cache.blocks import BlockCache, FileBlocks
 from mavftpfs.cache.flights import Flights
+from mavftpfs.cache.keeper import Keeper
 from mavftpfs.cache.options import MIB
 from mavftpfs.cache.readahead import Pace, Readahead
 from mavftpfs.cache.readonly import ReadOnlyHandle
@@ -66,6 +67,7 @@ class Files:
         invalidate: Callable[[bytes], None],
     ) -> None:
         """`facts` asks a fresh listing; `on_size` hears sizes that open ACKs told and listings did not."""
+        self.keeper: Keeper | None = None
         self._store = store
         self._cache = cache
         self._clock = cache.clock
@@ -123,8 +125,17 @@ class Files:
             self._drop_doubtful(version)
         if version is not None and self._still_right(version, entry, listed_at, fresh):
             self._current.move_to_end(path)
+            if self.keeper is not None:
+                self.keeper.watch(version)
             return version, True
-        return await self._start_version(path, entry), False
+        kept = await self.keeper.revive(path, entry, listed_at) if fresh and self.keeper else None
+        if kept is not None:
+            self._replace(path, kept)
+            return kept, False
+        version = await self._start_version(path, entry)
+        if fresh and self.keeper is not None:
+            self.keeper.keep(version, entry)
+        return version, False
 
     def _still_right(self, version: Version, entry: DirEntry, listed_at: float, fresh: bool) -> bool:
         """Return whether a version is known to be what the vehicle holds now."""
@@ -167,6 +178,11 @@ class Files:
             closed = (v for v in self._current.values() if not v.handles and v is not version)
             for surplus in list(islice(closed, 1)):
                 self._forget(surplus)
+
+    def status(self) -> dict[str, object]:
+        """Return counters."""
+        kept = {} if self.keeper is None else self.keeper.status()
+        return {"hits": self.hits, "misses": self.misses, "reads_unproven": self.fetcher.unproven, **kept}
 
     def pace(self) -> Pace:
         """Return the bounds for readahead now."""

@@ -22,6 +22,7 @@ from mavftpfs.cache.dentries import Dentries
 from mavftpfs.cache.directories import Directories, Found
 from mavftpfs.cache.files import Files
 from mavftpfs.cache.flights import Flights
+from mavftpfs.cache.keeper import Keeper
 from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.options import CacheOptions
 from mavftpfs.cache.remote import RemoteStore, WriteStore
@@ -53,12 +54,14 @@ class Tree:
         spool: SpoolDirectory | None = None,
         wall: Callable[[], float] = time.time,
         rng: Random | None = None,
+        keep: Callable[[BlockCache, Dentries], Keeper] | None = None,
     ) -> None:
         """`invalidate(path)`: the kernel's pages and attributes of a path are wrong; must not block.
 
         With a nursery, listings and snapshots under way survive the cancellation of who asked for them, and
         written bytes go to the vehicle while the program still writes. Without a writer all is read-only.
-        `spool` keeps what is not delivered; `wall`: seconds since 1970; `rng` numbers our temporary names.
+        `spool` keeps what is not delivered; `wall`: seconds since 1970; `rng` numbers our temporary names;
+        `keep` makes the keeper.
         """
         self._store = store
         self._options = options
@@ -75,6 +78,7 @@ class Tree:
             on_size=self._on_size,
             invalidate=self._invalidate,
         )
+        self._files.keeper = None if keep is None else keep(self._blocks, self._dentries)
         self._virtual = VirtualTrees(
             store,
             self._directories,
@@ -135,8 +139,7 @@ class Tree:
         remote, now = self._remote(path), self._clock()
         if self._virtual.hides(remote):
             return self._options.negative_timeout
-        until = self._dentries.absent_until(remote, now)
-        return max(0.0, min(self._options.negative_timeout, until - now))
+        return max(0.0, min(self._options.negative_timeout, self._dentries.absent_until(remote, now) - now))
 
     async def list(self, path: bytes) -> list[tuple[bytes, Stat]]:
         """Return a directory's entries without `.` and `..`.
@@ -192,8 +195,7 @@ class Tree:
         ours = None if self._writing is None else self._writing.crc32(remote)
         if ours is not None:
             return ours
-        found = await self._find_file(remote)
-        return await self._checksums.get(remote, found)
+        return await self._checksums.get(remote, await self._find_file(remote))
 
     # --- changing (all raise ReadOnly on a tree without a writer, and below `@` directories)
 
@@ -305,12 +307,10 @@ class Tree:
         files, blocks = self._files, self._blocks
         return {
             **({} if self._writing is None else self._writing.status()),
-            "hits": files.hits,
-            "misses": files.misses,
+            **files.status(),
             "bytes_cached": blocks.bytes_cached + self._virtual.snapshots.bytes_cached,
             "bytes_evicted_blocks": blocks.evictions,
             "rate": blocks.meter.rate,
-            "reads_unproven": files.fetcher.unproven,
             "listings_cached": len(self._dentries),
             "entries_cached": self._dentries.entry_count,
             "listings_asked": self._directories.sweeps,

@@ -13,6 +13,7 @@ from functools import partial
 
 from mavftpfs.cache.blocks import BlockCache, FileBlocks, Gaps
 from mavftpfs.cache.flights import Flights
+from mavftpfs.cache.kept import Kept
 from mavftpfs.cache.readahead import NOTHING, Plan
 from mavftpfs.cache.remote import Reader, RemoteStore
 from mavftpfs.shared.errors import (
@@ -41,7 +42,7 @@ class Version:
     mtime: None if not known to belong to this size. proven_at: when it was last known to be what the
     vehicle holds. handles: how many are open. shown: whether the kernel may hold pages of it and all of
     them are good. boot: how often the vehicle restarted while it was open. proven_boot: the one of these
-    after which it was proven to be the same file still.
+    after which it was proven to be the same file still. kept: its part on the local disk, if it may have one.
     """
 
     path: bytes
@@ -54,6 +55,7 @@ class Version:
     boot: int = 0
     proven_boot: int = 0
     dead: MavftpfsError | None = None
+    kept: Kept | None = None
 
     @property
     def size(self) -> int:
@@ -136,6 +138,8 @@ class Fetcher:
         blocks = version.blocks
         try:
             async with blocks.held(start, stop):
+                if version.kept is not None and blocks.missing(start, stop):
+                    await version.kept.fill(blocks, start, stop, version.require_alive)
                 if blocks.missing(start, stop):
                     reader = await self.reader(version)
                     await blocks.fill(start, stop, partial(_want, reader, plan))

@@ -157,12 +157,12 @@ class Counting:
             scratch.mkdir()
             self._bash(f"ls -l .. > /dev/null; {case.before}", where, scratch, case.timeout)
             self.settle()
-            mark, repeated = self.vehicle.asked(), self._status()["connection"]["retransmissions"]
+            mark, repeated = self.vehicle.asked(), self.status()["connection"]["retransmissions"]
             started = time.monotonic()
             self._bash(case.script, where, scratch, case.timeout)
             seconds = time.monotonic() - started
             self.settle()
-            if self._status()["connection"]["retransmissions"] == repeated:
+            if self.status()["connection"]["retransmissions"] == repeated:
                 cost = self.vehicle.cost_since(mark)
                 cost.seconds = seconds
                 return cost
@@ -173,19 +173,20 @@ class Counting:
         deadline = time.monotonic() + SETTLING
         seen, since = -1, time.monotonic()
         while time.monotonic() - since < SETTLED:
-            assert time.monotonic() < deadline, f"the mount does not come to rest: {self._status()}"
+            assert time.monotonic() < deadline, f"the mount does not come to rest: {self.status()}"
             now = self.vehicle.asked()
             if now != seen or not self._idle():
                 seen, since = now, time.monotonic()
             time.sleep(0.05)
 
     def _idle(self) -> bool:
-        status = self._status()
+        status = self.status()
         connection = status["connection"]
         waiting = status["cache"].get("files_undelivered")
         return connection["session_open"] is None and not connection["uploads"] and not waiting
 
-    def _status(self) -> dict[str, dict[str, Any]]:
+    def status(self) -> dict[str, dict[str, Any]]:
+        """Return what the mount says of itself."""
         socket = find_socket(os.path.realpath(self.mount.path), own_directories())
         facts: dict[str, dict[str, Any]] = ask(socket, {"command": "status"}, timeout=20)["status"]
         return facts

@@ -51,6 +51,7 @@ PURE_MODULES = {
     "cache.readahead",
     "cache.asides",
     "cache.draft",
+    "cache.persistent",
     "cache.plan",
     "cache.sending",
     "cache.times",

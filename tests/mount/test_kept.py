@@ -1,0 +1,93 @@
+"""`cache_dir=`: what one mount read, the next one of the same vehicle does not read again."""
+
+from __future__ import annotations
+
+import os
+import time
+from pathlib import Path
+
+import pytest
+
+from mavftpfs.cache.blocks import BLOCK_SIZE
+from tests.mount.conftest import Field
+from tests.support.mounts import Mount, wait_until
+from tests.support.requests import CountedVehicle, Counting
+from tests.support.trees import content
+
+YESTERDAY = 86_400
+FILES = {"00000001.BIN": 300_000, "00000002.BIN": 65_536, "LASTLOG.TXT": 3}
+KEEPING = 40.0
+"""Seconds in which what was read gets to the disk: it has to be beyond suspicion for 12 of them."""
+
+
+def fill(card: Path) -> Path:
+    """Put yesterday's logs on a card."""
+    logs = card / "logs"
+    logs.mkdir()
+    for name, size in FILES.items():
+        (logs / name).write_bytes(content(name, size))
+        os.utime(logs / name, (time.time() - YESTERDAY,) * 2)
+    return logs
+
+
+def read_all(mount: Mount, logs: Path) -> None:
+    """Compare all files with the card."""
+    mount.run("diff", "-r", logs, mount.path / "logs")
+
+
+def read_and_keep(field: Field, vehicle: CountedVehicle, logs: Path, cache: Path) -> None:
+    """Read all in a mount of its own, which ends when everything lies on the disk."""
+    mount = field.mount(vehicle.source, f"cache_dir={cache}")
+    read_all(mount, logs)
+    blocks = sum(-(-size // BLOCK_SIZE) for size in FILES.values())
+    counting = Counting(vehicle, mount)
+    wait_until("all is kept", lambda: counting.status()["cache"]["blocks_to_disk"] == blocks, KEEPING)
+    assert mount.unmount() == 0
+
+
+def opened(vehicle: CountedVehicle, mark: int) -> dict[str, int]:
+    """Return how many files were opened and chunks read since `mark` requests."""
+    counts = vehicle.cost_since(mark).counts
+    return {name: counts[name] for name in ("open", "read", "burst", "crc") if counts[name]}
+
+
+@pytest.mark.parametrize("profile", ["ardupilot5", "mavsdk"])
+def test_yesterdays_logs_are_not_read_again(field: Field, profile: str) -> None:
+    card, cache = field.local("card"), field.local("cache")
+    logs = fill(card)
+    vehicle = field.counted_sim(card, profile)
+    read_and_keep(field, vehicle, logs, cache)
+    mark = vehicle.asked()
+    mount = field.mount(vehicle.source, f"cache_dir={cache}")
+    read_all(mount, logs)
+    assert opened(vehicle, mark) == {}
+    (logs / "00000003.BIN").write_bytes(content("new", 1000))
+    mount.unmount()
+    mark = vehicle.asked()
+    read_all(field.mount(vehicle.source, f"cache_dir={cache}"), logs)
+    assert opened(vehicle, mark) == {"open": 1, "read": 5}
+
+
+def test_changed_logs_and_damaged_blocks_are_read_again(field: Field) -> None:
+    card, cache = field.local("card"), field.local("cache")
+    logs = fill(card)
+    vehicle = field.counted_sim(card, "mavsdk")
+    read_and_keep(field, vehicle, logs, cache)
+    (logs / "00000002.BIN").write_bytes(content("another", 65_536))  # of the same size
+    for block in (path for path in cache.rglob("*") if path.is_file()):
+        if block.stat().st_size < 60_000:
+            block.write_bytes(block.read_bytes()[:-1] + b"?")
+    mark = vehicle.asked()
+    read_all(field.mount(vehicle.source, f"cache_dir={cache}"), logs)
+    assert opened(vehicle, mark)["open"] == 3
+
+
+def test_without_mtimes_a_checksum_per_file_decides(field: Field) -> None:
+    card, cache = field.local("card"), field.local("cache")
+    logs = fill(card)
+    vehicle = field.counted_sim(card, "px4")
+    read_and_keep(field, vehicle, logs, cache)
+    (logs / "LASTLOG.TXT").write_bytes(b"12\n")
+    mark = vehicle.asked()
+    read_all(field.mount(vehicle.source, f"cache_dir={cache}"), logs)
+    assert opened(vehicle, mark) == {"crc": 3, "open": 1, "read": 1}

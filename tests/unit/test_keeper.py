@@ -1,0 +1,299 @@
+"""What is kept from one mount to the next: served only where it is provably the file, else read again."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator, Callable
+from pathlib import Path
+from typing import TypeVar
+
+import pytest
+import trio
+from trio.testing import MockClock
+
+from mavftpfs.cache.blockdirectory import BlockDirectory
+from mavftpfs.cache.blocks import BLOCK_SIZE, BlockCache
+from mavftpfs.cache.dentries import Dentries
+from mavftpfs.cache.keeper import CRC_LIMIT, PERIOD, Facts, Keeper
+from mavftpfs.cache.options import CacheOptions
+from mavftpfs.cache.persistent import SETTLED, BlockKey
+from mavftpfs.cache.tree import Tree
+from mavftpfs.protocol.payload import NakCode, Opcode
+from mavftpfs.shared.errors import FileChanged, FtpNak
+from mavftpfs.shared.model import DirEntry, split
+from tests.support.fake_store import FakeStore, read_file
+from tests.unit.test_files import DATA, LOG, content
+
+T = TypeVar("T")
+NOW = 1_800_000_000.0
+MTIME = 1_700_000_000
+ENOUGH = SETTLED + 2 * PERIOD + 1
+
+
+class Mounts:
+    """Mounts of one vehicle, one after the other, with one cache directory."""
+
+    def __init__(self, store: FakeStore, nursery: trio.Nursery, path: Path) -> None:
+        self.store = store
+        self.path = path
+        self.nursery = nursery
+        self.vehicle: bytes | None = b"vehicle"
+        self.crc_limit = 1 << 20
+        self.growing: set[bytes] = set()
+        self.keepers: list[Keeper] = []
+        self.disk_delay = 0.0
+
+    async def run(self, work: Callable[[], T], /) -> T:
+        """Work as a thread would, on virtual time."""
+        await trio.sleep(self.disk_delay)
+        return work()
+
+    def mount(self, **options: object) -> Tree:
+        """Return a tree that knows nothing but what lies in the directory."""
+
+        def keep(cache: BlockCache, dentries: Dentries) -> Keeper:
+            def remembered(path: bytes) -> DirEntry | None:
+                known = dentries.known(split(path)[0])
+                return None if known is None else known.entries.get(split(path)[1])
+
+            facts = Facts(
+                identity=lambda: self.vehicle,
+                remembered=remembered,
+                growing=self.growing.__contains__,
+                crc32=self.store.crc32,
+                crc_limit=lambda: self.crc_limit,
+                wall=lambda: NOW,
+            )
+            self.keepers.append(Keeper(BlockDirectory(self.path, 1 << 24), cache, facts, run=self.run))
+            self.nursery.start_soon(self.keepers[-1].run)
+            return self.keepers[-1]
+
+        self.store.calls.clear()
+        return Tree(
+            self.store,
+            CacheOptions(**options),  # type: ignore[arg-type]
+            clock=trio.current_time,
+            invalidate=self.store.invalidated.append,
+            keep=keep,
+        )
+
+    async def read_and_settle(self, path: bytes = LOG) -> None:
+        """Read a file in a mount of its own, which ends after a while."""
+        tree = self.mount()
+        assert await read_file(tree, path) == self.store.files[path].data
+        await trio.sleep(ENOUGH)
+
+    def asked(self) -> list[str]:
+        """Return what was asked of the vehicle since the last mount, listings aside."""
+        return [call for call, *_ in self.store.calls if call != "list"]
+
+
+@pytest.fixture
+async def mounts(nursery: trio.Nursery, tmp_path: Path) -> AsyncIterator[Mounts]:
+    store = FakeStore(nursery)
+    store.chunk = 16 * 1024
+    store.add(LOG, DATA, MTIME)
+    yield Mounts(store, nursery, tmp_path / "cache")
+    assert store.crimes == []
+    nursery.cancel_scope.cancel()
+
+
+async def test_a_file_read_yesterday_costs_nothing(mounts: Mounts, autojump_clock: MockClock) -> None:
+    await mounts.read_and_settle()
+    tree = mounts.mount()
+    assert await read_file(tree, LOG) == DATA
+    assert mounts.asked() == []
+    assert tree.status()["files_from_disk"] == 1
+
+
+async def test_only_the_rest_is_read(mounts: Mounts, autojump_clock: MockClock) -> None:
+    tree = mounts.mount()
+    handle = await tree.open(LOG)
+    await handle.read(0, 2 * BLOCK_SIZE)
+    handle.close()
+    await trio.sleep(ENOUGH)
+    tree = mounts.mount()
+    handle = await tree.open(LOG)
+    assert await handle.read(0, 100) == DATA[:100]
+    assert mounts.asked() == []
+    handle.close()
+    assert await read_file(tree, LOG) == DATA
+    assert mounts.store.count("open") == 1
+
+
+async def test_a_damaged_block_is_read_again(mounts: Mounts, autojump_clock: MockClock) -> None:
+    await mounts.read_and_settle()
+    for number, path in enumerate(p for p in mounts.path.rglob("*") if p.is_file()):
+        data = bytearray(path.read_bytes())
+        data[-number * 7 - 1] ^= 0x40
+        path.write_bytes(data if number % 2 else data[:-1])
+    tree = mounts.mount()
+    assert await read_file(tree, LOG) == DATA
+    assert mounts.store.count("open") == 1
+
+
+@pytest.mark.parametrize("change", ["size", "mtime", "vehicle", "unknown vehicle", "growing", "young"])
+async def test_anything_else_is_read_again(mounts: Mounts, autojump_clock: MockClock, change: str) -> None:
+    await mounts.read_and_settle()
+    new = content(len(DATA), seed=8)
+    mtime = MTIME
+    if change == "size":
+        new += b"x"
+    elif change == "mtime":
+        mtime += 1
+    elif change == "young":
+        mtime = int(NOW)
+    elif change == "growing":
+        mounts.growing.add(LOG)
+    else:
+        mounts.vehicle = b"other" if change == "vehicle" else None
+    mounts.store.add(LOG, new, mtime)
+    assert await read_file(mounts.mount(), LOG) == new
+    assert mounts.store.count("open") == 1
+
+
+@pytest.mark.parametrize(
+    "why", ["young", "growing", "vehicle unknown", "changed", "suspect", "soon", "other", "rebooted"]
+)
+async def test_what_is_not_beyond_doubt_is_not_kept(
+    mounts: Mounts, autojump_clock: MockClock, why: str
+) -> None:
+    if why == "young":
+        mounts.store.add(LOG, DATA, int(NOW) - 1)
+    if why == "growing":
+        mounts.growing.add(LOG)
+    if why == "vehicle unknown":
+        mounts.vehicle = None
+    tree = mounts.mount(dir_timeout=5)
+    handle = await tree.open(LOG)
+    for at in range(0, len(DATA), BLOCK_SIZE):
+        await handle.read(at, BLOCK_SIZE)
+    if why == "changed":
+        mounts.store.add(LOG, DATA, MTIME + 1)
+        await trio.sleep(6)
+        await tree.list(b"/logs")
+    if why == "other":
+        mounts.vehicle = b"other"
+    if why == "rebooted":
+        tree.rebooted()
+    if why == "suspect":
+        await trio.sleep(9)
+        for reader in mounts.store.readers:
+            reader.sink.on_suspect("somebody else")
+    await trio.sleep(SETTLED - 1 if why == "soon" else ENOUGH)
+    assert mounts.keepers[0].written == 0
+    handle.close()
+
+
+async def test_without_an_mtime_a_checksum_decides(mounts: Mounts, autojump_clock: MockClock) -> None:
+    mounts.store.add(LOG, DATA, None)
+    await mounts.read_and_settle()
+    tree = mounts.mount()
+    assert await read_file(tree, LOG) == DATA
+    assert mounts.asked() == ["crc"]
+    new = content(len(DATA), seed=9)
+    mounts.store.add(LOG, new, None)
+    assert await read_file(mounts.mount(), LOG) == new
+    assert mounts.store.count("open") == 1
+
+
+@pytest.mark.parametrize("why", ["not allowed", "refused", "silent", "incomplete"])
+async def test_without_an_mtime_and_a_checksum_all_is_read(
+    mounts: Mounts, autojump_clock: MockClock, why: str
+) -> None:
+    mounts.store.add(LOG, DATA, None)
+    await mounts.read_and_settle()
+    store = mounts.store
+    if why == "not allowed":
+        mounts.crc_limit = 0
+    if why == "incomplete":
+        max((p for p in mounts.path.rglob("*") if p.is_file()), key=lambda p: p.stat().st_size).unlink()
+
+    async def refuse(path: bytes, *, size: int | None = None) -> int:
+        if why == "silent":
+            await trio.sleep(10 * CRC_LIMIT)
+        raise FtpNak(Opcode.CALC_FILE_CRC32, NakCode.FAIL)
+
+    if why in ("refused", "silent"):
+        store.crc32 = refuse  # type: ignore[method-assign]
+    tree = mounts.mount()
+    began = trio.current_time()
+    assert await read_file(tree, LOG) == DATA
+    assert trio.current_time() - began < 2 * CRC_LIMIT
+    assert store.count("open") == 1
+
+
+async def test_a_silent_checksum_is_asked_for_once(mounts: Mounts, autojump_clock: MockClock) -> None:
+    for path in (LOG, b"/logs/b", b"/logs/c"):
+        mounts.store.add(path, DATA, None)
+        await mounts.read_and_settle(path)
+    asked = []
+
+    async def silent(path: bytes, *, size: int | None = None) -> int:
+        asked.append(path)
+        await trio.sleep_forever()
+        raise AssertionError
+
+    mounts.store.crc32 = silent  # type: ignore[method-assign]
+    tree = mounts.mount()
+    for path in (LOG, b"/logs/b", b"/logs/c"):
+        assert await read_file(tree, path) == DATA
+    assert asked == [LOG]
+
+
+async def test_a_full_disk_ends_the_keeping_not_the_reading(
+    mounts: Mounts, autojump_clock: MockClock, caplog: pytest.LogCaptureFixture
+) -> None:
+    tree = mounts.mount()
+
+    def full(key: BlockKey, data: bytes) -> None:
+        raise OSError(28, "No space left on device")
+
+    mounts.keepers[0]._directory.write = full  # type: ignore[method-assign]
+    for _ in range(2):
+        assert await read_file(tree, LOG) == DATA
+        await trio.sleep(ENOUGH)
+    assert [record.getMessage() for record in caplog.records if "cache_dir" in record.getMessage()] == [
+        "nothing more is kept in cache_dir: [Errno 28] No space left on device"
+    ]
+    assert tree.status()["disk_failed"] is True
+
+
+async def test_a_handle_of_a_file_that_changed_gets_nothing_from_the_disk(
+    mounts: Mounts, autojump_clock: MockClock
+) -> None:
+    await mounts.read_and_settle()
+    tree = mounts.mount(dir_timeout=5)
+    old = await tree.open(LOG)
+    await old.read(0, 100)
+    new = content(len(DATA), seed=3)
+    mounts.store.add(LOG, new, MTIME + 5)
+    await trio.sleep(6)
+    assert await read_file(tree, LOG) == new
+    with pytest.raises(FileChanged):
+        await old.read(2 * BLOCK_SIZE, 100)
+    old.close()
+
+
+async def test_a_file_that_changes_while_the_disk_is_slow(
+    mounts: Mounts, nursery: trio.Nursery, autojump_clock: MockClock
+) -> None:
+    await mounts.read_and_settle()
+    tree = mounts.mount(dir_timeout=5)
+    old = await tree.open(LOG)
+    mounts.disk_delay = 10.0
+    mounts.store.add(LOG, content(len(DATA), seed=3), MTIME + 5)
+    await trio.sleep(6)
+    nursery.start_soon(tree.open, LOG)
+    with pytest.raises(FileChanged):
+        await old.read(2 * BLOCK_SIZE, 100)
+    old.close()
+
+
+async def test_two_mounts_at_once_share_the_directory(mounts: Mounts, autojump_clock: MockClock) -> None:
+    first, second = mounts.mount(), mounts.mount()
+    async with trio.open_nursery() as both:
+        for tree in (first, second):
+            both.start_soon(read_file, tree, LOG)
+    await trio.sleep(ENOUGH)
+    assert await read_file(mounts.mount(), LOG) == DATA
+    assert mounts.asked() == []
