@@ -313,6 +313,8 @@ class Deliverer:
         assert attempt.places is not None
         if attempt.committing:
             present = await self.replacer.observe(attempt.places, node.path)
+            if present.target and not present.new:  # renamed, or tidied up by somebody who took it for litter
+                await self.verifier.check_doubted(node.path, _draft(node))
         else:
             present = Present(new=True, old=False, target=True)
         attempt.committing = True

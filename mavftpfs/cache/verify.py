@@ -52,15 +52,26 @@ class Verifier:
         Raises:
             VerificationFailed: it is another file. Else as WriteStore.stat_size.
         """
-        if self._context.options.verify == "none":
-            return
+        if self._context.options.verify != "none":
+            await self._check(path, draft, self._context.options.verify)
+
+    async def check_doubted(self, path: bytes, draft: Draft) -> None:
+        """Do the same for a file that may not be ours at all: verify=size and verify=none do not count.
+
+        Raises:
+            As check.
+        """
+        demanded = self._context.options.verify == "crc"
+        await self._check(path, draft, "crc" if demanded else "auto")
+
+    async def _check(self, path: bytes, draft: Draft, verify: str) -> None:
         size = await self.size(path)
         if size != draft.size:
             raise VerificationFailed(f"{path!r} has {size} bytes on the vehicle, {draft.size} were written")
-        if self._context.options.verify == "crc" and not draft.whole:
+        if verify == "crc" and not draft.whole:
             await self._require_changes(path, draft)
             self.by_reading += 1
-        elif await self._crc_agrees(path, draft):
+        elif await self._crc_agrees(path, draft, verify):
             self.by_crc += 1
         else:
             self.by_size += 1
@@ -78,17 +89,16 @@ class Verifier:
                 return entry.size
         return await self._context.writer.stat_size(path)
 
-    async def _crc_agrees(self, path: bytes, draft: Draft) -> bool:
+    async def _crc_agrees(self, path: bytes, draft: Draft, verify: str) -> bool:
         """Return whether the CRC32 was compared.
 
         Raises:
             VerificationFailed: it differs, or was not answered though verify=crc.
         """
-        options = self._context.options
-        demanded = options.verify == "crc"
-        if options.verify == "size" or not draft.whole or draft.size == 0:
+        demanded = verify == "crc"
+        if verify == "size" or not draft.whole or draft.size == 0:
             return False
-        if draft.size > options.verify_max and not demanded:
+        if draft.size > self._context.options.verify_max and not demanded:
             return False
         try:
             remote = await self._context.store.crc32(path, size=draft.size)

@@ -131,6 +131,30 @@ async def test_a_refused_finish_is_undone_in_flight(store: FakeWriter, tree: Tre
     assert store.files[FILE].data == OLD
 
 
+async def test_a_finish_that_is_refused_and_cannot_be_undone(
+    autojump_clock: object, store: FakeWriter, tree: Tree
+) -> None:
+    await tree.list(b"/card/dir")
+    left = 2
+
+    def refuse_and_vanish(*request: object) -> None:
+        nonlocal left
+        left -= request[0] == "rename"
+        if left == 0:
+            lose(store, tree)
+            store.before_request = None
+            raise FtpNak(Opcode.RENAME, NakCode.FAIL_ERRNO, 5)
+
+    store.before_request = refuse_and_vanish
+    with pytest.raises(FtpNak):
+        await tree.rename(OTHER, FILE)
+    assert FILE not in store.files
+    assert (await tree.stat(FILE)).size == len(OLD)
+    come_back(store, tree)
+    await trio.sleep(0.1)
+    assert store.files[FILE].data == OLD
+
+
 @pytest.mark.parametrize("armed", [False, True])
 async def test_a_gap_that_a_lost_link_left_is_closed_though_armed(
     autojump_clock: object, store: FakeWriter, tree: Tree, armed: bool
@@ -236,16 +260,21 @@ async def test_a_torn_name_that_nobody_asks_for_is_mended_without_news(
     assert store.count("list") == listings
 
 
-async def test_removing_a_torn_file_removes_it(store: FakeWriter, tree: Tree) -> None:
+@pytest.mark.parametrize("long", [False, True])
+async def test_removing_a_torn_file_removes_it(store: FakeWriter, tree: Tree, long: bool) -> None:
+    """long: what is left of it lies in a directory above, under names that do not tell."""
+    path = deep(125, b"f") if long else FILE
+    store.add(path, OLD)
     Trap(store, tree, 2, "lost")
     with pytest.raises(VehicleLost):
-        await write_file(tree, FILE, NEW)
+        await write_file(tree, path, NEW)
     store.lost = False
     tree._directories.lost = False
-    await tree.unlink(FILE)
-    tree.forget_caches()
-    assert [name for name, _ in await tree.list(b"/card/dir")] == [b"other"]
+    await tree.unlink(path)
     assert litter(store) == []
+    await listed(store, tree)
+    assert path not in store.files
+    assert not [name for name in store.files if b"recovered" in name]
 
 
 async def test_a_draft_written_on_after_the_gap_does_not_keep_it_open(
