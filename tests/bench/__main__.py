@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -24,6 +25,12 @@ from tempfile import TemporaryDirectory
 from tests.bench.record import Record
 
 MEASURED = ("goodput", "requests", "cost", "mount")
+TIMED = ("cost", "mount")
+"""Parts that use the machine's clock."""
+
+BUSY = 0.5
+"""Load for each CPU above which the user is warned."""
+
 INTERRUPTED = 130
 PARTS = (*MEASURED, "plots", "all")
 
@@ -45,6 +52,9 @@ def split(argv: Sequence[str]) -> tuple[str, list[str]]:
 
 def run_part(part: str, quick: bool, record: Record | None, date: str, rest: Sequence[str]) -> int:
     """Measure one part in a process of its own, note its section, and return its exit code."""
+    load = os.getloadavg()[0]
+    if part in TIMED and load > BUSY * (os.cpu_count() or 1):
+        print(f"scripts/bench: load {load:.1f} before we began: rates will be too low", file=sys.stderr)
     options = [*(QUICK.get(part, ()) if quick else ()), *rest]
     with TemporaryDirectory(prefix="mavftpfs-bench-") as folder:
         found = Path(folder) / "section.json"
@@ -55,7 +65,7 @@ def run_part(part: str, quick: bool, record: Record | None, date: str, rest: Seq
         if record is not None and found.exists():
             content = json.loads(found.read_text())
             command = " ".join(["scripts/bench", part, *(["--quick"] if quick else []), *rest])
-            record.put(part, command, content, date)
+            record.put(part, command, content, date, load)
     return code
 
 

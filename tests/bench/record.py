@@ -38,13 +38,17 @@ class Record:
         sections: dict[str, dict[str, Any]] = content["sections"]
         return sections
 
-    def put(self, name: str, command: str, results: Any, date: str) -> None:
-        """Write a section: what the command found, with versions and the date as the user gave it."""
+    def put(self, name: str, command: str, results: Any, date: str, load: float) -> None:
+        """Write a section: what the command found, with versions and the date as the user gave it.
+
+        load: the machine's load when it began; beyond a part of `cpus` seconds are worth little.
+        """
         sections = self.sections()
         sections[name] = {
             "command": command,
             "cpus": os.cpu_count(),
             "date": date,
+            "load": round(load, 1),
             "results": results,
             "versions": versions(),
         }

@@ -12,10 +12,12 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
+from tests.bench import __main__ as entry
 from tests.bench.cases import Direction
 from tests.bench.figures import BARE, US, Outcome, Run, summarise
 from tests.bench.mount import Bench, Cell, run_one
-from tests.bench.peers import Client, Environment, Job, MountClient, NotToBeHadError, Worker, clients
+from tests.bench.peers import PINS, Client, Environment, Job, MountClient, NotToBeHadError, Worker, clients
+from tests.bench.record import Record
 
 SIZE = 60_000
 EVERYBODY = clients(Environment(pins=()))
@@ -126,3 +128,17 @@ def test_the_environment_is_of_the_user_and_of_these_versions(
     assert one.path.is_relative_to(tmp_path / "mavftpfs")
     assert one.path != other.path
     assert Environment(["a==1"]).path == one.path
+
+
+def test_a_busy_machine_is_said_and_noted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("os.getloadavg", lambda: (50.0, 0.0, 0.0))
+    path = tmp_path / "results.json"
+    argv = ["mount", "--servers", "px4", "--links", "unshaped", "--directions", "read", "--clients", BARE]
+    assert entry.main([*argv, "--size", "20000", "--repetitions", "1", "--json", str(path)]) == 0
+    assert "load 50.0" in capsys.readouterr().err
+    section = Record(path).sections()["mount"]
+    assert section["load"] == 50.0
+    assert [row["outcome"] for row in section["results"]["rows"]] == ["ok"]
+    assert section["results"]["peers"] == list(PINS)

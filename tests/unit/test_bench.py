@@ -99,13 +99,14 @@ def test_a_row_survives_the_file() -> None:
 def test_a_section_replaces_only_itself(tmp_path: Path) -> None:
     record = Record(tmp_path / "new" / "results.json")
     assert record.sections() == {}
-    record.put("goodput", "scripts/bench goodput", [1], "2026-01-02")
-    record.put("mount", "scripts/bench mount", {"rows": []}, "")
-    record.put("goodput", "scripts/bench goodput --quick", [2], "2026-01-03")
+    record.put("goodput", "scripts/bench goodput", [1], "2026-01-02", 0.1)
+    record.put("mount", "scripts/bench mount", {"rows": []}, "", 0.25)
+    record.put("goodput", "scripts/bench goodput --quick", [2], "2026-01-03", 0.1)
     found = record.sections()
     assert found["mount"]["results"] == {"rows": []}
     assert found["goodput"]["results"] == [2]
     assert found["goodput"]["date"] == "2026-01-03"
+    assert found["mount"]["load"] == 0.2
     assert found["goodput"]["versions"].keys() >= {"python", "mavftpfs", "pymavlink"}
 
 
@@ -113,7 +114,7 @@ def test_another_kind_of_file_is_left_alone(tmp_path: Path) -> None:
     path = tmp_path / "mine.json"
     path.write_text('{"precious": 1}')
     with pytest.raises(ValueError, match="not written by this bench"):
-        Record(path).put("mount", "", {}, "")
+        Record(path).put("mount", "", {}, "", 0.0)
     assert path.read_text() == '{"precious": 1}'
 
 
