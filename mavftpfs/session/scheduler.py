@@ -72,6 +72,7 @@ class Scheduler:
         self.opener = SessionOpener(driver, engine, vehicle, self.gate, clock)
         self.write_traits = WriteTraits()
         self.op_deadline = op_deadline
+        self.stats = engine.stats
         self._holder = SessionHolder(self.opener)
         self._driver = driver
         self._vehicle = vehicle

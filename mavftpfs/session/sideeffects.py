@@ -2,6 +2,8 @@
 
 A request whose reply may have been lost can be executed twice, and the second answer is then a refusal
 (servers.md 14.4). Such a refusal, and a silence, are never interpreted: a listing tells what became of it.
+The network can do the same to a request that we sent once, by doubling it and losing the first answer: where
+answers were seen that nobody waited for, a refusal as missing is looked into as well.
 """
 
 from __future__ import annotations
@@ -25,6 +27,10 @@ VERIFY_LIMIT = 10.0
 """Seconds to spend on finding out what became of a request that was not answered."""
 
 _DOT = b"."
+
+_TAKES_AWAY = frozenset((Opcode.REMOVE_FILE, Opcode.REMOVE_DIRECTORY, Opcode.RENAME))
+_MISSING = frozenset((NakCode.FAIL, NakCode.FAIL_ERRNO, NakCode.FILE_NOT_FOUND))
+"""What servers say of a name that is not there (any more); the errno may be a stale one (servers.md 12)."""
 
 
 def fits_rename(old: bytes, new: bytes) -> bool:
@@ -127,10 +133,11 @@ class SideEffects:
             try:
                 await self._scheduler.metadata(operation)
             except FtpNak as nak:
+                twice = last or nak.retransmitted or self._may_be_doubled(nak)
                 # PX4 says 8 to everything after one "file exists", until a listing comes to its end.
-                if not nak.retransmitted and nak.code != NakCode.FILE_EXISTS:
+                if not twice and nak.code != NakCode.FILE_EXISTS:
                     raise
-                if await self._settle(nak, verify, last=last):
+                if await self._settle(nak, verify, twice=twice, last=last):
                     return
             except RequestTimeout as silence:
                 if await self._after_silence(verify) is not Outcome.DONE:
@@ -139,10 +146,18 @@ class SideEffects:
             else:
                 return
 
-    async def _settle(self, nak: FtpNak, verify: Verdict, *, last: bool) -> bool:
-        """Return True if the request was carried out after all, False to try it once more; else raise."""
+    def _may_be_doubled(self, nak: FtpNak) -> bool:
+        """Whether a refusal may answer the second execution of a request that was sent once."""
+        doubles = self._scheduler.stats.unknown + self._scheduler.stats.spurious > 0
+        return doubles and nak.opcode in _TAKES_AWAY and nak.code in _MISSING
+
+    async def _settle(self, nak: FtpNak, verify: Verdict, *, twice: bool, last: bool) -> bool:
+        """Return True if the request was carried out after all, False to try it once more; else raise.
+
+        twice: it may have been executed more than once.
+        """
         outcome = await self._verdict(nak, verify)
-        if outcome is Outcome.DONE and nak.retransmitted:
+        if outcome is Outcome.DONE and twice:
             return True
         if outcome is Outcome.UNDONE and not last:
             return False

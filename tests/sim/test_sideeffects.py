@@ -353,3 +353,41 @@ async def test_what_may_still_be_open_is_closed_first_too(profile: str, autojump
         faults.at(Opcode.REMOVE_FILE, lambda: open_then.append(here.vehicle.server.open_paths))
         await connection.store.remove(path(profile, "new"))
         assert open_then == [[]]
+
+
+DOUBLING = LinkSettings(delay=0.01, duplicate=1.0)
+
+
+@pytest.mark.parametrize("act", ["remove", "remove_directory", "rename"])
+@pytest.mark.parametrize("profile", EVERY_PROFILE)
+async def test_a_request_doubled_by_the_network_whose_first_answer_is_lost(
+    profile: str, act: str, autojump: MockClock
+) -> None:
+    """MAVSDK executes both, and all that comes back is the refusal of the second one."""
+    if profile == "littlefs" and act == "rename":
+        return  # it has none
+    here = world(profile, DOUBLING, file=b"content")
+    here.tree.add_directory(path(profile, "empty"))
+    faults = Faults(here)
+    async with here.connection() as connection:
+        store = connection.store
+        await store.stat_size(path(profile, "file"))  # answered twice, which shows what this link does
+        opcode = {"remove": Opcode.REMOVE_FILE, "rename": Opcode.RENAME}.get(act, Opcode.REMOVE_DIRECTORY)
+        faults.lose_reply_to(opcode)
+        if act == "remove":
+            await store.remove(path(profile, "file"))
+        elif act == "rename":
+            await store.rename(path(profile, "file"), path(profile, "renamed"))
+        else:
+            await store.remove_directory(path(profile, "empty"))
+    expected = {"remove": [b"empty"], "rename": [b"empty", b"renamed"]}.get(act, [b"file"])
+    assert names(here) == expected
+
+
+async def test_a_refusal_on_a_link_that_doubles_nothing_costs_no_listing(autojump: MockClock) -> None:
+    here = world("mavsdk", file=b"content")
+    faults = Faults(here)
+    async with here.connection() as connection:
+        with pytest.raises(FtpNak):
+            await connection.store.remove(path("mavsdk", "missing"))
+    assert not {Opcode.LIST_DIRECTORY, Opcode.LIST_DIRECTORY_WITH_TIME} & set(faults.requests)
