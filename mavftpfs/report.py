@@ -28,6 +28,9 @@ _WORDS = {
     "lists_times": "listings carry times",
     "other_ftp_client": "another FTP client heard",
     "pid": "process",
+    "window": "requests in flight",
+    "window_rate": "rate by requests",
+    "burst_rate": "rate by bursts",
 }
 _SECONDS = {"rtt", "heartbeat_age", "uptime", "eta"}
 
@@ -130,6 +133,10 @@ def describe(key: str, value: Any) -> str:
         return f"{value * 1000:.0f} ms" if value < 1 else f"{value:.1f} s"
     if isinstance(value, int) and "bytes" in key:
         return readable_size(value)
+    if key.endswith("rate") and isinstance(value, int | float):
+        return f"{readable_size(value)}/s"
+    if key == "loss":
+        return f"{value * 100:.1f} %"
     if key == "transfers" and value:
         return "; ".join(map(_transfer, value))
     if isinstance(value, list | tuple):

@@ -77,6 +77,7 @@ class Connection:
     link: Link
     options: ConnectOptions
     clock: Callable[[], float]
+    steering: ReadSteering
     was_lost: bool = False
     news: list[Callable[[str], None]] = field(default_factory=list)
     _first_heartbeat: trio.Event = field(default_factory=trio.Event)
@@ -112,6 +113,7 @@ class Connection:
             "reboots": vehicle.reboots,
             "other_ftp_client": vehicle.foreign_client(now),
             "rtt": self.engine.rtt,
+            "speed": self.steering.status(),
             "session_open": None
             if self.scheduler.session is None
             else self.scheduler.session.path.decode("utf-8", "replace"),
@@ -251,7 +253,7 @@ def _build(
         when_armed_ok=options.when_armed == "ok",
     )
     store = Store(scheduler, vehicle, clock=clock, op_deadline=options.op_deadline)
-    connection = Connection(store, vehicle, scheduler, engine, driver, link, options, clock)
+    connection = Connection(store, vehicle, scheduler, engine, driver, link, options, clock, steering)
     driver.on_batch = scheduler.on_batch
 
     def on_reboot() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from mavftpfs.protocol.engine import Engine
 from mavftpfs.protocol.payload import MAX_DATA
 from mavftpfs.protocol.transfers import ReadTransfer
-from mavftpfs.session.policy import ReadFacts, ReadMode, choose_strategy
+from mavftpfs.session.policy import ReadFacts, ReadMode, Strategy, choose_strategy
 
 
 class ReadSteering:
@@ -20,6 +20,18 @@ class ReadSteering:
         self._engine = engine
         self._window_rate: float | None = None
         self._burst_rate: float | None = None
+        self._chosen: Strategy | None = None
+
+    def status(self) -> dict[str, object]:
+        """Return what was chosen last and why; rates in bytes per second, None for what was not measured."""
+        return {
+            "reading_by": self._chosen,
+            "window": self._engine.flow.window,
+            "chunk": self.chunk,
+            "loss": round(self._engine.loss, 4),
+            "window_rate": self._window_rate,
+            "burst_rate": self._burst_rate,
+        }
 
     def steer(self, transfer: ReadTransfer, wanted: int, *, others_waiting: bool) -> None:
         """Let a running transfer go on by what is the better strategy now."""
@@ -36,7 +48,7 @@ class ReadSteering:
             burst_stoppable=traits.answers_during_burst,
             others_waiting=others_waiting,
         )
-        strategy = choose_strategy(facts)
+        strategy = self._chosen = choose_strategy(facts)
         if strategy != transfer.strategy:
             transfer.set_strategy(strategy)
 
@@ -48,3 +60,4 @@ class ReadSteering:
     def forget(self) -> None:
         """The server may be another one now."""
         self._window_rate = self._burst_rate = None
+        self._chosen = None

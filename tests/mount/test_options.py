@@ -162,7 +162,12 @@ def test_status_tells_about_vehicle_and_link(field: Field, small_tree: Path) -> 
     text = json.dumps(status)
     assert vehicle.source in text
     assert "retransmissions" in text
-    assert vehicle.source in mavftpfs("status", mount.path)
+    speed = status["connection"]["speed"]
+    assert (speed["reading_by"], speed["chunk"], speed["loss"]) == ("window", 239, 0.0)
+    assert speed["window"] >= 1
+    shown = mavftpfs("status", mount.path)
+    assert vehicle.source in shown
+    assert "reading by" in shown
     code = "import os, sys; print(os.getxattr(sys.argv[1], 'user.mavftpfs.status').decode())"
     assert vehicle.source in mount.python(code, mount.path)
 

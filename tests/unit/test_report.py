@@ -19,6 +19,9 @@ from mavftpfs.report import describe, printable, readable_size
         ("transfers", [], "none"),
         ("anything", {}, "none"),
         ("names", ["a", "b"], "a, b"),
+        ("window_rate", 5120.4, "5.0 KiB/s"),
+        ("rate", None, "unknown"),
+        ("loss", 0.052, "5.2 %"),
     ],
 )
 def test_describe(key: str, value: object, text: str) -> None:
