@@ -80,6 +80,7 @@ class ReadTransfer(Operation):
         self._demand = ExtentSet()
         self._ahead = ExtentSet()
         self._gaps = ExtentSet()
+        self._filling = False
         self._unanswered: dict[Request, None] = {}
         self._burst: Burst | None = None
         self._keep_alive_at = inf
@@ -162,28 +163,31 @@ class ReadTransfer(Operation):
         """Return the next ReadFile, the BurstReadFile that is due, or a keep-alive during a burst."""
         if self._burst is not None:
             return self._next_keep_alive(now)
-        gap = self._gaps.take_first(self.chunk)
-        if gap is not None:
-            self._forget_want(*gap)
-            return self._ask(*gap, now)
-        if self.strategy == "burst":
-            return self._next_burst()
-        return self._next_read(now)
-
-    def _next_read(self, now: float) -> Request | None:
-        piece = self._demand.take_first(self.chunk) or self._ahead.take_first(self.chunk)
-        return None if piece is None else self._ask(piece[0], piece[1], now)
-
-    def _forget_want(self, start: int, stop: int) -> None:
-        self._demand.discard(start, stop)
-        self._ahead.discard(start, stop)
-
-    def _ask(self, start: int, stop: int, now: float) -> Request:
+        piece = self._next_gap() if self._filling else None
+        if piece is None:
+            if self.strategy == "burst":
+                return self._next_burst()
+            piece = self._demand.take_first(self.chunk) or self._ahead.take_first(self.chunk)
+            if piece is None:
+                return None
+        start, stop = piece
         request = Request(self, _READ, READ_MANNER, self.session, start, stop - start)
         if not self._unanswered:
             self._window_mark = now
         self._unanswered[request] = None
         return request
+
+    def _next_gap(self) -> tuple[int, int] | None:
+        gap = self._gaps.take_first(self.chunk)
+        if gap is None:
+            self._filling = False
+        else:
+            self._forget_want(*gap)
+        return gap
+
+    def _forget_want(self, start: int, stop: int) -> None:
+        self._demand.discard(start, stop)
+        self._ahead.discard(start, stop)
 
     def _next_burst(self) -> Request | None:
         # ReadFile during a burst moves MAVSDK's shared stream position: never both at once.
@@ -314,6 +318,7 @@ class ReadTransfer(Operation):
         self._burst = None
         self._keep_alive_at = self.timer = inf
         self._gaps = ExtentSet(self.wants.intersection(0, burst.highest))
+        self._filling = True
         if burst.packets:
             self._barren_bursts = 0
             self._burst_bytes += burst.received
