@@ -149,5 +149,3 @@ class Nodes:
             del self._by_path[node.path]
             node.path = new + node.path[len(old) :]
             self._by_path[node.path] = node
-            if node.content is not None:
-                node.content.restate()

@@ -17,18 +17,16 @@ _LONGEST_HOLD = 8.0
 class Feed:
     """Hands a source's chunks on and remembers what was proven of them; chunk: most bytes of one.
 
-    A source that fails (the local disk that has its bytes) says so only to whoever waits for the upload,
-    never to the engine, which serves everybody.
+    To the engine, which serves everybody, a source that fails (the local disk that has its bytes) has nothing
+    for now; whoever waits for the upload is told why, because `has_more` is asked before it is complete.
 
     Attributes:
-        failure: why the source gave nothing when the engine asked.
         proven: a Terminate was ACKed, so that the remote file holds at least what was ACKed before it.
         unproven: bytes ACKed since then. reached: end of the highest ACKed byte of this file; once the
             session was lost, of the highest proven one.
     """
 
     def __init__(self, source: UploadSource, chunk: int) -> None:
-        self.failure: MavftpfsError | None = None
         self.proven = False
         self.unproven = 0
         self.reached = 0
@@ -56,15 +54,8 @@ class Feed:
             return held
         try:
             return self._source.next_chunk(limit)
-        except MavftpfsError as error:
-            self.failure = error
+        except MavftpfsError:
             return None
-
-    def require_source(self) -> None:
-        """Raise why the source gave nothing, once: it may do better next time."""
-        failure, self.failure = self.failure, None
-        if failure is not None:
-            raise failure
 
     def on_acked(self, offset: int, count: int) -> None:
         """See protocol.writing.ChunkSource."""

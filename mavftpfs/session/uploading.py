@@ -214,7 +214,6 @@ class Uploading:
         if not ours:
             raise SessionLost("the vehicle had closed the session before", by_server=True)
         feed.check_point()
-        feed.require_source()
         if stop is Stop.ARMED:
             upload.fail(Armed("the vehicle was armed"), self._clock())
         elif stop in (Stop.FINISHED, Stop.STARVED):

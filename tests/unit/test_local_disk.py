@@ -68,6 +68,20 @@ async def test_a_disk_that_fails_is_the_error_of_one_file(
     assert store.files[FILE].data == BIG
 
 
+async def test_a_cut_that_fails_changes_nothing(store: FakeWriter, monkeypatch: pytest.MonkeyPatch) -> None:
+    tree = make_writable(store, dirty_max=65536)
+    file = await begin(tree, store)
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "ftruncate", failing)
+        with pytest.raises(MavftpfsError) as told:
+            await file.truncate(10)
+        assert errno_for(told.value) == errno.EIO
+    assert file.size == len(BIG)
+    store.lost = False
+    await file.release()
+    assert store.files[FILE].data == BIG
+
+
 async def test_a_full_disk_is_told_to_the_writer_and_costs_nothing_accepted(
     store: FakeWriter, monkeypatch: pytest.MonkeyPatch
 ) -> None:
