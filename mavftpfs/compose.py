@@ -226,6 +226,7 @@ def connect_options(options: MountOptions) -> ConnectOptions:
         chunk=options.chunk,
         window=options.window,
         when_armed=cast(Literal["ro", "ok"], options.when_armed),
+        bwlimit=options.bwlimit,
     )
 
 

@@ -15,6 +15,7 @@ import random
 from collections import deque
 from collections.abc import Callable
 from math import inf
+from operator import attrgetter
 
 from mavftpfs.protocol.burstwatch import BurstWatch
 from mavftpfs.protocol.flow import Flow
@@ -261,7 +262,7 @@ class Engine:
         wires: list[bytes] = []
         self.flow.begin()
         if len(self._ops) > 1:
-            self._ops.sort(key=_priority)
+            self._ops.sort(key=attrgetter("priority"))
         starved = True
         for op in self._ops:
             starved = self._serve(op, now, wires)
@@ -269,6 +270,9 @@ class Engine:
                 break
         if starved:
             self.flow.on_starved()
+        if self.flow.held:
+            for op in self._ops:
+                op.progress_at = max(op.progress_at, now)
         self._retire()
         return wires
 
@@ -282,7 +286,7 @@ class Engine:
         ledger = self._ledger
         # Metadata may use one slot more than bulk work: a full window must not make it wait.
         in_flight = ledger.in_flight - (op.priority is Priority.METADATA)
-        room = self.flow.room(in_flight, now, paced=op.paced)
+        room = self.flow.room(in_flight, now, paced=op.paced, urgent=op.priority is Priority.METADATA)
         while room > 0:
             request = ledger.take_again(op) if ledger.again else None
             if request is None:
@@ -336,7 +340,7 @@ class Engine:
 
     def next_deadline(self) -> float | None:
         """Return when `on_deadline` wants to be called, or None if nothing is pending."""
-        deadline = min(self._due, self.flow.next_room_at()) if self._ledger.in_flight else inf
+        deadline = min(self._due if self._ledger.in_flight else inf, self.flow.next_room_at())
         for op in self._ops:
             deadline = min(deadline, op.timer, op.progress_at + self._patience(op))
         return None if deadline == inf else deadline
@@ -392,7 +396,3 @@ class Engine:
         if not op.done:
             self.stats.timeouts += 1
             op.fail(RequestTimeout(f"no answer within {self._patience(op):g} s"))
-
-
-def _priority(op: Operation) -> Priority:
-    return op.priority

@@ -19,6 +19,7 @@ from __future__ import annotations
 from collections import deque
 from math import inf
 
+from mavftpfs.protocol.budget import Budget
 from mavftpfs.protocol.easing import Easing
 from mavftpfs.protocol.pacing import Pacer
 from mavftpfs.protocol.stalls import Stalls
@@ -46,7 +47,7 @@ _TELLING_ROUND = 16
 
 class Flow:
     """The in-flight window, in requests. serial: small receive buffers are likely, so start at 1 and
-    grow by one. limit: the most that may ever be in flight, None for the default."""
+    grow by one. limit: the most that may ever be in flight, None for the default. budget: the user's."""
 
     __slots__ = (
         "_all",
@@ -74,11 +75,15 @@ class Flow:
         "_trains",
         "_wide_least",
         "_wide_window",
+        "budget",
         "loss",
         "window",
     )
 
-    def __init__(self, *, serial: bool = False, limit: int | None = None) -> None:
+    def __init__(
+        self, *, serial: bool = False, limit: int | None = None, budget: Budget | None = None
+    ) -> None:
+        self.budget = budget
         self._serial = serial
         self._limit = max(1, limit or (SERIAL_CAP if serial else DEFAULT_CAP))
         self._cap = self._limit
@@ -125,9 +130,27 @@ class Flow:
     def begin(self) -> None:
         """It is looked at anew who has something to send: `room` follows for each."""
         self._trains.begin()
+        if self._pacer is not None:
+            self._pacer.blocked = False
+        if self.budget is not None:
+            self.budget.begin()
 
-    def room(self, in_flight: int, now: float, *, paced: bool) -> int:
+    def room(self, in_flight: int, now: float, *, paced: bool, urgent: bool = False) -> int:
         """Return how many requests may go out now. paced: also beyond what the server queues, if evenly."""
+        room = self._room(in_flight, now, paced)
+        if self.budget is None or room <= 0:
+            return room
+        allowed = self.budget.room(now, urgent=urgent)
+        if allowed < room:
+            self._app_limited = True
+        return min(allowed, room)
+
+    @property
+    def held(self) -> bool:
+        """Whether somebody was only held back by the user's budget, so that waiting is no silence."""
+        return self.budget is not None and self.budget.held
+
+    def _room(self, in_flight: int, now: float, paced: bool) -> int:
         room = self.window - in_flight + (self._reserve() if paced else 0)
         if self._pacer is None:
             return min(room, self._trains.room(now)) if room > 0 else room
@@ -146,10 +169,14 @@ class Flow:
 
     def next_room_at(self) -> float:
         """Return when there will be room without an answer; inf if that does not depend on time."""
+        if self.budget is not None and self.budget.next_room_at() < inf:
+            return self.budget.next_room_at()  # before that, nothing goes out in any case
         return self._trains.next_room_at() if self._pacer is None else self._pacer.next_at()
 
     def on_sent(self, now: float) -> None:
         """A request goes out."""
+        if self.budget is not None:
+            self.budget.on_sent()
         self._trains.on_sent()
         if self._pacer is not None:
             self._pacer.on_sent(now)

@@ -19,6 +19,7 @@ from mavftpfs.link.messages import (
     MAV_TYPE_ONBOARD_CONTROLLER,
     Address,
 )
+from mavftpfs.protocol.budget import FRAME_OVERHEAD, SIGNATURE, Budget
 from mavftpfs.protocol.engine import Engine
 from mavftpfs.protocol.flow import Flow
 from mavftpfs.session.driver import Driver, PayloadTrace
@@ -50,7 +51,11 @@ _OLD_WAY_FROM = 2
 
 @dataclass(frozen=True, slots=True)
 class ConnectOptions:
-    """How to talk to the vehicle. 0 = find out; seconds for times."""
+    """How to talk to the vehicle. 0 = find out; seconds for times.
+
+    bwlimit: bytes per second that we may cause on the link (see protocol.budget). With it nothing is read by
+    bursts, whose pace is the server's.
+    """
 
     target_system: int = 0
     target_component: int = 0
@@ -63,6 +68,7 @@ class ConnectOptions:
     chunk: int | None = None
     window: int | None = None
     when_armed: Literal["ro", "ok"] = "ro"
+    bwlimit: int | None = None
 
 
 @dataclass(slots=True)
@@ -240,9 +246,13 @@ def _build(
     own = Address(options.source_system, options.source_component)
     framer = Framer(own, stream=link.is_stream, signing_key=options.signing_key, signing_clock=signing_now)
     vehicle = Vehicle(options.target_system, options.target_component, own)
-    engine = Engine(rng, Flow(serial=link.is_serial, limit=options.window), op_deadline=options.op_deadline)
+    signature = 0 if options.signing_key is None else SIGNATURE
+    budget = None if options.bwlimit is None else Budget(options.bwlimit, FRAME_OVERHEAD + signature)
+    flow = Flow(serial=link.is_serial, limit=options.window, budget=budget)
+    engine = Engine(rng, flow, op_deadline=options.op_deadline)
     driver = Driver(link, framer, engine, vehicle, clock=clock, trace=trace)
-    steering = ReadSteering(engine, options.read_mode, options.chunk)
+    mode = options.read_mode if budget is None else "window"
+    steering = ReadSteering(engine, mode, options.chunk)
     scheduler = Scheduler(
         driver,
         engine,

@@ -69,6 +69,7 @@ class Driver:
         self._pins = link if isinstance(link, PinsPeer) else None
         self._scope: trio.CancelScope | None = None
         self._waiting: dict[Operation, Callable[[], None]] = {}
+        self._budget = engine.flow.budget
 
     async def pump(self) -> None:
         """Run until cancelled or the link is closed for good (LinkClosed)."""
@@ -122,6 +123,8 @@ class Driver:
 
     def send(self, frame: bytes) -> None:
         """Send one ready frame that is not FTP (a heartbeat, a command)."""
+        if self._budget is not None:
+            self._budget.spend(len(frame), self._clock())
         self.link.send_nowait([frame])
 
     def _take(self, chunks: list[bytes], now: float) -> None:
@@ -141,7 +144,10 @@ class Driver:
         for message in messages:
             if type(message) is not FtpFrame or not vehicle.is_reply_to_us(message):
                 self._on_other(message, now, index)
-            elif self._trace is not None:
+                continue
+            if self._budget is not None:
+                self._budget.on_reply(message.payload, now)
+            if self._trace is not None:
                 self._on_traced_reply(message.payload, now, self._trace)
             else:
                 try:
@@ -191,6 +197,9 @@ class Driver:
     def _send(self, target: Address, payloads: list[bytes], now: float) -> None:
         if not payloads:
             return
+        if self._budget is not None:
+            for wire in payloads:
+                self._budget.on_request(wire, now)
         if self._trace is not None:
             for wire in payloads:
                 self._trace.payload(now, "request", wire, self._remarks.on_request(wire))

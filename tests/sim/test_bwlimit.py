@@ -1,0 +1,163 @@
+"""bwlimit=: what we cause on a link that could carry more, on virtual time."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Awaitable, Callable
+
+import pytest
+import trio
+from trio.testing import MockClock
+
+from mavftpfs.compose import connect_options
+from mavftpfs.fuse.options import parse_options
+from mavftpfs.link.fastframe import FTP_MESSAGE_ID
+from mavftpfs.protocol.payload import Opcode
+from mavftpfs.session.connection import Connection, ConnectOptions
+from mavftpfs.sim.linkmodel import LinkSettings
+from tests.support.sources import MemorySource
+from tests.support.worlds import ROOTS, World, read_file
+
+PROFILES = ["px4", "px4-nuttx", "ardupilot", "mavsdk"]
+LIMIT = 20_000
+FRAME = 266
+WIDE = LinkSettings(rate=100_000.0, delay=0.03)
+DATA = random.Random(4).randbytes(150_000)
+
+
+@pytest.fixture
+def autojump() -> MockClock:
+    return MockClock(autojump_threshold=0)
+
+
+class Meter:
+    """Sees all frames: what we sent, and replies of FTP. Times in seconds, sizes in bytes."""
+
+    def __init__(self, connection: Connection) -> None:
+        self.frames: list[tuple[float, int]] = []
+        self._own = connection.options.source_system
+        connection.driver.framer.on_frame = self._on_frame
+
+    def _on_frame(self, frame: bytes) -> None:
+        if frame[5] == self._own or int.from_bytes(frame[7:10], "little") == FTP_MESSAGE_ID:
+            self.frames.append((trio.current_time(), len(frame)))
+
+    def most_within(self, seconds: float) -> int:
+        """Return the most bytes that any stretch of so many seconds had."""
+        most = first = total = 0
+        for at, size in self.frames:
+            total += size
+            while self.frames[first][0] <= at - seconds:
+                total -= self.frames[first][1]
+                first += 1
+            most = max(most, total)
+        return most
+
+    @property
+    def rate(self) -> float:
+        """Return the average over all, in bytes per second."""
+        return sum(size for _, size in self.frames) / (self.frames[-1][0] - self.frames[0][0])
+
+
+def world(profile: str, settings: LinkSettings = WIDE) -> World:
+    here = World(profile, settings)
+    here.tree.add(ROOTS.get(profile, b"") + b"/d/f", DATA)
+    return here
+
+
+async def read(connection: Connection, here: World) -> None:
+    assert await read_file(connection, ROOTS.get(here.profile, b"") + b"/d/f") == DATA
+
+
+async def write(connection: Connection, here: World) -> None:
+    path = ROOTS.get(here.profile, b"") + b"/d/g"
+    source = MemorySource(DATA)
+    upload = await connection.store.open_upload(path, source, create=True)
+    await upload.finish()
+    await upload.abort()
+    assert here.tree.data(path) == DATA
+
+
+def check(meter: Meter, limit: float = LIMIT, *, late: float = 0.0) -> None:
+    """Hold the limit over any one and any two seconds, and use it; late: seconds by which a server may hold
+    replies back, so that they come at once."""
+    for seconds in (1.0, 2.0):
+        assert meter.most_within(seconds) <= (1.01 * seconds + late) * limit + FRAME
+    assert meter.rate >= 0.95 * limit
+
+
+@pytest.mark.parametrize("transfer", [read, write])
+@pytest.mark.parametrize("profile", PROFILES)
+async def test_bulk_keeps_the_limit_and_uses_it(
+    profile: str, transfer: Callable[[Connection, World], Awaitable[None]], autojump: MockClock
+) -> None:
+    here = world(profile)
+    limit = LIMIT // 2 if profile == "ardupilot" else LIMIT  # its short queue allows no more
+    async with here.connection(ConnectOptions(bwlimit=limit)) as connection:
+        meter = Meter(connection)
+        await transfer(connection, here)
+        check(meter, limit, late=here.vehicle.server.profile.stall_chance and 0.3)
+
+
+async def test_losses_are_paid_for_too(autojump: MockClock) -> None:
+    here = world("px4", LinkSettings(rate=100_000.0, delay=0.03, loss=0.1, jitter=0.02))
+    async with here.connection(ConnectOptions(bwlimit=LIMIT)) as connection:
+        meter = Meter(connection)
+        await write(connection, here)
+        for seconds in (1.0, 2.0):
+            assert meter.most_within(seconds) <= 1.01 * seconds * LIMIT + FRAME
+        assert connection.engine.stats.retransmissions > 50
+
+
+async def test_a_listing_goes_ahead_of_a_copy(autojump: MockClock) -> None:
+    here = world("px4")
+    async with here.connection(ConnectOptions(bwlimit=LIMIT)) as connection:
+        meter = Meter(connection)
+        async with trio.open_nursery() as nursery:
+            nursery.start_soon(read, connection, here)
+            await trio.sleep(2.0)
+            for _ in range(3):
+                began = trio.current_time()
+                await connection.store.list_directory(b"/d")
+                assert trio.current_time() - began < 0.5
+                await trio.sleep(1.0)
+        for seconds in (1.0, 2.0):
+            assert meter.most_within(seconds) <= 1.01 * seconds * LIMIT + 0.1 * LIMIT + FRAME
+
+
+async def test_the_slowest_limit_is_slow_and_no_time_out(autojump: MockClock) -> None:
+    here = World("px4", WIDE)
+    here.tree.add(b"/f", DATA[:5000])
+    async with here.connection(ConnectOptions(bwlimit=100)) as connection:
+        began = trio.current_time()
+        assert await read_file(connection, b"/f") == DATA[:5000]
+        assert 50.0 < trio.current_time() - began < 120.0  # our heartbeats alone take a fifth of it
+        assert connection.engine.stats.timeouts == 0
+        assert connection.engine.stats.retransmissions == 0
+
+
+async def test_a_dead_link_is_still_noticed(autojump: MockClock) -> None:
+    here = world("px4")
+    async with here.connection(ConnectOptions(bwlimit=2000)) as connection:
+        await trio.sleep(1.0)
+        here.link.cut()
+        source = MemorySource(DATA)
+        upload = await connection.store.open_upload(b"/d/g", source, create=True)
+        began = trio.current_time()
+        with pytest.raises(Exception, match=r"answer|silent"):
+            await upload.finish()
+        assert trio.current_time() - began < 45.0
+
+
+async def test_no_bursts_with_a_limit(autojump: MockClock) -> None:
+    here = world("ardupilot")
+    async with here.connection(ConnectOptions(bwlimit=LIMIT // 2, read_mode="burst")) as connection:
+        meter = Meter(connection)
+        await read(connection, here)
+        assert Opcode.BURST_READ_FILE not in connection.engine.stats.by_opcode
+        check(meter, LIMIT // 2)
+
+
+def test_the_option_arrives() -> None:
+    assert connect_options(parse_options(["bwlimit=5000"])).bwlimit == 5000
+    assert connect_options(parse_options([])).bwlimit is None
