@@ -124,7 +124,7 @@ class QueuedUpload:
             the background; refusals only when finish is called.
         running: the scheduler's task is at it. clean: everything given so far is ACKed and terminated.
         retry_at: not to be touched before. least: bytes the file has to have when it is opened to be written
-            on. opened: it was opened for that before. free_at: see WriteStore. begun: see Upload.
+            on. opened: it was opened before. free_at: see WriteStore. begun: see Upload.
     """
 
     def __init__(

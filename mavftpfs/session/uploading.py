@@ -57,7 +57,7 @@ class Uploading:
         self._op_deadline = op_deadline
         self._chunk = chunk
         self._when_armed_ok = when_armed_ok
-        self._wo_tells_no_size = False
+        self._wo_tells_size = False
 
     @property
     def turns(self) -> Turns:
@@ -163,7 +163,13 @@ class Uploading:
         if upload.free_at is not None and self._clock() - upload.free_at > FREE_FOR:
             await self._require_free(upload.path)
         upload.free_at, upload.begun = None, True  # what is there from now on may be ours
-        return await self._holder.open(upload.path, Opcode.CREATE_FILE)
+        session = await self._holder.open(upload.path, Opcode.CREATE_FILE)
+        upload.opened = True
+        return session
+
+    async def _size(self, upload: QueuedUpload) -> int | None:
+        """Return the size of the file. It is asked before OpenFileWO, which makes missing ones (servers.md 8)."""
+        return (await self._holder.open(upload.path, Opcode.OPEN_FILE_RO)).size
 
     async def _require_free(self, path: bytes) -> None:
         """Find out by one request that CreateFile empties nothing, under no other spelling either.
@@ -183,15 +189,18 @@ class Uploading:
     async def _reopen(self, upload: QueuedUpload, least: int) -> OpenSession:
         """Open a file that is to keep what it has, unless it has less than `least` bytes: then what was to
         stay is gone, and what is written behind it would leave a hole."""
-        size: int | None = None
-        if self._wo_tells_no_size and upload.opened:
-            size = (await self._holder.open(upload.path, Opcode.OPEN_FILE_RO)).size
-        session = await self._holder.open(upload.path, Opcode.OPEN_FILE_WO)
-        upload.opened = True
-        self._wo_tells_no_size = session.size is None
-        size = session.size if size is None else size
-        if size is None or size >= least:
-            return session
+        try:
+            size = await self._size(upload) if upload.opened and not self._wo_tells_size else None
+            session = await self._holder.open(upload.path, Opcode.OPEN_FILE_WO)
+        except FtpNak as nak:
+            if not upload.create or errno_for(nak) != errno.ENOENT:
+                raise
+            size, session = 0, None
+        if session is not None:
+            upload.opened, self._wo_tells_size = True, session.size is not None
+            size = session.size if size is None else size
+            if size is None or size >= least:
+                return session
         upload.feed.roll_back(everything=True)
         await self._holder.close()
         problem = f"{upload.path!r} has {size} bytes now, not {least}"

@@ -35,6 +35,10 @@ async def sent(faults: Faults, count: int) -> None:
         await trio.sleep(0.05)
 
 
+def names(here: World, path: bytes) -> list[bytes]:
+    return [entry.name for entry in here.tree.entries(path.rpartition(b"/")[0])]
+
+
 @pytest.mark.parametrize("shrinks", [False, True])
 @pytest.mark.parametrize("profile", KEEPING)
 async def test_a_lost_session_goes_on_only_where_the_rest_is_still_there(
@@ -66,6 +70,38 @@ async def test_a_lost_session_goes_on_only_where_the_rest_is_still_there(
         else:
             await upload.finish()
             assert here.tree.data(path) == NEW + (OLD + NEW)[len(NEW) :]
+        await upload.abort()
+        nursery.cancel_scope.cancel()
+
+
+@pytest.mark.parametrize("profile", KEEPING)
+async def test_a_temporary_that_was_tidied_up_is_sent_whole(profile: str, autojump: MockClock) -> None:
+    """OpenFileWO makes missing files on some servers: what was sent before would be a hole."""
+    here = World(profile, PLAIN)
+    path = ROOTS.get(profile, b"") + b"/d/file"
+    here.tree.add_directory(path.rpartition(b"/")[0])
+    faults = Faults(here)
+    async with here.connection() as connection, trio.open_nursery() as nursery:
+        await connection.store.probe_open_for_write(path + b"1", path + b"2")
+        source = MemorySource(NEW)
+        upload = await connection.store.open_upload(path, source, create=True)
+
+        def tidy_up() -> None:
+            if source.rollbacks == [] and path.rpartition(b"/")[2] in names(here, path):
+                here.tree.remove(path)
+
+        async def disturb() -> None:
+            await sent(faults, 60)
+            here.link.cut()
+            for opcode in (Opcode.OPEN_FILE_RO, Opcode.OPEN_FILE_WO):
+                faults.at(opcode, tidy_up)
+            await trio.sleep(4)
+            here.link.restore()
+
+        nursery.start_soon(disturb)
+        await upload.finish()
+        assert True in source.rollbacks
+        assert here.tree.data(path) == NEW
         await upload.abort()
         nursery.cancel_scope.cancel()
 
