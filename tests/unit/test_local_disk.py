@@ -71,15 +71,17 @@ async def test_a_disk_that_fails_is_the_error_of_one_file(
 async def test_a_cut_that_fails_changes_nothing(store: FakeWriter, monkeypatch: pytest.MonkeyPatch) -> None:
     tree = make_writable(store, dirty_max=65536)
     file = await begin(tree, store)
+    store.lost = False
+    await file.fsync()
     with monkeypatch.context() as patch:
         patch.setattr(os, "ftruncate", failing)
         with pytest.raises(MavftpfsError) as told:
             await file.truncate(10)
         assert errno_for(told.value) == errno.EIO
     assert file.size == len(BIG)
-    store.lost = False
+    await file.write(0, b"X")
     await file.release()
-    assert store.files[FILE].data == BIG
+    assert store.files[FILE].data == b"X" + BIG[1:]
 
 
 async def test_a_full_disk_is_told_to_the_writer_and_costs_nothing_accepted(
