@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pytest
 from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
@@ -9,6 +10,7 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, ru
 from mavftpfs.cache.draft import Draft, Where
 from mavftpfs.cache.sending import AHEAD, Sending
 from mavftpfs.protocol.crc import crc32
+from mavftpfs.shared.errors import SpoolFailed
 
 
 class Bytes:
@@ -56,6 +58,19 @@ def test_a_new_file_is_dirty_even_if_empty() -> None:
     assert draft.whole
     draft.delivered()
     assert draft.clean
+
+
+def test_a_cut_that_fails_changes_nothing() -> None:
+    class Failing(Bytes):
+        def cut(self, size: int) -> None:
+            raise SpoolFailed("bad sector")
+
+    draft = Draft(Failing(), None)
+    draft.write(0, b"abcdef")
+    with pytest.raises(SpoolFailed):
+        draft.truncate(2)
+    assert content(draft, b"") == b"abcdef"
+    assert sent(draft.begin(whole=True)) == [(0, b"abcdef")]
 
 
 def test_a_gap_beyond_the_end_is_zeros_and_is_sent() -> None:
