@@ -168,7 +168,7 @@ class Uploading:
         return session
 
     async def _size(self, upload: QueuedUpload) -> int | None:
-        """Return the size of the file. It is asked before OpenFileWO, which makes missing ones (servers.md 8)."""
+        """Return the size of the file, asked before OpenFileWO, which makes missing ones (servers.md 8)."""
         return (await self._holder.open(upload.path, Opcode.OPEN_FILE_RO)).size
 
     async def _require_free(self, path: bytes) -> None:
