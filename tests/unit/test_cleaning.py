@@ -1,0 +1,125 @@
+"""When what an interruption left is mended, and when it has to wait."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator
+
+import pytest
+import trio
+
+from mavftpfs.cache.asides import Kind, Reserved, is_reserved
+from mavftpfs.cache.cleaning import Cleaner
+from mavftpfs.cache.context import Context
+from mavftpfs.cache.dentries import Directory
+from mavftpfs.cache.tree import Tree
+from mavftpfs.shared.model import DirEntry, EntryKind, split
+from tests.support.fake_store import read_file
+from tests.support.fake_writer import KINDS, FakeWriter, make_writable
+
+OLD = bytes(range(256)) * 4
+DIRECTORY = b"/card/dir"
+FILE = DIRECTORY + b"/file.txt"
+
+
+@pytest.fixture
+async def store(nursery: trio.Nursery, autojump_clock: object) -> AsyncIterator[FakeWriter]:
+    store = FakeWriter(KINDS["fat"], nursery)
+    store.add_directory(DIRECTORY)
+    yield store
+    assert store.crimes == []
+    nursery.cancel_scope.cancel()
+
+
+@pytest.fixture
+def tree(store: FakeWriter) -> Tree:
+    return make_writable(store)
+
+
+def parts(tree: Tree) -> tuple[Context, Cleaner]:
+    assert tree._writing is not None
+    return tree._writing._context, tree._writing._cleaner
+
+
+def reserved(tree: Tree, kind: Kind, target: bytes | None = b"file.txt") -> bytes:
+    """A name that this mount left behind."""
+    return Reserved(parts(tree)[0].namer.owner, kind, b"sss", target).name
+
+
+def litter(store: FakeWriter) -> list[bytes]:
+    return [path for path in store.files if is_reserved(split(path)[1])]
+
+
+async def test_a_name_that_is_about_to_be_made_is_not_given_an_old_file(
+    store: FakeWriter, tree: Tree
+) -> None:
+    file = await tree.create(FILE, exclusive=True)
+    await file.write(0, b"ours")
+    store.add(DIRECTORY + b"/" + reserved(tree, Kind.OLD), OLD)
+    tree.forget_caches()
+    await tree.list(DIRECTORY)
+    assert FILE not in store.files
+    assert len(litter(store)) == 1
+    await file.release()
+    assert store.files[FILE].data == b"ours"
+    tree.forget_caches()
+    await tree.list(DIRECTORY)
+    assert store.files[FILE].data == b"ours"
+    assert litter(store) == []
+
+
+async def test_only_a_listing_that_counts_proves_a_torn_name_whole(store: FakeWriter, tree: Tree) -> None:
+    """One that began before the name was torn shows it because we said so."""
+    context, cleaner = parts(tree)
+    place = DIRECTORY + b"/" + reserved(tree, Kind.OLD)
+    context.torn[FILE] = place
+    now = trio.current_time()
+    shown = Directory({b"file.txt": DirEntry(b"file.txt", EntryKind.FILE, 3)}, now, now + 20, True)
+    await cleaner.on_swept(DIRECTORY, shown)
+    assert context.torn == {FILE: place}
+    store.add(FILE, OLD)
+    await tree.list(DIRECTORY)
+    assert context.torn == {}
+
+
+async def test_a_file_that_took_the_place_of_another_is_read_anew(store: FakeWriter, tree: Tree) -> None:
+    """The new content of a replacement that was completed later is not served from what is remembered."""
+    store.add(FILE, OLD)
+    assert await read_file(tree, FILE) == OLD
+    context = parts(tree)[0]
+    new, old = (DIRECTORY + b"/" + reserved(tree, kind) for kind in (Kind.NEW, Kind.OLD))
+    context.torn[FILE] = old
+    store.files[old] = store.files.pop(FILE)
+    store.add(new, OLD[::-1])  # of the same size
+    context.dentries.expire(DIRECTORY, trio.current_time())
+    assert await read_file(tree, FILE) == OLD[::-1]
+    assert context.torn == {}
+    assert litter(store) == []
+
+
+@pytest.mark.parametrize(
+    ("text", "goes_to"),
+    [
+        (b"/card/dir/x\0/card/dir/source", b"/card/dir/source"),
+        (b"/card/dir/x\0/card/dir/taken", b"/card/recovered-msss-x"),
+        (b"/card/dir/x\0/elsewhere/source", b"/card/recovered-msss-x"),
+        (b"/card/dir/x\0/card/../source", b"/card/recovered-msss-x"),
+        (b"/card/dir/x\0", b"/card/recovered-msss-x"),
+        (b"/elsewhere/x\0/card/dir/source", b"/card/recovered-msss"),
+        (b"garbage", b"/card/recovered-msss"),
+    ],
+)
+async def test_what_a_sidecar_may_say(nursery: trio.Nursery, text: bytes, goes_to: bytes) -> None:
+    """It lies on the card, where anybody may have written it."""
+    store = FakeWriter(KINDS["fat"], nursery)
+    for path in (b"/card/dir/x", b"/card/dir/taken", b"/elsewhere/x"):
+        store.add(path, b"stays")
+    tree = make_writable(store, root=b"/card")
+    moved = b"/card/" + reserved(tree, Kind.MOVED, None)
+    store.add(moved, b"moved")
+    store.add(b"/card/" + reserved(tree, Kind.SIDECAR, None), text)
+    await tree.list(b"/")
+    assert store.files[goes_to].data == b"moved"
+    assert {path for path, file in store.files.items() if file.data == b"moved"} == {goes_to}
+    assert sum(file.data == b"stays" for file in store.files.values()) == 3
+    assert litter(store) == []
+    nursery.cancel_scope.cancel()
