@@ -272,6 +272,8 @@ async def test_removing_a_torn_file_removes_it(store: FakeWriter, tree: Tree, lo
     tree._directories.lost = False
     await tree.unlink(path)
     assert litter(store) == []
+    assert tree._writing is not None
+    assert tree._writing._context.torn == {}
     await listed(store, tree)
     assert path not in store.files
     assert not [name for name in store.files if b"recovered" in name]
