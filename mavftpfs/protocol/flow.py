@@ -17,7 +17,7 @@ A round is the time until a request sent after the round's start is answered.
 from __future__ import annotations
 
 from collections import deque
-from math import inf
+from math import inf, sqrt
 
 from mavftpfs.protocol.budget import Budget
 from mavftpfs.protocol.easing import Easing
@@ -42,6 +42,7 @@ _ROUNDS_REMEMBERED = 10
 _PLATEAU_ROUNDS = 2
 _NARROW = 0.6
 _TELLING_LOSSES = 8
+_DOUBT = 3
 _TELLING_ROUND = 16
 
 
@@ -60,6 +61,7 @@ class Flow:
         "_collapsed",
         "_easing",
         "_goal",
+        "_hurried",
         "_limit",
         "_losses",
         "_pacer",
@@ -99,6 +101,7 @@ class Flow:
         self._trains = Trains()
         self._pacer: Pacer | None = None
         self._stalls = Stalls()
+        self._hurried = False
         self._brake = 1.0
         self._plateau = 0
         self._collapsed = 0
@@ -129,6 +132,7 @@ class Flow:
 
     def begin(self) -> None:
         """It is looked at anew who has something to send: `room` follows for each."""
+        self._hurried = False
         self._trains.begin()
         if self._pacer is not None:
             self._pacer.blocked = False
@@ -137,6 +141,10 @@ class Flow:
 
     def room(self, in_flight: int, now: float, *, paced: bool, urgent: bool = False) -> int:
         """Return how many requests may go out now. paced: also beyond what the server queues, if evenly."""
+        if urgent:
+            self._hurried = True
+        elif self._hurried:  # an answer that somebody waits for should not queue behind our slack
+            in_flight += min(_SLACK, self.window // 2)
         room = self._room(in_flight, now, paced)
         if self.budget is None or room <= 0:
             return room
@@ -158,9 +166,11 @@ class Flow:
         return self._pacer.room(in_flight, now) if paced and room <= 0 else room
 
     def _reserve(self) -> int:
-        """Return how many more bridge the pauses of a server; none where its buffers are small."""
+        """Return how many more bridge the pauses of a server; none where its buffers are small, or while
+        somebody waits for an answer that would have to queue behind them."""
         reserve = self._stalls.reserve
-        return 0 if not reserve or self._serial or self._pacer else self._bounded(reserve * self._best_rate)
+        none = not reserve or self._hurried or self._serial or self._pacer
+        return 0 if none else self._bounded(reserve * self._best_rate)
 
     def _bounded(self, reserve: float) -> int:
         """Never beyond the limit; and on a fast path a pause is ours or a busy computer's, and thousands of
@@ -309,12 +319,13 @@ class Flow:
         return held + min((_GAIN - 1.0) * held, _CURIOSITY) + _SLACK
 
     def _overflowed(self) -> bool:
-        """Whether this round lost so much more than all before it that its window must be to blame."""
+        """Whether so much more was lost than in all rounds before that the window must be to blame."""
         total, lost = self._replies + self._losses, self._losses
-        before = self._all_losses / self._all if self._all else 1.0
+        before = (self._all_losses + _DOUBT) / (self._all + 2 * _DOUBT)
         self._all += total
         self._all_losses += lost
-        return lost >= _TELLING_LOSSES and lost > (2 * before + 0.1) * total
+        chance = _DOUBT * sqrt(total * before * (1.0 - before))
+        return lost >= _TELLING_LOSSES and lost > (before + 0.1) * total + chance
 
     def _target(self) -> float:
         rate, base = self._best_rate, self._base_rtt

@@ -136,6 +136,7 @@ def test_requests_go_out_one_by_one() -> None:
             sent.append(now)
         now = max(now + 1e-9, pacer.next_at())
     assert 98 <= len(sent) <= 103
+    assert pacer.room(QUEUE, now + 5.0) == 2, "what was not used is not made up for at once"
 
 
 def test_a_flow_uses_it_where_the_server_queues_little_and_for_whom_it_suits() -> None:
