@@ -7,6 +7,7 @@ may make a system call on the mountpoint: it would wait for itself.
 
 from __future__ import annotations
 
+import gc
 import logging
 import os
 import signal
@@ -181,6 +182,8 @@ class _Life:
     async def _serve(self, invalidator: Invalidator, notice: str) -> None:
         async with trio.open_nursery() as nursery:
             nursery.start_soon(invalidator.run)
+            gc.collect()
+            gc.freeze()  # a full collection would look through all that was imported, in mid-transfer
             self.report(0, notice)
             with trio.CancelScope() as self._loop_scope:
                 if not self._stop_asked:

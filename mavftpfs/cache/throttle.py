@@ -18,6 +18,9 @@ LEAST, MOST = 64 * KIB, 8 * MIB
 UNMEASURED = 256 * KIB
 """What may wait before the first bytes were ACKed."""
 
+FAST, COARSE = 1e6, 16 * KIB
+"""Above so many bytes per second it is enough to look at the clock every so many bytes."""
+
 STALL = 5.0
 """After so many seconds in which nothing was ACKed a writer asks why."""
 
@@ -29,6 +32,8 @@ class Throttle:
         self._context = context
         self._moved = trio.Event()
         self.meter = RateMeter()
+        self._uncounted = 0
+        self._grain = 1
 
     @property
     def limit(self) -> int:
@@ -60,7 +65,11 @@ class Throttle:
 
     def on_acked(self, count: int) -> None:
         """Bytes arrived."""
-        self.meter.on_bytes(count, self._context.clock())
+        self._uncounted += count
+        if self._uncounted >= self._grain:
+            self.meter.on_bytes(self._uncounted, self._context.clock())
+            self._uncounted = 0
+            self._grain = COARSE if (self.meter.rate or 0.0) > FAST else 1
         self.let_go()
 
     def let_go(self) -> None:
