@@ -1,0 +1,97 @@
+"""What a cold `ls` or a small read waits during a bulk copy, on virtual time (design section 5, promise 7).
+
+p95 <= 3 round trips + 0.3 s + bytes asked for / rate, for every server, on links of every kind.
+"""
+
+from __future__ import annotations
+
+import random
+
+import pytest
+import trio
+from trio.testing import MockClock
+
+from mavftpfs.session.connection import Connection
+from mavftpfs.sim.linkmodel import Duplex, LinkSettings
+from mavftpfs.sim.profiles import PROFILES
+from tests.support.worlds import ROOTS, MemorySink, World, read_file
+
+SAMPLES = 20
+FRAME = 266
+SMALL_FRAME = 40
+
+RADIO = LinkSettings(rate=5760.0, delay=0.03, duplex=Duplex.HALF, queue=8192)
+SLOW = LinkSettings(rate=100_000.0, delay=0.05, queue=50_000)
+FAST = LinkSettings(rate=400_000.0, delay=0.015, queue=200_000)
+CASES = [
+    *(pytest.param(profile, RADIO, id=f"{profile}-radio") for profile in sorted(PROFILES)),
+    *(pytest.param(profile, SLOW, id=f"{profile}-slow") for profile in sorted(PROFILES)),
+    *(pytest.param(profile, FAST, id=f"{profile}-fast") for profile in ("px4", "ardupilot", "mavsdk")),
+]
+
+
+@pytest.fixture
+def autojump() -> MockClock:
+    return MockClock(autojump_threshold=0)
+
+
+class Copy:
+    """A bulk copy under way; how long others wait beside it."""
+
+    def __init__(self, profile: str, link: LinkSettings) -> None:
+        assert link.rate is not None
+        self.link = link
+        self.rate = link.rate
+        self.world = World(profile, link)
+        self.root = ROOTS.get(profile, b"") + b"/d"
+        self.size = int(40 * link.rate)
+        self.world.tree.add(
+            self.root + b"/big", random.Random(2).randbytes(self.size)
+        )  # zeros would not be sent
+        for number in range(SAMPLES):
+            self.world.tree.add(self.root + b"/fresh%d/f" % number, b"%d" % number * 100)
+        self.rng = random.Random(5)
+
+    def allowed(self, frames: int) -> float:
+        """Return the bound for something that takes so many full frames; a small one takes time both ways."""
+        round_trip = 2 * (self.link.delay + SMALL_FRAME / self.rate)
+        return 3 * round_trip + 0.3 + frames * FRAME / self.rate
+
+    async def waits(self, connection: Connection, kind: str) -> list[float]:
+        sink = MemorySink(self.size)
+        reader = await connection.store.open_reader(self.root + b"/big", sink)
+        reader.want(0, self.size, demand=True)
+        for _ in range(2):  # finds out how this server lists
+            await connection.store.list_directory(self.root)
+        await trio.sleep(3.0)
+        waits: list[float] = []
+        for number in range(SAMPLES):
+            await trio.sleep(self.rng.uniform(0.2, 0.8))
+            directory = self.root + b"/fresh%d" % number
+            began = trio.current_time()
+            if kind == "ls":
+                listing = await connection.store.list_directory(directory)
+                assert [entry.name for entry in listing.entries] == [b"f"]
+            else:
+                assert await read_file(connection, directory + b"/f") == b"%d" % number * 100
+            waits.append(trio.current_time() - began)
+        copied = sink.have.total
+        await trio.sleep(2.0)
+        assert sink.have.total > copied, "the copy goes on"
+        reader.close()
+        return sorted(waits)
+
+
+def p95(waits: list[float]) -> float:
+    return waits[len(waits) * 95 // 100 - 1]
+
+
+@pytest.mark.parametrize(("profile", "link"), CASES)
+@pytest.mark.parametrize(("kind", "frames"), [("ls", 2), ("read", 3)])
+async def test_nobody_waits_long_beside_a_copy(
+    kind: str, frames: int, profile: str, link: LinkSettings, autojump: MockClock
+) -> None:
+    copy = Copy(profile, link)
+    async with copy.world.connection() as connection:
+        waits = await copy.waits(connection, kind)
+    assert p95(waits) <= copy.allowed(frames)

@@ -1,0 +1,42 @@
+"""Reading uses what a link carries: representative cases of the table that scripts/bench prints.
+
+Virtual time, bytes compared; the whole table takes minutes, these take seconds (a slow link is cheap).
+"""
+
+from __future__ import annotations
+
+import pytest
+
+from mavftpfs.sim.profiles import PROFILES
+from tests.bench.cases import Case
+from tests.bench.goodput import measure
+
+LONG = 60.0
+SHORT = 20.0
+START = 0.06
+"""What the start of a short run may cost of its share."""
+
+
+@pytest.mark.parametrize("loss", [0.0, 0.01, 0.05, 0.1])
+@pytest.mark.parametrize("rtt", [0.01, 0.1, 0.3])
+@pytest.mark.parametrize("profile", sorted(PROFILES))
+def test_a_radio_of_57600_baud(profile: str, rtt: float, loss: float) -> None:
+    case = Case(profile, 5760.0, rtt, loss)
+    target = case.target
+    assert target is not None
+    assert measure(case, LONG).share >= target
+
+
+@pytest.mark.parametrize(("rtt", "loss"), [(0.01, 0.0), (0.1, 0.05), (0.3, 0.1)])
+@pytest.mark.parametrize("profile", ["px4", "px4-nuttx", "ardupilot", "mavsdk"])
+def test_a_hundred_kilobytes_per_second(profile: str, rtt: float, loss: float) -> None:
+    case = Case(profile, 100_000.0, rtt, loss)
+    target = case.target
+    assert target is not None
+    assert measure(case, SHORT).share >= target - START
+
+
+def test_a_short_shared_queue_does_not_empty_a_long_way() -> None:
+    """ArduPilot, 300 ms away: five at a time would be 3.9 kB/s, its bursts 30; evenly asked it is more."""
+    case = Case("ardupilot", 100_000.0, 0.3, 0.0)
+    assert measure(case, LONG).share * case.limit > 50_000.0
