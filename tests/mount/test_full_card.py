@@ -27,7 +27,8 @@ FULL = ("No space left on device", "Input/output error")
 PLAIN_WORDS = ("px4", "px4-nuttx", "ardupilot")
 """Servers that say what it is; FatFs below ArduPilot and MAVSDK have but one word for all failures."""
 
-KINDS = ("px4", "px4-nuttx", "ardupilot", "ardupilot5", "mavsdk", REAL)
+SLOW = pytest.param("ardupilot", marks=pytest.mark.soak)
+KINDS = ("px4", "px4-nuttx", SLOW, "ardupilot5", "mavsdk", REAL)
 
 
 @pytest.fixture
