@@ -58,7 +58,9 @@ def choose_strategy(facts: ReadFacts) -> Strategy:
 
     A window of ReadFile requests is the rule: it can be stopped, it fills gaps as it goes, and on PX4 and
     MAVSDK it is the faster way by far (servers.md 15). A burst wins only where the server's queue caps the
-    window and the round trip is long, so that w * chunk / RTT stays below the pace of a burst.
+    window and the round trip is long, so that w * chunk / RTT stays below the pace of a burst. None is begun
+    only to be measured: ArduPilot's cannot be stopped for 3 to 280 s, is paced to a third of the link, and
+    requests that are spread evenly (protocol.pacing) fill a long way better.
     """
     if facts.mode != "auto":
         return facts.mode
