@@ -89,6 +89,9 @@ class Keeper:
                 return None
         else:
             kept.give(blocks, 0, first)
+        if self._facts.remembered(path) is not entry:
+            blocks.clear()
+            return None  # listed anew, or changed by us, while the disk was read
         self.revived += 1
         version = Version(path, kept.key.mtime, blocks, proven_at, kept=kept)
         self._watched[version] = kept
@@ -134,8 +137,9 @@ class Keeper:
     # --- to the disk
 
     def keep(self, version: Version, entry: DirEntry) -> None:
-        """A version was opened that a fresh listing shows as `entry`: what is read of it may be kept."""
-        if entry.size == version.size:
+        """A version was opened that a fresh listing shows as `entry`: what is read of it may be kept, unless
+        it was listed anew, or changed by us, while it was opened."""
+        if entry.size == version.size and self._facts.remembered(version.path) is entry:
             version.kept = self._kept(version.path, entry)
             self.watch(version)
 

@@ -289,6 +289,28 @@ async def test_a_file_that_changes_while_the_disk_is_slow(
     old.close()
 
 
+@pytest.mark.parametrize("mtime", [MTIME, None])
+async def test_a_file_that_changes_while_it_is_opened_from_the_disk(
+    mounts: Mounts, nursery: trio.Nursery, autojump_clock: MockClock, mtime: int | None
+) -> None:
+    mounts.store.add(LOG, DATA, mtime)
+    await mounts.read_and_settle()
+    tree = mounts.mount(dir_timeout=5)
+    await tree.list(b"/logs")
+    mounts.disk_delay = 4.0
+
+    async def change() -> None:
+        await trio.sleep(6)
+        mounts.store.add(LOG, new, mtime and mtime + 5)
+        await tree.list(b"/logs")
+
+    new = content(len(DATA), seed=3)
+    if mtime is not None:
+        mounts.disk_delay = 10.0
+    nursery.start_soon(change)
+    assert await read_file(tree, LOG) == new
+
+
 async def test_two_mounts_at_once_share_the_directory(mounts: Mounts, autojump_clock: MockClock) -> None:
     first, second = mounts.mount(), mounts.mount()
     async with trio.open_nursery() as both:
