@@ -215,6 +215,31 @@ async def test_a_refusal_is_not_repeated_before_there_is_news(
     assert tree.undelivered() == []
 
 
+async def test_a_refusal_is_not_repeated_beside_others(
+    autojump_clock: object, store: FakeWriter, tree: Tree
+) -> None:
+    asked: list[object] = []
+
+    def refuse(what: object, path: object, *_: object) -> None:
+        if path == NEW:
+            asked.append(what)
+            raise FtpNak(Opcode.CREATE_FILE, NakCode.FAIL_ERRNO, 28)
+
+    store.before_request = refuse
+    await close_in_vain(tree)
+    count = len(asked)
+    other = await tree.create(b"/card/other", exclusive=True)
+    await other.write(0, b"content")
+    store.lost = True
+    with pytest.raises(VehicleLost):
+        await other.release()
+    await trio.sleep(100)
+    store.lost = False
+    await trio.sleep(100)
+    assert tree.undelivered() == [NEW]
+    assert len(asked) == count
+
+
 async def test_an_open_file_is_left_to_its_program(
     autojump_clock: object, store: FakeWriter, tree: Tree
 ) -> None:

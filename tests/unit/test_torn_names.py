@@ -212,15 +212,37 @@ async def test_a_move_over_a_file_that_was_cut_off_is_undone(
     assert await read_file(tree, FILE) == OLD
 
 
-async def test_who_opens_a_torn_name_gets_its_file(store: FakeWriter, tree: Tree) -> None:
+@pytest.mark.parametrize("long", [False, True])
+async def test_who_opens_a_torn_name_gets_its_file(store: FakeWriter, tree: Tree, long: bool) -> None:
     """Before the news that the link is back, too: the listing that comes first mends it."""
-    await tree.list(b"/card/dir")
+    source, target = LONG_FITTING if long else (OTHER, FILE)
+    store.add(source, NEW)
+    store.add(target, OLD)
+    await tree.list(split(target)[0])
     Trap(store, tree, 2, "lost")
     with pytest.raises(VehicleLost):
-        await tree.rename(OTHER, FILE)
+        await tree.rename(source, target)
     store.lost = False
     tree._directories.lost = False
-    assert await read_file(tree, FILE) == OLD
+    assert await read_file(tree, target) == OLD
+
+
+async def test_who_opens_what_was_on_its_way_elsewhere_gets_it(store: FakeWriter, tree: Tree) -> None:
+    """Its file lies where it was to go: that directory is listed, too."""
+    source, target = deep(125, b"a"), b"/card/b/" + b"n" * 114
+    store.add(source, NEW)
+    store.add(target, OLD)
+    for path in (source, target):
+        await tree.list(split(path)[0])
+    Trap(store, tree, 2, "lost")
+    with pytest.raises(VehicleLost):
+        await tree.rename(source, target)
+    assert [split(path)[0] for path in litter(store)] == [b"/card/b"] * 2
+    store.lost = False
+    tree._directories.lost = False
+    assert await read_file(tree, source) == NEW
+    assert store.files[target].data == OLD
+    assert litter(store) == []
 
 
 async def test_a_torn_name_that_is_being_read_is_mended(
