@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import errno
 
+import trio
+
 from mavftpfs.cache.remote import FREE_FOR, UploadSource
 from mavftpfs.protocol.payload import MAX_DATA, Opcode
 from mavftpfs.session.kit import Kit, Queue
@@ -28,6 +30,12 @@ from mavftpfs.shared.errors import (
 
 REFUSALS = (FtpNak, ProtocolError, FileChanged, AlreadyExists, SpoolFailed)
 """Errors that do not pass by themselves."""
+
+STRAGGLE = (0.25, 1.0)
+STRAGGLE_ROUND_TRIPS = 4.0
+"""How long after the last byte of a file no other is opened to be written (at least, at most, round trips)
+where the link was seen to hold datagrams back or to double them: a WriteFile names no file, so a late one
+would be written to the next."""
 
 REOPENS = 5
 """How often the session may be lost without getting further in the file before the upload fails."""
@@ -58,6 +66,9 @@ class Uploading:
         self._chunk = chunk
         self._when_armed_ok = when_armed_ok
         self._wo_tells_size = False
+        self._engine = kit.engine
+        self._written: QueuedUpload | None = None
+        self._written_at = float("-inf")
 
     @property
     def turns(self) -> Turns:
@@ -129,8 +140,9 @@ class Uploading:
         try:
             if not self._is_complete_already(upload):
                 self.check_may_write()
+                await self._let_stragglers_pass(upload)
                 session = await self._open(upload)
-                await self._let_go(upload, await self.writer.run(upload, session))
+                await self._let_go(upload, await self._write(upload, session))
         except SessionLost as lost:
             self._on_lost(upload, lost)
         except MavftpfsError as error:
@@ -140,6 +152,24 @@ class Uploading:
             upload.running = False
             upload.use.add(now - started, now)
             upload.tell()
+
+    async def _write(self, upload: QueuedUpload, session: OpenSession) -> Stop:
+        try:
+            return await self.writer.run(upload, session)
+        finally:
+            self._written, self._written_at = upload, self._clock()
+
+    async def _let_stragglers_pass(self, upload: QueuedUpload) -> None:
+        """Wait until what is left of the file before is dead, if this link was seen to be of that kind."""
+        stats = self._engine.stats
+        if upload is self._written or not stats.unknown + stats.spurious:
+            return
+        least, most = STRAGGLE
+        quiet = min(most, max(least, STRAGGLE_ROUND_TRIPS * (self._engine.rtt or 0.0)))
+        rest = self._written_at + quiet - self._clock()
+        if rest > 0.0:
+            await self._holder.close_quietly()
+            await trio.sleep(rest)
 
     def _is_complete_already(self, upload: QueuedUpload) -> bool:
         """Whether there is nothing to send; an empty file has to be created once."""
