@@ -279,7 +279,7 @@ class Deliverer:
 
     def _free_at(self, path: bytes, draft: Draft) -> float | None:
         """Return when a listing last showed the name of a new file to be free, None if it need not be."""
-        if draft.remote_size is not None or draft.made:
+        if draft.remote_size is not None or draft.made or draft.overwrites:
             return None
         parent, name = split(path)
         known = self._context.dentries.known(parent)

@@ -56,6 +56,7 @@ class Draft:
         remote_size: size of the file on the vehicle, None if there is none.
         sending: the attempt under way, None before the first and after success.
         made: an attempt may have made the file, so that what is there is ours; maybe_made: if it is empty.
+        overwrites: what is there was given up for this.
     """
 
     def __init__(self, content: Content, remote_size: int | None) -> None:
@@ -64,7 +65,7 @@ class Draft:
         self.base_limit = self.size
         self.remote_size = remote_size
         self.sending: Sending | None = None
-        self.made = self.maybe_made = False
+        self.made = self.maybe_made = self.overwrites = False
         self._held = ExtentSet()
         self._changed = ExtentSet()
         self._touched = False
@@ -227,7 +228,7 @@ class Draft:
         self._changed.clear()
         self.remote_size = self.base_limit = self.size
         self.sending = None
-        self._touched = self._ruined = self.made = self.maybe_made = False
+        self._touched = self._ruined = self.made = self.maybe_made = self.overwrites = False
         self._content.settle()
 
     def remote_removed(self) -> None:
@@ -236,6 +237,7 @@ class Draft:
         self._ruined = False
         self.base_limit = 0
         self.remote_size = None
+        self.overwrites = True
         self._changed = ExtentSet([(0, self.size)])
         self.sending = None
 

@@ -82,3 +82,24 @@ async def test_a_reader_of_the_old_part_goes_on_when_the_new_part_was_delivered(
             await writer.flush()
         for file in (reader, writer):
             await file.release()
+
+
+async def test_overwriting_in_place_that_failed_goes_on_later(
+    nursery: trio.Nursery, autojump_clock: object
+) -> None:
+    """What lies there is the old file, or a part of the new one: nobody else's."""
+    store = FakeWriter(KINDS["littlefs"], nursery)
+    store.add_directory(b"/d")
+    store.add(FILE, b"old" * 300)
+    tree = make_writable(store, inplace=True)
+    await write_file(tree, FILE, b"newer" * 200)
+    for number in range(1, 4):
+        store.fail_at[store.requests + number] = FtpNak(Opcode.WRITE_FILE, NakCode.FAIL_ERRNO, 5)
+        file = await tree.open(FILE, write=True, truncate=True)
+        await file.write(0, b"%d" % number * 700)
+        with pytest.raises(FtpNak):
+            await file.flush()
+        await trio.sleep(100)
+        await file.flush()
+        assert store.files[FILE].data == b"%d" % number * 700
+        await file.release()
