@@ -26,7 +26,7 @@ FAST = LinkSettings(rate=400_000.0, delay=0.015, queue=200_000)
 CASES = [
     *(pytest.param(profile, RADIO, id=f"{profile}-radio") for profile in sorted(PROFILES)),
     *(pytest.param(profile, SLOW, id=f"{profile}-slow") for profile in sorted(PROFILES)),
-    *(pytest.param(profile, FAST, id=f"{profile}-fast") for profile in ("px4", "ardupilot", "mavsdk")),
+    *(pytest.param(profile, FAST, id=f"{profile}-fast") for profile in ("px4", "ardupilot")),
 ]
 
 
