@@ -48,7 +48,8 @@ _TELLING_ROUND = 16
 
 class Flow:
     """The in-flight window, in requests. serial: small receive buffers are likely, so start at 1 and
-    grow by one. limit: the most that may ever be in flight, None for the default. budget: the user's."""
+    grow by one. limit: the most that may ever be in flight, None for the default. budget: the user's.
+    alone: no other client of the server was heard lately."""
 
     __slots__ = (
         "_all",
@@ -77,6 +78,7 @@ class Flow:
         "_trains",
         "_wide_least",
         "_wide_window",
+        "alone",
         "budget",
         "loss",
         "window",
@@ -86,6 +88,7 @@ class Flow:
         self, *, serial: bool = False, limit: int | None = None, budget: Budget | None = None
     ) -> None:
         self.budget = budget
+        self.alone = False
         self._serial = serial
         self._limit = max(1, limit or (SERIAL_CAP if serial else DEFAULT_CAP))
         self._cap = self._limit
@@ -159,11 +162,15 @@ class Flow:
         return self.budget is not None and self.budget.held
 
     def _room(self, in_flight: int, now: float, paced: bool) -> int:
-        room = self.window - in_flight + (self._reserve() if paced else 0)
+        room = self.window - in_flight + (self._reserve() if paced else self._spare())
         if self._pacer is None:
             return min(room, self._trains.room(now)) if room > 0 else room
         self._pacer.blocked = False
         return self._pacer.room(in_flight, now) if paced and room <= 0 else room
+
+    def _spare(self) -> int:
+        """Return how many more a short queue takes that is not shared with anybody (servers.md 3)."""
+        return int(self.alone and self._pacer is not None and self._cap < self._limit)
 
     def _reserve(self) -> int:
         """Return how many more bridge the pauses of a server; none where its buffers are small, or while

@@ -274,7 +274,12 @@ def _build(
         connection._tell("reboot")
 
     vehicle.on_reboot = on_reboot
-    vehicle.on_foreign = lambda: scheduler.on_suspect("another FTP client is active")
+
+    def on_foreign() -> None:
+        flow.alone = False
+        scheduler.on_suspect("another FTP client is active")
+
+    vehicle.on_foreign = on_foreign
     vehicle.on_heartbeat = connection._on_heartbeat
     vehicle.on_double = lambda: _move_away(connection)
 
@@ -313,8 +318,9 @@ async def _send_heartbeats(connection: Connection) -> None:
 
 
 async def _watch_link(connection: Connection) -> None:
-    """Tell when the vehicle is lost; its return is told by its heartbeat."""
+    """Tell when the vehicle is lost; its return is told by its heartbeat. Tell the window who else is about."""
     while True:
+        connection.engine.flow.alone = not connection.vehicle.foreign_client(connection.clock())
         await trio.sleep(HEARTBEAT_PERIOD)
         if not connection.was_lost and connection.vehicle.lost(connection.clock()):
             connection.was_lost = True

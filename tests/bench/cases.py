@@ -6,11 +6,15 @@ from dataclasses import dataclass
 from typing import Literal
 
 from mavftpfs.protocol.payload import MAX_DATA
+from mavftpfs.sim.profiles import PROFILES, Family
 
 Direction = Literal["read", "write"]
 
 FRAME = 266
 """Bytes of a MAVLink 2 frame that carries 239 bytes of data."""
+
+SMALL_FRAME = 30
+"""Bytes of a frame that asks for data, or that ACKs it."""
 
 ARDUPILOT_BURST = MAX_DATA / 0.0056
 ARDUPILOT_WINDOW = 5
@@ -40,11 +44,21 @@ class Case:
         """Bytes per second that could be read or written at best."""
         limit = self.rate * MAX_DATA / FRAME * (1 - self.loss)
         if self.profile.startswith(("ardupilot", "littlefs")):
-            ceiling = ARDUPILOT_WINDOW * MAX_DATA / (self.rtt + ARDUPILOT_POLL)
+            # What a lone request takes from the moment it is handed to the link until it is answered.
+            answered = self.rtt + ARDUPILOT_POLL + (FRAME + SMALL_FRAME) / self.rate
+            ceiling = ARDUPILOT_WINDOW * MAX_DATA / answered
             if self.direction == "read":
                 ceiling = max(ceiling, min(ARDUPILOT_BURST, self.rate / 3))
             limit = min(limit, ceiling)
-        return limit
+        return self._less_pauses(limit)
+
+    def _less_pauses(self, limit: float) -> float:
+        """Count the time for which a slow card stops the server: its input buffer takes little meanwhile."""
+        profile = PROFILES[self.profile]
+        if profile.family is not Family.PX4:
+            return limit
+        pause = profile.stall_chance * sum(profile.stall) / 2
+        return MAX_DATA / (max(MAX_DATA / limit, profile.request_cost) + pause)
 
     @property
     def target(self) -> float | None:

@@ -37,15 +37,17 @@ PIECE = 128 * 1024
 """Bytes that a program writes at once."""
 
 
-def measure(case: Case, seconds: float, *, queue: int | None = None) -> Result:
-    """Read or write for about `seconds` of link time; queue: bytes that wait for the link's transmitter.
+def measure(case: Case, seconds: float, *, queue: int | None = None, telemetry: float = 0.0) -> Result:
+    """Read or write for about `seconds` of link time; queue: bytes that wait for the link's transmitter;
+    telemetry: messages per second that the vehicle sends beside it.
 
     Raises:
         AssertionError: the bytes differ.
         trio.TooSlowError: it took PATIENCE times the ideal.
     """
     room = int(max(4096, case.rate / 2)) if queue is None else queue
-    world = World(case.profile, LinkSettings(rate=case.rate, delay=case.rtt / 2, loss=case.loss, queue=room))
+    settings = LinkSettings(rate=case.rate, delay=case.rtt / 2, loss=case.loss, queue=room)
+    world = World(case.profile, settings, telemetry=telemetry)
     data = random.Random(1).randbytes(int(case.limit * seconds))
     transfer = _read if case.direction == "read" else _write
 

@@ -223,3 +223,14 @@ def test_rounds_in_no_time_or_without_round_trips_are_survived() -> None:
         flow.on_reply(1.0, None, order, order + 1)
     assert flow.window <= 16
     assert flow.loss == 0.0
+
+
+def test_a_short_queue_of_ones_own_takes_one_more() -> None:
+    flow = Flow()
+    flow.alone = True
+    assert flow.room(0, 0.0, paced=False) == 8
+    flow.set_queue_limit(4)
+    assert flow.room(4, 0.0, paced=False) == 1
+    assert flow.room(5, 0.0, paced=False) == 0
+    flow.alone = False
+    assert flow.room(4, 0.0, paced=False) == 0
