@@ -22,14 +22,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+from tests.bench import tables
 from tests.bench.record import Record
 
 MEASURED = ("goodput", "requests", "cost", "mount")
 TIMED = ("cost", "mount")
 """Parts that use the machine's clock."""
-
-BUSY = 0.5
-"""Load for each CPU above which the user is warned."""
 
 INTERRUPTED = 130
 PARTS = (*MEASURED, "plots", "all")
@@ -53,7 +51,7 @@ def split(argv: Sequence[str]) -> tuple[str, list[str]]:
 def run_part(part: str, quick: bool, record: Record | None, date: str, rest: Sequence[str]) -> int:
     """Measure one part in a process of its own, note its section, and return its exit code."""
     load = os.getloadavg()[0]
-    if part in TIMED and load > BUSY * (os.cpu_count() or 1):
+    if part in TIMED and load > tables.BUSY * (os.cpu_count() or 1):
         print(f"scripts/bench: load {load:.1f} before we began: rates will be too low", file=sys.stderr)
     options = [*(QUICK.get(part, ()) if quick else ()), *rest]
     with TemporaryDirectory(prefix="mavftpfs-bench-") as folder:

@@ -69,6 +69,13 @@ class Cell:
             return min(server, LOOPBACK_WINDOW)
         return min(server, max(4, int(1.5 * self.shape.rate * self.shape.rtt / 266)))
 
+    @property
+    def patience(self) -> float:
+        """Seconds after which a request is lost, for those who must be told: twice a full window's trip."""
+        if self.shape is None:
+            return 0.25
+        return 0.1 + 2 * (self.shape.rtt + self.window * 277 / self.shape.rate)
+
     def size_for(self, client: str) -> int:
         """Return how much a client moves."""
         return self.size if client in (US, BARE) else self.peers_size
@@ -79,7 +86,7 @@ def cell(server: str, link: str, direction: Direction, *, quick: bool) -> Cell:
     shape = LINKS[link]
     slow = server.startswith(("ardupilot", "littlefs"))
     if shape is None:
-        size, peers_size = (200_000, 200_000) if slow else (16_000_000, 800_000)
+        size, peers_size = (200_000, 200_000) if slow else (8_000_000, 800_000)
         timeout = 10.0
     elif shape.rate < 10_000:
         size = peers_size = 60_000
@@ -139,6 +146,7 @@ class Stage:
             local=here / "file.bin",
             timeout=self.cell.timeout,
             window=self.cell.window,
+            patience=self.cell.patience,
             folder=self.folder,
         )
 

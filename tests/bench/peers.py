@@ -41,7 +41,8 @@ class NotToBeHadError(Exception):
 class Job:
     """One transfer: client port, REMOTE (a path on the vehicle), LOCAL (what to write or read here).
 
-    timeout: seconds. window: requests that the server can have in flight. folder: for logs and mount points.
+    timeout: seconds. window: requests that the server can have in flight. patience: seconds after which one
+    is lost. folder: for logs and mount points.
     """
 
     port: int
@@ -50,6 +51,7 @@ class Job:
     local: Path
     timeout: float
     window: int
+    patience: float
     folder: Path
 
 
@@ -328,7 +330,8 @@ def clients(environment: Environment) -> dict[str, Client]:
         return [*peer("peer_pymavlink")(job), "--chunk", "239", "--window", str(job.window)]
 
     def bare(job: Job) -> list[str]:
-        return [sys.executable, "-m", "tests.bench.bare", *_task(job), "--window", str(job.window)]
+        limits = ["--window", str(job.window), "--timeout", str(job.patience)]
+        return [sys.executable, "-m", "tests.bench.bare", *_task(job), *limits]
 
     def ours(job: Job, point: Path) -> list[str]:
         source = f"udpin:{HOST}:{job.port}"

@@ -88,9 +88,10 @@ def plot_goodput(results: Results, x: str, path: Path) -> None:
             axes.set_title(f"{direction}, {rate / 1000:g} kB/s, {said}", fontsize=10)
         figure.axes[0].set_ylim(0, max(1.05, figure.axes[0].get_ylim()[1]))
         figure.axes[0].set_ylabel("share of the limit")
-        figure.axes[0].legend(fontsize=9, loc="lower left")
+        handles, labels = figure.axes[0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside lower center", ncols=7, fontsize=9)
 
-    draw(path, (8.6, 3.4), paint)
+    draw(path, (8.6, 3.6), paint)
 
 
 def lossy(results: Results) -> float:

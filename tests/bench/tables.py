@@ -7,6 +7,9 @@ from typing import Any
 
 from tests.bench.figures import BARE, US, Outcome, Row, row_from_json
 
+BUSY = 0.5
+"""Load for each CPU, before a measurement, above which rates are too low."""
+
 BEGIN, END = "<!-- bench: {} -->", "<!-- bench: end -->"
 
 _SERVERS = {"px4": "PX4", "ardupilot": "ArduPilot", "mavsdk": "MAVSDK", "mavsdk-real": "MAVSDK"}
@@ -89,12 +92,21 @@ def cost_table(rows: Sequence[Row], server: str, link: str) -> str:
     return markdown(head, lines)
 
 
+def caption(section: dict[str, Any]) -> str:
+    """Return what made a section, and on what; a machine that was busy with other things is called that."""
+    made = f"{section['date']}, {section['cpus']} CPUs".removeprefix(", ")
+    if section["load"] > BUSY * section["cpus"]:
+        made += f", busy with other things (load {section['load']}), so that rates over loopback are too low"
+    return f"`{section['command']}`, {made}."
+
+
 def tables(sections: dict[str, dict[str, Any]]) -> dict[str, str]:
     """Return the tables by the name of their mark."""
     if "mount" not in sections:
         return {}
     rows = [row_from_json(fields) for fields in sections["mount"]["results"]["rows"]]
-    return {"peers": peers_table(rows), "cost": cost_table(rows, "px4", "unshaped")}
+    peers = f"{peers_table(rows)}\n\n{caption(sections['mount'])}"
+    return {"peers": peers, "cost": cost_table(rows, "px4", "unshaped")}
 
 
 def filled_in(text: str, sections: dict[str, dict[str, Any]]) -> str:

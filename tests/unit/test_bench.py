@@ -192,7 +192,8 @@ def sections() -> dict[str, dict[str, Any]]:
     runs += [run(client, 2.0, link="unshaped") for client in (US, BARE)]
     runs += [run("gone", None, outcome) for outcome in (Outcome.TIMEOUT, Outcome.FAILED)]
     rows = [as_json(row) for row in summarise(runs, TIMEOUTS)]
-    return {"goodput": {"results": goodput_runs}, "mount": {"results": {"rows": rows}}}
+    mount = {"command": "scripts/bench mount", "cpus": 2, "date": "2026-01-02", "load": 0.9}
+    return {"goodput": {"results": goodput_runs}, "mount": {**mount, "results": {"rows": rows}}}
 
 
 def test_lines_are_those_of_the_fixed_conditions() -> None:
@@ -234,5 +235,26 @@ def test_tables_go_between_their_marks() -> None:
     assert filled.endswith("\nc")
     assert "| PX4, Wi-Fi, 5 % loss, read | **500** | 500 (1.00) | failed | 500 (1.00) |" in filled
     assert "| mavftpfs | 0.500 / – | 120 / – | – / – |" in filled
+    assert "`scripts/bench mount`, 2026-01-02, 2 CPUs.\n" in filled
     with pytest.raises(ValueError, match="peers"):
         tables.filled_in("no marks", sections())
+
+
+def test_a_busy_machine_is_called_that() -> None:
+    busy = {**sections()["mount"], "load": 1.1, "date": ""}
+    assert tables.caption(busy).startswith("`scripts/bench mount`, 2 CPUs, busy with other things (load 1.1)")
+
+
+def test_readme_shows_what_was_recorded() -> None:
+    page = (PROJECT / "README.md").read_text()
+    recorded = Record(plots.RESULTS).sections()
+    assert tables.filled_in(page, recorded) == page, "scripts/bench plots --readme README.md"
+    pictures = re.findall(r"\]\((tests/bench/\S+\.svg)\)", page)
+    assert len(pictures) == 3
+    assert [name for name in pictures if not (PROJECT / name).is_file()] == []
+    for section in recorded.values():
+        assert f"`{' '.join(section['command'].split()[:2])}`" in page, "the command that made it"
+
+
+def test_the_record_names_no_machine() -> None:
+    assert re.findall(r"/(?:tmp|home|root|mnt|usr)\b[^\"]*", plots.RESULTS.read_text()) == []
