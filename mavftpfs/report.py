@@ -28,7 +28,7 @@ _WORDS = {
     "lists_times": "listings carry times",
     "other_ftp_client": "another FTP client heard",
     "pid": "process",
-    "window": "requests in flight",
+    "window": "requests at a time",
     "window_rate": "rate by requests",
     "burst_rate": "rate by bursts",
 }

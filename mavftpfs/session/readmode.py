@@ -27,6 +27,7 @@ class ReadSteering:
         return {
             "reading_by": self._chosen,
             "window": self._engine.flow.window,
+            "in_flight": self._engine.in_flight,
             "chunk": self.chunk,
             "loss": round(self._engine.loss, 4),
             "window_rate": self._window_rate,

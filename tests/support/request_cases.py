@@ -93,10 +93,10 @@ FIRST = Case("first append", "echo x >> f", "ls -l", small)
 """The first change of a part of a file: what the server does when it is written to is found out."""
 
 WRITING = (
-    Case("echo > new", "echo x > new", "ls -l", empty),
+    Case("echo > new", "echo x > new", "ls -l", empty, aged=True),
     Case("echo > old", "echo x > f", "ls -l", small),
     Case("echo >>", "echo x >> f", "ls -l", small),
-    Case("touch new", "touch new", "ls -l", empty),
+    Case("touch new", "touch new", "ls -l", empty, aged=True),
     Case("touch old", "touch f", "ls -l", small),
     Case("mkdir", "mkdir d", "ls -l", empty),
     Case("mv", "mv f g", "ls -l", small),
@@ -104,14 +104,25 @@ WRITING = (
     Case("rm -r", "rm -r ten", "ls -l ten", ten),
     Case("vim save", "vim -es -u NONE -i NONE -c '%s/$/x/' -c wq f", "ls -l", small),
     Case("nano save", f"{sys.executable} {PROGRAMS / 'nano_save.py'} f", "ls -l", small),
-    Case("cp 10 files to it", "cp ten/* .", "cat ten/* > /dev/null; ls -l", ten),
+    Case(
+        "cp 10 files to it",
+        "cp ten/* .",
+        "cat ten/* > /dev/null; ls -l",
+        ten,
+        aged=True,
+        most_looks=10,
+    ),
 )
 """What changes the card."""
 
 WHOLE = (
     Case("rsync unchanged", RSYNC, RSYNC, tree),
     Case(
-        "git status again", f"{GIT} status --short", f"{GIT} status --short; {GIT} status --short", repository
+        "git status again",
+        f"{GIT} status --short",
+        f"{GIT} status --short; {GIT} status --short",
+        repository,
+        aged=True,
     ),
 )
 """Programs that look at everything."""
