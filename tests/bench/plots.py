@@ -165,7 +165,7 @@ def paint_bars(axes: Axes, rows: Sequence[Row], names: Sequence[str]) -> None:
         range(len(groups)),
         [f"{tables.server_name(server)}\n{tables.link_name(link)}" for server, link in groups],
     )
-    axes.set_xlim(0, 1.12)
+    axes.set_xlim(0, max([1.0, *(share_of(row) for row in rows)]) + 0.15)
     axes.set_xlabel("share of the limit (loopback: of the bare loop)")
     axes.grid(visible=False, axis="y")
 
@@ -182,6 +182,8 @@ def note_of(row: Row) -> str:
         return {Outcome.TIMEOUT: "not in time", Outcome.CORRUPT: "wrong bytes"}.get(
             row.outcome, str(row.outcome)
         )
+    if row.of_limit is None and row.of_bare is None:
+        return "no bare loop to compare with"
     return f"{share_of(row):.2f}"
 
 

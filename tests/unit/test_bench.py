@@ -221,6 +221,12 @@ def test_pictures_are_drawn_and_the_same_each_time(tmp_path: Path) -> None:
     assert "ardupilot" in drawn[0]["goodput-rtt.svg"]
 
 
+def test_a_bar_says_why_it_is_missing() -> None:
+    rows = summarise([run(US, 2.0, link="unshaped"), run("slow", None, Outcome.TIMEOUT)], TIMEOUTS)
+    assert [plots.note_of(row) for row in rows] == ["no bare loop to compare with", "not in time"]
+    assert [plots.share_of(row) for row in rows] == [0.0, 0.0]
+
+
 def test_plots_need_results(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert plots.main(["--json", str(tmp_path / "none.json")]) == 1
     assert "nothing is recorded" in capsys.readouterr().err
