@@ -47,7 +47,7 @@ class Throttle:
     def is_full(self, node: Node) -> bool:
         """Return whether the writers of a file have to wait."""
         draft, attempt = node.draft, node.attempt
-        if draft is None or (attempt is not None and attempt.committing):
+        if draft is None:
             return False
         if attempt is None and (not node.background or self._context.nursery is None):
             return False  # nothing of it moves before it is closed: it waits on the local disk

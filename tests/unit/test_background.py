@@ -198,6 +198,13 @@ async def test_attempts_grow_seldom_and_go_on(autojump_clock: object, store: Fak
     count = len(asked)
     await trio.sleep(1000)
     assert len(asked) == count, "it ended"
+    store.before_request = None
+    store.files.clear()
+    tree.forget_caches()
+    store.fail_at[store.requests + 1] = RequestTimeout("silence")
+    await close_in_vain(tree)
+    await trio.sleep(2 * FIRST_PAUSE)
+    assert tree.undelivered() == [], "the next one begins anew"
 
 
 async def test_a_refusal_is_not_repeated_before_there_is_news(

@@ -107,6 +107,23 @@ async def test_an_upload_that_began_before_the_close_is_given_up_too(
     assert len(store.files[FILE].data) == 10
 
 
+async def test_news_of_lost_bytes_beat_an_upload_that_ended_well(store: FakeWriter, tree: Tree) -> None:
+    file = await tree.open(FILE, write=True)
+    await file.write(len(OLD), b"appended")
+
+    def empty(*request: object) -> None:
+        if request[0] == "terminate":
+            store.uploads[-1]._source.on_rollback(True)
+            store.files[FILE].data = bytes(len(OLD)) + b"appended"
+
+    store.before_request = empty
+    for _ in range(2):
+        with pytest.raises(FileChanged):
+            await file.fsync()
+    assert tree.undelivered() == [FILE]
+    file.close()
+
+
 def test_nothing_is_handed_out_for_a_file_that_was_emptied() -> None:
     sending = Sending(lambda start, stop: bytes(stop - start), [(100, 200)], whole=False)
     assert sending.next_chunk(50) is not None
