@@ -207,3 +207,13 @@ async def test_nothing_stays_in_the_directory_for_temporaries(
     assert await tree.drain(10) == []
     assert os.listdir(tmp_path) == []
     assert store.files[FILE].data == store.files[b"/card/second"].data == BIG
+
+
+async def test_what_is_recovered_has_its_whole_size(store: FakeWriter, tmp_path: Path) -> None:
+    tree = make_writable(store)
+    file = await tree.create(FILE, exclusive=True)
+    await file.write(0, b"abc")
+    await file.truncate(1000)
+    store.lost = True
+    (saved,) = tree.recover_to(tmp_path / "r")
+    assert saved.read_bytes() == b"abc".ljust(1000, b"\0")

@@ -243,3 +243,11 @@ async def test_cleaning_up_that_fails_does_not_fail_the_listing(
     await trio.sleep(STALE_AFTER)
     fat.fail_at[1] = PathTooLong("no")
     assert len(await tree.list(b"/d")) == 4
+
+
+async def test_a_rename_to_another_spelling_of_a_third_file_is_refused(fat: FakeWriter) -> None:
+    tree = make_writable(fat)
+    before = shape(fat)
+    with pytest.raises(AlreadyExists):
+        await tree.rename(b"/d/a", b"/d/B", noreplace=False)
+    assert shape(fat) == before
