@@ -58,6 +58,28 @@ async def test_a_file_that_appeared_is_not_emptied(
     assert store.files[NEW].data == content
 
 
+async def test_a_fresh_listing_that_shows_the_name_does_not_free_it(store: FakeWriter, tree: Tree) -> None:
+    file = await tree.create(NEW, exclusive=True)
+    await file.write(0, b"ours")
+    store.add(NEW, THEIRS)
+    tree.forget_caches()
+    await tree.list(b"/card")
+    with pytest.raises(AlreadyExists):
+        await file.release()
+    assert store.files[NEW].data == THEIRS
+
+
+async def test_a_listing_that_was_cut_short_frees_no_name(store: FakeWriter, tree: Tree) -> None:
+    store.incomplete.add(b"/card")
+    store.unlisted.add(NEW)
+    store.add(NEW, THEIRS)
+    file = await tree.create(NEW, exclusive=True)
+    await file.write(0, b"ours")
+    with pytest.raises(AlreadyExists):
+        await file.release()
+    assert store.files[NEW].data == THEIRS
+
+
 async def test_another_spelling_that_appeared_is_not_emptied(
     autojump_clock: object, nursery: trio.Nursery
 ) -> None:

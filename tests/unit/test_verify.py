@@ -43,6 +43,19 @@ async def test_a_checksum_is_given_the_time_that_the_size_needs(store: FakeWrite
     assert store.crc_sizes == [5000]
 
 
+async def test_a_size_that_differs_is_enough(store: FakeWriter) -> None:
+    def cut(*request: object) -> None:
+        if request[0] == "terminate":
+            store.before_request = None
+            store.files[b"/card/new"].data = b"cut"
+
+    store.before_request = cut
+    tree = make_writable(store, verify="size")
+    await write_file(tree, b"/card/new", b"x" * 5000)
+    assert store.before_request is None
+    assert store.files[b"/card/new"].data == b"x" * 5000
+
+
 async def test_a_part_that_arrived_wrong_is_found_where_checksums_are_demanded(store: FakeWriter) -> None:
     store.spoil_uploads = 1
     tree = make_writable(store, verify="crc")
