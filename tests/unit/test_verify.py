@@ -43,6 +43,13 @@ async def test_a_checksum_is_given_the_time_that_the_size_needs(store: FakeWrite
     assert store.crc_sizes == [5000]
 
 
+async def test_an_empty_file_has_no_checksum_worth_asking(store: FakeWriter) -> None:
+    tree = make_writable(store)
+    file = await tree.create(b"/card/new", exclusive=True)
+    await file.release()
+    assert store.count("crc") == 0
+
+
 async def test_a_size_that_differs_is_enough(store: FakeWriter) -> None:
     def cut(*request: object) -> None:
         if request[0] == "terminate":
