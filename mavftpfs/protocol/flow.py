@@ -162,7 +162,7 @@ class Flow:
         return self.budget is not None and self.budget.held
 
     def _room(self, in_flight: int, now: float, paced: bool) -> int:
-        room = self.window - in_flight + (self._reserve() if paced else self._spare())
+        room = self.window - in_flight + (self._reserve() if paced else 0) + self._spare()
         if self._pacer is None:
             return min(room, self._trains.room(now)) if room > 0 else room
         self._pacer.blocked = False
@@ -170,7 +170,7 @@ class Flow:
 
     def _spare(self) -> int:
         """Return how many more a short queue takes that is not shared with anybody (servers.md 3)."""
-        return int(self.alone and self._pacer is not None and self._cap < self._limit)
+        return int(self.alone and not self._hurried and self._pacer is not None)
 
     def _reserve(self) -> int:
         """Return how many more bridge the pauses of a server; none where its buffers are small, or while

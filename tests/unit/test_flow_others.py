@@ -42,3 +42,14 @@ def test_random_losses_at_the_start_are_not_taken_for_an_overflow(seed: int) -> 
     for _ in range(16):
         path.round(lost=sum(rng.random() < 0.19 for _ in range(flow.window)))
     assert flow.window > 60
+
+
+def test_reads_too_use_one_more_of_a_short_queue_of_ones_own() -> None:
+    """Five at a look instead of four: 116 KiB/s instead of 93 from an ArduPilot close by."""
+    flow = Flow()
+    flow.set_queue_limit(4)
+    assert flow.room(4, 0.0, paced=True) == 0
+    flow.alone = True
+    assert flow.room(4, 0.0, paced=True) == 1
+    flow.room(4, 0.0, paced=True, urgent=True)
+    assert flow.room(4, 0.0, paced=True) == 0, "left to who waits for a small answer"
