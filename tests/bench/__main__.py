@@ -30,6 +30,7 @@ TIMED = ("cost", "mount")
 """Parts that use the machine's clock."""
 
 INTERRUPTED = 130
+CLEANING_UP = 60.0
 PARTS = (*MEASURED, "plots", "all")
 
 QUICK: dict[str, tuple[str, ...]] = {
@@ -57,14 +58,22 @@ def run_part(part: str, quick: bool, record: Record | None, date: str, rest: Seq
     with TemporaryDirectory(prefix="mavftpfs-bench-") as folder:
         found = Path(folder) / "section.json"
         note = [] if record is None else ["--json", str(found)]
-        code = subprocess.run(
-            [sys.executable, "-m", f"tests.bench.{part}", *options, *note], check=False
-        ).returncode
+        code = ended([sys.executable, "-m", f"tests.bench.{part}", *options, *note])
         if record is not None and found.exists():
             content = json.loads(found.read_text())
             command = " ".join(["scripts/bench", part, *(["--quick"] if quick else []), *rest])
             record.put(part, command, content, date, load)
     return code
+
+
+def ended(command: Sequence[str]) -> int:
+    """Run a command and return its exit code; an interrupt goes to the child too, which cleans up first."""
+    child = subprocess.Popen(command)
+    try:
+        return child.wait()
+    except KeyboardInterrupt:
+        child.wait(CLEANING_UP)  # subprocess.run would kill it after a quarter of a second
+        raise
 
 
 def main(argv: Sequence[str]) -> int:

@@ -5,7 +5,10 @@ The real peers are not run in tests: they are others' programs, and have to be d
 
 from __future__ import annotations
 
+import os
 import random
+import signal
+import subprocess
 import sys
 from pathlib import Path
 
@@ -18,6 +21,8 @@ from tests.bench.figures import BARE, US, Outcome, Run, summarise
 from tests.bench.mount import Bench, Cell, run_one
 from tests.bench.peers import PINS, Client, Environment, Job, MountClient, NotToBeHadError, Worker, clients
 from tests.bench.record import Record
+from tests.support.mounts import processes_in, wait_until
+from tests.support.vehicles import PROJECT
 
 SIZE = 60_000
 EVERYBODY = clients(Environment(pins=()))
@@ -142,3 +147,22 @@ def test_a_busy_machine_is_said_and_noted(
     assert section["load"] == 50.0
     assert [row["outcome"] for row in section["results"]["rows"]] == ["ok"]
     assert section["results"]["peers"] == list(PINS)
+
+
+def test_an_interrupt_takes_everything_away(tmp_path: Path) -> None:
+    options = ["--servers", "px4", "--links", "57600", "--directions", "read", "--clients", US]
+    command = [sys.executable, "-m", "tests.bench", "mount", *options, "--size", "100000"]
+    environment = {**os.environ, "TMPDIR": str(tmp_path)}
+    bench = subprocess.Popen(command, cwd=PROJECT, env=environment)
+    try:
+        wait_until("mounted", lambda: f"{tmp_path}/" in Path("/proc/self/mounts").read_text(), 60.0)
+        children = Path(f"/proc/{bench.pid}/task/{bench.pid}/children").read_text().split()
+        for pid in (bench.pid, *map(int, children)):
+            os.kill(pid, signal.SIGINT)
+        assert bench.wait(60.0) == entry.INTERRUPTED
+    finally:
+        bench.kill()
+        bench.wait()
+    assert f"{tmp_path}/" not in Path("/proc/self/mounts").read_text()
+    assert processes_in(tmp_path) == []
+    assert list(tmp_path.iterdir()) == []
