@@ -30,7 +30,7 @@ TIMED = ("cost", "mount")
 """Parts that use the machine's clock."""
 
 INTERRUPTED = 130
-CLEANING_UP = 60.0
+CLEANING_UP = 120.0
 PARTS = (*MEASURED, "plots", "all")
 
 QUICK: dict[str, tuple[str, ...]] = {
