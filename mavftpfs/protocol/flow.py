@@ -166,7 +166,9 @@ class Flow:
         if self._pacer is None:
             return min(room, self._trains.room(now)) if room > 0 else room
         self._pacer.blocked = False
-        return self._pacer.room(in_flight, now) if paced and room <= 0 else room
+        # How evenly others send is not ours to say: beside them the queue is all there is.
+        beyond = paced and room <= 0 and self.alone
+        return self._pacer.room(in_flight, now) if beyond else room
 
     def _spare(self) -> int:
         """Return how many more a short queue takes that is not shared with anybody (servers.md 3)."""

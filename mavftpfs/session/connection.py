@@ -318,7 +318,7 @@ async def _send_heartbeats(connection: Connection) -> None:
 
 
 async def _watch_link(connection: Connection) -> None:
-    """Tell when the vehicle is lost; its return is told by its heartbeat. Tell the window who else is about."""
+    """Tell when the vehicle is lost (not its return), and the window who else is about."""
     while True:
         connection.engine.flow.alone = not connection.vehicle.foreign_client(connection.clock())
         await trio.sleep(HEARTBEAT_PERIOD)

@@ -147,12 +147,15 @@ def test_a_flow_uses_it_where_the_server_queues_little_and_for_whom_it_suits() -
         now = order * 0.01
         flow.on_sent(now)
         flow.on_reply(now, 0.3, order, order + QUEUE)
-    assert flow.room(QUEUE, 3.0, paced=True) > 0
+    assert flow.room(QUEUE, 3.0, paced=True) == 0, "beside other clients the queue is all there is"
+    flow.alone = True
+    shared = QUEUE + 1  # the place that is kept for others
+    assert flow.room(shared, 3.0, paced=True) > 0
     assert flow.next_room_at() < inf
-    assert flow.room(QUEUE, 3.0, paced=False) == 0
+    assert flow.room(shared, 3.0, paced=False) == 0
     assert flow.next_room_at() == inf
-    assert flow.room(QUEUE - 1, 3.0, paced=True) == 1
+    assert flow.room(shared - 1, 3.0, paced=True) == 1
     flow.set_queue_limit(QUEUE)
-    assert flow.room(QUEUE, 3.0, paced=True) > 0
+    assert flow.room(shared, 3.0, paced=True) > 0
     flow.on_silence()
-    assert flow.room(QUEUE, 3.0, paced=True) <= 0
+    assert flow.room(shared, 3.0, paced=True) <= 0
