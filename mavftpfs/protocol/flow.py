@@ -23,6 +23,7 @@ from mavftpfs.protocol.budget import Budget
 from mavftpfs.protocol.easing import Easing
 from mavftpfs.protocol.pacing import Pacer
 from mavftpfs.protocol.stalls import Stalls
+from mavftpfs.protocol.survival import Survival
 from mavftpfs.protocol.trains import Trains
 
 FIRST = 8
@@ -37,6 +38,9 @@ _LEAP = 4
 _FAST_PATH_SECONDS = 0.010
 _FAST_PATH_WINDOW = 96
 _MOST_RESERVE = 512
+_FASTEST_LINK = 6000.0
+"""Answers per second (1.4 MB/s) beyond which no radio is on the way."""
+
 _QUEUE_SECONDS = 0.005
 _ROUNDS_REMEMBERED = 10
 _PLATEAU_ROUNDS = 2
@@ -48,8 +52,8 @@ _TELLING_ROUND = 16
 
 class Flow:
     """The in-flight window, in requests. serial: small receive buffers are likely, so start at 1 and
-    grow by one. limit: the most that may ever be in flight, None for the default. budget: the user's.
-    alone: no other client of the server was heard lately."""
+    find out by `survival` what they hold. limit: the most that may ever be in flight, None for the
+    default. budget: the user's. alone: no other client of the server was heard lately."""
 
     __slots__ = (
         "_all",
@@ -65,6 +69,7 @@ class Flow:
         "_hurried",
         "_limit",
         "_losses",
+        "_narrow",
         "_pacer",
         "_plateau",
         "_rates",
@@ -72,9 +77,9 @@ class Flow:
         "_round_end",
         "_round_least",
         "_round_start",
-        "_serial",
         "_stalls",
         "_starting",
+        "_survival",
         "_trains",
         "_wide_least",
         "_wide_window",
@@ -89,8 +94,8 @@ class Flow:
     ) -> None:
         self.budget = budget
         self.alone = False
-        self._serial = serial
         self._limit = max(1, limit or (SERIAL_CAP if serial else DEFAULT_CAP))
+        self._survival = Survival(self._limit) if serial else None
         self._cap = self._limit
         self.window = min(1 if serial else FIRST, self._cap)
         self.loss = 0.0
@@ -100,6 +105,7 @@ class Flow:
         self._base_rtt = inf
         self._wide_window = 0
         self._wide_least = inf
+        self._narrow = False
         self._easing = Easing()
         self._trains = Trains()
         self._pacer: Pacer | None = None
@@ -178,12 +184,14 @@ class Flow:
         """Return how many more bridge the pauses of a server; none where its buffers are small, or while
         somebody waits for an answer that would have to queue behind them."""
         reserve = self._stalls.reserve
-        none = not reserve or self._hurried or self._serial or self._pacer
+        none = not reserve or self._hurried or self._survival or self._pacer
         return 0 if none else self._bounded(reserve * self._best_rate)
 
     def _bounded(self, reserve: float) -> int:
-        """Never beyond the limit; and on a fast path a pause is ours or a busy computer's, and thousands of
-        requests for 0.15 s would only overflow the sockets at both ends."""
+        """Never beyond the limit; and on a fast path a pause is ours or a busy computer's, which requests
+        cannot bridge: hundreds of them would only overflow the sockets at both ends."""
+        if self._best_rate > _FASTEST_LINK:
+            return 0
         return max(0, min(int(reserve), _MOST_RESERVE, self._cap - self.window))
 
     def next_room_at(self) -> float:
@@ -239,7 +247,8 @@ class Flow:
     def on_silence(self) -> None:
         """Nothing at all was heard for a retransmission timeout: probe with two until something is."""
         if not self._collapsed:
-            self._collapsed = max(1, self.window // 2)
+            # What a small buffer survived it will survive again: there a silence is a few losses in a row.
+            self._collapsed = self.window if self._survival else max(1, self.window // 2)
             self._goal = 0
             self.window = min(2, self.window)
         if self._pacer is not None:
@@ -270,7 +279,12 @@ class Flow:
             return
         self._learn_congestion()
         self._trains.end_round(self._replies, rate)
-        if self._starting and overflowed:
+        if self._survival is not None:
+            window = self._survival.end_round(
+                self._replies, self._losses, took, now, queued=self._queued(2.0)
+            )
+            self.window = min(self._cap, window)
+        elif self._starting and overflowed:
             self._starting = False
             self._goal = 0
             self._easing.ceiling = max(INITIAL, self._held(self._best_rate))
@@ -282,16 +296,19 @@ class Flow:
             self._approach(self._easing.next_window(self._target(), self.loss, next_order))
 
     def _learn_base(self) -> None:
-        """Keep the least round trip, until a much narrower window proves that it is gone."""
+        """Keep the least round trip, until two rounds of a much narrower window prove that it is gone: most
+        answers of the first are still to the wide one's requests."""
         least = self._round_least
+        in_flight = self.window + self._bounded(self._stalls.reserve * self._best_rate)
+        was_narrow, self._narrow = self._narrow, in_flight <= _NARROW * self._wide_window
         if least <= 1.1 * self._base_rtt:
             self._base_rtt = min(least, self._base_rtt)
             self._wide_window = 0
         elif least == inf:
             return
-        elif self.window > self._wide_window:
-            self._wide_window, self._wide_least = self.window, least
-        elif self.window <= _NARROW * self._wide_window:
+        elif in_flight > self._wide_window:
+            self._wide_window, self._wide_least = in_flight, least
+        elif self._narrow and was_narrow:
             # A queue of ours would have become shorter.
             if least > 0.9 * self._wide_least:
                 self._base_rtt = least
@@ -343,9 +360,5 @@ class Flow:
         return self._brake * max(self._held(rate), min(rate * _FAST_PATH_SECONDS, _FAST_PATH_WINDOW))
 
     def _approach(self, target: float) -> None:
-        if self._serial:
-            # One at a time, and back where most of a round was lost: what the far end's buffer survived.
-            step = -1 if self._losses > self._replies else 1
-            target = min(target, self.window + step)
-        least = 1 if self._serial else INITIAL  # so few are no load, and fewer find losses slowly
-        self.window = min(self._cap, max(least, round(target)))
+        # So few are no load, and fewer find losses slowly.
+        self.window = min(self._cap, max(INITIAL, round(target)))
