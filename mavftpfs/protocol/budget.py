@@ -79,9 +79,9 @@ class Budget:
             self._want()
         return self._left
 
-    def on_sent(self) -> None:
-        """One of these requests goes out."""
-        self._left -= 1
+    def on_sent(self, count: int) -> None:
+        """So many of these requests go out."""
+        self._left -= count
         if self._left == 0:
             self._want()
 

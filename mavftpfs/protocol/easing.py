@@ -19,21 +19,26 @@ _LEAST = 4.0
 
 
 class Easing:
-    """Plans eased rounds and judges them; `ceiling` is the widest window that seems to be survived."""
+    """Plans eased rounds and judges them.
 
-    __slots__ = ("_answered", "_eased", "_from", "_lost", "_to", "_wait", "ceiling")
+    Attributes:
+        ceiling: the widest window that seems to be survived.
+        until: only transmissions with a smaller order count; those sent while eased.
+    """
+
+    __slots__ = ("_answered", "_eased", "_from", "_lost", "_wait", "ceiling", "until")
 
     def __init__(self) -> None:
         self.ceiling = inf
         self._wait = _FIRST_AFTER
-        self._from = self._to = -1  # the orders sent while eased: from <= order < to
+        self._from = self.until = -1
         self._eased = 0.0
         self._answered = 0
         self._lost = 0
 
     def count(self, order: int, *, lost: bool) -> None:
         """A transmission was answered or lost."""
-        if self._from <= order < self._to:
+        if self._from <= order < self.until:
             if lost:
                 self._lost += 1
             else:
@@ -46,7 +51,7 @@ class Easing:
         """
         self._wait -= 1
         if self._wait == -1:
-            self._to = next_order
+            self.until = next_order
         elif self._wait == -3:
             self._judge(loss)
             self._wait = _ROUNDS_BETWEEN
@@ -56,7 +61,7 @@ class Easing:
                 self._wait = 1
                 self.ceiling *= _RISE
                 return target
-            self._from, self._to = next_order, 1 << 62
+            self._from, self.until = next_order, 1 << 62
             self._answered = self._lost = 0
             target *= _NARROWED
             self._eased = target

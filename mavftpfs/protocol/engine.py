@@ -194,14 +194,19 @@ class Engine:
         elif request.single:
             rtt = self._timers.sample(request, now)
         flow.on_reply(now, rtt, request.order, ledger.order)
-        while (lost := ledger.next_loss()) is not None:
-            flow.on_loss(lost.order)
-            ledger.lose(lost)
+        if ledger.newest_answered - ledger.reorder >= ledger.first:
+            self._find_losses()
         op = request.op
         op.progress_at = now
         op.on_reply(request, reply, now)
         if op.done:
             self._retire()
+
+    def _find_losses(self) -> None:
+        ledger = self._ledger
+        while (lost := ledger.next_loss()) is not None:
+            self.flow.on_loss(lost.order)
+            ledger.lose(lost)
 
     def _on_unknown(self, reply: Payload) -> None:
         op = self._bursts.op
@@ -287,26 +292,26 @@ class Engine:
         # Metadata may use one slot more than bulk work: a full window must not make it wait.
         in_flight = ledger.in_flight - (op.priority is Priority.METADATA)
         room = self.flow.room(in_flight, now, paced=op.paced, urgent=op.priority is Priority.METADATA)
-        while room > 0:
+        left = room
+        while left > 0:
             request = ledger.take_again(op) if ledger.again else None
             if request is None:
                 request = op.next_request(now)
             if request is None:
-                return True
+                break
             wires.append(self._transmit(request, now))
-            room -= 1
-        return False
+            left -= 1
+        if left < room:
+            self.stats.requests += room - left
+            self.flow.on_sent(room - left, now)
+        return left > 0
 
     def _transmit(self, request: Request, now: float) -> bytes:
-        stats = self.stats
-        stats.requests += 1
-        by_opcode = stats.by_opcode
         opcode = request.opcode
-        by_opcode[opcode] = by_opcode.get(opcode, 0) + 1
+        self.stats.by_opcode[opcode] += 1
         if request.follows:
             request.session = self.session
         timer = now + self._timers.of[request.manner.family].rto
-        self.flow.on_sent(now)
         if request.sends or opcode == _BURST:
             self._transmit_again(request, now)
         else:
@@ -389,7 +394,7 @@ class Engine:
         op = request.op
         if now - request.first_sent >= self._patience(op) and op is not self._ledger.ghost:
             self._time_out(op)
-        self.flow.on_loss(request.order)
+        self.flow.on_loss(request.order, request.sends)
         self._ledger.lose(request)
 
     def _time_out(self, op: Operation) -> None:

@@ -41,6 +41,7 @@ _MOST_RESERVE = 512
 _FASTEST_LINK = 6000.0
 """Answers per second (1.4 MB/s) beyond which no radio is on the way."""
 
+_OFTEN = 5
 _QUEUE_SECONDS = 0.005
 _ROUNDS_REMEMBERED = 10
 _PLATEAU_ROUNDS = 2
@@ -66,6 +67,7 @@ class Flow:
         "_collapsed",
         "_easing",
         "_goal",
+        "_heard_at",
         "_hurried",
         "_limit",
         "_losses",
@@ -110,6 +112,7 @@ class Flow:
         self._trains = Trains()
         self._pacer: Pacer | None = None
         self._stalls = Stalls()
+        self._heard_at = -inf
         self._hurried = False
         self._brake = 1.0
         self._plateau = 0
@@ -200,17 +203,18 @@ class Flow:
             return self.budget.next_room_at()  # before that, nothing goes out in any case
         return self._trains.next_room_at() if self._pacer is None else self._pacer.next_at()
 
-    def on_sent(self, now: float) -> None:
-        """A request goes out."""
+    def on_sent(self, count: int, now: float) -> None:
+        """So many requests, at least one, go out, which there was room for."""
         if self.budget is not None:
-            self.budget.on_sent()
-        self._trains.on_sent()
+            self.budget.on_sent(count)
+        self._trains.on_sent(count)
         if self._pacer is not None:
-            self._pacer.on_sent(now)
+            self._pacer.on_sent(count, now)
 
     def on_starved(self) -> None:
         """There was room in the window and nothing to send: this round's rate says little."""
         self._app_limited = True
+        self._heard_at = -inf
         self._stalls.interrupt()
         if self._pacer is not None:
             self._pacer.on_starved()
@@ -222,8 +226,11 @@ class Flow:
         if self.window < self._goal:
             # Two new requests for each answer: doubling without a flood, which a known pace prevents.
             self.window = self._goal if self._trains.proven else self.window + 1
-        self._easing.count(order, lost=False)
-        self._stalls.on_reply(now, 0.0 if self._starting else self._best_rate)
+        if order < self._easing.until:
+            self._easing.count(order, lost=False)
+        if now != self._heard_at:  # what comes at once has no pauses
+            self._heard_at = now
+            self._stalls.on_reply(now, 0.0 if self._starting else self._best_rate)
         if self._pacer is not None:
             self._pacer.on_reply(now, rtt, order, next_order)
         if rtt is not None and rtt < self._round_least:
@@ -233,9 +240,11 @@ class Flow:
         if order >= self._round_end:
             self._end_round(now, next_order)
 
-    def on_loss(self, order: int) -> None:
-        """The transmission numbered `order` is taken to be lost."""
+    def on_loss(self, order: int, sends: int = 1) -> None:
+        """The transmission numbered `order` is taken to be lost, the `sends`th of its request."""
         self._losses += 1
+        if self._survival is not None and sends >= _OFTEN:
+            self.window = 1  # it may always come second to a buffer for one: let it go alone
         self._easing.count(order, lost=True)
         if self._pacer is not None:
             self._pacer.on_loss(order)

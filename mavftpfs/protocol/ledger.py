@@ -43,20 +43,21 @@ class Ledger:
 
     Attributes:
         again: lost requests which go out again as soon as there is room.
+        newest_answered: order of the last transmission that was answered. first: no older one may be lost.
         order: number of the next transmission.
         reorder: how many transmissions later an answer must be to prove a loss; grows when that was wrong.
     """
 
     __slots__ = (
-        "_first",
         "_flying",
-        "_newest_answered",
         "_ordered",
         "_seq",
         "_table",
         "again",
         "find",
+        "first",
         "ghost",
+        "newest_answered",
         "order",
         "reorder",
     )
@@ -68,8 +69,8 @@ class Ledger:
         self.find = self._table.get
         """Returns the unanswered request to which a reply with a seq belongs, or None."""
         self._ordered: OrderedDict[int, Request] = OrderedDict()
-        self._first = 0  # nothing older is in `_ordered`
-        self._newest_answered = -1
+        self.first = 0  # nothing older is in `_ordered`
+        self.newest_answered = -1
         self.again: list[Request] = []
         self.ghost = Ghost()
         self.order = 0
@@ -157,8 +158,8 @@ class Ledger:
             request.flying = False
             del self._table[seq], self._flying[order]
             self._ordered.pop(order, None)
-            if order > self._newest_answered:
-                self._newest_answered = order
+            if order > self.newest_answered:
+                self.newest_answered = order
             return True
         outrun = request.outrun
         self.forget(request)
@@ -170,8 +171,8 @@ class Ledger:
             self.reorder = min(self.reorder * 2, _MAX_REORDER)
         elif current and request.sends > 1 and self.reorder > _MIN_REORDER:
             self.reorder -= 1
-        if request.order > self._newest_answered:
-            self._newest_answered = request.order
+        if request.order > self.newest_answered:
+            self.newest_answered = request.order
         return current
 
     def forget(self, request: Request) -> None:
@@ -188,13 +189,13 @@ class Ledger:
 
     def next_loss(self) -> Request | None:
         """Return a request that later answers prove to be lost, or None; the caller calls `lose`."""
-        proven = self._newest_answered - self.reorder
-        if proven < self._first:
+        proven = self.newest_answered - self.reorder
+        if proven < self.first:
             return None
         ordered = self._ordered
         if not ordered:
             return None
-        self._first = order = next(iter(ordered))
+        self.first = order = next(iter(ordered))
         if order > proven:
             return None
         request = ordered[order]

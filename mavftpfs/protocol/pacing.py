@@ -108,11 +108,11 @@ class Pacer:
             return inf
         return self._tokens_at + (1.0 - self._tokens) / self.rate + 1e-6
 
-    def on_sent(self, now: float) -> None:
-        """Any request goes out."""
+    def on_sent(self, count: int, now: float) -> None:
+        """Any requests go out."""
         if self.rate is not None:
             self._refill(self.rate, now)
-            self._tokens = max(-float(self.queue), self._tokens - 1.0)
+            self._tokens = max(-float(self.queue), self._tokens - count)
 
     def _refill(self, rate: float, now: float) -> None:
         self._tokens = min(_DEPTH, self._tokens + (now - self._tokens_at) * rate)

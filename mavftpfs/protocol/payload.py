@@ -108,7 +108,9 @@ def decode_reply(wire: bytes) -> Payload:
     Raises:
         RemoteProtocolError: wrong length, or `size` over 239.
     """
-    fields = _unpack(wire)
+    if len(wire) != PAYLOAD_SIZE:
+        raise _wrong_length(wire)
+    fields = _HEADER.unpack_from(wire)
     size = fields[3]
     if size > MAX_DATA:
         raise RemoteProtocolError(f"reply says it holds {size} bytes of data, more than {MAX_DATA}")
@@ -121,10 +123,11 @@ def decode_request(wire: bytes) -> Payload:
     Raises:
         RemoteProtocolError: wrong length. An oversize `size` is left for the server to refuse.
     """
-    return Payload(*_unpack(wire), wire[HEADER_SIZE:])
-
-
-def _unpack(wire: bytes) -> tuple[int, int, int, int, int, int, int]:
     if len(wire) != PAYLOAD_SIZE:
-        raise RemoteProtocolError(f"payload of {len(wire)} bytes, {PAYLOAD_SIZE} expected")
-    return _HEADER.unpack_from(wire)
+        raise _wrong_length(wire)
+    fields: tuple[int, int, int, int, int, int, int] = _HEADER.unpack_from(wire)
+    return Payload(*fields, wire[HEADER_SIZE:])
+
+
+def _wrong_length(wire: bytes) -> RemoteProtocolError:
+    return RemoteProtocolError(f"payload of {len(wire)} bytes, {PAYLOAD_SIZE} expected")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from dataclasses import dataclass, field
 
 
@@ -25,4 +26,4 @@ class EngineStats:
     stale: int = 0
     incoherent: int = 0
     timeouts: int = 0
-    by_opcode: dict[int, int] = field(default_factory=dict)
+    by_opcode: defaultdict[int, int] = field(default_factory=lambda: defaultdict(int))

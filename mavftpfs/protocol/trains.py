@@ -39,7 +39,7 @@ class Trains:
         self.rate = inf
         self.proven = False
         self._densest = inf
-        self._times: deque[float] = deque(maxlen=_LENGTH)
+        self._times = deque([-inf] * _LENGTH, maxlen=_LENGTH)
         self._rounds: deque[float] = deque(maxlen=_ROUNDS_REMEMBERED)
         self._blocked = False
         self._tokens = 0.0
@@ -50,10 +50,9 @@ class Trains:
     def on_reply(self, now: float) -> None:
         """A request was answered."""
         times = self._times
-        if len(times) == _LENGTH:
-            took = now - times[0]
-            if took < self._densest:
-                self._densest = took
+        took = now - times[0]
+        if took < self._densest:
+            self._densest = took
         times.append(now)
 
     def end_round(self, answers: int, average: float) -> None:
@@ -90,7 +89,7 @@ class Trains:
             return inf
         return self._tokens_at + (1.0 - self._tokens) / (_GAIN * self.rate) + 1e-6
 
-    def on_sent(self) -> None:
-        """A request goes out."""
-        self._tokens = max(-_DEPTH, self._tokens - 1.0)
+    def on_sent(self, count: int) -> None:
+        """So many requests go out."""
+        self._tokens = max(-_DEPTH, self._tokens - count)
         self._blocked = self._tokens < 1.0

@@ -23,7 +23,7 @@ def spend_all(budget: Budget, start: float, stop: float, *, urgent: bool = False
     while now < stop:
         budget.begin()
         for _ in range(budget.room(now, urgent=urgent)):
-            budget.on_sent()
+            budget.on_sent(1)
             budget.spend(COST, now)
             sends.append(now)
         now = budget.next_room_at()

@@ -44,7 +44,7 @@ class Server:
     def _ask(self) -> None:
         self.pacer.blocked = False
         while self.in_flight < QUEUE or self.pacer.room(self.in_flight, self.now) > 0:
-            self.pacer.on_sent(self.now)
+            self.pacer.on_sent(1, self.now)
             self.in_flight += 1
             self.busiest = max(self.busiest, self.in_flight)
             self._travel(self.order)
@@ -132,7 +132,7 @@ def test_requests_go_out_one_by_one() -> None:
         room = pacer.room(QUEUE, now)
         assert room <= 2
         for _ in range(room):
-            pacer.on_sent(now)
+            pacer.on_sent(1, now)
             sent.append(now)
         now = max(now + 1e-9, pacer.next_at())
     assert 98 <= len(sent) <= 103
@@ -145,7 +145,7 @@ def test_a_flow_uses_it_where_the_server_queues_little_and_for_whom_it_suits() -
     flow.set_queue_limit(QUEUE)
     for order in range(200):
         now = order * 0.01
-        flow.on_sent(now)
+        flow.on_sent(1, now)
         flow.on_reply(now, 0.3, order, order + QUEUE)
     assert flow.room(QUEUE, 3.0, paced=True) == 0, "beside other clients the queue is all there is"
     flow.alone = True

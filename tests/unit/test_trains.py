@@ -70,7 +70,7 @@ def test_no_more_goes_out_than_the_path_takes() -> None:
         room = trains.room(now)
         assert room <= 4
         for _ in range(room):
-            trains.on_sent()
+            trains.on_sent(1)
             sends.append(now)
         assert now < trains.next_room_at() < now + 3 / RATE
         now = trains.next_room_at()
@@ -83,7 +83,7 @@ def test_who_was_not_held_back_need_not_be_woken() -> None:
     assert trains.room(10.0) >= 1
     assert trains.next_room_at() == inf
     while trains.room(10.0):
-        trains.on_sent()
+        trains.on_sent(1)
     assert trains.next_room_at() < 10.1
     trains.begin()
     assert trains.next_room_at() == inf
