@@ -184,8 +184,7 @@ class Engine:
         if reply.opcode == _NAK:
             stats.naks += 1
         self._heard_at = now
-        rtt: float | None = None
-        flow, ledger = self.flow, self._ledger
+        rtt, flow, ledger = None, self.flow, self._ledger
         if not ledger.settle(request, reply.seq):
             stats.spurious += 1
             flow.on_spurious()
@@ -195,18 +194,13 @@ class Engine:
             rtt = self._timers.sample(request, now)
         flow.on_reply(now, rtt, request.order, ledger.order)
         if ledger.newest_answered - ledger.reorder >= ledger.first:
-            self._find_losses()
+            for lost in ledger.lose_outrun():
+                flow.on_loss(lost.order)
         op = request.op
         op.progress_at = now
         op.on_reply(request, reply, now)
         if op.done:
             self._retire()
-
-    def _find_losses(self) -> None:
-        ledger = self._ledger
-        while (lost := ledger.next_loss()) is not None:
-            self.flow.on_loss(lost.order)
-            ledger.lose(lost)
 
     def _on_unknown(self, reply: Payload) -> None:
         op = self._bursts.op
@@ -301,9 +295,9 @@ class Engine:
                 break
             wires.append(self._transmit(request, now))
             left -= 1
-        if left < room:
-            self.stats.requests += room - left
-            self.flow.on_sent(room - left, now)
+        if sent := room - left:
+            self.stats.requests += sent
+            self.flow.on_sent(sent, now)
         return left > 0
 
     def _transmit(self, request: Request, now: float) -> bytes:
@@ -394,7 +388,7 @@ class Engine:
         op = request.op
         if now - request.first_sent >= self._patience(op) and op is not self._ledger.ghost:
             self._time_out(op)
-        self.flow.on_loss(request.order, request.sends)
+        self.flow.on_loss(request.order)
         self._ledger.lose(request)
 
     def _time_out(self, op: Operation) -> None:

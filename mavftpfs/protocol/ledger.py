@@ -187,8 +187,15 @@ class Ledger:
         else:
             self.again = [other for other in self.again if other is not request]
 
-    def next_loss(self) -> Request | None:
-        """Return a request that later answers prove to be lost, or None; the caller calls `lose`."""
+    def lose_outrun(self) -> list[Request]:
+        """Lose the requests that later answers prove to be lost, and return them."""
+        lost = []
+        while (request := self._next_outrun()) is not None:
+            self.lose(request)
+            lost.append(request)
+        return lost
+
+    def _next_outrun(self) -> Request | None:
         proven = self.newest_answered - self.reorder
         if proven < self.first:
             return None
