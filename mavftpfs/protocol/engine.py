@@ -388,7 +388,7 @@ class Engine:
         op = request.op
         if now - request.first_sent >= self._patience(op) and op is not self._ledger.ghost:
             self._time_out(op)
-        self.flow.on_loss(request.order)
+        self.flow.on_loss(request.order, request.sends)
         self._ledger.lose(request)
 
     def _time_out(self, op: Operation) -> None:

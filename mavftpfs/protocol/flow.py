@@ -23,6 +23,7 @@ from mavftpfs.protocol.budget import Budget
 from mavftpfs.protocol.easing import Easing
 from mavftpfs.protocol.pacing import Pacer
 from mavftpfs.protocol.stalls import Stalls
+from mavftpfs.protocol.survival import Survival
 from mavftpfs.protocol.trains import Trains
 
 FIRST = 8
@@ -40,6 +41,7 @@ _MOST_RESERVE = 512
 _FASTEST_LINK = 6000.0
 """Answers per second (1.4 MB/s) beyond which no radio is on the way."""
 
+_OFTEN = 5
 _QUEUE_SECONDS = 0.005
 _ROUNDS_REMEMBERED = 10
 _PLATEAU_ROUNDS = 2
@@ -51,8 +53,8 @@ _TELLING_ROUND = 16
 
 class Flow:
     """The in-flight window, in requests. serial: small receive buffers are likely, so start at 1 and
-    grow by one. limit: the most that may ever be in flight, None for the default. budget: the user's.
-    alone: no other client of the server was heard lately."""
+    find out by `survival` what they hold. limit: the most that may ever be in flight, None for the
+    default. budget: the user's. alone: no other client of the server was heard lately."""
 
     __slots__ = (
         "_all",
@@ -77,9 +79,9 @@ class Flow:
         "_round_end",
         "_round_least",
         "_round_start",
-        "_serial",
         "_stalls",
         "_starting",
+        "_survival",
         "_trains",
         "_wide_least",
         "_wide_window",
@@ -94,8 +96,8 @@ class Flow:
     ) -> None:
         self.budget = budget
         self.alone = False
-        self._serial = serial
         self._limit = max(1, limit or (SERIAL_CAP if serial else DEFAULT_CAP))
+        self._survival = Survival(self._limit) if serial else None
         self._cap = self._limit
         self.window = min(1 if serial else FIRST, self._cap)
         self.loss = 0.0
@@ -185,7 +187,7 @@ class Flow:
         """Return how many more bridge the pauses of a server; none where its buffers are small, or while
         somebody waits for an answer that would have to queue behind them."""
         reserve = self._stalls.reserve
-        none = not reserve or self._hurried or self._serial or self._pacer
+        none = not reserve or self._hurried or self._survival or self._pacer
         return 0 if none else self._bounded(reserve * self._best_rate)
 
     def _bounded(self, reserve: float) -> int:
@@ -238,9 +240,11 @@ class Flow:
         if order >= self._round_end:
             self._end_round(now, next_order)
 
-    def on_loss(self, order: int) -> None:
-        """The transmission numbered `order` is taken to be lost."""
+    def on_loss(self, order: int, sends: int = 1) -> None:
+        """The transmission numbered `order` is taken to be lost, the `sends`th of its request."""
         self._losses += 1
+        if self._survival is not None and sends >= _OFTEN:
+            self.window = 1  # it may always come second to a buffer for one: let it go alone
         self._easing.count(order, lost=True)
         if self._pacer is not None:
             self._pacer.on_loss(order)
@@ -252,7 +256,8 @@ class Flow:
     def on_silence(self) -> None:
         """Nothing at all was heard for a retransmission timeout: probe with two until something is."""
         if not self._collapsed:
-            self._collapsed = max(1, self.window // 2)
+            # What a small buffer survived it will survive again: there a silence is a few losses in a row.
+            self._collapsed = self.window if self._survival else max(1, self.window // 2)
             self._goal = 0
             self.window = min(2, self.window)
         if self._pacer is not None:
@@ -283,7 +288,12 @@ class Flow:
             return
         self._learn_congestion()
         self._trains.end_round(self._replies, rate)
-        if self._starting and overflowed:
+        if self._survival is not None:
+            window = self._survival.end_round(
+                self._replies, self._losses, took, now, queued=self._queued(2.0)
+            )
+            self.window = min(self._cap, window)
+        elif self._starting and overflowed:
             self._starting = False
             self._goal = 0
             self._easing.ceiling = max(INITIAL, self._held(self._best_rate))
@@ -359,9 +369,5 @@ class Flow:
         return self._brake * max(self._held(rate), min(rate * _FAST_PATH_SECONDS, _FAST_PATH_WINDOW))
 
     def _approach(self, target: float) -> None:
-        if self._serial:
-            # One at a time, and back where most of a round was lost: what the far end's buffer survived.
-            step = -1 if self._losses > self._replies else 1
-            target = min(target, self.window + step)
-        least = 1 if self._serial else INITIAL  # so few are no load, and fewer find losses slowly
-        self.window = min(self._cap, max(least, round(target)))
+        # So few are no load, and fewer find losses slowly.
+        self.window = min(self._cap, max(INITIAL, round(target)))

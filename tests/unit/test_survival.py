@@ -1,0 +1,122 @@
+"""The window on a serial port: the largest one that the far end's receive buffer survives."""
+
+from __future__ import annotations
+
+import random
+from functools import cache
+
+import pytest
+
+from mavftpfs.link.messages import Address
+from mavftpfs.protocol.flow import SERIAL_CAP, Flow
+from mavftpfs.protocol.payload import MAX_DATA, Opcode, decode_request
+from mavftpfs.protocol.writing import WriteTransfer
+from mavftpfs.sim.linkmodel import LinkSettings
+from tests.support.replies import ack
+from tests.support.sources import MemorySource
+from tests.support.virtual import VirtualLink
+
+START = 20.0
+SECONDS = 60.0
+SEEDS = (1, 2)
+LOOK = 0.1
+SURVIVED = [1, 2, 4, 8, None]
+LOSSES = [0.0, 0.05, 0.1, 0.2]
+
+
+class Port:
+    """A receiver that is busy for about LOOK seconds at a time; its buffer holds so many requests then."""
+
+    def __init__(self, holds: int | None) -> None:
+        self.holds = holds
+        self.lost = self.arrived = 0
+        self._rng = random.Random(4)
+        self._waiting: list[tuple[bytes, Address]] = []
+        self._look_at: float | None = None
+        self._outbox: list[tuple[Address, bytes]] = []
+
+    def handle(self, wire: bytes, source: Address, now: float) -> None:
+        self.arrived += 1
+        if self._look_at is None:
+            self._look_at = now + LOOK * self._rng.uniform(0.5, 1.5)
+        if self.holds is None or len(self._waiting) < self.holds:
+            self._waiting.append((wire, source))
+        else:
+            self.lost += 1
+
+    def outgoing(self, now: float) -> list[tuple[Address, bytes]]:
+        if self._look_at is not None and now >= self._look_at:
+            self._look_at = None
+            self._outbox += [(source, answer(wire)) for wire, source in self._waiting]
+            self._waiting.clear()
+        sent, self._outbox = self._outbox, []
+        return sent
+
+    def next_deadline(self) -> float | None:
+        return self._look_at
+
+
+class Fixed(Flow):
+    """A window that never changes."""
+
+    def on_silence(self) -> None:
+        pass
+
+    def _end_round(self, now: float, next_order: int) -> None:
+        pass
+
+
+def fixed(window: int) -> Flow:
+    flow = Fixed()
+    flow.window = window
+    return flow
+
+
+def answer(wire: bytes) -> bytes:
+    request = decode_request(wire)
+    assert request.opcode == Opcode.WRITE_FILE
+    return ack(request).encode()
+
+
+def write(flow: Flow, port: Port, loss: float, *, seed: int = 1) -> float:
+    """Write for so long; return bytes per second ACKed after the start, when it has found out."""
+    link = VirtualLink(port, LinkSettings(delay=0.01, loss=loss), seed=seed, flow=flow)
+    transfer = WriteTransfer(0, MemorySource(bytes(MAX_DATA * 20_000)))
+    link.engine.start(transfer, link.now)
+    began = link.now
+    link.run_until(lambda: link.now >= began + START)
+    before, port.arrived, port.lost = transfer.acked_bytes, 0, 0
+    link.run_until(lambda: link.now >= began + START + SECONDS)
+    return (transfer.acked_bytes - before) / SECONDS
+
+
+@cache
+def best(holds: int | None, loss: float) -> float:
+    """Return what a window brings that is right from the beginning and never changes."""
+    return write(fixed(SERIAL_CAP if holds is None else holds), Port(holds), loss)
+
+
+@pytest.mark.parametrize("loss", LOSSES)
+@pytest.mark.parametrize("holds", SURVIVED)
+def test_it_settles_at_what_is_survived(holds: int | None, loss: float) -> None:
+    rate, overflow = 0.0, 0.0
+    for seed in SEEDS:
+        port = Port(holds)
+        rate += write(Flow(serial=True), port, loss, seed=seed) / len(SEEDS)
+        overflow += port.lost / port.arrived / len(SEEDS)
+    assert rate >= 0.85 * best(holds, loss)
+    assert overflow <= 0.35  # a wider window is tried now and then
+
+
+def test_a_limit_of_one_is_kept() -> None:
+    flow = Flow(serial=True, limit=1)
+    write(flow, Port(None), 0.2)
+    assert flow.window == 1
+
+
+def test_a_buffer_that_shrank_is_noticed() -> None:
+    flow, port = Flow(serial=True), Port(8)
+    write(flow, port, 0.0)
+    port.holds = 1
+    write(flow, port, 0.0)
+    assert flow.window <= 3
