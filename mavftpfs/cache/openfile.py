@@ -10,7 +10,7 @@ class OpenFile(Protocol):
 
     size: bytes; of a file being written it follows what was written, else it is fixed for the life of the
     handle. direct_io: the kernel must not cache its pages. keep_cache: pages the kernel holds from the last
-    open are still right. writable: write, truncate, flush and fsync do something.
+    open are still right. writable: write, truncate and flush do something; fsync may, of any handle.
     """
 
     @property

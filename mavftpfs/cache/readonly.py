@@ -22,7 +22,7 @@ class ReadOnlyHandle:
         """Do nothing: what other handles failed to deliver is theirs to hear."""
 
     async def fsync(self) -> None:
-        """Do nothing."""
+        """Do nothing: of a file that others may write, this is not all (writefile)."""
 
     async def release(self) -> None:
         """Close the handle."""

@@ -110,6 +110,14 @@ class ReadFile(_Reading, ReadOnlyHandle):
         self._owner = owner
         node.handles += 1
 
+    async def fsync(self) -> None:
+        """Deliver what others wrote.
+
+        Raises:
+            Why it is not delivered.
+        """
+        await self._owner.deliver(self._node)
+
     async def release(self) -> None:
         """Close the handle; the last one of an unlinked file has it removed."""
         if not self._closed:

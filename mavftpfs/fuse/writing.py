@@ -1,8 +1,9 @@
 """The handlers of a mount that may be changed. Layer: fuse.
 
 flush is called for every closed descriptor, whoever wrote (pyfuse3 tells no owner), so it asks the handle:
-one that was opened for reading has nothing to say. release cannot report; what it finds undelivered stays
-with the tree.
+one that was opened for reading has nothing to say. fsync is asked for by name, and is about the file: any
+handle will do (`sync FILE` opens for reading). release cannot report; what it finds undelivered stays with
+the tree.
 """
 
 from __future__ import annotations
@@ -128,10 +129,8 @@ class WritingOperations(Operations):
 
     @handler
     async def fsync(self, fh: int, datasync: bool) -> None:
-        """0 means that everything written is on the card, checked."""
-        file = _writable(self._file(fh))
-        if file is not None:
-            await file.fsync()
+        """0 means that everything written is on the card, checked, by whichever handle."""
+        await cast(WritableFile, self._file(fh).file).fsync()
 
     @handler
     async def release(self, fh: int) -> None:

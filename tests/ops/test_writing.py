@@ -71,10 +71,19 @@ async def test_a_read_handle_is_never_flushed_and_cannot_write() -> None:
     ops = operations(tree)
     info = await ops.open(await ino_of(ops, b"a.txt"), os.O_RDONLY, CTX)
     await ops.flush(info.fh)
-    await ops.fsync(info.fh, True)
     assert await failure(ops.write(info.fh, 0, b"x")) == errno.EBADF
     await ops.release(info.fh)
     assert {name for name, _ in tree.calls} <= {"stat", "open", "release"}
+
+
+async def test_fsync_of_a_read_handle_is_about_the_file() -> None:
+    tree = some_tree()
+    ops = operations(tree)
+    info = await ops.open(await ino_of(ops, b"a.txt"), os.O_RDONLY, CTX)
+    await ops.fsync(info.fh, True)
+    tree.error = NoSpace("the card is full")
+    await ops.flush(info.fh)
+    assert await failure(ops.fsync(info.fh, False)) == errno.ENOSPC
 
 
 async def test_an_unlinked_file_that_is_only_read_is_released_too() -> None:
