@@ -60,6 +60,12 @@ class Background:
             node.starting = True
             self._context.nursery.start_soon(self._start, node)
 
+    def settle(self, node: Node) -> None:
+        """Nobody has the file open: forget it, if the vehicle has it; what still sends it is called off."""
+        if node.needless and node.attempt is not None and self._context.nursery is not None:
+            self._context.nursery.start_soon(self._call_off, node)
+        self._context.nodes.maybe_forget(node)
+
     async def link_back(self) -> None:
         """What failed, or was refused, may work now."""
         self._pause = FIRST_PAUSE
@@ -99,6 +105,12 @@ class Background:
         finally:
             node.starting = False
             self._throttle.let_go()
+        self._context.nodes.maybe_forget(node)
+
+    async def _call_off(self, node: Node) -> None:
+        async with node.lock:
+            if node.needless:
+                await self._deliverer.abandon(node)
         self._context.nodes.maybe_forget(node)
 
     async def _redeliver(self) -> None:

@@ -18,6 +18,7 @@ from mavftpfs.cache.context import Context
 from mavftpfs.cache.draft import Draft
 from mavftpfs.cache.nodes import Attempt, Node
 from mavftpfs.cache.plan import SENDING, Plan, Rules, choose
+from mavftpfs.cache.recovery import describe
 from mavftpfs.cache.replacing import Present, Replacer
 from mavftpfs.cache.sure import Sure
 from mavftpfs.cache.throttle import Throttle
@@ -81,6 +82,7 @@ class Deliverer:
             As deliver.
         """
         if not node.undelivered:
+            await self.abandon(node)  # what was written since it began was taken back
             return
         node.quiet = trio.Event()
         try:
@@ -356,20 +358,6 @@ class Deliverer:
             content.persist(describe(node, draft, self._context.wall))
         except (NoSpace, OSError) as trouble:
             log.warning("%r is kept in memory only: %s", node.path, trouble)
-
-
-def describe(node: Node, draft: Draft, wall: Callable[[], float]) -> dict[str, object]:
-    """Return what a spooled file is, for people and JSON; `held` are the extents whose bytes are known."""
-    return {
-        "path": node.path.decode(errors="surrogateescape"),
-        "size": draft.size,
-        "whole": draft.whole,
-        "held": list(draft.held),
-        "changed": list(draft.changed),
-        "size_on_vehicle": draft.remote_size,
-        "error": None if node.error is None else str(node.error),
-        "at": wall(),
-    }
 
 
 def _draft(node: Node) -> Draft:

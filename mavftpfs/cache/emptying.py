@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import logging
 
-from mavftpfs.cache.asides import is_reserved, parse
+from mavftpfs.cache.asides import Kind, is_reserved, parse
 from mavftpfs.cache.context import Context
 from mavftpfs.cache.sure import Sure
 from mavftpfs.shared.errors import DirectoryNotEmpty, FileBusy
@@ -56,7 +56,9 @@ class Emptier:
 
     def _is_unlinked_file(self, path: bytes) -> bool:
         name = parse(split(path)[1])
-        return name is not None and path in self._context.live and name.owner == self._context.namer.owner
+        if name is None or name.kind is not Kind.DELETED:
+            return False
+        return path in self._context.live and name.owner == self._context.namer.owner
 
     async def _move_up(self, unlinked: bytes, directory: bytes) -> None:
         context, node = self._context, self._context.hidden.get(unlinked)

@@ -76,6 +76,11 @@ class Node:
         """Whether the vehicle lacks something of it that it should have."""
         return self.draft is not None and not self.removed and not self.draft.clean
 
+    @property
+    def needless(self) -> bool:
+        """Whether nobody has it open, and the vehicle has it."""
+        return not self.handles and not self.undelivered
+
     def require_reachable(self) -> None:
         """Raise FileChanged if its path may be another file's: it was replaced or removed, not hidden."""
         if self.removed and not self.hidden:
@@ -132,8 +137,8 @@ class Nodes:
         return [n for p, n in self._by_path.items() if p == path or p.startswith(path + b"/")]
 
     def maybe_forget(self, node: Node) -> None:
-        """Forget a node that nobody needs."""
-        if not node.handles and not node.undelivered and not node.lock.locked():
+        """Forget a node that nobody needs; an attempt has to be called off first."""
+        if node.needless and not node.lock.locked() and node.attempt is None:
             node.drop_draft()
             if self._by_path.get(node.path) is node:
                 del self._by_path[node.path]

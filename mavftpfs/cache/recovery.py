@@ -6,7 +6,6 @@ import json
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
-from mavftpfs.cache.delivery import describe
 from mavftpfs.cache.draft import Draft
 from mavftpfs.cache.nodes import Node
 from mavftpfs.cache.rescuing import free_name
@@ -39,6 +38,20 @@ def recover(nodes: Iterable[Node], directory: Path, wall: Callable[[], float]) -
         target = free_name(directory, MANIFEST)
         target.write_text(json.dumps(manifest, indent=1))
     return written
+
+
+def describe(node: Node, draft: Draft, wall: Callable[[], float]) -> dict[str, object]:
+    """Return what a spooled file is, for people and JSON; `held` are the extents whose bytes are known."""
+    return {
+        "path": node.path.decode(errors="surrogateescape"),
+        "size": draft.size,
+        "whole": draft.whole,
+        "held": list(draft.held),
+        "changed": list(draft.changed),
+        "size_on_vehicle": draft.remote_size,
+        "error": None if node.error is None else str(node.error),
+        "at": wall(),
+    }
 
 
 def _copy(draft: Draft, path: Path) -> None:

@@ -238,7 +238,7 @@ class Writeback:
         """Nobody has the file open: if the vehicle has it, its content is ordinary cache."""
         draft, context = node.draft, self._context
         if draft is None or not draft.clean or node.lock.locked():
-            context.nodes.maybe_forget(node)
+            self._background.settle(node)
             return
         fits = 0 < draft.size <= context.options.cache_size // ADOPTED_PART
         recent = context.clock() - node.delivered_at < context.options.dir_timeout
@@ -246,7 +246,7 @@ class Writeback:
             starts = range(0, draft.size, STEP)
             pieces = ((at, draft.local_bytes(at, min(at + STEP, draft.size))) for at in starts)
             context.files.adopt(node.path, draft.size, pieces)
-        context.nodes.maybe_forget(node)
+        self._background.settle(node)
 
     # --- names
 
