@@ -97,7 +97,11 @@ class Sending:
             return None
         else:
             start, stop = found
-        data = self._bytes(start, stop)
+        at, ahead = self._ahead
+        if at <= start and stop <= at + len(ahead):
+            data = ahead[start - at : stop - at]
+        else:
+            data = self._fetch(start, stop)
         self._dirty.discard(start, stop)
         self._in_flight.add(start, stop)
         if stop > self.reached:
@@ -181,12 +185,11 @@ class Sending:
                     return c, min(d, c + limit)
         return None
 
-    def _bytes(self, start: int, stop: int) -> bytes:
-        at, data = self._ahead
-        if not at <= start <= stop <= at + len(data):
-            extent = next(iter(self._dirty.intersection(start, start + AHEAD)))
-            at, data = self._ahead = (start, self._read(start, max(stop, extent[1])))
-        return data[start - at : stop - at]
+    def _fetch(self, start: int, stop: int) -> bytes:
+        extent = next(iter(self._dirty.intersection(start, start + AHEAD)))
+        data = self._read(start, max(stop, extent[1]))
+        self._ahead = (start, data)
+        return data[: stop - start]
 
     def _move(self, source: ExtentSet, target: ExtentSet) -> None:
         for start, stop in source:

@@ -31,6 +31,7 @@ class Throttle:
     def __init__(self, context: Context) -> None:
         self._context = context
         self._moved = trio.Event()
+        self._has_moved = False
         self.meter = RateMeter()
         self._uncounted = 0
         self._grain = 1
@@ -56,7 +57,8 @@ class Throttle:
 
     async def wait(self) -> bool:
         """Wait for anything to move; return False if nothing did for STALL seconds."""
-        if self._moved.is_set():
+        if self._has_moved:
+            self._has_moved = False
             self._moved = trio.Event()
         with trio.move_on_after(STALL):
             await self._moved.wait()
@@ -70,8 +72,12 @@ class Throttle:
             self.meter.on_bytes(self._uncounted, self._context.clock())
             self._uncounted = 0
             self._grain = COARSE if (self.meter.rate or 0.0) > FAST else 1
-        self.let_go()
+        if not self._has_moved:
+            self.let_go()
 
     def let_go(self) -> None:
         """Have those who wait look again."""
-        self._moved.set()  # whoever waits next makes a new one: one for each ACK would cost more than the ACK
+        self._has_moved = (
+            True  # whoever waits next undoes it: an event for each ACK would cost more than the ACK
+        )
+        self._moved.set()

@@ -84,6 +84,7 @@ class WriteTransfer(Operation):
         self._paused = False
         self._starved = False
         self._barren = 0
+        self._usual: bytes | None = None  # what says that a full chunk was written
 
     # --- what the owner says and sees
 
@@ -131,27 +132,25 @@ class WriteTransfer(Operation):
         """Return the next WriteFile."""
         if self._paused or (self._in_flight is not None and len(self._unanswered) >= self._in_flight):
             return None
-        piece = self._rest.popleft() if self._rest else self._pull()
-        if piece is None:
-            return None
-        offset, data = piece
-        request = Request(self, _WRITE, WRITE_MANNER, self.session, offset, len(data), data)
+        if self._rest:
+            offset, data = self._rest.popleft()
+            size = len(data)
+        else:
+            if self._starved or self.done:
+                return None
+            piece = self._source.next_chunk(self.chunk)
+            if piece is None:
+                self._starved = True
+                return None
+            offset, data = piece
+            size = len(data)
+            if not 1 <= size <= self.chunk or not 0 <= offset <= MAX_OFFSET - size:
+                self._rest.append(piece)
+                self.fail(LocalProtocolError(f"{size} bytes at {offset} do not fit a WriteFile request"))
+                return None
+        request = Request(self, _WRITE, WRITE_MANNER, self.session, offset, size, data)
         self._unanswered[request] = None
         return request
-
-    def _pull(self) -> tuple[int, bytes] | None:
-        if self._starved or self.done:
-            return None
-        piece = self._source.next_chunk(self.chunk)
-        if piece is None:
-            self._starved = True
-            return None
-        offset, data = piece
-        if not 1 <= len(data) <= self.chunk or not 0 <= offset <= MAX_OFFSET - len(data):
-            self._rest.append(piece)
-            self.fail(LocalProtocolError(f"{len(data)} bytes at {offset} do not fit a WriteFile request"))
-            return None
-        return piece
 
     # --- replies
 
@@ -162,7 +161,9 @@ class WriteTransfer(Operation):
             self.fail(self._meaning(nak_of(request, reply)))
             return
         del self._unanswered[request]
-        count = self._written(request, reply.data)
+        count = request.size
+        if reply.data != self._usual or count != self.chunk:
+            count = self._written(request, reply.data)
         if count:
             self._barren = 0
             self.acked_bytes += count
@@ -179,6 +180,8 @@ class WriteTransfer(Operation):
             return request.size
         traits.write_ack_counts = True
         count = int.from_bytes(data, "little")
+        if count == self.chunk == request.size:
+            self._usual = data
         # More than was sent: an answer to something else. Nothing is proven, so it goes again.
         return count if count <= request.size else 0
 

@@ -141,9 +141,11 @@ class Driver:
 
     def _handle(self, messages: list[Message], now: float, index: int = -1) -> None:
         vehicle, receive = self.vehicle, self.engine.receive
+        own, address = vehicle.own, vehicle.address
         for message in messages:
-            if type(message) is not FtpFrame or not vehicle.is_reply_to_us(message):
+            if type(message) is not FtpFrame or message.target != own or message.source != address:
                 self._on_other(message, now, index)
+                own, address = vehicle.own, vehicle.address
                 continue
             if self._budget is not None:
                 self._budget.on_reply(message.payload, now)

@@ -102,11 +102,6 @@ class Vehicle:
         """A request to the vehicle went unanswered to its deadline."""
         self._timed_out = True
 
-    def is_reply_to_us(self, frame: FtpFrame) -> bool:
-        """Return whether an FTP message is from our vehicle to us."""
-        source, target, _ = frame
-        return target == self.own and source == self.address
-
     def on_message(self, message: Message, now: float) -> None:
         """Learn from any message except FTP replies to us."""
         match message:

