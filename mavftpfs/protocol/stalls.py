@@ -3,10 +3,14 @@
 A card that is busy for a tenth of a second (PX4 on NuttX) leaves a slow link idle for as long, unless
 answers wait in the link's queue. So while such pauses cost more than they should, some more requests are
 kept on the way, up to 0.15 s worth, which is what others then wait for the link at most; and fewer again
-when pauses have become rare.
+when pauses have become rare. Where the server and not the link is the slowest part, no answers wait in a
+link, and more requests only overflow the server's buffer: so if pauses are as long with a reserve as they
+were without, there is none for a while.
 """
 
 from __future__ import annotations
+
+from math import inf
 
 MOST = 0.15
 _LEAST_PAUSE = 0.020
@@ -15,38 +19,81 @@ _PERIOD = 2.0
 _COSTLY = 0.01
 _STEP = 0.05
 _FADE = 0.98
+_FADED = 0.02
+_TELLING = 0.5
+"""Seconds of pauses to expect before it is judged whether a reserve shortens them."""
+
+_USELESS = 0.75
+_FIRST_HOLD = 120.0
+_LONGEST_HOLD = 960.0
 
 
 class Stalls:
     """Watches the gaps between answers. reserve: seconds of answers to keep in the link's queue."""
 
-    __slots__ = ("_began", "_last", "_paused", "reserve")
+    __slots__ = (
+        "_before",
+        "_expected",
+        "_hold",
+        "_last",
+        "_paused",
+        "_seen",
+        "_until",
+        "_watched",
+        "reserve",
+    )
 
     def __init__(self) -> None:
         self.reserve = 0.0
         self._last: float | None = None
-        self._began = 0.0
+        self._watched = 0.0
         self._paused = 0.0
+        self._before = 0.0  # share of the time that pauses took without a reserve; 0: it was seen to help
+        self._expected = self._seen = 0.0  # seconds of pauses with it: as without it, and really
+        self._until = -inf  # there is no reserve before
+        self._hold = _FIRST_HOLD
 
     def on_reply(self, now: float, rate: float) -> None:
         """A request was answered. rate: answers per second at best, 0 if unknown."""
         last, self._last = self._last, now
         if last is None:
-            self._began = now
-        elif rate > 0.0 and now - last > _LEAST_PAUSE + _INTERVALS / rate:
-            self._paused += now - last
-        if now - self._began > _PERIOD:
+            return
+        gap = now - last
+        self._watched += gap
+        if rate > 0.0 and gap > _LEAST_PAUSE + _INTERVALS / rate:
+            self._paused += gap
+        if self._watched > _PERIOD:
             self._end_period(now)
 
     def interrupt(self) -> None:
         """Too little was asked for: the gap before the next answer means nothing."""
         self._last = None
-        self._paused = 0.0
 
     def _end_period(self, now: float) -> None:
-        if self._paused > _COSTLY * (now - self._began):
+        seconds, paused = self._watched, self._paused
+        self._watched = self._paused = 0.0
+        costly = paused > _COSTLY * seconds
+        if self.reserve == 0.0:
+            if costly and now >= self._until:
+                self.reserve = _STEP
+                self._before, self._expected, self._seen = paused / seconds, 0.0, 0.0
+        elif self._before and self._is_useless(now, seconds, paused):
+            self.reserve = 0.0
+        elif costly:
             self.reserve = min(MOST, self.reserve + _STEP)
         else:
             self.reserve *= _FADE
-        self._began = now
-        self._paused = 0.0
+            if self.reserve < _FADED:
+                self.reserve = 0.0
+
+    def _is_useless(self, now: float, seconds: float, paused: float) -> bool:
+        """Whether pauses take as long as without a reserve; asked until it is known."""
+        self._expected += self._before * seconds
+        self._seen += paused
+        if self._expected < _TELLING:
+            return False
+        self._before = 0.0
+        if self._seen <= _USELESS * self._expected:
+            return False
+        self._until, self._hold = now + self._hold, min(_LONGEST_HOLD, 2 * self._hold)
+        return True

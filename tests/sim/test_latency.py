@@ -23,10 +23,15 @@ SMALL_FRAME = 40
 RADIO = LinkSettings(rate=5760.0, delay=0.03, duplex=Duplex.HALF, queue=8192)
 SLOW = LinkSettings(rate=100_000.0, delay=0.05, queue=50_000)
 FAST = LinkSettings(rate=400_000.0, delay=0.015, queue=200_000)
+FASTER = LinkSettings(rate=1e6, delay=0.015, queue=500_000)
 CASES = [
     *(pytest.param(profile, RADIO, id=f"{profile}-radio") for profile in sorted(PROFILES)),
     *(pytest.param(profile, SLOW, id=f"{profile}-slow") for profile in sorted(PROFILES)),
     *(pytest.param(profile, FAST, id=f"{profile}-fast") for profile in ("px4", "ardupilot")),
+    *(
+        pytest.param(profile, FASTER, id=f"{profile}-faster")
+        for profile in ("ardupilot", "ardupilot5", "littlefs")
+    ),
 ]
 
 
