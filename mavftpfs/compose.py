@@ -29,7 +29,15 @@ from mavftpfs.link.opening import open_link
 from mavftpfs.link.uri import LinkSpec
 from mavftpfs.session.connection import Connection, ConnectOptions, connected
 from mavftpfs.shared.errnos import errno_for
-from mavftpfs.shared.errors import FtpNak, NotADirectory, NotFound, RequestTimeout, UsageError, VehicleLost
+from mavftpfs.shared.errors import (
+    FtpNak,
+    NotADirectory,
+    NotFound,
+    RequestTimeout,
+    SessionBusy,
+    UsageError,
+    VehicleLost,
+)
 from mavftpfs.shared.model import ROOT
 from mavftpfs.trace import JsonTrace, PayloadSink, Tee, TextTrace, TlogWriter
 
@@ -166,12 +174,16 @@ async def _list_root(connection: Connection, tree: Tree, deadline: float, option
             return
     except (RequestTimeout, VehicleLost):
         pass  # the same to the user: no answer
+    except SessionBusy:
+        pass  # as when connect_timeout ends the same wait
     except (NotFound, NotADirectory, FtpNak) as exc:
         if options.root == ROOT or errno_for(exc) not in (errno.ENOENT, errno.ENOTDIR):
             raise NoFtp(f"{_vehicle(connection)} does not show its files: {exc}") from exc
         raise UsageError(
             f"{options.root.decode(errors='replace')} is not a directory of the vehicle"
         ) from exc
+    if connection.store.kept_out:
+        raise NoFtp(f"another client keeps the only FTP session of {_vehicle(connection)} in use")
     raise NoFtp(
         f"{_vehicle(connection)} sends heartbeats but did not answer MAVLink FTP "
         f"within {options.connect_timeout:g} s ({_flag(connection)})"

@@ -17,13 +17,13 @@ class Gate:
 
     def __init__(self) -> None:
         self._inside = 0
-        self._shut = False
+        self._shut = 0
         self._changed = trio.Event()
 
     @property
     def shut(self) -> bool:
         """Whether entering would wait."""
-        return self._shut
+        return self._shut > 0
 
     @asynccontextmanager
     async def passing(self) -> AsyncIterator[None]:
@@ -41,21 +41,27 @@ class Gate:
     async def held_shut(self, patience: float) -> AsyncIterator[bool]:
         """Let nobody in, and stay shut for the body once everybody is out.
 
-        Yields False, with the gate open, if somebody was still inside after `patience` seconds: a sweep of a
-        huge directory must not keep everybody else out until it ends.
+        Yields False, no longer holding it, if somebody was still inside after `patience` seconds: a sweep
+        of a huge directory must not keep everybody else out until it ends. The last who holds it opens it.
         """
-        self._shut = True
+        self._shut += 1
+        holding = True
         try:
             with trio.move_on_after(patience):
                 while self._inside:
                     await self._changed.wait()
             if self._inside:
-                self._shut = False
-                self._notify()
-            yield self._shut
+                holding = False
+                self._open()
+            yield holding
         finally:
-            self._shut = False
-            self._notify()
+            if holding:
+                self._open()
+
+    def _open(self) -> None:
+        """One of those who hold it shut lets go."""
+        self._shut -= 1
+        self._notify()
 
     def _notify(self) -> None:
         self._changed.set()

@@ -17,6 +17,7 @@ import trio
 from mavftpfs.protocol.operations import Simple
 from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.session.scheduler import Scheduler
+from mavftpfs.session.stale import StaleSessions
 from mavftpfs.shared.errors import FtpNak, MavftpfsError, PathTooLong, RequestTimeout
 from mavftpfs.shared.model import ROOT, DirEntry, EntryKind, Listing, split, wire_path
 
@@ -57,8 +58,9 @@ class SideEffects:
     RequestTimeout means: unknown, or known not to have happened. list_directory: sweeps a directory.
     """
 
-    def __init__(self, scheduler: Scheduler, list_directory: Lister) -> None:
+    def __init__(self, scheduler: Scheduler, list_directory: Lister, stale: StaleSessions) -> None:
         self._scheduler = scheduler
+        self._stale = stale
         self._list_directory = list_directory
 
     async def remove(self, path: bytes) -> None:
@@ -129,9 +131,8 @@ class SideEffects:
     async def _perform(self, make: Callable[[], Simple], verify: Verdict) -> None:
         """Run a request; verify it if its answer may not be the answer to its first execution."""
         for last in (False, True):
-            operation = make()
             try:
-                await self._scheduler.metadata(operation)
+                await self._stale.outlast(lambda: self._scheduler.metadata(make()), changes=True)
             except FtpNak as nak:
                 twice = last or nak.retransmitted or self._may_be_doubled(nak)
                 # PX4 says 8 to everything after one "file exists", until a listing comes to its end.

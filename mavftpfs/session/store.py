@@ -11,6 +11,7 @@ from mavftpfs.cache.remote import ReadSink
 from mavftpfs.protocol.operations import ListDirectory, Simple
 from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.session.scheduler import Scheduler
+from mavftpfs.session.stale import StaleSessions
 from mavftpfs.session.stream import FileStream
 from mavftpfs.session.vehicle import Vehicle
 from mavftpfs.session.writestore import COPY_RATE, WriteStore
@@ -42,7 +43,8 @@ class Store(WriteStore):
         clock: Callable[[], float],
         op_deadline: float = 30.0,
     ) -> None:
-        super().__init__(scheduler, self.list_directory)
+        self._stale = StaleSessions(scheduler, clock, op_deadline)
+        super().__init__(scheduler, self.list_directory, self._stale)
         self._op_deadline = op_deadline
         self._vehicle = vehicle
         self._clock = clock
@@ -54,6 +56,11 @@ class Store(WriteStore):
         """Whether this server answers opcode 16; None until it was asked."""
         return self._lists_times
 
+    @property
+    def kept_out(self) -> bool:
+        """Whether the last listing was refused because of a session that is not ours."""
+        return self._stale.in_the_way
+
     def forget_traits(self) -> None:
         """The vehicle rebooted, perhaps with other firmware."""
         self._lists_times = None
@@ -63,10 +70,7 @@ class Store(WriteStore):
         """Sweep a directory (see RemoteStore)."""
         wire = wire_path(path)
         started = self._clock()
-        if self._lists_times is False:
-            operation = await self._sweep(wire)
-        else:
-            operation = await self._sweep_asking_times(wire)
+        operation = await self._stale.outlast(partial(self._sweep_as_known, wire))
         entries: tuple[DirEntry, ...] = tuple(operation.entries)
         return Listing(entries, self._clock() - started, operation.complete, operation.hidden)
 
@@ -97,9 +101,13 @@ class Store(WriteStore):
             raise Armed("checksums are not asked for in flight")
         server_time = CRC_TIME if size is None else size / COPY_RATE
         wire = wire_path(path)
-        operation = Simple(Opcode.CALC_FILE_CRC32, wire, patience=CRC_PATIENCE, server_time=server_time)
-        await self._scheduler.metadata(operation, disturbs=False)
-        data = operation.reply.data
+
+        async def ask() -> bytes:
+            operation = Simple(Opcode.CALC_FILE_CRC32, wire, patience=CRC_PATIENCE, server_time=server_time)
+            await self._scheduler.metadata(operation, disturbs=False)
+            return operation.reply.data
+
+        data = await self._stale.outlast(ask)
         if len(data) < 4:
             raise RemoteProtocolError("the vehicle's checksum reply holds no checksum")
         return int.from_bytes(data[:4], "little")
@@ -108,6 +116,11 @@ class Store(WriteStore):
         """Opcode 16 was answered: the rest of the listing may take as long as it takes."""
         self._lists_times = True
         scope.deadline = float("inf")
+
+    async def _sweep_as_known(self, wire: bytes) -> ListDirectory:
+        if self._lists_times is False:
+            return await self._sweep(wire)
+        return await self._sweep_asking_times(wire)
 
     async def _sweep(self, wire: bytes, *, patience: float | None = None) -> ListDirectory:
         operation = ListDirectory(wire)

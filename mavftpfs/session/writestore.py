@@ -10,6 +10,7 @@ from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.session.probing import probe_writing
 from mavftpfs.session.scheduler import Scheduler
 from mavftpfs.session.sideeffects import Lister, Outcome, SideEffects
+from mavftpfs.session.stale import StaleSessions
 from mavftpfs.session.upload import QueuedUpload
 from mavftpfs.shared.errnos import errno_for
 from mavftpfs.shared.errors import AlreadyExists, FtpNak, MavftpfsError, RemoteProtocolError, RequestTimeout
@@ -28,9 +29,9 @@ _UNKNOWN_OPCODE = frozenset((NakCode.FAIL, NakCode.UNKNOWN_COMMAND))
 class WriteStore:
     """Uploads and side effects."""
 
-    def __init__(self, scheduler: Scheduler, list_directory: Lister) -> None:
+    def __init__(self, scheduler: Scheduler, list_directory: Lister, stale: StaleSessions) -> None:
         self._scheduler = scheduler
-        self._effects = SideEffects(scheduler, list_directory)
+        self._effects = SideEffects(scheduler, list_directory, stale)
 
     @property
     def traits(self) -> WriteTraits:
