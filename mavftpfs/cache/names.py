@@ -1,0 +1,137 @@
+"""What a path is: by drafts, by listings, by listings of just now, and in another spelling. Layer: cache.
+
+Servers do what they are told to whatever has the name by then: RemoveFile takes an empty directory where the
+server calls remove(3), a rename moves into a directory on NuttX, and replaces a file that others made
+(servers.md 9, 14.34). So whoever is about to change a name asks `current`, not what is remembered of it.
+"""
+
+from __future__ import annotations
+
+import errno
+import logging
+
+from mavftpfs.cache.asides import is_reserved
+from mavftpfs.cache.context import Context
+from mavftpfs.cache.remote import FREE_FOR
+from mavftpfs.shared.errnos import errno_for
+from mavftpfs.shared.errors import FtpNak, MavftpfsError
+from mavftpfs.shared.model import DirEntry, EntryKind, join, split
+
+log = logging.getLogger("mavftpfs.cache")
+
+
+class Names:
+    """Looks names up. Paths are the vehicle's, not local, not below `@`."""
+
+    def __init__(self, context: Context) -> None:
+        self._context = context
+
+    async def entry(self, path: bytes) -> DirEntry | None:
+        """Return what a path is, drafts included; None if it does not exist though its directory does.
+
+        Raises:
+            NotFound, NotADirectory: its directory. Else as RemoteStore.list_directory.
+        """
+        return self._drafted(path) or await self.listed(path)
+
+    async def listed(self, path: bytes) -> DirEntry | None:
+        """Return what the vehicle has there, as far as is remembered.
+
+        Raises:
+            As entry.
+        """
+        parent, name = split(path)
+        return (await self._context.directories.get(parent)).entries.get(name)
+
+    async def current(self, path: bytes, *, free: bool = False) -> DirEntry | None:
+        """Return what the vehicle has there, as it was shown to be at most FREE_FOR ago.
+
+        free: that it is nothing counts for no longer than that either. Else the time that the listing took is
+        not counted, so that the removal of many files does not list a large directory before each.
+
+        Raises:
+            As entry; VehicleLost instead of an old answer.
+        """
+        parent, name = split(path)
+        context = self._context
+        since = context.clock() - FREE_FOR
+        known = context.dentries.known(parent)
+        if known is not None and known.proven.get(name, float("-inf")) >= since:
+            return known.entries[name]
+        asked = context.directories.recent(parent, began=since if free else None, ended=since)
+        return (await asked).entries.get(name)
+
+    async def other_spelling(self, path: bytes) -> bytes | None:
+        """Return the listed spelling of the file or directory that a path not listed itself would open.
+
+        CreateFile of `README` empties `readme` where the card folds case (servers.md 9).
+        """
+        parent, name = split(path)
+        entries = (await self._context.directories.get(parent)).entries
+        folded = name.lower()
+        others = [n for n in entries if n != name and n.lower() == folded and not is_reserved(n)]
+        if not others or name in entries:
+            return None
+        if self._context.writer.traits.folds_case is None:
+            await self._learn_folding(parent, path, entries[others[0]])
+        return join(parent, others[0]) if self._context.writer.traits.folds_case is not False else None
+
+    # --- inside
+
+    def _drafted(self, path: bytes) -> DirEntry | None:
+        node = self._context.nodes.get(path)
+        if node is None or node.draft is None:
+            return None
+        return DirEntry(split(path)[1], EntryKind.FILE, node.draft.size)
+
+    async def _learn_folding(self, parent: bytes, path: bytes, other: DirEntry) -> None:
+        """Find out by a file whether names are found in another case; directories are not opened for it."""
+        try:
+            if other.kind is EntryKind.FILE:
+                await self._try_spelling(join(parent, other.name), path)
+            else:
+                await self._try_own_file(path)
+        except FtpNak as nak:
+            log.info("whether names in %r are told apart by case stays unknown: %s", parent, nak)
+
+    async def _try_spelling(self, there: bytes, spelled: bytes) -> None:
+        """Open a file by another spelling of its name; a refusal counts if it is still there by its own."""
+        traits = self._context.writer.traits
+        if await self._opens(spelled):
+            traits.folds_case = True
+        elif traits.folds_case is None and await self._opens(there):
+            traits.folds_case = False
+
+    async def _opens(self, path: bytes) -> bool:
+        """Return whether a file is there.
+
+        Raises:
+            FtpNak: refused for any reason but that it is not.
+        """
+        try:
+            await self._context.writer.stat_size(path)
+        except FtpNak as nak:
+            if errno_for(nak) != errno.ENOENT:
+                raise
+            return False
+        return True
+
+    async def _try_own_file(self, path: bytes) -> None:
+        """Try with a file of our own, which is removed, here or at a later listing."""
+        context = self._context
+        own = context.namer.probes(path)[0]
+        parent, name = split(own)
+        context.live.add(own)
+        try:
+            await context.writer.create_empty(own)
+            await self._try_spelling(own, join(parent, name.upper()))
+        finally:
+            context.live.discard(own)
+            await self._remove_own(own)
+
+    async def _remove_own(self, own: bytes) -> None:
+        try:
+            await self._context.writer.remove(own)
+        except MavftpfsError as error:
+            log.debug("%r goes at a later listing: %s", own, error)
+        self._context.dentries.expire(split(own)[0], self._context.clock())
