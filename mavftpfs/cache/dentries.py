@@ -34,7 +34,8 @@ class Directory:
 
     entries: by name, as listed. sizes: what opening told about an entry since, which beats the listing.
     growing: when a file was last seen to be larger than before, though we did not write it.
-    listed_at: when the sweep began; fresh_until: after that it proves nothing.
+    listed_at: when the sweep began, ended_at: when it was done; fresh_until: after that it proves nothing.
+    proven: when an entry was last shown to be what it is by other means than this listing.
     complete: whether a name that is not in it is absent.
     """
 
@@ -44,6 +45,8 @@ class Directory:
     complete: bool
     sizes: dict[bytes, int] = field(default_factory=dict)
     growing: dict[bytes, float] = field(default_factory=dict)
+    ended_at: float = float("-inf")
+    proven: dict[bytes, float] = field(default_factory=dict)
 
     def size_of(self, name: bytes) -> int | None:
         """Return the best known size of a listed name in bytes, None if nothing told it."""
@@ -133,7 +136,7 @@ class Dentries:
         life = max(self._dir_timeout, COST_FACTOR * listing.took)
         doubtful = sweep.reshaped or sweep.void
         directory = Directory(entries, sweep.began, now if doubtful else now + life, complete)
-        directory.growing = self._growing(sweep, directory, now)
+        directory.growing, directory.ended_at = self._growing(sweep, directory, now), now
         if not sweep.void:
             self._store(sweep.path, directory)
         return directory
@@ -175,6 +178,13 @@ class Dentries:
             directory.sizes[name] = size
             if now is not None and before is not None and size > before:
                 directory.growing[name] = now
+
+    def note_proven(self, path: bytes, now: float) -> None:
+        """The path is what its listing shows, as an answer of just now (`now`) proved."""
+        parent, name = split(path)
+        directory = self._directories.get(parent)
+        if directory is not None and name in directory.entries:
+            directory.proven[name] = now
 
     def is_growing(self, path: bytes, now: float) -> bool:
         """Return whether somebody on the vehicle seems to write the file."""
@@ -249,6 +259,7 @@ class Dentries:
             _put(directory.entries, name, entry)
             directory.sizes.pop(name, None)
             directory.growing.pop(name, None)
+            directory.proven.pop(name, None)
             self._weight += directory.weight
 
     def _doubt(self, path: bytes) -> None:

@@ -122,6 +122,19 @@ class Directories:
                 return directory
         raise VehicleLost("the vehicle does not answer")
 
+    async def recent(
+        self, path: bytes, *, began: float | None = None, ended: float | None = None
+    ) -> Directory:
+        """Return a listing that began, or ended, at the given time or later; asks for one if there is none.
+
+        Raises:
+            As ask.
+        """
+        known = self._dentries.fresh(path, self._clock())
+        if known is not None and known.listed_at >= (began or 0.0) and known.ended_at >= (ended or 0.0):
+            return known
+        return await self.ask(path)
+
     def rebooted(self) -> None:
         """What was learnt of the server's ways may no longer hold."""
         self._root_proven = self._root == ROOT

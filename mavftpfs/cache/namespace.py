@@ -14,11 +14,12 @@ from contextlib import AsyncExitStack
 
 import trio
 
-from mavftpfs.cache.asides import Places, fits_rename, is_reserved
+from mavftpfs.cache.asides import Places, fits_rename
 from mavftpfs.cache.context import Context
 from mavftpfs.cache.delivery import Deliverer
 from mavftpfs.cache.draft import Draft
 from mavftpfs.cache.emptying import Emptier
+from mavftpfs.cache.names import Names
 from mavftpfs.cache.nodes import Node
 from mavftpfs.cache.replacing import Present
 from mavftpfs.cache.spool import SpoolContent
@@ -37,14 +38,14 @@ from mavftpfs.shared.errors import (
     PathTooLong,
     RequestTimeout,
 )
-from mavftpfs.shared.model import DirEntry, EntryKind, join, split, wire_path
+from mavftpfs.shared.model import DirEntry, EntryKind, wire_path
 
 log = logging.getLogger("mavftpfs.cache")
 
 PIECE = 64 * 1024
 
 
-class Namespace:
+class Namespace(Names):
     """Changes of names on the vehicle. Paths are the vehicle's, not local, not below `@`."""
 
     def __init__(
@@ -59,72 +60,14 @@ class Namespace:
     ) -> None:
         """`purge(path)` removes what would bring a path back (Cleaner); `new_content(node)`: room for
         a draft; `on_renamed(old, new)`: the vehicle's path has another name."""
-        self._context = context
         self._sure = sure
         self._deliverer = deliverer
+        super().__init__(context)
         self._emptier = Emptier(context, sure)
         self._purge = purge
         self._new_content = new_content
         self._on_renamed = on_renamed
         self._lock = trio.Lock()
-
-    # --- looking
-
-    async def entry(self, path: bytes) -> DirEntry | None:
-        """Return what a path is, drafts included; None if it does not exist though its directory does.
-
-        Raises:
-            NotFound, NotADirectory: its directory. Else as RemoteStore.list_directory.
-        """
-        node = self._context.nodes.get(path)
-        if node is not None and node.draft is not None:
-            return DirEntry(split(path)[1], EntryKind.FILE, node.draft.size)
-        return await self.listed(path)
-
-    async def listed(self, path: bytes) -> DirEntry | None:
-        """Return what the vehicle has there; asks it whether another spelling is the same file.
-
-        Raises:
-            As entry.
-        """
-        parent, name = split(path)
-        entries = (await self._context.directories.get(parent)).entries
-        if name in entries:
-            return entries[name]
-        return None
-
-    async def check_new(self, path: bytes) -> None:
-        """Raise AlreadyExists if creating a name that no listing shows would hit another spelling of it.
-
-        CreateFile of `README` empties `readme` where the card folds case (servers.md 9).
-        """
-        wire_path(path)
-        other = await self.other_spelling(path)
-        if other is not None:
-            raise AlreadyExists(f"{path!r} is {other!r} on this card, which does not tell case apart")
-
-    async def other_spelling(self, path: bytes) -> bytes | None:
-        """Return the listed spelling of the file or directory that a path not listed itself would open."""
-        parent, name = split(path)
-        entries = (await self._context.directories.get(parent)).entries
-        folded = name.lower()
-        others = [n for n in entries if n != name and n.lower() == folded and not is_reserved(n)]
-        if not others or name in entries:
-            return None
-        traits = self._context.writer.traits
-        if traits.folds_case is None:
-            await self._learn_folding(path, entries[others[0]])
-        return join(parent, others[0]) if traits.folds_case is not False else None
-
-    async def _learn_folding(self, path: bytes, other: DirEntry) -> None:
-        if other.kind is not EntryKind.FILE:
-            return  # nothing safe to ask: opening or listing a directory by another name may hurt
-        try:
-            await self._context.writer.stat_size(path)
-        except FtpNak:
-            self._context.writer.traits.folds_case = False
-        else:
-            self._context.writer.traits.folds_case = True
 
     # --- changing
 
@@ -133,7 +76,8 @@ class Namespace:
         async with self._lock:
             if await self.entry(path) is not None:
                 raise AlreadyExists(f"{path!r} exists")
-            await self.check_new(path)
+            if self._context.writer.traits.folds_case and await self.other_spelling(path):
+                raise AlreadyExists(f"{path!r} exists in another spelling")  # else the server says it
             await self._sure.make_directory(path)
             self._context.on_changed(path)
 
@@ -150,26 +94,27 @@ class Namespace:
     async def unlink(self, path: bytes) -> None:
         """See Tree.unlink."""
         async with self._lock:
-            entry = await self.entry(path)
+            node = self._context.nodes.get(path)
+            if node is not None and await self.entry(path) is not None:
+                await self._unlink_node(node, path)
+                return
+            entry = await self.current(path)
             if entry is None:
                 raise NotFound(f"{path!r} does not exist")
             if entry.kind is not EntryKind.FILE:
                 raise IsADirectory(f"{path!r} is a directory")
-            node = self._context.nodes.get(path)
-            if node is None:
-                self._context.require_idle(path)
-                await self._remove(path)
-                return
-            await self._unlink_node(node, path)
+            self._context.require_idle(path)
+            await self._remove(path)
 
     async def rename(self, old: bytes, new: bytes, *, noreplace: bool) -> None:
         """See Tree.rename."""
         if new.startswith(old + b"/"):
             raise InvalidMove(f"{old!r} cannot become a part of itself")
         async with self._lock:
-            source = await self._need(old)
             wire_path(new)
-            target = await self.entry(new)
+            listed = await self.current(new, free=noreplace)
+            target = listed or await self.entry(new)
+            source = await self._need(old)
             other = None if target is not None else await self.other_spelling(new)
             if other not in (None, old):
                 raise AlreadyExists(f"{new!r} is {other!r} on this card, which does not tell case apart")
@@ -234,7 +179,7 @@ class Namespace:
             await self._deliverer.abandon(node)
             if path in self._context.torn:
                 await self._purge(path)
-            there = await self.listed(path) is not None
+            there = await self._is_file(path, node)
             if there and node.draft is None:
                 self._context.require_idle(path)
             if there and node.handles and not self._keep_content(node):
@@ -245,6 +190,17 @@ class Namespace:
             self._context.nodes.detach(node)
         if not node.handles:
             node.drop_draft()
+
+    async def _is_file(self, path: bytes, node: Node) -> bool:
+        """Return whether the vehicle has an open file; what else has its name by now is not to be removed.
+
+        Raises:
+            IsADirectory: it is a directory, and there is no file of ours that could lose its name.
+        """
+        entry = await self.current(path)
+        if entry is not None and entry.kind is EntryKind.DIRECTORY and node.draft is None:
+            raise IsADirectory(f"{path!r} is a directory")
+        return entry is not None and entry.kind is EntryKind.FILE
 
     def _keep_content(self, node: Node) -> bool:
         """Return whether the open file can be read on without the vehicle: hold what is cached of it."""

@@ -71,6 +71,7 @@ class Sure:
         await self._do(rename, lambda: self._is_moved(old, new))
         self._context.writer.traits.rename_works = True
         self._context.dentries.note_renamed(old, new)
+        self._context.dentries.note_proven(new, self._context.clock())
 
     # --- inside
 
