@@ -9,12 +9,14 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Awaitable, Callable
+from contextlib import suppress
 
 import trio
 
 from mavftpfs.cache.context import Context
 from mavftpfs.cache.delivery import PASSING, Deliverer
 from mavftpfs.cache.nodes import Node
+from mavftpfs.cache.plan import Plan
 from mavftpfs.cache.throttle import Throttle
 from mavftpfs.shared.errors import MavftpfsError
 
@@ -53,12 +55,22 @@ class Background:
 
     def kick(self, node: Node) -> None:
         """The draft got more: send it, or begin to, if that can be done beside the program."""
-        if node.attempt is not None:
+        if node.attempt is not None and not node.overtaken:
             if not node.attempt.committing:
                 node.attempt.upload.wake()
-        elif self._may_start(node) and self._context.nursery is not None:
+        elif self._context.nursery is not None and (self._may_start(node) or node.overtaken):
             node.starting = True
             self._context.nursery.start_soon(self._start, node)
+
+    def on_cut(self, node: Node) -> None:
+        """The draft was cut: what is on its way in place stays away, unless that is the way still."""
+        if node.attempt is None or node.attempt.plan is not Plan.IN_PLACE:
+            return
+        assert node.draft is not None
+        with suppress(MavftpfsError):
+            if self._deliverer.plan(node) is Plan.IN_PLACE:
+                return
+        node.draft.give_way()
 
     def settle(self, node: Node) -> None:
         """Nobody has the file open: forget it, if the vehicle has it; what still sends it is called off."""
@@ -94,10 +106,12 @@ class Background:
         return draft.unacked >= START_AT and node.undelivered and not blocked
 
     async def _start(self, node: Node) -> None:
-        """Begin an upload while the program still writes."""
+        """Begin an upload while the program still writes, or end one that may not go on."""
         try:
             async with node.lock:
-                if node.attempt is None and node.undelivered:
+                if node.overtaken:
+                    await self._deliverer.abandon(node)
+                elif node.attempt is None and node.undelivered:
                     node.background = await self._deliverer.begin_locked(node)
         except MavftpfsError as error:
             node.start_after = self._context.clock() + START_PAUSE

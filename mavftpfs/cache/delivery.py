@@ -106,14 +106,18 @@ class Deliverer:
         Raises:
             As deliver.
         """
-        plan = choose(_draft(node), self._context.writer.traits, self._rules)
+        plan = self.plan(node)
         if plan is Plan.PROBE:
             await self._probe(node)
-            plan = choose(_draft(node), self._context.writer.traits, self._rules)
+            plan = self.plan(node)
         if plan not in SENDING or plan is Plan.REWRITE:
             return False
         (await self._attempt(node, plan)).upload.wake()
         return True
+
+    def plan(self, node: Node) -> Plan:
+        """Return the next step for the node's draft. Raises as plan.choose."""
+        return choose(_draft(node), self._context.writer.traits, self._rules)
 
     async def abandon(self, node: Node) -> None:
         """Give up the present attempt; what it left under reserved names goes now or at the next listing."""
@@ -141,7 +145,7 @@ class Deliverer:
         mismatches = 0
         for _ in range(MAX_STEPS):
             draft = _draft(node)
-            plan = choose(draft, self._context.writer.traits, self._rules)
+            plan = self.plan(node)
             if plan is Plan.NOTHING:
                 await self.abandon(node)
                 return
@@ -175,7 +179,10 @@ class Deliverer:
             await base.fill(self._context, node)
         else:
             await self.abandon(node)
-            await self._act(node, plan)
+            if plan is Plan.TRUNCATE and not _draft(node).changed.empty:
+                await self._cut_first(node.path, _draft(node))
+            else:
+                await self._act(node, plan)
 
     async def _act(self, node: Node, plan: Plan) -> None:
         """Do what takes one request."""
@@ -186,6 +193,13 @@ class Deliverer:
             await self._context.writer.truncate(node.path, draft.size)
         await self.verifier.check(node.path, draft)
         self._on_delivered(node, draft)
+
+    async def _cut_first(self, path: bytes, draft: Draft) -> None:
+        """Cut a file of which a part is to be changed, too."""
+        await self._require_base(path, draft)
+        await self._context.writer.truncate(path, draft.size)
+        self._context.dentries.note_unsized(path)
+        draft.remote_cut(draft.size)
 
     async def _create_empty(self, path: bytes, draft: Draft) -> None:
         try:

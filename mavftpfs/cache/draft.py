@@ -231,6 +231,19 @@ class Draft:
         self._touched = self._ruined = self.made = self.maybe_made = self.overwrites = False
         self._content.settle()
 
+    def remote_cut(self, size: int) -> None:
+        """The vehicle's file has `size` bytes now, the first of what it had."""
+        self.begin_again()
+        self._touched = True
+        self.remote_size = size
+
+    def give_way(self) -> None:
+        """What the present attempt still has to send is not to arrive any more: another one has to follow."""
+        sending = self.sending
+        self.begin_again()
+        if sending is not None:
+            sending.on_cut(0)
+
     def remote_removed(self) -> None:
         """The vehicle's file is about to be overwritten: nothing of it counts; the draft must be whole."""
         self._touched = True

@@ -81,6 +81,15 @@ class Node:
         """Whether nobody has it open, and the vehicle has it."""
         return not self.handles and not self.undelivered
 
+    @property
+    def overtaken(self) -> bool:
+        """Whether its attempt may not go on, since the draft took another way."""
+        return (
+            self.attempt is not None
+            and self.draft is not None
+            and self.draft.sending is not self.attempt.sending
+        )
+
     def require_reachable(self) -> None:
         """Raise FileChanged if its path may be another file's: it was replaced or removed, not hidden."""
         if self.removed and not self.hidden:

@@ -20,8 +20,8 @@ class Plan(Enum):
     NOTHING: the vehicle has it. CREATE_EMPTY: CreateFile on the real name, no data. NEW: CreateFile on the
     real name, which is free. REPLACE: a temporary name, verified, renamed. FILL: fetch what only the
     vehicle has, then plan again. IN_PLACE: OpenFileWO, and only what changed. PROBE: find out whether
-    OpenFileWO empties files, then plan again. TRUNCATE: TruncateFile. REWRITE: CreateFile on the real name,
-    over what is there (`inplace`).
+    OpenFileWO empties files, then plan again. TRUNCATE: TruncateFile, then plan again if more is to be
+    changed. REWRITE: CreateFile on the real name, over what is there (`inplace`).
     """
 
     NOTHING = "nothing"
@@ -74,9 +74,14 @@ def choose(draft: Draft, traits: WriteTraits, rules: Rules) -> Plan:
 def _partial(draft: Draft, remote_size: int, traits: WriteTraits, rules: Rules) -> Plan:
     """Part of the file on the vehicle is to stay."""
     if draft.size < remote_size:
-        if draft.changed.empty and traits.truncate_works is not False:
+        if traits.truncate_works is False:
+            return _rewriting(draft, traits, rules)
+        if draft.changed.empty:
             return Plan.TRUNCATE
-        return _rewriting(draft, traits, rules)
+        if draft.whole and draft.size <= rules.rmw_max:  # replaced at one blow, and nothing has to be fetched
+            return _rewriting(draft, traits, rules)
+        if traits.wo_truncates is False:
+            return Plan.TRUNCATE  # what it changed follows in place
     if traits.wo_truncates is None:
         return Plan.PROBE
     return _rewriting(draft, traits, rules) if traits.wo_truncates else Plan.IN_PLACE

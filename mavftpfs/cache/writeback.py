@@ -194,6 +194,7 @@ class Writeback:
         assert node.draft is not None
         if size != node.draft.size:
             node.draft.truncate(size)
+            self._background.on_cut(node)
             self._on_written(node)
 
     async def deliver(self, node: Node) -> None:

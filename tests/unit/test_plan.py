@@ -45,7 +45,10 @@ def draft(base: int | None, *steps: tuple[int, bytes] | int) -> Draft:
         (draft(10, (0, bytes(10))), EMPTIES, Plan.REPLACE),
         (draft(10, 5), WriteTraits(), Plan.TRUNCATE),
         (draft(10, 5), WriteTraits(truncate_works=False), Plan.FILL),
-        (draft(10, 5, (0, b"x")), KEEPS, Plan.FILL),
+        (draft(10, 5, (0, b"x")), WriteTraits(), Plan.PROBE),
+        (draft(10, 5, (0, b"x")), KEEPS, Plan.TRUNCATE),
+        (draft(10, 5, (0, b"x")), WriteTraits(wo_truncates=False, truncate_works=False), Plan.FILL),
+        (draft(10, 5, (0, b"x")), EMPTIES, Plan.FILL),
         (draft(10, 5, (0, b"12345")), KEEPS, Plan.REPLACE),
     ],
 )

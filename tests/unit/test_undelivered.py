@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import AsyncIterator
+from contextlib import suppress
 from random import Random
 
 import pytest
@@ -11,9 +12,9 @@ import trio
 from mavftpfs.cache.asides import is_reserved, new_owner
 from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.tree import Tree
-from mavftpfs.shared.errors import FileBusy, VehicleLost
+from mavftpfs.shared.errors import FileBusy, FileTooLarge, MavftpfsError, RequestTimeout, VehicleLost
 from mavftpfs.shared.model import split
-from tests.support.fake_writer import KINDS, FakeWriter, make_writable
+from tests.support.fake_writer import CHUNK, KINDS, FakeWriter, make_writable
 
 OLD = bytes(range(256)) * 4
 FILE = b"/card/dir/file.txt"
@@ -106,3 +107,88 @@ async def test_only_unlinked_files_move_up_from_a_directory_that_goes(mavsdk: Fa
     with pytest.raises(FileBusy):
         await tree.rmdir(b"/card/other")
     assert used in mavsdk.files
+
+
+# --- what was emptied, or cut
+
+
+async def test_what_is_emptied_is_not_changed_in_place_any_more(
+    autojump_clock: object, store: FakeWriter
+) -> None:
+    """An append was on its way in place; the new content may only replace the file as a whole."""
+    tree = make_writable(store)
+    file = await tree.open(FILE, write=True)
+    await file.write(0, b"y")
+    await file.fsync()
+    store.write_delay = 0.01
+    await file.write(len(OLD), b"a" * 100 * 1024)
+    await trio.sleep(1)
+    reached = len(store.files[FILE].data)
+    assert len(OLD) < reached < len(OLD) + 100 * 1024
+    await file.truncate(0)
+    for at in range(0, 200 * 1024, 20 * 1024):
+        await file.write(at, b"N" * 20 * 1024)
+    await trio.sleep(3)
+    assert store.files[FILE].data.startswith(b"y" + OLD[1:] + b"a")
+    assert len(store.files[FILE].data) <= reached + CHUNK
+    assert litter(store), "it is replaced, beside the program"
+    await file.release()
+    assert store.files[FILE].data == b"N" * 200 * 1024
+    assert litter(store) == []
+
+
+LARGE = bytes(range(256)) * 400
+
+
+@pytest.fixture(params=["posix", "fat", "mavsdk"])
+async def large(
+    request: pytest.FixtureRequest, nursery: trio.Nursery, autojump_clock: object
+) -> AsyncIterator[FakeWriter]:
+    store = FakeWriter(KINDS[request.param], nursery)
+    store.add(FILE, LARGE)
+    yield store
+    assert store.crimes == []
+    nursery.cancel_scope.cancel()
+
+
+async def change_and_cut(tree: Tree) -> None:
+    file = await tree.open(FILE, write=True)
+    try:
+        await file.write(10, b"A" * 10)
+        await file.truncate(90_000)
+        await file.release()
+    finally:
+        file.close()
+
+
+async def test_a_large_file_is_changed_and_cut_where_both_can_be_done(large: FakeWriter) -> None:
+    tree = make_writable(large, rmw_max=50_000)
+    if large.kind != KINDS["posix"]:
+        with pytest.raises(FileTooLarge):
+            await change_and_cut(tree)
+        assert large.files[FILE].data == LARGE
+        return
+    await change_and_cut(tree)
+    assert large.files[FILE].data == (LARGE[:10] + b"A" * 10 + LARGE[20:])[:90_000]
+    assert sum(entry[0] == "write" and entry[1] == str(FILE) for entry in large.log) == 1
+    assert tree.undelivered() == []
+
+
+async def test_a_change_and_cut_goes_on_after_any_fault(large: FakeWriter) -> None:
+    if large.kind != KINDS["posix"]:
+        return
+    await change_and_cut(make_writable(large))
+    wanted = large.files[FILE].data
+    for number in range(1, large.requests + 1):
+        for lost in (False, True):
+            store = FakeWriter(KINDS["posix"], large.nursery)
+            store.add(FILE, LARGE)
+            tree = make_writable(store)
+            store.lose_reply_at = {number} if lost else set()
+            store.fail_at = {} if lost else {number: RequestTimeout("silence")}
+            with suppress(MavftpfsError):
+                await change_and_cut(tree)
+            assert tree.undelivered() or store.files[FILE].data == wanted
+            await tree.drain(60)
+            assert store.files[FILE].data == wanted
+            assert (tree.undelivered(), store.crimes) == ([], [])
