@@ -250,7 +250,7 @@ class Scheduler:
         self.write_traits = WriteTraits()
         self._holder.forget()
         self._reading.on_reboot()
-        self._uploading.writer.on_reboot()
+        self._uploading.on_reboot()
 
     def armed_changed(self, armed: bool) -> None:
         """On arming uploads are terminated and held; on disarming they go on (promise 9)."""
@@ -362,6 +362,7 @@ class Scheduler:
         for stream in list(self._streams):
             if stream.has_demand and stream.ticket is not None and stream.asked_at < oldest:
                 stream.fail(error)
+        self._uploading.expire(oldest, error)
         for job in [job for job in self._jobs if job.asked_at < oldest]:
             self._jobs.remove(job)
             job.fail(error)

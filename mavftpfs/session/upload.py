@@ -11,7 +11,8 @@ from mavftpfs.session.policy import Service
 from mavftpfs.shared.errors import LocalProtocolError, MavftpfsError
 
 LONGEST_BACKOFF = 30.0
-_LONGEST_HOLD = 8.0
+_LONGEST_HOLD = 300.0
+_HOLD_FACTOR, _MOST_HELD = 10.0, 3600.0
 
 
 class Feed:
@@ -107,6 +108,10 @@ class UploadHost(Protocol):
         """Raise Armed or VehicleLost."""
         ...
 
+    def now(self) -> float:
+        """Return the time."""
+        ...
+
     def on_news(self, upload: QueuedUpload) -> None:
         """Something about the upload changed."""
         ...
@@ -125,6 +130,9 @@ class QueuedUpload:
         running: the scheduler's task is at it. clean: everything given so far is ACKed and terminated.
         retry_at: not to be touched before. least: bytes the file has to have when it is opened to be written
             on. opened: it was opened before. free_at: see WriteStore. begun: see Upload.
+        asked_at: since when who waits for its end sees nothing happen. filled_in: seconds it took to send
+            all there was, last time. tried: it was reopened to see what OpenFileWO does.
+        anew: nothing that was proven counts any more.
     """
 
     def __init__(
@@ -147,6 +155,8 @@ class QueuedUpload:
         self.refused = False
         self.failures = 0
         self.restarts = 0
+        self.filled_in = 0.0
+        self.tried = self.anew = False
         self.refused_at: int | None = None
         self.retry_at = 0.0
         self._woken = True
@@ -173,6 +183,8 @@ class QueuedUpload:
             return
         self._host.check_may_write()
         self._begin_again()
+        if not self.finishing:
+            self.asked_at = self._host.now()
         self._calls += 1
         call = self._calls
         self._pending.add(call)
@@ -248,9 +260,11 @@ class QueuedUpload:
         self.tell()
 
     def hold_restart(self, now: float) -> None:
-        """The next byte costs the whole file again, so let some gather."""
+        """The next byte costs the whole file again, so let some gather: ever more, since a log may grow for
+        days, and at least so long that sending it all takes a small part of the time."""
         self.restarts += 1
-        self.retry_at = now + min(_LONGEST_HOLD, 2.0**self.restarts)
+        pause = min(_LONGEST_HOLD, 2.0 ** min(self.restarts, 10))
+        self.retry_at = now + max(pause, min(_MOST_HELD, _HOLD_FACTOR * self.filled_in))
 
     def fail(self, error: MavftpfsError, now: float, *, refused: bool = False) -> None:
         """Tell whoever waits; refused: asking again by ourselves is of no use."""

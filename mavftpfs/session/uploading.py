@@ -60,6 +60,7 @@ class Uploading:
         self.uploads: list[QueuedUpload] = []
         self.writer = Writer(kit, queue, chunk, lambda: self.may_write)
         self._holder = kit.holder
+        self._queue = queue
         self._vehicle = kit.vehicle
         self._clock = kit.clock
         self._op_deadline = op_deadline
@@ -97,6 +98,10 @@ class Uploading:
         if self._vehicle.lost(self._clock()):
             raise VehicleLost("the vehicle is silent; waiting for its heartbeat")
 
+    def now(self) -> float:
+        """See UploadHost."""
+        return self._clock()
+
     def on_news(self, upload: QueuedUpload) -> None:
         """See UploadHost."""
         self.writer.on_more(upload)
@@ -117,6 +122,12 @@ class Uploading:
                 upload.retry_at = now
         self._holder.wake()
 
+    def on_reboot(self) -> None:
+        """Perhaps it is another vehicle: what was proven of a new file is not there, whatever its size."""
+        for upload in self.uploads:
+            upload.anew = True
+        self.writer.on_reboot()
+
     # --- what the scheduler asks
 
     def due(self, now: float) -> list[QueuedUpload]:
@@ -132,6 +143,13 @@ class Uploading:
             return float("inf")
         later = [upload.retry_at for upload in self.uploads if upload.wanted and upload.retry_at > now]
         return min(later, default=float("inf"))
+
+    def expire(self, oldest: float, error: MavftpfsError) -> None:
+        """Tell those who have waited since before `oldest` for an upload that got no turn."""
+        now = self._clock()
+        for upload in self.uploads:
+            if upload.finishing and not upload.running and upload.asked_at < oldest:
+                upload.fail(error, now)
 
     async def serve(self, upload: QueuedUpload) -> None:
         """Use the session for an upload. Its errors are told to the upload."""
@@ -150,6 +168,7 @@ class Uploading:
         finally:
             now = self._clock()
             upload.running = False
+            upload.asked_at = now
             upload.use.add(now - started, now)
             upload.tell()
 
@@ -186,6 +205,11 @@ class Uploading:
         feed = upload.feed
         if not upload.create and not self.writer.resumable:
             raise LocalProtocolError("how the vehicle opens a file for writing is not known (any more)")
+        if upload.anew and upload.create and (feed.proven or feed.unproven):
+            feed.roll_back(everything=True)
+        upload.anew = False
+        if feed.proven and self.writer.may_try(upload):
+            await self._try_reopening(upload)
         if self.writer.resumable and (feed.proven or not upload.create):
             return await self._reopen(upload, max(feed.reached, upload.least))
         if feed.proven or feed.unproven:
@@ -196,6 +220,21 @@ class Uploading:
         session = await self._holder.open(upload.path, Opcode.CREATE_FILE)
         upload.opened = True
         return session
+
+    async def _try_reopening(self, upload: QueuedUpload) -> None:
+        """Find out on a file of our own making what OpenFileWO does (servers.md 8): the size tells, asked
+        afterwards, since the reply to OpenFileWO may say what it was before."""
+        traits, reached = self._queue.write_traits, upload.feed.reached
+        upload.tried = True
+        try:
+            await self._holder.open(upload.path, Opcode.OPEN_FILE_WO)
+            size = await self._size(upload)
+        except FtpNak:
+            return  # it is refused, or somebody removed the file: what is not seen stays unknown
+        if size == 0:
+            traits.wo_truncates = True
+        elif size is not None and size >= reached:
+            traits.wo_truncates = False
 
     async def _size(self, upload: QueuedUpload) -> int | None:
         """Return the size of the file, asked before OpenFileWO, which makes missing ones (servers.md 8)."""
@@ -258,7 +297,7 @@ class Uploading:
         elif stop in (Stop.FINISHED, Stop.STARVED):
             more = feed.has_more()
             upload.complete(more=more)
-            if not self.writer.resumable and not upload.finishing:
+            if not upload.finishing and not self.writer.resumable and not self.writer.may_try(upload):
                 upload.hold_restart(self._clock())
 
     def _is_open(self, upload: QueuedUpload) -> bool:

@@ -1,8 +1,9 @@
 """Drives the write transfer of one upload until there is a reason to let go of the session. Layer: session.
 
 Where OpenFileWO was seen to keep a file's content an upload can be interrupted at any time: drain the window,
-Terminate, and later OpenFileWO. Elsewhere that would begin the file anew, so the upload keeps the session
-until its source has nothing more (design section 4).
+Terminate, and later OpenFileWO. Where it was seen to empty files that would begin the file anew, so the
+upload keeps the session until its source has nothing more (design section 4). Where neither was seen yet, a
+file that the upload itself made is interrupted when somebody waits, and reopening it tells.
 """
 
 from __future__ import annotations
@@ -26,6 +27,10 @@ STARVE = 1.5
 
 BRIEF_STARVE = 0.05
 """The same where it can be interrupted and somebody else waits."""
+
+PATIENCE = 10.0
+"""Seconds of the session after which one that cannot be interrupted, and has nothing to send at the moment,
+lets go of it for who waits: a log that trickles would keep it for ever."""
 
 STALL = 2.0
 """Seconds without a reply after which a session that can be resumed is closed and opened anew."""
@@ -79,6 +84,7 @@ class Writer:
         self._disarmed_by_paths = False
         self._transfer: WriteTransfer | None = None
         self._starved_at: float | None = None
+        self._filled = False
 
     # --- news
 
@@ -106,6 +112,11 @@ class Writer:
         """Whether a file that was closed can be written on (WriteTraits.wo_truncates is False)."""
         return self._queue.write_traits.wo_truncates is False
 
+    def may_try(self, upload: QueuedUpload) -> bool:
+        """Whether reopening its file is to tell what OpenFileWO does: at most its own bytes go again."""
+        unknown = self._queue.write_traits.wo_truncates is None
+        return unknown and upload.create and not upload.tried and upload.feed.reached > 0
+
     # --- writing
 
     async def run(self, upload: QueuedUpload, session: OpenSession) -> Stop:
@@ -122,7 +133,7 @@ class Writer:
             self.turns.set_writing(False)
 
     async def _write(self, upload: QueuedUpload, session: OpenSession) -> Stop:
-        rearms = 0
+        rearms, self._filled = 0, False
         self.turns.set_writing(self._disarmed_by_paths)
         while True:
             transfer = WriteTransfer(session.id, upload.feed, self._chunk)
@@ -184,7 +195,7 @@ class Writer:
         """How long nothing needs to be looked at, unless there is news."""
         pressed = self._queue.rival_use(upload) is not None
         if transfer.starved:
-            return BRIEF_STARVE if pressed and self.resumable else _OFTEN
+            return BRIEF_STARVE if pressed else _OFTEN
         return _OFTEN if pressed else _SELDOM
 
     def _reason_to_stop(
@@ -199,24 +210,30 @@ class Writer:
             return Stop.YIELD
         waiting_use = self._queue.rival_use(upload)
         if transfer.starved:
-            return self._reason_of_starved(upload, now, pressed=waiting_use is not None)
+            return self._reason_of_starved(upload, now, session.opened_at, pressed=waiting_use is not None)
         self._starved_at = None
-        if self.resumable and self._is_turn_over(upload, now - session.opened_at, waiting_use):
-            return Stop.YIELD
-        return None
+        return Stop.YIELD if self._is_turn_over(upload, now - session.opened_at, waiting_use) else None
 
-    def _reason_of_starved(self, upload: QueuedUpload, now: float, *, pressed: bool) -> Stop | None:
+    def _reason_of_starved(
+        self, upload: QueuedUpload, now: float, since: float, *, pressed: bool
+    ) -> Stop | None:
         if upload.finishing:
             return Stop.FINISHED
         if self._starved_at is None:
             self._starved_at = now
-        patience = BRIEF_STARVE if pressed and self.resumable else STARVE
+            if not self._filled:
+                self._filled, upload.filled_in = True, now - since
+        patience = STARVE
+        if pressed and (self.resumable or self.may_try(upload)):
+            patience = BRIEF_STARVE
+        elif pressed and now - since >= PATIENCE:
+            patience = 0.0
         return Stop.STARVED if now - self._starved_at >= patience else None
 
     def _is_turn_over(self, upload: QueuedUpload, slice_: float, waiting_use: float | None) -> bool:
         if waiting_use is None:
-            return slice_ >= CHECKPOINT_EVERY
-        return should_switch(
+            return self.resumable and slice_ >= CHECKPOINT_EVERY
+        return (self.resumable or self.may_try(upload)) and should_switch(
             current_has_demand=True,
             current_slice=slice_,
             current_use=upload.use.recent(self._clock()),
