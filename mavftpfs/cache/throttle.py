@@ -48,8 +48,8 @@ class Throttle:
     def is_full(self, node: Node) -> bool:
         """Return whether the writers of a file have to wait."""
         draft, attempt = node.draft, node.attempt
-        if draft is None:
-            return False
+        if draft is None or node.removed:
+            return False  # nothing is delivered of a file without a name
         if attempt is None and (not node.background or self._context.nursery is None):
             return False  # nothing of it moves before it is closed: it waits on the local disk
         streams = sum(1 for other in self._context.nodes if other.attempt is not None)

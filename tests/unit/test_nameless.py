@@ -1,0 +1,113 @@
+"""A file without a name that is still open: its bytes wait for no vehicle, and hold no other writer back."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator, Awaitable, Callable
+
+import pytest
+import trio
+
+from mavftpfs.cache.openfile import OpenFile
+from mavftpfs.cache.throttle import STALL
+from mavftpfs.cache.tree import Tree
+from tests.support.fake_writer import KINDS, FakeWriter, make_writable, write_file
+
+KIB = 1024
+DIRTY = 256 * KIB
+FILE = b"/card/dir/file.txt"
+NEW = b"/card/dir/new"
+OLD = bytes(range(256)) * 2000
+PIECES = 48
+PIECE = 32 * KIB
+
+LoseName = Callable[[Tree], Awaitable[None]]
+
+
+@pytest.fixture
+async def store(nursery: trio.Nursery, autojump_clock: object) -> AsyncIterator[FakeWriter]:
+    store = FakeWriter(KINDS["posix"], nursery)
+    store.add(FILE, OLD)
+    yield store
+    assert store.crimes == []
+    nursery.cancel_scope.cancel()
+
+
+@pytest.fixture
+def tree(store: FakeWriter) -> Tree:
+    return make_writable(store, dirty_max=DIRTY)
+
+
+async def unlink(tree: Tree) -> None:
+    await tree.unlink(NEW)
+
+
+async def rename_over(tree: Tree) -> None:
+    await write_file(tree, b"/card/dir/other", b"it")
+    await tree.rename(b"/card/dir/other", NEW, noreplace=False)
+
+
+def piece(number: int) -> bytes:
+    return bytes([number + 1]) * PIECE
+
+
+async def fill(file: OpenFile, first: int = 0) -> None:
+    for number in range(first, PIECES):
+        await file.write(number * PIECE, piece(number))
+
+
+async def assert_filled(file: OpenFile) -> None:
+    assert file.size == PIECES * PIECE
+    for number in range(PIECES):
+        assert await file.read(number * PIECE, PIECE) == piece(number)
+
+
+@pytest.mark.parametrize("lose_name", [unlink, rename_over])
+async def test_much_more_than_dirty_max_is_written_and_read_back(
+    autojump_clock: object, store: FakeWriter, tree: Tree, lose_name: LoseName
+) -> None:
+    file = await tree.create(NEW, exclusive=True)
+    await lose_name(tree)
+    there = {path: node.data for path, node in store.files.items()}
+    before = trio.current_time()
+    await fill(file)
+    assert trio.current_time() - before < STALL
+    held = tree.status()
+    assert held["bytes_held"] >= PIECES * PIECE  # type: ignore[operator]
+    assert held["bytes_held_on_disk"] > 0  # type: ignore[operator]
+    await assert_filled(file)
+    await file.flush()
+    await file.fsync()
+    await file.release()
+    assert {path: node.data for path, node in store.files.items()} == there
+    assert tree.undelivered() == []
+    assert tree.status()["bytes_held"] == 0
+
+
+async def test_a_part_of_a_hidden_file_is_written_and_read_back(
+    autojump_clock: object, store: FakeWriter, tree: Tree
+) -> None:
+    file = await tree.open(FILE, write=True, truncate=False)
+    await tree.unlink(FILE)
+    before = trio.current_time()
+    await fill(file, 1)
+    assert trio.current_time() - before < STALL
+    assert await file.read(0, PIECE) == OLD[:PIECE]
+    assert await file.read(PIECE, PIECE) == piece(1)
+    await file.release()
+    assert FILE not in store.files
+    assert len(store.files) == 0
+
+
+async def test_it_holds_no_other_writer_back(autojump_clock: object, store: FakeWriter, tree: Tree) -> None:
+    nameless = await tree.create(NEW, exclusive=True)
+    await tree.unlink(NEW)
+    await fill(nameless)
+    other = await tree.create(NEW, exclusive=True)
+    before = trio.current_time()
+    await fill(other)
+    assert trio.current_time() - before < STALL
+    await other.release()
+    assert store.files[NEW].data == b"".join(piece(number) for number in range(PIECES))
+    await assert_filled(nameless)
+    await nameless.release()
+    assert len(store.files[NEW].data) == PIECES * PIECE
