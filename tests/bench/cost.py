@@ -4,7 +4,7 @@ First by part, replayed without waiting (`tests.bench.parts`): the shares hardly
 and to a real mount over loopback, between two runs of a bare pipelined loop against the same server. Seconds
 depend on what else the machine does, so the figures to go by are each process's CPU time (user + system) per
 chunk, and the ratio of rates to the bare loop. With --memory, the mount's largest resident size while a file
-of so many megabytes is read through it. Bytes are compared in every run.
+of so many megabytes is read, and another written, through it. Bytes are compared in every run.
 """
 
 from __future__ import annotations
@@ -61,8 +61,9 @@ class Copy:
 
 @dataclass(frozen=True, slots=True)
 class Memory:
-    """Bytes: of the file read, the mount's largest resident size, and what promise 8 allows."""
+    """Bytes: of the file read or written, the mount's largest resident size, and what promise 8 allows."""
 
+    what: str
     size: int
     peak: int
     allowed: int
@@ -161,9 +162,13 @@ def copies(server: str, size: int) -> list[Copy]:
         return bench.found
 
 
-def memory(size: int) -> Memory:
+CACHE = 64 << 20
+ALLOWED = CACHE + (8 << 20) + (60 << 20)
+"""Bytes of memory: cache_size, the default of dirty_max, and the program."""
+
+
+def memory_reading(size: int) -> Memory:
     """Read a large file through a mount and return how much memory that took at most."""
-    cache, dirty_max = 64 << 20, 8 << 20
     with TemporaryDirectory() as folder:
         bench = Bench("px4", Path(folder))
         rng = random.Random(2)
@@ -172,10 +177,25 @@ def memory(size: int) -> Memory:
                 file.seek(at)
                 file.write(rng.randbytes(4096))
             file.truncate(size)
-        with bench.running(), bench.mounted(f"cache_size={cache >> 20}M") as mount:
+        with bench.running(), bench.mounted(f"cache_size={CACHE >> 20}M") as mount:
             subprocess.run(["cmp", mount.path / "large.bin", bench.root / "large.bin"], check=True)
             peak = mount.alive().peak_memory()
-    return Memory(size, peak, cache + dirty_max + (60 << 20))
+    return Memory("read", size, peak, ALLOWED)
+
+
+def memory_writing(size: int) -> Memory:
+    """Write a large file through a mount and return how much memory that took at most."""
+    with TemporaryDirectory() as folder:
+        bench = Bench("px4", Path(folder))
+        local, block = bench.folder / "large.bin", random.Random(3).randbytes(1 << 20)
+        with local.open("wb") as file:
+            for at in range(0, size, len(block)):
+                file.write(block[: size - at])
+        with bench.running(), bench.mounted(f"cache_size={CACHE >> 20}M") as mount:
+            subprocess.run(["cp", local, mount.path / "large.bin"], check=True)
+            peak = mount.alive().peak_memory()
+        subprocess.run(["cmp", local, bench.root / "large.bin"], check=True)
+    return Memory("written", size, peak, ALLOWED)
 
 
 def show_parts(direction: str, parts: dict[str, float]) -> None:
@@ -207,7 +227,9 @@ def main() -> int:
     )
     parser.add_argument("--size", type=float, default=32.0, help="megabytes to copy (to slow servers less)")
     parser.add_argument("--servers", nargs="*", default=["px4", REAL_MAVSDK, "ardupilot"])
-    parser.add_argument("--memory", type=float, default=0.0, help="megabytes to read for the memory's peak")
+    parser.add_argument(
+        "--memory", type=float, default=0.0, help="megabytes to read and write for the memory's peak"
+    )
     parser.add_argument("--json", type=Path, help="write the results here too")
     arguments = parser.parse_args()
     parts = {"read": read_parts(), "write": write_parts()}
@@ -218,14 +240,18 @@ def main() -> int:
         found += copies(server, int(arguments.size * 1e6 * SIZE_SHARE.get(server, LEAST_SHARE)))
     if found:
         show_copies(found)
-    peak = memory(int(arguments.memory * 1e6)) if arguments.memory else None
-    if peak is not None:
-        print(f"{peak.size} bytes read: {peak.peak} bytes of memory at most, {peak.allowed} are allowed")
+    peaks: list[Memory] = []
+    if arguments.memory:
+        peaks = [measure(int(arguments.memory * 1e6)) for measure in (memory_reading, memory_writing)]
+    for peak in peaks:
+        print(
+            f"{peak.size} bytes {peak.what}: {peak.peak} bytes of memory at most, {peak.allowed} are allowed"
+        )
     if arguments.json is not None:
         results = {
             "parts": parts,
             "copies": [asdict(copy) for copy in found],
-            "memory": None if peak is None else asdict(peak),
+            "memory": [asdict(peak) for peak in peaks],
         }
         arguments.json.write_text(json.dumps(results, indent=1))
     return 0
