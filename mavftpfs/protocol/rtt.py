@@ -53,6 +53,12 @@ class RttEstimator:
         self.unfloored = rto = smoothed + (slack if slack > half else half)
         self.rto = rto if rto > self._floor else self._floor
 
+    def borrow(self, timeout: float) -> None:
+        """Wait no longer than another family does after its first round trip, until one of ours is known."""
+        if not self.samples and timeout < self.unfloored:
+            self.unfloored = timeout
+            self.rto = max(timeout, self._floor)
+
     def on_silence(self) -> None:
         """Nothing was heard for a whole timeout; from the third in a row on, each doubles it.
 

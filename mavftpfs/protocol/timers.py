@@ -9,6 +9,14 @@ from mavftpfs.protocol.rtt import INITIAL_RTO, RttEstimator
 
 _LONGEST_WAIT = 5.0
 
+_WORK = "work"
+_NO_WORK = 0.1
+"""Seconds of work that count as none: what takes no longer times the way and the server's readiness."""
+_PACE_MARGIN = 4.0
+"""A card may be so much slower than it was seen to be: others use it, and it stops to erase."""
+_LEAST_PACE = 0.05
+_FORGETTING = 0.125
+
 
 class Timers:
     """Round trips by family (see `requests.Manner`).
@@ -17,12 +25,13 @@ class Timers:
         of: the estimators.
     """
 
-    __slots__ = ("_at", "_manner", "_sent_at", "of")
+    __slots__ = ("_at", "_manner", "_pace", "_sent_at", "of")
 
     def __init__(self) -> None:
         self.of = {family: RttEstimator(floor) for family, floor in FLOORS.items()}
         self._at = self._sent_at = -inf
         self._manner: Manner | None = None
+        self._pace: dict[int, float] = {}
 
     @property
     def rtt(self) -> float | None:
@@ -47,14 +56,46 @@ class Timers:
         sent_at = request.sent_at
         if now != self._at or sent_at != self._sent_at or request.manner is not self._manner:
             self._at, self._sent_at, self._manner = now, sent_at, request.manner
-            self.of[request.manner.family].sample(now - sent_at)
+            if request.manner.family == _WORK and request.manner.patience > _NO_WORK:
+                self._learn_pace(request, now - sent_at)
+                return now - sent_at
+            timer = self.of[request.manner.family]
+            timer.sample(now - sent_at)
+            if timer.samples == 1:
+                self._lend(timer.unfloored)
         return now - sent_at
+
+    def _lend(self, timeout: float) -> None:
+        """A lost Open after a few listings should not cost a second: that is what nothing known would mean.
+
+        The first sample allows for three round trips, which is generous for whoever has none yet.
+        """
+        for timer in self.of.values():
+            timer.borrow(timeout)
 
     def wait(self, request: Request) -> float:
         """Return how long to wait for the reply to this transmission of a request, in seconds."""
         manner = request.manner
-        wait = rto = self.of[manner.family].rto
-        doublings = request.sends - manner.free_sends
+        timer = self.of[manner.family]
+        wait = rto = timer.rto
+        patient = request.sends >= manner.patient_after
+        if patient and manner.family == _WORK:
+            # The way and the work take their times one after the other.
+            wait = rto = rto + manner.patience * self._pace_of(request.opcode)
+        # Under the same seq no repetition tells the round trip: where that is not known, it may be longer.
+        free = manner.free_sends if timer.known or not manner.same_seq else 1
+        doublings = request.sends - free
         if doublings > 0:
             wait = min(rto * (1 << min(doublings, 6)), max(rto, _LONGEST_WAIT))
-        return max(wait, manner.patience) if request.sends >= manner.patient_after else wait
+        return max(wait, manner.patience) if patient and manner.family != _WORK else wait
+
+    def _learn_pace(self, request: Request, elapsed: float) -> None:
+        """Compare how long a server worked with what the slowest is given; the slowest lately counts."""
+        seen = elapsed / request.manner.patience
+        last = self._pace.get(request.opcode, seen)
+        self._pace[request.opcode] = max(seen, last + (seen - last) * _FORGETTING)
+
+    def _pace_of(self, opcode: int) -> float:
+        """Return the share of the slowest server's time to wait for the work of this one."""
+        seen = self._pace.get(opcode)
+        return 1.0 if seen is None else min(1.0, max(_LEAST_PACE, seen * _PACE_MARGIN))
