@@ -16,7 +16,6 @@ from dataclasses import dataclass
 from enum import Enum, IntEnum
 
 _BURST_LENGTH = 8.0
-_REORDER_HOLD = 0.020
 
 
 class Direction(IntEnum):
@@ -39,6 +38,7 @@ class LinkSettings:
 
     rate: bytes per second, None = no limit and no queue. queue: bytes that may wait for the transmitter.
     delay, jitter: seconds one way. loss, duplicate, reorder, corrupt: probabilities per frame.
+    hold: seconds by which a reordered frame is late, and three of its airtimes more.
     burst_loss: share of frames lost in runs of 8 on average. cuts: (start, stop) times without a link.
     """
 
@@ -51,6 +51,7 @@ class LinkSettings:
     burst_loss: float = 0.0
     duplicate: float = 0.0
     reorder: float = 0.0
+    hold: float = 0.020
     corrupt: float = 0.0
     cuts: tuple[tuple[float, float], ...] = ()
 
@@ -226,7 +227,7 @@ class LinkModel:
             arrival += self._rng.random() * self.settings.jitter
         if self._chance(self.settings.reorder):
             lane.counters.reordered += 1
-            arrival += _REORDER_HOLD + 3 * self._airtime(frame)
+            arrival += self.settings.hold + 3 * self._airtime(frame)
         else:
             arrival = lane.last_arrival = max(arrival, lane.last_arrival)
         self._serial += 1

@@ -1,0 +1,154 @@
+"""Random sequences of calls on a few files against a model: every kind of server, real requests, bad links.
+
+Everything between the calls of a program and the card is the real thing: caches, session, engine, frames. The
+vehicle and the link are simulated, time is virtual. What one call in one sequence is depends on the drawn
+example alone, trio's order of tasks included (which hypothesis seeds), so what fails once fails again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from random import Random
+from typing import Any
+
+import pytest
+import trio
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from trio.testing import MockClock
+
+from mavftpfs.cache.options import CacheOptions
+from mavftpfs.cache.tree import Tree
+from mavftpfs.session.connection import Connection
+from mavftpfs.shared.errors import FtpNak, RequestTimeout
+from mavftpfs.sim.filesystem import Kind
+from mavftpfs.sim.linkmodel import Duplex, LinkSettings
+from mavftpfs.sim.memorytree import MemoryTree
+from mavftpfs.sim.profiles import PROFILES, Storage
+from tests.sim.test_arming_replacement import subscribe
+from tests.support.filemodel import START, Model, calls, rewriting_calls
+from tests.support.worlds import ROOTS, World
+
+LINKS = {
+    "wifi": LinkSettings(delay=0.015, loss=0.05, duplicate=0.02, reorder=0.02),
+    "far": LinkSettings(delay=0.25, jitter=0.1, loss=0.05, duplicate=0.02, reorder=0.02),
+    "radio": LinkSettings(
+        rate=5760.0, queue=2048, duplex=Duplex.HALF, delay=0.02, loss=0.05, duplicate=0.02, corrupt=0.01
+    ),
+}
+"""What is held back arrives within a round trip (`hold`): a RENAME or REMOVE that arrives again after its
+answer is carried out again by servers that replay no answers, on whatever has the name by then. `STRAYING` is
+such a link, for calls that move no name."""
+
+STRAYING = LinkSettings(delay=0.02, loss=0.05, duplicate=0.02, reorder=0.05, hold=0.2)
+"""Held back for five round trips."""
+
+FAILURES = 2
+"""Calls of one sequence that may fail: too many answers in a row are lost. None is the rule."""
+
+LEAKS = ("spec",)
+"""Servers with several sessions that open another for an OpenFile or CreateFile that arrives twice; nobody
+learns its id if the answer is lost."""
+
+CALLS = 100
+"""Of one sequence."""
+
+sequences = st.lists(calls(largest=20_000, chunk=6000), min_size=CALLS, max_size=CALLS)
+rewriting = st.lists(rewriting_calls(largest=20_000, chunk=3000), min_size=CALLS, max_size=CALLS)
+
+
+class SimCard:
+    """All files of a simulated card below a root."""
+
+    def __init__(self, tree: MemoryTree, root: bytes) -> None:
+        self.tree = tree
+        self.root = root
+
+    def contents(self) -> Mapping[bytes, bytes]:
+        """Return every file by its path below the root."""
+        return dict(self._below(b""))
+
+    def _below(self, path: bytes) -> list[tuple[bytes, bytes]]:
+        found = []
+        for entry in self.tree.entries((self.root + path) or b"/"):
+            below = path + b"/" + entry.name
+            if entry.name in (b".", b".."):
+                continue
+            if entry.stat.kind is Kind.DIRECTORY:
+                found += self._below(below)
+            else:
+                found.append((below, self.tree.data(self.root + below)))
+        return found
+
+
+def mount(connection: Connection, nursery: trio.Nursery, profile: str, seed: int) -> Tree:
+    """Make the tree of a mount."""
+    tree = Tree(
+        connection.store,
+        CacheOptions(
+            root=ROOTS.get(profile, b"/"),
+            inplace=PROFILES[profile].storage is Storage.LITTLEFS,
+            dir_timeout=seed % 3 * 10.0,
+        ),
+        clock=trio.current_time,
+        invalidate=lambda path: None,
+        nursery=nursery,
+        writer=connection.store,
+        rng=Random(seed),
+    )
+    subscribe(connection, tree)
+    return tree
+
+
+async def deliver_all(profile: str, link: LinkSettings, sequence: list[tuple[Any, ...]], seed: int) -> World:
+    """Make the calls on both; in the end the card is the model and no session is open."""
+    here = World(profile, link, seed=seed)
+    root = ROOTS.get(profile, b"")
+    for path, data in START.items():
+        here.tree.add(root + path, data)
+    here.tree.add_directory(root + b"/d/sub")
+    async with here.connection(seed=seed) as connection, trio.open_nursery() as nursery:
+        model = Model(
+            mount(connection, nursery, profile, seed), SimCard(here.tree, root), (RequestTimeout, FtpNak)
+        )
+        for call in sequence:
+            await model.do(*call)
+            await model.check()
+        await model.end()
+        assert model.failures <= FAILURES
+        nursery.cancel_scope.cancel()
+    assert profile in LEAKS or here.vehicle.server.open_sessions == 0
+    return here
+
+
+def run(profile: str, link: LinkSettings, sequence: list[tuple[Any, ...]], seed: int) -> None:
+    """Run on virtual time."""
+    trio.run(deliver_all, profile, link, sequence, seed, clock=MockClock(autojump_threshold=0))
+
+
+@pytest.mark.parametrize("link", sorted(LINKS))
+@pytest.mark.parametrize("profile", sorted(PROFILES))
+@settings(max_examples=4)
+@given(sequence=sequences, seed=st.integers(0, 99))
+def test_the_card_becomes_the_model(
+    profile: str, link: str, sequence: list[tuple[Any, ...]], seed: int
+) -> None:
+    run(profile, LINKS[link], sequence, seed)
+
+
+@pytest.mark.parametrize("profile", sorted(PROFILES))
+@settings(max_examples=2)
+@given(sequence=rewriting, seed=st.integers(0, 99))
+def test_bytes_held_back_for_round_trips(profile: str, sequence: list[tuple[Any, ...]], seed: int) -> None:
+    run(profile, STRAYING, sequence, seed)
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("link", sorted(LINKS))
+@pytest.mark.parametrize("profile", sorted(PROFILES))
+@settings(max_examples=60)
+@given(sequence=sequences, seed=st.integers(0, 9999))
+def test_hundred_thousands_of_calls(
+    profile: str, link: str, sequence: list[tuple[Any, ...]], seed: int
+) -> None:
+    run(profile, LINKS[link], sequence, seed)
