@@ -26,7 +26,8 @@ class Simple(Operation):
         size: header field; None means len(data).
         side_effect: repeat under the same seq first, because a second execution would be another act.
         patience: seconds until RequestTimeout, None for the engine's deadline.
-        server_time: seconds that the server may work at it; a repetition waits for so long.
+        server_time: seconds that the slowest server works at it; a repetition waits for so long, or for as
+            long as this server may need by what was seen of it.
 
     Attributes:
         reply: the ACK, once done without error.
@@ -58,7 +59,7 @@ class Simple(Operation):
         if side_effect is not None:
             manner = manner._replace(same_seq=side_effect)
         if server_time is not None:
-            manner = manner._replace(family="work", patient_after=1, patience=server_time)
+            manner = manner._replace(family="work", free_sends=2, patient_after=1, patience=server_time)
         count = len(data) if size is None else size
         self._request: Request | None = Request(
             self, opcode, manner, session or 0, offset, count, data, follows=session is None

@@ -26,7 +26,8 @@ class Manner(NamedTuple):
     family: whose round trips are alike. same_seq: repeat under the same seq. ordered: servers answer
     in order, so answers to later requests prove a loss. echoes_offset: an ACK carries the request's
     offset. free_sends: transmissions before the waits double. patient_after: from so many transmissions
-    on, wait at least `patience` seconds (a slow server executes every one of them, servers.md 14.38).
+    on, wait at least `patience` seconds (a slow server executes every one of them, servers.md 14.38); of the
+    family "work", what the slowest server needs, of which one that was seen to be faster gets less.
     once: never repeated, and its loss matters to nobody.
     """
 
@@ -40,14 +41,14 @@ class Manner(NamedTuple):
     once: bool = False
 
 
-FLOORS = {"data": 0.05, "write": 0.05, "list": 0.25, "path": 0.2, "slow": 10.0, "work": 2.0}
+FLOORS = {"data": 0.05, "write": 0.05, "list": 0.25, "path": 0.2, "slow": 10.0, "work": 0.3}
 """Least retransmission timeout of each family in seconds."""
 
 READ_MANNER = Manner("data", same_seq=False, ordered=True, echoes_offset=True, free_sends=8)
 WRITE_MANNER = Manner("write", same_seq=False, ordered=True, free_sends=8)
 KEEP_ALIVE_MANNER = Manner("path", same_seq=False, once=True)
 _LIST = Manner("list", same_seq=False, ordered=True, patient_after=4, patience=2.5)
-_PATH = Manner("path", same_seq=True)
+_PATH = Manner("path", same_seq=True, free_sends=4)
 _SLOW = Manner("slow", same_seq=True, patient_after=2, patience=40.0)
 
 _MANNERS = {
