@@ -14,6 +14,7 @@ from typing import Protocol
 
 from mavftpfs.cache.spool import SpoolDirectory
 from mavftpfs.link.messages import Address
+from mavftpfs.shared.errors import MavftpfsError
 
 log = logging.getLogger("mavftpfs.mount")
 
@@ -58,12 +59,19 @@ def keep_the_rest(holder: Holder, choose: Callable[[], Path]) -> str:
         return ""
     directory = choose()
     try:
-        holder.recover_to(directory)
+        kept = holder.recover_to(directory)
     except OSError as exc:
         return (
             f"{len(left)} file(s) did not reach the vehicle, and {directory} is not writable: {exc.strerror}"
         )
-    return f"{len(left)} file(s) did not reach the vehicle; they are kept in {directory}"
+    except MavftpfsError as exc:
+        return f"{len(left)} file(s) did not reach the vehicle, and could not be copied to {directory}: {exc}"
+    if len(kept) == len(left):
+        return f"{len(left)} file(s) did not reach the vehicle; they are kept in {directory}"
+    return (
+        f"{len(left)} file(s) did not reach the vehicle; only {len(kept)} could be kept, in {directory}, "
+        "where manifest.json says why"
+    )
 
 
 async def say_goodbye(holder: Holder, source: str, tell: Callable[[str], None]) -> None:

@@ -36,6 +36,7 @@ from mavftpfs.shared.errors import (
     RemoteProtocolError,
     RequestTimeout,
     SessionBusy,
+    SpoolFailed,
     VerificationFailed,
 )
 from mavftpfs.shared.model import DirEntry, EntryKind, split
@@ -370,7 +371,7 @@ class Deliverer:
             return
         try:
             content.persist(describe(node, draft, self._context.wall))
-        except (NoSpace, OSError) as trouble:
+        except (NoSpace, SpoolFailed, OSError) as trouble:
             log.warning("%r is kept in memory only: %s", node.path, trouble)
 
 

@@ -3,27 +3,34 @@
 from __future__ import annotations
 
 import json
+import logging
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from mavftpfs.cache.draft import Draft
 from mavftpfs.cache.nodes import Node
 from mavftpfs.cache.rescuing import free_name
+from mavftpfs.shared.errors import SpoolFailed
+
+log = logging.getLogger("mavftpfs.cache")
 
 PIECE = 1024 * 1024
 MANIFEST = "manifest.json"
 
 
 def recover(nodes: Iterable[Node], directory: Path, wall: Callable[[], float]) -> list[Path]:
-    """Copy undelivered files into a directory, with a manifest that says what each is; return the files.
+    """Copy undelivered files into a directory, with a manifest that says what each is; return the copies.
 
     Of a file that was changed in part only the bytes known here are there; the manifest lists them, the
-    rest of such a file is a hole.
+    rest of such a file is a hole. A file that is copied is held no longer. One that the local disk does not
+    give back stays where it is, for the next mount, and costs no other: the manifest says why under
+    `not_saved`; what could be read of it may be there, too.
 
     Raises:
-        OSError.
+        OSError, SpoolFailed: nothing could be copied.
     """
-    written: list[Path] = []
+    copied: list[tuple[Node, Path]] = []
+    failed: list[OSError | SpoolFailed] = []
     manifest = []
     for node in nodes:
         if node.draft is None:
@@ -31,13 +38,22 @@ def recover(nodes: Iterable[Node], directory: Path, wall: Callable[[], float]) -
         directory.mkdir(mode=0o700, parents=True, exist_ok=True)
         name = node.path.decode(errors="surrogateescape").strip("/").replace("/", "__")
         path = free_name(directory, name)
-        _copy(node.draft, path)
-        written.append(path)
-        manifest.append({"file": path.name, **describe(node, node.draft, wall)})
-    if written:
-        target = free_name(directory, MANIFEST)
-        target.write_text(json.dumps(manifest, indent=1))
-    return written
+        facts = {"file": path.name, **describe(node, node.draft, wall)}
+        try:
+            _copy(node.draft, path)
+            copied.append((node, path))
+        except (OSError, SpoolFailed) as error:
+            log.error("%r could not be saved: %s", node.path, error)
+            failed.append(error)
+            facts["not_saved"] = str(error)
+        manifest.append(facts)
+    if failed and not copied:
+        raise failed[0]
+    if copied:
+        free_name(directory, MANIFEST).write_text(json.dumps(manifest, indent=1))
+    for node, _ in copied:
+        node.drop_draft()  # the spool need not offer it again
+    return [path for _, path in copied]
 
 
 def describe(node: Node, draft: Draft, wall: Callable[[], float]) -> dict[str, object]:

@@ -281,10 +281,11 @@ class Tree:
     def recover_to(self, directory: Path) -> Sequence[Path]:
         """Copy what could not be delivered into a directory, which is made, with a manifest.json.
 
-        Returns the files written, [] if there was nothing. Blocks: for the end of a mount.
+        Returns the copies, [] if there was nothing; what could not be copied stays held. Blocks: for the end
+        of a mount.
 
         Raises:
-            OSError.
+            OSError, SpoolFailed: nothing could be copied.
         """
         return [] if self._writing is None else self._writing.recover_to(directory)
 

@@ -324,10 +324,7 @@ class Writeback:
     def recover_to(self, directory: Path) -> list[Path]:
         """See Tree.recover_to."""
         lost = [node for node in self._context.nodes if node.undelivered]
-        written = recover(lost, directory, self._context.wall)
-        for node in lost:
-            node.drop_draft()  # the spool need not offer it again
-        return written
+        return recover(lost, directory, self._context.wall)
 
     def armed_changed(self, armed: bool) -> None:
         """See Tree.armed_changed."""

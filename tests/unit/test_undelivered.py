@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import json
+import os
 from collections.abc import AsyncIterator
 from contextlib import suppress
+from pathlib import Path
 from random import Random
 
 import pytest
@@ -11,8 +14,17 @@ import trio
 
 from mavftpfs.cache.asides import is_reserved, new_owner
 from mavftpfs.cache.openfile import OpenFile
+from mavftpfs.cache.spool import SpoolContent, SpoolDirectory
 from mavftpfs.cache.tree import Tree
-from mavftpfs.shared.errors import FileBusy, FileTooLarge, MavftpfsError, RequestTimeout, VehicleLost
+from mavftpfs.farewell import keep_the_rest
+from mavftpfs.shared.errors import (
+    FileBusy,
+    FileTooLarge,
+    MavftpfsError,
+    RequestTimeout,
+    SpoolFailed,
+    VehicleLost,
+)
 from mavftpfs.shared.model import split
 from tests.support.fake_writer import CHUNK, KINDS, FakeWriter, make_writable
 
@@ -192,3 +204,70 @@ async def test_a_change_and_cut_goes_on_after_any_fault(large: FakeWriter) -> No
             await tree.drain(60)
             assert store.files[FILE].data == wanted
             assert (tree.undelivered(), store.crimes) == ([], [])
+
+
+# --- what is kept at the end
+
+
+async def two_on_disk(store: FakeWriter, base: Path) -> tuple[Tree, SpoolDirectory]:
+    """Return a tree with two files on the local disk that the vehicle lacks; the first lost bytes."""
+    spool = SpoolDirectory(base / "spool", Random(1))
+    tree = make_writable(store, spool=spool)
+    files = [await tree.create(name, exclusive=True) for name in (b"/card/dir/a", b"/card/dir/b")]
+    store.lost = True
+    for file, name in zip(files, (b"/card/dir/a", b"/card/dir/b"), strict=True):
+        await file.write(0, name * 100)
+        with pytest.raises(VehicleLost):
+            await file.release()
+    os.truncate(min(spool.path.glob("*.data")), 10)
+    return tree, spool
+
+
+async def test_one_file_that_cannot_be_read_does_not_keep_the_others_from_being_saved(
+    store: FakeWriter, tmp_path: Path
+) -> None:
+    tree, spool = await two_on_disk(store, tmp_path)
+    message = keep_the_rest(tree, lambda: tmp_path / "kept")
+    assert f"2 file(s) did not reach the vehicle; only 1 could be kept, in {tmp_path / 'kept'}" in message
+    assert (tmp_path / "kept/card__dir__b").read_bytes() == b"/card/dir/b" * 100
+    first, second = json.loads((tmp_path / "kept/manifest.json").read_text())
+    assert first["path"] == "/card/dir/a"
+    assert "lost bytes" in first["not_saved"]
+    assert "not_saved" not in second
+    assert tree.undelivered() == [b"/card/dir/a"], "it stays in the spool"
+    assert len(list(spool.path.glob("*.data"))) == 1
+    spool.close()
+
+
+async def test_when_nothing_can_be_saved_that_is_said(store: FakeWriter, tmp_path: Path) -> None:
+    tree, spool = await two_on_disk(store, tmp_path)
+    for path in spool.path.glob("*.data"):
+        os.truncate(path, 10)
+    message = keep_the_rest(tree, lambda: tmp_path / "kept")
+    assert message.startswith("2 file(s) did not reach the vehicle")
+    assert "lost bytes" in message
+    spool.close()
+
+
+# --- a local disk that fails as the vehicle does
+
+
+async def test_a_disk_that_fails_does_not_hide_why_the_vehicle_lacks_a_file(
+    store: FakeWriter, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    spool = SpoolDirectory(tmp_path / "spool", Random(1))
+    tree = make_writable(store, spool=spool)
+    file = await tree.create(NEW, exclusive=True)
+    await file.write(0, b"abc")
+    store.lost = True
+
+    def persist(*_: object) -> None:
+        raise SpoolFailed("bad sector")
+
+    monkeypatch.setattr(SpoolContent, "persist", persist)
+    with pytest.raises(VehicleLost):
+        await file.release()
+    store.lost = False
+    assert await tree.drain(10) == []
+    assert store.files[NEW].data == b"abc"
+    spool.close()
