@@ -39,7 +39,7 @@ class Changes:
             self._local.mkdir(path)
             return
         self._context.require_disarmed()
-        self._overlay.require_free(path)
+        self._overlay.require_new(path)
         await self._namespace.mkdir(path)
 
     async def rmdir(self, path: bytes) -> None:
@@ -76,6 +76,8 @@ class Changes:
         self._context.require_disarmed()
         for path in (old, new):
             self._overlay.require_free(path)
+        if not local_new:
+            self._overlay.require_new(new)
         if local_old or local_new:
             await self._rename_across(old, new, to_vehicle=local_old, noreplace=noreplace)
         else:

@@ -12,7 +12,7 @@ from mavftpfs.cache.localfiles import LocalFiles
 from mavftpfs.cache.nodes import Node
 from mavftpfs.cache.times import SECOND, Times, shown
 from mavftpfs.shared.errors import NotADirectory, NotFound, NotSupported
-from mavftpfs.shared.model import EntryKind, join, split
+from mavftpfs.shared.model import EntryKind, join, require_listable, split
 
 
 class Overlay:
@@ -92,6 +92,15 @@ class Overlay:
         """Raise NotSupported for a name of our own."""
         if is_reserved(split(path)[1]):
             raise NotSupported(f"names that begin like {path!r} are for replacing files")
+
+    def require_new(self, path: bytes) -> None:
+        """Raise what is wrong with a name that is to be made on the vehicle.
+
+        Raises:
+            NotSupported, LocalProtocolError.
+        """
+        self.require_free(path)
+        require_listable(path)
 
     def on_written(self, path: bytes) -> None:
         """A file's content changed: what a user set is void, and a server that tells mtimes will tell now."""

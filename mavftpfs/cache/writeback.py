@@ -117,7 +117,7 @@ class Writeback:
             await self.changes.require_parent(path)
             return self._local.create(path, exclusive=exclusive)
         self._context.require_disarmed()
-        self.overlay.require_free(path)
+        self.overlay.require_new(path)
         wire_path(path)
         entry = await self._namespace.entry(path)
         other = None if entry is not None else await self._namespace.other_spelling(path)

@@ -100,6 +100,17 @@ def storage_of(directory: bytes) -> bytes:
     return b"/".join(parts[:3])
 
 
+def require_listable(path: bytes) -> None:
+    """Check that a listing could show a new name: what no listing shows can be neither found nor removed.
+
+    Raises:
+        LocalProtocolError: it holds a tab, which ends a name in a listing (servers.md 6, 14.33).
+    """
+    name = split(path)[1]
+    if b"\t" in name:
+        raise LocalProtocolError(f"{name!r} holds a tab, so no listing could show it")
+
+
 def usable_name(name: bytes) -> bool:
     """Return whether a listed name may enter the tree (promise 10)."""
     return bool(name) and name not in (b".", b"..") and b"/" not in name and b"\0" not in name
