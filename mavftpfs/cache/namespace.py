@@ -1,16 +1,16 @@
 """mkdir, rmdir, unlink and rename on the vehicle as rename(2) and its kin have it. Layer: cache.
 
 Servers check little: some remove files by rmdir, move into directories by rename, or truncate another
-spelling of a name (servers.md 9). So types and targets are looked up in listings first. One change runs at a
-time; what a draft below a path has undelivered is delivered before the path changes.
+spelling of a name (servers.md 9). So types and targets are looked up in listings first. Changes that concern
+one another wait for each other; what a draft has undelivered is delivered before its path changes.
 """
 
 from __future__ import annotations
 
 import errno
 import logging
-from collections.abc import Awaitable, Callable
-from contextlib import AsyncExitStack
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import AsyncExitStack, asynccontextmanager
 
 import trio
 
@@ -21,6 +21,7 @@ from mavftpfs.cache.draft import Draft
 from mavftpfs.cache.emptying import Emptier
 from mavftpfs.cache.names import Names
 from mavftpfs.cache.nodes import Node
+from mavftpfs.cache.pathlocks import PathLocks
 from mavftpfs.cache.replacing import Present
 from mavftpfs.cache.spool import SpoolContent
 from mavftpfs.cache.sure import Sure
@@ -28,6 +29,7 @@ from mavftpfs.shared.errnos import errno_for
 from mavftpfs.shared.errors import (
     AlreadyExists,
     CrossDevice,
+    FileBusy,
     FtpNak,
     InvalidMove,
     IsADirectory,
@@ -43,6 +45,8 @@ from mavftpfs.shared.model import DirEntry, EntryKind, wire_path
 log = logging.getLogger("mavftpfs.cache")
 
 PIECE = 64 * 1024
+TRIES = 5
+"""How often a change begins anew because files were opened or closed while it waited."""
 
 
 class Namespace(Names):
@@ -67,13 +71,13 @@ class Namespace(Names):
         self._purge = purge
         self._new_content = new_content
         self._on_renamed = on_renamed
-        self._lock = trio.Lock()
+        self._paths = PathLocks(context.options.op_deadline)
 
     # --- changing
 
     async def mkdir(self, path: bytes) -> None:
         """See Tree.mkdir."""
-        async with self._lock:
+        async with self._paths.hold(path):
             if await self.entry(path) is not None:
                 raise AlreadyExists(f"{path!r} exists")
             if self._context.writer.traits.folds_case and await self.other_spelling(path):
@@ -83,7 +87,7 @@ class Namespace(Names):
 
     async def rmdir(self, path: bytes) -> None:
         """See Tree.rmdir."""
-        async with self._lock:
+        async with self._paths.hold(path):
             entry = await self._need(path)
             if entry.kind is not EntryKind.DIRECTORY:
                 raise NotADirectory(f"{path!r} is not a directory")
@@ -93,7 +97,7 @@ class Namespace(Names):
 
     async def unlink(self, path: bytes) -> None:
         """See Tree.unlink."""
-        async with self._lock:
+        async with self._changing(path):
             node = self._context.nodes.get(path)
             if node is not None and await self.entry(path) is not None:
                 await self._unlink_node(node, path)
@@ -110,7 +114,7 @@ class Namespace(Names):
         """See Tree.rename."""
         if new.startswith(old + b"/"):
             raise InvalidMove(f"{old!r} cannot become a part of itself")
-        async with self._lock:
+        async with self._changing(old, new):
             wire_path(new)
             listed = await self.current(new, free=noreplace)
             target = listed or await self.entry(new)
@@ -137,6 +141,51 @@ class Namespace(Names):
                 await self._remove(node.path)
             finally:
                 self._context.forget_hidden(node)
+
+    # --- inside: whom to wait for
+
+    @asynccontextmanager
+    async def _changing(self, old: bytes, new: bytes | None = None) -> AsyncIterator[None]:
+        """Hold the path, or both, and the files there and below; those at the old path are delivered before.
+
+        A delivery may last: nobody waits for one, or makes one, while it keeps others from their paths.
+
+        Raises:
+            FileBusy: one is still being delivered. RequestTimeout: another change took too long. Else as
+            Deliverer.deliver.
+        """
+        paths = (old,) if new is None else (old, new)
+        for _ in range(TRIES):
+            nodes = self._nodes_of(paths)
+            try:
+                async with AsyncExitStack() as locks:
+                    await self._lock_nodes(nodes, locks)
+                    if new not in (None, old):
+                        await self._deliver_below(old, nodes)
+                    await locks.enter_async_context(self._paths.hold(*paths))
+                    if self._nodes_of(paths) == nodes:
+                        yield
+                        return
+            finally:
+                for node in nodes:
+                    self._context.nodes.maybe_forget(node)  # a close that found it locked could not
+        raise FileBusy(f"{old!r} is opened and closed all the time")
+
+    def _nodes_of(self, paths: tuple[bytes, ...]) -> list[Node]:
+        """Return the files concerned, in an order that renames do not change."""
+        return sorted({node for path in paths for node in self._context.nodes.below(path)}, key=id)
+
+    async def _lock_nodes(self, nodes: list[Node], locks: AsyncExitStack) -> None:
+        with trio.move_on_after(self._context.options.op_deadline) as scope:
+            for node in nodes:
+                await locks.enter_async_context(node.lock)
+        if scope.cancelled_caught:
+            raise FileBusy("a file that is concerned is still being delivered")
+
+    async def _deliver_below(self, path: bytes, locked: list[Node]) -> None:
+        for node in locked:
+            if node.path == path or node.path.startswith(path + b"/"):
+                await self._deliverer.deliver_locked(node)
 
     # --- inside: looking
 
@@ -175,21 +224,18 @@ class Namespace(Names):
             self._context.dentries.note_removed(path)
 
     async def _unlink_node(self, node: Node, path: bytes) -> None:
-        async with node.lock:
-            await self._deliverer.abandon(node)
-            if path in self._context.torn:
-                await self._purge(path)
-            there = await self._is_file(path, node)
-            if there and node.draft is None:
-                self._context.require_idle(path)
-            if there and node.handles and not self._keep_content(node):
-                await self._hide(node)
-            elif there:
-                await self.remove_perhaps(path)
-            node.lose_name()
-            self._context.nodes.detach(node)
-        if not node.handles:
-            node.drop_draft()
+        await self._deliverer.abandon(node)
+        if path in self._context.torn:
+            await self._purge(path)
+        there = await self._is_file(path, node)
+        if there and node.draft is None:
+            self._context.require_idle(path)
+        if there and node.handles and not self._keep_content(node):
+            await self._hide(node)
+        elif there:
+            await self.remove_perhaps(path)
+        node.lose_name()
+        self._context.nodes.detach(node)
 
     async def _is_file(self, path: bytes, node: Node) -> bool:
         """Return whether the vehicle has an open file; what else has its name by now is not to be removed.
@@ -251,24 +297,16 @@ class Namespace(Names):
             if context.nodes.get(path) is None:
                 context.require_idle(path)
         displaced = context.nodes.get(new)
-        nodes = sorted({*context.nodes.below(old), *context.nodes.below(new)}, key=lambda node: node.path)
-        async with AsyncExitStack() as locks:
-            for node in nodes:
-                await locks.enter_async_context(node.lock)
-            for node in context.nodes.below(old):
-                await self._deliverer.deliver_locked(node)
-            if displaced is not None:
-                await self._deliverer.abandon(displaced)
-            await self._purge(old)
-            await self._rename_or_refuse(old, new, target, by_case=by_case)
-            if displaced is not None:
-                self._displace(displaced)
-            if source.kind is EntryKind.DIRECTORY:
-                context.dentries.forget(old)
-            context.follow_rename(old, new)
-            self._on_renamed(old, new)
-        for node in nodes:
-            context.nodes.maybe_forget(node)  # a close that found it locked could not
+        if displaced is not None:
+            await self._deliverer.abandon(displaced)
+        await self._purge(old)
+        await self._rename_or_refuse(old, new, target, by_case=by_case)
+        if displaced is not None:
+            self._displace(displaced)
+        if source.kind is EntryKind.DIRECTORY:
+            context.dentries.forget(old)
+        context.follow_rename(old, new)
+        self._on_renamed(old, new)
 
     def _displace(self, node: Node) -> None:
         """The file that is open at a path lost its name; who has it open keeps what is held of it."""

@@ -1,13 +1,16 @@
 """Changes of the vehicle's names that are known to have happened when they return. Layer: cache.
 
 The reply to a request may be lost although the request was done, and its repetition is then refused
-(servers.md 14.4). So a refusal of a repetition, and silence, are checked by a listing asked for just then.
+(servers.md 14.4). So a refusal of a repetition, and silence, are checked by a listing asked for just then,
+unless whoever sent it did so already (`MavftpfsError.checked`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Awaitable, Callable
 from functools import partial
+
+import trio
 
 from mavftpfs.cache.context import Context
 from mavftpfs.shared.errors import FtpNak, MavftpfsError, NotADirectory, NotFound, RequestTimeout
@@ -38,7 +41,7 @@ class Sure:
         Raises:
             As WriteStore.
         """
-        await self._do(lambda: self._context.writer.remove(path), lambda: self._is_gone(path))
+        await self._do(lambda: self._context.writer.remove(path), lambda: self._is_gone(path), path)
         self._context.dentries.note_removed(path)
 
     async def remove_directory(self, path: bytes) -> None:
@@ -47,7 +50,7 @@ class Sure:
         Raises:
             As WriteStore.
         """
-        await self._do(lambda: self._context.writer.remove_directory(path), lambda: self._is_gone(path))
+        await self._do(lambda: self._context.writer.remove_directory(path), lambda: self._is_gone(path), path)
         self._context.dentries.note_removed(path)
 
     async def make_directory(self, path: bytes) -> None:
@@ -56,7 +59,9 @@ class Sure:
         Raises:
             As WriteStore.
         """
-        await self._do(lambda: self._context.writer.make_directory(path), lambda: self._is_directory(path))
+        await self._do(
+            lambda: self._context.writer.make_directory(path), lambda: self._is_directory(path), path
+        )
         self._context.dentries.note_created(path, DirEntry(split(path)[1], EntryKind.DIRECTORY))
 
     async def rename(self, old: bytes, new: bytes, *, completes: bool = False) -> None:
@@ -68,21 +73,34 @@ class Sure:
             As WriteStore.
         """
         rename = partial(self._context.writer.rename, old, new, completes=completes)
-        await self._do(rename, lambda: self._is_moved(old, new))
+        await self._do(rename, lambda: self._is_moved(old, new), old, new)
         self._context.writer.traits.rename_works = True
         self._context.dentries.note_renamed(old, new)
         self._context.dentries.note_proven(new, self._context.clock())
 
     # --- inside
 
-    async def _do(self, act: Callable[[], Awaitable[None]], done: Callable[[], Awaitable[bool]]) -> None:
+    async def _do(
+        self, act: Callable[[], Awaitable[None]], done: Callable[[], Awaitable[bool]], *paths: bytes
+    ) -> None:
         try:
             await act()
         except (FtpNak, RequestTimeout) as error:
             if isinstance(error, FtpNak) and not error.retransmitted:
                 raise
+            if error.checked:
+                self._doubt(paths)
+                raise
             if not await _ask(done, error):
                 raise
+        except trio.Cancelled:
+            self._doubt(paths)
+            raise
+
+    def _doubt(self, paths: tuple[bytes, ...]) -> None:
+        """Nobody knows whether it was done: what is remembered proves nothing any more."""
+        for path in paths:
+            self._context.dentries.expire(split(path)[0], self._context.clock())
 
     async def _is_gone(self, path: bytes) -> bool:
         return await self.entry(path) is None

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
 from enum import Enum
+from typing import TypeVar
 
 import trio
 
@@ -24,8 +25,9 @@ from mavftpfs.shared.model import ROOT, DirEntry, EntryKind, Listing, split, wir
 RENAME_LIMIT = 238
 """Bytes that both paths of a rename and the NUL between them may have (servers.md 9)."""
 
-VERIFY_LIMIT = 10.0
-"""Seconds to spend on finding out what became of a request that was not answered."""
+VERIFY_LIMIT = 4.0
+"""Seconds to spend on finding out what became of a request that was not answered. Whoever waits was promised
+an answer within `op_deadline`, and this comes after it."""
 
 _DOT = b"."
 
@@ -48,6 +50,7 @@ class Outcome(Enum):
     UNKNOWN = "unknown"
 
 
+E = TypeVar("E", bound=MavftpfsError)
 Lister = Callable[[bytes], Awaitable[Listing]]
 Verdict = Callable[[], Awaitable[Outcome]]
 
@@ -66,20 +69,20 @@ class SideEffects:
     async def remove(self, path: bytes) -> None:
         """Remove what is known to be a file."""
         wire = wire_path(path)
-        async with self._changing(path):
+        async with self._in_time(), self._changing(path):
             await self._perform(lambda: Simple(Opcode.REMOVE_FILE, wire), lambda: self._is_absent(path))
             self._scheduler.gone(path)
 
     async def remove_directory(self, path: bytes) -> None:
         """Remove what is known to be an empty directory."""
         wire = wire_path(path)
-        async with self._changing(path, below=True):
+        async with self._in_time(), self._changing(path, below=True):
             await self._perform(lambda: Simple(Opcode.REMOVE_DIRECTORY, wire), lambda: self._is_absent(path))
 
     async def make_directory(self, path: bytes) -> None:
         """Make a directory."""
         wire = wire_path(path)
-        async with self._changing(path):
+        async with self._in_time(), self._changing(path):
             await self._perform(
                 lambda: Simple(Opcode.CREATE_DIRECTORY, wire), lambda: self._is_new_directory(path)
             )
@@ -90,7 +93,11 @@ class SideEffects:
         if not fits_rename(old, new):
             raise PathTooLong(f"both paths of a rename have {len(data)} bytes, more than {RENAME_LIMIT}")
         may = self._scheduler.require_link if completes else self._scheduler.check_may_write
-        async with self._changing(old, below=True, may=may), self._changing(new, may=may):
+        async with (
+            self._in_time(),
+            self._changing(old, below=True, may=may),
+            self._changing(new, may=may),
+        ):
             await self._perform(lambda: Simple(Opcode.RENAME, data), lambda: self._is_renamed(old, new))
             self._scheduler.gone(new)
             self._scheduler.moved(old, new)
@@ -118,6 +125,14 @@ class SideEffects:
     # --- one request
 
     @asynccontextmanager
+    async def _in_time(self) -> AsyncIterator[None]:
+        """Bound the body: waiting for its turn, the request, and looking what became of it, all together."""
+        with trio.move_on_after(self._scheduler.op_deadline + VERIFY_LIMIT) as scope:
+            yield
+        if scope.cancelled_caught:
+            raise _checked(RequestTimeout("the vehicle did not get round to it in time"))
+
+    @asynccontextmanager
     async def _changing(
         self, path: bytes, *, below: bool = False, may: Callable[[], None] | None = None
     ) -> AsyncIterator[None]:
@@ -142,7 +157,7 @@ class SideEffects:
                     return
             except RequestTimeout as silence:
                 if await self._after_silence(verify) is not Outcome.DONE:
-                    raise silence
+                    raise _checked(silence) from None
                 return
             else:
                 return
@@ -162,13 +177,13 @@ class SideEffects:
             return True
         if outcome is Outcome.UNDONE and not last:
             return False
-        raise nak
+        raise _checked(nak)
 
     async def _verdict(self, nak: FtpNak, verify: Verdict) -> Outcome:
         try:
             return await verify()
         except FtpNak:
-            raise nak from None  # there is not even a parent to list
+            raise _checked(nak) from None  # there is not even a parent to list
 
     async def _after_silence(self, verify: Verdict) -> Outcome:
         with trio.move_on_after(VERIFY_LIMIT):
@@ -210,3 +225,9 @@ class SideEffects:
             return (await self._list_directory(_DOT)).entries
         except FtpNak:
             return ()
+
+
+def _checked(error: E) -> E:
+    """Return an error that says that nobody needs to look again."""
+    error.checked = True
+    return error

@@ -7,7 +7,13 @@ from __future__ import annotations
 
 
 class MavftpfsError(Exception):
-    """Base of every error this package raises on purpose; its text is one line for a person."""
+    """Base of every error this package raises on purpose; its text is one line for a person.
+
+    Attributes:
+        checked: it was tried already to find out by a listing whether the request was done after all.
+    """
+
+    checked = False
 
 
 class UsageError(MavftpfsError):
