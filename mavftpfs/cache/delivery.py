@@ -22,7 +22,7 @@ from mavftpfs.cache.recovery import describe
 from mavftpfs.cache.replacing import Present, Replacer
 from mavftpfs.cache.sure import Sure
 from mavftpfs.cache.throttle import Throttle
-from mavftpfs.cache.verify import Verifier
+from mavftpfs.cache.verify import SETTLED, Verifier, doubted
 from mavftpfs.shared.errors import (
     AlreadyExists,
     Armed,
@@ -247,7 +247,8 @@ class Deliverer:
             await self._finish(attempt)
             if draft.ruined and attempt.plan is Plan.IN_PLACE:
                 raise FileChanged(f"{node.path!r} was emptied on the vehicle while it was changed here")
-            await self.verifier.check(attempt.path, draft)
+            settled = self._context.clock() - node.delivered_at > SETTLED
+            await self.verifier.check(attempt.path, draft, doubted(attempt.upload, draft, settled=settled))
             await attempt.upload.abort()
         if attempt.places is not None:
             await self._commit(node, attempt)

@@ -137,6 +137,17 @@ class Upload(Protocol):
         """Whether the request that makes the file may have been sent."""
         ...
 
+    @property
+    def repeats(self) -> bool:
+        """Whether a request may reach the vehicle twice, the second time after newer ones."""
+        ...
+
+    @property
+    def shared(self) -> bool:
+        """Whether the server's session may have been another client's for a while, so that what was ACKed
+        was perhaps written to another file (servers.md 1)."""
+        ...
+
     def wake(self) -> None:
         """The source has more."""
         ...

@@ -27,6 +27,7 @@ class Sending:
         whole: the attempt began with an empty remote file, so a rollback of everything means all of it.
         progress: told how many bytes were ACKed.
         emptied: the remote file was emptied under us though its old bytes were to stay.
+        rewritten: bytes that changed after they may have been sent: an older copy may come late.
     """
 
     def __init__(
@@ -37,6 +38,8 @@ class Sending:
         self.emptied = False
         self.progress: Callable[[int], None] | None = None
         self.reached = 0
+        self.rewritten = ExtentSet()
+        self._sent_to = 0  # as `reached`, over rollbacks
         self._dirty = ExtentSet(extents)
         self._in_flight = ExtentSet()
         self._void = ExtentSet()  # in flight, but cut off since: nothing may overtake it
@@ -64,6 +67,9 @@ class Sending:
         """The draft's bytes [start, stop) changed: they go (again)."""
         self._enter_run()
         self._clear = 0
+        sent_to = max(self.reached, self._sent_to)
+        if start < sent_to:
+            self.rewritten.add(start, min(stop, sent_to))
         self._dirty.add(start, stop)
         self._acked.discard(start, stop)
         self._proven.discard(start, stop)
@@ -77,7 +83,7 @@ class Sending:
         self._clear = 0
         for start, stop in self._in_flight.intersection(size, max(size, self._in_flight.end)):
             self._void.add(start, stop)
-        for extents in (self._dirty, self._in_flight, self._acked, self._proven):
+        for extents in (self._dirty, self._in_flight, self._acked, self._proven, self.rewritten):
             extents.discard(size, max(extents.end, size))
         self._ahead = (0, b"")
 
@@ -144,6 +150,7 @@ class Sending:
             self._move(self._proven, self._dirty)
             self.emptied |= not self.whole
             if self.whole:
+                self._sent_to = max(self.reached, self._sent_to)
                 self.reached = 0
 
     def check_invariants(self) -> None:

@@ -4,6 +4,8 @@ The size always; the CRC32 where the content is wholly known here and the file i
 zeros do not change this CRC32 (servers.md 10), so it never stands alone. Silence or a refusal of the CRC32
 counts as verified by size, is logged once and counted, unless verify=crc.
 
+What is in doubt (`doubted`) is compared whatever verify= says: the size does not show it.
+
 Of a file that was changed in place only a part is known here. verify=crc has that part read back from the
 card and compared byte by byte; the rest was not sent, and is taken to be as it was. (Its CRC32 could be
 worked out only from one the vehicle computed before, which would prove the same and cost two of them.)
@@ -12,18 +14,49 @@ worked out only from one the vehicle computed before, which would prove the same
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 
 from mavftpfs.cache.context import Context
 from mavftpfs.cache.draft import Draft
 from mavftpfs.cache.readback import agrees
+from mavftpfs.cache.remote import Upload
 from mavftpfs.cache.sure import Sure
-from mavftpfs.shared.errors import Armed, FtpNak, MavftpfsError, RequestTimeout, VerificationFailed
+from mavftpfs.shared.errors import (
+    Armed,
+    DataUnproven,
+    FtpNak,
+    MavftpfsError,
+    RequestTimeout,
+    SessionBusy,
+    VerificationFailed,
+)
 from mavftpfs.shared.model import split
 
 log = logging.getLogger("mavftpfs.cache")
 
 SMALL_LISTING = 5
 """A directory of so few names is listed in one request, which tells more than opening the file."""
+
+
+FEW_BYTES = 64 * 1024
+"""So much is read back rather than have the vehicle compute the CRC32 of the whole file."""
+
+SETTLED = 10.0
+"""Seconds after which no copy of an older request is expected any more."""
+
+
+def doubted(upload: Upload, draft: Draft, *, settled: bool) -> list[tuple[int, int]]:
+    """Return of what was sent the ranges that the vehicle may not have though they were ACKed.
+
+    settled: the delivery of this file before is long ago.
+    """
+    sending = draft.sending
+    if sending is None:
+        return []
+    sent = [(0, draft.size)] if sending.whole else list(draft.changed)
+    if upload.shared or (upload.repeats and not sending.whole and not settled):
+        return sent
+    return list(sending.rewritten) if upload.repeats else []
 
 
 class Verifier:
@@ -46,14 +79,17 @@ class Verifier:
             "checksums_unanswered": self.unanswered,
         }
 
-    async def check(self, path: bytes, draft: Draft) -> None:
-        """Compare a file on the vehicle with a draft.
+    async def check(self, path: bytes, draft: Draft, doubted: Sequence[tuple[int, int]] = ()) -> None:
+        """Compare a file on the vehicle with a draft, and what is doubted of it byte by byte.
 
         Raises:
-            VerificationFailed: it is another file. Else as WriteStore.stat_size.
+            VerificationFailed: it is another file. SessionBusy: another client keeps it from being read
+            back. Else as WriteStore.stat_size.
         """
-        if self._context.options.verify != "none":
-            await self._check(path, draft, self._context.options.verify)
+        verify = self._context.options.verify
+        compared = verify != "none" and await self._check(path, draft, verify)
+        if doubted and not compared:
+            await self._dispel(path, draft, doubted)
 
     async def check_doubted(self, path: bytes, draft: Draft) -> None:
         """Do the same for a file that may not be ours at all: verify=size and verify=none do not count.
@@ -64,17 +100,27 @@ class Verifier:
         demanded = self._context.options.verify == "crc"
         await self._check(path, draft, "crc" if demanded else "auto")
 
-    async def _check(self, path: bytes, draft: Draft, verify: str) -> None:
+    async def _check(self, path: bytes, draft: Draft, verify: str) -> bool:
+        """Return whether what was sent was compared, not only the size."""
         size = await self.size(path)
         if size != draft.size:
             raise VerificationFailed(f"{path!r} has {size} bytes on the vehicle, {draft.size} were written")
         if verify == "crc" and not draft.whole:
-            await self._require_changes(path, draft)
-            self.by_reading += 1
-        elif await self._crc_agrees(path, draft, verify):
-            self.by_crc += 1
-        else:
+            await self._require(path, draft, list(draft.changed))
+        elif not await self._crc_agrees(path, draft, verify):
             self.by_size += 1
+            return False
+        return True
+
+    async def _dispel(self, path: bytes, draft: Draft, doubted: Sequence[tuple[int, int]]) -> None:
+        """Have the vehicle compute a CRC32 of more than is quickly read back."""
+        much = sum(stop - start for start, stop in doubted) > FEW_BYTES
+        if much and draft.whole and await self._crc_agrees(path, draft, "auto", limited=False):
+            return
+        try:
+            await self._require(path, draft, doubted)
+        except DataUnproven as error:
+            raise SessionBusy(f"{path!r} cannot be verified: {error}") from error
 
     async def size(self, path: bytes) -> int:
         """Return the size of a file on the vehicle, asked just now, whichever way is cheaper.
@@ -89,7 +135,7 @@ class Verifier:
                 return entry.size
         return await self._context.writer.stat_size(path)
 
-    async def _crc_agrees(self, path: bytes, draft: Draft, verify: str) -> bool:
+    async def _crc_agrees(self, path: bytes, draft: Draft, verify: str, *, limited: bool = True) -> bool:
         """Return whether the CRC32 was compared.
 
         Raises:
@@ -98,7 +144,7 @@ class Verifier:
         demanded = verify == "crc"
         if verify == "size" or not draft.whole or draft.size == 0:
             return False
-        if draft.size > self._context.options.verify_max and not demanded:
+        if limited and draft.size > self._context.options.verify_max and not demanded:
             return False
         try:
             remote = await self._context.store.crc32(path, size=draft.size)
@@ -107,18 +153,20 @@ class Verifier:
             return False
         if remote != draft.crc32():
             raise VerificationFailed(f"the vehicle's checksum of {path!r} is not that of what was written")
+        self.by_crc += 1
         return True
 
-    async def _require_changes(self, path: bytes, draft: Draft) -> None:
-        """Read back what was changed.
+    async def _require(self, path: bytes, draft: Draft, extents: Sequence[tuple[int, int]]) -> None:
+        """Read back what was written.
 
         Raises:
             VerificationFailed: the card has other bytes. Else as readback.agrees.
         """
         context = self._context
         patience = context.options.op_deadline
-        if not await agrees(context.store, path, draft.changed, draft.local_bytes, patience=patience):
+        if not await agrees(context.store, path, extents, draft.local_bytes, patience=patience):
             raise VerificationFailed(f"what was changed of {path!r} is not what the vehicle has there")
+        self.by_reading += 1
 
     def _note_unanswered(self, path: bytes, error: MavftpfsError, *, demanded: bool) -> None:
         if demanded:

@@ -112,6 +112,14 @@ class UploadHost(Protocol):
         """Return the time."""
         ...
 
+    def repeats(self) -> bool:
+        """Return whether this link was seen to lose, double or hold back requests or replies."""
+        ...
+
+    def heard_stranger(self, since: float) -> bool:
+        """Return whether another FTP client was heard since then, or shortly before."""
+        ...
+
     def on_news(self, upload: QueuedUpload) -> None:
         """Something about the upload changed."""
         ...
@@ -132,7 +140,7 @@ class QueuedUpload:
             on. opened: it was opened before. free_at: see WriteStore. begun: see Upload.
         asked_at: since when who waits for its end sees nothing happen. filled_in: seconds it took to send
             all there was, last time. tried: it was reopened to see what OpenFileWO does.
-        anew: nothing that was proven counts any more.
+        anew: nothing that was proven counts any more. usurped: the server closed the session by itself.
     """
 
     def __init__(
@@ -146,7 +154,8 @@ class QueuedUpload:
         self.free_at: float | None = None
         self.begun = False
         self.ticket = ticket
-        self.asked_at = asked_at
+        self.asked_at = self._since = asked_at
+        self.usurped = False
         self.use = Service()
         self.error: MavftpfsError | None = None
         self.running = False
@@ -168,6 +177,16 @@ class QueuedUpload:
         self._news = trio.Event()
 
     # --- the owner's side
+
+    @property
+    def repeats(self) -> bool:
+        """See cache.remote.Upload."""
+        return self._host.repeats()
+
+    @property
+    def shared(self) -> bool:
+        """See cache.remote.Upload."""
+        return self.usurped or self._host.heard_stranger(self._since)
 
     def wake(self) -> None:
         """The source has more."""

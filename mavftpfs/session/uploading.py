@@ -12,6 +12,7 @@ from mavftpfs.session.kit import Kit, Queue
 from mavftpfs.session.opening import TERMINATE_LIMIT, OpenSession
 from mavftpfs.session.turns import Turns
 from mavftpfs.session.upload import Feed, QueuedUpload
+from mavftpfs.session.vehicle import FOREIGN_MEMORY
 from mavftpfs.session.writing import Stop, Writer
 from mavftpfs.shared.errnos import errno_for
 from mavftpfs.shared.errors import (
@@ -101,6 +102,16 @@ class Uploading:
     def now(self) -> float:
         """See UploadHost."""
         return self._clock()
+
+    def repeats(self) -> bool:
+        """See UploadHost."""
+        stats = self._engine.stats
+        return stats.unknown + stats.spurious + stats.retransmissions > 0
+
+    def heard_stranger(self, since: float) -> bool:
+        """See UploadHost."""
+        foreign = self._vehicle.foreign_at
+        return foreign is not None and foreign > since - FOREIGN_MEMORY
 
     def on_news(self, upload: QueuedUpload) -> None:
         """See UploadHost."""
@@ -318,6 +329,7 @@ class Uploading:
         if upload.aborted:
             return
         self._roll_back(upload)
+        upload.usurped |= lost.by_server
         now = self._clock()
         failures = 1 if upload.feed.got_further() else upload.failures + 1
         if not self.may_write:

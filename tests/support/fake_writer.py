@@ -350,6 +350,7 @@ class FakeUpload:
         self._least = least
         self._free_at = free_at
         self.begun = False
+        self.repeats = self.shared = False
         self._open = False
         self._opened_before = False
         self._sending = trio.Lock()
