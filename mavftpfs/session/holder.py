@@ -35,8 +35,9 @@ class SessionHolder:
         session: what is open, if anything. switches: how often one file made room for another.
     """
 
-    def __init__(self, opener: SessionOpener) -> None:
+    def __init__(self, opener: SessionOpener, op_deadline: float = 30.0) -> None:
         self.opener = opener
+        self._op_deadline = op_deadline
         self.session: OpenSession | None = None
         self.switches = 0
         self._opening: bytes | None = None
@@ -80,14 +81,17 @@ class SessionHolder:
             self._tell()
         return self.session
 
-    async def close(self, limit: float = TERMINATE_LIMIT) -> bool:
-        """Terminate; True if there was nothing to do or it was we who closed it (SessionOpener.close)."""
+    async def close(self, limit: float | None = None) -> bool:
+        """Terminate; True if there was nothing to do or it was we who closed it (SessionOpener.close).
+
+        limit: seconds to wait for the answer; None: as for any request, for somebody is told of a failure.
+        """
         session, self.session = self.session, None
         if session is None:
             return True
         self._closing = session.path
         try:
-            return await self.opener.close(session, limit)
+            return await self.opener.close(session, self._op_deadline if limit is None else limit)
         finally:
             self._closing = None
             self._tell()
@@ -95,7 +99,7 @@ class SessionHolder:
     async def close_quietly(self) -> bool:
         """Close after a failure that is already being reported, or for somebody else's sake."""
         try:
-            return await self.close()
+            return await self.close(TERMINATE_LIMIT)
         except MavftpfsError:
             return False
 

@@ -73,7 +73,7 @@ class Scheduler:
         self.write_traits = WriteTraits()
         self.op_deadline = op_deadline
         self.stats = engine.stats
-        self._holder = SessionHolder(self.opener)
+        self._holder = SessionHolder(self.opener, op_deadline)
         self._driver = driver
         self._vehicle = vehicle
         self._steering = steering
