@@ -53,6 +53,9 @@ MAX_NAME = 255
 STALE_AFTER = 600.0
 """Seconds a stranger's reserved name must have stayed the same before it counts as left behind."""
 
+DELETED_AFTER = 24 * 3600.0
+"""The same for an unlinked file that is read: it stays the same as long as its reader lives."""
+
 _ALPHABET = b"abcdefghijklmnopqrstuvwxyz234567"  # one spelling on cards that fold case
 _RESERVED = re.compile(rb"\.mavftpfs-([a-z2-7]{4})([tomdp])([a-z2-7]{3})(?:-(.+))?", re.DOTALL)
 _SERIALS = 32**3
@@ -212,7 +215,7 @@ class Staleness:
         self._seen: dict[bytes, tuple[int | None, float]] = {}
 
     def is_stale(self, path: bytes, size: int | None, now: float) -> bool:
-        """Note a sighting; return whether it was the same for STALE_AFTER seconds."""
+        """Note a sighting; return whether it was the same for as long as its kind demands."""
         known = self._seen.get(path)
         if known is None or known[0] != size:
             self._seen.pop(path, None)
@@ -220,7 +223,9 @@ class Staleness:
             if len(self._seen) > self.MAX:
                 del self._seen[next(iter(self._seen))]
             return False
-        return now - known[1] >= STALE_AFTER
+        name = parse(split(path)[1])
+        deleted = name is not None and name.kind is Kind.DELETED
+        return now - known[1] >= (DELETED_AFTER if deleted else STALE_AFTER)
 
     def forget(self, path: bytes) -> None:
         """The name is gone."""

@@ -4,7 +4,7 @@ A directory with nothing but reserved names looks empty, and its removal should 
 repair knew for dead is gone by then (`cleaning`); a file that was unlinked while it is read moves up. What is
 left belongs to a mount that may be at work this moment: removing it could cost that mount's user the only
 copy of a file. So the directory is busy (EBUSY) until those names were seen unchanged for
-`asides.STALE_AFTER` seconds.
+`asides.STALE_AFTER` seconds, unlinked files for DELETED_AFTER.
 """
 
 from __future__ import annotations

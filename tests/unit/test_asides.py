@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mavftpfs.cache.asides import (
+    DELETED_AFTER,
     RENAME_ROOM,
     STALE_AFTER,
     Action,
@@ -217,6 +218,14 @@ def test_strangers_names_go_stale_slowly() -> None:
     for number in range(3 * Staleness.MAX):
         watch.is_stale(b"/%d" % number, 1, 0.0)
     assert not watch.is_stale(b"/x", 6, 20 * STALE_AFTER), "what is remembered is bounded"
+
+
+def test_an_unlinked_file_that_is_read_never_changes_and_is_left_alone_for_longer() -> None:
+    watch, path = Staleness(), b"/d/" + Reserved(b"abcd", Kind.DELETED, b"sss").name
+    assert not watch.is_stale(path, 5, 0.0)
+    assert not watch.is_stale(path, 5, 2 * STALE_AFTER)
+    assert not watch.is_stale(path, 5, DELETED_AFTER - 1)
+    assert watch.is_stale(path, 5, DELETED_AFTER)
 
 
 def test_recovered_names_fit_a_rename() -> None:

@@ -9,7 +9,7 @@ from random import Random
 import pytest
 import trio
 
-from mavftpfs.cache.asides import STALE_AFTER, is_reserved, new_owner
+from mavftpfs.cache.asides import DELETED_AFTER, STALE_AFTER, is_reserved, new_owner
 from mavftpfs.cache.tree import Tree
 from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.shared.errors import FileBusy, FtpNak, PathTooLong
@@ -52,6 +52,9 @@ async def test_what_another_mount_left_long_ago_does_not(store: FakeWriter, auto
     with pytest.raises(FileBusy):
         await tree.rmdir(b"/d/empty")
     await trio.sleep(STALE_AFTER)
+    with pytest.raises(FileBusy):  # somebody may be reading it
+        await tree.rmdir(b"/d/empty")
+    await trio.sleep(DELETED_AFTER)
     await tree.rmdir(b"/d/empty")
     assert b"/d/empty" not in store.directories
 
