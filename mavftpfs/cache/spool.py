@@ -26,6 +26,7 @@ from typing import Any
 
 from mavftpfs.cache import rescuing
 from mavftpfs.cache.asides import new_owner
+from mavftpfs.cache.fulldisk import FullDisk
 from mavftpfs.shared.errors import NoSpace, SpoolFailed
 from mavftpfs.shared.extents import ExtentSet
 
@@ -141,6 +142,7 @@ class Spool:
         self._number = 0
         self.in_memory = 0
         self.on_disk = 0
+        self.full = FullDisk()
 
     @property
     def bytes_held(self) -> int:
@@ -170,6 +172,7 @@ class Spool:
 
     def file_gone(self) -> None:
         """A file was removed: a directory that was made here goes with its last one."""
+        self.full.freed()
         if self._temporary is not None:
             with contextlib.suppress(OSError):  # another file is in it
                 self._temporary.rmdir()
@@ -207,9 +210,10 @@ class SpoolContent:
                 self._put_pages(offset, memoryview(data))
                 self._changed()
                 return
+        with self._spool.full.told():
             self._spill()
-        self._changed()
-        self._put_file(offset, data)
+            self._changed()
+            self._put_file(offset, data)
 
     def get(self, start: int, stop: int) -> bytes:
         """Return bytes that were put.

@@ -105,6 +105,48 @@ async def test_a_full_disk_is_told_to_the_writer_and_costs_nothing_accepted(
     assert store.files[FILE].data == BIG[:65_000]
 
 
+async def test_the_log_says_once_that_the_full_disk_is_the_one_here(
+    store: FakeWriter, caplog: pytest.LogCaptureFixture
+) -> None:
+    """To a program ENOSPC means the card."""
+    tree = make_writable(store, dirty_max=1, spool_max=65_010)
+    file = await begin(tree, store, BIG[:65_000])
+    for _ in range(3):
+        with pytest.raises(NoSpace):
+            await file.write(65_000, b"more than fits")
+    (said,) = caplog.messages
+    assert "here, not on the vehicle" in said
+    assert "spool_max" in said
+    store.lost = False
+    await file.release()
+    again = await tree.create(b"/card/again", exclusive=True)
+    await again.write(0, BIG[:65_000])
+    caplog.clear()
+    with pytest.raises(NoSpace):
+        await again.write(65_000, b"more than fits")
+    assert len(caplog.messages) == 1, "there was room meanwhile, so it is news"
+
+
+async def test_a_disk_without_room_for_what_was_in_memory_is_said_once(
+    store: FakeWriter, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    tree = make_writable(store, dirty_max=65536)
+    file = await begin(tree, store, b"in memory")
+
+    def full(*_: object) -> int:
+        raise OSError(errno.ENOSPC, "full")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "pwrite", full)
+        for _ in range(3):
+            with pytest.raises(NoSpace):
+                await file.write(65536, b"one more page")
+    assert len(caplog.messages) == 1
+    store.lost = False
+    await file.release()
+    assert store.files[FILE].data == b"in memory"
+
+
 # --- a process that is killed
 
 
