@@ -19,6 +19,7 @@ from mavftpfs.protocol.operations import Operation
 from mavftpfs.protocol.payload import Opcode
 from mavftpfs.protocol.transfers import ReadToEof
 from mavftpfs.session.driver import Driver
+from mavftpfs.session.echoes import Echoes
 from mavftpfs.session.gate import Gate
 from mavftpfs.session.holder import SessionHolder
 from mavftpfs.session.jobs import SessionJob
@@ -73,6 +74,7 @@ class Scheduler:
         self.write_traits = WriteTraits()
         self.op_deadline = op_deadline
         self.stats = engine.stats
+        self.echoes = Echoes(engine, clock)
         self._holder = SessionHolder(self.opener, op_deadline)
         self._driver = driver
         self._vehicle = vehicle

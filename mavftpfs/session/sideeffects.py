@@ -8,8 +8,8 @@ answers were seen that nobody waited for, a refusal as missing is looked into as
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator, Awaitable, Callable
-from contextlib import asynccontextmanager
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
+from contextlib import asynccontextmanager, contextmanager
 from enum import Enum
 from typing import TypeVar
 
@@ -70,19 +70,24 @@ class SideEffects:
         """Remove what is known to be a file."""
         wire = wire_path(path)
         async with self._in_time(), self._changing(path):
-            await self._perform(lambda: Simple(Opcode.REMOVE_FILE, wire), lambda: self._is_absent(path))
+            with self._taking(path):
+                await self._perform(lambda: Simple(Opcode.REMOVE_FILE, wire), lambda: self._is_absent(path))
             self._scheduler.gone(path)
 
     async def remove_directory(self, path: bytes) -> None:
         """Remove what is known to be an empty directory."""
         wire = wire_path(path)
         async with self._in_time(), self._changing(path, below=True):
-            await self._perform(lambda: Simple(Opcode.REMOVE_DIRECTORY, wire), lambda: self._is_absent(path))
+            with self._taking(path):
+                await self._perform(
+                    lambda: Simple(Opcode.REMOVE_DIRECTORY, wire), lambda: self._is_absent(path)
+                )
 
     async def make_directory(self, path: bytes) -> None:
         """Make a directory."""
         wire = wire_path(path)
         async with self._in_time(), self._changing(path):
+            await self._scheduler.echoes.let_pass(path)
             await self._perform(
                 lambda: Simple(Opcode.CREATE_DIRECTORY, wire), lambda: self._is_new_directory(path)
             )
@@ -98,7 +103,9 @@ class SideEffects:
             self._changing(old, below=True, may=may),
             self._changing(new, may=may),
         ):
-            await self._perform(lambda: Simple(Opcode.RENAME, data), lambda: self._is_renamed(old, new))
+            await self._scheduler.echoes.let_pass(new)
+            with self._taking(old):
+                await self._perform(lambda: Simple(Opcode.RENAME, data), lambda: self._is_renamed(old, new))
             self._scheduler.gone(new)
             self._scheduler.moved(old, new)
 
@@ -142,6 +149,16 @@ class SideEffects:
         async with self._scheduler.claim(path, below=below):
             may()  # closing our session may have taken a while
             yield
+
+    @contextmanager
+    def _taking(self, path: bytes) -> Iterator[None]:
+        """The body takes a name away; a second execution of it may follow, whatever became of the first."""
+        before = self._scheduler.stats.retransmissions
+        try:
+            yield
+        finally:
+            repeated = self._scheduler.stats.retransmissions > before  # ours or another's: better too often
+            self._scheduler.echoes.took(path, repeated=repeated)
 
     async def _perform(self, make: Callable[[], Simple], verify: Verdict) -> None:
         """Run a request; verify it if its answer may not be the answer to its first execution."""

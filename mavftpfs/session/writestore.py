@@ -50,6 +50,8 @@ class WriteStore:
         """Queue an upload; nothing is sent before the source has something or finish is called."""
         wire_path(path)
         self._scheduler.check_may_write()
+        if create:
+            await self._scheduler.echoes.let_pass(path)
         upload = self._scheduler.open_upload(path, source, create=create)
         upload.least = least
         upload.free_at = free_at
@@ -61,6 +63,7 @@ class WriteStore:
         self._scheduler.check_may_write()
         if free_at is not None and self._scheduler.seconds_since(free_at) > FREE_FOR:
             await self._require_free(path)
+        await self._scheduler.echoes.let_pass(path)
         await self._scheduler.use_session(path, Opcode.CREATE_FILE)
 
     async def remove(self, path: bytes) -> None:

@@ -16,6 +16,7 @@ from mavftpfs.protocol.payload import Opcode
 from mavftpfs.session.connection import Connection
 from mavftpfs.sim.linkmodel import LinkSettings
 from mavftpfs.sim.profiles import PROFILES
+from tests.sim.test_arming_replacement import NEW, Scene, replace
 from tests.support.sources import MemorySource
 from tests.support.worlds import ROOTS, World
 
@@ -52,6 +53,25 @@ def hold_back_a_write(here: World, start: Callable[..., object]) -> None:
     server.handle = watch  # type: ignore[method-assign]
 
 
+def double(here: World, opcode: Opcode, late: float, start: Callable[..., object]) -> None:
+    """Have the first request of a kind come once more, so much later."""
+    server = here.vehicle.server
+    handle = server.handle
+    kept: list[bytes] = []
+
+    async def arrive_late(wire: bytes, source: Address) -> None:
+        await trio.sleep(late)
+        handle(wire, source, trio.current_time())
+
+    def watch(wire: bytes, source: Address, now: float) -> None:
+        if wire[3] == opcode and not kept:
+            kept.append(wire)
+            start(arrive_late, wire, source)
+        handle(wire, source, now)
+
+    server.handle = watch  # type: ignore[method-assign]
+
+
 async def put(connection: Connection, path: bytes, data: bytes) -> None:
     upload = await connection.store.open_upload(path, MemorySource(data), create=True)
     await upload.finish()
@@ -81,3 +101,47 @@ async def test_a_link_that_keeps_the_order_costs_no_wait(autojump: MockClock) ->
         await put(connection, b"/d/first", FIRST)
         await put(connection, b"/d/second", SECOND)
         assert trio.current_time() - began < 8 * 0.04
+
+
+@pytest.mark.parametrize("profile", ["mavsdk", "ardupilot", "px4"])
+async def test_a_late_rename_does_not_take_the_next_file_of_that_name(
+    profile: str, autojump: MockClock
+) -> None:
+    here = World(profile, DOUBLING)
+    here.tree.add(b"/d/old", FIRST)
+    async with trio.open_nursery() as nursery, here.connection() as connection:
+        await connection.store.list_directory(b"/d")
+        double(here, Opcode.RENAME, LATE, nursery.start_soon)
+        await connection.store.rename(b"/d/old", b"/d/new")
+        await put(connection, b"/d/old", SECOND)
+        await trio.sleep(1)
+    assert here.tree.data(b"/d/new") == FIRST
+    assert here.tree.data(b"/d/old") == SECOND
+
+
+async def test_a_late_removal_does_not_take_the_next_directory(autojump: MockClock) -> None:
+    here = World("mavsdk", DOUBLING)
+    here.tree.add_directory(b"/d/e")
+    async with trio.open_nursery() as nursery, here.connection() as connection:
+        await connection.store.list_directory(b"/d")
+        double(here, Opcode.REMOVE_DIRECTORY, LATE, nursery.start_soon)
+        await connection.store.remove_directory(b"/d/e")
+        await connection.store.make_directory(b"/d/e")
+        await trio.sleep(1)
+    assert [entry.name for entry in here.tree.entries(b"/d") if entry.name == b"e"] == [b"e"]
+
+
+@pytest.mark.parametrize("late", [0.06, 0.09, 0.11])
+async def test_a_late_rename_of_the_old_file_does_not_take_the_new_one(
+    late: float, autojump: MockClock
+) -> None:
+    """On FAT the old file makes room first; its aside is removed last, whatever it is by then."""
+    scene = Scene("ardupilot5")
+    scene.world.model.settings = DOUBLING
+    async with scene.mounted() as tree, trio.open_nursery() as nursery:
+        await replace(scene, tree)
+        await tree.list(scene.root)
+        double(scene.world, Opcode.RENAME, late, nursery.start_soon)
+        await replace(scene, tree)
+        await trio.sleep(1)
+    assert scene.content() == NEW
