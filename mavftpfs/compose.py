@@ -47,11 +47,11 @@ KEY_SIZE = 32
 
 @dataclass(frozen=True, slots=True)
 class Attached:
-    """A vehicle whose root was listed. notice: what a person should know of earlier mounts, or ""."""
+    """A vehicle whose root was listed. notice: moves what earlier mounts left; gives a line on it, or ""."""
 
     connection: Connection
     tree: Tree
-    notice: str = ""
+    notice: Callable[[], str] = str
 
     def status(self) -> dict[str, Any]:
         """Return facts about the connection and the caches; JSON-able."""
@@ -109,7 +109,7 @@ async def attached(
 
     writing: the tree may be changed, if the options do not forbid it; what it holds then lies in a spool that
     survives the process. rescue_for: what earlier mounts left there is moved to a recovery directory that is
-    named after this SOURCE.
+    named after this SOURCE, when `Attached.notice` is called: not before there is somebody to be told.
 
     Raises:
         LinkClosed, VehicleLost, NoFtp: within connect_timeout, with the reason.
@@ -124,7 +124,9 @@ async def attached(
         keep = await keeper_for(options, connection)
         async with _nursery() as nursery:
             with spool_for(connection.vehicle.address) if writing else nullcontext() as spool:
-                notice = "" if spool is None or rescue_for is None else rescue(spool, rescue_for)
+                notice: Callable[[], str] = str
+                if spool is not None and rescue_for is not None:
+                    notice = partial(rescue, spool, rescue_for)
                 tree = Tree(
                     connection.store,
                     cache_options(options),

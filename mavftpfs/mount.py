@@ -71,12 +71,12 @@ class MountedTree(WritableTree, Holder, Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Content:
-    """What is behind a mount. notice: a line for whoever mounts, or ""."""
+    """What is behind a mount. notice: called once it is up, gives a line for whoever mounts, or ""."""
 
     tree: MountedTree
     status: Callable[[], dict[str, Any]] = dict
     space: Callable[[], Space | None] = lambda: None
-    notice: str = ""
+    notice: Callable[[], str] = str
 
 
 Attach = Callable[[Callable[[bytes], None]], AbstractAsyncContextManager[Content]]
@@ -179,12 +179,13 @@ class _Life:
         self.farewell = line
         self.code = ExitCode.UNDELIVERED
 
-    async def _serve(self, invalidator: Invalidator, notice: str) -> None:
+    async def _serve(self, invalidator: Invalidator, notice: Callable[[], str]) -> None:
         async with trio.open_nursery() as nursery:
             nursery.start_soon(invalidator.run)
             gc.collect()
             gc.freeze()  # a full collection would look through all that was imported, in mid-transfer
-            self.report(0, notice)
+            # Said by a mount that then failed, it would be lost: what was moved is not found a second time.
+            self.report(0, notice())
             with trio.CancelScope() as self._loop_scope:
                 if not self._stop_asked:
                     await fuse_loop()

@@ -1,0 +1,42 @@
+"""What a killed mount left is told to whoever mounts next, even if that mount is not the next one tried."""
+
+from __future__ import annotations
+
+import os
+import random
+import re
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from mavftpfs.cache.spool import SpoolDirectory
+from mavftpfs.exits import ExitCode
+from mavftpfs.farewell import spool_base
+from mavftpfs.link.messages import Address
+from tests.mount.conftest import Field
+from tests.support.mounts import Mount, wait_until
+
+LINE = re.compile(r"1 file\(s\) of an earlier mount did not reach the vehicle; they are in (.+)\n")
+
+
+def test_a_mount_that_fails_takes_no_news_away(
+    field: Field, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    state = tmp_path / "state"
+    state.mkdir()
+    monkeypatch.setenv("XDG_STATE_HOME", str(state))
+    dead = SpoolDirectory(spool_base(os.environ, Address(1, 1)), random.Random(1))
+    (dead.path / "000001.data").write_bytes(b"held")
+    dead.close()
+    source = field.sim(field.local("card")).source
+    failing = Mount(source, field.local("mnt"), field.local("out"), ("root=/nothing",))
+    ended = subprocess.run(failing.argv(), capture_output=True, text=True, timeout=60, check=False)
+    assert ended.returncode == ExitCode.USAGE, ended.stderr
+    assert "earlier mount" not in ended.stderr
+    assert (dead.path / "000001.data").read_bytes() == b"held"
+    process = field.mount(source).alive()
+    wait_until("it tells of them", lambda: LINE.search(process.text()) is not None, 20)
+    match = LINE.search(process.text())
+    assert match is not None
+    assert [path.read_bytes() for path in Path(match[1].strip()).iterdir()] == [b"held"]
