@@ -16,6 +16,7 @@ _FIRST_AFTER = 6
 _NARROWED = 0.7
 _RISE = 1.25
 _LEAST = 4.0
+_AS_MANY = 0.9
 
 
 class Easing:
@@ -26,13 +27,14 @@ class Easing:
         until: only transmissions with a smaller order count; those sent while eased.
     """
 
-    __slots__ = ("_answered", "_eased", "_from", "_lost", "_wait", "ceiling", "until")
+    __slots__ = ("_answered", "_eased", "_from", "_lost", "_usual", "_wait", "ceiling", "until")
 
     def __init__(self) -> None:
         self.ceiling = inf
         self._wait = _FIRST_AFTER
         self._from = self.until = -1
         self._eased = 0.0
+        self._usual = 0.0
         self._answered = 0
         self._lost = 0
 
@@ -63,6 +65,7 @@ class Easing:
                 return target
             self._from, self.until = next_order, 1 << 62
             self._answered = self._lost = 0
+            self._usual = target
             target *= _NARROWED
             self._eased = target
         return target
@@ -73,7 +76,10 @@ class Easing:
             return
         share = self._lost / sample
         doubt = 1.5 * sqrt(share * (1 - share) / sample) + 1 / sample
-        if share + doubt < 0.8 * loss:
+        # Losses also come in gusts, while a card writes, and a round between two of them looks innocent. A
+        # buffer that is too short answers as many of a narrow window; where fewer were, narrowing only costs.
+        as_many = self._answered >= _AS_MANY * self._usual * (1 - loss)
+        if as_many and share + doubt < 0.8 * loss:
             self.ceiling = max(_LEAST, self._eased)
         else:
             self.ceiling *= _RISE

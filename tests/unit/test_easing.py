@@ -63,3 +63,15 @@ def test_no_news_is_no_evidence() -> None:
     for _ in range(100):
         easing.next_window(100.0, 0.5, 10)
     assert easing.ceiling == inf
+
+
+def test_gusts_of_losses_set_no_ceiling_where_narrowing_answers_fewer() -> None:
+    easing = Easing()
+    window, order = 100.0, 0
+    for number in range(300):
+        sent, gust = int(window), number % 4 == 0
+        for index in range(sent):
+            easing.count(order + index, lost=gust and index < sent // 2)
+        order += sent
+        window = easing.next_window(100.0, 0.125, order)
+        assert easing.ceiling >= 70.0 * 1.25
