@@ -12,6 +12,7 @@ import shutil
 import stat
 import subprocess
 import tempfile
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -23,6 +24,10 @@ FUSE_DEVICE = "/dev/fuse"
 MOUNT_TABLE = "/proc/self/mountinfo"
 UNMOUNT_PATIENCE = 60.0
 """Seconds for an unmount: it waits for the last flush."""
+BUSY_PATIENCE = 1.0
+"""Seconds in which a mount may look busy without being it: the kernel lets go of the files of a program that
+ended a moment after its parent was told, and desktop services look at what is new."""
+_BUSY_PAUSE = 0.1
 
 
 def canonical(path: str) -> str:
@@ -97,12 +102,27 @@ def unmount(path: str, *, lazy: bool = False) -> None:
     words = [program, *(["-u"] if program == "fusermount3" else []), *(["-z"] if lazy else []), "--", path]
     if program == "umount" and lazy:
         words[1] = "-l"
+    said = _said_by(words, path)
+    for _ in range(round(BUSY_PATIENCE / _BUSY_PAUSE)):
+        if said is None or not _is_busy(said):
+            break
+        time.sleep(_BUSY_PAUSE)
+        said = _said_by(words, path)
+    if said is not None:
+        raise MountFailed(_describe_unmount(path, said))
+
+
+def _said_by(words: list[str], path: str) -> str | None:
+    """Return what an unmounting program complained of, None if it succeeded."""
     try:
         done = subprocess.run(words, capture_output=True, text=True, timeout=UNMOUNT_PATIENCE, check=False)
     except (OSError, subprocess.TimeoutExpired) as exc:
         raise MountFailed(f"cannot unmount {path}: {exc}") from exc
-    if done.returncode != 0:
-        raise MountFailed(_describe_unmount(path, done.stderr.strip()))
+    return done.stderr.strip() if done.returncode != 0 else None
+
+
+def _is_busy(said: str) -> bool:
+    return "busy" in said.lower()
 
 
 @contextmanager
@@ -144,7 +164,7 @@ def _describe_mounted(path: str) -> str:
 
 
 def _describe_unmount(path: str, said: str) -> str:
-    if "busy" in said.lower():
+    if _is_busy(said):
         return f"{path} is in use; close what has it open (fuser -vm {path}) and try again"
     first_line = said.splitlines()[0] if said else "no reason given"
     return f"cannot unmount {path}: {first_line}"

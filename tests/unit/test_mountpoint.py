@@ -125,3 +125,16 @@ def test_unmounting_what_is_busy_says_so(tmp_path: Path, monkeypatch: pytest.Mon
     monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
     with pytest.raises(MountFailed, match="in use"):
         unmount("/x")
+
+
+def test_what_is_busy_for_a_moment_is_unmounted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The kernel may still be closing the files of a program that has ended."""
+    program = tmp_path / "fusermount3"
+    program.write_text(
+        f"#!/bin/sh\necho x >> {tmp_path}/tries\n[ $(wc -l < {tmp_path}/tries) -ge 3 ] && exit 0\n"
+        "echo 'fusermount3: failed to unmount /x: Device or resource busy' >&2\nexit 1\n"
+    )
+    program.chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
+    unmount("/x")
+    assert (tmp_path / "tries").read_text() == "x\n" * 3
