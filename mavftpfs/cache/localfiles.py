@@ -280,6 +280,9 @@ class LocalHandle:
     async def release(self) -> None:
         """Close."""
 
+    def give_up(self) -> None:
+        """Close; what it made costs nothing and stays."""
+
     def close(self) -> None:
         """Close."""
 

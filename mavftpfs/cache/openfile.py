@@ -73,6 +73,10 @@ class OpenFile(Protocol):
         """
         ...
 
+    def give_up(self) -> None:
+        """Close; the call that opened it failed, so a file that was made by that is not wanted either."""
+        ...
+
     def close(self) -> None:
         """Close without delivering (what was not delivered is kept and delivered later)."""
         ...

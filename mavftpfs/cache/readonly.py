@@ -28,6 +28,10 @@ class ReadOnlyHandle:
         """Close the handle."""
         self.close()
 
+    def give_up(self) -> None:
+        """Close the handle: it made nothing."""
+        self.close()
+
     def close(self) -> None:
         """Close the handle; closing twice is harmless."""
         raise NotImplementedError

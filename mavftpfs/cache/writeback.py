@@ -126,9 +126,10 @@ class Writeback:
                 raise AlreadyExists(f"{path!r} exists")
             return await self.open(other or path, truncate=False)
         node = self._context.nodes.need(path)
-        if node.draft is None:
+        made = node.draft is None
+        if made:
             self._new_draft(node, None)
-        return WriteFile(self, self._context, node)
+        return WriteFile(self, self._context, node, made=made)
 
     async def _need_draft(self, path: bytes, *, truncate: bool) -> Node:
         """Return the node of a file that exists, with a draft."""
@@ -212,6 +213,13 @@ class Writeback:
         node.writers -= writing
         if not node.handles and not node.removed:
             self._settle(node)
+
+    def forget_made(self, node: Node) -> None:
+        """Nobody learnt of a new file, unless it was opened or written meanwhile."""
+        wanted = node.handles or node.removed or node.attempt is not None or node.lock.locked()
+        if not wanted and node.undelivered and node.draft is not None and not node.draft.size:
+            node.drop_draft()
+        self._context.nodes.maybe_forget(node)
 
     async def _may_write(self, node: Node) -> None:
         """Wait until a delivery under way is over and not too much is un-ACKed."""

@@ -29,6 +29,7 @@ class Owner(Protocol):
     async def deliver(self, node: Node) -> None: ...
     async def close(self, node: Node) -> None: ...
     def drop_handle(self, node: Node, *, writing: bool) -> None: ...
+    def forget_made(self, node: Node) -> None: ...
 
 
 class _Reading:
@@ -137,9 +138,11 @@ class WriteFile(_Reading):
 
     writable = True
 
-    def __init__(self, owner: Owner, context: Context, node: Node) -> None:
+    def __init__(self, owner: Owner, context: Context, node: Node, *, made: bool = False) -> None:
+        """`made`: there was no such file before."""
         super().__init__(context, node, None)
         self._owner = owner
+        self._made = made
         node.handles += 1
         node.writers += 1
 
@@ -186,6 +189,12 @@ class WriteFile(_Reading):
         finally:
             self.close()
             await self._owner.close(self._node)
+
+    def give_up(self) -> None:
+        """Close, also after release; see OpenFile.give_up."""
+        self.close()
+        if self._made:
+            self._owner.forget_made(self._node)
 
     def close(self) -> None:
         """Close without delivering; closing twice is harmless."""

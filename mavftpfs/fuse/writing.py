@@ -13,7 +13,8 @@ import logging
 import mmap
 import os
 import stat as stat_bits
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any, NoReturn, cast
 
 import pyfuse3
@@ -44,6 +45,16 @@ def _writable(handle: FileHandle) -> WritableFile | None:
     """Return the file of a handle that was opened for writing, else None."""
     file = cast(WritableFile, handle.file)
     return file if file.writable else None
+
+
+@contextmanager
+def _given_up_on_failure(file: WritableFile) -> Iterator[None]:
+    """Close a file whose creation fails after all, and forget it: it would appear on the card later."""
+    try:
+        yield
+    except BaseException:
+        file.give_up()
+        raise
 
 
 def _is_mapped_page(start: int, stop: int, told: int) -> bool:
@@ -96,7 +107,7 @@ class WritingOperations(Operations):
         """Create a file and open it."""
         path = self._child(parent_inode, name)
         file = await self._tree.create(path, exclusive=bool(flags & os.O_EXCL))
-        with closed_on_failure(file):
+        with _given_up_on_failure(file):
             if flags & os.O_TRUNC and file.size:
                 await file.truncate(0)
             found = Stat(EntryKind.FILE, file.size, (await self._tree.stat(path)).mtime, 0.0)
@@ -198,10 +209,9 @@ class WritingOperations(Operations):
             raise FUSEError(errno.EPERM)
         path = self._child(parent_inode, name)
         file = await self._tree.create(path, exclusive=True)
-        try:
+        with _given_up_on_failure(file):
             await file.release()
-        finally:
-            file.close()
+        file.close()
         return await self._new_entry(path, mode)
 
     @handler

@@ -59,6 +59,10 @@ class FakeFile:
         data = memoryview(self.content)[offset : offset + size]
         return data[: self.tree.short_read] if self.tree.short_read is not None else data
 
+    def give_up(self) -> None:
+        self.tree.calls.append(("give_up", self.path))
+        self.closed += 1
+
     def close(self) -> None:
         self.closed += 1
 

@@ -76,6 +76,24 @@ async def test_a_read_handle_is_never_flushed_and_cannot_write() -> None:
     assert {name for name, _ in tree.calls} <= {"stat", "open", "release"}
 
 
+@pytest.mark.parametrize(("call", "step"), [("create", "stat"), ("mknod", "release")])
+async def test_a_file_that_was_made_in_vain_is_given_up(call: str, step: str) -> None:
+    tree = some_tree()
+    ops = operations(tree)
+
+    def fail(name: str, path: bytes) -> None:
+        if name == step:
+            raise RequestTimeout("silence")
+
+    tree.on_call = fail
+    last = os.O_WRONLY if call == "create" else 0
+    told = await failure(getattr(ops, call)(ROOT_INO, b"new", stat.S_IFREG | 0o644, last, CTX))
+    assert told == errno.ETIMEDOUT
+    assert ("give_up", b"/new") in tree.calls
+    assert tree.opened[0].closed == 1
+    assert not list(ops.files)
+
+
 async def test_fsync_of_a_read_handle_is_about_the_file() -> None:
     tree = some_tree()
     ops = operations(tree)

@@ -45,7 +45,7 @@ async def store(nursery: trio.Nursery, autojump_clock: object) -> AsyncIterator[
 # --- who is told
 
 
-async def test_fsync_tells_a_reader_what_the_writer_left(store: FakeWriter) -> None:
+async def test_fsync_tells_a_reader_what_the_writer_left(autojump_clock: object, store: FakeWriter) -> None:
     """`sync FILE` opens for reading."""
     tree = make_writable(store)
     file = await tree.create(NEW, exclusive=True)
@@ -63,6 +63,47 @@ async def test_fsync_tells_a_reader_what_the_writer_left(store: FakeWriter) -> N
     assert store.files[NEW].data == b"abc" * 100
     reader.close()
     assert tree.undelivered() == []
+
+
+# --- what nobody learnt of
+
+
+async def test_a_file_whose_creation_failed_does_not_appear_later(
+    autojump_clock: object, store: FakeWriter
+) -> None:
+    tree = make_writable(store)
+    await tree.list(split(NEW)[0])
+    file = await tree.create(NEW, exclusive=True)
+    store.lost = True
+    with pytest.raises(VehicleLost):
+        await file.release()
+    file.give_up()
+    assert tree.undelivered() == []
+    store.lost = False
+    await trio.sleep(100)
+    assert NEW not in store.files
+
+
+async def test_a_file_whose_creation_failed_stays_if_somebody_wrote_it_or_it_was_there(
+    autojump_clock: object,
+    store: FakeWriter,
+) -> None:
+    tree = make_writable(store)
+    file = await tree.create(NEW, exclusive=True)
+    other = await tree.open(NEW, write=True)
+    await other.write(0, b"abc")
+    file.give_up()
+    assert tree.undelivered() == [NEW]
+    other.close()
+    old = await tree.create(NEW, exclusive=False)
+    old.give_up()
+    emptied = await tree.open(FILE, write=True, truncate=True)
+    emptied.close()
+    again = await tree.create(FILE, exclusive=False)
+    again.give_up()
+    assert sorted(tree.undelivered()) == [FILE, NEW]
+    assert await tree.drain(10) == []
+    assert (store.files[NEW].data, store.files[FILE].data) == (b"abc", b"")
 
 
 # --- what was taken back
@@ -94,7 +135,9 @@ def litter(store: FakeWriter) -> list[bytes]:
 
 
 @pytest.mark.parametrize("end", ["flush", "release", "close"])
-async def test_an_upload_of_what_was_taken_back_is_called_off(mavsdk: FakeWriter, end: str) -> None:
+async def test_an_upload_of_what_was_taken_back_is_called_off(
+    autojump_clock: object, mavsdk: FakeWriter, end: str
+) -> None:
     tree = make_writable(mavsdk)
     file = await append_and_take_back(mavsdk, tree)
     if end == "close":
@@ -110,7 +153,9 @@ async def test_an_upload_of_what_was_taken_back_is_called_off(mavsdk: FakeWriter
     await tree.rmdir(split(FILE)[0])
 
 
-async def test_only_unlinked_files_move_up_from_a_directory_that_goes(mavsdk: FakeWriter) -> None:
+async def test_only_unlinked_files_move_up_from_a_directory_that_goes(
+    autojump_clock: object, mavsdk: FakeWriter
+) -> None:
     """A temporary name that an upload still needs is nobody's to move."""
     tree = make_writable(mavsdk)
     used = b"/card/other/.mavftpfs-" + new_owner(Random(1)) + b"taaa"  # as make_writable's
@@ -173,7 +218,9 @@ async def change_and_cut(tree: Tree) -> None:
         file.close()
 
 
-async def test_a_large_file_is_changed_and_cut_where_both_can_be_done(large: FakeWriter) -> None:
+async def test_a_large_file_is_changed_and_cut_where_both_can_be_done(
+    autojump_clock: object, large: FakeWriter
+) -> None:
     tree = make_writable(large, rmw_max=50_000)
     if large.kind != KINDS["posix"]:
         with pytest.raises(FileTooLarge):
@@ -186,7 +233,7 @@ async def test_a_large_file_is_changed_and_cut_where_both_can_be_done(large: Fak
     assert tree.undelivered() == []
 
 
-async def test_a_change_and_cut_goes_on_after_any_fault(large: FakeWriter) -> None:
+async def test_a_change_and_cut_goes_on_after_any_fault(autojump_clock: object, large: FakeWriter) -> None:
     if large.kind != KINDS["posix"]:
         return
     await change_and_cut(make_writable(large))
@@ -224,7 +271,7 @@ async def two_on_disk(store: FakeWriter, base: Path) -> tuple[Tree, SpoolDirecto
 
 
 async def test_one_file_that_cannot_be_read_does_not_keep_the_others_from_being_saved(
-    store: FakeWriter, tmp_path: Path
+    autojump_clock: object, store: FakeWriter, tmp_path: Path
 ) -> None:
     tree, spool = await two_on_disk(store, tmp_path)
     message = keep_the_rest(tree, lambda: tmp_path / "kept")
@@ -239,7 +286,9 @@ async def test_one_file_that_cannot_be_read_does_not_keep_the_others_from_being_
     spool.close()
 
 
-async def test_when_nothing_can_be_saved_that_is_said(store: FakeWriter, tmp_path: Path) -> None:
+async def test_when_nothing_can_be_saved_that_is_said(
+    autojump_clock: object, store: FakeWriter, tmp_path: Path
+) -> None:
     tree, spool = await two_on_disk(store, tmp_path)
     for path in spool.path.glob("*.data"):
         os.truncate(path, 10)
@@ -253,7 +302,7 @@ async def test_when_nothing_can_be_saved_that_is_said(store: FakeWriter, tmp_pat
 
 
 async def test_a_disk_that_fails_does_not_hide_why_the_vehicle_lacks_a_file(
-    store: FakeWriter, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    autojump_clock: object, store: FakeWriter, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     spool = SpoolDirectory(tmp_path / "spool", Random(1))
     tree = make_writable(store, spool=spool)
