@@ -111,3 +111,26 @@ async def test_it_holds_no_other_writer_back(autojump_clock: object, store: Fake
     await assert_filled(nameless)
     await nameless.release()
     assert len(store.files[NEW].data) == PIECES * PIECE
+
+
+async def test_a_writer_who_waits_when_the_name_goes_is_let_go(
+    autojump_clock: object, store: FakeWriter, tree: Tree, nursery: trio.Nursery
+) -> None:
+    store.write_delay = 1.0  # of each chunk: it would wait for more than an hour
+    file = await tree.create(NEW, exclusive=True)
+    ended: list[float] = []
+
+    async def write() -> None:
+        await fill(file)
+        ended.append(trio.current_time())
+
+    nursery.start_soon(write)
+    await trio.sleep(20)
+    assert not ended
+    await tree.unlink(NEW)
+    removed = trio.current_time()
+    await trio.sleep(2 * STALL)
+    assert [at - removed <= STALL for at in ended] == [True]
+    await assert_filled(file)
+    await file.release()
+    assert NEW not in store.files
