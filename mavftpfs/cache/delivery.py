@@ -354,6 +354,7 @@ class Deliverer:
             context.dentries.note_resized(node.path, draft.size)
         else:
             context.dentries.note_created(node.path, entry)
+        context.dentries.note_proven(node.path, context.clock())
         draft.delivered()
         node.generation += 1
         node.delivered_at = context.clock()

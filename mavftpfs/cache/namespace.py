@@ -17,8 +17,8 @@ import trio
 from mavftpfs.cache.asides import Places, fits_rename
 from mavftpfs.cache.context import Context
 from mavftpfs.cache.delivery import Deliverer
-from mavftpfs.cache.draft import Draft
 from mavftpfs.cache.emptying import Emptier
+from mavftpfs.cache.hiding import Hider
 from mavftpfs.cache.names import Names
 from mavftpfs.cache.nodes import Node
 from mavftpfs.cache.pathlocks import PathLocks
@@ -37,14 +37,12 @@ from mavftpfs.shared.errors import (
     NotADirectory,
     NotFound,
     NotSupported,
-    PathTooLong,
     RequestTimeout,
 )
 from mavftpfs.shared.model import DirEntry, EntryKind, wire_path
 
 log = logging.getLogger("mavftpfs.cache")
 
-PIECE = 64 * 1024
 TRIES = 5
 """How often a change begins anew because files were opened or closed while it waited."""
 
@@ -69,7 +67,7 @@ class Namespace(Names):
         super().__init__(context)
         self._emptier = Emptier(context, sure)
         self._purge = purge
-        self._new_content = new_content
+        self._hider = Hider(context, sure, deliverer.replacer, new_content)
         self._on_renamed = on_renamed
         self._paths = PathLocks(context.options.op_deadline)
 
@@ -230,9 +228,11 @@ class Namespace(Names):
         there = await self._is_file(path, node)
         if there and node.draft is None:
             self._context.require_idle(path)
-        if there and node.handles and not self._keep_content(node):
-            await self._hide(node)
-        elif there:
+        hidden = False
+        if there and node.handles and not self._hider.keep_content(node):
+            await self._purge(path)
+            hidden = await self._hider.hide(node)
+        if there and not hidden:
             await self.remove_perhaps(path)
         node.lose_name()
         self._context.nodes.detach(node)
@@ -248,45 +248,6 @@ class Namespace(Names):
             raise IsADirectory(f"{path!r} is a directory")
         return entry is not None and entry.kind is EntryKind.FILE
 
-    def _keep_content(self, node: Node) -> bool:
-        """Return whether the open file can be read on without the vehicle: hold what is cached of it."""
-        draft = node.draft
-        blocks = self._context.files.cached(node.path)
-        if draft is not None and (draft.whole or blocks is None):
-            return draft.whole
-        if blocks is None or not blocks.complete:
-            return False
-        if draft is None:
-            node.content = self._new_content(node)
-            draft = node.draft = Draft(node.content, blocks.size)
-        for at in range(0, draft.base_limit, PIECE):
-            data = blocks.get(at, min(at + PIECE, draft.base_limit))
-            if data is None:
-                return False
-            draft.fill(at, data)
-        return True
-
-    async def _hide(self, node: Node) -> None:
-        """Keep an unlinked file on the vehicle under a reserved name as long as somebody reads it."""
-        context, old, hidden = self._context, node.path, b""
-        await self._purge(old)
-        try:
-            hidden = context.namer.hidden(old)
-            context.live.add(hidden)
-            await self._sure.rename(old, hidden)
-        except (FtpNak, PathTooLong) as error:
-            context.live.discard(hidden)
-            log.info("%r is removed although it is being read: %s", old, error)
-            await self._remove(old)
-            return
-        except BaseException:
-            context.live.discard(hidden)
-            raise
-        context.nodes.detach(node)
-        context.files.on_renamed(old, hidden)
-        context.hide(node, hidden)
-        context.on_changed(old)
-
     # --- inside: renaming
 
     async def _rename_checked(
@@ -300,20 +261,23 @@ class Namespace(Names):
         if displaced is not None:
             await self._deliverer.abandon(displaced)
         await self._purge(old)
-        await self._rename_or_refuse(old, new, target, by_case=by_case)
-        if displaced is not None:
-            self._displace(displaced)
+        if not await self._is_kept(old, new, displaced, by_case=by_case):
+            await self._rename_or_refuse(old, new, target, by_case=by_case)
+        if displaced is not None and not displaced.hidden:
+            self._hider.displace(displaced)
         if source.kind is EntryKind.DIRECTORY:
             context.dentries.forget(old)
         context.follow_rename(old, new)
         self._on_renamed(old, new)
 
-    def _displace(self, node: Node) -> None:
-        """The file that is open at a path lost its name; who has it open keeps what is held of it."""
-        if node.handles:
-            self._keep_content(node)
-        node.lose_name()
-        self._context.nodes.detach(node)
+    async def _is_kept(self, old: bytes, new: bytes, displaced: Node | None, *, by_case: bool) -> bool:
+        """Rename over an open file so that its readers keep it; return False if that is not the way."""
+        if displaced is None or by_case or not fits_rename(old, new):
+            return False
+        there = await self.current(new)
+        if there is None or there.kind is not EntryKind.FILE:
+            return False
+        return await self._hider.rename_over(old, new, displaced)
 
     async def _rename_or_refuse(
         self, old: bytes, new: bytes, target: DirEntry | None, *, by_case: bool

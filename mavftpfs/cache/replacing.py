@@ -92,6 +92,27 @@ class Replacer:
         there = await self._sure.entry(target) is not None if len(parents) > 1 else self._known(target)
         return Present(new is not None, old, there)
 
+    async def replace_open(self, source: bytes, target: bytes, places: Places) -> bool:
+        """Do as `replace`, but leave a target that is there at `places.old`; return False if that cannot be.
+
+        Raises:
+            As replace.
+        """
+        await self.write_sidecar(places, target)
+        try:
+            await self._sure.rename(target, places.old)
+        except FtpNak as nak:
+            log.debug("%r cannot be kept for its readers: %s", target, nak)
+            return False
+        except Armed:
+            raise  # before it was sent
+        except BaseException:
+            self.tear(target, places.old)
+            raise
+        await self._finish_rename(source, target, places, old=True)
+        await self.clean(target, places)
+        return True
+
     async def replace(self, source: bytes, target: bytes, places: Places, present: Present) -> None:
         """Rename `source` to `target`, over the file that is there.
 

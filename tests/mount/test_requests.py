@@ -55,7 +55,7 @@ EXACT = {
     "git status again": "list 2, look 1, open 1, create 1, write 1, close 2, crc 1, rename 1; 229 B",
 }
 REPLACED = "rename 2, remove 1"  # FAT does not rename over a file
-LOCK_FILE = "list 2, look 1, open 1, create 1, close 2, remove 1"
+LOCK_FILE = "look 1, open 1, create 1, close 2, remove 1"
 REWRITTEN = "list 4, open 1, create 1, read 2, write 2, close 2, crc 1, rename 1; 602 B"
 ELSEWHERE = {
     "px4-nuttx": {

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import AsyncIterator
+from contextlib import suppress
 
 import pytest
 import trio
@@ -17,6 +18,7 @@ from mavftpfs.shared.errors import (
     NotADirectory,
     NotFound,
     PathTooLong,
+    VehicleLost,
 )
 from mavftpfs.shared.model import split
 from tests.support.fake_store import read_file
@@ -251,3 +253,44 @@ async def test_a_rename_to_another_spelling_of_a_third_file_is_refused(fat: Fake
     with pytest.raises(AlreadyExists):
         await tree.rename(b"/d/a", b"/d/B", noreplace=False)
     assert shape(fat) == before
+
+
+async def test_a_reader_of_a_file_that_is_renamed_over_reads_on(store: FakeWriter) -> None:
+    if not store.kind.renames:
+        return
+    old = bytes(range(256)) * 2000
+    store.add(b"/d/long", old)
+    tree = make_writable(store)
+    file = await tree.open(b"/d/long")
+    assert bytes(await file.read(0, 10)) == old[:10]
+    await tree.rename(b"/d/a", b"/d/long")
+    assert store.files[b"/d/long"].data == b"A"
+    assert await read_file(tree, b"/d/long") == b"A"
+    assert bytes(await file.read(400_000, 10)) == old[400_000:400_010]
+    assert {name for name, _ in await tree.list(b"/d")} == {b"b", b"empty", b"full", b"long"}
+    await file.release()
+    file.close()
+    assert not [path for path in store.files if is_reserved(split(path)[1])]
+
+
+@pytest.mark.parametrize("kind", [name for name in sorted(KINDS) if KINDS[name].renames])
+@pytest.mark.parametrize("requests", range(5))
+async def test_power_lost_while_an_open_file_is_renamed_over_loses_neither(
+    kind: str, requests: int, nursery: trio.Nursery, autojump_clock: object
+) -> None:
+    store = scene(FakeWriter(KINDS[kind], nursery))
+    old = bytes(range(256)) * 2000
+    store.add(b"/d/long", old)
+    tree = make_writable(store)
+    file = await tree.open(b"/d/long")
+    await file.read(0, 10)
+    store.freeze_at = requests
+    with suppress(VehicleLost):
+        await tree.rename(b"/d/a", b"/d/long")
+    file.close()
+    store.revive()
+    next_mount = make_writable(store)  # of the same name, so that what is left is nobody's
+    await next_mount.list(b"/d")
+    assert store.files[b"/d/long"].data in (old, b"A")
+    assert b"A" in (store.files[b"/d/long"].data, store.files.get(b"/d/a", store.files[b"/d/b"]).data)
+    assert not [path for path in store.files if is_reserved(split(path)[1])]
