@@ -2,11 +2,13 @@
 
 Uploads begin while the program still writes; one that cannot begin is tried again after a pause, and when the
 link is back. What a close could not deliver is tried again, too, ever more seldom, until the vehicle has it
-or refuses it: a link that fails and returns between two looks at its heartbeats is no news to anybody.
+or refuses it: a link that fails and returns between two looks at its heartbeats is no news to anybody. Nor is
+room on a card that was full: it is asked again after minutes, and then hours.
 """
 
 from __future__ import annotations
 
+import errno
 import logging
 from collections.abc import Awaitable, Callable
 from contextlib import suppress
@@ -18,6 +20,7 @@ from mavftpfs.cache.delivery import PASSING, Deliverer
 from mavftpfs.cache.nodes import Node
 from mavftpfs.cache.plan import Plan
 from mavftpfs.cache.throttle import Throttle
+from mavftpfs.shared.errnos import errno_for
 from mavftpfs.shared.errors import MavftpfsError
 
 log = logging.getLogger("mavftpfs.cache")
@@ -30,6 +33,9 @@ START_PAUSE = 5.0
 
 FIRST_PAUSE, LONGEST_PAUSE = 2.0, 30.0
 """Seconds between two attempts to deliver what nobody has open."""
+
+ROOM_PAUSES = (120.0, 3600.0)
+"""The same for what the card had no room for: most of a file may travel before that shows again."""
 
 
 class Background:
@@ -49,7 +55,7 @@ class Background:
         self._deliverer = deliverer
         self._throttle = throttle
         self._pause = FIRST_PAUSE
-        self._redelivering = False
+        self._redelivering = self._awaits_room = False
         deliverer.on_undelivered = self.redeliver
         deliverer.replacer.on_torn = self.redeliver
 
@@ -85,14 +91,18 @@ class Background:
         for node in self._context.nodes:
             node.start_after = float("-inf")
             self.kick(node)
-        await self._deliver_closed(refused_too=True)
+        await self._deliver_closed(lambda node: True)
 
     def redeliver(self) -> None:
         """Something was not delivered, or left a name without a file: try again by and by."""
-        if self._context.nursery is not None and not self._redelivering:
+        nursery = self._context.nursery
+        if nursery is not None and not self._redelivering:
             self._redelivering = True
             self._pause = FIRST_PAUSE
-            self._context.nursery.start_soon(self._redeliver)
+            nursery.start_soon(self._redeliver)
+        if nursery is not None and not self._awaits_room and self._any(_lacked_room):
+            self._awaits_room = True
+            nursery.start_soon(self._await_room)
 
     # --- inside
 
@@ -129,19 +139,32 @@ class Background:
 
     async def _redeliver(self) -> None:
         try:
-            while self._context.torn or any(n.undelivered and _may_pass(n) for n in self._context.nodes):
+            while self._context.torn or self._any(_may_pass):
                 pause, self._pause = self._pause, min(2 * self._pause, LONGEST_PAUSE)
                 await trio.sleep(pause)
                 await self._mend()
-                await self._deliver_closed()
+                await self._deliver_closed(_may_pass)
         finally:
             self._redelivering = False
 
-    async def _deliver_closed(self, *, refused_too: bool = False) -> None:
+    async def _await_room(self) -> None:
+        pause, longest = ROOM_PAUSES
+        try:
+            while self._any(_lacked_room):
+                await trio.sleep(pause)
+                pause = min(2 * pause, longest)
+                await self._deliver_closed(_lacked_room)
+        finally:
+            self._awaits_room = False
+
+    def _any(self, which: Callable[[Node], bool]) -> bool:
+        return any(node.undelivered and which(node) for node in self._context.nodes)
+
+    async def _deliver_closed(self, which: Callable[[Node], bool]) -> None:
         """Try once what nobody writes any more, and what left a name without a file."""
         for node in self._context.nodes:
             done = not node.undelivered or (node.writers and node.path not in self._context.torn)
-            if done or not (refused_too or _may_pass(node)):
+            if done or not which(node):
                 continue
             try:
                 await self._deliverer.deliver(node)
@@ -154,3 +177,8 @@ class Background:
 def _may_pass(node: Node) -> bool:
     """Return whether what kept a file from being delivered, if anything did, may be over by itself."""
     return node.error is None or isinstance(node.error, PASSING)
+
+
+def _lacked_room(node: Node) -> bool:
+    """Return whether a file is not delivered because it did not fit: others may be removed."""
+    return node.error is not None and errno_for(node.error) == errno.ENOSPC

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import errno
 from collections.abc import AsyncIterator
 
 import pytest
 import trio
 
-from mavftpfs.cache.background import FIRST_PAUSE, LONGEST_PAUSE, START_PAUSE
+from mavftpfs.cache.background import FIRST_PAUSE, LONGEST_PAUSE, ROOM_PAUSES, START_PAUSE
 from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.tree import Tree
 from mavftpfs.protocol.payload import NakCode, Opcode
@@ -210,8 +211,8 @@ async def test_attempts_grow_seldom_and_go_on(autojump_clock: object, store: Fak
 async def test_a_refusal_is_not_repeated_before_there_is_news(
     autojump_clock: object, store: FakeWriter, tree: Tree
 ) -> None:
-    full = FtpNak(Opcode.CREATE_FILE, NakCode.FAIL_ERRNO, 28)
-    store.fail_at = dict.fromkeys(range(1, 20), full)
+    denied = FtpNak(Opcode.CREATE_FILE, NakCode.FAIL_ERRNO, errno.EACCES)
+    store.fail_at = dict.fromkeys(range(1, 20), denied)
     await close_in_vain(tree)
     requests = store.requests
     await trio.sleep(1000)
@@ -222,6 +223,30 @@ async def test_a_refusal_is_not_repeated_before_there_is_news(
     assert tree.undelivered() == []
 
 
+async def test_what_did_not_fit_is_tried_again_seldom(
+    autojump_clock: object, store: FakeWriter, tree: Tree
+) -> None:
+    asked: list[float] = []
+
+    def refuse(*_: object) -> None:
+        asked.append(trio.current_time())
+        raise FtpNak(Opcode.WRITE_FILE, NakCode.FAIL_ERRNO, errno.ENOSPC)
+
+    store.before_request = refuse
+    await close_in_vain(tree)
+    asked.clear()
+    await trio.sleep(10 * ROOM_PAUSES[1])
+    times = sorted(set(asked))
+    assert 10 < len(times) < 30
+    assert times[-1] - times[-2] == pytest.approx(ROOM_PAUSES[1], abs=2)
+    store.before_request = None
+    await trio.sleep(ROOM_PAUSES[1] + 1)
+    assert tree.undelivered() == []
+    count = store.requests
+    await trio.sleep(10 * ROOM_PAUSES[1])
+    assert store.requests == count, "it ended"
+
+
 async def test_a_refusal_is_not_repeated_beside_others(
     autojump_clock: object, store: FakeWriter, tree: Tree
 ) -> None:
@@ -230,7 +255,7 @@ async def test_a_refusal_is_not_repeated_beside_others(
     def refuse(what: object, path: object, *_: object) -> None:
         if path == NEW:
             asked.append(what)
-            raise FtpNak(Opcode.CREATE_FILE, NakCode.FAIL_ERRNO, 28)
+            raise FtpNak(Opcode.CREATE_FILE, NakCode.FAIL_ERRNO, errno.EACCES)
 
     store.before_request = refuse
     await close_in_vain(tree)
