@@ -174,7 +174,8 @@ class SessionOpener:
         if nak.code in (NakCode.NO_SESSIONS_AVAILABLE, NakCode.INVALID_SESSION, NakCode.FILE_EXISTS):
             return True
         plain = nak.code != NakCode.FAIL or self._server_assigns is True or path in self._failing
-        if plain or not nak.retransmitted:  # else the first one may have been executed: ArduPilot's NAK 1
+        # Else one of ours may have been executed, and a file be open under our id: ArduPilot's NAK 1.
+        if plain or not (nak.retransmitted or self._engine.stats.unknown + self._engine.stats.spurious):
             self._doubtful = None
         return not plain
 

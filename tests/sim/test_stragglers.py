@@ -145,3 +145,18 @@ async def test_a_late_rename_of_the_old_file_does_not_take_the_new_one(
         await replace(scene, tree)
         await trio.sleep(1)
     assert scene.content() == NEW
+
+
+@pytest.mark.parametrize("profile", sorted(PROFILES))
+async def test_a_late_create_does_not_lock_us_out(profile: str, autojump: MockClock) -> None:
+    """ArduPilot opens the file again, under our id, and refuses all others until we close it."""
+    here = World(profile, DOUBLING)
+    root = ROOTS.get(profile, b"") + b"/d"
+    here.tree.add_directory(root)
+    async with trio.open_nursery() as nursery, here.connection() as connection:
+        await connection.store.list_directory(root)
+        double(here, Opcode.CREATE_FILE, 0.3, nursery.start_soon)
+        await put(connection, root + b"/first", FIRST)
+        await trio.sleep(0.5)
+        await put(connection, root + b"/second", SECOND)
+    assert here.tree.data(root + b"/second") == SECOND
