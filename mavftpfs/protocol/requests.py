@@ -41,7 +41,7 @@ class Manner(NamedTuple):
     once: bool = False
 
 
-FLOORS = {"data": 0.05, "write": 0.05, "list": 0.25, "path": 0.2, "slow": 10.0, "work": 0.3}
+FLOORS = {"data": 0.05, "write": 0.05, "list": 0.25, "path": 0.1, "slow": 10.0, "work": 0.3}
 """Least retransmission timeout of each family in seconds."""
 
 READ_MANNER = Manner("data", same_seq=False, ordered=True, echoes_offset=True, free_sends=8)

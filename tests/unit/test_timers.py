@@ -26,7 +26,7 @@ def test_nothing_known() -> None:
     assert Timers().wait(sent(Opcode.OPEN_FILE_RO)) == INITIAL_RTO
 
 
-@pytest.mark.parametrize(("rtt", "wait"), [(0.03, 0.2), (0.1, 0.3), (0.3, 0.9), (0.6, 1.0)])
+@pytest.mark.parametrize(("rtt", "wait"), [(0.03, 0.1), (0.1, 0.3), (0.3, 0.9), (0.6, 1.0)])
 def test_an_open_waits_as_long_as_listings_took_and_not_a_second(rtt: float, wait: float) -> None:
     timers = Timers()
     answered(timers, Opcode.LIST_DIRECTORY, rtt)
