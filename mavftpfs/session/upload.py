@@ -116,6 +116,9 @@ class UploadHost(Protocol):
         """Return whether this link was seen to lose, double or hold back requests or replies."""
         ...
 
+    async def outlast_copies(self, created_at: float | None) -> None:
+        """Wait until no second CreateFile comes late and empties what was created then."""
+
     def heard_stranger(self, since: float) -> bool:
         """Return whether another FTP client was heard since then, or shortly before."""
         ...
@@ -165,6 +168,7 @@ class QueuedUpload:
         self.failures = 0
         self.restarts = 0
         self.filled_in = 0.0
+        self.created_at: float | None = None
         self.tried = self.anew = False
         self.refused_at: int | None = None
         self.retry_at = 0.0
@@ -198,8 +202,11 @@ class QueuedUpload:
         """See cache.remote.Upload."""
         if self.aborted:
             raise LocalProtocolError("the upload was aborted")
-        if self.clean and not self.feed.has_more():
-            return
+        if not self.clean or self.feed.has_more():
+            await self._finish()
+        await self._host.outlast_copies(self.created_at)
+
+    async def _finish(self) -> None:
         self._host.check_may_write()
         self._begin_again()
         if not self.finishing:

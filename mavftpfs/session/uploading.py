@@ -108,6 +108,21 @@ class Uploading:
         stats = self._engine.stats
         return stats.unknown + stats.spurious + stats.retransmissions > 0
 
+    async def outlast_copies(self, created_at: float | None) -> None:
+        """See UploadHost. What is verified after that stays as it is."""
+        if created_at is not None:
+            rest = self._feared_until(created_at) - self._clock()
+            if rest > 0.0:
+                await trio.sleep(rest)
+
+    def _feared_until(self, sent_at: float) -> float:
+        """Return until when a copy of a request may still come, if this link was seen to be of that kind."""
+        stats = self._engine.stats
+        if not stats.unknown + stats.spurious:
+            return sent_at
+        least, most = STRAGGLE
+        return sent_at + min(most, max(least, STRAGGLE_ROUND_TRIPS * (self._engine.rtt or 0.0)))
+
     def heard_stranger(self, since: float) -> bool:
         """See UploadHost."""
         foreign = self._vehicle.foreign_at
@@ -190,14 +205,9 @@ class Uploading:
             self._written, self._written_at = upload, self._clock()
 
     async def _let_stragglers_pass(self, upload: QueuedUpload) -> None:
-        """Wait until what is left of the file before is dead, if this link was seen to be of that kind."""
-        stats = self._engine.stats
-        if upload is self._written or not stats.unknown + stats.spurious:
-            return
-        least, most = STRAGGLE
-        quiet = min(most, max(least, STRAGGLE_ROUND_TRIPS * (self._engine.rtt or 0.0)))
-        rest = self._written_at + quiet - self._clock()
-        if rest > 0.0:
+        """Wait until what is left of the file before is dead."""
+        rest = self._feared_until(self._written_at) - self._clock()
+        if upload is not self._written and rest > 0.0:
             await self._holder.close_quietly()
             await trio.sleep(rest)
 
@@ -229,6 +239,7 @@ class Uploading:
             await self._require_free(upload.path)
         upload.free_at, upload.begun = None, True  # what is there from now on may be ours
         session = await self._holder.open(upload.path, Opcode.CREATE_FILE)
+        upload.created_at = self._clock()
         upload.opened = True
         return session
 

@@ -62,6 +62,7 @@ def double(here: World, opcode: Opcode, late: float, start: Callable[..., object
     async def arrive_late(wire: bytes, source: Address) -> None:
         await trio.sleep(late)
         handle(wire, source, trio.current_time())
+        here.link.kick()
 
     def watch(wire: bytes, source: Address, now: float) -> None:
         if wire[3] == opcode and not kept:
@@ -160,3 +161,19 @@ async def test_a_late_create_does_not_lock_us_out(profile: str, autojump: MockCl
         await trio.sleep(0.5)
         await put(connection, root + b"/second", SECOND)
     assert here.tree.data(root + b"/second") == SECOND
+
+
+@pytest.mark.parametrize("profile", sorted(PROFILES))
+async def test_a_late_create_empties_nothing_that_is_said_to_be_there(
+    profile: str, autojump: MockClock
+) -> None:
+    here = World(profile, DOUBLING)
+    root = ROOTS.get(profile, b"") + b"/d"
+    here.tree.add_directory(root)
+    async with trio.open_nursery() as nursery, here.connection() as connection:
+        await connection.store.list_directory(root)
+        double(here, Opcode.CREATE_FILE, 0.24, nursery.start_soon)
+        await put(connection, root + b"/first", FIRST)
+        verified = here.tree.data(root + b"/first")  # emptied by now, or not at all
+        await trio.sleep(1)
+    assert here.tree.data(root + b"/first") == verified
