@@ -28,7 +28,7 @@ from tests.support.worlds import ROOTS, World
 OLD, NEW = content("old", 900), content("new", 700)
 CUT = 300
 CHANGED = OLD[:200] + NEW[:100] + OLD[300:]
-QUICK = ConnectOptions(op_deadline=4.0)
+QUICK = ConnectOptions(op_deadline=8.0)
 MOST_REQUESTS = 60
 NO_RENAME = "littlefs"
 """Without rename nothing can be replaced in one step: whoever mounts it inplace has chosen that."""
@@ -99,7 +99,7 @@ async def mounted(connection: Connection, place: Path, seed: int, *, inplace: bo
     async with trio.open_nursery() as nursery:
         yield Tree(
             connection.store,
-            CacheOptions(inplace=inplace, op_deadline=4.0),
+            CacheOptions(inplace=inplace, op_deadline=8.0),
             clock=trio.current_time,
             invalidate=lambda path: None,
             nursery=nursery,
