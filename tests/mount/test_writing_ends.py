@@ -17,7 +17,7 @@ import pytest
 from tests.mount.conftest import Field
 from tests.support.mounts import Mount, abort_mount, mounted_at, wait_until
 from tests.support.trees import content
-from tests.support.vehicles import SimVehicle
+from tests.support.vehicles import Process, SimVehicle
 
 QUICK = ("op_deadline=4",)
 RECOVERED = re.compile(r"did not reach the vehicle; they are (?:kept )?in (.+)")
@@ -153,6 +153,12 @@ def recovered(text: str) -> Path:
     return Path(match[1].strip())
 
 
+def told(process: Process) -> Path:
+    """Return the directory that a new mount names a moment after it is up."""
+    wait_until("the notice", lambda: RECOVERED.search(process.text()) is not None, 30)
+    return recovered(process.text())
+
+
 def test_unmounting_with_undelivered_data_keeps_it(field: Field, data: Path) -> None:
     card = field.local("card")
     vehicle = field.sim(card)
@@ -228,7 +234,7 @@ def test_a_killed_daemon_loses_only_what_was_not_confirmed(field: Field, data: P
     again = field.mount(vehicle.source, *QUICK)
     assert (card / "confirmed").read_text() == "confirmed\n"
     assert again.read_bytes(again.path / "replaced.bin") in (b"old" * 1000, b"n" * 300000)
-    place = recovered(again.alive().text())
+    place = told(again.alive())
     found = {path.name: path for path in place.iterdir()}
     assert found["lost.bin"].read_bytes() == data.read_bytes()
     assert json.loads(found["lost.bin.json"].read_text())["path"] == "/lost.bin"
@@ -254,7 +260,7 @@ def test_a_killed_daemon_leaves_what_was_being_written_under_its_name(field: Fie
         process, mount.process = mount.alive(), None
         process.kill()
         abort_mount(mount.path)
-    place = recovered(field.mount(vehicle.source, *QUICK).alive().text())
+    place = told(field.mount(vehicle.source, *QUICK).alive())
     found = {path.name: path for path in place.iterdir()}
     assert found["log.bin"].read_bytes() == b"n" * 100_000
     assert json.loads(found["log.bin.json"].read_text()) == {"path": "/log.bin", "unfinished": True}
