@@ -29,8 +29,14 @@ SERVERS: dict[str, tuple[str, tuple[str, ...]]] = {
     "littlefs": ("APM", ("inplace",)),
     "mavsdk": ("", ()),
     "mavsdk-server": ("", ()),
+    "spec": ("", ()),
+    "px4-2026": ("", ()),
+    "mavsdk-old": ("", ()),
 }
 """Where each may be written, and the options it needs for that."""
+
+ALIKE = ("spec", "px4-2026", "mavsdk-old")
+"""So like one of the others that they take their turn in the soak."""
 
 FAT = ("px4-nuttx", "ardupilot5")
 NOT_ON_FAT = re.compile(rb'[?"*:<>|\\]')
@@ -50,7 +56,10 @@ def make_twins(field: Field, kind: str, *options: str) -> tuple[Twins, UdpVehicl
     return Twins(mount, mount.path / folder, card, field.local("twin")), vehicle
 
 
-@pytest.fixture(scope="module", params=SERVERS)
+@pytest.fixture(
+    scope="module",
+    params=[pytest.param(kind, marks=pytest.mark.soak if kind in ALIKE else ()) for kind in SERVERS],
+)
 def kind(request: pytest.FixtureRequest) -> str:
     """The server's name."""
     name: str = request.param
