@@ -6,6 +6,7 @@ handle is closed.
 
 from __future__ import annotations
 
+import errno
 import logging
 from collections.abc import Callable
 
@@ -15,6 +16,7 @@ from mavftpfs.cache.nodes import Node
 from mavftpfs.cache.replacing import Replacer
 from mavftpfs.cache.spool import SpoolContent
 from mavftpfs.cache.sure import Sure
+from mavftpfs.shared.errnos import errno_for
 from mavftpfs.shared.errors import FtpNak, MavftpfsError, PathTooLong
 
 log = logging.getLogger("mavftpfs.cache")
@@ -70,7 +72,33 @@ class Hider:
             raise
         self._call_hidden(node, hidden)
         context.on_changed(old)
+        await self._settle(node)
         return True
+
+    async def drop_unread(self, node: Node) -> None:
+        """Remove what was hidden of a file if nobody has it open; its path must not change meanwhile.
+
+        Raises:
+            As Sure.remove; the next listing of the directory removes it then.
+        """
+        if not node.hidden or node.handles:
+            return
+        try:
+            await self._sure.remove(node.path)
+        except FtpNak as nak:
+            if errno_for(nak) != errno.ENOENT:
+                raise
+        finally:
+            self._context.forget_hidden(node)
+        self._context.files.on_removed(node.path)
+        self._context.on_changed(node.path)
+
+    async def _settle(self, node: Node) -> None:
+        """A file was hidden: its last reader may have closed it before there was anything to remove."""
+        try:
+            await self.drop_unread(node)
+        except MavftpfsError as error:
+            log.info("%r stays until its directory is listed again: %s", node.path, error)
 
     def _call_hidden(self, node: Node, hidden: bytes) -> None:
         """The file was renamed to a reserved name, under which it is read on."""
@@ -97,6 +125,7 @@ class Hider:
             replacer.release(places)
             context.live.update(context.hidden)
         await self._rehide(displaced, hidden)
+        await self._settle(displaced)
         return True
 
     async def _rehide(self, node: Node, hidden: bytes) -> None:

@@ -134,11 +134,16 @@ class Namespace(Names):
             As Sure.remove; the next listing of the directory removes it then.
         """
         node.drop_draft()
-        if node.hidden:
+        async with node.lock:  # it may be about to get its reserved name
             try:
-                await self._remove(node.path)
+                while node.hidden:
+                    path = node.path
+                    async with self._paths.hold(path):  # a directory above it may be about to move
+                        if node.path == path:
+                            await self._hider.drop_unread(node)
             finally:
-                self._context.forget_hidden(node)
+                if node.hidden:
+                    self._context.forget_hidden(node)
 
     # --- inside: whom to wait for
 

@@ -134,3 +134,63 @@ async def test_a_writer_who_waits_when_the_name_goes_is_let_go(
     await assert_filled(file)
     await file.release()
     assert NEW not in store.files
+
+
+# --- the last reader closes it at any moment
+
+
+async def rename_over_directory(tree: Tree) -> None:
+    await tree.unlink(FILE)
+    await tree.rename(b"/card/dir", b"/card/moved", noreplace=False)
+
+
+async def remove_directory(tree: Tree) -> None:
+    await tree.unlink(FILE)
+    await tree.rmdir(b"/card/dir")
+
+
+async def replace_by_other(tree: Tree) -> None:
+    await tree.rename(b"/card/other", FILE, noreplace=False)
+
+
+LOSE: dict[str, LoseName] = {
+    "unlink": lambda tree: tree.unlink(FILE),
+    "rename over": replace_by_other,
+    "directory renamed": rename_over_directory,
+    "directory removed": remove_directory,
+}
+
+
+@pytest.mark.parametrize("kind", ["posix", "fat"])
+@pytest.mark.parametrize("how", sorted(LOSE))
+async def test_nothing_stays_when_the_last_reader_closes(
+    nursery: trio.Nursery, autojump_clock: object, how: str, kind: str
+) -> None:
+    """Whatever request is under way then."""
+    for request in range(1, 12):
+        store = FakeWriter(KINDS[kind], nursery)
+        store.write_delay = 1.0
+        store.add(FILE, OLD)
+        store.add(b"/card/other", b"it")
+        tree = make_writable(store)
+        reading = await tree.open(FILE)
+        await reading.read(0, 1)
+        async with trio.open_nursery() as programs:
+            programs.start_soon(close_beside, store, reading, request)
+            await LOSE[how](tree)
+            asked = store.requests
+        await trio.sleep(5)
+        assert [path for path in store.files if b".mavftpfs-" in path] == []
+        assert store.crimes == []
+        if asked < request:
+            break
+    assert 1 < request < 11
+
+
+async def close_beside(store: FakeWriter, reading: OpenFile, request: int) -> None:
+    """Close while the vehicle works on that request, or later."""
+    with trio.move_on_after(20):
+        while store.requests < request - 1:
+            await trio.sleep(0.01)
+        await trio.sleep(0.5)
+    await reading.release()
