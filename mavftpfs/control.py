@@ -14,6 +14,7 @@ import os
 import pwd
 import socket
 import stat
+import time
 from collections.abc import Awaitable, Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -32,7 +33,10 @@ MAX_LINE = 1 << 20
 REQUEST_PATIENCE = 10.0
 """Seconds for a client to send its line, and for us to hand it the reply."""
 MAX_CLIENTS = 16
-"""Clients served at a time; more wait."""
+"""Clients served at a time; more wait in the kernel, where they cost this process no descriptors."""
+ACCEPT_PAUSE = 0.25
+"""Seconds to wait where a client cannot be taken (no descriptors left): the mount must not end with it."""
+_QUEUE_PAUSE = 0.05
 _MAX_SOCKET_PATH = 107
 _SUFFIX = ".sock"
 
@@ -106,7 +110,7 @@ class ControlServer:
     def __init__(self, path: Path, commands: Mapping[str, Command]) -> None:
         self._path = path
         self._commands = commands
-        self._limiter = trio.CapacityLimiter(MAX_CLIENTS)
+        self._places = trio.Semaphore(MAX_CLIENTS)
         self._accepting = trio.CancelScope()
         self.closed = trio.Event()
 
@@ -121,9 +125,7 @@ class ControlServer:
             async with trio.open_nursery() as clients:
                 task_status.started()
                 with self._accepting:
-                    while True:
-                        accepted, _ = await listener.accept()
-                        clients.start_soon(self._serve_client, trio.SocketStream(accepted))
+                    await self._accept(listener, clients)
         finally:
             listener.close()
             self._path.unlink(missing_ok=True)
@@ -133,15 +135,28 @@ class ControlServer:
         """Take no more clients."""
         self._accepting.cancel()
 
-    async def _serve_client(self, stream: trio.SocketStream) -> None:
-        async with stream:
+    async def _accept(self, listener: trio.socket.SocketType, clients: trio.Nursery) -> None:
+        while True:
+            await self._places.acquire()
             try:
-                async with self._limiter:
-                    reply = await _answer(stream, self._commands)
+                accepted, _ = await listener.accept()
+            except OSError as exc:
+                log.warning("a control client cannot be served now: %s", exc)
+                self._places.release()
+                await trio.sleep(ACCEPT_PAUSE)
+                continue
+            clients.start_soon(self._serve_client, trio.SocketStream(accepted))
+
+    async def _serve_client(self, stream: trio.SocketStream) -> None:
+        try:
+            async with stream:
+                reply = await _answer(stream, self._commands)
                 with trio.move_on_after(REQUEST_PATIENCE):
                     await stream.send_all(json.dumps(reply, default=str).encode() + b"\n")
-            except (trio.BrokenResourceError, trio.ClosedResourceError):
-                log.debug("a control client went away")
+        except (trio.BrokenResourceError, trio.ClosedResourceError):
+            log.debug("a control client went away")
+        finally:
+            self._places.release()
 
 
 def _bind(path: Path) -> trio.socket.SocketType:
@@ -167,7 +182,7 @@ async def _answer(stream: trio.SocketStream, commands: Mapping[str, Command]) ->
     try:
         request = json.loads(line)
         command = commands[request["command"]]
-    except (ValueError, KeyError, TypeError):
+    except (ValueError, KeyError, TypeError, RecursionError):  # the last for a line of many brackets
         return failure("not a command of this mount")
     try:
         return {"ok": True, **await command(request)}
@@ -205,8 +220,7 @@ def ask(path: Path, request: Reply, *, timeout: float) -> Reply:
     """
     try:
         with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as client:
-            client.settimeout(timeout)
-            client.connect(str(path))
+            _connect(client, path, timeout)
             client.sendall(json.dumps(request).encode() + b"\n")
             with client.makefile("rb") as lines:
                 line = lines.readline(MAX_LINE)
@@ -218,6 +232,20 @@ def ask(path: Path, request: Reply, *, timeout: float) -> Reply:
     if not isinstance(reply, dict) or not reply.get("ok"):
         raise ControlError(str(reply.get("error")) if isinstance(reply, dict) else "malformed answer")
     return reply
+
+
+def _connect(client: socket.socket, path: Path, timeout: float) -> None:
+    """Connect, waiting for room in the queue: there is none while many others wait."""
+    client.settimeout(timeout)
+    deadline = time.monotonic() + timeout
+    while True:
+        try:
+            client.connect(str(path))
+            return
+        except BlockingIOError:
+            if time.monotonic() >= deadline:
+                raise
+        time.sleep(_QUEUE_PAUSE)
 
 
 def find_socket(mountpoint: str, directories: list[Path]) -> Path:

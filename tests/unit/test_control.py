@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import json
 import os
+import resource
 import socket
 import stat
 from collections.abc import AsyncIterator, Mapping
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import pytest
 import trio
+import trio.testing
 
 from mavftpfs import control
 from mavftpfs.control import Command, ControlError, ControlServer, NobodyThere, Reply, ask
@@ -67,7 +69,9 @@ async def test_refusals_name_the_reason(
 
 
 @pytest.mark.parametrize(
-    "line", [b"\n", b"{}\n", b"[]\n", b"[1]\n", b'{"command": []}\n', b"\xff\xfe\n", b""]
+    "line",
+    [b"\n", b"{}\n", b"[]\n", b"[1]\n", b'{"command": []}\n', b"\xff\xfe\n", b"", b"[" * 200_000 + b"\n"],
+    ids=range(8),
 )
 async def test_garbage_is_answered_and_harmless(tmp_path: Path, line: bytes) -> None:
     path = tmp_path / "s.sock"
@@ -91,6 +95,40 @@ async def test_a_client_that_leaves_disturbs_nobody(tmp_path: Path) -> None:
             await stream.send_all(b'{"command": "echo"}\n')
             await stream.aclose()
         assert (await ask_from_outside(path, {"command": "echo"}))["ok"]
+
+
+async def test_a_crowd_of_silent_clients_costs_few_descriptors(tmp_path: Path) -> None:
+    path = tmp_path / "s.sock"
+    async with serving(path, {"echo": echo}):
+        before = len(os.listdir("/proc/self/fd"))
+        crowd = [socket.socket(socket.AF_UNIX) for _ in range(4 * control.MAX_CLIENTS)]
+        for client in crowd:
+            client.setblocking(False)
+            with suppress(BlockingIOError):  # the queue is full: it is not even connected
+                client.connect(str(path))
+            await trio.testing.wait_all_tasks_blocked(0.001)
+        assert len(os.listdir("/proc/self/fd")) - before - len(crowd) <= control.MAX_CLIENTS
+        for client in crowd:
+            client.close()
+        assert (await ask_from_outside(path, {"command": "echo"}))["ok"]
+
+
+async def test_no_descriptors_left_is_got_over(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    path = tmp_path / "s.sock"
+    limits = resource.getrlimit(resource.RLIMIT_NOFILE)
+    async with serving(path, {"echo": echo}):
+        with socket.socket(socket.AF_UNIX) as client:
+            resource.setrlimit(resource.RLIMIT_NOFILE, (1, limits[1]))
+            try:
+                client.connect(str(path))
+                client.sendall(b'{"command": "echo", "word": "hi"}\n')
+                with trio.fail_after(20):
+                    while not caplog.records:  # noqa: ASYNC110
+                        await trio.sleep(0.01)
+            finally:
+                resource.setrlimit(resource.RLIMIT_NOFILE, limits)
+            answer = await trio.to_thread.run_sync(client.recv, 4096)
+    assert json.loads(answer)["heard"] == "hi"
 
 
 async def test_a_reply_in_the_making_is_still_sent_after_close(tmp_path: Path) -> None:
