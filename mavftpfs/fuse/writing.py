@@ -13,7 +13,8 @@ import logging
 import mmap
 import os
 import stat as stat_bits
-from collections.abc import Iterator, Sequence
+import time
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, NoReturn, cast
 
@@ -26,7 +27,7 @@ from mavftpfs.fuse.inodes import Inode
 from mavftpfs.fuse.keeping import NANO, Keeping
 from mavftpfs.fuse.operations import Operations, Presentation, handler
 from mavftpfs.shared.errors import MavftpfsError
-from mavftpfs.shared.model import EntryKind
+from mavftpfs.shared.model import EntryKind, split
 
 log = logging.getLogger("mavftpfs.fuse")
 
@@ -71,9 +72,18 @@ class WritingOperations(Operations):
 
     _tree: WritableTree
 
-    def __init__(self, tree: WritableTree, presentation: Presentation, **others: Any) -> None:
+    def __init__(
+        self,
+        tree: WritableTree,
+        presentation: Presentation,
+        *,
+        now_ns: Callable[[], int] = time.time_ns,
+        **others: Any,
+    ) -> None:
+        """`now_ns()`: the time of day, nanoseconds since 1970 UTC."""
         super().__init__(tree, presentation, **others)
         self._keeping = Keeping()
+        self._now_ns = now_ns
 
     def budget(self, name: str, args: Sequence[Any]) -> float:
         """Return the seconds a handler may take."""
@@ -111,7 +121,7 @@ class WritingOperations(Operations):
             if flags & os.O_TRUNC and file.size:
                 await file.truncate(0)
             found = Stat(EntryKind.FILE, file.size, (await self._tree.stat(path)).mtime, 0.0)
-        self._keeping.at(path).mode = stat_bits.S_IMODE(mode)
+        self._made(path, mode)
         inode = self.inodes.lookup(path)
         fh = self.files.add(FileHandle(inode.ino, file, flags))
         info = FileInfo(fh=fh, direct_io=file.direct_io, keep_cache=file.keep_cache)
@@ -195,8 +205,9 @@ class WritingOperations(Operations):
         if fields.update_atime:
             kept.atime_ns = attr.st_atime_ns
         if fields.update_mtime:
-            kept.mtime_ns = attr.st_mtime_ns
-            await self._tree.set_times(path, attr.st_mtime_ns)
+            kept.mtime_ns, kept.changed_ns = attr.st_mtime_ns, self._now_ns()
+            if (await self._tree.stat(path)).kind is EntryKind.FILE:
+                await self._tree.set_times(path, attr.st_mtime_ns)
 
     # -- names ------------------------------------------------------------------------------------
 
@@ -219,6 +230,7 @@ class WritingOperations(Operations):
         """Make a directory."""
         path = self._child(parent_inode, name)
         await self._tree.mkdir(path)
+        self._keeping.entries_changed(path, self._now_ns())
         return await self._new_entry(path, mode)
 
     @handler
@@ -253,6 +265,8 @@ class WritingOperations(Operations):
         await self._tree.rename(old, new, noreplace=bool(flags & pyfuse3.RENAME_NOREPLACE))
         self.inodes.rename(old, new)
         self._keeping.move(old, new)
+        self._entry_changed(old)
+        self._entry_changed(new)
 
     async def _not_on_a_card(self, *_: object) -> NoReturn:
         raise FUSEError(errno.EPERM)
@@ -270,9 +284,19 @@ class WritingOperations(Operations):
     def _gone(self, path: bytes) -> None:
         self.inodes.unlink(path)
         self._keeping.drop(path)
+        self._entry_changed(path)
+
+    def _made(self, path: bytes, mode: int) -> None:
+        kept = self._keeping.at(path)
+        kept.mode, kept.atime_ns = stat_bits.S_IMODE(mode), self._now_ns()
+        self._entry_changed(path)
+
+    def _entry_changed(self, path: bytes) -> None:
+        """A name came or went; the kernel asks for its directory's attributes again by itself."""
+        self._keeping.entries_changed(split(path)[0], self._now_ns())
 
     async def _new_entry(self, path: bytes, mode: int) -> EntryAttributes:
-        self._keeping.at(path).mode = stat_bits.S_IMODE(mode)
+        self._made(path, mode)
         found = await self._tree.stat(path)
         return self._attributes(self.inodes.lookup(path), found)
 
@@ -298,11 +322,15 @@ class WritingOperations(Operations):
             entry.st_uid = kept.uid
         if kept.gid is not None:
             entry.st_gid = kept.gid
-        if not found.mtime_nsec:  # else the tree knows it to the nanosecond
+        if found.kind is EntryKind.DIRECTORY:
+            entry.st_mtime_ns, entry.st_ctime_ns = kept.directory_times(entry.st_mtime_ns)
+        elif not found.mtime_nsec:  # else the tree knows it to the nanosecond
             entry.st_mtime_ns = entry.st_ctime_ns = kept.shown_mtime_ns(found.mtime)
-        if found.kind is EntryKind.DIRECTORY and kept.mtime_ns is not None:
-            entry.st_mtime_ns = kept.mtime_ns
         entry.st_atime_ns = entry.st_mtime_ns if kept.atime_ns is None else kept.atime_ns
-        if kept.mtime_ns is not None and kept.mtime_ns // NANO != found.mtime:
+        if (
+            found.kind is EntryKind.FILE
+            and kept.mtime_ns is not None
+            and kept.mtime_ns // NANO != found.mtime
+        ):
             kept.atime_ns = None  # the file changed since
         return entry

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import stat
+from collections.abc import Callable
 from typing import Any, cast
 
 import pyfuse3
@@ -195,6 +196,78 @@ async def test_a_removed_name_forgets_what_was_kept() -> None:
     assert entry.st_ino != ino
     assert stat.S_IMODE(entry.st_mode) == 0o644
     assert entry.st_mtime_ns == MTIME * NANO
+
+
+NOW = 1_800_000_000 * NANO + 5
+
+
+async def _times(ops: WritingOperations, ino: int) -> tuple[int, int]:
+    entry = await ops.getattr(ino, CTX)
+    return entry.st_mtime_ns, entry.st_ctime_ns
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda ops, log: ops.create(log, b"new", 0o644, os.O_WRONLY, CTX),
+        lambda ops, log: ops.mknod(log, b"new", stat.S_IFREG | 0o644, 0, CTX),
+        lambda ops, log: ops.mkdir(log, b"new", 0o755, CTX),
+        lambda ops, log: ops.unlink(log, b"1.ulg", CTX),
+        lambda ops, log: ops.rmdir(log, b"sub", CTX),
+        lambda ops, log: ops.rename(log, b"1.ulg", log, b"2.ulg", 0, CTX),
+        lambda ops, log: ops.rename(log, b"1.ulg", ROOT_INO, b"out", 0, CTX),
+        lambda ops, log: ops.rename(ROOT_INO, b"a.txt", log, b"in", 0, CTX),
+    ],
+)
+async def test_a_directory_shows_when_its_entries_were_changed(change: Callable[..., Any]) -> None:
+    tree = some_tree()
+    tree.directories.add(b"/log/sub")
+    ops = operations(tree, now_ns=lambda: NOW)
+    log = await ino_of(ops, b"log")
+    assert await _times(ops, log) == (MTIME * NANO, MTIME * NANO)
+    tree.error = NoSpace("the card is full")
+    await failure(change(ops, log))
+    tree.error = None
+    assert await _times(ops, log) == (MTIME * NANO, MTIME * NANO)
+    await change(ops, log)
+    assert await _times(ops, log) == (NOW, NOW)
+    tree.times[b"/log"] = NOW // NANO + 9  # others changed it on the vehicle
+    assert await _times(ops, log) == (NOW + 9 * NANO - 5, NOW + 9 * NANO - 5)
+
+
+async def test_a_rename_changes_both_directories_and_a_new_one_is_of_now() -> None:
+    ops = operations(now_ns=lambda: NOW)
+    await ops.rename(ROOT_INO, b"a.txt", await ino_of(ops, b"empty"), b"in", 0, CTX)
+    assert await _times(ops, ROOT_INO) == await _times(ops, await ino_of(ops, b"empty")) == (NOW, NOW)
+    entry = await ops.mkdir(await ino_of(ops, b"log"), b"sub", 0o755, CTX)
+    assert (entry.st_mtime_ns, entry.st_ctime_ns) == (NOW, NOW)
+
+
+async def test_what_was_just_made_was_used_just_now() -> None:
+    """Mail readers remove by its atime what a program left behind long ago."""
+    tree = some_tree()
+    ops = operations(tree, now_ns=lambda: NOW)
+    _, made = await ops.create(ROOT_INO, b"new", 0o644, os.O_WRONLY, CTX)
+    tree.times[b"/new"] = 315532800  # the vehicle tells none
+    assert (await ops.getattr(made.st_ino, CTX)).st_atime_ns == NOW
+
+
+async def test_a_time_that_is_set_on_a_directory_holds_until_its_entries_change() -> None:
+    clock = [NOW]
+    tree = some_tree()
+    ops = operations(tree, now_ns=lambda: clock[0])
+    log = await ino_of(ops, b"log")
+    await ops.rename(log, b"1.ulg", log, b"2.ulg", 0, CTX)
+    clock[0] += 1
+    wanted = attributes(st_atime_ns=5, st_mtime_ns=6 * NANO + 2)
+    await ops.setattr(log, wanted, fields("atime", "mtime"), None, CTX)
+    tree.times[b"/log"] = MTIME + 1  # what our own change came to on the vehicle
+    assert await _times(ops, log) == (6 * NANO + 2, NOW + 1)
+    assert (await ops.getattr(log, CTX)).st_atime_ns == 5
+    clock[0] += 1
+    await ops.create(log, b"new", 0o644, os.O_WRONLY, CTX)
+    assert await _times(ops, log) == (NOW + 2, NOW + 2)
+    assert (await ops.getattr(log, CTX)).st_atime_ns == 5
 
 
 async def test_an_open_file_without_a_name_still_has_attributes_and_can_be_cut() -> None:
