@@ -1,13 +1,16 @@
 """Which names are being changed: changes that concern one another wait for each other. Layer: cache.
 
 Two changes concern one another if they name the same path, in any case, or one names a directory above the
-other's. All others go on side by side, so that one that is not answered holds up nobody else.
+other's. All others go on side by side, so that one that is not answered holds up nobody else. Files are
+opened between changes of their names, not during one: else who opened would hold neither the old file nor
+the new one. Opening holds its path `shared`.
 """
 
 from __future__ import annotations
 
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
+from dataclasses import dataclass
 
 import trio
 
@@ -23,17 +26,19 @@ class PathLocks:
     def __init__(self, patience: float) -> None:
         """`patience`: seconds to wait for a lock; with the change that follows SLACK more."""
         self._patience = patience
-        self._held: list[tuple[bytes, ...]] = []
+        self._held: list[_Hold] = []
         self._news = trio.Event()
 
     @asynccontextmanager
-    async def hold(self, *paths: bytes) -> AsyncIterator[None]:
+    async def hold(self, *paths: bytes, shared: bool = False) -> AsyncIterator[None]:
         """Hold the paths for the length of the body; one that had to wait may not last its full time.
+
+        shared: beside others that share them.
 
         Raises:
             RequestTimeout: others took too long.
         """
-        wanted = tuple(path.lower() for path in paths)
+        wanted = _Hold(tuple(path.lower() for path in paths), shared)
         began = trio.current_time()
         with trio.CancelScope(deadline=began + self._patience) as scope:
             self._held.append(wanted)
@@ -48,22 +53,28 @@ class PathLocks:
         if scope.cancelled_caught:
             raise RequestTimeout(f"another change that concerns {paths[0]!r} took too long")
 
-    async def _wait(self, wanted: tuple[bytes, ...]) -> bool:
+    async def _wait(self, wanted: _Hold) -> bool:
         """Wait until none that came before is in the way; return whether any was."""
         waited = False
-        while any(_concern(held, wanted) for held in self._before(wanted)):
+        while any(held.concerns(wanted) for held in self._before(wanted)):
             waited = True
             await self._news.wait()
         return waited
 
-    def _before(self, wanted: tuple[bytes, ...]) -> list[tuple[bytes, ...]]:
+    def _before(self, wanted: _Hold) -> list[_Hold]:
         places = [place for place, held in enumerate(self._held) if held is wanted]
         return self._held[: places[0]]
 
 
-def _concern(some: tuple[bytes, ...], others: tuple[bytes, ...]) -> bool:
-    return any(
-        one == other or one.startswith(other + b"/") or other.startswith(one + b"/")
-        for one in some
-        for other in others
-    )
+@dataclass(frozen=True, slots=True, eq=False)
+class _Hold:
+    paths: tuple[bytes, ...]
+    shared: bool
+
+    def concerns(self, other: _Hold) -> bool:
+        """Return whether one has to wait for the other."""
+        return not (self.shared and other.shared) and any(
+            one == two or one.startswith(two + b"/") or two.startswith(one + b"/")
+            for one in self.paths
+            for two in other.paths
+        )

@@ -89,11 +89,11 @@ class Writeback:
         self.overlay.stat(path)  # raises NotFound for names that are hidden
         if self._local.owns(path):
             return self._local.open(path, write=False)
-        node = self._context.nodes.get(path)
-        handle = None
-        if node is None or node.draft is None:
-            handle = await open_base(self._context, path)
-        return ReadFile(self, self._context, self._context.nodes.need(path), handle)
+        async with self._namespace.steady(path):
+            node, handle = self._context.nodes.get(path), None
+            if node is None or node.draft is None:
+                handle = await open_base(self._context, path)
+            return ReadFile(self, self._context, self._context.nodes.need(path), handle)
 
     async def open(self, path: bytes, *, truncate: bool) -> OpenFile:
         """Open a file for writing."""
@@ -101,7 +101,8 @@ class Writeback:
         if self._local.owns(path):
             return self._local.open(path, write=True, truncate=truncate)
         self._context.require_disarmed()
-        file = WriteFile(self, self._context, await self._need_draft(path, truncate=truncate))
+        async with self._namespace.steady(path):
+            file = WriteFile(self, self._context, await self._need_draft(path, truncate=truncate))
         if truncate:
             try:
                 await file.truncate(0)
@@ -150,16 +151,13 @@ class Writeback:
                 size = base.size
             try:
                 context.require_idle(path)
-            except MavftpfsError:
+                node = context.nodes.need(path)
+                if node.draft is None:
+                    self._new_draft(node, size)
+                    node.base, base = base, node.base
+            finally:
                 if base is not None:
                     base.close()
-                raise
-            node = context.nodes.need(path)
-        if node.draft is None:
-            self._new_draft(node, size)
-            node.base, base = base, node.base
-        if base is not None:
-            base.close()
         return node
 
     def _new_draft(self, node: Node, size: int | None) -> None:
@@ -266,8 +264,9 @@ class Writeback:
             await self._local.open(path, write=True).truncate(size)
             return
         self._context.require_disarmed()
-        node = await self._need_draft(path, truncate=size == 0)
-        file = WriteFile(self, self._context, node)  # also beside other writers: they may end meanwhile
+        async with self._namespace.steady(path):
+            node = await self._need_draft(path, truncate=size == 0)
+            file = WriteFile(self, self._context, node)  # also beside other writers: they may end meanwhile
         had = node.undelivered
         try:
             await file.truncate(size)

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Awaitable, Callable
+
 import pytest
 import trio
 
+from mavftpfs.cache.openfile import OpenFile
+from mavftpfs.cache.tree import Tree
 from mavftpfs.protocol.payload import NakCode, Opcode
-from mavftpfs.shared.errors import FtpNak, NotSupported
+from mavftpfs.shared.errors import FtpNak, NotFound, NotSupported
 from tests.support.fake_writer import KINDS, FakeWriter, make_writable, write_file
 
 FILE = b"/d/file"
@@ -103,3 +107,62 @@ async def test_overwriting_in_place_that_failed_goes_on_later(
         await file.flush()
         assert store.files[FILE].data == b"%d" % number * 700
         await file.release()
+
+
+OPENINGS = {
+    "reader": lambda tree: tree.open(FILE),
+    "writer": lambda tree: tree.open(FILE, write=True),
+    "emptier": lambda tree: tree.open(FILE, write=True, truncate=True),
+}
+OTHER, NEW = b"/d/other", b"new" * 300
+"""As long as the old content: no size tells them apart."""
+
+
+async def program(tree: Tree, opening: Callable[[Tree], Awaitable[OpenFile]], later: float) -> None:
+    """Open at that time, use it and close; that there is no such file is the only excuse."""
+    await trio.sleep(later)
+    try:
+        file = await opening(tree)
+    except NotFound:
+        return
+    old = bytes(await file.read(0, 900))
+    assert old in (b"old" * 300, NEW, b"")
+    if file.writable:
+        await file.write(3, b"mid")
+        assert await file.read(0, 900) == old[:3].ljust(3, b"\0") + b"mid" + old[6:]
+    await file.release()
+
+
+@pytest.mark.parametrize("change", ["unlink", "rename over", "rename"])
+@pytest.mark.parametrize("opening", sorted(OPENINGS))
+@pytest.mark.parametrize("kind", sorted(set(KINDS) - {"littlefs"}))
+async def test_a_file_is_opened_before_or_after_its_name_is_changed(
+    nursery: trio.Nursery, autojump_clock: object, kind: str, opening: str, change: str
+) -> None:
+    """Not meanwhile: who opened would hold neither the old file nor the new one."""
+    for later in range(-10, 14):
+        store = FakeWriter(KINDS[kind], nursery)
+        store.add(FILE, b"old" * 300)
+        store.add(OTHER, NEW)
+        tree = make_writable(store)
+        await tree.list(b"/d")
+        store.write_delay = store.list_delay = 0.1
+        store.open_delay = 0.25
+        async with trio.open_nursery() as both:
+            both.start_soon(program, tree, OPENINGS[opening], max(later, 0) * 0.05)
+            await trio.sleep(max(-later, 0) * 0.05 + 0.001)
+            if change == "unlink":
+                await tree.unlink(FILE)
+            elif change == "rename":
+                await tree.rename(FILE, OTHER)
+            else:
+                await tree.rename(OTHER, FILE)
+        await trio.sleep(60)
+        assert tree.undelivered() == []
+        left = {path: file.data for path, file in store.files.items()}
+        there = {"unlink": OTHER, "rename": OTHER, "rename over": FILE}[change]
+        assert sorted(left) == [there]
+        base = {"unlink": NEW, "rename": b"old" * 300, "rename over": NEW}[change]
+        written = () if change == "unlink" else (base[:3] + b"mid" + base[6:], b"\0\0\0mid")
+        assert left[there] in (base, *written)
+        assert store.crimes == []
