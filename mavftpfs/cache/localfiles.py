@@ -23,17 +23,22 @@ from mavftpfs.shared.errors import (
     NotADirectory,
     NotFound,
 )
-from mavftpfs.shared.model import EntryKind, join, split
+from mavftpfs.shared.model import EntryKind, split
 
 MAX_ENTRIES = 10_000
 
 
 @dataclass(slots=True, eq=False)
 class LocalEntry:
-    """A file (data is its content) or a directory (data is None)."""
+    """A file (data is its content) or a directory (data is None).
+
+    handles: how many are open; named: it was not unlinked.
+    """
 
     data: bytearray | None
     mtime_ns: int
+    handles: int = 0
+    named: bool = True
 
     @property
     def kind(self) -> EntryKind:
@@ -120,7 +125,8 @@ class LocalFiles:
         old = self._entries.get(path)
         if old is not None and old.data is None:
             raise IsADirectory(f"{path!r} is a directory")
-        self.require_room(len(data) - (0 if old is None or old.data is None else len(old.data)))
+        freed = 0 if old is None or old.handles else len(old.data or b"")
+        self.require_room(len(data) - freed)
         if old is not None:
             self.unlink(path)
         self._add(path, LocalEntry(bytearray(data), self._now_ns()))
@@ -145,8 +151,9 @@ class LocalFiles:
         entry = self.find(path)
         if entry.data is None:
             raise IsADirectory(f"{path!r} is a directory")
-        self._used -= len(entry.data)
         del self._entries[path]
+        entry.named = False
+        self._forget_unused(entry)
 
     def rmdir(self, path: bytes) -> None:
         """Remove an empty directory.
@@ -181,11 +188,6 @@ class LocalFiles:
         for path in [p for p in self._entries if p == old or p.startswith(old + b"/")]:
             self._entries[new + path[len(old) :]] = self._entries.pop(path)
 
-    def forget_below(self, directory: bytes) -> None:
-        """The vehicle's directory is gone, and what was local in it."""
-        for path in [p for p in self._entries if p.startswith(join(directory, b""))]:
-            self._used -= len(self._entries.pop(path).data or b"")
-
     def set_times(self, path: bytes, mtime_ns: int) -> None:
         """Set the mtime.
 
@@ -207,8 +209,7 @@ class LocalFiles:
             entry.data.extend(bytes(more))
         else:
             del entry.data[size:]
-        if any(known is entry for known in self._entries.values()):
-            self._used += more
+        self._used += more
         entry.mtime_ns = self._now_ns()
 
     def require_room(self, more: int) -> None:
@@ -219,6 +220,19 @@ class LocalFiles:
     def touch(self, entry: LocalEntry) -> None:
         """A file was written."""
         entry.mtime_ns = self._now_ns()
+
+    def opened(self, entry: LocalEntry) -> None:
+        """A handle of the file was made."""
+        entry.handles += 1
+
+    def closed(self, entry: LocalEntry) -> None:
+        """A handle of the file was closed."""
+        entry.handles -= 1
+        self._forget_unused(entry)
+
+    def _forget_unused(self, entry: LocalEntry) -> None:
+        if not entry.named and not entry.handles:
+            self._used -= len(entry.data or b"")
 
     def _add(self, path: bytes, entry: LocalEntry) -> None:
         if len(self._entries) >= MAX_ENTRIES:
@@ -235,7 +249,9 @@ class LocalHandle:
     def __init__(self, files: LocalFiles, entry: LocalEntry, *, writable: bool) -> None:
         self._files = files
         self._entry = entry
+        self._closed = False
         self.writable = writable
+        files.opened(entry)
 
     @property
     def size(self) -> int:
@@ -279,12 +295,17 @@ class LocalHandle:
 
     async def release(self) -> None:
         """Close."""
+        self.close()
 
     def give_up(self) -> None:
         """Close; what it made costs nothing and stays."""
+        self.close()
 
     def close(self) -> None:
-        """Close."""
+        """Close; closing twice is harmless."""
+        if not self._closed:
+            self._closed = True
+            self._files.closed(self._entry)
 
     @property
     def _data(self) -> bytearray:

@@ -26,7 +26,7 @@ STALL = 5.0
 
 
 class Throttle:
-    """Knows how fast bytes are ACKed."""
+    """Knows how fast bytes are ACKed, and which wait."""
 
     def __init__(self, context: Context) -> None:
         self._context = context
@@ -81,3 +81,21 @@ class Throttle:
             True  # whoever waits next undoes it: an event for each ACK would cost more than the ACK
         )
         self._moved.set()
+
+    def transfers(self) -> list[dict[str, object]]:
+        """Return what is not delivered, what is on its way first; eta: seconds at the measured rate."""
+        waiting = [node for node in self._context.nodes if node.undelivered]
+        rate, before, found = self.meter.rate, 0, []
+        for node in sorted(waiting, key=lambda node: node.attempt is None):
+            assert node.draft is not None
+            before += node.draft.unacked
+            found.append(
+                {
+                    "path": node.path.decode(errors="replace"),
+                    "size": node.draft.size,
+                    "bytes_left": node.draft.unacked,
+                    "sending": node.attempt is not None,
+                    "eta": round(before / rate, 1) if rate else None,
+                }
+            )
+        return found

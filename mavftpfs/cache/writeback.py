@@ -7,6 +7,7 @@ vehicle's. Paths are the vehicle's, normalised; those below `@` never come here 
 from __future__ import annotations
 
 import logging
+from contextlib import closing
 from pathlib import Path
 
 import trio
@@ -261,7 +262,8 @@ class Writeback:
         """See Tree.truncate."""
         path = self.overlay.spelled(path)
         if self._local.owns(path):
-            await self._local.open(path, write=True).truncate(size)
+            with closing(self._local.open(path, write=True)) as local:
+                await local.truncate(size)
             return
         self._context.require_disarmed()
         async with self._namespace.steady(path):
@@ -284,21 +286,27 @@ class Writeback:
     async def _put(self, path: bytes, data: bytes, exclusive: bool) -> None:
         """Write and deliver a whole file; if that fails, nothing of it is kept."""
         file = await self.create(path, exclusive=exclusive)
-        node = self._context.nodes.get(path)
+        assert isinstance(file, WriteFile)
+        replacing = False
         try:
+            if file.size:
+                await file.fsync()  # what was accepted before does not depend on what follows
+            replacing = True
             await file.truncate(0)
             await file.write(0, data)
             await file.release()
         except BaseException:
             file.close()
-            if node is not None and not node.handles:
-                await self._forget_draft(node)
+            if replacing and not file.node.handles:
+                await self._forget_draft(file.node)
             raise
 
     async def _forget_draft(self, node: Node) -> None:
         """What was to be written is not wanted any more, since its caller got an error."""
         async with node.lock:
             await self._deliverer.abandon(node)
+            if node.writers:
+                return  # who opened it meanwhile completes it
             made = node.draft is not None and node.draft.made
             node.drop_draft()
         self._context.nodes.maybe_forget(node)
@@ -360,31 +368,13 @@ class Writeback:
             "dirty_max": self._throttle.limit,
             "write_rate": self._throttle.meter.rate,
             "files_undelivered": len(self.undelivered()),
-            "transfers": self._transfers(),
+            "transfers": self._throttle.transfers(),
             "errors": {path.decode(errors="replace"): text for path, text in errors.items()},
             "files_delivered": self._deliverer.delivered,
             **self._deliverer.verifier.status(),
             "leftovers_mended": self._cleaner.mended,
             "armed": self._context.armed,
         }
-
-    def _transfers(self) -> list[dict[str, object]]:
-        """Return what is not delivered, what is on its way first; eta: seconds at the measured rate."""
-        waiting = [node for node in self._context.nodes if node.undelivered]
-        rate, before, found = self._throttle.meter.rate, 0, []
-        for node in sorted(waiting, key=lambda node: node.attempt is None):
-            assert node.draft is not None
-            before += node.draft.unacked
-            found.append(
-                {
-                    "path": node.path.decode(errors="replace"),
-                    "size": node.draft.size,
-                    "bytes_left": node.draft.unacked,
-                    "sending": node.attempt is not None,
-                    "eta": round(before / rate, 1) if rate else None,
-                }
-            )
-        return found
 
     async def _deliver_all(self) -> None:
         """Try to deliver everything once."""

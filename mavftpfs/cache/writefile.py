@@ -134,7 +134,7 @@ class ReadFile(_Reading, ReadOnlyHandle):
 
 
 class WriteFile(_Reading):
-    """One open() for writing (see cache.openfile.OpenFile)."""
+    """One open() for writing (see cache.openfile.OpenFile) of `node`."""
 
     writable = True
 
@@ -143,6 +143,7 @@ class WriteFile(_Reading):
         super().__init__(context, node, None)
         self._owner = owner
         self._made = made
+        self.node = node
         node.handles += 1
         node.writers += 1
 

@@ -12,6 +12,7 @@ from mavftpfs.shared.errors import (
     AlreadyExists,
     CrossDevice,
     DirectoryNotEmpty,
+    FtpNak,
     IsADirectory,
     NoSpace,
     NotADirectory,
@@ -165,3 +166,57 @@ async def test_they_are_bounded(store: FakeWriter) -> None:
     assert ((await tree.stat(SWAP)).mtime, (await tree.stat(SWAP)).mtime_nsec) == (7, 5)
     await tree.rename(FILE, b"/scripts/._x")
     assert store.files == {}
+
+
+async def test_a_failed_move_costs_nothing_that_was_accepted_before(
+    autojump_clock: object, nursery: trio.Nursery
+) -> None:
+    """The target was closed while the vehicle refused it, so its bytes are only here."""
+    store = FakeWriter(KINDS["posix"], nursery)
+    store.add_directory(b"/scripts")
+    tree = make_writable(store)
+    await write_file(tree, SWAP, b"new")
+    store.capacity = 0
+    with pytest.raises(FtpNak):
+        await write_file(tree, FILE, b"accepted")
+    with pytest.raises(FtpNak):
+        await tree.rename(SWAP, FILE)
+    assert await read_file(tree, SWAP) == b"new"
+    store.capacity = None
+    assert await tree.drain(60) == []
+    assert store.files[FILE].data == b"accepted"
+    nursery.cancel_scope.cancel()
+
+
+async def test_a_failed_move_over_another_spelling_moves_nothing(store: FakeWriter, tree: Tree) -> None:
+    other = b"/scripts/HOVER.LUA"
+    await write_file(tree, SWAP, b"new")
+    store.capacity = 0
+    with pytest.raises(FtpNak):
+        await tree.rename(SWAP, other)
+    store.capacity = None
+    assert tree.undelivered() == []
+    assert store.files[FILE].data == b"-- old"
+
+
+async def test_unlinked_ones_that_are_open_count_too(store: FakeWriter) -> None:
+    tree = make_writable(store, local_max=1000)
+    open_files = []
+    for _ in range(3):
+        file = await tree.create(SWAP, exclusive=True)
+        await file.write(0, b"x" * 100)
+        await tree.unlink(SWAP)
+        for at in range(100, 300, 100):
+            await file.write(at, b"x" * 100)
+        open_files.append(file)
+    assert tree.status()["bytes_local"] == 900
+    with pytest.raises(NoSpace):
+        await file.write(300, b"x" * 101)
+    with pytest.raises(NoSpace):
+        await write_file(tree, SWAP, b"x" * 101)
+    for file in open_files:
+        assert await file.read(0, 300) == b"x" * 300
+        await file.release()
+        file.close()
+    assert tree.status()["bytes_local"] == 0
+    await write_file(tree, SWAP, b"x" * 1000)

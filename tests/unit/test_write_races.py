@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Awaitable, Callable
+from typing import Any
 
 import pytest
 import trio
@@ -10,8 +11,8 @@ import trio
 from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.tree import Tree
 from mavftpfs.protocol.payload import NakCode, Opcode
-from mavftpfs.shared.errors import FtpNak, NotFound, NotSupported
-from tests.support.fake_writer import KINDS, FakeWriter, make_writable, write_file
+from mavftpfs.shared.errors import FtpNak, NotFound, NotSupported, RequestTimeout
+from tests.support.fake_writer import KINDS, FakeUpload, FakeWriter, make_writable, write_file
 
 FILE = b"/d/file"
 
@@ -166,3 +167,41 @@ async def test_a_file_is_opened_before_or_after_its_name_is_changed(
         written = () if change == "unlink" else (base[:3] + b"mid" + base[6:], b"\0\0\0mid")
         assert left[there] in (base, *written)
         assert store.crimes == []
+
+
+class SlowEnd(FakeWriter):
+    """Its uploads end slowly, as over a link that is silent."""
+
+    async def open_upload(self, *args: Any, **options: Any) -> FakeUpload:
+        upload = await super().open_upload(*args, **options)
+        abort = upload.abort
+
+        async def slow() -> None:
+            await trio.sleep(1)
+            await abort()
+
+        upload.abort = slow  # type: ignore[method-assign]
+        return upload
+
+
+async def test_what_is_opened_while_a_failed_truncation_is_given_up_is_written(
+    nursery: trio.Nursery, autojump_clock: object
+) -> None:
+    store = SlowEnd(KINDS["nuttx"], nursery)
+    store.add(FILE, b"x" * 700)
+    tree = make_writable(store)
+    await tree.list(b"/d")
+
+    async def cut() -> None:
+        store.fail_at = {4: RequestTimeout("silence")}
+        with pytest.raises(RequestTimeout):
+            await tree.truncate(FILE, 300)
+
+    async with trio.open_nursery() as both:
+        both.start_soon(cut)
+        await trio.sleep(0.5)
+        file = await tree.open(FILE, write=True)
+        await file.write(100, b"y")
+    await file.write(101, b"z")
+    await file.release()
+    assert store.files[FILE].data == b"x" * 100 + b"yz" + b"x" * 198
