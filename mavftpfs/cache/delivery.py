@@ -18,6 +18,7 @@ from mavftpfs.cache.context import Context
 from mavftpfs.cache.draft import Draft
 from mavftpfs.cache.nodes import Attempt, Node
 from mavftpfs.cache.plan import SENDING, Plan, Rules, choose
+from mavftpfs.cache.probes import Prober
 from mavftpfs.cache.recovery import describe
 from mavftpfs.cache.replacing import Present, Replacer
 from mavftpfs.cache.sure import Sure
@@ -27,12 +28,10 @@ from mavftpfs.shared.errors import (
     AlreadyExists,
     Armed,
     FileChanged,
-    FtpNak,
     LinkError,
     MavftpfsError,
     NoSpace,
     NotSupported,
-    PathTooLong,
     RemoteProtocolError,
     RequestTimeout,
     SessionBusy,
@@ -64,6 +63,7 @@ class Deliverer:
         self._rules = Rules(context.options.rmw_max, inplace=context.options.inplace)
         self.replacer = Replacer(context, sure)
         self.verifier = Verifier(context, sure)
+        self._prober = Prober(context)
         self.delivered = 0
         self.on_undelivered: Callable[[], None] = lambda: None
 
@@ -73,15 +73,22 @@ class Deliverer:
         Raises:
             The reason why not: as WriteStore; VerificationFailed, NotSupported, FileTooLarge, FileChanged.
         """
-        async with node.lock:
-            await self.deliver_locked(node)
+        while True:
+            async with node.lock:
+                if not node.doomed and await self.deliver_locked(node):
+                    return
 
-    async def deliver_locked(self, node: Node) -> None:
-        """Do the same for who holds the node's lock.
+    async def deliver_locked(self, node: Node) -> bool:
+        """Do the same for who holds the node's lock; return False if it was called off (Node.dooming).
 
         Raises:
             As deliver.
         """
+        with node.delivering() as scope:
+            await self._deliver_or_note(node)
+        return not scope.cancelled_caught
+
+    async def _deliver_or_note(self, node: Node) -> None:
         if not node.undelivered:
             await self.abandon(node)  # what was written since it began was taken back
             return
@@ -107,14 +114,19 @@ class Deliverer:
         Raises:
             As deliver.
         """
-        plan = self.plan(node)
-        if plan is Plan.PROBE:
-            await self._probe(node)
+        with node.delivering():
             plan = self.plan(node)
-        if plan not in SENDING or plan is Plan.REWRITE:
-            return False
-        (await self._attempt(node, plan)).upload.wake()
+            if plan is Plan.PROBE:
+                await self._prober.probe(node.path)
+                plan = self.plan(node)
+            if plan not in SENDING or plan is Plan.REWRITE:
+                return False
+            (await self._attempt(node, plan)).upload.wake()
         return True
+
+    def let_go(self) -> None:
+        """A file lost its name: who waits to write it need not wait."""
+        self._throttle.let_go()
 
     def plan(self, node: Node) -> Plan:
         """Return the next step for the node's draft. Raises as plan.choose."""
@@ -122,9 +134,12 @@ class Deliverer:
 
     async def abandon(self, node: Node) -> None:
         """Give up the present attempt; what it left under reserved names goes now or at the next listing."""
-        attempt, node.attempt = node.attempt, None
-        if attempt is None:
-            return
+        with node.firmly():
+            attempt, node.attempt = node.attempt, None
+            if attempt is not None:
+                await self._abandon(node, attempt)
+
+    async def _abandon(self, node: Node, attempt: Attempt) -> None:
         await attempt.upload.abort()
         if node.draft is not None:
             node.draft.made |= attempt.plan is Plan.NEW and attempt.upload.begun
@@ -134,7 +149,7 @@ class Deliverer:
         if attempt.places is not None:
             try:
                 if not attempt.committing:
-                    await self.replacer.clean(node.path, attempt.places, new=True)
+                    await self.replacer.clean(node.path, attempt.places, new=attempt.upload.begun)
                 elif node.path in self._context.torn:
                     self.replacer.leave(node.path, attempt.places)
             finally:
@@ -175,7 +190,7 @@ class Deliverer:
         if plan in SENDING:
             await self._send(node, plan)
         elif plan is Plan.PROBE:
-            await self._probe(node)
+            await self._prober.probe(node.path)
         elif plan is Plan.FILL:
             await base.fill(self._context, node)
         else:
@@ -189,7 +204,8 @@ class Deliverer:
         """Do what takes one request."""
         draft = _draft(node)
         if plan is Plan.CREATE_EMPTY:
-            await self._create_empty(node.path, draft)
+            with node.firmly():
+                await self._create_empty(node.path, draft)
         else:
             await self._context.writer.truncate(node.path, draft.size)
         await self.verifier.check(node.path, draft)
@@ -216,28 +232,6 @@ class Deliverer:
         draft.made = draft.maybe_made and await self.verifier.size(path) == 0
         return draft.made
 
-    async def _probe(self, node: Node) -> None:
-        """Find out what OpenFileWO does; what does not show itself is taken to empty files."""
-        try:
-            await self._probe_beside(node.path)
-        except PathTooLong as error:
-            log.info("what the vehicle does to open files stays unknown: %s", error)
-        traits = self._context.writer.traits
-        if traits.wo_truncates is None:
-            traits.wo_truncates = True
-
-    async def _probe_beside(self, path: bytes) -> None:
-        live, names = self._context.live, self._context.namer.probes(path)
-        live.update(names)
-        try:
-            await self._context.writer.probe_open_for_write(*names)
-        except FtpNak as nak:
-            if split(names[0])[0] == split(path)[0]:
-                raise
-            log.info("nothing can be tried out in a directory above %r: %s", path, nak)
-        finally:
-            live.difference_update(names)  # what is left there by an interruption is litter from now on
-
     # --- sending
 
     async def _send(self, node: Node, plan: Plan) -> None:
@@ -249,11 +243,13 @@ class Deliverer:
                 raise FileChanged(f"{node.path!r} was emptied on the vehicle while it was changed here")
             settled = self._context.clock() - node.delivered_at > SETTLED
             await self.verifier.check(attempt.path, draft, doubted(attempt.upload, draft, settled=settled))
-            await attempt.upload.abort()
-        if attempt.places is not None:
-            await self._commit(node, attempt)
-        node.attempt = None
-        self._on_delivered(node, draft)
+        with node.firmly():
+            if not attempt.committing:
+                await attempt.upload.abort()
+            if attempt.places is not None:
+                await self._commit(node, attempt)
+            node.attempt = None
+            self._on_delivered(node, draft)
 
     async def _attempt(self, node: Node, plan: Plan) -> Attempt:
         """Return the attempt under way if it still fits, else a new one."""

@@ -103,7 +103,7 @@ class Namespace(Names):
 
     async def unlink(self, path: bytes) -> None:
         """See Tree.unlink."""
-        async with self._changing(path):
+        async with self._changing(path, doomed=path):
             node = self._context.nodes.get(path)
             if node is not None and await self.entry(path) is not None:
                 await self._unlink_node(node, path)
@@ -120,7 +120,7 @@ class Namespace(Names):
         """See Tree.rename."""
         if new.startswith(old + b"/"):
             raise InvalidMove(f"{old!r} cannot become a part of itself")
-        async with self._changing(old, new):
+        async with self._changing(old, new, doomed=None if noreplace or old == new else new):
             wire_path(new)
             listed = await self.current(new, free=noreplace)
             target = listed or await self.entry(new)
@@ -156,10 +156,14 @@ class Namespace(Names):
     # --- inside: whom to wait for
 
     @asynccontextmanager
-    async def _changing(self, old: bytes, new: bytes | None = None) -> AsyncIterator[None]:
+    async def _changing(
+        self, old: bytes, new: bytes | None = None, *, doomed: bytes | None = None
+    ) -> AsyncIterator[None]:
         """Hold the path, or both, and the files there and below; those at the old path are delivered before.
 
-        A delivery may last: nobody waits for one, or makes one, while it keeps others from their paths.
+        A delivery may last: nobody waits for one, or makes one, while it keeps others from their paths. That
+        of a file which is to lose its name (`doomed`) is called off instead; if it keeps it after all, who
+        waits for the delivery has it begin again.
 
         Raises:
             FileBusy: one is still being delivered. RequestTimeout: another change took too long. Else as
@@ -170,9 +174,9 @@ class Namespace(Names):
             nodes = self._nodes_of(paths)
             try:
                 async with AsyncExitStack() as locks:
-                    await self._lock_nodes(nodes, locks)
-                    if new not in (None, old):
-                        await self._deliver_below(old, nodes)
+                    await self._lock_nodes(nodes, doomed, locks)
+                    if new not in (None, old) and not await self._deliver_below(old, nodes):
+                        continue
                     await locks.enter_async_context(self._paths.hold(*paths))
                     if self._nodes_of(paths) == nodes:
                         yield
@@ -180,23 +184,29 @@ class Namespace(Names):
             finally:
                 for node in nodes:
                     self._context.nodes.maybe_forget(node)  # a close that found it locked could not
+                self._deliverer.let_go()
         raise FileBusy(f"{old!r} is opened and closed all the time")
 
     def _nodes_of(self, paths: tuple[bytes, ...]) -> list[Node]:
         """Return the files concerned, in an order that renames do not change."""
         return sorted({node for path in paths for node in self._context.nodes.below(path)}, key=id)
 
-    async def _lock_nodes(self, nodes: list[Node], locks: AsyncExitStack) -> None:
+    async def _lock_nodes(self, nodes: list[Node], doomed: bytes | None, locks: AsyncExitStack) -> None:
         with trio.move_on_after(self._context.options.op_deadline) as scope:
             for node in nodes:
+                if node.path == doomed:
+                    locks.enter_context(node.dooming())
                 await locks.enter_async_context(node.lock)
         if scope.cancelled_caught:
             raise FileBusy("a file that is concerned is still being delivered")
 
-    async def _deliver_below(self, path: bytes, locked: list[Node]) -> None:
+    async def _deliver_below(self, path: bytes, locked: list[Node]) -> bool:
+        """Return False if a file among them is about to lose its name."""
         for node in locked:
-            if node.path == path or node.path.startswith(path + b"/"):
-                await self._deliverer.deliver_locked(node)
+            concerned = node.path == path or node.path.startswith(path + b"/")
+            if concerned and not await self._deliverer.deliver_locked(node):
+                return False
+        return True
 
     # --- inside: looking
 

@@ -7,6 +7,7 @@ it is unlinked. Nodes without handles and without anything to deliver are forgot
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 
 import trio
@@ -47,7 +48,8 @@ class Node:
     on the vehicle under a reserved name. error: why it could not be delivered. quiet: no delivery is under
     way, so it may be written. lock: held to deliver it and to change its path. starting: a background
     upload is about to begin. background: whether it may begin by itself; start_after: not before.
-    base: reads the vehicle's file. delivered_at: when the vehicle last had it all.
+    base: reads the vehicle's file. delivered_at: when the vehicle last had it all. doomed: how many changes
+    that take its name away have the lock, or are about to: no delivery begins or goes on.
     """
 
     path: bytes
@@ -67,6 +69,9 @@ class Node:
     delivered_at: float = float("-inf")
     lock: trio.Lock = field(default_factory=trio.Lock)
     quiet: trio.Event = field(default_factory=trio.Event)
+    doomed: int = 0
+    _delivery: trio.CancelScope | None = None
+    _firm: int = 0
 
     def __post_init__(self) -> None:
         self.quiet.set()
@@ -89,6 +94,40 @@ class Node:
             and self.draft is not None
             and self.draft.sending is not self.attempt.sending
         )
+
+    @contextmanager
+    def delivering(self) -> Iterator[trio.CancelScope]:
+        """The body brings it to the vehicle, unless it is cancelled because the name goes (`dooming`)."""
+        with trio.CancelScope() as scope:
+            self._delivery = scope
+            try:
+                yield scope
+            finally:
+                self._delivery = None
+
+    @contextmanager
+    def firmly(self) -> Iterator[None]:
+        """The body is short, and nobody would find what it leaves half done: it is not called off."""
+        self._firm += 1
+        try:
+            yield
+        finally:
+            self._firm -= 1
+            self._heed()
+
+    @contextmanager
+    def dooming(self) -> Iterator[None]:
+        """The body takes the lock, and then the name away: what is being delivered of it is called off."""
+        self.doomed += 1
+        self._heed()
+        try:
+            yield
+        finally:
+            self.doomed -= 1
+
+    def _heed(self) -> None:
+        if self.doomed and not self._firm and self._delivery is not None:
+            self._delivery.cancel()
 
     def require_reachable(self) -> None:
         """Raise FileChanged if its path may be another file's: it was replaced or removed, not hidden."""

@@ -378,8 +378,8 @@ class FakeUpload:
     async def abort(self) -> None:
         """See Upload."""
         self.aborted = True
-        self._open = False
-        await trio.lowlevel.checkpoint()
+        async with self._sending:  # what is under way is executed
+            self._open = False
 
     async def _run(self) -> None:
         try:
@@ -418,8 +418,8 @@ class FakeUpload:
         store = self._store
         store.require_free(self.path, self._free_at)
         reopened = self._opened_before and not store.kind.wo_truncates
-        await store.request("open", self.path, "create" if self._create and not reopened else "write")
         self._free_at, self.begun = None, True
+        await store.request("open", self.path, "create" if self._create and not reopened else "write")
         if self._create and not reopened:
             store._create(self.path)
             if self._opened_before:

@@ -25,6 +25,7 @@ class Faults:
         self._cut_after: int | None = None
         self._lose: list[int] = []
         self._deaf: set[int] = set()
+        self._counted: dict[int, Callable[[], None]] = {}
         self._hooks: list[tuple[int, Callable[[], None]]] = []
         server = world.vehicle.server
         self._handle, self._outgoing = server.handle, server.outgoing
@@ -47,10 +48,15 @@ class Faults:
         """Do something before the next request of this kind is executed."""
         self._hooks.append((int(opcode), action))
 
+    def after(self, count: int, action: Callable[[], None]) -> None:
+        """Do something when `count` more requests came to the server, before the last of them is executed."""
+        self._counted[len(self.requests) + count] = action
+
     def _on_request(self, wire: bytes, source: Address, now: float) -> None:
         if self._is_cut() or wire[_OPCODE] in self._deaf:
             return
         self.requests.append(wire[_OPCODE])
+        self._counted.pop(len(self.requests), lambda: None)()
         for hook in [hook for hook in self._hooks if hook[0] == wire[_OPCODE]]:
             self._hooks.remove(hook)
             hook[1]()
