@@ -27,3 +27,9 @@ class EngineStats:
     incoherent: int = 0
     timeouts: int = 0
     by_opcode: defaultdict[int, int] = field(default_factory=lambda: defaultdict(int))
+
+    @property
+    def strays(self) -> int:
+        """Answers that nobody waited for any more: the path doubles or holds back what it carries, so that a
+        request may reach the server once more, after newer ones."""
+        return self.unknown + self.spurious

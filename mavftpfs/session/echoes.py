@@ -31,8 +31,7 @@ class Echoes:
         """A request that takes a name away was answered or given up; repeated: it was sent more than once."""
         now = self._clock()
         self._until = {name: until for name, until in self._until.items() if until > now}
-        stats = self._engine.stats
-        if repeated or stats.unknown + stats.spurious:
+        if repeated or self._engine.stats.strays:
             least, most = QUIET
             quiet = min(most, max(least, QUIET_ROUND_TRIPS * (self._engine.rtt or 0.0)))
             self._until[path.lower()] = now + quiet

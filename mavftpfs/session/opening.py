@@ -175,7 +175,7 @@ class SessionOpener:
             return True
         plain = nak.code != NakCode.FAIL or self._server_assigns is True or path in self._failing
         # Else one of ours may have been executed, and a file be open under our id: ArduPilot's NAK 1.
-        if plain or not (nak.retransmitted or self._engine.stats.unknown + self._engine.stats.spurious):
+        if plain or not (nak.retransmitted or self._engine.stats.strays):
             self._doubtful = None
         return not plain
 

@@ -18,6 +18,10 @@ from mavftpfs.shared.traits import WriteTraits
 
 CONTENT = b"abc"
 
+LOOKS = 3
+"""How often at most it is looked what OpenFileWO does where requests are seen to come twice: until two looks
+agree. A late WriteFile fills a file that was emptied, a late CreateFile empties one that was not."""
+
 SILENCE = 6.0
 """Seconds after which TruncateFile of three bytes counts as not answered."""
 
@@ -49,7 +53,7 @@ class _Probe:
         try:
             if self._traits.wo_creates is None:
                 await self._open_missing()
-            await self._scheduler.use_session(self._path, Opcode.CREATE_FILE, self._write)
+            await self._fill()
             size: int | None = len(CONTENT)
             if self._traits.wo_truncates is None:
                 size = await self._open_existing()
@@ -82,19 +86,30 @@ class _Probe:
         entry, _ = await self._effects.find(self._path)
         self._traits.wo_creates = entry is not None
 
+    async def _fill(self) -> None:
+        await self._scheduler.use_session(self._path, Opcode.CREATE_FILE, self._write)
+
     async def _write(self, session: OpenSession) -> None:
         operation = Simple(Opcode.WRITE_FILE, CONTENT, session=session.id)
         await self._scheduler.metadata(operation, disturbs=False)
 
     async def _open_existing(self) -> int | None:
         """Return the size afterwards."""
-        try:
-            await self._scheduler.use_session(self._path, Opcode.OPEN_FILE_WO)
-        except FtpNak:
-            return len(CONTENT)
-        size = await self._size()
-        if size in (0, len(CONTENT)):
-            self._traits.wo_truncates = size == 0
+        seen: list[int | None] = []
+        for _ in range(LOOKS):
+            if seen and seen[-1] != len(CONTENT):
+                await self._fill()
+            try:
+                await self._scheduler.use_session(self._path, Opcode.OPEN_FILE_WO)
+            except FtpNak:
+                return len(CONTENT)
+            size = await self._size()
+            sure = size in seen or not self._scheduler.stats.strays
+            if sure and size in (0, len(CONTENT)):
+                self._traits.wo_truncates = size == 0
+            if sure:
+                break
+            seen.append(size)
         return size
 
     async def _truncate(self, size: int | None) -> None:
@@ -103,7 +118,7 @@ class _Probe:
             self._traits.truncate_works = False
             return
         if size == 0:  # emptied by OpenFileWO: fill it again
-            await self._scheduler.use_session(self._path, Opcode.CREATE_FILE, self._write)
+            await self._fill()
         wire = wire_path(self._path)
         operation = Simple(Opcode.TRUNCATE_FILE, wire, offset=1, patience=SILENCE, server_time=0.5)
         try:

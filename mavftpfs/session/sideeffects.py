@@ -181,7 +181,7 @@ class SideEffects:
 
     def _may_be_doubled(self, nak: FtpNak) -> bool:
         """Whether a refusal may answer the second execution of a request that was sent once."""
-        doubles = self._scheduler.stats.unknown + self._scheduler.stats.spurious > 0
+        doubles = self._scheduler.stats.strays > 0
         return doubles and nak.opcode in _TAKES_AWAY and nak.code in _MISSING
 
     async def _settle(self, nak: FtpNak, verify: Verdict, *, twice: bool, last: bool) -> bool:

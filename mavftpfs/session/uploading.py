@@ -106,7 +106,7 @@ class Uploading:
     def repeats(self) -> bool:
         """See UploadHost."""
         stats = self._engine.stats
-        return stats.unknown + stats.spurious + stats.retransmissions > 0
+        return stats.strays + stats.retransmissions > 0
 
     async def outlast_copies(self, created_at: float | None) -> None:
         """See UploadHost. What is verified after that stays as it is."""
@@ -117,8 +117,7 @@ class Uploading:
 
     def _feared_until(self, sent_at: float) -> float:
         """Return until when a copy of a request may still come, if this link was seen to be of that kind."""
-        stats = self._engine.stats
-        if not stats.unknown + stats.spurious:
+        if not self._engine.stats.strays:
             return sent_at
         least, most = STRAGGLE
         return sent_at + min(most, max(least, STRAGGLE_ROUND_TRIPS * (self._engine.rtt or 0.0)))
@@ -245,18 +244,25 @@ class Uploading:
 
     async def _try_reopening(self, upload: QueuedUpload) -> None:
         """Find out on a file of our own making what OpenFileWO does (servers.md 8): the size tells, asked
-        afterwards, since the reply to OpenFileWO may say what it was before."""
+        afterwards, since the reply to OpenFileWO may say what it was before.
+
+        Where requests come twice that is looked at twice: a late WriteFile fills a file that was emptied.
+        """
         traits, reached = self._queue.write_traits, upload.feed.reached
         upload.tried = True
-        try:
-            await self._holder.open(upload.path, Opcode.OPEN_FILE_WO)
-            size = await self._size(upload)
-        except FtpNak:
-            return  # it is refused, or somebody removed the file: what is not seen stays unknown
-        if size == 0:
-            traits.wo_truncates = True
-        elif size is not None and size >= reached:
-            traits.wo_truncates = False
+        await self.outlast_copies(upload.created_at)  # a late CreateFile empties it, too
+        for _ in range(2):
+            try:
+                await self._holder.open(upload.path, Opcode.OPEN_FILE_WO)
+                size = await self._size(upload)
+            except FtpNak:
+                return  # it is refused, or somebody removed the file: what is not seen stays unknown
+            if size is None or size < reached:
+                traits.wo_truncates = True if size == 0 else traits.wo_truncates
+                return
+            if not self._engine.stats.strays:
+                break
+        traits.wo_truncates = False
 
     async def _size(self, upload: QueuedUpload) -> int | None:
         """Return the size of the file, asked before OpenFileWO, which makes missing ones (servers.md 8)."""

@@ -1,0 +1,40 @@
+"""Requests that the network delivers once more, at an exact place among those that came after them."""
+
+from __future__ import annotations
+
+from mavftpfs.link.messages import Address
+from mavftpfs.protocol.payload import Opcode
+from tests.support.worlds import World
+
+_OPCODE = 3
+
+
+class Latecomer:
+    """Has a request of a kind executed once more, right after the server got the nth of another kind.
+
+    Which request of a kind: the last that came before. Its answer travels like any other.
+
+    Attributes:
+        late: seconds after the first execution; None while it was not repeated.
+    """
+
+    def __init__(self, world: World, what: Opcode, *, after: Opcode, nth: int = 1) -> None:
+        self.late: float | None = None
+        self._world = world
+        self._what, self._after, self._left = what, after, nth
+        self._kept: tuple[bytes, float] | None = None
+        self._handle = world.vehicle.server.handle
+        world.vehicle.server.handle = self._on_request  # type: ignore[method-assign]
+
+    def _on_request(self, wire: bytes, source: Address, now: float) -> None:
+        self._handle(wire, source, now)
+        if self.late is not None:
+            return
+        if wire[_OPCODE] == self._after and self._kept is not None:
+            self._left -= 1
+            if self._left == 0:
+                self.late = now - self._kept[1]
+                self._handle(self._kept[0], source, now)
+                self._world.link.kick()
+        if wire[_OPCODE] == self._what:
+            self._kept = (wire, now)
