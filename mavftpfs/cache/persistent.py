@@ -31,7 +31,7 @@ YOUNG = 60.0
 
 SETTLED = 12.0
 """Seconds after which bytes are beyond suspicion: another client of the vehicle is noticed within 10
-(session.scheduler.SUSPECT_WITHIN)."""
+(session.suspicion.SUSPECT_WITHIN)."""
 
 _LENGTH = struct.Struct("<I")
 

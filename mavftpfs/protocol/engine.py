@@ -51,6 +51,7 @@ class Engine:
     Attributes:
         session: the id that session-agnostic requests carry (the open one, else home_session).
         home_session: the id to ask for when opening, 1..255.
+        on_unknown: told of each answer that nobody waits for.
     """
 
     def __init__(
@@ -67,6 +68,7 @@ class Engine:
         self.flow = flow
         self.traits = Traits() if traits is None else traits
         self.stats = EngineStats()
+        self.on_unknown: Callable[[Payload], None] = lambda reply: None
         self._ledger = Ledger(rng.randrange(LAST_SEQ + 1))
         self._op_deadline = op_deadline
         self._note = note
@@ -208,6 +210,7 @@ class Engine:
             self.stats.incoherent += 1
         else:
             self.stats.unknown += 1
+            self.on_unknown(reply)
 
     def _on_stale(self, request: Request) -> None:
         """A replay of some earlier reply under this seq: this seq will never be answered (servers.md 2)."""

@@ -149,8 +149,7 @@ class SessionHolder:
         session = self.session
         if session is not None and self.claimed(session.path):
             await self.close_quietly()
-        doubtful = self.opener.doubtful_path
-        if doubtful is not None and self.claimed(doubtful):
+        if any(self.claimed(doubtful) for doubtful in self.opener.doubtful_paths):
             await self.close_doubtful()
 
     async def close_doubtful(self) -> None:
@@ -164,7 +163,7 @@ class SessionHolder:
 
     def _busy(self) -> list[bytes]:
         open_path = None if self.session is None else self.session.path
-        paths = (open_path, self._opening, self._closing, self.opener.doubtful_path)
+        paths = (open_path, self._opening, self._closing, *self.opener.doubtful_paths)
         return [path for path in paths if path is not None]
 
     def _tell(self) -> None:

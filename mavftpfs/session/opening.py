@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
+from functools import partial
 
 import trio
 
@@ -31,6 +32,7 @@ GATE_PATIENCE = 5.0
 """Seconds to wait for requests under way before falling silent."""
 
 _MAX_FAILING = 256
+_MAX_OPENED = 64
 
 TERMINATE_LIMIT = 5.0
 """Seconds to wait for a Terminate before the session is treated as doubtful."""
@@ -41,13 +43,15 @@ _SURELY_OPEN = 8.0
 
 @dataclass(frozen=True, slots=True)
 class OpenSession:
-    """The server's session, open on a file. size: as the open ACK said, None where it said nothing."""
+    """The server's session, open on a file. size: as the open ACK said, None where it said nothing. seq: of
+    that ACK."""
 
     path: bytes
     id: int
     size: int | None
     opened_at: float
     writing: bool = False
+    seq: int = -1
 
 
 class SessionOpener:
@@ -61,17 +65,28 @@ class SessionOpener:
         self._vehicle = vehicle
         self._gate = gate
         self._clock = clock
-        self._doubtful: int | None = None
-        self._doubtful_path: bytes | None = None
+        self._doubtful: dict[int, bytes] = {}
+        self._reopened: dict[int, bytes] = {}
+        self._opened: dict[int, bytes] = {}
+        self._disturbed = False
         self._server_assigns: bool | None = None
         self._failing: dict[bytes, None] = {}
         self.resets = 0
         self.quiet_periods = 0
 
     @property
-    def doubtful_path(self) -> bytes | None:
-        """The file that may still be open over there by our doing, None if there is none."""
-        return None if self._doubtful is None else self._doubtful_path
+    def doubtful_paths(self) -> list[bytes]:
+        """The files that may still be open over there by our doing."""
+        return [*self._doubtful.values(), *self._reopened.values()]
+
+    def opened_by(self, seq: int) -> bytes | None:
+        """Return which file an open had opened that was answered under `seq` lately, None if none was."""
+        return self._opened.get(seq)
+
+    def leave_open(self, session: int, path: bytes) -> None:
+        """An open came to the server once more: what it opened there is to be closed."""
+        self._disturbed |= session == self._own_id
+        self._reopened[session] = path
 
     async def open(self, path: bytes, opcode: Opcode = Opcode.OPEN_FILE_RO) -> OpenSession:
         """Open a file: OpenFileRO, OpenFileWO or CreateFile.
@@ -79,13 +94,13 @@ class SessionOpener:
         Raises:
             FtpNak: the server refused. SessionBusy: its session stayed taken. RequestTimeout.
         """
-        if self._doubtful is not None:
+        if self.doubtful_paths:
             await self._close_doubtful()
         remedies = [self._close_own, self._fall_silent, self._reset]
         last: FtpNak | None = None
         while True:
             try:
-                return await self._open_once(path, opcode)
+                return await self._open_undisturbed(path, opcode)
             except FtpNak as nak:
                 last = nak
                 if not self._looks_taken(nak, path):
@@ -119,11 +134,11 @@ class SessionOpener:
             self._vehicle.note_timeout()
             raise RequestTimeout("no answer to TerminateSession") from None
         except FtpNak as nak:
-            self._doubtful = None
+            self._trust(session.id)
             if nak.code != NakCode.FILE_EXISTS:  # PX4's sticky errno for "no such session"
                 raise
             operation.already_closed = True
-        self._doubtful = None
+        self._trust(session.id)
         if not operation.already_closed:
             return True
         return operation.retransmitted and self._clock() - asked_at < _SURELY_OPEN
@@ -143,25 +158,50 @@ class SessionOpener:
 
     def forget(self) -> None:
         """The server rebooted: nothing of ours is open."""
-        self._doubtful = None
+        self._doubtful.clear()
+        self._reopened.clear()
+        self._opened.clear()
         self._server_assigns = None
         self._engine.session = self._engine.home_session
 
     def _doubt(self, session: int, path: bytes) -> None:
-        self._doubtful = session
-        self._doubtful_path = path
+        self._doubtful[session] = path
+
+    def _trust(self, session: int) -> None:
+        self._doubtful.pop(session, None)
+
+    @property
+    def _own_id(self) -> int:
+        """The id under which a file is open over there that we asked for."""
+        return 0 if self._server_assigns is True else self._engine.home_session
+
+    async def _open_undisturbed(self, path: bytes, opcode: Opcode) -> OpenSession:
+        """Open; once more where an older open came to the server again meanwhile, perhaps after this one: on
+        MAVSDK the session is that file's then."""
+        self._disturbed = False
+        session = await self._open_once(path, opcode)
+        if self._disturbed:
+            await self.close(session)
+            session = await self._open_once(path, opcode)
+        return session
 
     async def _open_once(self, path: bytes, opcode: Opcode) -> OpenSession:
-        asked = self._engine.home_session
+        asked, expected = self._engine.home_session, self._own_id
         operation = OpenFile(opcode, wire_path(path), asked)
-        self._doubt(asked if self._server_assigns is not True else 0, path)
+        self._doubt(expected, path)
         # A time-out or cancellation leaves it doubtful: the open may have been executed.
         await self._run(operation)
-        self._doubtful = None
+        self._trust(expected)
+        self._trust(operation.session)
+        self._reopened.pop(operation.session, None)
         self._server_assigns = operation.session != asked
         self._engine.session = operation.session
+        seq = operation.reply.seq
+        self._opened[seq] = path
+        if len(self._opened) > _MAX_OPENED:
+            del self._opened[next(iter(self._opened))]
         writing = opcode != Opcode.OPEN_FILE_RO
-        return OpenSession(path, operation.session, operation.size, self._clock(), writing)
+        return OpenSession(path, operation.session, operation.size, self._clock(), writing, seq)
 
     def _remember_failing(self, path: bytes) -> None:
         """Silence did not help: what fails is this file, and nobody waits for it again."""
@@ -176,7 +216,7 @@ class SessionOpener:
         plain = nak.code != NakCode.FAIL or self._server_assigns is True or path in self._failing
         # Else one of ours may have been executed, and a file be open under our id: ArduPilot's NAK 1.
         if plain or not (nak.retransmitted or self._engine.stats.strays):
-            self._doubtful = None
+            self._trust(self._own_id)
         return not plain
 
     async def _close_own(self, nak: FtpNak) -> bool:
@@ -207,15 +247,20 @@ class SessionOpener:
         return await self._tolerate(lambda: self._run(reset))
 
     async def _close_doubtful(self) -> bool:
-        """Close a session that may still be ours, unless another client may own it by now."""
-        doubtful, self._doubtful = self._doubtful, None
-        if doubtful is None or (doubtful == 0 and self._vehicle.foreign_client(self._clock())):
-            return False
-        try:
-            return await self._tolerate(lambda: self._terminate(doubtful))
-        except BaseException:
-            self._doubtful = doubtful  # not answered: as doubtful as before
-            raise
+        """Close what may still be ours, but for what another client may own by now."""
+        closed = False
+        self._doubtful = self._reopened | self._doubtful
+        self._reopened.clear()
+        for session, path in list(self._doubtful.items()):
+            self._trust(session)
+            if session == 0 and self._vehicle.foreign_client(self._clock()):
+                continue
+            try:
+                closed |= await self._tolerate(partial(self._terminate, session))
+            except BaseException:
+                self._doubtful.setdefault(session, path)  # not answered: as doubtful as before
+                raise
+        return closed
 
     async def _terminate(self, session: int) -> None:
         """Terminate by the id we asked for, and by 0 where the server may have given us that instead."""

@@ -58,8 +58,8 @@ class Reading:
         if transfer.idle or transfer.done:
             self._holder.wake()
 
-    def on_reboot(self) -> None:
-        """Whatever is under way gets no more answers."""
+    def cut_off(self) -> None:
+        """Whatever is under way gets no more answers, or none to be believed."""
         if self._transfer is not None:
             self._driver.cancel(self._transfer)
 

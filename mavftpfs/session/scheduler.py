@@ -6,7 +6,6 @@ wake it. Metadata requests do not need the session: they run beside it and carry
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Awaitable, Callable
 from contextlib import AbstractAsyncContextManager
 from itertools import count
@@ -28,7 +27,9 @@ from mavftpfs.session.opening import OpenSession, SessionOpener
 from mavftpfs.session.policy import LIGHT_USE, is_starving
 from mavftpfs.session.reading import Reading
 from mavftpfs.session.readmode import ReadSteering
+from mavftpfs.session.strays import StrayOpens
 from mavftpfs.session.stream import FileStream
+from mavftpfs.session.suspicion import Suspicion
 from mavftpfs.session.upload import QueuedUpload
 from mavftpfs.session.uploading import Uploading
 from mavftpfs.session.vehicle import Vehicle
@@ -38,10 +39,6 @@ from mavftpfs.shared.traits import WriteTraits
 IDLE_CLOSE = 1.5
 """Seconds a file stays open on the server without being read. Below the 2 s after which PX4 frees its
 buffers and the 3 s after which ArduPilot gives the session away: so a session is never doubtful."""
-
-SUSPECT_WITHIN = 10.0
-"""Seconds before another FTP client is heard in which it may have been at work already: servers answer it
-on its own link, and a router may pass on only some of that."""
 
 _DOUBT_RETRY = 5.0
 _User = SessionJob | FileStream | QueuedUpload
@@ -83,13 +80,16 @@ class Scheduler:
         self._used_at = clock()
         self._tickets = count(1)
         self._streams: set[FileStream] = set()
-        self._closed: deque[FileStream] = deque()  # for as long as their bytes may yet come under suspicion
+        self._suspicion = Suspicion(clock)
         self._jobs: list[SessionJob] = []
         kit = Kit(self._holder, driver, engine, vehicle, self.gate, clock)
         self._reading = Reading(kit, self, steering)
         self._uploading = Uploading(
             kit, self, op_deadline=op_deadline, chunk=steering.chunk, when_armed_ok=when_armed_ok
         )
+        writer = self._uploading.writer
+        strays = StrayOpens(self._holder, self._others_about, self._on_session_taken, writer.on_emptied)
+        engine.on_unknown = strays.on_unknown
 
     @property
     def session(self) -> OpenSession | None:
@@ -234,24 +234,24 @@ class Scheduler:
 
     def on_suspect(self, reason: str) -> None:
         """Another FTP client was heard: what was read lately is provisional, also of files closed since."""
-        self._forget_closed()
-        for stream in [*self._streams, *self._closed]:
-            if stream is self._reading.active or self._is_recent(stream):
-                stream.on_suspect(reason)
+        self._suspicion.tell(self._streams, self._reading.active, reason)
 
-    def _is_recent(self, stream: FileStream) -> bool:
-        return stream.last_data_at is not None and stream.last_data_at > self._clock() - SUSPECT_WITHIN
+    def _on_session_taken(self, reason: str) -> None:
+        """What is open over there is another file than we think."""
+        self.on_suspect(reason)
+        self._reading.cut_off()
+        self._uploading.writer.cut_off()
+        self._holder.abandon()
+        self._holder.wake()
 
-    def _forget_closed(self) -> None:
-        """Forget the oldest of the closed streams, whose bytes are beyond suspicion."""
-        while self._closed and not self._is_recent(self._closed[0]):
-            self._closed.popleft()
+    def _others_about(self) -> bool:
+        return self._vehicle.foreign_client(self._clock())
 
     def on_reboot(self) -> None:
         """The vehicle restarted, perhaps as another one: nothing is open, nothing is known of it."""
         self.write_traits = WriteTraits()
         self._holder.forget()
-        self._reading.on_reboot()
+        self._reading.cut_off()
         self._uploading.on_reboot()
 
     def armed_changed(self, armed: bool) -> None:
@@ -292,8 +292,7 @@ class Scheduler:
         """Terminate the session, best effort; the caller bounds the wait and cancels `serve` first."""
         if self.session is not None:
             await self._holder.close()
-        else:
-            await self.opener.close_doubtful()
+        await self.opener.close_doubtful()
 
     def _on_want(self, stream: FileStream) -> None:
         if stream.closed:
@@ -303,11 +302,9 @@ class Scheduler:
         self._holder.wake()
 
     def _on_closed(self, stream: FileStream) -> None:
-        self._forget_closed()
         if stream in self._streams:
             self._streams.remove(stream)
-            if self._is_recent(stream):
-                self._closed.append(stream)
+            self._suspicion.on_closed(stream)
 
     def _take_ticket(self, stream: FileStream) -> None:
         if stream.has_demand:
@@ -377,7 +374,7 @@ class Scheduler:
             left = max(0.0, self._used_at + IDLE_CLOSE - now)
             if not await self._holder.sleep(min(left, until_upload)) and self._next() is None:
                 await self._holder.close()
-        elif self.opener.doubtful_path is not None and not self._vehicle.lost(now):
+        elif self.opener.doubtful_paths and not self._vehicle.lost(now):
             # An open or a Terminate that was never answered: leave no orphan over there.
             if not await self._holder.sleep(min(_DOUBT_RETRY, until_upload)):
                 await self._holder.close_doubtful()

@@ -104,8 +104,17 @@ class Writer:
     def on_reboot(self) -> None:
         """Perhaps other firmware runs now; nothing under way gets an answer."""
         self._disarmed_by_paths = False
+        self.cut_off()
+
+    def cut_off(self) -> None:
+        """The session is another file's, or nobody's."""
         if self._transfer is not None:
             self._driver.cancel(self._transfer)
+
+    def on_emptied(self) -> None:
+        """The file may have been emptied after the first bytes of it were written."""
+        if self.current is not None and self.current.feed.unproven:
+            self.current.usurped = True
 
     @property
     def resumable(self) -> bool:
@@ -174,7 +183,7 @@ class Writer:
         stop: Stop | None = None
         while not transfer.done:
             if self._holder.session is not session:
-                raise SessionLost("the vehicle restarted", by_server=True)
+                raise SessionLost("the vehicle restarted, or opened another file", by_server=True)
             stop = stop or self._reason_to_stop(upload, session, transfer)
             if self._in_doubt(transfer):
                 stop = Stop.DOUBT

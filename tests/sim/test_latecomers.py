@@ -5,18 +5,23 @@ Each is repeated at one exact place, within the time in which such copies are fe
 
 from __future__ import annotations
 
+import random
 from dataclasses import replace
 
 import pytest
 import trio
 from trio.testing import MockClock
 
+from mavftpfs.cache.options import CacheOptions
+from mavftpfs.cache.tree import Tree
 from mavftpfs.protocol.payload import Opcode
+from mavftpfs.session.connection import ConnectOptions
 from mavftpfs.session.echoes import QUIET
 from mavftpfs.sim.linkmodel import LinkSettings
 from mavftpfs.sim.profiles import PROFILES
 from tests.sim.test_upload import content, path, probes, put, world
 from tests.support.latecomers import Latecomer
+from tests.support.worlds import MemorySink, read_file
 
 EVERY_PROFILE = sorted(PROFILES)
 DOUBLING = LinkSettings(delay=0.02, duplicate=0.3, reorder=0.1)
@@ -70,3 +75,71 @@ async def test_a_late_write_does_not_hide_that_reopening_empties_files(
         assert connection.store.traits.wo_truncates is True
     for name, data in files.items():
         assert here.tree.data(name) == data
+
+
+@pytest.mark.parametrize("nth", [8, 9, 12])
+@pytest.mark.parametrize("profile", EVERY_PROFILE)
+async def test_a_late_open_of_another_file_gives_no_wrong_bytes(
+    profile: str, nth: int, autojump: MockClock
+) -> None:
+    """MAVSDK closes what is open and opens that one, under the same id; files of one size hide it."""
+    one, two = content(1500, 1), content(1500, 2)
+    here = world(profile, DOUBLING, one=one, two=two)
+    async with here.connection(ConnectOptions(window=1)) as connection:
+        await connection.store.list_directory(path(profile, ""))
+        copy = Latecomer(here, Opcode.OPEN_FILE_RO, after=Opcode.READ_FILE, nth=nth, first=True)
+        assert await read_file(connection, path(profile, "one")) == one
+        sink = MemorySink(len(two))
+        reader = await connection.store.open_reader(path(profile, "two"), sink)
+        reader.want(0, reader.size, demand=True)
+        data = await sink.wait_for(0, reader.size)
+        await trio.sleep(1)
+        assert copy.late is not None
+        assert data == two or sink.suspicions
+        reader.close()
+
+
+@pytest.mark.parametrize("opcode", [Opcode.OPEN_FILE_RO, Opcode.CREATE_FILE])
+@pytest.mark.parametrize("profile", EVERY_PROFILE)
+async def test_what_a_late_open_left_open_is_closed(
+    profile: str, opcode: Opcode, autojump: MockClock
+) -> None:
+    """On a server of several sessions the copy has one of its own, and its answer alone tells which."""
+    here = world(profile, f=content(1500))
+    async with here.connection() as connection:
+        await connection.store.list_directory(path(profile, ""))
+        copy = Latecomer(here, opcode, after=Opcode.TERMINATE_SESSION)
+        if opcode is Opcode.CREATE_FILE:
+            await put(connection, path(profile, "new"), content(500))
+        else:
+            await read_file(connection, path(profile, "f"))
+        await trio.sleep(8)
+        assert copy.late is not None
+        assert here.vehicle.server.open_sessions == 0
+
+
+@pytest.mark.parametrize("nth", [2, 20])
+@pytest.mark.parametrize("profile", EVERY_PROFILE)
+async def test_a_file_that_a_late_create_emptied_in_mid_upload_is_compared(
+    profile: str, nth: int, autojump: MockClock
+) -> None:
+    """MAVSDK writes on at the offsets it is told, so that the size is right and zeros come first."""
+    here = world(profile, DOUBLING)
+    data = content(6000)
+    async with here.connection(ConnectOptions(window=1)) as connection:
+        tree = Tree(
+            connection.store,
+            CacheOptions(verify="size"),
+            clock=trio.current_time,
+            invalidate=lambda path: None,
+            writer=connection.store,
+            rng=random.Random(3),
+        )
+        await tree.list(path(profile, "")[:-1])
+        copy = Latecomer(here, Opcode.CREATE_FILE, after=Opcode.WRITE_FILE, nth=nth)
+        file = await tree.create(path(profile, "new"), exclusive=True)
+        await file.write(0, data)
+        await file.release()
+        file.close()
+        assert copy.late is not None
+    assert here.tree.data(path(profile, "new")) == data

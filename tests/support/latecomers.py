@@ -12,16 +12,19 @@ _OPCODE = 3
 class Latecomer:
     """Has a request of a kind executed once more, right after the server got the nth of another kind.
 
-    Which request of a kind: the last that came before. Its answer travels like any other.
+    Which request of a kind: the first, or the last that came before. Its answer travels like any other.
 
     Attributes:
         late: seconds after the first execution; None while it was not repeated.
     """
 
-    def __init__(self, world: World, what: Opcode, *, after: Opcode, nth: int = 1) -> None:
+    def __init__(
+        self, world: World, what: Opcode, *, after: Opcode, nth: int = 1, first: bool = False
+    ) -> None:
         self.late: float | None = None
         self._world = world
         self._what, self._after, self._left = what, after, nth
+        self._first = first
         self._kept: tuple[bytes, float] | None = None
         self._handle = world.vehicle.server.handle
         world.vehicle.server.handle = self._on_request  # type: ignore[method-assign]
@@ -36,5 +39,5 @@ class Latecomer:
                 self.late = now - self._kept[1]
                 self._handle(self._kept[0], source, now)
                 self._world.link.kick()
-        if wire[_OPCODE] == self._what:
+        if wire[_OPCODE] == self._what and not (self._first and self._kept is not None):
             self._kept = (wire, now)

@@ -1,0 +1,55 @@
+"""Answers to opens that nobody waits for any more: the network doubled the request. Layer: session.
+
+An open that comes to the server once more is carried out once more (servers.md 2). What is open there then
+is another file than we think: MAVSDK closes ours and opens that one under the same id, CreateFile empties
+it first, other servers keep a session that nobody closes. The answer tells, because its seq is an old one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from mavftpfs.protocol.payload import Opcode, Payload
+from mavftpfs.session.holder import SessionHolder
+
+_OPENING = frozenset((Opcode.OPEN_FILE_RO, Opcode.OPEN_FILE_WO, Opcode.CREATE_FILE))
+
+
+class StrayOpens:
+    """Tells what a late second open did to the session.
+
+    Args:
+        is_shared: whether ids that the server chose may be another client's by now.
+        on_taken: the session was opened on another file: nothing that came by it lately is to be believed.
+        on_emptied: the file that is being written may have been emptied.
+    """
+
+    def __init__(
+        self,
+        holder: SessionHolder,
+        is_shared: Callable[[], bool],
+        on_taken: Callable[[str], None],
+        on_emptied: Callable[[], None],
+    ) -> None:
+        self._holder = holder
+        self._is_shared = is_shared
+        self._on_taken = on_taken
+        self._on_emptied = on_emptied
+
+    def on_unknown(self, reply: Payload) -> None:
+        """Take an answer that fits nothing outstanding."""
+        if reply.opcode != Opcode.ACK or reply.req_opcode not in _OPENING:
+            return
+        path = self._holder.opener.opened_by(reply.seq)
+        if path is None:
+            return
+        session = self._holder.session
+        changes = reply.req_opcode != Opcode.OPEN_FILE_RO
+        if session is not None and session.writing and session.path == path and changes:
+            self._on_emptied()
+        if session is None or session.id != reply.session:
+            if not self._is_shared():
+                self._holder.opener.leave_open(reply.session, path)
+                self._holder.wake()
+        elif session.seq != reply.seq and (changes or not session.writing):
+            self._on_taken(f"{path!r} was opened once more by a late request")
