@@ -123,6 +123,9 @@ class Background:
                     await self._deliverer.abandon(node)
                 elif node.attempt is None and node.undelivered:
                     node.background = await self._deliverer.begin_locked(node)
+                    self.on_cut(node)  # it may have been, meanwhile
+                    if node.overtaken:
+                        await self._deliverer.abandon(node)
         except MavftpfsError as error:
             node.start_after = self._context.clock() + START_PAUSE
             log.info("%r is not sent just now: %s", node.path, error)

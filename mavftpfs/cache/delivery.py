@@ -31,7 +31,6 @@ from mavftpfs.shared.errors import (
     LinkError,
     MavftpfsError,
     NoSpace,
-    NotSupported,
     RemoteProtocolError,
     RequestTimeout,
     SessionBusy,
@@ -144,7 +143,9 @@ class Deliverer:
         if node.draft is not None:
             node.draft.made |= attempt.plan is Plan.NEW and attempt.upload.begun
             node.draft.begin_again()
-        if attempt.path == node.path:
+        if attempt.plan is Plan.NEW and not attempt.upload.begun:
+            self._context.dentries.expire(split(node.path)[0], self._context.clock())  # it shows the file
+        elif attempt.path == node.path:
             self._context.dentries.note_unsized(node.path)
         if attempt.places is not None:
             try:
@@ -293,11 +294,11 @@ class Deliverer:
 
     def _free_at(self, path: bytes, draft: Draft) -> float | None:
         """Return when a listing last showed the name of a new file to be free, None if it need not be."""
-        if draft.remote_size is not None or draft.made or draft.overwrites:
+        if draft.on_vehicle:
             return None
         parent, name = split(path)
         known = self._context.dentries.known(parent)
-        if known is None or name in known.entries or not known.complete:
+        if known is None or not known.complete or name.lower() in map(bytes.lower, known.entries):
             return float("-inf")
         return known.listed_at
 
@@ -334,8 +335,9 @@ class Deliverer:
         attempt.committing = True
         try:
             await self.replacer.replace(attempt.path, node.path, attempt.places, present)
-        except NotSupported:
-            attempt.committing = False  # nothing was moved
+        except MavftpfsError as error:
+            if not isinstance(error, PASSING):
+                attempt.committing = node.path in self._context.torn  # else all is where it was
             raise
         self.replacer.release(attempt.places)
 

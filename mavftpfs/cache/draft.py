@@ -86,6 +86,11 @@ class Draft:
         return max(self.remote_size, self.sending.reached)
 
     @property
+    def on_vehicle(self) -> bool:
+        """Whether what has its name there is this file: it was there before, or we made it."""
+        return self.remote_size is not None or self.made or self.overwrites
+
+    @property
     def fresh(self) -> bool:
         """Whether nothing of the file on the vehicle is to stay."""
         return self.base_limit == 0

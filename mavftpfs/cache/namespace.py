@@ -266,10 +266,12 @@ class Namespace(Names):
         Raises:
             IsADirectory: it is a directory, and there is no file of ours that could lose its name.
         """
-        entry = await self.current(path)
-        if entry is not None and entry.kind is EntryKind.DIRECTORY and node.draft is None:
+        entry, draft = await self.current(path), node.draft
+        if entry is not None and entry.kind is EntryKind.DIRECTORY and draft is None:
             raise IsADirectory(f"{path!r} is a directory")
-        return entry is not None and entry.kind is EntryKind.FILE
+        if entry is None or entry.kind is not EntryKind.FILE:
+            return False
+        return draft is None or draft.on_vehicle or (draft.maybe_made and not entry.size)
 
     # --- inside: renaming
 

@@ -96,6 +96,54 @@ async def test_another_spelling_that_appeared_is_not_emptied(
     nursery.cancel_scope.cancel()
 
 
+async def test_two_spellings_of_a_new_name_are_not_one_file(
+    autojump_clock: object, nursery: trio.Nursery
+) -> None:
+    """Both are made before either is on a card that folds case; the listing shows neither."""
+    store = FakeWriter(KINDS["fat"], nursery)
+    store.add_directory(b"/card")
+    tree = make_writable(store)
+    files = [await tree.create(path, exclusive=True) for path in (NEW, b"/card/NEW")]
+    for number, file in enumerate(files):
+        await file.write(0, b"%d" % number)
+    await files[0].release()
+    with pytest.raises(AlreadyExists):
+        await files[1].release()
+    assert store.files[NEW].data == b"0"
+    assert tree.undelivered() == [b"/card/NEW"]
+    nursery.cancel_scope.cancel()
+
+
+async def test_removing_ours_does_not_remove_what_appeared(
+    autojump_clock: object, store: FakeWriter, tree: Tree
+) -> None:
+    file = await tree.create(NEW, exclusive=True)
+    await file.write(0, b"ours")
+    store.add(NEW, THEIRS)
+    await trio.sleep(FREE_FOR + 0.1)
+    with pytest.raises(AlreadyExists):
+        await file.release()
+    await tree.unlink(NEW)
+    assert (tree.undelivered(), store.files[NEW].data) == ([], THEIRS)
+    assert (await tree.stat(NEW)).size == len(THEIRS)
+    await tree.unlink(NEW)
+    assert NEW not in store.files
+
+
+async def test_removing_what_may_be_ours(autojump_clock: object, store: FakeWriter, tree: Tree) -> None:
+    """The reply to CreateFile was lost: an empty file is ours, one with content is not."""
+    for theirs in (b"", THEIRS):
+        file = await tree.create(NEW, exclusive=True)
+        store.lose_reply_at = {store.requests + 1}
+        with pytest.raises(RequestTimeout):
+            await file.release()
+        assert store.files[NEW].data == b""
+        store.add(NEW, theirs)
+        await trio.sleep(FREE_FOR + 0.1)
+        await tree.unlink(NEW)
+        assert (NEW in store.files) == bool(theirs)
+
+
 async def test_what_we_made_ourselves_is_gone_on_with(
     autojump_clock: object, store: FakeWriter, tree: Tree
 ) -> None:

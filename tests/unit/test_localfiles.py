@@ -17,6 +17,7 @@ from mavftpfs.shared.errors import (
     NoSpace,
     NotADirectory,
     NotFound,
+    VehicleLost,
 )
 from mavftpfs.shared.model import EntryKind
 from tests.support.fake_store import read_file
@@ -95,6 +96,19 @@ async def test_a_failed_move_to_the_vehicle_moves_nothing(store: FakeWriter, tre
     assert await read_file(tree, SWAP) == bytes(500)
     assert tree.undelivered() == []
     assert sorted(store.files) == [FILE]
+
+
+async def test_a_move_that_was_not_begun_shows_nothing(
+    monkeypatch: pytest.MonkeyPatch, store: FakeWriter, tree: Tree
+) -> None:
+    def lose_link(path: bytes, free_at: float | None) -> None:
+        raise VehicleLost("while it was looked for")
+
+    await write_file(tree, SWAP, b"new")
+    monkeypatch.setattr(store, "require_free", lose_link)
+    with pytest.raises(VehicleLost):
+        await tree.rename(SWAP, b"/scripts/new")
+    assert sorted(name for name, _ in await tree.list(b"/scripts")) == [b".hover.lua.swp", b"hover.lua"]
 
 
 async def test_trash(store: FakeWriter, tree: Tree) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 from collections.abc import AsyncIterator
+from contextlib import suppress
 
 import pytest
 import trio
@@ -145,3 +146,39 @@ async def test_the_same_when_it_is_listed_before(store: FakeWriter, tree: Tree) 
     await list_all(store, tree)
     assert not [path for path in store.files if is_reserved(split(path)[1])]
     assert await read_file(tree, FILE) == NEW
+
+
+@pytest.mark.parametrize("kind", ["posix", "fat"])
+@pytest.mark.parametrize("refused", [1, 2])
+async def test_what_is_refused_a_name_again_and_again_does_not_fill_the_card(
+    autojump_clock: object, nursery: trio.Nursery, kind: str, refused: int
+) -> None:
+    """No listing is made that would show it."""
+    store = FakeWriter(KINDS[kind], nursery)
+    store.add(FILE, OLD)
+    for number in range(10):  # so many that sizes are asked otherwise
+        store.add(b"/card/dir/%d" % number, b"x")
+    tree = make_writable(store)
+    await tree.list(b"/card/dir")
+    renames_left = 0
+
+    def refuse(what: str, *_: object) -> None:
+        nonlocal renames_left
+        renames_left -= what == "rename"
+        if what == "rename" and not renames_left:
+            store.fail_at[store.requests + 1] = FtpNak(Opcode.RENAME, NakCode.FAIL_ERRNO, errno.EACCES)
+
+    store.before_request = refuse
+    file = await tree.open(FILE, write=True, truncate=True)
+    await file.write(0, NEW)
+    for _ in range(5):
+        renames_left = refused
+        with suppress(FtpNak):
+            await file.flush()
+        assert [path for path in store.files if is_reserved(split(path)[1])] == []
+        if not tree.undelivered():
+            await file.write(0, b"x")
+    await file.release()
+    assert store.files[FILE].data in (NEW, b"x" + NEW[1:])
+    assert store.crimes == []
+    nursery.cancel_scope.cancel()

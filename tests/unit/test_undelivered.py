@@ -194,6 +194,27 @@ async def test_what_is_emptied_is_not_changed_in_place_any_more(
     assert litter(store) == []
 
 
+@pytest.mark.parametrize("size", [0, 100])
+async def test_what_is_cut_while_it_is_about_to_be_changed_in_place_is_not(
+    autojump_clock: object, store: FakeWriter, size: int
+) -> None:
+    """The size on the vehicle is being asked for."""
+    store.add(FILE, LARGE)
+    store.traits.wo_truncates = False
+    tree = make_writable(store)
+    file = await tree.open(FILE, write=True)
+    store.list_delay = 1.0
+    await file.write(0, b"n" * 70_000)
+    await trio.sleep(0.5)
+    await file.truncate(size)
+    await file.write(0, b"m" * 70_000)
+    await trio.sleep(20)
+    assert store.files[FILE].data == LARGE
+    await file.release()
+    assert store.files[FILE].data == b"m" * 70_000
+    assert litter(store) == []
+
+
 LARGE = bytes(range(256)) * 400
 
 
