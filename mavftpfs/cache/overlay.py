@@ -104,8 +104,7 @@ class Overlay:
 
     def on_written(self, path: bytes) -> None:
         """A file's content changed: what a user set is void, and a server that tells mtimes will tell now."""
-        directory = self._context.dentries.known(split(path)[0])
-        if directory is not None and any(entry.mtime is not None for entry in directory.entries.values()):
+        if self._context.dentries.tells_mtimes:
             self.times.set(path, self.now_ns())
         else:
             self.times.forget(path)  # the same constant as in every mount

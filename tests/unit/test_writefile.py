@@ -297,6 +297,15 @@ async def test_where_mtimes_are_listed_a_written_file_shows_the_time_of_day(
     assert (await tree.stat(FILE)).mtime == 1_700_000_000
 
 
+async def test_in_a_directory_just_made_too(store: FakeWriter, tree: Tree) -> None:
+    """Else the next listing changed the time of a file that an editor has open, and the editor asks who did."""
+    store.files[FILE].mtime = 1_500_000_000
+    await tree.stat(FILE)
+    await tree.mkdir(b"/card/new")
+    await write_file(tree, b"/card/new/file", b"data")
+    assert (await tree.stat(b"/card/new/file")).mtime == 1_700_000_000
+
+
 # --- files without a name
 
 
