@@ -298,7 +298,7 @@ async def test_where_mtimes_are_listed_a_written_file_shows_the_time_of_day(
 
 
 async def test_in_a_directory_just_made_too(store: FakeWriter, tree: Tree) -> None:
-    """Else the next listing changed the time of a file that an editor has open, and the editor asks who did."""
+    """Else the next listing changes the time of an open file, and its editor asks who changed it."""
     store.files[FILE].mtime = 1_500_000_000
     await tree.stat(FILE)
     await tree.mkdir(b"/card/new")
