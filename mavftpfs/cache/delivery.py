@@ -208,6 +208,8 @@ class Deliverer:
             with node.firmly():
                 await self._create_empty(node.path, draft)
         else:
+            if (size := await self.verifier.size(node.path)) < draft.size:  # it would be filled up with zeros
+                raise FileChanged(f"{node.path!r} has {size} bytes on the vehicle now: nothing to cut")
             await self._context.writer.truncate(node.path, draft.size)
         await self.verifier.check(node.path, draft)
         self._on_delivered(node, draft)

@@ -69,6 +69,41 @@ async def test_a_file_that_shrank_gets_no_hole(store: FakeWriter, tree: Tree, si
     file.close()
 
 
+@pytest.mark.parametrize("size", [0, 100, 499])
+async def test_cutting_a_file_that_shrank_since_does_not_fill_it_up(
+    size: int, nursery: trio.Nursery, autojump_clock: object
+) -> None:
+    """TruncateFile extends what is shorter: zeros where the program was shown bytes."""
+    store = FakeWriter(KINDS["posix"], nursery)
+    store.add(FILE, OLD)
+    tree = make_writable(store)
+    file = await tree.open(FILE, write=True)
+    store.files[FILE].data = OLD[:size]
+    await file.truncate(500)
+    for _ in range(2):
+        with pytest.raises(FileChanged):
+            await file.fsync()
+    assert store.files[FILE].data == OLD[:size]
+    file.close()
+    nursery.cancel_scope.cancel()
+
+
+@pytest.mark.parametrize("now", [OLD + OLD, OLD[:500]])
+async def test_cutting_a_file_that_grew_or_was_cut_there_is_no_matter(
+    now: bytes, nursery: trio.Nursery, autojump_clock: object
+) -> None:
+    store = FakeWriter(KINDS["posix"], nursery)
+    store.add(FILE, OLD)
+    tree = make_writable(store)
+    file = await tree.open(FILE, write=True)
+    store.files[FILE].data = now
+    await file.truncate(500)
+    await file.release()
+    assert store.files[FILE].data == OLD[:500]
+    file.close()
+    nursery.cancel_scope.cancel()
+
+
 async def test_what_is_known_here_is_sent_whole(store: FakeWriter, tree: Tree) -> None:
     """Nothing is left that could be kept, so it is allowed where files cannot be replaced, too."""
     file = await tree.open(FILE, write=True)
