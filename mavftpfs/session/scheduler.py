@@ -27,7 +27,7 @@ from mavftpfs.session.opening import OpenSession, SessionOpener
 from mavftpfs.session.policy import LIGHT_USE, is_starving
 from mavftpfs.session.reading import Reading
 from mavftpfs.session.readmode import ReadSteering
-from mavftpfs.session.strays import StrayOpens
+from mavftpfs.session.strays import Strays
 from mavftpfs.session.stream import FileStream
 from mavftpfs.session.suspicion import Suspicion
 from mavftpfs.session.upload import QueuedUpload
@@ -88,7 +88,8 @@ class Scheduler:
             kit, self, op_deadline=op_deadline, chunk=steering.chunk, when_armed_ok=when_armed_ok
         )
         writer = self._uploading.writer
-        strays = StrayOpens(self._holder, self._others_about, self._on_session_taken, writer.on_emptied)
+        news = (self._on_session_taken, writer.on_emptied, writer.on_disturbed)
+        strays = Strays(self._holder, self._others_about, *news)
         engine.on_unknown = strays.on_unknown
 
     @property

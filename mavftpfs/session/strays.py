@@ -1,8 +1,9 @@
-"""Answers to opens that nobody waits for any more: the network doubled the request. Layer: session.
+"""Answers that nobody waits for any more: the network doubled the request. Layer: session.
 
 An open that comes to the server once more is carried out once more (servers.md 2). What is open there then
 is another file than we think: MAVSDK closes ours and opens that one under the same id, CreateFile empties
 it first, other servers keep a session that nobody closes. The answer tells, because its seq is an old one.
+A ReadFile without an open file closes all that is open on MAVSDK, and a Terminate does on most.
 """
 
 from __future__ import annotations
@@ -13,15 +14,22 @@ from mavftpfs.protocol.payload import Opcode, Payload
 from mavftpfs.session.holder import SessionHolder
 
 _OPENING = frozenset((Opcode.OPEN_FILE_RO, Opcode.OPEN_FILE_WO, Opcode.CREATE_FILE))
+_DISTURBING = _OPENING | {
+    Opcode.READ_FILE,
+    Opcode.BURST_READ_FILE,
+    Opcode.TERMINATE_SESSION,
+    Opcode.RESET_SESSIONS,
+}
 
 
-class StrayOpens:
-    """Tells what a late second open did to the session.
+class Strays:
+    """Tells what a late second request did to the session.
 
     Args:
         is_shared: whether ids that the server chose may be another client's by now.
         on_taken: the session was opened on another file: nothing that came by it lately is to be believed.
         on_emptied: the file that is being written may have been emptied.
+        on_disturbed: a request came again that closes a session of some servers.
     """
 
     def __init__(
@@ -30,14 +38,18 @@ class StrayOpens:
         is_shared: Callable[[], bool],
         on_taken: Callable[[str], None],
         on_emptied: Callable[[], None],
+        on_disturbed: Callable[[], None],
     ) -> None:
         self._holder = holder
         self._is_shared = is_shared
         self._on_taken = on_taken
         self._on_emptied = on_emptied
+        self._on_disturbed = on_disturbed
 
     def on_unknown(self, reply: Payload) -> None:
         """Take an answer that fits nothing outstanding."""
+        if reply.req_opcode in _DISTURBING:
+            self._on_disturbed()
         if reply.opcode != Opcode.ACK or reply.req_opcode not in _OPENING:
             return
         path = self._holder.opener.opened_by(reply.seq)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from enum import Enum
+from math import inf
 
 from mavftpfs.protocol.operations import Simple
 from mavftpfs.protocol.payload import NakCode, Opcode
@@ -37,6 +38,9 @@ STALL = 2.0
 
 CHECKPOINT_EVERY = 60.0
 """Seconds after which an upload is terminated and resumed: what a lost session can cost."""
+
+DISTURBED_BEFORE = 1.0
+"""Seconds before we knew of a session in which the answer may have come to what closed it."""
 
 _TURN = 0.5
 _OFTEN = 0.25
@@ -85,6 +89,7 @@ class Writer:
         self._transfer: WriteTransfer | None = None
         self._starved_at: float | None = None
         self._filled = False
+        self._disturbed_at = -inf
 
     # --- news
 
@@ -115,6 +120,10 @@ class Writer:
         """The file may have been emptied after the first bytes of it were written."""
         if self.current is not None and self.current.feed.unproven:
             self.current.usurped = True
+
+    def on_disturbed(self) -> None:
+        """A request came again that may have closed the session."""
+        self._disturbed_at = self._clock()
 
     @property
     def resumable(self) -> bool:
@@ -155,7 +164,7 @@ class Writer:
                 return stop
             assert error is not None
             if not _is_disarmed(error) or rearms > 0:
-                self._note_refusal(upload, transfer.failed_at, error)
+                self._note_refusal(upload, session, transfer.failed_at, error)
                 raise error
             rearms += 1
             # From now on path operations take turns with this upload: first those that are under way end.
@@ -261,10 +270,14 @@ class Writer:
             return False
         return self.resumable or self._vehicle.foreign_client(now)
 
-    def _note_refusal(self, upload: QueuedUpload, offset: int | None, error: MavftpfsError) -> None:
-        """A refusal that means a lost session may mean a full card, too: the same place twice is enough."""
+    def _note_refusal(
+        self, upload: QueuedUpload, session: OpenSession, offset: int | None, error: MavftpfsError
+    ) -> None:
+        """A refusal that means a lost session may mean a full card, too: the same place twice is enough, but
+        for what a request of ours explains that came again."""
         nak = error.__cause__
-        if isinstance(nak, FtpNak) and nak.code == NakCode.FAIL:
+        disturbed = self._disturbed_at > session.opened_at - DISTURBED_BEFORE
+        if isinstance(nak, FtpNak) and nak.code == NakCode.FAIL and not disturbed:
             if offset is not None and offset == upload.refused_at:
                 raise nak
             upload.refused_at = offset

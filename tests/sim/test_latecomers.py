@@ -143,3 +143,16 @@ async def test_a_file_that_a_late_create_emptied_in_mid_upload_is_compared(
         file.close()
         assert copy.late is not None
     assert here.tree.data(path(profile, "new")) == data
+
+
+@pytest.mark.parametrize("profile", EVERY_PROFILE)
+async def test_late_reads_are_not_taken_for_a_full_card(profile: str, autojump: MockClock) -> None:
+    """MAVSDK closes what is written when a ReadFile comes, and refuses as where the card is full."""
+    here = world(profile, DOUBLING, f=content(1500))
+    async with here.connection() as connection:
+        await connection.store.list_directory(path(profile, ""))
+        copies = [Latecomer(here, Opcode.READ_FILE, after=Opcode.CREATE_FILE, nth=nth) for nth in (1, 2)]
+        await read_file(connection, path(profile, "f"))
+        await put(connection, path(profile, "new"), content(3000, 5))
+        assert copies[0].late is not None
+    assert here.tree.data(path(profile, "new")) == content(3000, 5)
