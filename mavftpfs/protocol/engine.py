@@ -363,20 +363,20 @@ class Engine:
 
     def _check_timers(self, now: float) -> None:
         self._due = inf
-        silent: set[str] = set()
+        silent: list[str] = []
         for request in self._ledger.flying():
             if request.timer <= now:
                 request.timer = self._reconsidered(request)
             if request.timer <= now:
                 if self._heard_at < request.sent_at:
-                    silent.add(request.manner.family)
+                    silent += [request.manner.family] * request.sends
                 self._expire(request, now)
             else:
                 self._due = min(self._due, request.timer)
-        for family in silent:
+        for family in set(silent):
             self._timers.of[family].on_silence()
         if silent:
-            self.flow.on_silence()
+            self.flow.on_silence(len(silent))
 
     def _reconsidered(self, request: Request) -> float:
         """Return when this transmission is overdue by what is known now: round trips may have grown."""

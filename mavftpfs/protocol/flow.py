@@ -21,6 +21,7 @@ from math import inf, sqrt
 
 from mavftpfs.protocol.budget import Budget
 from mavftpfs.protocol.easing import Easing
+from mavftpfs.protocol.flights import Flights
 from mavftpfs.protocol.pacing import Pacer
 from mavftpfs.protocol.stalls import Stalls
 from mavftpfs.protocol.survival import Survival
@@ -49,6 +50,7 @@ _NARROW = 0.6
 _TELLING_LOSSES = 8
 _DOUBT = 3
 _TELLING_ROUND = 16
+_TELLING_SILENCE = 3
 
 
 class Flow:
@@ -66,6 +68,7 @@ class Flow:
         "_cap",
         "_collapsed",
         "_easing",
+        "_flights",
         "_goal",
         "_heard_at",
         "_hurried",
@@ -123,6 +126,7 @@ class Flow:
         self._replies = 0
         self._losses = 0
         self._goal = 0
+        self._flights = Flights()
         self._all = 0
         self._all_losses = 0
         self._app_limited = False
@@ -238,7 +242,9 @@ class Flow:
         if self._collapsed:
             self.window, self._collapsed = min(self._cap, self._collapsed), 0
         if order >= self._round_end:
-            self._end_round(now, next_order)
+            self._end_round(now, order, next_order)
+        elif self._starting and order >= self._flights.due:
+            self._end_flight(now, order)
 
     def on_loss(self, order: int, sends: int = 1) -> None:
         """The transmission numbered `order` is taken to be lost, the `sends`th of its request."""
@@ -253,8 +259,11 @@ class Flow:
         """What was taken to be lost was answered after all."""
         self._losses = max(0, self._losses - 1)
 
-    def on_silence(self) -> None:
-        """Nothing at all was heard for a retransmission timeout: probe with two until something is."""
+    def on_silence(self, unheard: int = _TELLING_SILENCE) -> None:
+        """Nothing at all was heard for a retransmission timeout, after so many transmissions: probe with two
+        until something is. One or two are a lone request's bad luck."""
+        if unheard < _TELLING_SILENCE:
+            return
         if not self._collapsed:
             # What a small buffer survived it will survive again: there a silence is a few losses in a row.
             self._collapsed = self.window if self._survival else max(1, self.window // 2)
@@ -263,10 +272,19 @@ class Flow:
         if self._pacer is not None:
             self._pacer.on_silence()
 
-    def _end_round(self, now: float, next_order: int) -> None:
+    def _end_flight(self, now: float, order: int) -> None:
+        flights = self._flights
+        leap = flights.end(order, now - self._round_start, self._base_rtt)
+        if flights.measured:
+            self._trains.learn(flights.rate)
+            self._goal = int(min(self._cap, leap * self.window, self._filling(flights.rate)))
+            self.window = max(self.window, self._goal)
+
+    def _end_round(self, now: float, order: int, next_order: int) -> None:
         if self._round_end >= 0:
             self._learn(now, next_order)
         self._round_end = next_order
+        self._flights.begin(order, next_order, self.window)
         self._round_start = now
         self._round_least = inf
         self._replies = self._losses = 0
@@ -299,7 +317,7 @@ class Flow:
             self._easing.ceiling = max(INITIAL, self._held(self._best_rate))
             self._approach(self._easing.ceiling)
         elif self._starting and not self._leaves_start(grown):
-            self._goal = self._next_goal() if grown else 0
+            self._goal = self._next_goal() if grown and not self._flights.measured else 0
         else:
             self._goal = 0
             self._approach(self._easing.next_window(self._target(), self.loss, next_order))
@@ -341,7 +359,7 @@ class Flow:
         return not self._starting
 
     def _next_goal(self) -> int:
-        if not self._trains.proven:
+        if not self._trains.proven or self._flights.rate < self._trains.rate / 2:  # it was that of a bunch
             return min(self._cap, self.window * 2)
         return int(min(self._cap, self.window * _LEAP, self._held(inf)))
 
@@ -350,7 +368,11 @@ class Flow:
 
         rate: of answers; infinite to go by their pace alone, as while the window may be too small.
         """
-        held = min(rate / max(0.3, 1.0 - self.loss), self._trains.rate) * self._base_rtt
+        answered = max(0.3, 1.0 - self.loss)
+        return self._filling(min(rate / answered, self._trains.rate / sqrt(answered)))
+
+    def _filling(self, rate: float) -> float:
+        held = rate * self._base_rtt
         return held + min((_GAIN - 1.0) * held, _CURIOSITY) + _SLACK
 
     def _overflowed(self) -> bool:

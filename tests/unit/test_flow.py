@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import random
+from collections.abc import Callable
 from itertools import pairwise
 
 import pytest
 
+from mavftpfs.protocol.engine import Engine
 from mavftpfs.protocol.flow import DEFAULT_CAP, SERIAL_CAP, Flow
+from mavftpfs.protocol.operations import Simple
+from mavftpfs.protocol.payload import Opcode
 
 
 def test_a_pause_on_a_fast_path_lets_no_thousands_loose() -> None:
@@ -120,6 +125,56 @@ def test_goes_straight_to_what_a_path_with_a_pace_of_its_own_holds() -> None:
         now += max(0.3, window / 400.0)
         widest = max(widest, flow.window)
     assert 120 <= flow.window <= widest <= 132
+
+
+def flights(flow: Flow, spread: Callable[[int], float], count: int, *, base: float = 0.3) -> list[int]:
+    """Answer so many rows of requests that left in one go, spread(n) seconds from the first to the last of
+    n; return the windows they found."""
+    now, first = 0.0, 0
+    for _ in range(3):  # the round trip is known from some listings
+        now += base
+        flow.on_starved()
+        flow.on_reply(now, base, first, first + 1)
+        first += 1
+    windows = []
+    for _ in range(count):
+        window = flow.window
+        windows.append(window)
+        last = spread(window)
+        for index in range(window):
+            at = now + base + last * index / max(1, window - 1)
+            flow.on_reply(at, at - now, first + index, first + window + (index > 0))
+        first += window
+        now += max(base, last * window / max(1, window - 1))
+    return windows
+
+
+def test_two_rows_of_answers_tell_how_much_a_long_fat_path_holds() -> None:
+    rate = 3700.0
+    windows = flights(Flow(), lambda answers: (answers - 1) / rate, 6)
+    assert windows[:2] == [8, 64]
+    assert 0.3 * rate <= windows[2] <= 0.3 * rate + 16
+    assert max(windows) <= 0.3 * rate + 16
+
+
+def test_a_row_that_came_in_a_bunch_is_not_believed_alone() -> None:
+    """As where the air is shared out in turns: eight answers come at once, many do not."""
+    windows = flights(Flow(), lambda answers: 0.0001 if answers <= 8 else answers / 300.0, 4)
+    assert windows[:2] == [8, 64]
+    assert max(windows) <= 128
+    assert flights(Flow(), lambda answers: 0.0, 3)[1] <= 16
+
+
+def test_one_lost_request_is_no_silent_link() -> None:
+    engine = Engine(random.Random(1), Flow())
+    engine.start(Simple(Opcode.NONE), 0.0)
+    window = engine.flow.window
+    now = 0.0
+    for sends in range(1, 4):
+        engine.outgoing(now)
+        now = engine.next_deadline() or 0.0
+        engine.on_deadline(now)
+        assert (engine.flow.window == window) is (sends < 3)
 
 
 def test_random_loss_does_not_shrink_it() -> None:
