@@ -147,14 +147,20 @@ class ListDirectory(Operation):
 
     Only for paths known to be directories: listing a file kills a MAVSDK server.
 
+    Args:
+        foreseen: how many strings the directory probably holds, 0 if nobody knows. What follows them is asked
+            for beside the first page, and its answer used only if the first page ends just there: the request
+            is the one that would have gone out then, a round trip later.
+
     Attributes:
         entries: what was listed, each name once, `.` and `..` left out.
         complete: False when a cap or empty pages ended the sweep: absence of a name then proves nothing.
         hidden: names that cannot be shown (with a slash, a tab, or unparsable).
+        strings: how many strings were received so far, which is where the next page begins.
         on_page: called for each page.
     """
 
-    def __init__(self, path: bytes, with_time: bool = False) -> None:
+    def __init__(self, path: bytes, with_time: bool = False, *, foreseen: int = 0) -> None:
         super().__init__()
         if len(path) > MAX_DATA:
             raise PathTooLong(f"path of {len(path)} bytes does not fit the {MAX_DATA} of a request")
@@ -166,23 +172,42 @@ class ListDirectory(Operation):
         self._with_time = with_time
         self._opcode = Opcode.LIST_DIRECTORY_WITH_TIME if with_time else Opcode.LIST_DIRECTORY
         self._names: set[bytes] = set()
-        self._offset = 0
+        self.strings = 0
+        self._foreseen = foreseen
+        self._early: Request | None = None
+        self._early_reply: Payload | None = None
         self._asked = False
         self._pages = 0
         self._stale_pages = 0
         self._empty_pages = 0
 
     def next_request(self, now: float) -> Request | None:
-        """Return the request for the next page, one at a time."""
-        if self._asked:
-            return None
-        self._asked = True
+        """Return the request for the next page, and once the one for what probably follows it."""
+        if not self._asked:
+            self._asked = True
+            if self._early is None or self._early.offset != self.strings:
+                return self._request(self.strings)
+        if self._foreseen > self.strings == 0:
+            self._early, self._foreseen = self._request(self._foreseen), 0
+            return self._early
+        return None
+
+    def _request(self, offset: int) -> Request:
         manner = manner_of(self._opcode)
-        size = len(self._path)
-        return Request(self, self._opcode, manner, 0, self._offset, size, self._path, follows=True)
+        return Request(self, self._opcode, manner, 0, offset, len(self._path), self._path, follows=True)
 
     def on_reply(self, request: Request, reply: Payload, now: float) -> None:
         """Take a page, or find that there are no more."""
+        if request.offset != self.strings:  # what is behind the first page came before it, or is not there
+            self._early_reply = reply
+            return
+        self._on_page(request, reply)
+        early, known = self._early, self._early_reply
+        if early is not None and known is not None and early.offset == self.strings and not self.done:
+            self._early_reply = None
+            self._on_page(early, known)
+
+    def _on_page(self, request: Request, reply: Payload) -> None:
         if reply.opcode == Opcode.NAK:
             self._on_nak(nak_of(request, reply))
             return
@@ -194,7 +219,7 @@ class ListDirectory(Operation):
             self._on_empty_page()
             return
         self._empty_pages = 0
-        self._offset += page.strings
+        self.strings += page.strings
         self.hidden += page.hidden
         self._take(page.entries)
         if (
@@ -228,7 +253,7 @@ class ListDirectory(Operation):
     def _on_empty_page(self) -> None:
         # Old PX4 ends so; newer ones when an entry fits no page, and offset + 1 gets past it.
         self._empty_pages += 1
-        self._offset += 1
+        self.strings += 1
         if self._empty_pages >= _MAX_EMPTY_PAGES:
             # So many neighbours whose names fit no page look the same: behind them there may be more.
             self.complete = self._pages == self._empty_pages

@@ -17,6 +17,7 @@ import trio
 
 from mavftpfs.protocol.operations import Simple
 from mavftpfs.protocol.payload import NakCode, Opcode
+from mavftpfs.session.foresight import Foresight
 from mavftpfs.session.scheduler import Scheduler
 from mavftpfs.session.stale import StaleSessions
 from mavftpfs.shared.errors import FtpNak, MavftpfsError, PathTooLong, RequestTimeout
@@ -61,8 +62,11 @@ class SideEffects:
     RequestTimeout means: unknown, or known not to have happened. list_directory: sweeps a directory.
     """
 
-    def __init__(self, scheduler: Scheduler, list_directory: Lister, stale: StaleSessions) -> None:
+    def __init__(
+        self, scheduler: Scheduler, list_directory: Lister, stale: StaleSessions, foresight: Foresight
+    ) -> None:
         self._scheduler = scheduler
+        self._foresight = foresight
         self._stale = stale
         self._list_directory = list_directory
 
@@ -72,6 +76,7 @@ class SideEffects:
         async with self._in_time(), self._changing(path):
             with self._taking(path):
                 await self._perform(lambda: Simple(Opcode.REMOVE_FILE, wire), lambda: self._is_absent(path))
+            self._foresight.took(path)
             self._scheduler.gone(path)
 
     async def remove_directory(self, path: bytes) -> None:
@@ -82,6 +87,7 @@ class SideEffects:
                 await self._perform(
                     lambda: Simple(Opcode.REMOVE_DIRECTORY, wire), lambda: self._is_absent(path)
                 )
+            self._foresight.took(path)
 
     async def make_directory(self, path: bytes) -> None:
         """Make a directory."""
@@ -91,6 +97,7 @@ class SideEffects:
             await self._perform(
                 lambda: Simple(Opcode.CREATE_DIRECTORY, wire), lambda: self._is_new_directory(path)
             )
+            self._foresight.made(path)
 
     async def rename(self, old: bytes, new: bytes, *, completes: bool = False) -> None:
         """Rename; who reads the old path goes on under the new one. completes: in flight, too."""
@@ -106,6 +113,8 @@ class SideEffects:
             await self._scheduler.echoes.let_pass(new)
             with self._taking(old):
                 await self._perform(lambda: Simple(Opcode.RENAME, data), lambda: self._is_renamed(old, new))
+            self._foresight.took(old)
+            self._foresight.made(new)
             self._scheduler.gone(new)
             self._scheduler.moved(old, new)
 

@@ -10,6 +10,7 @@ import trio
 from mavftpfs.cache.remote import ReadSink
 from mavftpfs.protocol.operations import ListDirectory, Simple
 from mavftpfs.protocol.payload import NakCode, Opcode
+from mavftpfs.session.foresight import Foresight
 from mavftpfs.session.scheduler import Scheduler
 from mavftpfs.session.stale import StaleSessions
 from mavftpfs.session.stream import FileStream
@@ -44,7 +45,8 @@ class Store(WriteStore):
         op_deadline: float = 30.0,
     ) -> None:
         self._stale = StaleSessions(scheduler, clock, op_deadline)
-        super().__init__(scheduler, self.list_directory, self._stale)
+        self._foresight = Foresight()
+        super().__init__(scheduler, self.list_directory, self._stale, self._foresight)
         self._op_deadline = op_deadline
         self._vehicle = vehicle
         self._clock = clock
@@ -65,12 +67,14 @@ class Store(WriteStore):
         """The vehicle rebooted, perhaps with other firmware."""
         self._lists_times = None
         self._time_silences = 0
+        self._foresight.forget()
 
     async def list_directory(self, path: bytes) -> Listing:
         """Sweep a directory (see RemoteStore)."""
         wire = wire_path(path)
         started = self._clock()
         operation = await self._stale.outlast(partial(self._sweep_as_known, wire))
+        self._foresight.learn(wire, operation.strings)
         entries: tuple[DirEntry, ...] = tuple(operation.entries)
         return Listing(entries, self._clock() - started, operation.complete, operation.hidden)
 
@@ -123,7 +127,7 @@ class Store(WriteStore):
         return await self._sweep_asking_times(wire)
 
     async def _sweep(self, wire: bytes, *, patience: float | None = None) -> ListDirectory:
-        operation = ListDirectory(wire)
+        operation = ListDirectory(wire, foreseen=self._foresight.strings(wire))
         operation.patience = patience
         await self._scheduler.metadata(operation)
         return operation
@@ -133,7 +137,8 @@ class Store(WriteStore):
         began = self._clock()
         refused = False
         limit = float("inf") if self._lists_times else TIME_PROBE_LIMIT
-        asking = ListDirectory(wire, with_time=True)
+        foreseen = self._foresight.strings(wire) if self._lists_times else 0
+        asking = ListDirectory(wire, with_time=True, foreseen=foreseen)
         try:
             with trio.move_on_after(limit) as scope:
                 asking.on_page = partial(self._on_times, scope)

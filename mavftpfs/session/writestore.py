@@ -7,6 +7,7 @@ import errno
 from mavftpfs.cache.remote import FREE_FOR, UploadSource
 from mavftpfs.protocol.operations import Simple
 from mavftpfs.protocol.payload import NakCode, Opcode
+from mavftpfs.session.foresight import Foresight
 from mavftpfs.session.probing import probe_writing
 from mavftpfs.session.scheduler import Scheduler
 from mavftpfs.session.sideeffects import Lister, Outcome, SideEffects
@@ -29,9 +30,12 @@ _UNKNOWN_OPCODE = frozenset((NakCode.FAIL, NakCode.UNKNOWN_COMMAND))
 class WriteStore:
     """Uploads and side effects."""
 
-    def __init__(self, scheduler: Scheduler, list_directory: Lister, stale: StaleSessions) -> None:
+    def __init__(
+        self, scheduler: Scheduler, list_directory: Lister, stale: StaleSessions, foresight: Foresight
+    ) -> None:
         self._scheduler = scheduler
-        self._effects = SideEffects(scheduler, list_directory, stale)
+        self._foresight = foresight
+        self._effects = SideEffects(scheduler, list_directory, stale, foresight)
 
     @property
     def traits(self) -> WriteTraits:
@@ -52,6 +56,7 @@ class WriteStore:
         self._scheduler.check_may_write()
         if create:
             await self._scheduler.echoes.let_pass(path)
+            self._foresight.made(path)
         upload = self._scheduler.open_upload(path, source, create=create)
         upload.least = least
         upload.free_at = free_at
@@ -64,6 +69,7 @@ class WriteStore:
         if free_at is not None and self._scheduler.seconds_since(free_at) > FREE_FOR:
             await self._require_free(path)
         await self._scheduler.echoes.let_pass(path)
+        self._foresight.made(path)
         await self._scheduler.use_session(path, Opcode.CREATE_FILE)
 
     async def remove(self, path: bytes) -> None:

@@ -7,7 +7,7 @@ import trio
 from trio.testing import MockClock
 
 from mavftpfs.sim.linkmodel import LinkSettings
-from tests.support.worlds import World, read_file
+from tests.support.worlds import ROOTS, World, read_file
 
 RTT = 0.3
 LONG = LinkSettings(delay=RTT / 2)
@@ -30,3 +30,35 @@ async def test_a_long_fat_way_is_full_after_three_round_trips(
         began = trio.current_time()
         assert len(await read_file(connection, b"/d/f")) == size
         assert trio.current_time() - began <= 4 * RTT + READY + size / rate * 266 / 239
+
+
+@pytest.mark.parametrize("profile", PROFILES)
+async def test_a_directory_is_listed_again_in_one_round_trip(profile: str, autojump_clock: MockClock) -> None:
+    """The names and that there are no more of them: two requests, and neither waits for the other."""
+    world = World(profile, LONG)
+    directory = ROOTS.get(profile, b"") + b"/d"
+    for name in (b"a", b"b"):
+        world.tree.add(directory + b"/" + name, name)
+    async with world.connection() as connection:
+        store = connection.store
+
+        async def names() -> tuple[float, set[bytes]]:
+            began = trio.current_time()
+            listing = await store.list_directory(directory)
+            return trio.current_time() - began, {entry.name for entry in listing.entries}
+
+        await names()
+        requests = connection.engine.stats.requests
+        took, seen = await names()
+        assert (took <= RTT + READY, seen) == (True, {b"a", b"b"})
+        assert connection.engine.stats.requests == requests + 2
+        await store.make_directory(directory + b"/c")
+        await store.remove(directory + b"/a")
+        await store.create_empty(directory + b"/e")
+        await store.create_empty(directory + b"/f")
+        took, seen = await names()
+        assert (took <= RTT + READY, seen) == (True, {b"b", b"c", b"e", b"f"})
+        world.tree.add(directory + b"/g", b"of somebody else")
+        took, seen = await names()
+        assert (took <= 2 * RTT + READY, seen) == (True, {b"b", b"c", b"e", b"f", b"g"})
+        assert (await names())[0] <= RTT + READY

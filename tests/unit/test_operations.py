@@ -250,6 +250,72 @@ def test_empty_pages_behind_others_prove_no_end() -> None:
     assert not lister.op.complete
 
 
+class Foreseeing(Lister):
+    """A sweep that knows where the directory probably ends; pages are answered in any order."""
+
+    def __init__(self, foreseen: int) -> None:
+        super().__init__()
+        self.engine.cancel(self.op, 0.0)
+        self.op = ListDirectory(b"/d", foreseen=foreseen)
+        self.engine.start(self.op, 0.0)
+        self.asked: dict[int, Payload] = {}
+
+    def look(self) -> list[int]:
+        """Return the offsets of what goes out now."""
+        requests = sent(self.engine, 0.0)
+        self.asked |= {request.offset: request for request in requests}
+        return [request.offset for request in requests]
+
+    def tell(self, offset: int, data: bytes | None) -> None:
+        request = self.asked.pop(offset)
+        self.engine.receive(eof(request) if data is None else ack(request, data), 0.0)
+
+
+PAGE = b"Fa\t1\0Fb\t1\0"
+
+
+@pytest.mark.parametrize("order", [(0, 2), (2, 0)])
+def test_the_end_is_asked_for_beside_the_first_page_where_it_is_foreseen(order: tuple[int, int]) -> None:
+    lister = Foreseeing(2)
+    assert lister.look() == [0, 2]
+    for offset in order:
+        assert not lister.op.done
+        lister.tell(offset, None if offset else PAGE)
+    assert lister.op.done
+    assert lister.op.complete
+    assert lister.names == [b"a", b"b"]
+    assert lister.op.strings == 2
+
+
+@pytest.mark.parametrize("foreseen", [1, 4])
+@pytest.mark.parametrize("early_first", [True, False])
+def test_what_follows_another_number_of_names_proves_nothing(foreseen: int, early_first: bool) -> None:
+    """Others made or removed files: the sweep goes on where the first page ended."""
+    lister = Foreseeing(foreseen)
+    assert lister.look() == [0, foreseen]
+    early = None if foreseen == 4 else b"Fb\t1\0Fc\t1\0"
+    for offset in (foreseen, 0) if early_first else (0, foreseen):
+        lister.tell(offset, early if offset else PAGE)
+    assert not lister.op.done
+    assert lister.look() == [2]
+    lister.tell(2, b"Fc\t1\0")
+    assert lister.look() == [3]
+    lister.tell(3, None)
+    assert lister.op.done
+    assert lister.names == [b"a", b"b", b"c"]
+
+
+def test_an_end_foreseen_behind_several_pages_is_kept_until_the_sweep_comes_there() -> None:
+    lister = Foreseeing(4)
+    assert lister.look() == [0, 4]
+    lister.tell(4, None)
+    lister.tell(0, PAGE)
+    assert lister.look() == [2]
+    lister.tell(2, b"Fc\t1\0Fd\t1\0")
+    assert lister.op.done
+    assert lister.names == [b"a", b"b", b"c", b"d"]
+
+
 def test_empty_pages_alone_are_an_empty_directory() -> None:
     lister = Lister()
     for _ in range(4):

@@ -1,0 +1,47 @@
+"""How many strings a directory probably holds, so that a sweep can ask for its end at once. Layer: session.
+
+A server says that a listing is over only when it is asked for what follows, which costs a round trip more
+than the names do. Where they probably end is known from the last sweep and our own changes since then; who
+else changes the directory makes that wrong, which costs one request and proves nothing.
+"""
+
+from __future__ import annotations
+
+from mavftpfs.shared.model import split, wire_path
+
+_MOST = 512
+
+
+class Foresight:
+    """Remembers directories by path, the latest swept ones."""
+
+    def __init__(self) -> None:
+        self._strings: dict[bytes, int] = {}
+
+    def learn(self, directory: bytes, strings: int) -> None:
+        """A sweep came to its end after so many strings."""
+        self._strings.pop(directory, None)
+        self._strings[directory] = strings
+        if len(self._strings) > _MOST:
+            del self._strings[next(iter(self._strings))]
+
+    def strings(self, directory: bytes) -> int:
+        """Return how many a sweep will probably bring, 0 if nobody knows."""
+        return max(0, self._strings.get(directory, 0))
+
+    def made(self, path: bytes) -> None:
+        """We make this name."""
+        self._count(path, 1)
+
+    def took(self, path: bytes) -> None:
+        """We took this name away."""
+        self._count(path, -1)
+
+    def forget(self) -> None:
+        """It may be another card."""
+        self._strings.clear()
+
+    def _count(self, path: bytes, names: int) -> None:
+        directory = wire_path(split(path)[0])
+        if directory in self._strings:
+            self._strings[directory] += names
