@@ -1,14 +1,16 @@
-"""Names that a request may take away again, when the network delivers it late once more. Layer: session.
+"""Names that a request may change again, when the network delivers it late once more. Layer: session.
 
-RENAME, REMOVE and REMOVE DIRECTORY carry names, and servers carry out what they get: a request that was held
-back for longer than a round trip, and repeated meanwhile, moves or removes whatever has the name by then
-(servers replay the last answer only, MAVSDK none; servers.md 4). So a name that was taken away is not given
-to something new before such a request is dead.
+Requests that carry names are carried out whenever they come: one that was held back for longer than a round
+trip, and repeated meanwhile, moves, removes, makes, empties or cuts whatever has the name by then (servers
+replay the last answer only, MAVSDK none; servers.md 4). So a name that was taken away is not given to
+something new, one that was given is not taken away, and a file that was cut or emptied is not changed,
+before such a request is dead.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 
 import trio
 
@@ -20,15 +22,25 @@ QUIET_ROUND_TRIPS = 4.0
 
 
 class Echoes:
-    """What was taken away lately. Names that differ by case alone count as one, as on many cards."""
+    """What was changed lately. Names that differ by case alone count as one, as on many cards."""
 
     def __init__(self, engine: Engine, clock: Callable[[], float]) -> None:
         self._engine = engine
         self._clock = clock
         self._until: dict[bytes, float] = {}
 
-    def took(self, path: bytes, *, repeated: bool) -> None:
-        """A request that takes a name away was answered or given up; repeated: it was sent more than once."""
+    @contextmanager
+    def noted(self, path: bytes) -> Iterator[None]:
+        """The body sends a request that changes what has a name; a second execution of it may follow,
+        whatever became of the first."""
+        before = self._engine.stats.retransmissions
+        try:
+            yield
+        finally:
+            repeated = self._engine.stats.retransmissions > before  # ours or another's: better too often
+            self._note(path, repeated=repeated)
+
+    def _note(self, path: bytes, *, repeated: bool) -> None:
         now = self._clock()
         self._until = {name: until for name, until in self._until.items() if until > now}
         if repeated or self._engine.stats.strays:
@@ -37,7 +49,7 @@ class Echoes:
             self._until[path.lower()] = now + quiet
 
     async def let_pass(self, path: bytes) -> None:
-        """Wait until nothing takes the name away any more, one second at most; call before it is given."""
+        """Wait until no such request changes what has the name any more, one second at most."""
         rest = self._until.get(path.lower(), 0.0) - self._clock()
         if rest > 0.0:
             await trio.sleep(rest)

@@ -8,8 +8,8 @@ answers were seen that nobody waited for, a refusal as missing is looked into as
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
-from contextlib import asynccontextmanager, contextmanager
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import asynccontextmanager
 from enum import Enum
 from typing import TypeVar
 
@@ -74,7 +74,8 @@ class SideEffects:
         """Remove what is known to be a file."""
         wire = wire_path(path)
         async with self._in_time(), self._changing(path):
-            with self._taking(path):
+            await self._scheduler.echoes.let_pass(path)
+            with self._scheduler.echoes.noted(path):
                 await self._perform(lambda: Simple(Opcode.REMOVE_FILE, wire), lambda: self._is_absent(path))
             self._foresight.took(path)
             self._scheduler.gone(path)
@@ -83,7 +84,8 @@ class SideEffects:
         """Remove what is known to be an empty directory."""
         wire = wire_path(path)
         async with self._in_time(), self._changing(path, below=True):
-            with self._taking(path):
+            await self._scheduler.echoes.let_pass(path)
+            with self._scheduler.echoes.noted(path):
                 await self._perform(
                     lambda: Simple(Opcode.REMOVE_DIRECTORY, wire), lambda: self._is_absent(path)
                 )
@@ -94,9 +96,10 @@ class SideEffects:
         wire = wire_path(path)
         async with self._in_time(), self._changing(path):
             await self._scheduler.echoes.let_pass(path)
-            await self._perform(
-                lambda: Simple(Opcode.CREATE_DIRECTORY, wire), lambda: self._is_new_directory(path)
-            )
+            with self._scheduler.echoes.noted(path):
+                await self._perform(
+                    lambda: Simple(Opcode.CREATE_DIRECTORY, wire), lambda: self._is_new_directory(path)
+                )
             self._foresight.made(path)
 
     async def rename(self, old: bytes, new: bytes, *, completes: bool = False) -> None:
@@ -110,8 +113,9 @@ class SideEffects:
             self._changing(old, below=True, may=may),
             self._changing(new, may=may),
         ):
+            await self._scheduler.echoes.let_pass(old)
             await self._scheduler.echoes.let_pass(new)
-            with self._taking(old):
+            with self._scheduler.echoes.noted(old):
                 await self._perform(lambda: Simple(Opcode.RENAME, data), lambda: self._is_renamed(old, new))
             self._foresight.took(old)
             self._foresight.made(new)
@@ -121,7 +125,9 @@ class SideEffects:
     async def perform(self, path: bytes, make: Callable[[], Simple], verify: Verdict) -> None:
         """Run another request that changes `path`; verify tells from a listing what became of it."""
         async with self._changing(path):
-            await self._perform(make, verify)
+            await self._scheduler.echoes.let_pass(path)
+            with self._scheduler.echoes.noted(path):
+                await self._perform(make, verify)
 
     async def find(self, path: bytes) -> tuple[DirEntry | None, bool]:
         """Return a name's entry by a fresh listing of its parent, and whether the listing is complete."""
@@ -158,16 +164,6 @@ class SideEffects:
         async with self._scheduler.claim(path, below=below):
             may()  # closing our session may have taken a while
             yield
-
-    @contextmanager
-    def _taking(self, path: bytes) -> Iterator[None]:
-        """The body takes a name away; a second execution of it may follow, whatever became of the first."""
-        before = self._scheduler.stats.retransmissions
-        try:
-            yield
-        finally:
-            repeated = self._scheduler.stats.retransmissions > before  # ours or another's: better too often
-            self._scheduler.echoes.took(path, repeated=repeated)
 
     async def _perform(self, make: Callable[[], Simple], verify: Verdict) -> None:
         """Run a request; verify it if its answer may not be the answer to its first execution."""

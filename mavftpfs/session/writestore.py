@@ -54,8 +54,8 @@ class WriteStore:
         """Queue an upload; nothing is sent before the source has something or finish is called."""
         wire_path(path)
         self._scheduler.check_may_write()
+        await self._scheduler.echoes.let_pass(path)
         if create:
-            await self._scheduler.echoes.let_pass(path)
             self._foresight.made(path)
         upload = self._scheduler.open_upload(path, source, create=create)
         upload.least = least
@@ -70,7 +70,8 @@ class WriteStore:
             await self._require_free(path)
         await self._scheduler.echoes.let_pass(path)
         self._foresight.made(path)
-        await self._scheduler.use_session(path, Opcode.CREATE_FILE)
+        with self._scheduler.echoes.noted(path):
+            await self._scheduler.use_session(path, Opcode.CREATE_FILE)
 
     async def remove(self, path: bytes) -> None:
         """See cache.remote.WriteStore."""

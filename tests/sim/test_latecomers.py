@@ -15,12 +15,14 @@ from trio.testing import MockClock
 from mavftpfs.cache.options import CacheOptions
 from mavftpfs.cache.tree import Tree
 from mavftpfs.protocol.payload import Opcode
-from mavftpfs.session.connection import ConnectOptions
+from mavftpfs.session.connection import Connection, ConnectOptions
 from mavftpfs.session.echoes import QUIET
 from mavftpfs.sim.linkmodel import LinkSettings
 from mavftpfs.sim.profiles import PROFILES
+from tests.sim.test_stragglers import double
 from tests.sim.test_upload import content, path, probes, put, world
 from tests.support.latecomers import Latecomer
+from tests.support.sources import MemorySource
 from tests.support.worlds import MemorySink, read_file
 
 EVERY_PROFILE = sorted(PROFILES)
@@ -156,3 +158,68 @@ async def test_late_reads_are_not_taken_for_a_full_card(profile: str, autojump: 
         await put(connection, path(profile, "new"), content(3000, 5))
         assert copies[0].late is not None
     assert here.tree.data(path(profile, "new")) == content(3000, 5)
+
+
+SOON = [0.02, 0.1, 0.2]
+"""Seconds after which a request comes once more; a round trip takes 4 ms."""
+
+
+@pytest.mark.parametrize("late", SOON)
+@pytest.mark.parametrize("profile", EVERY_PROFILE)
+async def test_a_directory_that_was_removed_does_not_come_back(
+    profile: str, late: float, autojump: MockClock
+) -> None:
+    here = world(profile, replace(DOUBLING, delay=0.002, duplicate=1.0))
+    async with trio.open_nursery() as nursery, here.connection() as connection:
+        await connection.store.list_directory(path(profile, ""))
+        double(here, Opcode.CREATE_DIRECTORY, late, nursery.start_soon)
+        await connection.store.make_directory(path(profile, "new"))
+        await connection.store.remove_directory(path(profile, "new"))
+        await trio.sleep(1)
+    assert b"new" not in {entry.name for entry in here.tree.entries(path(profile, "")[:-1])}
+
+
+async def append(connection: Connection, target: bytes, data: bytes, at: int) -> None:
+    """Change a file in place."""
+    source = MemorySource(bytes(at) + data)
+    source.dirty.discard(0, at)
+    source.proven.add(0, at)
+    upload = await connection.store.open_upload(target, source, create=False)
+    await upload.finish()
+    await upload.abort()
+
+
+KEEPING = ["px4", "px4-2026", "spec", "ardupilot", "ardupilot5", "littlefs"]
+"""Servers whose OpenFileWO empties nothing."""
+
+
+@pytest.mark.parametrize("late", SOON)
+@pytest.mark.parametrize("profile", KEEPING)
+async def test_a_file_is_not_emptied_again_after_it_was_written(
+    profile: str, late: float, autojump: MockClock
+) -> None:
+    here = world(profile, replace(DOUBLING, delay=0.002, duplicate=1.0), f=content(100))
+    async with trio.open_nursery() as nursery, here.connection() as connection:
+        connection.store.traits.wo_truncates = False
+        await connection.store.list_directory(path(profile, ""))
+        double(here, Opcode.CREATE_FILE, late, nursery.start_soon)
+        await connection.store.create_empty(path(profile, "f"))
+        await append(connection, path(profile, "f"), b"hello", 0)
+        await trio.sleep(1)
+    assert here.tree.data(path(profile, "f")) == b"hello"
+
+
+@pytest.mark.parametrize("late", SOON)
+@pytest.mark.parametrize("profile", ["px4", "px4-2026", "spec"])
+async def test_a_file_is_not_cut_again_after_it_was_appended_to(
+    profile: str, late: float, autojump: MockClock
+) -> None:
+    here = world(profile, replace(DOUBLING, delay=0.002, duplicate=1.0), f=content(1000))
+    async with trio.open_nursery() as nursery, here.connection() as connection:
+        connection.store.traits.wo_truncates = False
+        await connection.store.list_directory(path(profile, ""))
+        double(here, Opcode.TRUNCATE_FILE, late, nursery.start_soon)
+        await connection.store.truncate(path(profile, "f"), 500)
+        await append(connection, path(profile, "f"), b"hello", 500)
+        await trio.sleep(1)
+    assert here.tree.data(path(profile, "f")) == content(1000)[:500] + b"hello"
