@@ -26,6 +26,11 @@ class BurstWatch:
         self._order = 0
         self._proof_wanted = 0
 
+    @property
+    def running(self) -> bool:
+        """Whether a burst is under way that we follow."""
+        return self.op is not None and self.op.bursting
+
     def begin(self, request: Request) -> None:
         """A BurstReadFile goes out."""
         self.op = request.op
@@ -51,7 +56,7 @@ class BurstWatch:
         """
         if traits.answers_during_burst is not None or not request.single or request.order < self._order:
             return
-        if self.op is not None and self.op.bursting:
+        if self.running:
             self._proof_wanted = _PACKETS_TO_BELIEVE
         elif self.heard_at - request.sent_at > 2 * timeout:
             traits.answers_during_burst = False

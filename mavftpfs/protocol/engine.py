@@ -12,19 +12,18 @@ Nothing that comes in can raise: `receive` takes any payload at any time.
 from __future__ import annotations
 
 import random
-from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from math import inf
 from operator import attrgetter
 
 from mavftpfs.protocol.burstwatch import BurstWatch
 from mavftpfs.protocol.flow import Flow
 from mavftpfs.protocol.ledger import LAST_SEQ, Ledger
-from mavftpfs.protocol.payload import NakCode, Opcode, Payload
-from mavftpfs.protocol.requests import Operation, Priority, Request
+from mavftpfs.protocol.payload import NakCode, Opcode, Payload, reply_of, split_run
+from mavftpfs.protocol.requests import Operation, Priority, Request, Run, encode_run
 from mavftpfs.protocol.stats import EngineStats
 from mavftpfs.protocol.timers import Timers
-from mavftpfs.shared.errors import RequestTimeout
+from mavftpfs.shared.errors import RemoteProtocolError, RequestTimeout
 from mavftpfs.shared.traits import Traits
 
 __all__ = ["Engine", "EngineStats"]
@@ -73,7 +72,7 @@ class Engine:
         self._op_deadline = op_deadline
         self._note = note
         self._ops: list[Operation] = []
-        self._finished: deque[Operation] = deque()
+        self._finished: list[Operation] = []
         self._timers = Timers()
         self._due = inf
         self._heard_at = -inf
@@ -137,8 +136,7 @@ class Engine:
 
     def take_finished(self) -> list[Operation]:
         """Return the operations that ended since the last call."""
-        finished = list(self._finished)
-        self._finished.clear()
+        finished, self._finished = self._finished, []
         return finished
 
     def _release(self, op: Operation) -> None:
@@ -161,56 +159,71 @@ class Engine:
             return
         request = self._ledger.find(seq)
         if request is None:
-            self._on_unknown(reply)
+            if req_opcode == _BURST and self._bursts.running:
+                self.stats.incoherent += 1
+            else:
+                self.stats.unknown += 1
+                self.on_unknown(reply)
         elif req_opcode != request.opcode:
             self._on_stale(request)
         elif opcode == _ACK and offset == request.offset and session == request.session:
             self._believe(request, reply, now)
-        elif not self._coherent(request, reply):
+        elif not request.fits(reply, self.traits):
             self.stats.incoherent += 1
         elif reply.opcode == _NAK and self._asks_again(request, reply):
             self.note("refused under an old session id: asking again")
         else:
             self._believe(request, reply, now)
 
-    def _coherent(self, request: Request, reply: Payload) -> bool:
-        if self.traits.ack_carries_own_session and reply.session != request.session and not request.follows:
-            return False
-        if reply.opcode == _ACK:
-            return reply.offset == request.offset or not request.manner.echoes_offset
-        return reply.opcode == _NAK
+    def receive_run(self, wires: Sequence[bytes], now: float) -> int:
+        """Take replies of 251 bytes that came together as `receive` does; return how many were malformed."""
+        replies = split_run(wires)
+        at, malformed = 0, 0
+        while at < len(replies):
+            run = self._ledger.settle_run(replies, at, self._bursts.heard_at)
+            try:
+                if run:
+                    self._believe_run(run, now)
+                else:
+                    self.receive(reply_of(replies[at]), now)
+            except RemoteProtocolError:
+                malformed += 1
+            at += len(run) or 1
+        return malformed
+
+    def _believe_run(self, run: Run, now: float) -> None:
+        request = run[0][0]
+        op = request.op
+        self.stats.replies += len(run)
+        self._heard_at = op.progress_at = now
+        rtt = self._timers.sample(request, now)
+        self.flow.on_replies(now, rtt, [request.order for request, _ in run], self._ledger.order)
+        for lost in self._ledger.lose_outrun():
+            self.flow.on_loss(lost.order)
+        op.on_run(run, now)
+        if op.done:
+            self._retire()
 
     def _believe(self, request: Request, reply: Payload, now: float) -> None:
-        stats = self.stats
-        stats.replies += 1
-        if reply.opcode == _NAK:
-            stats.naks += 1
+        self.stats.replies += 1
+        self.stats.naks += reply.opcode == _NAK
         self._heard_at = now
-        rtt, flow, ledger = None, self.flow, self._ledger
-        if not ledger.settle(request, reply.seq):
-            stats.spurious += 1
+        rtt, flow = None, self.flow
+        if not self._ledger.settle(request, reply.seq):
+            self.stats.spurious += 1
             flow.on_spurious()
         if self._bursts.heard_at >= request.sent_at:
             self._bursts.on_answer(request, self.traits, self.timeout(request.manner.family))
         elif request.single:
             rtt = self._timers.sample(request, now)
-        flow.on_reply(now, rtt, request.order, ledger.order)
-        if ledger.newest_answered - ledger.reorder >= ledger.first:
-            for lost in ledger.lose_outrun():
-                flow.on_loss(lost.order)
+        flow.on_reply(now, rtt, request.order, self._ledger.order)
+        for lost in self._ledger.lose_outrun():
+            self.flow.on_loss(lost.order)
         op = request.op
         op.progress_at = now
         op.on_reply(request, reply, now)
         if op.done:
             self._retire()
-
-    def _on_unknown(self, reply: Payload) -> None:
-        op = self._bursts.op
-        if reply.req_opcode == _BURST and op is not None and op.bursting:
-            self.stats.incoherent += 1
-        else:
-            self.stats.unknown += 1
-            self.on_unknown(reply)
 
     def _on_stale(self, request: Request) -> None:
         """A replay of some earlier reply under this seq: this seq will never be answered (servers.md 2)."""
@@ -252,11 +265,6 @@ class Engine:
             self._retire()
         return True
 
-    def _begin_burst(self, request: Request, now: float) -> None:
-        self._bursts.begin(request)
-        # Whatever the burst's packets use as seq must not be a seq of ours (servers.md 2, collision).
-        self._ledger.jump(request.op.on_burst_sent(request, now))
-
     # --- what goes out
 
     def outgoing(self, now: float) -> list[bytes]:
@@ -265,12 +273,7 @@ class Engine:
         self.flow.begin()
         if len(self._ops) > 1:
             self._ops.sort(key=attrgetter("priority"))
-        starved = True
-        for op in self._ops:
-            starved = self._serve(op, now, wires)
-            if not starved:
-                break
-        if starved:
+        if all(self._serve(op, now, wires) for op in self._ops):
             self.flow.on_starved()
         if self.flow.held:
             for op in self._ops:
@@ -291,48 +294,42 @@ class Engine:
         room = self.flow.room(in_flight, now, paced=op.paced, urgent=op.priority is Priority.METADATA)
         left = room
         while left > 0:
-            request = ledger.take_again(op) if ledger.again else None
-            if request is None:
-                request = op.next_request(now)
-            if request is None:
+            again = ledger.take_again(op) if ledger.again else None
+            requests = op.next_requests(left, now) if again is None else [again]
+            if not requests:
                 break
-            wires.append(self._transmit(request, now))
-            left -= 1
+            wires += self._transmit(requests, now)
+            left -= len(requests)
         if sent := room - left:
             self.stats.requests += sent
             self.flow.on_sent(sent, now)
         return left > 0
 
-    def _transmit(self, request: Request, now: float) -> bytes:
-        opcode = request.opcode
-        self.stats.by_opcode[opcode] += 1
-        if request.follows:
-            request.session = self.session
-        timer = now + self._timers.of[request.manner.family].rto
-        if request.sends or opcode == _BURST:
-            self._transmit_again(request, now)
+    def _transmit(self, requests: Sequence[Request], now: float) -> list[bytes]:
+        """Number requests of one opcode and return them encoded."""
+        first = requests[0]
+        opcode = first.opcode
+        self.stats.by_opcode[opcode] += len(requests)
+        if first.follows:
+            first.session = self.session
+        if first.sends or opcode == _BURST:
+            self._transmit_again(first, now)
         else:
-            request.sent_at = request.first_sent = now
-            request.op.sent = True
-            self._ledger.launch(request)
-            request.sends = 1
-            request.timer = timer
-            if timer < self._due:
-                self._due = timer
-        return request.encode()
+            timer = now + self._timers.of[first.manner.family].rto
+            first.op.sent = True
+            self._ledger.launch(requests, now, timer)
+            self._due = min(self._due, timer)
+        return encode_run(requests)
 
     def _transmit_again(self, request: Request, now: float) -> None:
         """Number a repeated request, or a burst, which is never repeated."""
-        self._ledger.number(request)
-        request.sent_at = now
-        if request.sends == 0:
-            request.first_sent = now
-            request.op.sent = True
-        else:
-            self.stats.retransmissions += 1
-        request.sends += 1
+        self._ledger.number(request, now)
+        request.op.sent = True
+        self.stats.retransmissions += request.sends > 1
         if request.opcode == _BURST:
-            self._begin_burst(request, now)
+            self._bursts.begin(request)
+            # Whatever the burst's packets use as seq must not be a seq of ours (servers.md 2, collision).
+            self._ledger.jump(request.op.on_burst_sent(request, now))
         else:
             self._ledger.enter(request)
             request.timer = now + self._timers.wait(request)

@@ -22,6 +22,7 @@ from math import inf, sqrt
 from mavftpfs.protocol.budget import Budget
 from mavftpfs.protocol.easing import Easing
 from mavftpfs.protocol.flights import Flights
+from mavftpfs.protocol.overflow import Overflow
 from mavftpfs.protocol.pacing import Pacer
 from mavftpfs.protocol.stalls import Stalls
 from mavftpfs.protocol.survival import Survival
@@ -47,8 +48,6 @@ _QUEUE_SECONDS = 0.005
 _ROUNDS_REMEMBERED = 10
 _PLATEAU_ROUNDS = 2
 _NARROW = 0.6
-_TELLING_LOSSES = 8
-_DOUBT = 3
 _TELLING_ROUND = 16
 _TELLING_SILENCE = 3
 
@@ -59,8 +58,6 @@ class Flow:
     default. budget: the user's. alone: no other client of the server was heard lately."""
 
     __slots__ = (
-        "_all",
-        "_all_losses",
         "_app_limited",
         "_base_rtt",
         "_best_rate",
@@ -75,6 +72,7 @@ class Flow:
         "_limit",
         "_losses",
         "_narrow",
+        "_overflow",
         "_pacer",
         "_plateau",
         "_rates",
@@ -118,17 +116,14 @@ class Flow:
         self._heard_at = -inf
         self._hurried = False
         self._brake = 1.0
-        self._plateau = 0
-        self._collapsed = 0
+        self._plateau = self._collapsed = 0
         self._round_end = -1
         self._round_start = 0.0
         self._round_least = inf
-        self._replies = 0
-        self._losses = 0
+        self._replies = self._losses = 0
         self._goal = 0
         self._flights = Flights()
-        self._all = 0
-        self._all_losses = 0
+        self._overflow = Overflow()
         self._app_limited = False
 
     @property
@@ -225,26 +220,45 @@ class Flow:
 
     def on_reply(self, now: float, rtt: float | None, order: int, next_order: int) -> None:
         """A request was answered. order: of its transmission; next_order: what the next one will get."""
-        self._replies += 1
-        self._trains.on_reply(now)
+        self._count(1, now, rtt)
         if self.window < self._goal:
             # Two new requests for each answer: doubling without a flood, which a known pace prevents.
             self.window = self._goal if self._trains.proven else self.window + 1
         if order < self._easing.until:
             self._easing.count(order, lost=False)
-        if now != self._heard_at:  # what comes at once has no pauses
-            self._heard_at = now
-            self._stalls.on_reply(now, 0.0 if self._starting else self._best_rate)
         if self._pacer is not None:
             self._pacer.on_reply(now, rtt, order, next_order)
-        if rtt is not None and rtt < self._round_least:
-            self._round_least = rtt
         if self._collapsed:
             self.window, self._collapsed = min(self._cap, self._collapsed), 0
         if order >= self._round_end:
             self._end_round(now, order, next_order)
         elif self._starting and order >= self._flights.due:
             self._end_flight(now, order)
+
+    def on_replies(self, now: float, rtt: float, orders: list[int], next_order: int) -> None:
+        """As `on_reply`, of requests that went out together and were answered together."""
+        closely = self._starting or self.window < self._goal or self._collapsed or self._pacer is not None
+        closely = closely or min(orders) < self._easing.until
+        plain = 0
+        for order in orders:
+            if closely or order >= self._round_end:
+                self._count(plain, now, rtt)
+                plain = 0
+                self.on_reply(now, rtt, order, next_order)
+            else:
+                plain += 1
+        self._count(plain, now, rtt)
+
+    def _count(self, answers: int, now: float, rtt: float | None) -> None:
+        if not answers:
+            return
+        self._replies += answers
+        self._trains.on_replies(answers, now)
+        if now != self._heard_at:  # what comes at once has no pauses
+            self._heard_at = now
+            self._stalls.on_reply(now, 0.0 if self._starting else self._best_rate)
+        if rtt is not None and rtt < self._round_least:
+            self._round_least = rtt
 
     def on_loss(self, order: int, sends: int = 1) -> None:
         """The transmission numbered `order` is taken to be lost, the `sends`th of its request."""
@@ -291,7 +305,7 @@ class Flow:
         self._app_limited = False
 
     def _learn(self, now: float, next_order: int) -> None:
-        overflowed = self._overflowed()
+        overflowed = self._overflow.judge(self._replies, self._losses)
         total = self._replies + self._losses
         self.loss += (self._losses / total - self.loss) * 0.2
         self._learn_base()
@@ -374,15 +388,6 @@ class Flow:
     def _filling(self, rate: float) -> float:
         held = rate * self._base_rtt
         return held + min((_GAIN - 1.0) * held, _CURIOSITY) + _SLACK
-
-    def _overflowed(self) -> bool:
-        """Whether so much more was lost than in all rounds before that the window must be to blame."""
-        total, lost = self._replies + self._losses, self._losses
-        before = (self._all_losses + _DOUBT) / (self._all + 2 * _DOUBT)
-        self._all += total
-        self._all_losses += lost
-        chance = _DOUBT * sqrt(total * before * (1.0 - before))
-        return lost >= _TELLING_LOSSES and lost > (before + 0.1) * total + chance
 
     def _target(self) -> float:
         rate, base = self._best_rate, self._base_rtt

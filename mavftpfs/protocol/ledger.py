@@ -9,10 +9,11 @@ its place in the window, because the server still has it in its queue.
 
 from __future__ import annotations
 
-from collections import OrderedDict
+from collections.abc import Sequence
+from itertools import islice
 
-from mavftpfs.protocol.payload import Payload
-from mavftpfs.protocol.requests import Operation, Request, Transmission
+from mavftpfs.protocol.payload import MAX_DATA, Fields, Opcode, Payload
+from mavftpfs.protocol.requests import Operation, Request, Run, Transmission
 from mavftpfs.shared.errors import LocalProtocolError
 
 LAST_SEQ = 65534
@@ -22,6 +23,7 @@ BURST_JUMP = 4096
 FURTHEST_JUMP = LAST_SEQ + 1 - 2 * BURST_JUMP
 """Further on come the seqs just used, whose late replies may still be about."""
 
+_ACK = int(Opcode.ACK)
 _MIN_REORDER = 3
 _MAX_REORDER = 64
 _MOST_QUICK_SENDS = 8
@@ -50,7 +52,6 @@ class Ledger:
 
     __slots__ = (
         "_flying",
-        "_ordered",
         "_seq",
         "_table",
         "again",
@@ -68,8 +69,7 @@ class Ledger:
         self._flying: dict[int, Request] = {}
         self.find = self._table.get
         """Returns the unanswered request to which a reply with a seq belongs, or None."""
-        self._ordered: OrderedDict[int, Request] = OrderedDict()
-        self.first = 0  # nothing older is in `_ordered`
+        self.first = 0
         self.newest_answered = -1
         self.again: list[Request] = []
         self.ghost = Ghost()
@@ -102,26 +102,30 @@ class Ledger:
         distance = min(max(BURST_JUMP, 2 * packets), FURTHEST_JUMP)
         self._seq = (self._seq + distance) % (LAST_SEQ + 1)
 
-    def launch(self, request: Request) -> None:
-        """Number a request that goes out for the first time, and note that it is on its way."""
-        table = self._table
-        seq = self._seq
-        if seq > LAST_SEQ or seq + 1 in table:
-            seq = self.take_seq()
-        else:
-            self._seq = seq + 1
+    def launch(self, requests: Sequence[Request], now: float, timer: float) -> None:
+        """Number requests that go out for the first time, and note that they are on their way."""
+        table, flying = self._table, self._flying
         order = self.order
-        self.order = order + 1
-        request.seq = seq
-        request.order = order
-        table[seq + 1] = self._flying[order] = request
-        request.flying = True
-        if request.manner.ordered:
-            self._ordered[order] = request
+        for request in requests:
+            seq = self._seq
+            if seq > LAST_SEQ or seq + 1 in table:
+                seq = self.take_seq()
+            else:
+                self._seq = seq + 1
+            request.seq = seq
+            request.order = order
+            request.sent_at = request.first_sent = now
+            request.timer = timer
+            request.sends = 1
+            request.flying = True
+            table[seq + 1] = flying[order] = request
+            order += 1
+        self.order = order
 
-    def number(self, request: Request) -> None:
+    def number(self, request: Request, now: float) -> None:
         """Give a request that goes out (again) its seq and order number."""
         if request.sends == 0:
+            request.first_sent = now
             request.seq = self.take_seq()
         elif request.manner.same_seq and not request.fresh_seq:
             request.single = False
@@ -135,6 +139,8 @@ class Ledger:
             request.fresh_seq = False
         request.order = self.order
         request.outrun = False
+        request.sent_at = now
+        request.sends += 1
         self.order += 1
 
     def enter(self, request: Request) -> None:
@@ -142,25 +148,43 @@ class Ledger:
         self._table[request.seq + 1] = request
         self._flying[request.order] = request
         request.flying = True
-        # One that was lost so often may never be answered: only its timer repeats it from now on.
-        if request.manner.ordered and request.sends <= _MOST_QUICK_SENDS:
-            self._ordered[request.order] = request
 
     # --- coming in
+
+    def settle_run(self, replies: list[Fields], at: int, after: float) -> Run:
+        """Take out requests as long as replies, from index `at` on, are usual ones; return what they answer.
+
+        Usual is the ACK, as `Engine.receive` would believe it, to the only transmission of a request with the
+        opcode `bulk` of its operation, sent later than `after`. The run ends where operation or time change.
+        """
+        table, flying = self._table, self._flying
+        request = table.get(replies[at][0])
+        run: Run = []
+        if request is None or request.sent_at <= after:
+            return run
+        op, opcode, sent_at, newest = request.op, request.op.bulk, request.sent_at, self.newest_answered
+        for seq, session, ack, size, req_opcode, _, offset, data in islice(replies, at, None):
+            request = table.get(seq)
+            if request is None or ack != _ACK or not req_opcode == request.opcode == opcode:
+                break
+            if offset != request.offset or session != request.session or size > MAX_DATA:
+                break
+            if request.sends != 1 or not request.flying or request.sent_at != sent_at or request.op is not op:
+                break
+            request.flying = False
+            order = request.order
+            del table[seq], flying[order]
+            if order > newest:
+                newest = order
+            run.append((request, data if size == MAX_DATA else data[:size]))
+        self.newest_answered = newest
+        return run
 
     def settle(self, request: Request, seq: int) -> bool:
         """Take out a request answered under `seq`; return False if that was an alias.
 
         Its order, sent_at and single are those of the answered transmission from then on.
         """
-        if request.sends == 1 and request.flying and seq == request.seq + 1:  # nearly always
-            order = request.order
-            request.flying = False
-            del self._table[seq], self._flying[order]
-            self._ordered.pop(order, None)
-            if order > self.newest_answered:
-                self.newest_answered = order
-            return True
         outrun = request.outrun
         self.forget(request)
         current = seq == request.seq + 1
@@ -196,18 +220,18 @@ class Ledger:
         return lost
 
     def _next_outrun(self) -> Request | None:
-        proven = self.newest_answered - self.reorder
-        if proven < self.first:
-            return None
-        ordered = self._ordered
-        if not ordered:
-            return None
-        self.first = order = next(iter(ordered))
-        if order > proven:
-            return None
-        request = ordered[order]
-        request.outrun = True
-        return request
+        """Look at what is older than what was answered, at each transmission once."""
+        proven, order, flying = self.newest_answered - self.reorder, self.first, self._flying
+        found = None
+        while order <= proven and found is None:
+            request = flying.get(order)
+            # One that was lost so often may never be answered: only its timer repeats it from now on.
+            if request is not None and request.manner.ordered and request.sends <= _MOST_QUICK_SENDS:
+                request.outrun = True
+                found = request
+            order += 1
+        self.first = order
+        return found
 
     def lose(self, request: Request) -> None:
         """This transmission will not be answered: ask again, unless nobody would want to know."""
@@ -220,7 +244,6 @@ class Ledger:
     def _land(self, request: Request) -> None:
         request.flying = False
         del self._flying[request.order]
-        self._ordered.pop(request.order, None)
 
     # --- by operation
 

@@ -8,8 +8,9 @@ dialects lack opcode 16.
 from __future__ import annotations
 
 import struct
+from collections.abc import Sequence
 from enum import IntEnum
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 from mavftpfs.shared.errors import LocalProtocolError, RemoteProtocolError
 
@@ -18,6 +19,7 @@ HEADER_SIZE = 12
 MAX_DATA = 239
 
 _HEADER = struct.Struct("<HBBBBBxI")
+_WHOLE = struct.Struct(f"<HBBBBBxI{MAX_DATA}s")
 _ZEROS = bytes(PAYLOAD_SIZE)
 _new = tuple.__new__  # once per chunk: a NamedTuple's own costs twice as much
 
@@ -113,8 +115,36 @@ def decode_reply(wire: bytes) -> Payload:
     fields = _HEADER.unpack_from(wire)
     size = fields[3]
     if size > MAX_DATA:
-        raise RemoteProtocolError(f"reply says it holds {size} bytes of data, more than {MAX_DATA}")
+        raise _oversize(size)
     return _new(Payload, (*fields, wire[HEADER_SIZE : HEADER_SIZE + size]))
+
+
+Fields: TypeAlias = tuple[int, int, int, int, int, int, int, bytes]
+"""What a Payload has, as a plain tuple; `data` is the whole field of 239 bytes, and `size` is not checked."""
+
+
+def split_run(wires: Sequence[bytes]) -> list[Fields]:
+    """Return the fields of several payloads of 251 bytes, at a third of what decoding them one by one costs.
+
+    Raises:
+        RemoteProtocolError: they are not of that length.
+    """
+    joined = b"".join(wires)
+    if len(joined) != PAYLOAD_SIZE * len(wires):
+        raise RemoteProtocolError(f"payloads that are not of {PAYLOAD_SIZE} bytes")
+    return list(_WHOLE.iter_unpack(joined))
+
+
+def reply_of(fields: Fields) -> Payload:
+    """Return a reply from its fields.
+
+    Raises:
+        RemoteProtocolError: `size` over 239.
+    """
+    size = fields[3]
+    if size > MAX_DATA:
+        raise _oversize(size)
+    return _new(Payload, (*fields[:7], fields[7][:size]))
 
 
 def decode_request(wire: bytes) -> Payload:
@@ -127,6 +157,10 @@ def decode_request(wire: bytes) -> Payload:
         raise _wrong_length(wire)
     fields: tuple[int, int, int, int, int, int, int] = _HEADER.unpack_from(wire)
     return Payload(*fields, wire[HEADER_SIZE:])
+
+
+def _oversize(size: int) -> RemoteProtocolError:
+    return RemoteProtocolError(f"reply says it holds {size} bytes of data, more than {MAX_DATA}")
 
 
 def _wrong_length(wire: bytes) -> RemoteProtocolError:

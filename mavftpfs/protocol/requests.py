@@ -7,10 +7,11 @@ again under the *same* seq first, because PX4 and ArduPilot replay their last re
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from enum import IntEnum
 from math import inf
 from struct import Struct
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, TypeAlias
 
 from mavftpfs.protocol.payload import MAX_DATA, NakCode, Opcode, Payload
 from mavftpfs.shared.errors import FtpNak, LocalProtocolError, MavftpfsError
@@ -140,6 +141,14 @@ class Request:
         self.single = True
         self.outrun = False
 
+    def fits(self, reply: Payload, traits: Traits) -> bool:
+        """Whether this may be an answer to this request, whose seq and opcode it carries."""
+        if traits.ack_carries_own_session and reply.session != self.session and not self.follows:
+            return False
+        if reply.opcode == Opcode.ACK:
+            return reply.offset == self.offset or not self.manner.echoes_offset
+        return reply.opcode == Opcode.NAK
+
     def encode(self) -> bytes:
         """Return the 251 wire bytes under the present seq.
 
@@ -152,6 +161,21 @@ class Request:
         if len(data) > MAX_DATA:
             raise LocalProtocolError(f"{len(data)} bytes of data do not fit {MAX_DATA}")
         return _pack(self.seq, self.session, self.opcode, self.size, 0, 0, self.offset, data)
+
+
+def encode_run(requests: Sequence[Request]) -> list[bytes]:
+    """Return what `encode` returns for each.
+
+    Raises:
+        LocalProtocolError: as `encode`.
+    """
+    if len(requests) == 1 or requests[0].data:
+        return [request.encode() for request in requests]
+    return [_pack_empty(r.seq, r.session, r.opcode, r.size, 0, 0, r.offset) for r in requests]
+
+
+Run: TypeAlias = list[tuple[Request, bytes]]
+"""Requests of one operation and opcode that went out together, once, with the data of their ACKs."""
 
 
 def nak_of(request: Request, reply: Payload) -> FtpNak:
@@ -199,6 +223,9 @@ class Operation:
     """
 
     rank = Priority.METADATA
+    bulk = -1
+    """The opcode whose ACKs may come as an `on_run`; -1: none."""
+
     paced = True
     """Whether more may be on the way than a server queues, evenly spread (see `pacing`)."""
 
@@ -247,8 +274,18 @@ class Operation:
         """Return the next new request, or None if there is none for now."""
         raise NotImplementedError
 
+    def next_requests(self, most: int, now: float) -> list[Request]:
+        """Return some of the next new requests, at most `most` (at least one) and all of one opcode; none if
+        there is none for now."""
+        request = self.next_request(now)
+        return [] if request is None else [request]
+
     def on_reply(self, request: Request, reply: Payload, now: float) -> None:
         """Take the believed ACK or NAK to `request`."""
+        raise NotImplementedError
+
+    def on_run(self, run: Run, now: float) -> None:
+        """Take believed ACKs to requests with the opcode `bulk`, in the order in which they came."""
         raise NotImplementedError
 
     def on_burst_sent(self, request: Request, now: float) -> int:

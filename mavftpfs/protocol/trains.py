@@ -61,6 +61,11 @@ class Trains:
             self.rate = rate
             self.proven = True
 
+    def on_replies(self, count: int, now: float) -> None:
+        """So many requests were answered at once."""
+        for _ in range(min(count, _LENGTH + 1)):  # more of the same instant say nothing new
+            self.on_reply(now)
+
     def end_round(self, answers: int, average: float) -> None:
         """A round in which there was always something to send is over; average: its answers per second."""
         if answers >= _TELLING_ROUND:

@@ -13,6 +13,7 @@ from mavftpfs.protocol.requests import (
     Operation,
     Priority,
     Request,
+    Run,
     manner_of,
     nak_of,
 )
@@ -64,6 +65,8 @@ class ReadTransfer(Operation):
     Fails with SessionLost (reopen, and start another with `wants`), FileChanged (the file ends before its
     size), FtpNak, or RequestTimeout. `wants` stays valid after a failure.
     """
+
+    bulk = _READ
 
     def __init__(
         self, session: int, size: int, sink: DataSink, chunk: int = MAX_DATA, strategy: Strategy = "window"
@@ -177,6 +180,24 @@ class ReadTransfer(Operation):
         self._unanswered[request] = None
         return request
 
+    def next_requests(self, most: int, now: float) -> list[Request]:
+        """Return ReadFile requests for a row of chunks, or what `next_request` says."""
+        if self._burst is not None or self._filling or self.strategy == "burst":
+            return super().next_requests(most, now)
+        chunk, session = self.chunk, self.session
+        row = self._demand.take_first(most * chunk) or self._ahead.take_first(most * chunk)
+        if row is None:
+            return []
+        start, stop = row
+        requests = [
+            Request(self, _READ, READ_MANNER, session, offset, chunk) for offset in range(start, stop, chunk)
+        ]
+        requests[-1].size = stop - requests[-1].offset
+        if not self._unanswered:
+            self._window_mark = now
+        self._unanswered.update(dict.fromkeys(requests))
+        return requests
+
     def _next_gap(self) -> tuple[int, int] | None:
         gap = self._gaps.take_first(self.chunk)
         if gap is None:
@@ -227,6 +248,36 @@ class ReadTransfer(Operation):
             self.received_bytes += count
             self._window_bytes += count
             self._sink.on_data(request.offset, data)
+
+    def on_run(self, run: Run, now: float) -> None:
+        """Place chunks, those in a row together."""
+        unanswered = self._unanswered
+        self._window_seconds += now - self._window_mark
+        self._window_mark = now
+        pieces: list[bytes] = []
+        start = stop = run[0][0].offset
+        for request, data in run:
+            offset, size = request.offset, request.size
+            del unanswered[request]
+            if offset != stop:
+                self._place(start, pieces)
+                pieces, start = [], offset
+            if len(data) != size:
+                data = data[:size]
+                if len(data) < size:
+                    self._on_short(request, len(data))
+            pieces.append(data)
+            stop = offset + len(data)
+            if self.done:
+                break
+        self._place(start, pieces)
+
+    def _place(self, offset: int, pieces: list[bytes]) -> None:
+        data = pieces[0] if len(pieces) == 1 else b"".join(pieces)
+        if data:
+            self.received_bytes += len(data)
+            self._window_bytes += len(data)
+            self._sink.on_data(offset, data)
 
     def _on_short(self, request: Request, count: int) -> None:
         start = request.offset + count

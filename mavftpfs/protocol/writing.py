@@ -10,7 +10,7 @@ from collections import deque
 from typing import Protocol
 
 from mavftpfs.protocol.payload import MAX_DATA, NakCode, Opcode, Payload
-from mavftpfs.protocol.requests import WRITE_MANNER, Operation, Priority, Request, nak_of
+from mavftpfs.protocol.requests import WRITE_MANNER, Operation, Priority, Request, Run, nak_of
 from mavftpfs.shared.errors import (
     FtpNak,
     LocalProtocolError,
@@ -27,6 +27,9 @@ MAX_OFFSET = 1 << 32
 _WRITE = int(Opcode.WRITE_FILE)
 _NAK = int(Opcode.NAK)
 _COUNT_SIZE = 4
+_ROW = 64
+"""Most chunks to take from the source at once."""
+
 _BARREN_TOLERATED = 3
 _EBADF = 9
 _SESSION_CODES = frozenset((NakCode.FAIL, NakCode.INVALID_SESSION, NakCode.FILE_NOT_FOUND))
@@ -66,6 +69,8 @@ class WriteTransfer(Operation):
 
     rank = Priority.WRITE
     paced = False  # what a slow card cannot take would be lost, and leave holes for a while
+
+    bulk = _WRITE
 
     def __init__(
         self, session: int, source: ChunkSource, chunk: int = MAX_DATA, *, in_flight: int | None = None
@@ -130,27 +135,40 @@ class WriteTransfer(Operation):
 
     def next_request(self, now: float) -> Request | None:
         """Return the next WriteFile."""
-        if self._paused or (self._in_flight is not None and len(self._unanswered) >= self._in_flight):
+        return next(iter(self.next_requests(1, now)), None)
+
+    def next_requests(self, most: int, now: float) -> list[Request]:
+        """Return WriteFile requests for bytes in a row."""
+        if self._in_flight is not None:
+            most = min(most, self._in_flight - len(self._unanswered))
+        if self._paused or most <= 0:
+            return []
+        piece = self._rest.popleft() if self._rest else self._next_piece(min(most, _ROW) * self.chunk)
+        if piece is None:
+            return []
+        offset, data = piece
+        session, chunk = self.session, self.chunk
+        requests = [
+            Request(self, _WRITE, WRITE_MANNER, session, offset + at, chunk, data[at : at + chunk])
+            for at in range(0, len(data), chunk)
+        ]
+        requests[-1].size = len(requests[-1].data)
+        self._unanswered.update(dict.fromkeys(requests))
+        return requests
+
+    def _next_piece(self, limit: int) -> tuple[int, bytes] | None:
+        if self._starved or self.done:
             return None
-        if self._rest:
-            offset, data = self._rest.popleft()
-            size = len(data)
-        else:
-            if self._starved or self.done:
-                return None
-            piece = self._source.next_chunk(self.chunk)
-            if piece is None:
-                self._starved = True
-                return None
-            offset, data = piece
-            size = len(data)
-            if not 1 <= size <= self.chunk or not 0 <= offset <= MAX_OFFSET - size:
-                self._rest.append(piece)
-                self.fail(LocalProtocolError(f"{size} bytes at {offset} do not fit a WriteFile request"))
-                return None
-        request = Request(self, _WRITE, WRITE_MANNER, self.session, offset, size, data)
-        self._unanswered[request] = None
-        return request
+        piece = self._source.next_chunk(limit)
+        if piece is None:
+            self._starved = True
+            return None
+        offset, size = piece[0], len(piece[1])
+        if not 1 <= size <= limit or not 0 <= offset <= MAX_OFFSET - size:
+            self._rest.append(piece)
+            self.fail(LocalProtocolError(f"{size} bytes at {offset} do not fit WriteFile requests"))
+            return None
+        return piece
 
     # --- replies
 
@@ -170,6 +188,34 @@ class WriteTransfer(Operation):
             self._source.on_acked(request.offset, count)
         if count < request.size:
             self._on_short(request, count)
+
+    def on_run(self, run: Run, now: float) -> None:
+        """Tell the source what was written, in a row at once."""
+        unanswered, usual, chunk = self._unanswered, self._usual, self.chunk
+        start = stop = run[0][0].offset
+        for request, data in run:
+            offset, count = request.offset, request.size
+            del unanswered[request]
+            if data != usual or count != chunk:
+                count = self._written(request, data)
+                usual = self._usual
+            if offset != stop:
+                self._tell(start, stop)
+                start = offset
+            stop = offset + count
+            if count < request.size:
+                self._tell(start, stop)
+                start = stop
+                self._on_short(request, count)
+                if self.done:
+                    return
+        self._tell(start, stop)
+
+    def _tell(self, start: int, stop: int) -> None:
+        if start < stop:
+            self._barren = 0
+            self.acked_bytes += stop - start
+            self._source.on_acked(start, stop - start)
 
     def _written(self, request: Request, data: bytes) -> int:
         """Return how many bytes an ACK stands for (servers.md 8: only PX4 says, and may write less)."""

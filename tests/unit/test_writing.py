@@ -227,7 +227,7 @@ def test_silence_times_out_and_gives_back() -> None:
     assert source.dirty.covers(0, 239)
 
 
-@pytest.mark.parametrize("piece", [(0, b""), (0, bytes(240)), (-1, b"x"), (MAX_OFFSET - 1, b"xy")])
+@pytest.mark.parametrize("piece", [(0, b""), (0, bytes(1 << 20)), (-1, b"x"), (MAX_OFFSET - 1, b"xy")])
 def test_a_chunk_that_does_not_fit_is_refused_without_a_raise(piece: tuple[int, bytes]) -> None:
     class Broken(MemorySource):
         def next_chunk(self, limit: int) -> tuple[int, bytes] | None:
