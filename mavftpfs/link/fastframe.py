@@ -19,13 +19,14 @@ from collections.abc import Iterable
 
 from fastcrc import crc16
 
-from mavftpfs.link.messages import Address, FtpFrame, Message
+from mavftpfs.link.messages import Address, FtpRun, Message
 
 FTP_MESSAGE_ID = 110
 FTP_PAYLOAD_SIZE = 251
 
 _MAGIC = 0xFD
-_BEFORE_CRC = 10
+_OVERHEAD = 12
+_LONGEST = 266
 _FULL = 254  # payload of 110 before trimming
 _SHORTEST = 15  # with the three target bytes
 _ZEROS = bytes(224)
@@ -61,6 +62,7 @@ class FtpFrameCodec:
         self.source = source
         self._extra = bytes((crc_extra,))
         self._routes: dict[bytes, tuple[Address, Address]] = {}
+        self._alike: tuple[bytes, bytes, int, tuple[Address, Address]] = (b"", b"", 0, (source, source))
 
     def encode(self, seq: int, target: Address, payloads: Iterable[bytes]) -> list[bytes]:
         """Return the frames; seq: frame sequence number (0..255) of the first; payloads: 251 bytes each."""
@@ -69,37 +71,57 @@ class FtpFrameCodec:
         frames = []
         for payload in payloads:
             # Most requests end in zeros, and strip is slow over a long tail.
-            content = (payload[:_SHORT] if payload.endswith(_ZEROS) else payload).rstrip(b"\0")
+            if payload[-1]:
+                content = payload
+            else:
+                content = (payload[:_SHORT] if payload.endswith(_ZEROS) else payload).rstrip(b"\0")
             body = _head(len(content) + 3, 0, seq, route) + content if content else _empty_body(seq, route)
             frames.append(b"\xfd" + body + _pack_crc(_crc(body + extra)))
             seq = (seq + 1) & 0xFF
         return frames
 
-    def decode_run(self, data: bytes, start: int, out: list[Message]) -> int:
-        """Append the unbroken run of whole, valid frames at `start` to `out`; return where it ends.
+    def decode_runs(self, data: bytes, start: int, out: list[Message | FtpRun]) -> int:
+        """Append the unbroken row of whole, valid frames at `start` to `out`; return where it ends.
 
         Stops, without judging, at the first byte that does not begin such a frame: another message,
         a bad CRC, a payload shorter than the target ids or longer than 254, the end of the data.
         """
-        extra = self._extra
-        routes = self._routes
-        end = len(data)
-        # Indices rather than a parser object: this loop runs once per chunk of every transfer.
+        extra, end, payloads = self._extra, len(data), None
+        before_seq, route, length, addresses = self._alike
+        # This loop runs once per chunk of every transfer, mostly over frames that are alike.
         while start + _SHORTEST <= end:
-            magic, size, flags, route = _fields(data, start)
-            at_crc = start + size + _BEFORE_CRC
-            addresses = routes.get(route) or self._learn(route)
-            if addresses is None or magic != _MAGIC or flags or not 3 <= size <= _FULL or at_crc + 2 > end:
+            if data[start : start + 4] != before_seq or data[start + 5 : start + 13] != route:
+                if not self._look(data, start):
+                    break
+                before_seq, route, length, addresses = self._alike
+                payloads = None
+            stop = start + length
+            if stop > end:
                 break
-            body = data[start + 1 : at_crc]
-            if _crc(body + extra) != data[at_crc] | data[at_crc + 1] << 8:
+            body = data[start + 1 : stop - 2]
+            if _crc(body + extra) != data[stop - 2] | data[stop - 1] << 8:
                 break
             payload = body[12:]
-            if size != _FULL:
+            if length != _LONGEST:
                 payload = payload.ljust(FTP_PAYLOAD_SIZE, b"\0")
-            out.append(_new(FtpFrame, (*addresses, payload)))
-            start = at_crc + 2
+            if payloads is None:
+                payloads = [payload]
+                out.append(_new(FtpRun, (*addresses, payloads)))
+            else:
+                payloads.append(payload)
+            start = stop
         return start
+
+    def _look(self, data: bytes, start: int) -> bool:
+        """Return whether a frame of ours seems to begin there, and remember what those alike begin with."""
+        magic, size, flags, route = _fields(data, start)
+        if magic != _MAGIC or flags or not 3 <= size <= _FULL:
+            return False
+        addresses = self._routes.get(route) or self._learn(route)
+        if addresses is None:
+            return False
+        self._alike = (data[start : start + 4], route, size + _OVERHEAD, addresses)
+        return True
 
     def _learn(self, route: bytes) -> tuple[Address, Address] | None:
         """Return source and target of a route, None if it is not one of our message."""

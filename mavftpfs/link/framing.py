@@ -30,7 +30,7 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from mavftpfs.link.decoding import DECODERS
 from mavftpfs.link.fastframe import FTP_MESSAGE_ID, FTP_PAYLOAD_SIZE, FtpFrameCodec, frame_crc
-from mavftpfs.link.messages import MAV_AUTOPILOT_INVALID, Address, Message, Other
+from mavftpfs.link.messages import MAV_AUTOPILOT_INVALID, Address, FtpFrame, FtpRun, Message, Other, singly
 from mavftpfs.link.signing import SIGNATURE_BLOCK, SignatureCheck
 from mavftpfs.shared.errors import LocalProtocolError
 
@@ -112,13 +112,21 @@ class Framer:
 
     def feed(self, data: bytes) -> list[Message]:
         """Take a chunk of the stream, or a datagram, and return the messages it completed."""
+        return singly(self.feed_runs(data))
+
+    def feed_runs(self, data: bytes) -> list[Message | FtpRun]:
+        """As `feed`, but each FtpFrame comes in an FtpRun, with those behind it where there are any."""
         if self._tail:
             data = self._join(data)
-        out: list[Message] = []
+        out: list[Message | FtpRun] = []
         position = self._scan(data, out)
         self._tail = data[position:]
-        self.stats.frames += len(out)
+        self._count(out)
         return out
+
+    def _count(self, found: list[Message | FtpRun]) -> None:
+        for message in found:
+            self.stats.frames += len(message.payloads) if type(message) is FtpRun else 1
 
     def reset(self) -> None:
         """Forget a half-received frame: the stream was reopened."""
@@ -130,9 +138,9 @@ class Framer:
         """Whether a stream ended in what may be the beginning of a frame."""
         return self.stream and bool(self._tail)
 
-    def give_up(self) -> list[Message]:
+    def give_up(self) -> list[Message | FtpRun]:
         """The stream fell silent in mid-frame: there was none; return what is found behind its beginning."""
-        out: list[Message] = []
+        out: list[Message | FtpRun] = []
         self.stream = False  # as at the end of a datagram: nothing more decides
         try:
             while self._tail:
@@ -141,7 +149,7 @@ class Framer:
                 self._tail = self._tail[skipped:]
         finally:
             self.stream = True
-        self.stats.frames += len(out)
+        self._count(out)
         return out
 
     def _join(self, data: bytes) -> bytes:
@@ -149,12 +157,12 @@ class Framer:
             self.reset()
         return self._tail + data
 
-    def _scan(self, data: bytes, out: list[Message]) -> int:
+    def _scan(self, data: bytes, out: list[Message | FtpRun]) -> int:
         """Append the messages of `data` to `out`; return where an unfinished frame begins."""
         position = 0
         while True:
             if self._check is None:
-                start, position = position, self._codec.decode_run(data, position, out)
+                start, position = position, self._codec.decode_runs(data, position, out)
                 if self.on_frame is not None:
                     self._report_run(data, start, position)
             if position >= len(data):
@@ -170,7 +178,7 @@ class Framer:
             self.on_frame(data[start:end])
             start = end
 
-    def _step(self, data: bytes, position: int, out: list[Message]) -> int:
+    def _step(self, data: bytes, position: int, out: list[Message | FtpRun]) -> int:
         """Deal with what begins at `position`; return where to go on, the same if more is needed."""
         magic = data[position]
         if magic not in (_V1, _V2):
@@ -194,7 +202,7 @@ class Framer:
         return self._judge(data, position, stop, message_id, signature, out)
 
     def _judge(
-        self, data: bytes, start: int, stop: int, message_id: int, signature: int, out: list[Message]
+        self, data: bytes, start: int, stop: int, message_id: int, signature: int, out: list[Message | FtpRun]
     ) -> int:
         frame = data[start:stop]
         crc_at = len(frame) - signature - 2
@@ -214,7 +222,7 @@ class Framer:
         self.stats.garbage_bytes += stop - start
         return stop
 
-    def _accept(self, frame: bytes, message_id: int, signed: bool, out: list[Message]) -> None:
+    def _accept(self, frame: bytes, message_id: int, signed: bool, out: list[Message | FtpRun]) -> None:
         at = 5 if frame[0] == _V2 else 3
         source = Address(frame[at], frame[at + 1])
         if not self._authentic(frame, message_id, signed, source):
@@ -226,10 +234,11 @@ class Framer:
             out.append(Other(source, message_id))
         else:
             try:
-                out.append(decode(source, self._decoder.decode(bytearray(frame))))
+                message = decode(source, self._decoder.decode(bytearray(frame)))
             except (dialect.MAVError, AttributeError, TypeError, ValueError):
                 self.stats.unreadable += 1
                 return
+            out.append(FtpRun(*message[:2], [message.payload]) if isinstance(message, FtpFrame) else message)
         if self.on_frame is not None:
             self.on_frame(frame)
 
@@ -250,9 +259,8 @@ class Framer:
 
     def encode_ftp_run(self, target: Address, payloads: Sequence[bytes]) -> list[bytes]:
         """Return the frames of several payloads, in order; otherwise as encode_ftp."""
-        for payload in payloads:
-            if len(payload) != FTP_PAYLOAD_SIZE:
-                raise LocalProtocolError(f"FTP payload of {len(payload)} bytes, {FTP_PAYLOAD_SIZE} needed")
+        if wrong := set(map(len, payloads)) - {FTP_PAYLOAD_SIZE}:
+            raise LocalProtocolError(f"FTP payload of {wrong.pop()} bytes, {FTP_PAYLOAD_SIZE} needed")
         if self._check is not None:
             return [self._pack(self._ftp_message(target, payload)) for payload in payloads]
         sender = self._sender

@@ -5,6 +5,7 @@ Everything else on the link is `Other`: counted, traced, never an error.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import NamedTuple, TypeAlias
 
@@ -29,6 +30,14 @@ class FtpFrame(NamedTuple):
     source: Address
     target: Address
     payload: bytes
+
+
+class FtpRun(NamedTuple):
+    """FtpFrames that came one behind the other from one source to one target; payloads: at least one."""
+
+    source: Address
+    target: Address
+    payloads: list[bytes]
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,3 +144,15 @@ Message: TypeAlias = (
     | CommandLong
     | Other
 )
+
+
+def singly(messages: Iterable[Message | FtpRun]) -> list[Message]:
+    """Return the messages with runs taken apart."""
+    single: list[Message] = []
+    for message in messages:
+        if isinstance(message, FtpRun):
+            source, target, payloads = message
+            single += [FtpFrame(source, target, payload) for payload in payloads]
+        else:
+            single.append(message)
+    return single

@@ -14,7 +14,7 @@ import trio
 
 from mavftpfs.link.base import Link, PinsPeer
 from mavftpfs.link.framing import Framer
-from mavftpfs.link.messages import Address, FtpFrame, Message
+from mavftpfs.link.messages import Address, FtpRun, Message, singly
 from mavftpfs.protocol.engine import Engine
 from mavftpfs.protocol.operations import Operation
 from mavftpfs.protocol.payload import decode_reply
@@ -70,6 +70,7 @@ class Driver:
         self._scope: trio.CancelScope | None = None
         self._waiting: dict[Operation, Callable[[], None]] = {}
         self._budget = engine.flow.budget
+        self._gathered: list[bytes] = []
 
     async def pump(self) -> None:
         """Run until cancelled or the link is closed for good (LinkClosed)."""
@@ -85,6 +86,7 @@ class Driver:
                 self.engine.on_deadline(now)
                 if now >= self._quiet_at:
                     self._handle(self.framer.give_up(), now)
+                    self._pass_on(now)
                     self.on_batch(now)
             else:
                 self._take(chunks, now)
@@ -132,31 +134,44 @@ class Driver:
             self.framer.reset()
             return
         self._heard_at = now
-        feed = self.framer.feed
+        feed = self.framer.feed_runs
         for index, chunk in enumerate(chunks):
             self._handle(feed(chunk), now, index)
             if index % REFILL_EVERY == REFILL_EVERY - 1:
+                self._pass_on(now)
                 self._refill(now)
+        self._pass_on(now)
         self.on_batch(now)
 
-    def _handle(self, messages: list[Message], now: float, index: int = -1) -> None:
-        vehicle, receive = self.vehicle, self.engine.receive
-        own, address = vehicle.own, vehicle.address
+    def _handle(self, messages: list[Message | FtpRun], now: float, index: int = -1) -> None:
+        """Gather replies, and tell the vehicle everything else, in its turn."""
+        vehicle = self.vehicle
         for message in messages:
-            if type(message) is not FtpFrame or message.target != own or message.source != address:
-                self._on_other(message, now, index)
-                own, address = vehicle.own, vehicle.address
-                continue
-            if self._budget is not None:
-                self._budget.on_reply(message.payload, now)
-            if self._trace is not None:
-                self._on_traced_reply(message.payload, now, self._trace)
+            ours = (vehicle.address, vehicle.own)
+            if type(message) is FtpRun and (message.source, message.target) == ours:
+                self._gathered += message.payloads
             else:
-                try:
-                    receive(decode_reply(message.payload), now)
-                    self.last_reply_at = now
-                except RemoteProtocolError:
-                    self.bad_payloads += 1
+                self._pass_on(now)
+                for single in singly([message]):
+                    self._on_other(single, now, index)
+
+    def _pass_on(self, now: float) -> None:
+        """Give the engine the gathered replies."""
+        wires = self._gathered
+        if not wires:
+            return
+        self._gathered = []
+        if self._budget is not None:
+            for wire in wires:
+                self._budget.on_reply(wire, now)
+        if self._trace is not None:
+            for wire in wires:
+                self._on_traced_reply(wire, now, self._trace)
+            return
+        malformed = self.engine.receive_run(wires, now)
+        self.bad_payloads += malformed
+        if malformed < len(wires):
+            self.last_reply_at = now
 
     @property
     def _quiet_at(self) -> float:

@@ -23,7 +23,7 @@ from mavftpfs.link.messages import (
     MAV_PROTOCOL_CAPABILITY_FTP,
     Address,
     CommandLong,
-    FtpFrame,
+    FtpRun,
     Heartbeat,
 )
 from mavftpfs.sim.filesystem import Tree
@@ -114,11 +114,12 @@ class SimVehicle:
         if now < self._down_until:
             return
         handle, address = self.server.handle, self.address
-        for message in self.framer.feed(data):
-            if type(message) is FtpFrame:  # a transfer is thousands of these a second
-                source, target, payload = message
+        for message in self.framer.feed_runs(data):
+            if type(message) is FtpRun:  # a transfer is thousands of these a second
+                source, target, payloads = message
                 if target == address or self._is_for_us(target):
-                    handle(payload, source, now)
+                    for payload in payloads:
+                        handle(payload, source, now)
                 continue
             match message:
                 case CommandLong():

@@ -23,7 +23,7 @@ from mavftpfs.link.messages import Address
 from mavftpfs.link.udp import UdpLink
 from mavftpfs.protocol.engine import Engine
 from mavftpfs.protocol.flow import Flow
-from mavftpfs.protocol.payload import MAX_DATA, Opcode, Payload, decode_reply, decode_request
+from mavftpfs.protocol.payload import MAX_DATA, Opcode, Payload, decode_request
 from mavftpfs.protocol.transfers import ReadTransfer
 from mavftpfs.protocol.writing import WriteTransfer
 from mavftpfs.session.upload import Feed
@@ -35,6 +35,8 @@ US = 1e6
 _SIZE = CHUNKS * MAX_DATA
 _CLIENT, _VEHICLE = Address(254, 191), Address(1, 1)
 _PER_DATAGRAM = 5
+_ROW = WINDOW // 2 * MAX_DATA
+"""Bytes that come or go together."""
 
 
 class Meter:
@@ -71,7 +73,6 @@ def read_parts() -> dict[str, float]:
     return {
         "receive (system call)": cost(_receiving(replies)),
         "find and check frames": cost(_decoding(replies)),
-        "fields of the payload": cost(_fields(replies)),
         "engine and transfer": cost(_engine_reading),
         "placing in the cache": cost(_placing),
         "build frames": cost(_encoding(requests)),
@@ -86,7 +87,6 @@ def write_parts() -> dict[str, float]:
     return {
         "receive (system call)": cost(_receiving(replies)),
         "find and check frames": cost(_decoding(replies)),
-        "fields of the payload": cost(_fields(replies)),
         "engine and transfer": cost(_engine_writing),
         "taking from the spool": cost(_drafting),
         "build frames": cost(_encoding(requests)),
@@ -97,6 +97,7 @@ def write_parts() -> dict[str, float]:
 # --- payloads
 
 _DATA = random.Random(1).randbytes(MAX_DATA)
+_CONTENT = _DATA * CHUNKS
 
 
 def _read_request(seq: int, offset: int) -> bytes:
@@ -136,16 +137,7 @@ def _decoding(payloads: list[bytes]) -> Part:
         framer = Framer(_CLIENT, stream=False)
         with meter.on():
             for datagram in datagrams:
-                framer.feed(datagram)
-
-    return run
-
-
-def _fields(payloads: list[bytes]) -> Part:
-    def run(meter: Meter) -> None:
-        with meter.on():
-            for payload in payloads:
-                decode_reply(payload)
+                framer.feed_runs(datagram)
 
     return run
 
@@ -224,7 +216,7 @@ class _NullSink:
 
 
 class _EndlessSource:
-    """Has a file's worth of the same chunk."""
+    """Has a file's worth of the same chunk, in memory."""
 
     def __init__(self) -> None:
         self._next = 0
@@ -233,8 +225,8 @@ class _EndlessSource:
         at = self._next
         if at >= _SIZE:
             return None
-        self._next = at + MAX_DATA
-        return at, _DATA
+        self._next = stop = min(_SIZE, at + limit)
+        return at, _CONTENT[at:stop]
 
     def on_acked(self, offset: int, count: int) -> None:
         return
@@ -266,23 +258,22 @@ def _run_engine(meter: Meter, transfer: ReadTransfer | WriteTransfer, data: byte
             wires = engine.outgoing(now)
         replies = [_answer(decode_request(wire), data) for wire in wires]
         with meter.on():
-            for reply in replies:
-                engine.receive(reply, now)
+            engine.receive_run(replies, now)
             engine.take_finished()
 
 
-def _answer(request: Payload, data: bytes) -> Payload:
+def _answer(request: Payload, data: bytes) -> bytes:
     return Payload(
         request.seq + 1 & 0xFFFF, 0, Opcode.ACK, len(data), request.opcode, 0, request.offset, data
-    )
+    ).encode()
 
 
 def _placing(meter: Meter) -> None:
     cache = BlockCache(2 * _SIZE, clock=lambda: 0.0, patience=1.0)
     blocks = FileBlocks(cache, _SIZE)
     with meter.on():
-        for at in range(0, _SIZE, MAX_DATA):
-            blocks.on_data(at, _DATA)
+        for at in range(0, _SIZE, _ROW):
+            blocks.on_data(at, _CONTENT[at : at + _ROW])
 
 
 def _drafting(meter: Meter) -> None:
@@ -292,11 +283,10 @@ def _drafting(meter: Meter) -> None:
         draft.write(0, bytes(_SIZE))
         feed = Feed(draft.begin(whole=True), MAX_DATA)
         with meter.on():
-            for _ in range(0, CHUNKS, WINDOW):
-                taken = [feed.next_chunk(MAX_DATA) for _ in range(WINDOW)]
-                for piece in taken:
-                    assert piece is not None
-                    feed.on_acked(piece[0], MAX_DATA)
+            for _ in range(0, _SIZE, _ROW):
+                piece = feed.next_chunk(_ROW)
+                assert piece is not None
+                feed.on_acked(piece[0], len(piece[1]))
 
     trio.run(run, clock=MockClock())
 

@@ -11,7 +11,7 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from mavftpfs.link.fastframe import FtpFrameCodec
 from mavftpfs.link.framing import Framer
-from mavftpfs.link.messages import Address, FtpFrame, Message, Other
+from mavftpfs.link.messages import Address, FtpFrame, FtpRun, Message, Other, singly
 
 EXTRA = dialect.MAVLink_file_transfer_protocol_message.crc_extra
 KEY = bytes(32)
@@ -55,13 +55,27 @@ def test_fast_encoding_is_pymavlinks_byte_for_byte(
 @given(addresses, addresses, st.integers(0, 255), payloads)
 def test_fast_decoding_is_pymavlinks(source: Address, target: Address, seq: int, payload: bytes) -> None:
     frame = reference_frame(source, target, payload, seq=seq)
-    out: list[Message] = []
+    out: list[Message | FtpRun] = []
     if len(frame) >= 15:
-        assert FtpFrameCodec(Address(9, 9), EXTRA).decode_run(frame, 0, out) == len(frame)
-        assert out == [FtpFrame(source, target, payload)]
+        assert FtpFrameCodec(Address(9, 9), EXTRA).decode_runs(frame, 0, out) == len(frame)
+        assert out == [FtpRun(source, target, [payload])]
     message = pymavlink(source).decode(bytearray(frame))
     assert bytes(message.payload) == payload
     assert Framer(Address(9, 9), stream=True).feed(frame) == [FtpFrame(source, target, payload)]
+
+
+@given(st.lists(st.tuples(addresses, addresses, payloads), max_size=8), st.integers(0, 255))
+def test_fast_decoding_of_several_is_pymavlinks(
+    several: list[tuple[Address, Address, bytes]], seq: int
+) -> None:
+    frames = [reference_frame(*one, seq=(seq + index) & 0xFF) for index, one in enumerate(several)]
+    data, wanted = b"".join(frames), [FtpFrame(*one) for one in several]
+    found = Framer(Address(9, 9), stream=True).feed_runs(data)
+    assert singly(found) == wanted
+    if all(len(frame) >= 15 for frame in frames):
+        out: list[Message | FtpRun] = []
+        assert FtpFrameCodec(Address(9, 9), EXTRA).decode_runs(data, 0, out) == len(data)
+        assert singly(out) == wanted
 
 
 @given(addresses, addresses, payloads, st.booleans())

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from mavftpfs.link.framing import Framer
-from mavftpfs.link.messages import Address, FtpFrame, Heartbeat
+from mavftpfs.link.messages import Address, FtpFrame, Heartbeat, singly
 
 US = Address(254, 191)
 VEHICLE = Address(1, 1)
@@ -26,7 +26,7 @@ def test_a_damaged_length_hides_what_follows_until_given_up() -> None:
     beat = vehicle.encode_heartbeat(2, 12)
     assert us.feed(damaged(beat) + beat + beat) == []
     assert us.waiting
-    found = us.give_up()
+    found = singly(us.give_up())
     assert [type(message) for message in found] == [Heartbeat, Heartbeat]
     assert not us.waiting
     assert us.stats.frames == 2
@@ -36,8 +36,8 @@ def test_a_damaged_length_hides_what_follows_until_given_up() -> None:
 def test_a_chunk_behind_it_is_found() -> None:
     vehicle, us = pair()
     chunk = bytes(range(100)) + bytes(151)  # a short frame: MAVLink 2 trims the zeros
-    found = us.feed(damaged(vehicle.encode_heartbeat(2, 12)) + vehicle.encode_ftp(US, chunk)) + us.give_up()
-    assert found == [FtpFrame(VEHICLE, US, chunk)]
+    found = us.feed_runs(damaged(vehicle.encode_heartbeat(2, 12)) + vehicle.encode_ftp(US, chunk))
+    assert singly(found + us.give_up()) == [FtpFrame(VEHICLE, US, chunk)]
 
 
 @pytest.mark.parametrize("cut", [1, 5, 9, 12, 20])

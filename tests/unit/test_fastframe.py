@@ -8,7 +8,8 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from mavftpfs.link.fastframe import FtpFrameCodec, frame_crc
-from mavftpfs.link.messages import Address, FtpFrame, Message
+from mavftpfs.link.framing import Framer
+from mavftpfs.link.messages import Address, FtpFrame, FtpRun, Message, singly
 
 US = Address(254, 191)
 EXTRA = 84
@@ -44,16 +45,16 @@ def test_encodes_as_pymavlink(payload: bytes, target: Address) -> None:
 
 @pytest.mark.parametrize("payload", PAYLOADS)
 def test_decodes_what_pymavlink_made(payload: bytes) -> None:
-    out: list[Message] = []
+    out: list[Message | FtpRun] = []
     frame = reference(9, Address(1, 2), payload)
-    assert FtpFrameCodec(US, EXTRA).decode_run(frame, 0, out) == len(frame)
-    assert out == [FtpFrame(US, Address(1, 2), payload)]
+    assert FtpFrameCodec(US, EXTRA).decode_runs(frame, 0, out) == len(frame)
+    assert out == [FtpRun(US, Address(1, 2), [payload])]
 
 
 def test_a_frame_trimmed_into_its_target_is_left_to_pymavlink() -> None:
-    out: list[Message] = []
+    out: list[Message | FtpRun] = []
     for target in (Address(0, 0), Address(1, 0)):
-        assert FtpFrameCodec(US, EXTRA).decode_run(reference(9, target, bytes(251)), 0, out) == 0
+        assert FtpFrameCodec(US, EXTRA).decode_runs(reference(9, target, bytes(251)), 0, out) == 0
     assert out == []
 
 
@@ -61,9 +62,30 @@ def test_run_of_frames_stops_where_it_ends() -> None:
     codec = FtpFrameCodec(US, EXTRA)
     frames = codec.encode(0, Address(1, 1), [bytes([n]) * 251 for n in range(5)])
     data = b"junk" + b"".join(frames) + b"\xfd\x09"
-    out: list[Message] = []
-    assert codec.decode_run(data, 4, out) == len(data) - 2
-    assert [m.payload[0] for m in out if isinstance(m, FtpFrame)] == [0, 1, 2, 3, 4]
+    out: list[Message | FtpRun] = []
+    assert codec.decode_runs(data, 4, out) == len(data) - 2
+    assert [m.payload[0] for m in singly(out) if isinstance(m, FtpFrame)] == [0, 1, 2, 3, 4]
+
+
+@pytest.mark.parametrize("at", [0, 2, 3, 5, 6, 7, 8, 9, 10, 11, 12, 13, 100, 263, 264, 265])
+def test_a_row_of_frames_ends_at_a_damaged_one(at: int) -> None:
+    codec = FtpFrameCodec(US, EXTRA)
+    payloads = [bytes([n]) * 251 for n in range(1, 6)]
+    frames = codec.encode(254, Address(1, 1), payloads)
+    frames[2] = frames[2][:at] + bytes([frames[2][at] ^ 1]) + frames[2][at + 1 :]
+    out: list[Message | FtpRun] = []
+    assert codec.decode_runs(b"".join(frames), 0, out) == 2 * len(frames[0])
+    assert out == [FtpRun(US, Address(1, 1), payloads[:2])]
+    found = singly(Framer(US, stream=False).feed_runs(b"".join(frames)))
+    assert [m.payload for m in found if isinstance(m, FtpFrame)] == payloads[:2] + payloads[3:]
+
+
+def test_a_signed_frame_among_others_is_left_to_pymavlink() -> None:
+    frame = reference(1, Address(1, 1), FULL)
+    body = frame[1:2] + b"\1" + frame[3:-2]  # says that it is signed, and its CRC is right
+    signed = b"\xfd" + body + frame_crc(body, EXTRA).to_bytes(2, "little") + bytes(13)
+    out: list[Message | FtpRun] = []
+    assert FtpFrameCodec(US, EXTRA).decode_runs(frame + signed + frame, 0, out) == len(frame)
 
 
 @pytest.mark.parametrize(
@@ -81,15 +103,15 @@ def test_run_of_frames_stops_where_it_ends() -> None:
     ids=["cut", "crc", "content", "magic", "flags", "id", "id high", "nothing"],
 )
 def test_leaves_everything_else_alone(damage: Callable[[bytes], bytes]) -> None:
-    out: list[Message] = []
+    out: list[Message | FtpRun] = []
     frame = damage(reference(1, Address(1, 1), FULL))
-    assert FtpFrameCodec(US, EXTRA).decode_run(frame, 0, out) == 0
+    assert FtpFrameCodec(US, EXTRA).decode_runs(frame, 0, out) == 0
     assert out == []
 
 
 def test_a_wrong_extra_byte_is_a_wrong_crc() -> None:
-    out: list[Message] = []
-    assert FtpFrameCodec(US, 85).decode_run(reference(1, Address(1, 1), FULL), 0, out) == 0
+    out: list[Message | FtpRun] = []
+    assert FtpFrameCodec(US, 85).decode_runs(reference(1, Address(1, 1), FULL), 0, out) == 0
 
 
 def test_a_flood_of_senders_does_not_grow_the_cache() -> None:
@@ -97,8 +119,8 @@ def test_a_flood_of_senders_does_not_grow_the_cache() -> None:
     for system in range(256):
         for component in range(0, 256, 16):
             sender = FtpFrameCodec(Address(system, component), EXTRA)
-            out: list[Message] = []
-            codec.decode_run(sender.encode(0, Address(1, 1), [FULL])[0], 0, out)
+            out: list[Message | FtpRun] = []
+            codec.decode_runs(sender.encode(0, Address(1, 1), [FULL])[0], 0, out)
             assert out[0].source == (system, component)
     assert len(codec._routes) <= 1024
 
