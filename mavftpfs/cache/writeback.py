@@ -34,7 +34,6 @@ from mavftpfs.shared.errors import (
     IsADirectory,
     MavftpfsError,
     NotFound,
-    RequestTimeout,
 )
 from mavftpfs.shared.model import EntryKind, wire_path
 
@@ -233,9 +232,10 @@ class Writeback:
             if await self._throttle.wait():
                 idle_since = self._context.clock()
                 continue
+            if node.starting and self._context.clock() - idle_since < self._context.options.op_deadline:
+                continue  # an upload is about to begin: to wait for all of it would stop the program
             await self.deliver(node)  # says what is wrong, if anything is
-            if self._context.clock() - idle_since > self._context.options.op_deadline:
-                raise RequestTimeout(f"nothing of {node.path!r} was taken by the vehicle")
+            idle_since = self._context.clock()
 
     def _on_written(self, node: Node) -> None:
         if not node.removed:

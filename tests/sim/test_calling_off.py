@@ -1,4 +1,5 @@
 """A file that loses its name while it is on its way: what sends it is called off, at any moment of it.
+One that gets another name is delivered first.
 
 A local disk unlinks at once, and fsync and close of the file without a name say 0. Here the name costs a few
 round trips, whatever the size of the file, and nothing of it comes back or stays on the card.
@@ -10,6 +11,7 @@ import random
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
 from itertools import product
+from typing import Any
 
 import pytest
 import trio
@@ -19,6 +21,7 @@ from mavftpfs.cache.asides import is_reserved
 from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.options import CacheOptions
 from mavftpfs.cache.tree import Tree
+from mavftpfs.shared.errors import CrossDevice
 from mavftpfs.sim.linkmodel import LinkSettings
 from tests.support.faults import Faults
 from tests.support.trees import content
@@ -49,11 +52,11 @@ def autojump() -> MockClock:
 
 
 @asynccontextmanager
-async def mounted(world: World, *, inplace: bool = False) -> AsyncIterator[Tree]:
+async def mounted(world: World, **options: Any) -> AsyncIterator[Tree]:
     async with world.connection() as connection, trio.open_nursery() as nursery:
         yield Tree(
             connection.store,
-            CacheOptions(inplace=inplace),
+            CacheOptions(**options),
             clock=trio.current_time,
             invalidate=lambda path: None,
             nursery=nursery,
@@ -227,3 +230,38 @@ async def test_a_name_goes_in_a_few_round_trips_whatever_the_size(
             assert trio.current_time() - began - moment < PROMPT
             assert bytes(await file.read(0, len(LONG) + 1)) == LONG
             await file.release()
+
+
+@pytest.mark.parametrize(
+    "profile",
+    [
+        pytest.param(name, marks=() if name in {"px4-nuttx", "mavsdk"} else pytest.mark.soak)
+        for name in PROFILES
+    ],
+)
+async def test_a_file_gets_another_name_while_it_is_written(profile: str, autojump: MockClock) -> None:
+    """What was accepted is on the card then, and the program goes on; on some servers that means all anew."""
+    world = World(profile, SLOW)
+    folder = ROOTS.get(profile, b"") + b"/d"
+    path, other = folder + b"/file", folder + b"/other"
+    world.tree.add(folder + b"/z", b"")
+    piece = content("piece", 32768)
+    async with mounted(world, dirty_max=65536) as tree, trio.open_nursery() as nursery:
+        file = await tree.create(path, exclusive=True)
+
+        async def write() -> None:
+            for number in range(8):
+                await file.write(number * len(piece), piece)
+            await file.flush()
+            await file.release()
+
+        nursery.start_soon(write)
+        await trio.sleep(10)
+        if profile == NO_RENAME:
+            with pytest.raises(CrossDevice):  # mv copies then
+                await tree.rename(path, other)
+            other = path
+        else:
+            await tree.rename(path, other)
+            assert len(world.tree.data(other)) >= 2 * len(piece)
+    assert world.tree.data(other) == 8 * piece
