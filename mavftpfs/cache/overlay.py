@@ -54,7 +54,13 @@ class Overlay:
         return Stat(EntryKind.FILE, node.draft.size, seconds, self._context.options.attr_timeout, nanoseconds)
 
     def shown_time(self, path: bytes, size: int, mtime: int | None) -> tuple[int, int] | None:
-        """Return the (seconds, nanoseconds) that a user set for a listed path, None if there are none."""
+        """Return the (seconds, nanoseconds) that a user set for a listed path, None if there are none.
+
+        A listing says nothing of a file that is being written: not which size and mtime go with what was set.
+        """
+        node = self._context.nodes.get(path)
+        if node is not None and node.draft is not None:
+            return None  # `overlay` shows it
         known = self.times.get(path, size, mtime)
         return None if known is None else shown(known)
 

@@ -253,59 +253,6 @@ async def test_growth_shows_when_a_file_is_opened_too_and_force_goes_on(store: F
     await file.release()
 
 
-# --- times
-
-
-async def test_times_are_kept_until_the_file_changes(store: FakeWriter, tree: Tree) -> None:
-    file = await tree.open(FILE, write=True, truncate=True)
-    await file.write(0, b"data")
-    await tree.set_times(FILE, 1_234_567_890_123_456_789)
-    await file.release()
-    for _ in range(2):
-        stat = await tree.stat(FILE)
-        assert (stat.mtime, stat.mtime_nsec) == (1_234_567_890, 123_456_789)
-        tree.forget_caches()
-    store.files[FILE].mtime = 1_600_000_000  # a server that tells mtimes has its own idea
-    tree.forget_caches()
-    assert (await tree.stat(FILE)).mtime == 1_234_567_890
-    store.files[FILE].mtime = 1_600_000_001
-    tree.forget_caches()
-    assert (await tree.stat(FILE)).mtime == 1_600_000_001
-
-
-async def test_times_follow_a_rename_and_end_with_another_size(store: FakeWriter, tree: Tree) -> None:
-    await write_file(tree, b"/card/.file.tmp", b"data")
-    await tree.set_times(b"/card/.file.tmp", 5 * 10**9)
-    await tree.rename(b"/card/.file.tmp", FILE)
-    assert (await tree.stat(FILE)).mtime == 5
-    store.files[FILE].data += b"x"
-    tree.forget_caches()
-    assert (await tree.stat(FILE)).mtime != 5
-
-
-async def test_writing_ends_a_set_time(tree: Tree) -> None:
-    await tree.set_times(FILE, 5 * 10**9)
-    await tree.truncate(FILE, 10)
-    assert (await tree.stat(FILE)).mtime != 5
-
-
-async def test_where_mtimes_are_listed_a_written_file_shows_the_time_of_day(
-    store: FakeWriter, tree: Tree
-) -> None:
-    store.files[FILE].mtime = 1_500_000_000
-    await write_file(tree, FILE, b"data")
-    assert (await tree.stat(FILE)).mtime == 1_700_000_000
-
-
-async def test_in_a_directory_just_made_too(store: FakeWriter, tree: Tree) -> None:
-    """Else the next listing changes the time of an open file, and its editor asks who changed it."""
-    store.files[FILE].mtime = 1_500_000_000
-    await tree.stat(FILE)
-    await tree.mkdir(b"/card/new")
-    await write_file(tree, b"/card/new/file", b"data")
-    assert (await tree.stat(b"/card/new/file")).mtime == 1_700_000_000
-
-
 # --- files without a name
 
 
