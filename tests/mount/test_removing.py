@@ -1,0 +1,38 @@
+"""rm, and mv over it, of a file that a slow link has not brought to the card yet."""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.mount.conftest import Field
+from tests.support.mounts import wait_until
+from tests.support.trees import content
+
+SLOW = ("--rate", "3000", "--delay", "0.05")
+SIZE = 200_000
+"""Takes over a minute on that link: more than a change of names waits for anything."""
+
+
+@pytest.mark.parametrize("profile", ["px4", "mavsdk"])
+@pytest.mark.parametrize("command", ["rm", "mv"])
+def test_the_name_goes_while_cp_waits_for_the_card(field: Field, profile: str, command: str) -> None:
+    """cp is in its close(), and is told that all is well: nothing is owed for a file without a name."""
+    card, disk = field.local("card"), field.local("disk")
+    (card / "other").write_text("other\n")
+    (disk / "big").write_bytes(content("big", SIZE))
+    vehicle = field.sim(card, profile, SLOW)
+    mount = field.mount(vehicle.source, "dirty_max=1M")
+    with mount.started("cp", disk / "big", mount.path / "big") as cp:
+        there = card / "big"
+        wait_until("a part is on the card", lambda: there.exists() and there.stat().st_size > 5000, 60)
+        if command == "rm":
+            mount.run("rm", mount.path / "big")
+            left = {"other"}
+        else:
+            mount.run("mv", mount.path / "other", mount.path / "big")
+            left = {"big"}
+        assert cp.wait(30) == 0
+    assert set(mount.run("ls", "-A", mount.path).stdout.split()) == left
+    assert {path.name for path in card.iterdir()} == left
+    assert {path.read_text() for path in card.iterdir()} == {"other\n"}
+    assert mount.unmount() == 0
