@@ -33,6 +33,7 @@ GATE_PATIENCE = 5.0
 
 _MAX_FAILING = 256
 _MAX_OPENED = 64
+_MAX_EARLY = 16
 
 TERMINATE_LIMIT = 5.0
 """Seconds to wait for a Terminate before the session is treated as doubtful."""
@@ -69,6 +70,7 @@ class SessionOpener:
         self._reopened: dict[int, bytes] = {}
         self._opened: dict[int, bytes] = {}
         self._disturbed = False
+        self._early: set[tuple[int, int]] = set()
         self._server_assigns: bool | None = None
         self._failing: dict[bytes, None] = {}
         self.resets = 0
@@ -82,6 +84,11 @@ class SessionOpener:
     def opened_by(self, seq: int) -> bytes | None:
         """Return which file an open had opened that was answered under `seq` lately, None if none was."""
         return self._opened.get(seq)
+
+    def note_early(self, seq: int, session: int) -> None:
+        """An open was answered once more that is not known: the one under way may have been, at once."""
+        if len(self._early) < _MAX_EARLY:
+            self._early.add((seq, session))
 
     def leave_open(self, session: int, path: bytes) -> None:
         """An open came to the server once more: what it opened there is to be closed."""
@@ -189,6 +196,7 @@ class SessionOpener:
         asked, expected = self._engine.home_session, self._own_id
         operation = OpenFile(opcode, wire_path(path), asked)
         self._doubt(expected, path)
+        self._early.clear()
         # A time-out or cancellation leaves it doubtful: the open may have been executed.
         await self._run(operation)
         self._trust(expected)
@@ -200,6 +208,9 @@ class SessionOpener:
         self._opened[seq] = path
         if len(self._opened) > _MAX_OPENED:
             del self._opened[next(iter(self._opened))]
+        for early, session in self._early:
+            if early == seq and session != operation.session:
+                self._reopened[session] = path
         writing = opcode != Opcode.OPEN_FILE_RO
         return OpenSession(path, operation.session, operation.size, self._clock(), writing, seq)
 

@@ -54,6 +54,7 @@ class Strays:
             return
         path = self._holder.opener.opened_by(reply.seq)
         if path is None:
+            self._holder.opener.note_early(reply.seq, reply.session)
             return
         session = self._holder.session
         changes = reply.req_opcode != Opcode.OPEN_FILE_RO

@@ -14,7 +14,8 @@ from trio.testing import MockClock
 
 from mavftpfs.cache.options import CacheOptions
 from mavftpfs.cache.tree import Tree
-from mavftpfs.protocol.payload import Opcode
+from mavftpfs.link.messages import Address
+from mavftpfs.protocol.payload import Opcode, request
 from mavftpfs.session.connection import Connection, ConnectOptions
 from mavftpfs.session.echoes import QUIET
 from mavftpfs.sim.linkmodel import LinkSettings
@@ -118,6 +119,33 @@ async def test_what_a_late_open_left_open_is_closed(
         await trio.sleep(8)
         assert copy.late is not None
         assert here.vehicle.server.open_sessions == 0
+
+
+@pytest.mark.parametrize("opcode", [Opcode.OPEN_FILE_RO, Opcode.CREATE_FILE])
+@pytest.mark.parametrize("profile", EVERY_PROFILE)
+async def test_what_an_open_that_came_twice_at_once_left_open_is_closed(
+    profile: str, opcode: Opcode, autojump: MockClock
+) -> None:
+    """Both answers are there before it is known what was opened."""
+    here = world(profile, f=content(1500))
+    async with here.connection() as connection:
+        server = here.vehicle.server
+        handle = server.handle
+
+        def twice(wire: bytes, source: Address, now: float) -> None:
+            handle(wire, source, now)
+            if wire[3] == opcode:
+                server.handle = handle  # type: ignore[method-assign]
+                handle(request(0, Opcode.NONE).encode(), source, now)  # no mere replay of the last answer
+                handle(wire, source, now)
+
+        server.handle = twice  # type: ignore[method-assign]
+        if opcode is Opcode.CREATE_FILE:
+            await put(connection, path(profile, "new"), content(500))
+        else:
+            await read_file(connection, path(profile, "f"))
+        await trio.sleep(8)
+        assert server.open_sessions == 0
 
 
 @pytest.mark.parametrize("nth", [2, 20])
