@@ -5,7 +5,7 @@ from __future__ import annotations
 from mavftpfs.cache.context import Context
 from mavftpfs.cache.files import FileHandle
 from mavftpfs.cache.nodes import Node
-from mavftpfs.shared.errors import FileChanged, IsADirectory
+from mavftpfs.shared.errors import FileChanged, FtpNak, IsADirectory, NotFound
 from mavftpfs.shared.model import EntryKind
 
 STEP = 128 * 1024
@@ -24,6 +24,22 @@ async def open_base(context: Context, path: bytes) -> FileHandle:
     return await context.files.open(path, found.entry, found.directory.listed_at, fresh=fresh)
 
 
+async def open_node(context: Context, node: Node) -> FileHandle:
+    """Open what the vehicle has of a node, whatever it is called by now.
+
+    Raises:
+        FileChanged: it has no name there. Else as open_base.
+    """
+    while True:
+        async with context.paths.steady(lambda: node.path) as path:
+            node.require_reachable()
+            try:
+                return await open_base(context, path)
+            except (NotFound, FtpNak):
+                if node.path == path:
+                    raise  # else it got its lasting hidden name meanwhile
+
+
 async def read_base(context: Context, node: Node, start: int, stop: int) -> bytes | memoryview:
     """Return bytes of the vehicle's file that a node's draft lies over.
 
@@ -33,8 +49,7 @@ async def read_base(context: Context, node: Node, start: int, stop: int) -> byte
     if node.draft is not None and node.draft.ruined:
         raise FileChanged(f"{node.path!r} was emptied on the vehicle while it was changed here")
     if node.base is None:
-        node.require_reachable()
-        handle = await open_base(context, node.path)
+        handle = await open_node(context, node)
         if node.base is None:
             node.base = handle
         else:

@@ -187,6 +187,11 @@ class FileBlocks:
                 waiter.error = error
                 waiter.done.set()
 
+    def ask_again(self) -> None:
+        """Those who wait look again, and ask anew for what is missing: their reader is gone."""
+        for waiter in self._waiters:
+            waiter.done.set()
+
     # --- life of the version
 
     def begin_reading(self) -> None:

@@ -13,6 +13,7 @@ from mavftpfs.cache.directories import Directories
 from mavftpfs.cache.files import Files
 from mavftpfs.cache.nodes import Node, Nodes
 from mavftpfs.cache.options import CacheOptions
+from mavftpfs.cache.pathlocks import PathLocks
 from mavftpfs.cache.remote import RemoteStore, WriteStore
 from mavftpfs.shared.errors import Armed, FileBusy
 
@@ -45,6 +46,11 @@ class Context:
     garbage: dict[bytes, bytes] = field(default_factory=dict)
     torn: dict[bytes, bytes] = field(default_factory=dict)
     armed: bool = False
+
+    @property
+    def paths(self) -> PathLocks:
+        """Whose names are being changed, or must not be: files are opened between such changes."""
+        return self.files.fetcher.paths
 
     def require_disarmed(self) -> None:
         """Raise Armed if nothing may be changed now."""

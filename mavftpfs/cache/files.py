@@ -32,7 +32,7 @@ from mavftpfs.cache.options import MIB
 from mavftpfs.cache.readahead import Pace, Readahead
 from mavftpfs.cache.readonly import ReadOnlyHandle
 from mavftpfs.cache.remote import RemoteStore
-from mavftpfs.cache.versions import MAX_RESTARTS, Fetcher, Version
+from mavftpfs.cache.versions import MAX_RESTARTS, Fetcher, Version, became_another, is_the_same
 from mavftpfs.shared.errors import (
     DataUnproven,
     FileChanged,
@@ -142,7 +142,7 @@ class Files:
         if version.dead is not None or version.recheck:
             return False
         newer = listed_at > version.proven_at
-        if newer and _became_another(version, entry):
+        if newer and became_another(version, entry):
             self._kill(version)
             return False
         same_size = entry.size in (None, version.size)
@@ -240,9 +240,9 @@ class Files:
         except (NotFound, NotADirectory):
             self._kill(version)
             return
-        if _became_another(version, entry):
+        if became_another(version, entry):
             self._kill(version)
-        elif _is_the_same(version, entry):
+        elif is_the_same(version, entry):
             version.proven_boot = boot
         elif not version.blocks.given:
             version.close_reader()
@@ -261,8 +261,9 @@ class Files:
 
     def on_written(self, path: bytes) -> None:
         """What was cached of the path is no longer the file; who has it open opens it anew."""
-        version = self._current.pop(path, None)
-        if version is not None:
+        current = self._current.pop(path, None)
+        older = [v for v in self._open_versions if v.path == path and v is not current]
+        for version in older if current is None else [current, *older]:
             version.dead = FileChanged(f"{path!r} was written")
             version.close_reader()
             version.blocks.on_failed(version.dead)
@@ -280,17 +281,25 @@ class Files:
     def on_renamed(self, old: bytes, new: bytes) -> None:
         """A file, or a directory with all below it, has another path now; open files follow."""
         self.on_removed(new)
-        moved = [path for path in self._current if path == old or path.startswith(old + b"/")]
-        for path in moved:
-            version = self._current.pop(path)
+        for version in self._versions(old):
+            current = self._current.get(version.path) is version
+            if current:
+                del self._current[version.path]
             version.close_reader()
-            version.path = new + path[len(old) :]
-            self._current[version.path] = version
+            version.path = new + version.path[len(old) :]
+            version.blocks.ask_again()
+            if current:
+                self._current[version.path] = version
 
     def on_removed(self, path: bytes) -> None:
         """A file, or an empty directory, is gone."""
-        for known in [p for p in self._current if p == path or p.startswith(path + b"/")]:
-            self.on_written(known)
+        for version in self._versions(path):
+            self.on_written(version.path)
+
+    def _versions(self, path: bytes) -> list[Version]:
+        """Return what is cached or open of a path, older ones too, and of what lies below it."""
+        known = dict.fromkeys((*self._current.values(), *self._open_versions))
+        return [v for v in known if v.path == path or v.path.startswith(path + b"/")]
 
     # --- closing
 
@@ -381,18 +390,3 @@ class FileHandle(ReadOnlyHandle):
         if version.reader is not None and plan.start < plan.stop:
             version.reader.want(plan.start, plan.stop, demand=False)
         return data
-
-
-def _is_the_same(version: Version, entry: DirEntry) -> bool:
-    """Return whether a listing after a restart shows the very file."""
-    known = entry.size is not None and entry.mtime is not None
-    return known and (entry.size, entry.mtime) == (version.size, version.mtime)
-
-
-def _became_another(version: Version, entry: DirEntry) -> bool:
-    """Return whether a listing newer than the version's proof contradicts it (a larger file only grew)."""
-    if entry.size is None or entry.size > version.size:
-        return False
-    if entry.size < version.size:
-        return True
-    return entry.mtime is not None and version.mtime is not None and entry.mtime != version.mtime

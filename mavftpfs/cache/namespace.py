@@ -10,7 +10,7 @@ from __future__ import annotations
 import errno
 import logging
 from collections.abc import AsyncIterator, Awaitable, Callable
-from contextlib import AbstractAsyncContextManager, AsyncExitStack, asynccontextmanager
+from contextlib import AsyncExitStack, asynccontextmanager
 
 import trio
 
@@ -21,7 +21,6 @@ from mavftpfs.cache.emptying import Emptier
 from mavftpfs.cache.hiding import Hider
 from mavftpfs.cache.names import Names
 from mavftpfs.cache.nodes import Node
-from mavftpfs.cache.pathlocks import PathLocks
 from mavftpfs.cache.replacing import Present
 from mavftpfs.cache.spool import SpoolContent
 from mavftpfs.cache.sure import Sure
@@ -69,21 +68,12 @@ class Namespace(Names):
         self._purge = purge
         self._hider = Hider(context, sure, deliverer.replacer, new_content)
         self._on_renamed = on_renamed
-        self._paths = PathLocks(context.options.op_deadline)
-
-    def steady(self, path: bytes) -> AbstractAsyncContextManager[None]:
-        """Have a path, and the directories above it, keep their names while the body opens it.
-
-        Raises:
-            RequestTimeout: a change of them took too long.
-        """
-        return self._paths.hold(path, shared=True)
 
     # --- changing
 
     async def mkdir(self, path: bytes) -> None:
         """See Tree.mkdir."""
-        async with self._paths.hold(path):
+        async with self._context.paths.hold(path):
             if await self.entry(path) is not None:
                 raise AlreadyExists(f"{path!r} exists")
             if self._context.writer.traits.folds_case and await self.other_spelling(path):
@@ -93,7 +83,7 @@ class Namespace(Names):
 
     async def rmdir(self, path: bytes) -> None:
         """See Tree.rmdir."""
-        async with self._paths.hold(path):
+        async with self._context.paths.hold(path):
             entry = await self._need(path)
             if entry.kind is not EntryKind.DIRECTORY:
                 raise NotADirectory(f"{path!r} is not a directory")
@@ -146,7 +136,7 @@ class Namespace(Names):
             try:
                 while node.hidden:
                     path = node.path
-                    async with self._paths.hold(path):  # a directory above it may be about to move
+                    async with self._context.paths.hold(path):  # a directory above it may be about to move
                         if node.path == path:
                             await self._hider.drop_unread(node)
             finally:
@@ -177,7 +167,7 @@ class Namespace(Names):
                     await self._lock_nodes(nodes, doomed, locks)
                     if new not in (None, old) and not await self._deliver_below(old, nodes):
                         continue
-                    await locks.enter_async_context(self._paths.hold(*paths))
+                    await locks.enter_async_context(self._context.paths.hold(*paths))
                     if self._nodes_of(paths) == nodes:
                         yield
                         return

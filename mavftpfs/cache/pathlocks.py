@@ -8,7 +8,7 @@ the new one. Opening holds its path `shared`.
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 
@@ -52,6 +52,22 @@ class PathLocks:
                 self._news = trio.Event()
         if scope.cancelled_caught:
             raise RequestTimeout(f"another change that concerns {paths[0]!r} took too long")
+
+    @asynccontextmanager
+    async def steady(self, path: Callable[[], bytes]) -> AsyncIterator[bytes]:
+        """Open a file in the body: its path, which is yielded, and those above it keep their names.
+
+        `path()`: what it is called by now, since it may change until that begins.
+
+        Raises:
+            RequestTimeout: a change took too long.
+        """
+        while True:
+            known = path()
+            async with self.hold(known, shared=True):
+                if path() == known:
+                    yield known
+                    return
 
     async def _wait(self, wanted: _Hold) -> bool:
         """Wait until none that came before is in the way; return whether any was."""

@@ -14,6 +14,7 @@ from functools import partial
 from mavftpfs.cache.blocks import BlockCache, FileBlocks, Gaps
 from mavftpfs.cache.flights import Flights
 from mavftpfs.cache.kept import Kept
+from mavftpfs.cache.pathlocks import PathLocks
 from mavftpfs.cache.readahead import NOTHING, Plan
 from mavftpfs.cache.remote import Reader, RemoteStore
 from mavftpfs.shared.errors import (
@@ -26,6 +27,7 @@ from mavftpfs.shared.errors import (
     RemoteProtocolError,
     RequestTimeout,
 )
+from mavftpfs.shared.model import DirEntry
 
 MAX_RESTARTS = 8
 """How often one read starts anew because other readers of the file dropped doubtful bytes meanwhile."""
@@ -96,6 +98,9 @@ class Fetcher:
 
     After a restart of the vehicle the same check decides, where the listing cannot, whether the file is
     still the one of which bytes were given out (cache.files); it decides only if all of these are held.
+
+    Attributes:
+        paths: whose names are being changed by us: nothing is opened meanwhile.
     """
 
     def __init__(
@@ -111,6 +116,7 @@ class Fetcher:
         self._cache = cache
         self._on_distrust = on_distrust
         self._on_changed = on_changed
+        self.paths = PathLocks(cache.patience)
         self._opening: Flights[Version, Reader] = Flights()
         self._settling: Flights[Version, bool] = Flights()
         self.unproven = 0
@@ -162,9 +168,11 @@ class Fetcher:
         raise DataUnproven(f"{version.path!r} is doubted again and again")
 
     async def _open(self, version: Version, expected: int | None) -> Reader:
-        version.close_reader()
-        version.blocks.begin_reading()
-        reader = await self._store.open_reader(version.path, version.blocks, expected_size=expected)
+        async with self.paths.steady(lambda: version.path) as path:
+            version.require_alive()
+            version.close_reader()
+            version.blocks.begin_reading()
+            reader = await self._store.open_reader(path, version.blocks, expected_size=expected)
         if version.handles == 0:
             reader.close()
             raise LocalProtocolError(f"{version.path!r} was closed while it was read")
@@ -214,8 +222,9 @@ class Fetcher:
                 raise
             return False  # after a restart nothing else can prove it, and asking takes minutes
         async with version.blocks.held(0, version.size):
-            reader = await self.reader(version)
-            await version.blocks.fill(0, version.size, partial(_want, reader, NOTHING))
+            while version.blocks.missing(0, version.size):
+                reader = await self.reader(version)
+                await version.blocks.fill(0, version.size, partial(_want, reader, NOTHING))
             fresh = await self._opening.run(version, partial(self._open, version, None))
             return fresh.size == version.size and remote == await version.blocks.crc32()
 
@@ -233,3 +242,18 @@ def _want(reader: Reader, plan: Plan, gaps: Gaps) -> None:
         reader.want(start, stop, demand=True)
     if plan.start < plan.stop:
         reader.want(plan.start, plan.stop, demand=False)
+
+
+def is_the_same(version: Version, entry: DirEntry) -> bool:
+    """Return whether a listing after a restart shows the very file."""
+    known = entry.size is not None and entry.mtime is not None
+    return known and (entry.size, entry.mtime) == (version.size, version.mtime)
+
+
+def became_another(version: Version, entry: DirEntry) -> bool:
+    """Return whether a listing newer than the version's proof contradicts it (a larger file only grew)."""
+    if entry.size is None or entry.size > version.size:
+        return False
+    if entry.size < version.size:
+        return True
+    return entry.mtime is not None and version.mtime is not None and entry.mtime != version.mtime

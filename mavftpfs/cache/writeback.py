@@ -89,7 +89,7 @@ class Writeback:
         self.overlay.stat(path)  # raises NotFound for names that are hidden
         if self._local.owns(path):
             return self._local.open(path, write=False)
-        async with self._namespace.steady(path):
+        async with self._context.paths.hold(path, shared=True):
             node, handle = self._context.nodes.get(path), None
             if node is None or node.draft is None:
                 handle = await open_base(self._context, path)
@@ -101,7 +101,7 @@ class Writeback:
         if self._local.owns(path):
             return self._local.open(path, write=True, truncate=truncate)
         self._context.require_disarmed()
-        async with self._namespace.steady(path):
+        async with self._context.paths.hold(path, shared=True):
             file = WriteFile(self, self._context, await self._need_draft(path, truncate=truncate))
         if truncate:
             try:
@@ -266,7 +266,7 @@ class Writeback:
                 await local.truncate(size)
             return
         self._context.require_disarmed()
-        async with self._namespace.steady(path):
+        async with self._context.paths.hold(path, shared=True):
             node = await self._need_draft(path, truncate=size == 0)
             file = WriteFile(self, self._context, node)  # also beside other writers: they may end meanwhile
         had = node.undelivered

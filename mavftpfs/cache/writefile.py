@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import Protocol
 
-from mavftpfs.cache.base import open_base, read_base
+from mavftpfs.cache.base import open_node, read_base
 from mavftpfs.cache.context import Context
 from mavftpfs.cache.draft import Draft, Where
 from mavftpfs.cache.files import FileHandle
@@ -80,8 +80,7 @@ class _Reading:
         if self._handle is None or self._generation != node.generation:
             self._close_handle()
             self._generation = node.generation
-            node.require_reachable()
-            self._handle = await open_base(self._context, node.path)
+            self._handle = await open_node(self._context, node)
         return await self._handle.read(offset, size)
 
     async def _read_draft(self, draft: Draft, start: int, stop: int) -> bytes | memoryview:

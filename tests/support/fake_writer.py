@@ -192,6 +192,7 @@ class FakeWriter(FakeStore):
             self.crimes.append(f"RemoveFile of the directory {path!r}")
         self._file(path, Opcode.REMOVE_FILE)
         del self.files[path]
+        self._end_readers(path)
         _maybe_lose(lost)
 
     async def make_directory(self, path: bytes) -> None:
@@ -271,6 +272,7 @@ class FakeWriter(FakeStore):
             if not self.kind.replaces:
                 raise FtpNak(Opcode.RENAME, NakCode.FILE_EXISTS)
             del self.files[there]
+            self._end_readers(there)
         elif there == old and there != new and not self.kind.replaces:
             raise FtpNak(Opcode.RENAME, NakCode.FILE_EXISTS)  # FatFs sees the name itself
         self._require_parent(new, Opcode.RENAME)
@@ -282,6 +284,16 @@ class FakeWriter(FakeStore):
 
         self.files = {moved(path): file for path, file in self.files.items()}
         self.directories = {moved(path) for path in self.directories}
+        for reader in self.readers:  # as the session has it
+            reader.path = moved(reader.path)
+
+    def _end_readers(self, path: bytes) -> None:
+        """The session ends the readers of what we removed or replaced."""
+        for reader in self.readers:
+            if reader.path == path and not reader.closed:
+                reader.demand.clear()
+                reader.ahead.clear()
+                reader.sink.on_failed(FileChanged(f"{path!r} was removed or replaced"))
 
     async def crc32(self, path: bytes, *, size: int | None = None) -> int:
         return await super().crc32(self.real(path), size=size)

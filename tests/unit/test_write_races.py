@@ -205,3 +205,76 @@ async def test_what_is_opened_while_a_failed_truncation_is_given_up_is_written(
     await file.write(101, b"z")
     await file.release()
     assert store.files[FILE].data == b"x" * 100 + b"yz" + b"x" * 198
+
+
+# --- reading while names change
+
+
+async def read_slowly(store: FakeWriter, file: OpenFile, expected: bytes) -> None:
+    """Read what takes a while, as a program that copies does."""
+    store.chunk_delay = 0.1
+    assert bytes(await file.read(0, len(expected))) == expected
+    store.chunk_delay = 0.0
+
+
+@pytest.mark.parametrize("kind", ["posix", "fat"])
+async def test_a_read_under_way_goes_on_when_the_file_is_renamed(
+    nursery: trio.Nursery, autojump_clock: object, kind: str
+) -> None:
+    old = bytes(range(256)) * 100
+    for later in range(20):
+        store = FakeWriter(KINDS[kind], nursery)
+        store.add(FILE, old)
+        store.add(OTHER, b"n" * len(old))
+        tree = make_writable(store)
+        store.chunk, store.write_delay = 4096, 0.1
+        file, replaced = await tree.open(FILE), await tree.open(OTHER)
+        began = trio.current_time()
+        async with trio.open_nursery() as both:
+            both.start_soon(read_slowly, store, file, old)
+            both.start_soon(read_slowly, store, replaced, b"n" * len(old))
+            await trio.sleep(later * 0.05)
+            await tree.rename(FILE, OTHER)
+        assert trio.current_time() - began < 10
+        for handle in (file, replaced):
+            await handle.release()
+        await trio.sleep(5)
+        assert list(store.files) == [OTHER]
+
+
+async def test_a_reader_never_gets_bytes_of_what_replaces_its_file(
+    nursery: trio.Nursery, autojump_clock: object
+) -> None:
+    """Its file was delivered by another handle, so it opens it anew at the next read: at any moment."""
+    for later in range(30):
+        store = FakeWriter(KINDS["posix"], nursery)
+        store.add(FILE, b"old" * 300)
+        store.add(OTHER, NEW)
+        tree = make_writable(store)
+        writer, reader = await tree.open(FILE, write=True), await tree.open(FILE)
+        await writer.write(0, b"O")
+        await writer.release()
+        store.write_delay, store.open_delay = 0.1, 0.25
+        async with trio.open_nursery() as both:
+            both.start_soon(tree.rename, OTHER, FILE)
+            await trio.sleep(later * 0.02 + 0.001)
+            assert bytes(await reader.read(0, 900)) == b"Old" + b"old" * 299
+        await reader.release()
+
+
+async def test_who_opened_an_older_version_follows_the_renames_too(
+    nursery: trio.Nursery, autojump_clock: object
+) -> None:
+    """Logs are rotated, and are as long as each other."""
+    store = FakeWriter(KINDS["posix"], nursery)
+    store.add(FILE, b"old" * 300)
+    tree = make_writable(store, dir_timeout=0.0)
+    first = await tree.open(FILE)
+    await tree.rename(FILE, OTHER)
+    last = await tree.open(OTHER)
+    await tree.rename(OTHER, b"/d/third")
+    for name in (FILE, OTHER):
+        store.add(name, NEW)
+    for file in (first, last):
+        assert bytes(await file.read(0, 900)) == b"old" * 300
+        await file.release()
