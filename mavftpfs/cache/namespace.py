@@ -27,6 +27,7 @@ from mavftpfs.cache.sure import Sure
 from mavftpfs.shared.errnos import errno_for
 from mavftpfs.shared.errors import (
     AlreadyExists,
+    Armed,
     CrossDevice,
     FileBusy,
     FtpNak,
@@ -313,6 +314,8 @@ class Namespace(Names):
         if not there and not by_case and fits_rename(old, new):
             await self._rename_plainly(old, new)
             return
+        if not fits_rename(old, new) and self._context.writer.traits.rename_works is False:
+            raise NotSupported("this server cannot rename")  # a small file would be made for nothing
         replacer = self._deliverer.replacer
         places = self._context.namer.places(new, old)
         replacer.reserve(places)
@@ -323,6 +326,10 @@ class Namespace(Names):
             else:
                 await self._step_aside(old, new, places)
                 await replacer.replace_by_way(old, new, places, present)
+        except (FtpNak, Armed, NotSupported):
+            if self._context.torn.keys().isdisjoint((old, new)):
+                await replacer.clean(new, places)  # all is where it was
+            raise
         finally:
             replacer.release(places)
 

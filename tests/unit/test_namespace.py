@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import errno
 from collections.abc import AsyncIterator
 from contextlib import suppress
+from itertools import count
 
 import pytest
 import trio
 
 from mavftpfs.cache.asides import STALE_AFTER, Kind, Reserved, is_reserved
+from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.shared.errors import (
     AlreadyExists,
     CrossDevice,
     DirectoryNotEmpty,
+    FtpNak,
     InvalidMove,
     IsADirectory,
     NotADirectory,
@@ -154,6 +158,34 @@ async def test_long_paths_are_renamed_in_two_steps(fat: FakeWriter) -> None:
     await tree.rename(long + b"2", long + b"3")
     assert fat.files[long + b"3"].data == b"1"
     assert not [path for path in fat.files if is_reserved(split(path)[1])]
+
+
+@pytest.mark.parametrize(("kind", "refused"), [("littlefs", -1), ("fat", 0), ("fat", 1)])
+async def test_a_long_rename_that_is_refused_leaves_nothing(
+    autojump_clock: object, nursery: trio.Nursery, kind: str, refused: int
+) -> None:
+    """The small file that says where a short name belongs is written before anything is moved."""
+    store = FakeWriter(KINDS[kind], nursery)
+    old, new = (b"/d/" + letter * 140 for letter in (b"o", b"n"))
+    store.add(old, b"O")
+    tree = make_writable(store)
+    renames = count()
+
+    def refuse(what: str, *_: object) -> None:
+        if what == "rename" and next(renames) == refused:
+            store.fail_at[store.requests + 1] = FtpNak(Opcode.RENAME, NakCode.FAIL_ERRNO, errno.EACCES)
+
+    store.before_request = refuse
+    with pytest.raises((CrossDevice, FtpNak)):
+        await tree.rename(old, new)
+    assert shape(store) == {old: b"O"}
+    if kind == "littlefs":  # what was learnt is not tried again at such a price
+        asked = store.requests
+        with pytest.raises(CrossDevice):
+            await tree.rename(old, new)
+        assert store.requests == asked
+    assert store.crimes == []
+    nursery.cancel_scope.cancel()
 
 
 # --- case
