@@ -37,6 +37,11 @@ class Foresight:
         """We took this name away."""
         self._count(path, -1)
 
+    def lose(self, *paths: bytes) -> None:
+        """These names may be there now, or not."""
+        for path in paths:
+            self._strings.pop(wire_path(split(path)[0]), None)
+
     def forget(self) -> None:
         """It may be another card."""
         self._strings.clear()

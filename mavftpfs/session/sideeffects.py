@@ -117,8 +117,7 @@ class SideEffects:
             await self._scheduler.echoes.let_pass(new)
             with self._scheduler.echoes.noted(old):
                 await self._perform(lambda: Simple(Opcode.RENAME, data), lambda: self._is_renamed(old, new))
-            self._foresight.took(old)
-            self._foresight.made(new)
+            self._foresight.lose(old, new)  # there may have been a file of the new name
             self._scheduler.gone(new)
             self._scheduler.moved(old, new)
 

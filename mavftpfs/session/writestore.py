@@ -138,6 +138,7 @@ class WriteStore:
         wire_path(first)
         wire_path(second)
         self._scheduler.check_may_write()
+        self._foresight.lose(first, second)
         await probe_writing(self._scheduler, self._effects, first, second)
 
     async def _require_free(self, path: bytes) -> None:
