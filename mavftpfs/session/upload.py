@@ -233,6 +233,7 @@ class QueuedUpload:
         finally:
             self._host.forget(self)
         self.feed.put_back()
+        await self._host.outlast_copies(self.created_at)  # or what is removed next comes back empty
 
     def _begin_again(self) -> None:
         self.clean = False

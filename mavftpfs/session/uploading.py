@@ -237,8 +237,10 @@ class Uploading:
         if upload.free_at is not None and self._clock() - upload.free_at > FREE_FOR:
             await self._require_free(upload.path)
         upload.free_at, upload.begun = None, True  # what is there from now on may be ours
-        session = await self._holder.open(upload.path, Opcode.CREATE_FILE)
-        upload.created_at = self._clock()
+        try:
+            session = await self._holder.open(upload.path, Opcode.CREATE_FILE)
+        finally:
+            upload.created_at = self._clock()
         upload.opened = True
         return session
 
