@@ -228,6 +228,8 @@ class Deliverer:
             draft.maybe_made = True
             raise
         draft.made = True
+        # Whoever takes its name away before it was looked at has to find it there.
+        self._context.dentries.note_created(path, DirEntry(split(path)[1], EntryKind.FILE, 0))
 
     async def _is_ours(self, path: bytes, draft: Draft) -> bool:
         """Return whether a file that appeared is the empty one we may have made; note it if so."""
