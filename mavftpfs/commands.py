@@ -128,11 +128,27 @@ def umount(args: argparse.Namespace) -> int:
         if not is_ours(mountpoint):
             raise MountFailed(f"no vehicle is mounted on {mountpoint}") from exc
         unmount(mountpoint, lazy=args.lazy)
-        return ExitCode.OK
+        return _after_a_killed_mount()
     _wait_for_end(int(reply["pid"]))
     if reply.get("message"):
         print(f"mavftpfs: {reply['message']}", file=sys.stderr)
     return int(reply["exit_code"])
+
+
+def _after_a_killed_mount() -> int:
+    """Nobody delivers what it held: say so."""
+    from mavftpfs.farewell import left_by_killed_mounts
+
+    left = left_by_killed_mounts(os.environ)
+    if not left:
+        return ExitCode.OK
+    places = ", ".join(sorted({str(data.parent) for data in left}))
+    print(
+        f"mavftpfs: {len(left)} file(s) did not reach the vehicle when a mount was killed; they lie "
+        f"in {places} until it is mounted again, which moves them to a recovery directory",
+        file=sys.stderr,
+    )
+    return ExitCode.UNDELIVERED
 
 
 def _wait_for_end(pid: int) -> None:

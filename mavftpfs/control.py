@@ -16,6 +16,7 @@ import socket
 import stat
 import time
 from collections.abc import Awaitable, Callable, Iterator, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -121,14 +122,18 @@ class ControlServer:
             OSError: the socket cannot be bound.
         """
         listener = _bind(self._path)
+        ours = self._path.lstat().st_ino
         try:
             async with trio.open_nursery() as clients:
                 task_status.started()
                 with self._accepting:
                     await self._accept(listener, clients)
         finally:
+            with suppress(FileNotFoundError):
+                # While we delivered, the next mount may have put its socket there.
+                if self._path.lstat().st_ino == ours:
+                    self._path.unlink()
             listener.close()
-            self._path.unlink(missing_ok=True)
             self.closed.set()
 
     def close(self) -> None:

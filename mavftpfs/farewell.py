@@ -12,6 +12,7 @@ from pathlib import Path
 from random import SystemRandom
 from typing import Protocol
 
+from mavftpfs.cache.rescuing import left_in
 from mavftpfs.cache.spool import SpoolDirectory
 from mavftpfs.link.messages import Address
 from mavftpfs.shared.errors import MavftpfsError
@@ -92,6 +93,12 @@ def spool_base(environment: Mapping[str, str], vehicle: Address | None) -> Path:
     """Return where the mounts of one vehicle keep what they hold: by its address, whatever the link."""
     name = "unknown" if vehicle is None else f"{vehicle.system}-{vehicle.component}"
     return state_directory(environment) / "mavftpfs" / "spool" / name
+
+
+def left_by_killed_mounts(environment: Mapping[str, str]) -> list[Path]:
+    """Return what killed mounts of this user hold that no vehicle has; the next mount of each offers it."""
+    spools = state_directory(environment) / "mavftpfs" / "spool"
+    return [data for slot in sorted(spools.glob("*/slot*")) for data in left_in(slot)]
 
 
 @contextmanager

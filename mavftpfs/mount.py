@@ -34,7 +34,7 @@ from mavftpfs.fuse.options import MountOptions, fuse_words
 from mavftpfs.fuse.writing import WritingOperations
 from mavftpfs.kernelnews import Invalidator
 from mavftpfs.link.uri import LinkSpec
-from mavftpfs.mountpoint import stderr_of, unmount
+from mavftpfs.mountpoint import is_ours, stderr_of, unmount
 from mavftpfs.shared.errors import MavftpfsError
 
 log = logging.getLogger("mavftpfs.mount")
@@ -139,6 +139,7 @@ class _Life:
         self._loop_scope: trio.CancelScope | None = None
         self._signals = 0
         self._stop_asked = False
+        self._let_go = False
         self._started = time.time()
 
     def fail(self, error: MavftpfsError) -> None:
@@ -190,6 +191,7 @@ class _Life:
                 if not self._stop_asked:
                     await fuse_loop()
             self._loop_scope = None
+            self._let_go = True
             nursery.cancel_scope.cancel()
 
     # -- control ----------------------------------------------------------------------------------
@@ -212,7 +214,13 @@ class _Life:
     async def _umount(self, request: Reply) -> Reply:
         lazy = bool(request.get("lazy"))
         action = partial(unmount, self.request.mountpoint, lazy=lazy)
-        await trio.to_thread.run_sync(action, abandon_on_cancel=True)
+        if not self._let_go:
+            try:
+                await trio.to_thread.run_sync(action, abandon_on_cancel=True)
+            except MountFailed:
+                if await trio.to_thread.run_sync(is_ours, self.request.mountpoint):
+                    raise
+                # Somebody else unmounted it meanwhile: wait for the end as they do.
         if lazy:
             self._stop_gently()  # the kernel lets go only when the last user does, which may be never
         await self.finished.wait()

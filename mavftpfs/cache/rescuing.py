@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import fcntl
 import json
 import logging
 import os
@@ -69,10 +70,10 @@ def rescue(slot: Path, recovery: Path) -> tuple[list[Path], list[OSError]]:
     for data in data_in(slot):
         facts = _read_facts(data)
         try:
-            if facts.get("needed") is False or (facts.get("unfinished") and not data.stat().st_size):
-                remove(data)
-            else:
+            if _is_needed(data, facts):
                 found.append(_move(data, facts, recovery))
+            else:
+                remove(data)
         except OSError as exc:
             log.warning("%s stays where it is: %s", data, exc)
             failed.append(exc)
@@ -81,6 +82,21 @@ def rescue(slot: Path, recovery: Path) -> tuple[list[Path], list[OSError]]:
             with contextlib.suppress(OSError):
                 stray.unlink()
     return found, failed
+
+
+def left_in(slot: Path) -> list[Path]:
+    """Return the files that the vehicle lacks and that nobody holds any more; none while a mount uses it."""
+    try:
+        descriptor = os.open(slot / "owner", os.O_RDWR | os.O_CLOEXEC)
+    except OSError:
+        return []
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        return [data for data in data_in(slot) if _is_needed(data, _read_facts(data))]
+    except OSError:
+        return []
+    finally:
+        os.close(descriptor)
 
 
 def free_name(directory: Path, name: str) -> Path:
@@ -119,6 +135,11 @@ def _read_facts(data: Path) -> dict[str, object]:
         log.warning("%s: what it belongs to was not written down: %s", data, exc)
         return {}
     return facts if isinstance(facts, dict) else {}
+
+
+def _is_needed(data: Path, facts: Mapping[str, object]) -> bool:
+    """Return whether the vehicle lacks a spooled file and somebody may want it."""
+    return facts.get("needed") is not False and not (facts.get("unfinished") and not data.stat().st_size)
 
 
 def _move(data: Path, facts: Mapping[str, object], recovery: Path) -> Path:

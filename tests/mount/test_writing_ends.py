@@ -7,6 +7,7 @@ import json
 import os
 import re
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -14,6 +15,7 @@ from pathlib import Path
 
 import pytest
 
+from mavftpfs import control
 from tests.mount.conftest import Field
 from tests.support.mounts import Mount, abort_mount, mounted_at, wait_until
 from tests.support.trees import content
@@ -208,6 +210,42 @@ def test_unmounting_waits_for_a_vehicle_that_comes_back(field: Field, data: Path
     assert (child.returncode, errors) == (0, "")
     assert (card / "lost.bin").read_bytes() == data.read_bytes()
     assert sorted(path.name for path in card.iterdir()) == ["confirmed", "lost.bin"]
+
+
+def test_whoever_unmounts_second_waits_for_the_delivery_too(field: Field, data: Path) -> None:
+    card = field.local("card")
+    vehicle = field.sim(card)
+    mount = field.mount(vehicle.source, *QUICK)
+    write_to_nobody(mount, vehicle, data)
+    subprocess.run(["fusermount3", "-u", mount.path], check=True, timeout=60)
+    wait_until("it delivers before it ends", lambda: "delivering" in mount.alive_or_ended().text(), 20)
+    path = control.find_socket(str(mount.path), control.own_directories())
+    with socket.socket(socket.AF_UNIX) as client:
+        client.settimeout(60)
+        client.connect(str(path))
+        client.sendall(b'{"command": "umount"}\n')
+        control.ask(path, {"command": "status"}, timeout=20)  # served after the one before
+        vehicle.resume()
+        reply = json.loads(client.makefile().readline())
+    assert (reply["ok"], reply.get("exit_code")) == (True, 0), reply
+    assert (card / "lost.bin").read_bytes() == data.read_bytes()
+
+
+def test_unmounting_what_a_killed_daemon_left_says_what_it_held(field: Field, data: Path) -> None:
+    vehicle = field.sim(field.local("card"))
+    vehicle.left_alone = True
+    mount = field.mount(vehicle.source, *QUICK)
+    write_to_nobody(mount, vehicle, data)
+    process, mount.process = mount.alive(), None
+    process.kill()
+    argv = [sys.executable, "-m", "mavftpfs", "umount", str(mount.path)]
+    done = subprocess.run(argv, capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 4, done.stderr
+    assert "1 file(s) did not reach the vehicle" in done.stderr
+    assert not mounted_at(mount.path)
+    vehicle.resume()
+    place = told(field.mount(vehicle.source, *QUICK).alive())
+    assert (place / "lost.bin").read_bytes() == data.read_bytes()
 
 
 def test_a_killed_daemon_loses_only_what_was_not_confirmed(field: Field, data: Path) -> None:

@@ -97,6 +97,16 @@ async def test_a_client_that_leaves_disturbs_nobody(tmp_path: Path) -> None:
         assert (await ask_from_outside(path, {"command": "echo"}))["ok"]
 
 
+async def test_a_mount_that_ends_leaves_the_socket_of_the_next_one_there(tmp_path: Path) -> None:
+    path = tmp_path / "s.sock"
+    async with serving(path, {"echo": echo}) as first, serving(path, {"echo": echo}):
+        first.close()
+        with trio.fail_after(20):
+            await first.closed.wait()
+        assert (await ask_from_outside(path, {"command": "echo"}))["ok"]
+    assert not path.exists()
+
+
 async def test_a_crowd_of_silent_clients_costs_few_descriptors(tmp_path: Path) -> None:
     path = tmp_path / "s.sock"
     async with serving(path, {"echo": echo}):
