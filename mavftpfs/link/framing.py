@@ -121,12 +121,8 @@ class Framer:
         out: list[Message | FtpRun] = []
         position = self._scan(data, out)
         self._tail = data[position:]
-        self._count(out)
+        self.stats.frames += _frames(out)
         return out
-
-    def _count(self, found: list[Message | FtpRun]) -> None:
-        for message in found:
-            self.stats.frames += len(message.payloads) if type(message) is FtpRun else 1
 
     def reset(self) -> None:
         """Forget a half-received frame: the stream was reopened."""
@@ -149,7 +145,7 @@ class Framer:
                 self._tail = self._tail[skipped:]
         finally:
             self.stream = True
-        self._count(out)
+        self.stats.frames += _frames(out)
         return out
 
     def _join(self, data: bytes) -> bytes:
@@ -372,3 +368,10 @@ class Framer:
         if self.on_frame is not None:
             self.on_frame(frame)
         return frame
+
+
+def _frames(messages: list[Message | FtpRun]) -> int:
+    frames = 0
+    for message in messages:
+        frames += len(message.payloads) if type(message) is FtpRun else 1
+    return frames

@@ -26,8 +26,8 @@ QUIET = 0.5
 """Seconds of silence in mid-frame after which a stream's unfinished frame is not waited for. TCP may pause
 for a retransmission, serial ports do not pause inside a frame."""
 
-REFILL_EVERY = 8
-"""Chunks of input after which room in the window is used at once: the server works meanwhile."""
+REFILL_AT = 32
+"""Replies after which room in the window is used at once: the server works meanwhile."""
 
 BACKLOG_LIMIT = 16 * 1024
 """Bytes the link may hold unsent before the engine is asked for more: nothing overtakes what waits there."""
@@ -137,7 +137,7 @@ class Driver:
         feed = self.framer.feed_runs
         for index, chunk in enumerate(chunks):
             self._handle(feed(chunk), now, index)
-            if index % REFILL_EVERY == REFILL_EVERY - 1:
+            if len(self._gathered) >= REFILL_AT:
                 self._pass_on(now)
                 self._refill(now)
         self._pass_on(now)

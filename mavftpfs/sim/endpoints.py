@@ -24,6 +24,8 @@ from mavftpfs.sim.linkmodel import Direction, LinkModel
 from mavftpfs.sim.vehicle import SimVehicle
 
 _PTY_OUTBOX = 16 * 1024
+_ANSWER_AT = 16
+"""Replies that wait at most for others before they are sent."""
 
 
 class Endpoint:
@@ -100,7 +102,8 @@ class Endpoint:
     def _exchange(self, chunks: list[bytes], now: float) -> None:
         for chunk in chunks if not self.cut else ():
             self.vehicle.receive(chunk, now)
-            self._answer(now)  # at once, so that the client works on it while the next is served
+            if self.vehicle.server.ready >= _ANSWER_AT:  # the client works on it while the next is served
+                self._answer(now)
         self._answer(now)
 
     def _answer(self, now: float) -> None:

@@ -66,6 +66,11 @@ class Firmware(ABC):
         self._ready_bytes = 0
         return ready
 
+    @property
+    def ready(self) -> int:
+        """How many replies are due."""
+        return len(self._ready)
+
     def next_deadline(self) -> float | None:
         """When `outgoing` may have something, or a timer runs; None if only a request can change anything."""
         if self._ready:

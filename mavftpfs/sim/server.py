@@ -112,6 +112,11 @@ class FtpServer:
         return self._firmware.crashed
 
     @property
+    def ready(self) -> int:
+        """How many replies wait for the next `outgoing`, not counting those that are due only later."""
+        return self._firmware.ready
+
+    @property
     def dropped_requests(self) -> int:
         """Requests lost to a full queue or receive buffer."""
         return self._firmware.dropped_requests
