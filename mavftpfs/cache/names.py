@@ -9,12 +9,14 @@ from __future__ import annotations
 
 import errno
 import logging
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
 
 from mavftpfs.cache.asides import is_reserved
 from mavftpfs.cache.context import Context
 from mavftpfs.cache.remote import FREE_FOR
 from mavftpfs.shared.errnos import errno_for
-from mavftpfs.shared.errors import FtpNak, MavftpfsError
+from mavftpfs.shared.errors import FtpNak, LocalProtocolError, MavftpfsError
 from mavftpfs.shared.model import DirEntry, EntryKind, join, split
 
 log = logging.getLogger("mavftpfs.cache")
@@ -76,6 +78,29 @@ class Names:
             await self._learn_folding(parent, path, entries[others[0]])
         return join(parent, others[0]) if self._context.writer.traits.folds_case is not False else None
 
+    async def require_kept(self, path: bytes) -> None:
+        """Refuse a new name that the card would take for another one, of which it would change the file.
+
+        FatFs drops dots and blanks at the end of every name (its create_name), which a file of our own
+        shows. NuttX drops the dot behind a short name only (its fat_parsesfname): there it is looked whether
+        the name opens a file although no listing shows it.
+
+        Raises:
+            LocalProtocolError. Else as entry and WriteStore.create_empty, stat_size.
+        """
+        parent, name = split(path)
+        entries = (await self._context.directories.get(parent)).entries
+        if name in entries:
+            return
+        traits, plain = self._context.writer.traits, _without_end(name)
+        ends = len(plain) < len(name)
+        if ends and traits.drops_ends is None:
+            async with self._own_file(path) as own:
+                traits.drops_ends = await self._opens(own + b".")
+        alike = any(_without_end(n) == plain and n.lower() != name.lower() for n in entries)
+        if (ends and traits.drops_ends) or (alike and await self._opens(path)):
+            raise LocalProtocolError(f"this card drops dots and blanks at the end of names as {name!r}")
+
     # --- inside
 
     def _drafted(self, path: bytes) -> DirEntry | None:
@@ -117,14 +142,19 @@ class Names:
         return True
 
     async def _try_own_file(self, path: bytes) -> None:
-        """Try with a file of our own, which is removed, here or at a later listing."""
+        async with self._own_file(path) as own:
+            parent, name = split(own)
+            await self._try_spelling(own, join(parent, name.upper()))
+
+    @asynccontextmanager
+    async def _own_file(self, path: bytes) -> AsyncIterator[bytes]:
+        """Try with an empty file of our own beside `path`, which is removed, here or at a later listing."""
         context = self._context
         own = context.namer.probes(path)[0]
-        parent, name = split(own)
         context.live.add(own)
         try:
             await context.writer.create_empty(own)
-            await self._try_spelling(own, join(parent, name.upper()))
+            yield own
         finally:
             context.live.discard(own)
             await self._remove_own(own)
@@ -135,3 +165,7 @@ class Names:
         except MavftpfsError as error:
             log.debug("%r goes at a later listing: %s", own, error)
         self._context.dentries.expire(split(own)[0], self._context.clock())
+
+
+def _without_end(name: bytes) -> bytes:
+    return name.rstrip(b". ").lower()

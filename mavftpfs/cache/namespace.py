@@ -79,6 +79,7 @@ class Namespace(Names):
                 raise AlreadyExists(f"{path!r} exists")
             if self._context.writer.traits.folds_case and await self.other_spelling(path):
                 raise AlreadyExists(f"{path!r} exists in another spelling")  # else the server says it
+            await self.require_kept(path)
             await self._sure.make_directory(path)
             self._context.on_changed(path)
 
@@ -119,6 +120,8 @@ class Namespace(Names):
             other = None if target is not None else await self.other_spelling(new)
             if other not in (None, old):
                 raise AlreadyExists(f"{new!r} is {other!r} on this card, which does not tell case apart")
+            if target is None:
+                await self.require_kept(new)
             if target is not None and noreplace:
                 raise AlreadyExists(f"{new!r} exists")
             if old == new:

@@ -126,6 +126,7 @@ class Writeback:
             if exclusive:
                 raise AlreadyExists(f"{path!r} exists")
             return await self.open(other or path, truncate=False)
+        await self._namespace.require_kept(path)
         node = self._context.nodes.need(path)
         made = node.draft is None
         if made:

@@ -50,6 +50,7 @@ class WriteTraits:
         rename_works: a rename succeeded (False: LittleFS has none). Filled by the cache.
         rename_replaces: a rename onto an existing file worked (False: FAT refuses it). Filled by the cache.
         folds_case: two spellings of a name open the same file. Filled by the cache.
+        drops_ends: dots and blanks at the end of a name do not count (FatFs). Filled by the cache.
     """
 
     wo_truncates: bool | None = None
@@ -58,3 +59,4 @@ class WriteTraits:
     rename_works: bool | None = None
     rename_replaces: bool | None = None
     folds_case: bool | None = None
+    drops_ends: bool | None = None

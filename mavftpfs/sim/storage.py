@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import errno
 import random
+import re
 import weakref
 from typing import Protocol
 
@@ -18,6 +19,7 @@ from mavftpfs.sim.profiles import Profile
 from mavftpfs.sim.pseudo import VirtualTrees
 
 _FAT_FORBIDDEN = frozenset(b'"*:<>?|\x7f') | frozenset(range(32))
+_SHORT_WITH_DOT = re.compile(rb"([!#-)\-0-9@^-`{}~A-Z]{1,8}|[!#-)\-0-9@^-`{}~a-z]{1,8})\.")
 _GAP_LIMIT = 65_536
 _CRC_BLOCK = 65_536
 
@@ -201,14 +203,29 @@ class Storage:
         return Entry(entry.name, entry.stat._replace(mtime=entry.stat.mtime & ~1))
 
     def _resolve(self, path: bytes) -> bytes:
-        """Replace each name by the one that exists in another case, if there is none in this."""
-        if not self._fold:
+        """Return the path as this filesystem has it.
+
+        On FAT ends of names are dropped (`_kept`); where case is folded, each name is replaced by the one
+        that exists in another case, if there is none in this.
+        """
+        if not self._fat:
             return path
         resolved = b""
         for name in path.split(b"/"):
             if name:
-                resolved += b"/" + self._folded(resolved or b"/", name)
+                kept = self._kept(name)
+                resolved += b"/" + (self._folded(resolved or b"/", kept) if self._fold else kept)
         return resolved or b"/"
+
+    def _kept(self, name: bytes) -> bytes:
+        """Return a name without the end that FAT drops.
+
+        FatFs drops all dots and blanks there (its create_name). NuttX keeps them in long names; one dot
+        behind a short name in one case only begins an empty extension (its fat_parsesfname).
+        """
+        if self.kind is profiles.Storage.NUTTX_FAT:
+            return name[:-1] if _SHORT_WITH_DOT.fullmatch(name) else name
+        return name.rstrip(b". ") or name
 
     def _folded(self, parent: bytes, name: bytes) -> bytes:
         try:

@@ -40,7 +40,8 @@ class Kind:
 
     replaces: rename over a file works (else FileExists, as FAT). moves_into: rename onto a directory moves
     into it, as NuttX. renames: there is a rename at all. wo_truncates: OpenFileWO empties. truncates:
-    TruncateFile works (None: silence). folds_case: names are found in any case.
+    TruncateFile works (None: silence). folds_case: names are found in any case. drops_ends: dots and blanks
+    at the end of a name are dropped.
     """
 
     replaces: bool = True
@@ -49,12 +50,13 @@ class Kind:
     wo_truncates: bool = False
     truncates: bool | None = True
     folds_case: bool = False
+    drops_ends: bool = False
 
 
 KINDS = {
     "posix": Kind(),
     "nuttx": Kind(moves_into=True, truncates=False),
-    "fat": Kind(replaces=False, folds_case=True, truncates=False),
+    "fat": Kind(replaces=False, folds_case=True, drops_ends=True, truncates=False),
     "littlefs": Kind(renames=False, truncates=False),
     "mavsdk": Kind(wo_truncates=True, truncates=None),
 }
@@ -74,6 +76,7 @@ class FakeWriter(FakeStore):
         capacity: bytes of all files; beyond that WriteFile is refused.
         before_request: called with what is asked, before anything is decided.
         looks: how often a name was looked for before a file was made.
+        aliases: names that are those of others.
         spoil_uploads: how many more uploads arrive with a wrong byte. writable_armed: refuse while `armed`.
     """
 
@@ -92,6 +95,7 @@ class FakeWriter(FakeStore):
         self.uploads: list[FakeUpload] = []
         self.probes = 0
         self.looks = 0
+        self.aliases: dict[bytes, bytes] = {}
         self.before_request: Callable[..., object] | None = None
 
     # --- what requests go through
@@ -137,6 +141,9 @@ class FakeWriter(FakeStore):
 
     def real(self, path: bytes) -> bytes:
         """Return the stored spelling of a path."""
+        path = self.aliases.get(path, path)
+        if self.kind.drops_ends:
+            path = path.rstrip(b". ")
         if path in self.files or path in self.directories or not self.kind.folds_case:
             return path
         for known in [*self.files, *self.directories]:

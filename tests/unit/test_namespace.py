@@ -19,6 +19,7 @@ from mavftpfs.shared.errors import (
     FtpNak,
     InvalidMove,
     IsADirectory,
+    LocalProtocolError,
     NotADirectory,
     NotFound,
     PathTooLong,
@@ -185,6 +186,55 @@ async def test_a_long_rename_that_is_refused_leaves_nothing(
             await tree.rename(old, new)
         assert store.requests == asked
     assert store.crimes == []
+    nursery.cancel_scope.cancel()
+
+
+# --- spelling
+
+
+ENDS = [b"a.", b"A.", b"a. .", b"a ", b"new.", b"empty."]
+
+
+@pytest.mark.parametrize("name", ENDS)
+async def test_a_name_that_the_card_would_cut_is_refused(fat: FakeWriter, name: bytes) -> None:
+    """FatFs drops dots and blanks at the end: `a.` would empty `a`."""
+    tree = make_writable(fat)
+    before = shape(fat)
+    path = b"/d/" + name
+    for change in (
+        lambda: write_file(tree, path, b"other"),
+        lambda: tree.mkdir(path),
+        lambda: tree.rename(b"/d/b", path),
+    ):
+        with pytest.raises(LocalProtocolError):
+            await change()
+    assert shape(fat) == before
+    assert sum(what[0] != "stat" for what in fat.log) == 2  # one look, with a file of our own
+    assert b"new." not in dict(await tree.list(b"/d"))
+
+
+@pytest.mark.parametrize("name", ENDS)
+async def test_where_it_is_kept_it_is_a_name_like_others(nursery: trio.Nursery, name: bytes) -> None:
+    store = scene(FakeWriter(KINDS["posix"], nursery))
+    tree = make_writable(store)
+    await write_file(tree, b"/d/" + name, b"other")
+    assert shape(store) == {**shape(scene(FakeWriter(KINDS["posix"], nursery))), b"/d/" + name: b"other"}
+    nursery.cancel_scope.cancel()
+
+
+async def test_a_name_that_opens_another_file_is_refused(nursery: trio.Nursery) -> None:
+    """NuttX keeps the dot of a long name and drops that behind a short one."""
+    store = scene(FakeWriter(KINDS["nuttx"], nursery))
+    store.aliases = {b"/d/a.": b"/d/a", b"/d/x.": b"/d/x"}
+    tree = make_writable(store)
+    await write_file(tree, b"/d/b.", b"other")
+    await tree.list(b"/d")
+    await write_file(tree, b"/d/x.", b"first")  # not listed since: we believe that it is called so
+    for name in (b"/d/a.", b"/d/x"):
+        with pytest.raises(LocalProtocolError):
+            await write_file(tree, name, b"other")
+    contents = [store.files[path].data for path in (b"/d/a", b"/d/x", b"/d/b.")]
+    assert contents == [b"A", b"first", b"other"]
     nursery.cancel_scope.cancel()
 
 

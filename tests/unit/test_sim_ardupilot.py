@@ -395,6 +395,12 @@ def test_fat_folds_case() -> None:
     assert nak(Client("littlefs").ask(Opcode.OPEN_FILE_RO, b"/FS/microsd/a.bin")) == NOT_FOUND
 
 
+def test_fat_drops_dots_and_blanks_at_the_end_of_names() -> None:
+    for name in (b"a.bin.", b"A.bin. . "):
+        assert ack(Client("ardupilot5").open(b"/fs/microsd/" + name)) == struct.pack("<I", 1024)
+        assert nak(Client("littlefs").ask(Opcode.OPEN_FILE_RO, b"/fs/microsd/" + name)) == NOT_FOUND
+
+
 def test_fat_refuses_names() -> None:
     refused = Client("ardupilot5").ask(Opcode.CREATE_FILE, b"/fs/a:b")
     assert nak(refused) == bytes([NakCode.FAIL_ERRNO, errno.EINVAL])

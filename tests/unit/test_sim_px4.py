@@ -261,6 +261,17 @@ def test_skip_entries_are_counted() -> None:
     assert nak(c.ask(Opcode.LIST_DIRECTORY, b"/", offset=6)) == bytes([NakCode.EOF])
 
 
+def test_nuttx_drops_the_dot_behind_a_short_name_only() -> None:
+    tree = MemoryTree()
+    for name in (b"short", b"Mixed", b"longer-than-8", b"a.b"):
+        tree.add(b"/fs/microsd/" + name)
+    c = client("px4-nuttx", tree, request_cost=0.0, stall_chance=0.0)
+    assert c.open(b"/fs/microsd/short.").size == 4
+    ack(c.ask(Opcode.TERMINATE_SESSION))
+    for name in (b"Mixed.", b"longer-than-8.", b"a.b.", b"short ", b"short.."):
+        assert nak(c.ask(Opcode.OPEN_FILE_RO, b"/fs/microsd/" + name)) == bytes([NakCode.FILE_NOT_FOUND])
+
+
 def test_nuttx_has_no_dot_entries() -> None:
     c = prompt()
     assert nak(c.ask(Opcode.LIST_DIRECTORY, DIR)) == bytes([NakCode.EOF])
