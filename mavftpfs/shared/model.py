@@ -72,7 +72,11 @@ def normalise(path: bytes) -> bytes:
 
 
 def is_virtual(path: bytes) -> bool:
-    """Return whether the path lies in an `@` tree (servers.md 11: the prefix decides)."""
+    """Return whether the path lies in an `@` tree.
+
+    The prefix decides (servers.md 14.13), also on a server that has no such tree and would take `/@x` for a
+    file: no listing tells the two apart, and what is written to `@PARAM` changes the vehicle.
+    """
     return path.startswith(b"/@")
 
 
