@@ -69,12 +69,12 @@ class SessionHolder:
             What SessionOpener.open raises, and close of a file that was written to. That a file which was
             only read could not be closed is no news to whoever opens the next: the opener tries again.
         """
-        if self.session is not None:
-            close = self.close if self.session.writing else self.close_quietly
-            await close()
-            self.switches += 1
-        self._opening = path
+        self._opening = path  # from now on nobody may change that name, also while the other file is closed
         try:
+            if self.session is not None:
+                close = self.close if self.session.writing else self.close_quietly
+                await close()
+                self.switches += 1
             self.session = await self.opener.open(path, opcode)
         finally:
             self._opening = None

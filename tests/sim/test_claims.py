@@ -7,10 +7,12 @@ import trio
 from trio.testing import MockClock
 
 from mavftpfs.protocol.payload import Opcode
+from mavftpfs.session.connection import Connection
 from mavftpfs.session.scheduler import Scheduler
 from mavftpfs.sim.linkmodel import LinkSettings
+from tests.support.faults import Faults
 from tests.support.trees import content
-from tests.support.worlds import World, read_file
+from tests.support.worlds import MemorySink, World, read_file
 
 ROUNDS = 10_000
 
@@ -43,3 +45,33 @@ async def test_a_reader_goes_on_beside_a_job_that_has_to_wait(
             await trio.sleep(0.1)
             assert await read_file(connection, b"/big") == content("big", 20_000)
     assert rounds < 100
+
+
+@pytest.mark.parametrize("profile", ["px4", "mavsdk", "ardupilot"])
+async def test_a_file_is_not_opened_under_a_name_that_it_lost_meanwhile(
+    autojump: MockClock, profile: str
+) -> None:
+    """Another file is open and has to be closed first; once more, where the answer to that is lost."""
+    old, new = content("old", 5000), content("new", 5000)
+    for lost in (False, True):
+        for later in range(0, 60, 3):
+            here = World(profile, LinkSettings(delay=0.1))
+            for path, data in ((b"/a", old), (b"/b", new), (b"/other", new)):
+                here.tree.add(path, data)
+            async with here.connection() as connection, trio.open_nursery() as nursery:
+                store, sink = connection.store, MemorySink(5000)
+                assert await read_file(connection, b"/other") == new
+                reader = await store.open_reader(b"/a", sink, expected_size=5000)
+                faults = Faults(here)
+                if lost:
+                    faults.lose_reply_to(Opcode.TERMINATE_SESSION)
+
+                async def change(connection: Connection = connection, later: int = later) -> None:
+                    await trio.sleep(later * 0.02)
+                    await connection.store.rename(b"/a", b"/aside")
+                    await connection.store.rename(b"/b", b"/a")
+
+                nursery.start_soon(change)
+                reader.want(0, 5000, demand=True)
+                assert await sink.wait_for(0, 5000) == old
+                reader.close()
