@@ -38,7 +38,7 @@ _SLACK = 3
 _CURIOSITY = 6
 _LEAP = 4
 _FAST_PATH_SECONDS = 0.010
-_FAST_PATH_WINDOW = 96
+_FAST_PATH_WINDOW = 192
 _MOST_RESERVE = 512
 _FASTEST_LINK = 6000.0
 """Answers per second (1.4 MB/s) beyond which no radio is on the way."""

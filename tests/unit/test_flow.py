@@ -112,6 +112,14 @@ def test_grows_to_what_the_path_holds_and_not_far_beyond() -> None:
     assert 200 <= flow.window <= 270
 
 
+def test_a_fast_path_gets_more_than_it_holds_but_no_flood() -> None:
+    """Nobody waits for long there, and long batches cost both ends less a chunk."""
+    flow = Flow()
+    path = Path(flow, rate=60_000.0, base=0.0005)
+    path.rounds(60)
+    assert 150 <= flow.window <= 200
+
+
 def test_goes_straight_to_what_a_path_with_a_pace_of_its_own_holds() -> None:
     """Answers come at the path's pace although few are under way: requests left in one go."""
     flow = Flow()
