@@ -43,6 +43,23 @@ async def test_a_checksum_is_given_the_time_that_the_size_needs(store: FakeWrite
     assert store.crc_sizes == [5000]
 
 
+@pytest.mark.parametrize("kind", ["posix", "fat", "mavsdk"])
+async def test_what_was_sent_and_cut_off_is_not_there_though_nothing_is_verified(
+    nursery: trio.Nursery, autojump_clock: object, kind: str
+) -> None:
+    store = FakeWriter(KINDS[kind], nursery)
+    store.add(FILE, OLD)
+    tree = make_writable(store, verify="none")
+    file = await tree.open(FILE, write=True, truncate=True)
+    await file.write(0, b"n" * 100_000)
+    await trio.sleep(20)
+    assert store.used > len(OLD), "it is sent while the program writes"
+    await file.truncate(50_000)
+    await file.release()
+    assert store.files[FILE].data == b"n" * 50_000
+    nursery.cancel_scope.cancel()
+
+
 async def test_an_empty_file_has_no_checksum_worth_asking(store: FakeWriter) -> None:
     tree = make_writable(store)
     file = await tree.create(b"/card/new", exclusive=True)
