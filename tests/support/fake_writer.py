@@ -6,11 +6,12 @@ every chunk of an upload, counts as one.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from dataclasses import dataclass
 from random import Random
 from typing import Any
 
+import pytest
 import trio
 
 from mavftpfs.cache.options import CacheOptions
@@ -309,6 +310,23 @@ class FakeWriter(FakeStore):
         self, path: bytes, sink: ReadSink, *, expected_size: int | None = None
     ) -> FakeReader:
         return await super().open_reader(self.real(path), sink, expected_size=expected_size)
+
+
+def card(files: Mapping[bytes, bytes], *, kinds: Sequence[str] = ("posix",)) -> Any:
+    """Return a fixture: a vehicle with these files, of each kind in turn; it must end without a complaint."""
+
+    @pytest.fixture(params=kinds if len(kinds) > 1 else None)
+    async def vehicle(
+        request: pytest.FixtureRequest, nursery: trio.Nursery, autojump_clock: object
+    ) -> AsyncIterator[FakeWriter]:
+        store = FakeWriter(KINDS[getattr(request, "param", kinds[0])], nursery)
+        for path, data in files.items():
+            store.add(path, data)
+        yield store
+        assert store.crimes == []
+        nursery.cancel_scope.cancel()
+
+    return vehicle
 
 
 def make_writable(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-from collections.abc import AsyncIterator
 
 import pytest
 import trio
@@ -13,7 +12,7 @@ from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.tree import Tree
 from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.shared.errors import FtpNak, MavftpfsError, RequestTimeout, VehicleLost
-from tests.support.fake_writer import KINDS, FakeWriter, make_writable
+from tests.support.fake_writer import KINDS, FakeWriter, card, make_writable
 
 OLD = bytes(range(256)) * 400
 FILE = b"/card/dir/file.txt"
@@ -21,13 +20,7 @@ NEW = b"/card/new"
 KIB = 1024
 
 
-@pytest.fixture
-async def store(nursery: trio.Nursery, autojump_clock: object) -> AsyncIterator[FakeWriter]:
-    store = FakeWriter(KINDS["posix"], nursery)
-    store.add(FILE, OLD)
-    yield store
-    assert store.crimes == []
-    nursery.cancel_scope.cancel()
+store = card({FILE: OLD})
 
 
 @pytest.fixture

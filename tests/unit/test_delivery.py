@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import errno
 import json
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import Awaitable, Callable
 from pathlib import Path
 from random import Random
 
@@ -30,31 +30,17 @@ from mavftpfs.shared.errors import (
 )
 from mavftpfs.shared.model import split
 from tests.support.fake_store import read_file
-from tests.support.fake_writer import KINDS, FakeWriter, Kind, make_writable, write_file
+from tests.support.fake_writer import KINDS, FakeWriter, Kind, card, make_writable, write_file
 
 OLD = bytes(range(256)) * 4
 NEW = b"new content " * 100
 FILE = b"/card/dir/file.txt"
 
 
-@pytest.fixture
-async def store(nursery: trio.Nursery, autojump_clock: object) -> AsyncIterator[FakeWriter]:
-    store = FakeWriter(KINDS["posix"], nursery)
-    store.add(FILE, OLD)
-    yield store
-    assert store.crimes == []
-    nursery.cancel_scope.cancel()
+store = card({FILE: OLD})
 
 
-@pytest.fixture(params=sorted(KINDS))
-async def any_store(
-    request: pytest.FixtureRequest, nursery: trio.Nursery, autojump_clock: object
-) -> AsyncIterator[FakeWriter]:
-    store = FakeWriter(KINDS[request.param], nursery)
-    store.add(FILE, OLD)
-    yield store
-    assert store.crimes == []
-    nursery.cancel_scope.cancel()
+any_store = card({FILE: OLD}, kinds=sorted(KINDS))
 
 
 def litter(store: FakeWriter) -> list[bytes]:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator
-
 import pytest
 import trio
 
@@ -21,20 +19,14 @@ from mavftpfs.shared.errors import (
 )
 from mavftpfs.shared.model import EntryKind
 from tests.support.fake_store import read_file
-from tests.support.fake_writer import KINDS, FakeWriter, make_writable, write_file
+from tests.support.fake_writer import KINDS, FakeWriter, card, make_writable, write_file
 
 FILE = b"/scripts/hover.lua"
 SWAP = b"/scripts/.hover.lua.swp"
 TRASH = b"/.Trash-1000"
 
 
-@pytest.fixture
-async def store(nursery: trio.Nursery, autojump_clock: object) -> AsyncIterator[FakeWriter]:
-    store = FakeWriter(KINDS["fat"], nursery)
-    store.add(FILE, b"-- old")
-    yield store
-    assert store.crimes == []
-    nursery.cancel_scope.cancel()
+store = card({FILE: b"-- old"}, kinds=["fat"])
 
 
 @pytest.fixture

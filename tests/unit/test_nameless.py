@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import Awaitable, Callable
 
 import pytest
 import trio
@@ -10,7 +10,7 @@ import trio
 from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.throttle import STALL
 from mavftpfs.cache.tree import Tree
-from tests.support.fake_writer import KINDS, FakeWriter, make_writable, write_file
+from tests.support.fake_writer import KINDS, FakeWriter, card, make_writable, write_file
 
 KIB = 1024
 DIRTY = 256 * KIB
@@ -23,13 +23,7 @@ PIECE = 32 * KIB
 LoseName = Callable[[Tree], Awaitable[None]]
 
 
-@pytest.fixture
-async def store(nursery: trio.Nursery, autojump_clock: object) -> AsyncIterator[FakeWriter]:
-    store = FakeWriter(KINDS["posix"], nursery)
-    store.add(FILE, OLD)
-    yield store
-    assert store.crimes == []
-    nursery.cancel_scope.cancel()
+store = card({FILE: OLD})
 
 
 @pytest.fixture

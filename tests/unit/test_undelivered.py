@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import AsyncIterator
 from contextlib import suppress
 from pathlib import Path
 from random import Random
@@ -26,20 +25,14 @@ from mavftpfs.shared.errors import (
     VehicleLost,
 )
 from mavftpfs.shared.model import split
-from tests.support.fake_writer import CHUNK, KINDS, FakeWriter, make_writable
+from tests.support.fake_writer import CHUNK, KINDS, FakeWriter, card, make_writable
 
 OLD = bytes(range(256)) * 4
 FILE = b"/card/dir/file.txt"
 NEW = b"/card/dir/new"
 
 
-@pytest.fixture
-async def store(nursery: trio.Nursery, autojump_clock: object) -> AsyncIterator[FakeWriter]:
-    store = FakeWriter(KINDS["posix"], nursery)
-    store.add(FILE, OLD)
-    yield store
-    assert store.crimes == []
-    nursery.cancel_scope.cancel()
+store = card({FILE: OLD})
 
 
 # --- who is told
@@ -109,13 +102,7 @@ async def test_a_file_whose_creation_failed_stays_if_somebody_wrote_it_or_it_was
 # --- what was taken back
 
 
-@pytest.fixture
-async def mavsdk(nursery: trio.Nursery, autojump_clock: object) -> AsyncIterator[FakeWriter]:
-    store = FakeWriter(KINDS["mavsdk"], nursery)
-    store.add(FILE, OLD)
-    yield store
-    assert store.crimes == []
-    nursery.cancel_scope.cancel()
+mavsdk = card({FILE: OLD}, kinds=["mavsdk"])
 
 
 async def append_and_take_back(store: FakeWriter, tree: Tree) -> OpenFile:
@@ -218,15 +205,7 @@ async def test_what_is_cut_while_it_is_about_to_be_changed_in_place_is_not(
 LARGE = bytes(range(256)) * 400
 
 
-@pytest.fixture(params=["posix", "fat", "mavsdk"])
-async def large(
-    request: pytest.FixtureRequest, nursery: trio.Nursery, autojump_clock: object
-) -> AsyncIterator[FakeWriter]:
-    store = FakeWriter(KINDS[request.param], nursery)
-    store.add(FILE, LARGE)
-    yield store
-    assert store.crimes == []
-    nursery.cancel_scope.cancel()
+large = card({FILE: LARGE}, kinds=["posix", "fat", "mavsdk"])
 
 
 async def change_and_cut(tree: Tree) -> None:

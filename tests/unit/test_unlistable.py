@@ -3,29 +3,22 @@
 from __future__ import annotations
 
 import errno
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import Awaitable, Callable
 
 import pytest
-import trio
 
 from mavftpfs.cache.tree import Tree
 from mavftpfs.shared.errnos import errno_for
 from mavftpfs.shared.errors import MavftpfsError
 from tests.support.fake_store import read_file
-from tests.support.fake_writer import KINDS, FakeWriter, make_writable, write_file
+from tests.support.fake_writer import FakeWriter, card, make_writable, write_file
 
 SEEN = b"/d/seen"
 BAD = [b"/d/ta\tb", b"/d/\tx", b"/d/x\t", b"/d/7\t8"]
 SWAP = b"/d/.ta\tb.swp"
 
 
-@pytest.fixture
-async def store(nursery: trio.Nursery, autojump_clock: object) -> AsyncIterator[FakeWriter]:
-    store = FakeWriter(KINDS["posix"], nursery)
-    store.add(SEEN, b"it")
-    yield store
-    assert store.crimes == []
-    nursery.cancel_scope.cancel()
+store = card({SEEN: b"it"})
 
 
 @pytest.fixture

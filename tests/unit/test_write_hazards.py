@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-from collections.abc import AsyncIterator
 from random import Random
 
 import pytest
@@ -15,7 +14,7 @@ from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.shared.errors import FileChanged, FtpNak
 from mavftpfs.shared.model import split
 from tests.support.fake_store import FakeReader
-from tests.support.fake_writer import KINDS, FakeWriter, make_writable, write_file
+from tests.support.fake_writer import KINDS, FakeWriter, card, make_writable, write_file
 from tests.unit.test_draft import draft_over
 
 OLD = bytes(range(256)) * 4
@@ -23,13 +22,7 @@ FILE = b"/card/dir/file.txt"
 FULL = FtpNak(Opcode.CREATE_FILE, NakCode.FAIL_ERRNO, 28)
 
 
-@pytest.fixture
-async def store(nursery: trio.Nursery, autojump_clock: object) -> AsyncIterator[FakeWriter]:
-    store = FakeWriter(KINDS["posix"], nursery)
-    store.add(FILE, OLD)
-    yield store
-    assert store.crimes == []
-    nursery.cancel_scope.cancel()
+store = card({FILE: OLD})
 
 
 @pytest.fixture

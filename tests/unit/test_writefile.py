@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator
-
 import pytest
 import trio
 
@@ -23,19 +21,13 @@ from mavftpfs.shared.errors import (
 )
 from mavftpfs.shared.model import EntryKind, split
 from tests.support.fake_store import make_tree, read_file
-from tests.support.fake_writer import KINDS, FakeWriter, make_writable, write_file
+from tests.support.fake_writer import FakeWriter, card, make_writable, write_file
 
 DATA = bytes(range(256)) * 300
 FILE = b"/card/dir/file.bin"
 
 
-@pytest.fixture
-async def store(nursery: trio.Nursery, autojump_clock: object) -> AsyncIterator[FakeWriter]:
-    store = FakeWriter(KINDS["posix"], nursery)
-    store.add(FILE, DATA)
-    yield store
-    assert store.crimes == []
-    nursery.cancel_scope.cancel()
+store = card({FILE: DATA})
 
 
 @pytest.fixture
