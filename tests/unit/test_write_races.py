@@ -278,3 +278,45 @@ async def test_who_opened_an_older_version_follows_the_renames_too(
     for file in (first, last):
         assert bytes(await file.read(0, 900)) == b"old" * 300
         await file.release()
+
+
+# --- a caller that gives up
+
+
+class SlowAnswers(FakeWriter):
+    """Does what it is asked at once, and says so late."""
+
+    async def remove(self, path: bytes) -> None:  # type: ignore[override]
+        await super().remove(path)
+        await trio.sleep(1)
+
+    async def make_directory(self, path: bytes) -> None:
+        await super().make_directory(path)
+        await trio.sleep(1)
+
+    async def rename(self, old: bytes, new: bytes, *, completes: bool = False) -> None:
+        await super().rename(old, new, completes=completes)
+        await trio.sleep(1)
+
+
+CHANGES = {
+    "unlink": lambda tree: tree.unlink(FILE),
+    "mkdir": lambda tree: tree.mkdir(b"/d/made"),
+    "rename": lambda tree: tree.rename(FILE, b"/d/moved"),
+}
+
+
+@pytest.mark.parametrize("change", sorted(CHANGES))
+async def test_what_became_of_a_change_that_was_given_up_is_looked_up(
+    nursery: trio.Nursery, autojump_clock: object, change: str
+) -> None:
+    store = SlowAnswers(KINDS["posix"], nursery)
+    store.add(FILE, b"x")
+    tree = make_writable(store)
+    await tree.list(b"/d")
+    with trio.move_on_after(0.5) as scope:
+        await CHANGES[change](tree)
+    assert scope.cancelled_caught
+    there = {path for path in (*store.files, *store.directories) if path.startswith(b"/d/")}
+    assert there == {"unlink": set(), "mkdir": {FILE, b"/d/made"}, "rename": {b"/d/moved"}}[change]
+    assert {b"/d/" + name for name, _ in await tree.list(b"/d")} == there
