@@ -202,7 +202,7 @@ async def test_what_was_read_shortly_before_is_under_suspicion_though_closed(
         await trio.sleep(11)
         connection.scheduler.on_suspect("once more")
         assert len(sink.suspicions) <= 2  # it was heard twice: question and answer
-        assert not connection.scheduler._closed
+        assert not connection.scheduler._suspicion._closed
 
 
 async def test_times_that_could_not_be_asked_for_are_not_refused(autojump: MockClock) -> None:
