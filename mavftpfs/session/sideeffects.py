@@ -3,7 +3,8 @@
 A request whose reply may have been lost can be executed twice, and the second answer is then a refusal
 (servers.md 14.4). Such a refusal, and a silence, are never interpreted: a listing tells what became of it.
 The network can do the same to a request that we sent once, by doubling it and losing the first answer: where
-answers were seen that nobody waited for, a refusal as missing is looked into as well.
+answers were seen that nobody waited for, a refusal as missing, or of a directory as being there, is looked
+into as well.
 """
 
 from __future__ import annotations
@@ -35,6 +36,10 @@ _DOT = b"."
 _TAKES_AWAY = frozenset((Opcode.REMOVE_FILE, Opcode.REMOVE_DIRECTORY, Opcode.RENAME))
 _MISSING = frozenset((NakCode.FAIL, NakCode.FAIL_ERRNO, NakCode.FILE_NOT_FOUND))
 """What servers say of a name that is not there (any more); the errno may be a stale one (servers.md 12)."""
+
+_THERE = frozenset((NakCode.FAIL, NakCode.FAIL_ERRNO, NakCode.FILE_EXISTS))
+_SECOND = {**dict.fromkeys(_TAKES_AWAY, _MISSING), Opcode.CREATE_DIRECTORY: _THERE}
+"""What servers may say to a request that was done already, by opcode."""
 
 
 def fits_rename(old: bytes, new: bytes) -> bool:
@@ -185,8 +190,7 @@ class SideEffects:
 
     def _may_be_doubled(self, nak: FtpNak) -> bool:
         """Whether a refusal may answer the second execution of a request that was sent once."""
-        doubles = self._scheduler.stats.strays > 0
-        return doubles and nak.opcode in _TAKES_AWAY and nak.code in _MISSING
+        return self._scheduler.stats.strays > 0 and nak.code in _SECOND.get(Opcode(nak.opcode), ())
 
     async def _settle(self, nak: FtpNak, verify: Verdict, *, twice: bool, last: bool) -> bool:
         """Return True if the request was carried out after all, False to try it once more; else raise.

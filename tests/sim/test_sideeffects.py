@@ -356,9 +356,15 @@ async def test_what_may_still_be_open_is_closed_first_too(profile: str, autojump
 
 
 DOUBLING = LinkSettings(delay=0.01, duplicate=1.0)
+DOUBLED = {
+    "remove": Opcode.REMOVE_FILE,
+    "remove_directory": Opcode.REMOVE_DIRECTORY,
+    "make_directory": Opcode.CREATE_DIRECTORY,
+    "rename": Opcode.RENAME,
+}
 
 
-@pytest.mark.parametrize("act", ["remove", "remove_directory", "rename"])
+@pytest.mark.parametrize("act", ["remove", "remove_directory", "make_directory", "rename"])
 @pytest.mark.parametrize("profile", EVERY_PROFILE)
 async def test_a_request_doubled_by_the_network_whose_first_answer_is_lost(
     profile: str, act: str, autojump: MockClock
@@ -372,16 +378,22 @@ async def test_a_request_doubled_by_the_network_whose_first_answer_is_lost(
     async with here.connection() as connection:
         store = connection.store
         await store.stat_size(path(profile, "file"))  # answered twice, which shows what this link does
-        opcode = {"remove": Opcode.REMOVE_FILE, "rename": Opcode.RENAME}.get(act, Opcode.REMOVE_DIRECTORY)
-        faults.lose_reply_to(opcode)
+        faults.lose_reply_to(DOUBLED[act])
         if act == "remove":
             await store.remove(path(profile, "file"))
+        elif act == "make_directory":
+            await store.make_directory(path(profile, "made"))
         elif act == "rename":
             await store.rename(path(profile, "file"), path(profile, "renamed"))
         else:
             await store.remove_directory(path(profile, "empty"))
-    expected = {"remove": [b"empty"], "rename": [b"empty", b"renamed"]}.get(act, [b"file"])
-    assert names(here) == expected
+    left = {
+        "remove": [b"empty"],
+        "remove_directory": [b"file"],
+        "make_directory": [b"empty", b"file", b"made"],
+        "rename": [b"empty", b"renamed"],
+    }
+    assert names(here) == left[act]
 
 
 async def test_a_refusal_on_a_link_that_doubles_nothing_costs_no_listing(autojump: MockClock) -> None:
