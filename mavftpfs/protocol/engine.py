@@ -32,6 +32,7 @@ OP_DEADLINE = 30.0
 _MAX_REPLAYS = 8
 _MAX_SIDE_EFFECT_REPLAYS = 2
 _INVALID_SESSION = bytes((NakCode.INVALID_SESSION,))
+_FEW = 4
 _BURST = int(Opcode.BURST_READ_FILE)
 _ACK = int(Opcode.ACK)
 _NAK = int(Opcode.NAK)
@@ -292,6 +293,8 @@ class Engine:
         # Metadata may use one slot more than bulk work: a full window must not make it wait.
         in_flight = ledger.in_flight - (op.priority is Priority.METADATA)
         room = self.flow.room(in_flight, now, paced=op.paced, urgent=op.priority is Priority.METADATA)
+        if room <= 0 and in_flight <= _FEW and (unheard := ledger.unheard()):
+            room = self.flow.room(in_flight - unheard, now, paced=op.paced)
         left = room
         while left > 0:
             again = ledger.take_again(op) if ledger.again else None

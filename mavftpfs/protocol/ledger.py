@@ -85,6 +85,14 @@ class Ledger:
         """Return the requests on their way, oldest transmission first."""
         return list(self._flying.values())
 
+    def unheard(self) -> int:
+        """Return how many that carry no bytes were repeated in vain: perhaps nobody will ever answer them.
+
+        A TruncateFile is waited for two minutes, and MAVSDK answers none (servers.md 8): it would keep a
+        window that losses made narrow from everybody else.
+        """
+        return sum(request.sends > 1 and not request.manner.ordered for request in self._flying.values())
+
     # --- going out
 
     def take_seq(self) -> int:
