@@ -228,6 +228,10 @@ async def test_a_growing_file_is_busy(autojump_clock: object, store: FakeWriter)
     ):
         with pytest.raises(FileBusy):
             await ask()
+    reader = await tree.open(FILE)
+    with pytest.raises(FileBusy):
+        await tree.unlink(FILE)
+    await reader.release()
     await trio.sleep(60)
     await tree.truncate(FILE, 0)
     assert store.files[FILE].data == b""
