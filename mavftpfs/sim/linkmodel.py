@@ -39,6 +39,7 @@ class LinkSettings:
     rate: bytes per second, None = no limit and no queue. queue: bytes that may wait for the transmitter.
     delay, jitter: seconds one way. loss, duplicate, reorder, corrupt: probabilities per frame.
     hold: seconds by which a reordered frame is late, and three of its airtimes more.
+    byte_loss: probability per byte that it is received wrong and its frame is thrown away for it.
     burst_loss: share of frames lost in runs of 8 on average. cuts: (start, stop) times without a link.
     """
 
@@ -48,6 +49,7 @@ class LinkSettings:
     delay: float = 0.0
     jitter: float = 0.0
     loss: float = 0.0
+    byte_loss: float = 0.0
     burst_loss: float = 0.0
     duplicate: float = 0.0
     reorder: float = 0.0
@@ -213,7 +215,7 @@ class LinkModel:
         lane.on_air = len(frame)
         sent = max(lane.free_at, pushed_at) + self._airtime(frame)
         lane.free_at = sent
-        if self._is_lost(lane):
+        if self._is_lost(lane, len(frame)):
             lane.counters.lost += 1
             return
         self._schedule(lane, sent, self._maybe_corrupt(lane, frame))
@@ -233,14 +235,15 @@ class LinkModel:
         self._serial += 1
         heapq.heappush(lane.arrivals, (arrival, self._serial, sent, frame))
 
-    def _is_lost(self, lane: _Lane) -> bool:
+    def _is_lost(self, lane: _Lane, size: int) -> bool:
         share = self.settings.burst_loss
         if share:
             # Two states (Gilbert): in the bad one every frame is lost, and `share` is lost in the long run.
             leave = 1 / _BURST_LENGTH
             enter = min(1.0, leave * share / (1 - share)) if share < 1 else 1.0
             lane.bad = not self._chance(leave) if lane.bad else self._chance(enter)
-        return (lane.bad and bool(share)) or self._chance(self.settings.loss)
+        whole = (1.0 - self.settings.byte_loss) ** size
+        return (lane.bad and bool(share)) or self._chance(self.settings.loss) or self._chance(1.0 - whole)
 
     def _maybe_corrupt(self, lane: _Lane, frame: bytes) -> bytes:
         if not frame or not self._chance(self.settings.corrupt):

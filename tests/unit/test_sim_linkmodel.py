@@ -119,6 +119,16 @@ def test_loss_has_the_share_it_was_given(fields: dict[str, float], low: float, h
     assert low <= link.counters(UP).lost / 10_000 <= high
 
 
+def test_long_frames_are_damaged_more_often() -> None:
+    link = model(byte_loss=1e-3)
+    for i in range(10_000):
+        link.push(UP, bytes(266), float(i))
+        link.push(DOWN, bytes(30), float(i))
+    link.pop(UP, 1e6)
+    assert 0.21 <= link.counters(UP).lost / 10_000 <= 0.26
+    assert 0.02 <= link.counters(DOWN).lost / 10_000 <= 0.04
+
+
 def test_burst_loss_comes_in_runs() -> None:
     def runs(**fields: float) -> float:
         link = model(**fields)
