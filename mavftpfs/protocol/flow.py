@@ -19,6 +19,7 @@ from __future__ import annotations
 from collections import deque
 from math import inf, sqrt
 
+from mavftpfs.protocol.basertt import BaseRtt
 from mavftpfs.protocol.budget import Budget
 from mavftpfs.protocol.easing import Easing
 from mavftpfs.protocol.flights import Flights
@@ -47,7 +48,6 @@ _OFTEN = 5
 _QUEUE_SECONDS = 0.005
 _ROUNDS_REMEMBERED = 10
 _PLATEAU_ROUNDS = 2
-_NARROW = 0.6
 _TELLING_ROUND = 16
 _TELLING_SILENCE = 3
 
@@ -59,9 +59,11 @@ class Flow:
 
     __slots__ = (
         "_app_limited",
+        "_base",
         "_base_rtt",
         "_best_rate",
         "_brake",
+        "_bridging",
         "_cap",
         "_collapsed",
         "_easing",
@@ -71,7 +73,6 @@ class Flow:
         "_hurried",
         "_limit",
         "_losses",
-        "_narrow",
         "_overflow",
         "_pacer",
         "_plateau",
@@ -84,8 +85,6 @@ class Flow:
         "_starting",
         "_survival",
         "_trains",
-        "_wide_least",
-        "_wide_window",
         "alone",
         "budget",
         "loss",
@@ -105,14 +104,13 @@ class Flow:
         self._starting = not serial
         self._rates: deque[float] = deque(maxlen=_ROUNDS_REMEMBERED)
         self._best_rate = 0.0
+        self._base = BaseRtt()
         self._base_rtt = inf
-        self._wide_window = 0
-        self._wide_least = inf
-        self._narrow = False
         self._easing = Easing()
         self._trains = Trains()
         self._pacer: Pacer | None = None
         self._stalls = Stalls()
+        self._bridging = False
         self._heard_at = -inf
         self._hurried = False
         self._brake = 1.0
@@ -145,6 +143,7 @@ class Flow:
         """It is looked at anew who has something to send: `room` follows for each."""
         self._hurried = False
         self._trains.begin()
+        self._stalls.wake = inf
         if self._pacer is not None:
             self._pacer.blocked = False
         if self.budget is not None:
@@ -170,7 +169,7 @@ class Flow:
         return self.budget is not None and self.budget.held
 
     def _room(self, in_flight: int, now: float, paced: bool) -> int:
-        room = self.window - in_flight + (self._reserve() if paced else 0) + self._spare()
+        room = self.window - in_flight + self._reserve(now, paced) + self._spare()
         if self._pacer is None:
             return min(room, self._trains.room(now)) if room > 0 else room
         self._pacer.blocked = False
@@ -182,12 +181,14 @@ class Flow:
         """Return how many more a short queue takes that is not shared with anybody (servers.md 3)."""
         return int(self.alone and not self._hurried and self._pacer is not None)
 
-    def _reserve(self) -> int:
+    def _reserve(self, now: float, paced: bool) -> int:
         """Return how many more bridge the pauses of a server; none where its buffers are small, or while
         somebody waits for an answer that would have to queue behind them."""
-        reserve = self._stalls.reserve
-        none = not reserve or self._hurried or self._survival or self._pacer
-        return 0 if none else self._bounded(reserve * self._best_rate)
+        if self._hurried or self._survival or self._pacer:
+            return 0
+        self._bridging = not paced
+        seconds = self._stalls.reserve if paced else self._stalls.silence(now, self._best_rate)
+        return self._bounded(seconds * self._best_rate) if seconds else 0
 
     def _bounded(self, reserve: float) -> int:
         """Never beyond the limit; and on a fast path a pause is ours or a busy computer's, which requests
@@ -200,7 +201,8 @@ class Flow:
         """Return when there will be room without an answer; inf if that does not depend on time."""
         if self.budget is not None and self.budget.next_room_at() < inf:
             return self.budget.next_room_at()  # before that, nothing goes out in any case
-        return self._trains.next_room_at() if self._pacer is None else self._pacer.next_at()
+        paced_at = self._trains.next_room_at() if self._pacer is None else self._pacer.next_at()
+        return min(paced_at, self._stalls.wake)
 
     def on_sent(self, count: int, now: float) -> None:
         """So many requests, at least one, go out, which there was room for."""
@@ -280,7 +282,8 @@ class Flow:
             return
         if not self._collapsed:
             # What a small buffer survived it will survive again: there a silence is a few losses in a row.
-            self._collapsed = self.window if self._survival else max(1, self.window // 2)
+            kept = self._survival or self._stalls.usual  # so is a pause of a server that makes them
+            self._collapsed = self.window if kept else max(1, self.window // 2)
             self._goal = 0
             self.window = min(2, self.window)
         if self._pacer is not None:
@@ -308,7 +311,8 @@ class Flow:
         overflowed = self._overflow.judge(self._replies, self._losses)
         total = self._replies + self._losses
         self.loss += (self._losses / total - self.loss) * 0.2
-        self._learn_base()
+        in_flight = self.window + self._bounded(self._stalls.reserve * self._best_rate)
+        self._base_rtt = self._base.learn(self._round_least, in_flight)
         took = now - self._round_start
         rate = self._replies / took if took > 0 else 0.0
         # What the window was doubled for shows two rounds later.
@@ -334,26 +338,14 @@ class Flow:
             self._goal = self._next_goal() if grown and not self._flights.measured else 0
         else:
             self._goal = 0
-            self._approach(self._easing.next_window(self._target(), self.loss, next_order))
+            loss = 0.0 if self._excused() else self.loss
+            self._approach(self._easing.next_window(self._target(), loss, next_order))
 
-    def _learn_base(self) -> None:
-        """Keep the least round trip, until two rounds of a much narrower window prove that it is gone: most
-        answers of the first are still to the wide one's requests."""
-        least = self._round_least
-        in_flight = self.window + self._bounded(self._stalls.reserve * self._best_rate)
-        was_narrow, self._narrow = self._narrow, in_flight <= _NARROW * self._wide_window
-        if least <= 1.1 * self._base_rtt:
-            self._base_rtt = min(least, self._base_rtt)
-            self._wide_window = 0
-        elif least == inf:
-            return
-        elif in_flight > self._wide_window:
-            self._wide_window, self._wide_least = in_flight, least
-        elif self._narrow and was_narrow:
-            # A queue of ours would have become shorter.
-            if least > 0.9 * self._wide_least:
-                self._base_rtt = least
-            self._wide_window = 0
+    def _excused(self) -> bool:
+        """Whether pauses explain what was lost: writes went on, and the server takes more than the link
+        brings."""
+        quick = self._trains.rate > 1.5 * self._best_rate
+        return quick and self._bridging and self._stalls.usual
 
     def _learn_congestion(self) -> None:
         if self._losses and self._queued(2.0):

@@ -6,6 +6,11 @@ kept on the way, up to 0.15 s worth, which is what others then wait for the link
 when pauses have become rare. Where the server and not the link is the slowest part, no answers wait in a
 link, and more requests only overflow the server's buffer: so if pauses are as long with a reserve as they
 were without, there is none for a while.
+
+Writes need no answers in a queue, and what waits in front of a small buffer would be lost. But what arrives
+while the card pauses is lost as well, and if nothing is sent either because no answers come, the server has
+nothing to do a round trip later, for as long again. So while answers pause, writes go on at their pace for
+at most 0.4 s; what is lost of them makes room by itself.
 """
 
 from __future__ import annotations
@@ -18,6 +23,10 @@ _INTERVALS = 8
 _PERIOD = 2.0
 _COSTLY = 0.01
 _STEP = 0.05
+_BRIDGED = 0.4
+_CALM = 10
+"""Periods without costly pauses after which none are expected."""
+
 _FADE = 0.98
 _FADED = 0.02
 _TELLING = 0.5
@@ -29,10 +38,16 @@ _LONGEST_HOLD = 960.0
 
 
 class Stalls:
-    """Watches the gaps between answers. reserve: seconds of answers to keep in the link's queue."""
+    """Watches the gaps between answers.
+
+    Attributes:
+        reserve: seconds of answers to keep in the link's queue.
+        wake: when `silence` grows without an answer.
+    """
 
     __slots__ = (
         "_before",
+        "_calm",
         "_expected",
         "_hold",
         "_last",
@@ -41,10 +56,13 @@ class Stalls:
         "_until",
         "_watched",
         "reserve",
+        "wake",
     )
 
     def __init__(self) -> None:
         self.reserve = 0.0
+        self.wake = inf
+        self._calm = _CALM
         self._last: float | None = None
         self._watched = 0.0
         self._paused = 0.0
@@ -65,6 +83,20 @@ class Stalls:
         if self._watched > _PERIOD:
             self._end_period(now)
 
+    @property
+    def usual(self) -> bool:
+        """Whether there were pauses lately that cost something."""
+        return self._calm < _CALM
+
+    def silence(self, now: float, rate: float) -> float:
+        """Return for how many seconds of a pause writes go on at their pace (see above)."""
+        if self._last is None or not self.usual:
+            return 0.0
+        seconds = now - self._last
+        if seconds < _BRIDGED and rate > 0.0:
+            self.wake = now + _INTERVALS / rate
+        return min(seconds, _BRIDGED)
+
     def interrupt(self) -> None:
         """Too little was asked for: the gap before the next answer means nothing."""
         self._last = None
@@ -73,6 +105,7 @@ class Stalls:
         seconds, paused = self._watched, self._paused
         self._watched = self._paused = 0.0
         costly = paused > _COSTLY * seconds
+        self._calm = 0 if costly else self._calm + 1
         if self.reserve == 0.0:
             if costly and now >= self._until:
                 self.reserve = _STEP

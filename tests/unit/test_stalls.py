@@ -86,3 +86,29 @@ def test_the_reserve_is_for_reads_where_the_buffers_are_not_known_to_be_small(se
     full = flow.window
     assert (flow.room(full, now, paced=True) > 0) is not serial
     assert flow.room(full, now, paced=False) == 0
+
+
+def test_writes_go_on_while_answers_pause_but_not_for_long() -> None:
+    """What arrives during a pause is lost; what was not sent would leave the server idle after it."""
+    flow = Flow()
+    now, order = 0.0, 0
+    for order in range(4000):
+        now += 1 / RATE if order % 200 else 0.15
+        flow.on_reply(now, 0.05, order, order + flow.window)
+    full = flow.window
+    flow._trains.proven = False  # as when many are allowed at once
+    flow.begin()
+    assert flow.room(full, now, paced=False) == 0
+    assert now < flow.next_room_at() < now + 0.05
+    assert flow.room(full, now + 0.1, paced=False) == pytest.approx(0.1 * RATE, rel=0.1)
+    assert flow.room(full, now + 5.0, paced=False) == pytest.approx(0.4 * RATE, rel=0.1)
+    flow.begin()
+    assert flow.room(0, now, paced=True, urgent=True) > 0
+    assert flow.room(full, now + 0.1, paced=False) <= 0, "who waits for an answer waits behind it"
+
+
+def test_where_no_pauses_were_seen_writes_wait_for_answers() -> None:
+    flow = Flow()
+    for order in range(4000):
+        flow.on_reply(order / RATE, 0.05, order, order + flow.window)
+    assert flow.room(flow.window, 4000 / RATE + 1.0, paced=False) == 0
