@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import errno
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import suppress
 from itertools import count
 
@@ -201,11 +201,12 @@ async def test_a_name_that_the_card_would_cut_is_refused(fat: FakeWriter, name: 
     tree = make_writable(fat)
     before = shape(fat)
     path = b"/d/" + name
-    for change in (
+    changes: tuple[Callable[[], Awaitable[None]], ...] = (
         lambda: write_file(tree, path, b"other"),
         lambda: tree.mkdir(path),
         lambda: tree.rename(b"/d/b", path),
-    ):
+    )
+    for change in changes:
         with pytest.raises(LocalProtocolError):
             await change()
     assert shape(fat) == before

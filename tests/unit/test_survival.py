@@ -59,10 +59,10 @@ class Port:
 class Fixed(Flow):
     """A window that never changes."""
 
-    def on_silence(self) -> None:
+    def on_silence(self, unheard: int = 0) -> None:
         pass
 
-    def _end_round(self, now: float, next_order: int) -> None:
+    def _end_round(self, now: float, order: int, next_order: int) -> None:
         pass
 
 
