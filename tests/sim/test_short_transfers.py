@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import random
+
 import pytest
 import trio
 from trio.testing import MockClock
 
+from mavftpfs.cache.options import CacheOptions
+from mavftpfs.cache.tree import Tree
+from mavftpfs.shared.model import split
 from mavftpfs.sim.linkmodel import LinkSettings
 from tests.support.worlds import ROOTS, World, read_file
 
@@ -68,3 +73,34 @@ async def test_a_directory_is_listed_again_in_one_round_trip(profile: str, autoj
         took, seen = await names()
         assert (took <= 2 * RTT + READY, seen) == (True, {b"b", b"c", b"e", b"e2", b"g"})
         assert (await names())[0] <= RTT + READY
+
+
+@pytest.mark.parametrize("profile", PROFILES)
+async def test_a_small_file_is_written_and_proven_in_four_round_trips(
+    profile: str, autojump_clock: MockClock
+) -> None:
+    """CreateFile, its bytes, Terminate, and then size and CRC32 at once."""
+    world = World(profile, LONG)
+    world.tree.add_directory(ROOTS.get(profile, b"") + b"/d")
+    path = ROOTS.get(profile, b"") + b"/d/f"
+    async with world.connection() as connection, trio.open_nursery() as nursery:
+        tree = Tree(
+            connection.store,
+            CacheOptions(),
+            clock=trio.current_time,
+            invalidate=lambda path: None,
+            nursery=nursery,
+            writer=connection.store,
+            rng=random.Random(3),
+        )
+        await tree.list(split(path)[0])
+        began = trio.current_time()
+        file = await tree.create(path, exclusive=False)
+        await file.write(0, bytes(range(200)))
+        await file.flush()
+        took = trio.current_time() - began
+        assert tree.status()["verified_by_crc"] == 1
+        assert world.tree.data(path) == bytes(range(200))
+        await file.release()
+        nursery.cancel_scope.cancel()
+    assert took <= 4 * RTT + READY
