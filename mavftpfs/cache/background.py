@@ -63,6 +63,7 @@ class Background:
         """The draft got more: send it, or begin to, if that can be done beside the program."""
         if node.attempt is not None and not node.overtaken:
             if not node.attempt.committing:
+                node.attempt.sending.growing = True
                 node.attempt.upload.wake()
         elif self._context.nursery is not None and (self._may_start(node) or node.overtaken):
             node.starting = True
@@ -126,6 +127,8 @@ class Background:
                     self.on_cut(node)  # it may have been, meanwhile
                     if node.overtaken:
                         await self._deliverer.abandon(node)
+                    else:
+                        self.kick(node)
         except MavftpfsError as error:
             node.start_after = self._context.clock() + START_PAUSE
             log.info("%r is not sent just now: %s", node.path, error)

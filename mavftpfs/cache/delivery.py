@@ -108,7 +108,7 @@ class Deliverer:
                 self.on_undelivered()
 
     async def begin_locked(self, node: Node) -> bool:
-        """Begin to send a draft that may still grow; return False if that has to wait for a close.
+        """Prepare to send a draft that may still grow; return False if that has to wait for a close.
 
         Raises:
             As deliver.
@@ -120,7 +120,7 @@ class Deliverer:
                 plan = self.plan(node)
             if plan not in SENDING or plan is Plan.REWRITE:
                 return False
-            (await self._attempt(node, plan)).upload.wake()
+            await self._attempt(node, plan)
         return True
 
     def let_go(self) -> None:
@@ -320,6 +320,7 @@ class Deliverer:
         return size
 
     async def _finish(self, attempt: Attempt) -> None:
+        attempt.sending.growing = False
         for _ in range(FINISHES):
             attempt.upload.wake()
             await attempt.upload.finish()

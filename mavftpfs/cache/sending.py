@@ -17,6 +17,9 @@ from mavftpfs.shared.extents import ExtentSet
 AHEAD = 64 * 1024
 """Bytes fetched from the spool at once, since chunks are small."""
 
+FULL = 239
+"""Bytes of a full request (servers.md 1)."""
+
 
 class Sending:
     """One attempt to send `extents` of a draft whose bytes `read(start, stop)` returns.
@@ -28,6 +31,7 @@ class Sending:
         progress: told how many bytes were ACKed.
         emptied: the remote file was emptied under us though its old bytes were to stay.
         rewritten: bytes that changed after they may have been sent: an older copy may come late.
+        growing: more may be written behind the last byte; what fills no request there waits for it.
     """
 
     def __init__(
@@ -35,7 +39,7 @@ class Sending:
     ) -> None:
         self._read = read
         self.whole = whole
-        self.emptied = False
+        self.emptied = self.growing = False
         self.progress: Callable[[int], None] | None = None
         self.reached = 0
         self.rewritten = ExtentSet()
@@ -103,6 +107,10 @@ class Sending:
             return None
         else:
             start, stop = found
+        if self.growing and stop == self._dirty.end:
+            stop -= (stop - start) % FULL
+            if start == stop:
+                return None
         at, ahead = self._ahead
         if at <= start and stop <= at + len(ahead):
             data = ahead[start - at : stop - at]

@@ -178,6 +178,26 @@ async def test_a_log_written_now_and_then_costs_little(profile: str, autojump: M
     assert faults.requests.count(Opcode.WRITE_FILE) <= (10 if profile in TRUNCATING else 2) * needed
 
 
+@pytest.mark.parametrize("step", [1, 100])
+@pytest.mark.parametrize("profile", KEEPING)
+async def test_a_few_bytes_at_a_time_fill_requests(profile: str, step: int, autojump: MockClock) -> None:
+    """A program without a buffer of its own writes faster than answers come, and slower than the link."""
+    place = Place(profile, LinkSettings(rate=100_000.0, delay=0.02))
+    data = random.Random(5).randbytes(70_000 + 2000 * step)
+    async with place.mounted() as (_, tree):
+        file = await tree.create(place.root + b"/log", exclusive=True)
+        await file.write(0, data[:70_000])
+        await trio.sleep(10)  # it is on its way, and all there is was sent
+        faults = Faults(place.world)
+        for at in range(70_000, len(data), step):
+            await file.write(at, data[at : at + step])
+            await trio.sleep(0.004)
+        await file.flush()
+        await file.release()
+    assert faults.requests.count(Opcode.WRITE_FILE) <= 1.1 * (2000 * step // 239) + 3
+    assert place.data(b"log") == data
+
+
 @pytest.mark.parametrize("profile", EVERY_PROFILE)
 @pytest.mark.parametrize("size", [100, 3000])
 async def test_what_was_learnt_by_it_costs_the_bytes_once_at_most(
