@@ -230,6 +230,7 @@ class Deliverer:
         draft.made = True
         # Whoever takes its name away before it was looked at has to find it there.
         self._context.dentries.note_created(path, DirEntry(split(path)[1], EntryKind.FILE, 0))
+        self._context.dentries.note_proven(path, self._context.clock())
 
     async def _is_ours(self, path: bytes, draft: Draft) -> bool:
         """Return whether a file that appeared is the empty one we may have made; note it if so."""

@@ -88,6 +88,10 @@ ELSEWHERE = {
 """Where a server needs something else."""
 
 
+SPARED = {"git status again": ["look 1, create 1, close 1, remove 1"]}
+"""git removes the lock that it has just made, often before its size was looked at."""
+
+
 class Counted:
     """One mount, and what it and the first change cost."""
 
@@ -115,14 +119,18 @@ def counted(request: pytest.FixtureRequest, module_field: Field) -> Counted:
 def check(counted: Counted, name: str, cost: Cost) -> None:
     """Compare with the table; a keep-alive per second is bearable while a file is open, more are not."""
     expected = ELSEWHERE.get(counted.profile, {}).get(name, EXACT[name])
-    if cost.repeats:
-        extra = Counter(cost.counts)
-        extra.subtract(parsed(expected))
-        assert min(extra.values()) >= 0, cost.text()
-        assert extra.total() == cost.repeats, cost.text()
-    else:
-        assert cost.text() == expected, "\n".join(cost.requests[:60])
+    fits = [text for text in (expected, *SPARED.get(name, ())) if is_cost(cost, text)]
+    assert fits, "\n".join([cost.text(), *cost.requests[:60]])
     assert cost.keep_alives <= 2 + cost.seconds
+
+
+def is_cost(cost: Cost, expected: str) -> bool:
+    """Return whether the requests are these, and repetitions of them."""
+    if not cost.repeats:
+        return cost.text() == expected
+    extra = Counter(cost.counts)
+    extra.subtract(parsed(expected))
+    return min(extra.values()) >= 0 and extra.total() == cost.repeats
 
 
 def parsed(text: str) -> dict[str, int]:
