@@ -13,7 +13,7 @@ from dataclasses import astuple
 
 import trio
 
-from mavftpfs.cache import base
+from mavftpfs.cache import base, overwritten
 from mavftpfs.cache.context import Context
 from mavftpfs.cache.draft import Draft
 from mavftpfs.cache.nodes import Attempt, Node
@@ -281,6 +281,7 @@ class Deliverer:
         try:
             if places is not None:
                 await self.replacer.write_sidecar(places, node.path)
+            await overwritten.fetch_endangered(self._context, node, plan)
             sending = draft.begin(whole=plan is not Plan.IN_PLACE)
             sending.progress = self._throttle.on_acked
             writer = self._context.writer

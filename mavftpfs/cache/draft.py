@@ -14,6 +14,7 @@ from enum import Enum
 from typing import Protocol
 
 from mavftpfs.cache.sending import Sending
+from mavftpfs.shared.errors import DataUnproven
 from mavftpfs.shared.extents import ExtentSet
 
 STEP = 64 * 1024
@@ -70,13 +71,14 @@ class Draft:
         self._changed = ExtentSet()
         self._touched = False
         self._ruined = False
+        self._lost = ExtentSet()
 
     # --- what it is
 
     @property
     def clean(self) -> bool:
         """Whether the vehicle has it all."""
-        return self._changed.empty and self.size == self.remote_end
+        return self._changed.empty and self._lost.empty and self.size == self.remote_end
 
     @property
     def remote_end(self) -> int | None:
@@ -192,7 +194,7 @@ class Draft:
         """
         if size < self.size:
             self._content.cut(size)
-            for extents in (self._held, self._changed):
+            for extents in (self._held, self._changed, self._lost):
                 extents.discard(size, max(size, extents.end))
             self.base_limit = min(self.base_limit, size)
             if self.sending is not None:
@@ -211,6 +213,26 @@ class Draft:
         for a, b in self._held.missing(offset, stop):
             self._content.put(a, memoryview(data)[a - offset : b - offset])
             self._held.add(a, b)
+
+    def doubt(self, start: int, stop: int) -> list[tuple[int, int]]:
+        """The vehicle may have other bytes in [start, stop): return those that are known here, which the next
+        attempt sends if they are not compared before. The others are lost (`require_sound`)."""
+        known = []
+        for where, a, b in self.segments(start, stop):
+            if where is Where.BASE:
+                self._lost.add(a, b)
+            else:
+                self._changed.add(a, b)
+                known.append((a, b))
+        return known
+
+    def require_sound(self) -> None:
+        """Raise DataUnproven if there are bytes that nobody has for certain."""
+        for start, stop in self._lost:
+            raise DataUnproven(
+                f"its bytes {start} to {stop - 1} on the vehicle may be another file's, by a request that"
+                " came late: write them, or the whole file, again"
+            )
 
     # --- delivering it
 
@@ -231,6 +253,7 @@ class Draft:
     def delivered(self) -> None:
         """The vehicle has it, checked: from now on that is the base."""
         self._changed.clear()
+        self._lost.clear()
         self.remote_size = self.base_limit = self.size
         self.sending = None
         self._touched = self._ruined = self.made = self.maybe_made = self.overwrites = False
@@ -272,5 +295,6 @@ class Draft:
 
     def _note_changed(self, start: int, stop: int) -> None:
         self._changed.add(start, stop)
+        self._lost.discard(start, stop)
         if self.sending is not None:
             self.sending.on_write(start, stop)

@@ -53,6 +53,7 @@ def choose(draft: Draft, traits: WriteTraits, rules: Rules) -> Plan:
     Raises:
         NotSupported: the file cannot be replaced, and `inplace` was not given.
         FileChanged: the vehicle's file lost what was to stay of it, and only the vehicle had that.
+        DataUnproven: of bytes that are to stay nobody knows what they were.
         FileTooLarge: the change would need more of the file to be sent than rmw_max.
     """
     if draft.clean:
@@ -73,6 +74,7 @@ def choose(draft: Draft, traits: WriteTraits, rules: Rules) -> Plan:
 
 def _partial(draft: Draft, remote_size: int, traits: WriteTraits, rules: Rules) -> Plan:
     """Part of the file on the vehicle is to stay."""
+    draft.require_sound()
     if draft.size < remote_size:
         if traits.truncate_works is False:
             return _rewriting(draft, traits, rules)

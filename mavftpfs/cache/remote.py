@@ -5,6 +5,8 @@ All paths are normalised mount paths (shared.model). All calls raise only Mavftp
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Protocol
 
 from mavftpfs.shared.model import Listing
@@ -14,6 +16,18 @@ FREE_FOR = 2.0
 """Seconds for which a listing that lacks a name lets a file be made there without another look. Ten small
 files are copied into a directory by one listing where that takes no longer; else each costs one more request.
 """
+
+
+@dataclass(frozen=True, slots=True)
+class Overwrite:
+    """Bytes [start, stop) of an uploaded file in the place of which others may have come.
+
+    same: but for what was changed since, they are what the file had there anyway.
+    """
+
+    start: int
+    stop: int
+    same: bool = False
 
 
 class ReadSink(Protocol):
@@ -148,6 +162,12 @@ class Upload(Protocol):
         was perhaps written to another file (servers.md 1)."""
         ...
 
+    @property
+    def overwrites(self) -> Sequence[Overwrite]:
+        """Where a WriteFile that was meant for another file, or for this one before, came late and may have
+        been written to this one. Known when finish returns, if the network keeps the order of the answers."""
+        ...
+
     def wake(self) -> None:
         """The source has more."""
         ...
@@ -231,6 +251,11 @@ class WriteStore(Protocol):
 
     async def stat_size(self, path: bytes) -> int:
         """Return a file's size by a fresh OpenFileRO + Terminate."""
+        ...
+
+    def endangered(self, path: bytes) -> list[tuple[int, int]]:
+        """Return the few bytes of this file that late copies of what was just tried out would hit,
+        where requests are seen to come twice."""
         ...
 
     async def probe_open_for_write(self, first: bytes, second: bytes) -> None:

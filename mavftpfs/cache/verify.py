@@ -20,6 +20,7 @@ import trio
 
 from mavftpfs.cache.context import Context
 from mavftpfs.cache.draft import Draft
+from mavftpfs.cache.overwritten import overwritten
 from mavftpfs.cache.readback import agrees
 from mavftpfs.cache.remote import Upload
 from mavftpfs.cache.sure import Sure
@@ -54,14 +55,18 @@ def doubted(upload: Upload, draft: Draft, *, settled: bool) -> list[tuple[int, i
     """Return of what was sent the ranges that the vehicle may not have though they were ACKed.
 
     settled: the delivery of this file before is long ago.
+
+    Raises:
+        DataUnproven: of some of them nobody knows what they should be.
     """
     sending = draft.sending
     if sending is None:
         return []
     sent = [(0, draft.size)] if sending.whole else list(draft.changed)
+    late = overwritten(upload, draft)
     if upload.shared or (upload.repeats and not sending.whole and not settled):
-        return sent
-    return list(sending.rewritten) if upload.repeats else []
+        return [*sent, *late]
+    return [*sending.rewritten, *late] if upload.repeats else late
 
 
 class Verifier:
@@ -93,6 +98,8 @@ class Verifier:
         """
         verify = self._context.options.verify
         compared = verify != "none" and await self._check(path, draft, verify)
+        if doubted and verify == "none" and await self.size(path) != draft.size:
+            raise VerificationFailed(f"{path!r} has not the {draft.size} bytes that were written")
         if doubted and not compared:
             await self._dispel(path, draft, doubted)
 

@@ -34,8 +34,7 @@ _MAX_SIDE_EFFECT_REPLAYS = 2
 _INVALID_SESSION = bytes((NakCode.INVALID_SESSION,))
 _FEW = 4
 _BURST = int(Opcode.BURST_READ_FILE)
-_ACK = int(Opcode.ACK)
-_NAK = int(Opcode.NAK)
+_ACK, _NAK = int(Opcode.ACK), int(Opcode.NAK)
 
 
 class Engine:
@@ -70,6 +69,7 @@ class Engine:
         self.stats = EngineStats()
         self.on_unknown: Callable[[Payload], None] = lambda reply: None
         self._ledger = Ledger(rng.randrange(LAST_SEQ + 1))
+        self._ledger.ghost.on_written = lambda reply: self.on_unknown(reply)
         self._op_deadline = op_deadline
         self._note = note
         self._ops: list[Operation] = []

@@ -9,7 +9,7 @@ its place in the window, because the server still has it in its queue.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import islice
 
 from mavftpfs.protocol.payload import MAX_DATA, Fields, Opcode, Payload
@@ -30,14 +30,24 @@ _MOST_QUICK_SENDS = 8
 
 
 class Ghost(Operation):
-    """Owns the requests of cancelled operations until they are answered or given up."""
+    """Owns the requests of cancelled operations until they are answered or given up.
+
+    Attributes:
+        on_written: told of a WriteFile that was executed after all, perhaps in another file.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.on_written: Callable[[Payload], None] = lambda reply: None
 
     def next_request(self, now: float) -> Request | None:
         """Never asked: a ghost is in no engine's list."""
         raise LocalProtocolError("a ghost asks for nothing")
 
     def on_reply(self, request: Request, reply: Payload, now: float) -> None:
-        """Nobody wants to know."""
+        """Nobody wants to know, but for what may have gone to another file."""
+        if reply.req_opcode == Opcode.WRITE_FILE:
+            self.on_written(reply)
 
 
 class Ledger:

@@ -179,6 +179,8 @@ class WriteTransfer(Operation):
             self.fail(self._meaning(nak_of(request, reply)))
             return
         del self._unanswered[request]
+        if reply.offset:
+            self.port.traits.write_ack_offset = True
         count = request.size
         if reply.data != self._usual or count != self.chunk:
             count = self._written(request, reply.data)
@@ -193,6 +195,8 @@ class WriteTransfer(Operation):
         """Tell the source what was written, in a row at once."""
         unanswered, usual, chunk = self._unanswered, self._usual, self.chunk
         start = stop = run[0][0].offset
+        if run[-1][0].offset:  # a run's answers have the offsets of their requests
+            self.port.traits.write_ack_offset = True
         for request, data in run:
             offset, count = request.offset, request.size
             del unanswered[request]

@@ -91,7 +91,10 @@ class _Probe:
 
     async def _write(self, session: OpenSession) -> None:
         operation = Simple(Opcode.WRITE_FILE, CONTENT, session=session.id)
-        await self._scheduler.metadata(operation, disturbs=False)
+        try:
+            await self._scheduler.metadata(operation, disturbs=False)
+        finally:
+            self._scheduler.on_probed(session, len(CONTENT))
 
     async def _open_existing(self) -> int | None:
         """Return the size afterwards."""

@@ -17,6 +17,7 @@ from mavftpfs.protocol.engine import Engine
 from mavftpfs.protocol.operations import Operation
 from mavftpfs.protocol.payload import Opcode
 from mavftpfs.protocol.transfers import ReadToEof
+from mavftpfs.session.copies import Written
 from mavftpfs.session.driver import Driver
 from mavftpfs.session.echoes import Echoes
 from mavftpfs.session.gate import Gate
@@ -88,7 +89,8 @@ class Scheduler:
             kit, self, op_deadline=op_deadline, chunk=steering.chunk, when_armed_ok=when_armed_ok
         )
         writer = self._uploading.writer
-        news = (self._on_session_taken, writer.on_emptied, writer.on_disturbed)
+        self.written, self.on_probed = self._uploading.written, self._uploading.on_probed
+        news = (self._on_session_taken, writer.on_emptied, writer.on_disturbed, self.written.on_late)
         strays = Strays(self._holder, self._others_about, *news)
         engine.on_unknown = strays.on_unknown
 
@@ -200,8 +202,8 @@ class Scheduler:
     def moved(self, old: bytes, new: bytes) -> None:
         """A file or directory was renamed: who reads or writes it, or in it, goes on under the new path."""
         prefix = old + b"/"
-        users: list[FileStream | QueuedUpload] = [*self._streams, *self._uploading.uploads]
-        for user in users:
+        users: list[FileStream | QueuedUpload | Written] = [*self._streams, *self._uploading.uploads]
+        for user in [*users, *self.written.sessions]:
             if user.path == old:
                 user.path = new
             elif user.path.startswith(prefix):
@@ -209,6 +211,7 @@ class Scheduler:
 
     def gone(self, path: bytes) -> None:
         """The file of this name was removed or replaced: what its readers still want cannot be had."""
+        self.written.gone(path)
         for stream in list(self._streams):
             if stream.path == path:
                 stream.orphan()

@@ -30,6 +30,7 @@ class Strays:
         on_taken: the session was opened on another file: nothing that came by it lately is to be believed.
         on_emptied: the file that is being written may have been emptied.
         on_disturbed: a request came again that closes a session of some servers.
+        on_written: a WriteFile was ACKed, whose bytes went to what was open.
     """
 
     def __init__(
@@ -39,17 +40,21 @@ class Strays:
         on_taken: Callable[[str], None],
         on_emptied: Callable[[], None],
         on_disturbed: Callable[[], None],
+        on_written: Callable[[Payload], None],
     ) -> None:
         self._holder = holder
         self._is_shared = is_shared
         self._on_taken = on_taken
         self._on_emptied = on_emptied
         self._on_disturbed = on_disturbed
+        self._on_written = on_written
 
     def on_unknown(self, reply: Payload) -> None:
         """Take an answer that fits nothing outstanding."""
         if reply.req_opcode in _DISTURBING:
             self._on_disturbed()
+        if reply.opcode == Opcode.ACK and reply.req_opcode == Opcode.WRITE_FILE:
+            self._on_written(reply)
         if reply.opcode != Opcode.ACK or reply.req_opcode not in _OPENING:
             return
         path = self._holder.opener.opened_by(reply.seq)

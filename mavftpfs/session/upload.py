@@ -6,7 +6,8 @@ from typing import Protocol
 
 import trio
 
-from mavftpfs.cache.remote import UploadSource
+from mavftpfs.cache.remote import Overwrite, UploadSource
+from mavftpfs.session.copies import Span
 from mavftpfs.session.policy import Service
 from mavftpfs.shared.errors import LocalProtocolError, MavftpfsError
 
@@ -24,7 +25,7 @@ class Feed:
     Attributes:
         proven: a Terminate was ACKed, so that the remote file holds at least what was ACKed before it.
         unproven: bytes ACKed since then. reached: end of the highest ACKed byte of this file; once the
-            session was lost, of the highest proven one.
+            session was lost, of the highest proven one. span: what was handed on.
     """
 
     def __init__(self, source: UploadSource, chunk: int) -> None:
@@ -32,6 +33,7 @@ class Feed:
         self.unproven = 0
         self.reached = 0
         self._proven_to = 0
+        self.span = Span()
         self._source = source
         self._chunk = chunk
         self._held: tuple[int, bytes] | None = None
@@ -52,11 +54,15 @@ class Feed:
         """See protocol.writing.ChunkSource."""
         if self._held is not None:
             held, self._held = self._held, None
+            self.span.add(held[0], held[0] + len(held[1]))
             return held
         try:
-            return self._source.next_chunk(limit)
+            found = self._source.next_chunk(limit)
         except MavftpfsError:
             return None
+        if found is not None:
+            self.span.add(found[0], found[0] + len(found[1]))
+        return found
 
     def on_acked(self, offset: int, count: int) -> None:
         """See protocol.writing.ChunkSource."""
@@ -152,6 +158,7 @@ class QueuedUpload:
         self.path = path
         self.feed = feed
         self.create = create
+        self.overwrites: list[Overwrite] = []
         self.least = 0
         self.opened = False
         self.free_at: float | None = None

@@ -8,6 +8,7 @@ import trio
 
 from mavftpfs.cache.remote import FREE_FOR, UploadSource
 from mavftpfs.protocol.payload import MAX_DATA, Opcode
+from mavftpfs.session.copies import Span, WriteLog
 from mavftpfs.session.kit import Kit, Queue
 from mavftpfs.session.opening import TERMINATE_LIMIT, OpenSession
 from mavftpfs.session.turns import Turns
@@ -69,6 +70,7 @@ class Uploading:
         self._when_armed_ok = when_armed_ok
         self._wo_tells_size = False
         self._engine = kit.engine
+        self.written = WriteLog(kit.engine.stats, lambda: kit.engine.traits, kit.clock, chunk)
         self._written: QueuedUpload | None = None
         self._written_at = float("-inf")
 
@@ -151,6 +153,7 @@ class Uploading:
         """Perhaps it is another vehicle: what was proven of a new file is not there, whatever its size."""
         for upload in self.uploads:
             upload.anew = True
+        self.written.forget()
         self.writer.on_reboot()
 
     # --- what the scheduler asks
@@ -199,9 +202,17 @@ class Uploading:
 
     async def _write(self, upload: QueuedUpload, session: OpenSession) -> Stop:
         try:
+            made = upload.create and not upload.feed.proven
+            self.written.begin(upload.path, session.seq, upload.feed.span, upload.overwrites, made=made)
             return await self.writer.run(upload, session)
         finally:
+            self.written.end()
             self._written, self._written_at = upload, self._clock()
+
+    def on_probed(self, session: OpenSession, size: int) -> None:
+        """`size` bytes were written to a file that only shows what the server does."""
+        self.written.begin(session.path, session.seq, Span(0, size), None, made=True)
+        self._written, self._written_at = None, self._clock()
 
     async def _let_stragglers_pass(self, upload: QueuedUpload) -> None:
         """Wait until what is left of the file before is dead."""

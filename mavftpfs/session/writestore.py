@@ -141,6 +141,10 @@ class WriteStore:
         self._foresight.lose(first, second)
         await probe_writing(self._scheduler, self._effects, first, second)
 
+    def endangered(self, path: bytes) -> list[tuple[int, int]]:
+        """See cache.remote.WriteStore."""
+        return self._scheduler.written.feared(path)
+
     async def _require_free(self, path: bytes) -> None:
         """Raise AlreadyExists if CreateFile would empty something, perhaps of another spelling."""
         try:

@@ -23,6 +23,7 @@ class Traits:
         burst_size_honoured: burst packets had the size asked for (False: PX4 always sends 239).
         answers_during_burst: another request was answered between the packets of a burst.
         write_ack_counts: WriteFile ACKs say how many bytes were written.
+        write_ack_offset: they say where (MAVSDK's say 0).
     """
 
     ack_carries_own_session: bool | None = None
@@ -30,6 +31,7 @@ class Traits:
     burst_size_honoured: bool | None = None
     answers_during_burst: bool | None = None
     write_ack_counts: bool | None = None
+    write_ack_offset: bool | None = None
 
     def learn_session_echo(self, echoed: bool) -> None:
         """Note whether an Open ACK carried the id asked for; an echoing server has the shared queue."""

@@ -15,7 +15,7 @@ import pytest
 import trio
 
 from mavftpfs.cache.options import CacheOptions
-from mavftpfs.cache.remote import FREE_FOR, ReadSink, UploadSource
+from mavftpfs.cache.remote import FREE_FOR, Overwrite, ReadSink, UploadSource
 from mavftpfs.cache.spool import SpoolDirectory
 from mavftpfs.cache.tree import Tree
 from mavftpfs.protocol.payload import NakCode, Opcode
@@ -179,6 +179,10 @@ class FakeWriter(FakeStore):
         lost = await self.request("create", path)
         self._create(path)
         _maybe_lose(lost)
+
+    def endangered(self, path: bytes) -> list[tuple[int, int]]:
+        """See WriteStore."""
+        return []
 
     async def truncate(self, path: bytes, size: int) -> None:
         lost = await self.request("truncate", path, size)
@@ -388,6 +392,7 @@ class FakeUpload:
         self._free_at = free_at
         self.begun = False
         self.repeats = self.shared = False
+        self.overwrites: list[Overwrite] = []
         self._open = False
         self._opened_before = False
         self._sending = trio.Lock()

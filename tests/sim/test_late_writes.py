@@ -1,0 +1,167 @@
+"""A WriteFile of one file that comes once more, later than is feared, when another file is being written.
+
+It names no file, so the server writes it to the one that is open; its answer is all that tells. What is
+believed then: the right bytes, or an error.
+"""
+
+from __future__ import annotations
+
+import errno
+
+import pytest
+import trio
+from trio.testing import MockClock
+
+from mavftpfs.cache.tree import Tree
+from mavftpfs.protocol.payload import Opcode
+from mavftpfs.session.echoes import QUIET
+from mavftpfs.shared.errnos import errno_for
+from mavftpfs.shared.errors import DataUnproven
+from mavftpfs.sim.linkmodel import LinkSettings
+from mavftpfs.sim.profiles import PROFILES
+from tests.sim.test_doubted_bytes import CLEAN, DOUBLING, KEEPING, mounted
+from tests.sim.test_upload import content, path, world
+from tests.support.latecomers import Latecomer
+
+EVERY_PROFILE = sorted(PROFILES)
+LONG = QUIET[1] + 3.0
+"""Seconds: no copy is feared any more."""
+
+
+@pytest.fixture
+def autojump() -> MockClock:
+    return MockClock(autojump_threshold=0)
+
+
+async def change(tree: Tree, name: bytes, at: int, data: bytes) -> None:
+    """Change a part of a file, and close it."""
+    file = await tree.open(name, write=True)
+    try:
+        await file.write(at, data)
+        await file.flush()
+    finally:
+        file.close()
+
+
+async def make(tree: Tree, name: bytes, data: bytes) -> None:
+    """Make a file, and close it."""
+    file = await tree.create(name, exclusive=True)
+    try:
+        await file.write(0, data)
+        await file.flush()
+    finally:
+        file.close()
+
+
+@pytest.mark.parametrize("profile", KEEPING)
+async def test_what_was_tried_out_is_not_written_to_the_users_file(profile: str, autojump: MockClock) -> None:
+    """On a link that was seen to double: the few bytes are fetched before, and written back."""
+    old, name = content(20_000), path(profile, "f")
+    here = world(profile, DOUBLING, f=old)
+    async with mounted(here, path(profile, "")[:-1]) as (connection, tree):
+        while not connection.engine.stats.strays:
+            await connection.store.list_directory(path(profile, "")[:-1])
+        copy = Latecomer(here, Opcode.WRITE_FILE, after=Opcode.WRITE_FILE, first=True)
+        await change(tree, name, 5000, b"new")
+        assert copy.late is not None
+        assert copy.late >= QUIET[0]
+        assert here.tree.data(name) == old[:5000] + b"new" + old[5003:]
+
+
+@pytest.mark.parametrize("profile", KEEPING)
+async def test_bytes_that_only_the_vehicle_had_are_an_error(profile: str, autojump: MockClock) -> None:
+    """Where nothing had come twice before they were not fetched; the error stays until they are written."""
+    old, name = content(20_000), path(profile, "f")
+    here = world(profile, CLEAN, f=old)
+    async with mounted(here, path(profile, "")[:-1]) as (_, tree):
+        copy = Latecomer(here, Opcode.WRITE_FILE, after=Opcode.WRITE_FILE, first=True)
+        file = await tree.open(name, write=True)
+        await file.write(5000, b"new")
+        for _ in range(2):
+            with pytest.raises(DataUnproven) as caught:
+                await file.flush()
+            assert errno_for(caught.value) == errno.EIO
+        assert "bytes 0 to 2 " in str(caught.value)
+        assert copy.late is not None
+        await file.write(0, b"own")
+        await file.flush()
+        file.close()
+        assert here.tree.data(name) == b"own" + old[3:5000] + b"new" + old[5003:]
+
+
+@pytest.mark.parametrize("link", [CLEAN, DOUBLING])
+@pytest.mark.parametrize("profile", KEEPING)
+async def test_another_files_bytes_are_never_kept_silently(
+    profile: str, link: LinkSettings, autojump: MockClock
+) -> None:
+    old = content(20_000)
+    here = world(profile, link, f=old, g=old)
+    f, g = path(profile, "f"), path(profile, "g")
+    async with mounted(here, path(profile, "")[:-1]) as (_, tree):
+        await change(tree, f, 1, b"x")
+        await trio.sleep(LONG)
+        copy = Latecomer(here, Opcode.WRITE_FILE, after=Opcode.WRITE_FILE, first=True, nth=99)
+        await change(tree, f, 1000, b"of f" * 500)
+        await trio.sleep(LONG)
+        copy.rearm(Opcode.WRITE_FILE)
+        with pytest.raises(DataUnproven):
+            await change(tree, g, 9000, b"of g")
+        assert copy.late is not None
+        assert copy.late > LONG
+        await change(tree, g, 900, b"g" * 400)  # it covers what was hit
+        assert here.tree.data(g) == old[:900] + b"g" * 400 + old[1300:9000] + b"of g" + old[9004:]
+        assert here.tree.data(f) == old[:1] + b"x" + old[2:1000] + b"of f" * 500 + old[3000:]
+
+
+@pytest.mark.parametrize("verify", ["auto", "size", "none"])
+@pytest.mark.parametrize("size", [100, 6000])
+@pytest.mark.parametrize("profile", EVERY_PROFILE)
+async def test_a_file_that_is_sent_whole_is_right(
+    profile: str, size: int, verify: str, autojump: MockClock
+) -> None:
+    """A copy of bytes that lie within it, or beyond its end."""
+    here = world(profile, CLEAN)
+    one, two = path(profile, "one"), path(profile, "two")
+    async with mounted(here, path(profile, "")[:-1], verify=verify) as (_, tree):
+        copy = Latecomer(here, Opcode.WRITE_FILE, after=Opcode.WRITE_FILE, nth=99)
+        await make(tree, one, content(3000, 1))
+        await trio.sleep(LONG)
+        copy.rearm(Opcode.WRITE_FILE, nth=1 + size // 239)
+        await make(tree, two, content(size, 2))
+        assert copy.late is not None
+        assert copy.late > LONG
+        assert here.tree.data(two) == content(size, 2)
+
+
+@pytest.mark.parametrize("profile", KEEPING)
+async def test_an_earlier_change_of_the_same_file_harms_nothing(profile: str, autojump: MockClock) -> None:
+    old, name = content(20_000), path(profile, "f")
+    here = world(profile, CLEAN, f=old)
+    async with mounted(here, path(profile, "")[:-1]) as (_, tree):
+        await change(tree, name, 1, b"x")
+        await trio.sleep(LONG)
+        copy = Latecomer(here, Opcode.WRITE_FILE, after=Opcode.WRITE_FILE, first=True, nth=99)
+        await change(tree, name, 1000, b"1" * 100)
+        await trio.sleep(20)
+        copy.rearm(Opcode.WRITE_FILE)
+        await change(tree, name, 1050, b"2" * 10)
+        assert copy.late is not None
+        new = old[:1] + b"x" + old[2:1000] + b"1" * 50 + b"2" * 10 + b"1" * 40 + old[1100:]
+        assert here.tree.data(name) == new
+
+
+@pytest.mark.parametrize("profile", KEEPING)
+async def test_a_change_that_was_overtaken_is_an_error(profile: str, autojump: MockClock) -> None:
+    """The same file, but these bytes were written again since, and only the vehicle has them."""
+    old, name = content(20_000), path(profile, "f")
+    here = world(profile, CLEAN, f=old)
+    async with mounted(here, path(profile, "")[:-1]) as (_, tree):
+        await change(tree, name, 1, b"x")
+        copy = Latecomer(here, Opcode.WRITE_FILE, after=Opcode.WRITE_FILE, first=True, nth=99)
+        await change(tree, name, 1000, b"1" * 100)
+        await change(tree, name, 1000, b"2" * 100)
+        await trio.sleep(20)
+        copy.rearm(Opcode.WRITE_FILE)
+        with pytest.raises(DataUnproven):
+            await change(tree, name, 5000, b"3")
+        assert copy.late is not None
