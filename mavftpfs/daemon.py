@@ -33,12 +33,15 @@ def in_background(work: Callable[[Report], int]) -> int:
     read_end, write_end = os.pipe()
     sys.stdout.flush()
     sys.stderr.flush()
+    # Python's own hooks around a fork would swallow a KeyboardInterrupt.
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     pid = os.fork()
     if pid == 0:
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
         os.close(read_end)
         _be_child(write_end, work)
     os.close(write_end)
-    return _await_report(read_end, pid)
+    return _await_report(read_end, pid, mask)
 
 
 def _be_child(write_end: int, work: Callable[[Report], int]) -> NoReturn:
@@ -82,9 +85,11 @@ def _detach() -> None:
         os.close(null)
 
 
-def _await_report(read_end: int, pid: int) -> int:
+def _await_report(read_end: int, pid: int, mask: set[int]) -> int:
+    """Return what the child says; `mask`: the signals that were blocked before the fork."""
     try:
         with os.fdopen(read_end, "rb") as pipe:
+            signal.pthread_sigmask(signal.SIG_SETMASK, mask)
             text = pipe.read(MAX_REPORT).decode("utf-8", "surrogateescape")
     except KeyboardInterrupt:
         os.kill(pid, signal.SIGTERM)

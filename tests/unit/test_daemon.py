@@ -77,22 +77,32 @@ def test_a_child_that_dies_is_an_error_with_a_reason(tmp_path: Path, work: str, 
     assert words in done.stderr.splitlines()[-1]
 
 
-def test_interrupting_the_parent_ends_the_child(tmp_path: Path) -> None:
+AT_FORK = "os.register_at_fork(after_in_parent=lambda: os.kill(os.getpid(), signal.SIGINT))"
+
+
+@pytest.mark.parametrize("at_fork", ["", AT_FORK], ids=["later", "at once"])
+def test_interrupting_the_parent_ends_the_child(tmp_path: Path, at_fork: str) -> None:
     code = f"""
-import pathlib, sys, time
+import os, pathlib, signal, sys, time
 from mavftpfs.daemon import in_background
+{at_fork}
 def work(report):
     pathlib.Path({str(tmp_path / "pid")!r}).write_text(str(__import__("os").getpid()))
     time.sleep(60)
 sys.exit(in_background(work))
 """
-    parent = subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.PIPE)
-    child = int(wait_for(tmp_path / "pid"))
-    parent.send_signal(signal.SIGINT)
-    parent.communicate(timeout=20)
+    with subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.PIPE) as parent:
+        try:
+            if not at_fork:
+                wait_for(tmp_path / "pid")
+                parent.send_signal(signal.SIGINT)
+            parent.communicate(timeout=20)
+        finally:
+            parent.kill()
     assert parent.returncode == 130
-    with pytest.raises(ProcessLookupError):
-        os.kill(child, 0)
+    if (tmp_path / "pid").exists():
+        with pytest.raises(ProcessLookupError):
+            os.kill(int((tmp_path / "pid").read_text()), 0)
 
 
 @pytest.fixture
