@@ -18,6 +18,7 @@ import pytest
 
 from tests.mount.conftest import Field
 from tests.support.mounts import wait_until
+from tests.support.takingturns import taking_turns
 from tests.support.twins import Twins
 from tests.support.vehicles import UdpVehicle
 
@@ -34,9 +35,6 @@ SERVERS: dict[str, tuple[str, tuple[str, ...]]] = {
     "mavsdk-old": ("", ()),
 }
 """Where each may be written, and the options it needs for that."""
-
-ALIKE = ("spec", "px4-2026", "mavsdk-old")
-"""So like one of the others that they take their turn in the soak."""
 
 FAT = ("px4-nuttx", "ardupilot5")
 NOT_ON_FAT = re.compile(rb'[?"*:<>|\\]')
@@ -58,7 +56,7 @@ def make_twins(field: Field, kind: str, *options: str) -> tuple[Twins, UdpVehicl
 
 @pytest.fixture(
     scope="module",
-    params=[pytest.param(kind, marks=pytest.mark.soak if kind in ALIKE else ()) for kind in SERVERS],
+    params=taking_turns(SERVERS),
 )
 def kind(request: pytest.FixtureRequest) -> str:
     """The server's name."""

@@ -22,6 +22,7 @@ from mavftpfs.sim.profiles import PROFILES
 from tests.sim.test_doubted_bytes import CLEAN, DOUBLING, KEEPING, mounted
 from tests.sim.test_upload import content, path, world
 from tests.support.latecomers import Latecomer
+from tests.support.takingturns import taking_turns
 
 EVERY_PROFILE = sorted(PROFILES)
 LONG = QUIET[1] + 3.0
@@ -53,7 +54,7 @@ async def make(tree: Tree, name: bytes, data: bytes) -> None:
         file.close()
 
 
-@pytest.mark.parametrize("profile", KEEPING)
+@pytest.mark.parametrize("profile", taking_turns(KEEPING))
 async def test_what_was_tried_out_is_not_written_to_the_users_file(profile: str, autojump: MockClock) -> None:
     """On a link that was seen to double: the few bytes are fetched before, and written back."""
     old, name = content(20_000), path(profile, "f")
@@ -68,7 +69,7 @@ async def test_what_was_tried_out_is_not_written_to_the_users_file(profile: str,
         assert here.tree.data(name) == old[:5000] + b"new" + old[5003:]
 
 
-@pytest.mark.parametrize("profile", KEEPING)
+@pytest.mark.parametrize("profile", taking_turns(KEEPING))
 async def test_bytes_that_only_the_vehicle_had_are_an_error(profile: str, autojump: MockClock) -> None:
     """Where nothing had come twice before they were not fetched; the error stays until they are written."""
     old, name = content(20_000), path(profile, "f")
@@ -90,7 +91,7 @@ async def test_bytes_that_only_the_vehicle_had_are_an_error(profile: str, autoju
 
 
 @pytest.mark.parametrize("link", [CLEAN, DOUBLING])
-@pytest.mark.parametrize("profile", KEEPING)
+@pytest.mark.parametrize("profile", taking_turns(KEEPING))
 async def test_another_files_bytes_are_never_kept_silently(
     profile: str, link: LinkSettings, autojump: MockClock
 ) -> None:
@@ -115,7 +116,7 @@ async def test_another_files_bytes_are_never_kept_silently(
 
 @pytest.mark.parametrize("verify", ["auto", "size", "none"])
 @pytest.mark.parametrize("size", [100, 6000])
-@pytest.mark.parametrize("profile", EVERY_PROFILE)
+@pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
 async def test_a_file_that_is_sent_whole_is_right(
     profile: str, size: int, verify: str, autojump: MockClock
 ) -> None:
@@ -133,7 +134,7 @@ async def test_a_file_that_is_sent_whole_is_right(
         assert here.tree.data(two) == content(size, 2)
 
 
-@pytest.mark.parametrize("profile", KEEPING)
+@pytest.mark.parametrize("profile", taking_turns(KEEPING))
 async def test_an_earlier_change_of_the_same_file_harms_nothing(profile: str, autojump: MockClock) -> None:
     old, name = content(20_000), path(profile, "f")
     here = world(profile, CLEAN, f=old)
@@ -150,7 +151,7 @@ async def test_an_earlier_change_of_the_same_file_harms_nothing(profile: str, au
         assert here.tree.data(name) == new
 
 
-@pytest.mark.parametrize("profile", KEEPING)
+@pytest.mark.parametrize("profile", taking_turns(KEEPING))
 async def test_a_change_that_was_overtaken_is_an_error(profile: str, autojump: MockClock) -> None:
     """The same file, but these bytes were written again since, and only the vehicle has them."""
     old, name = content(20_000), path(profile, "f")

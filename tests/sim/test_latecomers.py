@@ -24,6 +24,7 @@ from tests.sim.test_stragglers import double
 from tests.sim.test_upload import content, path, probes, put, world
 from tests.support.latecomers import Latecomer
 from tests.support.sources import MemorySource
+from tests.support.takingturns import taking_turns
 from tests.support.worlds import MemorySink, read_file
 
 EVERY_PROFILE = sorted(PROFILES)
@@ -42,7 +43,7 @@ def autojump() -> MockClock:
         (Opcode.CREATE_FILE, Opcode.TERMINATE_SESSION),  # empties what was not
     ],
 )
-@pytest.mark.parametrize("profile", EVERY_PROFILE)
+@pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
 async def test_a_copy_does_not_teach_what_the_server_does_not_do(
     profile: str, what: Opcode, after: Opcode, autojump: MockClock
 ) -> None:
@@ -81,7 +82,7 @@ async def test_a_late_write_does_not_hide_that_reopening_empties_files(
 
 
 @pytest.mark.parametrize("nth", [8, 9, 12])
-@pytest.mark.parametrize("profile", EVERY_PROFILE)
+@pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
 async def test_a_late_open_of_another_file_gives_no_wrong_bytes(
     profile: str, nth: int, autojump: MockClock
 ) -> None:
@@ -103,7 +104,7 @@ async def test_a_late_open_of_another_file_gives_no_wrong_bytes(
 
 
 @pytest.mark.parametrize("opcode", [Opcode.OPEN_FILE_RO, Opcode.CREATE_FILE])
-@pytest.mark.parametrize("profile", EVERY_PROFILE)
+@pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
 async def test_what_a_late_open_left_open_is_closed(
     profile: str, opcode: Opcode, autojump: MockClock
 ) -> None:
@@ -122,7 +123,7 @@ async def test_what_a_late_open_left_open_is_closed(
 
 
 @pytest.mark.parametrize("opcode", [Opcode.OPEN_FILE_RO, Opcode.CREATE_FILE])
-@pytest.mark.parametrize("profile", EVERY_PROFILE)
+@pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
 async def test_what_an_open_that_came_twice_at_once_left_open_is_closed(
     profile: str, opcode: Opcode, autojump: MockClock
 ) -> None:
@@ -149,7 +150,7 @@ async def test_what_an_open_that_came_twice_at_once_left_open_is_closed(
 
 
 @pytest.mark.parametrize("nth", [2, 20])
-@pytest.mark.parametrize("profile", EVERY_PROFILE)
+@pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
 async def test_a_file_that_a_late_create_emptied_in_mid_upload_is_compared(
     profile: str, nth: int, autojump: MockClock
 ) -> None:
@@ -175,7 +176,7 @@ async def test_a_file_that_a_late_create_emptied_in_mid_upload_is_compared(
     assert here.tree.data(path(profile, "new")) == data
 
 
-@pytest.mark.parametrize("profile", EVERY_PROFILE)
+@pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
 async def test_late_reads_are_not_taken_for_a_full_card(profile: str, autojump: MockClock) -> None:
     """MAVSDK closes what is written when a ReadFile comes, and refuses as where the card is full."""
     here = world(profile, DOUBLING, f=content(1500))
@@ -193,7 +194,7 @@ SOON = [0.02, 0.1, 0.2]
 
 
 @pytest.mark.parametrize("late", SOON)
-@pytest.mark.parametrize("profile", EVERY_PROFILE)
+@pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
 async def test_a_directory_that_was_removed_does_not_come_back(
     profile: str, late: float, autojump: MockClock
 ) -> None:
@@ -222,7 +223,7 @@ KEEPING = ["px4", "px4-2026", "spec", "ardupilot", "ardupilot5", "littlefs"]
 
 
 @pytest.mark.parametrize("late", SOON)
-@pytest.mark.parametrize("profile", KEEPING)
+@pytest.mark.parametrize("profile", taking_turns(KEEPING))
 async def test_a_file_is_not_emptied_again_after_it_was_written(
     profile: str, late: float, autojump: MockClock
 ) -> None:

@@ -14,6 +14,7 @@ from trio.testing import MockClock
 from mavftpfs.session.connection import Connection
 from mavftpfs.sim.linkmodel import Duplex, LinkSettings
 from mavftpfs.sim.profiles import PROFILES
+from tests.support.takingturns import ALIKE
 from tests.support.worlds import ROOTS, MemorySink, World, read_file
 
 SAMPLES = 20
@@ -26,10 +27,15 @@ FAST = LinkSettings(rate=400_000.0, delay=0.015, queue=200_000)
 FASTER = LinkSettings(rate=1e6, delay=0.015, queue=500_000)
 CASES = [
     *(pytest.param(profile, RADIO, id=f"{profile}-radio") for profile in sorted(PROFILES)),
-    *(pytest.param(profile, SLOW, id=f"{profile}-slow") for profile in sorted(PROFILES)),
+    *(
+        pytest.param(profile, SLOW, marks=pytest.mark.soak if profile in ALIKE else (), id=f"{profile}-slow")
+        for profile in sorted(PROFILES)
+    ),
     *(pytest.param(profile, FAST, id=f"{profile}-fast") for profile in ("px4", "ardupilot")),
     *(
-        pytest.param(profile, FASTER, id=f"{profile}-faster")
+        pytest.param(
+            profile, FASTER, marks=pytest.mark.soak if profile in ALIKE else (), id=f"{profile}-faster"
+        )
         for profile in ("ardupilot", "ardupilot5", "littlefs")
     ),
 ]

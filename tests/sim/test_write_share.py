@@ -34,7 +34,7 @@ def test_writing_uses_a_faster_link(profile: str, rtt: float, loss: float) -> No
     assert measure(case, 20.0).share >= case.target
 
 
-@pytest.mark.parametrize(("rtt", "share"), [(0.1, 0.95), (0.3, 0.93)])
+@pytest.mark.parametrize(("rtt", "share"), [pytest.param(0.1, 0.95, marks=pytest.mark.soak), (0.3, 0.93)])
 def test_the_pauses_of_a_card_cost_their_time_once(rtt: float, share: float) -> None:
     """The server had nothing to do a round trip after a pause, for as long again: 0.87 to 0.91. In this run
     the card pauses for 2 % longer than on average, which is what the limit knows."""
