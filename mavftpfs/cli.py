@@ -18,6 +18,7 @@ from mavftpfs import commands
 from mavftpfs.exits import ExitCode, exit_code_for
 from mavftpfs.fuse.options import option_names
 from mavftpfs.shared.errors import MavftpfsError, UsageError
+from mavftpfs.shared.readable import readable
 
 _DESCRIPTION = """Mount a drone's files (MAVLink FTP: PX4, ArduPilot, MAVSDK) as a local directory.
 
@@ -55,7 +56,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _complain(message: str, code: int) -> int:
-    print(f"mavftpfs: {message}", file=sys.stderr)
+    print(f"mavftpfs: {readable(message)}", file=sys.stderr)
     return code
 
 

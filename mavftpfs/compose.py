@@ -138,7 +138,7 @@ async def attached(
                     rng=SystemRandom(),
                     keep=None if keep is None else partial(_start_keeper, keep, nursery),
                 )
-                _subscribe(connection, tree)
+                subscribe(connection, tree)
                 if list_root:
                     await _list_root(connection, tree, deadline, options)
                 try:
@@ -204,7 +204,8 @@ def _flag(connection: Connection) -> str:
     return "it says it supports FTP" if flag else "it says it does not support FTP"
 
 
-def _subscribe(connection: Connection, tree: Tree) -> None:
+def subscribe(connection: Connection, tree: Tree) -> None:
+    """Have a tree told what happens to the vehicle and the link."""
     reactions: dict[str, Callable[[], None]] = {
         "reboot": tree.rebooted,
         "back": tree.link_back,

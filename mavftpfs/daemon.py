@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import NoReturn
 
 from mavftpfs.exits import ExitCode
+from mavftpfs.shared.readable import readable
 
 Report = Callable[[int, str], None]
 """Tells the waiting parent (exit code, one line); only the first call counts."""
@@ -138,8 +139,16 @@ def log_in_background(fallback: Path, level: int, *, socket: str = SYSLOG_SOCKET
     _install(handler, form, level)
 
 
+class _Readable(logging.Formatter):
+    """Shows names as a person reads them."""
+
+    def formatMessage(self, record: logging.LogRecord) -> str:
+        """See logging.Formatter."""
+        return readable(super().formatMessage(record))
+
+
 def _install(handler: logging.Handler, form: str, level: int) -> None:
-    handler.setFormatter(logging.Formatter(form))
+    handler.setFormatter(_Readable(form))
     root = logging.getLogger()
     for old in root.handlers[:]:
         root.removeHandler(old)

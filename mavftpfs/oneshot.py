@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
-from contextlib import AbstractAsyncContextManager
+import secrets
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractAsyncContextManager, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
@@ -117,7 +118,7 @@ async def get_paths(
 
     Raises:
         DataUnproven: size or checksum disagreed twice; no file is left under the final name.
-        IsADirectory: a directory without `recursive`.
+        IsADirectory: a directory without `recursive`. UsageError: the local disk does not take it.
     """
     async with target.attached() as vehicle:
         tree = vehicle.tree
@@ -135,6 +136,15 @@ def _local_name(local: Path, path: bytes, *, single: bool) -> Path:
     return local / name if local.is_dir() or not single else local
 
 
+@contextmanager
+def _local_disk(place: Path) -> Iterator[None]:
+    """Turn what the local disk refuses into an error that says so in a line."""
+    try:
+        yield
+    except OSError as exc:
+        raise UsageError(f"{place}: {exc.strerror}") from exc
+
+
 @dataclass(frozen=True, slots=True)
 class _Getter:
     """Fetches files that are proven before they get their names."""
@@ -149,15 +159,18 @@ class _Getter:
         while pending:
             remote, place, stat = pending.pop()
             if stat.kind is EntryKind.FILE:
-                tell(await self.get(remote, place, stat))
+                with _local_disk(place):
+                    fetched = await self.get(remote, place, stat)
+                tell(fetched)
                 continue
-            place.mkdir(parents=True, exist_ok=True)
+            with _local_disk(place):
+                place.mkdir(parents=True, exist_ok=True)
             for name, below in reversed(await self.tree.list(remote)):
                 pending.append((join(remote, name), place / os.fsdecode(name), below))
 
     async def get(self, remote: bytes, local: Path, found: Stat) -> Fetched:
         """Fetch one file under a temporary name and rename it when its bytes are proven; tries twice."""
-        part = local.with_name(local.name + PART_SUFFIX)
+        part = local.with_name(f".{secrets.token_hex(8)}{PART_SUFFIX}")  # no name of the user's
         try:
             try:
                 size, proof = await self._fetch_and_prove(remote, part)

@@ -6,6 +6,7 @@ import logging
 import os
 import tempfile
 from collections.abc import Iterator
+from itertools import zip_longest
 from pathlib import Path
 
 import pytest
@@ -53,10 +54,26 @@ def tier_of(path: Path) -> str:
     return path.relative_to(TESTS).parts[0]
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Sort by tier and mark the mount tier."""
     for item in items:
         if tier_of(item.path) == "mount":
             item.add_marker(pytest.mark.mount)
     rank = {tier: number for number, tier in enumerate(TIERS)}
     items.sort(key=lambda item: rank.get(tier_of(item.path), len(TIERS)))
+    if hasattr(config, "workerinput"):
+        items[:] = packed(items)
+
+
+def packed(items: list[pytest.Item]) -> list[pytest.Item]:
+    """Order files for workers that take one at a time: those that wait for a kernel and those that compute
+    in turns, then the short ones, so that none is left running alone at the end."""
+    files: dict[Path, list[pytest.Item]] = {}
+    for item in items:
+        files.setdefault(item.path, []).append(item)
+    longest = sorted(files, key=lambda path: -len(files[path]))
+    waiting = [path for path in longest if tier_of(path) == "mount"]
+    computing = [path for path in longest if tier_of(path) == "sim"]
+    turns = [path for pair in zip_longest(waiting, computing) for path in pair if path is not None]
+    rest = [path for path in longest if path not in turns]
+    return [item for path in (*turns, *rest) for item in files[path]]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from mavftpfs.cache.context import Context
 from mavftpfs.cache.files import FileHandle
 from mavftpfs.cache.nodes import Node
-from mavftpfs.shared.errors import FileChanged, FtpNak, IsADirectory, NotFound
+from mavftpfs.shared.errors import FileChanged, FtpNak, IsADirectory, LocalProtocolError, NotFound
 from mavftpfs.shared.model import EntryKind
 
 STEP = 128 * 1024
@@ -44,19 +44,30 @@ async def read_base(context: Context, node: Node, start: int, stop: int) -> byte
     """Return bytes of the vehicle's file that a node's draft lies over.
 
     Raises:
-        FileChanged: it is another file by now. Else as open_base and FileHandle.read.
+        FileChanged: it is another file by now. DataUnproven: they may be another file's. Else as open_base
+        and FileHandle.read.
     """
     if node.draft is not None and node.draft.ruined:
         raise FileChanged(f"{node.path!r} was emptied on the vehicle while it was changed here")
-    if node.base is None:
-        handle = await open_node(context, node)
+    data: bytes | memoryview | None = None
+    while data is None:
         if node.base is None:
-            node.base = handle
-        else:
-            handle.close()
-    if node.draft is not None and node.base.size < stop:
-        raise FileChanged(f"{node.path!r} became shorter on the vehicle")
-    return await node.base.read(start, stop - start)
+            handle = await open_node(context, node)
+            if node.base is None:
+                node.base = handle
+            else:
+                handle.close()
+        base = node.base
+        if node.draft is not None and base.size < stop:
+            raise FileChanged(f"{node.path!r} became shorter on the vehicle")
+        try:
+            data = await base.read(start, stop - start)
+        except (FileChanged, LocalProtocolError):
+            if node.base is base:
+                raise  # else we changed it there ourselves meanwhile, but not these bytes
+    if node.draft is not None:
+        node.draft.require_sound(start, stop)
+    return data
 
 
 async def fill(context: Context, node: Node) -> None:

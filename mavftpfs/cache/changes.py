@@ -8,7 +8,7 @@ from mavftpfs.cache.context import Context
 from mavftpfs.cache.namespace import Namespace
 from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.overlay import Overlay
-from mavftpfs.shared.errors import AlreadyExists, CrossDevice, DirectoryNotEmpty, NotADirectory
+from mavftpfs.shared.errors import AlreadyExists, CrossDevice, DirectoryNotEmpty, FileBusy, NotADirectory
 from mavftpfs.shared.model import EntryKind, split
 
 
@@ -84,24 +84,47 @@ class Changes:
             await self._namespace.rename(self._overlay.spelled(old), new, noreplace=noreplace)
 
     async def _rename_across(self, old: bytes, new: bytes, *, to_vehicle: bool, noreplace: bool) -> None:
-        """Rename between a local name and one of the vehicle's: a copy, since they are two places."""
+        """Rename between a local name and one of the vehicle's: a copy, since they are two places.
+
+        Raises:
+            FileBusy: a program writes the file, or did meanwhile. It stays then.
+        """
         if await self._is_directory(old):
             raise CrossDevice(f"{old!r} and {new!r} are in different places")
         source = await self._open_reader(old)
         try:
-            if not to_vehicle:
-                self._local.require_room(source.size)
-            data = bytes(await source.read(0, source.size))
-        finally:
-            await source.release()
-        if not to_vehicle:
+            if to_vehicle:
+                await self._copy_to_vehicle(old, new, source, noreplace=noreplace)
+                self._local.unlink(old)
+                return
+            data = await self._read_from_vehicle(old, source)
             await self.require_parent(new)
             self._require_no_local(new, noreplace=noreplace)
-            self._local.put(new, data)
-            await self.unlink(old)
-            return
+        finally:
+            await source.release()
+        self._local.put(new, data)
+        await self.unlink(old)
+
+    async def _copy_to_vehicle(self, old: bytes, new: bytes, source: OpenFile, *, noreplace: bool) -> None:
+        self._require_unwritten(old, self._local.find(old).writers)
+        data = bytes(await source.read(0, source.size))
         await self._put(new, data, noreplace)
-        self._local.unlink(old)
+        entry = self._local.find(old)
+        self._require_unwritten(old, entry.writers or bytes(entry.data or b"") != data)
+
+    async def _read_from_vehicle(self, path: bytes, source: OpenFile) -> bytes:
+        node = self._context.nodes.need(path)  # its reader is open
+        self._require_unwritten(path, node.writers)
+        self._local.require_room(source.size)
+        await source.fsync()
+        known = node.generation
+        data = bytes(await source.read(0, source.size))
+        self._require_unwritten(path, node.writers or node.undelivered or node.generation != known)
+        return data
+
+    def _require_unwritten(self, path: bytes, writing: int) -> None:
+        if writing:
+            raise FileBusy(f"{path!r} is being written, so it cannot be moved to another place")
 
     async def require_parent(self, path: bytes) -> None:
         """Check that the directory of a local path exists, here or on the vehicle.

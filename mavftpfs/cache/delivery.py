@@ -23,7 +23,7 @@ from mavftpfs.cache.recovery import describe
 from mavftpfs.cache.replacing import Present, Replacer
 from mavftpfs.cache.sure import Sure
 from mavftpfs.cache.throttle import Throttle
-from mavftpfs.cache.verify import SETTLED, Verifier, doubted
+from mavftpfs.cache.verify import Verifier, doubted
 from mavftpfs.shared.errors import (
     AlreadyExists,
     Armed,
@@ -133,13 +133,27 @@ class Deliverer:
 
     async def abandon(self, node: Node) -> None:
         """Give up the present attempt; what it left under reserved names goes now or at the next listing."""
-        with node.firmly():
+        async with node.firmly():
             attempt, node.attempt = node.attempt, None
             if attempt is not None:
                 await self._abandon(node, attempt)
 
     async def _abandon(self, node: Node, attempt: Attempt) -> None:
-        await attempt.upload.abort()
+        places = attempt.places
+        try:
+            try:
+                await attempt.upload.abort()
+            finally:  # also if who waits for it gives up
+                self._note_abandoned(node, attempt)
+            if places is not None and not attempt.committing:
+                await self.replacer.clean(node.path, places, new=attempt.upload.begun)
+            elif places is not None and node.path in self._context.torn:
+                self.replacer.leave(node.path, places)
+        finally:
+            if places is not None:
+                self.replacer.release(places)
+
+    def _note_abandoned(self, node: Node, attempt: Attempt) -> None:
         if node.draft is not None:
             node.draft.made |= attempt.plan is Plan.NEW and attempt.upload.begun
             node.draft.begin_again()
@@ -147,14 +161,6 @@ class Deliverer:
             self._context.dentries.expire(split(node.path)[0], self._context.clock())  # it shows the file
         elif attempt.path == node.path:
             self._context.dentries.note_unsized(node.path)
-        if attempt.places is not None:
-            try:
-                if not attempt.committing:
-                    await self.replacer.clean(node.path, attempt.places, new=attempt.upload.begun)
-                elif node.path in self._context.torn:
-                    self.replacer.leave(node.path, attempt.places)
-            finally:
-                self.replacer.release(attempt.places)
 
     # --- planning
 
@@ -162,6 +168,8 @@ class Deliverer:
         mismatches = 0
         for _ in range(MAX_STEPS):
             draft = _draft(node)
+            if draft.stretched and node.attempt is None:
+                draft.has_size(await self.verifier.size(node.path))
             plan = self.plan(node)
             if plan is Plan.NOTHING:
                 await self.abandon(node)
@@ -172,7 +180,7 @@ class Deliverer:
             except VerificationFailed as error:
                 mismatches += 1
                 await self.abandon(node)
-                if mismatches > 1:
+                if mismatches > 1 or isinstance(error.__cause__, Armed):  # no second copy can be checked
                     raise
                 log.warning("%s; sending it again", error)
             except MavftpfsError as error:
@@ -197,7 +205,7 @@ class Deliverer:
         else:
             await self.abandon(node)
             if plan is Plan.TRUNCATE and not _draft(node).changed.empty:
-                await self._cut_first(node.path, _draft(node))
+                await self._cut_first(node, _draft(node))
             else:
                 await self._act(node, plan)
 
@@ -205,7 +213,7 @@ class Deliverer:
         """Do what takes one request."""
         draft = _draft(node)
         if plan is Plan.CREATE_EMPTY:
-            with node.firmly():
+            async with node.firmly():
                 await self._create_empty(node.path, draft)
         else:
             if (size := await self.verifier.size(node.path)) < draft.size:  # it would be filled up with zeros
@@ -214,12 +222,16 @@ class Deliverer:
         await self.verifier.check(node.path, draft)
         self._on_delivered(node, draft)
 
-    async def _cut_first(self, path: bytes, draft: Draft) -> None:
+    async def _cut_first(self, node: Node, draft: Draft) -> None:
         """Cut a file of which a part is to be changed, too."""
+        path = node.path
         await self._require_base(path, draft)
         await self._context.writer.truncate(path, draft.size)
         self._context.dentries.note_unsized(path)
         draft.remote_cut(draft.size)
+        # What it was opened as is longer: a read would say that somebody had changed it.
+        self._context.files.on_written(path)
+        node.close_base()
 
     async def _create_empty(self, path: bytes, draft: Draft) -> None:
         try:
@@ -247,9 +259,8 @@ class Deliverer:
             await self._finish(attempt)
             if draft.ruined and attempt.plan is Plan.IN_PLACE:
                 raise FileChanged(f"{node.path!r} was emptied on the vehicle while it was changed here")
-            settled = self._context.clock() - node.delivered_at > SETTLED
-            await self.verifier.check(attempt.path, draft, doubted(attempt.upload, draft, settled=settled))
-        with node.firmly():
+            await self.verifier.check(attempt.path, draft, doubted(attempt.upload, draft))
+        async with node.firmly():
             if not attempt.committing:
                 await attempt.upload.abort()
             if attempt.places is not None:
@@ -261,7 +272,7 @@ class Deliverer:
         """Return the attempt under way if it still fits, else a new one."""
         draft = _draft(node)
         attempt = node.attempt
-        if attempt is not None and _still_fits(attempt, plan, draft):
+        if attempt is not None and attempt.fits(plan, draft):
             return attempt
         await self.abandon(node)
         least = 0
@@ -274,8 +285,6 @@ class Deliverer:
         if plan is Plan.REWRITE:
             draft.remote_removed()
         free_at = self._free_at(path, draft) if plan is Plan.NEW else None
-        if plan is Plan.NEW:
-            self._context.dentries.note_created(path, DirEntry(split(path)[1], EntryKind.FILE, 0))
         if places is not None:
             self.replacer.reserve(places)
         try:
@@ -289,6 +298,8 @@ class Deliverer:
                 upload = await writer.open_upload(path, sending, create=False, least=least)
             else:
                 upload = await writer.open_upload(path, sending, create=True, free_at=free_at)
+            if plan is Plan.NEW:
+                self._context.dentries.note_created(path, DirEntry(split(path)[1], EntryKind.FILE, 0))
             if places is None:
                 self._context.dentries.note_unsized(path)
         except BaseException:
@@ -385,16 +396,3 @@ class Deliverer:
 def _draft(node: Node) -> Draft:
     assert node.draft is not None
     return node.draft
-
-
-def _still_fits(attempt: Attempt, plan: Plan, draft: Draft) -> bool:
-    """Return whether going on with an attempt ends with the draft's content on the vehicle."""
-    sending = attempt.sending
-    if attempt.committing and sending.unacked:
-        return False
-    return (
-        attempt.plan is plan
-        and draft.sending is sending
-        and not sending.emptied
-        and sending.reached <= draft.size
-    )

@@ -79,8 +79,6 @@ class Dentries:
         self._weight = 0
         self._sweeps: dict[bytes, list[Sweep]] = {}
         self._absent: OrderedDict[bytes, float] = OrderedDict()
-        self.tells_mtimes = False
-        """Whether a listing showed an mtime: then what is new will have one in the next."""
 
     def __len__(self) -> int:
         return len(self._directories)
@@ -132,7 +130,6 @@ class Dentries:
         """Remember a listing and return it, local changes applied."""
         self.abandon(sweep)
         entries = {entry.name: tidy(entry) for entry in listing.entries if usable_name(entry.name)}
-        self.tells_mtimes = self.tells_mtimes or any(entry.mtime is not None for entry in entries.values())
         for name, entry in sweep.changes.items():
             _put(entries, name, entry)
         complete = listing.complete and not sweep.reshaped

@@ -58,6 +58,7 @@ class Draft:
         sending: the attempt under way, None before the first and after success.
         made: an attempt may have made the file, so that what is there is ours; maybe_made: if it is empty.
         overwrites: what is there was given up for this.
+        stretched: the vehicle's file may reach to here, by requests of others that came late; 0 if not.
     """
 
     def __init__(self, content: Content, remote_size: int | None) -> None:
@@ -67,6 +68,7 @@ class Draft:
         self.remote_size = remote_size
         self.sending: Sending | None = None
         self.made = self.maybe_made = self.overwrites = False
+        self.stretched = 0
         self._held = ExtentSet()
         self._changed = ExtentSet()
         self._touched = False
@@ -226,11 +228,11 @@ class Draft:
                 known.append((a, b))
         return known
 
-    def require_sound(self) -> None:
-        """Raise DataUnproven if there are bytes that nobody has for certain."""
-        for start, stop in self._lost:
+    def require_sound(self, start: int = 0, stop: int | None = None) -> None:
+        """Raise DataUnproven if there are bytes in [start, stop) that nobody has for certain."""
+        for a, b in self._lost.intersection(start, self.size if stop is None else stop):
             raise DataUnproven(
-                f"its bytes {start} to {stop - 1} on the vehicle may be another file's, by a request that"
+                f"its bytes {a} to {b - 1} on the vehicle may be another file's, by a request that"
                 " came late: write them, or the whole file, again"
             )
 
@@ -257,7 +259,14 @@ class Draft:
         self.remote_size = self.base_limit = self.size
         self.sending = None
         self._touched = self._ruined = self.made = self.maybe_made = self.overwrites = False
+        self.stretched = 0
         self._content.settle()
+
+    def has_size(self, size: int) -> None:
+        """The vehicle's file was found to have `size` bytes: what was feared to be too long may be."""
+        if self.remote_size is not None and self.remote_size < size <= self.stretched:
+            self.remote_size = size
+        self.stretched = 0
 
     def remote_cut(self, size: int) -> None:
         """The vehicle's file has `size` bytes now, the first of what it had."""

@@ -72,6 +72,7 @@ class Files:
         self._cache = cache
         self._clock = cache.clock
         self._dir_timeout = dir_timeout
+        self._rebooted_at = float("-inf")
         self._facts = facts
         self._on_size = on_size
         self._invalidate = invalidate
@@ -218,6 +219,7 @@ class Files:
 
     def rebooted(self) -> None:
         """Nothing is proven any more; open files are compared with a listing before their next read."""
+        self._rebooted_at = self._clock()
         for version in self._current.values():
             version.proven_at = float("-inf")
         for version in self._open_versions:
@@ -269,14 +271,16 @@ class Files:
             version.blocks.on_failed(version.dead)
             version.blocks.clear()
 
-    def adopt(self, path: bytes, size: int, pieces: Iterable[tuple[int, bytes]]) -> None:
-        """Take over the content of a file we wrote: (offset, bytes) of all of it, proven on the vehicle."""
+    def adopt(self, path: bytes, size: int, pieces: Iterable[tuple[int, bytes]], *, proven_at: float) -> None:
+        """Take over the content of a file we wrote: (offset, bytes) of all of it, then proven."""
         self.on_written(path)
+        if proven_at <= self._rebooted_at:
+            return
         blocks = FileBlocks(self._cache, size)
         for offset, data in pieces:
             blocks.preload(offset, data)
         blocks.on_given(0, size)
-        self._replace(path, Version(path, None, blocks, self._clock(), shown=True))
+        self._replace(path, Version(path, None, blocks, proven_at, shown=True))
 
     def on_renamed(self, old: bytes, new: bytes) -> None:
         """A file, or a directory with all below it, has another path now; open files follow."""

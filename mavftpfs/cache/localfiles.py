@@ -32,12 +32,13 @@ MAX_ENTRIES = 10_000
 class LocalEntry:
     """A file (data is its content) or a directory (data is None).
 
-    handles: how many are open; named: it was not unlinked.
+    handles: how many are open, writers: those for writing; named: it was not unlinked.
     """
 
     data: bytearray | None
     mtime_ns: int
     handles: int = 0
+    writers: int = 0
     named: bool = True
 
     @property
@@ -221,13 +222,15 @@ class LocalFiles:
         """A file was written."""
         entry.mtime_ns = self._now_ns()
 
-    def opened(self, entry: LocalEntry) -> None:
+    def opened(self, entry: LocalEntry, *, writing: bool) -> None:
         """A handle of the file was made."""
         entry.handles += 1
+        entry.writers += writing
 
-    def closed(self, entry: LocalEntry) -> None:
+    def closed(self, entry: LocalEntry, *, writing: bool) -> None:
         """A handle of the file was closed."""
         entry.handles -= 1
+        entry.writers -= writing
         self._forget_unused(entry)
 
     def _forget_unused(self, entry: LocalEntry) -> None:
@@ -251,7 +254,7 @@ class LocalHandle:
         self._entry = entry
         self._closed = False
         self.writable = writable
-        files.opened(entry)
+        files.opened(entry, writing=writable)
 
     @property
     def size(self) -> int:
@@ -305,7 +308,7 @@ class LocalHandle:
         """Close; closing twice is harmless."""
         if not self._closed:
             self._closed = True
-            self._files.closed(self._entry)
+            self._files.closed(self._entry, writing=self.writable)
 
     @property
     def _data(self) -> bytearray:

@@ -6,8 +6,8 @@ it is unlinked. Nodes without handles and without anything to deliver are forgot
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import AsyncIterator, Iterator
+from contextlib import asynccontextmanager, contextmanager
 from dataclasses import dataclass, field
 
 import trio
@@ -36,6 +36,18 @@ class Attempt:
     upload: Upload
     places: Places | None = None
     committing: bool = False
+
+    def fits(self, plan: Plan, draft: Draft) -> bool:
+        """Return whether going on ends with the draft's content on the vehicle, by that plan."""
+        sending = self.sending
+        if self.committing and sending.unacked:
+            return False
+        return (
+            self.plan is plan
+            and draft.sending is sending
+            and not sending.emptied
+            and sending.reached <= draft.size
+        )
 
 
 @dataclass(slots=True, eq=False)
@@ -100,14 +112,17 @@ class Node:
         """The body brings it to the vehicle, unless it is cancelled because the name goes (`dooming`)."""
         with trio.CancelScope() as scope:
             self._delivery = scope
+            self._heed()
             try:
                 yield scope
             finally:
                 self._delivery = None
 
-    @contextmanager
-    def firmly(self) -> Iterator[None]:
-        """The body is short, and nobody would find what it leaves half done: it is not called off."""
+    @asynccontextmanager
+    async def firmly(self) -> AsyncIterator[None]:
+        """The body is short, and nobody would find what it leaves half done: it is called off before it, or
+        not at all."""
+        await trio.lowlevel.checkpoint_if_cancelled()  # else the body would be, at its first wait
         self._firm += 1
         try:
             yield

@@ -109,11 +109,8 @@ class Overlay:
         require_listable(path)
 
     def on_written(self, path: bytes) -> None:
-        """A file's content changed: what a user set is void, and a server that tells mtimes will tell now."""
-        if self._context.dentries.tells_mtimes:
-            self.times.set(path, self.now_ns())
-        else:
-            self.times.forget(path)  # the same constant as in every mount
+        """A file's content changed: it is of now, also where no listing tells times."""
+        self.times.set(path, self.now_ns())
 
     def set_times(self, path: bytes, mtime_ns: int) -> None:
         """Show this mtime until the file changes; of a local file keep it."""

@@ -42,7 +42,11 @@ def overwritten(upload: Upload, draft: Draft) -> list[tuple[int, int]]:
         stop = min(hit.stop, draft.size)
         if whole:
             found.append((min(hit.start, stop), stop))
-        elif hit.same:
+            continue
+        if hit.stop > draft.size:  # there is nothing to compare behind the end but the size
+            draft.stretched = max(draft.stretched, hit.stop)
+            found.append((draft.size, draft.size))
+        if hit.same:
             found += draft.changed.intersection(hit.start, stop)
         else:
             found += draft.doubt(hit.start, stop)

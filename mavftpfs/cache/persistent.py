@@ -1,5 +1,5 @@
 """What is kept of the vehicle's files from one mount to the next, and when it may be believed. Layer: cache;
-pure: disk and time belong to `diskcache`.
+pure: disk and time belong to `blockdirectory` and `keeper`.
 
 A block on the disk is named by a digest of everything that decides whose bytes it holds: the vehicle, the
 path, the size, the mtime and the block's place; the same digest is part of its checksum. So a block of

@@ -157,6 +157,11 @@ class Upload(Protocol):
         ...
 
     @property
+    def again(self) -> Sequence[tuple[int, int]]:
+        """Which bytes of this file another upload wrote so lately that copies of that may still come."""
+        ...
+
+    @property
     def shared(self) -> bool:
         """Whether the server's session may have been another client's for a while, so that what was ACKed
         was perhaps written to another file (servers.md 1)."""

@@ -294,13 +294,14 @@ class SpoolContent:
 
     def _changed(self) -> None:
         """Something of it is the vehicle's no longer: what is written down must not be less than true."""
-        known = not self._settled and not self._persisted
+        before = (self._settled, self._persisted)
         self._settled = self._persisted = False
-        if self._path is None or known:
+        if self._path is None or not any(before):
             return
         try:
             self._write_name(self._path)
         except OSError as exc:
+            self._settled, self._persisted = before  # else the next one would take it for written
             raise rescuing.trouble(exc, self._path) from exc
 
     def _write_name(self, data: Path) -> None:

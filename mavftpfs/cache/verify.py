@@ -47,14 +47,9 @@ QUICKLY_READ = 64 * 1024
 FEW_BYTES = 64 * 1024
 """So much is read back rather than have the vehicle compute the CRC32 of the whole file."""
 
-SETTLED = 10.0
-"""Seconds after which no copy of an older request is expected any more."""
 
-
-def doubted(upload: Upload, draft: Draft, *, settled: bool) -> list[tuple[int, int]]:
+def doubted(upload: Upload, draft: Draft) -> list[tuple[int, int]]:
     """Return of what was sent the ranges that the vehicle may not have though they were ACKed.
-
-    settled: the delivery of this file before is long ago.
 
     Raises:
         DataUnproven: of some of them nobody knows what they should be.
@@ -62,11 +57,14 @@ def doubted(upload: Upload, draft: Draft, *, settled: bool) -> list[tuple[int, i
     sending = draft.sending
     if sending is None:
         return []
-    sent = [(0, draft.size)] if sending.whole else list(draft.changed)
-    late = overwritten(upload, draft)
-    if upload.shared or (upload.repeats and not sending.whole and not settled):
-        return [*sent, *late]
-    return [*sending.rewritten, *late] if upload.repeats else late
+    found = overwritten(upload, draft)
+    if upload.shared:
+        found += [(0, draft.size)] if sending.whole else draft.changed
+    elif upload.repeats:
+        found += sending.rewritten
+        for start, stop in [] if sending.whole else upload.again:
+            found += draft.changed.intersection(start, stop)
+    return found
 
 
 class Verifier:

@@ -131,6 +131,7 @@ class Writeback:
         made = node.draft is None
         if made:
             self._new_draft(node, None)
+            self.overlay.on_written(path)
         return WriteFile(self, self._context, node, made=made)
 
     async def _need_draft(self, path: bytes, *, truncate: bool) -> Node:
@@ -254,7 +255,7 @@ class Writeback:
         if fits and recent and draft.whole:
             starts = range(0, draft.size, STEP)
             pieces = ((at, draft.local_bytes(at, min(at + STEP, draft.size))) for at in starts)
-            context.files.adopt(node.path, draft.size, pieces)
+            context.files.adopt(node.path, draft.size, pieces, proven_at=node.delivered_at)
         self._background.settle(node)
 
     # --- names

@@ -50,7 +50,7 @@ class Engine:
     Attributes:
         session: the id that session-agnostic requests carry (the open one, else home_session).
         home_session: the id to ask for when opening, 1..255.
-        on_unknown: told of each answer that nobody waits for.
+        on_unknown: told of each answer that nobody waits for (of what was given up: to writes and opens).
     """
 
     def __init__(
@@ -69,7 +69,7 @@ class Engine:
         self.stats = EngineStats()
         self.on_unknown: Callable[[Payload], None] = lambda reply: None
         self._ledger = Ledger(rng.randrange(LAST_SEQ + 1))
-        self._ledger.ghost.on_written = lambda reply: self.on_unknown(reply)
+        self._ledger.ghost.on_done = lambda reply: self.on_unknown(reply)
         self._op_deadline = op_deadline
         self._note = note
         self._ops: list[Operation] = []

@@ -24,6 +24,7 @@ FURTHEST_JUMP = LAST_SEQ + 1 - 2 * BURST_JUMP
 """Further on come the seqs just used, whose late replies may still be about."""
 
 _ACK = int(Opcode.ACK)
+_TELLING = frozenset((Opcode.WRITE_FILE, Opcode.OPEN_FILE_RO, Opcode.OPEN_FILE_WO, Opcode.CREATE_FILE))
 _MIN_REORDER = 3
 _MAX_REORDER = 64
 _MOST_QUICK_SENDS = 8
@@ -33,21 +34,21 @@ class Ghost(Operation):
     """Owns the requests of cancelled operations until they are answered or given up.
 
     Attributes:
-        on_written: told of a WriteFile that was executed after all, perhaps in another file.
+        on_done: told of a WriteFile that was executed after all, perhaps in another file, and of an open.
     """
 
     def __init__(self) -> None:
         super().__init__()
-        self.on_written: Callable[[Payload], None] = lambda reply: None
+        self.on_done: Callable[[Payload], None] = lambda reply: None
 
     def next_request(self, now: float) -> Request | None:
         """Never asked: a ghost is in no engine's list."""
         raise LocalProtocolError("a ghost asks for nothing")
 
     def on_reply(self, request: Request, reply: Payload, now: float) -> None:
-        """Nobody wants to know, but for what may have gone to another file."""
-        if reply.req_opcode == Opcode.WRITE_FILE:
-            self.on_written(reply)
+        """Nobody wants to know, but for what may have gone to another file, or put another in its place."""
+        if reply.req_opcode in _TELLING:
+            self.on_done(reply)
 
 
 class Ledger:

@@ -146,7 +146,8 @@ class Request:
         if traits.ack_carries_own_session and reply.session != self.session and not self.follows:
             return False
         if reply.opcode == Opcode.ACK:
-            return reply.offset == self.offset or not self.manner.echoes_offset
+            echoed = self.manner.echoes_offset or (self.manner is WRITE_MANNER and traits.write_ack_offset)
+            return reply.offset == self.offset or not echoed
         return reply.opcode == Opcode.NAK
 
     def encode(self) -> bytes:

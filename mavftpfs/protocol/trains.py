@@ -33,12 +33,25 @@ class Trains:
         proven: it is the path's own, and not just how we sent.
     """
 
-    __slots__ = ("_blocked", "_densest", "_rounds", "_times", "_tokens", "_tokens_at", "proven", "rate")
+    __slots__ = (
+        "_answers",
+        "_blocked",
+        "_densest",
+        "_rounds",
+        "_seconds",
+        "_times",
+        "_tokens",
+        "_tokens_at",
+        "proven",
+        "rate",
+    )
 
     def __init__(self) -> None:
         self.rate = inf
         self.proven = False
         self._densest = inf
+        self._answers = 0
+        self._seconds = 0.0  # that they took
         self._times = deque([-inf] * _LENGTH, maxlen=_LENGTH)
         self._rounds: deque[float] = deque(maxlen=_ROUNDS_REMEMBERED)
         self._blocked = False
@@ -67,13 +80,24 @@ class Trains:
             self.on_reply(now)
 
     def end_round(self, answers: int, average: float) -> None:
-        """A round in which there was always something to send is over; average: its answers per second."""
+        """A round in which there was always something to send is over; average: its answers per second.
+
+        Who keeps a pace never sees many answers in a round once the way has become short: there several
+        rounds count as one, or the pace of a slow link would be kept for ever.
+        """
+        if self.proven and average > 0.0:
+            self._seconds += answers / average
+            answers = self._answers = self._answers + answers
+            if answers < _TELLING_ROUND:
+                return
+            average = answers / self._seconds
         if answers >= _TELLING_ROUND:
             before = self.rate
             self._rounds.append(_LENGTH / self._densest if self._densest > 0 else inf)
             self.rate = max(self._rounds)
             dense = self.rate > _DENSE * average
             self.proven = self.rate < inf and (dense or self.rate <= _SAME * before < inf)
+        self._answers, self._seconds = 0, 0.0
         self._densest = inf
 
     # --- pacing

@@ -179,7 +179,7 @@ class WriteTransfer(Operation):
             self.fail(self._meaning(nak_of(request, reply)))
             return
         del self._unanswered[request]
-        if reply.offset:
+        if reply.offset and reply.offset == request.offset:
             self.port.traits.write_ack_offset = True
         count = request.size
         if reply.data != self._usual or count != self.chunk:

@@ -28,7 +28,8 @@ _AGES = _SEQS - 4096
 """Requests after which a seq is no older one's any more."""
 
 _FEARED = 10.0
-"""Seconds for which bytes that a copy of what was tried out may overwrite are fetched before."""
+"""Seconds for which bytes that a copy of what was tried out may overwrite are fetched before, and those that
+one of an earlier change may are compared."""
 
 
 @dataclass(slots=True)
@@ -105,6 +106,12 @@ class WriteLog:
         since = self._clock() - _FEARED
         tried = [s for s in self.sessions if s.hits is None and s.path != path and s.at >= since]
         return [(session.span.start, session.span.stop) for session in tried]
+
+    def lately(self, path: bytes, hits: list[Overwrite]) -> list[tuple[int, int]]:
+        """Return where others than who gives these hits wrote to a file so lately that copies are feared."""
+        since = self._clock() - _FEARED
+        others = [s for s in self.sessions if s.path == path and s.hits is not hits and s.at >= since]
+        return [(session.span.start, session.span.stop) for session in others]
 
     def on_late(self, reply: Payload) -> None:
         """A WriteFile was ACKed that nobody waits for: note where it may have been written."""

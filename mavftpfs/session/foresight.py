@@ -1,4 +1,5 @@
-"""How many strings a directory probably holds, so that a sweep can ask for its end at once. Layer: session.
+"""How many strings a directory probably holds, so that a sweep can ask for its end at once, and whether its
+names moved up while a sweep went on. Layer: session.
 
 A server says that a listing is over only when it is asked for what follows, which costs a round trip more
 than the names do. Where they probably end is known from the last sweep and our own changes since then; who
@@ -6,6 +7,9 @@ else changes the directory makes that wrong, which costs one request and proves 
 """
 
 from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 from mavftpfs.shared.model import split, wire_path
 
@@ -17,6 +21,25 @@ class Foresight:
 
     def __init__(self) -> None:
         self._strings: dict[bytes, int] = {}
+        self._moved: dict[bytes, int] = {}
+        self._moving: list[bytes] = []
+
+    @contextmanager
+    def moving_up(self, *paths: bytes) -> Iterator[None]:
+        """The body sends a request that takes these names away: servers count names, so that one of those
+        behind them comes to lie before the place where a sweep goes on."""
+        directories = [wire_path(split(path)[0]) for path in paths]
+        self._moving += directories
+        try:
+            yield
+        finally:
+            for directory in directories:
+                self._moving.remove(directory)
+                self._moved[directory] = self._moved.get(directory, 0) + 1
+
+    def moves(self, directory: bytes) -> int | None:
+        """Return how often its names moved up so far, None while they may be moving."""
+        return None if directory in self._moving else self._moved.get(directory, 0)
 
     def learn(self, directory: bytes, strings: int) -> None:
         """A sweep came to its end after so many strings."""

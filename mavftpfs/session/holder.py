@@ -111,8 +111,8 @@ class SessionHolder:
         self._tell()
 
     def forget(self) -> None:
-        """The vehicle restarted: nothing is open."""
-        self.session = None
+        """The vehicle restarted: nothing is open, unless it was opened before we heard of that."""
+        self.abandon()
         self.opener.forget()
         self._tell()
         self.wake()

@@ -35,6 +35,9 @@ _MAX_FAILING = 256
 _MAX_OPENED = 64
 _MAX_EARLY = 16
 
+_MORE_LOST_ACKS = 3
+"""How often an open is tried again whose ACKs are lost, one after the other, before that is called busy."""
+
 TERMINATE_LIMIT = 5.0
 """Seconds to wait for a Terminate before the session is treated as doubtful."""
 
@@ -103,7 +106,7 @@ class SessionOpener:
         """
         if self.doubtful_paths:
             await self._close_doubtful()
-        remedies = [self._close_own, self._fall_silent, self._reset]
+        remedies = [self._close_own, *[self._close_again] * _MORE_LOST_ACKS, self._fall_silent, self._reset]
         last: FtpNak | None = None
         while True:
             try:
@@ -164,9 +167,7 @@ class SessionOpener:
         self._engine.session = self._engine.home_session
 
     def forget(self) -> None:
-        """The server rebooted: nothing of ours is open."""
-        self._doubtful.clear()
-        self._reopened.clear()
+        """The server restarted. The news may come a second later: what is doubtful may be open since then."""
         self._opened.clear()
         self._server_assigns = None
         self._engine.session = self._engine.home_session
@@ -238,7 +239,12 @@ class SessionOpener:
             return await self._close_doubtful()
         return False
 
+    async def _close_again(self, nak: FtpNak) -> bool:
+        """The ACK of that open was lost, too: what refused its repetition is ours."""
+        return nak.retransmitted and nak.code != NakCode.FILE_EXISTS and await self._close_doubtful()
+
     async def _fall_silent(self, nak: FtpNak) -> bool:
+        await self._close_again(nak)
         seconds = (
             SILENCE_PX4
             if nak.code in (NakCode.NO_SESSIONS_AVAILABLE, NakCode.FILE_EXISTS)

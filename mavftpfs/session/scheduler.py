@@ -365,6 +365,7 @@ class Scheduler:
         for stream in list(self._streams):
             if stream.has_demand and stream.ticket is not None and stream.asked_at < oldest:
                 stream.fail(error)
+                stream.ticket = None  # who asks again waits anew
         self._uploading.expire(oldest, error)
         for job in [job for job in self._jobs if job.asked_at < oldest]:
             self._jobs.remove(job)

@@ -81,7 +81,9 @@ class SideEffects:
         async with self._in_time(), self._changing(path):
             await self._scheduler.echoes.let_pass(path)
             with self._scheduler.echoes.noted(path):
-                await self._perform(lambda: Simple(Opcode.REMOVE_FILE, wire), lambda: self._is_absent(path))
+                await self._perform(
+                    lambda: Simple(Opcode.REMOVE_FILE, wire), lambda: self._is_absent(path), path
+                )
             self._foresight.took(path)
             self._scheduler.gone(path)
 
@@ -92,7 +94,7 @@ class SideEffects:
             await self._scheduler.echoes.let_pass(path)
             with self._scheduler.echoes.noted(path):
                 await self._perform(
-                    lambda: Simple(Opcode.REMOVE_DIRECTORY, wire), lambda: self._is_absent(path)
+                    lambda: Simple(Opcode.REMOVE_DIRECTORY, wire), lambda: self._is_absent(path), path
                 )
             self._foresight.took(path)
 
@@ -121,7 +123,9 @@ class SideEffects:
             await self._scheduler.echoes.let_pass(old)
             await self._scheduler.echoes.let_pass(new)
             with self._scheduler.echoes.noted(old):
-                await self._perform(lambda: Simple(Opcode.RENAME, data), lambda: self._is_renamed(old, new))
+                await self._perform(
+                    lambda: Simple(Opcode.RENAME, data), lambda: self._is_renamed(old, new), old, new
+                )
             self._foresight.lose(old, new)  # there may have been a file of the new name
             self._scheduler.gone(new)
             self._scheduler.moved(old, new)
@@ -169,11 +173,13 @@ class SideEffects:
             may()  # closing our session may have taken a while
             yield
 
-    async def _perform(self, make: Callable[[], Simple], verify: Verdict) -> None:
-        """Run a request; verify it if its answer may not be the answer to its first execution."""
+    async def _perform(self, make: Callable[[], Simple], verify: Verdict, *taken: bytes) -> None:
+        """Run a request; verify it if its answer may not be the answer to its first execution. taken: the
+        names that it takes away."""
         for last in (False, True):
             try:
-                await self._stale.outlast(lambda: self._scheduler.metadata(make()), changes=True)
+                with self._foresight.moving_up(*taken):
+                    await self._stale.outlast(lambda: self._scheduler.metadata(make()), changes=True)
             except FtpNak as nak:
                 twice = last or nak.retransmitted or self._may_be_doubled(nak)
                 # PX4 says 8 to everything after one "file exists", until a listing comes to its end.

@@ -26,6 +26,9 @@ TIME_SILENCES = 2
 """How often that must happen, with ListDirectory answering, before opcode 16 counts as unknown: loss may
 look the same once."""
 
+SWEEPS = 3
+"""How often a directory is swept at most because names were taken away from it meanwhile."""
+
 CRC_PATIENCE = 120.0
 """Seconds a vehicle may need for a checksum (design promise 2)."""
 
@@ -46,7 +49,7 @@ class Store(WriteStore):
     ) -> None:
         self._stale = StaleSessions(scheduler, clock, op_deadline)
         self._foresight = Foresight()
-        super().__init__(scheduler, self.list_directory, self._stale, self._foresight)
+        super().__init__(scheduler, self._list_steady, self._stale, self._foresight)
         self._op_deadline = op_deadline
         self._vehicle = vehicle
         self._clock = clock
@@ -77,6 +80,16 @@ class Store(WriteStore):
         self._foresight.learn(wire, operation.strings)
         entries: tuple[DirEntry, ...] = tuple(operation.entries)
         return Listing(entries, self._clock() - started, operation.complete, operation.hidden)
+
+    async def _list_steady(self, path: bytes) -> Listing:
+        """As list_directory, again if we took names away meanwhile (the caches see to that themselves)."""
+        wire = wire_path(path)
+        for _ in range(SWEEPS):
+            before = self._foresight.moves(wire)
+            listing = await self.list_directory(path)
+            if before is not None and before == self._foresight.moves(wire):
+                break
+        return listing
 
     async def open_reader(
         self, path: bytes, sink: ReadSink, *, expected_size: int | None = None

@@ -58,11 +58,14 @@ class Strays:
         if reply.opcode != Opcode.ACK or reply.req_opcode not in _OPENING:
             return
         path = self._holder.opener.opened_by(reply.seq)
-        if path is None:
-            self._holder.opener.note_early(reply.seq, reply.session)
-            return
         session = self._holder.session
         changes = reply.req_opcode != Opcode.OPEN_FILE_RO
+        if path is None:
+            self._holder.opener.note_early(reply.seq, reply.session)
+            # While a file is open it is none under way, but one that was given up unanswered.
+            if session is not None and session.id == reply.session and (changes or not session.writing):
+                self._on_taken("a file was opened by a late request that had been given up")
+            return
         if session is not None and session.writing and session.path == path and changes:
             self._on_emptied()
         if session is None or session.id != reply.session:

@@ -159,6 +159,7 @@ class QueuedUpload:
         self.feed = feed
         self.create = create
         self.overwrites: list[Overwrite] = []
+        self.again: list[tuple[int, int]] = []
         self.least = 0
         self.opened = False
         self.free_at: float | None = None

@@ -202,6 +202,7 @@ class Uploading:
 
     async def _write(self, upload: QueuedUpload, session: OpenSession) -> Stop:
         try:
+            upload.again = upload.again or self.written.lately(upload.path, upload.overwrites)
             made = upload.create and not upload.feed.proven
             self.written.begin(upload.path, session.seq, upload.feed.span, upload.overwrites, made=made)
             return await self.writer.run(upload, session)

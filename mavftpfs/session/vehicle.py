@@ -36,6 +36,10 @@ FOREIGN_MEMORY = 10.0
 
 _OPCODE_INDEX = 3
 _REBOOT_SLACK_MS = 2000
+_OLDEST_NEWS_MS = 20_000
+"""Of a restart that is news the boot time is less than twice what passed since the last message (simulators
+may run faster than the clock), and this. What is behind and more than that was held back by the network."""
+
 _MISSING_MS = 20_000
 """Less boot time than half of what passed, and this beyond it, is a restart that nobody saw: a full queue
 delays a message less, and simulators may run slower than the clock."""
@@ -70,6 +74,7 @@ class Vehicle:
     _armed: bool | None = None
     _boot_ms: int | None = None
     boot_heard_at: float = 0.0
+    _held_back: bool = False
     _timed_out: bool = False
 
     @property
@@ -182,9 +187,15 @@ class Vehicle:
 
     def _on_boot_time(self, boot_ms: int, now: float) -> None:
         before, elapsed_ms = self._boot_ms, (now - self.boot_heard_at) * 1000
+        went_back = before is not None and boot_ms + _REBOOT_SLACK_MS < before
+        # Two of them in a row are believed, whatever clock they follow.
+        if went_back and boot_ms > 2 * elapsed_ms + _OLDEST_NEWS_MS and not self._held_back:
+            self._held_back = True
+            return
+        self._held_back = False
         self._boot_ms, self.boot_heard_at = boot_ms, now
         if before is None:
             return
-        if boot_ms + _REBOOT_SLACK_MS < before or boot_ms - before < elapsed_ms / 2 - _MISSING_MS:
+        if went_back or boot_ms - before < elapsed_ms / 2 - _MISSING_MS:
             self.reboots += 1
             self.on_reboot()

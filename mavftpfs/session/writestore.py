@@ -21,6 +21,10 @@ from mavftpfs.shared.traits import WriteTraits
 TRUNCATE_PATIENCE = 120.0
 """Seconds a vehicle may need to cut a file (design promise 2)."""
 
+FIRST_TRUNCATE_PATIENCE = 20.0
+"""Seconds, and what the slowest card needs, after which one that was not seen to cut files counts as not
+answering: MAVSDK never does (servers.md 8), and until then nobody can read the file."""
+
 COPY_RATE = 100_000.0
 """Bytes per second that the slowest card copies or checksums; a repetition waits for so long."""
 
@@ -107,14 +111,13 @@ class WriteStore:
         if traits.truncate_works is False:
             raise FtpNak(Opcode.TRUNCATE_FILE, NakCode.UNKNOWN_COMMAND)
 
+        work = 2 * size / COPY_RATE
+        patience = TRUNCATE_PATIENCE
+        if traits.truncate_works is None:
+            patience = min(patience, FIRST_TRUNCATE_PATIENCE + work)
+
         def make() -> Simple:
-            return Simple(
-                Opcode.TRUNCATE_FILE,
-                wire,
-                offset=size,
-                patience=TRUNCATE_PATIENCE,
-                server_time=2 * size / COPY_RATE,
-            )
+            return Simple(Opcode.TRUNCATE_FILE, wire, offset=size, patience=patience, server_time=work)
 
         async def verify() -> Outcome:
             entry, _ = await self._effects.find(path)

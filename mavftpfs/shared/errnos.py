@@ -118,16 +118,6 @@ _BY_CLASS: dict[type[BaseException], int] = {
     errors.NoSpace: errno.ENOSPC,
     errors.SpoolFailed: errno.EIO,
     errors.VerificationFailed: errno.EIO,
-    errors.ReadOnly: errno.EROFS,
-    errors.AlreadyExists: errno.EEXIST,
-    errors.DirectoryNotEmpty: errno.ENOTEMPTY,
-    errors.InvalidMove: errno.EINVAL,
-    errors.CrossDevice: errno.EXDEV,
-    errors.FileBusy: errno.EBUSY,
-    errors.NotSupported: errno.EOPNOTSUPP,
-    errors.FileTooLarge: errno.EFBIG,
-    errors.NoSpace: errno.ENOSPC,
-    errors.VerificationFailed: errno.EIO,
 }
 
 

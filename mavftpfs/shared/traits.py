@@ -23,7 +23,7 @@ class Traits:
         burst_size_honoured: burst packets had the size asked for (False: PX4 always sends 239).
         answers_during_burst: another request was answered between the packets of a burst.
         write_ack_counts: WriteFile ACKs say how many bytes were written.
-        write_ack_offset: they say where (MAVSDK's say 0).
+        write_ack_offset: they say where (MAVSDK's say 0), and are believed only if that is the place.
     """
 
     ack_carries_own_session: bool | None = None

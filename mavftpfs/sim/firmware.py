@@ -10,7 +10,7 @@ from __future__ import annotations
 import random
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from mavftpfs.link.messages import Address
 from mavftpfs.sim.profiles import Profile
@@ -40,6 +40,13 @@ class Firmware(ABC):
     @abstractmethod
     def handle(self, wire: bytes, source: Address, now: float) -> None:
         """Take a request of 251 bytes."""
+
+    def handle_run(self, wires: Sequence[bytes], source: Address, now: float) -> None:
+        """Take requests of 251 bytes that came together: the same as one by one."""
+        for wire in wires:
+            if self.crashed:
+                return
+            self.handle(wire, source, now)
 
     @abstractmethod
     def advance(self, now: float) -> None:

@@ -10,8 +10,7 @@ import contextlib
 import errno
 import random
 from collections import deque
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 
 from mavftpfs.link.messages import Address
 from mavftpfs.protocol.payload import MAX_DATA, NakCode, Opcode
@@ -19,6 +18,8 @@ from mavftpfs.sim import px4ops
 from mavftpfs.sim.firmware import Firmware
 from mavftpfs.sim.profiles import Profile
 from mavftpfs.sim.px4ops import Refusal
+from mavftpfs.sim.px4rows import NOT_KEPT, read_row, write_row
+from mavftpfs.sim.px4stream import Stream
 from mavftpfs.sim.storage import OpenFile, StaleErrno, Storage
 from mavftpfs.sim.wire import ACK, FULL_FRAME, HEADER, NAK, REPLY, Request, frame_size, parse
 
@@ -32,16 +33,6 @@ _EOF = int(NakCode.EOF)
 _FAIL_ERRNO = int(NakCode.FAIL_ERRNO)
 
 
-@dataclass(slots=True)
-class _Stream:
-    """A running burst."""
-
-    target: Address
-    offset: int
-    seq: int
-    sent: int = 0
-
-
 class Px4(Firmware):
     """One instance, as each MAVLink link of a vehicle has one."""
 
@@ -51,7 +42,7 @@ class Px4(Firmware):
         self._path = b""
         self._file_size = 0
         self._writing = False
-        self._stream: _Stream | None = None
+        self._stream: Stream | None = None
         self._cached: bytes | None = None
         self._cached_seq = -1
         self._cached_target = Address(0, 0)
@@ -91,6 +82,30 @@ class Px4(Firmware):
             self._wait(wire, source)
         else:
             self._execute(wire, source, now)
+
+    def handle_run(self, wires: Sequence[bytes], source: Address, now: float) -> None:
+        """See Firmware."""
+        served, least = 0, _CACHED_DATA + 1
+        if wires and self._file is not None and self._is_plain(wires[0], now):
+            if self._writing:
+                served = write_row(wires, self._file, source, self._ready)
+            else:
+                served = read_row(wires, self._file, self._file_size, least, source, self._ready)
+        if served:
+            self.now = self._last_request = now
+            self._cached = None
+            self._keep(source, self._ready[-1][1])
+        super().handle_run(wires[served:], source, now)
+
+    def _is_plain(self, wire: bytes, now: float) -> bool:
+        """Whether a row that begins with this is answered at once, and nothing else is due before."""
+        idle = self._stream is None and not self._pending and not self._later and self.tx_room is None
+        fresh = now - self._last_request <= _BUFFER_LIFE and now < self._last_request + self._idle_close
+        quick = not self._has_cost and not self._extra_cost and self._busy_until <= now
+        if not (idle and fresh and quick and self._started is not None):
+            return False
+        repeated = self._cached is not None and HEADER.unpack_from(wire)[0] + 1 == self._cached_seq
+        return not repeated and not (self._writing and self._is_protected(self.scratch))
 
     def _wait(self, wire: bytes, source: Address) -> None:
         size = frame_size(wire)
@@ -143,9 +158,9 @@ class Px4(Firmware):
         elif self._cached is not None and seq + 1 == self._cached_seq:
             self._replay(now)
         elif opcode == _READ and self._readable(session, offset):
-            self._fast_read(wire, fields, source, now)
+            self._read(wire, fields, source, now)
         elif opcode == _WRITE:
-            self._fast_write(wire, fields, source, now)
+            self._write(wire, fields, source, now)
         else:
             self._dispatch(parse(wire, source), wire, now)
 
@@ -185,12 +200,15 @@ class Px4(Firmware):
         self._deliver(target, REPLY.pack(*header, data), now)
 
     def _deliver(self, target: Address, wire: bytes, now: float) -> None:
+        self._keep(target, wire)
+        self._transmit(target, wire, now)
+
+    def _keep(self, target: Address, wire: bytes) -> None:
         size = wire[4]
-        if size <= _CACHED_DATA and not (size and wire[12] == NakCode.NO_SESSIONS_AVAILABLE):
+        if size <= _CACHED_DATA and not (size and wire[12] == NOT_KEPT):
             self._cached = wire[: 12 + _CACHED_DATA]
             self._cached_seq = wire[0] | wire[1] << 8
             self._cached_target = target
-        self._transmit(target, wire, now)
 
     def _transmit(self, target: Address, wire: bytes, now: float) -> None:
         due = now
@@ -288,7 +306,7 @@ class Px4(Firmware):
     def _readable(self, session: int, offset: int) -> bool:
         return session == 0 and self._file is not None and not self._writing and offset < self._file_size
 
-    def _fast_read(self, wire: bytes, fields: _Fields, source: Address, now: float) -> None:
+    def _read(self, wire: bytes, fields: _Fields, source: Address, now: float) -> None:
         assert self._file is not None
         seq, session, opcode, size, _, complete, offset = fields
         try:
@@ -298,10 +316,7 @@ class Px4(Firmware):
             return
         self._cached = None
         packed = REPLY.pack(seq + 1 & 0xFFFF, session, ACK, len(data), opcode, complete, offset, data)
-        if len(data) <= _CACHED_DATA or self._has_cost or self._later or self.tx_room is not None:
-            self._deliver(source, packed, now)
-        else:
-            self._ready.append((source, packed))
+        self._deliver(source, packed, now)
 
     def refuse_read(self, request: Request) -> bytes:
         """Say why a ReadFile cannot be served."""
@@ -312,7 +327,7 @@ class Px4(Firmware):
         nuttx = bool(self.profile.writable_root)
         raise OSError(errno.EACCES if nuttx else errno.EBADF, "opened for writing")
 
-    def _fast_write(self, wire: bytes, fields: _Fields, source: Address, now: float) -> None:
+    def _write(self, wire: bytes, fields: _Fields, source: Address, now: float) -> None:
         seq, session, opcode, size, _, complete, offset = fields
         try:
             self._check_write(session)
@@ -338,9 +353,12 @@ class Px4(Firmware):
 
     def check_writable(self, path: bytes) -> None:
         """Refuse paths outside the whitelist; for WriteFile the path is what the scratch buffer holds."""
-        root = self.profile.writable_root
-        if root and (not path.startswith(root) or b"/../" in path):
+        if self._is_protected(path):
             raise Refusal(NakCode.FILE_PROTECTED)
+
+    def _is_protected(self, path: bytes) -> bool:
+        root = self.profile.writable_root
+        return bool(root) and (not path.startswith(root) or b"/../" in path)
 
     # -- bursts ------------------------------------------------------------------------------
 
@@ -348,7 +366,7 @@ class Px4(Firmware):
         """Start a stream. Session 0 is accepted with no file open; the request's size is ignored."""
         if request.session != 0 and self._file is None:
             raise Refusal(NakCode.INVALID_SESSION)
-        self._stream = _Stream(request.source, request.offset, request.seq + 1)
+        self._stream = Stream(request.source, request.offset, request.seq + 1)
         self._tick = max(self._tick, self._tick_after(self._last_request))
         return b""
 
@@ -364,37 +382,17 @@ class Px4(Firmware):
                 return
             room -= FULL_FRAME
 
-    def _send_packet(self, stream: _Stream, now: float, last: bool, alone: bool) -> None:
-        offset = stream.offset
+    def _send_packet(self, stream: Stream, now: float, last: bool, alone: bool) -> None:
         try:
-            if offset >= self._file_size:
+            if stream.offset >= self._file_size:
                 raise Refusal(_EOF)
             if self._file is None:
                 raise Refusal(_FAIL_ERRNO)
-            data = self._file.read(offset, MAX_DATA)
+            packed = stream.read(self._file, last=last, alone=alone, profile=self.profile, rng=self.rng)
+            if stream.is_over(last, self.profile):
+                self._stream = None
         except (Refusal, OSError) as exc:
-            self._end_stream(stream, exc, now)
-            return
-        stream.offset += len(data)
-        stream.sent += len(data)
-        complete = 0
-        if last and stream.sent > self.profile.burst_bytes:
-            complete, self._stream = 1, None
-        elif last and alone:
-            # The field is not written on a tick's last packet; only then is it the stack's garbage.
-            complete = int(self.rng.random() < self.profile.garbage_complete)
-        self._send_stream(stream, ACK, complete, offset, data, now)
-
-    def _end_stream(self, stream: _Stream, exc: Refusal | OSError, now: float) -> None:
-        self._stream = None
-        code = exc.code if isinstance(exc, Refusal) else _FAIL_ERRNO
-        number = exc.errno if isinstance(exc, OSError) and exc.errno else self._errno
-        data = bytes([code, number & 0xFF]) if code == _FAIL_ERRNO else bytes([code])
-        self._send_stream(stream, NAK, 0, stream.offset, data, now)
-
-    def _send_stream(
-        self, stream: _Stream, opcode: int, complete: int, offset: int, data: bytes, now: float
-    ) -> None:
-        packed = REPLY.pack(stream.seq & 0xFFFF, 0, opcode, len(data), _BURST, complete, offset, data)
-        stream.seq += 1
+            code = exc.code if isinstance(exc, Refusal) else _FAIL_ERRNO
+            number = exc.errno if isinstance(exc, OSError) and exc.errno else self._errno
+            packed, self._stream = stream.end(code, number), None
         self._deliver(stream.target, packed, now)

@@ -95,15 +95,17 @@ class SimVehicle:
         """Be disarmed from the next heartbeat on, which is sent at once."""
         self._set_armed(False)
 
-    def reboot(self, now: float, downtime: float = 0.0) -> None:
-        """Restart: sessions and boot time are lost, files stay; deaf and mute for `downtime` seconds."""
+    def reboot(self, now: float, downtime: float = 0.0, *, beat_after: float = 0.0) -> None:
+        """Restart: sessions and boot time are lost, files stay; deaf and mute for `downtime` seconds. The
+        first heartbeat and boot time come `beat_after` seconds later."""
         self.server.reboot(now)
         self.framer.reset()
         self.armed = False
         self._ready.clear()
         self._booted_at = now
         self._down_until = now + downtime
-        self._next_beat = self._next_telemetry = float("-inf")
+        self._next_beat = self._down_until + beat_after
+        self._next_telemetry = float("-inf")
 
     def set_stream(self, stream: bool) -> None:
         """Say what `receive` will get, before it gets anything."""
@@ -113,13 +115,12 @@ class SimVehicle:
         """Take a datagram or a piece of the stream."""
         if now < self._down_until:
             return
-        handle, address = self.server.handle, self.address
+        address = self.address
         for message in self.framer.feed_runs(data):
             if type(message) is FtpRun:  # a transfer is thousands of these a second
                 source, target, payloads = message
                 if target == address or self._is_for_us(target):
-                    for payload in payloads:
-                        handle(payload, source, now)
+                    self.server.handle_run(payloads, source, now)
                 continue
             match message:
                 case CommandLong():

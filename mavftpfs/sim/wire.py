@@ -12,6 +12,7 @@ from typing import NamedTuple
 from mavftpfs.link.messages import Address
 
 HEADER = struct.Struct("<HBBBBBxI")
+HEADER_SIZE = HEADER.size
 REPLY = struct.Struct("<HBBBBBxI239s")
 FRAME_OVERHEAD = 12
 """Bytes that MAVLink 2 puts around a payload, unsigned."""

@@ -21,13 +21,12 @@ from rich.console import Console
 from rich.table import Table
 from trio.testing import MockClock
 
-from mavftpfs.cache.options import CacheOptions
-from mavftpfs.cache.tree import Tree
 from mavftpfs.protocol.payload import MAX_DATA
 from mavftpfs.session.connection import Connection
 from mavftpfs.sim.linkmodel import Direction as LinkDirection
 from mavftpfs.sim.linkmodel import LinkSettings
 from tests.bench.cases import Case, Direction, Result
+from tests.support.mounting import writable_tree
 from tests.support.worlds import ROOTS, MemorySink, World
 
 PATIENCE = 20
@@ -79,15 +78,7 @@ async def _write(world: World, connection: Connection, data: bytes) -> float:
     world.tree.add_directory(_directory(world))
     path = _directory(world) + b"/log.bin"
     async with trio.open_nursery() as nursery:
-        tree = Tree(
-            connection.store,
-            CacheOptions(verify="size"),
-            clock=trio.current_time,
-            invalidate=lambda path: None,
-            nursery=nursery,
-            writer=connection.store,
-            rng=random.Random(3),
-        )
+        tree = writable_tree(connection, nursery, verify="size")
         assert path not in dict(await tree.list(_directory(world)))  # as a lookup does before the open
         began = trio.current_time()
         file = await tree.create(path, exclusive=False)

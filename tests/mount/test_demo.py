@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from mavftpfs.mountpoint import mounted_types
 from tests.support.logs import suspects
 from tests.support.mounts import abort_mount, processes_in, wait_until
 from tests.support.vehicles import PROJECT
@@ -21,10 +22,16 @@ HANG = 120.0
 @pytest.fixture
 def place(tmp_path: Path) -> Iterator[Path]:
     """The demo's TMPDIR; whatever of it is still mounted at the end is freed."""
-    yield tmp_path
-    for line in Path("/proc/self/mounts").read_text().splitlines():
-        if line.split()[1].startswith(str(tmp_path)):
-            abort_mount(Path(line.split()[1]))
+    path = tmp_path / "two words"
+    path.mkdir()
+    yield path
+    for mountpoint in mounts_in(path):
+        abort_mount(Path(mountpoint))
+
+
+def mounts_in(place: Path) -> list[str]:
+    """Return what is mounted below a directory."""
+    return [path for path in mounted_types() if path.startswith(f"{place}/")]
 
 
 def start_demo(place: Path) -> subprocess.Popen[str]:
@@ -42,13 +49,15 @@ def start_demo(place: Path) -> subprocess.Popen[str]:
 
 def assert_nothing_is_left(place: Path) -> None:
     """No file, no mount, no process."""
-    wait_until("all processes ended", lambda: not processes_in(place), 10)
+    wait_until("all processes ended", lambda: not processes_in(place))
     assert list(place.iterdir()) == []
-    assert str(place) not in Path("/proc/self/mounts").read_text()
+    assert mounts_in(place) == []
 
 
-def test_the_demo_shows_the_tour_and_cleans_up(place: Path) -> None:
-    demo = start_demo(place)
+def test_the_demo_shows_the_tour_and_cleans_up(place: Path, tmp_path: Path) -> None:
+    """Also where the directory for temporaries has another name."""
+    (tmp_path / "link").symlink_to(place)
+    demo = start_demo(tmp_path / "link")
     out, _ = demo.communicate(timeout=HANG)
     assert demo.returncode == 0, out
     assert suspects(out) == []

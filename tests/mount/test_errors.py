@@ -148,7 +148,7 @@ def test_the_daemon_returns_when_mounted_and_goes_on(field: Field, small_tree: P
         pids = processes_in(mount.path)
         assert len(pids) == 1
         subprocess.run(["fusermount3", "-u", str(mount.path)], check=True, timeout=30)
-        wait_until("the daemon ended", lambda: not processes_in(mount.path), 30)
+        wait_until("the daemon ended", lambda: not processes_in(mount.path))
     finally:
         abort_mount(mount.path)
     assert suspects(log.read_text()) == []

@@ -12,12 +12,11 @@ from mavftpfs.cache.blocks import BLOCK_SIZE
 from tests.mount.conftest import Field
 from tests.support.mounts import Mount, wait_until
 from tests.support.requests import CountedVehicle, Counting
+from tests.support.takingturns import taking_turns
 from tests.support.trees import content
 
 YESTERDAY = 86_400
 FILES = {"00000001.BIN": 300_000, "00000002.BIN": 65_536, "LASTLOG.TXT": 3}
-KEEPING = 40.0
-"""Seconds in which what was read gets to the disk: it has to be beyond suspicion for 12 of them."""
 
 
 def fill(card: Path) -> Path:
@@ -41,7 +40,8 @@ def read_and_keep(field: Field, vehicle: CountedVehicle, logs: Path, cache: Path
     read_all(mount, logs)
     blocks = sum(-(-size // BLOCK_SIZE) for size in FILES.values())
     counting = Counting(vehicle, mount)
-    wait_until("all is kept", lambda: counting.status()["cache"]["blocks_to_disk"] == blocks, KEEPING)
+    # What was read gets to the disk when it was beyond suspicion for 12 s.
+    wait_until("all is kept", lambda: counting.status()["cache"]["blocks_to_disk"] == blocks)
     assert mount.unmount() == 0
 
 
@@ -51,7 +51,7 @@ def opened(vehicle: CountedVehicle, mark: int) -> dict[str, int]:
     return {name: counts[name] for name in ("open", "read", "burst", "crc") if counts[name]}
 
 
-@pytest.mark.parametrize("profile", ["ardupilot5", "mavsdk"])
+@pytest.mark.parametrize("profile", taking_turns(["ardupilot5", "mavsdk"]))
 def test_yesterdays_logs_are_not_read_again(field: Field, profile: str) -> None:
     card, cache = field.local("card"), field.local("cache")
     logs = fill(card)
@@ -68,6 +68,7 @@ def test_yesterdays_logs_are_not_read_again(field: Field, profile: str) -> None:
     assert opened(vehicle, mark) == {"open": 1, "read": 5}
 
 
+@pytest.mark.soak
 def test_changed_logs_and_damaged_blocks_are_read_again(field: Field) -> None:
     card, cache = field.local("card"), field.local("cache")
     logs = fill(card)

@@ -132,7 +132,7 @@ def test_pages_in_use_are_dropped_when_the_bytes_changed(server: KernelServer) -
         assert asks_the_server()
         assert not asks_the_server(), "the page is cached"
         server.do("invalidate", path="/a")
-        wait_until("the kernel dropped the page", asks_the_server, 20)
+        wait_until("the kernel dropped the page", asks_the_server)
 
 
 def test_an_absence_is_asked_for_once(server: KernelServer) -> None:
@@ -147,7 +147,7 @@ def test_the_kernel_forgets_and_every_number_stays(server: KernelServer) -> None
     before = server.run(code, server.path / "many")
     assert server.counts()["inodes"] > 1500
     drop_caches()
-    wait_until("forgotten", lambda: server.counts()["inodes"] < 10, 20)
+    wait_until("forgotten", lambda: server.counts()["inodes"] < 10)
     assert server.run(code, server.path / "many") == before
     counts = server.counts()
     assert counts["excess_forgets"] == 0
@@ -156,4 +156,4 @@ def test_the_kernel_forgets_and_every_number_stays(server: KernelServer) -> None
 
 def test_handles_are_closed(server: KernelServer) -> None:
     server.run("[open(sys.argv[1]).close() for _ in range(100)]", server.path / "a")
-    wait_until("released", lambda: server.counts()["open_files"] == 0, 20)
+    wait_until("released", lambda: server.counts()["open_files"] == 0)

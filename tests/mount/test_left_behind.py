@@ -36,7 +36,7 @@ def test_a_mount_that_fails_takes_no_news_away(
     assert "earlier mount" not in ended.stderr
     assert (dead.path / "000001.data").read_bytes() == b"held"
     process = field.mount(source).alive()
-    wait_until("it tells of them", lambda: LINE.search(process.text()) is not None, 20)
+    wait_until("it tells of them", lambda: LINE.search(process.text()) is not None)
     match = LINE.search(process.text())
     assert match is not None
     assert [path.read_bytes() for path in Path(match[1].strip()).iterdir()] == [b"held"]

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from tests.mount.conftest import Field
+from tests.support.mounts import Mount
 from tests.support.trees import content
 from tests.support.vehicles import UdpVehicle
 
@@ -26,7 +27,9 @@ COPIES = {
 """Vehicle -> (bytes to copy, options of the link), so that the copy takes several seconds."""
 
 
-@pytest.mark.parametrize("kind", COPIES)
+@pytest.mark.parametrize(
+    "kind", [pytest.param(kind, marks=pytest.mark.soak if kind == "mavsdk" else ()) for kind in COPIES]
+)
 def test_ls_overtakes_a_large_copy(
     field: Field, tmp_path: Path, kind: str, report_line: Callable[[str], None]
 ) -> None:
@@ -38,7 +41,7 @@ def test_ls_overtakes_a_large_copy(
         (card / f"fresh{number}" / f"file{number}").touch()
     vehicle: UdpVehicle = field.mavsdk(card) if kind == "mavsdk-server" else field.sim(card, kind, link)
     mount = field.mount(vehicle.source)
-    times = []
+    times, beside = [], 0
     start = time.monotonic()
     with mount.started("cp", mount.path / "large.bin", tmp_path / "copy") as copy:
         for number in range(FRESH_DIRECTORIES):
@@ -49,28 +52,56 @@ def test_ls_overtakes_a_large_copy(
             names = mount.run("ls", mount.path / f"fresh{number}").stdout
             times.append(time.monotonic() - before)
             assert names == f"file{number}\n"
+            beside += copy.poll() is None
         _, errors = copy.communicate(timeout=300)
     took = time.monotonic() - start
     assert (copy.returncode, errors) == (0, "")
     assert (tmp_path / "copy").read_bytes() == (card / "large.bin").read_bytes()
-    ordered = sorted(times)
-    report = (
-        f"cp {took:.1f} s, {len(times)} ls: median {ordered[len(times) // 2]:.3f} s, max {ordered[-1]:.3f} s"
-    )
+    median, longest = sorted(times)[len(times) // 2], max(times)
+    report = f"cp {took:.1f} s, {beside} ls beside it: median {median:.3f} s, max {longest:.3f} s"
     report_line(f"{kind}: {report}")
-    assert len(times) >= 5, report
-    assert max(times) < took / 2, f"an ls waited for the copy: {report}"
+    assert beside >= 5, f"ls waits for the copy: {report}"
+
+
+SLACK = 12 * MIB
+"""Bytes that a long transfer may take beside what is held: buffers, and what Python keeps of freed ones."""
+
+
+def peaks(mount: Mount, source: Path, target: Path) -> tuple[int, int]:
+    """Copy a small file and then a large one; return the peak memory after each, in bytes."""
+    found = []
+    for name in ("small", "large"):
+        mount.run("cp", source / name, target / name, timeout=300)
+        found.append(mount.alive().peak_memory())
+    return found[0], found[1]
+
+
+def two_files(folder: Path, large: int) -> Path:
+    """Make a file of a megabyte and one of `large` bytes."""
+    (folder / "small").write_bytes(content("small", MIB))
+    (folder / "large").write_bytes(content("memory", large))
+    return folder
 
 
 def test_memory_is_bounded_while_reading_ten_times_the_cache(field: Field, tmp_path: Path) -> None:
-    cache = 2 * MIB
-    card = field.local("card")
-    (card / "large.bin").write_bytes(content("memory", 10 * cache))
+    cache, dirty_max = 2 * MIB, 8 * MIB
+    card = two_files(field.local("card"), 16 * cache)
     mount = field.mount(field.sim(card).source, f"cache_size={cache}")
-    mount.run("cp", mount.path / "large.bin", tmp_path / "copy", timeout=300)
-    assert (tmp_path / "copy").read_bytes() == (card / "large.bin").read_bytes()
-    dirty_max = 8 * MIB
-    assert mount.alive().peak_memory() <= cache + dirty_max + 60 * MIB
+    before, after = peaks(mount, mount.path, tmp_path)
+    assert (tmp_path / "large").read_bytes() == (card / "large").read_bytes()
+    assert after <= cache + dirty_max + 60 * MIB
+    assert after - before <= cache + SLACK
+
+
+def test_memory_is_bounded_while_writing_ten_times_dirty_max(field: Field) -> None:
+    """What the vehicle does not provably have yet waits on the local disk."""
+    cache, dirty_max = 2 * MIB, MIB
+    card, local = field.local("card"), two_files(field.local("local"), 24 * dirty_max)
+    mount = field.mount(field.sim(card).source, f"cache_size={cache}", f"dirty_max={dirty_max}")
+    before, after = peaks(mount, local, mount.path)
+    assert (card / "large").read_bytes() == (local / "large").read_bytes()
+    assert after <= cache + dirty_max + 60 * MIB
+    assert after - before <= dirty_max + SLACK
 
 
 OPEN_ALL = """

@@ -14,6 +14,7 @@ from typing import Any
 
 import pytest
 
+from mavftpfs.protocol.crc import crc32
 from tests.mount.conftest import Field
 from tests.support.mounts import Mount, abort_mount, mounted_at, processes_in, wait_until
 from tests.support.vehicles import PROJECT
@@ -179,6 +180,29 @@ def test_xattrs(field: Field, small_tree: Path) -> None:
     assert mount.errno_of(missing, path) == "ENODATA"
     assert mount.errno_of(missing, mount.path / "sizes") == "ENODATA"
     assert mount.python("import os, sys; print(os.listxattr(sys.argv[1]))", path).strip() == "[]"
+    checksum = "import os, sys; print(os.getxattr(sys.argv[1], 'user.mavftp.crc32').decode())"
+    expected = crc32((small_tree / "sizes/478.bin").read_bytes())
+    assert mount.python(checksum, path) == f"{expected:08x}\n"
+    shown = mount.python("import os, sys; print(os.listxattr(sys.argv[1]))", mount.path)
+    assert shown.strip() == "['user.mavftpfs.status']"
+
+
+REFUSED = {
+    "os.symlink('a', sys.argv[1] + '/b')": "EPERM",
+    "os.link(sys.argv[1] + '/file', sys.argv[1] + '/b')": "EPERM",
+    "os.mkfifo(sys.argv[1] + '/b')": "EPERM",
+    "os.setxattr(sys.argv[1] + '/file', 'user.x', b'y')": "ENOTSUP",
+}
+
+
+def test_what_no_card_has_is_refused(field: Field) -> None:
+    card = field.local("card")
+    (card / "file").write_text("content\n")
+    mount = field.mount(field.sim(card).source)
+    assert {code: mount.errno_of(code, mount.path) for code in REFUSED} == REFUSED
+    refused = mount.run("fallocate", "-l", "1M", mount.path / "file", code=None)
+    assert "not supported" in refused.stderr
+    assert [(path.name, path.read_text()) for path in card.iterdir()] == [("file", "content\n")]
 
 
 # mount(8) runs the program named by the type from a fixed PATH, so one is made to hold it, in a mount
@@ -210,7 +234,7 @@ def test_mount_8_and_umount_8(field: Field, small_tree: Path, tmp_path: Path) ->
     assert line.split()[:3] == [mount.source, str(mount.path), "fuse.mavftp"]
     assert {"ro", "noatime"} <= set(line.split()[3].split(","))
     assert owner == "uid 1000"
-    wait_until("the daemon ended", lambda: not processes_in(mount.path), 30)
+    wait_until("the daemon ended", lambda: not processes_in(mount.path))
 
 
 def test_mount_8_names_an_unknown_option(field: Field, small_tree: Path, tmp_path: Path) -> None:
@@ -226,7 +250,7 @@ def test_auto_unmount_clears_after_a_kill(field: Field, small_tree: Path) -> Non
     process, mount.process = mount.alive(), None
     process.kill()
     try:
-        wait_until("the kernel's mount is gone", lambda: not mounted_at(mount.path), 20)
+        wait_until("the kernel's mount is gone", lambda: not mounted_at(mount.path))
     finally:
         abort_mount(mount.path)
 
@@ -246,4 +270,4 @@ def test_a_remote_change_is_seen_within_the_cache_time(field: Field, tmp_path: P
             "second, longer\nnew\n"
         )
 
-    wait_until("the change is seen", seen, 20)
+    wait_until("the change is seen", seen)

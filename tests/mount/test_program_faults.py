@@ -57,7 +57,7 @@ def test_a_killed_program_leaves_what_it_wrote(field: Field, kind: str, source: 
     written = mount.read_bytes(target)
     assert len(written) >= 25_000
     assert DATA.startswith(written)
-    wait_until("it arrives", lambda: (place.card / "killed.bin").read_bytes() == written, 40)
+    wait_until("it arrives", lambda: (place.card / "killed.bin").read_bytes() == written)
     mount.run("cp", source, target)
     assert (place.card / "killed.bin").read_bytes() == DATA
 
@@ -70,13 +70,13 @@ def test_a_copy_goes_on_over_a_restart_of_the_vehicle(field: Field, kind: str, s
     mount.run("cp", source, mount.path / place.folder / "old.bin")
     source.write_bytes(DATA[::-1])
     with mount.started("cp", source, mount.path / place.folder / "old.bin") as child:
-        wait_until("it is under way", lambda: len(list(place.card.iterdir())) > 1 or is_new(place.card), 20)
+        wait_until("it is under way", lambda: len(list(place.card.iterdir())) > 1 or is_new(place.card))
         place.vehicle.send_signal(signal.SIGHUP)
         _, errors = child.communicate(timeout=90)
     assert (child.returncode, errors) == (0, "")
     assert (place.card / "old.bin").read_bytes() == DATA[::-1]
     mount.run("ls", "-A", mount.path / place.folder)
-    wait_until("no litter", lambda: [path.name for path in place.card.iterdir()] == ["old.bin"], 40)
+    wait_until("no litter", lambda: [path.name for path in place.card.iterdir()] == ["old.bin"])
 
 
 def is_new(card: Path) -> bool:

@@ -24,7 +24,7 @@ def test_the_name_goes_while_cp_waits_for_the_card(field: Field, profile: str, c
     mount = field.mount(vehicle.source, "dirty_max=1M")
     with mount.started("cp", disk / "big", mount.path / "big") as cp:
         there = card / "big"
-        wait_until("a part is on the card", lambda: there.exists() and there.stat().st_size > 5000, 60)
+        wait_until("a part is on the card", lambda: there.exists() and there.stat().st_size > 5000)
         if command == "rm":
             mount.run("rm", mount.path / "big")
             left = {"other"}

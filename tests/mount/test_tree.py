@@ -16,11 +16,12 @@ import pytest
 from mavftpfs.sim.profiles import PROFILES
 from tests.mount.conftest import Field
 from tests.support.mounts import Mount
+from tests.support.takingturns import taking_turns
 from tests.support.trees import AWKWARD_SIZES, MANY, build_tree
 from tests.support.vehicles import UdpVehicle
 
 BAD_LINK = ("--seed", "7", "--loss", "0.05", "--dup", "0.02", "--reorder", "0.02", "--corrupt", "0.01")
-VEHICLES = (*PROFILES, "mavsdk-server", "mavsdk-server-bad-link")
+VEHICLES = taking_turns((*PROFILES, "mavsdk-server", "mavsdk-server-bad-link"))
 
 SLOW = ("ardupilot", "littlefs")
 """Servers that send no times either, so that each tool reads again."""

@@ -159,9 +159,9 @@ def test_vim_and_nano_save(twins: Twins, tmp_path: Path) -> None:
     tmux = ("tmux", "-L", session)
     try:
         subprocess.run([*tmux, "new-session", "-d", "sh", str(script)], check=True, timeout=20)
-        wait_until("nano is there", lambda: "nano.txt" in screen(tmux), 20)
+        wait_until("nano is there", lambda: "nano.txt" in screen(tmux))
         subprocess.run([*tmux, "send-keys", "from nano", "C-o", "Enter"], check=True, timeout=20)
-        wait_until("nano has saved", lambda: "Wrote" in screen(tmux), 30)
+        wait_until("nano has saved", lambda: "Wrote" in screen(tmux))
         assert (twins.card / "nano.txt").read_text() == "from nano\n"
         subprocess.run([*tmux, "send-keys", "C-x"], check=True, timeout=20)
     finally:

@@ -16,6 +16,7 @@ from pathlib import Path
 import pytest
 
 from mavftpfs import control
+from mavftpfs.cache.asides import is_reserved
 from tests.mount.conftest import Field
 from tests.support.mounts import Mount, abort_mount, mounted_at, wait_until
 from tests.support.trees import content
@@ -102,7 +103,7 @@ def test_arming_in_mid_copy_refuses_and_disarming_delivers(field: Field, profile
     vehicle.send_signal(signal.SIGUSR1)
     expected = BLOCK * (taken // len(BLOCK))
     place = card / "APM" / "flight.bin"
-    wait_until("what was held is delivered", lambda: place.read_bytes() == expected, 60)
+    wait_until("what was held is delivered", lambda: place.read_bytes() == expected)
     mount.run("sh", "-c", f"echo new > {mount.path}/APM/new.txt")
     assert (card / "APM" / "new.txt").read_text() == "new\n"
     assert [line for line in mount.alive().text().splitlines() if "armed" in line] == [
@@ -157,7 +158,7 @@ def recovered(text: str) -> Path:
 
 def told(process: Process) -> Path:
     """Return the directory that a new mount names a moment after it is up."""
-    wait_until("the notice", lambda: RECOVERED.search(process.text()) is not None, 30)
+    wait_until("the notice", lambda: RECOVERED.search(process.text()) is not None)
     return recovered(process.text())
 
 
@@ -168,7 +169,7 @@ def test_unmounting_with_undelivered_data_keeps_it(field: Field, data: Path) -> 
     write_to_nobody(mount, vehicle, data)
     process, mount.process = mount.alive(), None
     process.send_signal(signal.SIGTERM)
-    wait_until("it delivers before it ends", lambda: "delivering" in process.text(), 20)
+    wait_until("it delivers before it ends", lambda: "delivering" in process.text())
     process.send_signal(signal.SIGTERM)
     assert process.wait(30) == 4
     assert not mounted_at(mount.path)
@@ -204,7 +205,7 @@ def test_unmounting_waits_for_a_vehicle_that_comes_back(field: Field, data: Path
     write_to_nobody(mount, vehicle, data)
     argv = [sys.executable, "-m", "mavftpfs", "umount", str(mount.path)]
     with mount.started(*argv) as child:
-        wait_until("it delivers before it ends", lambda: "delivering" in mount.alive_or_ended().text(), 20)
+        wait_until("it delivers before it ends", lambda: "delivering" in mount.alive_or_ended().text())
         vehicle.resume()
         _, errors = child.communicate(timeout=60)
     assert (child.returncode, errors) == (0, "")
@@ -218,7 +219,7 @@ def test_whoever_unmounts_second_waits_for_the_delivery_too(field: Field, data: 
     mount = field.mount(vehicle.source, *QUICK)
     write_to_nobody(mount, vehicle, data)
     subprocess.run(["fusermount3", "-u", mount.path], check=True, timeout=60)
-    wait_until("it delivers before it ends", lambda: "delivering" in mount.alive_or_ended().text(), 20)
+    wait_until("it delivers before it ends", lambda: "delivering" in mount.alive_or_ended().text())
     path = control.find_socket(str(mount.path), control.own_directories())
     with socket.socket(socket.AF_UNIX) as client:
         client.settimeout(60)
@@ -251,19 +252,19 @@ def test_unmounting_what_a_killed_daemon_left_says_what_it_held(field: Field, da
 def test_a_killed_daemon_loses_only_what_was_not_confirmed(field: Field, data: Path) -> None:
     card = field.local("card")
     (card / "replaced.bin").write_bytes(b"old" * 1000)
-    vehicle = field.sim(card, "px4", ("--rate", "100000"))
+    vehicle = field.sim(card, "px4", ("--rate", "10000"))  # what is held takes a quarter of a minute
     vehicle.left_alone = True
     mount = field.mount(vehicle.source, *QUICK)
     write_to_nobody(mount, vehicle, data)
     vehicle.resume()
-    wait_until("heartbeats are back", lambda: readable(mount), 30)
+    wait_until("heartbeats are back", lambda: readable(mount))
     code = (
         "import os, sys, time\n"
         "f = open(sys.argv[1], 'r+b', 0); f.truncate(0); f.write(b'n' * 300000)\n"
         "print('written', flush=True); time.sleep(60)"
     )
-    with mount.started(sys.executable, "-c", code, mount.path / "replaced.bin") as child:
-        assert child.stdout is not None
+    with mount.started(sys.executable, "-c", code, mount.path / "replaced.bin"):
+        wait_until("it is under way", lambda: any(map(is_reserved, os.listdir(os.fsencode(card)))))
         vehicle.pause()
         process, mount.process = mount.alive(), None
         process.kill()
@@ -278,7 +279,7 @@ def test_a_killed_daemon_loses_only_what_was_not_confirmed(field: Field, data: P
     assert json.loads(found["lost.bin.json"].read_text())["path"] == "/lost.bin"
     again.run("ls", "-A", again.path)
     wait_until(
-        "no litter", lambda: {p.name for p in card.iterdir()} <= {"confirmed", "replaced.bin", "lost.bin"}, 20
+        "no litter", lambda: {p.name for p in card.iterdir()} <= {"confirmed", "replaced.bin", "lost.bin"}
     )
 
 

@@ -11,7 +11,7 @@ import pytest
 from mavftpfs import oneshot
 from mavftpfs.cache.tree import Tree
 from mavftpfs.link.messages import Address, Heartbeat
-from mavftpfs.oneshot import PART_SUFFIX, Fetched, _Getter
+from mavftpfs.oneshot import Fetched, _Getter
 from mavftpfs.report import SilentMeter
 from mavftpfs.shared.errors import Armed, DataUnproven, FtpNak, RequestTimeout, UsageError
 from tests.ops.faketree import MTIME, FakeFile, FakeTree
@@ -84,7 +84,7 @@ async def test_wrong_bytes_twice_leave_nothing_and_keep_the_old_file(tmp_path: P
     with pytest.raises(DataUnproven, match="CRC32"):
         await get(tree, b"/big", tmp_path / "big")
     assert (tmp_path / "big").read_bytes() == b"old"
-    assert not (tmp_path / f"big{PART_SUFFIX}").exists()
+    assert names_in(tmp_path) == ["big"]
 
 
 @pytest.mark.parametrize(
@@ -119,6 +119,22 @@ async def test_a_read_that_ends_early_is_no_file(tmp_path: Path) -> None:
     with pytest.raises(DataUnproven, match="ended"):
         await get(tree, b"/big", tmp_path / "big")
     assert names_in(tmp_path) == []
+
+
+async def test_no_file_of_the_users_is_taken_for_a_part(tmp_path: Path) -> None:
+    (tmp_path / "big.part").write_bytes(b"the user's")
+    await get(SpoiltTree({b"/big": BIG}), b"/big", tmp_path / "big")
+    assert (tmp_path / "big.part").read_bytes() == b"the user's"
+    assert names_in(tmp_path) == ["big", "big.part"]
+
+
+async def test_what_the_local_disk_refuses_is_told_in_a_line(tmp_path: Path) -> None:
+    tree = SpoiltTree({b"/d/a": b"1"})
+    (tmp_path / "file").write_bytes(b"in the way")
+    for path, place in ((b"/d/a", tmp_path / "none" / "a"), (b"/d", tmp_path / "file")):
+        with pytest.raises(UsageError, match=f"^{place}: (No such file|File exists)"):
+            await getter(tree).get_tree(path, place, tree.stat_now(path), lambda _: None)
+    assert (tmp_path / "file").read_bytes() == b"in the way"
 
 
 async def test_a_directory_with_all_below(tmp_path: Path) -> None:

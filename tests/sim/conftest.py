@@ -1,9 +1,16 @@
-"""The same order of tasks at every run: what fails once fails again. Tier: sim."""
+"""Virtual time, and the same order of tasks at every run: what fails once fails again. Tier: sim."""
 
 from __future__ import annotations
 
 import pytest
 import trio._core._run as scheduler
+from trio.testing import MockClock
+
+
+@pytest.fixture
+def autojump() -> MockClock:
+    """Virtual time: it jumps to whatever is waited for."""
+    return MockClock(autojump_threshold=0)
 
 
 @pytest.fixture(autouse=True)

@@ -19,11 +19,6 @@ EVERY_PROFILE = sorted(PROFILES)
 LONG_AGO = float("-inf")
 
 
-@pytest.fixture
-def autojump() -> MockClock:
-    return MockClock(autojump_threshold=0)
-
-
 def path(profile: str, name: str) -> bytes:
     return ROOTS.get(profile, b"") + b"/d/" + name.encode()
 

@@ -5,31 +5,25 @@ from __future__ import annotations
 import random
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
-from functools import partial
 
 import pytest
 import trio
 from trio.testing import MockClock
 
 from mavftpfs.cache.asides import is_reserved
-from mavftpfs.cache.options import CacheOptions
 from mavftpfs.cache.tree import Tree
+from mavftpfs.compose import subscribe
 from mavftpfs.link.messages import Address
 from mavftpfs.protocol.payload import Opcode
-from mavftpfs.session.connection import Connection
 from mavftpfs.shared.errors import MavftpfsError
 from mavftpfs.sim.profiles import PROFILES
+from tests.support.mounting import mounted
 from tests.support.worlds import ROOTS, World
 
 OLD = random.Random(1).randbytes(3000)
 NEW = random.Random(2).randbytes(4000)
 RENAMING = [name for name in PROFILES if name != "littlefs"]
 SILENCE = 40.0
-
-
-@pytest.fixture
-def autojump() -> MockClock:
-    return MockClock(autojump_threshold=0)
 
 
 class Scene:
@@ -45,19 +39,9 @@ class Scene:
     @asynccontextmanager
     async def mounted(self) -> AsyncIterator[Tree]:
         """Give a tree that hears the news as a mount does."""
-        async with self.world.connection() as connection, trio.open_nursery() as nursery:
-            tree = Tree(
-                connection.store,
-                CacheOptions(),
-                clock=trio.current_time,
-                invalidate=lambda path: None,
-                nursery=nursery,
-                writer=connection.store,
-                rng=random.Random(3),
-            )
+        async with mounted(self.world) as (connection, tree):
             subscribe(connection, tree)
             yield tree
-            nursery.cancel_scope.cancel()
 
     def before_rename(self, number: int, act: Callable[[], None]) -> None:
         """Have something happen as the server gets a rename."""
@@ -86,17 +70,6 @@ class Scene:
     def content(self) -> bytes:
         """Return what the card has under the name."""
         return self.world.tree.data(self.file)
-
-
-def subscribe(connection: Connection, tree: Tree) -> None:
-    reactions: dict[str, Callable[[], None]] = {
-        "lost": tree.link_lost,
-        "back": tree.link_back,
-        "armed": partial(tree.armed_changed, True),
-        "disarmed": partial(tree.armed_changed, False),
-    }
-    connection.subscribe(lambda news: reactions.get(news, lambda: None)())
-    tree.armed_changed(connection.vehicle.armed)
 
 
 async def replace(scene: Scene, tree: Tree) -> None:

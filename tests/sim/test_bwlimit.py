@@ -25,11 +25,6 @@ WIDE = LinkSettings(rate=100_000.0, delay=0.03)
 DATA = random.Random(4).randbytes(150_000)
 
 
-@pytest.fixture
-def autojump() -> MockClock:
-    return MockClock(autojump_threshold=0)
-
-
 class Meter:
     """Sees all frames: what we sent, and replies of FTP. Times in seconds, sizes in bytes."""
 

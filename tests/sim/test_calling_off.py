@@ -7,11 +7,8 @@ round trips, whatever the size of the file, and nothing of it comes back or stay
 
 from __future__ import annotations
 
-import random
-from collections.abc import AsyncIterator, Awaitable, Callable
-from contextlib import asynccontextmanager
+from collections.abc import Awaitable, Callable
 from itertools import product
-from typing import Any
 
 import pytest
 import trio
@@ -19,7 +16,6 @@ from trio.testing import MockClock
 
 from mavftpfs.cache.asides import is_reserved
 from mavftpfs.cache.openfile import OpenFile
-from mavftpfs.cache.options import CacheOptions
 from mavftpfs.cache.tree import Tree
 from mavftpfs.cache.verify import SMALL_LISTING
 from mavftpfs.protocol.payload import Opcode
@@ -28,6 +24,7 @@ from mavftpfs.shared.errors import CrossDevice
 from mavftpfs.sim.linkmodel import LinkSettings
 from tests.support.faults import Faults
 from tests.support.latecomers import Latecomer
+from tests.support.mounting import mounted
 from tests.support.trees import content
 from tests.support.worlds import ROOTS, World
 
@@ -48,26 +45,6 @@ MOST_REQUESTS = 120
 
 Write = Callable[[Tree, bytes], Awaitable[OpenFile]]
 Take = Callable[[Tree, bytes], Awaitable[None]]
-
-
-@pytest.fixture
-def autojump() -> MockClock:
-    return MockClock(autojump_threshold=0)
-
-
-@asynccontextmanager
-async def mounted(world: World, **options: Any) -> AsyncIterator[Tree]:
-    async with world.connection() as connection, trio.open_nursery() as nursery:
-        yield Tree(
-            connection.store,
-            CacheOptions(**options),
-            clock=trio.current_time,
-            invalidate=lambda path: None,
-            nursery=nursery,
-            writer=connection.store,
-            rng=random.Random(3),
-        )
-        nursery.cancel_scope.cancel()
 
 
 async def create(tree: Tree, path: bytes) -> OpenFile:
@@ -123,7 +100,7 @@ async def take_after(count: int, profile: str, write: str, take: str, settings: 
     world.tree.add(path + b".other", OTHER)
     faults = Faults(world)
     taken: float | None = None
-    async with mounted(world, inplace=profile == NO_RENAME) as tree, trio.open_nursery() as nursery:
+    async with mounted(world, inplace=profile == NO_RENAME) as (_, tree), trio.open_nursery() as nursery:
         await tree.list(folder)
         file = await WRITES[write][0](tree, path)
         now = trio.Event()
@@ -221,7 +198,7 @@ async def test_an_empty_file_among_many_loses_its_name(profile: str, take: str, 
     for number in range(SMALL_LISTING):
         world.tree.add(b"%b/%d" % (folder, number), b"")
     faults = Faults(world)
-    async with mounted(world) as tree, trio.open_nursery() as nursery:
+    async with mounted(world) as (_, tree), trio.open_nursery() as nursery:
         await tree.list(folder)
         file = await tree.create(path, exclusive=True)
         made = trio.Event()
@@ -247,7 +224,7 @@ async def test_a_name_goes_in_a_few_round_trips_whatever_the_size(
         world = World(profile, SLOW)
         path = ROOTS.get(profile, b"") + b"/d/file"
         world.tree.add(path + b".other", OTHER)
-        async with mounted(world) as tree:
+        async with mounted(world) as (_, tree):
             file = await tree.create(path, exclusive=True)
             await file.write(0, LONG)
             began = trio.current_time()
@@ -276,7 +253,7 @@ async def test_a_file_gets_another_name_while_it_is_written(profile: str, autoju
     path, other = folder + b"/file", folder + b"/other"
     world.tree.add(folder + b"/z", b"")
     piece = content("piece", 32768)
-    async with mounted(world, dirty_max=65536) as tree, trio.open_nursery() as nursery:
+    async with mounted(world, dirty_max=65536) as (_, tree), trio.open_nursery() as nursery:
         file = await tree.create(path, exclusive=True)
 
         async def write() -> None:
@@ -309,7 +286,7 @@ async def test_what_made_the_file_is_dead_before_it_goes(
     path = ROOTS.get(profile, b"") + b"/d/file"
     world.tree.add(path + b".other", OTHER)
     faults = Faults(world)
-    async with mounted(world) as tree, trio.open_nursery() as nursery:
+    async with mounted(world) as (_, tree), trio.open_nursery() as nursery:
         await tree.list(path.rpartition(b"/")[0])  # answered twice
         file = await tree.create(path, exclusive=True)
         await file.write(0, NEW)

@@ -17,11 +17,6 @@ from tests.support.worlds import MemorySink, World, read_file
 ROUNDS = 10_000
 
 
-@pytest.fixture
-def autojump() -> MockClock:
-    return MockClock(autojump_threshold=0)
-
-
 async def test_a_reader_goes_on_beside_a_job_that_has_to_wait(
     autojump: MockClock, monkeypatch: pytest.MonkeyPatch
 ) -> None:

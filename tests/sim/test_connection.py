@@ -9,7 +9,14 @@ import trio
 from trio.testing import MockClock
 
 from mavftpfs.link.framing import MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES, MAV_CMD_REQUEST_MESSAGE, Framer
-from mavftpfs.link.messages import MAV_AUTOPILOT_INVALID, Address, CommandLong
+from mavftpfs.link.messages import (
+    MAV_AUTOPILOT_INVALID,
+    MAV_TYPE_GCS,
+    MAV_TYPE_ONBOARD_CONTROLLER,
+    Address,
+    CommandLong,
+    Heartbeat,
+)
 from mavftpfs.link.opening import open_link
 from mavftpfs.link.uri import parse_source
 from mavftpfs.protocol.payload import decode_request
@@ -24,11 +31,6 @@ from tests.support.worlds import World, read_file
 
 KEY = bytes(range(32))
 DATA = random.Random(5).randbytes(30_000)
-
-
-@pytest.fixture
-def autojump() -> MockClock:
-    return MockClock(autojump_threshold=0)
 
 
 class Collected:
@@ -95,6 +97,26 @@ async def test_old_firmware_is_asked_for_its_capabilities_in_the_old_way(autojum
         await trio.sleep(10)
         assert connection.vehicle.ftp_flag is True
         assert vehicle.asked.count(MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES) == 1
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (ConnectOptions(), MAV_TYPE_ONBOARD_CONTROLLER),
+        (ConnectOptions(heartbeat="gcs"), MAV_TYPE_GCS),
+        (ConnectOptions(heartbeat="none"), None),
+    ],
+)
+async def test_what_we_say_we_are(options: ConnectOptions, said: int | None, autojump: MockClock) -> None:
+    """A ground station's heartbeat would feed the autopilot's failsafe, and trigger it later (promise 6)."""
+    here = World("px4")
+    here.tree.add(b"/f", DATA)
+    async with here.connection(options) as connection:
+        await trio.sleep(3)
+        us = Address(254, 191)
+        heard = {} if said is None else {us: Heartbeat(us, said, MAV_AUTOPILOT_INVALID, 0, 4)}
+        assert here.vehicle.heard == heard
+        assert await read_file(connection, b"/f") == DATA
 
 
 async def test_a_neighbour_with_our_address_makes_us_move(autojump: MockClock) -> None:

@@ -5,53 +5,27 @@ The size tells nothing of either, so what is in doubt is read back, whatever ver
 
 from __future__ import annotations
 
-import random
 import struct
-from collections.abc import AsyncIterator, Callable
-from contextlib import asynccontextmanager
-from typing import Any
+from collections.abc import Callable
 
 import pytest
 import trio
 from trio.testing import MockClock
 
-from mavftpfs.cache.options import CacheOptions
-from mavftpfs.cache.tree import Tree
 from mavftpfs.link.messages import Address
 from mavftpfs.protocol.payload import Opcode
-from mavftpfs.session.connection import Connection
 from mavftpfs.shared.errors import MavftpfsError
 from mavftpfs.sim.linkmodel import LinkSettings
 from mavftpfs.sim.profiles import PROFILES
 from tests.support.faults import Faults
+from tests.support.mounting import mounted
+from tests.support.takingturns import taking_turns
 from tests.support.worlds import ROOTS, World
 
 KEEPING = sorted(name for name in PROFILES if not PROFILES[name].write_only_truncates)
 DOUBLING = LinkSettings(delay=0.02, duplicate=0.3)
 CLEAN = LinkSettings(delay=0.02)
 STRANGER = Address(255, 190)
-
-
-@pytest.fixture
-def autojump() -> MockClock:
-    return MockClock(autojump_threshold=0)
-
-
-@asynccontextmanager
-async def mounted(world: World, root: bytes, **options: Any) -> AsyncIterator[tuple[Connection, Tree]]:
-    async with world.connection() as connection, trio.open_nursery() as nursery:
-        tree = Tree(
-            connection.store,
-            CacheOptions(**options),
-            clock=trio.current_time,
-            invalidate=lambda path: None,
-            nursery=nursery,
-            writer=connection.store,
-            rng=random.Random(3),
-        )
-        await tree.list(root)
-        yield connection, tree
-        nursery.cancel_scope.cancel()
 
 
 def on_write(world: World, act: Callable[[int, bytes, Address], None]) -> Callable[[bytes], None]:
@@ -89,7 +63,7 @@ def come_late(world: World, nursery: trio.Nursery, late: float) -> trio.Event:
 
 
 @pytest.mark.parametrize("late", [0.12, 0.15, 0.2, 0.25])
-@pytest.mark.parametrize("profile", KEEPING)
+@pytest.mark.parametrize("profile", taking_turns(KEEPING))
 async def test_an_older_copy_of_a_part_that_was_written_twice(
     profile: str, late: float, autojump: MockClock
 ) -> None:

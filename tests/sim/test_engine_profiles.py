@@ -256,3 +256,27 @@ def test_small_reads_here_and_there(name: str) -> None:
         assert transfer.error is None
         assert bytes(sink.data[start:stop]) == content[start:stop]
         assert sink.held.covers(start, stop)
+
+
+def spend(link: VirtualLink, seconds: float) -> None:
+    """Let time pass while something is under way."""
+    end = link.now + seconds
+    link.run_until(lambda: link.now >= end, seconds + 10.0)
+
+
+def test_a_slow_link_that_becomes_fast_is_used() -> None:
+    """The pace of a radio is kept while that is the way; then the cable is plugged in."""
+    rig = Rig("px4", LinkSettings(rate=5760.0, queue=4096, delay=0.05))
+    data = random.Random(3).randbytes(4_000_000)
+    rig.tree.add(b"/f", data)
+    link, size = rig.link, rig.open(b"/f")
+    transfer = ReadTransfer(rig.session, size, MemorySink(size), CHUNK)
+    link.engine.start(transfer, link.now)
+    transfer.want(0, size, True)
+    for rate in (100_000.0, 5760.0):
+        spend(link, 15.0)
+        link.model.settings = LinkSettings(rate=rate, queue=16_384, delay=0.01)
+        spend(link, 5.0)
+        before = transfer.received_bytes
+        spend(link, 5.0)
+        assert transfer.received_bytes - before > 0.8 * 5.0 * rate * CHUNK / 266

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import random
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
 
 import pytest
 import trio
 from trio.testing import MockClock
 
+from mavftpfs.cache.remote import Upload
 from mavftpfs.protocol.payload import Opcode
 from mavftpfs.shared.errors import FileChanged
 from mavftpfs.sim.linkmodel import LinkSettings
@@ -22,17 +25,26 @@ NEW = random.Random(2).randbytes(20_000)
 PLAIN = LinkSettings(rate=20_000.0, delay=0.02)
 
 
-@pytest.fixture
-def autojump() -> MockClock:
-    return MockClock(autojump_threshold=0)
-
-
 async def sent(faults: Faults, count: int) -> None:
     """Wait until so many writes reached the server."""
     for _ in range(10_000):
         if faults.requests.count(Opcode.WRITE_FILE) >= count:
             return
         await trio.sleep(0.05)
+
+
+@asynccontextmanager
+async def uploading(
+    here: World, path: bytes, source: MemorySource, least: int | None = None
+) -> AsyncIterator[tuple[Upload, trio.Nursery]]:
+    """Open an upload where it is known what OpenFileWO does; of a new file unless it has `least` bytes."""
+    async with here.connection() as connection, trio.open_nursery() as nursery:
+        store = connection.store
+        await store.probe_open_for_write(path + b"1", path + b"2")
+        upload = await store.open_upload(path, source, create=least is None, least=least or 0)
+        yield upload, nursery
+        await upload.abort()
+        nursery.cancel_scope.cancel()
 
 
 def names(here: World, path: bytes) -> list[bytes]:
@@ -49,10 +61,8 @@ async def test_a_lost_session_goes_on_only_where_the_rest_is_still_there(
     path = ROOTS.get(profile, b"") + b"/d/file"
     here.tree.add(path, OLD + NEW)
     faults = Faults(here)
-    async with here.connection() as connection, trio.open_nursery() as nursery:
-        await connection.store.probe_open_for_write(path + b"1", path + b"2")
-        source = MemorySource(NEW)
-        upload = await connection.store.open_upload(path, source, create=False, least=len(OLD + NEW))
+    source = MemorySource(NEW)
+    async with uploading(here, path, source, least=len(OLD + NEW)) as (upload, nursery):
 
         async def disturb() -> None:
             await sent(faults, 30)
@@ -70,8 +80,6 @@ async def test_a_lost_session_goes_on_only_where_the_rest_is_still_there(
         else:
             await upload.finish()
             assert here.tree.data(path) == NEW + (OLD + NEW)[len(NEW) :]
-        await upload.abort()
-        nursery.cancel_scope.cancel()
 
 
 @pytest.mark.parametrize("profile", KEEPING)
@@ -81,10 +89,8 @@ async def test_a_temporary_that_was_tidied_up_is_sent_whole(profile: str, autoju
     path = ROOTS.get(profile, b"") + b"/d/file"
     here.tree.add_directory(path.rpartition(b"/")[0])
     faults = Faults(here)
-    async with here.connection() as connection, trio.open_nursery() as nursery:
-        await connection.store.probe_open_for_write(path + b"1", path + b"2")
-        source = MemorySource(NEW)
-        upload = await connection.store.open_upload(path, source, create=True)
+    source = MemorySource(NEW)
+    async with uploading(here, path, source) as (upload, nursery):
 
         def tidy_up() -> None:
             if source.rollbacks == [] and path.rpartition(b"/")[2] in names(here, path):
@@ -102,8 +108,6 @@ async def test_a_temporary_that_was_tidied_up_is_sent_whole(profile: str, autoju
         await upload.finish()
         assert True in source.rollbacks
         assert here.tree.data(path) == NEW
-        await upload.abort()
-        nursery.cancel_scope.cancel()
 
 
 @pytest.mark.parametrize("profile", ["spec", "px4", "px4-nuttx", "px4-2026"])
@@ -114,10 +118,8 @@ async def test_what_was_never_proven_may_be_missing(profile: str, autojump: Mock
     path = ROOTS.get(profile, b"") + b"/d/file"
     here.tree.add(path, OLD)
     faults = Faults(here)
-    async with here.connection() as connection, trio.open_nursery() as nursery:
-        await connection.store.probe_open_for_write(path + b"1", path + b"2")
-        source = MemorySource(OLD + NEW)
-        upload = await connection.store.open_upload(path, source, create=False, least=len(OLD))
+    source = MemorySource(OLD + NEW)
+    async with uploading(here, path, source, least=len(OLD)) as (upload, nursery):
 
         async def disturb() -> None:
             await sent(faults, 60)
@@ -130,5 +132,3 @@ async def test_what_was_never_proven_may_be_missing(profile: str, autojump: Mock
         nursery.start_soon(disturb)
         await upload.finish()
         assert here.tree.data(path) == OLD + NEW
-        await upload.abort()
-        nursery.cancel_scope.cancel()

@@ -37,11 +37,6 @@ READS = (
 """(offset, count) in no order of use: far jumps, both sides of the sign bit and the end."""
 
 
-@pytest.fixture
-def autojump() -> MockClock:
-    return MockClock(autojump_threshold=0)
-
-
 def expected(offset: int, count: int) -> bytes:
     """Return what the huge file holds there: each eight bytes say where they are."""
     stop = min(offset + count, SIZE)

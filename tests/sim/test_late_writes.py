@@ -19,19 +19,16 @@ from mavftpfs.shared.errnos import errno_for
 from mavftpfs.shared.errors import DataUnproven
 from mavftpfs.sim.linkmodel import LinkSettings
 from mavftpfs.sim.profiles import PROFILES
-from tests.sim.test_doubted_bytes import CLEAN, DOUBLING, KEEPING, mounted
+from tests.sim.test_doubted_bytes import CLEAN, DOUBLING, KEEPING
 from tests.sim.test_upload import content, path, world
 from tests.support.latecomers import Latecomer
+from tests.support.mounting import mounted
 from tests.support.takingturns import taking_turns
+from tests.support.worlds import World
 
 EVERY_PROFILE = sorted(PROFILES)
 LONG = QUIET[1] + 3.0
 """Seconds: no copy is feared any more."""
-
-
-@pytest.fixture
-def autojump() -> MockClock:
-    return MockClock(autojump_threshold=0)
 
 
 async def change(tree: Tree, name: bytes, at: int, data: bytes) -> None:
@@ -83,6 +80,10 @@ async def test_bytes_that_only_the_vehicle_had_are_an_error(profile: str, autoju
                 await file.flush()
             assert errno_for(caught.value) == errno.EIO
         assert "bytes 0 to 2 " in str(caught.value)
+        for reader in (file, await tree.open(name)):
+            with pytest.raises(DataUnproven):
+                await reader.read(0, 10)
+            assert await reader.read(3, 10) == old[3:13]
         assert copy.late is not None
         await file.write(0, b"own")
         await file.flush()
@@ -134,17 +135,24 @@ async def test_a_file_that_is_sent_whole_is_right(
         assert here.tree.data(two) == content(size, 2)
 
 
+async def overtaken(here: World, tree: Tree, name: bytes, *changes: bytes) -> Latecomer:
+    """Change the bytes from 1000 on in turn; the first of these comes once more with the next WriteFile."""
+    await change(tree, name, 1, b"x")
+    await trio.sleep(LONG)
+    copy = Latecomer(here, Opcode.WRITE_FILE, after=Opcode.WRITE_FILE, first=True, nth=99)
+    for data in changes:
+        await change(tree, name, 1000, data)
+    await trio.sleep(20)
+    copy.rearm(Opcode.WRITE_FILE)
+    return copy
+
+
 @pytest.mark.parametrize("profile", taking_turns(KEEPING))
 async def test_an_earlier_change_of_the_same_file_harms_nothing(profile: str, autojump: MockClock) -> None:
     old, name = content(20_000), path(profile, "f")
     here = world(profile, CLEAN, f=old)
     async with mounted(here, path(profile, "")[:-1]) as (_, tree):
-        await change(tree, name, 1, b"x")
-        await trio.sleep(LONG)
-        copy = Latecomer(here, Opcode.WRITE_FILE, after=Opcode.WRITE_FILE, first=True, nth=99)
-        await change(tree, name, 1000, b"1" * 100)
-        await trio.sleep(20)
-        copy.rearm(Opcode.WRITE_FILE)
+        copy = await overtaken(here, tree, name, b"1" * 100)
         await change(tree, name, 1050, b"2" * 10)
         assert copy.late is not None
         new = old[:1] + b"x" + old[2:1000] + b"1" * 50 + b"2" * 10 + b"1" * 40 + old[1100:]
@@ -154,15 +162,49 @@ async def test_an_earlier_change_of_the_same_file_harms_nothing(profile: str, au
 @pytest.mark.parametrize("profile", taking_turns(KEEPING))
 async def test_a_change_that_was_overtaken_is_an_error(profile: str, autojump: MockClock) -> None:
     """The same file, but these bytes were written again since, and only the vehicle has them."""
-    old, name = content(20_000), path(profile, "f")
-    here = world(profile, CLEAN, f=old)
+    name = path(profile, "f")
+    here = world(profile, CLEAN, f=content(20_000))
     async with mounted(here, path(profile, "")[:-1]) as (_, tree):
-        await change(tree, name, 1, b"x")
-        copy = Latecomer(here, Opcode.WRITE_FILE, after=Opcode.WRITE_FILE, first=True, nth=99)
-        await change(tree, name, 1000, b"1" * 100)
-        await change(tree, name, 1000, b"2" * 100)
-        await trio.sleep(20)
-        copy.rearm(Opcode.WRITE_FILE)
+        copy = await overtaken(here, tree, name, b"1" * 100, b"2" * 100)
         with pytest.raises(DataUnproven):
             await change(tree, name, 5000, b"3")
         assert copy.late is not None
+
+
+@pytest.mark.parametrize("verify", ["auto", "size", "none"])
+@pytest.mark.parametrize("profile", taking_turns(KEEPING))
+async def test_a_file_that_a_copy_made_longer_gets_its_size_back(
+    profile: str, verify: str, autojump: MockClock
+) -> None:
+    """What only the vehicle had is as it was: the copy hit what was sent, and what lies behind the end."""
+    old = content(20_000)
+    here = world(profile, CLEAN, f=old, g=old[:1000])
+    f, g = path(profile, "f"), path(profile, "g")
+    inplace = profile == "littlefs"  # it can neither cut nor rename
+    async with mounted(here, path(profile, "")[:-1], verify=verify, inplace=inplace) as (_, tree):
+        await change(tree, f, 1, b"x")
+        await trio.sleep(LONG)
+        copy = Latecomer(here, Opcode.WRITE_FILE, after=Opcode.WRITE_FILE, first=True, nth=99)
+        await change(tree, f, 900, b"of f" * 50)
+        await trio.sleep(LONG)
+        copy.rearm(Opcode.WRITE_FILE)
+        await change(tree, g, 20, b"of g" * 245)
+        assert copy.late is not None
+        assert here.tree.data(g) == old[:20] + b"of g" * 245
+
+
+@pytest.mark.parametrize("profile", taking_turns(KEEPING))
+async def test_what_was_closed_and_written_again_at_once(profile: str, autojump: MockClock) -> None:
+    """The copy's answer is lost, so nothing tells that it came; but this link loses and doubles."""
+    old, name = content(20_000), path(profile, "f")
+    here = world(profile, DOUBLING, f=old)
+    async with mounted(here, path(profile, "")[:-1]) as (connection, tree):
+        await change(tree, name, 1, b"x")
+        await trio.sleep(LONG)
+        copy = Latecomer(here, Opcode.WRITE_FILE, after=Opcode.WRITE_FILE, first=True, nth=99, mute=True)
+        await change(tree, name, 1000, b"1" * 100)
+        assert connection.engine.stats.strays
+        copy.rearm(Opcode.WRITE_FILE)
+        await change(tree, name, 1000, b"2" * 100)
+        assert copy.late is not None
+        assert here.tree.data(name) == old[:1] + b"x" + old[2:1000] + b"2" * 100 + old[1100:]

@@ -5,35 +5,30 @@ Each is repeated at one exact place, within the time in which such copies are fe
 
 from __future__ import annotations
 
-import random
 from dataclasses import replace
 
 import pytest
 import trio
 from trio.testing import MockClock
 
-from mavftpfs.cache.options import CacheOptions
-from mavftpfs.cache.tree import Tree
 from mavftpfs.link.messages import Address
 from mavftpfs.protocol.payload import Opcode, request
 from mavftpfs.session.connection import Connection, ConnectOptions
 from mavftpfs.session.echoes import QUIET
+from mavftpfs.shared.errors import RequestTimeout
 from mavftpfs.sim.linkmodel import LinkSettings
 from mavftpfs.sim.profiles import PROFILES
 from tests.sim.test_stragglers import double
 from tests.sim.test_upload import content, path, probes, put, world
+from tests.support.faults import Faults
 from tests.support.latecomers import Latecomer
+from tests.support.mounting import writable_tree
 from tests.support.sources import MemorySource
 from tests.support.takingturns import taking_turns
 from tests.support.worlds import MemorySink, read_file
 
 EVERY_PROFILE = sorted(PROFILES)
 DOUBLING = LinkSettings(delay=0.02, duplicate=0.3, reorder=0.1)
-
-
-@pytest.fixture
-def autojump() -> MockClock:
-    return MockClock(autojump_threshold=0)
 
 
 @pytest.mark.parametrize(
@@ -81,6 +76,17 @@ async def test_a_late_write_does_not_hide_that_reopening_empties_files(
         assert here.tree.data(name) == data
 
 
+async def read_or_doubt(connection: Connection, target: bytes, expected: bytes) -> None:
+    """Read a file whole: its own bytes, or doubt about them within a second."""
+    sink = MemorySink(len(expected))
+    reader = await connection.store.open_reader(target, sink)
+    reader.want(0, reader.size, demand=True)
+    data = await sink.wait_for(0, reader.size)
+    await trio.sleep(1)
+    assert data == expected or sink.suspicions
+    reader.close()
+
+
 @pytest.mark.parametrize("nth", [8, 9, 12])
 @pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
 async def test_a_late_open_of_another_file_gives_no_wrong_bytes(
@@ -93,14 +99,33 @@ async def test_a_late_open_of_another_file_gives_no_wrong_bytes(
         await connection.store.list_directory(path(profile, ""))
         copy = Latecomer(here, Opcode.OPEN_FILE_RO, after=Opcode.READ_FILE, nth=nth, first=True)
         assert await read_file(connection, path(profile, "one")) == one
-        sink = MemorySink(len(two))
-        reader = await connection.store.open_reader(path(profile, "two"), sink)
-        reader.want(0, reader.size, demand=True)
-        data = await sink.wait_for(0, reader.size)
-        await trio.sleep(1)
+        await read_or_doubt(connection, path(profile, "two"), two)
         assert copy.late is not None
-        assert data == two or sink.suspicions
-        reader.close()
+
+
+@pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
+async def test_a_late_open_that_was_given_up_gives_no_wrong_bytes(profile: str, autojump: MockClock) -> None:
+    """Nobody knows its seq: no answer ever came."""
+    one, two = content(1500, 1), content(1500, 2)
+    here = world(profile, LinkSettings(delay=0.02), one=one, two=two)
+    faults = Faults(here)
+    async with here.connection(ConnectOptions(window=1, op_deadline=2.0)) as connection:
+        copy = Latecomer(here, Opcode.OPEN_FILE_RO, after=Opcode.READ_FILE, nth=3, first=True)
+        faults.cut_after(0)
+        with pytest.raises(RequestTimeout):
+            await read_file(connection, path(profile, "one"))
+        faults.cut_after(None)
+        await read_or_doubt(connection, path(profile, "two"), two)
+        assert copy.late is not None
+
+
+async def open_and_leave(connection: Connection, profile: str, opcode: Opcode) -> None:
+    """Make a file, or read one, and wait until its session is closed."""
+    if opcode is Opcode.CREATE_FILE:
+        await put(connection, path(profile, "new"), content(500))
+    else:
+        await read_file(connection, path(profile, "f"))
+    await trio.sleep(8)
 
 
 @pytest.mark.parametrize("opcode", [Opcode.OPEN_FILE_RO, Opcode.CREATE_FILE])
@@ -113,11 +138,7 @@ async def test_what_a_late_open_left_open_is_closed(
     async with here.connection() as connection:
         await connection.store.list_directory(path(profile, ""))
         copy = Latecomer(here, opcode, after=Opcode.TERMINATE_SESSION)
-        if opcode is Opcode.CREATE_FILE:
-            await put(connection, path(profile, "new"), content(500))
-        else:
-            await read_file(connection, path(profile, "f"))
-        await trio.sleep(8)
+        await open_and_leave(connection, profile, opcode)
         assert copy.late is not None
         assert here.vehicle.server.open_sessions == 0
 
@@ -141,11 +162,7 @@ async def test_what_an_open_that_came_twice_at_once_left_open_is_closed(
                 handle(wire, source, now)
 
         server.handle = twice  # type: ignore[method-assign]
-        if opcode is Opcode.CREATE_FILE:
-            await put(connection, path(profile, "new"), content(500))
-        else:
-            await read_file(connection, path(profile, "f"))
-        await trio.sleep(8)
+        await open_and_leave(connection, profile, opcode)
         assert server.open_sessions == 0
 
 
@@ -158,14 +175,7 @@ async def test_a_file_that_a_late_create_emptied_in_mid_upload_is_compared(
     here = world(profile, DOUBLING)
     data = content(6000)
     async with here.connection(ConnectOptions(window=1)) as connection:
-        tree = Tree(
-            connection.store,
-            CacheOptions(verify="size"),
-            clock=trio.current_time,
-            invalidate=lambda path: None,
-            writer=connection.store,
-            rng=random.Random(3),
-        )
+        tree = writable_tree(connection, verify="size")
         await tree.list(path(profile, "")[:-1])
         copy = Latecomer(here, Opcode.CREATE_FILE, after=Opcode.WRITE_FILE, nth=nth)
         file = await tree.create(path(profile, "new"), exclusive=True)

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import random
-from collections.abc import AsyncIterator, Awaitable, Callable
-from contextlib import asynccontextmanager
+from collections.abc import Awaitable, Callable
 
 import pytest
-import trio
 from trio.testing import MockClock
 
 from mavftpfs.cache.asides import is_reserved
-from mavftpfs.cache.options import CacheOptions
 from mavftpfs.cache.tree import Tree
 from mavftpfs.link.messages import Address
 from mavftpfs.protocol.payload import Opcode
@@ -22,6 +19,7 @@ from mavftpfs.sim.tree import Kind
 from tests.support.fake_store import read_file
 from tests.support.fake_writer import write_file
 from tests.support.faults import Faults
+from tests.support.mounting import mounted
 from tests.support.worlds import ROOTS, World
 
 RENAMING = sorted(name for name in PROFILES if name != "littlefs")
@@ -39,32 +37,12 @@ CHANGING = {
 }
 
 
-@pytest.fixture
-def autojump() -> MockClock:
-    return MockClock(autojump_threshold=0)
-
-
 def long_path(profile: str, length: int, last: bytes = b"x", name: int = 40) -> bytes:
     """A path of `length` bytes in many directories, with a name of at most `name` bytes."""
     path = ROOTS.get(profile, b"") + b"/d"
     while length - len(path) > name:
         path += b"/directory-%02d" % (len(path) % 100)
     return path + b"/" + b"n" * (length - len(path) - 2) + last
-
-
-@asynccontextmanager
-async def mounted(here: World, root: bytes = b"/") -> AsyncIterator[Tree]:
-    async with here.connection() as connection, trio.open_nursery() as nursery:
-        yield Tree(
-            connection.store,
-            CacheOptions(root=root),
-            clock=trio.current_time,
-            invalidate=lambda path: None,
-            nursery=nursery,
-            writer=connection.store,
-            rng=random.Random(3),
-        )
-        nursery.cancel_scope.cancel()
 
 
 def everything(here: World, directory: bytes = b"/") -> list[bytes]:
@@ -106,7 +84,7 @@ async def test_everything_works_up_to_200_bytes(profile: str, length: int, autoj
     path, other = long_path(profile, length), long_path(profile, length, b"y")
     here.tree.add_directory(split(path)[0])
     before = set(everything(here))
-    async with mounted(here) as tree:
+    async with mounted(here) as (_, tree):
         await write_file(tree, path, OLD)
         assert here.tree.data(path) == OLD
         await write_file(tree, path, NEW)
@@ -141,7 +119,7 @@ async def test_the_first_change_may_be_an_append(
     path = long_path(profile, length, name=name)
     here.tree.add(path, OLD)
     before = set(everything(here))
-    async with mounted(here) as tree:
+    async with mounted(here) as (_, tree):
         await append(tree, path, NEW)
     assert here.tree.data(path) == OLD + NEW
     assert set(everything(here)) == before
@@ -171,7 +149,7 @@ async def test_230_bytes_are_refused_before_anything_is_changed(profile: str, au
         lambda tree: tree.mkdir(new),
         lambda tree: read_file(tree, path),
     ]
-    async with mounted(here) as tree:
+    async with mounted(here) as (_, tree):
         for act in acts:
             with pytest.raises(PathTooLong):
                 await act(tree)
@@ -188,7 +166,7 @@ async def test_what_is_tried_out_may_be_interrupted_anywhere(profile: str, autoj
         here = World(profile)
         here.tree.add(path, OLD)
         faults = Faults(here)
-        async with mounted(here) as tree:
+        async with mounted(here) as (_, tree):
             await tree.list(split(path)[0])
             file = await tree.open(path, write=True)
             await file.write(file.size, b"more")

@@ -8,7 +8,6 @@ example alone, trio's order of tasks included (which hypothesis seeds), so what 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from random import Random
 from typing import Any
 
 import pytest
@@ -17,16 +16,17 @@ from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 from trio.testing import MockClock
 
-from mavftpfs.cache.options import CacheOptions
 from mavftpfs.cache.tree import Tree
+from mavftpfs.compose import subscribe
 from mavftpfs.session.connection import Connection
 from mavftpfs.shared.errors import FtpNak, RequestTimeout
 from mavftpfs.sim.filesystem import Kind
 from mavftpfs.sim.linkmodel import Duplex, LinkSettings
 from mavftpfs.sim.memorytree import MemoryTree
 from mavftpfs.sim.profiles import PROFILES, Storage
-from tests.sim.test_arming_replacement import subscribe
 from tests.support.filemodel import START, Model, calls, rewriting_calls
+from tests.support.mounting import writable_tree
+from tests.support.takingturns import taking_turns
 from tests.support.worlds import ROOTS, World
 
 LINKS = {
@@ -86,18 +86,13 @@ class SimCard:
 
 def mount(connection: Connection, nursery: trio.Nursery, profile: str, seed: int) -> Tree:
     """Make the tree of a mount."""
-    tree = Tree(
-        connection.store,
-        CacheOptions(
-            root=ROOTS.get(profile, b"/"),
-            inplace=PROFILES[profile].storage is Storage.LITTLEFS,
-            dir_timeout=seed % 3 * 10.0,
-        ),
-        clock=trio.current_time,
-        invalidate=lambda path: None,
-        nursery=nursery,
-        writer=connection.store,
-        rng=Random(seed),
+    tree = writable_tree(
+        connection,
+        nursery,
+        seed=seed,
+        root=ROOTS.get(profile, b"/"),
+        inplace=PROFILES[profile].storage is Storage.LITTLEFS,
+        dir_timeout=seed % 3 * 10.0,
     )
     subscribe(connection, tree)
     return tree
@@ -130,7 +125,7 @@ def run(profile: str, link: LinkSettings, sequence: list[tuple[Any, ...]], seed:
 
 
 @pytest.mark.parametrize("link", sorted(LINKS))
-@pytest.mark.parametrize("profile", sorted(PROFILES))
+@pytest.mark.parametrize("profile", taking_turns(sorted(PROFILES)))
 @settings(max_examples=4, phases=ONCE)
 @given(sequence=sequences, seed=st.integers(0, 99))
 def test_the_card_becomes_the_model(

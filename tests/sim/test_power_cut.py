@@ -15,13 +15,13 @@ import trio
 from trio.testing import MockClock
 
 from mavftpfs.cache.asides import is_reserved
-from mavftpfs.cache.options import CacheOptions
 from mavftpfs.cache.spool import SpoolDirectory
 from mavftpfs.cache.tree import Tree
 from mavftpfs.session.connection import Connection, ConnectOptions
 from mavftpfs.shared.errors import MavftpfsError
 from mavftpfs.sim.profiles import PROFILES
 from tests.support.faults import Faults
+from tests.support.mounting import writable_tree
 from tests.support.trees import content
 from tests.support.worlds import ROOTS, World
 
@@ -32,11 +32,6 @@ QUICK = ConnectOptions(op_deadline=8.0)
 MOST_REQUESTS = 60
 NO_RENAME = "littlefs"
 """Without rename nothing can be replaced in one step: whoever mounts it inplace has chosen that."""
-
-
-@pytest.fixture
-def autojump() -> MockClock:
-    return MockClock(autojump_threshold=0)
 
 
 async def replace(tree: Tree, path: bytes) -> None:
@@ -97,16 +92,7 @@ async def mounted(connection: Connection, place: Path, seed: int, *, inplace: bo
     """What a mount has over a connection; its end is that of the process."""
     spool = SpoolDirectory(place, Random(seed))
     async with trio.open_nursery() as nursery:
-        yield Tree(
-            connection.store,
-            CacheOptions(inplace=inplace, op_deadline=8.0),
-            clock=trio.current_time,
-            invalidate=lambda path: None,
-            nursery=nursery,
-            writer=connection.store,
-            spool=spool,
-            rng=Random(seed),
-        )
+        yield writable_tree(connection, nursery, seed=seed, spool=spool, inplace=inplace, op_deadline=8.0)
         nursery.cancel_scope.cancel()
     spool.close()
 

@@ -15,13 +15,14 @@ import pytest
 import trio
 from trio.testing import MockClock
 
-from mavftpfs.cache.options import CacheOptions
 from mavftpfs.cache.tree import OpenFile, Tree
+from mavftpfs.compose import subscribe
 from mavftpfs.session.connection import Connection
 from mavftpfs.shared.errors import LocalProtocolError, MavftpfsError, NotFound
 from mavftpfs.sim.filesystem import Kind
 from mavftpfs.sim.linkmodel import Duplex, LinkSettings
 from mavftpfs.sim.profiles import PROFILES, Storage
+from tests.support.mounting import writable_tree
 from tests.support.trees import content
 from tests.support.worlds import World
 
@@ -32,11 +33,6 @@ HOUR = 3600.0
 FOLDERS = {"px4-nuttx": b"/fs/microsd/d", "ardupilot": b"/d", "ardupilot5": b"/APM/d"}
 LOG = content("log", 40_000)
 STEP = 4096
-
-
-@pytest.fixture
-def autojump() -> MockClock:
-    return MockClock(autojump_threshold=0)
 
 
 @dataclass(eq=False)
@@ -73,24 +69,8 @@ class Hour:
 
     def mount(self, connection: Connection, nursery: trio.Nursery, seed: int) -> None:
         """Make the tree, told of what the vehicle says as a mount's is."""
-        tree = self.tree = Tree(
-            connection.store,
-            CacheOptions(inplace=not self.renames),
-            clock=trio.current_time,
-            invalidate=lambda path: None,
-            nursery=nursery,
-            writer=connection.store,
-            rng=Random(seed),
-        )
-        reactions: dict[str, Callable[[], None]] = {
-            "reboot": tree.rebooted,
-            "back": tree.link_back,
-            "lost": tree.link_lost,
-            "armed": lambda: tree.armed_changed(True),
-            "disarmed": lambda: tree.armed_changed(False),
-        }
-        connection.subscribe(lambda news: reactions.get(news, lambda: None)())
-        tree.armed_changed(connection.vehicle.armed)
+        self.tree = writable_tree(connection, nursery, seed=seed, inplace=not self.renames)
+        subscribe(connection, self.tree)
 
     def path(self, name: bytes) -> bytes:
         """Return the path of a name."""

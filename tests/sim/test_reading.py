@@ -25,11 +25,6 @@ from mavftpfs.sim.linkmodel import LinkSettings
 from tests.support.worlds import MemorySink, World, read_file
 
 
-@pytest.fixture
-def autojump() -> MockClock:
-    return MockClock(autojump_threshold=0)
-
-
 async def test_a_reboot_between_open_and_first_read_is_bridged(autojump: MockClock) -> None:
     here = World("px4", LinkSettings(delay=0.02))
     here.tree.add(b"/f", b"hello")

@@ -33,11 +33,6 @@ CHECK_PERIOD = STALL / 2
 """How often a reading looks whether it stalled."""
 
 
-@pytest.fixture
-def autojump() -> MockClock:
-    return MockClock(autojump_threshold=0)
-
-
 def path(profile: str, name: str) -> bytes:
     return ROOTS.get(profile, b"") + b"/d/" + name.encode()
 

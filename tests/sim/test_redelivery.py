@@ -12,11 +12,6 @@ from tests.sim.test_arming_replacement import Scene
 from tests.support.faults import Faults
 
 
-@pytest.fixture
-def autojump() -> MockClock:
-    return MockClock(autojump_threshold=0)
-
-
 @pytest.mark.parametrize("patience", [5.0, 100.0])
 @pytest.mark.parametrize("profile", list(PROFILES))
 async def test_requests_unanswered_beside_heartbeats(

@@ -14,16 +14,12 @@ from mavftpfs.session.connection import Connection
 from mavftpfs.shared.errors import FileChanged
 from mavftpfs.sim.linkmodel import LinkSettings
 from mavftpfs.sim.profiles import PROFILES
+from tests.support.takingturns import taking_turns
 from tests.support.worlds import ROOTS, World
 
 OLD = random.Random(1).randbytes(200_000)
 NEW = random.Random(2).randbytes(260_000)
 STEP = 16_384
-
-
-@pytest.fixture
-def autojump() -> MockClock:
-    return MockClock(autojump_threshold=0)
 
 
 def mounted(connection: Connection) -> Tree:
@@ -78,7 +74,7 @@ async def test_the_end_of_a_copy_waits_for_the_news_of_a_reboot(profile: str, au
 
 
 @pytest.mark.parametrize("size", [0, 200_000, 260_000])
-@pytest.mark.parametrize("profile", list(PROFILES))
+@pytest.mark.parametrize("profile", taking_turns(PROFILES))
 async def test_a_copy_over_a_reboot_is_of_one_version(profile: str, size: int, autojump: MockClock) -> None:
     """size: of the successor; 0 = the file stays."""
     here = World(profile, LinkSettings(rate=20_000.0, delay=0.02))

@@ -19,11 +19,6 @@ EVERY_PROFILE = sorted(PROFILES)
 BAD = LinkSettings(rate=60_000.0, delay=0.02, loss=0.1, duplicate=0.02, reorder=0.05)
 
 
-@pytest.fixture
-def autojump() -> MockClock:
-    return MockClock(autojump_threshold=0)
-
-
 def content(size: int, seed: int = 0) -> bytes:
     return random.Random(seed).randbytes(size)
 

@@ -10,6 +10,7 @@ import pytest
 from mavftpfs.sim.profiles import PROFILES
 from tests.bench.cases import Case
 from tests.bench.goodput import measure
+from tests.support.takingturns import taking_turns
 
 LONG = 60.0
 SHORT = 20.0
@@ -19,7 +20,7 @@ START = 0.06
 
 @pytest.mark.parametrize("loss", [0.0, 0.01, 0.05, 0.1])
 @pytest.mark.parametrize("rtt", [0.01, 0.1, 0.3])
-@pytest.mark.parametrize("profile", sorted(PROFILES))
+@pytest.mark.parametrize("profile", taking_turns(sorted(PROFILES)))
 def test_a_radio_of_57600_baud(profile: str, rtt: float, loss: float) -> None:
     case = Case(profile, 5760.0, rtt, loss)
     target = case.target
@@ -27,7 +28,10 @@ def test_a_radio_of_57600_baud(profile: str, rtt: float, loss: float) -> None:
     assert measure(case, LONG).share >= target
 
 
-@pytest.mark.parametrize(("rtt", "loss"), [(0.01, 0.0), (0.1, 0.05), (0.3, 0.1)])
+@pytest.mark.parametrize(
+    ("rtt", "loss"),
+    [(0.1, 0.05), *(pytest.param(*case, marks=pytest.mark.soak) for case in [(0.01, 0.0), (0.3, 0.1)])],
+)
 @pytest.mark.parametrize("profile", ["px4", "px4-nuttx", "ardupilot", "mavsdk"])
 def test_a_hundred_kilobytes_per_second(profile: str, rtt: float, loss: float) -> None:
     case = Case(profile, 100_000.0, rtt, loss)

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import random
-
 import pytest
 import trio
 from trio.testing import MockClock
 
-from mavftpfs.cache.options import CacheOptions
-from mavftpfs.cache.tree import Tree
 from mavftpfs.shared.model import split
 from mavftpfs.sim.linkmodel import LinkSettings
+from tests.support.mounting import mounted
 from tests.support.worlds import ROOTS, World, read_file
 
 RTT = 0.3
@@ -83,17 +80,7 @@ async def test_a_small_file_is_written_and_proven_in_four_round_trips(
     world = World(profile, LONG)
     world.tree.add_directory(ROOTS.get(profile, b"") + b"/d")
     path = ROOTS.get(profile, b"") + b"/d/f"
-    async with world.connection() as connection, trio.open_nursery() as nursery:
-        tree = Tree(
-            connection.store,
-            CacheOptions(),
-            clock=trio.current_time,
-            invalidate=lambda path: None,
-            nursery=nursery,
-            writer=connection.store,
-            rng=random.Random(3),
-        )
-        await tree.list(split(path)[0])
+    async with mounted(world, split(path)[0]) as (_, tree):
         began = trio.current_time()
         file = await tree.create(path, exclusive=False)
         await file.write(0, bytes(range(200)))
@@ -102,5 +89,4 @@ async def test_a_small_file_is_written_and_proven_in_four_round_trips(
         assert tree.status()["verified_by_crc"] == 1
         assert world.tree.data(path) == bytes(range(200))
         await file.release()
-        nursery.cancel_scope.cancel()
     assert took <= 4 * RTT + READY

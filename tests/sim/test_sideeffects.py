@@ -27,11 +27,6 @@ TRUNCATING = [name for name in EVERY_PROFILE if PROFILES[name].truncate_file and
 BAD = LinkSettings(rate=60_000.0, delay=0.02, loss=0.25)
 
 
-@pytest.fixture
-def autojump() -> MockClock:
-    return MockClock(autojump_threshold=0)
-
-
 def path(profile: str, name: str) -> bytes:
     return ROOTS.get(profile, b"") + b"/d/" + name.encode()
 
@@ -285,8 +280,10 @@ async def test_a_server_without_truncate_is_known_afterwards(profile: str, autoj
     here = world(profile, file=b"content")
     faults = Faults(here)
     async with here.connection() as connection:
+        began = trio.current_time()
         with pytest.raises((FtpNak, RequestTimeout)):
             await connection.store.truncate(path(profile, "file"), 3)
+        assert trio.current_time() - began < 30  # until then nobody can read the file
         assert connection.store.traits.truncate_works is False
         count = len(faults.requests)
         with pytest.raises(FtpNak):
@@ -403,3 +400,27 @@ async def test_a_refusal_on_a_link_that_doubles_nothing_costs_no_listing(autojum
         with pytest.raises(FtpNak):
             await connection.store.remove(path("mavsdk", "missing"))
     assert not {Opcode.LIST_DIRECTORY, Opcode.LIST_DIRECTORY_WITH_TIME} & set(faults.requests)
+
+
+@pytest.mark.parametrize("profile", EVERY_PROFILE)
+async def test_who_looks_misses_no_name_because_we_take_others_away(
+    profile: str, autojump: MockClock
+) -> None:
+    """A page begins where the one before ended, by number: what moved up meanwhile is on neither."""
+    names = [f"name of some length {number:02}" for number in range(60)]
+    here = world(profile, LinkSettings(delay=0.1))
+    for name in names:
+        here.tree.add(path(profile, name), b"x")
+    shown: set[str] = set()
+    async with here.connection() as connection, trio.open_nursery() as nursery:
+
+        async def sweep() -> None:
+            entries, _ = await connection.store._effects.entries(path(profile, "")[:-1])
+            shown.update(entry.name.decode() for entry in entries)
+
+        await connection.store.list_directory(path(profile, "")[:-1])
+        nursery.start_soon(sweep)
+        await trio.sleep(0.5)
+        for name in names[:3]:
+            await connection.store.remove(path(profile, name))
+    assert shown >= set(names[3:])

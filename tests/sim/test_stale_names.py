@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import random
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
@@ -10,13 +9,13 @@ import pytest
 import trio
 from trio.testing import MockClock
 
-from mavftpfs.cache.options import CacheOptions
 from mavftpfs.cache.tree import Tree
 from mavftpfs.protocol.payload import Opcode
 from mavftpfs.shared.errors import AlreadyExists, IsADirectory
 from mavftpfs.sim.linkmodel import LinkSettings
 from mavftpfs.sim.profiles import PROFILES, Storage
 from tests.support.faults import Faults
+from tests.support.mounting import mounted
 from tests.support.worlds import GOOD_LINK, ROOTS, World
 
 EVERY = sorted(PROFILES)
@@ -24,11 +23,6 @@ RENAMING = [name for name in EVERY if PROFILES[name].storage is not Storage.LITT
 TELLING_CASE = [name for name in EVERY if not PROFILES[name].case_fold]
 LONG = 10.0
 LISTS = (Opcode.LIST_DIRECTORY, Opcode.LIST_DIRECTORY_WITH_TIME)
-
-
-@pytest.fixture
-def autojump() -> MockClock:
-    return MockClock(autojump_threshold=0)
 
 
 class Scene:
@@ -42,19 +36,8 @@ class Scene:
 
     @asynccontextmanager
     async def mounted(self, **options: float) -> AsyncIterator[Tree]:
-        async with self.world.connection() as connection, trio.open_nursery() as nursery:
-            tree = Tree(
-                connection.store,
-                CacheOptions(**options),  # type: ignore[arg-type]
-                clock=trio.current_time,
-                invalidate=lambda path: None,
-                nursery=nursery,
-                writer=connection.store,
-                rng=random.Random(3),
-            )
-            await tree.list(self.root)
+        async with mounted(self.world, self.root, **options) as (_, tree):
             yield tree
-            nursery.cancel_scope.cancel()
 
     def names(self, path: bytes | None = None) -> list[bytes]:
         found = (entry.name for entry in self.world.tree.entries(path or self.root))

@@ -27,11 +27,6 @@ LATE = 0.1
 FIRST, SECOND = b"a" * 500, b"b" * 400
 
 
-@pytest.fixture
-def autojump() -> MockClock:
-    return MockClock(autojump_threshold=0)
-
-
 def hold_back_a_write(here: World, start: Callable[..., object]) -> None:
     """Have the first WriteFile come once more, LATE after the first Terminate."""
     server = here.vehicle.server

@@ -20,11 +20,6 @@ BAD = LinkSettings(rate=60_000.0, delay=0.02, loss=0.1, duplicate=0.02, reorder=
 PLAIN = LinkSettings(rate=60_000.0, delay=0.02)
 
 
-@pytest.fixture
-def autojump() -> MockClock:
-    return MockClock(autojump_threshold=0)
-
-
 def content(size: int, seed: int = 0) -> bytes:
     return random.Random(seed).randbytes(size)
 

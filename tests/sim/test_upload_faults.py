@@ -19,16 +19,11 @@ from mavftpfs.sim.linkmodel import LinkSettings
 from mavftpfs.sim.profiles import PROFILES
 from tests.support.faults import Faults
 from tests.support.sources import MemorySource
-from tests.support.worlds import GOOD_LINK, ROOTS, World, read_file
+from tests.support.worlds import GOOD_LINK, ROOTS, MemorySink, World, read_file
 
 EVERY_PROFILE = sorted(PROFILES)
 PLAIN = LinkSettings(rate=20_000.0, delay=0.02)
 QUICK = ConnectOptions(op_deadline=5.0)
-
-
-@pytest.fixture
-def autojump() -> MockClock:
-    return MockClock(autojump_threshold=0)
 
 
 def content(size: int, seed: int = 0) -> bytes:
@@ -107,6 +102,42 @@ async def test_one_lost_reply_costs_no_error_and_leaves_no_orphan(
 
 # The textbook's server gives ids that cannot be guessed, and never forgets.
 @pytest.mark.parametrize("profile", [profile for profile in EVERY_PROFILE if profile != "spec"])
+async def test_answers_to_opens_that_are_lost_one_after_the_other(profile: str, autojump: MockClock) -> None:
+    """Servers replay nothing once they have answered another request, and refuse what is open: by us."""
+    here = world(profile, PLAIN)
+    server, lost = here.vehicle.server, [Opcode.CREATE_FILE] * 3
+    outgoing = server.outgoing
+
+    def lossy(now: float) -> list[tuple[Address, bytes]]:
+        replies = outgoing(now)
+        for reply in replies:
+            if reply[1][3] == Opcode.ACK and reply[1][5] in lost:
+                lost.pop()
+                replies.remove(reply)
+                break
+        return replies
+
+    server.outgoing = lossy  # type: ignore[method-assign]
+    async with here.connection() as connection, trio.open_nursery() as nursery:
+
+        async def list_all_the_time() -> None:
+            while True:
+                await connection.store.list_directory(path(profile, "")[:-1])
+
+        nursery.start_soon(list_all_the_time)
+        source = MemorySource(content(3000))
+        upload = await start(connection, profile, source)
+        await upload.finish()
+        assert lost == []
+        assert source.all_proven
+        assert connection.scheduler.opener.quiet_periods == 0
+        nursery.cancel_scope.cancel()
+    assert here.tree.data(path(profile, "new")) == content(3000)
+    assert server.open_sessions == 0
+
+
+# The textbook's server gives ids that cannot be guessed, and never forgets.
+@pytest.mark.parametrize("profile", [profile for profile in EVERY_PROFILE if profile != "spec"])
 async def test_an_open_nobody_waits_for_any_more_is_closed(profile: str, autojump: MockClock) -> None:
     here = world(profile)
     faults = Faults(here)
@@ -171,6 +202,29 @@ async def test_a_reboot_in_mid_upload_is_bridged(profile: str, probed: bool, aut
         assert True in source.rollbacks
         assert connection.store.traits.wo_truncates is None
     assert here.tree.data(path(profile, "new")) == data
+
+
+@pytest.mark.parametrize("profile", EVERY_PROFILE)
+async def test_what_was_opened_before_the_news_of_a_restart_is_closed(
+    profile: str, autojump: MockClock
+) -> None:
+    """The upload goes on at once, in a session that is forgotten when the boot time tells of the restart."""
+    data = content(80_000)
+    here = world(profile, PLAIN)
+    async with here.connection() as connection:
+        await trio.sleep(5)
+        upload = await start(connection, profile, MemorySource(data))
+        async with trio.open_nursery() as nursery:
+            nursery.start_soon(upload.finish)
+            await trio.sleep(1.5)
+            here.vehicle.reboot(trio.current_time(), beat_after=0.9)
+            here.link.kick()
+            began = trio.current_time()
+        assert connection.vehicle.reboots == 1
+        assert connection.scheduler.opener.quiet_periods == 0
+        assert trio.current_time() - began < 9
+    assert here.tree.data(path(profile, "new")) == data
+    assert here.vehicle.server.open_sessions == 0
 
 
 @pytest.mark.parametrize("profile", EVERY_PROFILE)
@@ -390,6 +444,26 @@ async def test_what_cannot_be_interrupted_keeps_readers_waiting_until_their_dead
             assert trio.current_time() - began < 5
         assert source.rollbacks == []
     assert here.tree.data(path(profile, "new")) == data
+
+
+async def test_who_gave_up_waiting_and_asks_again_waits_as_long_again(autojump: MockClock) -> None:
+    """Not told at once that it waited too long: that was the time before."""
+    here = world("mavsdk", LinkSettings(rate=5_000.0, delay=0.05), old=b"hello")
+    async with here.connection() as connection, trio.open_nursery() as nursery:
+        await probe(connection, "mavsdk")
+        upload = await start(connection, "mavsdk", MemorySource(content(400_000)))
+        nursery.start_soon(upload.finish)
+        await trio.sleep(1.5)
+        sink = MemorySink(5)
+        reader = await connection.store.open_reader(path("mavsdk", "old"), sink, expected_size=5)
+        for _ in range(2):
+            began = trio.current_time()
+            reader.want(0, 5, demand=True)
+            with pytest.raises(RequestTimeout):
+                await sink.wait_for(0, 5)
+            assert trio.current_time() - began == pytest.approx(30.0, abs=2.0)
+        reader.close()
+        nursery.cancel_scope.cancel()
 
 
 async def test_what_can_be_interrupted_makes_room_at_once(autojump: MockClock) -> None:

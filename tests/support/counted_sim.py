@@ -13,6 +13,7 @@ import json
 import random
 import signal
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TextIO
 
@@ -41,6 +42,11 @@ class JournalServer(FtpServer):
         if len(wire) == PAYLOAD_SIZE:
             print(json.dumps(described(wire)), file=self.journal, flush=True)
         super().handle(wire, source, now)
+
+    def handle_run(self, wires: Sequence[bytes], source: Address, now: float) -> None:
+        """Write each request down, too."""
+        for wire in wires:
+            self.handle(wire, source, now)
 
 
 def described(wire: bytes) -> dict[str, object]:

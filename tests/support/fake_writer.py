@@ -78,6 +78,7 @@ class FakeWriter(FakeStore):
         before_request: called with what is asked, before anything is decided.
         looks: how often a name was looked for before a file was made.
         aliases: names that are those of others.
+        linger: seconds that it takes to give up an upload.
         spoil_uploads: how many more uploads arrive with a wrong byte. writable_armed: refuse while `armed`.
     """
 
@@ -93,6 +94,7 @@ class FakeWriter(FakeStore):
         self.capacity: int | None = None
         self.spoil_uploads = 0
         self.write_delay = 0.0
+        self.linger = 0.0
         self.uploads: list[FakeUpload] = []
         self.probes = 0
         self.looks = 0
@@ -316,8 +318,11 @@ class FakeWriter(FakeStore):
         return await super().open_reader(self.real(path), sink, expected_size=expected_size)
 
 
-def card(files: Mapping[bytes, bytes], *, kinds: Sequence[str] = ("posix",)) -> Any:
-    """Return a fixture: a vehicle with these files, of each kind in turn; it must end without a complaint."""
+def card(
+    files: Mapping[bytes, bytes], *, directories: Sequence[bytes] = (), kinds: Sequence[str] = ("posix",)
+) -> Any:
+    """Return a fixture: a vehicle with these files and empty directories, of each kind in turn; it must end
+    without a complaint."""
 
     @pytest.fixture(params=kinds if len(kinds) > 1 else None)
     async def vehicle(
@@ -326,6 +331,8 @@ def card(files: Mapping[bytes, bytes], *, kinds: Sequence[str] = ("posix",)) -> 
         store = FakeWriter(KINDS[getattr(request, "param", kinds[0])], nursery)
         for path, data in files.items():
             store.add(path, data)
+        for path in directories:
+            store.add_directory(path)
         yield store
         assert store.crimes == []
         nursery.cancel_scope.cancel()
@@ -393,6 +400,7 @@ class FakeUpload:
         self.begun = False
         self.repeats = self.shared = False
         self.overwrites: list[Overwrite] = []
+        self.again: list[tuple[int, int]] = []
         self._open = False
         self._opened_before = False
         self._sending = trio.Lock()
@@ -420,8 +428,12 @@ class FakeUpload:
     async def abort(self) -> None:
         """See Upload."""
         self.aborted = True
-        async with self._sending:  # what is under way is executed
-            self._open = False
+        if self._sending.locked():  # what is under way is executed
+            async with self._sending:
+                pass
+        self._open = False
+        if self._store.linger:
+            await trio.sleep(self._store.linger)
 
     async def _run(self) -> None:
         try:

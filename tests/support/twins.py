@@ -19,7 +19,7 @@ from tests.support.vehicles import PROJECT
 
 PRELUDE = """
 set -e
-export LC_ALL=C.UTF-8 TZ=UTC GIT_CONFIG_GLOBAL=/dev/null GIT_CONFIG_NOSYSTEM=1 HOME=/nonexistent
+export LC_ALL=C.UTF-8 TZ=UTC GIT_CONFIG_GLOBAL=/dev/null GIT_CONFIG_NOSYSTEM=1 HOME=/proc/none
 export GIT_AUTHOR_NAME=a GIT_AUTHOR_EMAIL=a@b GIT_COMMITTER_NAME=a GIT_COMMITTER_EMAIL=a@b
 export GIT_AUTHOR_DATE=2026-01-01T00:00:00Z GIT_COMMITTER_DATE=2026-01-01T00:00:00Z
 cd "$1"
@@ -27,7 +27,6 @@ shift
 """
 
 LOCAL_TIMEOUT = 60.0
-SETTLING = 20.0
 
 
 @dataclass
@@ -64,7 +63,7 @@ class Twins:
         Only an empty file may take its time: it is brought when it is released, which close() does not await.
         """
         if self._only_empty_files_differ():
-            wait_until("empty files are brought", lambda: not self._differences(), SETTLING)
+            wait_until("empty files are brought", lambda: not self._differences())
         differences = self._differences()
         assert differences == [], "\n".join(differences[:20])
         argv = (sys.executable, "-m", "tests.support.trees", "compare", self.twin, self.shown)

@@ -19,7 +19,7 @@ from tests.support.logs import assert_clean
 
 HOST = "127.0.0.1"
 PROJECT = Path(__file__).resolve().parents[2]
-STOP_TIMEOUT = 20.0
+STOP_TIMEOUT = 60.0
 
 
 def free_udp_port() -> int:

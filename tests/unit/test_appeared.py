@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-from collections.abc import AsyncIterator
 
 import pytest
 import trio
@@ -14,26 +13,15 @@ from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.shared.errnos import errno_for
 from mavftpfs.shared.errors import AlreadyExists, FtpNak, MavftpfsError, RequestTimeout
 from tests.support.fake_store import FakeFile
-from tests.support.fake_writer import KINDS, FakeWriter, make_writable, write_file
+from tests.support.fake_writer import FakeWriter, card, make_writable, write_file
 
 NEW = b"/card/new"
 THEIRS = b"the vehicle's own log"
 
 
-@pytest.fixture(params=["posix", "fat", "mavsdk"])
-async def store(
-    request: pytest.FixtureRequest, nursery: trio.Nursery, autojump_clock: object
-) -> AsyncIterator[FakeWriter]:
-    store = FakeWriter(KINDS[request.param], nursery)
-    store.add_directory(b"/card")
-    yield store
-    assert store.crimes == []
-    nursery.cancel_scope.cancel()
-
-
-@pytest.fixture
-def tree(store: FakeWriter) -> Tree:
-    return make_writable(store)
+store = card({}, directories=[b"/card"], kinds=["posix", "fat", "mavsdk"])
+posix = card({}, directories=[b"/card"])
+fat = card({}, directories=[b"/card"], kinds=["fat"])
 
 
 @pytest.mark.parametrize("content", [b"", b"ours"])
@@ -80,38 +68,28 @@ async def test_a_listing_that_was_cut_short_frees_no_name(store: FakeWriter, tre
     assert store.files[NEW].data == THEIRS
 
 
-async def test_another_spelling_that_appeared_is_not_emptied(
-    autojump_clock: object, nursery: trio.Nursery
-) -> None:
-    store = FakeWriter(KINDS["fat"], nursery)
-    store.add_directory(b"/card")
-    tree = make_writable(store)
+async def test_another_spelling_that_appeared_is_not_emptied(autojump_clock: object, fat: FakeWriter) -> None:
+    tree = make_writable(fat)
     file = await tree.create(NEW, exclusive=True)
     await file.write(0, b"ours")
-    store.add(b"/card/NEW", THEIRS)
+    fat.add(b"/card/NEW", THEIRS)
     await trio.sleep(FREE_FOR + 0.1)
     with pytest.raises(AlreadyExists):
         await file.release()
-    assert store.files[b"/card/NEW"].data == THEIRS
-    nursery.cancel_scope.cancel()
+    assert fat.files[b"/card/NEW"].data == THEIRS
 
 
-async def test_two_spellings_of_a_new_name_are_not_one_file(
-    autojump_clock: object, nursery: trio.Nursery
-) -> None:
+async def test_two_spellings_of_a_new_name_are_not_one_file(autojump_clock: object, fat: FakeWriter) -> None:
     """Both are made before either is on a card that folds case; the listing shows neither."""
-    store = FakeWriter(KINDS["fat"], nursery)
-    store.add_directory(b"/card")
-    tree = make_writable(store)
+    tree = make_writable(fat)
     files = [await tree.create(path, exclusive=True) for path in (NEW, b"/card/NEW")]
     for number, file in enumerate(files):
         await file.write(0, b"%d" % number)
     await files[0].release()
     with pytest.raises(AlreadyExists):
         await files[1].release()
-    assert store.files[NEW].data == b"0"
+    assert fat.files[NEW].data == b"0"
     assert tree.undelivered() == [b"/card/NEW"]
-    nursery.cancel_scope.cancel()
 
 
 async def test_removing_ours_does_not_remove_what_appeared(
@@ -196,22 +174,19 @@ async def test_an_empty_file_that_may_be_ours(
 
 
 async def test_a_move_into_the_mount_does_not_remove_what_appeared(
-    autojump_clock: object, nursery: trio.Nursery
+    autojump_clock: object, posix: FakeWriter
 ) -> None:
     """A failed attempt is cleaned up only if it may have made something."""
-    store = FakeWriter(KINDS["posix"], nursery)
-    store.add_directory(b"/card")
-    tree = make_writable(store)
+    tree = make_writable(posix)
     await tree.list(b"/card")
     local = await tree.create(b"/card/.new.swp", exclusive=True)
     await local.write(0, b"ours")
     await local.release()
     await trio.sleep(FREE_FOR + 0.1)
-    store.add(NEW, THEIRS)
+    posix.add(NEW, THEIRS)
     with pytest.raises(AlreadyExists):
         await tree.rename(b"/card/.new.swp", NEW)
-    assert store.files[NEW].data == THEIRS
-    nursery.cancel_scope.cancel()
+    assert posix.files[NEW].data == THEIRS
 
 
 async def test_a_copy_of_small_files_lists_once(

@@ -15,12 +15,13 @@ from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.tree import Tree
 from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.shared.errors import AlreadyExists, FtpNak, MavftpfsError, NotFound, RequestTimeout
-from mavftpfs.shared.model import split
-from tests.support.fake_writer import KINDS, FakeWriter, make_writable, write_file
+from mavftpfs.shared.model import Listing, split
+from tests.support.fake_writer import CHUNK, KINDS, FakeWriter, Kind, make_writable, write_file
 
 FILE, NEW, OTHER = b"/card/dir/file.txt", b"/card/dir/new", b"/card/dir/other"
 OLD = bytes(range(256)) * 20
 DATA = bytes(reversed(range(256))) * 30
+LARGE = DATA * 13
 DENIED = FtpNak(Opcode.REMOVE_FILE, NakCode.FAIL_ERRNO, 13)
 SILENCE = RequestTimeout("no answer")
 
@@ -147,3 +148,139 @@ async def test_a_name_that_went_is_free_for_another_file(autojump_clock: object,
     await trio.sleep(60)
     assert store.files[FILE].data == b"another"
     assert litter(store) == []
+
+
+# --- at any moment
+
+
+class Held(FakeWriter):
+    """Keeps back an answer, so that the test decides what happens in the moment when it comes.
+
+    Attributes:
+        left: how many answers more until then. refuses: it is a refusal.
+    """
+
+    def __init__(self, kind: Kind, nursery: trio.Nursery) -> None:
+        super().__init__(kind, nursery)
+        self.add(FILE, OLD)
+        self.add(OTHER, OLD)
+        self.held, self.go = trio.Event(), trio.Event()
+        self.left = 0
+        self.refuses = False
+
+    async def answer(self) -> None:
+        self.left -= 1
+        if self.left == 0:
+            self.held.set()
+            await self.go.wait()
+            if self.refuses:
+                raise DENIED
+
+    async def request(self, *what: object, in_flight: bool = False) -> bool:
+        lost = await super().request(*what, in_flight=in_flight)
+        await self.answer()
+        return lost
+
+    async def stat_size(self, path: bytes) -> int:
+        size = await super().stat_size(path)
+        await self.answer()
+        return size
+
+    async def crc32(self, path: bytes, *, size: int | None = None) -> int:
+        value = await super().crc32(path, size=size)
+        await self.answer()
+        return value
+
+    async def list_directory(self, path: bytes) -> Listing:
+        listing = await super().list_directory(path)
+        await self.answer()
+        return listing
+
+
+async def take_when_answered(
+    kind: str, path: bytes, nth: int, nursery: trio.Nursery, *, refused: bool
+) -> bool:
+    """Remove a file in the moment when who delivers it has the nth answer, and did not go on yet; return
+    False if that needs fewer."""
+    store = Held(KINDS[kind], nursery)
+    tree = make_writable(store, verify="none")
+    file = await begun(tree, store, path)
+    store.write_delay, store.linger = 0.0, 0.5
+    store.left, store.refuses = nth, refused
+    async with trio.open_nursery() as waiting:
+        waiting.start_soon(file.fsync)
+        with trio.move_on_after(60) as scope:
+            await store.held.wait()
+        if scope.cancelled_caught:
+            return False
+        store.go.set()
+        await tree.unlink(path)
+    assert bytes(await file.read(0, len(DATA))) == DATA
+    await file.release()
+    for _ in range(2):
+        await trio.sleep(60)
+        await tree.list(split(path)[0])
+    assert set(store.files) == {FILE, OTHER} - {path}, f"answer {nth}"
+    assert store.crimes == []
+    return True
+
+
+@pytest.mark.parametrize("kind", ["posix", "fat", "mavsdk"])
+@pytest.mark.parametrize("path", [NEW, FILE])
+@pytest.mark.parametrize("refused", [False, True])
+async def test_a_name_goes_in_the_moment_of_any_answer(
+    autojump_clock: object, nursery: trio.Nursery, refused: bool, path: bytes, kind: str
+) -> None:
+    """Called off, the delivery may have got what it waited for, and may just be about to go on."""
+    nth = 1
+    while await take_when_answered(kind, path, nth, nursery, refused=refused):
+        nth += 1
+    assert nth > len(DATA) // CHUNK
+    nursery.cancel_scope.cancel()
+
+
+@pytest.mark.parametrize("path", [NEW, FILE])
+async def test_a_removal_that_was_given_up_loses_nothing(
+    autojump_clock: object, store: FakeWriter, path: bytes
+) -> None:
+    """It had ended the upload: what that left on the vehicle is ours."""
+    tree = make_writable(store)
+    file = await (
+        tree.create(path, exclusive=True) if path == NEW else tree.open(path, write=True, truncate=True)
+    )
+    store.write_delay = 0.1
+    await file.write(0, LARGE)
+    await trio.sleep(1.05)
+    with trio.move_on_after(0.01) as scope:
+        await tree.unlink(path)
+    assert scope.cancelled_caught
+    store.write_delay = 0.0
+    await trio.sleep(5)
+    await file.fsync()
+    assert store.files[path].data == LARGE
+    await file.release()
+    await trio.sleep(60)
+    await tree.list(split(path)[0])
+    assert litter(store) == []
+
+
+async def test_what_waits_to_begin_an_upload_does_not_begin_it(
+    autojump_clock: object, store: FakeWriter
+) -> None:
+    """It comes before the removal at the lock, and is called off like the delivery before it."""
+    tree = make_writable(store)
+    file = await tree.open(FILE, write=True)
+    store.lost = True
+    await file.write(100, LARGE)
+    await trio.sleep(0.1)  # it could not begin
+    store.lost = False
+    store.write_delay = 5.0
+    async with trio.open_nursery() as waiting:
+        waiting.start_soon(file.fsync)
+        await trio.sleep(0.1)
+        tree.link_back()
+        await trio.sleep(0.1)
+        before = trio.current_time()
+        await tree.unlink(FILE)
+        assert trio.current_time() - before < 1.5 * store.write_delay
+    await file.release()

@@ -30,11 +30,6 @@ async def store(nursery: trio.Nursery, autojump_clock: object) -> AsyncIterator[
     nursery.cancel_scope.cancel()
 
 
-@pytest.fixture
-def tree(store: FakeWriter) -> Tree:
-    return make_writable(store)
-
-
 def parts(tree: Tree) -> tuple[Context, Cleaner]:
     assert tree._writing is not None
     return tree._writing._context, tree._writing._cleaner

@@ -90,7 +90,7 @@ def test_the_documented_numbers() -> None:
         (("status", "a", "b"), "b"),
         (("put", SOURCE), "LOCAL"),
         (("put", SOURCE, "/etc/hostname"), "PATH"),
-        (("put", SOURCE, "/nonexistent/file", "/x"), "/nonexistent/file"),
+        (("put", SOURCE, "/proc/none/file", "/x"), "/proc/none/file"),
         (("put", SOURCE, "/etc", "/x"), "-r"),
         (("put", SOURCE, "/etc/hostname", "/a/../b"), ".."),
         (("rm", SOURCE), "PATH"),
@@ -99,8 +99,8 @@ def test_the_documented_numbers() -> None:
         (("rmdir", SOURCE, "mftp://comp=0:/a"), "0"),
         (("mv", SOURCE, "/a"), "NEW"),
         (("mv", SOURCE, "mftp://comp=1:/a", "mftp://comp=2:/b"), "components"),
-        (("crc", SOURCE, "/x", "-o", "signing_key=/nonexistent/key"), "/nonexistent/key"),
-        (("ls", SOURCE, "/", "-o", "trace=/nonexistent/t"), "/nonexistent/t"),
+        (("crc", SOURCE, "/x", "-o", "signing_key=/proc/none/key"), "/proc/none/key"),
+        (("ls", SOURCE, "/", "-o", "trace=/proc/none/t"), "/proc/none/t"),
     ],
 )
 def test_usage_errors_are_one_line_and_exit_1(
@@ -160,6 +160,26 @@ def test_baud_and_relative_paths(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     assert commands.absolute_paths(options).log_file == str(tmp_path / "a" / "b.log")
 
 
+@pytest.mark.parametrize(
+    ("name", "shown"),
+    [
+        (b"/logs/a b", "'/logs/a b'"),
+        ("/Flüge".encode(), "'/Flüge'"),
+        (b"it's", "'it's'"),
+        (b"\xff\x1b[2J", "'\\xff?[2J'"),
+    ],
+)
+def test_names_of_the_vehicle_are_shown_as_they_are_read(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], name: bytes, shown: str
+) -> None:
+    def fail(args: argparse.Namespace) -> tuple[MountOptions, Any]:
+        raise errors.NotFound(f"{name!r} does not exist, nor does {name!r}")
+
+    monkeypatch.setattr(commands, "connection_of", fail)
+    code, line = complaint(capsys, SOURCE, "/mnt")
+    assert (code, line) == (1, f"mavftpfs: {shown} does not exist, nor does {shown}")
+
+
 def test_a_bug_is_one_line_without_d(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -189,7 +209,7 @@ def test_a_reader_that_leaves_is_no_error(tmp_path: Path) -> None:
         child.stdout.close()
         assert child.stderr is not None
         assert child.stderr.read() == b""
-        assert child.wait(20) == 0
+        assert child.wait(90) == 0
 
 
 # -- one-shot runs --------------------------------------------------------------------------------

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import signal
+import socket
 import subprocess
 import sys
 import textwrap
@@ -14,9 +15,10 @@ from pathlib import Path
 import pytest
 
 from mavftpfs import daemon
+from mavftpfs.shared.readable import readable
 
 
-def run(work: str, tmp_path: Path, timeout: float = 30.0) -> subprocess.CompletedProcess[str]:
+def run(work: str, tmp_path: Path, timeout: float = 90.0) -> subprocess.CompletedProcess[str]:
     """Run `in_background(work)` in a fresh process; the body of `work` may use `report`, `here` and os."""
     code = f"""
 import os, pathlib, signal, sys, time
@@ -31,7 +33,7 @@ sys.exit(in_background(work))
 
 
 def wait_for(path: Path) -> str:
-    deadline = time.monotonic() + 20
+    deadline = time.monotonic() + 90
     while not path.exists() or not path.read_text():
         assert time.monotonic() < deadline, f"{path} never came"
         time.sleep(0.01)
@@ -96,7 +98,7 @@ sys.exit(in_background(work))
             if not at_fork:
                 wait_for(tmp_path / "pid")
                 parent.send_signal(signal.SIGINT)
-            parent.communicate(timeout=20)
+            parent.communicate(timeout=90)
         finally:
             parent.kill()
     assert parent.returncode == 130
@@ -130,6 +132,20 @@ def test_without_syslog_the_log_goes_to_a_small_private_file(tmp_path: Path) -> 
     logging.getLogger("mavftpfs.mount").info("hello")
     assert "hello" in path.read_text()
     assert f"[{os.getpid()}]" in path.read_text()
+    assert path.parent.stat().st_mode & 0o777 == 0o700
+
+
+@pytest.mark.usefixtures("restored_logging")
+def test_where_there_is_syslog_the_log_goes_there(tmp_path: Path) -> None:
+    place, file = tmp_path / "devlog", tmp_path / "state" / "mavftpfs.log"
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as syslog:
+        syslog.bind(str(place))
+        syslog.settimeout(20)
+        daemon.log_in_background(file, logging.INFO, socket=str(place))
+        logging.getLogger("mavftpfs.mount").info("hello")
+        line = syslog.recv(1000).decode()
+    assert f"mavftpfs[{os.getpid()}]: INFO mavftpfs.mount: hello" in line
+    assert not file.exists()
 
 
 @pytest.mark.usefixtures("restored_logging")
@@ -143,3 +159,16 @@ def test_a_log_file_is_appended_to(tmp_path: Path) -> None:
     assert text.startswith("before\n")
     assert "after" in text
     assert "unseen" not in text
+
+
+@pytest.mark.usefixtures("restored_logging")
+def test_the_log_shows_names_as_they_are_read(tmp_path: Path) -> None:
+    path = tmp_path / "log"
+    daemon.log_to_file(str(path), logging.INFO)
+    logging.getLogger("mavftpfs").info("%r is not delivered: %s", "/Flüge".encode(), b"it's\x1b")
+    assert path.read_text().endswith("'/Flüge' is not delivered: 'it's?'\n")
+
+
+@pytest.mark.parametrize("text", ["cannot open /tmp/b'ü'", "no b'\\x' here", "b'one\ntwo'"])
+def test_what_only_looks_like_a_name_is_left_alone(text: str) -> None:
+    assert readable(text) == text

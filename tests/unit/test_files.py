@@ -678,7 +678,7 @@ async def test_what_the_kernel_may_hold_of_a_file_we_wrote_counts_as_read(
     store: FakeStore, tree: Tree, autojump_clock: MockClock
 ) -> None:
     store.add(LOG, DATA)
-    tree._files.adopt(LOG, len(DATA), [(0, DATA)])
+    tree._files.adopt(LOG, len(DATA), [(0, DATA)], proven_at=trio.current_time())
     handle = await tree.open(LOG)
     store.add(LOG, OTHER)
     tree.rebooted()

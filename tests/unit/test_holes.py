@@ -9,11 +9,11 @@ import trio
 
 from mavftpfs.cache.plan import Plan, choose
 from mavftpfs.cache.sending import Sending
-from mavftpfs.cache.tree import Tree
+from mavftpfs.cache.tree import OpenFile, Tree
 from mavftpfs.shared.errors import FileChanged, RequestTimeout
 from mavftpfs.shared.traits import WriteTraits
 from tests.support.fake_store import read_file
-from tests.support.fake_writer import KINDS, FakeWriter, make_writable
+from tests.support.fake_writer import KINDS, FakeWriter, card, make_writable
 from tests.unit.test_plan import KEEPS, RULES, draft
 
 OLD = bytes(range(256)) * 4
@@ -33,9 +33,7 @@ async def store(
     nursery.cancel_scope.cancel()
 
 
-@pytest.fixture
-def tree(store: FakeWriter) -> Tree:
-    return make_writable(store)
+posix = card({FILE: OLD})
 
 
 def shrink_at(store: FakeWriter, number: int, size: int, *, lose: bool = False) -> None:
@@ -69,39 +67,35 @@ async def test_a_file_that_shrank_gets_no_hole(store: FakeWriter, tree: Tree, si
     file.close()
 
 
+async def cut_to_500(store: FakeWriter, now: bytes) -> OpenFile:
+    """Open a file, have the vehicle change it to `now`, and cut it for the program."""
+    file = await make_writable(store).open(FILE, write=True)
+    store.files[FILE].data = now
+    await file.truncate(500)
+    return file
+
+
 @pytest.mark.parametrize("size", [0, 100, 499])
 async def test_cutting_a_file_that_shrank_since_does_not_fill_it_up(
-    size: int, nursery: trio.Nursery, autojump_clock: object
+    size: int, posix: FakeWriter, autojump_clock: object
 ) -> None:
     """TruncateFile extends what is shorter: zeros where the program was shown bytes."""
-    store = FakeWriter(KINDS["posix"], nursery)
-    store.add(FILE, OLD)
-    tree = make_writable(store)
-    file = await tree.open(FILE, write=True)
-    store.files[FILE].data = OLD[:size]
-    await file.truncate(500)
+    file = await cut_to_500(posix, OLD[:size])
     for _ in range(2):
         with pytest.raises(FileChanged):
             await file.fsync()
-    assert store.files[FILE].data == OLD[:size]
+    assert posix.files[FILE].data == OLD[:size]
     file.close()
-    nursery.cancel_scope.cancel()
 
 
 @pytest.mark.parametrize("now", [OLD + OLD, OLD[:500]])
 async def test_cutting_a_file_that_grew_or_was_cut_there_is_no_matter(
-    now: bytes, nursery: trio.Nursery, autojump_clock: object
+    now: bytes, posix: FakeWriter, autojump_clock: object
 ) -> None:
-    store = FakeWriter(KINDS["posix"], nursery)
-    store.add(FILE, OLD)
-    tree = make_writable(store)
-    file = await tree.open(FILE, write=True)
-    store.files[FILE].data = now
-    await file.truncate(500)
+    file = await cut_to_500(posix, now)
     await file.release()
-    assert store.files[FILE].data == OLD[:500]
+    assert posix.files[FILE].data == OLD[:500]
     file.close()
-    nursery.cancel_scope.cancel()
 
 
 async def test_what_is_known_here_is_sent_whole(store: FakeWriter, tree: Tree) -> None:

@@ -10,6 +10,7 @@ from mavftpfs.shared.errors import (
     AlreadyExists,
     CrossDevice,
     DirectoryNotEmpty,
+    FileBusy,
     FtpNak,
     IsADirectory,
     NoSpace,
@@ -19,7 +20,7 @@ from mavftpfs.shared.errors import (
 )
 from mavftpfs.shared.model import EntryKind
 from tests.support.fake_store import read_file
-from tests.support.fake_writer import KINDS, FakeWriter, card, make_writable, write_file
+from tests.support.fake_writer import FakeWriter, card, make_writable, write_file
 
 FILE = b"/scripts/hover.lua"
 SWAP = b"/scripts/.hover.lua.swp"
@@ -27,11 +28,7 @@ TRASH = b"/.Trash-1000"
 
 
 store = card({FILE: b"-- old"}, kinds=["fat"])
-
-
-@pytest.fixture
-def tree(store: FakeWriter) -> Tree:
-    return make_writable(store)
+posix = card({}, directories=[b"/scripts"])
 
 
 @pytest.mark.parametrize(
@@ -90,17 +87,74 @@ async def test_a_failed_move_to_the_vehicle_moves_nothing(store: FakeWriter, tre
     assert sorted(store.files) == [FILE]
 
 
+@pytest.mark.parametrize("step", ["open_upload", "require_free"])
 async def test_a_move_that_was_not_begun_shows_nothing(
-    monkeypatch: pytest.MonkeyPatch, store: FakeWriter, tree: Tree
+    monkeypatch: pytest.MonkeyPatch, store: FakeWriter, tree: Tree, step: str
 ) -> None:
-    def lose_link(path: bytes, free_at: float | None) -> None:
-        raise VehicleLost("while it was looked for")
+    def lose_link(*_: object, **__: object) -> None:
+        raise VehicleLost("before it was made")
 
     await write_file(tree, SWAP, b"new")
-    monkeypatch.setattr(store, "require_free", lose_link)
-    with pytest.raises(VehicleLost):
-        await tree.rename(SWAP, b"/scripts/new")
+    with monkeypatch.context() as patch:
+        patch.setattr(store, step, lose_link)
+        with pytest.raises(VehicleLost):
+            await tree.rename(SWAP, b"/scripts/new")
     assert sorted(name for name, _ in await tree.list(b"/scripts")) == [b".hover.lua.swp", b"hover.lua"]
+
+
+async def test_a_file_that_is_being_written_is_not_moved_to_another_place(
+    store: FakeWriter, tree: Tree
+) -> None:
+    """It would be a copy, and what the program writes after that would be lost without a word."""
+    for old, new in ((SWAP, b"/scripts/new"), (b"/scripts/it", SWAP)):
+        file = await tree.create(old, exclusive=True)
+        await file.write(0, b"begun")
+        with pytest.raises(FileBusy):
+            await tree.rename(old, new)
+        await file.write(5, b", done")
+        await file.release()
+        assert await read_file(tree, old) == b"begun, done"
+        with pytest.raises(NotFound):
+            await tree.stat(new)
+        reader = await tree.open(old)
+        await tree.rename(old, new)
+        assert await read_file(tree, new) == b"begun, done"
+        assert await reader.read(0, 5) == b"begun"
+        await reader.release()
+        await tree.unlink(new)
+
+
+async def test_a_file_that_is_written_while_it_is_moved_stays(
+    autojump_clock: object, store: FakeWriter, tree: Tree
+) -> None:
+    """The target has what was there at first; nothing that was written is lost."""
+    await write_file(tree, SWAP, b"first")
+    store.write_delay = 1.0
+
+    async def change() -> None:
+        await trio.sleep(0.5)
+        await write_file(tree, SWAP, b"second")
+
+    async with trio.open_nursery() as both:
+        both.start_soon(change)
+        with pytest.raises(FileBusy):
+            await tree.rename(SWAP, b"/scripts/it")
+    assert await read_file(tree, SWAP) == b"second"
+    assert store.files[b"/scripts/it"].data == b"first"
+
+
+async def test_a_file_that_is_written_while_it_is_read_to_be_moved_stays(
+    autojump_clock: object, store: FakeWriter, tree: Tree
+) -> None:
+    store.chunk_delay = 1.0
+
+    async with trio.open_nursery() as both:
+        both.start_soon(write_file, tree, FILE, b"second")
+        with pytest.raises(FileBusy):
+            await tree.rename(FILE, SWAP)
+    assert store.files[FILE].data == b"second"
+    with pytest.raises(NotFound):
+        await tree.stat(SWAP)
 
 
 async def test_trash(store: FakeWriter, tree: Tree) -> None:
@@ -175,23 +229,20 @@ async def test_they_are_bounded(store: FakeWriter) -> None:
 
 
 async def test_a_failed_move_costs_nothing_that_was_accepted_before(
-    autojump_clock: object, nursery: trio.Nursery
+    autojump_clock: object, posix: FakeWriter
 ) -> None:
     """The target was closed while the vehicle refused it, so its bytes are only here."""
-    store = FakeWriter(KINDS["posix"], nursery)
-    store.add_directory(b"/scripts")
-    tree = make_writable(store)
+    tree = make_writable(posix)
     await write_file(tree, SWAP, b"new")
-    store.capacity = 0
+    posix.capacity = 0
     with pytest.raises(FtpNak):
         await write_file(tree, FILE, b"accepted")
     with pytest.raises(FtpNak):
         await tree.rename(SWAP, FILE)
     assert await read_file(tree, SWAP) == b"new"
-    store.capacity = None
+    posix.capacity = None
     assert await tree.drain(60) == []
-    assert store.files[FILE].data == b"accepted"
-    nursery.cancel_scope.cancel()
+    assert posix.files[FILE].data == b"accepted"
 
 
 async def test_a_failed_move_over_another_spelling_moves_nothing(store: FakeWriter, tree: Tree) -> None:

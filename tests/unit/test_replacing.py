@@ -34,11 +34,6 @@ async def store(nursery: trio.Nursery, autojump_clock: object) -> AsyncIterator[
     nursery.cancel_scope.cancel()
 
 
-@pytest.fixture
-def tree(store: FakeWriter) -> Tree:
-    return make_writable(store)
-
-
 def renames(store: FakeWriter) -> int:
     return sum(entry[0] == "rename" for entry in store.log)
 
@@ -182,3 +177,14 @@ async def test_what_is_refused_a_name_again_and_again_does_not_fill_the_card(
     assert store.files[FILE].data in (NEW, b"x" + NEW[1:])
     assert store.crimes == []
     nursery.cancel_scope.cancel()
+
+
+async def test_a_temporary_that_was_not_made_leaves_nothing_beside_it(store: FakeWriter, tree: Tree) -> None:
+    """The request that makes it was refused: what says where it belongs goes at once all the same."""
+    store.add(LONG, OLD)
+    store.fail_at[4] = FtpNak(Opcode.CREATE_FILE, NakCode.FAIL_ERRNO, errno.ENOSPC)
+    with pytest.raises(FtpNak):
+        await write_file(tree, LONG, NEW)
+    assert store.log[3][0] == "open"
+    assert [path for path in store.files if is_reserved(split(path)[1])] == []
+    assert store.files[LONG].data == OLD

@@ -107,6 +107,69 @@ def test_no_bytes_make_a_server_raise(name: str, events: list[tuple[bytes, Addre
     assert server.outgoing(1e6) == []
 
 
+HARMLESS = [
+    Opcode.NONE,
+    Opcode.TERMINATE_SESSION,
+    Opcode.READ_FILE,
+    Opcode.WRITE_FILE,
+    Opcode.BURST_READ_FILE,
+]
+
+
+def random_rows(rng: random.Random) -> list[tuple[list[bytes], float]]:
+    """Return rows of a transfer's requests, with repetitions and strangers among them, and pauses."""
+    rows: list[tuple[list[bytes], float]] = []
+    seq = rng.choice([5, 65_500])
+    for _ in range(6):
+        reads = rng.random() < 0.5
+        usual = Opcode.READ_FILE if reads else Opcode.WRITE_FILE
+        opening = Opcode.OPEN_FILE_RO if reads else rng.choice([Opcode.OPEN_FILE_WO, Opcode.CREATE_FILE])
+        path = rng.choice([A, A, b"/none/of/these"])
+        for kind in (Opcode.RESET_SESSIONS, opening):
+            seq += 1
+            rows.append(([request(seq & 0xFFFF, kind, data=path).encode()], 0.0))
+        for _ in range(3):
+            row: list[bytes] = []
+            for _ in range(rng.randrange(10)):
+                seq += rng.choice([1, 1, 1, 1, 7])
+                kind = usual if rng.random() < 0.95 else rng.choice([*HARMLESS, usual, opening])
+                data = b"" if kind is Opcode.READ_FILE else rng.randbytes(rng.choice([0, 5, 239, 239, 239]))
+                size = rng.choice([239, 239, 239, 100, 3, 250]) if kind is Opcode.READ_FILE else len(data)
+                session, offset = int(rng.random() < 0.05), 239 * rng.randrange(6)
+                wire = request(seq & 0xFFFF, kind, session=session, offset=offset, data=data, size=size)
+                row.append(wire.encode())
+                if rng.random() < 0.1:
+                    row.append(rng.choice(row[-2:]))
+            rows.append((row, rng.choice([0.0, 0.0, 0.001, 0.5, 3.0, 12.0])))
+    return rows
+
+
+@pytest.mark.parametrize("name", sorted(PROFILES))
+@pytest.mark.parametrize("seed", range(30))
+def test_a_row_is_answered_as_one_by_one(name: str, seed: int) -> None:
+    def run(by_rows: bool) -> tuple[list[tuple[Address, bytes]], bytes, object]:
+        tree = small_tree()
+        tree.add(A, bytes(range(250)) * 4)
+        server = FtpServer(tree, PROFILES[name], rng=random.Random(3))
+        now, sent = 0.0, []
+        for row, pause in random_rows(random.Random(seed)):
+            if by_rows:
+                server.handle_run(row, CLIENT, now)
+            else:
+                for wire in row:
+                    server.handle(wire, CLIENT, now)
+            sent += server.outgoing(now)
+            now += pause
+            sent += server.outgoing(now)
+        return (
+            sent,
+            bytes(tree.data(A)),
+            (server.requests, server.replays, server.dropped_requests, server.open_paths),
+        )
+
+    assert run(by_rows=True) == run(by_rows=False)
+
+
 @pytest.mark.parametrize("name", sorted(PROFILES))
 def test_a_real_directory_can_be_served(name: str, tmp_path: Path) -> None:
     (tmp_path / "fs" / "microsd").mkdir(parents=True)

@@ -12,6 +12,7 @@ from random import Random
 
 import pytest
 
+from mavftpfs.cache import rescuing
 from mavftpfs.cache.spool import PAGE, SLOTS, Spool, SpoolContent, SpoolDirectory
 from mavftpfs.shared.errors import NoSpace, SpoolFailed
 
@@ -233,6 +234,25 @@ def test_killed_between_the_name_and_the_first_byte(tmp_path: Path) -> None:
 def test_what_the_vehicle_has_is_not_offered_until_more_is_written(tmp_path: Path) -> None:
     directory, content = spilled(tmp_path)
     content.settle()
+    content.put(6, b", and more")
+    assert rescued(directory, tmp_path) == {"card__log.bin": b"so far, and more"}
+
+
+@pytest.mark.parametrize("change", [lambda content: content.put(6, b"more"), lambda content: content.cut(2)])
+def test_what_could_not_be_written_down_is_tried_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, change: Callable[[SpoolContent], None]
+) -> None:
+    """The text still says that the vehicle has it all."""
+    directory, content = spilled(tmp_path)
+    content.settle()
+
+    def full(*_: object, **__: object) -> None:
+        raise OSError(errno.ENOSPC, "full")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(rescuing, "write_facts", full)
+        with pytest.raises(NoSpace):
+            change(content)
     content.put(6, b", and more")
     assert rescued(directory, tmp_path) == {"card__log.bin": b"so far, and more"}
 

@@ -5,18 +5,13 @@ from __future__ import annotations
 import pytest
 
 from mavftpfs.cache.tree import Tree
-from tests.support.fake_writer import FakeWriter, card, make_writable, write_file
+from tests.support.fake_writer import FakeWriter, card, write_file
 
 DATA = bytes(range(256)) * 300
 FILE = b"/card/dir/file.bin"
 
 
 store = card({FILE: DATA})
-
-
-@pytest.fixture
-def tree(store: FakeWriter) -> Tree:
-    return make_writable(store)
 
 
 async def test_times_are_kept_until_the_file_changes(store: FakeWriter, tree: Tree) -> None:
@@ -52,12 +47,25 @@ async def test_writing_ends_a_set_time(tree: Tree) -> None:
     assert (await tree.stat(FILE)).mtime != 5
 
 
-async def test_where_mtimes_are_listed_a_written_file_shows_the_time_of_day(
-    store: FakeWriter, tree: Tree
+@pytest.mark.parametrize("listed", [None, 1_500_000_000])
+@pytest.mark.parametrize("data", [b"", b"data"])
+async def test_what_is_made_and_written_shows_the_time_of_day(
+    store: FakeWriter, tree: Tree, data: bytes, listed: int | None
 ) -> None:
-    store.files[FILE].mtime = 1_500_000_000
-    await write_file(tree, FILE, b"data")
-    assert (await tree.stat(FILE)).mtime == 1_700_000_000
+    """Where the vehicle tells none, too: make(1) compares them, `git gc` removes at once what is of 1980."""
+    store.files[FILE].mtime = listed
+    file = await tree.create(b"/card/dir/new", exclusive=True)
+    assert (await tree.stat(b"/card/dir/new")).mtime == 1_700_000_000
+    if data:
+        await file.write(0, data)
+    await file.release()
+    file.close()
+    await write_file(tree, FILE, data)
+    await tree.rename(b"/card/dir/new", b"/card/other")
+    for _ in range(2):
+        for path in (FILE, b"/card/other"):
+            assert (await tree.stat(path)).mtime == 1_700_000_000
+        tree.forget_caches()
 
 
 async def test_in_a_directory_just_made_too(store: FakeWriter, tree: Tree) -> None:

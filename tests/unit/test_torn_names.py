@@ -37,11 +37,6 @@ async def store(nursery: trio.Nursery, autojump_clock: object) -> AsyncIterator[
     nursery.cancel_scope.cancel()
 
 
-@pytest.fixture
-def tree(store: FakeWriter) -> Tree:
-    return make_writable(store)
-
-
 class Trap:
     """Does something before, or instead of, one of the renames."""
 

@@ -62,6 +62,23 @@ def test_an_old_pace_is_forgotten() -> None:
     assert abs(trains.rate - RATE / 4) < 1.0
 
 
+def test_a_way_that_became_short_and_fast_is_noticed() -> None:
+    """At the old pace each round has one answer, and a round that short tells nothing by itself."""
+    trains = Trains()
+    answer(trains, 0.0, 8, 0.02)
+    assert trains.proven
+    now = 10.0
+    while now < 20.0:
+        trains.begin()
+        for _ in range(min(4, trains.room(now))):
+            trains.on_sent(1)
+            now += 0.001
+            trains.on_reply(now)
+            trains.end_round(1, 1 / 0.001)
+        now = min(trains.next_room_at(), now + 0.01)
+    assert not trains.proven or trains.rate > 500.0
+
+
 def test_no_more_goes_out_than_the_path_takes() -> None:
     trains = known()
     now, sends = 10.0, []

@@ -121,6 +121,31 @@ def test_boot_time_going_back_is_a_reboot_and_reordering_is_not() -> None:
     assert reboots == [1]
 
 
+def test_a_message_that_was_held_back_is_no_reboot() -> None:
+    reboots: list[int] = []
+    vehicle = listener()
+    vehicle.on_reboot = lambda: reboots.append(1)
+    vehicle.on_message(heartbeat(PILOT), 0.0)
+    for now, boot_ms in ((0.0, 60_000), (4.0, 64_000), (4.1, 61_000), (5.0, 65_000), (8.0, 62_000)):
+        vehicle.on_message(SystemTime(PILOT, 0, boot_ms), now)
+    assert reboots == []
+    assert vehicle.boot_heard_at == 5.0
+    vehicle.on_message(SystemTime(PILOT, 0, 69_000), 9.0)
+    assert reboots == []
+    vehicle.on_message(SystemTime(PILOT, 0, 900), 12.0)
+    assert reboots == [1]
+
+
+def test_a_clock_that_stays_behind_is_one_of_another_boot() -> None:
+    reboots: list[int] = []
+    vehicle = listener()
+    vehicle.on_reboot = lambda: reboots.append(1)
+    vehicle.on_message(heartbeat(PILOT), 0.0)
+    for now, boot_ms in ((0.0, 900_000), (1.0, 60_000), (2.0, 61_000), (3.0, 62_000)):
+        vehicle.on_message(SystemTime(PILOT, 0, boot_ms), now)
+    assert reboots == [1]
+
+
 def test_a_reboot_during_a_long_outage_is_seen_by_the_time_that_is_missing() -> None:
     reboots: list[int] = []
     vehicle = listener()

@@ -9,7 +9,9 @@ import trio
 
 from mavftpfs.cache.readback import PIECE, TRIES, agrees
 from mavftpfs.cache.tree import Tree
-from mavftpfs.shared.errors import DataUnproven, FtpNak, RequestTimeout, VerificationFailed
+from mavftpfs.protocol.crc import crc32
+from mavftpfs.shared.errors import Armed, DataUnproven, FtpNak, RequestTimeout, VerificationFailed
+from tests.support.fake_store import read_file
 from tests.support.fake_writer import KINDS, FakeWriter, make_writable, write_file
 
 OLD = bytes(range(256)) * 400
@@ -118,6 +120,15 @@ async def test_all_of_a_large_change_is_compared(store: FakeWriter) -> None:
         assert uploaded > len(data) // 239 + 1, "it was sent again"
 
 
+async def test_a_checksum_that_is_not_asked_for_in_flight_sends_nothing_again(store: FakeWriter) -> None:
+    """A second copy could not be checked either."""
+    store.fail[("crc", b"/card/new")] = [Armed("flying")]
+    tree = make_writable(store, verify="crc", write_armed=True)
+    with pytest.raises(VerificationFailed):
+        await write_file(tree, b"/card/new", b"x" * 5000)
+    assert store.count("crc") == 1
+
+
 @pytest.mark.parametrize("verify", ["auto", "size", "none"])
 async def test_nothing_is_read_back_unasked(store: FakeWriter, verify: str) -> None:
     tree = make_writable(store, verify=verify)
@@ -132,6 +143,38 @@ async def test_a_whole_content_is_summed_though_it_was_changed_in_place(store: F
     await change(tree, (0, OLD[::-1]))
     assert store.count("crc") == 1
     assert tree.status()["verified_by_crc"] == 1
+
+
+@pytest.mark.parametrize("part", [PART, (0, OLD[::-1])])
+async def test_what_is_remembered_of_a_file_goes_with_its_old_bytes(
+    store: FakeWriter, part: tuple[int, bytes]
+) -> None:
+    """Its size stays the same, and no listing tells a time."""
+    tree = make_writable(store)
+    assert await tree.crc32(FILE) == crc32(OLD)
+    assert await read_file(tree, FILE) == OLD
+    await change(tree, part)
+    new = OLD[: part[0]] + part[1] + OLD[part[0] + len(part[1]) :]
+    assert await tree.crc32(FILE) == crc32(new)
+    assert await read_file(tree, FILE) == new
+
+
+@pytest.mark.parametrize("restarts", [False, True])
+async def test_what_was_written_is_believed_from_the_moment_when_it_was_verified(
+    autojump_clock: object, store: FakeWriter, restarts: bool
+) -> None:
+    """Not from when the program closed it: somebody else may have changed it before that."""
+    tree = make_writable(store, dir_timeout=20)
+    file = await tree.open(FILE, write=True, truncate=True)
+    await file.write(0, OLD)
+    await file.fsync()
+    await trio.sleep(0 if restarts else 15)
+    store.files[FILE].data = OLD[::-1]
+    if restarts:
+        tree.rebooted()
+    await file.release()
+    await trio.sleep(0 if restarts else 15)
+    assert await read_file(tree, FILE) == OLD[::-1]
 
 
 async def test_a_cut_is_verified_by_its_size(store: FakeWriter) -> None:

@@ -25,11 +25,6 @@ FULL = FtpNak(Opcode.CREATE_FILE, NakCode.FAIL_ERRNO, 28)
 store = card({FILE: OLD})
 
 
-@pytest.fixture
-def tree(store: FakeWriter) -> Tree:
-    return make_writable(store)
-
-
 async def test_who_has_a_replaced_file_open_never_reads_its_successor(store: FakeWriter, tree: Tree) -> None:
     store.add(b"/card/dir/other", b"Z" * len(OLD))
     file = await tree.open(FILE, write=True)

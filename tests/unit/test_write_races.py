@@ -320,3 +320,41 @@ async def test_what_became_of_a_change_that_was_given_up_is_looked_up(
     there = {path for path in (*store.files, *store.directories) if path.startswith(b"/d/")}
     assert there == {"unlink": set(), "mkdir": {FILE, b"/d/made"}, "rename": {b"/d/moved"}}[change]
     assert {b"/d/" + name for name, _ in await tree.list(b"/d")} == there
+
+
+class Mute(FakeWriter):
+    """Does what it is asked, and is not heard; to look what became of it was in vain, too."""
+
+    def silence(self) -> RequestTimeout:
+        error = RequestTimeout("no answer")
+        error.checked = True
+        return error
+
+    async def remove(self, path: bytes) -> None:  # type: ignore[override]
+        await super().remove(path)
+        raise self.silence()
+
+    async def make_directory(self, path: bytes) -> None:
+        await super().make_directory(path)
+        raise self.silence()
+
+    async def rename(self, old: bytes, new: bytes, *, completes: bool = False) -> None:
+        await super().rename(old, new, completes=completes)
+        raise self.silence()
+
+
+@pytest.mark.parametrize("change", sorted(CHANGES))
+async def test_a_change_that_may_have_happened_is_looked_up_when_it_is_asked_for(
+    nursery: trio.Nursery, autojump_clock: object, change: str
+) -> None:
+    """Not before: who was to change it waited long enough."""
+    store = Mute(KINDS["posix"], nursery)
+    store.add(FILE, b"x")
+    tree = make_writable(store)
+    await tree.list(b"/d")
+    listed = store.count("list")
+    with pytest.raises(RequestTimeout):
+        await CHANGES[change](tree)
+    assert store.count("list") == listed
+    there = {path for path in (*store.files, *store.directories) if path.startswith(b"/d/")}
+    assert {b"/d/" + name for name, _ in await tree.list(b"/d")} == there

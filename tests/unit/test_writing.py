@@ -103,6 +103,21 @@ def test_an_ack_without_a_count_is_for_all() -> None:
     assert engine.traits.write_ack_counts is False
 
 
+def test_an_ack_of_another_place_is_not_believed_where_acks_tell_the_place() -> None:
+    """PX4 replays its last reply to whoever comes with that seq, whatever he asked (servers.md 2)."""
+    engine = make(limit=1)
+    _, source = writing(engine)
+    for _ in range(2):
+        (request,) = sent(engine, 0.0)
+        engine.receive(ack(request, count(239)), 0.1)
+    (request,) = sent(engine, 0.2)
+    engine.receive(ack(request, count(239))._replace(offset=239), 0.3)
+    assert not source.acked.covers(478, 479)
+    assert engine.in_flight == 1
+    engine.receive(ack(request, count(239)), 0.4)
+    assert source.acked.covers(0, 717)
+
+
 @pytest.mark.parametrize("number", [0, 240, 2**32 - 1])
 def test_acks_that_prove_nothing_end_it_after_a_few(number: int) -> None:
     engine = make()

@@ -1,0 +1,136 @@
+"""The commands that need no mount, each as a user runs it: a process of its own, over a real link."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from mavftpfs.protocol.crc import crc32
+from tests.mount.conftest import Field
+from tests.support.logs import suspects
+from tests.support.mounts import COMMAND_TIMEOUT
+from tests.support.trees import differing
+from tests.support.vehicles import PROJECT, SimVehicle
+
+
+@pytest.fixture(scope="module")
+def vehicle(module_field: Field, small_tree: Path) -> SimVehicle:
+    """A vehicle that nobody mounts; one command after the other speaks with it."""
+    return module_field.sim(small_tree)
+
+
+def mavftpfs(command: str, *words: str | Path, code: int = 0) -> tuple[str, list[str]]:
+    """Run a command that must end with `code`; return its output and the lines of its complaint."""
+    argv = [sys.executable, "-m", "mavftpfs", command, *map(str, words)]
+    done = subprocess.run(
+        argv, capture_output=True, text=True, timeout=COMMAND_TIMEOUT, cwd=PROJECT, check=False
+    )
+    assert done.returncode == code, f"{argv}: exit {done.returncode}\n{done.stdout}{done.stderr}"
+    assert suspects(done.stderr) == []
+    return done.stdout, done.stderr.splitlines()
+
+
+def test_ls(vehicle: SimVehicle, small_tree: Path) -> None:
+    out, _ = mavftpfs("ls", vehicle.source, "/", "/sizes/478.bin")
+    expected = [path.name + "/" * path.is_dir() for path in small_tree.iterdir()]
+    assert sorted(out.splitlines()) == sorted([*expected, "478.bin"])
+    out, _ = mavftpfs("ls", "-l", vehicle.source, "mftp://comp=1:/sizes")
+    sizes = {line.split()[-1]: int(line.split()[0]) for line in out.splitlines()}
+    assert sizes == {path.name: path.stat().st_size for path in (small_tree / "sizes").iterdir()}
+    out, _ = mavftpfs("ls", "--json", f"{vehicle.source}#/deep", "/")
+    kinds = {entry["name"]: entry["kind"] for entry in json.loads(out)}
+    assert kinds == {
+        path.name: "directory" if path.is_dir() else "file" for path in (small_tree / "deep").iterdir()
+    }
+
+
+def test_get_is_verified(vehicle: SimVehicle, small_tree: Path, tmp_path: Path) -> None:
+    out, _ = mavftpfs("get", vehicle.source, "/sizes/35850.bin", "/README.txt", "--to", tmp_path)
+    assert [line.partition(": ")[2] for line in out.splitlines()] == [
+        "35.0 KiB, verified by size and CRC32",
+        f"{(small_tree / 'README.txt').stat().st_size} B, verified by size and CRC32",
+    ]
+    assert (tmp_path / "35850.bin").read_bytes() == (small_tree / "sizes/35850.bin").read_bytes()
+    for folder in ("deep", "names"):
+        mavftpfs("get", "-r", vehicle.source, f"/{folder}", "--to", tmp_path)
+        assert list(differing(os.fsencode(small_tree / folder), os.fsencode(tmp_path / folder))) == []
+
+
+def test_crc(vehicle: SimVehicle, small_tree: Path) -> None:
+    out, _ = mavftpfs("crc", vehicle.source, "/sizes/478.bin")
+    assert out == f"{crc32((small_tree / 'sizes/478.bin').read_bytes()):08x}  /sizes/478.bin\n"
+
+
+@pytest.mark.parametrize(
+    ("words", "named"),
+    [
+        (("ls", "/none"), "/none"),
+        (("get", "/sizes"), "-r"),
+        (("get", "/README.txt", "--to", "/proc/none/here"), "/proc/none/here"),
+        (("rmdir", "/sizes"), "empty"),
+    ],
+)
+def test_what_cannot_be_done_is_a_line_and_exit_1(
+    vehicle: SimVehicle, words: tuple[str, ...], named: str
+) -> None:
+    out, complaint = mavftpfs(words[0], vehicle.source, *words[1:], code=1)
+    assert out == ""
+    assert len(complaint) == 1, complaint
+    assert named in complaint[0]
+
+
+def test_rmdir(field: Field) -> None:
+    card = field.local("card")
+    (card / "empty").mkdir()
+    mavftpfs("rmdir", field.sim(card).source, "/empty")
+    assert list(card.iterdir()) == []
+
+
+def test_files_that_are_made_when_opened(module_field: Field, small_tree: Path, tmp_path: Path) -> None:
+    out, _ = mavftpfs(
+        "get", module_field.sim(small_tree, "ardupilot5").source, "mftp://@SYS/uarts.txt", "--to", tmp_path
+    )
+    assert "verified by size (generated" in out
+    assert (tmp_path / "uarts.txt").stat().st_size > 0
+
+
+def test_scan_shows_who_answers(vehicle: SimVehicle) -> None:
+    out, _ = mavftpfs("scan", "--json", vehicle.source)
+    found: list[dict[str, Any]] = json.loads(out)
+    assert [(peer["system"], peer["component"], peer["what"]) for peer in found] == [(1, 1, "PX4, disarmed")]
+    assert (found[0]["ftp"], found[0]["answers"], found[0]["facts"]["ftp_flag"]) == ("answers", True, True)
+    out, _ = mavftpfs("scan", vehicle.source)
+    assert "1/1" in out
+    assert "answers" in out
+
+
+def test_scan_of_a_vehicle_without_ftp(field: Field) -> None:
+    """Whatever its capability flag says."""
+    hostile = field.hostile("mute")
+    assert hostile.process is not None
+    hostile.await_ready(hostile.process)
+    out, _ = mavftpfs("scan", "--json", hostile.source)
+    (peer,) = json.loads(out)
+    assert peer["answers"] is False
+    assert peer["ftp"].startswith("no answer")
+
+
+def test_status_can_be_watched(field: Field, small_tree: Path) -> None:
+    mount = field.mount(field.sim(small_tree).source)
+    terminal, theirs = os.openpty()
+    argv = [sys.executable, "-m", "mavftpfs", "status", "--watch", str(mount.path)]
+    with subprocess.Popen(argv, stdout=theirs, cwd=PROJECT, env={**os.environ, "TERM": "xterm"}) as watch:
+        os.close(theirs)
+        shown = b""
+        while shown.count(b"uptime") < 3:  # drawn again and again
+            shown += os.read(terminal, 65536)
+        watch.send_signal(signal.SIGINT)
+        assert watch.wait(COMMAND_TIMEOUT) == 130
+    os.close(terminal)

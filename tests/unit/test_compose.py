@@ -1,0 +1,62 @@
+"""Every option of the table reaches whoever it is meant for."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from mavftpfs.compose import cache_options, connect_options
+from mavftpfs.fuse.options import MountOptions, fuse_words
+from mavftpfs.mount import presentation
+
+OTHER: dict[str, Any] = {
+    "read_only": True,
+    "allow_other": True,
+    "auto_unmount": True,
+    "uid": 12345,
+    "gid": 54321,
+    "umask": 0o777,
+    "fmask": 0o777,
+    "dmask": 0o777,
+    "fsname": "drone",
+    "root": b"/fs",
+    "heartbeat": "none",
+    "read_mode": "burst",
+    "verify": "size",
+    "when_armed": "ok",
+    "local": (),
+    "force": True,
+    "inplace": True,
+    "kernel_words": ("noatime",),
+}
+"""Values that are no default; numbers are made below."""
+
+ELSEWHERE = {"baud", "connect_timeout", "cache_dir", "log_file", "trace", "tlog"}
+"""What is taken from the options themselves; the mount tier has a test of each but the baud rate, which is
+`test_cli.test_baud_and_relative_paths`."""
+
+
+def told(options: MountOptions) -> tuple[Any, ...]:
+    """Return what kernel, session and caches are told."""
+    return (
+        connect_options(options),
+        cache_options(options),
+        fuse_words(options, "SOURCE"),
+        presentation(options),
+    )
+
+
+@pytest.mark.parametrize("name", sorted({field.name for field in fields(MountOptions)} - ELSEWHERE))
+def test_every_option_is_passed_on(name: str, tmp_path: Path) -> None:
+    defaults = MountOptions()
+    value = OTHER.get(name, 77)
+    if name == "signing_key":
+        value = str(tmp_path / "key")
+        (tmp_path / "key").write_bytes(bytes(32))
+    elif name == "cache_size":
+        value = 77 << 20
+    assert value != getattr(defaults, name)
+    assert told(replace(defaults, **{name: value})) != told(defaults)
