@@ -206,7 +206,7 @@ def _status_parser(name: str) -> Parser:
     parser = Parser(f"mavftpfs {name}", description="Show what mounts are doing.")
     parser.add_argument("mountpoint", metavar="MOUNTPOINT", nargs="?", help="default: all of this user")
     parser.add_argument("--json", action="store_true", help="print JSON")
-    parser.add_argument("--watch", action="store_true", help="redraw each second")
+    parser.add_argument("--watch", action="store_true", help="again each second")
     return parser
 
 

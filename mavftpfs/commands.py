@@ -170,15 +170,14 @@ def status(args: argparse.Namespace) -> int:
         fetch = all_statuses
     else:
         fetch = partial(_one_status, canonical(args.mountpoint))
-    if args.json:
-        facts = fetch()
-        print(json.dumps(facts[0] if args.mountpoint is not None else facts, indent=2))
-        return ExitCode.OK
     from mavftpfs import report
 
-    if args.watch:
+    if args.json:
+        report.print_json(fetch, single=args.mountpoint is not None, watch=args.watch)
+    elif args.watch:
         report.watch_status(fetch)
-    report.print_status(fetch())
+    else:
+        report.print_status(fetch())
     return ExitCode.OK
 
 
@@ -261,11 +260,11 @@ def ls(args: argparse.Namespace) -> int:
     from mavftpfs import oneshot, report
 
     paths, component = oneshot.parse_paths(args.paths or ["/"])
-    entries = _run(args, lambda target: oneshot.list_paths(target, paths), component)
+    listings = _run(args, lambda target: oneshot.list_paths(target, paths), component)
     if args.json:
-        print(json.dumps(entries, indent=2))
+        print(json.dumps([entry for _, entries in listings for entry in entries], indent=2))
     else:
-        report.print_names(entries, detailed=args.detailed)
+        report.print_listings(listings, detailed=args.detailed)
     return ExitCode.OK
 
 

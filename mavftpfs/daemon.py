@@ -11,11 +11,12 @@ import logging.handlers
 import os
 import signal
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import NoReturn
 
-from mavftpfs.exits import ExitCode
+from mavftpfs.exits import SIGNALLED, ExitCode
 from mavftpfs.shared.readable import readable
 
 Report = Callable[[int, str], None]
@@ -24,6 +25,16 @@ Report = Callable[[int, str], None]
 SYSLOG_SOCKET = "/dev/log"
 MAX_REPORT = 64 * 1024
 _LOG_SIZE = 1 << 20
+_ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+"""What ends a parent that still waits, and the child with it."""
+
+
+class _Ended(BaseException):
+    """A signal told the waiting parent to end."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__(number)
+        self.number = number
 
 
 def in_background(work: Callable[[Report], int]) -> int:
@@ -34,8 +45,8 @@ def in_background(work: Callable[[Report], int]) -> int:
     read_end, write_end = os.pipe()
     sys.stdout.flush()
     sys.stderr.flush()
-    # Python's own hooks around a fork would swallow a KeyboardInterrupt.
-    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    # Python's own hooks around a fork would swallow an exception of a signal handler.
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, _ENDING)
     pid = os.fork()
     if pid == 0:
         signal.pthread_sigmask(signal.SIG_SETMASK, mask)
@@ -89,19 +100,35 @@ def _detach() -> None:
 def _await_report(read_end: int, pid: int, mask: set[int]) -> int:
     """Return what the child says; `mask`: the signals that were blocked before the fork."""
     try:
-        with os.fdopen(read_end, "rb") as pipe:
+        with os.fdopen(read_end, "rb") as pipe, _ending_raises():
             signal.pthread_sigmask(signal.SIG_SETMASK, mask)
             text = pipe.read(MAX_REPORT).decode("utf-8", "surrogateescape")
-    except KeyboardInterrupt:
+    except _Ended as exc:
         os.kill(pid, signal.SIGTERM)
         os.waitpid(pid, 0)
-        return ExitCode.INTERRUPTED
+        return SIGNALLED + exc.number
     code, _, message = text.partition(" ")
     if not code:
         return _explain_death(pid)
     if message.strip():
         print(f"mavftpfs: {message.strip()}", file=sys.stderr)
     return int(code)
+
+
+@contextmanager
+def _ending_raises() -> Iterator[None]:
+    """Have the signals that end us raise _Ended, but for those that our caller has us ignore (nohup)."""
+
+    def end(number: int, _frame: object) -> NoReturn:
+        raise _Ended(number)
+
+    taken = [number for number in _ENDING if signal.getsignal(number) != signal.SIG_IGN]
+    before = {number: signal.signal(number, end) for number in taken}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def _explain_death(pid: int) -> int:

@@ -36,6 +36,10 @@ class ExitCode(IntEnum):
     INTERRUPTED = 130
 
 
+SIGNALLED = 128
+"""Plus a signal's number: that signal ended it, as shells say it."""
+
+
 class MountFailed(MavftpfsError):
     """The kernel side cannot be set up or taken down."""
 

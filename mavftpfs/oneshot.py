@@ -72,18 +72,22 @@ class Target:
 Entry = dict[str, Any]
 
 
-async def list_paths(target: Target, paths: list[bytes]) -> list[Entry]:
+Listing = tuple[str | None, list[Entry]]
+"""A directory's name and what it holds; None: the path is a file, the only entry."""
+
+
+async def list_paths(target: Target, paths: list[bytes]) -> list[Listing]:
     """Return the entries of directories, and files themselves, as JSON-able facts."""
     async with target.attached() as vehicle:
-        entries: list[Entry] = []
-        for path in paths:
-            found = await vehicle.tree.stat(path)
-            if found.kind is EntryKind.FILE:
-                entries.append(_entry(path, split(path)[1], found))
-                continue
-            for name, below in sorted(await vehicle.tree.list(path), key=lambda entry: entry[0]):
-                entries.append(_entry(join(path, name), name, below))
-        return entries
+        return [await _list_path(vehicle.tree, path) for path in paths]
+
+
+async def _list_path(tree: Tree, path: bytes) -> Listing:
+    found = await tree.stat(path)
+    if found.kind is EntryKind.FILE:
+        return None, [_entry(path, split(path)[1], found)]
+    below = sorted(await tree.list(path), key=lambda entry: entry[0])
+    return _text(path), [_entry(join(path, name), name, stat) for name, stat in below]
 
 
 def _entry(path: bytes, name: bytes, found: Stat) -> Entry:

@@ -5,6 +5,7 @@ Names come from the vehicle, so nothing reaches the terminal that could be an es
 
 from __future__ import annotations
 
+import json
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -96,6 +97,19 @@ def watch_status(fetch: Callable[[], Sequence[Mapping[str, Any]]]) -> None:
             live.update(_blocks(fetch()), refresh=True)
 
 
+def print_json(fetch: Callable[[], Sequence[Mapping[str, Any]]], *, single: bool, watch: bool) -> None:
+    """Print the status as JSON: once to be read, or with `watch` one line each second until interrupted.
+
+    single: the only status is the whole answer, not a list of one.
+    """
+    while True:
+        facts = fetch()
+        print(json.dumps(facts[0] if single else facts, indent=None if watch else 2), flush=True)
+        if not watch:
+            return
+        time.sleep(WATCH_PERIOD)
+
+
 def _blocks(statuses: Sequence[Mapping[str, Any]]) -> RenderableType:
     if not statuses:
         return Text("no vehicle is mounted")
@@ -162,17 +176,40 @@ def readable_size(count: float) -> str:
     return f"{count:.1f} GiB"
 
 
+def print_listings(
+    listings: Sequence[tuple[str | None, Sequence[Mapping[str, Any]]]], *, detailed: bool
+) -> None:
+    """Print several paths as ls does: files (no directory) first, then directories with headings."""
+    files = [entry for directory, entries in listings if directory is None for entry in entries]
+    print_names(files, detailed=detailed)
+    apart = bool(files)
+    for directory, entries in listings:
+        if directory is None:
+            continue
+        if len(listings) > 1:
+            _print_line("\n" * apart + _shown(directory) + ":")
+        print_names(entries, detailed=detailed)
+        apart = True
+
+
 def print_names(entries: Sequence[Mapping[str, Any]], *, detailed: bool) -> None:
     """Print a listing: one name a line, directories with a slash; detailed with size and time."""
     for entry in entries:
-        name = entry["name"] + ("/" if entry["kind"] == "directory" else "")
-        if sys.stdout.isatty():
-            name = printable(name)
+        name = _shown(entry["name"]) + ("/" if entry["kind"] == "directory" else "")
         if detailed:
             when = datetime.fromtimestamp(entry["mtime"], UTC).strftime("%Y-%m-%d %H:%M")
             name = f"{entry['size']:>12} {when} {name}"
-        sys.stdout.buffer.write(name.encode("utf-8", "surrogateescape") + b"\n")
+        _print_line(name)
     sys.stdout.flush()
+
+
+def _shown(name: str) -> str:
+    """Return a name as the terminal may get it; in a pipe it is the name."""
+    return printable(name) if sys.stdout.isatty() else name
+
+
+def _print_line(line: str) -> None:
+    sys.stdout.buffer.write(line.encode("utf-8", "surrogateescape") + b"\n")
 
 
 def print_scan(found: Sequence[Mapping[str, Any]]) -> None:

@@ -38,12 +38,17 @@ def mavftpfs(command: str, *words: str | Path, code: int = 0) -> tuple[str, list
 
 
 def test_ls(vehicle: SimVehicle, small_tree: Path) -> None:
-    out, _ = mavftpfs("ls", vehicle.source, "/", "/sizes/478.bin")
-    expected = [path.name + "/" * path.is_dir() for path in small_tree.iterdir()]
-    assert sorted(out.splitlines()) == sorted([*expected, "478.bin"])
+    out, _ = mavftpfs("ls", vehicle.source, "/")
+    assert sorted(out.splitlines()) == sorted(
+        path.name + "/" * path.is_dir() for path in small_tree.iterdir()
+    )
+    out, _ = mavftpfs("ls", vehicle.source, "/sizes", "/sizes/478.bin", "/deep")
+    sizes = sorted(path.name for path in (small_tree / "sizes").iterdir())
+    deep = sorted(path.name + "/" * path.is_dir() for path in (small_tree / "deep").iterdir())
+    assert out.splitlines() == ["478.bin", "", "/sizes:", *sizes, "", "/deep:", *deep]
     out, _ = mavftpfs("ls", "-l", vehicle.source, "mftp://comp=1:/sizes")
-    sizes = {line.split()[-1]: int(line.split()[0]) for line in out.splitlines()}
-    assert sizes == {path.name: path.stat().st_size for path in (small_tree / "sizes").iterdir()}
+    detailed = {line.split()[-1]: int(line.split()[0]) for line in out.splitlines()}
+    assert detailed == {path.name: path.stat().st_size for path in (small_tree / "sizes").iterdir()}
     out, _ = mavftpfs("ls", "--json", f"{vehicle.source}#/deep", "/")
     kinds = {entry["name"]: entry["kind"] for entry in json.loads(out)}
     assert kinds == {
@@ -134,3 +139,14 @@ def test_status_can_be_watched(field: Field, small_tree: Path) -> None:
         watch.send_signal(signal.SIGINT)
         assert watch.wait(COMMAND_TIMEOUT) == 130
     os.close(terminal)
+
+
+def test_status_can_be_followed_by_a_program(field: Field, small_tree: Path) -> None:
+    mount = field.mount(field.sim(small_tree).source)
+    argv = [sys.executable, "-m", "mavftpfs", "status", "--json", "--watch", str(mount.path)]
+    with subprocess.Popen(argv, stdout=subprocess.PIPE, cwd=PROJECT) as watch:
+        assert watch.stdout is not None
+        first, second = (json.loads(watch.stdout.readline()) for _ in range(2))
+        assert second["uptime"] > first["uptime"] >= 0
+        watch.send_signal(signal.SIGINT)
+        assert watch.wait(COMMAND_TIMEOUT) == 130

@@ -79,11 +79,13 @@ def test_a_child_that_dies_is_an_error_with_a_reason(tmp_path: Path, work: str, 
     assert words in done.stderr.splitlines()[-1]
 
 
-AT_FORK = "os.register_at_fork(after_in_parent=lambda: os.kill(os.getpid(), signal.SIGINT))"
+AT_FORK = "os.register_at_fork(after_in_parent=lambda: os.kill(os.getpid(), signal.{}))"
 
 
-@pytest.mark.parametrize("at_fork", ["", AT_FORK], ids=["later", "at once"])
-def test_interrupting_the_parent_ends_the_child(tmp_path: Path, at_fork: str) -> None:
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize("form", ["", AT_FORK], ids=["later", "at once"])
+def test_interrupting_the_parent_ends_the_child(tmp_path: Path, form: str, number: signal.Signals) -> None:
+    at_fork = form.format(number.name)
     code = f"""
 import os, pathlib, signal, sys, time
 from mavftpfs.daemon import in_background
@@ -97,11 +99,11 @@ sys.exit(in_background(work))
         try:
             if not at_fork:
                 wait_for(tmp_path / "pid")
-                parent.send_signal(signal.SIGINT)
+                parent.send_signal(number)
             parent.communicate(timeout=90)
         finally:
             parent.kill()
-    assert parent.returncode == 130
+    assert parent.returncode == 128 + number
     if (tmp_path / "pid").exists():
         with pytest.raises(ProcessLookupError):
             os.kill(int((tmp_path / "pid").read_text()), 0)
