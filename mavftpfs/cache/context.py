@@ -78,6 +78,9 @@ class Context:
             node = self.hidden[path]
             self.live.discard(path)
             self.hide(node, new + path[len(old) :])
+        for left in (self.garbage, self.torn):
+            for path in [p for p in left if p.startswith(old + b"/")]:
+                left[_moved(path, old, new)] = _moved(left.pop(path), old, new)
         self.on_changed(old)
         self.on_changed(new)
 
@@ -85,3 +88,8 @@ class Context:
         """Raise FileBusy if somebody on the vehicle seems to write the file."""
         if not self.options.force and self.dentries.is_growing(path, self.clock()):
             raise FileBusy(f"{path!r} grows: somebody on the vehicle is writing it")
+
+
+def _moved(path: bytes, old: bytes, new: bytes) -> bytes:
+    """Return what a path is called after a directory got another name."""
+    return new + path[len(old) :] if path.startswith(old + b"/") else path

@@ -296,6 +296,25 @@ async def test_removing_a_torn_file_removes_it(store: FakeWriter, tree: Tree, lo
     assert not [name for name in store.files if b"recovered" in name]
 
 
+async def test_a_torn_name_in_a_directory_that_is_renamed(
+    autojump_clock: object, store: FakeWriter, tree: Tree
+) -> None:
+    await tree.list(b"/card/dir")
+    Trap(store, tree, 2, "lost")
+    with pytest.raises(VehicleLost):
+        await tree.rename(OTHER, FILE)
+    store.lost = False
+    tree._directories.lost = False
+    await tree.rename(b"/card/dir", b"/card/new")
+    tree.link_back()
+    await trio.sleep(100)
+    assert store.files[b"/card/new/file.txt"].data == OLD
+    assert litter(store) == []
+    listings = store.count("list")
+    await trio.sleep(1000)
+    assert store.count("list") == listings
+
+
 async def test_a_draft_written_on_after_the_gap_does_not_keep_it_open(
     autojump_clock: object, store: FakeWriter, tree: Tree
 ) -> None:
