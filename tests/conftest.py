@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import signal
 import tempfile
 from collections.abc import Iterator
 from itertools import zip_longest
@@ -37,6 +38,14 @@ def temporaries(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
         patch.setenv("TMPDIR", str(path))
         patch.setattr(tempfile, "tempdir", None)
         yield path
+
+
+@pytest.fixture(scope="session", autouse=True)
+def signals_that_end() -> None:
+    """Have Ctrl-C and a hang-up end programs again where whoever runs the tests ignores them (`&`, nohup)."""
+    for number, handler in ((signal.SIGINT, signal.default_int_handler), (signal.SIGHUP, signal.SIG_DFL)):
+        if signal.getsignal(number) == signal.SIG_IGN:
+            signal.signal(number, handler)
 
 
 @pytest.fixture(autouse=True)

@@ -13,7 +13,7 @@ from tests.mount.conftest import Field
 from tests.support.hostile import BROKEN, FINE, GOOD, GOOD_NAMES, NAKED
 from tests.support.mounts import Mount, mounted_at
 
-QUICK = ("op_deadline=3", "dir_timeout=60")
+QUICK = ("op_deadline=6", "dir_timeout=600")
 REFUSALS = {
     "open": {3: "ENAMETOOLONG", 4: "EBUSY", 5: "EBUSY", 7: "ENOTSUP", 8: "EBUSY", 9: "EACCES", 10: "ENOENT"},
     "read": {5: "EBUSY", 7: "ENOTSUP", 9: "EACCES"},
@@ -59,7 +59,7 @@ def test_endless_listings_end(liar: Mount, directory: str) -> None:
 
 @pytest.mark.parametrize("name", BROKEN)
 def test_a_file_that_cannot_be_completed_is_an_error(liar: Mount, name: str) -> None:
-    error = liar.errno_of("open(sys.argv[1], 'rb').read()", liar.path / "broken" / name, timeout=60)
+    error = liar.errno_of("open(sys.argv[1], 'rb').read()", liar.path / "broken" / name, timeout=120)
     assert error in {"EIO", "ESTALE", "ETIMEDOUT"}
     assert liar.read_bytes(liar.path / "fine.bin") == FINE
 
@@ -67,7 +67,7 @@ def test_a_file_that_cannot_be_completed_is_an_error(liar: Mount, name: str) -> 
 @pytest.mark.parametrize("step", ["open", "read"])
 @pytest.mark.parametrize("code", NAKED)
 def test_every_refusal_has_an_errno(liar: Mount, step: str, code: int) -> None:
-    error = liar.errno_of("open(sys.argv[1], 'rb').read()", liar.path / "nak" / f"{step}{code}", timeout=60)
+    error = liar.errno_of("open(sys.argv[1], 'rb').read()", liar.path / "nak" / f"{step}{code}", timeout=120)
     assert error == REFUSALS[step].get(code, "EIO")
 
 
@@ -89,7 +89,7 @@ def test_a_vehicle_that_never_answers_ftp_is_exit_2(field: Field) -> None:
     vehicle.await_ready(vehicle.process)  # its first heartbeat must come in time
     mount = field.prepare(vehicle.source)
     result = mount.run(
-        sys.executable, "-m", "mavftpfs", vehicle.source, mount.path, "-o", "connect_timeout=3", code=2
+        sys.executable, "-m", "mavftpfs", vehicle.source, mount.path, "-o", "connect_timeout=8", code=2
     )
     assert len(result.stderr.splitlines()) == 1, result.stderr
     assert "FTP" in result.stderr

@@ -12,7 +12,7 @@ import pytest
 from tests.mount.conftest import Field
 from tests.support.mounts import Mount, wait_until
 from tests.support.trees import content
-from tests.support.vehicles import HOST, free_udp_port
+from tests.support.vehicles import HOST, SimVehicle, free_udp_port
 
 BAD = (
     "--loss",
@@ -39,6 +39,12 @@ def free_port_link(kind: str) -> str:
 def size_of(path: Path) -> int:
     """Return a local file's size, 0 if it is not there yet."""
     return path.stat().st_size if path.exists() else 0
+
+
+def says(vehicle: SimVehicle, words: str) -> bool:
+    """Return whether a vehicle said so: of two equal signals at once it would get one."""
+    assert vehicle.process is not None
+    return words in vehicle.process.text()
 
 
 def compare(mount: Mount, expected: Path) -> None:
@@ -81,8 +87,9 @@ def test_a_cut_or_a_reboot_in_mid_copy(field: Field, tmp_path: Path, kind: str, 
     with mount.started("cp", mount.path / "log.bin", tmp_path / "copy") as copy:
         wait_until("it is under way", lambda: size_of(tmp_path / "copy") > 0)
         vehicle.send_signal(signal.SIGUSR2 if what == "cut" else signal.SIGHUP)
-        time.sleep(3.0)
+        wait_until("it is done", lambda: says(vehicle, "link cut" if what == "cut" else "rebooted"))
         if what == "cut":
+            time.sleep(3.0)
             vehicle.send_signal(signal.SIGUSR2)
         _, errors = copy.communicate(timeout=120)
     assert (copy.returncode, errors) == (0, "")

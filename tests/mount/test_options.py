@@ -121,7 +121,7 @@ def test_trace_holds_every_payload_decoded(field: Field, small_tree: Path, tmp_p
     text = trace.read_text()
     records = [json.loads(line) for line in text.splitlines()]
     opened = [record for record in records if record["opcode"] == "OPEN_FILE_RO"]
-    assert [bytes.fromhex(record["data"]) for record in opened] == [b"/sizes/478.bin"]
+    assert {bytes.fromhex(record["data"]) for record in opened} == {b"/sizes/478.bin"}
     answered = {record.get("req_opcode") for record in records if record["dir"] == "reply"}
     assert {"LIST_DIRECTORY", "OPEN_FILE_RO", "TERMINATE_SESSION"} <= answered
     assert answered & {"READ_FILE", "BURST_READ_FILE"}
@@ -164,7 +164,8 @@ def test_status_tells_about_vehicle_and_link(field: Field, small_tree: Path) -> 
     assert vehicle.source in text
     assert "retransmissions" in text
     speed = status["connection"]["speed"]
-    assert (speed["reading_by"], speed["chunk"], speed["loss"]) == ("window", 239, 0.0)
+    assert (speed["reading_by"], speed["chunk"]) == ("window", 239)
+    assert speed["loss"] == 0.0 or status["connection"]["retransmissions"], "an answer may have come late"
     assert speed["window"] >= 1
     shown = mavftpfs("status", mount.path)
     assert vehicle.source in shown

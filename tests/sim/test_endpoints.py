@@ -30,6 +30,7 @@ from mavftpfs.sim.memory import MemoryLink
 from mavftpfs.sim.profiles import PROFILES
 from mavftpfs.sim.tree import MemoryTree
 from mavftpfs.sim.vehicle import SimVehicle
+from tests.support.vehicles import free_udp_port
 
 US = Address(254, 191)
 DRONE = Address(1, 1)
@@ -174,9 +175,9 @@ async def test_a_model_in_between_loses_damages_and_doubles() -> None:
     async with serving("udpin:127.0.0.1:0", model) as (_, client):
         for _ in range(60):
             client.send(request(1, Opcode.NONE))
-        for _ in range(3):
-            await client.beat()
         counters = model.counters(Direction.TO_VEHICLE)
+        while counters.pushed < 61 or counters.delivered <= 30:
+            await client.beat()
         assert counters.pushed == 61
         assert 0 < counters.lost < 30
         assert counters.delivered > 30
@@ -187,8 +188,8 @@ async def test_frames_of_one_datagram_meet_the_model_one_by_one() -> None:
     async with serving("udpin:127.0.0.1:0", model) as (_, client):
         frames = [client.framer.encode_ftp(DRONE, request(n, Opcode.NONE).encode()) for n in range(40)]
         client.link.send_nowait(frames)
-        await client.beat()
-        await client.beat()
+        while model.counters(Direction.TO_VEHICLE).pushed < 41:
+            await client.beat()
         assert model.counters(Direction.TO_VEHICLE).pushed == 41
         assert 5 < model.counters(Direction.TO_VEHICLE).lost < 36
 
@@ -217,8 +218,9 @@ async def test_arming_is_heard_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
         assert not (await client.beat()).armed
 
 
-async def test_a_slow_stream_paces_the_burst() -> None:
+async def test_a_slow_stream_paces_the_burst(monkeypatch: pytest.MonkeyPatch) -> None:
     """PX4 sends what its transmit buffer takes; a pty holds 4 KiB."""
+    monkeypatch.setattr("mavftpfs.sim.vehicle.HEARTBEAT_PERIOD", 1000.0)
     async with serving("pty") as (endpoint, client):
         await client.ask(Opcode.OPEN_FILE_RO, b"/log.bin")
         client.send(request(5000, Opcode.BURST_READ_FILE, size=MAX_DATA))
@@ -318,7 +320,7 @@ def running(*words: str) -> Iterator[subprocess.Popen[str]]:
         yield child
     finally:
         child.kill()
-        child.communicate(timeout=20)
+        child.communicate(timeout=60)
 
 
 def line(stream: IO[str] | None) -> str:
@@ -327,8 +329,9 @@ def line(stream: IO[str] | None) -> str:
 
 
 def test_says_where_to_connect_reacts_to_signals_and_ends_cleanly(tmp_path: Path) -> None:
-    with running(str(tmp_path), "--link", "udpout:127.0.0.1:14999") as child:
-        assert line(child.stdout) == "mavftpfs udpin:127.0.0.1:14999 MOUNTPOINT"
+    port = free_udp_port()
+    with running(str(tmp_path), "--link", f"udpout:127.0.0.1:{port}") as child:
+        assert line(child.stdout) == f"mavftpfs udpin:127.0.0.1:{port} MOUNTPOINT"
         for number, says in (
             (signal.SIGUSR1, "armed"),
             (signal.SIGUSR1, "disarmed"),
@@ -340,7 +343,7 @@ def test_says_where_to_connect_reacts_to_signals_and_ends_cleanly(tmp_path: Path
             assert line(child.stdout) == says
         child.send_signal(signal.SIGTERM)
         assert line(child.stdout) == "ended after 0 FTP requests, open sessions: 0"
-        assert child.wait(20) == 0
+        assert child.wait(60) == 0
 
 
 @pytest.mark.parametrize("extra", [[], ["--rate", "100000", "--delay", "0.001"]], ids=["direct", "modelled"])
@@ -356,14 +359,14 @@ async def test_a_directory_is_served_by_the_process(tmp_path: Path, link: str, e
             await client.beat()
             assert await client.read_file(b"/log.bin") == CONTENT[:5000]
         child.send_signal(signal.SIGINT)
-        assert await trio.to_thread.run_sync(child.wait, 20) == 0
+        assert await trio.to_thread.run_sync(child.wait, 60) == 0
 
 
 async def test_the_process_joins_the_pieces_of_a_stream(tmp_path: Path) -> None:
     """Cut where a datagram's reader would think that a new frame begins."""
     frame = Framer(US, stream=True).encode_ftp(DRONE, request(7, Opcode.NONE, data=b"\xfd" * 20).encode())
     middle = frame.index(b"\xfd", 1)
-    with running(str(tmp_path), "--link", "tcpin:127.0.0.1:0") as child, trio.fail_after(20):
+    with running(str(tmp_path), "--link", "tcpin:127.0.0.1:0") as child, trio.fail_after(60):
         words = (await trio.to_thread.run_sync(line, child.stdout)).split()
         async with open_link(parse_source(words[1])) as client_link:
             client = Client(client_link)

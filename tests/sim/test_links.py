@@ -26,6 +26,7 @@ from mavftpfs.link.tcp import open_tcp
 from mavftpfs.link.udp import MAX_CHUNKS, UdpLink
 from mavftpfs.link.uri import parse_source
 from mavftpfs.shared.errors import LinkClosed
+from tests.support.vehicles import free_udp_port
 
 US = Address(254, 191)
 DRONE = Address(1, 1)
@@ -35,8 +36,8 @@ HOST = "127.0.0.1"
 
 @asynccontextmanager
 async def opened(source: str) -> AsyncIterator[Link]:
-    """Open a link; the test ends within seconds whatever happens."""
-    with trio.fail_after(20):
+    """Open a link; the test ends in time whatever happens."""
+    with trio.fail_after(120):
         async with open_link(parse_source(source)) as link:
             yield link
 
@@ -52,7 +53,7 @@ async def udpin() -> AsyncIterator[tuple[UdpLink, int]]:
 def udp_socket(host: str = HOST, port: int = 0) -> Iterator[socket.socket]:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
         sock.bind((host, port))
-        sock.settimeout(5)
+        sock.settimeout(60)
         yield sock
 
 
@@ -69,7 +70,7 @@ async def pymavlink(device: str, **options: Any) -> AsyncIterator[Any]:
 async def hear(connection: Any, kind: str) -> Any:
     """Return the next message of a kind that pymavlink receives."""
     message = await trio.to_thread.run_sync(
-        lambda: connection.recv_match(type=kind, blocking=True, timeout=5)
+        lambda: connection.recv_match(type=kind, blocking=True, timeout=60)
     )
     assert message is not None
     return message
@@ -77,7 +78,7 @@ async def hear(connection: Any, kind: str) -> Any:
 
 async def read(link: Link, framer: Framer, wanted: Callable[[Message], bool]) -> Message:
     """Receive until a message is the wanted one."""
-    with trio.fail_after(10):
+    with trio.fail_after(60):
         while True:
             for chunk in await link.receive():
                 for message in framer.feed(chunk):
@@ -91,7 +92,7 @@ def is_ftp(message: Message) -> bool:
 
 async def read_bytes(link: Link, size: int) -> bytes:
     data = b""
-    with trio.fail_after(10):
+    with trio.fail_after(60):
         while len(data) < size:
             data += b"".join(await link.receive())
     return data
@@ -262,9 +263,8 @@ async def test_cancelling_receive_loses_nothing() -> None:
                     if n % 3 == 2:  # noticed at the next checkpoint
                         scope.deadline = float("-inf")
                     got += await link.receive()
-            with trio.move_on_after(0.2):
-                while True:
-                    got += await link.receive()
+            while len(got) < 200:
+                got += await link.receive()
         assert [int.from_bytes(c, "big") for c in got] == list(range(200))
 
 
@@ -305,8 +305,7 @@ async def test_sends_before_anybody_was_heard_are_dropped() -> None:
 
 
 async def test_udpout_keeps_one_port_and_does_not_mind_a_closed_one() -> None:
-    with udp_socket() as vehicle:
-        port = vehicle.getsockname()[1]
+    port = free_udp_port()
     async with opened(f"udpout:{HOST}:{port}") as link:
         for _ in range(3):  # each is answered by ICMP "port unreachable"
             link.send_nowait([b"anybody?"])
@@ -414,11 +413,11 @@ async def test_an_error_of_the_body_comes_out_as_itself(source: str) -> None:
 
 
 async def accept(listener: socket.socket) -> socket.socket:
-    with trio.fail_after(10):
+    with trio.fail_after(60):
         await trio.lowlevel.wait_readable(listener)
         peer, _ = listener.accept()
         peer.setblocking(True)
-        peer.settimeout(5)
+        peer.settimeout(60)
         return peer
 
 
@@ -426,6 +425,21 @@ def listening(port: int = 0) -> socket.socket:
     listener = socket.create_server((HOST, port))
     listener.setblocking(False)
     return listener
+
+
+async def lose(link: Link) -> None:
+    """Receive until the link has noticed that the other end is gone."""
+    assert isinstance(link, StreamLink)
+    async with trio.open_nursery() as nursery:
+
+        async def receive() -> None:
+            await link.receive()
+            pytest.fail("nothing was sent")
+
+        nursery.start_soon(receive)
+        while link.connected:  # noqa: ASYNC110 (a link tells nobody)
+            await trio.sleep(0.01)
+        nursery.cancel_scope.cancel()
 
 
 async def test_tcp_connects_again_and_says_so() -> None:
@@ -436,9 +450,7 @@ async def test_tcp_connects_again_and_says_so() -> None:
                 peer.sendall(b"one")
                 assert await link.receive() == [b"one"]
             listener.close()
-            with trio.move_on_after(0.1):
-                await link.receive()
-                pytest.fail("nothing was sent")
+            await lose(link)
             link.send_nowait([b"lost"])
             assert link.stats.dropped_sends == 1
             with listening(port) as again:
@@ -460,9 +472,8 @@ async def test_tcp_connects_again_and_says_so() -> None:
 
 
 async def test_a_patient_tcp_link_waits_for_its_first_peer() -> None:
-    with listening() as listener:
-        port = listener.getsockname()[1]
-    with trio.fail_after(10):
+    port = free_udp_port()
+    with trio.fail_after(60):
         async with open_tcp(parse_source(f"tcp:{HOST}:{port}"), patient=True) as link:
             await trio.sleep(0.1)
             with listening(port) as listener, await accept(listener) as peer:
@@ -480,7 +491,7 @@ async def test_tcpin_serves_one_peer_and_then_the_next() -> None:
         first.sendall(b"first")
         assert await link.receive() == [b"first"]
         with socket.create_connection(address) as second:
-            second.settimeout(5)
+            second.settimeout(60)
             second.sendall(b"second")
             with trio.move_on_after(0.1):
                 await link.receive()
@@ -496,12 +507,13 @@ async def test_tcpin_leaves_a_silent_peer_for_a_new_one(monkeypatch: pytest.Monk
     monkeypatch.setattr("mavftpfs.link.tcp.PEER_PATIENCE", 0.2)
     async with opened(f"tcpin:{HOST}:0") as link:
         address = (HOST, parse_source(link.description).port)
-        with socket.create_connection(address) as dead, socket.create_connection(address) as fresh:
+        with socket.create_connection(address) as dead:
             dead.sendall(b"x")
             assert await link.receive() == [b"x"]
-            fresh.sendall(b"y")
-            assert await link.receive() == []
-            assert await link.receive() == [b"y"]
+            with socket.create_connection(address) as fresh:
+                fresh.sendall(b"y")
+                assert await link.receive() == []
+                assert await link.receive() == [b"y"]
 
 
 async def test_a_slow_peer_costs_whole_frames_never_parts() -> None:
@@ -521,7 +533,7 @@ async def test_a_slow_peer_costs_whole_frames_never_parts() -> None:
             peer.setblocking(False)
             other = Framer(DRONE, stream=True)
             received = 0
-            with trio.fail_after(10):
+            with trio.fail_after(60):
                 while received < built - link.stats.dropped_sends:
                     await trio.lowlevel.wait_readable(peer)
                     received += len(other.feed(peer.recv(65536)))

@@ -15,7 +15,9 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
+from mavftpfs.control import ControlError, ask, find_socket, own_directories
 from tests.support.logs import assert_clean
 from tests.support.vehicles import Process
 
@@ -90,10 +92,26 @@ class Mount:
         return [*base, *options, *self.extra]
 
     def start(self) -> None:
-        """Start it and wait until it is mounted; a daemon that ends instead fails the test."""
+        """Start it and wait until it serves; a daemon that ends instead fails the test."""
         process = self.process = Process("mount", self.argv(), self.folder)
-        wait_until(f"{self.argv()} mounted", lambda: mounted_at(self.path) or not process.running)
+        wait_until(f"{self.argv()} mounted", lambda: self.serves() or not process.running)
         assert process.running, f"the mount ended with {process.popen.returncode}:\n{process.text()}"
+
+    def serves(self) -> bool:
+        """Return whether it is mounted and can be asked for its status, which is so a moment later."""
+        if not mounted_at(self.path):
+            return False
+        try:
+            self.status()
+        except ControlError:
+            return False
+        return True
+
+    def status(self) -> dict[str, dict[str, Any]]:
+        """Return what it says of itself."""
+        socket = find_socket(os.path.realpath(self.path), own_directories())
+        facts: dict[str, dict[str, Any]] = ask(socket, {"command": "status"}, timeout=20)["status"]
+        return facts
 
     def alive_or_ended(self) -> Process:
         """Return the process."""

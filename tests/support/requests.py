@@ -16,7 +16,6 @@ than FREE_FOR old lacks it. `aged` makes the first look certain; how many follow
 from __future__ import annotations
 
 import json
-import os
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -25,7 +24,6 @@ from pathlib import Path
 from typing import Any
 
 from mavftpfs.cache.remote import FREE_FOR
-from mavftpfs.control import ask, find_socket, own_directories
 from tests.support.mounts import Mount
 from tests.support.twins import PRELUDE
 from tests.support.vehicles import SimVehicle
@@ -214,9 +212,7 @@ class Counting:
 
     def status(self) -> dict[str, dict[str, Any]]:
         """Return what the mount says of itself."""
-        socket = find_socket(os.path.realpath(self.mount.path), own_directories())
-        facts: dict[str, dict[str, Any]] = ask(socket, {"command": "status"}, timeout=20)["status"]
-        return facts
+        return self.mount.status()
 
     def _bash(self, script: str, where: Path, scratch: Path, timeout: float) -> None:
         self.mount.run("bash", "-c", PRELUDE + script, "bash", where, scratch, timeout=timeout)

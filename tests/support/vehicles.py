@@ -4,7 +4,9 @@ the bad link of `proxy`. Each speaks UDP to a port on 127.0.0.1 where the mount 
 
 from __future__ import annotations
 
+import itertools
 import json
+import os
 import re
 import signal
 import socket
@@ -22,12 +24,32 @@ PROJECT = Path(__file__).resolve().parents[2]
 STOP_TIMEOUT = 60.0
 
 
+PORTS_EACH = 1400
+_turns = itertools.count(os.getpid())
+
+
 def free_udp_port() -> int:
-    """Return a UDP port of the loopback that nobody uses at the moment."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
-        sock.bind((HOST, 0))
-        port: int = sock.getsockname()[1]
-        return port
+    """Return a port of the loopback that nobody uses at the moment, for UDP or TCP.
+
+    It is none of those that the kernel gives to whoever asks for any, nor that another worker of pytest
+    takes: between this and its use, which is in another process, nobody is given it.
+    """
+    worker = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw"))
+    first = 10_000 + worker % 16 * PORTS_EACH
+    for turn in itertools.islice(_turns, PORTS_EACH):
+        if _is_free(first + turn % PORTS_EACH):
+            return first + turn % PORTS_EACH
+    raise AssertionError("no port is free")
+
+
+def _is_free(port: int) -> bool:
+    for kind in (socket.SOCK_DGRAM, socket.SOCK_STREAM):
+        with socket.socket(socket.AF_INET, kind) as sock:
+            try:
+                sock.bind((HOST, port))
+            except OSError:
+                return False
+    return True
 
 
 class Process:
