@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import random
 import signal
 import sys
@@ -59,11 +60,18 @@ def run(args: argparse.Namespace) -> int:
         tree = DirectoryTree(args.directory)
     except OSError as exc:
         raise UsageError(f"cannot serve {args.directory}: {exc.strerror}") from exc
+    profile = PROFILES[args.profile]
+    storage = os.fsdecode(profile.writable_root.strip(b"/"))
+    if not os.path.isdir(os.path.join(args.directory, storage)):
+        hint = (
+            f"nothing can be written: this server takes files below /{storage} only, and DIR has no {storage}"
+        )
+        print(f"mavftpfs: {hint}", file=sys.stderr)
     settings = link_settings(args)
     model = None if settings == LinkSettings(queue=settings.queue) else LinkModel(rng, settings)
     vehicle = SimVehicle(
         tree,
-        PROFILES[args.profile],
+        profile,
         rng=rng,
         telemetry=args.telemetry,
         armed=args.armed,

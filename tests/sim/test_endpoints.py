@@ -291,6 +291,19 @@ def test_a_missing_directory_is_the_users_error(tmp_path: Path) -> None:
         command.run(arguments(str(tmp_path / "nowhere")))
 
 
+@pytest.mark.parametrize(
+    ("profile", "storage", "told"),
+    [("px4", "", False), ("px4-nuttx", "", True), ("px4-nuttx", "fs/microsd", False)],
+)
+def test_a_card_that_nothing_can_be_written_to_is_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], profile: str, storage: str, told: bool
+) -> None:
+    (tmp_path / storage).mkdir(parents=True, exist_ok=True)
+    with pytest.raises(LinkClosed):
+        command.run(arguments(str(tmp_path), "--profile", profile, "--link", "udpin:198.51.100.1:1"))
+    assert ("/fs/microsd only" in capsys.readouterr().err) == told
+
+
 def test_a_bad_link_is_the_users_error(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="write for example"):
         command.run(arguments(str(tmp_path), "--link", "smoke:signals"))
