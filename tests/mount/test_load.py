@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import time
 from collections.abc import Callable
@@ -15,6 +16,7 @@ from tests.support.trees import content
 from tests.support.vehicles import UdpVehicle
 
 FRESH_DIRECTORIES = 60
+COPIES_AT_MOST = 4
 MIB = 1 << 20
 
 COPIES = {
@@ -35,28 +37,33 @@ def test_ls_overtakes_a_large_copy(
 ) -> None:
     size, link = COPIES[kind]
     card = field.local("card")
-    (card / "large.bin").write_bytes(content(kind, size))
+    (card / "large0.bin").write_bytes(content(kind, size))
+    for number in range(1, COPIES_AT_MOST):
+        os.link(card / "large0.bin", card / f"large{number}.bin")
     for number in range(FRESH_DIRECTORIES):
         (card / f"fresh{number}").mkdir()
         (card / f"fresh{number}" / f"file{number}").touch()
     vehicle: UdpVehicle = field.mavsdk(card) if kind == "mavsdk-server" else field.sim(card, kind, link)
     mount = field.mount(vehicle.source)
-    times, beside = [], 0
-    start = time.monotonic()
-    with mount.started("cp", mount.path / "large.bin", tmp_path / "copy") as copy:
-        for number in range(FRESH_DIRECTORIES):
-            time.sleep(0.1)
-            if copy.poll() is not None:
-                break
-            before = time.monotonic()
-            names = mount.run("ls", mount.path / f"fresh{number}").stdout
-            times.append(time.monotonic() - before)
-            assert names == f"file{number}\n"
-            beside += copy.poll() is None
-        _, errors = copy.communicate(timeout=300)
-    took = time.monotonic() - start
-    assert (copy.returncode, errors) == (0, "")
-    assert (tmp_path / "copy").read_bytes() == (card / "large.bin").read_bytes()
+    fresh, times, beside = iter(range(FRESH_DIRECTORIES)), [], 0
+    for attempt in range(COPIES_AT_MOST):  # whoever is kept from working for seconds needs a second one
+        start = time.monotonic()
+        with mount.started("cp", mount.path / f"large{attempt}.bin", tmp_path / "copy") as copy:
+            for number in fresh:
+                time.sleep(0.1)
+                if copy.poll() is not None:
+                    break
+                before = time.monotonic()
+                names = mount.run("ls", mount.path / f"fresh{number}").stdout
+                times.append(time.monotonic() - before)
+                assert names == f"file{number}\n"
+                beside += copy.poll() is None
+            _, errors = copy.communicate(timeout=300)
+        took = time.monotonic() - start
+        assert (copy.returncode, errors) == (0, "")
+        assert (tmp_path / "copy").read_bytes() == (card / "large0.bin").read_bytes()
+        if beside >= 5:
+            break
     median, longest = sorted(times)[len(times) // 2], max(times)
     report = f"cp {took:.1f} s, {beside} ls beside it: median {median:.3f} s, max {longest:.3f} s"
     report_line(f"{kind}: {report}")
@@ -124,7 +131,7 @@ with concurrent.futures.ThreadPoolExecutor(len(names)) as pool:
 
 def test_120_blocked_opens_do_not_freeze_df(field: Field, tree: Path) -> None:
     vehicle = field.sim(tree)
-    mount = field.mount(vehicle.source)
+    mount = field.mount(vehicle.source, "dir_timeout=600")  # stat is to need nothing of the vehicle
     names = mount.run("ls", mount.path / "many").stdout.split()[:120]
     assert len(names) == 120
     vehicle.pause()
@@ -132,8 +139,8 @@ def test_120_blocked_opens_do_not_freeze_df(field: Field, tree: Path) -> None:
         assert readers.stdout is not None
         readers.stdout.readline()
         time.sleep(1.0)
-        mount.run("df", mount.path, timeout=20)
-        mount.run("stat", mount.path / "many" / names[0], timeout=20)
+        mount.run("df", mount.path, timeout=25)
+        mount.run("stat", mount.path / "many" / names[0], timeout=25)
         vehicle.resume()
         out, errors = readers.communicate(timeout=120)
     assert readers.returncode == 0, errors

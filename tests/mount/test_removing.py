@@ -31,7 +31,7 @@ def test_the_name_goes_while_cp_waits_for_the_card(field: Field, profile: str, c
         else:
             mount.run("mv", mount.path / "other", mount.path / "big")
             left = {"big"}
-        assert cp.wait(30) == 0
+        assert cp.wait(50) == 0
     assert set(mount.run("ls", "-A", mount.path).stdout.split()) == left
     assert {path.name for path in card.iterdir()} == left
     assert {path.read_text() for path in card.iterdir()} == {"other\n"}

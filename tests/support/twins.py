@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from difflib import unified_diff
 from pathlib import Path
 
+from mavftpfs.cache.asides import parse
 from tests.support.mounts import Mount, wait_until
 from tests.support.trees import differing, walk
 from tests.support.vehicles import PROJECT
@@ -75,10 +76,22 @@ class Twins:
     def _only_empty_files_differ(self) -> bool:
         there = {path for path, _ in walk(os.fsencode(self.card))}
         here = {path for path, _ in walk(os.fsencode(self.twin))}
-        changed = [path for path in here if self._differs(path, there)]
-        empty = all((self.twin / os.fsdecode(path)).stat().st_size == 0 for path in changed)
-        return bool(changed) and empty and there <= here
+        changed = {path for path in here if self._differs(path, there)} | set(map(meant, there - here))
+        return bool(changed) and changed <= here and all(map(self._is_empty_here, changed))
+
+    def _is_empty_here(self, path: bytes) -> bool:
+        return (self.twin / os.fsdecode(path)).stat().st_size == 0
 
     def _differs(self, path: bytes, there: set[bytes]) -> bool:
         ours, theirs = self.twin / os.fsdecode(path), self.card / os.fsdecode(path)
-        return path not in there or (ours.is_file() and ours.read_bytes() != theirs.read_bytes())
+        try:
+            return path not in there or (ours.is_file() and ours.read_bytes() != theirs.read_bytes())
+        except FileNotFoundError:  # it is being replaced at this moment
+            return True
+
+
+def meant(path: bytes) -> bytes:
+    """Return the path that a name of ours stands for while it is being replaced; any other as it is."""
+    folder, name = os.path.split(path)
+    ours = parse(name)
+    return path if ours is None or ours.target is None else os.path.join(folder, ours.target)
