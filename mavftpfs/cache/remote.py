@@ -163,8 +163,8 @@ class Upload(Protocol):
 
     @property
     def shared(self) -> bool:
-        """Whether the server's session may have been another client's for a while, so that what was ACKed
-        was perhaps written to another file (servers.md 1)."""
+        """Whether the server's session may have been another client's for a while, or nobody's, so that what
+        was ACKed was perhaps written to another file (servers.md 1), or lost with the vehicle's memory."""
         ...
 
     @property

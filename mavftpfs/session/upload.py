@@ -149,7 +149,8 @@ class QueuedUpload:
             on. opened: it was opened before. free_at: see WriteStore. begun: see Upload.
         asked_at: since when who waits for its end sees nothing happen. filled_in: seconds it took to send
             all there was, last time. tried: it was reopened to see what OpenFileWO does.
-        anew: nothing that was proven counts any more. usurped: the server closed the session by itself.
+        anew: nothing that was proven counts any more. usurped: the server closed the session by itself,
+            or may have.
     """
 
     def __init__(

@@ -9,11 +9,12 @@ import trio
 from mavftpfs.cache.remote import FREE_FOR, UploadSource
 from mavftpfs.protocol.payload import MAX_DATA, Opcode
 from mavftpfs.session.copies import Span, WriteLog
+from mavftpfs.session.echoes import feared_for
 from mavftpfs.session.kit import Kit, Queue
 from mavftpfs.session.opening import TERMINATE_LIMIT, OpenSession
 from mavftpfs.session.turns import Turns
 from mavftpfs.session.upload import Feed, QueuedUpload
-from mavftpfs.session.vehicle import FOREIGN_MEMORY
+from mavftpfs.session.vehicle import BOOT_NEWS_AGE, FOREIGN_MEMORY
 from mavftpfs.session.writing import Stop, Writer
 from mavftpfs.shared.errnos import errno_for
 from mavftpfs.shared.errors import (
@@ -32,12 +33,6 @@ from mavftpfs.shared.errors import (
 
 REFUSALS = (FtpNak, ProtocolError, FileChanged, AlreadyExists, SpoolFailed)
 """Errors that do not pass by themselves."""
-
-STRAGGLE = (0.25, 1.0)
-STRAGGLE_ROUND_TRIPS = 4.0
-"""How long after the last byte of a file no other is opened to be written (at least, at most, round trips)
-where the link was seen to hold datagrams back or to double them: a WriteFile names no file, so a late one
-would be written to the next."""
 
 REOPENS = 5
 """How often the session may be lost without getting further in the file before the upload fails."""
@@ -62,6 +57,7 @@ class Uploading:
         self.uploads: list[QueuedUpload] = []
         self.writer = Writer(kit, queue, chunk, lambda: self.may_write)
         self._holder = kit.holder
+        self._driver = kit.driver
         self._queue = queue
         self._vehicle = kit.vehicle
         self._clock = kit.clock
@@ -118,11 +114,13 @@ class Uploading:
                 await trio.sleep(rest)
 
     def _feared_until(self, sent_at: float) -> float:
-        """Return until when a copy of a request may still come, if this link was seen to be of that kind."""
+        """Return until when a copy of a request may still come, if this link was seen to be of that kind.
+
+        A WriteFile names no file: a late one would be written to the next.
+        """
         if not self._engine.stats.strays:
             return sent_at
-        least, most = STRAGGLE
-        return sent_at + min(most, max(least, STRAGGLE_ROUND_TRIPS * (self._engine.rtt or 0.0)))
+        return sent_at + feared_for(self._engine, self._clock())
 
     def heard_stranger(self, since: float) -> bool:
         """See UploadHost."""
@@ -327,12 +325,16 @@ class Uploading:
             await self._holder.close_quietly()
             return
         limit = TERMINATE_LIMIT if stop is Stop.ARMED else self._op_deadline
+        heard_at, reboots = self._driver.last_reply_at, self._vehicle.reboots
         try:
             ours = await self._holder.close(limit)
         except RequestTimeout as error:
             raise SessionLost(str(error)) from error
-        if not ours:
+        if not ours or self._vehicle.reboots != reboots:
             raise SessionLost("the vehicle had closed the session before", by_server=True)
+        # Else one who restarted, of which the news may be on its way, may have answered (servers.md 1).
+        alive_at = max(heard_at, self._vehicle.boot_heard_at)
+        upload.usurped |= self._clock() - alive_at > BOOT_NEWS_AGE
         feed.check_point()
         if stop is Stop.ARMED:
             upload.fail(Armed("the vehicle was armed"), self._clock())

@@ -1,6 +1,7 @@
-"""Bytes that were ACKed and are not what the card has: an older copy came late, or another client was there.
+"""Bytes that were ACKed and are not what the card has: an older copy came late, another client was there, or
+the power went.
 
-The size tells nothing of either, so what is in doubt is read back, whatever verify= says (promise 2).
+The size tells nothing of these, so what is in doubt is read back, whatever verify= says (promise 2).
 """
 
 from __future__ import annotations
@@ -145,6 +146,39 @@ async def test_another_clients_file_took_the_bytes(profile: str, leaves: bool, a
         else:
             pytest.fail("it never ended well")
         assert bytes(world.tree.data(root + b"/f")) == new + b"x" * (300_000 - len(new))
+        file.close()
+
+
+@pytest.mark.parametrize(("downtime", "beat_after"), [(0.0, 0.0), (3.0, 0.0), (4.0, 0.9), (12.0, 0.9)])
+@pytest.mark.parametrize("profile", taking_turns(KEEPING))
+async def test_the_power_went_between_the_last_answer_and_the_close(
+    profile: str, downtime: float, beat_after: float, autojump: MockClock
+) -> None:
+    """The last sector was in its memory. Who restarted may ACK the Terminate, too, before we hear of that."""
+    world = World(profile, CLEAN)
+    root = ROOTS.get(profile, b"") + b"/d"
+    world.tree.add(root + b"/f", b"x" * 300_000)
+    async with mounted(world, root) as (_, tree):
+        file = await tree.open(root + b"/f", write=True)
+        await file.write(0, b"A" * 100)
+        await file.fsync()
+        await trio.sleep(30)
+        before = bytes(world.tree.data(root + b"/f"))
+        server = world.vehicle.server
+        handle = server.handle
+
+        def power_cut(wire: bytes, source: Address, now: float) -> None:
+            if wire[3] != Opcode.TERMINATE_SESSION:
+                handle(wire, source, now)
+                return
+            server.handle = handle  # type: ignore[method-assign]
+            world.vehicle.reboot(now, downtime, beat_after=beat_after)
+            world.tree.add(root + b"/f", before)
+
+        await file.write(1000, b"B" * 100)
+        server.handle = power_cut  # type: ignore[method-assign]
+        await file.fsync()
+        assert bytes(world.tree.data(root + b"/f")) == before[:1000] + b"B" * 100 + before[1100:]
         file.close()
 
 
