@@ -21,7 +21,9 @@ class Foresight:
 
     def __init__(self) -> None:
         self._strings: dict[bytes, int] = {}
+        self._moves = 0
         self._moved: dict[bytes, int] = {}
+        self._moved_before = 0
         self._moving: list[bytes] = []
 
     @contextmanager
@@ -35,11 +37,19 @@ class Foresight:
         finally:
             for directory in directories:
                 self._moving.remove(directory)
-                self._moved[directory] = self._moved.get(directory, 0) + 1
+                self._note_moved(directory)
+
+    def _note_moved(self, directory: bytes) -> None:
+        self._moves += 1
+        self._moved.pop(directory, None)
+        self._moved[directory] = self._moves
+        if len(self._moved) > _MOST:
+            oldest = next(iter(self._moved))
+            self._moved_before = self._moved.pop(oldest)
 
     def moves(self, directory: bytes) -> int | None:
-        """Return how often its names moved up so far, None while they may be moving."""
-        return None if directory in self._moving else self._moved.get(directory, 0)
+        """Return a number that grows when its names move up, None while they may be moving."""
+        return None if directory in self._moving else self._moved.get(directory, self._moved_before)
 
     def learn(self, directory: bytes, strings: int) -> None:
         """A sweep came to its end after so many strings."""

@@ -31,7 +31,8 @@ VERIFY_LIMIT = 4.0
 """Seconds to spend on finding out what became of a request that was not answered. Whoever waits was promised
 an answer within `op_deadline`, and this comes after it."""
 
-_DOT = b"."
+DOT = b"."
+"""Lists the root on ArduPilot's SITL, with the files that "/" does not show there (servers.md 6)."""
 
 _TAKES_AWAY = frozenset((Opcode.REMOVE_FILE, Opcode.REMOVE_DIRECTORY, Opcode.RENAME))
 _MISSING = frozenset((NakCode.FAIL, NakCode.FAIL_ERRNO, NakCode.FILE_NOT_FOUND))
@@ -253,7 +254,7 @@ class SideEffects:
 
     async def _entries_of_dot(self) -> tuple[DirEntry, ...]:
         try:
-            return (await self._list_directory(_DOT)).entries
+            return (await self._list_directory(DOT)).entries
         except FtpNak:
             return ()
 

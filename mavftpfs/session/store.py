@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 
 import trio
@@ -12,12 +13,13 @@ from mavftpfs.protocol.operations import ListDirectory, Simple
 from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.session.foresight import Foresight
 from mavftpfs.session.scheduler import Scheduler
+from mavftpfs.session.sideeffects import DOT
 from mavftpfs.session.stale import StaleSessions
 from mavftpfs.session.stream import FileStream
 from mavftpfs.session.vehicle import Vehicle
 from mavftpfs.session.writestore import COPY_RATE, WriteStore
 from mavftpfs.shared.errors import Armed, FtpNak, RemoteProtocolError, RequestTimeout
-from mavftpfs.shared.model import DirEntry, Listing, wire_path
+from mavftpfs.shared.model import ROOT, DirEntry, Listing, wire_path
 
 TIME_PROBE_LIMIT = 2.5
 """Seconds of silence after which ListDirectory is tried in place of ListDirectoryWithTime."""
@@ -82,14 +84,19 @@ class Store(WriteStore):
         return Listing(entries, self._clock() - started, operation.complete, operation.hidden)
 
     async def _list_steady(self, path: bytes) -> Listing:
-        """As list_directory, again if we took names away meanwhile (the caches see to that themselves)."""
-        wire = wire_path(path)
+        """As list_directory, again if we took names away meanwhile (the caches see to that themselves).
+
+        If they never stood still: what any of the sweeps saw, for each missed others.
+        """
+        wire = wire_path(ROOT if path == DOT else path)
+        seen: dict[bytes, DirEntry] = {}
         for _ in range(SWEEPS):
             before = self._foresight.moves(wire)
             listing = await self.list_directory(path)
+            seen |= {entry.name: entry for entry in listing.entries}
             if before is not None and before == self._foresight.moves(wire):
-                break
-        return listing
+                return listing
+        return replace(listing, entries=tuple(seen.values()))
 
     async def open_reader(
         self, path: bytes, sink: ReadSink, *, expected_size: int | None = None

@@ -14,11 +14,13 @@ from mavftpfs.protocol.payload import Opcode
 from mavftpfs.session.connection import Connection, ConnectOptions
 from mavftpfs.session.store import Store
 from mavftpfs.shared.errors import FileChanged, FtpNak, PathTooLong, RequestTimeout
+from mavftpfs.shared.model import join
 from mavftpfs.sim.filesystem import Kind
 from mavftpfs.sim.linkmodel import LinkSettings
 from mavftpfs.sim.profiles import PROFILES, Storage
 from tests.support.faults import Faults
 from tests.support.sources import MemorySource
+from tests.support.takingturns import taking_turns
 from tests.support.worlds import GOOD_LINK, ROOTS, MemorySink, World, read_file
 
 EVERY_PROFILE = sorted(PROFILES)
@@ -402,25 +404,28 @@ async def test_a_refusal_on_a_link_that_doubles_nothing_costs_no_listing(autojum
     assert not {Opcode.LIST_DIRECTORY, Opcode.LIST_DIRECTORY_WITH_TIME} & set(faults.requests)
 
 
-@pytest.mark.parametrize("profile", EVERY_PROFILE)
+@pytest.mark.parametrize("taken", [3, 30])
+@pytest.mark.parametrize("in_root", [False, True])
+@pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
 async def test_who_looks_misses_no_name_because_we_take_others_away(
-    profile: str, autojump: MockClock
+    profile: str, in_root: bool, taken: int, autojump: MockClock
 ) -> None:
     """A page begins where the one before ended, by number: what moved up meanwhile is on neither."""
-    names = [f"name of some length {number:02}" for number in range(60)]
+    names = [b"name of some length %02d" % number for number in range(60)]
     here = world(profile, LinkSettings(delay=0.1))
+    directory = ROOTS.get(profile, b"/") if in_root else path(profile, "")[:-1]
     for name in names:
-        here.tree.add(path(profile, name), b"x")
-    shown: set[str] = set()
+        here.tree.add(join(directory, name), b"x")
+    shown: set[bytes] = set()
     async with here.connection() as connection, trio.open_nursery() as nursery:
 
         async def sweep() -> None:
-            entries, _ = await connection.store._effects.entries(path(profile, "")[:-1])
-            shown.update(entry.name.decode() for entry in entries)
+            entries, _ = await connection.store._effects.entries(directory)
+            shown.update(entry.name for entry in entries)
 
-        await connection.store.list_directory(path(profile, "")[:-1])
+        await connection.store.list_directory(directory)
         nursery.start_soon(sweep)
         await trio.sleep(0.5)
-        for name in names[:3]:
-            await connection.store.remove(path(profile, name))
-    assert shown >= set(names[3:])
+        for name in names[:taken]:
+            await connection.store.remove(join(directory, name))
+    assert shown >= set(names[taken:])
