@@ -112,6 +112,15 @@ class OpenFile(Simple):
         super().__init__(opcode, path, session=session)
         self.session = session
         self.size: int | None = None
+        self._asked = self._request
+
+    @property
+    def answers(self) -> list[int]:
+        """The seqs that its answers may have: one for each seq under which it went out."""
+        asked = self._asked
+        if asked is None or not asked.sends:
+            return []
+        return [*(asked.aliases or ()), asked.seq + 1]
 
     def on_ack(self, request: Request, reply: Payload) -> None:
         """Take session and size; learn whether the server echoes ids."""

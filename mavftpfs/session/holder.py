@@ -14,7 +14,7 @@ import trio
 
 from mavftpfs.protocol.payload import Opcode
 from mavftpfs.session.opening import TERMINATE_LIMIT, OpenSession, SessionOpener
-from mavftpfs.shared.errors import MavftpfsError, RequestTimeout
+from mavftpfs.shared.errors import MavftpfsError, RequestTimeout, SessionLost
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,6 +102,11 @@ class SessionHolder:
             return await self.close(TERMINATE_LIMIT)
         except MavftpfsError:
             return False
+
+    def require(self, session: OpenSession) -> None:
+        """Raise SessionLost if this one is not believed in any more."""
+        if self.session is not session:
+            raise SessionLost("the vehicle restarted, or opened another file", by_server=True)
 
     def abandon(self) -> None:
         """The session is lost or not to be believed: the next open closes it first."""

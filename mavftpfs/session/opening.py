@@ -72,7 +72,7 @@ class SessionOpener:
         self._doubtful: dict[int, bytes] = {}
         self._reopened: dict[int, bytes] = {}
         self._opened: dict[int, bytes] = {}
-        self._disturbed = False
+        self._disturbed: set[int] = set()
         self._early: set[tuple[int, int]] = set()
         self._server_assigns: bool | None = None
         self._failing: dict[bytes, None] = {}
@@ -85,7 +85,7 @@ class SessionOpener:
         return [*self._doubtful.values(), *self._reopened.values()]
 
     def opened_by(self, seq: int) -> bytes | None:
-        """Return which file an open had opened that was answered under `seq` lately, None if none was."""
+        """Return which file an open was to open whose answers have this seq, None if there was none."""
         return self._opened.get(seq)
 
     def note_early(self, seq: int, session: int) -> None:
@@ -95,7 +95,7 @@ class SessionOpener:
 
     def leave_open(self, session: int, path: bytes) -> None:
         """An open came to the server once more: what it opened there is to be closed."""
-        self._disturbed |= session == self._own_id
+        self._disturbed.add(session)
         self._reopened[session] = path
 
     async def open(self, path: bytes, opcode: Opcode = Opcode.OPEN_FILE_RO) -> OpenSession:
@@ -167,8 +167,8 @@ class SessionOpener:
         self._engine.session = self._engine.home_session
 
     def forget(self) -> None:
-        """The server restarted. The news may come a second later: what is doubtful may be open since then."""
-        self._opened.clear()
+        """The server restarted. The news may come a second later: what is doubtful may be open since then.
+        What was asked before may be carried out yet, too."""
         self._server_assigns = None
         self._engine.session = self._engine.home_session
 
@@ -186,9 +186,9 @@ class SessionOpener:
     async def _open_undisturbed(self, path: bytes, opcode: Opcode) -> OpenSession:
         """Open; once more where an older open came to the server again meanwhile, perhaps after this one: on
         MAVSDK the session is that file's then."""
-        self._disturbed = False
+        self._disturbed.clear()
         session = await self._open_once(path, opcode)
-        if self._disturbed:
+        if session.id in self._disturbed:
             await self.close(session)
             session = await self._open_once(path, opcode)
         return session
@@ -199,21 +199,27 @@ class SessionOpener:
         self._doubt(expected, path)
         self._early.clear()
         # A time-out or cancellation leaves it doubtful: the open may have been executed.
-        await self._run(operation)
+        try:
+            await self._run(operation)
+        finally:  # also refused or given up: the network may bring it to the server later, or once more
+            self._note_asked(operation, path)
         self._trust(expected)
         self._trust(operation.session)
         self._reopened.pop(operation.session, None)
+        for early, session in self._early:
+            if early in operation.answers and session != operation.session:
+                self._reopened[session] = path
         self._server_assigns = operation.session != asked
         self._engine.session = operation.session
-        seq = operation.reply.seq
-        self._opened[seq] = path
-        if len(self._opened) > _MAX_OPENED:
-            del self._opened[next(iter(self._opened))]
-        for early, session in self._early:
-            if early == seq and session != operation.session:
-                self._reopened[session] = path
         writing = opcode != Opcode.OPEN_FILE_RO
+        seq = operation.reply.seq
         return OpenSession(path, operation.session, operation.size, self._clock(), writing, seq)
+
+    def _note_asked(self, operation: OpenFile, path: bytes) -> None:
+        for seq in operation.answers:
+            self._opened[seq] = path
+        while len(self._opened) > _MAX_OPENED:
+            del self._opened[next(iter(self._opened))]
 
     def _remember_failing(self, path: bytes) -> None:
         """Silence did not help: what fails is this file, and nobody waits for it again."""

@@ -91,8 +91,7 @@ class Scheduler:
         writer = self._uploading.writer
         self.written, self.on_probed = self._uploading.written, self._uploading.on_probed
         news = (self._on_session_taken, writer.on_emptied, writer.on_disturbed, self.written.on_late)
-        strays = Strays(self._holder, self._others_about, *news)
-        engine.on_unknown = strays.on_unknown
+        engine.on_unknown = Strays(self._holder, self._others_about, *news).on_unknown
 
     @property
     def session(self) -> OpenSession | None:
@@ -151,6 +150,7 @@ class Scheduler:
             foreign_at = self._vehicle.foreign_at
             operation = ReadToEof(session.id, self._steering.chunk, limit)
             await self._run_beside(operation)
+            self._holder.require(session)
             if self._vehicle.foreign_at != foreign_at:
                 raise DataUnproven(f"another FTP client was active while {path!r} was read")
             data = operation.data

@@ -62,9 +62,9 @@ class Strays:
         changes = reply.req_opcode != Opcode.OPEN_FILE_RO
         if path is None:
             self._holder.opener.note_early(reply.seq, reply.session)
-            # While a file is open it is none under way, but one that was given up unanswered.
+            # While a file is open it is none under way, but one of which nothing is known any more.
             if session is not None and session.id == reply.session and (changes or not session.writing):
-                self._on_taken("a file was opened by a late request that had been given up")
+                self._on_taken("a file was opened by a late request that had been forgotten")
             return
         if session is not None and session.writing and session.path == path and changes:
             self._on_emptied()

@@ -20,7 +20,7 @@ from mavftpfs.session.opening import OpenSession
 from mavftpfs.session.policy import should_switch
 from mavftpfs.session.turns import Turns
 from mavftpfs.session.upload import QueuedUpload
-from mavftpfs.shared.errors import FtpNak, MavftpfsError, SessionLost
+from mavftpfs.shared.errors import FtpNak, MavftpfsError
 from mavftpfs.shared.model import ROOT, split, wire_path
 
 STARVE = 1.5
@@ -191,8 +191,7 @@ class Writer:
     ) -> Stop | None:
         stop: Stop | None = None
         while not transfer.done:
-            if self._holder.session is not session:
-                raise SessionLost("the vehicle restarted, or opened another file", by_server=True)
+            self._holder.require(session)
             stop = stop or self._reason_to_stop(upload, session, transfer)
             if self._in_doubt(transfer):
                 stop = Stop.DOUBT

@@ -25,7 +25,7 @@ from tests.support.latecomers import Latecomer
 from tests.support.mounting import writable_tree
 from tests.support.sources import MemorySource
 from tests.support.takingturns import taking_turns
-from tests.support.worlds import MemorySink, read_file
+from tests.support.worlds import MemorySink, World, read_file
 
 EVERY_PROFILE = sorted(PROFILES)
 DOUBLING = LinkSettings(delay=0.02, duplicate=0.3, reorder=0.1)
@@ -164,6 +164,106 @@ async def test_what_an_open_that_came_twice_at_once_left_open_is_closed(
         server.handle = twice  # type: ignore[method-assign]
         await open_and_leave(connection, profile, opcode)
         assert server.open_sessions == 0
+
+
+class Held:
+    """Keeps a kind of request from the server, until it hands over the last of them."""
+
+    def __init__(self, here: World, opcode: Opcode) -> None:
+        self.deaf = True
+        self._here = here
+        self._opcode = opcode
+        self._kept: tuple[bytes, Address] | None = None
+        self._handle = here.vehicle.server.handle
+        here.vehicle.server.handle = self._on_request  # type: ignore[method-assign]
+
+    def deliver(self, now: float) -> None:
+        """Have it carried out."""
+        assert self._kept is not None
+        self._handle(*self._kept, now)
+        self._here.link.kick()
+
+    def deliver_behind_the_next(self) -> None:
+        """Have it carried out right after the next of its kind, and the later answer come first."""
+        server = self._here.vehicle.server
+        outgoing = server.outgoing
+
+        def on_request(wire: bytes, source: Address, now: float) -> None:
+            self._handle(wire, source, now)
+            if wire[3] == self._opcode:
+                server.handle = self._handle  # type: ignore[method-assign]
+                self.deliver(now)
+
+        held: list[tuple[Address, bytes]] = []
+
+        def swapped(now: float) -> list[tuple[Address, bytes]]:
+            found = outgoing(now)
+            held.extend(reply for reply in found if reply[1][5] == self._opcode)
+            others = [reply for reply in found if reply[1][5] != self._opcode]
+            if len(held) < 2:
+                return others
+            server.outgoing = outgoing  # type: ignore[method-assign]
+            return [*others, *held[::-1]]
+
+        server.handle, server.outgoing = on_request, swapped  # type: ignore[method-assign]
+
+    def _on_request(self, wire: bytes, source: Address, now: float) -> None:
+        if self.deaf and wire[3] == self._opcode:
+            self._kept = (wire, source)
+        else:
+            self._handle(wire, source, now)
+
+
+@pytest.mark.parametrize("opcode", [Opcode.OPEN_FILE_RO, Opcode.CREATE_FILE])
+@pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
+async def test_what_an_open_that_was_given_up_left_open_is_closed(
+    profile: str, opcode: Opcode, autojump: MockClock
+) -> None:
+    """It comes when we have made sure that nothing is open; no server but PX4 would close it by itself."""
+    here = world(profile, LinkSettings(delay=0.02), f=content(1500))
+    async with here.connection(ConnectOptions(op_deadline=2.0)) as connection:
+        await connection.store.list_directory(path(profile, ""))
+        held = Held(here, opcode)
+        with pytest.raises(RequestTimeout):
+            await open_and_leave(connection, profile, opcode)
+        held.deaf = False
+        await trio.sleep(8)
+        held.deliver(trio.current_time())
+        await trio.sleep(8)
+        assert here.vehicle.server.open_sessions == 0
+
+
+@pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
+async def test_an_open_that_was_given_up_comes_behind_the_next_and_is_answered_before_it(
+    profile: str, autojump: MockClock
+) -> None:
+    """MAVSDK has the first file open then, under the id that the second was told."""
+    one, two = content(1500, 1), content(1500, 2)
+    here = world(profile, LinkSettings(delay=0.02), one=one, two=two)
+    async with here.connection(ConnectOptions(window=1, op_deadline=2.0)) as connection:
+        held = Held(here, Opcode.OPEN_FILE_RO)
+        with pytest.raises(RequestTimeout):
+            await read_file(connection, path(profile, "one"))
+        held.deliver_behind_the_next()
+        await read_or_doubt(connection, path(profile, "two"), two)
+        await trio.sleep(8)
+        assert here.vehicle.server.open_sessions == 0
+
+
+@pytest.mark.parametrize("nth", [8, 9, 12])
+@pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
+async def test_a_late_open_of_another_file_while_one_is_read_whole(
+    profile: str, nth: int, autojump: MockClock
+) -> None:
+    one, two = content(6 * 239, 1), content(6 * 239, 2)
+    here = world(profile, DOUBLING, one=one)
+    here.tree.add(b"/@two", two)
+    async with here.connection(ConnectOptions(window=1)) as connection:
+        await connection.store.list_directory(path(profile, ""))
+        Latecomer(here, Opcode.OPEN_FILE_RO, after=Opcode.READ_FILE, nth=nth, first=True)
+        assert await read_file(connection, path(profile, "one")) == one
+        if not PROFILES[profile].virtual_trees:  # else there is no such file
+            assert await connection.store.read_whole(b"/@two", 10_000) == two
 
 
 @pytest.mark.parametrize("nth", [2, 20])
