@@ -99,9 +99,9 @@ WRITING = (
     Case("touch new", "touch new", "ls -l", empty, aged=True),
     Case("touch old", "touch f", "ls -l", small),
     Case("mkdir", "mkdir d", "ls -l", empty),
-    Case("mv", "mv f g", "ls -l", small),
-    Case("rm", "rm f", "ls -l", small),
-    Case("rm -r", "rm -r ten", "ls -l ten", ten),
+    Case("mv", "mv f g", "ls -l", small, fresh=True),
+    Case("rm", "rm f", "ls -l", small, fresh=True),
+    Case("rm -r", "rm -r ten", "ls -l ten", ten, fresh=True),
     Case("vim save", "vim -es -u NONE -i NONE -c '%s/$/x/' -c wq f", "ls -l", small),
     Case("nano save", f"{sys.executable} {PROGRAMS / 'nano_save.py'} f", "ls -l", small),
     Case(

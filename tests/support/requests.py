@@ -69,7 +69,8 @@ class Case:
     """One command; `$1` is an empty directory on the local disk.
 
     aged: what was listed before is no news any more (remote.FREE_FOR) when the script starts. most_looks: how
-    many looks a slow machine may need; the count is that of a fast one.
+    many looks a slow machine may need; the count is that of a fast one. fresh: what was listed before must be
+    news still when the script ends; a run in which it was not is made again.
     """
 
     name: str
@@ -79,17 +80,19 @@ class Case:
     timeout: float = 120.0
     aged: bool = False
     most_looks: int = 1
+    fresh: bool = False
 
 
 @dataclass(slots=True)
 class Cost:
     """What one run of a case cost. payload: bytes of file data asked for or sent. repeats: how many of the
-    requests the client says were repetitions."""
+    requests the client says were repetitions. late: names were listed once more, because time had passed."""
 
     counts: Counter[str] = field(default_factory=Counter)
     keep_alives: int = 0
     payload: int = 0
     repeats: int = 0
+    late: bool = False
     seconds: float = 0.0
     requests: list[str] = field(default_factory=list)
 
@@ -166,10 +169,10 @@ class Counting:
         return self.vehicle.cost_since(0)
 
     def run(self, case: Case) -> Cost:
-        """Run a case in each of its directories until the client repeated nothing."""
+        """Run a case in each of its directories until the client repeated nothing and was in time."""
         for attempt in range(ATTEMPTS):
             cost = self._run_once(case, attempt)
-            if not cost.repeats:
+            if not cost.repeats and not cost.late:
                 break
         if 1 < cost.counts[LOOK] <= case.most_looks:
             cost.counts[LOOK] = 1
@@ -179,6 +182,7 @@ class Counting:
         where = self.folder / directory(case, attempt)
         scratch = self.mount.folder / where.name
         scratch.mkdir()
+        listed = time.monotonic()
         self._bash(f"ls -l .. > /dev/null; {case.before}", where, scratch, case.timeout)
         self.settle()
         time.sleep(FREE_FOR + 0.1 if case.aged else 0)
@@ -186,9 +190,10 @@ class Counting:
         started = time.monotonic()
         self._bash(case.script, where, scratch, case.timeout)
         seconds = time.monotonic() - started
+        late = case.fresh and time.monotonic() - listed > FREE_FOR
         self.settle()
         cost = self.vehicle.cost_since(mark)
-        cost.seconds = seconds
+        cost.seconds, cost.late = seconds, late
         cost.repeats = self.status()["connection"]["retransmissions"] - repeated
         return cost
 
