@@ -20,7 +20,7 @@ BIG = 300 << 20
 """Bytes of a sparse file that no server sends within a test."""
 SILENCE = 60.0
 """Seconds within which everything that waits for a dead vehicle must have ended."""
-QUICK = ("op_deadline=5",)
+QUICK = ("op_deadline=6",)
 
 READ_ALL = """
 import sys

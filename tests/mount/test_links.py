@@ -98,7 +98,7 @@ def test_a_cut_or_a_reboot_in_mid_copy(field: Field, tmp_path: Path, kind: str, 
 
 def test_tcp_comes_back_after_the_vehicle_did(field: Field, small_tree: Path) -> None:
     vehicle = field.sim(small_tree, link=free_port_link("tcpin"))
-    mount = field.mount(vehicle.source, "op_deadline=5")
+    mount = field.mount(vehicle.source, "op_deadline=8")
     assert mount.run("cat", mount.path / "deep/at0.txt").stdout == "level 0\n"
     vehicle.kill()
     vehicle.start()
