@@ -8,12 +8,13 @@ import trio
 
 from mavftpfs.cache.remote import FREE_FOR, UploadSource
 from mavftpfs.protocol.payload import MAX_DATA, Opcode
+from mavftpfs.session.closing import close_refused, close_written
 from mavftpfs.session.copies import Span, WriteLog
 from mavftpfs.session.kit import Kit, Queue
 from mavftpfs.session.opening import TERMINATE_LIMIT, OpenSession
 from mavftpfs.session.turns import Turns
 from mavftpfs.session.upload import Feed, QueuedUpload
-from mavftpfs.session.vehicle import BOOT_NEWS_AGE, FOREIGN_MEMORY
+from mavftpfs.session.vehicle import FOREIGN_MEMORY
 from mavftpfs.session.writing import Stop, Writer
 from mavftpfs.shared.errnos import errno_for
 from mavftpfs.shared.errors import (
@@ -62,7 +63,7 @@ class Uploading:
         self.uploads: list[QueuedUpload] = []
         self.writer = Writer(kit, queue, chunk, lambda: self.may_write)
         self._holder = kit.holder
-        self._driver = kit.driver
+        self._kit = kit
         self._queue = queue
         self._vehicle = kit.vehicle
         self._clock = kit.clock
@@ -328,16 +329,12 @@ class Uploading:
             await self._holder.close_quietly()
             return
         limit = TERMINATE_LIMIT if stop is Stop.ARMED else self._op_deadline
-        heard_at, reboots = self._driver.last_reply_at, self._vehicle.reboots
         try:
-            ours = await self._holder.close(limit)
+            ours = await close_written(self._kit, upload, limit)
         except RequestTimeout as error:
             raise SessionLost(str(error)) from error
-        if not ours or self._vehicle.reboots != reboots:
+        if not ours:
             raise SessionLost("the vehicle had closed the session before", by_server=True)
-        # Else one who restarted, of which the news may be on its way, may have answered (servers.md 1).
-        alive_at = max(heard_at, self._vehicle.boot_heard_at)
-        upload.usurped |= self._clock() - alive_at > BOOT_NEWS_AGE
         feed.check_point()
         if stop is Stop.ARMED:
             upload.fail(Armed("the vehicle was armed"), self._clock())
@@ -346,11 +343,6 @@ class Uploading:
             upload.complete(more=more)
             if not upload.finishing and not self.writer.resumable and not self.writer.may_try(upload):
                 upload.hold_restart(self._clock())
-
-    def _is_open(self, upload: QueuedUpload) -> bool:
-        """Whether the session is this upload's: it may have failed before it got it."""
-        session = self._holder.session
-        return session is not None and session.writing and session.path == upload.path
 
     def _roll_back(self, upload: QueuedUpload) -> None:
         keep = not upload.create or (self.writer.resumable and upload.feed.proven)
@@ -385,7 +377,7 @@ class Uploading:
         if not refused or isinstance(error, RequestTimeout):
             self._holder.abandon()
             self._roll_back(upload)
-        elif self._is_open(upload) and await self._holder.close_quietly():
+        elif await close_refused(self._kit, upload):
             upload.feed.check_point()
         else:
             self._roll_back(upload)

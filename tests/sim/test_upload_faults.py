@@ -275,6 +275,41 @@ async def test_a_full_card_is_told(profile: str, autojump: MockClock) -> None:
     assert here.vehicle.server.open_sessions == 0
 
 
+@pytest.mark.parametrize(("downtime", "beat_after"), [(0.0, 0.0), (3.0, 0.9)])
+@pytest.mark.parametrize("profile", [name for name in EVERY_PROFILE if not name.startswith("mavsdk")])
+async def test_the_power_goes_while_a_file_that_became_too_long_is_closed(
+    profile: str, downtime: float, beat_after: float, autojump: MockClock
+) -> None:
+    """What was changed before the refusal was ACKed, and is gone though the Terminate is ACKed, too."""
+    old, new = content(4 * 239), content(6_000, 1)
+    here = world(profile, PLAIN, f=old)
+    target = path(profile, "f")
+    async with here.connection() as connection:
+        connection.store.traits.wo_truncates = False
+        await trio.sleep(30)
+        here.tree.capacity = len(old)
+        server = here.vehicle.server
+        handle = server.handle
+
+        def power_cut(wire: bytes, source_address: Address, now: float) -> None:
+            if wire[3] != Opcode.TERMINATE_SESSION:
+                handle(wire, source_address, now)
+                return
+            server.handle = handle  # type: ignore[method-assign]
+            here.vehicle.reboot(now, downtime, beat_after=beat_after)
+            here.tree.add(target, old)
+
+        server.handle = power_cut  # type: ignore[method-assign]
+        upload = await connection.store.open_upload(target, MemorySource(new), create=False)
+        with pytest.raises(FtpNak):
+            await upload.finish()
+        here.tree.capacity = None
+        connection.store.traits.wo_truncates = False
+        await upload.finish()
+        await upload.abort()
+        assert here.tree.data(target) == new or upload.shared
+
+
 class FailingSource(MemorySource):
     """Bytes on a local disk that does not give back those from `bad` on."""
 
