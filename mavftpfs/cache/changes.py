@@ -91,19 +91,17 @@ class Changes:
         """
         if await self._is_directory(old):
             raise CrossDevice(f"{old!r} and {new!r} are in different places")
+        if not to_vehicle:
+            old = self._overlay.spelled(old)
         source = await self._open_reader(old)
         try:
             if to_vehicle:
                 await self._copy_to_vehicle(old, new, source, noreplace=noreplace)
                 self._local.unlink(old)
-                return
-            data = await self._read_from_vehicle(old, source)
-            await self.require_parent(new)
-            self._require_no_local(new, noreplace=noreplace)
+            else:
+                await self._move_from_vehicle(old, new, source, noreplace=noreplace)
         finally:
             await source.release()
-        self._local.put(new, data)
-        await self.unlink(old)
 
     async def _copy_to_vehicle(self, old: bytes, new: bytes, source: OpenFile, *, noreplace: bool) -> None:
         self._require_unwritten(old, self._local.find(old).writers)
@@ -112,15 +110,29 @@ class Changes:
         entry = self._local.find(old)
         self._require_unwritten(old, entry.writers or bytes(entry.data or b"") != data)
 
-    async def _read_from_vehicle(self, path: bytes, source: OpenFile) -> bytes:
-        node = self._context.nodes.need(path)  # its reader is open
-        self._require_unwritten(path, node.writers)
+    async def _move_from_vehicle(self, old: bytes, new: bytes, source: OpenFile, *, noreplace: bool) -> None:
+        node = self._context.nodes.need(old)  # its reader is open
+        self._require_unwritten(old, node.writers)
+        await self.require_parent(new)
         self._local.require_room(source.size)
         await source.fsync()
         known = node.generation
         data = bytes(await source.read(0, source.size))
-        self._require_unwritten(path, node.writers or node.undelivered or node.generation != known)
-        return data
+        kept = False
+
+        def keep() -> None:
+            """Nobody can open it any more: it is what was read, or it stays."""
+            nonlocal kept
+            same = self._context.nodes.get(old) is node and node.generation == known
+            self._require_unwritten(old, node.writers or node.undelivered or not same)
+            if not kept:
+                self._require_no_local(new, noreplace=noreplace)
+                self._local.put(new, data)
+                source.close()  # else it would be kept on the vehicle for this reader
+                kept = True
+
+        await self._namespace.unlink(old, first=keep)
+        self._overlay.times.forget(old)
 
     def _require_unwritten(self, path: bytes, writing: int) -> None:
         if writing:

@@ -93,9 +93,10 @@ class Namespace(Names):
             await self._sure.remove_directory(path)
             self._context.on_changed(path)
 
-    async def unlink(self, path: bytes) -> None:
-        """See Tree.unlink."""
+    async def unlink(self, path: bytes, *, first: Callable[[], None] = lambda: None) -> None:
+        """See Tree.unlink; `first()` is called when nobody else can open the file, and may raise."""
         async with self._changing(path, doomed=path):
+            first()
             node = self._context.nodes.get(path)
             if node is not None and await self.entry(path) is not None:
                 await self._unlink_node(node, path)

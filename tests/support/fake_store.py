@@ -137,13 +137,17 @@ class FakeStore:
     async def open_reader(
         self, path: bytes, sink: ReadSink, *, expected_size: int | None = None
     ) -> FakeReader:
-        await self._begin("reader", path, Opcode.OPEN_FILE_RO)
         reader = FakeReader(self, path, sink)
-        if expected_size is None:
-            await reader.open_on_server()
-        else:
-            reader.size = expected_size
-        self.readers.append(reader)
+        self.readers.append(reader)  # from the first moment, as the session has it: renames take it along
+        try:
+            await self._begin("reader", path, Opcode.OPEN_FILE_RO)
+            if expected_size is None:
+                await reader.open_on_server()
+            else:
+                reader.size = expected_size
+        except BaseException:
+            self.readers.remove(reader)
+            raise
         return reader
 
     async def read_whole(self, path: bytes, limit: int) -> bytes:

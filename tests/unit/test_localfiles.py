@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import trio
 
-from mavftpfs.cache.tree import Tree
+from mavftpfs.cache.tree import OpenFile, Tree
 from mavftpfs.shared.errors import (
     AlreadyExists,
     CrossDevice,
@@ -20,7 +20,7 @@ from mavftpfs.shared.errors import (
 )
 from mavftpfs.shared.model import EntryKind
 from tests.support.fake_store import read_file
-from tests.support.fake_writer import FakeWriter, card, make_writable, write_file
+from tests.support.fake_writer import KINDS, FakeWriter, card, make_writable, write_file
 
 FILE = b"/scripts/hover.lua"
 SWAP = b"/scripts/.hover.lua.swp"
@@ -155,6 +155,76 @@ async def test_a_file_that_is_written_while_it_is_read_to_be_moved_stays(
     assert store.files[FILE].data == b"second"
     with pytest.raises(NotFound):
         await tree.stat(SWAP)
+
+
+async def move(tree: Tree, old: bytes, new: bytes) -> bytes:
+    """Return where the file is then."""
+    try:
+        await tree.rename(old, new)
+    except FileBusy:
+        return old
+    return new
+
+
+@pytest.mark.parametrize("new", [SWAP, b"/other/.x.swp"])
+async def test_what_is_written_at_any_moment_of_a_move_is_not_lost(
+    autojump_clock: object, nursery: trio.Nursery, new: bytes
+) -> None:
+    """It stays, or what was written goes along."""
+    for moment in range(30):
+        store = FakeWriter(KINDS["posix"], nursery)
+        store.add(FILE, b"-- old")
+        store.add_directory(b"/other")
+        tree = make_writable(store)
+        await tree.list(b"/scripts")
+        store.list_delay, store.open_delay, store.chunk_delay, store.write_delay = 1.0, 0.3, 0.3, 0.1
+
+        async def write() -> None:
+            await trio.sleep(moment * 0.1)  # noqa: B023
+            try:
+                file = await tree.open(FILE, write=True)  # noqa: B023
+            except NotFound:
+                return
+            await file.write(0, b"++")
+            await trio.sleep(2)
+            await file.release()
+            written.append(file)  # noqa: B023
+
+        written: list[OpenFile] = []
+        async with trio.open_nursery() as both:
+            both.start_soon(write)
+            place = await move(tree, FILE, new)
+        assert await read_file(tree, place) == (b"++ old" if written else b"-- old"), moment
+
+
+async def test_what_replaces_a_file_while_it_is_moved_is_not_removed(
+    autojump_clock: object, store: FakeWriter, tree: Tree
+) -> None:
+    await write_file(tree, b"/scripts/other", b"other")
+    store.chunk_delay = 1.0
+    async with trio.open_nursery() as both:
+
+        async def replace() -> None:
+            await trio.sleep(0.5)
+            await tree.rename(b"/scripts/other", FILE)
+
+        both.start_soon(replace)
+        assert await move(tree, FILE, SWAP) == FILE
+    assert store.files[FILE].data == b"other"
+    with pytest.raises(NotFound):
+        await tree.stat(SWAP)
+
+
+async def test_a_file_is_moved_by_another_spelling_of_its_name(store: FakeWriter, tree: Tree) -> None:
+    store.traits.folds_case = True
+    file = await tree.open(FILE, write=True)
+    await file.write(0, b"++")
+    other = b"/scripts/HOVER.LUA"
+    assert await move(tree, other, SWAP) == other
+    await file.release()
+    assert await move(tree, other, SWAP) == SWAP
+    assert await read_file(tree, SWAP) == b"++ old"
+    assert store.files == {}
 
 
 async def test_trash(store: FakeWriter, tree: Tree) -> None:
