@@ -70,6 +70,13 @@ async def read_base(context: Context, node: Node, start: int, stop: int) -> byte
     return data
 
 
+def outdate(context: Context, node: Node) -> None:
+    """We changed the vehicle's file: who reads it opens it anew, which is no change of somebody else's."""
+    node.generation += 1
+    node.close_base()
+    context.files.on_written(node.path)
+
+
 async def fill(context: Context, node: Node) -> None:
     """Fetch what only the vehicle has, so that the draft is whole.
 

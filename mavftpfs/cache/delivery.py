@@ -218,20 +218,20 @@ class Deliverer:
         else:
             if (size := await self.verifier.size(node.path)) < draft.size:  # it would be filled up with zeros
                 raise FileChanged(f"{node.path!r} has {size} bytes on the vehicle now: nothing to cut")
-            await self._context.writer.truncate(node.path, draft.size)
+            await self._cut(node, draft.size)
         await self.verifier.check(node.path, draft)
         self._on_delivered(node, draft)
 
     async def _cut_first(self, node: Node, draft: Draft) -> None:
         """Cut a file of which a part is to be changed, too."""
-        path = node.path
-        await self._require_base(path, draft)
-        await self._context.writer.truncate(path, draft.size)
-        self._context.dentries.note_unsized(path)
+        await self._require_base(node.path, draft)
+        await self._cut(node, draft.size)
         draft.remote_cut(draft.size)
-        # What it was opened as is longer: a read would say that somebody had changed it.
-        self._context.files.on_written(path)
-        node.close_base()
+
+    async def _cut(self, node: Node, size: int) -> None:
+        await self._context.writer.truncate(node.path, size)
+        self._context.dentries.note_unsized(node.path)
+        base.outdate(self._context, node)
 
     async def _create_empty(self, path: bytes, draft: Draft) -> None:
         try:
@@ -372,10 +372,8 @@ class Deliverer:
             context.dentries.note_created(node.path, entry)
         context.dentries.note_proven(node.path, context.clock())
         draft.delivered()
-        node.generation += 1
         node.delivered_at = context.clock()
-        node.close_base()
-        context.files.on_written(node.path)
+        base.outdate(context, node)
         context.on_changed(node.path)
         self.delivered += 1
 

@@ -91,6 +91,8 @@ class _Reading:
             where, a, b = draft.segments(at, stop)[0]
             if where is Where.BASE:
                 parts.append(await read_base(self._context, self._node, a, b))
+                if self._node.draft is not draft:
+                    raise FileChanged(f"what was changed of {self._node.path!r} was given up")
             else:
                 parts.append(draft.local_bytes(a, b))
             at = b
