@@ -21,7 +21,7 @@ from mavftpfs.cache.plan import SENDING, Plan, Rules, choose
 from mavftpfs.cache.probes import Prober
 from mavftpfs.cache.recovery import describe
 from mavftpfs.cache.replacing import Present, Replacer
-from mavftpfs.cache.sure import Sure
+from mavftpfs.cache.sure import Sure, may_have_made
 from mavftpfs.cache.throttle import Throttle
 from mavftpfs.cache.verify import Verifier, doubted
 from mavftpfs.shared.errors import (
@@ -236,8 +236,8 @@ class Deliverer:
     async def _create_empty(self, path: bytes, draft: Draft) -> None:
         try:
             await self._context.writer.create_empty(path, free_at=self._free_at(path, draft))
-        except RequestTimeout:
-            draft.maybe_made = True
+        except BaseException as error:  # also if who waits for it gives up
+            draft.maybe_made |= may_have_made(error)
             raise
         draft.made = True
         # Whoever takes its name away before it was looked at has to find it there.

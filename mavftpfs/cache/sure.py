@@ -13,8 +13,17 @@ from functools import partial
 import trio
 
 from mavftpfs.cache.context import Context
-from mavftpfs.shared.errors import FtpNak, MavftpfsError, NotADirectory, NotFound, RequestTimeout
+from mavftpfs.shared.errors import (
+    FtpNak,
+    MavftpfsError,
+    NotADirectory,
+    NotFound,
+    RequestTimeout,
+    SessionBusy,
+)
 from mavftpfs.shared.model import DirEntry, EntryKind, split
+
+_TERMINATE_SESSION = 1
 
 
 class Sure:
@@ -111,6 +120,13 @@ class Sure:
 
     async def _is_moved(self, old: bytes, new: bytes) -> bool:
         return await self.entry(old) is None and await self.entry(new) is not None
+
+
+def may_have_made(error: BaseException) -> bool:
+    """Return whether an empty file may be there though WriteStore.create_empty ended with this."""
+    if isinstance(error, FtpNak):
+        return error.opcode == _TERMINATE_SESSION
+    return isinstance(error, RequestTimeout | SessionBusy | trio.Cancelled)
 
 
 async def _ask(done: Callable[[], Awaitable[bool]], error: MavftpfsError) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+from contextlib import suppress
 
 import pytest
 import trio
@@ -11,7 +12,7 @@ from mavftpfs.cache.remote import FREE_FOR
 from mavftpfs.cache.tree import Tree
 from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.shared.errnos import errno_for
-from mavftpfs.shared.errors import AlreadyExists, FtpNak, MavftpfsError, RequestTimeout
+from mavftpfs.shared.errors import AlreadyExists, FtpNak, MavftpfsError, RequestTimeout, SessionBusy
 from tests.support.fake_store import FakeFile
 from tests.support.fake_writer import FakeWriter, card, make_writable, write_file
 
@@ -150,6 +151,37 @@ async def test_what_may_be_ours_is_not_taken_for_anothers(
     await trio.sleep(100)
     await file.release()
     assert store.files[NEW].data == b"ours"
+
+
+UNCLOSED = FtpNak(Opcode.TERMINATE_SESSION, NakCode.FAIL_ERRNO, errno.EIO)
+
+
+@pytest.mark.parametrize("error", [None, UNCLOSED, SessionBusy("refused, since it was open")])
+async def test_an_empty_file_is_ours_though_making_it_did_not_end_well(
+    monkeypatch: pytest.MonkeyPatch,
+    autojump_clock: object,
+    store: FakeWriter,
+    tree: Tree,
+    error: MavftpfsError | None,
+) -> None:
+    """Who waited for it gave up (None), or an answer after the one to CreateFile was bad."""
+    make = store.create_empty
+
+    async def make_badly(path: bytes, *, free_at: float | None = None) -> None:
+        await make(path, free_at=free_at)
+        if error is not None:
+            raise error
+        await trio.sleep(60)
+
+    file = await tree.create(NEW, exclusive=True)
+    with monkeypatch.context() as patch:
+        patch.setattr(store, "create_empty", make_badly)
+        with suppress(FtpNak, SessionBusy), trio.move_on_after(1):
+            await file.fsync()
+    assert tree.undelivered() == [NEW]
+    await trio.sleep(100)
+    await file.release()
+    assert tree.undelivered() == []
 
 
 @pytest.mark.parametrize("content", [b"", b"ours"])
