@@ -23,7 +23,7 @@ from mavftpfs.cache.recovery import describe
 from mavftpfs.cache.replacing import Present, Replacer
 from mavftpfs.cache.sure import Sure, may_have_made
 from mavftpfs.cache.throttle import Throttle
-from mavftpfs.cache.verify import Verifier, doubted
+from mavftpfs.cache.verify import Verifier
 from mavftpfs.shared.errors import (
     AlreadyExists,
     Armed,
@@ -259,7 +259,7 @@ class Deliverer:
             await self._finish(attempt)
             if draft.ruined and attempt.plan is Plan.IN_PLACE:
                 raise FileChanged(f"{node.path!r} was emptied on the vehicle while it was changed here")
-            await self.verifier.check(attempt.path, draft, doubted(attempt.upload, draft))
+            await self.verifier.check_sent(attempt.path, draft, attempt.upload)
         async with node.firmly():
             if not attempt.committing:
                 await attempt.upload.abort()

@@ -44,6 +44,9 @@ SMALL_LISTING = 5
 QUICKLY_READ = 64 * 1024
 """Of so much every vehicle computes the CRC32 so fast that nothing waits long behind it."""
 
+CHECKS = 8
+"""How often a file is compared because answers to requests of others go on coming."""
+
 FEW_BYTES = 64 * 1024
 """So much is read back rather than have the vehicle compute the CRC32 of the whole file."""
 
@@ -100,6 +103,20 @@ class Verifier:
             raise VerificationFailed(f"{path!r} has not the {draft.size} bytes that were written")
         if doubted and not compared:
             await self._dispel(path, draft, doubted)
+
+    async def check_sent(self, path: bytes, draft: Draft, upload: Upload) -> None:
+        """Do the same for what an upload sent; anew if answers tell meanwhile that more of it may be hit.
+
+        Raises:
+            As check and doubted.
+        """
+        told = -1
+        for _ in range(CHECKS):
+            if told == len(upload.overwrites):
+                return
+            told = len(upload.overwrites)
+            await self.check(path, draft, doubted(upload, draft))
+        raise VerificationFailed(f"requests of other files hit {path!r} again and again")
 
     async def check_doubted(self, path: bytes, draft: Draft) -> None:
         """Do the same for a file that may not be ours at all: verify=size and verify=none do not count.

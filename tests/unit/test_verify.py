@@ -8,9 +8,11 @@ import pytest
 import trio
 
 from mavftpfs.cache.readback import PIECE, TRIES, agrees
+from mavftpfs.cache.remote import Overwrite
 from mavftpfs.cache.tree import Tree
 from mavftpfs.protocol.crc import crc32
 from mavftpfs.shared.errors import Armed, DataUnproven, FtpNak, RequestTimeout, VerificationFailed
+from mavftpfs.shared.model import Listing
 from tests.support.fake_store import read_file
 from tests.support.fake_writer import KINDS, FakeWriter, make_writable, write_file
 
@@ -175,6 +177,23 @@ async def test_what_was_written_is_believed_from_the_moment_when_it_was_verified
     await file.release()
     await trio.sleep(0 if restarts else 15)
     assert await read_file(tree, FILE) == OLD[::-1]
+
+
+@pytest.mark.parametrize("verify", ["auto", "size"])
+async def test_an_answer_that_comes_while_it_is_compared_counts(
+    store: FakeWriter, monkeypatch: pytest.MonkeyPatch, verify: str
+) -> None:
+    """The network brought it later than that to Terminate: a request of another file hit this one."""
+    tree, look = make_writable(store, verify=verify), store.list_directory
+
+    async def look_late(path: bytes) -> Listing:
+        if store.uploads and not store.uploads[-1].overwrites:
+            store.uploads[-1].overwrites.append(Overwrite(500, 510))
+        return await look(path)
+
+    monkeypatch.setattr(store, "list_directory", look_late)
+    with pytest.raises(DataUnproven):
+        await change(tree, PART)
 
 
 async def test_a_cut_is_verified_by_its_size(store: FakeWriter) -> None:
