@@ -277,10 +277,10 @@ class Files:
         if proven_at <= self._rebooted_at:
             return
         blocks = FileBlocks(self._cache, size)
-        for offset, data in pieces:
-            blocks.preload(offset, data)
         blocks.on_given(0, size)
         self._replace(path, Version(path, None, blocks, proven_at, shown=True))
+        for offset, data in pieces:
+            blocks.preload(offset, data)
 
     def on_renamed(self, old: bytes, new: bytes) -> None:
         """A file, or a directory with all below it, has another path now; open files follow."""

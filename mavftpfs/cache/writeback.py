@@ -7,7 +7,7 @@ vehicle's. Paths are the vehicle's, normalised; those below `@` never come here 
 from __future__ import annotations
 
 import logging
-from contextlib import closing
+from contextlib import closing, suppress
 from pathlib import Path
 
 import trio
@@ -34,6 +34,7 @@ from mavftpfs.shared.errors import (
     IsADirectory,
     MavftpfsError,
     NotFound,
+    SpoolFailed,
 )
 from mavftpfs.shared.model import EntryKind, wire_path
 
@@ -255,7 +256,8 @@ class Writeback:
         if fits and recent and draft.whole:
             starts = range(0, draft.size, STEP)
             pieces = ((at, draft.local_bytes(at, min(at + STEP, draft.size))) for at in starts)
-            context.files.adopt(node.path, draft.size, pieces, proven_at=node.delivered_at)
+            with suppress(SpoolFailed):  # the local disk does not give it back: it is on the vehicle
+                context.files.adopt(node.path, draft.size, pieces, proven_at=node.delivered_at)
         self._background.settle(node)
 
     # --- names

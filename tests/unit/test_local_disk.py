@@ -68,6 +68,20 @@ async def test_a_disk_that_fails_is_the_error_of_one_file(
     assert store.files[FILE].data == BIG
 
 
+async def test_a_disk_that_fails_when_all_is_delivered_harms_nothing(
+    store: FakeWriter, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The last close would have kept the content as what was read."""
+    tree = make_writable(store, dirty_max=65536)
+    file = await begin(tree, store)
+    store.lost = False
+    await file.fsync()
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "pread", failing)
+        await file.release()
+    assert await read_file(tree, FILE) == BIG
+
+
 async def test_a_cut_that_fails_changes_nothing(store: FakeWriter, monkeypatch: pytest.MonkeyPatch) -> None:
     tree = make_writable(store, dirty_max=65536)
     file = await begin(tree, store)
