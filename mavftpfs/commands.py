@@ -23,6 +23,7 @@ from mavftpfs.fuse.options import MountOptions, parse_options, with_root
 from mavftpfs.link.uri import LinkSpec, parse_source
 from mavftpfs.mountpoint import canonical, check_fuse, check_mountpoint, is_ours, unmount
 from mavftpfs.shared.errors import UsageError
+from mavftpfs.shared.readable import readable
 
 if TYPE_CHECKING:
     from mavftpfs.oneshot import Target
@@ -89,7 +90,7 @@ def _report_in_foreground(code: int, message: str) -> None:
     if code == 0:
         logging.getLogger("mavftpfs").info("mounted; Ctrl-C unmounts")
     elif message:
-        print(f"mavftpfs: {message}", file=sys.stderr)
+        print(f"mavftpfs: {readable(message)}", file=sys.stderr)
 
 
 def _start_logging(options: MountOptions, *, foreground: bool, debug: bool) -> None:

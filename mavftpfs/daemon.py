@@ -111,7 +111,7 @@ def _await_report(read_end: int, pid: int, mask: set[int]) -> int:
     if not code:
         return _explain_death(pid)
     if message.strip():
-        print(f"mavftpfs: {message.strip()}", file=sys.stderr)
+        print(f"mavftpfs: {readable(message.strip())}", file=sys.stderr)
     return int(code)
 
 
@@ -150,7 +150,9 @@ def log_to_file(path: str, level: int) -> None:
     Raises:
         OSError: it cannot be opened.
     """
-    _install(logging.FileHandler(path), "%(asctime)s %(levelname)s %(name)s: %(message)s", level)
+    _install(
+        logging.FileHandler(path, encoding="utf-8"), "%(asctime)s %(levelname)s %(name)s: %(message)s", level
+    )
 
 
 def log_in_background(fallback: Path, level: int, *, socket: str = SYSLOG_SOCKET) -> None:
@@ -161,13 +163,19 @@ def log_in_background(fallback: Path, level: int, *, socket: str = SYSLOG_SOCKET
         handler = logging.handlers.SysLogHandler(socket)
     else:
         fallback.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        handler = logging.handlers.RotatingFileHandler(fallback, maxBytes=_LOG_SIZE, backupCount=1)
+        handler = logging.handlers.RotatingFileHandler(
+            fallback, maxBytes=_LOG_SIZE, backupCount=1, encoding="utf-8"
+        )
         form = f"%(asctime)s {form}"
     _install(handler, form, level)
 
 
 class _Readable(logging.Formatter):
-    """Shows names as a person reads them."""
+    """Shows names as a person reads them; local ones may be no text."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """See logging.Formatter."""
+        return super().format(record).encode("utf-8", "backslashreplace").decode()
 
     def formatMessage(self, record: logging.LogRecord) -> str:
         """See logging.Formatter."""

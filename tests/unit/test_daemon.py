@@ -171,6 +171,19 @@ def test_the_log_shows_names_as_they_are_read(tmp_path: Path) -> None:
     assert path.read_text().endswith("'/Flüge' is not delivered: 'it's?'\n")
 
 
+@pytest.mark.usefixtures("restored_logging")
+def test_a_name_that_is_no_text_is_logged_too(tmp_path: Path) -> None:
+    path = tmp_path / "log"
+    daemon.log_to_file(str(path), logging.INFO)
+    logging.getLogger("mavftpfs").info("%s stays where it is", os.fsdecode(b"/spool/\xff"))
+    assert path.read_text().endswith("/spool/\\udcff stays where it is\n")
+
+
+def test_what_the_child_reports_shows_names_as_they_are_read(tmp_path: Path) -> None:
+    done = run("report(1, repr('/Flüge'.encode()) + ' does not exist')\nreturn 1", tmp_path)
+    assert (done.returncode, done.stderr) == (1, "mavftpfs: '/Flüge' does not exist\n")
+
+
 @pytest.mark.parametrize("text", ["cannot open /tmp/b'ü'", "no b'\\x' here", "b'one\ntwo'"])
 def test_what_only_looks_like_a_name_is_left_alone(text: str) -> None:
     assert readable(text) == text
