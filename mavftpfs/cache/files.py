@@ -261,6 +261,10 @@ class Files:
         version = self._current.get(path)
         return None if version is None or version.dead is not None else version.blocks
 
+    def was_replaced(self, path: bytes) -> bool:
+        """Return whether somebody has a version of the path open that is not the vehicle's any more."""
+        return any(version.path == path and version.dead is not None for version in self._open_versions)
+
     def on_written(self, path: bytes) -> None:
         """What was cached of the path is no longer the file; who has it open opens it anew."""
         current = self._current.pop(path, None)

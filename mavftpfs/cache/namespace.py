@@ -94,13 +94,18 @@ class Namespace(Names):
             self._context.on_changed(path)
 
     async def unlink(self, path: bytes, *, first: Callable[[], None] = lambda: None) -> None:
-        """See Tree.unlink; `first()` is called when nobody else can open the file, and may raise."""
-        async with self._changing(path, doomed=path):
+        """See Tree.unlink; `first()` is called, perhaps twice, when nobody else can open the file, and may
+        raise."""
+        if not await self._unlink(path, first):
+            await self._unlink(path, first, fetched=True)
+
+    async def _unlink(self, path: bytes, first: Callable[[], None], *, fetched: bool = False) -> bool:
+        """Return False if it has to be fetched first; `fetched`: do that."""
+        async with self._changing(path, doomed=path, fetched=fetched):
             first()
             node = self._context.nodes.get(path)
             if node is not None and await self.entry(path) is not None:
-                await self._unlink_node(node, path)
-                return
+                return await self._unlink_node(node, path, fetched=fetched)
             entry = await self.current(path)
             if entry is None:
                 raise NotFound(f"{path!r} does not exist")
@@ -108,6 +113,7 @@ class Namespace(Names):
                 raise IsADirectory(f"{path!r} is a directory")
             self._context.require_idle(path)
             await self._remove(path)
+            return True
 
     async def rename(self, old: bytes, new: bytes, *, noreplace: bool) -> None:
         """See Tree.rename."""
@@ -152,17 +158,18 @@ class Namespace(Names):
 
     @asynccontextmanager
     async def _changing(
-        self, old: bytes, new: bytes | None = None, *, doomed: bytes | None = None
+        self, old: bytes, new: bytes | None = None, *, doomed: bytes | None = None, fetched: bool = False
     ) -> AsyncIterator[None]:
-        """Hold the path, or both, and the files there and below; those at the old path are delivered before.
+        """Hold the path, or both, and the files there and below; those at the old path are delivered before,
+        and what is not known of one that is to lose its name while it is open is fetched if that is asked.
 
         A delivery may last: nobody waits for one, or makes one, while it keeps others from their paths. That
         of a file which is to lose its name (`doomed`) is called off instead; if it keeps it after all, who
         waits for the delivery has it begin again.
 
         Raises:
-            FileBusy: one is still being delivered. RequestTimeout: another change took too long. Else as
-            Deliverer.deliver.
+            FileBusy: one is still being delivered, or cannot be fetched. RequestTimeout: another change took
+            too long. Else as Deliverer.deliver.
         """
         paths = (old,) if new is None else (old, new)
         for _ in range(TRIES):
@@ -170,6 +177,8 @@ class Namespace(Names):
             try:
                 async with AsyncExitStack() as locks:
                     await self._lock_nodes(nodes, doomed, locks)
+                    if fetched:
+                        await self._fetch(nodes, doomed)
                     if new not in (None, old) and not await self._deliver_below(old, nodes):
                         continue
                     await locks.enter_async_context(self._context.paths.hold(*paths))
@@ -192,8 +201,16 @@ class Namespace(Names):
                 if node.path == doomed:
                     locks.enter_context(node.dooming())
                 await locks.enter_async_context(node.lock)
+                if node.path == doomed:
+                    locks.enter_context(self._hider.keeping(node))
         if scope.cancelled_caught:
             raise FileBusy("a file that is concerned is still being delivered")
+
+    async def _fetch(self, locked: list[Node], doomed: bytes | None) -> None:
+        for node in locked:
+            if node.path == doomed:
+                await self._deliverer.abandon(node)
+                await self._hider.fetch(node)
 
     async def _deliver_below(self, path: bytes, locked: list[Node]) -> bool:
         """Return False if a file among them is about to lose its name."""
@@ -239,7 +256,8 @@ class Namespace(Names):
                 raise
             self._context.dentries.note_removed(path)
 
-    async def _unlink_node(self, node: Node, path: bytes) -> None:
+    async def _unlink_node(self, node: Node, path: bytes, *, fetched: bool) -> bool:
+        """Return False if it can be neither held here nor hidden, and was not fetched before."""
         await self._deliverer.abandon(node)
         if path in self._context.torn:
             await self._purge(path)
@@ -247,13 +265,16 @@ class Namespace(Names):
         if there and node.draft is None:
             self._context.require_idle(path)
         hidden = False
-        if there and node.handles and not self._hider.keep_content(node):
+        if there and node.handles and not self._hider.keep_content(node) and not fetched:
             await self._purge(path)
             hidden = await self._hider.hide(node)
+            if not hidden:
+                return False
         if there and not hidden:
             await self.remove_perhaps(path)
         node.lose_name()
         self._context.nodes.detach(node)
+        return True
 
     async def _is_file(self, path: bytes, node: Node) -> bool:
         """Return whether the vehicle has an open file; what else has its name by now is not to be removed.

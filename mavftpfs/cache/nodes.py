@@ -55,11 +55,12 @@ class Node:
     """One file.
 
     path: its name, or the reserved name it was hidden under. draft: what the vehicle does not have of it;
-    content: the draft's bytes. handles: how many are open, writers: those for writing. generation: counts how
-    often its content on the vehicle was changed by us. removed: it has no name any more. hidden: it is still
-    on the vehicle under a reserved name. error: why it could not be delivered. quiet: no delivery is under
-    way, so it may be written. lock: held to deliver it and to change its path. starting: a background
-    upload is about to begin. background: whether it may begin by itself; start_after: not before.
+    content: the draft's bytes. copied: the draft was made only because the name was to go. handles: how many
+    are open, writers: those for writing. generation: counts how often its content on the vehicle was changed
+    by us. removed: it has no name any more. hidden: it is still on the vehicle under a reserved name. error:
+    why it could not be delivered. quiet: no delivery is under way, so it may be written. lock: held to
+    deliver it and to change its path. starting: a background upload is about to begin. background: whether
+    it may begin by itself; start_after: not before.
     base: reads the vehicle's file. delivered_at: when the vehicle last had it all. doomed: how many changes
     that take its name away have the lock, or are about to: no delivery begins or goes on.
     """
@@ -67,6 +68,7 @@ class Node:
     path: bytes
     draft: Draft | None = None
     content: SpoolContent | None = None
+    copied: bool = False
     handles: int = 0
     writers: int = 0
     generation: int = 0
@@ -171,7 +173,7 @@ class Node:
         if self.content is not None:
             self.content.close()
         self.draft = self.content = self.attempt = self.error = None
-        self.background = True
+        self.background, self.copied = True, False
 
 
 class Nodes:

@@ -33,7 +33,8 @@ class CacheOptions:
     op_deadline: a read ends when none of its bytes came for so long.
     dirty_max: written bytes that may wait in memory, and un-ACKed before writers wait; None = about ten
     seconds of the measured rate. spool_max: bytes that may wait on the local disk.
-    rmw_max: the largest file that is sent whole for a change of a part of it.
+    rmw_max: the largest file that is sent whole for a change of a part of it, and the most that is fetched of
+    an open file that is to be removed and cannot be hidden.
     verify: auto, size, crc (see cache.verify) or none; verify_max: largest file whose CRC32 is
     asked. write_armed: change things in flight too. force: change files that somebody else writes.
     inplace: overwrite files where they cannot be replaced. local: patterns of names that never reach the

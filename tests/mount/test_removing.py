@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+
 import pytest
 
 from tests.mount.conftest import Field
@@ -35,4 +37,35 @@ def test_the_name_goes_while_cp_waits_for_the_card(field: Field, profile: str, c
     assert set(mount.run("ls", "-A", mount.path).stdout.split()) == left
     assert {path.name for path in card.iterdir()} == left
     assert {path.read_text() for path in card.iterdir()} == {"other\n"}
+    assert mount.unmount() == 0
+
+
+@pytest.mark.parametrize("command", ["rm", "mv"])
+@pytest.mark.parametrize("mode", ["rb", "r+b"])
+def test_a_file_goes_while_a_program_has_a_part_of_it(field: Field, command: str, mode: str) -> None:
+    """Where nothing can be renamed: as on a local disk, the program goes on with all of it."""
+    card, disk = field.local("card"), field.local("disk")
+    old = content("old", SIZE)
+    (card / "file").write_bytes(old)
+    (disk / "file").write_bytes(b"new\n")
+    vehicle = field.sim(card, "littlefs")
+    mount = field.mount(vehicle.source)
+    expected = bytearray(old)
+    with open(mount.path / "file", mode, buffering=0) as file:
+        assert os.pread(file.fileno(), 100, 1000) == old[1000:1100]
+        if mode != "rb":
+            expected[50_000:50_004] = b"here"
+            os.pwrite(file.fileno(), b"here", 50_000)
+        if command == "rm":
+            mount.run("rm", mount.path / "file")
+            assert os.listdir(card) == []
+        else:
+            mount.run("mv", disk / "file", mount.path / "file")
+            assert (card / "file").read_bytes() == b"new\n"
+        assert file.read() == expected
+        if mode != "rb":
+            os.pwrite(file.fileno(), b"more", SIZE)
+            os.fsync(file.fileno())
+            assert os.pread(file.fileno(), SIZE + 10, 0) == expected + b"more"
+    assert [path.read_bytes() for path in card.iterdir()] == ([] if command == "rm" else [b"new\n"])
     assert mount.unmount() == 0

@@ -111,6 +111,7 @@ async def test_a_file_renamed_while_it_is_closed_is_forgotten(
 async def test_an_unlinked_file_made_anew_is_another_one(store: FakeWriter, tree: Tree) -> None:
     store.kind = KINDS["littlefs"]  # nothing can be hidden by renaming
     file = await tree.open(FILE)
+    store.files[FILE].data = OLD[:-1]  # nor is what was opened there to be fetched any more
     await tree.unlink(FILE)
     await write_file(tree, FILE, bytes(Random(1).randbytes(len(OLD))))
     with pytest.raises(FileChanged):
