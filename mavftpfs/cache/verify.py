@@ -196,7 +196,7 @@ class Verifier:
         """Return whether the CRC32 was compared.
 
         Raises:
-            VerificationFailed: it differs, or was not answered though verify=crc.
+            VerificationFailed: it differs, or was not answered though verify=crc. Armed: not asked for now.
         """
         demanded = verify == "crc"
         if verify == "size" or not draft.whole or draft.size == 0:
@@ -227,6 +227,7 @@ class Verifier:
 
     def _note_unanswered(self, path: bytes, error: MavftpfsError, *, demanded: bool) -> None:
         if demanded:
+            self._context.require_disarmed()  # else it is asked for after the flight
             raise VerificationFailed(f"no checksum of {path!r}: {error}") from error
         if not isinstance(error, Armed):
             self.unanswered += 1

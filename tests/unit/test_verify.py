@@ -131,6 +131,32 @@ async def test_a_checksum_that_is_not_asked_for_in_flight_sends_nothing_again(st
     assert store.count("crc") == 1
 
 
+@pytest.mark.parametrize("path", [b"/card/new", FILE])
+async def test_armed_while_the_checksum_is_asked_for(
+    autojump_clock: object, store: FakeWriter, monkeypatch: pytest.MonkeyPatch, path: bytes
+) -> None:
+    """As at any other moment (promise 9); what is there is compared after it was disarmed."""
+    tree, ask = make_writable(store, verify="crc"), store.crc32
+
+    async def ask_in_flight(path: bytes, *, size: int | None = None) -> int:
+        tree.armed_changed(True)
+        store.armed = True
+        return await ask(path, size=size)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(store, "crc32", ask_in_flight)
+        with pytest.raises(Armed):
+            await write_file(tree, path, b"x" * 5000)
+    sent = [what for what in store.log if what[0] == "write"]
+    store.armed = False
+    tree.armed_changed(False)
+    await trio.sleep(60)
+    assert tree.undelivered() == []
+    assert store.files[path].data == b"x" * 5000
+    assert [what for what in store.log if what[0] == "write"] == sent
+    assert set(store.files) == {FILE, path}
+
+
 @pytest.mark.parametrize("verify", ["auto", "size", "none"])
 async def test_nothing_is_read_back_unasked(store: FakeWriter, verify: str) -> None:
     tree = make_writable(store, verify=verify)
