@@ -29,6 +29,7 @@ from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, Trans
 from rich.table import Table
 
 from mavftpfs import control
+from mavftpfs.daemon import signals_held
 from mavftpfs.mountpoint import mounted_types
 
 HOST = "127.0.0.1"
@@ -127,18 +128,20 @@ def daemon(name: str, arguments: Sequence[str], folder: Path) -> Iterator[subpro
 
     It gets a session of its own, so that Ctrl-C reaches only the tour, which then ends things in order.
     """
-    with (folder / f"{name}.log").open("wb") as log:
-        process = subprocess.Popen(
-            [sys.executable, "-m", "mavftpfs", *arguments],
-            stdin=subprocess.DEVNULL,
-            stdout=log,
-            stderr=log,
-            start_new_session=True,
-        )
+    process = None
     try:
+        with (folder / f"{name}.log").open("wb") as log, signals_held():
+            process = subprocess.Popen(
+                [sys.executable, "-m", "mavftpfs", *arguments],
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=log,
+                start_new_session=True,
+            )
         yield process
     finally:
-        end(process)
+        if process is not None:
+            end(process)
 
 
 def end(process: subprocess.Popen[bytes]) -> None:
