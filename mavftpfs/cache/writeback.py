@@ -30,6 +30,7 @@ from mavftpfs.cache.throttle import Throttle
 from mavftpfs.cache.writefile import ReadFile, WriteFile
 from mavftpfs.shared.errors import (
     AlreadyExists,
+    FileBusy,
     FileTooLarge,
     IsADirectory,
     MavftpfsError,
@@ -295,6 +296,8 @@ class Writeback:
         try:
             if file.size:
                 await file.fsync()  # what was accepted before does not depend on what follows
+            if file.node.writers > 1:
+                raise FileBusy(f"{path!r} is being written, so nothing can be moved over it")
             replacing = True
             await file.truncate(0)
             await file.write(0, data)

@@ -157,6 +157,29 @@ async def test_a_file_that_is_written_while_it_is_read_to_be_moved_stays(
         await tree.stat(SWAP)
 
 
+@pytest.mark.parametrize("later", [0.0, 0.5])
+async def test_nothing_is_moved_over_a_file_that_is_being_written(
+    autojump_clock: object, store: FakeWriter, tree: Tree, later: float
+) -> None:
+    """What the program writes after that would land in what was moved there."""
+    await write_file(tree, SWAP, b"rescued")
+    store.write_delay = 1.0
+    file = await tree.open(FILE, write=True)
+    await file.write(0, b"begun")
+    async with trio.open_nursery() as both:
+
+        async def move_over() -> None:
+            await trio.sleep(later)
+            assert await move(tree, SWAP, FILE) == SWAP
+
+        both.start_soon(move_over)
+        both.start_soon(file.fsync)
+    await file.write(5, b", done")
+    await file.release()
+    assert store.files[FILE].data == b"begun, done"
+    assert await read_file(tree, SWAP) == b"rescued"
+
+
 async def move(tree: Tree, old: bytes, new: bytes) -> bytes:
     """Return where the file is then."""
     try:
