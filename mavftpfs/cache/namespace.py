@@ -119,7 +119,12 @@ class Namespace(Names):
         """See Tree.rename."""
         if new.startswith(old + b"/"):
             raise InvalidMove(f"{old!r} cannot become a part of itself")
-        async with self._changing(old, new, doomed=None if noreplace or old == new else new):
+        if not await self._rename(old, new, noreplace=noreplace):
+            await self._rename(old, new, noreplace=noreplace, fetched=True)
+
+    async def _rename(self, old: bytes, new: bytes, *, noreplace: bool, fetched: bool = False) -> bool:
+        """Return False if what is to be replaced has to be fetched first; `fetched`: do that."""
+        async with self._changing(old, new, doomed=None if noreplace or old == new else new, fetched=fetched):
             wire_path(new)
             listed = await self.current(new, free=noreplace)
             target = listed or await self.entry(new)
@@ -132,9 +137,12 @@ class Namespace(Names):
             if target is not None and noreplace:
                 raise AlreadyExists(f"{new!r} exists")
             if old == new:
-                return
+                return True
             await self._require_replaceable(source, new, target)
+            if not fetched and self._would_lose(old, new):
+                return False
             await self._rename_checked(old, new, source, target, by_case=other == old)
+            return True
 
     async def release(self, node: Node) -> None:
         """Nobody has an unlinked file open any more: remove what was hidden of it.
@@ -310,6 +318,13 @@ class Namespace(Names):
             context.dentries.forget(old)
         context.follow_rename(old, new)
         self._on_renamed(old, new)
+
+    def _would_lose(self, old: bytes, new: bytes) -> bool:
+        """Return whether readers of what is replaced, in steps, would lose it: it cannot be hidden then."""
+        node = self._context.nodes.get(new)
+        if node is None or not node.handles or fits_rename(old, new):
+            return False
+        return self._context.writer.traits.rename_works is not False and not self._hider.keep_content(node)
 
     async def _is_kept(self, old: bytes, new: bytes, displaced: Node | None, *, by_case: bool) -> bool:
         """Rename over an open file so that its readers keep it; return False if that is not the way."""

@@ -55,10 +55,10 @@ class Node:
     """One file.
 
     path: its name, or the reserved name it was hidden under. draft: what the vehicle does not have of it;
-    content: the draft's bytes. copied: the draft was made only because the name was to go. handles: how many
-    are open, writers: those for writing. generation: counts how often its content on the vehicle was changed
-    by us. removed: it has no name any more. hidden: it is still on the vehicle under a reserved name. error:
-    why it could not be delivered. quiet: no delivery is under way, so it may be written. lock: held to
+    content: the draft's bytes. copied: the draft is only a copy, made because the name was to go. handles:
+    how many are open, writers: those for writing. generation: counts how often its content on the vehicle was
+    changed by us. removed: it has no name any more. hidden: it is still on the vehicle under a reserved name.
+    error: why it could not be delivered. quiet: no delivery is under way, so it may be written. lock: held to
     deliver it and to change its path. starting: a background upload is about to begin. background: whether
     it may begin by itself; start_after: not before.
     base: reads the vehicle's file. delivered_at: when the vehicle last had it all. doomed: how many changes

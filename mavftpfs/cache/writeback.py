@@ -242,6 +242,7 @@ class Writeback:
             idle_since = self._context.clock()
 
     def _on_written(self, node: Node) -> None:
+        node.copied = False
         if not node.removed:
             self.overlay.on_written(node.path)
             self._background.kick(node)

@@ -20,7 +20,16 @@ from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.spool import SpoolDirectory
 from mavftpfs.cache.tree import Tree
 from mavftpfs.protocol.payload import NakCode, Opcode
-from mavftpfs.shared.errors import Armed, FileBusy, FileChanged, FtpNak, MavftpfsError, VehicleLost
+from mavftpfs.shared.errors import (
+    Armed,
+    CrossDevice,
+    FileBusy,
+    FileChanged,
+    FtpNak,
+    MavftpfsError,
+    RequestTimeout,
+    VehicleLost,
+)
 from mavftpfs.shared.model import split
 from tests.support.fake_store import read_file
 from tests.support.fake_writer import KINDS, FakeWriter, card, make_writable
@@ -210,6 +219,33 @@ async def test_what_became_another_file_cannot_be_kept(
     await file.release()
 
 
+@pytest.mark.parametrize("kind", sorted(KINDS))
+async def test_who_opened_what_was_there_before_does_not_get_the_other(
+    nursery: trio.Nursery, autojump_clock: object, kind: str
+) -> None:
+    """Its bytes would be of two files; who opened the one that is removed goes on."""
+    store = FakeWriter(KINDS[kind], nursery)
+    store.add(FILE, OLD, mtime=1)
+    tree = make_writable(store)
+    before, _ = await partly_read(tree)
+    store.add(FILE, OLD[::-1], mtime=2)
+    tree.forget_caches()
+    after = await tree.open(FILE)
+    assert await whole(after) == OLD[::-1]
+    with pytest.raises(FileChanged):
+        await before.read(0, 10)
+    await tree.unlink(FILE)
+    with pytest.raises(FileChanged):
+        await before.read(0, 10)
+    if KINDS[kind].renames:
+        assert await whole(after) == OLD[::-1]
+    await before.release()
+    await after.release()
+    assert FILE not in store.files
+    assert store.crimes == []
+    nursery.cancel_scope.cancel()
+
+
 # --- it is not removed
 
 
@@ -352,7 +388,70 @@ async def test_a_dead_mount_offers_no_copy_of_what_the_card_has(
     spool.close()
 
 
-# --- names too long to hide it
+async def test_a_copy_that_was_written_is_no_copy_any_more(
+    autojump_clock: object, store: FakeWriter, tree: Tree
+) -> None:
+    reader, _ = await unread(tree)
+    store.fail_at = {2: RequestTimeout("no answer")}  # the first was to rename it
+    with pytest.raises(RequestTimeout):
+        await tree.unlink(FILE)
+    writer = await tree.open(FILE, write=True)
+    await writer.write(AT, NEW)
+    await writer.release()
+    assert store.files[FILE].data == CHANGED
+    store.fail_at = {store.requests + 1: DENIED}
+    with pytest.raises(FtpNak):
+        await tree.unlink(FILE)
+    opened = store.count("reader")
+    assert await whole(reader) == CHANGED
+    assert store.count("reader") == opened
+    await reader.release()
+    assert held(tree) == 0
+
+
+# --- where others are hidden
+
+LONG_NAMES = (b"/card/dir/" + b"o" * 140, b"/card/dir/" + b"n" * 140)
+
+
+@pytest.mark.parametrize("kind", [name for name in sorted(KINDS) if KINDS[name].renames])
+@pytest.mark.parametrize("write", [False, True])
+async def test_renamed_over_by_steps(
+    nursery: trio.Nursery, autojump_clock: object, kind: str, write: bool
+) -> None:
+    """Names that do not fit one request: the file that is replaced is not hidden."""
+    store = FakeWriter(KINDS[kind], nursery)
+    old, new = LONG_NAMES
+    store.add(old, b"it")
+    store.add(new, OLD)
+    tree = make_writable(store)
+    file, content = await tree.open(new, write=write), OLD
+    if write:
+        await file.write(AT, NEW)
+        content = CHANGED
+    await tree.rename(old, new)
+    assert {path: node.data for path, node in store.files.items()} == {new: b"it"}
+    assert await read_file(tree, new) == b"it"
+    assert await whole(file) == content
+    await file.release()
+    assert {path: node.data for path, node in store.files.items()} == {new: b"it"}
+    assert held(tree) == 0
+    assert store.crimes == []
+    nursery.cancel_scope.cancel()
+
+
+async def test_nothing_is_fetched_for_a_rename_that_cannot_be(
+    autojump_clock: object, store: FakeWriter, tree: Tree
+) -> None:
+    file, content = await unread(tree)
+    store.chunk_delay = 10.0
+    with pytest.raises(CrossDevice):
+        await tree.rename(OTHER, FILE)
+    with pytest.raises(CrossDevice):
+        await tree.rename(OTHER, FILE)
+    store.chunk_delay = 0.001
+    assert await whole(file) == content
+    await file.release()
 
 
 @pytest.mark.parametrize("kind", [name for name in sorted(KINDS) if KINDS[name].renames])
