@@ -22,6 +22,7 @@ _FAT_FORBIDDEN = frozenset(b'"*:<>?|\x7f') | frozenset(range(32))
 _SHORT_WITH_DOT = re.compile(rb"([!#-)\-0-9@^-`{}~A-Z]{1,8}|[!#-)\-0-9@^-`{}~a-z]{1,8})\.")
 _GAP_LIMIT = 65_536
 _CRC_BLOCK = 65_536
+_SECTOR = 512
 
 
 class OpenFile(Protocol):
@@ -238,7 +239,8 @@ class Storage:
 
 
 class _FatFile:
-    """A FAT file open for writing: its directory entry learns the size when it is closed.
+    """A FAT file open for writing: its directory entry learns the size when it is closed, and the sector that
+    was written last is in memory until then, or until another one is written.
 
     On FatFs a full card is EIO, a write of nothing too, and a gap holds whatever the card held.
     """
@@ -249,11 +251,14 @@ class _FatFile:
         self._rng = rng
         self._durable = real.size()
         self._open = True
+        self._sector = -1
+        self._on_card = b""
         self.read = real.read
         self.size = real.size
 
     def write(self, offset: int, data: bytes) -> int:
         """See OpenFile."""
+        self._hold_sector(offset + len(data) - 1)
         if not self._fatfs:
             return self._real.write(offset, data)
         if not data:
@@ -272,6 +277,18 @@ class _FatFile:
         self._real.close()
 
     def lose(self) -> None:
-        """The power goes: what was appended since the file was opened is gone."""
-        if self._open and self._real.size() > self._durable:
+        """The power goes: what was appended since the file was opened is gone, and what was in memory."""
+        if not self._open:
+            return
+        if self._on_card:
+            self._real.write(self._sector * _SECTOR, self._on_card)
+        if self._real.size() > self._durable:
             self._real.resize(self._durable)
+
+    def _hold_sector(self, offset: int) -> None:
+        """The sector of this place is about to be written in memory."""
+        sector = offset // _SECTOR
+        if sector != self._sector:
+            start = sector * _SECTOR
+            self._sector = sector
+            self._on_card = self._real.read(start, min(_SECTOR, max(0, self._durable - start)))

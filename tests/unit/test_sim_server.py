@@ -16,6 +16,7 @@ from mavftpfs.link.messages import Address
 from mavftpfs.protocol.payload import NakCode, Opcode, decode_reply, request
 from mavftpfs.sim.profiles import PROFILES
 from mavftpfs.sim.server import FtpServer
+from mavftpfs.sim.storage import Storage
 from mavftpfs.sim.tree import DirectoryTree, MemoryTree
 from tests.support.sim_client import CLIENT, OTHER, Client, ack, nak, small_tree
 
@@ -168,6 +169,29 @@ def test_a_row_is_answered_as_one_by_one(name: str, seed: int) -> None:
         )
 
     assert run(by_rows=True) == run(by_rows=False)
+
+
+@pytest.mark.parametrize("real", [False, True])
+@pytest.mark.parametrize("name", ["px4-nuttx", "ardupilot5"])
+def test_fat_loses_the_sector_in_memory_with_the_power(name: str, real: bool, tmp_path: Path) -> None:
+    """Both FatFs and NuttX write it when another one is needed, or the file is closed."""
+    (tmp_path / "fs" / "microsd").mkdir(parents=True)
+    tree = DirectoryTree(tmp_path) if real else small_tree()
+    storage = Storage(tree, PROFILES[name], random.Random(3))
+    old, new = bytes(range(250)) * 8, b"x" * 100
+    for closed in (False, True):
+        opened = storage.open(A, write=True, create=True, truncate=True)
+        opened.write(0, old)
+        opened.close()
+        opened = storage.open(A, write=True)
+        for offset in (0, 500, 600, 1000):
+            opened.write(offset, new)
+        if closed:
+            opened.close()
+        storage.lose_power()
+        expected = new + old[100:500] + new + new + old[700:1000] + new + old[1100:]
+        kept = storage.open(A).read(0, 4096)
+        assert kept == (expected if closed else expected[:1024] + old[1024:])
 
 
 @pytest.mark.parametrize("name", sorted(PROFILES))
