@@ -68,7 +68,7 @@ class Engine:
         self.traits = Traits() if traits is None else traits
         self.stats = EngineStats()
         self.on_unknown: Callable[[Payload], None] = lambda reply: None
-        self._ledger = Ledger(rng.randrange(LAST_SEQ + 1))
+        self._ledger = Ledger(rng.randrange(LAST_SEQ + 1), self.stats.lateness)
         self._ledger.ghost.on_done = lambda reply: self.on_unknown(reply)
         self._op_deadline = op_deadline
         self._note = note
@@ -163,7 +163,7 @@ class Engine:
             if req_opcode == _BURST and self._bursts.running:
                 self.stats.incoherent += 1
             else:
-                self.stats.unknown += 1
+                self.stats.on_unknown(seq, now)
                 self.on_unknown(reply)
         elif req_opcode != request.opcode:
             self._on_stale(request)
@@ -181,7 +181,7 @@ class Engine:
         replies = split_run(wires)
         at, malformed = 0, 0
         while at < len(replies):
-            run = self._ledger.settle_run(replies, at, self._bursts.heard_at)
+            run = self._ledger.settle_run(replies, at, self._bursts.heard_at, now)
             try:
                 if run:
                     self._believe_run(run, now)
@@ -210,7 +210,7 @@ class Engine:
         self.stats.naks += reply.opcode == _NAK
         self._heard_at = now
         rtt, flow = None, self.flow
-        if not self._ledger.settle(request, reply.seq):
+        if not self._ledger.settle(request, reply.seq, now):
             self.stats.spurious += 1
             flow.on_spurious()
         if self._bursts.heard_at >= request.sent_at:

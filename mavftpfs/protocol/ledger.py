@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from itertools import islice
 
+from mavftpfs.protocol.lateness import Lateness
 from mavftpfs.protocol.payload import MAX_DATA, Fields, Opcode, Payload
 from mavftpfs.protocol.requests import Operation, Request, Run, Transmission
 from mavftpfs.shared.errors import LocalProtocolError
@@ -24,6 +25,9 @@ FURTHEST_JUMP = LAST_SEQ + 1 - 2 * BURST_JUMP
 """Further on come the seqs just used, whose late replies may still be about."""
 
 _ACK = int(Opcode.ACK)
+_WORKING = frozenset(("slow", "work"))
+"""Families of requests whose answers come after those to newer ones by themselves."""
+
 _TELLING = frozenset((Opcode.WRITE_FILE, Opcode.OPEN_FILE_RO, Opcode.OPEN_FILE_WO, Opcode.CREATE_FILE))
 _MIN_REORDER = 3
 _MAX_REORDER = 64
@@ -52,7 +56,8 @@ class Ghost(Operation):
 
 
 class Ledger:
-    """The outstanding requests of one engine. next_seq: the first seq to use.
+    """The outstanding requests of one engine. next_seq: the first seq to use. lateness: told of what goes out
+    and is answered, of several at once that go out only of the first.
 
     Attributes:
         again: lost requests which go out again as soon as there is room.
@@ -63,6 +68,7 @@ class Ledger:
 
     __slots__ = (
         "_flying",
+        "_lateness",
         "_seq",
         "_table",
         "again",
@@ -74,8 +80,9 @@ class Ledger:
         "reorder",
     )
 
-    def __init__(self, next_seq: int) -> None:
+    def __init__(self, next_seq: int, lateness: Lateness) -> None:
         self._seq = next_seq
+        self._lateness = lateness
         self._table: dict[int, Request] = {}
         self._flying: dict[int, Request] = {}
         self.find = self._table.get
@@ -140,6 +147,8 @@ class Ledger:
             table[seq + 1] = flying[order] = request
             order += 1
         self.order = order
+        if requests[0].manner.family not in _WORKING:
+            self._lateness.on_sent(requests[0].seq + 1, now)
 
     def number(self, request: Request, now: float) -> None:
         """Give a request that goes out (again) its seq and order number."""
@@ -161,6 +170,8 @@ class Ledger:
         request.sent_at = now
         request.sends += 1
         self.order += 1
+        if request.manner.family not in _WORKING and request.opcode != Opcode.BURST_READ_FILE:
+            self._lateness.on_sent(request.seq + 1, now)
 
     def enter(self, request: Request) -> None:
         """Note that a numbered request is on its way."""
@@ -170,7 +181,7 @@ class Ledger:
 
     # --- coming in
 
-    def settle_run(self, replies: list[Fields], at: int, after: float) -> Run:
+    def settle_run(self, replies: list[Fields], at: int, after: float, now: float) -> Run:
         """Take out requests as long as replies, from index `at` on, are usual ones; return what they answer.
 
         Usual is the ACK, as `Engine.receive` would believe it, to the only transmission of a request with the
@@ -197,9 +208,11 @@ class Ledger:
                 newest = order
             run.append((request, data if size == MAX_DATA else data[:size]))
         self.newest_answered = newest
+        if run:
+            self._lateness.on_answered(sent_at, now)
         return run
 
-    def settle(self, request: Request, seq: int) -> bool:
+    def settle(self, request: Request, seq: int, now: float) -> bool:
         """Take out a request answered under `seq`; return False if that was an alias.
 
         Its order, sent_at and single are those of the answered transmission from then on.
@@ -216,6 +229,10 @@ class Ledger:
             self.reorder -= 1
         if request.order > self.newest_answered:
             self.newest_answered = request.order
+        if current:
+            self._lateness.on_answered(request.sent_at, now)
+        else:
+            self._lateness.on_stray(seq, now)
         return current
 
     def forget(self, request: Request) -> None:

@@ -18,7 +18,18 @@ from mavftpfs.protocol.engine import Engine
 
 QUIET = (0.25, 1.0)
 QUIET_ROUND_TRIPS = 4.0
-"""Seconds for which a second execution is feared (at least, at most, round trips)."""
+"""Seconds for which a second execution is feared (at least, at most, round trips), or, where copies were seen
+to come later than that, ..."""
+
+MARGIN = 1.25
+"""... so many times as long as the latest took."""
+
+
+def feared_for(engine: Engine, now: float) -> float:
+    """Return for how many seconds a copy of a request may yet come, on a path that makes copies."""
+    least, most = QUIET
+    quiet = min(most, max(least, QUIET_ROUND_TRIPS * (engine.rtt or 0.0)))
+    return max(quiet, MARGIN * engine.stats.lateness.seen(now))
 
 
 class Echoes:
@@ -44,12 +55,10 @@ class Echoes:
         now = self._clock()
         self._until = {name: until for name, until in self._until.items() if until > now}
         if repeated or self._engine.stats.strays:
-            least, most = QUIET
-            quiet = min(most, max(least, QUIET_ROUND_TRIPS * (self._engine.rtt or 0.0)))
-            self._until[path.lower()] = now + quiet
+            self._until[path.lower()] = now + feared_for(self._engine, now)
 
     async def let_pass(self, path: bytes) -> None:
-        """Wait until no such request changes what has the name any more, one second at most."""
+        """Wait until no such request changes what has the name any more."""
         rest = self._until.get(path.lower(), 0.0) - self._clock()
         if rest > 0.0:
             await trio.sleep(rest)

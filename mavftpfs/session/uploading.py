@@ -10,6 +10,7 @@ from mavftpfs.cache.remote import FREE_FOR, UploadSource
 from mavftpfs.protocol.payload import MAX_DATA, Opcode
 from mavftpfs.session.closing import close_refused, close_written
 from mavftpfs.session.copies import Span, WriteLog
+from mavftpfs.session.echoes import feared_for
 from mavftpfs.session.kit import Kit, Queue
 from mavftpfs.session.opening import TERMINATE_LIMIT, OpenSession
 from mavftpfs.session.turns import Turns
@@ -33,12 +34,6 @@ from mavftpfs.shared.errors import (
 
 REFUSALS = (FtpNak, ProtocolError, FileChanged, AlreadyExists, SpoolFailed)
 """Errors that do not pass by themselves."""
-
-STRAGGLE = (0.25, 1.0)
-STRAGGLE_ROUND_TRIPS = 4.0
-"""How long after the last byte of a file no other is opened to be written (at least, at most, round trips)
-where the link was seen to hold datagrams back or to double them: a WriteFile names no file, so a late one
-would be written to the next."""
 
 REOPENS = 5
 """How often the session may be lost without getting further in the file before the upload fails."""
@@ -120,11 +115,13 @@ class Uploading:
                 await trio.sleep(rest)
 
     def _feared_until(self, sent_at: float) -> float:
-        """Return until when a copy of a request may still come, if this link was seen to be of that kind."""
+        """Return until when a copy of a request may still come, if this link was seen to be of that kind.
+
+        A WriteFile names no file: a late one would be written to the next.
+        """
         if not self._engine.stats.strays:
             return sent_at
-        least, most = STRAGGLE
-        return sent_at + min(most, max(least, STRAGGLE_ROUND_TRIPS * (self._engine.rtt or 0.0)))
+        return sent_at + feared_for(self._engine, self._clock())
 
     def heard_stranger(self, since: float) -> bool:
         """See UploadHost."""

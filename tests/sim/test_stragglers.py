@@ -17,7 +17,12 @@ from mavftpfs.session.connection import Connection
 from mavftpfs.sim.linkmodel import LinkSettings
 from mavftpfs.sim.profiles import PROFILES
 from tests.sim.test_arming_replacement import NEW, Scene, replace
+from tests.sim.test_doubted_bytes import CLEAN, KEEPING
+from tests.sim.test_late_writes import change
+from tests.sim.test_upload import content
+from tests.support.mounting import mounted
 from tests.support.sources import MemorySource
+from tests.support.takingturns import taking_turns
 from tests.support.worlds import ROOTS, World
 
 DOUBLING = LinkSettings(delay=0.02, duplicate=1.0, reorder=0.1)
@@ -48,8 +53,10 @@ def hold_back_a_write(here: World, start: Callable[..., object]) -> None:
     server.handle = watch  # type: ignore[method-assign]
 
 
-def double(here: World, opcode: Opcode, late: float, start: Callable[..., object]) -> None:
-    """Have the first request of a kind come once more, so much later."""
+def double(
+    here: World, opcode: Opcode, late: float, start: Callable[..., object], *, mute: bool = False
+) -> None:
+    """Have the first request of a kind come once more, so much later; mute: the second answer is lost."""
     server = here.vehicle.server
     handle = server.handle
     kept: list[bytes] = []
@@ -57,6 +64,8 @@ def double(here: World, opcode: Opcode, late: float, start: Callable[..., object
     async def arrive_late(wire: bytes, source: Address) -> None:
         await trio.sleep(late)
         handle(wire, source, trio.current_time())
+        if mute:
+            server.outgoing(trio.current_time())
         here.link.kick()
 
     def watch(wire: bytes, source: Address, now: float) -> None:
@@ -172,3 +181,73 @@ async def test_a_late_create_empties_nothing_that_is_said_to_be_there(
         verified = here.tree.data(root + b"/first")  # emptied by now, or not at all
         await trio.sleep(1)
     assert here.tree.data(root + b"/first") == verified
+
+
+VERY_LATE = 3.0
+"""Seconds; QUIET is one at most."""
+
+
+async def show(here: World, connection: Connection, root: bytes, late: float, nursery: trio.Nursery) -> None:
+    """Let the client see how late copies come on this path."""
+    while connection.store.lists_times is None:
+        await connection.store.list_directory(root)
+    timed = connection.store.lists_times
+    listing = Opcode.LIST_DIRECTORY_WITH_TIME if timed else Opcode.LIST_DIRECTORY
+    double(here, listing, late, nursery.start_soon)
+    await connection.store.list_directory(root)
+    await connection.store.list_directory(root)
+    await trio.sleep(late + 1)
+
+
+@pytest.mark.parametrize("profile", taking_turns(KEEPING))
+async def test_a_write_as_late_as_others_were_does_not_reach_the_next_file(
+    profile: str, autojump: MockClock
+) -> None:
+    """Its answer is lost, so that nothing but the time keeps it from there."""
+    here = World(profile, LinkSettings(delay=0.02, rate=5760.0))
+    root = ROOTS.get(profile, b"") + b"/d"
+    old = content(20_000)
+    for name in (b"/first", b"/second"):
+        here.tree.add(root + name, old)
+    async with trio.open_nursery() as nursery, mounted(here, root) as (connection, tree):
+        await change(tree, root + b"/first", 1, b"x")  # tries out what the server does
+        await show(here, connection, root, VERY_LATE + 0.1, nursery)
+        double(here, Opcode.WRITE_FILE, VERY_LATE, nursery.start_soon, mute=True)
+        await change(tree, root + b"/first", 100, FIRST)
+        await trio.sleep(VERY_LATE - 1.5)
+        await change(tree, root + b"/second", 5000, content(10_000, 2))
+        await trio.sleep(VERY_LATE)
+    assert here.tree.data(root + b"/second") == old[:5000] + content(10_000, 2) + old[15_000:]
+    assert here.tree.data(root + b"/first") == old[:1] + b"x" + old[2:100] + FIRST + old[600:]
+
+
+@pytest.mark.parametrize("profile", taking_turns(sorted(PROFILES)))
+async def test_a_create_as_late_as_others_were_empties_nothing_that_is_said_to_be_there(
+    profile: str, autojump: MockClock
+) -> None:
+    here = World(profile, CLEAN)
+    root = ROOTS.get(profile, b"") + b"/d"
+    here.tree.add_directory(root)
+    async with trio.open_nursery() as nursery, here.connection() as connection:
+        await show(here, connection, root, VERY_LATE + 0.1, nursery)
+        double(here, Opcode.CREATE_FILE, VERY_LATE, nursery.start_soon)
+        await put(connection, root + b"/first", FIRST)
+        verified = here.tree.data(root + b"/first")  # emptied by now, or not at all
+        await trio.sleep(VERY_LATE)
+    assert here.tree.data(root + b"/first") == verified
+
+
+@pytest.mark.parametrize("profile", ["mavsdk", "ardupilot", "px4"])
+async def test_a_rename_as_late_as_others_were_does_not_take_the_next_file(
+    profile: str, autojump: MockClock
+) -> None:
+    here = World(profile, CLEAN)
+    here.tree.add(b"/d/old", FIRST)
+    async with trio.open_nursery() as nursery, here.connection() as connection:
+        await show(here, connection, b"/d", VERY_LATE + 0.1, nursery)
+        double(here, Opcode.RENAME, VERY_LATE, nursery.start_soon)
+        await connection.store.rename(b"/d/old", b"/d/new")
+        await put(connection, b"/d/old", SECOND)
+        await trio.sleep(VERY_LATE)
+    assert here.tree.data(b"/d/new") == FIRST
+    assert here.tree.data(b"/d/old") == SECOND

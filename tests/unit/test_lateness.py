@@ -1,0 +1,99 @@
+"""How late a path is seen to deliver what it doubled or held back."""
+
+from __future__ import annotations
+
+import random
+
+import pytest
+
+from mavftpfs.protocol.engine import Engine
+from mavftpfs.protocol.flow import Flow
+from mavftpfs.protocol.lateness import LONGEST, MEMORY, Lateness
+from mavftpfs.protocol.operations import Simple
+from mavftpfs.protocol.payload import Opcode, Payload
+from tests.support.replies import ack, sent
+
+
+def exchange(lateness: Lateness, answer: int, sent: float, answered: float) -> None:
+    """One request and its answer."""
+    lateness.on_sent(answer, sent)
+    lateness.on_answered(sent, answered)
+
+
+def test_a_copy_is_late_since_it_was_overtaken() -> None:
+    lateness = Lateness()
+    exchange(lateness, 1, 0.0, 0.1)
+    exchange(lateness, 2, 0.2, 0.3)
+    exchange(lateness, 3, 0.4, 0.5)
+    lateness.on_stray(1, 3.3)
+    assert lateness.seen(3.3) == pytest.approx(3.0)
+
+
+def test_what_nothing_overtook_is_not_late() -> None:
+    """A queue, or a card that makes a pause, keeps everybody waiting."""
+    lateness = Lateness()
+    exchange(lateness, 1, 0.0, 8.0)
+    lateness.on_stray(1, 8.1)
+    lateness.on_sent(1, 9.0)  # repeated, so that nobody knows which of both this answers
+    lateness.on_stray(1, 9.5)
+    assert lateness.seen(10.0) == 0.0
+
+
+def test_the_longest_counts_and_is_forgotten() -> None:
+    lateness = Lateness()
+    exchange(lateness, 1, 0.0, 0.1)
+    exchange(lateness, 2, 0.2, 0.3)
+    exchange(lateness, 3, 0.4, 0.5)
+    lateness.on_stray(1, 2.3)
+    lateness.on_stray(2, 1.0)
+    assert lateness.seen(3.0) == pytest.approx(2.0)
+    assert lateness.seen(2.3 + MEMORY + 1) == 0.0
+
+
+def test_answers_of_others_tell_nothing() -> None:
+    lateness = Lateness()
+    exchange(lateness, 1, 0.0, 0.1)
+    exchange(lateness, 2, 0.2, 0.3)
+    lateness.on_stray(77, 1.0)
+    lateness.on_stray(1, 0.3 + LONGEST + 1)
+    assert lateness.seen(12.0) == 0.0
+
+
+def test_little_is_remembered() -> None:
+    lateness = Lateness()
+    for number in range(10_000):
+        exchange(lateness, number, float(number), number + 0.5)
+    lateness.on_stray(1, 10_000.0)
+    assert lateness.seen(10_000.0) == 0.0
+    lateness.on_stray(9_995, 10_000.0)
+    assert lateness.seen(10_000.0) == pytest.approx(3.5)
+
+
+def ask(engine: Engine, opcode: Opcode, now: float) -> Payload:
+    """Send a request of a kind, and return it."""
+    engine.start(Simple(opcode, b"/d"), now)
+    (request,) = sent(engine, now)
+    return request
+
+
+def test_the_engine_sees_copies_of_answers() -> None:
+    engine = Engine(random.Random(1), Flow())
+    first = ack(ask(engine, Opcode.CREATE_DIRECTORY, 0.0))
+    engine.receive(first, 0.1)
+    engine.receive(first, 0.2)
+    assert engine.stats.lateness.seen(0.2) == 0.0
+    engine.receive(ack(ask(engine, Opcode.REMOVE_DIRECTORY, 1.0)), 1.1)
+    engine.receive(first, 4.1)
+    assert engine.stats.lateness.seen(4.1) == pytest.approx(3.0)
+
+
+def test_work_that_takes_long_is_not_late() -> None:
+    """A checksum that was asked for twice is worked out twice, while others are answered."""
+    engine = Engine(random.Random(1), Flow())
+    slow = ack(ask(engine, Opcode.CALC_FILE_CRC32, 0.0), bytes(4))
+    for number in range(5):
+        engine.receive(ack(ask(engine, Opcode.CREATE_DIRECTORY, number + 1.0)), number + 1.1)
+    engine.receive(slow, 6.0)
+    engine.receive(slow, 9.0)
+    assert engine.stats.unknown == 1
+    assert engine.stats.lateness.seen(9.0) == 0.0
