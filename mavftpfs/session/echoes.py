@@ -3,8 +3,8 @@
 Requests that carry names are carried out whenever they come: one that was held back for longer than a round
 trip, and repeated meanwhile, moves, removes, makes, empties or cuts whatever has the name by then (servers
 replay the last answer only, MAVSDK none; servers.md 4). So a name that was taken away is not given to
-something new, one that was given is not taken away, and a file that was cut or emptied is not changed,
-before such a request is dead.
+something new, one that was given, or opened to be written, is not taken away, and a file that was cut or
+emptied is not changed, before such a request is dead.
 """
 
 from __future__ import annotations
@@ -39,26 +39,31 @@ class Echoes:
         self._engine = engine
         self._clock = clock
         self._until: dict[bytes, float] = {}
+        self._opened: dict[bytes, float] = {}
 
     @contextmanager
-    def noted(self, path: bytes) -> Iterator[None]:
+    def noted(self, path: bytes, *, opens: bool = False) -> Iterator[None]:
         """The body sends a request that changes what has a name; a second execution of it may follow,
-        whatever became of the first."""
+        whatever became of the first. opens: OpenFileWO, which only brings back what was taken away."""
         before = self._engine.stats.retransmissions
         try:
             yield
         finally:
             repeated = self._engine.stats.retransmissions > before  # ours or another's: better too often
-            self._note(path, repeated=repeated)
+            self._note(self._opened if opens else self._until, path, repeated=repeated)
 
-    def _note(self, path: bytes, *, repeated: bool) -> None:
+    def _note(self, times: dict[bytes, float], path: bytes, *, repeated: bool) -> None:
         now = self._clock()
-        self._until = {name: until for name, until in self._until.items() if until > now}
+        for name in [name for name, until in times.items() if until <= now]:
+            del times[name]
         if repeated or self._engine.stats.strays:
-            self._until[path.lower()] = now + feared_for(self._engine, now)
+            times[path.lower()] = now + feared_for(self._engine, now)
 
-    async def let_pass(self, path: bytes) -> None:
-        """Wait until no such request changes what has the name any more."""
-        rest = self._until.get(path.lower(), 0.0) - self._clock()
+    async def let_pass(self, path: bytes, *, taken: bool = False) -> None:
+        """Wait until no such request changes what has the name any more; taken: it is about to be free."""
+        until = self._until.get(path.lower(), 0.0)
+        if taken:
+            until = max(until, self._opened.get(path.lower(), 0.0))
+        rest = until - self._clock()
         if rest > 0.0:
             await trio.sleep(rest)

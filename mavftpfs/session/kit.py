@@ -8,6 +8,7 @@ from typing import Protocol
 
 from mavftpfs.protocol.engine import Engine
 from mavftpfs.session.driver import Driver
+from mavftpfs.session.echoes import Echoes
 from mavftpfs.session.gate import Gate
 from mavftpfs.session.holder import SessionHolder
 from mavftpfs.session.vehicle import Vehicle
@@ -24,6 +25,7 @@ class Kit:
     vehicle: Vehicle
     gate: Gate
     clock: Callable[[], float]
+    echoes: Echoes
 
 
 class Queue(Protocol):

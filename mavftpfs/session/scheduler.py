@@ -83,7 +83,7 @@ class Scheduler:
         self._streams: set[FileStream] = set()
         self._suspicion = Suspicion(clock)
         self._jobs: list[SessionJob] = []
-        kit = Kit(self._holder, driver, engine, vehicle, self.gate, clock)
+        kit = Kit(self._holder, driver, engine, vehicle, self.gate, clock, self.echoes)
         self._reading = Reading(kit, self, steering)
         self._uploading = Uploading(
             kit, self, op_deadline=op_deadline, chunk=steering.chunk, when_armed_ok=when_armed_ok

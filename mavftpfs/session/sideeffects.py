@@ -80,7 +80,7 @@ class SideEffects:
         """Remove what is known to be a file."""
         wire = wire_path(path)
         async with self._in_time(), self._changing(path):
-            await self._scheduler.echoes.let_pass(path)
+            await self._scheduler.echoes.let_pass(path, taken=True)
             with self._scheduler.echoes.noted(path):
                 await self._perform(
                     lambda: Simple(Opcode.REMOVE_FILE, wire), lambda: self._is_absent(path), path
@@ -121,7 +121,7 @@ class SideEffects:
             self._changing(old, below=True, may=may),
             self._changing(new, may=may),
         ):
-            await self._scheduler.echoes.let_pass(old)
+            await self._scheduler.echoes.let_pass(old, taken=True)
             await self._scheduler.echoes.let_pass(new)
             with self._scheduler.echoes.noted(old):
                 await self._perform(

@@ -62,6 +62,7 @@ class Uploading:
         self._queue = queue
         self._vehicle = kit.vehicle
         self._clock = kit.clock
+        self._echoes = kit.echoes
         self._op_deadline = op_deadline
         self._chunk = chunk
         self._when_armed_ok = when_armed_ok
@@ -301,7 +302,8 @@ class Uploading:
         stay is gone, and what is written behind it would leave a hole."""
         try:
             size = await self._size(upload) if upload.opened and not self._wo_tells_size else None
-            session = await self._holder.open(upload.path, Opcode.OPEN_FILE_WO)
+            with self._echoes.noted(upload.path, opens=True):
+                session = await self._holder.open(upload.path, Opcode.OPEN_FILE_WO)
         except FtpNak as nak:
             if not upload.create or errno_for(nak) != errno.ENOENT:
                 raise

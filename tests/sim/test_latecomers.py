@@ -18,12 +18,11 @@ from mavftpfs.session.echoes import QUIET
 from mavftpfs.shared.errors import RequestTimeout
 from mavftpfs.sim.linkmodel import LinkSettings
 from mavftpfs.sim.profiles import PROFILES
-from tests.sim.test_stragglers import double
+from tests.sim.test_stragglers import append, double
 from tests.sim.test_upload import content, path, probes, put, world
 from tests.support.faults import Faults
 from tests.support.latecomers import Latecomer
 from tests.support.mounting import writable_tree
-from tests.support.sources import MemorySource
 from tests.support.takingturns import taking_turns
 from tests.support.worlds import MemorySink, World, read_file
 
@@ -316,16 +315,6 @@ async def test_a_directory_that_was_removed_does_not_come_back(
         await connection.store.remove_directory(path(profile, "new"))
         await trio.sleep(1)
     assert b"new" not in {entry.name for entry in here.tree.entries(path(profile, "")[:-1])}
-
-
-async def append(connection: Connection, target: bytes, data: bytes, at: int) -> None:
-    """Change a file in place."""
-    source = MemorySource(bytes(at) + data)
-    source.dirty.discard(0, at)
-    source.proven.add(0, at)
-    upload = await connection.store.open_upload(target, source, create=False)
-    await upload.finish()
-    await upload.abort()
 
 
 KEEPING = ["px4", "px4-2026", "spec", "ardupilot", "ardupilot5", "littlefs"]

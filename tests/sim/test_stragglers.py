@@ -14,6 +14,7 @@ from trio.testing import MockClock
 from mavftpfs.link.messages import Address
 from mavftpfs.protocol.payload import Opcode
 from mavftpfs.session.connection import Connection
+from mavftpfs.shared.model import split
 from mavftpfs.sim.linkmodel import LinkSettings
 from mavftpfs.sim.profiles import PROFILES
 from tests.sim.test_arming_replacement import NEW, Scene, replace
@@ -136,6 +137,23 @@ async def test_a_late_removal_does_not_take_the_next_directory(autojump: MockClo
     assert [entry.name for entry in here.tree.entries(b"/d") if entry.name == b"e"] == [b"e"]
 
 
+@pytest.mark.parametrize("profile", taking_turns(KEEPING))
+async def test_a_name_that_was_removed_does_not_come_back(profile: str, autojump: MockClock) -> None:
+    """OpenFileWO makes missing files on most servers."""
+    here = World(profile, DOUBLING)
+    name = ROOTS.get(profile, b"") + b"/d/f"
+    here.tree.add(name, content(100))
+    async with trio.open_nursery() as nursery, here.connection() as connection:
+        connection.store.traits.wo_truncates = False
+        await connection.store.list_directory(split(name)[0])
+        double(here, Opcode.OPEN_FILE_WO, 0.24, nursery.start_soon)
+        await append(connection, name, b"hello", 100)
+        assert here.tree.data(name) == content(100) + b"hello"
+        await connection.store.remove(name)
+        await trio.sleep(1)
+    assert b"f" not in {entry.name for entry in here.tree.entries(split(name)[0])}
+
+
 @pytest.mark.parametrize("late", [0.06, 0.09, 0.11])
 async def test_a_late_rename_of_the_old_file_does_not_take_the_new_one(
     late: float, autojump: MockClock
@@ -185,6 +203,16 @@ async def test_a_late_create_empties_nothing_that_is_said_to_be_there(
 
 VERY_LATE = 3.0
 """Seconds; QUIET is one at most."""
+
+
+async def append(connection: Connection, target: bytes, data: bytes, at: int) -> None:
+    """Change a file in place."""
+    source = MemorySource(bytes(at) + data)
+    source.dirty.discard(0, at)
+    source.proven.add(0, at)
+    upload = await connection.store.open_upload(target, source, create=False)
+    await upload.finish()
+    await upload.abort()
 
 
 async def show(here: World, connection: Connection, root: bytes, late: float, nursery: trio.Nursery) -> None:
