@@ -248,6 +248,8 @@ class Uploading:
             feed.roll_back(everything=True)
         if upload.free_at is not None and self._clock() - upload.free_at > FREE_FOR:
             await self._require_free(upload.path)
+        if upload.aborted:  # its owner was told that nothing was begun
+            raise LocalProtocolError("the upload was given up before its file was made")
         upload.free_at, upload.begun = None, True  # what is there from now on may be ours
         try:
             session = await self._holder.open(upload.path, Opcode.CREATE_FILE)

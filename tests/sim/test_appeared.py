@@ -10,10 +10,11 @@ from mavftpfs.cache.remote import FREE_FOR
 from mavftpfs.protocol.operations import Simple
 from mavftpfs.protocol.payload import Opcode
 from mavftpfs.shared.errors import AlreadyExists, FtpNak, MavftpfsError
+from mavftpfs.sim.linkmodel import LinkSettings
 from mavftpfs.sim.profiles import PROFILES
 from tests.support.faults import Faults
 from tests.support.sources import MemorySource
-from tests.support.worlds import ROOTS, World
+from tests.support.worlds import GOOD_LINK, ROOTS, World
 
 EVERY_PROFILE = sorted(PROFILES)
 LONG_AGO = float("-inf")
@@ -23,8 +24,8 @@ def path(profile: str, name: str) -> bytes:
     return ROOTS.get(profile, b"") + b"/d/" + name.encode()
 
 
-def world(profile: str) -> World:
-    made = World(profile)
+def world(profile: str, link: LinkSettings = GOOD_LINK) -> World:
+    made = World(profile, link)
     made.tree.add(path(profile, "there"), b"theirs")
     return made
 
@@ -68,6 +69,27 @@ async def test_a_free_name_costs_one_request_unless_it_was_just_seen(
             await upload.abort()
             await connection.store.create_empty(path(profile, name + "-empty"), free_at=free_at)
             assert here.tree.data(path(profile, name + "-empty")) == b""
+
+
+@pytest.mark.parametrize("profile", EVERY_PROFILE)
+async def test_what_was_given_up_while_its_name_is_looked_for_makes_nothing(
+    profile: str, autojump: MockClock
+) -> None:
+    """Who gave it up may not have waited for its end, and would take what is there for somebody else's."""
+    here, target = world(profile, LinkSettings(delay=0.05)), path(profile, "new")
+    faults = Faults(here)
+    async with here.connection() as connection:
+        store, source = connection.store, MemorySource(b"ours")
+        upload = await store.open_upload(target, source, create=True, free_at=LONG_AGO)
+        upload.wake()
+        while Opcode.OPEN_FILE_RO not in faults.requests:  # noqa: ASYNC110 - the vehicle tells nobody
+            await trio.sleep(0.001)
+        with trio.move_on_after(0):
+            await upload.abort()
+        await trio.sleep(10)
+        assert not upload.begun
+        assert b"new" not in [entry.name for entry in here.tree.entries(path(profile, "")[:-1])]
+    assert here.vehicle.server.open_sessions == 0
 
 
 @pytest.mark.parametrize("profile", EVERY_PROFILE)
