@@ -206,15 +206,16 @@ class Draft:
         self.size = size
 
     def fill(self, offset: int, data: bytes | memoryview) -> None:
-        """Hold bytes of the base, where nothing newer is held.
+        """Hold bytes of the base, where nothing newer is held, but for what is lost: it stays so.
 
         Raises:
             NoSpace.
         """
         stop = min(offset + len(data), self.base_limit, self.size)
-        for a, b in self._held.missing(offset, stop):
-            self._content.put(a, memoryview(data)[a - offset : b - offset])
-            self._held.add(a, b)
+        for start, end in self._held.missing(offset, stop):
+            for a, b in self._lost.missing(start, end):
+                self._content.put(a, memoryview(data)[a - offset : b - offset])
+                self._held.add(a, b)
 
     def doubt(self, start: int, stop: int) -> list[tuple[int, int]]:
         """The vehicle may have other bytes in [start, stop): return those that are known here, which the next

@@ -11,10 +11,17 @@ from mavftpfs.cache.readback import PIECE, TRIES, agrees
 from mavftpfs.cache.remote import Overwrite
 from mavftpfs.cache.tree import Tree
 from mavftpfs.protocol.crc import crc32
-from mavftpfs.shared.errors import Armed, DataUnproven, FtpNak, RequestTimeout, VerificationFailed
+from mavftpfs.shared.errors import (
+    Armed,
+    DataUnproven,
+    FileChanged,
+    FtpNak,
+    RequestTimeout,
+    VerificationFailed,
+)
 from mavftpfs.shared.model import Listing
 from tests.support.fake_store import read_file
-from tests.support.fake_writer import KINDS, FakeWriter, make_writable, write_file
+from tests.support.fake_writer import KINDS, FakeUpload, FakeWriter, make_writable, write_file
 
 OLD = bytes(range(256)) * 400
 FILE = b"/card/dir/file.txt"
@@ -220,6 +227,31 @@ async def test_an_answer_that_comes_while_it_is_compared_counts(
     monkeypatch.setattr(store, "list_directory", look_late)
     with pytest.raises(DataUnproven):
         await change(tree, PART)
+
+
+async def test_bytes_that_nobody_has_for_certain_are_not_read_on_without_a_name(
+    store: FakeWriter, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What is cached may be what the request of another file left there."""
+    tree = make_writable(store)
+    assert await read_file(tree, FILE) == OLD
+    file = await tree.open(FILE, write=True)
+    await file.write(*PART)
+    end = FakeUpload.finish
+
+    async def end_late(self: FakeUpload) -> None:
+        await end(self)
+        self.overwrites.append(Overwrite(500, 510))
+
+    monkeypatch.setattr(FakeUpload, "finish", end_late)
+    for act in (file.fsync(), file.read(0, len(OLD))):
+        with pytest.raises(DataUnproven):
+            await act
+    await tree.unlink(FILE)
+    assert await file.read(0, 200) == OLD[:100] + b"changed" + OLD[107:200]
+    with pytest.raises((DataUnproven, FileChanged)):
+        await file.read(500, 10)
+    await file.release()
 
 
 async def test_a_cut_is_verified_by_its_size(store: FakeWriter) -> None:
