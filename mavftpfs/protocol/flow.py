@@ -311,8 +311,8 @@ class Flow:
         overflowed = self._overflow.judge(self._replies, self._losses)
         total = self._replies + self._losses
         self.loss += (self._losses / total - self.loss) * 0.2
-        in_flight = self.window + self._bounded(self._stalls.reserve * self._best_rate)
-        self._base_rtt = self._base.learn(self._round_least, in_flight)
+        reserve = self._bounded(self._stalls.reserve * self._best_rate)
+        self._base_rtt = self._base.learn(self._round_least, self.window + reserve)
         took = now - self._round_start
         rate = self._replies / took if took > 0 else 0.0
         # What the window was doubled for shows two rounds later.
@@ -340,6 +340,8 @@ class Flow:
             self._goal = 0
             loss = 0.0 if self._excused() else self.loss
             self._approach(self._easing.next_window(self._target(), loss, next_order))
+            if self._pacer is None:
+                self.window = max(1, int(self._base.next_window(self.window, reserve)))
 
     def _excused(self) -> bool:
         """Whether pauses explain what was lost: writes went on, and the server takes more than the link

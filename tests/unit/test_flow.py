@@ -97,6 +97,17 @@ class Path:
             self.round(lost=lost)
 
 
+def listed(flow: Flow, *, rate: float, base: float) -> Path:
+    """Return a path whose round trip is known from listings."""
+    path = Path(flow, rate=rate, base=base)
+    for _ in range(3):
+        path.now += base
+        flow.on_starved()
+        flow.on_reply(path.now, base, path.order, path.order + 1)
+        path.order += 1
+    return path
+
+
 def test_begins_small() -> None:
     assert Flow().window == 8
     assert Flow(serial=True).window == 1
@@ -308,6 +319,34 @@ def test_a_longer_way_is_noticed() -> None:
     path.rounds(30)
     path.base = 0.2
     path.rounds(400)
+    assert flow.window >= 200
+
+
+def test_a_longer_way_is_noticed_by_a_window_that_is_too_small_to_become_narrow_by_itself() -> None:
+    flow = Flow()
+    path = listed(flow, rate=12.0, base=0.05)
+    path.rounds(60)
+    assert flow.window <= 5
+    path.rate, path.base = 250.0, 0.5
+    path.rounds(60)
+    assert 125 <= flow.window <= 140
+
+
+def test_a_queue_of_ours_is_looked_into_less_and_less_often() -> None:
+    flow = Flow()
+    path = listed(flow, rate=20.0, base=0.2)
+    path.rounds(12)
+    usual = flow.window
+    assert usual >= 7
+    narrow = []
+    for number in range(1000):
+        path.round()
+        assert flow.window <= usual
+        if flow.window < 0.7 * usual:
+            narrow.append(number)
+    assert 3 <= len(narrow) <= 8
+    path.rate, path.base = 250.0, 0.8  # whatever proved to be ours before, this is not
+    path.rounds(75)
     assert flow.window >= 200
 
 
