@@ -45,6 +45,7 @@ _FASTEST_LINK = 6000.0
 """Answers per second (1.4 MB/s) beyond which no radio is on the way."""
 
 _OFTEN = 5
+_MORE_LOSS = 0.15
 _QUEUE_SECONDS = 0.005
 _ROUNDS_REMEMBERED = 10
 _PLATEAU_ROUNDS = 2
@@ -184,10 +185,12 @@ class Flow:
     def _reserve(self, now: float, paced: bool) -> int:
         """Return how many more bridge the pauses of a server; none where its buffers are small, or while
         somebody waits for an answer that would have to queue behind them."""
-        if self._hurried or self._survival or self._pacer:
+        if self._hurried or self._survival or self._pacer or self._best_rate > _FASTEST_LINK:
             return 0
-        self._bridging = not paced
-        seconds = self._stalls.reserve if paced else self._stalls.silence(now, self._best_rate)
+        seconds = self._stalls.reserve if paced else 0.0
+        self._bridging = not seconds
+        if self._bridging:
+            seconds = self._stalls.silence(now, self._best_rate)
         return self._bounded(seconds * self._best_rate) if seconds else 0
 
     def _bounded(self, reserve: float) -> int:
@@ -338,16 +341,19 @@ class Flow:
             self._goal = self._next_goal() if grown and not self._flights.measured else 0
         else:
             self._goal = 0
-            loss = 0.0 if self._excused() else self.loss
+            loss = self.loss
+            if self._excused():
+                loss, self._easing.ceiling = 0.0, inf
             self._approach(self._easing.next_window(self._target(), loss, next_order))
             if self._pacer is None:
                 self.window = max(1, int(self._base.next_window(self.window, reserve)))
 
     def _excused(self) -> bool:
-        """Whether pauses explain what was lost: writes went on, and the server takes more than the link
-        brings."""
-        quick = self._trains.rate > 1.5 * self._best_rate
-        return quick and self._bridging and self._stalls.usual
+        """Whether pauses explain what was lost: who wrote went on, and lost no more than comes in a pause, or
+        the server takes more than the link brings."""
+        if not (self._bridging and self._stalls.usual):
+            return False
+        return self.loss < self._stalls.share + _MORE_LOSS or self._trains.rate > 1.5 * self._best_rate
 
     def _learn_congestion(self) -> None:
         if self._losses and self._queued(2.0):

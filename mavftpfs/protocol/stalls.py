@@ -10,7 +10,7 @@ were without, there is none for a while.
 Writes need no answers in a queue, and what waits in front of a small buffer would be lost. But what arrives
 while the card pauses is lost as well, and if nothing is sent either because no answers come, the server has
 nothing to do a round trip later, for as long again. So while answers pause, writes go on at their pace for
-at most 0.4 s; what is lost of them makes room by itself.
+at most 0.4 s; what is lost of them makes room by itself. Reads do the same where no reserve is kept.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ _BRIDGED = 0.4
 _CALM = 10
 """Periods without costly pauses after which none are expected."""
 
+_SMOOTHING = 0.5
 _FADE = 0.98
 _FADED = 0.02
 _TELLING = 0.5
@@ -42,6 +43,7 @@ class Stalls:
 
     Attributes:
         reserve: seconds of answers to keep in the link's queue.
+        share: of the time lately that pauses took.
         wake: when `silence` grows without an answer.
     """
 
@@ -56,11 +58,13 @@ class Stalls:
         "_until",
         "_watched",
         "reserve",
+        "share",
         "wake",
     )
 
     def __init__(self) -> None:
         self.reserve = 0.0
+        self.share = 0.0
         self.wake = inf
         self._calm = _CALM
         self._last: float | None = None
@@ -104,6 +108,7 @@ class Stalls:
     def _end_period(self, now: float) -> None:
         seconds, paused = self._watched, self._paused
         self._watched = self._paused = 0.0
+        self.share += (paused / seconds - self.share) * _SMOOTHING
         costly = paused > _COSTLY * seconds
         self._calm = 0 if costly else self._calm + 1
         if self.reserve == 0.0:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections import deque
+
 import pytest
 
 from mavftpfs.protocol.flow import Flow
@@ -105,6 +107,43 @@ def test_writes_go_on_while_answers_pause_but_not_for_long() -> None:
     flow.begin()
     assert flow.room(0, now, paced=True, urgent=True) > 0
     assert flow.room(full, now + 0.1, paced=False) <= 0, "who waits for an answer waits behind it"
+
+
+def test_reads_go_on_too_where_a_reserve_would_only_overflow_the_servers_buffer() -> None:
+    flow = Flow()
+    flow._stalls._until = 1e9  # it was found useless
+    now = 0.0
+    for order in range(4000):
+        now += 1 / RATE if order % 200 else 0.15
+        flow.on_reply(now, 0.05, order, order + flow.window)
+    full = flow.window
+    flow._trains.proven = False  # as when many are allowed at once
+    flow.begin()
+    assert flow.room(full, now, paced=True) == 0
+    assert flow.room(full, now + 0.1, paced=True) == pytest.approx(0.1 * RATE, rel=0.1)
+
+
+def test_what_is_lost_in_pauses_puts_no_ceiling_on_the_window() -> None:
+    """Such a ceiling stood for a quarter of a minute, at half of what the server took."""
+    flow = Flow()
+    answers: deque[tuple[float, int]] = deque()
+    pace, rtt, now, free, order = 2000.0, 0.3, 0.0, 0.0, 0
+    for step in range(20_000):
+        now = step / pace
+        flow.begin()
+        if flow.room(len(answers), now, paced=False) > 0:
+            flow.on_sent(1, now)
+            if step % 800 < 300:  # what arrives half a round trip later finds the server's buffer full
+                flow.on_loss(order)
+            else:
+                free = max(now + rtt, free + 1 / pace)
+                answers.append((free, order))
+            order += 1
+        while answers and answers[0][0] <= now:
+            flow.on_reply(now, rtt, answers.popleft()[1], order)
+        if step == 8000:
+            flow._easing.ceiling, flow._easing._wait = 450.0, 60  # an overflow was seen
+    assert flow.window > 600
 
 
 def test_where_no_pauses_were_seen_writes_wait_for_answers() -> None:
