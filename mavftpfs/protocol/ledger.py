@@ -31,7 +31,7 @@ _WORKING = frozenset(("slow", "work"))
 _TELLING = frozenset((Opcode.WRITE_FILE, Opcode.OPEN_FILE_RO, Opcode.OPEN_FILE_WO, Opcode.CREATE_FILE))
 _MIN_REORDER = 3
 _MAX_REORDER = 64
-_MOST_QUICK_SENDS = 8
+_MOST_QUICK_SENDS = 20
 
 
 class Ghost(Operation):

@@ -45,8 +45,8 @@ class Manner(NamedTuple):
 FLOORS = {"data": 0.05, "write": 0.05, "list": 0.25, "path": 0.1, "slow": 10.0, "work": 0.3}
 """Least retransmission timeout of each family in seconds."""
 
-READ_MANNER = Manner("data", same_seq=False, ordered=True, echoes_offset=True, free_sends=8)
-WRITE_MANNER = Manner("write", same_seq=False, ordered=True, free_sends=8)
+READ_MANNER = Manner("data", same_seq=False, ordered=True, echoes_offset=True, free_sends=20)
+WRITE_MANNER = Manner("write", same_seq=False, ordered=True, free_sends=20)
 KEEP_ALIVE_MANNER = Manner("path", same_seq=False, once=True)
 _LIST = Manner("list", same_seq=False, ordered=True, patient_after=4, patience=2.5)
 _PATH = Manner("path", same_seq=True, free_sends=4)

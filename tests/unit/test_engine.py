@@ -367,6 +367,22 @@ def test_later_answers_prove_a_loss() -> None:
     assert not sink.held.covers(0, 1)
 
 
+def test_what_was_lost_often_does_not_wait_for_its_timer() -> None:
+    """A card that pauses half of the time loses every second write: the last ones went out every 5 s."""
+    engine = make(limit=8)
+    reading(engine, 239 * 1000)
+    now, tries = 0.0, []
+    while now < 1.5:
+        for request in sent(engine, now):
+            if request.offset == 0:
+                tries.append(now)
+            else:
+                engine.receive(ack(request, bytes(request.size)), now)
+        now += 0.1
+        engine.on_deadline(now)
+    assert len(tries) >= 14
+
+
 def test_a_lost_listing_is_found_by_later_reads_too() -> None:
     engine = make(limit=8)
     engine.start(ListDirectory(b"/"), 0.0)
