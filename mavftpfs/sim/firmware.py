@@ -32,6 +32,8 @@ class Firmware(ABC):
         self.dropped_requests = 0
         self.dropped_replies = 0
         self.replays = 0
+        self._card_uses = 0
+        self._pauses = 0.0
         self.now = float("-inf")
         self._ready: list[tuple[Address, bytes]] = []
         self._ready_bytes = 0
@@ -87,6 +89,17 @@ class Firmware(ABC):
             due = self._later[0][0]
             return due if wake is None else min(due, wake)
         return wake
+
+    def note_pause(self, seconds: float) -> float:
+        """Count a read or write that the card made wait so long, 0 included; return it."""
+        self._card_uses += 1
+        self._pauses += seconds
+        return seconds
+
+    @property
+    def paused(self) -> float:
+        """Seconds that the card made reads and writes wait, on average of all."""
+        return self._pauses / max(1, self._card_uses)
 
     def forget_outbox(self) -> None:
         """Drop what was not sent yet."""

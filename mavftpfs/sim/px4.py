@@ -230,8 +230,9 @@ class Px4(Firmware):
         """Return how long the request that is being answered takes."""
         cost = self.profile.request_cost + self._extra_cost
         self._extra_cost = 0.0
-        if opcode in (_READ, _WRITE) and self.rng.random() < self.profile.stall_chance:
-            cost += self.rng.uniform(*self.profile.stall)
+        if opcode in (_READ, _WRITE):
+            hit = self.rng.random() < self.profile.stall_chance
+            cost += self.note_pause(self.rng.uniform(*self.profile.stall) if hit else 0.0)
         return cost
 
     def set_errno(self, number: int) -> None:

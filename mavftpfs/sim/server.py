@@ -141,6 +141,11 @@ class FtpServer:
         return self._firmware.dropped_replies
 
     @property
+    def paused(self) -> float:
+        """Seconds that a slow card made reads and writes wait, on average of all."""
+        return self._firmware.paused
+
+    @property
     def replays(self) -> int:
         """Requests answered from the replay slot."""
         return self._firmware.replays

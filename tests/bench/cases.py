@@ -41,7 +41,12 @@ class Case:
 
     @property
     def limit(self) -> float:
-        """Bytes per second that could be read or written at best."""
+        """Bytes per second that could be read or written at best, with as many pauses as usual."""
+        profile = PROFILES[self.profile]
+        return self.limit_beside(profile.stall_chance * sum(profile.stall) / 2)
+
+    def limit_beside(self, pause: float) -> float:
+        """Return the same where the card made each request wait for `pause` seconds on average."""
         limit = self.rate * MAX_DATA / FRAME * (1 - self.loss)
         if self.profile.startswith(("ardupilot", "littlefs")):
             # What a lone request takes from the moment it is handed to the link until it is answered.
@@ -50,15 +55,15 @@ class Case:
             if self.direction == "read":
                 ceiling = max(ceiling, min(ARDUPILOT_BURST, self.rate / 3))
             limit = min(limit, ceiling)
-        return self._less_pauses(limit)
-
-    def _less_pauses(self, limit: float) -> float:
-        """Count the time for which a slow card stops the server: its input buffer takes little meanwhile."""
         profile = PROFILES[self.profile]
         if profile.family is not Family.PX4:
             return limit
-        pause = profile.stall_chance * sum(profile.stall) / 2
-        return MAX_DATA / (max(MAX_DATA / limit, profile.request_cost) + pause)
+        link = MAX_DATA / limit
+        if self.direction == "write":
+            # What a full link brings meanwhile is lost, but for what the server's input buffer holds.
+            held = profile.stall_chance * (profile.rx_buffer // FRAME) * link
+            link += max(0.0, pause - held)
+        return MAX_DATA / max(link, profile.request_cost + pause)
 
     @property
     def target(self) -> float | None:
@@ -68,10 +73,11 @@ class Case:
 
 @dataclass(frozen=True, slots=True)
 class Result:
-    """share: goodput over the limit. requests: per chunk of data. dropped: frames that found the link's queue
-    full, both ways."""
+    """limit: the case's, with the pauses that the card really made. share: goodput over it. requests: per
+    chunk of data. dropped: frames that found the link's queue full, both ways."""
 
     case: Case
+    limit: float
     share: float
     requests: float
     dropped: int

@@ -56,7 +56,8 @@ def measure(case: Case, seconds: float, *, queue: int | None = None, telemetry: 
                 took = await transfer(world, connection, data)
         requests = connection.engine.stats.requests * MAX_DATA / len(data)
         dropped = sum(world.model.counters(direction).dropped for direction in LinkDirection)
-        return Result(case, len(data) / took / case.limit, requests, dropped)
+        limit = case.limit_beside(world.vehicle.server.paused)
+        return Result(case, limit, len(data) / took / limit, requests, dropped)
 
     return trio.run(run, clock=MockClock(autojump_threshold=0))
 
@@ -130,7 +131,7 @@ def show(results: list[Result]) -> None:
 
 def as_json(results: list[Result]) -> list[dict[str, object]]:
     """Return everything that is known of each run."""
-    return [asdict(result) | {"limit": result.case.limit, "target": result.case.target} for result in results]
+    return [asdict(result) | {"target": result.case.target} for result in results]
 
 
 def main() -> int:

@@ -43,6 +43,18 @@ def test_limit_is_what_design_says() -> None:
     assert limit("ardupilot", "wifi", "write") == Case("ardupilot", 625_000, 0.030, 0.0, "write").limit
 
 
+def test_a_card_that_pauses_costs_where_nothing_bridges_it() -> None:
+    """A request takes 0.5 ms and every 500th pauses for 175 ms on average."""
+    link, always_busy = 100_000 * 239 / 266, 239 / 0.00085
+    assert Case("px4-nuttx", 1e6, 0.1, 0.0, "read").limit == pytest.approx(always_busy)
+    assert Case("px4-nuttx", 1e6, 0.1, 0.0, "write").limit == pytest.approx(always_busy)
+    assert Case("px4-nuttx", 1e5, 0.1, 0.0, "read").limit == pytest.approx(link), "answers wait in the link"
+    write = Case("px4-nuttx", 1e5, 0.1, 0.0, "write")
+    assert 239 / (0.00266 + 0.00035) < write.limit < link, "five writes wait, the others are lost"
+    assert write.limit_beside(0.0007) < write.limit < write.limit_beside(0.0)
+    assert Case("px4", 1e5, 0.1, 0.0, "write").limit_beside(0.0) == pytest.approx(link)
+
+
 def test_a_row_has_the_median_and_its_shares() -> None:
     runs = [run(US, 2.0), run(BARE, 1.0), run(US, 4.0), run(BARE, 1.6), run(US, 2.5)]
     ours = row_of(summarise(runs, TIMEOUTS), US)
