@@ -104,19 +104,32 @@ class Verifier:
         if doubted and not compared:
             await self._dispel(path, draft, doubted)
 
-    async def check_sent(self, path: bytes, draft: Draft, upload: Upload) -> None:
+    async def check_sent(self, path: bytes, draft: Draft, upload: Upload, told: int = -1) -> int:
         """Do the same for what an upload sent; anew if answers tell meanwhile that more of it may be hit.
+
+        told: how many of these were heeded before; returned is how many are by now.
 
         Raises:
             As check and doubted.
         """
-        told = -1
         for _ in range(CHECKS):
             if told == len(upload.overwrites):
-                return
+                return told
             told = len(upload.overwrites)
             await self.check(path, draft, doubted(upload, draft))
         raise VerificationFailed(f"requests of other files hit {path!r} again and again")
+
+    async def check_replaced(self, path: bytes, draft: Draft, upload: Upload, told: int) -> None:
+        """Do the same for a file that got its name after it was checked, if it may have been hit since.
+
+        Raises:
+            As check_sent.
+        """
+        try:
+            await self.check_sent(path, draft, upload, told)
+        except VerificationFailed:
+            draft.remote_removed()  # the old file is gone, and nothing of what is there counts
+            raise
 
     async def check_doubted(self, path: bytes, draft: Draft) -> None:
         """Do the same for a file that may not be ours at all: verify=size and verify=none do not count.

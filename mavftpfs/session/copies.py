@@ -13,7 +13,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from mavftpfs.cache.remote import Overwrite
-from mavftpfs.protocol.payload import Payload
+from mavftpfs.protocol.payload import Opcode, Payload
 from mavftpfs.protocol.stats import EngineStats
 from mavftpfs.shared.traits import Traits
 
@@ -55,13 +55,14 @@ class Span:
 class Written:
     """A session in which a file was written. path: empty once the file is gone. hits: what late requests of
     other files may have written to this one, None if nobody cares. seq: of the ACK that opened it, requests:
-    how many had gone out by then."""
+    how many had gone out by then. made: by CreateFile."""
 
     path: bytes
     span: Span
     hits: list[Overwrite] | None
     seq: int
     requests: int
+    made: bool
     at: float = field(default=0.0)
 
 
@@ -81,7 +82,7 @@ class WriteLog:
         """A file was opened to be written; made: by CreateFile. An upload gives the same hits each time."""
         if made:
             self.gone(path)
-        self.sessions.append(Written(path, span, hits, seq, self._stats.requests))
+        self.sessions.append(Written(path, span, hits, seq, self._stats.requests, made))
         self.end()
 
     def end(self) -> None:
@@ -114,7 +115,10 @@ class WriteLog:
         return [(session.span.start, session.span.stop) for session in others]
 
     def on_late(self, reply: Payload) -> None:
-        """A WriteFile was ACKed that nobody waits for: note where it may have been written."""
+        """A WriteFile or a CreateFile was ACKed that nobody waits for: note what it may have changed."""
+        if reply.req_opcode == Opcode.CREATE_FILE:
+            self._on_emptied(reply.seq)
+            return
         if not self.sessions or (hits := self.sessions[-1].hits) is None:
             return
         origin = self._origin(reply.seq)
@@ -125,6 +129,12 @@ class WriteLog:
             start, stop = reply.offset, min(reply.offset + self._chunk, max(stop, reply.offset + 1))
         same = origin is not None and self._is_still_there(origin, start, stop)
         hits.append(Overwrite(start, stop, same=same))
+
+    def _on_emptied(self, seq: int) -> None:
+        """The file that was made with this answer may have been emptied since, whatever its name is now."""
+        for session in self.sessions:
+            if session.made and session.seq == seq and session.hits is not None:
+                session.hits.append(Overwrite(0, 1 << 32, same=False))
 
     def _origin(self, seq: int) -> Written | None:
         """Return the session in which a request was sent, the newest that may be; None: a forgotten one."""

@@ -30,7 +30,8 @@ class Strays:
         on_taken: the session was opened on another file: nothing that came by it lately is to be believed.
         on_emptied: the file that is being written may have been emptied.
         on_disturbed: a request came again that closes a session of some servers.
-        on_written: a WriteFile was ACKed, whose bytes went to what was open.
+        on_written: a WriteFile was ACKed, whose bytes went to what was open, or a CreateFile, which may have
+            emptied a file after it was closed.
     """
 
     def __init__(
@@ -59,6 +60,8 @@ class Strays:
             return
         path = self._holder.opener.opened_by(reply.seq)
         session = self._holder.session
+        if reply.req_opcode == Opcode.CREATE_FILE and (session is None or session.seq != reply.seq):
+            self._on_written(reply)
         changes = reply.req_opcode != Opcode.OPEN_FILE_RO
         if path is None:
             self._holder.opener.note_early(reply.seq, reply.session)

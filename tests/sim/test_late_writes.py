@@ -13,6 +13,7 @@ import trio
 from trio.testing import MockClock
 
 from mavftpfs.cache.tree import Tree
+from mavftpfs.link.messages import Address
 from mavftpfs.protocol.payload import Opcode
 from mavftpfs.session.echoes import QUIET
 from mavftpfs.shared.errnos import errno_for
@@ -208,3 +209,33 @@ async def test_what_was_closed_and_written_again_at_once(profile: str, autojump:
         await change(tree, name, 1000, b"2" * 100)
         assert copy.late is not None
         assert here.tree.data(name) == old[:1] + b"x" + old[2:1000] + b"2" * 100 + old[1100:]
+
+
+@pytest.mark.parametrize("verify", ["auto", "size", "none"])
+@pytest.mark.parametrize("profile", taking_turns([name for name in EVERY_PROFILE if name != "littlefs"]))
+async def test_a_file_that_is_emptied_after_it_was_checked_is_sent_again(
+    profile: str, verify: str, autojump: MockClock
+) -> None:
+    """A replacement gets its name last (LittleFS has none), and by then the answer is there."""
+    name = path(profile, "f")
+    here = world(profile, CLEAN, f=content(5000))
+    async with mounted(here, path(profile, "")[:-1], verify=verify) as (_, tree):
+        server = here.vehicle.server
+        handle = server.handle
+        kept: list[bytes] = []
+
+        def on_request(wire: bytes, source: Address, now: float) -> None:
+            if wire[3] == Opcode.CREATE_FILE and not kept:
+                kept.append(wire)
+            if wire[3] == Opcode.RENAME and len(kept) == 1:
+                kept.append(wire)
+                handle(kept[0], source, now)
+            handle(wire, source, now)
+
+        server.handle = on_request  # type: ignore[method-assign]
+        file = await tree.open(name, write=True, truncate=True)
+        await file.write(0, content(4000, 2))
+        await file.flush()
+        file.close()
+        assert len(kept) == 2
+        assert here.tree.data(name) == content(4000, 2)
