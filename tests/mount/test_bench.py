@@ -50,7 +50,10 @@ def program(text: str) -> Worker:
     return Worker("peer", argv)
 
 
-def test_our_mount_and_the_bare_loop_are_measured_in_turns(tmp_path: Path) -> None:
+def test_our_mount_and_the_bare_loop_are_measured_in_turns(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("tests.bench.mount.SPEND", 1000.0)  # a slow machine has all repetitions, too
     bench = Bench([EVERYBODY[BARE], EVERYBODY[US]], 2, tmp_path, Console(quiet=True))
     cells = [Cell("px4", "unshaped", way, 300_000, SIZE, 30.0) for way in ("read", "write")]
     runs = bench.run(cells)

@@ -13,6 +13,7 @@ import socket
 import subprocess
 import sys
 import time
+from collections import deque
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Protocol
@@ -25,21 +26,37 @@ STOP_TIMEOUT = 60.0
 
 
 PORTS_EACH = 1400
+_RESERVED = 32
 _turns = itertools.count(os.getpid())
+_reserved: deque[socket.socket] = deque()
 
 
 def free_udp_port() -> int:
     """Return a port of the loopback that nobody uses at the moment, for UDP or TCP.
 
-    It is none of those that the kernel gives to whoever asks for any, nor that another worker of pytest
-    takes: between this and its use, which is in another process, nobody is given it.
+    It is none of those that the kernel gives to whoever asks for any, nor that another worker of pytest, or
+    another run of it, takes: between this and its use, which is in another process, nobody is given it.
     """
     worker = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw"))
     first = 10_000 + worker % 16 * PORTS_EACH
     for turn in itertools.islice(_turns, PORTS_EACH):
-        if _is_free(first + turn % PORTS_EACH):
+        if _is_free(first + turn % PORTS_EACH) and _reserve(first + turn % PORTS_EACH):
             return first + turn % PORTS_EACH
     raise AssertionError("no port is free")
+
+
+def _reserve(port: int) -> bool:
+    """Tell other runs of these tests, by a name that they try too, to leave a port alone for a while."""
+    sock = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+    try:
+        sock.bind(f"\0mavftpfs tests port {port}")
+    except OSError:
+        sock.close()
+        return False
+    _reserved.append(sock)
+    if len(_reserved) > _RESERVED:
+        _reserved.popleft().close()
+    return True
 
 
 def _is_free(port: int) -> bool:
