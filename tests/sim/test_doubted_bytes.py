@@ -6,6 +6,7 @@ The size tells nothing of these, so what is in doubt is read back, whatever veri
 
 from __future__ import annotations
 
+import random
 import struct
 from collections.abc import Callable
 
@@ -179,6 +180,45 @@ async def test_the_power_went_between_the_last_answer_and_the_close(
         server.handle = power_cut  # type: ignore[method-assign]
         await file.fsync()
         assert bytes(world.tree.data(root + b"/f")) == before[:1000] + b"B" * 100 + before[1100:]
+        file.close()
+
+
+@pytest.mark.parametrize(
+    "seed", [0, 1, *(pytest.param(seed, marks=pytest.mark.soak) for seed in range(2, 60))]
+)
+@pytest.mark.parametrize("profile", ["px4-nuttx", "ardupilot5"])
+async def test_fsync_is_true_though_the_vehicle_restarts_at_any_request(
+    profile: str, seed: int, autojump: MockClock
+) -> None:
+    """FAT has a sector in memory until the file is closed."""
+    rng = random.Random(seed)
+    settings = LinkSettings(delay=rng.choice([0.02, 0.1, 0.4]), loss=rng.choice([0.0, 0.05]))
+    world = World(profile, settings, seed=seed)
+    path = ROOTS.get(profile, b"") + b"/d/f"
+    model = bytearray(rng.randbytes(20_000))
+    world.tree.add(path, bytes(model))
+    faults = Faults(world)
+    async with mounted(world, verify=rng.choice(["auto", "size", "none"])) as (_, tree):
+        file = await tree.open(path, write=True)
+        for _ in range(12):
+            await trio.sleep(rng.uniform(1, 40))
+            for _ in range(rng.randrange(1, 4)):
+                at, data = rng.randrange(19_000), rng.randbytes(rng.choice([1, 50, 300, 900]))
+                model[at : at + len(data)] = data
+                await file.write(at, data)
+            downtime, beat_after = rng.choice([(0.0, 0.0), (2.6, 0.5), (3.0, 0.9), (5.0, 0.0), (9.0, 0.9)])
+
+            def restart(downtime: float = downtime, beat_after: float = beat_after) -> None:
+                world.vehicle.reboot(trio.current_time(), downtime, beat_after=beat_after)
+
+            faults.after(rng.randrange(1, 14), restart)
+            for _ in range(8):
+                try:
+                    await file.fsync()
+                    break
+                except MavftpfsError:
+                    await trio.sleep(10)
+            assert bytes(world.tree.data(path)) == bytes(model)
         file.close()
 
 
