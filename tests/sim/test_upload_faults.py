@@ -291,9 +291,9 @@ async def test_the_power_goes_while_a_file_that_became_too_long_is_closed(
         server = here.vehicle.server
         handle = server.handle
 
-        def power_cut(wire: bytes, source_address: Address, now: float) -> None:
+        def power_cut(wire: bytes, source: Address, now: float) -> None:
             if wire[3] != Opcode.TERMINATE_SESSION:
-                handle(wire, source_address, now)
+                handle(wire, source, now)
                 return
             server.handle = handle  # type: ignore[method-assign]
             here.vehicle.reboot(now, downtime, beat_after=beat_after)
