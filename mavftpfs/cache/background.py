@@ -62,7 +62,7 @@ class Background:
     def kick(self, node: Node) -> None:
         """The draft got more: send it, or begin to, if that can be done beside the program."""
         if node.attempt is not None and not node.overtaken:
-            if not node.attempt.committing:
+            if not node.attempt.ended:
                 node.attempt.sending.growing = node.quiet.is_set()  # nobody writes to one being delivered
                 node.attempt.upload.wake()
         elif self._context.nursery is not None and (self._may_start(node) or node.overtaken):

@@ -255,13 +255,14 @@ class Deliverer:
     async def _send(self, node: Node, plan: Plan) -> None:
         attempt = await self._attempt(node, plan)
         draft, told = _draft(node), 0
-        if not attempt.committing:
+        if not attempt.ended:
             await self._finish(attempt)
             if draft.ruined and attempt.plan is Plan.IN_PLACE:
                 raise FileChanged(f"{node.path!r} was emptied on the vehicle while it was changed here")
             told = await self.verifier.check_sent(attempt.path, draft, attempt.upload)
         async with node.firmly():
             if not attempt.committing:
+                attempt.ended = True
                 await attempt.upload.abort()
             if attempt.places is not None:
                 await self._commit(node, attempt)

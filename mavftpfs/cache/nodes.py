@@ -26,8 +26,8 @@ from mavftpfs.shared.errors import FileChanged, MavftpfsError
 class Attempt:
     """One try to deliver a draft.
 
-    path: where its bytes go. places: the reserved names, for a replacement. committing: verified, and the
-    renames may have begun.
+    path: where its bytes go. places: the reserved names, for a replacement. ended: verified, and the upload
+    is over, or nobody waits for that. committing: the renames may have begun, too.
     """
 
     plan: Plan
@@ -35,12 +35,13 @@ class Attempt:
     sending: Sending
     upload: Upload
     places: Places | None = None
+    ended: bool = False
     committing: bool = False
 
     def fits(self, plan: Plan, draft: Draft) -> bool:
         """Return whether going on ends with the draft's content on the vehicle, by that plan."""
         sending = self.sending
-        if self.committing and sending.unacked:
+        if self.ended and sending.unacked:
             return False
         return (
             self.plan is plan

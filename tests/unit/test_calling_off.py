@@ -264,6 +264,25 @@ async def test_a_removal_that_was_given_up_loses_nothing(
     assert litter(store) == []
 
 
+@pytest.mark.parametrize("more", [b"", b"more"])
+@pytest.mark.parametrize("path", [NEW, FILE])
+async def test_a_delivery_that_was_given_up_at_its_very_end_goes_on(
+    autojump_clock: object, store: FakeWriter, path: bytes, more: bytes
+) -> None:
+    """Nobody waits for the end of the upload any more, which takes nothing more."""
+    tree = make_writable(store)
+    file = await begun(tree, store, path)
+    store.write_delay, store.linger = 0.0, 1.0
+    with trio.move_on_after(0.5) as scope:
+        await file.fsync()
+    assert scope.cancelled_caught
+    await file.write(len(DATA), more)
+    await file.release()
+    assert tree.undelivered() == []
+    assert store.files[path].data == DATA + more
+    assert len(store.uploads) == 1 + bool(more)
+
+
 async def test_what_waits_to_begin_an_upload_does_not_begin_it(
     autojump_clock: object, store: FakeWriter
 ) -> None:
