@@ -229,10 +229,10 @@ class Ledger:
             self.reorder -= 1
         if request.order > self.newest_answered:
             self.newest_answered = request.order
-        if current:
-            self._lateness.on_answered(request.sent_at, now)
-        else:
+        if not current:
             self._lateness.on_stray(seq, now)
+        elif request.single:  # else it may answer an earlier transmission
+            self._lateness.on_answered(request.sent_at, now)
         return current
 
     def forget(self, request: Request) -> None:

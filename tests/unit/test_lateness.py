@@ -97,3 +97,20 @@ def test_work_that_takes_long_is_not_late() -> None:
     engine.receive(slow, 9.0)
     assert engine.stats.unknown == 1
     assert engine.stats.lateness.seen(9.0) == 0.0
+
+
+def test_a_long_way_is_not_late() -> None:
+    """What was repeated before anything could be answered is answered as often, in order."""
+    engine = Engine(random.Random(1), Flow())
+    answers = []
+    for start, opcode in ((0.0, Opcode.CREATE_DIRECTORY), (0.5, Opcode.REMOVE_DIRECTORY)):
+        request = ask(engine, opcode, start)
+        answers.append((start + 5.0, ack(request)))
+        for now in (start + 1.0, start + 2.0, start + 4.0):
+            engine.on_deadline(now + 0.01)
+            answers += [(now + 5.01, ack(again)) for again in sent(engine, now + 0.01)]
+    assert len(answers) > 4
+    for now, answer in sorted(answers, key=lambda item: item[0]):
+        engine.receive(answer, now)
+    assert engine.stats.unknown
+    assert engine.stats.lateness.seen(12.0) == 0.0
