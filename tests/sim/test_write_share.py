@@ -38,14 +38,14 @@ def test_writing_uses_a_faster_link(profile: str, rtt: float, loss: float) -> No
 @pytest.mark.parametrize(
     ("rtt", "seconds", "share"),
     [
-        (0.3, 20.0, 0.94),
+        (0.3, 20.0, 0.90),
         pytest.param(0.1, 60.0, 0.95, marks=pytest.mark.soak),
-        pytest.param(0.3, 60.0, 0.93, marks=pytest.mark.soak),
+        pytest.param(0.3, 60.0, 0.95, marks=pytest.mark.soak),
     ],
 )
 def test_the_pauses_of_a_card_cost_their_time_once(rtt: float, seconds: float, share: float) -> None:
-    """The server had nothing to do a round trip after a pause, for as long again: 0.87 to 0.91. In a minute
-    the card pauses for 2 % longer than on average, which is what the limit knows."""
+    """The server had nothing to do a round trip after a pause, for as long again: 0.84 to 0.89. Of 20 s the
+    start takes a part."""
     assert measure(Case("px4-nuttx", 100_000.0, rtt, 0.0, "write"), seconds).share >= share
 
 
