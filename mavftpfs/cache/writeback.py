@@ -122,19 +122,20 @@ class Writeback:
         self._context.require_disarmed()
         self.overlay.require_new(path)
         wire_path(path)
-        entry = await self._namespace.entry(path)
-        other = None if entry is not None else await self._namespace.other_spelling(path)
-        if entry is not None or other is not None:
-            if exclusive:
-                raise AlreadyExists(f"{path!r} exists")
-            return await self.open(other or path, truncate=False)
-        await self._namespace.require_kept(path)
-        node = self._context.nodes.need(path)
-        made = node.draft is None
-        if made:
-            self._new_draft(node, None)
-            self.overlay.on_written(path)
-        return WriteFile(self, self._context, node, made=made)
+        async with self._context.paths.hold(path, shared=True):
+            entry = await self._namespace.entry(path)
+            other = None if entry is not None else await self._namespace.other_spelling(path)
+            if entry is None and other is None:
+                await self._namespace.require_kept(path)
+                node = self._context.nodes.need(path)
+                made = node.draft is None
+                if made:
+                    self._new_draft(node, None)
+                    self.overlay.on_written(path)
+                return WriteFile(self, self._context, node, made=made)
+        if exclusive:
+            raise AlreadyExists(f"{path!r} exists")
+        return await self.open(other or path, truncate=False)
 
     async def _need_draft(self, path: bytes, *, truncate: bool) -> Node:
         """Return the node of a file that exists, with a draft."""

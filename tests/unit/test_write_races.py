@@ -169,6 +169,30 @@ async def test_a_file_is_opened_before_or_after_its_name_is_changed(
         assert store.crimes == []
 
 
+@pytest.mark.parametrize("kind", sorted(set(KINDS) - {"littlefs"}))
+async def test_a_file_is_made_before_or_after_another_gets_its_name(
+    nursery: trio.Nursery, autojump_clock: object, kind: str
+) -> None:
+    """Not meanwhile: it would be two files of one name, and the program's could never be delivered."""
+    for later in range(14):
+        store = FakeWriter(KINDS[kind], nursery)
+        store.add(OTHER, NEW)
+        tree = make_writable(store)
+        await tree.list(b"/d")
+        store.write_delay = store.list_delay = 0.1
+        async with trio.open_nursery() as both:
+            both.start_soon(tree.rename, OTHER, FILE)
+            await trio.sleep(later * 0.05)
+            file = await tree.create(FILE, exclusive=False)
+            await file.write(0, b"mid")
+            await file.release()
+        assert tree.undelivered() == []
+        ((path, left),) = store.files.items()
+        assert path == FILE
+        assert left.data in (NEW, b"mid" + NEW[3:])
+        assert store.crimes == []
+
+
 async def test_a_read_of_what_is_cut_off_meanwhile_ends_at_the_new_end(
     nursery: trio.Nursery, autojump_clock: object
 ) -> None:
