@@ -122,7 +122,7 @@ class SideEffects:
             self._changing(new, may=may),
         ):
             await self._scheduler.echoes.let_pass(old, taken=True)
-            await self._scheduler.echoes.let_pass(new)
+            await self._scheduler.echoes.let_pass(new, taken=True)
             with self._scheduler.echoes.noted(old):
                 await self._perform(
                     lambda: Simple(Opcode.RENAME, data), lambda: self._is_renamed(old, new), old, new

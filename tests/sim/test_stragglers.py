@@ -154,6 +154,28 @@ async def test_a_name_that_was_removed_does_not_come_back(profile: str, autojump
     assert b"f" not in {entry.name for entry in here.tree.entries(split(name)[0])}
 
 
+@pytest.mark.parametrize("profile", taking_turns([name for name in KEEPING if name != "littlefs"]))
+async def test_what_was_written_to_a_file_does_not_come_to_the_next_of_its_name(
+    profile: str, autojump: MockClock
+) -> None:
+    """OpenFileWO and WriteFile come once more, both: only so a write finds the file that took the place."""
+    here = World(profile, DOUBLING)
+    name, other = (ROOTS.get(profile, b"") + b"/d/" + end for end in (b"f", b"g"))
+    here.tree.add(name, content(100))
+    here.tree.add(other, content(1000, 2))
+    async with trio.open_nursery() as nursery, here.connection() as connection:
+        connection.store.traits.wo_truncates = False
+        await connection.store.list_directory(split(name)[0])
+        double(here, Opcode.OPEN_FILE_WO, 0.2, nursery.start_soon)
+        double(here, Opcode.WRITE_FILE, 0.2, nursery.start_soon)
+        await append(connection, name, b"hello", 100)
+        if profile in ("ardupilot5", "px4-nuttx"):  # FAT: they rename over no file
+            await connection.store.remove(name)
+        await connection.store.rename(other, name)
+        await trio.sleep(1)
+    assert here.tree.data(name) == content(1000, 2)
+
+
 @pytest.mark.parametrize("late", [0.06, 0.09, 0.11])
 async def test_a_late_rename_of_the_old_file_does_not_take_the_new_one(
     late: float, autojump: MockClock
