@@ -261,7 +261,7 @@ class Flow:
         self._trains.on_replies(answers, now)
         if now != self._heard_at:  # what comes at once has no pauses
             self._heard_at = now
-            self._stalls.on_reply(now, 0.0 if self._starting else self._best_rate)
+            self._stalls.on_reply(now, 0.0 if self._starting else self._best_rate, self._base_rtt)
         if rtt is not None and rtt < self._round_least:
             self._round_least = rtt
 
@@ -349,11 +349,10 @@ class Flow:
                 self.window = max(1, int(self._base.next_window(self.window, reserve)))
 
     def _excused(self) -> bool:
-        """Whether pauses explain what was lost: who wrote went on, and lost no more than comes in a pause, or
+        """Whether pauses explain what was lost: it is no more than comes in them, or who wrote went on, and
         the server takes more than the link brings."""
-        if not (self._bridging and self._stalls.usual):
-            return False
-        return self.loss < self._stalls.share + _MORE_LOSS or self._trains.rate > 1.5 * self._best_rate
+        quick = self._bridging and self._trains.rate > 1.5 * self._best_rate
+        return self._stalls.usual and (quick or self.loss < self._stalls.share + _MORE_LOSS)
 
     def _learn_congestion(self) -> None:
         if self._losses and self._queued(2.0):
@@ -362,8 +361,9 @@ class Flow:
             self._brake = min(1.0, self._brake * 1.05)
 
     def _queued(self, factor: float) -> bool:
-        """Whether even the quickest answer of the round took `factor` times the base, and a little."""
-        return factor * self._base_rtt + _QUEUE_SECONDS < self._round_least < inf
+        """Whether even the quickest answer of the round took `factor` times the base, and a little; an answer
+        queues behind a reserve, too."""
+        return factor * self._base_rtt + self._stalls.reserve + _QUEUE_SECONDS < self._round_least < inf
 
     def _leaves_start(self, grown: bool) -> bool:
         few = self._replies + self._losses < _TELLING_ROUND and self.window + 1 < self._held(inf)

@@ -2,10 +2,10 @@
 
 A card that is busy for a tenth of a second (PX4 on NuttX) leaves a slow link idle for as long, unless
 answers wait in the link's queue. So while such pauses cost more than they should, some more requests are
-kept on the way, up to 0.15 s worth, which is what others then wait for the link at most; and fewer again
-when pauses have become rare. Where the server and not the link is the slowest part, no answers wait in a
-link, and more requests only overflow the server's buffer: so if pauses are as long with a reserve as they
-were without, there is none for a while.
+kept on the way, up to 0.15 s and half a round trip worth, which is what others then wait for the link at
+most; and fewer again when pauses have become rare. Where the server and not the link is the slowest part, no
+answers wait in a link, and more requests only overflow the server's buffer: so if pauses are as long with a
+reserve as they were without, there is none for a while.
 
 Writes need no answers in a queue, and what waits in front of a small buffer would be lost. But what arrives
 while the card pauses is lost as well, and if nothing is sent either because no answers come, the server has
@@ -18,6 +18,7 @@ from __future__ import annotations
 from math import inf
 
 MOST = 0.15
+_MOST_ON_A_LONG_WAY = 0.3
 _LEAST_PAUSE = 0.020
 _INTERVALS = 8
 _PERIOD = 2.0
@@ -75,8 +76,8 @@ class Stalls:
         self._until = -inf  # there is no reserve before
         self._hold = _FIRST_HOLD
 
-    def on_reply(self, now: float, rate: float) -> None:
-        """A request was answered. rate: answers per second at best, 0 if unknown."""
+    def on_reply(self, now: float, rate: float, rtt: float = 0.0) -> None:
+        """A request was answered. rate: answers per second at best, 0 if unknown. rtt: least round trip."""
         last, self._last = self._last, now
         if last is None:
             return
@@ -85,7 +86,7 @@ class Stalls:
         if rate > 0.0 and gap > _LEAST_PAUSE + _INTERVALS / rate:
             self._paused += gap
         if self._watched > _PERIOD:
-            self._end_period(now)
+            self._end_period(now, rtt)
 
     @property
     def usual(self) -> bool:
@@ -105,7 +106,7 @@ class Stalls:
         """Too little was asked for: the gap before the next answer means nothing."""
         self._last = None
 
-    def _end_period(self, now: float) -> None:
+    def _end_period(self, now: float, rtt: float) -> None:
         seconds, paused = self._watched, self._paused
         self._watched = self._paused = 0.0
         self.share += (paused / seconds - self.share) * _SMOOTHING
@@ -118,7 +119,8 @@ class Stalls:
         elif self._before and self._is_useless(now, seconds, paused):
             self.reserve = 0.0
         elif costly:
-            self.reserve = min(MOST, self.reserve + _STEP)
+            most = min(MOST + rtt / 2, _MOST_ON_A_LONG_WAY)
+            self.reserve = min(most, self.reserve + _STEP)
         else:
             self.reserve *= _FADE
             if self.reserve < _FADED:

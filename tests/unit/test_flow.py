@@ -67,6 +67,18 @@ def test_a_queue_of_our_reserve_is_no_longer_way() -> None:
     assert flow.window <= 1.1 * before
 
 
+def test_losses_in_pauses_do_not_brake_for_the_queue_of_our_reserve() -> None:
+    flow = Flow()
+    path = Path(flow, rate=400.0, base=0.1)
+    path.rounds(40)
+    before = flow.window
+    flow._stalls.reserve, flow._stalls._calm = 0.15, 0
+    flow._stalls._watched = -1e9  # so it stays
+    path.waiting = 60
+    path.rounds(40, lost=4)
+    assert flow.window >= before
+
+
 class Path:
     """A path of a fixed rate (replies/s) and base round trip; the window is always full."""
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from math import inf
 
 import pytest
 
@@ -36,6 +37,20 @@ def test_steady_answers_need_no_reserve() -> None:
     stalls = Stalls()
     run(stalls, 60.0)
     assert stalls.reserve == 0.0
+
+
+@pytest.mark.parametrize(("rtt", "most"), [(0.01, 0.155), (0.1, 0.2), (0.3, 0.3), (2.0, 0.3), (inf, 0.3)])
+def test_a_longer_way_allows_a_longer_queue(rtt: float, most: float) -> None:
+    """Who lists a directory meanwhile may wait three round trips and 0.3 s (design section 5)."""
+    stalls = Stalls()
+    now = since = 0.0
+    while now < 60.0:
+        now += 1 / RATE
+        if now - since > 1.0:
+            now += max(0.0, (0.15 if now < 20.0 else 0.4) - stalls.reserve)
+            since = now
+        stalls.on_reply(now, RATE, rtt)
+    assert stalls.reserve == pytest.approx(most)
 
 
 def test_pauses_that_cost_are_bridged_and_forgotten_when_they_end() -> None:
