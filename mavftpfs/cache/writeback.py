@@ -317,11 +317,12 @@ class Writeback:
             if node.writers:
                 return  # who opened it meanwhile completes it
             made = node.draft is not None and node.draft.made
+            maybe = node.draft is not None and node.draft.maybe_made
             node.drop_draft()
         self._context.nodes.maybe_forget(node)
-        if made:
+        if made or maybe:
             try:
-                await self._namespace.remove_perhaps(node.path)
+                await self._namespace.take_back(node.path, if_empty=not made)
             except MavftpfsError as error:
                 log.info("a part of %r may have stayed on the vehicle: %s", node.path, error)
 

@@ -16,6 +16,7 @@ from mavftpfs.shared.errors import (
     NoSpace,
     NotADirectory,
     NotFound,
+    RequestTimeout,
     VehicleLost,
 )
 from mavftpfs.shared.model import EntryKind
@@ -85,6 +86,31 @@ async def test_a_failed_move_to_the_vehicle_moves_nothing(store: FakeWriter, tre
     assert await read_file(tree, SWAP) == bytes(500)
     assert tree.undelivered() == []
     assert sorted(store.files) == [FILE]
+
+
+@pytest.mark.parametrize("theirs", [None, b"", b"the vehicle's own"])
+async def test_a_move_of_an_empty_file_that_may_have_made_one_leaves_none(
+    store: FakeWriter, tree: Tree, theirs: bytes | None
+) -> None:
+    """The reply to CreateFile was lost; one with content is somebody else's."""
+    await write_file(tree, SWAP, b"")
+    store.lose_reply_at = {1}
+    truly = store.create_empty
+
+    async def create_empty(path: bytes, *, free_at: float | None = None) -> None:
+        try:
+            await truly(path, free_at=free_at)
+        finally:
+            if theirs is not None:
+                store.add(path, theirs)
+
+    store.create_empty = create_empty  # type: ignore[method-assign]
+    with pytest.raises(RequestTimeout):
+        await tree.rename(SWAP, b"/scripts/new")
+    assert await read_file(tree, SWAP) == b""
+    assert {path: file.data for path, file in store.files.items() if path != FILE} == (
+        {b"/scripts/new": theirs} if theirs else {}
+    )
 
 
 @pytest.mark.parametrize("step", ["open_upload", "require_free"])
