@@ -138,6 +138,17 @@ class Changes:
         if writing:
             raise FileBusy(f"{path!r} is being written, so it cannot be moved to another place")
 
+    async def take_back(self, path: bytes, *, if_empty: bool) -> None:
+        """Remove a file that we made for what failed then, or made perhaps: then only an empty one.
+
+        Raises:
+            As WriteStore.
+        """
+        async with self._context.paths.hold(path):
+            others = self._context.nodes.get(path) is not None
+            if not others and not (if_empty and await self._context.writer.stat_size(path)):
+                await self._namespace.remove_perhaps(path)
+
     async def require_parent(self, path: bytes) -> None:
         """Check that the directory of a local path exists, here or on the vehicle.
 

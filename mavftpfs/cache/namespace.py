@@ -255,13 +255,6 @@ class Namespace(Names):
         self._context.files.on_removed(path)
         self._context.on_changed(path)
 
-    async def take_back(self, path: bytes, *, if_empty: bool) -> None:
-        """Remove a file that we made for what failed then, or made perhaps: then only an empty one."""
-        async with self._context.paths.hold(path):
-            others = self._context.nodes.get(path) is not None
-            if not others and not (if_empty and await self._deliverer.verifier.size(path)):
-                await self.remove_perhaps(path)
-
     async def remove_perhaps(self, path: bytes) -> None:
         """Remove a file that we were about to make: CreateFile may not have come to it."""
         try:

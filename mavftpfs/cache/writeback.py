@@ -322,7 +322,7 @@ class Writeback:
         self._context.nodes.maybe_forget(node)
         if made or maybe:
             try:
-                await self._namespace.take_back(node.path, if_empty=not made)
+                await self.changes.take_back(node.path, if_empty=not made)
             except MavftpfsError as error:
                 log.info("a part of %r may have stayed on the vehicle: %s", node.path, error)
 
