@@ -10,6 +10,7 @@ it, SSS counts, and the kind k is
      behind a NUL, the one that m had before. It is
      written first and removed last, and only where NAME does not fit: rename carries both paths in one
      request of 238 bytes, so long paths use the short form, in the nearest directory above that fits.
+One more, `MVF~OOOO`, shows what the card does to names of at most eight characters; it is removed like d.
 
 What an interruption leaves, and what `repair` does with it (new, old and target have the same number):
   target there                  remove new, then old, then the sidecar
@@ -46,6 +47,7 @@ from mavftpfs.shared.model import (
 )
 
 PREFIX = b".mavftpfs-"
+SHORT_PREFIX = b"MVF~"
 RENAME_ROOM = 238
 """Bytes of both paths of a rename and the NUL between them (servers.md 9)."""
 
@@ -58,6 +60,7 @@ DELETED_AFTER = 24 * 3600.0
 
 _ALPHABET = b"abcdefghijklmnopqrstuvwxyz234567"  # one spelling on cards that fold case
 _RESERVED = re.compile(rb"\.mavftpfs-([a-z2-7]{4})([tomdp])([a-z2-7]{3})(?:-(.+))?", re.DOTALL)
+_SHORT_PROBE = re.compile(rb"MVF~([A-Z2-7]{4})")
 _SERIALS = 32**3
 _OWNER_LENGTH, _SERIAL_LENGTH = 4, 3
 
@@ -74,7 +77,8 @@ class Kind(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Reserved:
-    """A reserved name's parts; target: the name it belongs to, None in the short form."""
+    """A reserved name's parts; target: the name it belongs to, None in the short form; serial: empty in the
+    name of eight characters."""
 
     owner: bytes
     kind: Kind
@@ -84,6 +88,8 @@ class Reserved:
     @property
     def name(self) -> bytes:
         """The directory entry's name."""
+        if not self.serial:
+            return SHORT_PREFIX + self.owner.upper()
         short = PREFIX + self.owner + self.kind.value + self.serial
         return short if self.target is None else short + b"-" + self.target
 
@@ -108,11 +114,14 @@ class Action:
 
 def is_reserved(name: bytes) -> bool:
     """Return whether a name is hidden from programs."""
-    return name.startswith(PREFIX)
+    return name.startswith(PREFIX) or _SHORT_PROBE.fullmatch(name) is not None
 
 
 def parse(name: bytes) -> Reserved | None:
     """Return the parts of a reserved name, None for any other name."""
+    probe = _SHORT_PROBE.fullmatch(name)
+    if probe is not None:
+        return Reserved(probe[1].lower(), Kind.DELETED, b"")
     match = _RESERVED.fullmatch(name)
     if match is None:
         return None
@@ -170,6 +179,19 @@ class Namer:
             if len(first) <= MAX_WIRE_PATH:
                 return first, second
             parent = self._above(parent, path)
+
+    def short_probe(self, path: bytes) -> bytes:
+        """Return a name that FAT keeps without a long one, to find out what becomes of those like `path`'s.
+
+        Of capitals, which are short whatever a card does to small letters. It is always the same.
+
+        Raises:
+            PathTooLong.
+        """
+        parent, name = split(path)[0], Reserved(self.owner, Kind.DELETED, b"").name
+        while len(own := join(parent, name)) >= MAX_WIRE_PATH:  # one byte is left for a dot behind it
+            parent = self._above(parent, path)
+        return own
 
     def hidden(self, path: bytes) -> bytes:
         """Return a name for a file that is unlinked while it is read.

@@ -9,8 +9,11 @@ from __future__ import annotations
 
 import errno
 import logging
+import re
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
+
+import trio
 
 from mavftpfs.cache.asides import is_reserved
 from mavftpfs.cache.context import Context
@@ -21,12 +24,16 @@ from mavftpfs.shared.model import DirEntry, EntryKind, join, split
 
 log = logging.getLogger("mavftpfs.cache")
 
+_SHORT_WITH_DOT = re.compile(rb"[!-\-/-@\[-~]{1,8}\.|[!-\-/-`{-~]{1,8}\.")
+"""A name of at most eight characters in one case, with a dot behind it."""
+
 
 class Names:
     """Looks names up. Paths are the vehicle's, not local, not below `@`."""
 
     def __init__(self, context: Context) -> None:
         self._context = context
+        self._trying = trio.Lock()
 
     async def entry(self, path: bytes) -> DirEntry | None:
         """Return what a path is, drafts included; None if it does not exist though its directory does.
@@ -81,27 +88,43 @@ class Names:
     async def require_kept(self, path: bytes) -> None:
         """Refuse a new name that the card would take for another one, of which it would change the file.
 
-        FatFs drops dots and blanks at the end of every name (its create_name), which a file of our own
-        shows. NuttX drops the dot behind a short name only (its fat_parsesfname): there it is looked whether
-        the name opens a file although no listing shows it.
+        FatFs drops dots and blanks at the end of every name (its create_name), NuttX the dot behind a short
+        one only (its fat_parsesfname): files of our own show it. It is looked, too, whether the name opens a
+        file although no listing shows it.
 
         Raises:
-            LocalProtocolError. Else as entry and WriteStore.create_empty, stat_size.
+            LocalProtocolError. Else as entry and WriteStore.create_empty, stat_size; PathTooLong.
         """
         parent, name = split(path)
         entries = (await self._context.directories.get(parent)).entries
         if name in entries:
             return
-        traits, plain = self._context.writer.traits, _without_end(name)
-        ends = len(plain) < len(name)
-        if ends and traits.drops_ends is None:
-            async with self._own_file(path) as own:
-                traits.drops_ends = await self._opens(own + b".")
+        plain = _without_end(name)
         alike = any(_without_end(n) == plain and n.lower() != name.lower() for n in entries)
-        if (ends and traits.drops_ends) or (alike and await self._opens(path)):
+        dropped = len(plain) < len(name) and await self._drops_end(path)
+        if dropped or (alike and await self._opens(path)):
             raise LocalProtocolError(f"this card drops dots and blanks at the end of names as {name!r}")
 
     # --- inside
+
+    async def _drops_end(self, path: bytes) -> bool:
+        """Return whether the card drops the end of a name, or may: what shows nothing proves nothing."""
+        traits, short = self._context.writer.traits, _SHORT_WITH_DOT.fullmatch(split(path)[1]) is not None
+        if traits.drops_ends:
+            return True
+        async with self._trying:  # the short name is always the same
+            if short and traits.drops_short_ends is None:
+                async with self._own_file(self._context.namer.short_probe(path)) as own:
+                    traits.drops_short_ends = await self._drops_dot(own)
+            elif not short and traits.drops_ends is None:
+                async with self._own_file(self._context.namer.probes(path)[0]) as own:
+                    traits.drops_ends = await self._drops_dot(own)
+        return (traits.drops_short_ends if short else traits.drops_ends) is not False
+
+    async def _drops_dot(self, own: bytes) -> bool | None:
+        if await self._opens(own + b"."):
+            return True
+        return False if await self._opens(own) else None
 
     def _drafted(self, path: bytes) -> DirEntry | None:
         node = self._context.nodes.get(path)
@@ -142,15 +165,14 @@ class Names:
         return True
 
     async def _try_own_file(self, path: bytes) -> None:
-        async with self._own_file(path) as own:
+        async with self._own_file(self._context.namer.probes(path)[0]) as own:
             parent, name = split(own)
             await self._try_spelling(own, join(parent, name.upper()))
 
     @asynccontextmanager
-    async def _own_file(self, path: bytes) -> AsyncIterator[bytes]:
-        """Try with an empty file of our own beside `path`, which is removed, here or at a later listing."""
+    async def _own_file(self, own: bytes) -> AsyncIterator[bytes]:
+        """Try with an empty file of our own, which is removed, here or at a later listing."""
         context = self._context
-        own = context.namer.probes(path)[0]
         context.live.add(own)
         try:
             await context.writer.create_empty(own)

@@ -53,6 +53,7 @@ class WriteTraits:
         rename_replaces: a rename onto an existing file worked (False: FAT refuses it). Filled by the cache.
         folds_case: two spellings of a name open the same file. Filled by the cache.
         drops_ends: dots and blanks at the end of a name do not count (FatFs). Filled by the cache.
+        drops_short_ends: a dot behind at most eight characters does not (NuttX). Filled by the cache.
     """
 
     wo_truncates: bool | None = None
@@ -62,3 +63,4 @@ class WriteTraits:
     rename_replaces: bool | None = None
     folds_case: bool | None = None
     drops_ends: bool | None = None
+    drops_short_ends: bool | None = None

@@ -11,9 +11,10 @@ from trio.testing import MockClock
 
 from mavftpfs.cache.tree import Tree
 from mavftpfs.protocol.payload import Opcode
-from mavftpfs.shared.errors import AlreadyExists, IsADirectory
+from mavftpfs.shared.errors import AlreadyExists, IsADirectory, LocalProtocolError
 from mavftpfs.sim.linkmodel import LinkSettings
 from mavftpfs.sim.profiles import PROFILES, Storage
+from tests.support.fake_writer import write_file
 from tests.support.faults import Faults
 from tests.support.mounting import mounted
 from tests.support.worlds import GOOD_LINK, ROOTS, World
@@ -135,3 +136,27 @@ async def test_they_are_one_elsewhere(profile: str, autojump: MockClock) -> None
         with pytest.raises(IsADirectory):
             await tree.create(scene.root + b"/TEST", exclusive=False)
     assert scene.names() == [b"a", b"test"]
+
+
+ENDS = (b"short.", b"UPPER.", b"7.", b"Mixed.", b"longer-than-eight.", b"a.b.", b"blank ", b"two..")
+KEPT = {Storage.FATFS: (), Storage.NUTTX_FAT: ENDS[3:]}
+"""Which of these the card keeps as they are, where it is not all."""
+
+
+@pytest.mark.parametrize("profile", EVERY)
+@pytest.mark.parametrize("order", [1, -1])
+async def test_a_new_name_is_the_cards_or_refused(profile: str, order: int, autojump: MockClock) -> None:
+    """Whichever comes first: what one name shows says nothing about those of another kind."""
+    scene = Scene(profile)
+    kept = KEPT.get(PROFILES[profile].storage, ENDS)
+    async with scene.mounted() as tree:
+        for name in ENDS[::order]:
+            path = scene.root + b"/" + name
+            if name in kept:
+                await write_file(tree, path, name)
+                assert scene.world.tree.data(path) == name
+                continue
+            for change in (write_file(tree, path, name), tree.mkdir(path), tree.rename(scene.a, path)):
+                with pytest.raises(LocalProtocolError):
+                    await change
+    assert scene.names() == sorted([b"a", *kept])

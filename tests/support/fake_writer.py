@@ -6,6 +6,7 @@ every chunk of an upload, counts as one.
 
 from __future__ import annotations
 
+import re
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from dataclasses import dataclass
 from random import Random
@@ -33,6 +34,7 @@ from mavftpfs.shared.traits import WriteTraits
 from tests.support.fake_store import FakeFile, FakeReader, FakeStore
 
 CHUNK = 239
+_SHORT_WITH_DOT = re.compile(rb"([0-9_~-]|[A-Z]){1,8}\.|([0-9_~-]|[a-z]){1,8}\.")
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +44,7 @@ class Kind:
     replaces: rename over a file works (else FileExists, as FAT). moves_into: rename onto a directory moves
     into it, as NuttX. renames: there is a rename at all. wo_truncates: OpenFileWO empties. truncates:
     TruncateFile works (None: silence). folds_case: names are found in any case. drops_ends: dots and blanks
-    at the end of a name are dropped.
+    at the end of a name are dropped. drops_short_ends: a dot behind eight characters of one case at most is.
     """
 
     replaces: bool = True
@@ -52,11 +54,12 @@ class Kind:
     truncates: bool | None = True
     folds_case: bool = False
     drops_ends: bool = False
+    drops_short_ends: bool = False
 
 
 KINDS = {
     "posix": Kind(),
-    "nuttx": Kind(moves_into=True, truncates=False),
+    "nuttx": Kind(moves_into=True, truncates=False, drops_short_ends=True),
     "fat": Kind(replaces=False, folds_case=True, drops_ends=True, truncates=False),
     "littlefs": Kind(renames=False, truncates=False),
     "mavsdk": Kind(wo_truncates=True, truncates=None),
@@ -147,6 +150,8 @@ class FakeWriter(FakeStore):
         path = self.aliases.get(path, path)
         if self.kind.drops_ends:
             path = path.rstrip(b". ")
+        if self.kind.drops_short_ends and _SHORT_WITH_DOT.fullmatch(split(path)[1]):
+            path = path[:-1]
         if path in self.files or path in self.directories or not self.kind.folds_case:
             return path
         for known in [*self.files, *self.directories]:

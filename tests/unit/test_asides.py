@@ -107,6 +107,19 @@ def test_names_for_trying_out_are_two_new_ones_near_by() -> None:
         assert reserved.kind is Kind.DELETED
 
 
+def test_the_short_name_for_trying_out_is_short_for_every_card_and_ours() -> None:
+    """On NuttX that depends on the case, but for capitals it does not."""
+    namer = Namer(b"ab2d", b"/r", Random(5))
+    assert namer.short_probe(b"/r/d/file") == b"/r/d/MVF~AB2D"
+    assert parse(b"MVF~AB2D") == Reserved(b"ab2d", Kind.DELETED, b"")
+    assert Reserved(b"ab2d", Kind.DELETED, b"").name == b"MVF~AB2D"
+    deep = b"/r/" + b"a" * 100 + b"/" + b"b" * 90 + b"/f"
+    assert split(namer.short_probe(deep))[0] == b"/r/" + b"a" * 100
+    assert is_reserved(b"MVF~AB2D")
+    for name in (b"MVF~AB1D", b"MVF~AB2", b"MVF~AB2DX", b"mvf~ab2d", b"MVF~AB2D.", b"XMVF~AB2D"):
+        assert not is_reserved(name)
+
+
 NEW, OLD, MOVED, SIDECAR, DELETED = (
     b"/d/" + kind.value for kind in (Kind.NEW, Kind.OLD, Kind.MOVED, Kind.SIDECAR, Kind.DELETED)
 )

@@ -223,9 +223,47 @@ async def test_where_it_is_kept_it_is_a_name_like_others(nursery: trio.Nursery, 
     nursery.cancel_scope.cancel()
 
 
-async def test_a_name_that_opens_another_file_is_refused(nursery: trio.Nursery) -> None:
-    """NuttX keeps the dot of a long name and drops that behind a short one."""
+@pytest.mark.parametrize("name", [b"a.", b"A.", b"new.", b"12345678."])
+async def test_a_short_name_whose_dot_the_card_would_cut_is_refused(
+    nursery: trio.Nursery, name: bytes
+) -> None:
+    """NuttX keeps the dot behind a long name and drops that behind a short one, of new names, too."""
     store = scene(FakeWriter(KINDS["nuttx"], nursery))
+    tree = make_writable(store)
+    await write_file(tree, b"/d/a-long-name.", b"kept")  # which says nothing about short ones
+    before = shape(store)
+    changes: tuple[Callable[[], Awaitable[None]], ...] = (
+        lambda: write_file(tree, b"/d/" + name, b"other"),
+        lambda: tree.mkdir(b"/d/" + name),
+        lambda: tree.rename(b"/d/b", b"/d/" + name),
+    )
+    for change in changes:
+        with pytest.raises(LocalProtocolError):
+            await change()
+    assert shape(store) == before
+    assert sum(what[0] == "remove" for what in store.log) == 2  # one look for each kind of name
+    for other in (b"Mixed.", b"123456789.", b"a.b.", b"a..", b"c "):
+        await write_file(tree, b"/d/" + other, other)
+        assert store.files[b"/d/" + other].data == other
+    nursery.cancel_scope.cancel()
+
+
+async def test_many_names_are_looked_at_at_once(nursery: trio.Nursery) -> None:
+    """They share the name of what is tried out."""
+    store = scene(FakeWriter(KINDS["posix"], nursery))
+    tree = make_writable(store)
+    names = [b"/d/%d." % number for number in range(4)]
+    async with trio.open_nursery() as several:
+        for name in names:
+            several.start_soon(write_file, tree, name, name)
+    assert [store.files[name].data for name in names] == names
+    assert {split(path)[1] for path in store.files} == {b"a", b"b", b"x", *(split(name)[1] for name in names)}
+    nursery.cancel_scope.cancel()
+
+
+async def test_a_name_that_opens_another_file_is_refused(nursery: trio.Nursery) -> None:
+    """Whatever the reason, and whatever our own files showed."""
+    store = scene(FakeWriter(KINDS["posix"], nursery))
     store.aliases = {b"/d/a.": b"/d/a", b"/d/x.": b"/d/x"}
     tree = make_writable(store)
     await write_file(tree, b"/d/b.", b"other")
