@@ -316,8 +316,9 @@ class Writeback:
             await self._deliverer.abandon(node)
             if node.writers:
                 return  # who opened it meanwhile completes it
-            made = node.draft is not None and node.draft.made
-            maybe = node.draft is not None and node.draft.maybe_made
+            made, maybe, draft = False, False, node.draft
+            if draft is not None and draft.remote_size is None and not draft.overwrites:  # else it was there
+                made, maybe = draft.made, draft.maybe_made
             node.drop_draft()
         self._context.nodes.maybe_forget(node)
         if made or maybe:

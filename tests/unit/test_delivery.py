@@ -7,6 +7,7 @@ import json
 from collections.abc import Awaitable, Callable
 from pathlib import Path
 from random import Random
+from typing import NoReturn
 
 import pytest
 import trio
@@ -581,6 +582,28 @@ async def test_one_fault_at_any_request(
             assert (None if file is None else file.data) in allowed
             nursery.cancel_scope.cancel()
         assert store.crimes == []
+
+
+@pytest.mark.parametrize("kind", sorted(KINDS))
+async def test_a_file_that_was_emptied_stays_though_nobody_could_look_at_it(
+    monkeypatch: pytest.MonkeyPatch, autojump_clock: object, nursery: trio.Nursery, kind: str
+) -> None:
+    """What cannot be verified is an error, and no reason to remove what was there before."""
+    store = scene(KINDS[kind], nursery)
+    tree = make_writable(store)
+    await tree.stat(FILE)
+
+    async def silent(path: bytes) -> NoReturn:
+        raise RequestTimeout("silence")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(store, "list_directory", silent)
+        patch.setattr(store, "stat_size", silent)
+        with pytest.raises(RequestTimeout):
+            await tree.truncate(FILE, 0)
+    assert store.files[FILE].data == b""
+    assert tree.undelivered() == []
+    nursery.cancel_scope.cancel()
 
 
 def put_fault(store: FakeWriter, number: int, fault: str) -> None:
