@@ -237,7 +237,9 @@ class Deliverer:
         try:
             await self._context.writer.create_empty(path, free_at=self._free_at(path, draft))
         except BaseException as error:  # also if who waits for it gives up
-            draft.maybe_made |= may_have_made(error)
+            if may_have_made(error):
+                draft.maybe_made = True
+                self._context.dentries.expire(split(path)[0], self._context.clock())
             raise
         draft.made = True
         # Whoever takes its name away before it was looked at has to find it there.

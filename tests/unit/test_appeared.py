@@ -109,7 +109,10 @@ async def test_removing_ours_does_not_remove_what_appeared(
     assert NEW not in store.files
 
 
-async def test_removing_what_may_be_ours(autojump_clock: object, store: FakeWriter, tree: Tree) -> None:
+@pytest.mark.parametrize("later", [0.0, FREE_FOR + 0.1])
+async def test_removing_what_may_be_ours(
+    autojump_clock: object, store: FakeWriter, tree: Tree, later: float
+) -> None:
     """The reply to CreateFile was lost: an empty file is ours, one with content is not."""
     for theirs in (b"", THEIRS):
         file = await tree.create(NEW, exclusive=True)
@@ -118,7 +121,7 @@ async def test_removing_what_may_be_ours(autojump_clock: object, store: FakeWrit
             await file.release()
         assert store.files[NEW].data == b""
         store.add(NEW, theirs)
-        await trio.sleep(FREE_FOR + 0.1)
+        await trio.sleep(later)
         await tree.unlink(NEW)
         assert (NEW in store.files) == bool(theirs)
 
