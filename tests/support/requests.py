@@ -33,6 +33,9 @@ SETTLED = 0.3
 """Seconds without a request, with nothing open and nothing to deliver, after which a command has had its
 effects."""
 
+LOST = 10.0
+"""Seconds after which a request that did not come will not come."""
+
 SETTLING = 60.0
 KEEP_ALIVE = "NONE"
 FOLDERS = {"px4-nuttx": "fs/microsd"}
@@ -200,16 +203,19 @@ class Counting:
     def settle(self) -> None:
         """Wait until the mount is idle: nothing open, nothing to deliver, nothing asked."""
         deadline = time.monotonic() + SETTLING
-        seen, since = -1, time.monotonic()
-        while time.monotonic() - since < SETTLED:
-            assert time.monotonic() < deadline, f"the mount does not come to rest: {self.status()}"
+        seen, since, quiet = -1, time.monotonic(), SETTLED
+        while time.monotonic() - since < quiet:
+            status = self.status()
+            assert time.monotonic() < deadline, f"the mount does not come to rest: {status}"
             now = self.vehicle.asked()
-            if now != seen or not self._idle():
+            # A vehicle that had no time yet to take what was sent has not counted it.
+            quiet = SETTLED if now >= status["connection"]["requests"] else LOST
+            if now != seen or not self._idle(status):
                 seen, since = now, time.monotonic()
             time.sleep(0.05)
 
-    def _idle(self) -> bool:
-        status = self.status()
+    @staticmethod
+    def _idle(status: dict[str, dict[str, Any]]) -> bool:
         connection = status["connection"]
         waiting = status["cache"].get("files_undelivered")
         busy = connection["session_open"] is not None or connection["speed"]["in_flight"]
