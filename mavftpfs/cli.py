@@ -16,7 +16,7 @@ from typing import NoReturn
 import mavftpfs
 from mavftpfs import commands
 from mavftpfs.exits import ExitCode, exit_code_for
-from mavftpfs.fuse.options import option_names
+from mavftpfs.fuse.optionhelp import option_help
 from mavftpfs.shared.errors import MavftpfsError, UsageError
 from mavftpfs.shared.readable import readable
 
@@ -118,9 +118,7 @@ def _add_options(parser: Parser) -> None:
 
 
 def _sources_and_options() -> str:
-    words = [f"  -o {name}" for name in option_names()]
-    lines = ["".join(f"{word:<24}" for word in words[i : i + 4]).rstrip() for i in range(0, len(words), 4)]
-    return "\n".join([_SOURCES, "", "options:", *lines])
+    return "\n".join([_SOURCES, "", "mount options, as -o ro,cache_size=1G:", *option_help()])
 
 
 def _source_parser(name: str, description: str) -> Parser:

@@ -34,6 +34,7 @@ from mavftpfs.shared.errors import (
     VehicleLost,
 )
 from mavftpfs.shared.model import EntryKind, is_virtual, join, normalise, split
+from mavftpfs.shared.readable import autopilot_name
 
 if TYPE_CHECKING:  # rich is slow to import and not needed here
     from mavftpfs.report import Meter
@@ -296,14 +297,10 @@ def describe_peer(heartbeat: Heartbeat) -> str:
     """Return what a heartbeat says its sender is."""
     if heartbeat.vehicle_type == MAV_TYPE_GCS:
         return "ground station"
-    kind = _AUTOPILOTS.get(heartbeat.autopilot, f"autopilot type {heartbeat.autopilot}")
+    kind = autopilot_name(heartbeat.autopilot)
     if not heartbeat.is_autopilot:
         return f"component (type {heartbeat.vehicle_type})"
     return f"{kind}, {'armed' if heartbeat.armed else 'disarmed'}"
-
-
-_AUTOPILOTS = {3: "ArduPilot", 12: "PX4", 0: "generic autopilot"}
-"""MAV_AUTOPILOT values people meet."""
 
 
 def parse_paths(texts: Sequence[str]) -> tuple[list[bytes], int | None]:

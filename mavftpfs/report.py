@@ -20,6 +20,8 @@ from rich.progress import TransferSpeedColumn as SpeedColumn
 from rich.table import Table
 from rich.text import Text
 
+from mavftpfs.shared.readable import autopilot_name
+
 WATCH_PERIOD = 1.0
 
 _WORDS = {
@@ -33,6 +35,9 @@ _WORDS = {
     "window_rate": "rate by requests",
     "burst_rate": "rate by bursts",
 }
+_FIRST = ("bytes_held", "files_undelivered", "transfers", "errors")
+"""What people look for in `cache`: a small terminal that shows the status again and again cuts its end."""
+
 _SECONDS = {"rtt", "heartbeat_age", "uptime", "eta"}
 
 
@@ -122,9 +127,18 @@ def _block(status: Mapping[str, Any]) -> Table:
     table.add_column(style="bold")
     table.add_column(overflow="fold")
     facts = {key: value for key, value in status.items() if key not in ("source", "mountpoint")}
-    for name, value in _rows(facts):
+    for name, value in rows(facts):
         table.add_row(Text(name), Text(value))
     return table
+
+
+def rows(facts: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+    """Return names and values as a person reads them, what matters most first."""
+    cache = facts.get("cache")
+    if isinstance(cache, Mapping):
+        yield from _rows({key: cache[key] for key in _FIRST if key in cache}, "cache: ")
+        facts = {**facts, "cache": {key: value for key, value in cache.items() if key not in _FIRST}}
+    yield from _rows(facts)
 
 
 def _rows(facts: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
@@ -140,19 +154,19 @@ def _rows(facts: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str
 def describe(key: str, value: Any) -> str:
     """Return a fact as a person reads it."""
     if value is None:
-        return "unknown"
+        return "none" if key == "session_open" else "unknown"
     if isinstance(value, bool):
         return "yes" if value else "no"
     if key in _SECONDS and isinstance(value, int | float):
         return f"{value * 1000:.0f} ms" if value < 1 else f"{value:.1f} s"
-    if isinstance(value, int) and "bytes" in key:
+    if isinstance(value, int) and ("bytes" in key or key == "dirty_max"):
         return readable_size(value)
     if key.endswith("rate") and isinstance(value, int | float):
         return f"{readable_size(value)}/s"
     if key == "loss":
         return f"{value * 100:.1f} %"
-    if key == "transfers" and value:
-        return "; ".join(map(_transfer, value))
+    if key in _WRITTEN and value != []:
+        return _WRITTEN[key](value)
     if isinstance(value, list | tuple):
         return ", ".join(map(str, value)) or "none"
     return "none" if value == {} else str(value)
@@ -165,6 +179,22 @@ def _transfer(facts: Mapping[str, Any]) -> str:
     state = "sending" if facts["sending"] else "waiting"
     eta = "" if facts["eta"] is None else f", {facts['eta']:.0f} s left"
     return f"{facts['path']} {state}, {share} of {readable_size(facts['size'])}{eta}"
+
+
+def _upload(facts: Mapping[str, Any]) -> str:
+    """Return how far the bytes of one file went."""
+    error = "" if facts["error"] is None else f" ({facts['error']})"
+    state = "running" if facts["running"] else "waiting"
+    return f"{facts['path']} {state}, {readable_size(facts['reached'])} sent{error}"
+
+
+_WRITTEN: dict[str, Callable[[Any], str]] = {
+    "transfers": lambda value: "; ".join(map(_transfer, value)),
+    "uploads": lambda value: "; ".join(map(_upload, value)),
+    "autopilot": autopilot_name,
+    "vehicle": lambda value: "system {}, component {}".format(*value),
+}
+"""Facts that are no sentence by themselves."""
 
 
 def readable_size(count: float) -> str:

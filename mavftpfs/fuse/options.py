@@ -7,6 +7,7 @@ and everything else that is not in the table is refused by name.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any, TypeVar
@@ -107,36 +108,51 @@ class MountOptions:
 Parser = Callable[[str], Any]
 
 
+def _or_auto(parse: Parser) -> Parser:
+    """Return a parser that also takes `auto`, and says so."""
+
+    def parse_or_auto(text: str) -> Any:
+        try:
+            return None if text == "auto" else parse(text)
+        except ValueError as exc:
+            raise ValueError(f"{exc}, or auto") from None
+
+    return parse_or_auto
+
+
 def size(low: int, high: int, *, auto: bool = False) -> Parser:
     """Return a parser of sizes: a number with K, M or G (powers of 1024), within [low, high]."""
 
-    def parse(text: str) -> int | None:
-        if auto and text == "auto":
-            return None
+    def parse(text: str) -> int:
         unit = text[-1:].upper()
         digits = text[:-1] if unit in _UNITS and unit else text
-        value = _digits(digits) * _UNITS.get(unit, 1)
-        return _within(value, low, high)
+        if not _is_number(digits):
+            raise ValueError("must be a whole number of bytes, perhaps with K, M or G behind it")
+        return _within(int(digits) * _UNITS.get(unit, 1), low, high, shown=_with_unit)
 
-    return parse
+    return _or_auto(parse) if auto else parse
 
 
 def number(low: int, high: int, *, auto: bool = False) -> Parser:
     """Return a parser of whole numbers within [low, high]."""
 
-    def parse(text: str) -> int | None:
-        if auto and text == "auto":
-            return None
-        return _within(_digits(text), low, high)
+    def parse(text: str) -> int:
+        if not _is_number(text):
+            raise ValueError("must be a whole number")
+        return _within(int(text), low, high)
 
-    return parse
+    return _or_auto(parse) if auto else parse
 
 
 def seconds(low: float, high: float) -> Parser:
     """Return a parser of seconds within [low, high]."""
 
     def parse(text: str) -> float:
-        return _within(float(text), low, high)
+        try:
+            value = float(text)
+        except ValueError:
+            raise ValueError("must be a number of seconds") from None
+        return _within(value, low, high, shown="{:g}".format)
 
     return parse
 
@@ -154,8 +170,9 @@ def choice(*words: str) -> Parser:
 
 def mask(text: str) -> int:
     """Parse an octal permission mask."""
-    value = int(text, 8) if text.isdigit() else -1
-    return _within(value, 0, 0o777)
+    if not re.fullmatch("[0-7]{1,4}", text) or int(text, 8) > 0o777:
+        raise ValueError("must be an octal number of at most 777, as 022")
+    return int(text, 8)
 
 
 def text_value(text: str) -> str:
@@ -341,16 +358,21 @@ def _escape(name: str) -> str:
     return ascii_name.replace("\\", "\\\\").replace(",", "\\,")
 
 
-def _digits(text: str) -> int:
-    if not (text.isascii() and text.isdigit()):
-        raise ValueError("must be a whole number")
-    return int(text)
+def _is_number(text: str) -> bool:
+    return text.isascii() and text.isdigit()
+
+
+def _with_unit(value: float) -> str:
+    """Return a size as it may be written."""
+    units = [(unit, factor) for unit, factor in _UNITS.items() if value and value % factor == 0]
+    unit, factor = max(units, key=lambda pair: pair[1], default=("", 1))
+    return f"{value // factor:.0f}{unit}"
 
 
 NumberT = TypeVar("NumberT", int, float)
 
 
-def _within(value: NumberT, low: NumberT, high: NumberT) -> NumberT:
+def _within(value: NumberT, low: NumberT, high: NumberT, shown: Callable[[NumberT], str] = str) -> NumberT:
     if not low <= value <= high:
-        raise ValueError(f"must be within {low} and {high}")
+        raise ValueError(f"must be within {shown(low)} and {shown(high)}")
     return value

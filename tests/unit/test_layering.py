@@ -46,6 +46,7 @@ PURE_MODULES = {
     "link.problems",
     "link.signing",
     "link.uri",
+    "session.identity",
     "session.policy",
     "cache.dentries",
     "cache.readahead",
@@ -57,6 +58,7 @@ PURE_MODULES = {
     "cache.times",
     "fuse.inodes",
     "fuse.handles",
+    "fuse.optionhelp",
     "fuse.options",
 }
 IMPURE_MODULES = {"sim.endpoints", "sim.memory", "sim.command"}

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from mavftpfs.fuse.optionhelp import HELP, option_help
 from mavftpfs.fuse.options import (
     FLAGS,
     IGNORED_WORDS,
@@ -183,6 +184,35 @@ def test_modes(text: str, files: int, directories: int) -> None:
     options = parse_options([text])
     assert options.file_mode(0o022) == files
     assert options.directory_mode(0o022) == directories
+
+
+@pytest.mark.parametrize(
+    ("text", "advice"),
+    [
+        ("cache_size=3x", "with K, M or G"),
+        ("cache_size=1K", "within 1M and 1024G"),
+        ("bwlimit=7", "within 100 and 1024G"),
+        ("dirty_max=1", "within 64K and 1024G, or auto"),
+        ("spool_max=-1", "with K, M or G"),
+        ("window=0", "within 1 and 256, or auto"),
+        ("chunk=64K", "whole number, or auto"),
+        ("baud=fast", "whole number"),
+        ("op_deadline=soon", "number of seconds"),
+        ("op_deadline=nan", "within 1 and 3600"),
+        ("umask=9", "octal"),
+        ("umask=7777", "octal"),
+    ],
+)
+def test_a_bad_value_is_answered_by_what_would_do(text: str, advice: str) -> None:
+    with pytest.raises(UsageError, match=advice):
+        parse_options([text])
+
+
+def test_help_says_what_each_option_is_for() -> None:
+    lines = option_help()
+    assert [line.split()[0] for line in lines] == option_names()
+    assert set(HELP) == set(option_names())
+    assert all(len(line) <= 78 and len(line.split()) > 1 for line in lines)
 
 
 def test_help_names_every_option_but_the_one_that_is_always_on() -> None:

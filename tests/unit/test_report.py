@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from mavftpfs.report import describe, printable, readable_size
+from mavftpfs.report import describe, printable, readable_size, rows
 
 
 @pytest.mark.parametrize(
@@ -22,6 +22,17 @@ from mavftpfs.report import describe, printable, readable_size
         ("window_rate", 5120.4, "5.0 KiB/s"),
         ("rate", None, "unknown"),
         ("loss", 0.052, "5.2 %"),
+        ("session_open", None, "none"),
+        ("session_open", "/logs/1", "/logs/1"),
+        ("autopilot", 12, "PX4"),
+        ("autopilot", 3, "ArduPilot"),
+        ("autopilot", 0, "generic autopilot"),
+        ("autopilot", 77, "autopilot type 77"),
+        ("autopilot", None, "unknown"),
+        ("vehicle", [1, 191], "system 1, component 191"),
+        ("vehicle", None, "unknown"),
+        ("dirty_max", 65536, "64.0 KiB"),
+        ("uploads", [], "none"),
     ],
 )
 def test_describe(key: str, value: object, text: str) -> None:
@@ -34,6 +45,29 @@ def test_transfers_show_how_far_they_are() -> None:
     assert describe("transfers", [sending, waiting]) == (
         "/a sending, 75 % of 4.0 KiB, 3 s left; /b waiting, empty of 0 B"
     )
+
+
+def test_uploads_show_how_far_they_are() -> None:
+    upload = {"path": "/a", "running": True, "reached": 2048, "unproven": 512, "clean": True, "error": None}
+    waiting = {**upload, "path": "/b", "running": False, "reached": 0, "error": "the vehicle is armed"}
+    assert describe("uploads", [upload, waiting]) == (
+        "/a running, 2.0 KiB sent; /b waiting, 0 B sent (the vehicle is armed)"
+    )
+
+
+def test_what_a_person_looks_for_comes_first() -> None:
+    """A small terminal that shows the status again and again cuts its end."""
+    facts = {
+        "pid": 7,
+        "connection": {"rtt": 0.1, "uploads": []},
+        "cache": {"bytes_cached": 3, "errors": {"/x": "no"}, "transfers": [], "bytes_held": 9, "hits": 1},
+        "kernel": {"inodes": 1},
+    }
+    names = [name for name, _ in rows(facts)]
+    first = ["cache: bytes held", "cache: transfers", "cache: errors: /x"]
+    assert names == [*first, "process", *names[4:6], "cache: bytes cached", "cache: hits", "kernel: inodes"]
+    assert [name for name, _ in rows({"problem": "gone"})] == ["problem"]
+    assert [name for name, _ in rows({"cache": "gone"})] == ["cache"]
 
 
 def test_sizes_and_names() -> None:
