@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import random
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable
@@ -30,6 +31,8 @@ from mavftpfs.session.store import Store
 from mavftpfs.session.vehicle import Vehicle
 from mavftpfs.shared.errors import MavftpfsError, VehicleLost
 
+log = logging.getLogger("mavftpfs.session")
+
 AUTOPILOT_VERSION_ID = 148
 STORAGE_INFORMATION_ID = 261
 
@@ -47,6 +50,10 @@ _INFO_TRIES = 4
 _INFO_PERIOD = 2.0
 _OLD_WAY_FROM = 2
 """The try from which AUTOPILOT_VERSION is also asked for in the way that older firmware understands."""
+
+_IDENTITY_PERIOD = 0.5
+_STRANGER_PERIOD = 5.0
+_ANOTHER = "another vehicle answers as %d/%d: nothing is read from it or written to it; mount it anew"
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,6 +94,7 @@ class Connection:
     was_lost: bool = False
     news: list[Callable[[str], None]] = field(default_factory=list)
     _first_heartbeat: trio.Event = field(default_factory=trio.Event)
+    _doubted: trio.Event = field(default_factory=trio.Event)
 
     async def ready(self, timeout: float) -> None:
         """Wait for the vehicle's first heartbeat.
@@ -116,6 +124,7 @@ class Connection:
             "heartbeat_age": None if vehicle.heartbeat_at is None else round(vehicle.silence(now), 1),
             "ftp_flag": vehicle.ftp_flag,
             "lost": vehicle.lost(now),
+            "another_vehicle": vehicle.identity.stranger,
             "reboots": vehicle.reboots,
             "other_ftp_client": vehicle.foreign_client(now),
             "rtt": self.engine.rtt,
@@ -147,6 +156,10 @@ class Connection:
         names = ", ".join(f"{system}/{component}" for system, component in heard)
         return f": heard only {names}; check target_system and target_component"
 
+    def on_doubt(self) -> None:
+        """It is to be asked who answers."""
+        self._doubted.set()
+
     def _on_heartbeat(self) -> None:
         self._first_heartbeat.set()
         if self.was_lost:
@@ -176,6 +189,7 @@ async def connected(
         tasks.start(connection.driver.pump)
         tasks.start(lambda: _send_heartbeats(connection))
         tasks.start(lambda: _ask_about_vehicle(connection))
+        tasks.start(lambda: _ask_who_it_is(connection))
         tasks.start(lambda: _watch_link(connection))
         serving = tasks.start(connection.scheduler.serve)
         try:
@@ -281,6 +295,7 @@ def _build(
 
     vehicle.on_foreign = on_foreign
     vehicle.on_heartbeat = connection._on_heartbeat
+    vehicle.identity.on_doubt = connection.on_doubt
     vehicle.on_double = lambda: _move_away(connection)
 
     def on_armed(armed: bool) -> None:
@@ -345,3 +360,26 @@ async def _ask_about_vehicle(connection: Connection) -> None:
         if attempt >= _OLD_WAY_FROM and vehicle.version is None and vehicle.address is not None:
             driver.send(driver.framer.encode_request_capabilities(vehicle.address))
         await trio.sleep(_INFO_PERIOD)
+
+
+async def _ask_who_it_is(connection: Connection) -> None:
+    """Have the vehicle tell its unique id again each time it may have become another one."""
+    vehicle, driver, identity = connection.vehicle, connection.driver, connection.vehicle.identity
+    while True:
+        await connection._doubted.wait()
+        connection._doubted = trio.Event()
+        warned = False
+        asked = 0
+        while not identity.trusted and vehicle.address is not None:
+            asked_at = connection.clock()
+            driver.send(driver.framer.encode_request_message(vehicle.address, AUTOPILOT_VERSION_ID))
+            if asked >= _OLD_WAY_FROM:
+                driver.send(driver.framer.encode_request_capabilities(vehicle.address))
+            asked += 1
+            await trio.sleep(_STRANGER_PERIOD if identity.stranger else _IDENTITY_PERIOD)
+            if identity.stranger and not warned:
+                warned = True
+                log.warning(_ANOTHER, *vehicle.address)
+            elif identity.heard_since(asked_at):
+                identity.unanswered()
+                driver.kick()

@@ -132,6 +132,7 @@ class Driver:
     def _take(self, chunks: list[bytes], now: float) -> None:
         if not chunks:
             self.framer.reset()
+            self.vehicle.identity.doubt()  # there may be another one at the other end
             return
         self._heard_at = now
         feed = self.framer.feed_runs
@@ -164,6 +165,8 @@ class Driver:
         if self._budget is not None:
             for wire in wires:
                 self._budget.on_reply(wire, now)
+        if not self.vehicle.believes_reply(now):
+            return  # what was asked is asked again once it is known who answers
         if self._trace is not None:
             for wire in wires:
                 self._on_traced_reply(wire, now, self._trace)
@@ -197,8 +200,11 @@ class Driver:
 
     def _refill(self, now: float) -> None:
         target = self.vehicle.address
-        if target is not None and self.link.backlog < BACKLOG_LIMIT:
+        if target is not None and self._may_send(now):
             self._send(target, self.engine.outgoing(now), now)
+
+    def _may_send(self, now: float) -> bool:
+        return self.link.backlog < BACKLOG_LIMIT and self.vehicle.identity.may_be_asked(now)
 
     def _settle(self, now: float) -> None:
         self._refill(now)
@@ -223,8 +229,10 @@ class Driver:
         self.link.send_nowait(self.framer.encode_ftp_run(target, payloads))
 
     def _next_deadline(self) -> float:
-        deadline = self.engine.next_deadline()
+        deadline, now = self.engine.next_deadline(), self._clock()
         if self.link.backlog >= BACKLOG_LIMIT:
             # Nobody tells us that the link drained, and before that nothing can go out.
-            deadline = self._clock() + 0.01
+            deadline = now + 0.01
+        elif deadline is not None and not self._may_send(now):
+            deadline = max(deadline, now + 0.05)  # nothing can go out, whatever is due
         return self._quiet_at if deadline is None else min(deadline, self._quiet_at)

@@ -23,6 +23,7 @@ from mavftpfs.link.messages import (
     SystemTime,
 )
 from mavftpfs.protocol.payload import Opcode
+from mavftpfs.session.identity import Identity
 
 SILENCE_LIMIT = 5.0
 """Seconds without heartbeats after which one timed-out request means that the vehicle is lost."""
@@ -70,12 +71,16 @@ class Vehicle:
     last_text: StatusText | None = None
     foreign_at: float | None = None
     reboots: int = 0
+    identity: Identity = field(default_factory=Identity)
     heard: dict[Address, Heartbeat] = field(default_factory=dict)
     _armed: bool | None = None
     _boot_ms: int | None = None
     boot_heard_at: float = 0.0
     _held_back: bool = False
     _timed_out: bool = False
+
+    def __post_init__(self) -> None:
+        self.identity.on_settled = self._on_settled
 
     @property
     def armed(self) -> bool:
@@ -93,7 +98,7 @@ class Vehicle:
 
     def lost(self, now: float) -> bool:
         """Return whether requests that need the link should fail at once."""
-        return self._timed_out and self.silence(now) > SILENCE_LIMIT
+        return self.identity.stranger or (self._timed_out and self.silence(now) > SILENCE_LIMIT)
 
     def foreign_client(self, now: float) -> bool:
         """Return whether another FTP client of this vehicle was heard lately."""
@@ -103,12 +108,19 @@ class Vehicle:
         """Return whether a restart may have gone unnoticed: the boot time was told before, but not lately."""
         return self._boot_ms is not None and now - self.boot_heard_at > BOOT_NEWS_AGE
 
+    def believes_reply(self, now: float) -> bool:
+        """Something of the vehicle's FTP came: return whether it is known to be the vehicle."""
+        self.identity.heard(now)
+        return self.identity.trusted
+
     def note_timeout(self) -> None:
         """A request to the vehicle went unanswered to its deadline."""
         self._timed_out = True
 
     def on_message(self, message: Message, now: float) -> None:
         """Learn from any message except FTP replies to us."""
+        if self.address is not None and message.source == self.address:
+            self.identity.heard(now)
         match message:
             case Heartbeat():
                 self._on_heartbeat(message, now)
@@ -119,7 +131,10 @@ class Vehicle:
             case _ if self.address is None or message.source.system != self.address.system:
                 return
             case AutopilotVersion() if message.source == self.address:
-                self.version = message
+                if self.identity.told(message):
+                    self.version = message
+            case _ if self.identity.stranger:
+                return
             case StorageInformation():
                 self._on_storage(message)
             case SystemTime() if message.source == self.address:
@@ -140,9 +155,22 @@ class Vehicle:
         if not self._proves_life(heartbeat.source):
             return
         self.heartbeat_at = now
-        self._timed_out = False
         self.heartbeat = heartbeat
+        self.identity.heard(now)
+        if self.identity.trusted:
+            self._on_alive()
+
+    def _on_alive(self) -> None:
+        self._timed_out = False
         self.on_heartbeat()
+
+    def _on_settled(self, was_stranger: bool) -> None:
+        """It is ours again. Whether it restarted while another one told its boot time is not known."""
+        if was_stranger:
+            self._boot_ms = None
+            self.reboots += 1
+            self.on_reboot()
+        self._on_alive()
 
     def _on_armed(self, armed: bool) -> None:
         if armed is not self._armed:
@@ -198,4 +226,5 @@ class Vehicle:
             return
         if went_back or boot_ms - before < elapsed_ms / 2 - _MISSING_MS:
             self.reboots += 1
+            self.identity.doubt()
             self.on_reboot()

@@ -1,0 +1,118 @@
+"""Whether who answers is still the vehicle that was there at first. Layer: session; pure.
+
+Two vehicles have the same MAVLink address unless somebody gave them others: PX4's system id is 1 wherever it
+is fresh. Who lands one and switches on the next has another card behind the same link: what is held for the
+first must not be written to the second, nor what was read of one be completed from the other.
+AUTOPILOT_VERSION tells the board's unique id. A vehicle that told it once has to tell it again after each
+restart and after each silence, before anything else is believed or sent.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from enum import Enum
+
+from mavftpfs.link.messages import AutopilotVersion
+
+ABSENCE = 2.5
+"""Seconds of silence in which one vehicle may have been exchanged for another: no autopilot starts faster. (A
+cable that is moved reopens the link, which is told.)"""
+
+PATIENCE = 20
+"""Questions that a vehicle which is heard leaves unanswered before it is believed to be the same one: some
+tell their id only once."""
+
+
+class Standing(Enum):
+    """What is known of who answers."""
+
+    TRUSTED = "trusted"
+    DOUBTED = "doubted"
+    STRANGER = "stranger"
+
+
+class Identity:
+    """Who the vehicle is.
+
+    Attributes:
+        standing: of who answers now; only a trusted one is asked for files.
+        on_doubt: it has to tell its unique id again.
+        on_settled: called with whether it was a stranger meanwhile: it is trusted again.
+    """
+
+    def __init__(self) -> None:
+        self.standing = Standing.TRUSTED
+        self.on_doubt: Callable[[], None] = lambda: None
+        self.on_settled: Callable[[bool], None] = lambda was_stranger: None
+        self._known: AutopilotVersion | None = None
+        self._strange = False
+        self._unanswered = 0
+        self._heard_at: float | None = None
+
+    @property
+    def trusted(self) -> bool:
+        """Whether it is the vehicle that was there at first, as far as can be known."""
+        return self.standing is Standing.TRUSTED
+
+    @property
+    def stranger(self) -> bool:
+        """Whether another vehicle answers."""
+        return self.standing is Standing.STRANGER
+
+    def may_be_asked(self, now: float) -> bool:
+        """Whether requests may go out now: also not into a silence, at whose end another one may hear them."""
+        if self._known is None or self._heard_at is None:
+            return True
+        return self.trusted and now - self._heard_at <= ABSENCE
+
+    def heard(self, now: float) -> None:
+        """Something came from the vehicle's address."""
+        before, self._heard_at = self._heard_at, now
+        if before is not None and now - before > ABSENCE:
+            self.doubt()
+
+    def heard_since(self, when: float) -> bool:
+        """Return whether something came from it after that."""
+        return self._heard_at is not None and self._heard_at > when
+
+    def doubt(self) -> None:
+        """It may be another one since now: it restarted, or was silent."""
+        if self._known is None:
+            return
+        self._strange |= self.stranger
+        self.standing = Standing.DOUBTED
+        self._unanswered = 0
+        self.on_doubt()
+
+    def told(self, version: AutopilotVersion) -> bool:
+        """It told who it is; return whether it is the same as ever."""
+        if self._known is not None and is_another(self._known, version):
+            self.standing = Standing.STRANGER
+            return False
+        if self._known is None and (version.uid or any(version.uid2)):
+            self._known = version
+        self._settle()
+        return True
+
+    def unanswered(self) -> None:
+        """It was heard, but did not tell who it is though it was asked."""
+        self._unanswered += 1
+        if self._unanswered >= PATIENCE and self.standing is Standing.DOUBTED:
+            self._settle()
+
+    def _settle(self) -> None:
+        if self.trusted:
+            return
+        strange = self._strange or self.stranger
+        self.standing, self._strange = Standing.TRUSTED, False
+        self.on_settled(strange)
+
+
+def is_another(known: AutopilotVersion, version: AutopilotVersion) -> bool:
+    """Return whether two answers are of two boards.
+
+    What one of them lacks tells nothing: uid2 is an extension, which MAVLink 1 frames do not carry.
+    """
+    if known.uid and version.uid and known.uid != version.uid:
+        return True
+    return any(known.uid2) and any(version.uid2) and known.uid2 != version.uid2

@@ -1,0 +1,118 @@
+"""Identity: whether who answers is the vehicle that was there at first."""
+
+from __future__ import annotations
+
+import pytest
+
+from mavftpfs.link.messages import Address, AutopilotVersion
+from mavftpfs.session.identity import ABSENCE, PATIENCE, Identity, is_another
+
+VEHICLE = Address(1, 1)
+
+
+def version(uid: int = 0, uid2: int = 0) -> AutopilotVersion:
+    return AutopilotVersion(VEHICLE, 0, 0, bytes(8), uid, uid2.to_bytes(18))
+
+
+class Watched(Identity):
+    """An identity that counts what it tells. doubts: questions wanted; settled: what on_settled was told."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.doubts = 0
+        self.settled: list[bool] = []
+        self.on_doubt = self._count
+        self.on_settled = self.settled.append
+
+    def _count(self) -> None:
+        self.doubts += 1
+
+
+@pytest.mark.parametrize(
+    ("known", "told", "another"),
+    [
+        (version(1), version(1), False),
+        (version(1), version(2), True),
+        (version(1, 7), version(1, 8), True),
+        (version(0, 7), version(0, 8), True),
+        (version(1, 7), version(1), False),
+        (version(1), version(1, 7), False),
+        (version(1), version(0, 7), False),
+        (version(1, 7), version(), False),
+    ],
+)
+def test_what_tells_two_boards_apart(known: AutopilotVersion, told: AutopilotVersion, another: bool) -> None:
+    assert is_another(known, told) is another
+
+
+@pytest.mark.parametrize("first", [None, version()])
+def test_a_vehicle_that_never_told_is_never_doubted(first: AutopilotVersion | None) -> None:
+    identity = Watched()
+    if first is not None:
+        assert identity.told(first)
+    identity.heard(0.0)
+    identity.heard(1000.0)
+    identity.doubt()
+    assert identity.trusted
+    assert identity.doubts == 0
+    assert identity.settled == []
+
+
+def test_nothing_is_asked_into_a_silence() -> None:
+    identity = Watched()
+    identity.heard(0.0)
+    assert identity.may_be_asked(1000.0), "it never told who it is"
+    identity.told(version(1))
+    assert identity.may_be_asked(ABSENCE)
+    assert not identity.may_be_asked(ABSENCE + 0.1)
+    identity.heard(ABSENCE + 0.2)
+    assert not identity.may_be_asked(ABSENCE + 0.2)
+    identity.told(version(1))
+    assert identity.may_be_asked(ABSENCE + 0.2)
+
+
+def test_a_silence_makes_it_doubtful_and_the_same_id_trusted() -> None:
+    identity = Watched()
+    identity.told(version(1))
+    identity.heard(0.0)
+    identity.heard(ABSENCE)
+    assert identity.trusted
+    identity.heard(2 * ABSENCE + 0.1)
+    assert (identity.trusted, identity.stranger, identity.doubts) == (False, False, 1)
+    assert identity.told(version(1))
+    assert identity.trusted
+    assert identity.settled == [False]
+
+
+def test_another_id_is_a_stranger_s_until_ours_is_told() -> None:
+    identity = Watched()
+    identity.told(version(1))
+    identity.doubt()
+    assert not identity.told(version(2))
+    assert identity.stranger
+    identity.doubt()  # it went: who comes now is not known
+    assert not identity.stranger
+    assert not identity.trusted
+    assert identity.told(version(1))
+    assert identity.trusted
+    assert identity.settled == [True]
+
+
+def test_who_is_heard_but_does_not_tell_is_believed_in_the_end() -> None:
+    identity = Watched()
+    identity.told(version(1))
+    identity.doubt()
+    for _ in range(PATIENCE - 1):
+        identity.unanswered()
+    assert not identity.trusted
+    identity.unanswered()
+    assert identity.trusted
+
+
+def test_a_stranger_that_falls_silent_about_itself_stays_one() -> None:
+    identity = Watched()
+    identity.told(version(1))
+    identity.told(version(2))
+    for _ in range(2 * PATIENCE):
+        identity.unanswered()
+    assert identity.stranger
