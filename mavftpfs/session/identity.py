@@ -60,7 +60,7 @@ class Identity:
         return self.standing is Standing.STRANGER
 
     def may_be_asked(self, now: float) -> bool:
-        """Whether requests may go out now: also not into a silence, at whose end another one may hear them."""
+        """Whether requests may go out now: not into a silence either, at whose end another one may hear."""
         if self._known is None or self._heard_at is None:
             return True
         return self.trusted and now - self._heard_at <= ABSENCE
