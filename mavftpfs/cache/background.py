@@ -12,6 +12,7 @@ import errno
 import logging
 from collections.abc import Awaitable, Callable
 from contextlib import suppress
+from functools import partial
 
 import trio
 
@@ -166,14 +167,17 @@ class Background:
     def _any(self, which: Callable[[Node], bool]) -> bool:
         return any(node.undelivered and which(node) for node in self._context.nodes)
 
+    def _is_left_to_us(self, node: Node) -> bool:
+        return node.undelivered and (not node.writers or node.path in self._context.torn)
+
     async def _deliver_closed(self, which: Callable[[Node], bool]) -> None:
         """Try once what nobody writes any more, and what left a name without a file."""
         for node in self._context.nodes:
-            done = not node.undelivered or (node.writers and node.path not in self._context.torn)
-            if done or not which(node):
+            wanted = partial(self._is_left_to_us, node)
+            if not wanted() or not which(node):
                 continue
             try:
-                await self._deliverer.deliver(node)
+                await self._deliverer.deliver(node, wanted=wanted)
             except MavftpfsError as error:
                 log.debug("%r is still not delivered: %s", node.path, error)
             else:

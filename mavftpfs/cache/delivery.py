@@ -66,19 +66,19 @@ class Deliverer:
         self.delivered = 0
         self.on_undelivered: Callable[[], None] = lambda: None
 
-    async def deliver(self, node: Node) -> None:
-        """Have the vehicle hold the node's file, checked.
+    async def deliver(self, node: Node, *, wanted: Callable[[], bool] = lambda: True) -> None:
+        """Have the vehicle hold the node's file, checked, as long as that is `wanted`.
 
         Raises:
             The reason why not: as WriteStore; VerificationFailed, NotSupported, FileTooLarge, FileChanged.
         """
-        while True:
+        while wanted():
             async with node.lock:
                 if not node.doomed and await self.deliver_locked(node):
                     return
 
     async def deliver_locked(self, node: Node) -> bool:
-        """Do the same for who holds the node's lock; return False if it was called off (Node.dooming).
+        """Do the same for who holds the node's lock; return False if it was called off (Node.doomed).
 
         Raises:
             As deliver.

@@ -63,7 +63,7 @@ class Node:
     deliver it and to change its path. starting: a background upload is about to begin. background: whether
     it may begin by itself; start_after: not before.
     base: reads the vehicle's file. delivered_at: when the vehicle last had it all. doomed: how many changes
-    that take its name away have the lock, or are about to: no delivery begins or goes on.
+    that take its name away have the lock, or are about to, or empty it: no delivery begins or goes on.
     """
 
     path: bytes
@@ -112,7 +112,8 @@ class Node:
 
     @contextmanager
     def delivering(self) -> Iterator[trio.CancelScope]:
-        """The body brings it to the vehicle, unless it is cancelled because the name goes (`dooming`)."""
+        """The body brings it to the vehicle, unless it is cancelled because the name goes (`dooming`), or
+        the content (`call_off`)."""
         with trio.CancelScope() as scope:
             self._delivery = scope
             self._heed()
@@ -142,6 +143,13 @@ class Node:
             yield
         finally:
             self.doomed -= 1
+
+    async def call_off(self) -> None:
+        """Have what is being delivered of it called off, since its content is about to go: who waits for the
+        delivery has it begin again then. When this returns nothing is delivered before the next wait."""
+        with self.dooming():
+            while not self.quiet.is_set():  # the next one may have begun while we woke up
+                await self.quiet.wait()
 
     def _heed(self) -> None:
         if self.doomed and not self._firm and self._delivery is not None:

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import trio
 
+from mavftpfs.cache.admission import Admission
 from mavftpfs.cache.background import Background
 from mavftpfs.cache.base import open_base
 from mavftpfs.cache.changes import Changes
@@ -68,6 +69,7 @@ class Writeback:
         self._cleaner = cleaner
         sure = Sure(context)
         self._deliverer = Deliverer(context, sure, throttle)
+        self._admission = Admission(context, self._deliverer, throttle)
         self._background = Background(context, self._deliverer, throttle, mend=cleaner.mend_torn)
         self.overlay = Overlay(context)
         self._namespace = Namespace(
@@ -184,7 +186,7 @@ class Writeback:
         """Take bytes into a draft; see OpenFile.write."""
         if offset + len(data) > MAX_FILE:
             raise FileTooLarge(f"no vehicle takes files of more than {MAX_FILE} bytes")
-        await self._may_write(node)
+        await self._admission.may_write(node)
         assert node.draft is not None
         node.draft.write(offset, data)
         self._on_written(node)
@@ -194,8 +196,11 @@ class Writeback:
         """Cut or extend a draft; see OpenFile.truncate."""
         if size > MAX_FILE:
             raise FileTooLarge(f"no vehicle takes files of more than {MAX_FILE} bytes")
-        await self._may_write(node)
         assert node.draft is not None
+        if size == 0 < node.draft.size:
+            await self._admission.may_empty(node)
+        else:
+            await self._admission.may_write(node)
         if size != node.draft.size:
             node.draft.truncate(size)
             self._background.on_cut(node)
@@ -223,24 +228,6 @@ class Writeback:
         if not wanted and node.undelivered and node.draft is not None and not node.draft.size:
             node.drop_draft()
         self._context.nodes.maybe_forget(node)
-
-    async def _may_write(self, node: Node) -> None:
-        """Wait until a delivery under way is over and not too much is un-ACKed."""
-        idle_since = self._context.clock()
-        while True:
-            self._context.require_disarmed()
-            await node.quiet.wait()
-            if not node.quiet.is_set():
-                continue  # the next delivery began while we woke up
-            if not self._throttle.is_full(node):
-                return
-            if await self._throttle.wait():
-                idle_since = self._context.clock()
-                continue
-            if node.starting and self._context.clock() - idle_since < self._context.options.op_deadline:
-                continue  # an upload is about to begin: to wait for all of it would stop the program
-            await self.deliver(node)  # says what is wrong, if anything is
-            idle_since = self._context.clock()
 
     def _on_written(self, node: Node) -> None:
         node.copied = False

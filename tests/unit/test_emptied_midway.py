@@ -1,0 +1,250 @@
+"""A file that is emptied while what it held is on its way: nobody waits for that, or sends it any more.
+
+The same at any request of its delivery on every simulated server: tests/sim/test_emptied_midway.py.
+"""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator, Awaitable, Callable
+
+import pytest
+import trio
+
+from mavftpfs.cache.asides import is_reserved
+from mavftpfs.cache.openfile import OpenFile
+from mavftpfs.cache.tree import Tree
+from mavftpfs.shared.errors import Armed, FileBusy, RequestTimeout
+from mavftpfs.shared.model import split
+from tests.support.fake_writer import KINDS, FakeWriter, make_writable
+
+FOLDER = b"/card/dir"
+FILE, NEW = FOLDER + b"/file.txt", FOLDER + b"/new"
+OLD = bytes(range(256)) * 20
+DATA = bytes(reversed(range(256))) * 30
+SHORT = b"short" * 100
+
+PROMPT = 0.6
+"""Seconds; a chunk takes 0.1 and the whole delivery more than 3."""
+
+
+@pytest.fixture(params=["posix", "fat", "mavsdk", "littlefs"])
+async def store(
+    nursery: trio.Nursery, autojump_clock: object, request: pytest.FixtureRequest
+) -> AsyncIterator[FakeWriter]:
+    store = FakeWriter(KINDS[request.param], nursery)
+    store.add(FILE, OLD)
+    yield store
+    assert store.crimes == []
+    nursery.cancel_scope.cancel()
+
+
+def writable(store: FakeWriter) -> Tree:
+    return make_writable(store, inplace=not store.kind.renames)
+
+
+async def begun(tree: Tree, store: FakeWriter, path: bytes, *, whole: bool = True) -> OpenFile:
+    """Return a file that is not delivered; from now on that takes seconds."""
+    if path == NEW:
+        file = await tree.create(path, exclusive=True)
+    else:
+        file = await tree.open(path, write=True, truncate=whole)
+    await file.write(0, DATA)
+    store.write_delay = 0.1
+    return file
+
+
+async def left(tree: Tree, store: FakeWriter) -> set[bytes]:
+    """Return which names the card has once all that may follow by itself did."""
+    for _ in range(2):
+        await trio.sleep(60)
+        await tree.list(FOLDER)
+    assert not any(is_reserved(split(path)[1]) for path in store.files)
+    return set(store.files)
+
+
+async def by_opening(tree: Tree, path: bytes, file: OpenFile) -> OpenFile:
+    return await tree.open(path, write=True, truncate=True)
+
+
+async def by_another_handle(tree: Tree, path: bytes, file: OpenFile) -> OpenFile:
+    other = await tree.open(path, write=True)
+    await other.truncate(0)
+    return other
+
+
+async def by_its_own_handle(tree: Tree, path: bytes, file: OpenFile) -> OpenFile:
+    await file.truncate(0)
+    return await tree.open(path, write=True)
+
+
+async def by_name(tree: Tree, path: bytes, file: OpenFile) -> OpenFile:
+    await tree.truncate(path, 0)
+    return await tree.open(path, write=True)
+
+
+Empty = Callable[[Tree, bytes, OpenFile], Awaitable[OpenFile]]
+WAYS: list[Empty] = [by_opening, by_another_handle, by_its_own_handle, by_name]
+
+
+@pytest.mark.parametrize("empty", WAYS)
+@pytest.mark.parametrize("path", [NEW, FILE])
+@pytest.mark.parametrize("content", [b"", SHORT, DATA + SHORT])
+async def test_emptying_waits_for_no_delivery(
+    autojump_clock: object, store: FakeWriter, path: bytes, empty: Empty, content: bytes
+) -> None:
+    """Who waits for it hears 0 when the card has what the file is by then."""
+    tree = writable(store)
+    file = await begun(tree, store, path)
+    async with trio.open_nursery() as waiting:
+        for _ in range(2):
+            waiting.start_soon(file.fsync)
+        await trio.sleep(1.05)
+        before = trio.current_time()
+        other = await empty(tree, path, file)
+        assert trio.current_time() - before < PROMPT
+        await other.write(0, content)
+    assert store.files[path].data in (b"", content)
+    await file.release()
+    await other.release()
+    assert tree.undelivered() == []
+    assert store.files[path].data == content
+    assert await left(tree, store) == {FILE, path}
+    assert store.files[path].data == content
+
+
+async def test_a_change_in_place_is_called_off_too(autojump_clock: object, store: FakeWriter) -> None:
+    tree = writable(store)
+    file = await begun(tree, store, FILE, whole=False)
+    async with trio.open_nursery() as waiting:
+        waiting.start_soon(file.fsync)
+        await trio.sleep(1.05)
+        before = trio.current_time()
+        other = await by_opening(tree, FILE, file)
+        assert trio.current_time() - before < PROMPT
+        await other.write(0, SHORT)
+    await other.release()
+    assert store.files[FILE].data == SHORT
+    await file.release()
+    assert await left(tree, store) == {FILE}
+    assert store.files[FILE].data == SHORT
+
+
+async def test_an_error_is_that_of_what_the_file_is_now(autojump_clock: object, store: FakeWriter) -> None:
+    tree = writable(store)
+    file = await begun(tree, store, FILE)
+    async with trio.open_nursery() as waiting:
+
+        async def fsync() -> None:
+            with pytest.raises(RequestTimeout):
+                await file.fsync()
+
+        waiting.start_soon(fsync)
+        await trio.sleep(1.05)
+        other = await by_opening(tree, FILE, file)
+        store.before_request = refuse
+    store.before_request = None
+    assert tree.undelivered() == [FILE]
+    await other.release()
+    assert store.files[FILE].data == b""
+    await file.release()
+
+
+def refuse(*_: object) -> None:
+    raise RequestTimeout("no answer")
+
+
+async def test_what_nobody_waits_for_leaves_the_old_file_until_there_is_another(
+    autojump_clock: object, store: FakeWriter
+) -> None:
+    """A delivery that is tried again by itself does not bring the emptied file to the card."""
+    tree = writable(store)
+    file = await begun(tree, store, FILE)
+    store.before_request = refuse
+    with pytest.raises(RequestTimeout):
+        await file.release()
+    store.before_request = None
+    if not store.kind.renames:
+        return  # what overwrites it in place emptied it
+    await trio.sleep(3.0)
+    assert any(is_reserved(split(path)[1]) for path in store.files)  # on its way again
+    before = trio.current_time()
+    other = await by_opening(tree, FILE, file)
+    assert trio.current_time() - before < PROMPT
+    await trio.sleep(120)
+    assert store.files[FILE].data == OLD
+    await other.write(0, SHORT)
+    await other.release()
+    assert store.files[FILE].data == SHORT
+    assert await left(tree, store) == {FILE}
+
+
+async def test_emptying_waits_for_no_room(autojump_clock: object, store: FakeWriter) -> None:
+    """Who writes too fast has to wait; who empties the file makes room, also for the other."""
+    tree = make_writable(store, inplace=True, dirty_max=64 * 1024)
+    file = await tree.create(NEW, exclusive=True)
+    store.write_delay = 0.1
+    await file.write(0, bytes(128 * 1024))
+    async with trio.open_nursery() as writing:
+
+        async def write() -> None:
+            await file.write(0, SHORT)
+
+        writing.start_soon(write)
+        await trio.sleep(1.05)
+        before = trio.current_time()
+        other = await by_opening(tree, NEW, file)
+        assert trio.current_time() - before < PROMPT
+    assert trio.current_time() - before < 2 * PROMPT
+    await other.release()
+    await file.release()
+    assert store.files[NEW].data == SHORT
+
+
+async def test_a_rename_of_an_emptied_file_goes_on(autojump_clock: object, store: FakeWriter) -> None:
+    """It delivers the file first: what it is by now."""
+    if not store.kind.renames:
+        return
+    tree = writable(store)
+    file = await begun(tree, store, NEW)
+    async with trio.open_nursery() as waiting:
+        waiting.start_soon(tree.rename, NEW, FILE)
+        await trio.sleep(1.05)
+        before = trio.current_time()
+        await file.truncate(0)
+        assert trio.current_time() - before < PROMPT
+    assert store.files[FILE].data == b""
+    await file.write(0, SHORT)
+    await file.release()
+    assert store.files[FILE].data == SHORT
+    assert await left(tree, store) == {FILE}
+
+
+async def test_emptying_does_not_wait_for_ever(autojump_clock: object, nursery: trio.Nursery) -> None:
+    """The renames of a replacement are not called off; they may last longer than a call may."""
+    store = FakeWriter(KINDS["posix"], nursery)
+    store.add(FILE, OLD)
+    tree = make_writable(store)
+    file = await begun(tree, store, FILE)
+    store.write_delay = 0.0
+    async with trio.open_nursery() as waiting:
+        store.before_request = lambda *what: setattr(store, "write_delay", 100.0 * (what[0] == "rename"))
+        waiting.start_soon(file.fsync)
+        await trio.sleep(5.0)
+        before = trio.current_time()
+        with pytest.raises(FileBusy):
+            await by_opening(tree, FILE, file)
+        assert trio.current_time() - before == pytest.approx(30.0)
+    assert store.files[FILE].data == DATA
+    await file.release()
+    nursery.cancel_scope.cancel()
+
+
+async def test_nothing_is_emptied_in_flight(autojump_clock: object, store: FakeWriter) -> None:
+    tree = writable(store)
+    file = await begun(tree, store, FILE)
+    tree.armed_changed(True)
+    with pytest.raises(Armed):
+        await file.truncate(0)
+    tree.armed_changed(False)
+    await file.release()
+    assert store.files[FILE].data == DATA
