@@ -28,7 +28,7 @@ from tests.support.mounts import Mount
 from tests.support.twins import PRELUDE
 from tests.support.vehicles import SimVehicle
 
-ATTEMPTS = 3
+ATTEMPTS = 5
 SETTLED = 0.3
 """Seconds without a request, with nothing open and nothing to deliver, after which a command has had its
 effects."""
