@@ -3,9 +3,9 @@
 The limit is the link's, and at most the server's ceiling, which for PX4 and MAVSDK is whatever they answer. A
 PX4 whose card pauses (px4-nuttx) answers a read later, and the answers that wait in the link meanwhile bridge
 that: only where the server is slower than the link do pauses lower the limit. Of writes it has room for five,
-and what a full link brings beyond them is never answered. Which pauses there were is chance, a tenth more or
-less of them in a minute, so a run is compared with what its own pauses allowed. The window that a receive
-buffer survives is the limit of a serial port only, which these links are not: six writes a round trip would be
+and what a full link brings beyond them is never answered. How many pauses there are is chance, a tenth more
+or less in a minute, so a run is compared with what its own pauses allowed. The window that a receive buffer
+survives is the limit of a serial port only, which these links are not: six writes a round trip would be
 4.8 kB/s at 300 ms, of which a share says nothing where 75 kB/s are reached.
 """
 
