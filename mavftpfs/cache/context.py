@@ -57,6 +57,14 @@ class Context:
         if self.armed and not self.options.write_armed:
             raise Armed("the vehicle is armed: nothing is written in flight (when_armed=ro)")
 
+    def is_changing(self, path: bytes) -> bool:
+        """Return whether we are changing what the vehicle has of a path, or may have done so in part."""
+        node = self.nodes.get(path)
+        if node is None:
+            return False
+        begun = node.lock.locked() or node.attempt is not None or node.error is not None
+        return begun or (node.draft is not None and (node.draft.touched or node.draft.ruined))
+
     def hide(self, node: Node, path: bytes) -> None:
         """An unlinked file's node is called `path`, a reserved name, from now on."""
         self.hidden.pop(node.path, None)

@@ -6,16 +6,11 @@ At open it is decided whether what is cached of the path is still the vehicle's 
   listing says otherwise: it is kept, and nothing is asked;
 - else the file is opened on the vehicle and a new version starts with the size in the ACK, because equal
   sizes without an mtime prove nothing.
-Old handles of a file that turned out smaller, or of the same size with another mtime, get FileChanged; of
-one that is larger they go on at the size they opened: logs grow. The kernel has one page cache for all
-handles of a path, so a new version bypasses it (direct_io) while handles of an older one are open.
-
-While a vehicle restarts its card may be written elsewhere, or be another one. A file that is open meanwhile
-is compared before more of it is given out, also what a read under way brought:
-- size and mtime are known and equal: it goes on;
-- nothing of it was given out yet: what is held is forgotten, and all is read from what is there now;
-- else, if the size is the same, the vehicle's CRC32 must be that of the bytes held and the rest; if it is
-  not, or cannot be had (armed, refused, too large), or the file is larger, old handles get FileChanged.
+Old handles of a file that turned out smaller, or of the same size with another mtime, get FileChanged, for
+good (`Version.lost`) unless that came of what we are changing there; of one that is larger they go on at the
+size they opened: logs grow. The kernel has one page cache for all handles of a path, so a new version
+bypasses it (direct_io) while handles of an older one are open. What a restart of the vehicle does to open
+files says `restarts`.
 """
 
 from __future__ import annotations
@@ -32,14 +27,12 @@ from mavftpfs.cache.options import MIB
 from mavftpfs.cache.readahead import Pace, Readahead
 from mavftpfs.cache.readonly import ReadOnlyHandle
 from mavftpfs.cache.remote import RemoteStore
-from mavftpfs.cache.versions import MAX_RESTARTS, Fetcher, Version, became_another, is_the_same
+from mavftpfs.cache.restarts import Restarts
+from mavftpfs.cache.versions import MAX_RESTARTS, Fetcher, Version, became_another
 from mavftpfs.shared.errors import (
     DataUnproven,
-    FileChanged,
     FileTooLarge,
     LocalProtocolError,
-    NotADirectory,
-    NotFound,
 )
 from mavftpfs.shared.model import DirEntry
 
@@ -54,7 +47,11 @@ MAX_PIECE = MIB
 
 
 class Files:
-    """All regular files that are open or cached. Paths are the vehicle's."""
+    """All regular files that are open or cached. Paths are the vehicle's.
+
+    Attributes:
+        is_changing: whether we are changing what the vehicle has of a path, or may have done so in part.
+    """
 
     def __init__(
         self,
@@ -68,20 +65,20 @@ class Files:
     ) -> None:
         """`facts` asks a fresh listing; `on_size` hears sizes that open ACKs told and listings did not."""
         self.keeper: Keeper | None = None
+        self.is_changing: Callable[[bytes], bool] = lambda path: False
         self._store = store
         self._cache = cache
         self._clock = cache.clock
         self._dir_timeout = dir_timeout
         self._rebooted_at = float("-inf")
-        self._facts = facts
         self._on_size = on_size
         self._invalidate = invalidate
         self.fetcher = Fetcher(store, cache, on_distrust=self._distrust, on_changed=self._kill)
+        self.recheck = Restarts(self.fetcher, facts, on_changed=self._kill).recheck
         self.piece = min(MAX_PIECE, cache.budget // 4)
         self._current: OrderedDict[bytes, Version] = OrderedDict()
         self._open_versions: dict[Version, None] = {}
         self._opening: Flights[bytes, tuple[Version, bool]] = Flights()
-        self._rechecking: Flights[Version, None] = Flights()
         self.open_count = 0
         self.hits = 0
         self.misses = 0
@@ -101,7 +98,8 @@ class Files:
         version.shown = True
         self.open_count += 1
         self._open_versions[version] = None
-        direct_io = any(other.path == path and other is not version for other in self._open_versions)
+        others = (v for v in self._open_versions if v.path == path and v is not version)
+        direct_io = any(v.dead is None or v.lost for v in others)
         return FileHandle(self, version, keep_cache=keep_cache, direct_io=direct_io)
 
     async def learn_size(self, path: bytes) -> int:
@@ -198,13 +196,15 @@ class Files:
     # --- the file changed
 
     def _kill(self, version: Version) -> None:
-        """The path is another file now."""
-        if version.dead is None:
-            version.dead = FileChanged(f"{version.path!r} changed on the vehicle after it was opened")
-            version.close_reader()
-            version.blocks.on_failed(version.dead)
-            version.blocks.clear()
-            self._invalidate(version.path)
+        """The path is another file now: none of those that were opened there up to this version."""
+        lost = not self.is_changing(version.path)
+        newest = self._current.get(version.path) is version
+        older = [v for v in self._open_versions if newest and v.path == version.path]
+        for one in dict.fromkeys((version, *older)):
+            if one.dead is None:
+                one.lost = lost
+                one.end(f"{one.path!r} changed on the vehicle after it was opened")
+                self._invalidate(one.path)
 
     def _distrust(self, version: Version) -> None:
         """Bytes of it were dropped as doubtful: the kernel may hold copies."""
@@ -225,35 +225,6 @@ class Files:
         for version in self._open_versions:
             version.boot += 1
 
-    async def recheck(self, version: Version) -> None:
-        """Compare an open version with what the vehicle holds, if that restarted since.
-
-        Raises:
-            FileChanged: it is not provably the same. Else as RemoteStore.list_directory and crc32.
-        """
-        if version.recheck:
-            await self._rechecking.run(version, partial(self._recheck_once, version))
-        version.require_alive()
-
-    async def _recheck_once(self, version: Version) -> None:
-        boot = version.boot
-        try:
-            entry = await self._facts(version.path)
-        except (NotFound, NotADirectory):
-            self._kill(version)
-            return
-        if became_another(version, entry):
-            self._kill(version)
-        elif is_the_same(version, entry):
-            version.proven_boot = boot
-        elif not version.blocks.given:
-            version.close_reader()
-            version.blocks.start_over()
-            version.mtime = entry.mtime if entry.size == version.size else None
-            version.proven_boot = boot
-        elif entry.size not in (None, version.size) or not await self.fetcher.prove(version):
-            self._kill(version)
-
     # --- we changed the file ourselves
 
     def cached(self, path: bytes) -> FileBlocks | None:
@@ -261,19 +232,20 @@ class Files:
         version = self._current.get(path)
         return None if version is None or version.dead is not None else version.blocks
 
+    def was_lost(self, path: bytes) -> bool:
+        """Return whether somebody has a version of the path open, and is to read nothing more."""
+        return any(v.path == path and v.lost for v in self._open_versions)
+
     def was_replaced(self, path: bytes) -> bool:
-        """Return whether somebody has a version of the path open that is not the vehicle's any more."""
-        return any(version.path == path and version.dead is not None for version in self._open_versions)
+        """Return whether somebody who is to read on has a version open that is not the vehicle's any more."""
+        return any(v.path == path and v.dead is not None and not v.lost for v in self._open_versions)
 
     def on_written(self, path: bytes) -> None:
         """What was cached of the path is no longer the file; who has it open opens it anew."""
         current = self._current.pop(path, None)
         older = [v for v in self._open_versions if v.path == path and v is not current]
         for version in older if current is None else [current, *older]:
-            version.dead = FileChanged(f"{path!r} was written")
-            version.close_reader()
-            version.blocks.on_failed(version.dead)
-            version.blocks.clear()
+            version.end(f"{path!r} was written")
 
     def adopt(self, path: bytes, size: int, pieces: Iterable[tuple[int, bytes]], *, proven_at: float) -> None:
         """Take over the content of a file we wrote: (offset, bytes) of all of it, then proven."""
@@ -369,6 +341,11 @@ class FileHandle(ReadOnlyHandle):
                 version.blocks.on_given(offset, stop)
                 return data
         raise DataUnproven(f"the vehicle restarts again and again while {version.path!r} is read")
+
+    def require_not_lost(self) -> None:
+        """Raise FileChanged if the file became another one by somebody else's doing."""
+        if self._version.lost:
+            self._version.require_alive()
 
     async def _read_range(self, offset: int, stop: int) -> bytes | memoryview:
         if stop - offset <= self._files.piece:

@@ -148,7 +148,8 @@ class Hider:
                 content.close()
 
     def _require_same(self, node: Node) -> None:
-        if self._context.files.was_replaced(node.path):
+        files = self._context.files
+        if files.was_replaced(node.path) or files.was_lost(node.path):
             raise FileChanged("who opened it before had another one")
 
     async def _fill(

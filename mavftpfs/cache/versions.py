@@ -2,7 +2,8 @@
 
 A version is what one open ACK's size and one listing's mtime describe. Handles of the same version share
 its blocks and its remote reader. When the file is seen to have become another one, the old version is
-`dead`: its handles get FileChanged, and new opens start a new version.
+`dead`: its handles get FileChanged, and new opens start a new version. If that was somebody else's doing the
+version is `lost`: who has it open is not to be given what has its path now, whoever wrote that.
 """
 
 from __future__ import annotations
@@ -44,7 +45,8 @@ class Version:
     mtime: None if not known to belong to this size. proven_at: when it was last known to be what the
     vehicle holds. handles: how many are open. shown: whether the kernel may hold pages of it and all of
     them are good. boot: how often the vehicle restarted while it was open. proven_boot: the one of these
-    after which it was proven to be the same file still. kept: its part on the local disk, if it may have one.
+    after which it was proven to be the same file still. dead: why it is not the path's file any more; lost:
+    somebody else changed that. kept: its part on the local disk, if it may have one.
     """
 
     path: bytes
@@ -57,6 +59,7 @@ class Version:
     boot: int = 0
     proven_boot: int = 0
     dead: MavftpfsError | None = None
+    lost: bool = False
     kept: Kept | None = None
 
     @property
@@ -73,6 +76,13 @@ class Version:
         """Raise FileChanged if the file became another one."""
         if self.dead is not None:
             raise self.dead.with_traceback(None)
+
+    def end(self, why: str) -> None:
+        """It is not the path's file any more; who waits for its bytes hears so."""
+        self.dead = FileChanged(why)
+        self.close_reader()
+        self.blocks.on_failed(self.dead)
+        self.blocks.clear()
 
     def close_reader(self) -> None:
         """Drop readahead and the remote reader."""
@@ -97,7 +107,7 @@ class Fetcher:
     A time-out or a lost link while settling is the reader's error and leaves the bytes provisional.
 
     After a restart of the vehicle the same check decides, where the listing cannot, whether the file is
-    still the one of which bytes were given out (cache.files); it decides only if all of these are held.
+    still the one of which bytes were given out (`restarts`); it decides only if all of these are held.
 
     Attributes:
         paths: whose names are being changed by us: nothing is opened meanwhile.
@@ -242,12 +252,6 @@ def _want(reader: Reader, plan: Plan, gaps: Gaps) -> None:
         reader.want(start, stop, demand=True)
     if plan.start < plan.stop:
         reader.want(plan.start, plan.stop, demand=False)
-
-
-def is_the_same(version: Version, entry: DirEntry) -> bool:
-    """Return whether a listing after a restart shows the very file."""
-    known = entry.size is not None and entry.mtime is not None
-    return known and (entry.size, entry.mtime) == (version.size, version.mtime)
 
 
 def became_another(version: Version, entry: DirEntry) -> bool:

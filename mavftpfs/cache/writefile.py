@@ -2,7 +2,8 @@
 
 Every handle of a file shares its node, so that a reader sees at once what a writer wrote, whatever the
 vehicle has. A handle opened for reading keeps its own readahead and opens the vehicle's file anew after we
-changed it.
+changed it. If somebody else replaced the file it reads nothing more, whatever is written there later: what
+has the path now is another file.
 """
 
 from __future__ import annotations
@@ -35,8 +36,6 @@ class Owner(Protocol):
 class _Reading:
     """Reads of one handle: the draft if there is one, else the vehicle's file."""
 
-    direct_io = False
-
     def __init__(self, context: Context, node: Node, handle: FileHandle | None) -> None:
         self._context = context
         self._node = node
@@ -50,6 +49,13 @@ class _Reading:
         if self._node.draft is not None:
             return self._node.draft.size
         return 0 if self._handle is None else self._handle.size
+
+    @property
+    def direct_io(self) -> bool:
+        """Whether the kernel's pages could come from, or go to, who has another file of the path open."""
+        if self._context.files.was_lost(self._node.path):
+            return True
+        return self._node.draft is None and self._handle is not None and self._handle.direct_io
 
     @property
     def keep_cache(self) -> bool:
@@ -75,6 +81,8 @@ class _Reading:
 
     async def _read(self, offset: int, size: int) -> bytes | memoryview:
         node = self._node
+        if self._handle is not None:
+            self._handle.require_not_lost()
         if node.draft is not None:
             return await self._read_draft(node.draft, offset, offset + size)
         if self._handle is None or self._generation != node.generation:

@@ -64,4 +64,5 @@ def make_writeback(
     )
     cleaner = Cleaner(context, Sure(context), dead)
     directories.on_swept = cleaner.on_swept
+    files.is_changing = context.is_changing
     return Writeback(context, spool, throttle, cleaner)

@@ -1,0 +1,146 @@
+"""Who has a file open that became another one gets ESTALE for good, whatever is written there later."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator
+
+import pytest
+import trio
+
+from mavftpfs.cache.openfile import OpenFile
+from mavftpfs.cache.tree import Tree
+from mavftpfs.shared.errors import FileChanged
+from tests.support.fake_writer import KINDS, FakeWriter, make_writable
+
+FILE = b"/d/file"
+OLD, NEW = b"old" * 300, b"NEW" * 300
+"""As long as one another: only the times differ."""
+
+
+@pytest.fixture(params=sorted(KINDS))
+async def store(request: pytest.FixtureRequest, nursery: trio.Nursery) -> AsyncIterator[FakeWriter]:
+    store = FakeWriter(KINDS[request.param], nursery)
+    store.add(FILE, OLD, 1)
+    yield store
+    assert store.crimes == []
+
+
+async def reader_of_another(store: FakeWriter, tree: Tree) -> OpenFile:
+    """Return a reader that got bytes of a file which somebody else replaced afterwards."""
+    reader = await tree.open(FILE)
+    assert bytes(await reader.read(0, 9)) == OLD[:9]
+    store.add(FILE, NEW, 2)
+    tree.forget_caches()
+    return reader
+
+
+async def require_lost(reader: OpenFile) -> None:
+    for _ in range(2):
+        with pytest.raises(FileChanged):
+            await reader.read(9, 9)
+
+
+async def test_it_stays_lost_while_the_new_file_is_written_and_afterwards(
+    store: FakeWriter, autojump_clock: object
+) -> None:
+    tree = make_writable(store, inplace=True)
+    lost = await reader_of_another(store, tree)
+    later = await tree.open(FILE)
+    await require_lost(lost)
+    writer = await tree.open(FILE, write=True)
+    await require_lost(lost)
+    await writer.write(0, b"mid")
+    await require_lost(lost)
+    await writer.fsync()
+    await require_lost(lost)
+    for file in (later, writer):
+        assert bytes(await file.read(0, 900)) == b"mid" + NEW[3:]
+        await file.release()
+    await require_lost(lost)
+    await lost.release()
+    assert store.files[FILE].data == b"mid" + NEW[3:]
+
+
+async def test_it_is_lost_when_a_writer_finds_the_new_file(
+    store: FakeWriter, tree: Tree, autojump_clock: object
+) -> None:
+    lost = await reader_of_another(store, tree)
+    writer = await tree.open(FILE, write=True)
+    await require_lost(lost)
+    assert bytes(await writer.read(0, 900)) == NEW
+    for file in (writer, lost):
+        await file.release()
+
+
+async def test_it_is_lost_when_the_new_file_is_unlinked_or_replaced_here(
+    store: FakeWriter, tree: Tree, autojump_clock: object
+) -> None:
+    lost = await reader_of_another(store, tree)
+    later = await tree.open(FILE)
+    assert bytes(await later.read(0, 900)) == NEW
+    await tree.unlink(FILE)
+    await require_lost(lost)
+    assert bytes(await later.read(0, 900)) == NEW
+    for file in (later, lost):
+        await file.release()
+
+
+async def test_the_kernel_keeps_no_pages_of_the_new_file_while_the_old_one_is_open(
+    store: FakeWriter, tree: Tree, autojump_clock: object
+) -> None:
+    """It would give them to who has the old one open, without asking."""
+    lost = await reader_of_another(store, tree)
+    later = await tree.open(FILE)
+    writer = await tree.open(FILE, write=True)
+    beside = await tree.open(FILE)
+    assert [file.direct_io for file in (later, writer, beside)] == [True] * 3
+    await lost.release()
+    for file in (later, writer, beside):
+        await file.release()
+    assert not (await tree.open(FILE)).direct_io
+
+
+async def test_all_older_versions_are_lost(store: FakeWriter, tree: Tree, autojump_clock: object) -> None:
+    """Also the one that was opened before the file grew."""
+    first = await tree.open(FILE)
+    assert bytes(await first.read(0, 9)) == OLD[:9]
+    store.add(FILE, OLD + OLD, 2)
+    tree.forget_caches()
+    second = await tree.open(FILE)
+    assert bytes(await first.read(0, 900)) == OLD
+    assert bytes(await second.read(0, 9)) == OLD[:9]
+    store.add(FILE, NEW + NEW, 3)
+    tree.forget_caches()
+    third = await tree.open(FILE)
+    assert bytes(await third.read(0, 1800)) == NEW + NEW
+    await require_lost(second)
+    await require_lost(first)
+    for file in (first, second, third):
+        await file.release()
+
+
+async def test_what_we_write_ourselves_loses_nobody(store: FakeWriter, autojump_clock: object) -> None:
+    """Also where listings show the new file before its delivery is over."""
+    tree = make_writable(store, inplace=True)
+    reader, writer = await tree.open(FILE), await tree.open(FILE, write=True)
+    assert bytes(await reader.read(0, 9)) == OLD[:9]
+    store.write_delay = store.list_delay = 0.1
+
+    async def look() -> None:
+        while True:
+            tree.forget_caches()
+            await (await tree.open(FILE)).release()
+            assert bytes(await reader.read(0, 3)) == b"new"
+            await trio.sleep(0.05)
+
+    async with trio.open_nursery() as both:
+        await writer.write(0, b"new")
+        both.start_soon(look)
+        await writer.fsync()
+        await writer.write(100, b"newer")
+        await writer.truncate(500)
+        await writer.fsync()
+        both.cancel_scope.cancel()
+    for file in (writer, reader):
+        await file.release()
+    assert store.files[FILE].data == b"new" + OLD[3:100] + b"newer" + OLD[105:500]
