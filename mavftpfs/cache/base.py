@@ -70,6 +70,13 @@ async def read_base(context: Context, node: Node, start: int, stop: int) -> byte
     return data
 
 
+def require_not_lost(node: Node) -> None:
+    """Raise FileChanged if the file below the draft is known to be another one by now: what was changed here
+    of the old one is not to be changed there."""
+    if node.base is not None:
+        node.base.require_not_lost()
+
+
 def outdate(context: Context, node: Node) -> None:
     """We changed the vehicle's file: who reads it opens it anew, which is no change of somebody else's."""
     node.generation += 1

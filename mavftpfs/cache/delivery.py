@@ -224,11 +224,12 @@ class Deliverer:
 
     async def _cut_first(self, node: Node, draft: Draft) -> None:
         """Cut a file of which a part is to be changed, too."""
-        await self._require_base(node.path, draft)
+        await self._require_base(node, draft)
         await self._cut(node, draft.size)
         draft.remote_cut(draft.size)
 
     async def _cut(self, node: Node, size: int) -> None:
+        base.require_not_lost(node)
         await self._context.writer.truncate(node.path, size)
         self._context.dentries.note_unsized(node.path)
         base.outdate(self._context, node)
@@ -281,7 +282,7 @@ class Deliverer:
         await self.abandon(node)
         least = 0
         if not draft.fresh and not draft.ruined:
-            least = await self._require_base(node.path, draft)
+            least = await self._require_base(node, draft)
         path, places = node.path, None
         if plan is Plan.REPLACE:
             places = self._context.namer.places(node.path)
@@ -323,17 +324,16 @@ class Deliverer:
             return float("-inf")
         return known.listed_at
 
-    async def _require_base(self, path: bytes, draft: Draft) -> int:
+    async def _require_base(self, node: Node, draft: Draft) -> int:
         """Return the size on the vehicle of a file of which a part is to stay.
 
         Raises:
-            FileChanged: it grew or shrank.
+            FileChanged: it grew or shrank, or is another one.
         """
-        size, most = await self.verifier.size(path), draft.remote_end
+        base.require_not_lost(node)
+        size, most = await self.verifier.size(node.path), draft.remote_end
         if most is not None and not draft.base_limit <= size <= most:
-            raise FileChanged(
-                f"{path!r} has {size} bytes on the vehicle now, {most} when it was changed here"
-            )
+            raise FileChanged(f"{node.path!r} has {size} bytes now, {most} when it was changed here")
         return size
 
     async def _finish(self, attempt: Attempt) -> None:

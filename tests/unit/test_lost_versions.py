@@ -144,3 +144,25 @@ async def test_what_we_write_ourselves_loses_nobody(store: FakeWriter, autojump_
     for file in (writer, reader):
         await file.release()
     assert store.files[FILE].data == b"new" + OLD[3:100] + b"newer" + OLD[105:500]
+
+
+@pytest.mark.parametrize("cut", [False, True])
+async def test_changes_of_a_lost_file_do_not_go_to_the_new_one(
+    store: FakeWriter, autojump_clock: object, cut: bool
+) -> None:
+    """The vehicle restarted with another card; only what is written whole replaces what is there."""
+    tree = make_writable(store, inplace=True)
+    writer = await tree.open(FILE, write=True)
+    assert bytes(await writer.read(0, 9)) == OLD[:9]
+    store.add(FILE, NEW, 2)
+    tree.rebooted()
+    await require_lost(writer)
+    await (writer.truncate(500) if cut else writer.write(0, b"mid"))
+    for _ in range(2):
+        with pytest.raises(FileChanged):
+            await writer.fsync()
+    assert store.files[FILE].data == NEW
+    await writer.truncate(0)
+    await writer.write(0, b"whole")
+    await writer.release()
+    assert store.files[FILE].data == b"whole"
