@@ -41,7 +41,7 @@ LOOPBACK_WINDOW = 64
 SPEND = 5.0
 """Seconds after which a client has no further repetition in a cell."""
 
-READY_TIMEOUT = 30.0
+READY_TIMEOUT = 90.0
 TABLE_WIDTH = 132
 
 

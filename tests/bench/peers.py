@@ -28,7 +28,7 @@ from tests.support.mounts import abort_mount, mounted_at
 from tests.support.vehicles import HOST, PROJECT, Process
 
 PINS = ("fusepy==3.0.1", "loguru==0.7.3", "mavsdk==4.1.0", "pymavlink==2.4.50")
-CONNECT_TIMEOUT = 40.0
+CONNECT_TIMEOUT = 120.0
 END_TIMEOUT = 20.0
 HERE = Path(__file__).parent
 

@@ -159,12 +159,12 @@ def test_an_interrupt_takes_everything_away(tmp_path: Path) -> None:
     environment = {**os.environ, "TMPDIR": str(tmp_path)}
     bench = subprocess.Popen(command, cwd=PROJECT, env=environment)
     try:
-        wait_until("mounted", lambda: f"{tmp_path}/" in Path("/proc/self/mounts").read_text())
+        wait_until("mounted", lambda: f"{tmp_path}/" in Path("/proc/self/mounts").read_text(), 180.0)
         children = Path(f"/proc/{bench.pid}/task/{bench.pid}/children").read_text().split()
         for pid in (bench.pid, *map(int, children)):
             with suppress(ProcessLookupError):  # one that has just ended
                 os.kill(pid, signal.SIGINT)
-        assert bench.wait(60.0) == entry.INTERRUPTED
+        assert bench.wait(180.0) == entry.INTERRUPTED
     finally:
         bench.kill()
         bench.wait()
