@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import errno
 import logging
-import re
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
@@ -18,14 +17,12 @@ import trio
 from mavftpfs.cache.asides import is_reserved
 from mavftpfs.cache.context import Context
 from mavftpfs.cache.remote import FREE_FOR
+from mavftpfs.cache.shortnames import is_short
 from mavftpfs.shared.errnos import errno_for
 from mavftpfs.shared.errors import FtpNak, LocalProtocolError, MavftpfsError
 from mavftpfs.shared.model import DirEntry, EntryKind, join, split
 
 log = logging.getLogger("mavftpfs.cache")
-
-_SHORT_WITH_DOT = re.compile(rb"[!-\-/-@\[-~]{1,8}\.|[!-\-/-`{-~]{1,8}\.")
-"""A name of at most eight characters in one case, with a dot behind it."""
 
 
 class Names:
@@ -73,7 +70,8 @@ class Names:
     async def other_spelling(self, path: bytes) -> bytes | None:
         """Return the listed spelling of the file or directory that a path not listed itself would open.
 
-        CreateFile of `README` empties `readme` where the card folds case (servers.md 9).
+        CreateFile of `README` empties `readme` where the card folds case (servers.md 9): FatFs that of all
+        names, NuttX that of short ones.
         """
         parent, name = split(path)
         entries = (await self._context.directories.get(parent)).entries
@@ -81,9 +79,11 @@ class Names:
         others = [n for n in entries if n != name and n.lower() == folded and not is_reserved(n)]
         if not others or name in entries:
             return None
-        if self._context.writer.traits.folds_case is None:
-            await self._learn_folding(parent, path, entries[others[0]])
-        return join(parent, others[0]) if self._context.writer.traits.folds_case is not False else None
+        # Short ones first: what opens by their name tells nothing about the long ones.
+        for other in sorted(others, key=is_short, reverse=True):
+            if await self._is_other(parent, name, entries[other]):
+                return join(parent, other)
+        return None
 
     async def require_kept(self, path: bytes) -> None:
         """Refuse a new name that the card would take for another one, of which it would change the file.
@@ -109,22 +109,19 @@ class Names:
 
     async def _drops_end(self, path: bytes) -> bool:
         """Return whether the card drops the end of a name, or may: what shows nothing proves nothing."""
-        traits, short = self._context.writer.traits, _SHORT_WITH_DOT.fullmatch(split(path)[1]) is not None
+        traits, short = self._context.writer.traits, is_short(split(path)[1])
         if traits.drops_ends:
             return True
         async with self._trying:  # the short name is always the same
             if short and traits.drops_short_ends is None:
-                async with self._own_file(self._context.namer.short_probe(path)) as own:
-                    traits.drops_short_ends = await self._drops_dot(own)
+                traits.drops_short_ends = await self._learn_ends(path, short=True)
             elif not short and traits.drops_ends is None:
-                async with self._own_file(self._context.namer.probes(path)[0]) as own:
-                    traits.drops_ends = await self._drops_dot(own)
+                traits.drops_ends = await self._learn_ends(path, short=False)
         return (traits.drops_short_ends if short else traits.drops_ends) is not False
 
-    async def _drops_dot(self, own: bytes) -> bool | None:
-        if await self._opens(own + b"."):
-            return True
-        return False if await self._opens(own) else None
+    async def _learn_ends(self, path: bytes, *, short: bool) -> bool | None:
+        async with self._own_file(self._probe(path, short=short)) as own:
+            return await self._finds(own, own + b".")
 
     def _drafted(self, path: bytes) -> DirEntry | None:
         node = self._context.nodes.get(path)
@@ -132,23 +129,37 @@ class Names:
             return None
         return DirEntry(split(path)[1], EntryKind.FILE, node.draft.size)
 
-    async def _learn_folding(self, parent: bytes, path: bytes, other: DirEntry) -> None:
+    async def _is_other(self, parent: bytes, name: bytes, other: DirEntry) -> bool:
+        """Return whether a name is, or may be, that other one which differs in case only."""
+        traits, short = self._context.writer.traits, is_short(name) and is_short(other.name)
+        if traits.folds_case:
+            return True
+        if short:
+            if traits.folds_short_case is None:
+                traits.folds_short_case = await self._learn_folding(join(parent, name), other, short=True)
+            return traits.folds_short_case is not False
+        if traits.folds_case is None:
+            traits.folds_case = await self._learn_folding(join(parent, name), other, short=False)
+        return traits.folds_case is not False
+
+    async def _learn_folding(self, path: bytes, other: DirEntry, *, short: bool) -> bool | None:
         """Find out by a file whether names are found in another case; directories are not opened for it."""
+        parent = split(path)[0]
         try:
             if other.kind is EntryKind.FILE:
-                await self._try_spelling(join(parent, other.name), path)
-            else:
-                await self._try_own_file(path)
+                return await self._finds(join(parent, other.name), path)
+            async with self._trying, self._own_file(self._probe(path, short=short)) as own:
+                above, name = split(own)
+                return await self._finds(own, join(above, name.swapcase()))
         except FtpNak as nak:
             log.info("whether names in %r are told apart by case stays unknown: %s", parent, nak)
+            return None
 
-    async def _try_spelling(self, there: bytes, spelled: bytes) -> None:
+    async def _finds(self, there: bytes, spelled: bytes) -> bool | None:
         """Open a file by another spelling of its name; a refusal counts if it is still there by its own."""
-        traits = self._context.writer.traits
         if await self._opens(spelled):
-            traits.folds_case = True
-        elif traits.folds_case is None and await self._opens(there):
-            traits.folds_case = False
+            return True
+        return False if await self._opens(there) else None
 
     async def _opens(self, path: bytes) -> bool:
         """Return whether a file is there.
@@ -164,10 +175,9 @@ class Names:
             return False
         return True
 
-    async def _try_own_file(self, path: bytes) -> None:
-        async with self._own_file(self._context.namer.probes(path)[0]) as own:
-            parent, name = split(own)
-            await self._try_spelling(own, join(parent, name.upper()))
+    def _probe(self, path: bytes, *, short: bool) -> bytes:
+        namer = self._context.namer
+        return namer.short_probe(path) if short else namer.probes(path)[0]
 
     @asynccontextmanager
     async def _own_file(self, own: bytes) -> AsyncIterator[bytes]:

@@ -77,7 +77,7 @@ class Namespace(Names):
         async with self._context.paths.hold(path):
             if await self.entry(path) is not None:
                 raise AlreadyExists(f"{path!r} exists")
-            if self._context.writer.traits.folds_case and await self.other_spelling(path):
+            if self._context.writer.traits.folds and await self.other_spelling(path):
                 raise AlreadyExists(f"{path!r} exists in another spelling")  # else the server says it
             await self.require_kept(path)
             await self._sure.make_directory(path)

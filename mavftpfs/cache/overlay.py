@@ -10,6 +10,7 @@ from mavftpfs.cache.context import Context
 from mavftpfs.cache.draft import Draft
 from mavftpfs.cache.localfiles import LocalFiles
 from mavftpfs.cache.nodes import Node
+from mavftpfs.cache.shortnames import is_short
 from mavftpfs.cache.times import SECOND, Times, shown
 from mavftpfs.shared.errors import NotADirectory, NotFound, NotSupported
 from mavftpfs.shared.model import EntryKind, join, require_listable, split
@@ -32,9 +33,12 @@ class Overlay:
         """Return the listed spelling of a path on a card that does not tell case apart."""
         parent, name = split(path)
         directory = self._context.dentries.known(parent)
-        if not self._context.writer.traits.folds_case or directory is None or name in directory.entries:
+        traits = self._context.writer.traits
+        folds = traits.folds_case or (traits.folds_short_case and is_short(name))
+        if not folds or directory is None or name in directory.entries:
             return path
-        others = [n for n in directory.entries if n.lower() == name.lower()]
+        alike = [n for n in directory.entries if n.lower() == name.lower()]
+        others = [n for n in alike if traits.folds_case or is_short(n)]
         return join(parent, others[0]) if others else path
 
     def stat(self, path: bytes) -> Stat | None:

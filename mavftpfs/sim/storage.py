@@ -19,7 +19,12 @@ from mavftpfs.sim.profiles import Profile
 from mavftpfs.sim.pseudo import VirtualTrees
 
 _FAT_FORBIDDEN = frozenset(b'"*:<>?|\x7f') | frozenset(range(32))
-_SHORT_WITH_DOT = re.compile(rb"([!#-)\-0-9@^-`{}~A-Z]{1,8}|[!#-)\-0-9@^-`{}~a-z]{1,8})\.")
+_SIGNS = rb"!#-)\-0-9@^-`{}~"
+_SHORT = re.compile(
+    rb"(?:[%(s)bA-Z]{1,8}|[%(s)ba-z]{1,8})(?:\.(?:[%(s)bA-Z]{,3}|[%(s)ba-z]{,3}))?" % {b"s": _SIGNS}
+)
+"""What NuttX keeps without a long name (its fat_parsesfname)."""
+
 _GAP_LIMIT = 65_536
 _CRC_BLOCK = 65_536
 _SECTOR = 512
@@ -206,8 +211,8 @@ class Storage:
     def _resolve(self, path: bytes) -> bytes:
         """Return the path as this filesystem has it.
 
-        On FAT ends of names are dropped (`_kept`); where case is folded, each name is replaced by the one
-        that exists in another case, if there is none in this.
+        On FAT ends of names are dropped (`_kept`); where case is folded, as NuttX does with short names, each
+        name is replaced by the one that exists in another case, if there is none in this.
         """
         if not self._fat:
             return path
@@ -215,27 +220,41 @@ class Storage:
         for name in path.split(b"/"):
             if name:
                 kept = self._kept(name)
-                resolved += b"/" + (self._folded(resolved or b"/", kept) if self._fold else kept)
+                folds = self._fold or self._is_short(kept)
+                resolved += b"/" + (self._folded(resolved or b"/", kept) if folds else kept)
         return resolved or b"/"
 
     def _kept(self, name: bytes) -> bytes:
         """Return a name without the end that FAT drops.
 
         FatFs drops all dots and blanks there (its create_name). NuttX keeps them in long names; one dot
-        behind a short name in one case only begins an empty extension (its fat_parsesfname).
+        behind a short name only begins an empty extension.
         """
         if self.kind is profiles.Storage.NUTTX_FAT:
-            return name[:-1] if _SHORT_WITH_DOT.fullmatch(name) else name
+            return name.removesuffix(b".") if self._is_short(name) else name
         return name.rstrip(b". ") or name
 
+    def _is_short(self, name: bytes) -> bool:
+        return self.kind is profiles.Storage.NUTTX_FAT and _SHORT.fullmatch(name) is not None
+
+    def _exists(self, path: bytes) -> bool:
+        try:
+            self._tree.stat(path)
+        except OSError:
+            return False
+        return True
+
     def _folded(self, parent: bytes, name: bytes) -> bytes:
+        if not self._fold and self._exists(parent.rstrip(b"/") + b"/" + name):
+            return name
         try:
             names = [entry.name for entry in self._tree.entries(parent)]
         except OSError:
             return name
         if name in names:
             return name
-        return next((other for other in names if other.lower() == name.lower()), name)
+        alike = (other for other in names if other.lower() == name.lower())
+        return next((other for other in alike if self._fold or self._is_short(other)), name)
 
 
 class _FatFile:

@@ -34,7 +34,8 @@ from mavftpfs.shared.traits import WriteTraits
 from tests.support.fake_store import FakeFile, FakeReader, FakeStore
 
 CHUNK = 239
-_SHORT_WITH_DOT = re.compile(rb"([0-9_~-]|[A-Z]){1,8}\.|([0-9_~-]|[a-z]){1,8}\.")
+_SHORT = re.compile(rb"([0-9_~-]|[A-Z]){1,8}(\.([0-9A-Z]{,3}|[0-9a-z]{,3}))?")
+_SHORT_SMALL = re.compile(rb"([0-9_~-]|[a-z]){1,8}(\.([0-9A-Z]{,3}|[0-9a-z]{,3}))?")
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +45,8 @@ class Kind:
     replaces: rename over a file works (else FileExists, as FAT). moves_into: rename onto a directory moves
     into it, as NuttX. renames: there is a rename at all. wo_truncates: OpenFileWO empties. truncates:
     TruncateFile works (None: silence). folds_case: names are found in any case. drops_ends: dots and blanks
-    at the end of a name are dropped. drops_short_ends: a dot behind eight characters of one case at most is.
+    at the end of a name are dropped. short_names: those of eight characters of one case at most, and three
+    behind a dot, are found in the other case, and lose a dot at the end.
     """
 
     replaces: bool = True
@@ -54,16 +56,21 @@ class Kind:
     truncates: bool | None = True
     folds_case: bool = False
     drops_ends: bool = False
-    drops_short_ends: bool = False
+    short_names: bool = False
 
 
 KINDS = {
     "posix": Kind(),
-    "nuttx": Kind(moves_into=True, truncates=False, drops_short_ends=True),
+    "nuttx": Kind(moves_into=True, truncates=False, short_names=True),
     "fat": Kind(replaces=False, folds_case=True, drops_ends=True, truncates=False),
     "littlefs": Kind(renames=False, truncates=False),
     "mavsdk": Kind(wo_truncates=True, truncates=None),
 }
+
+
+def _is_short(path: bytes) -> bool:
+    name = split(path)[1]
+    return any(kind.fullmatch(name) is not None for kind in (_SHORT, _SHORT_SMALL))
 
 
 class Frozen(VehicleLost):
@@ -150,12 +157,12 @@ class FakeWriter(FakeStore):
         path = self.aliases.get(path, path)
         if self.kind.drops_ends:
             path = path.rstrip(b". ")
-        if self.kind.drops_short_ends and _SHORT_WITH_DOT.fullmatch(split(path)[1]):
-            path = path[:-1]
-        if path in self.files or path in self.directories or not self.kind.folds_case:
+        short = self.kind.short_names and _is_short(path)
+        path = path.removesuffix(b".") if short else path
+        if path in self.files or path in self.directories or not (self.kind.folds_case or short):
             return path
         for known in [*self.files, *self.directories]:
-            if known.lower() == path.lower():
+            if known.lower() == path.lower() and (self.kind.folds_case or _is_short(known)):
                 return known
         return path
 

@@ -55,6 +55,7 @@ PURE_MODULES = {
     "cache.persistent",
     "cache.plan",
     "cache.sending",
+    "cache.shortnames",
     "cache.times",
     "fuse.inodes",
     "fuse.handles",

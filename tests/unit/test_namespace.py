@@ -284,7 +284,7 @@ async def test_another_spelling_is_the_same_file_where_the_card_says_so(fat: Fak
     tree = make_writable(fat)
     with pytest.raises(AlreadyExists):
         await tree.create(b"/d/A", exclusive=True)
-    assert fat.traits.folds_case
+    assert fat.traits.folds_short_case
     assert (await tree.stat(b"/d/A")).size == 1
     await write_file(tree, b"/d/A", b"more")
     assert fat.files[b"/d/a"].data == b"more"
@@ -295,11 +295,43 @@ async def test_another_spelling_is_the_same_file_where_the_card_says_so(fat: Fak
     assert b"/d/a" not in fat.files
 
 
+@pytest.mark.parametrize("order", [1, -1])
+async def test_what_short_names_show_says_nothing_about_long_ones(nursery: trio.Nursery, order: int) -> None:
+    """NuttX finds `a` as `A`, and neither `Readme` nor `long-name.ext` by another spelling."""
+    store = scene(FakeWriter(KINDS["nuttx"], nursery))
+    others = [b"/d/Readme", b"/d/Long-Name.ext", b"/d/a+b", b"/d/e.html"]
+    for path in others:
+        store.add(path, b"theirs")
+    tree = make_writable(store)
+
+    async def short() -> None:
+        with pytest.raises(AlreadyExists):
+            await tree.create(b"/d/A", exclusive=True)
+        await write_file(tree, b"/d/A", b"more")
+        assert (store.files[b"/d/a"].data, b"/d/A" in store.files) == (b"more", False)
+        assert (await tree.stat(b"/d/A")).size == 4
+        with pytest.raises(AlreadyExists):
+            await tree.mkdir(b"/d/EMPTY")
+        with pytest.raises(AlreadyExists):
+            await tree.rename(b"/d/b", b"/d/EMPTY")
+
+    async def long() -> None:
+        for path in (b"/d/README", b"/d/LONG-NAME.EXT", b"/d/A+B", b"/d/E.HTML"):
+            await write_file(tree, path, b"other")
+            assert store.files[path].data == b"other"
+
+    for part in (short, long)[::order]:
+        await part()
+    assert [store.files[path].data for path in others] == [b"theirs"] * len(others)
+    assert store.crimes == []
+    nursery.cancel_scope.cancel()
+
+
 async def test_two_spellings_are_two_files_elsewhere(nursery: trio.Nursery) -> None:
     store = scene(FakeWriter(KINDS["posix"], nursery))
     tree = make_writable(store)
     await write_file(tree, b"/d/A", b"other")
-    assert store.traits.folds_case is False
+    assert store.traits.folds_short_case is False
     assert (store.files[b"/d/a"].data, store.files[b"/d/A"].data) == (b"A", b"other")
 
 

@@ -272,6 +272,18 @@ def test_nuttx_drops_the_dot_behind_a_short_name_only() -> None:
         assert nak(c.ask(Opcode.OPEN_FILE_RO, b"/fs/microsd/" + name)) == bytes([NakCode.FILE_NOT_FOUND])
 
 
+def test_nuttx_folds_the_case_of_short_names_only() -> None:
+    tree = MemoryTree()
+    for number, name in enumerate((b"short", b"UP.txt", b"Mixed", b"longer-than-8", b"e.html", b"a+b")):
+        tree.add(b"/fs/microsd/" + name, bytes(number + 1))
+    c = client("px4-nuttx", tree, request_cost=0.0, stall_chance=0.0)
+    for name, size in ((b"SHORT", 1), (b"SHORT.", 1), (b"up.TXT", 2), (b"Mixed", 3)):
+        assert ack(c.ask(Opcode.OPEN_FILE_RO, b"/fs/microsd/" + name)) == struct.pack("<I", size)
+        ack(c.ask(Opcode.TERMINATE_SESSION))
+    for name in (b"Short", b"Up.txt", b"mixed", b"MIXED", b"LONGER-THAN-8", b"E.HTML", b"A+B"):
+        assert nak(c.ask(Opcode.OPEN_FILE_RO, b"/fs/microsd/" + name)) == bytes([NakCode.FILE_NOT_FOUND])
+
+
 def test_nuttx_has_no_dot_entries() -> None:
     c = prompt()
     assert nak(c.ask(Opcode.LIST_DIRECTORY, DIR)) == bytes([NakCode.EOF])
