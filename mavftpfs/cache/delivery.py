@@ -78,11 +78,7 @@ class Deliverer:
                     return
 
     async def deliver_locked(self, node: Node) -> bool:
-        """Do the same for who holds the node's lock; return False if it was called off (Node.doomed).
-
-        Raises:
-            As deliver.
-        """
+        """Do the same for who holds the node's lock; return False if it was called off (Node.doomed)."""
         with node.delivering() as scope:
             await self._deliver_or_note(node)
         return not scope.cancelled_caught
@@ -168,7 +164,7 @@ class Deliverer:
         mismatches = 0
         for _ in range(MAX_STEPS):
             draft = _draft(node)
-            if draft.stretched and node.attempt is None:
+            if draft.stretched and not draft.fresh and node.attempt is None:
                 draft.has_size(await self.verifier.size(node.path))
             plan = self.plan(node)
             if plan is Plan.NOTHING:
@@ -332,7 +328,7 @@ class Deliverer:
         """
         base.require_not_lost(node)
         size, most = await self.verifier.size(node.path), draft.remote_end
-        if most is not None and not draft.base_limit <= size <= most:
+        if most is not None and not draft.base_limit <= size <= max(most, draft.stretched):
             raise FileChanged(f"{node.path!r} has {size} bytes now, {most} when it was changed here")
         return size
 
@@ -347,21 +343,24 @@ class Deliverer:
 
     async def _commit(self, node: Node, attempt: Attempt) -> None:
         """Rename; if that was begun before, find out first how far it came."""
-        assert attempt.places is not None
+        draft, places = _draft(node), attempt.places
+        assert places is not None
         if attempt.committing:
-            present = await self.replacer.observe(attempt.places, node.path)
+            present = await self.replacer.observe(places, node.path)
             if present.target and not present.new:  # renamed, or tidied up by somebody who took it for litter
-                await self.verifier.check_doubted(node.path, _draft(node))
+                await self.verifier.check_doubted(node.path, draft)
         else:
             present = Present(new=True, old=False, target=True)
         attempt.committing = True
+        draft.place()
         try:
-            await self.replacer.replace(attempt.path, node.path, attempt.places, present)
+            await self.replacer.replace(attempt.path, node.path, places, present)
         except MavftpfsError as error:
             if not isinstance(error, PASSING):
                 attempt.committing = node.path in self._context.torn  # else all is where it was
+                draft.placed = attempt.committing or isinstance(error, VerificationFailed)
             raise
-        self.replacer.release(attempt.places)
+        self.replacer.release(places)
 
     # --- after
 

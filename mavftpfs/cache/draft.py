@@ -58,7 +58,8 @@ class Draft:
         sending: the attempt under way, None before the first and after success.
         made: an attempt may have made the file, so that what is there is ours; maybe_made: if it is empty.
         overwrites: what is there was given up for this.
-        stretched: the vehicle's file may reach to here, by requests of others that came late; 0 if not.
+        placed: what a replacement sent may have the name on the vehicle, so that what was there may be gone.
+        stretched: the vehicle's file may reach to here, also by requests of others that came late; 0 if not.
     """
 
     def __init__(self, content: Content, remote_size: int | None) -> None:
@@ -67,7 +68,7 @@ class Draft:
         self.base_limit = self.size
         self.remote_size = remote_size
         self.sending: Sending | None = None
-        self.made = self.maybe_made = self.overwrites = False
+        self.made = self.maybe_made = self.overwrites = self.placed = False
         self.stretched = 0
         self._held = ExtentSet()
         self._changed = ExtentSet()
@@ -80,7 +81,8 @@ class Draft:
     @property
     def clean(self) -> bool:
         """Whether the vehicle has it all."""
-        return self._changed.empty and self._lost.empty and self.size == self.remote_end
+        same = self._changed.empty and self._lost.empty and self.size == self.remote_end
+        return same and not self.placed
 
     @property
     def remote_end(self) -> int | None:
@@ -260,8 +262,14 @@ class Draft:
         self.remote_size = self.base_limit = self.size
         self.sending = None
         self._touched = self._ruined = self.made = self.maybe_made = self.overwrites = False
-        self.stretched = 0
+        self.placed, self.stretched = False, 0
         self._content.settle()
+
+    def place(self) -> None:
+        """What was sent under another name is about to get that of the vehicle's file."""
+        self.placed = True
+        if not self.fresh:
+            self.stretched = max(self.stretched, self.size)
 
     def has_size(self, size: int) -> None:
         """The vehicle's file was found to have `size` bytes: what was feared to be too long may be."""

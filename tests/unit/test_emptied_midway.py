@@ -6,6 +6,7 @@ The same at any request of its delivery on every simulated server: tests/sim/tes
 from __future__ import annotations
 
 from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import suppress
 
 import pytest
 import trio
@@ -13,7 +14,7 @@ import trio
 from mavftpfs.cache.asides import is_reserved
 from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.tree import Tree
-from mavftpfs.shared.errors import Armed, FileBusy, RequestTimeout
+from mavftpfs.shared.errors import Armed, FileBusy, LinkError, RequestTimeout
 from mavftpfs.shared.model import split
 from tests.support.fake_writer import KINDS, FakeWriter, make_writable
 
@@ -248,3 +249,41 @@ async def test_nothing_is_emptied_in_flight(autojump_clock: object, store: FakeW
     tree.armed_changed(False)
     await file.release()
     assert store.files[FILE].data == DATA
+
+
+@pytest.mark.parametrize("nth", [1, 2, 3])
+@pytest.mark.parametrize(("old", "new"), [(b"", b""), (OLD, b""), (OLD, OLD)])
+async def test_what_was_taken_back_may_have_got_its_place(
+    autojump_clock: object,
+    store: FakeWriter,
+    monkeypatch: pytest.MonkeyPatch,
+    old: bytes,
+    new: bytes,
+    nth: int,
+) -> None:
+    """Nobody knows whether the card has what it had before: that is not to be taken for delivered."""
+    store.add(FILE, old)
+    tree = writable(store)
+    file = await tree.open(FILE, write=True)
+    await file.write(len(old), SHORT)
+    given, renames = store.rename, 0
+
+    async def rename(old: bytes, new: bytes, *, completes: bool = False) -> None:
+        nonlocal renames
+        renames += 1
+        await given(old, new, completes=completes)
+        if renames == nth:
+            store.lost = True
+            raise RequestTimeout("no answer")
+
+    monkeypatch.setattr(store, "rename", rename)
+    with suppress(LinkError, RequestTimeout):
+        await file.fsync()
+    store.lost = False
+    monkeypatch.setattr(store, "rename", given)
+    await file.truncate(len(new))
+    await file.fsync()
+    assert store.files[FILE].data == new
+    await file.release()
+    assert await left(tree, store) == {FILE}
+    assert store.files[FILE].data == new
