@@ -22,6 +22,7 @@ from dataclasses import dataclass
 
 import trio
 
+from mavftpfs.cache.openings import Openings
 from mavftpfs.cache.readahead import Pace, RateMeter
 from mavftpfs.cache.room import Room
 from mavftpfs.shared.errors import RequestTimeout
@@ -115,6 +116,8 @@ class FileBlocks:
         self._waiters: list[_Waiter] = []
         self._arrived = 0
         self.intact = True
+        self.openings = Openings()
+        self._pristine = True
 
     def __contains__(self, index: int) -> bool:
         """Return whether the block is held."""
@@ -140,6 +143,10 @@ class FileBlocks:
     def missing(self, start: int, stop: int) -> Gaps:
         """Return the parts of [start, stop) not yet held, within the file."""
         return self._present.missing(start, min(stop, self.size))
+
+    def on_opened(self, at: float) -> None:
+        """What comes from now on is of the file that was opened at that time."""
+        self.openings.on_opened(at, first=self._pristine and not self.given)
 
     def on_data(self, offset: int, data: bytes | memoryview) -> None:
         """Keep what is not held yet; what lies beyond the opened size is dropped."""
@@ -212,6 +219,7 @@ class FileBlocks:
         """Forget every byte, proven or not; whoever waits starts anew."""
         self._proven.clear()
         self.drop_unproven()
+        self._pristine = True
 
     def drop_unproven(self) -> None:
         """Forget provisional bytes; whoever waits starts anew."""
@@ -343,6 +351,7 @@ class FileBlocks:
             start = end
 
     def _new_block(self, index: int) -> bytearray:
+        self._pristine = False
         start, stop = self._extent(index)
         self._cache.add(self, index, stop - start)
         block = self._blocks[index] = bytearray(stop - start)

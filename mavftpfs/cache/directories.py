@@ -61,6 +61,7 @@ class Directories:
         self._root_proven = root == ROOT
         self._dot_refused = False
         self.on_swept: Callable[[bytes, Directory], Awaitable[None]] | None = None
+        self.on_listed: Callable[[bytes, Directory], None] = lambda path, directory: None
         self.lost = False
         self.sweeps = 0
         self.served_stale = 0
@@ -189,7 +190,10 @@ class Directories:
         except BaseException:
             self._dentries.abandon(sweep)
             raise
-        return self._dentries.finish(sweep, listing, self._clock()), sweep.reshaped
+        directory = self._dentries.finish(sweep, listing, self._clock())
+        if not sweep.void:
+            self.on_listed(path, directory)
+        return directory, sweep.reshaped
 
     def _doubt(self, path: bytes) -> None:
         """The server refused to list it: perhaps it is gone, so the parent is asked again."""

@@ -10,29 +10,32 @@ Old handles of a file that turned out smaller, or of the same size with another 
 good (`Version.lost`) unless that came of what we are changing there; of one that is larger they go on at the
 size they opened: logs grow. The kernel has one page cache for all handles of a path, so a new version
 bypasses it (direct_io) while handles of an older one are open. What a restart of the vehicle does to open
-files says `restarts`.
+files says `restarts`, and `reopens` what the end of the server's session on one does.
 """
 
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Awaitable, Callable, Iterable
+from collections.abc import Callable, Iterable
 from functools import partial
 from itertools import islice
 
 from mavftpfs.cache.blocks import BlockCache, FileBlocks
+from mavftpfs.cache.directories import Directories
 from mavftpfs.cache.flights import Flights
 from mavftpfs.cache.keeper import Keeper
 from mavftpfs.cache.options import MIB
 from mavftpfs.cache.readahead import Pace, Readahead
 from mavftpfs.cache.readonly import ReadOnlyHandle
 from mavftpfs.cache.remote import RemoteStore
+from mavftpfs.cache.reopens import Reopens
 from mavftpfs.cache.restarts import Restarts
 from mavftpfs.cache.versions import MAX_RESTARTS, Fetcher, Version, became_another
 from mavftpfs.shared.errors import (
     DataUnproven,
     FileTooLarge,
     LocalProtocolError,
+    VehicleLost,
 )
 from mavftpfs.shared.model import DirEntry
 
@@ -59,11 +62,11 @@ class Files:
         cache: BlockCache,
         *,
         dir_timeout: float,
-        facts: Callable[[bytes], Awaitable[DirEntry]],
+        directories: Directories,
         on_size: Callable[[bytes, int], None],
         invalidate: Callable[[bytes], None],
     ) -> None:
-        """`facts` asks a fresh listing; `on_size` hears sizes that open ACKs told and listings did not."""
+        """`on_size` hears sizes that open ACKs told and listings did not."""
         self.keeper: Keeper | None = None
         self.is_changing: Callable[[bytes], bool] = lambda path: False
         self._store = store
@@ -71,10 +74,19 @@ class Files:
         self._clock = cache.clock
         self._dir_timeout = dir_timeout
         self._rebooted_at = float("-inf")
+        self._directories = directories
         self._on_size = on_size
         self._invalidate = invalidate
         self.fetcher = Fetcher(store, cache, on_distrust=self._distrust, on_changed=self._kill)
-        self.recheck = Restarts(self.fetcher, facts, on_changed=self._kill).recheck
+        self.recheck = Restarts(self.fetcher, self._facts, on_changed=self._kill).recheck
+        self.reopens = Reopens(
+            self.fetcher,
+            directories,
+            clock=cache.clock,
+            opened=lambda: self._open_versions,
+            is_changing=lambda path: self.is_changing(path),
+            on_changed=self._kill,
+        )
         self.piece = min(MAX_PIECE, cache.budget // 4)
         self._current: OrderedDict[bytes, Version] = OrderedDict()
         self._open_versions: dict[Version, None] = {}
@@ -225,6 +237,13 @@ class Files:
         for version in self._open_versions:
             version.boot += 1
 
+    async def _facts(self, path: bytes) -> DirEntry:
+        """Return an entry listed since the last reboot."""
+        found = await self._directories.find(path)
+        if found.directory.listed_at < self._rebooted_at:
+            raise VehicleLost("the vehicle restarted and does not answer yet")
+        return found.entry
+
     # --- we changed the file ourselves
 
     def cached(self, path: bytes) -> FileBlocks | None:
@@ -332,14 +351,18 @@ class FileHandle(ReadOnlyHandle):
         stop = min(offset + size, self.size)
         if offset >= stop:
             return b""
-        version = self._version
+        version, reopens, at_end = self._version, self._files.reopens, stop == self.size
         for _ in range(MAX_RESTARTS):
             await self._files.recheck(version)
             boot = version.boot
             data = await self._read_range(offset, stop)
-            if boot == version.boot and not version.recheck:
+            if boot != version.boot or version.recheck:
+                continue
+            if not reopens.due(version, at_end=at_end):
                 version.blocks.on_given(offset, stop)
                 return data
+            await reopens.compare(version)
+            at_end = False
         raise DataUnproven(f"the vehicle restarts again and again while {version.path!r} is read")
 
     def require_not_lost(self) -> None:

@@ -21,6 +21,7 @@ from mavftpfs.cache.blockdirectory import BlockDirectory
 from mavftpfs.cache.blocks import BLOCK_SIZE, BlockCache, FileBlocks
 from mavftpfs.cache.kept import InThread, Kept, extent, in_thread
 from mavftpfs.cache.persistent import key_of, trusted
+from mavftpfs.cache.reopens import is_unsettled
 from mavftpfs.cache.versions import Version
 from mavftpfs.shared.errors import Armed, FtpNak, RemoteProtocolError, RequestTimeout, VehicleLost
 from mavftpfs.shared.model import DirEntry
@@ -181,7 +182,7 @@ class Keeper:
 
     async def _write(self, version: Version, kept: Kept, index: int) -> None:
         data = version.blocks.get(*extent(kept.key.size, index))  # never provisional
-        if data is None or version.dead is not None or self._broken:
+        if data is None or version.dead is not None or is_unsettled(version) or self._broken:
             return
         try:
             await self._run(partial(self._directory.write, kept.block(index), bytes(data)))

@@ -98,6 +98,9 @@ class _Piece(ReadSink):
         cut = [(max(start, a), min(stop, b)) for a, b in self._gaps]
         return [(a, b) for a, b in cut if a < b]
 
+    def on_opened(self, at: float) -> None:
+        """See ReadSink: another file would not compare."""
+
     def on_data(self, offset: int, data: bytes) -> None:
         """See ReadSink."""
         end = offset + len(data)

@@ -37,6 +37,11 @@ class ReadSink(Protocol):
         """Return the parts of [start, stop) not yet held."""
         ...
 
+    def on_opened(self, at: float) -> None:
+        """What comes from now on is of the file that the server's session was opened on at that time (the
+        caches' clock). Told before the first byte of each session, and perhaps more than once."""
+        ...
+
     def on_data(self, offset: int, data: bytes) -> None:
         """Take proven-by-protocol bytes; what is already held must not be overwritten."""
         ...

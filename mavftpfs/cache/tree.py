@@ -30,7 +30,7 @@ from mavftpfs.cache.spool import SpoolDirectory
 from mavftpfs.cache.virtual import VirtualTrees, is_snapshot
 from mavftpfs.cache.writeback import Writeback
 from mavftpfs.cache.writing import make_writeback
-from mavftpfs.shared.errors import FtpNak, IsADirectory, ReadOnly, VehicleLost
+from mavftpfs.shared.errors import FtpNak, IsADirectory, ReadOnly
 from mavftpfs.shared.model import ROOT, DirEntry, EntryKind, is_virtual, join, normalise
 
 __all__ = ["OpenFile", "Stat", "Tree"]
@@ -74,7 +74,7 @@ class Tree:
             store,
             self._blocks,
             dir_timeout=options.dir_timeout,
-            facts=self._facts,
+            directories=self._directories,
             on_size=self._on_size,
             invalidate=self._invalidate,
         )
@@ -90,7 +90,6 @@ class Tree:
         )
         self._learning: Flights[bytes, int] = Flights()
         self._checksums = Checksums(store, clock=clock, lifetime=options.dir_timeout)
-        self._rebooted_at = float("-inf")
         self._writing: Writeback | None = None
         if writer is not None:
             self._writing = make_writeback(
@@ -331,8 +330,7 @@ class Tree:
 
     def rebooted(self) -> None:
         """The vehicle restarted: what was known of it must be asked again."""
-        self._rebooted_at = self._clock()
-        self._dentries.expire_all(self._rebooted_at)
+        self._dentries.expire_all(self._clock())
         self._directories.rebooted()
         self._virtual.rebooted()
         self._files.rebooted()
@@ -377,13 +375,6 @@ class Tree:
         if found.entry.kind is not EntryKind.FILE:
             raise IsADirectory(f"{remote!r} is a directory")
         return found
-
-    async def _facts(self, remote: bytes) -> DirEntry:
-        """Return an entry listed since the last reboot."""
-        found = await self._directories.find(remote)
-        if found.directory.listed_at < self._rebooted_at:
-            raise VehicleLost("the vehicle restarted and does not answer yet")
-        return found.entry
 
     async def _learn_size(self, remote: bytes) -> int:
         """Open a file whose listing tells no size; one that is refused counts as empty until listed again."""

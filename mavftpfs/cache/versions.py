@@ -193,6 +193,14 @@ class Fetcher:
         version.reader = reader
         return reader
 
+    async def reopen(self, version: Version) -> Reader:
+        """Have the server open a version's file anew.
+
+        Raises:
+            As `reader`.
+        """
+        return await self._opening.run(version, partial(self._open, version, None))
+
     async def prove(self, version: Version) -> bool:
         """Return whether what was given out and is held of a version is what the vehicle holds.
 
@@ -235,7 +243,7 @@ class Fetcher:
             while version.blocks.missing(0, version.size):
                 reader = await self.reader(version)
                 await version.blocks.fill(0, version.size, partial(_want, reader, NOTHING))
-            fresh = await self._opening.run(version, partial(self._open, version, None))
+            fresh = await self.reopen(version)
             return fresh.size == version.size and remote == await version.blocks.crc32()
 
     def _affordable(self, version: Version) -> bool:

@@ -89,6 +89,7 @@ class Reading:
             if session.size is None:
                 raise RemoteProtocolError("the vehicle's open reply holds no size")
             stream.on_opened(session.size)
+            stream.on_session(session.opened_at)
         except (FileChanged, RemoteProtocolError):
             await self._holder.close_quietly()
             raise

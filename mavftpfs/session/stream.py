@@ -112,6 +112,11 @@ class FileStream:
         elif size < self._size:
             raise FileChanged(f"{self.path!r} shrank from {self._size} to {size} bytes")
 
+    def on_session(self, opened_at: float) -> None:
+        """Bytes come from a session that was opened at that time."""
+        if not self.closed:
+            self._sink.on_opened(opened_at)
+
     def attach(self, transfer: ReadTransfer) -> None:
         """Hand what is wanted to a transfer; later wants go to it directly."""
         self._transfer = transfer

@@ -57,11 +57,15 @@ class MemorySink:
         self.data = bytearray(size)
         self.have = ExtentSet()
         self.suspicions: list[str] = []
+        self.openings: list[float] = []
         self.errors: list[Exception] = []
         self._news = trio.Event()
 
     def missing(self, start: int, stop: int) -> list[tuple[int, int]]:
         return self.have.missing(start, stop)
+
+    def on_opened(self, at: float) -> None:
+        self.openings.append(at)
 
     def on_data(self, offset: int, data: bytes) -> None:
         assert offset + len(data) <= len(self.data)

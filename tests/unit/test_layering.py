@@ -52,6 +52,7 @@ PURE_MODULES = {
     "cache.readahead",
     "cache.asides",
     "cache.draft",
+    "cache.openings",
     "cache.persistent",
     "cache.plan",
     "cache.sending",

@@ -1,0 +1,111 @@
+"""Whether an open file is still the same after the server's session on it was opened anew. Layer: cache.
+
+A session is closed when nobody wants bytes for a while, or another file needs it, and by losses; in between
+others may replace the file by one of the same size. So where listings tell mtimes, a listing that began
+after the reopening is compared before more of the file is given out, also what came meanwhile:
+- the size and mtime are those it was opened with, or it only grew: it goes on;
+- nothing of it was given out yet: all is read from what is there now;
+- else old handles get FileChanged.
+Where readers take turns, each turn is a reopening: then the comparison is put off (`openings`), but for the
+read that reaches the end of the file. Without mtimes the size in the open ACK alone decides.
+
+Any listing that shows another mtime ends the open versions of that file, too, reopened or not.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from functools import partial
+
+from mavftpfs.cache.dentries import Directory
+from mavftpfs.cache.directories import Directories
+from mavftpfs.cache.flights import Flights
+from mavftpfs.cache.versions import Fetcher, Version, became_another
+from mavftpfs.shared.model import DirEntry, EntryKind, split
+
+
+class Reopens:
+    """Compares versions with listings."""
+
+    def __init__(
+        self,
+        fetcher: Fetcher,
+        directories: Directories,
+        *,
+        clock: Callable[[], float],
+        opened: Callable[[], Iterable[Version]],
+        is_changing: Callable[[bytes], bool],
+        on_changed: Callable[[Version], None],
+    ) -> None:
+        """`opened` tells what is open; `is_changing` whether we are changing what the vehicle has of a path,
+        which says nothing of others; `on_changed` hears that a file became another."""
+        self._fetcher = fetcher
+        self._directories = directories
+        self._clock = clock
+        self._opened = opened
+        self._is_changing = is_changing
+        self._on_changed = on_changed
+        self._comparing: Flights[Version, None] = Flights()
+        directories.on_listed = self._on_listed
+
+    def due(self, version: Version, *, at_end: bool) -> bool:
+        """Return whether a version has to be compared before more of it is given out; `at_end`: the last."""
+        if not is_unsettled(version) or self._is_changing(version.path):
+            return False
+        return at_end or self._clock() >= version.blocks.openings.look_at
+
+    async def compare(self, version: Version) -> None:
+        """Compare an open version with a listing that begins after its file was opened on the vehicle.
+
+        Raises:
+            FileChanged: it is another. Else as RemoteStore.list_directory and open_reader.
+        """
+        await self._comparing.run(version, partial(self._compare_once, version))
+        version.require_alive()
+
+    async def _compare_once(self, version: Version) -> None:
+        openings = version.blocks.openings
+        count, parent = openings.count, split(version.path)[0]
+        directory = await self._directories.recent(parent, began=openings.latest)
+        async with self._fetcher.paths.steady(lambda: version.path) as path:
+            entry = directory.entries.get(split(path)[1])
+            if split(path)[0] != parent or self._is_changing(path):
+                return
+        if entry is None:
+            another = directory.complete
+        else:
+            another = entry.kind is not EntryKind.FILE or became_another(version, entry)
+        if not another:
+            openings.on_compared(count, directory.ended_at - directory.listed_at, self._clock())
+        elif entry is None or entry.size != version.size or version.blocks.given:
+            self._on_changed(version)
+        else:
+            await self._start_over(version, entry)
+
+    async def _start_over(self, version: Version, entry: DirEntry) -> None:
+        """Nothing was given out: the version is of the file that is there now, opened once more for that."""
+        version.boot += 1  # reads under way hold bytes of the old one
+        version.proven_boot += 1
+        version.kept = None
+        version.close_reader()
+        version.blocks.start_over()
+        version.mtime = entry.mtime
+        reader = await self._fetcher.reopen(version)
+        if reader.size != version.size:
+            version.mtime = None
+
+    def _on_listed(self, path: bytes, directory: Directory) -> None:
+        """A directory was listed."""
+        for version in list(self._opened()):
+            parent, name = split(version.path)
+            entry = directory.entries.get(name) if parent == path else None
+            if entry is None or version.mtime is None or directory.listed_at <= version.proven_at:
+                continue
+            ours = self._is_changing(version.path)
+            if version.blocks.given and became_another(version, entry) and not ours:
+                self._on_changed(version)
+
+
+def is_unsettled(version: Version) -> bool:
+    """Return whether what is held of a version may be of two files, which a listing could tell."""
+    return version.mtime is not None and not version.blocks.openings.settled
