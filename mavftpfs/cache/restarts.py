@@ -58,6 +58,7 @@ class Restarts:
             version.proven_boot = boot
         elif not version.blocks.given:
             version.close_reader()
+            version.kept = None
             version.blocks.start_over()
             version.mtime = entry.mtime if entry.size == version.size else None
             version.proven_boot = boot

@@ -184,6 +184,24 @@ async def test_what_is_not_beyond_doubt_is_not_kept(
     handle.close()
 
 
+async def test_what_is_kept_is_no_part_of_the_file_that_came_by_a_restart(
+    mounts: Mounts, autojump_clock: MockClock
+) -> None:
+    """It is larger, so it may only have grown, and nothing of it was read since it was opened."""
+    tree = mounts.mount()
+    handle = await tree.open(LOG)
+    await handle.read(0, 2 * BLOCK_SIZE)
+    handle.close()
+    await trio.sleep(ENOUGH)
+    tree = mounts.mount()
+    handle = await tree.open(LOG)
+    new = content(len(DATA) + 1000, seed=8)
+    mounts.store.add(LOG, new, MTIME + 1)
+    tree.rebooted()
+    assert await handle.read(0, len(DATA)) == new[: len(DATA)]
+    handle.close()
+
+
 async def test_without_an_mtime_a_checksum_decides(mounts: Mounts, autojump_clock: MockClock) -> None:
     mounts.store.add(LOG, DATA, None)
     await mounts.read_and_settle()
