@@ -62,8 +62,7 @@ def test_a_file_as_mountpoint_is_exit_3(tmp_path: Path) -> None:
 def test_a_dead_mountpoint_is_exit_3_and_says_the_cure(field: Field, small_tree: Path) -> None:
     vehicle = field.sim(small_tree)
     mount = field.mount(vehicle.source)
-    process, mount.process = mount.alive(), None
-    process.kill()
+    mount.kill()
     try:
         line = mavftpfs(vehicle.source, mount.path, code=3)
         assert "fusermount3 -u" in line

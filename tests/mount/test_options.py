@@ -248,8 +248,7 @@ def test_mount_8_names_an_unknown_option(field: Field, small_tree: Path, tmp_pat
 
 def test_auto_unmount_clears_after_a_kill(field: Field, small_tree: Path) -> None:
     mount = field.mount(field.sim(small_tree).source, "auto_unmount")
-    process, mount.process = mount.alive(), None
-    process.kill()
+    mount.kill()
     try:
         wait_until("the kernel's mount is gone", lambda: not mounted_at(mount.path))
     finally:

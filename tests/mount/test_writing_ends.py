@@ -252,8 +252,7 @@ def test_unmounting_what_a_killed_daemon_left_says_what_it_held(field: Field, da
     vehicle.left_alone = True
     mount = field.mount(vehicle.source, *QUICK)
     write_to_nobody(mount, vehicle, data)
-    process, mount.process = mount.alive(), None
-    process.kill()
+    mount.kill()
     argv = [sys.executable, "-m", "mavftpfs", "umount", str(mount.path)]
     done = subprocess.run(argv, capture_output=True, text=True, timeout=60, check=False)
     assert done.returncode == 4, done.stderr
@@ -281,8 +280,7 @@ def test_a_killed_daemon_loses_only_what_was_not_confirmed(field: Field, data: P
     with mount.started(sys.executable, "-c", code, mount.path / "replaced.bin"):
         wait_until("it is under way", lambda: any(map(is_reserved, os.listdir(os.fsencode(card)))))
         vehicle.pause()
-        process, mount.process = mount.alive(), None
-        process.kill()
+        mount.kill()
         abort_mount(mount.path)
     vehicle.resume()
     again = field.mount(vehicle.source, *QUICK)
@@ -313,8 +311,7 @@ def test_a_killed_daemon_leaves_what_was_being_written_under_its_name(field: Fie
     with mount.started(sys.executable, "-c", code, mount.path / "log.bin") as child:
         assert child.stdout is not None
         assert child.stdout.readline()
-        process, mount.process = mount.alive(), None
-        process.kill()
+        mount.kill()
         abort_mount(mount.path)
     place = told(field.mount(vehicle.source, *QUICK).alive())
     found = {path.name: path for path in place.iterdir()}
@@ -353,8 +350,7 @@ def test_the_background_parent_names_what_an_earlier_mount_left(
     vehicle.left_alone = True
     mount = field.mount(vehicle.source, *QUICK)
     write_to_nobody(mount, vehicle, data)
-    process, mount.process = mount.alive(), None
-    process.kill()
+    mount.kill()
     abort_mount(mount.path)
     vehicle.resume()
     time.sleep(0.1)

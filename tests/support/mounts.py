@@ -6,6 +6,7 @@ aborting the connection; then the test fails.
 
 from __future__ import annotations
 
+import errno
 import os
 import re
 import signal
@@ -50,6 +51,14 @@ def mounted_at(path: Path) -> bool:
     escaped = re.sub(r"[\\\s]", lambda hit: f"\\{ord(hit[0]):03o}", str(path))
     lines = Path("/proc/self/mounts").read_text().splitlines()
     return any(line.split(" ")[1] == escaped for line in lines)
+
+
+def _is_served(path: Path) -> bool:
+    try:
+        os.stat(path)
+    except OSError as error:
+        return error.errno not in (errno.ENOTCONN, errno.ECONNABORTED)
+    return mounted_at(path)
 
 
 def abort_mount(path: Path) -> None:
@@ -117,6 +126,13 @@ class Mount:
         """Return the process."""
         assert self.process is not None
         return self.process
+
+    def kill(self) -> None:
+        """kill -9 of the mount's process, until the kernel knows too that nobody serves the mount any more:
+        that may be after the process was reaped."""
+        process, self.process = self.alive(), None
+        process.kill()
+        wait_until("the kernel gives the mount up", lambda: not _is_served(self.path))
 
     def alive(self) -> Process:
         """Return the process, which must run."""
