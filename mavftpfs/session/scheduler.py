@@ -34,7 +34,7 @@ from mavftpfs.session.suspicion import Suspicion
 from mavftpfs.session.upload import QueuedUpload
 from mavftpfs.session.uploading import Uploading
 from mavftpfs.session.vehicle import Vehicle
-from mavftpfs.shared.errors import DataUnproven, MavftpfsError, RequestTimeout, SessionLost, VehicleLost
+from mavftpfs.shared.errors import DataUnproven, MavftpfsError, RequestTimeout, SessionLost
 from mavftpfs.shared.traits import WriteTraits
 
 IDLE_CLOSE = 1.5
@@ -222,8 +222,7 @@ class Scheduler:
 
     def require_link(self) -> None:
         """Raise VehicleLost while the vehicle is silent (promise 4: fail at once)."""
-        if self._vehicle.lost(self._clock()):
-            raise VehicleLost("the vehicle is silent; waiting for its heartbeat")
+        self._vehicle.require_there(self._clock())
 
     def check_may_write(self) -> None:
         """Raise Armed or VehicleLost (promises 4 and 9)."""

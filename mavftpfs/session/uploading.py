@@ -29,7 +29,6 @@ from mavftpfs.shared.errors import (
     RequestTimeout,
     SessionLost,
     SpoolFailed,
-    VehicleLost,
 )
 
 REFUSALS = (FtpNak, ProtocolError, FileChanged, AlreadyExists, SpoolFailed)
@@ -96,8 +95,7 @@ class Uploading:
         """Raise Armed or VehicleLost."""
         if not self.may_write:
             raise Armed("the vehicle is armed: nothing is written in flight")
-        if self._vehicle.lost(self._clock()):
-            raise VehicleLost("the vehicle is silent; waiting for its heartbeat")
+        self._vehicle.require_there(self._clock())
 
     def now(self) -> float:
         """See UploadHost."""

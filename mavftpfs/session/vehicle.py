@@ -24,6 +24,7 @@ from mavftpfs.link.messages import (
 )
 from mavftpfs.protocol.payload import Opcode
 from mavftpfs.session.identity import Identity
+from mavftpfs.shared.errors import VehicleLost
 
 SILENCE_LIMIT = 5.0
 """Seconds without heartbeats after which one timed-out request means that the vehicle is lost."""
@@ -99,6 +100,13 @@ class Vehicle:
     def lost(self, now: float) -> bool:
         """Return whether requests that need the link should fail at once."""
         return self.identity.stranger or (self._timed_out and self.silence(now) > SILENCE_LIMIT)
+
+    def require_there(self, now: float) -> None:
+        """Raise VehicleLost while requests that need the link should fail at once."""
+        if self.identity.stranger:
+            raise VehicleLost("another vehicle answers in place of the one that was mounted")
+        if self.lost(now):
+            raise VehicleLost("the vehicle is silent; waiting for its heartbeat")
 
     def foreign_client(self, now: float) -> bool:
         """Return whether another FTP client of this vehicle was heard lately."""

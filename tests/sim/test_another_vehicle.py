@@ -12,7 +12,7 @@ from trio.testing import MockClock
 
 from mavftpfs.cache.tree import Tree
 from mavftpfs.compose import subscribe
-from mavftpfs.shared.errors import MavftpfsError
+from mavftpfs.shared.errors import MavftpfsError, VehicleLost
 from mavftpfs.sim.linkmodel import Direction, LinkSettings
 from mavftpfs.sim.memorytree import MemoryTree
 from mavftpfs.sim.profiles import PROFILES
@@ -80,8 +80,10 @@ async def test_what_is_held_for_one_is_not_written_to_the_other(
         await trio.sleep(100.0)
         assert scene.other.server.requests.total() == 0
         assert tree.undelivered() == [scene.file]
-        with pytest.raises(MavftpfsError):
-            await tree.stat(scene.root + b"/new")
+        again = await tree.open(scene.file, write=True)
+        with pytest.raises(VehicleLost, match="another vehicle answers"):
+            await again.fsync()
+        again.close()
         await swap(scene.world, scene.ours, gap=4.0)
         await trio.sleep(100.0)
         assert tree.undelivered() == []
