@@ -14,7 +14,6 @@ import pytest
 import trio
 from trio.testing import MockClock
 
-from mavftpfs.cache.asides import is_reserved
 from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.tree import Tree
 from mavftpfs.cache.verify import SMALL_LISTING
@@ -22,48 +21,34 @@ from mavftpfs.protocol.payload import Opcode
 from mavftpfs.session.echoes import QUIET
 from mavftpfs.shared.errors import CrossDevice
 from mavftpfs.sim.linkmodel import LinkSettings
+from tests.support.deliveries import (
+    BAD,
+    GOOD,
+    LONG,
+    MOMENTS,
+    MOST_REQUESTS,
+    NEW,
+    NO_RENAME,
+    OLD,
+    PROFILES,
+    PROMPT,
+    SLOW,
+    Write,
+    change,
+    create,
+    names_on_card,
+    names_shown,
+    replace,
+)
 from tests.support.faults import Faults
 from tests.support.latecomers import Latecomer
 from tests.support.mounting import mounted
 from tests.support.trees import content
 from tests.support.worlds import ROOTS, World
 
-OLD, NEW, OTHER = content("old", 3000), content("new", 3500), content("other", 500)
-GOOD = LinkSettings(rate=50_000.0, delay=0.02)
-BAD = LinkSettings(rate=50_000.0, delay=0.02, loss=0.05, duplicate=0.05, reorder=0.05)
-SLOW = LinkSettings(rate=6000.0, delay=0.05)
-LONG = content("long", 60_000)
-MOMENTS = (0.1, 1.0, 5.0, 9.0)
-"""Seconds since the delivery of that began; it takes 11 and more on the slow link."""
+OTHER = content("other", 500)
 
-PROMPT = 2.0
-"""Seconds for a few round trips on that link, with what is in its queue at the time."""
-
-PROFILES = ("px4", "px4-nuttx", "ardupilot", "littlefs", "mavsdk")
-NO_RENAME = "littlefs"
-MOST_REQUESTS = 120
-
-Write = Callable[[Tree, bytes], Awaitable[OpenFile]]
 Take = Callable[[Tree, bytes], Awaitable[None]]
-
-
-async def create(tree: Tree, path: bytes) -> OpenFile:
-    await tree.unlink(path)
-    file = await tree.create(path, exclusive=True)
-    await file.write(0, NEW)
-    return file
-
-
-async def replace(tree: Tree, path: bytes) -> OpenFile:
-    file = await tree.open(path, write=True, truncate=True)
-    await file.write(0, NEW)
-    return file
-
-
-async def change(tree: Tree, path: bytes) -> OpenFile:
-    file = await tree.open(path, write=True)
-    await file.write(100, NEW[100:])
-    return file
 
 
 async def empty(tree: Tree, path: bytes) -> OpenFile:
@@ -123,9 +108,8 @@ async def take_after(count: int, profile: str, write: str, take: str, settings: 
             await look(tree, file, path, write, take)
         nursery.cancel_scope.cancel()
     if taken is not None:
-        left = [entry.name for entry in world.tree.entries(folder) if not entry.name.startswith(b"..")]
         expected = {b"file.other"} if TAKES[take][1] is None else {b"file"}
-        assert set(left) - {b"."} == expected, f"{left} after request {count}"
+        assert names_on_card(world, folder) == expected, f"after request {count}"
     return taken
 
 
@@ -139,11 +123,7 @@ async def look(tree: Tree, file: OpenFile, path: bytes, write: str, take: str) -
     await file.fsync()
     await file.release()
     assert tree.undelivered() == []
-    for _ in range(2):
-        names = {name for name, _ in await tree.list(path.rpartition(b"/")[0])}
-        await trio.sleep(5)
-        tree.forget_caches()
-    assert not any(is_reserved(name) for name in names)
+    names = await names_shown(tree, path.rpartition(b"/")[0])
     assert (b"file" in names) == (TAKES[take][1] is not None)
     if TAKES[take][1] is not None:
         other = await tree.open(path, write=False)
@@ -206,8 +186,7 @@ async def test_an_empty_file_among_many_loses_its_name(profile: str, take: str, 
         await made.wait()
         assert world.tree.data(path) == b""
         await TAKES[take][0](tree, path)
-    left = {entry.name for entry in world.tree.entries(folder)}
-    assert (b"file" in left) == (TAKES[take][1] is not None)
+    assert (b"file" in names_on_card(world, folder)) == (TAKES[take][1] is not None)
     if TAKES[take][1] is not None:
         assert world.tree.data(path) == TAKES[take][1]
 

@@ -14,52 +14,34 @@ import pytest
 import trio
 from trio.testing import MockClock
 
-from mavftpfs.cache.asides import is_reserved
 from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.tree import Tree
 from mavftpfs.shared.errors import MavftpfsError
 from mavftpfs.sim.linkmodel import LinkSettings
+from tests.support.deliveries import (
+    BAD,
+    GOOD,
+    LONG,
+    MOMENTS,
+    MOST_REQUESTS,
+    NO_RENAME,
+    OLD,
+    PROFILES,
+    PROMPT,
+    SLOW,
+    Write,
+    change,
+    create,
+    names_on_card,
+    names_shown,
+    replace,
+)
 from tests.support.faults import Faults
 from tests.support.mounting import mounted
 from tests.support.trees import content
 from tests.support.worlds import ROOTS, World
 
-OLD, NEW, NEXT = content("old", 3000), content("new", 3500), content("next", 700)
-LONGER = content("longer", 5000)
-GOOD = LinkSettings(rate=50_000.0, delay=0.02)
-BAD = LinkSettings(rate=50_000.0, delay=0.02, loss=0.05, duplicate=0.05, reorder=0.05)
-SLOW = LinkSettings(rate=6000.0, delay=0.05)
-LONG = content("long", 60_000)
-MOMENTS = (0.1, 1.0, 5.0, 9.0)
-"""Seconds since the delivery of that began; it takes 11 and more on the slow link."""
-
-PROMPT = 2.0
-"""Seconds for a few round trips on that link, with what is in its queue at the time."""
-
-PROFILES = ("px4", "px4-nuttx", "ardupilot", "littlefs", "mavsdk")
-NO_RENAME = "littlefs"
-MOST_REQUESTS = 120
-
-Write = Callable[[Tree, bytes], Awaitable[OpenFile]]
-
-
-async def create(tree: Tree, path: bytes) -> OpenFile:
-    await tree.unlink(path)
-    file = await tree.create(path, exclusive=True)
-    await file.write(0, NEW)
-    return file
-
-
-async def replace(tree: Tree, path: bytes) -> OpenFile:
-    file = await tree.open(path, write=True, truncate=True)
-    await file.write(0, NEW)
-    return file
-
-
-async def change(tree: Tree, path: bytes) -> OpenFile:
-    file = await tree.open(path, write=True)
-    await file.write(100, NEW[100:])
-    return file
+NEXT, LONGER = content("next", 700), content("longer", 5000)
 
 
 async def cut(tree: Tree, path: bytes) -> OpenFile:
@@ -75,8 +57,7 @@ NEXTS = {"nothing": b"", "shorter": NEXT, "longer": LONGER}
 def card_has(world: World, path: bytes) -> bytes | None:
     """Return what the card has under the name, None if it has none."""
     folder, _, name = path.rpartition(b"/")
-    there = any(entry.name == name for entry in world.tree.entries(folder))
-    return world.tree.data(path) if there else None
+    return world.tree.data(path) if name in names_on_card(world, folder) else None
 
 
 async def empty_after(
@@ -118,16 +99,11 @@ async def empty_after(
         await file.release()
         if taken is not None:
             assert tree.undelivered() == []
-            for _ in range(2):
-                names = {name for name, _ in await tree.list(folder)}
-                await trio.sleep(5)
-                tree.forget_caches()
-            assert not any(is_reserved(name) for name in names)
+            await names_shown(tree, folder)
             assert (await tree.stat(path)).size == len(NEXTS[then])
         nursery.cancel_scope.cancel()
     if taken is not None:
-        left = [entry.name for entry in world.tree.entries(folder) if not entry.name.startswith(b"..")]
-        assert set(left) - {b"."} == {b"file"}, f"{left} after request {count}"
+        assert names_on_card(world, folder) == {b"file"}, f"after request {count}"
         assert world.tree.data(path) == NEXTS[then], f"after request {count}"
     return taken
 

@@ -1,0 +1,65 @@
+"""Files on their way to each server, for the tests of what happens to them in mid-delivery."""
+
+from __future__ import annotations
+
+from collections.abc import Awaitable, Callable
+
+import trio
+
+from mavftpfs.cache.asides import is_reserved
+from mavftpfs.cache.openfile import OpenFile
+from mavftpfs.cache.tree import Tree
+from mavftpfs.sim.linkmodel import LinkSettings
+from tests.support.trees import content
+from tests.support.worlds import World
+
+OLD, NEW = content("old", 3000), content("new", 3500)
+GOOD = LinkSettings(rate=50_000.0, delay=0.02)
+BAD = LinkSettings(rate=50_000.0, delay=0.02, loss=0.05, duplicate=0.05, reorder=0.05)
+SLOW = LinkSettings(rate=6000.0, delay=0.05)
+LONG = content("long", 60_000)
+MOMENTS = (0.1, 1.0, 5.0, 9.0)
+"""Seconds since the delivery of that began; it takes 11 and more on the slow link."""
+
+PROMPT = 2.0
+"""Seconds for a few round trips on that link, with what is in its queue at the time."""
+
+PROFILES = ("px4", "px4-nuttx", "ardupilot", "littlefs", "mavsdk")
+NO_RENAME = "littlefs"
+MOST_REQUESTS = 120
+
+Write = Callable[[Tree, bytes], Awaitable[OpenFile]]
+"""Makes a file, or changes the one that is there (OLD); nothing of that is delivered."""
+
+
+async def create(tree: Tree, path: bytes) -> OpenFile:
+    await tree.unlink(path)
+    file = await tree.create(path, exclusive=True)
+    await file.write(0, NEW)
+    return file
+
+
+async def replace(tree: Tree, path: bytes) -> OpenFile:
+    file = await tree.open(path, write=True, truncate=True)
+    await file.write(0, NEW)
+    return file
+
+
+async def change(tree: Tree, path: bytes) -> OpenFile:
+    file = await tree.open(path, write=True)
+    await file.write(100, NEW[100:])
+    return file
+
+
+async def names_shown(tree: Tree, folder: bytes) -> set[bytes]:
+    """Return the names that a program sees once all that follows by itself did; none of them is ours."""
+    for _ in range(2):
+        names = {name for name, _ in await tree.list(folder)}
+        await trio.sleep(5)
+        tree.forget_caches()
+    assert not any(is_reserved(name) for name in names)
+    return names
+
+
+def names_on_card(world: World, folder: bytes) -> set[bytes]:
+    return {entry.name for entry in world.tree.entries(folder)} - {b".", b".."}
