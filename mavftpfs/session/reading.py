@@ -128,6 +128,8 @@ class Reading:
         try:
             while self._go_on(stream, transfer, started):
                 others = self._steer(transfer, stream)
+                # What woke us may be a new want, and with nothing in flight no answer would send for it.
+                self._driver.kick()
                 await self._holder.sleep(_OFTEN if others else STALL / 2)
                 if self._stalled(transfer):
                     raise SessionLost("no answer for a while during a read", by_server=False)

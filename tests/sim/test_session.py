@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import random
-
 import pytest
 import trio
 from trio.testing import MockClock
@@ -13,25 +11,11 @@ from mavftpfs.session.connection import ConnectOptions
 from mavftpfs.shared.errors import FtpNak, RequestTimeout, VehicleLost
 from mavftpfs.sim.linkmodel import LinkSettings
 from mavftpfs.sim.profiles import PROFILES
-from tests.support.worlds import GOOD_LINK, ROOTS, MemorySink, World, read_file
+from tests.support.uploads import content, path, world
+from tests.support.worlds import MemorySink, read_file
 
 EVERY_PROFILE = sorted(PROFILES)
 BAD = LinkSettings(rate=60_000.0, delay=0.02, loss=0.1, duplicate=0.02, reorder=0.05)
-
-
-def content(size: int, seed: int = 0) -> bytes:
-    return random.Random(seed).randbytes(size)
-
-
-def world(profile: str, settings: LinkSettings = GOOD_LINK, **files: bytes) -> World:
-    made = World(profile, settings)
-    for name, data in files.items():
-        made.tree.add(path(profile, name), data)
-    return made
-
-
-def path(profile: str, name: str) -> bytes:
-    return ROOTS.get(profile, b"") + b"/d/" + name.encode()
 
 
 @pytest.mark.parametrize("profile", EVERY_PROFILE)
@@ -77,6 +61,42 @@ async def test_several_files_at_once_share_the_session(profile: str, autojump: M
             nursery.start_soon(fetch, name)
     assert got == files
     assert here.vehicle.server.open_sessions == 0
+
+
+@pytest.mark.parametrize("profile", EVERY_PROFILE)
+async def test_what_is_asked_for_as_the_last_bytes_come_goes_out_at_once(
+    profile: str, autojump: MockClock
+) -> None:
+    """It may be asked for before who serves the session has seen that it has nothing more to do."""
+    rtt, step, steps = 0.1, 239, 60
+    here = world(profile, LinkSettings(rate=1e6, delay=rtt / 2), f=content(steps * step))
+    async with here.connection() as connection:
+        sink = MemorySink(steps * step)
+        reader = await connection.store.open_reader(path(profile, "f"), sink)
+        began = trio.current_time()
+        for start in range(0, steps * step, step):
+            reader.want(start, start + step, demand=True)
+            await sink.wait_for(start, start + step)
+        assert trio.current_time() - began < 1.2 * steps * rtt
+        reader.close()
+
+
+@pytest.mark.parametrize("profile", EVERY_PROFILE)
+async def test_what_is_asked_for_meanwhile_does_not_wait_for_an_answer(
+    profile: str, autojump: MockClock
+) -> None:
+    rtt = 1.0
+    here = world(profile, LinkSettings(rate=1e6, delay=rtt / 2), f=content(478))
+    async with here.connection() as connection:
+        sink = MemorySink(478)
+        reader = await connection.store.open_reader(path(profile, "f"), sink)
+        began = trio.current_time()
+        reader.want(0, 239, demand=True)
+        await trio.sleep(0.5 * rtt)
+        reader.want(239, 478, demand=True)
+        await sink.wait_for(0, 478)
+        assert trio.current_time() - began < 1.8 * rtt
+        reader.close()
 
 
 @pytest.mark.parametrize("profile", EVERY_PROFILE)
