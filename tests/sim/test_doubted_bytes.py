@@ -19,7 +19,7 @@ from mavftpfs.protocol.payload import Opcode
 from mavftpfs.shared.errors import MavftpfsError
 from mavftpfs.sim.linkmodel import LinkSettings
 from mavftpfs.sim.profiles import PROFILES
-from tests.support.faults import Faults
+from tests.support.faults import Faults, power_goes_at_close
 from tests.support.mounting import mounted
 from tests.support.takingturns import taking_turns
 from tests.support.worlds import ROOTS, World
@@ -165,19 +165,8 @@ async def test_the_power_went_between_the_last_answer_and_the_close(
         await file.fsync()
         await trio.sleep(30)
         before = bytes(world.tree.data(root + b"/f"))
-        server = world.vehicle.server
-        handle = server.handle
-
-        def power_cut(wire: bytes, source: Address, now: float) -> None:
-            if wire[3] != Opcode.TERMINATE_SESSION:
-                handle(wire, source, now)
-                return
-            server.handle = handle  # type: ignore[method-assign]
-            world.vehicle.reboot(now, downtime, beat_after=beat_after)
-            world.tree.add(root + b"/f", before)
-
         await file.write(1000, b"B" * 100)
-        server.handle = power_cut  # type: ignore[method-assign]
+        power_goes_at_close(world, root + b"/f", before, downtime=downtime, beat_after=beat_after)
         await file.fsync()
         assert bytes(world.tree.data(root + b"/f")) == before[:1000] + b"B" * 100 + before[1100:]
         file.close()

@@ -21,10 +21,10 @@ from mavftpfs.shared.errors import DataUnproven
 from mavftpfs.sim.linkmodel import LinkSettings
 from mavftpfs.sim.profiles import PROFILES
 from tests.sim.test_doubted_bytes import CLEAN, DOUBLING, KEEPING
-from tests.sim.test_upload import content, path, world
 from tests.support.latecomers import Latecomer
 from tests.support.mounting import mounted
 from tests.support.takingturns import taking_turns
+from tests.support.uploads import content, path, world
 from tests.support.worlds import World
 
 EVERY_PROFILE = sorted(PROFILES)

@@ -18,12 +18,12 @@ from mavftpfs.session.echoes import QUIET
 from mavftpfs.shared.errors import RequestTimeout
 from mavftpfs.sim.linkmodel import LinkSettings
 from mavftpfs.sim.profiles import PROFILES
-from tests.sim.test_stragglers import append, double
-from tests.sim.test_upload import content, path, probes, put, world
+from tests.sim.test_stragglers import double
 from tests.support.faults import Faults
 from tests.support.latecomers import Latecomer
 from tests.support.mounting import writable_tree
 from tests.support.takingturns import taking_turns
+from tests.support.uploads import append, content, path, probe, put, world
 from tests.support.worlds import MemorySink, World, read_file
 
 EVERY_PROFILE = sorted(PROFILES)
@@ -43,13 +43,13 @@ async def test_a_copy_does_not_teach_what_the_server_does_not_do(
 ) -> None:
     plain = world(profile)
     async with plain.connection() as connection:
-        await connection.store.probe_open_for_write(*probes(profile))
+        await probe(connection, profile)
         truth = connection.store.traits
     here = world(profile, DOUBLING)
     async with here.connection() as connection:
         await connection.store.list_directory(path(profile, ""))  # answered twice
         copy = Latecomer(here, what, after=after)
-        await connection.store.probe_open_for_write(*probes(profile))
+        await probe(connection, profile)
         assert copy.late is not None
         assert copy.late < QUIET[0]
         assert connection.store.traits == truth

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import random
 from collections.abc import Awaitable, Callable
 
 import pytest
@@ -21,28 +20,13 @@ from mavftpfs.sim.profiles import PROFILES, Storage
 from tests.support.faults import Faults
 from tests.support.sources import MemorySource
 from tests.support.takingturns import taking_turns
-from tests.support.worlds import GOOD_LINK, ROOTS, MemorySink, World, read_file
+from tests.support.uploads import content, path, probe, world
+from tests.support.worlds import ROOTS, MemorySink, World, read_file
 
 EVERY_PROFILE = sorted(PROFILES)
 RENAMING = [name for name in EVERY_PROFILE if PROFILES[name].storage is not Storage.LITTLEFS]
 TRUNCATING = [name for name in EVERY_PROFILE if PROFILES[name].truncate_file and name != "px4-nuttx"]
 BAD = LinkSettings(rate=60_000.0, delay=0.02, loss=0.25)
-
-
-def path(profile: str, name: str) -> bytes:
-    return ROOTS.get(profile, b"") + b"/d/" + name.encode()
-
-
-def probes(profile: str) -> tuple[bytes, bytes]:
-    return path(profile, ".mavftpfs-aaaadaaa"), path(profile, ".mavftpfs-aaaadaab")
-
-
-def world(profile: str, settings: LinkSettings = GOOD_LINK, **files: bytes) -> World:
-    made = World(profile, settings)
-    made.tree.add_directory(path(profile, "")[:-1])
-    for name, data in files.items():
-        made.tree.add(path(profile, name), data)
-    return made
 
 
 def names(here: World) -> list[bytes]:
@@ -227,7 +211,7 @@ async def test_our_own_session_is_closed_before_a_path_changes(profile: str, aut
 
 @pytest.mark.parametrize("profile", RENAMING)
 async def test_readers_follow_a_rename(profile: str, autojump: MockClock) -> None:
-    data = random.Random(1).randbytes(40_000)
+    data = content(40_000)
     here = world(profile, LinkSettings(rate=20_000.0, delay=0.02))
     here.tree.add(path(profile, "dir/file"), data)
     faults = Faults(here)
@@ -254,7 +238,7 @@ async def test_an_upload_makes_room_for_a_change_of_its_path(
     open_then: list[list[bytes]] = []
     async with here.connection() as connection:
         if probed:
-            await connection.store.probe_open_for_write(*probes(profile))
+            await probe(connection, profile)
         source = MemorySource(bytes(300_000))
         upload = await connection.store.open_upload(path(profile, "file"), source, create=True)
         await trio.sleep(1)

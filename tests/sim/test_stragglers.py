@@ -20,11 +20,10 @@ from mavftpfs.sim.profiles import PROFILES
 from tests.sim.test_arming_replacement import NEW, Scene, replace
 from tests.sim.test_doubted_bytes import CLEAN, KEEPING
 from tests.sim.test_late_writes import change
-from tests.sim.test_upload import content
 from tests.support.mounting import mounted
-from tests.support.sources import MemorySource
 from tests.support.takingturns import taking_turns
-from tests.support.worlds import ROOTS, World
+from tests.support.uploads import append, content, path, put, world
+from tests.support.worlds import World
 
 DOUBLING = LinkSettings(delay=0.02, duplicate=1.0, reorder=0.1)
 LATE = 0.1
@@ -78,17 +77,27 @@ def double(
     server.handle = watch  # type: ignore[method-assign]
 
 
-async def put(connection: Connection, path: bytes, data: bytes) -> None:
-    upload = await connection.store.open_upload(path, MemorySource(data), create=True)
-    await upload.finish()
-    await upload.abort()
+async def rename_late(here: World, connection: Connection, late: float, nursery: trio.Nursery) -> None:
+    """Rename a file and make another one of its old name, with the rename coming once more."""
+    double(here, Opcode.RENAME, late, nursery.start_soon)
+    await connection.store.rename(b"/d/old", b"/d/new")
+    await put(connection, b"/d/old", SECOND)
+    await trio.sleep(late + 1)
+
+
+async def create_late(here: World, connection: Connection, late: float, nursery: trio.Nursery) -> bytes:
+    """Make a file with its CreateFile coming once more; return what it was when it was said to be there:
+    emptied by then, or not at all."""
+    double(here, Opcode.CREATE_FILE, late, nursery.start_soon)
+    await put(connection, path(here.profile, "first"), FIRST)
+    verified = here.tree.data(path(here.profile, "first"))
+    await trio.sleep(late + 1)
+    return verified
 
 
 @pytest.mark.parametrize("profile", sorted(PROFILES))
 async def test_a_late_write_does_not_reach_the_next_file(profile: str, autojump: MockClock) -> None:
-    here = World(profile, DOUBLING)
-    root = ROOTS.get(profile, b"") + b"/d"
-    here.tree.add_directory(root)
+    here, root = world(profile, DOUBLING), path(profile, "")[:-1]
     async with trio.open_nursery() as nursery, here.connection() as connection:
         await connection.store.list_directory(root)  # answered twice, which shows what this link does
         hold_back_a_write(here, nursery.start_soon)
@@ -99,8 +108,7 @@ async def test_a_late_write_does_not_reach_the_next_file(profile: str, autojump:
 
 
 async def test_a_link_that_keeps_the_order_costs_no_wait(autojump: MockClock) -> None:
-    here = World("px4", LinkSettings(delay=0.02))
-    here.tree.add_directory(b"/d")
+    here = world("px4", LinkSettings(delay=0.02))
     async with here.connection() as connection:
         await connection.store.list_directory(b"/d")
         began = trio.current_time()
@@ -113,14 +121,10 @@ async def test_a_link_that_keeps_the_order_costs_no_wait(autojump: MockClock) ->
 async def test_a_late_rename_does_not_take_the_next_file_of_that_name(
     profile: str, autojump: MockClock
 ) -> None:
-    here = World(profile, DOUBLING)
-    here.tree.add(b"/d/old", FIRST)
+    here = world(profile, DOUBLING, old=FIRST)
     async with trio.open_nursery() as nursery, here.connection() as connection:
         await connection.store.list_directory(b"/d")
-        double(here, Opcode.RENAME, LATE, nursery.start_soon)
-        await connection.store.rename(b"/d/old", b"/d/new")
-        await put(connection, b"/d/old", SECOND)
-        await trio.sleep(1)
+        await rename_late(here, connection, LATE, nursery)
     assert here.tree.data(b"/d/new") == FIRST
     assert here.tree.data(b"/d/old") == SECOND
 
@@ -140,9 +144,7 @@ async def test_a_late_removal_does_not_take_the_next_directory(autojump: MockClo
 @pytest.mark.parametrize("profile", taking_turns(KEEPING))
 async def test_a_name_that_was_removed_does_not_come_back(profile: str, autojump: MockClock) -> None:
     """OpenFileWO makes missing files on most servers."""
-    here = World(profile, DOUBLING)
-    name = ROOTS.get(profile, b"") + b"/d/f"
-    here.tree.add(name, content(100))
+    here, name = world(profile, DOUBLING, f=content(100)), path(profile, "f")
     async with trio.open_nursery() as nursery, here.connection() as connection:
         connection.store.traits.wo_truncates = False
         await connection.store.list_directory(split(name)[0])
@@ -159,10 +161,8 @@ async def test_what_was_written_to_a_file_does_not_come_to_the_next_of_its_name(
     profile: str, autojump: MockClock
 ) -> None:
     """OpenFileWO and WriteFile come once more, both: only so a write finds the file that took the place."""
-    here = World(profile, DOUBLING)
-    name, other = (ROOTS.get(profile, b"") + b"/d/" + end for end in (b"f", b"g"))
-    here.tree.add(name, content(100))
-    here.tree.add(other, content(1000, 2))
+    here = world(profile, DOUBLING, f=content(100), g=content(1000, 2))
+    name, other = path(profile, "f"), path(profile, "g")
     async with trio.open_nursery() as nursery, here.connection() as connection:
         connection.store.traits.wo_truncates = False
         await connection.store.list_directory(split(name)[0])
@@ -195,9 +195,7 @@ async def test_a_late_rename_of_the_old_file_does_not_take_the_new_one(
 @pytest.mark.parametrize("profile", sorted(PROFILES))
 async def test_a_late_create_does_not_lock_us_out(profile: str, autojump: MockClock) -> None:
     """ArduPilot opens the file again, under our id, and refuses all others until we close it."""
-    here = World(profile, DOUBLING)
-    root = ROOTS.get(profile, b"") + b"/d"
-    here.tree.add_directory(root)
+    here, root = world(profile, DOUBLING), path(profile, "")[:-1]
     async with trio.open_nursery() as nursery, here.connection() as connection:
         await connection.store.list_directory(root)
         double(here, Opcode.CREATE_FILE, 0.3, nursery.start_soon)
@@ -211,30 +209,15 @@ async def test_a_late_create_does_not_lock_us_out(profile: str, autojump: MockCl
 async def test_a_late_create_empties_nothing_that_is_said_to_be_there(
     profile: str, autojump: MockClock
 ) -> None:
-    here = World(profile, DOUBLING)
-    root = ROOTS.get(profile, b"") + b"/d"
-    here.tree.add_directory(root)
+    here, root = world(profile, DOUBLING), path(profile, "")[:-1]
     async with trio.open_nursery() as nursery, here.connection() as connection:
         await connection.store.list_directory(root)
-        double(here, Opcode.CREATE_FILE, 0.24, nursery.start_soon)
-        await put(connection, root + b"/first", FIRST)
-        verified = here.tree.data(root + b"/first")  # emptied by now, or not at all
-        await trio.sleep(1)
-    assert here.tree.data(root + b"/first") == verified
+        verified = await create_late(here, connection, 0.24, nursery)
+    assert here.tree.data(path(profile, "first")) == verified
 
 
 VERY_LATE = 3.0
 """Seconds; QUIET is one at most."""
-
-
-async def append(connection: Connection, target: bytes, data: bytes, at: int) -> None:
-    """Change a file in place."""
-    source = MemorySource(bytes(at) + data)
-    source.dirty.discard(0, at)
-    source.proven.add(0, at)
-    upload = await connection.store.open_upload(target, source, create=False)
-    await upload.finish()
-    await upload.abort()
 
 
 async def show(here: World, connection: Connection, root: bytes, late: float, nursery: trio.Nursery) -> None:
@@ -254,11 +237,9 @@ async def test_a_write_as_late_as_others_were_does_not_reach_the_next_file(
     profile: str, autojump: MockClock
 ) -> None:
     """Its answer is lost, so that nothing but the time keeps it from there."""
-    here = World(profile, LinkSettings(delay=0.02, rate=5760.0))
-    root = ROOTS.get(profile, b"") + b"/d"
     old = content(20_000)
-    for name in (b"/first", b"/second"):
-        here.tree.add(root + name, old)
+    here = world(profile, LinkSettings(delay=0.02, rate=5760.0), first=old, second=old)
+    root = path(profile, "")[:-1]
     async with trio.open_nursery() as nursery, mounted(here, root) as (connection, tree):
         await change(tree, root + b"/first", 1, b"x")  # tries out what the server does
         await show(here, connection, root, VERY_LATE + 0.1, nursery)
@@ -275,29 +256,20 @@ async def test_a_write_as_late_as_others_were_does_not_reach_the_next_file(
 async def test_a_create_as_late_as_others_were_empties_nothing_that_is_said_to_be_there(
     profile: str, autojump: MockClock
 ) -> None:
-    here = World(profile, CLEAN)
-    root = ROOTS.get(profile, b"") + b"/d"
-    here.tree.add_directory(root)
+    here, root = world(profile, CLEAN), path(profile, "")[:-1]
     async with trio.open_nursery() as nursery, here.connection() as connection:
         await show(here, connection, root, VERY_LATE + 0.1, nursery)
-        double(here, Opcode.CREATE_FILE, VERY_LATE, nursery.start_soon)
-        await put(connection, root + b"/first", FIRST)
-        verified = here.tree.data(root + b"/first")  # emptied by now, or not at all
-        await trio.sleep(VERY_LATE)
-    assert here.tree.data(root + b"/first") == verified
+        verified = await create_late(here, connection, VERY_LATE, nursery)
+    assert here.tree.data(path(profile, "first")) == verified
 
 
 @pytest.mark.parametrize("profile", ["mavsdk", "ardupilot", "px4"])
 async def test_a_rename_as_late_as_others_were_does_not_take_the_next_file(
     profile: str, autojump: MockClock
 ) -> None:
-    here = World(profile, CLEAN)
-    here.tree.add(b"/d/old", FIRST)
+    here = world(profile, CLEAN, old=FIRST)
     async with trio.open_nursery() as nursery, here.connection() as connection:
         await show(here, connection, b"/d", VERY_LATE + 0.1, nursery)
-        double(here, Opcode.RENAME, VERY_LATE, nursery.start_soon)
-        await connection.store.rename(b"/d/old", b"/d/new")
-        await put(connection, b"/d/old", SECOND)
-        await trio.sleep(VERY_LATE)
+        await rename_late(here, connection, VERY_LATE, nursery)
     assert here.tree.data(b"/d/new") == FIRST
     assert here.tree.data(b"/d/old") == SECOND

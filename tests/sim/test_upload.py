@@ -2,52 +2,19 @@
 
 from __future__ import annotations
 
-import random
-
 import pytest
 import trio
 from trio.testing import MockClock
 
 from mavftpfs.protocol.payload import Opcode
-from mavftpfs.session.connection import Connection
 from mavftpfs.sim.linkmodel import LinkSettings
 from mavftpfs.sim.profiles import PROFILES
-from tests.support.sources import MemorySource
-from tests.support.worlds import GOOD_LINK, ROOTS, World, read_file
+from tests.support.uploads import content, path, probe, put, world
+from tests.support.worlds import read_file
 
 EVERY_PROFILE = sorted(PROFILES)
 BAD = LinkSettings(rate=60_000.0, delay=0.02, loss=0.1, duplicate=0.02, reorder=0.05)
 PLAIN = LinkSettings(rate=60_000.0, delay=0.02)
-
-
-def content(size: int, seed: int = 0) -> bytes:
-    return random.Random(seed).randbytes(size)
-
-
-def path(profile: str, name: str) -> bytes:
-    return ROOTS.get(profile, b"") + b"/d/" + name.encode()
-
-
-def probes(profile: str) -> tuple[bytes, bytes]:
-    return path(profile, ".mavftpfs-aaaadaaa"), path(profile, ".mavftpfs-aaaadaab")
-
-
-def world(profile: str, settings: LinkSettings = GOOD_LINK, **files: bytes) -> World:
-    made = World(profile, settings)
-    made.tree.add_directory(path(profile, "")[:-1])
-    for name, data in files.items():
-        made.tree.add(path(profile, name), data)
-    return made
-
-
-async def put(connection: Connection, target: bytes, data: bytes) -> MemorySource:
-    """Upload a whole file."""
-    source = MemorySource(data)
-    upload = await connection.store.open_upload(target, source, create=True)
-    await upload.finish()
-    assert source.all_proven
-    await upload.abort()
-    return source
 
 
 @pytest.mark.parametrize("profile", EVERY_PROFILE)
@@ -80,7 +47,7 @@ async def test_two_uploads_and_a_reader_at_once(profile: str, probed: bool, auto
     got: list[bytes] = []
     async with here.connection() as connection:
         if probed:
-            await connection.store.probe_open_for_write(*probes(profile))
+            await probe(connection, profile)
         async with trio.open_nursery() as nursery:
 
             async def read() -> None:
@@ -101,7 +68,7 @@ async def test_the_probe_learns_what_the_profile_says(profile: str, autojump: Mo
     here = world(profile, LinkSettings(rate=60_000.0, delay=0.02, loss=0.05))
     facts = PROFILES[profile]
     async with here.connection() as connection:
-        await connection.store.probe_open_for_write(*probes(profile))
+        await probe(connection, profile)
         traits = connection.store.traits
         assert traits.wo_truncates is facts.write_only_truncates
         assert traits.wo_creates is (facts.write_only_creates or facts.name == "spec")

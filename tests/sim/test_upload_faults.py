@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import random
-
 import pytest
 import trio
 from trio.testing import MockClock
@@ -11,49 +9,19 @@ from trio.testing import MockClock
 from mavftpfs.link.messages import Address
 from mavftpfs.protocol.operations import Simple
 from mavftpfs.protocol.payload import Opcode, request
-from mavftpfs.session.connection import Connection, ConnectOptions
-from mavftpfs.session.upload import QueuedUpload
+from mavftpfs.session.connection import ConnectOptions
 from mavftpfs.shared.errnos import errno_for
 from mavftpfs.shared.errors import Armed, FtpNak, MavftpfsError, RequestTimeout, SpoolFailed, VehicleLost
 from mavftpfs.sim.linkmodel import LinkSettings
 from mavftpfs.sim.profiles import PROFILES
-from tests.support.faults import Faults
+from tests.support.faults import Faults, power_goes_at_close
 from tests.support.sources import MemorySource
-from tests.support.worlds import GOOD_LINK, ROOTS, MemorySink, World, read_file
+from tests.support.uploads import content, path, probe, start, under_way, world
+from tests.support.worlds import MemorySink, World, read_file
 
 EVERY_PROFILE = sorted(PROFILES)
 PLAIN = LinkSettings(rate=20_000.0, delay=0.02)
 QUICK = ConnectOptions(op_deadline=5.0)
-
-
-def content(size: int, seed: int = 0) -> bytes:
-    return random.Random(seed).randbytes(size)
-
-
-def path(profile: str, name: str) -> bytes:
-    return ROOTS.get(profile, b"") + b"/d/" + name.encode()
-
-
-def probes(profile: str) -> tuple[bytes, bytes]:
-    return path(profile, ".mavftpfs-aaaadaaa"), path(profile, ".mavftpfs-aaaadaab")
-
-
-def world(profile: str, settings: LinkSettings = GOOD_LINK, **files: bytes) -> World:
-    made = World(profile, settings)
-    made.tree.add_directory(path(profile, "")[:-1])
-    for name, data in files.items():
-        made.tree.add(path(profile, name), data)
-    return made
-
-
-async def probe(connection: Connection, profile: str) -> None:
-    await connection.store.probe_open_for_write(*probes(profile))
-
-
-async def start(
-    connection: Connection, profile: str, source: MemorySource, name: str = "new"
-) -> QueuedUpload:
-    return await connection.store.open_upload(path(profile, name), source, create=True)
 
 
 @pytest.mark.parametrize("profile", EVERY_PROFILE)
@@ -165,11 +133,7 @@ async def test_a_cut_in_mid_upload_is_bridged(
     async with here.connection() as connection:
         if probed:
             await probe(connection, profile)
-        source = MemorySource(data)
-        upload = await start(connection, profile, source)
-        async with trio.open_nursery() as nursery:
-            nursery.start_soon(upload.finish)
-            await trio.sleep(1.5)
+        async with under_way(connection, profile, data) as source:
             here.link.cut()
             await trio.sleep(length)
             here.link.restore()
@@ -191,11 +155,7 @@ async def test_a_reboot_in_mid_upload_is_bridged(profile: str, probed: bool, aut
         if probed:
             await probe(connection, profile)
         await trio.sleep(5)
-        source = MemorySource(data)
-        upload = await start(connection, profile, source)
-        async with trio.open_nursery() as nursery:
-            nursery.start_soon(upload.finish)
-            await trio.sleep(1.5)
+        async with under_way(connection, profile, data) as source:
             here.vehicle.reboot(trio.current_time(), downtime=4.0)
             here.link.kick()
         assert source.all_proven
@@ -213,10 +173,7 @@ async def test_what_was_opened_before_the_news_of_a_restart_is_closed(
     here = world(profile, PLAIN)
     async with here.connection() as connection:
         await trio.sleep(5)
-        upload = await start(connection, profile, MemorySource(data))
-        async with trio.open_nursery() as nursery:
-            nursery.start_soon(upload.finish)
-            await trio.sleep(1.5)
+        async with under_way(connection, profile, data):
             here.vehicle.reboot(trio.current_time(), beat_after=0.9)
             here.link.kick()
             began = trio.current_time()
@@ -236,11 +193,7 @@ async def test_a_session_taken_away_is_got_back(profile: str, probed: bool, auto
     async with here.connection() as connection:
         if probed:
             await probe(connection, profile)
-        source = MemorySource(data)
-        upload = await start(connection, profile, source)
-        async with trio.open_nursery() as nursery:
-            nursery.start_soon(upload.finish)
-            await trio.sleep(1.5)
+        async with under_way(connection, profile, data) as source:
             session = connection.scheduler.session
             assert session is not None
             wire = request(77, Opcode.TERMINATE_SESSION, session=session.id).encode()
@@ -288,18 +241,7 @@ async def test_the_power_goes_while_a_file_that_became_too_long_is_closed(
         connection.store.traits.wo_truncates = False
         await trio.sleep(30)
         here.tree.capacity = len(old)
-        server = here.vehicle.server
-        handle = server.handle
-
-        def power_cut(wire: bytes, source: Address, now: float) -> None:
-            if wire[3] != Opcode.TERMINATE_SESSION:
-                handle(wire, source, now)
-                return
-            server.handle = handle  # type: ignore[method-assign]
-            here.vehicle.reboot(now, downtime, beat_after=beat_after)
-            here.tree.add(target, old)
-
-        server.handle = power_cut  # type: ignore[method-assign]
+        power_goes_at_close(here, target, old, downtime=downtime, beat_after=beat_after)
         upload = await connection.store.open_upload(target, MemorySource(new), create=False)
         with pytest.raises(FtpNak):
             await upload.finish()
@@ -465,11 +407,7 @@ async def test_what_cannot_be_interrupted_keeps_readers_waiting_until_their_dead
     here = world(profile, LinkSettings(rate=5_000.0, delay=0.02), old=b"hello")
     async with here.connection() as connection:
         await probe(connection, profile)
-        source = MemorySource(data)
-        upload = await start(connection, profile, source)
-        async with trio.open_nursery() as nursery:
-            nursery.start_soon(upload.finish)
-            await trio.sleep(1.5)
+        async with under_way(connection, profile, data) as source:
             began = trio.current_time()
             with pytest.raises(RequestTimeout):
                 await read_file(connection, path(profile, "old"))
@@ -508,11 +446,7 @@ async def test_what_can_be_interrupted_makes_room_at_once(autojump: MockClock) -
     async with here.connection() as connection:
         await probe(connection, "px4")
         faults.requests.clear()
-        source = MemorySource(data)
-        upload = await start(connection, "px4", source)
-        async with trio.open_nursery() as nursery:
-            nursery.start_soon(upload.finish)
-            await trio.sleep(5)
+        async with under_way(connection, "px4", data, seconds=5) as source:
             began = trio.current_time()
             assert await read_file(connection, b"/d/old") == b"hello"
             assert trio.current_time() - began < 3
@@ -529,11 +463,7 @@ async def test_path_operations_beside_an_upload_on_nuttx(autojump: MockClock) ->
     here.tree.add(b"/etc/init.d/rcS", b"#")
     faults = Faults(here)
     async with here.connection() as connection:
-        source = MemorySource(data)
-        upload = await start(connection, "px4-nuttx", source)
-        async with trio.open_nursery() as nursery:
-            nursery.start_soon(upload.finish)
-            await trio.sleep(0.5)
+        async with under_way(connection, "px4-nuttx", data, seconds=0.5) as source:
             for _ in range(8):
                 await connection.store.list_directory(b"/etc/init.d")
                 await trio.sleep(0.3)
@@ -550,11 +480,7 @@ async def test_a_write_after_silence_on_nuttx(autojump: MockClock) -> None:
     data = content(60_000)
     here = world("px4-nuttx", PLAIN)
     async with here.connection() as connection:
-        source = MemorySource(data)
-        upload = await start(connection, "px4-nuttx", source)
-        async with trio.open_nursery() as nursery:
-            nursery.start_soon(upload.finish)
-            await trio.sleep(1.5)
+        async with under_way(connection, "px4-nuttx", data) as source:
             here.link.cut()
             await trio.sleep(4)
             here.link.restore()
@@ -642,11 +568,7 @@ async def test_with_another_client_about_silence_is_not_survived(probed: bool, a
     async with here.connection() as connection:
         if probed:
             await probe(connection, "mavsdk")
-        source = MemorySource(data)
-        upload = await start(connection, "mavsdk", source)
-        async with trio.open_nursery() as nursery:
-            nursery.start_soon(upload.finish)
-            await trio.sleep(1.5)
+        async with under_way(connection, "mavsdk", data) as source:
             listing = request(9, Opcode.LIST_DIRECTORY, data=b"/").encode()
             here.vehicle.foreign_request(listing, Address(255, 190), trio.current_time())
             here.link.kick()
@@ -800,11 +722,7 @@ async def test_who_gives_up_waiting_for_its_turn_does_not_stop_the_writer(autoju
     here.tree.add(b"/etc/rc", b"#")
     faults = Faults(here)
     async with here.connection() as connection:
-        source = MemorySource(data)
-        upload = await start(connection, "px4-nuttx", source)
-        async with trio.open_nursery() as nursery:
-            nursery.start_soon(upload.finish)
-            await trio.sleep(1)
+        async with under_way(connection, "px4-nuttx", data, seconds=1) as source:
             await connection.store.list_directory(b"/etc")
             await trio.sleep(5)
             asked = faults.requests.count(Opcode.LIST_DIRECTORY)

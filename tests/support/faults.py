@@ -77,3 +77,21 @@ class Faults:
 
     def _is_cut(self) -> bool:
         return self._cut_after is not None and len(self.requests) >= self._cut_after
+
+
+def power_goes_at_close(
+    world: World, path: bytes, left: bytes, *, downtime: float, beat_after: float
+) -> None:
+    """Have the vehicle restart where the next TerminateSession comes, with `left` in the file it was for."""
+    server = world.vehicle.server
+    handle = server.handle
+
+    def power_cut(wire: bytes, source: Address, now: float) -> None:
+        if wire[_OPCODE] != Opcode.TERMINATE_SESSION:
+            handle(wire, source, now)
+            return
+        server.handle = handle  # type: ignore[method-assign]
+        world.vehicle.reboot(now, downtime, beat_after=beat_after)
+        world.tree.add(path, left)
+
+    server.handle = power_cut  # type: ignore[method-assign]
