@@ -6,12 +6,14 @@ The server's session is closed when nobody wanted bytes for a while. Virtual tim
 from __future__ import annotations
 
 import random
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
 
 import pytest
 import trio
 from trio.testing import MockClock
 
-from mavftpfs.cache.tree import OpenFile
+from mavftpfs.cache.tree import OpenFile, Tree
 from mavftpfs.shared.errors import FileChanged
 from mavftpfs.sim.linkmodel import LinkSettings
 from tests.sim.test_replaced import STEP, copy, mounted
@@ -42,6 +44,21 @@ class Card:
         self.world.tree.add(folder + b"other", data, mtime)
         self.world.tree.rename(folder + b"other", self.path)
 
+    @asynccontextmanager
+    async def opened(self) -> AsyncIterator[tuple[Tree, OpenFile]]:
+        """Mount it and open the file."""
+        async with self.world.connection() as connection:
+            tree = mounted(connection)
+            handle = await tree.open(self.path)
+            yield tree, handle
+            handle.close()
+
+
+async def read_head(handle: OpenFile) -> None:
+    """Read the first bytes, and wait until the session is closed."""
+    assert await handle.read(0, STEP) == OLD[:STEP]
+    await trio.sleep(IDLE)
+
 
 async def read_on(handle: OpenFile, start: int) -> bytes:
     """Read from there to the end."""
@@ -51,11 +68,8 @@ async def read_on(handle: OpenFile, start: int) -> bytes:
 @pytest.mark.parametrize("profile", TIMED)
 async def test_an_open_descriptor_gets_no_bytes_of_a_successor(profile: str, autojump: MockClock) -> None:
     card = Card(profile)
-    async with card.world.connection() as connection:
-        tree = mounted(connection)
-        handle = await tree.open(card.path)
-        assert await handle.read(0, STEP) == OLD[:STEP]
-        await trio.sleep(IDLE)
+    async with card.opened() as (tree, handle):
+        await read_head(handle)
         card.replace()
         with pytest.raises(FileChanged):
             await read_on(handle, STEP)
@@ -66,9 +80,7 @@ async def test_an_open_descriptor_gets_no_bytes_of_a_successor(profile: str, aut
 @pytest.mark.parametrize("profile", TIMED)
 async def test_a_copy_is_not_of_a_cached_head_and_another_file(profile: str, autojump: MockClock) -> None:
     card = Card(profile)
-    async with card.world.connection() as connection:
-        tree = mounted(connection)
-        handle = await tree.open(card.path)
+    async with card.opened() as (tree, handle):
         assert await handle.read(0, STEP) == OLD[:STEP]
         handle.close()
         await trio.sleep(IDLE)
@@ -81,9 +93,7 @@ async def test_a_copy_is_not_of_a_cached_head_and_another_file(profile: str, aut
 @pytest.mark.parametrize("profile", TIMED)
 async def test_what_nobody_got_yet_is_read_anew(profile: str, autojump: MockClock) -> None:
     card = Card(profile)
-    async with card.world.connection() as connection:
-        tree = mounted(connection)
-        handle = await tree.open(card.path)
+    async with card.opened() as (_, handle):
         blocks = handle._version.blocks  # type: ignore[attr-defined]
         with trio.move_on_after(0.01):  # a read that is given up
             await handle.read(0, STEP)
@@ -95,15 +105,12 @@ async def test_what_nobody_got_yet_is_read_anew(profile: str, autojump: MockCloc
         assert await handle.read(0, len(OLD)) == NEW[: len(OLD)]
         await trio.sleep(IDLE)
         assert await read_on(handle, 0) == NEW[: len(OLD)]
-        handle.close()
 
 
 @pytest.mark.parametrize("profile", [*TIMED, *UNTIMED])
 async def test_the_same_file_is_read_on(profile: str, autojump: MockClock) -> None:
     card = Card(profile)
-    async with card.world.connection() as connection:
-        tree = mounted(connection)
-        handle = await tree.open(card.path)
+    async with card.opened() as (_, handle):
         parts = []
         for start in range(0, len(OLD), 100_000):
             await trio.sleep(IDLE)
@@ -115,40 +122,30 @@ async def test_the_same_file_is_read_on(profile: str, autojump: MockClock) -> No
 @pytest.mark.parametrize("profile", TIMED)
 async def test_a_file_that_grew_is_read_to_its_opened_size(profile: str, autojump: MockClock) -> None:
     card = Card(profile)
-    async with card.world.connection() as connection:
-        tree = mounted(connection)
-        handle = await tree.open(card.path)
-        assert await handle.read(0, STEP) == OLD[:STEP]
-        await trio.sleep(IDLE)
+    async with card.opened() as (_, handle):
+        await read_head(handle)
         card.replace(OLD + b"more")
         assert await read_on(handle, STEP) == OLD[STEP:]
-        handle.close()
 
 
 @pytest.mark.parametrize("profile", TIMED)
 async def test_a_newer_listing_ends_what_it_contradicts(profile: str, autojump: MockClock) -> None:
     card = Card(profile)
-    async with card.world.connection() as connection:
-        tree = mounted(connection)
-        handle = await tree.open(card.path)
+    async with card.opened() as (tree, handle):
         assert await read_on(handle, 0) == OLD
         card.replace()
         await trio.sleep(30.0)
         assert (await tree.stat(card.path)).mtime == THEN + 100
         with pytest.raises(FileChanged):
             await handle.read(0, STEP)
-        handle.close()
 
 
 @pytest.mark.parametrize("profile", UNTIMED)
 async def test_without_times_nothing_more_is_asked(profile: str, autojump: MockClock) -> None:
     card = Card(profile)
-    async with card.world.connection() as connection:
-        tree = mounted(connection)
-        handle = await tree.open(card.path)
-        assert await handle.read(0, STEP) == OLD[:STEP]
+    async with card.opened() as (tree, handle):
         sweeps = tree.status()["listings_asked"]
-        await trio.sleep(IDLE)
+        await read_head(handle)
         assert await read_on(handle, STEP) == OLD[STEP:]
         handle.close()
         assert tree.status()["listings_asked"] == sweeps
@@ -183,15 +180,11 @@ async def test_turns_of_two_readers_cost_few_listings(profile: str, autojump: Mo
 async def test_the_end_of_a_copy_by_turns_is_compared(profile: str, autojump: MockClock) -> None:
     """Between two comparisons bytes go out unproven, but for the last."""
     card = Card(profile)
-    async with card.world.connection() as connection:
-        tree = mounted(connection)
-        handle = await tree.open(card.path)
-        assert await handle.read(0, STEP) == OLD[:STEP]
-        await trio.sleep(IDLE)
+    async with card.opened() as (_, handle):
+        await read_head(handle)
         assert await handle.read(200_000, STEP) == OLD[200_000 : 200_000 + STEP]
         handle._version.blocks.openings.look_at = float("inf")  # type: ignore[attr-defined]
         await trio.sleep(IDLE)
         card.replace()
         with pytest.raises(FileChanged):
             await read_on(handle, 200_000)
-        handle.close()
