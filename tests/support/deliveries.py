@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Awaitable, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import asynccontextmanager
 
 import trio
 
@@ -59,6 +60,16 @@ async def names_shown(tree: Tree, folder: bytes) -> set[bytes]:
         tree.forget_caches()
     assert not any(is_reserved(name) for name in names)
     return names
+
+
+@asynccontextmanager
+async def in_the_middle(file: OpenFile, waiting: int = 1) -> AsyncIterator[None]:
+    """Enter when so many wait for the delivery, which takes some seconds; leaving waits for its end."""
+    async with trio.open_nursery() as nursery:
+        for _ in range(waiting):
+            nursery.start_soon(file.fsync)
+        await trio.sleep(1.05)
+        yield
 
 
 def names_on_card(world: World, folder: bytes) -> set[bytes]:

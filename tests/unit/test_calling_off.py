@@ -5,7 +5,8 @@ How names go in mid-delivery on every simulated server: tests/sim/test_calling_o
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Awaitable
+from typing import TypeVar
 
 import pytest
 import trio
@@ -16,6 +17,7 @@ from mavftpfs.cache.tree import Tree
 from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.shared.errors import AlreadyExists, FtpNak, MavftpfsError, NotFound, RequestTimeout
 from mavftpfs.shared.model import Listing, split
+from tests.support.deliveries import in_the_middle
 from tests.support.fake_writer import CHUNK, KINDS, FakeWriter, Kind, make_writable, write_file
 
 FILE, NEW, OTHER = b"/card/dir/file.txt", b"/card/dir/new", b"/card/dir/other"
@@ -38,13 +40,13 @@ async def store(
     nursery.cancel_scope.cancel()
 
 
-async def begun(tree: Tree, store: FakeWriter, path: bytes) -> OpenFile:
+async def begun(tree: Tree, store: FakeWriter, path: bytes, data: bytes = DATA) -> OpenFile:
     """Return a file with a few of its bytes on their way."""
     file = await (
         tree.create(path, exclusive=True) if path == NEW else tree.open(path, write=True, truncate=True)
     )
-    await file.write(0, DATA)
     store.write_delay = 0.1
+    await file.write(0, data)
     return file
 
 
@@ -60,10 +62,7 @@ async def test_a_name_that_stays_gets_its_file(
     """The program hears 0 when the card has it, as if nobody had tried."""
     tree = make_writable(store)
     file = await begun(tree, store, path)
-    async with trio.open_nursery() as waiting:
-        for _ in range(2):
-            waiting.start_soon(file.fsync)
-        await trio.sleep(1.05)
+    async with in_the_middle(file, waiting=2):
 
         def fail(what: object, *names: object) -> None:
             if what == "remove" and names == (path,):
@@ -84,9 +83,7 @@ async def test_a_name_that_stays_gets_its_file(
 async def test_a_rename_that_may_not_replace_stops_nothing(autojump_clock: object, store: FakeWriter) -> None:
     tree = make_writable(store)
     file = await begun(tree, store, NEW)
-    async with trio.open_nursery() as waiting:
-        waiting.start_soon(file.fsync)
-        await trio.sleep(1.05)
+    async with in_the_middle(file):
         with pytest.raises(AlreadyExists):
             await tree.rename(OTHER, NEW, noreplace=True)
     assert len(store.uploads) == 1
@@ -137,9 +134,7 @@ async def test_an_upload_that_is_about_to_begin_by_itself_is_called_off(
 async def test_a_name_that_went_is_free_for_another_file(autojump_clock: object, store: FakeWriter) -> None:
     tree = make_writable(store)
     file = await begun(tree, store, FILE)
-    async with trio.open_nursery() as waiting:
-        waiting.start_soon(file.fsync)
-        await trio.sleep(1.05)
+    async with in_the_middle(file):
         await tree.unlink(FILE)
         store.write_delay = 0.0
         await write_file(tree, FILE, b"another")
@@ -151,6 +146,8 @@ async def test_a_name_that_went_is_free_for_another_file(autojump_clock: object,
 
 
 # --- at any moment
+
+Answer = TypeVar("Answer")
 
 
 class Held(FakeWriter):
@@ -168,33 +165,27 @@ class Held(FakeWriter):
         self.left = 0
         self.refuses = False
 
-    async def answer(self) -> None:
+    async def late(self, asked: Awaitable[Answer]) -> Answer:
+        answer = await asked
         self.left -= 1
         if self.left == 0:
             self.held.set()
             await self.go.wait()
             if self.refuses:
                 raise DENIED
+        return answer
 
     async def request(self, *what: object, in_flight: bool = False) -> bool:
-        lost = await super().request(*what, in_flight=in_flight)
-        await self.answer()
-        return lost
+        return await self.late(super().request(*what, in_flight=in_flight))
 
     async def stat_size(self, path: bytes) -> int:
-        size = await super().stat_size(path)
-        await self.answer()
-        return size
+        return await self.late(super().stat_size(path))
 
     async def crc32(self, path: bytes, *, size: int | None = None) -> int:
-        value = await super().crc32(path, size=size)
-        await self.answer()
-        return value
+        return await self.late(super().crc32(path, size=size))
 
     async def list_directory(self, path: bytes) -> Listing:
-        listing = await super().list_directory(path)
-        await self.answer()
-        return listing
+        return await self.late(super().list_directory(path))
 
 
 async def take_when_answered(
@@ -245,11 +236,7 @@ async def test_a_removal_that_was_given_up_loses_nothing(
 ) -> None:
     """It had ended the upload: what that left on the vehicle is ours."""
     tree = make_writable(store)
-    file = await (
-        tree.create(path, exclusive=True) if path == NEW else tree.open(path, write=True, truncate=True)
-    )
-    store.write_delay = 0.1
-    await file.write(0, LARGE)
+    file = await begun(tree, store, path, LARGE)
     await trio.sleep(1.05)
     with trio.move_on_after(0.01) as scope:
         await tree.unlink(path)

@@ -16,6 +16,7 @@ from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.tree import Tree
 from mavftpfs.shared.errors import Armed, FileBusy, LinkError, RequestTimeout
 from mavftpfs.shared.model import split
+from tests.support.deliveries import in_the_middle
 from tests.support.fake_writer import KINDS, FakeWriter, make_writable
 
 FOLDER = b"/card/dir"
@@ -96,10 +97,7 @@ async def test_emptying_waits_for_no_delivery(
     """Who waits for it hears 0 when the card has what the file is by then."""
     tree = writable(store)
     file = await begun(tree, store, path)
-    async with trio.open_nursery() as waiting:
-        for _ in range(2):
-            waiting.start_soon(file.fsync)
-        await trio.sleep(1.05)
+    async with in_the_middle(file, waiting=2):
         before = trio.current_time()
         other = await empty(tree, path, file)
         assert trio.current_time() - before < PROMPT
@@ -116,9 +114,7 @@ async def test_emptying_waits_for_no_delivery(
 async def test_a_change_in_place_is_called_off_too(autojump_clock: object, store: FakeWriter) -> None:
     tree = writable(store)
     file = await begun(tree, store, FILE, whole=False)
-    async with trio.open_nursery() as waiting:
-        waiting.start_soon(file.fsync)
-        await trio.sleep(1.05)
+    async with in_the_middle(file):
         before = trio.current_time()
         other = await by_opening(tree, FILE, file)
         assert trio.current_time() - before < PROMPT

@@ -12,6 +12,7 @@ from trio.testing import MockClock
 
 from mavftpfs.cache.blocks import BLOCK_SIZE, BlockCache, FileBlocks
 from mavftpfs.cache.files import MAX_CLOSED
+from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.tree import Tree
 from mavftpfs.cache.versions import MAX_RESTARTS
 from mavftpfs.protocol.payload import Opcode
@@ -529,12 +530,18 @@ async def test_after_a_reboot_recency_is_no_proof(
     handle.close()
 
 
+async def read_before_a_reboot(tree: Tree) -> OpenFile:
+    """Return a handle of a file that was read whole before the vehicle restarted."""
+    handle = await tree.open(LOG)
+    await handle.read(0, len(DATA))
+    tree.rebooted()
+    return handle
+
+
 async def test_a_handle_open_over_a_reboot_is_not_shared_with_new_opens(
     store: FakeStore, tree: Tree, autojump_clock: MockClock
 ) -> None:
-    old = await tree.open(LOG)
-    await old.read(0, len(DATA))
-    tree.rebooted()
+    old = await read_before_a_reboot(tree)
     new = await tree.open(LOG)
     assert not new.keep_cache
     old.close()
@@ -544,9 +551,7 @@ async def test_a_handle_open_over_a_reboot_is_not_shared_with_new_opens(
 async def test_closing_after_a_reboot_forgets_the_file(
     store: FakeStore, tree: Tree, autojump_clock: MockClock
 ) -> None:
-    handle = await tree.open(LOG)
-    await handle.read(0, len(DATA))
-    tree.rebooted()
+    handle = await read_before_a_reboot(tree)
     handle.close()
     assert tree.status()["bytes_cached"] == 0
 

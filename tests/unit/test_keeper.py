@@ -14,6 +14,7 @@ from mavftpfs.cache.blockdirectory import BlockDirectory
 from mavftpfs.cache.blocks import BLOCK_SIZE, BlockCache
 from mavftpfs.cache.dentries import Dentries
 from mavftpfs.cache.keeper import CRC_LIMIT, PERIOD, Facts, Keeper
+from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.options import CacheOptions
 from mavftpfs.cache.persistent import SETTLED, BlockKey
 from mavftpfs.cache.tree import Tree
@@ -82,6 +83,15 @@ class Mounts:
         assert await read_file(tree, path) == self.store.files[path].data
         await trio.sleep(ENOUGH)
 
+    async def open_partly_kept(self) -> tuple[Tree, OpenFile]:
+        """Open a file of which a mount before this one read the beginning."""
+        handle = await self.mount().open(LOG)
+        await handle.read(0, 2 * BLOCK_SIZE)
+        handle.close()
+        await trio.sleep(ENOUGH)
+        tree = self.mount()
+        return tree, await tree.open(LOG)
+
     def asked(self) -> list[str]:
         """Return what was asked of the vehicle since the last mount, listings aside."""
         return [call for call, *_ in self.store.calls if call != "list"]
@@ -106,13 +116,7 @@ async def test_a_file_read_yesterday_costs_nothing(mounts: Mounts, autojump_cloc
 
 
 async def test_only_the_rest_is_read(mounts: Mounts, autojump_clock: MockClock) -> None:
-    tree = mounts.mount()
-    handle = await tree.open(LOG)
-    await handle.read(0, 2 * BLOCK_SIZE)
-    handle.close()
-    await trio.sleep(ENOUGH)
-    tree = mounts.mount()
-    handle = await tree.open(LOG)
+    tree, handle = await mounts.open_partly_kept()
     assert await handle.read(0, 100) == DATA[:100]
     assert mounts.asked() == []
     handle.close()
@@ -188,13 +192,7 @@ async def test_what_is_kept_is_no_part_of_the_file_that_came_by_a_restart(
     mounts: Mounts, autojump_clock: MockClock
 ) -> None:
     """It is larger, so it may only have grown, and nothing of it was read since it was opened."""
-    tree = mounts.mount()
-    handle = await tree.open(LOG)
-    await handle.read(0, 2 * BLOCK_SIZE)
-    handle.close()
-    await trio.sleep(ENOUGH)
-    tree = mounts.mount()
-    handle = await tree.open(LOG)
+    tree, handle = await mounts.open_partly_kept()
     new = content(len(DATA) + 1000, seed=8)
     mounts.store.add(LOG, new, MTIME + 1)
     tree.rebooted()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Awaitable, Callable
 
 import pytest
 import trio
@@ -61,24 +61,23 @@ async def test_it_stays_lost_while_the_new_file_is_written_and_afterwards(
     assert store.files[FILE].data == b"mid" + NEW[3:]
 
 
-async def test_it_is_lost_when_a_writer_finds_the_new_file(
-    store: FakeWriter, tree: Tree, autojump_clock: object
-) -> None:
-    lost = await reader_of_another(store, tree)
-    writer = await tree.open(FILE, write=True)
-    await require_lost(lost)
-    assert bytes(await writer.read(0, 900)) == NEW
-    for file in (writer, lost):
-        await file.release()
+async def found_by_a_writer(tree: Tree) -> OpenFile:
+    return await tree.open(FILE, write=True)
 
 
-async def test_it_is_lost_when_the_new_file_is_unlinked_or_replaced_here(
-    store: FakeWriter, tree: Tree, autojump_clock: object
-) -> None:
-    lost = await reader_of_another(store, tree)
+async def read_and_unlinked(tree: Tree) -> OpenFile:
     later = await tree.open(FILE)
     assert bytes(await later.read(0, 900)) == NEW
     await tree.unlink(FILE)
+    return later
+
+
+@pytest.mark.parametrize("meet", [found_by_a_writer, read_and_unlinked])
+async def test_it_is_lost_whatever_happens_to_the_new_file_here(
+    store: FakeWriter, tree: Tree, autojump_clock: object, meet: Callable[[Tree], Awaitable[OpenFile]]
+) -> None:
+    lost = await reader_of_another(store, tree)
+    later = await meet(tree)
     await require_lost(lost)
     assert bytes(await later.read(0, 900)) == NEW
     for file in (later, lost):

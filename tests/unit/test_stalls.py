@@ -105,16 +105,22 @@ def test_the_reserve_is_for_reads_where_the_buffers_are_not_known_to_be_small(se
     assert flow.room(full, now, paced=False) == 0
 
 
-def test_writes_go_on_while_answers_pause_but_not_for_long() -> None:
-    """What arrives during a pause is lost; what was not sent would leave the server idle after it."""
-    flow = Flow()
-    now, order = 0.0, 0
+def at_work_with_pauses(flow: Flow) -> float:
+    """Have a server answer at RATE, with a pause now and then; return the time when that was seen."""
+    now = 0.0
     for order in range(4000):
         now += 1 / RATE if order % 200 else 0.15
         flow.on_reply(now, 0.05, order, order + flow.window)
-    full = flow.window
     flow._trains.proven = False  # as when many are allowed at once
     flow.begin()
+    return now
+
+
+def test_writes_go_on_while_answers_pause_but_not_for_long() -> None:
+    """What arrives during a pause is lost; what was not sent would leave the server idle after it."""
+    flow = Flow()
+    now = at_work_with_pauses(flow)
+    full = flow.window
     assert flow.room(full, now, paced=False) == 0
     assert now < flow.next_room_at() < now + 0.05
     assert flow.room(full, now + 0.1, paced=False) == pytest.approx(0.1 * RATE, rel=0.1)
@@ -127,13 +133,8 @@ def test_writes_go_on_while_answers_pause_but_not_for_long() -> None:
 def test_reads_go_on_too_where_a_reserve_would_only_overflow_the_servers_buffer() -> None:
     flow = Flow()
     flow._stalls._until = 1e9  # it was found useless
-    now = 0.0
-    for order in range(4000):
-        now += 1 / RATE if order % 200 else 0.15
-        flow.on_reply(now, 0.05, order, order + flow.window)
+    now = at_work_with_pauses(flow)
     full = flow.window
-    flow._trains.proven = False  # as when many are allowed at once
-    flow.begin()
     assert flow.room(full, now, paced=True) == 0
     assert flow.room(full, now + 0.1, paced=True) == pytest.approx(0.1 * RATE, rel=0.1)
 

@@ -11,6 +11,7 @@ import trio
 
 from mavftpfs.cache.asides import Group, Kind, is_reserved, repair
 from mavftpfs.cache.background import FIRST_PAUSE
+from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.spool import SpoolDirectory
 from mavftpfs.cache.tree import Tree
 from mavftpfs.protocol.payload import NakCode, Opcode
@@ -170,14 +171,20 @@ async def test_a_gap_that_a_lost_link_left_is_closed_though_armed(
 # --- the link is lost between the two renames
 
 
-async def test_a_gap_is_closed_although_the_program_has_the_file_open(
-    autojump_clock: object, store: FakeWriter, tree: Tree
-) -> None:
+async def torn_and_open(store: FakeWriter, tree: Tree) -> OpenFile:
+    """Return the open file of a replacement that stopped between its renames."""
     file = await tree.open(FILE, write=True, truncate=True)
     await file.write(0, NEW)
     Trap(store, tree, 2, "lost")
     with pytest.raises(VehicleLost):
         await file.fsync()
+    return file
+
+
+async def test_a_gap_is_closed_although_the_program_has_the_file_open(
+    autojump_clock: object, store: FakeWriter, tree: Tree
+) -> None:
+    file = await torn_and_open(store, tree)
     come_back(store, tree)
     await trio.sleep(1)
     assert store.files[FILE].data == NEW
@@ -318,11 +325,7 @@ async def test_a_torn_name_in_a_directory_that_is_renamed(
 async def test_a_draft_written_on_after_the_gap_does_not_keep_it_open(
     autojump_clock: object, store: FakeWriter, tree: Tree
 ) -> None:
-    file = await tree.open(FILE, write=True, truncate=True)
-    await file.write(0, NEW)
-    Trap(store, tree, 2, "lost")
-    with pytest.raises(VehicleLost):
-        await file.fsync()
+    file = await torn_and_open(store, tree)
     await file.write(0, b"more")
     arm(store, tree, armed=True)
     come_back(store, tree)

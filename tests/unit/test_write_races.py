@@ -356,19 +356,29 @@ async def test_who_opened_an_older_version_follows_the_renames_too(
 # --- a caller that gives up
 
 
-class SlowAnswers(FakeWriter):
-    """Does what it is asked at once, and says so late."""
+class Afterwards(FakeWriter):
+    """Something happens when a change was made, before that is told."""
+
+    async def afterwards(self) -> None:
+        raise NotImplementedError
 
     async def remove(self, path: bytes) -> None:  # type: ignore[override]
         await super().remove(path)
-        await trio.sleep(1)
+        await self.afterwards()
 
     async def make_directory(self, path: bytes) -> None:
         await super().make_directory(path)
-        await trio.sleep(1)
+        await self.afterwards()
 
     async def rename(self, old: bytes, new: bytes, *, completes: bool = False) -> None:
         await super().rename(old, new, completes=completes)
+        await self.afterwards()
+
+
+class SlowAnswers(Afterwards):
+    """Does what it is asked at once, and says so late."""
+
+    async def afterwards(self) -> None:
         await trio.sleep(1)
 
 
@@ -377,6 +387,10 @@ CHANGES = {
     "mkdir": lambda tree: tree.mkdir(b"/d/made"),
     "rename": lambda tree: tree.rename(FILE, b"/d/moved"),
 }
+
+
+def names_there(store: FakeWriter) -> set[bytes]:
+    return {path for path in (*store.files, *store.directories) if path.startswith(b"/d/")}
 
 
 @pytest.mark.parametrize("change", sorted(CHANGES))
@@ -390,30 +404,18 @@ async def test_what_became_of_a_change_that_was_given_up_is_looked_up(
     with trio.move_on_after(0.5) as scope:
         await CHANGES[change](tree)
     assert scope.cancelled_caught
-    there = {path for path in (*store.files, *store.directories) if path.startswith(b"/d/")}
+    there = names_there(store)
     assert there == {"unlink": set(), "mkdir": {FILE, b"/d/made"}, "rename": {b"/d/moved"}}[change]
     assert {b"/d/" + name for name, _ in await tree.list(b"/d")} == there
 
 
-class Mute(FakeWriter):
+class Mute(Afterwards):
     """Does what it is asked, and is not heard; to look what became of it was in vain, too."""
 
-    def silence(self) -> RequestTimeout:
+    async def afterwards(self) -> None:
         error = RequestTimeout("no answer")
         error.checked = True
-        return error
-
-    async def remove(self, path: bytes) -> None:  # type: ignore[override]
-        await super().remove(path)
-        raise self.silence()
-
-    async def make_directory(self, path: bytes) -> None:
-        await super().make_directory(path)
-        raise self.silence()
-
-    async def rename(self, old: bytes, new: bytes, *, completes: bool = False) -> None:
-        await super().rename(old, new, completes=completes)
-        raise self.silence()
+        raise error
 
 
 @pytest.mark.parametrize("change", sorted(CHANGES))
@@ -429,5 +431,5 @@ async def test_a_change_that_may_have_happened_is_looked_up_when_it_is_asked_for
     with pytest.raises(RequestTimeout):
         await CHANGES[change](tree)
     assert store.count("list") == listed
-    there = {path for path in (*store.files, *store.directories) if path.startswith(b"/d/")}
+    there = names_there(store)
     assert {b"/d/" + name for name, _ in await tree.list(b"/d")} == there
