@@ -26,8 +26,6 @@ from mavftpfs.protocol.timers import Timers
 from mavftpfs.shared.errors import RemoteProtocolError, RequestTimeout
 from mavftpfs.shared.traits import Traits
 
-__all__ = ["Engine", "EngineStats"]
-
 OP_DEADLINE = 30.0
 _MAX_REPLAYS = 8
 _MAX_SIDE_EFFECT_REPLAYS = 2
@@ -282,13 +280,15 @@ class Engine:
         self._retire()
         return wires
 
+    def hold(self, now: float) -> None:
+        """Nothing may go out now; who begins to want something meanwhile does not wait for ever either."""
+        for op in self._ops:
+            op.waits(now)
+
     def _serve(self, op: Operation, now: float, wires: list[bytes]) -> bool:
         """Send what `op` has; return False when the window is full."""
-        if op.idle:
-            op.progress_at = inf
+        if not op.waits(now):
             return True
-        if op.progress_at == inf:
-            op.progress_at = now
         ledger = self._ledger
         # Metadata may use one slot more than bulk work: a full window must not make it wait.
         in_flight = ledger.in_flight - (op.priority is Priority.METADATA)

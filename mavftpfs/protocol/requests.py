@@ -271,6 +271,15 @@ class Operation:
         if not self.idle:
             self.progress_at = now
 
+    def waits(self, now: float) -> bool:
+        """Return whether something is wanted of the server: since now, if nothing was before."""
+        if self.idle:
+            self.progress_at = inf
+            return False
+        if self.progress_at == inf:
+            self.progress_at = now
+        return True
+
     def next_request(self, now: float) -> Request | None:
         """Return the next new request, or None if there is none for now."""
         raise NotImplementedError

@@ -202,6 +202,8 @@ class Driver:
         target = self.vehicle.address
         if target is not None and self._may_send(now):
             self._send(target, self.engine.outgoing(now), now)
+        else:
+            self.engine.hold(now)
 
     def _may_send(self, now: float) -> bool:
         return self.link.backlog < BACKLOG_LIMIT and self.vehicle.identity.may_be_asked(now)

@@ -375,6 +375,33 @@ async def test_a_silent_vehicle_is_told_at_once_and_the_rest_goes_by_itself(auto
     assert here.tree.data(b"/d/new") == data
 
 
+@pytest.mark.parametrize("more", [b"", b"more"])
+@pytest.mark.parametrize("profile", ["px4", "ardupilot", "mavsdk"])
+async def test_a_link_that_is_reopened_and_stays_silent_ends_the_wait(
+    profile: str, more: bytes, autojump: MockClock
+) -> None:
+    """Nothing was under way just then, and nothing is sent before it is known who is at the other end."""
+    here = world(profile, PLAIN)
+    here.link.is_stream = True
+    here.vehicle.set_stream(True)
+    async with here.connection() as connection:
+        await trio.sleep(3)  # it told who it is
+        source = MemorySource(content(2_000))
+        upload = await start(connection, profile, source)
+        await trio.sleep(0.8)
+        assert connection.scheduler.session is not None
+        assert source.dirty.empty
+        assert source.in_flight.empty
+        here.link.cut()
+        here.link.restore()
+        here.link.cut()
+        await trio.sleep(0.1)
+        source.add(more)
+        upload.wake()
+        with trio.fail_after(100.0), pytest.raises(MavftpfsError):
+            await upload.finish()
+
+
 @pytest.mark.parametrize("profile", EVERY_PROFILE)
 @pytest.mark.parametrize("probed", [False, True], ids=["unknown", "probed"])
 async def test_a_program_that_writes_now_and_then(profile: str, probed: bool, autojump: MockClock) -> None:

@@ -501,6 +501,19 @@ def test_slow_progress_is_progress() -> None:
     assert isinstance(op.error, RequestTimeout)
 
 
+def test_who_begins_to_want_something_while_nothing_may_go_out_does_not_wait_for_ever() -> None:
+    engine = make()
+    transfer = ReadTransfer(0, SIZE, MemorySink(SIZE))
+    engine.start(transfer, 0.0)
+    engine.hold(0.0)
+    assert engine.next_deadline() is None
+    transfer.want(0, SIZE, True)
+    engine.hold(100.0)
+    assert engine.next_deadline() == 130.0
+    engine.on_deadline(130.0)
+    assert isinstance(transfer.error, RequestTimeout)
+
+
 def test_progress_and_patience_may_end_at_the_same_moment() -> None:
     engine = make(limit=1)
     transfer, _ = reading(engine)
