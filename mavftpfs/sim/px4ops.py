@@ -59,9 +59,9 @@ def handlers(server: Server) -> dict[int, Callable[[Request], bytes]]:
     bound: dict[int, Callable[[Request], bytes]] = {
         Opcode.READ_FILE: server.refuse_read,
         Opcode.LIST_DIRECTORY: bind(_list),
-        Opcode.REMOVE_FILE: bind(_remove),
-        Opcode.CREATE_DIRECTORY: bind(_mkdir),
-        Opcode.REMOVE_DIRECTORY: bind(_rmdir),
+        Opcode.REMOVE_FILE: bind(_changing(Storage.unlink)),
+        Opcode.CREATE_DIRECTORY: bind(_changing(Storage.mkdir)),
+        Opcode.REMOVE_DIRECTORY: bind(_changing(Storage.rmdir)),
         Opcode.RENAME: bind(_rename),
         Opcode.TRUNCATE_FILE: bind(_truncate),
         Opcode.CALC_FILE_CRC32: bind(_crc),
@@ -156,25 +156,16 @@ def _entry_text(profile: Profile, directory: bytes, entry: Entry, with_time: boo
     return b"S"
 
 
-def _remove(server: Server, request: Request) -> bytes:
-    server.scratch = path = path_of(server, request)
-    server.check_writable(path)
-    server.storage.unlink(path)
-    return b""
+def _changing(change: Callable[[Storage, bytes], None]) -> Callable[[Server, Request], bytes]:
+    """Return the handler that does this to the path in a request."""
 
+    def handle(server: Server, request: Request) -> bytes:
+        server.scratch = path = path_of(server, request)
+        server.check_writable(path)
+        change(server.storage, path)
+        return b""
 
-def _mkdir(server: Server, request: Request) -> bytes:
-    server.scratch = path = path_of(server, request)
-    server.check_writable(path)
-    server.storage.mkdir(path)
-    return b""
-
-
-def _rmdir(server: Server, request: Request) -> bytes:
-    server.scratch = path = path_of(server, request)
-    server.check_writable(path)
-    server.storage.rmdir(path)
-    return b""
+    return handle
 
 
 def _rename(server: Server, request: Request) -> bytes:
