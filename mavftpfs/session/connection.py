@@ -370,7 +370,7 @@ async def _ask_who_it_is(connection: Connection) -> None:
         connection._doubted = trio.Event()
         warned = False
         asked = 0
-        while not identity.trusted and vehicle.address is not None:
+        while (not asked or not identity.trusted) and vehicle.address is not None:
             asked_at = connection.clock()
             driver.send(driver.framer.encode_request_message(vehicle.address, AUTOPILOT_VERSION_ID))
             if asked >= _OLD_WAY_FROM:

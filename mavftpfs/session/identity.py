@@ -20,7 +20,7 @@ cable that is moved reopens the link, which is told.)"""
 
 PATIENCE = 20
 """Questions that a vehicle which is heard leaves unanswered before it is believed to be the same one: some
-tell their id only once."""
+tell their id only once. From then on it is asked as before, but believed meanwhile."""
 
 
 class Standing(Enum):
@@ -36,7 +36,7 @@ class Identity:
 
     Attributes:
         standing: of who answers now; only a trusted one is asked for files.
-        on_doubt: it has to tell its unique id again.
+        on_doubt: it is to be asked for its unique id again.
         on_settled: called with whether it was a stranger meanwhile: it is trusted again.
     """
 
@@ -46,6 +46,7 @@ class Identity:
         self.on_settled: Callable[[bool], None] = lambda was_stranger: None
         self._known: AutopilotVersion | None = None
         self._strange = False
+        self._mute = False
         self._unanswered = 0
         self._heard_at: float | None = None
 
@@ -79,15 +80,19 @@ class Identity:
         """It may be another one since now: it restarted, or was silent."""
         if self._known is None:
             return
-        self._strange |= self.stranger
-        self.standing = Standing.DOUBTED
-        self._unanswered = 0
+        if not self._mute and self.standing is not Standing.DOUBTED:
+            self._strange |= self.stranger
+            self.standing = Standing.DOUBTED
+            self._unanswered = 0
         self.on_doubt()
 
     def told(self, version: AutopilotVersion) -> bool:
         """It told who it is; return whether it is the same as ever."""
+        self._mute = False
         if self._known is not None and is_another(self._known, version):
-            self.standing = Standing.STRANGER
+            was_trusted, self.standing = self.trusted, Standing.STRANGER
+            if was_trusted:  # nobody asks, and ours may come back without a silence
+                self.on_doubt()
             return False
         if self._known is None and (version.uid or any(version.uid2)):
             self._known = version
@@ -98,6 +103,7 @@ class Identity:
         """It was heard, but did not tell who it is though it was asked."""
         self._unanswered += 1
         if self._unanswered >= PATIENCE and self.standing is Standing.DOUBTED:
+            self._mute = True
             self._settle()
 
     def _settle(self) -> None:

@@ -131,3 +131,33 @@ async def test_a_vehicle_that_does_not_tell_who_it_is_is_believed(
         start = trio.current_time()
         assert await read_file(tree, scene.file) == OURS
         assert (trio.current_time() - start > 5.0) == (tells == "once")
+
+
+async def test_a_vehicle_that_is_seldom_heard_and_told_once_is_believed(
+    autojump: MockClock, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Between two heartbeats another one could have come, each time."""
+    scene = Scene("px4", LinkSettings(delay=0.02))
+    async with scene.mounted() as tree:
+        monkeypatch.setattr(scene.ours, "_on_command", lambda command, now: None)
+        monkeypatch.setattr("mavftpfs.sim.vehicle.HEARTBEAT_PERIOD", 4.0)
+        await trio.sleep(120.0)
+        start = trio.current_time()
+        for _ in range(10):
+            assert await read_file(tree, scene.file) == OURS
+            await trio.sleep(5.0)
+        assert trio.current_time() - start < 120.0
+
+
+async def test_ours_is_known_again_though_nobody_was_silent(autojump: MockClock) -> None:
+    """A ground station asked the other one, which is switched on as ours is switched off."""
+    scene = Scene("px4", LinkSettings(delay=0.02))
+    async with scene.mounted() as tree:
+        await swap(scene.world, scene.other, gap=0.5)
+        scene.world.model.push(Direction.TO_CLIENT, scene.other._version(), trio.current_time())
+        await trio.sleep(2.0)
+        with pytest.raises(VehicleLost, match="another vehicle answers"):
+            await tree.open(scene.file)
+        await swap(scene.world, scene.ours, gap=0.5)
+        await trio.sleep(10.0)
+        assert await read_file(tree, scene.file) == OURS

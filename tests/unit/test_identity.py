@@ -109,6 +109,48 @@ def test_who_is_heard_but_does_not_tell_is_believed_in_the_end() -> None:
     assert identity.trusted
 
 
+def test_silences_between_the_questions_do_not_make_it_doubtful_for_ever() -> None:
+    identity = Watched()
+    identity.told(version(1))
+    for beat in range(PATIENCE + 1):
+        identity.heard(beat * 2 * ABSENCE)
+        identity.unanswered()
+    assert identity.trusted
+
+
+def mute() -> Watched:
+    """Return who told its id once, and never again."""
+    identity = Watched()
+    identity.told(version(1))
+    identity.doubt()
+    for _ in range(PATIENCE):
+        identity.unanswered()
+    return identity
+
+
+def test_who_never_told_again_is_asked_but_not_kept_waiting() -> None:
+    identity = mute()
+    identity.doubt()
+    assert identity.trusted
+    assert identity.doubts == 2
+    assert not identity.told(version(2))
+    assert identity.stranger
+
+
+def test_who_tells_again_is_doubted_again() -> None:
+    identity = mute()
+    assert identity.told(version(1))
+    identity.doubt()
+    assert not identity.trusted
+
+
+def test_another_id_without_a_silence_is_asked_for_again() -> None:
+    identity = Watched()
+    identity.told(version(1))
+    assert not identity.told(version(2))
+    assert identity.doubts == 1
+
+
 def test_a_stranger_that_falls_silent_about_itself_stays_one() -> None:
     identity = Watched()
     identity.told(version(1))
