@@ -14,25 +14,15 @@ from mavftpfs.sim.linkmodel import LinkSettings
 from mavftpfs.sim.profiles import PROFILES
 from tests.support.faults import Faults
 from tests.support.sources import MemorySource
-from tests.support.worlds import GOOD_LINK, ROOTS, World
+from tests.support.worlds import path, world
 
 EVERY_PROFILE = sorted(PROFILES)
 LONG_AGO = float("-inf")
 
 
-def path(profile: str, name: str) -> bytes:
-    return ROOTS.get(profile, b"") + b"/d/" + name.encode()
-
-
-def world(profile: str, link: LinkSettings = GOOD_LINK) -> World:
-    made = World(profile, link)
-    made.tree.add(path(profile, "there"), b"theirs")
-    return made
-
-
 @pytest.mark.parametrize("profile", EVERY_PROFILE)
 async def test_what_is_there_is_not_emptied(profile: str, autojump: MockClock) -> None:
-    here = world(profile)
+    here = world(profile, there=b"theirs")
     async with here.connection() as connection:
         store, target = connection.store, path(profile, "there")
         upload = await store.open_upload(target, MemorySource(b"ours"), create=True, free_at=LONG_AGO)
@@ -54,7 +44,7 @@ async def test_what_is_there_is_not_emptied(profile: str, autojump: MockClock) -
 async def test_a_free_name_costs_one_request_unless_it_was_just_seen(
     profile: str, autojump: MockClock
 ) -> None:
-    here = world(profile)
+    here = world(profile, there=b"theirs")
     faults = Faults(here)
     async with here.connection() as connection:
         now = trio.current_time()
@@ -76,7 +66,7 @@ async def test_what_was_given_up_while_its_name_is_looked_for_makes_nothing(
     profile: str, autojump: MockClock
 ) -> None:
     """Who gave it up may not have waited for its end, and would take what is there for somebody else's."""
-    here, target = world(profile, LinkSettings(delay=0.05)), path(profile, "new")
+    here, target = world(profile, LinkSettings(delay=0.05), there=b"theirs"), path(profile, "new")
     faults = Faults(here)
     async with here.connection() as connection:
         store, source = connection.store, MemorySource(b"ours")
@@ -95,7 +85,7 @@ async def test_what_was_given_up_while_its_name_is_looked_for_makes_nothing(
 @pytest.mark.parametrize("profile", EVERY_PROFILE)
 async def test_a_repeated_attempt_is_our_own(profile: str, autojump: MockClock) -> None:
     """The link fails after CreateFile: the file that is there afterwards is ours."""
-    here = world(profile)
+    here = world(profile, there=b"theirs")
     faults = Faults(here)
     async with here.connection() as connection:
         source, target = MemorySource(b"ours" * 100), path(profile, "new")
@@ -111,7 +101,7 @@ async def test_a_repeated_attempt_is_our_own(profile: str, autojump: MockClock) 
 
 @pytest.mark.parametrize("profile", ["px4", "px4-nuttx", "px4-2026"])
 async def test_a_sticky_file_exists_does_not_look_like_a_file(profile: str, autojump: MockClock) -> None:
-    here = world(profile)
+    here = world(profile, there=b"theirs")
 
     async with here.connection() as connection:
         for name in ("new", "empty"):

@@ -24,8 +24,7 @@ from tests.sim.test_doubted_bytes import CLEAN, DOUBLING, KEEPING
 from tests.support.latecomers import Latecomer
 from tests.support.mounting import mounted
 from tests.support.takingturns import taking_turns
-from tests.support.uploads import content, path, world
-from tests.support.worlds import World
+from tests.support.worlds import World, content, path, world
 
 EVERY_PROFILE = sorted(PROFILES)
 LONG = QUIET[1] + 3.0

@@ -23,8 +23,8 @@ from tests.support.faults import Faults
 from tests.support.latecomers import Latecomer
 from tests.support.mounting import writable_tree
 from tests.support.takingturns import taking_turns
-from tests.support.uploads import append, content, path, probe, put, world
-from tests.support.worlds import MemorySink, World, read_file
+from tests.support.uploads import append, probe, put
+from tests.support.worlds import MemorySink, World, content, path, read_file, world
 
 EVERY_PROFILE = sorted(PROFILES)
 DOUBLING = LinkSettings(delay=0.02, duplicate=0.3, reorder=0.1)
@@ -166,10 +166,12 @@ async def test_what_an_open_that_came_twice_at_once_left_open_is_closed(
 
 
 class Held:
-    """Keeps a kind of request from the server, until it hands over the last of them."""
+    """Keeps a kind of request from the server (`deaf`), until it hands over the last of them, or does so once
+    more."""
 
     def __init__(self, here: World, opcode: Opcode) -> None:
         self.deaf = True
+        self.delivered = False
         self._here = here
         self._opcode = opcode
         self._kept: tuple[bytes, Address] | None = None
@@ -181,6 +183,7 @@ class Held:
         assert self._kept is not None
         self._handle(*self._kept, now)
         self._here.link.kick()
+        self.delivered = True
 
     def deliver_behind_the_next(self) -> None:
         """Have it carried out right after the next of its kind, and the later answer come first."""
@@ -207,10 +210,11 @@ class Held:
         server.handle, server.outgoing = on_request, swapped  # type: ignore[method-assign]
 
     def _on_request(self, wire: bytes, source: Address, now: float) -> None:
-        if self.deaf and wire[3] == self._opcode:
+        if wire[3] == self._opcode:
             self._kept = (wire, source)
-        else:
-            self._handle(wire, source, now)
+            if self.deaf:
+                return
+        self._handle(wire, source, now)
 
 
 @pytest.mark.parametrize("opcode", [Opcode.OPEN_FILE_RO, Opcode.CREATE_FILE])
@@ -230,6 +234,41 @@ async def test_what_an_open_that_was_given_up_left_open_is_closed(
         held.deliver(trio.current_time())
         await trio.sleep(8)
         assert here.vehicle.server.open_sessions == 0
+
+
+@pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
+async def test_what_a_late_open_left_open_as_we_leave_is_closed(profile: str, autojump: MockClock) -> None:
+    """It comes when all is said and done, within the time in which such copies are feared."""
+    here = world(profile, replace(DOUBLING, reorder=0.0), f=content(1500))
+    async with trio.open_nursery() as nursery:
+        async with here.connection() as connection:
+            for _ in range(5):
+                await connection.store.list_directory(path(profile, ""))
+            assert connection.engine.stats.strays
+            await trio.sleep(3)
+            here.model.settings = replace(DOUBLING, duplicate=0.0, reorder=0.0)
+            held = Held(here, Opcode.OPEN_FILE_RO)
+            held.deaf = False
+            await read_file(connection, path(profile, "f"))
+
+            async def deliver() -> None:
+                await trio.sleep(0.15)
+                held.deliver(trio.current_time())
+
+            nursery.start_soon(deliver)
+    assert held.delivered
+    assert here.vehicle.server.open_sessions == 0
+
+
+@pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
+async def test_what_is_being_opened_as_we_leave_is_closed(profile: str, autojump: MockClock) -> None:
+    here = world(profile, LinkSettings(delay=0.1), f=content(1500))
+    async with here.connection() as connection:
+        await read_file(connection, path(profile, "f"))
+        await trio.sleep(8)
+        with trio.move_on_after(0.05):
+            await read_file(connection, path(profile, "f"))
+    assert here.vehicle.server.open_sessions == 0
 
 
 @pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))

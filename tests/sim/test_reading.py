@@ -22,7 +22,7 @@ from mavftpfs.shared.errors import (
     VehicleLost,
 )
 from mavftpfs.sim.linkmodel import LinkSettings
-from tests.support.worlds import MemorySink, World, read_file
+from tests.support.worlds import MemorySink, World, begin_to_read, read_file
 
 
 async def test_a_reboot_between_open_and_first_read_is_bridged(autojump: MockClock) -> None:
@@ -156,10 +156,7 @@ async def test_what_is_read_meanwhile_is_under_suspicion(trouble: str, autojump:
     data = random.Random(2).randbytes(60_000)
     here.tree.add(b"/f", data)
     async with here.connection() as connection:
-        sink = MemorySink(60_000)
-        reader = await connection.store.open_reader(b"/f", sink)
-        reader.want(0, 60_000, demand=True)
-        await sink.wait_for(0, 10_000)
+        _, sink = await begin_to_read(connection, b"/f", 10_000)
         assert sink.suspicions == []
         session = connection.scheduler.session
         assert session is not None

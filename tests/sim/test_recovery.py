@@ -19,7 +19,7 @@ from mavftpfs.session.store import TIME_PROBE_LIMIT
 from mavftpfs.shared.errors import FileChanged, MavftpfsError, SessionBusy, SessionLost
 from mavftpfs.sim.linkmodel import LinkSettings
 from mavftpfs.sim.profiles import PROFILES
-from tests.support.worlds import ROOTS, MemorySink, World, read_file
+from tests.support.worlds import MemorySink, World, begin_to_read, path, read_file, world
 
 RIVAL = Address(255, 190)
 RIVALS_SESSION = 77
@@ -31,17 +31,6 @@ OTHER = random.Random(2).randbytes(60_000)
 EVERY_PROFILE = sorted(PROFILES)
 CHECK_PERIOD = STALL / 2
 """How often a reading looks whether it stalled."""
-
-
-def path(profile: str, name: str) -> bytes:
-    return ROOTS.get(profile, b"") + b"/d/" + name.encode()
-
-
-def world(profile: str, settings: LinkSettings = LINK, **files: bytes) -> World:
-    here = World(profile, settings)
-    for name, data in files.items():
-        here.tree.add(path(profile, name), data)
-    return here
 
 
 class Log:
@@ -88,7 +77,7 @@ def rival_asks(here: World, opcode: Opcode, data: bytes = b"", *, seq: int, hear
 
 async def test_a_killed_clients_session_is_got_over_by_saying_nothing(autojump: MockClock) -> None:
     """ArduPilot gives a session away after 3 s in which it answered nobody, with a refusal neither."""
-    here = world("ardupilot", f=DATA, stale=OTHER)
+    here = world("ardupilot", LINK, f=DATA, stale=OTHER)
     async with here.connection() as connection, trio.open_nursery() as nursery:
         rival_asks(here, Opcode.OPEN_FILE_RO, path("ardupilot", "stale"), seq=5, heard=False)
         await trio.sleep(0.1)
@@ -121,7 +110,7 @@ async def _tolerate_refusals(work: Callable[[], object]) -> None:
 @pytest.mark.parametrize("profile", ["px4", "ardupilot"])
 async def test_another_clients_session_is_left_alone(profile: str, autojump: MockClock) -> None:
     """Whoever is heard is alive: no ResetSessions, no Terminate, and its file stays open (promise 6)."""
-    here = world(profile, f=DATA, theirs=OTHER)
+    here = world(profile, LINK, f=DATA, theirs=OTHER)
     async with here.connection() as connection, trio.open_nursery() as nursery:
         log = Log(here)
         rival_asks(here, Opcode.OPEN_FILE_RO, path(profile, "theirs"), seq=5)
@@ -153,10 +142,7 @@ async def test_after_a_silence_nothing_is_believed_before_the_file_was_opened_ag
     here = world("px4", SLOW, f=DATA, theirs=OTHER)
     async with here.connection() as connection:
         log = Log(here)
-        sink = MemorySink(len(DATA))
-        reader = await connection.store.open_reader(path("px4", "f"), sink)
-        reader.want(0, len(DATA), demand=True)
-        await sink.wait_for(0, 10_000)
+        _, sink = await begin_to_read(connection, path("px4", "f"), 10_000)
         here.link.cut()
         await trio.sleep(0.2)
         rival_asks(here, Opcode.TERMINATE_SESSION, seq=5, heard=False)
@@ -170,7 +156,7 @@ async def test_after_a_silence_nothing_is_believed_before_the_file_was_opened_ag
 
 
 async def test_a_session_that_is_lost_each_time_is_an_error_in_the_end(autojump: MockClock) -> None:
-    here = world("px4", f=DATA)
+    here = world("px4", LINK, f=DATA)
 
     def close_at_once(opcode: int) -> None:
         if opcode == Opcode.OPEN_FILE_RO:
@@ -190,10 +176,7 @@ async def test_a_server_that_closed_an_idle_session_during_an_outage(
     here = world(profile, SLOW, f=DATA)
     async with here.connection() as connection:
         log = Log(here)
-        sink = MemorySink(len(DATA))
-        reader = await connection.store.open_reader(path(profile, "f"), sink)
-        reader.want(0, len(DATA), demand=True)
-        await sink.wait_for(0, 10_000)
+        _, sink = await begin_to_read(connection, path(profile, "f"), 10_000)
         here.link.cut()
         await trio.sleep(outage)
         here.link.kick()
@@ -209,7 +192,7 @@ async def test_a_server_that_closed_an_idle_session_during_an_outage(
 async def test_a_session_is_closed_within_two_seconds_of_its_last_use(
     profile: str, autojump: MockClock
 ) -> None:
-    here = world(profile, f=DATA)
+    here = world(profile, LINK, f=DATA)
     async with here.connection() as connection:
         log = Log(here)
         sink = MemorySink(len(DATA))
@@ -231,7 +214,7 @@ async def test_a_session_is_closed_within_two_seconds_of_its_last_use(
 async def test_a_file_that_shrank_while_it_was_closed_is_another_one(
     profile: str, autojump: MockClock
 ) -> None:
-    here = world(profile, f=DATA)
+    here = world(profile, LINK, f=DATA)
     async with here.connection() as connection:
         sink = MemorySink(len(DATA))
         reader = await connection.store.open_reader(path(profile, "f"), sink)
@@ -252,7 +235,7 @@ async def test_a_file_that_shrank_while_it_was_closed_is_another_one(
 
 async def test_two_silences_prove_that_listings_show_no_times(autojump: MockClock) -> None:
     """One may be loss; MAVSDK's old server never answers an opcode that it does not know."""
-    here = world("mavsdk-old", f=DATA)
+    here = world("mavsdk-old", LINK, f=DATA)
     async with here.connection() as connection:
         log = Log(here)
         for known in (None, False, False):
@@ -267,7 +250,7 @@ async def test_two_silences_prove_that_listings_show_no_times(autojump: MockCloc
 
 
 async def test_an_answer_after_one_silence_is_taken(autojump: MockClock) -> None:
-    here = world("ardupilot5", f=DATA)
+    here = world("ardupilot5", LINK, f=DATA)
     async with here.connection() as connection:
         here.link.cut()
         with trio.CancelScope() as scope:

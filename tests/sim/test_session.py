@@ -11,8 +11,7 @@ from mavftpfs.session.connection import ConnectOptions
 from mavftpfs.shared.errors import FtpNak, RequestTimeout, VehicleLost
 from mavftpfs.sim.linkmodel import LinkSettings
 from mavftpfs.sim.profiles import PROFILES
-from tests.support.uploads import content, path, world
-from tests.support.worlds import MemorySink, read_file
+from tests.support.worlds import MemorySink, begin_to_read, content, path, read_file, world
 
 EVERY_PROFILE = sorted(PROFILES)
 BAD = LinkSettings(rate=60_000.0, delay=0.02, loss=0.1, duplicate=0.02, reorder=0.05)
@@ -106,10 +105,7 @@ async def test_a_small_read_overtakes_a_bulk_copy(profile: str, autojump: MockCl
     files = {f"small{number}": content(200, number) for number in range(5)}
     here = world(profile, LinkSettings(rate=rate, delay=rtt / 2), big=content(400_000), **files)
     async with here.connection() as connection, trio.open_nursery() as nursery:
-        sink = MemorySink(400_000)
-        reader = await connection.store.open_reader(path(profile, "big"), sink)
-        reader.want(0, 400_000, demand=True)
-        await sink.wait_for(0, 20_000)
+        _, sink = await begin_to_read(connection, path(profile, "big"), 20_000)
         for name, data in files.items():
             await trio.sleep(0.4)  # less than a quantum: the copy has only just begun again
             copied_before, began = sink.have.total, trio.current_time()
@@ -192,10 +188,7 @@ async def test_a_session_left_by_a_killed_client_is_got_over(profile: str, autoj
     here = world(profile, LinkSettings(rate=100_000.0, delay=0.02), big=data)
     with trio.CancelScope():
         async with here.connection(seed=3) as connection:
-            sink = MemorySink(50_000)
-            reader = await connection.store.open_reader(path(profile, "big"), sink)
-            reader.want(0, 50_000, demand=True)
-            await sink.wait_for(0, 1000)
+            await begin_to_read(connection, path(profile, "big"), 1000)
             here.link.cut()  # so that the farewell does not arrive: kill -9
     here.link.restore()
     async with here.connection(seed=4) as connection:

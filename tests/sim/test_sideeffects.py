@@ -20,8 +20,8 @@ from mavftpfs.sim.profiles import PROFILES, Storage
 from tests.support.faults import Faults
 from tests.support.sources import MemorySource
 from tests.support.takingturns import taking_turns
-from tests.support.uploads import content, path, probe, world
-from tests.support.worlds import ROOTS, MemorySink, World, read_file
+from tests.support.uploads import probe
+from tests.support.worlds import ROOTS, World, begin_to_read, content, path, read_file, world
 
 EVERY_PROFILE = sorted(PROFILES)
 RENAMING = [name for name in EVERY_PROFILE if PROFILES[name].storage is not Storage.LITTLEFS]
@@ -194,10 +194,7 @@ async def test_our_own_session_is_closed_before_a_path_changes(profile: str, aut
     faults = Faults(here)
     open_then: list[list[bytes]] = []
     async with here.connection() as connection:
-        sink = MemorySink(60_000)
-        reader = await connection.store.open_reader(path(profile, "file"), sink)
-        reader.want(0, 60_000, demand=True)
-        await sink.wait_for(0, 1000)
+        reader, sink = await begin_to_read(connection, path(profile, "file"), 1000)
         faults.at(Opcode.REMOVE_FILE, lambda: open_then.append(here.vehicle.server.open_paths))
         await connection.store.remove(path(profile, "file"))
         assert open_then == [[]]
@@ -217,10 +214,7 @@ async def test_readers_follow_a_rename(profile: str, autojump: MockClock) -> Non
     faults = Faults(here)
     open_then: list[list[bytes]] = []
     async with here.connection() as connection:
-        sink = MemorySink(40_000)
-        reader = await connection.store.open_reader(path(profile, "dir/file"), sink)
-        reader.want(0, 40_000, demand=True)
-        await sink.wait_for(0, 1000)
+        _, sink = await begin_to_read(connection, path(profile, "dir/file"), 1000)
         faults.at(Opcode.RENAME, lambda: open_then.append(here.vehicle.server.open_paths))
         await connection.store.rename(path(profile, "dir"), path(profile, "moved"))
         assert open_then == [[]]

@@ -22,8 +22,8 @@ from tests.sim.test_doubted_bytes import CLEAN, KEEPING
 from tests.sim.test_late_writes import change
 from tests.support.mounting import mounted
 from tests.support.takingturns import taking_turns
-from tests.support.uploads import append, content, path, put, world
-from tests.support.worlds import World
+from tests.support.uploads import append, put
+from tests.support.worlds import World, content, path, world
 
 DOUBLING = LinkSettings(delay=0.02, duplicate=1.0, reorder=0.1)
 LATE = 0.1

@@ -9,8 +9,8 @@ from trio.testing import MockClock
 from mavftpfs.protocol.payload import Opcode
 from mavftpfs.sim.linkmodel import LinkSettings
 from mavftpfs.sim.profiles import PROFILES
-from tests.support.uploads import content, path, probe, put, world
-from tests.support.worlds import read_file
+from tests.support.uploads import probe, put
+from tests.support.worlds import content, path, read_file, world
 
 EVERY_PROFILE = sorted(PROFILES)
 BAD = LinkSettings(rate=60_000.0, delay=0.02, loss=0.1, duplicate=0.02, reorder=0.05)

@@ -16,8 +16,8 @@ from mavftpfs.sim.linkmodel import LinkSettings
 from mavftpfs.sim.profiles import PROFILES
 from tests.support.faults import Faults, power_goes_at_close
 from tests.support.sources import MemorySource
-from tests.support.uploads import content, path, probe, start, under_way, world
-from tests.support.worlds import MemorySink, World, read_file
+from tests.support.uploads import probe, start, under_way
+from tests.support.worlds import MemorySink, World, content, path, read_file, world
 
 EVERY_PROFILE = sorted(PROFILES)
 PLAIN = LinkSettings(rate=20_000.0, delay=0.02)

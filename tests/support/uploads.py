@@ -1,8 +1,7 @@
-"""A vehicle with one directory, and uploads to it without a mount."""
+"""Uploads to a vehicle of one directory (worlds.world), without a mount."""
 
 from __future__ import annotations
 
-import random
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
@@ -10,25 +9,8 @@ import trio
 
 from mavftpfs.session.connection import Connection
 from mavftpfs.session.upload import QueuedUpload
-from mavftpfs.sim.linkmodel import LinkSettings
 from tests.support.sources import MemorySource
-from tests.support.worlds import GOOD_LINK, ROOTS, World
-
-
-def content(size: int, seed: int = 0) -> bytes:
-    return random.Random(seed).randbytes(size)
-
-
-def path(profile: str, name: str) -> bytes:
-    return ROOTS.get(profile, b"") + b"/d/" + name.encode()
-
-
-def world(profile: str, settings: LinkSettings = GOOD_LINK, **files: bytes) -> World:
-    made = World(profile, settings)
-    made.tree.add_directory(path(profile, "")[:-1])
-    for name, data in files.items():
-        made.tree.add(path(profile, name), data)
-    return made
+from tests.support.worlds import path
 
 
 async def probe(connection: Connection, profile: str) -> None:

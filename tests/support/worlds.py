@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 
 import trio
 
+from mavftpfs.cache.remote import Reader
 from mavftpfs.session.connection import Connection, ConnectOptions, connected
 from mavftpfs.shared.extents import ExtentSet
 from mavftpfs.sim.linkmodel import LinkModel, LinkSettings
@@ -48,6 +49,24 @@ class World:
         async with connected(self.link, options, rng=random.Random(seed)) as connection:
             await connection.ready(30.0)
             yield connection
+
+
+def content(size: int, seed: int = 0) -> bytes:
+    return random.Random(seed).randbytes(size)
+
+
+def path(profile: str, name: str) -> bytes:
+    """Return the path of a name in the directory of `world`."""
+    return ROOTS.get(profile, b"") + b"/d/" + name.encode()
+
+
+def world(profile: str, settings: LinkSettings = GOOD_LINK, **files: bytes) -> World:
+    """Return a vehicle with one directory, in which there are these files."""
+    made = World(profile, settings)
+    made.tree.add_directory(path(profile, "")[:-1])
+    for name, data in files.items():
+        made.tree.add(path(profile, name), data)
+    return made
 
 
 class MemorySink:
@@ -104,3 +123,12 @@ async def read_file(connection: Connection, path: bytes) -> bytes:
         return await sink.wait_for(0, reader.size)
     finally:
         reader.close()
+
+
+async def begin_to_read(connection: Connection, target: bytes, count: int) -> tuple[Reader, MemorySink]:
+    """Want a file whole; return its reader and what comes, once so many bytes did."""
+    sink = MemorySink(1 << 22)
+    reader = await connection.store.open_reader(target, sink)
+    reader.want(0, reader.size, demand=True)
+    await sink.wait_for(0, count)
+    return reader, sink
