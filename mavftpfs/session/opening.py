@@ -17,6 +17,7 @@ from mavftpfs.protocol.engine import Engine
 from mavftpfs.protocol.operations import ListDirectory, OpenFile, Simple, Terminate
 from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.session.driver import Driver
+from mavftpfs.session.echoes import feared_for
 from mavftpfs.session.gate import Gate
 from mavftpfs.session.vehicle import Vehicle
 from mavftpfs.shared.errors import FtpNak, MavftpfsError, RequestTimeout, SessionBusy
@@ -40,6 +41,9 @@ _MORE_LOST_ACKS = 3
 
 TERMINATE_LIMIT = 5.0
 """Seconds to wait for a Terminate before the session is treated as doubtful."""
+
+_FEARED_ON_LEAVING = 3.0
+"""Most seconds to wait on leaving for an open that the network brings once more."""
 
 _SURELY_OPEN = 8.0
 """Seconds in which no server closes an idle session (PX4 does after 10)."""
@@ -76,6 +80,7 @@ class SessionOpener:
         self._early: set[tuple[int, int]] = set()
         self._server_assigns: bool | None = None
         self._failing: dict[bytes, None] = {}
+        self._asked_at = float("-inf")
         self.resets = 0
         self.quiet_periods = 0
 
@@ -154,12 +159,26 @@ class SessionOpener:
         return operation.retransmitted and self._clock() - asked_at < _SURELY_OPEN
 
     async def close_doubtful(self) -> None:
-        """Close what may still be ours, on leaving.
+        """Close what may still be ours.
 
         Raises:
             RequestTimeout: no answer.
         """
         await self._close_doubtful()
+
+    async def leave(self) -> None:
+        """Close what may still be ours, also what the network may yet have opened once more: where sessions
+        have numbers nobody else would close it.
+
+        Raises:
+            RequestTimeout: no answer.
+        """
+        await self._close_doubtful()
+        if self._engine.stats.strays and not self._vehicle.lost(self._clock()):
+            feared = min(_FEARED_ON_LEAVING, feared_for(self._engine, self._clock()))
+            await trio.sleep(max(0.0, self._asked_at + feared - self._clock()))
+        while self.doubtful_paths:
+            await self._close_doubtful()
 
     def abandon(self, session: OpenSession) -> None:
         """Stop believing in a session after silence or a reboot; the next open closes it first."""
@@ -216,6 +235,7 @@ class SessionOpener:
         return OpenSession(path, operation.session, operation.size, self._clock(), writing, seq)
 
     def _note_asked(self, operation: OpenFile, path: bytes) -> None:
+        self._asked_at = self._clock()
         for seq in operation.answers:
             self._opened[seq] = path
         while len(self._opened) > _MAX_OPENED:

@@ -293,9 +293,8 @@ class Scheduler:
 
     async def close(self) -> None:
         """Terminate the session, best effort; the caller bounds the wait and cancels `serve` first."""
-        if self.session is not None:
-            await self._holder.close()
-        await self.opener.close_doubtful()
+        await self._holder.close_quietly()
+        await self.opener.leave()
 
     def _on_want(self, stream: FileStream) -> None:
         if stream.closed:

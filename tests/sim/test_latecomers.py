@@ -240,22 +240,21 @@ async def test_what_an_open_that_was_given_up_left_open_is_closed(
 async def test_what_a_late_open_left_open_as_we_leave_is_closed(profile: str, autojump: MockClock) -> None:
     """It comes when all is said and done, within the time in which such copies are feared."""
     here = world(profile, replace(DOUBLING, reorder=0.0), f=content(1500))
-    async with trio.open_nursery() as nursery:
-        async with here.connection() as connection:
-            for _ in range(5):
-                await connection.store.list_directory(path(profile, ""))
-            assert connection.engine.stats.strays
-            await trio.sleep(3)
-            here.model.settings = replace(DOUBLING, duplicate=0.0, reorder=0.0)
-            held = Held(here, Opcode.OPEN_FILE_RO)
-            held.deaf = False
-            await read_file(connection, path(profile, "f"))
+    async with trio.open_nursery() as nursery, here.connection() as connection:
+        for _ in range(5):
+            await connection.store.list_directory(path(profile, ""))
+        assert connection.engine.stats.strays
+        await trio.sleep(3)
+        here.model.settings = replace(DOUBLING, duplicate=0.0, reorder=0.0)
+        held = Held(here, Opcode.OPEN_FILE_RO)
+        held.deaf = False
+        await read_file(connection, path(profile, "f"))
 
-            async def deliver() -> None:
-                await trio.sleep(0.15)
-                held.deliver(trio.current_time())
+        async def deliver() -> None:
+            await trio.sleep(0.15)
+            held.deliver(trio.current_time())
 
-            nursery.start_soon(deliver)
+        nursery.start_soon(deliver)
     assert held.delivered
     assert here.vehicle.server.open_sessions == 0
 
