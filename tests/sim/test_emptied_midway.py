@@ -23,13 +23,13 @@ from tests.support.deliveries import (
     GOOD,
     LONG,
     MOMENTS,
-    MOST_REQUESTS,
     NO_RENAME,
     OLD,
     PROFILES,
     PROMPT,
     SLOW,
     Write,
+    at_each_request,
     change,
     create,
     names_on_card,
@@ -125,21 +125,12 @@ CASES = [
 async def test_emptied_at_any_request_of_its_delivery(
     profile: str, write: str, then: str, autojump: MockClock
 ) -> None:
-    for count in range(1, MOST_REQUESTS, 2):
-        taken = await empty_after(count, profile, write, then, GOOD)
-        if taken is None:
-            assert count > 2
-            return
-        assert taken < PROMPT, f"after request {count}"
-    raise AssertionError("it was never delivered")
+    await at_each_request(lambda count: empty_after(count, profile, write, then, GOOD), step=2, most=PROMPT)
 
 
 @pytest.mark.parametrize(("profile", "write", "then"), CASES)
 async def test_emptied_on_a_bad_link(profile: str, write: str, then: str, autojump: MockClock) -> None:
-    for count in range(1, MOST_REQUESTS, 3):
-        if await empty_after(count, profile, write, then, BAD) is None:
-            return
-    raise AssertionError("it was never delivered")
+    await at_each_request(lambda count: empty_after(count, profile, write, then, BAD), step=3)
 
 
 async def by_opening(tree: Tree, path: bytes) -> None:

@@ -64,11 +64,19 @@ class Rig:
             assert op.error is None, op.error
         self.link.engine.session = self.link.engine.home_session
 
-    def read(self, path: bytes, strategy: Strategy, *, chunk: int = CHUNK) -> bytes:
+    def start(
+        self, path: bytes, strategy: Strategy = "window", chunk: int = CHUNK
+    ) -> tuple[ReadTransfer, MemorySink]:
+        """Open a file, and return a transfer that wants nothing yet, and where its bytes go."""
         size = self.open(path)
         sink = MemorySink(size)
         transfer = ReadTransfer(self.session, size, sink, chunk, strategy)
         self.link.engine.start(transfer, self.link.now)
+        return transfer, sink
+
+    def read(self, path: bytes, strategy: Strategy, *, chunk: int = CHUNK) -> bytes:
+        transfer, sink = self.start(path, strategy, chunk)
+        size = transfer.size
         transfer.want(0, size, True)
         self.link.run_until(lambda: transfer.idle or transfer.done, 3600.0)
         assert transfer.error is None, transfer.error
@@ -166,10 +174,8 @@ def test_metadata_beside_a_transfer(name: str) -> None:
     rig = Rig(name, LinkSettings(rate=57_600.0, delay=0.02, loss=0.02))
     content = random.Random(7).randbytes(100_000)
     rig.tree.add(b"/big", content)
-    size = rig.open(b"/big")
-    sink = MemorySink(size)
-    transfer = ReadTransfer(rig.session, size, sink)
-    rig.link.engine.start(transfer, rig.link.now)
+    transfer, sink = rig.start(b"/big")
+    size = transfer.size
     transfer.want(0, size, True)
     rig.link.run_until(lambda: sink.held.total > 10_000)
     for _ in range(5):
@@ -243,10 +249,8 @@ def test_small_reads_here_and_there(name: str) -> None:
     rig = Rig(name, BAD, seed=11)
     content = random.Random(7).randbytes(100_000)
     rig.tree.add(b"/big", content)
-    size = rig.open(b"/big")
-    sink = MemorySink(size)
-    transfer = ReadTransfer(rig.session, size, sink)
-    rig.link.engine.start(transfer, rig.link.now)
+    transfer, sink = rig.start(b"/big")
+    size = transfer.size
     rng = random.Random(1)
     for _ in range(10):
         start = rng.randrange(size)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
+from math import inf
 
 import trio
 
@@ -60,6 +61,20 @@ async def names_shown(tree: Tree, folder: bytes) -> set[bytes]:
         tree.forget_caches()
     assert not any(is_reserved(name) for name in names)
     return names
+
+
+async def at_each_request(
+    attempt: Callable[[int], Awaitable[float | None]], *, step: int = 1, most: float = inf
+) -> None:
+    """Try something when so many requests of a delivery came, until it needs fewer (None). attempt: returns
+    how long that took, at most `most` seconds."""
+    for count in range(1, MOST_REQUESTS, step):
+        taken = await attempt(count)
+        if taken is None:
+            assert count > 2
+            return
+        assert taken < most, f"after request {count}"
+    raise AssertionError("it was never delivered")
 
 
 @asynccontextmanager

@@ -428,14 +428,19 @@ async def test_a_stale_mtime_is_not_credited_to_the_size_in_the_ack(
     assert await old.read(0, 10) == DATA[:10]
 
 
-async def test_a_partly_cached_file_is_opened_again_only_when_bytes_are_wanted(
-    store: FakeStore, tree: Tree, autojump_clock: MockClock
-) -> None:
+async def open_partly_cached(store: FakeStore, tree: Tree) -> OpenFile:
+    """Open a large file again of which the beginning was read."""
     store.add(b"/big", content(MIB), 5)
     handle = await tree.open(b"/big")
     await handle.read(0, 4 * KIB)
     handle.close()
-    handle = await tree.open(b"/big")
+    return await tree.open(b"/big")
+
+
+async def test_a_partly_cached_file_is_opened_again_only_when_bytes_are_wanted(
+    store: FakeStore, tree: Tree, autojump_clock: MockClock
+) -> None:
+    handle = await open_partly_cached(store, tree)
     assert store.count("open", b"/big") == 1
     await handle.read(512 * KIB, 4 * KIB)
     assert store.count("open", b"/big") == 2
@@ -444,11 +449,7 @@ async def test_a_partly_cached_file_is_opened_again_only_when_bytes_are_wanted(
 async def test_a_file_that_shrank_before_it_was_opened_again(
     store: FakeStore, tree: Tree, autojump_clock: MockClock
 ) -> None:
-    store.add(b"/big", content(MIB), 5)
-    handle = await tree.open(b"/big")
-    await handle.read(0, 4 * KIB)
-    handle.close()
-    handle = await tree.open(b"/big")
+    handle = await open_partly_cached(store, tree)
     store.add(b"/big", b"short", 6)
     with pytest.raises(FileChanged):
         await handle.read(512 * KIB, 4 * KIB)

@@ -181,6 +181,14 @@ def spool(tmp_path: Path) -> SpoolDirectory:
     return SpoolDirectory(tmp_path / "spool", Random(1))
 
 
+async def written(store: FakeWriter, spool: SpoolDirectory) -> tuple[Tree, OpenFile]:
+    """Return a mount and a file of it of which more was written than memory takes."""
+    tree = make_writable(store, spool=spool, dirty_max=65536)
+    file = await tree.create(FILE, exclusive=True)
+    await file.write(0, BIG)
+    return tree, file
+
+
 async def test_killed_before_any_close(store: FakeWriter, spool: SpoolDirectory, tmp_path: Path) -> None:
     tree = make_writable(store, spool=spool, dirty_max=65536)
     await begin(tree, store)
@@ -188,9 +196,7 @@ async def test_killed_before_any_close(store: FakeWriter, spool: SpoolDirectory,
 
 
 async def test_killed_after_a_rename(store: FakeWriter, spool: SpoolDirectory, tmp_path: Path) -> None:
-    tree = make_writable(store, spool=spool, dirty_max=65536)
-    file = await tree.create(FILE, exclusive=True)
-    await file.write(0, BIG)
+    tree, file = await written(store, spool)
     await tree.rename(FILE, b"/card/name", noreplace=False)
     store.lost = True
     await file.write(0, b"X")
@@ -200,17 +206,13 @@ async def test_killed_after_a_rename(store: FakeWriter, spool: SpoolDirectory, t
 async def test_killed_after_a_rename_of_what_waits(
     store: FakeWriter, spool: SpoolDirectory, tmp_path: Path
 ) -> None:
-    tree = make_writable(store, spool=spool, dirty_max=65536)
-    file = await tree.create(FILE, exclusive=True)
-    await file.write(0, BIG)
+    tree, _ = await written(store, spool)
     await tree.rename(FILE, b"/card/name", noreplace=False)
     assert await killed(tree, spool, tmp_path) == {}, "a rename delivers first"
 
 
 async def test_killed_after_it_was_unlinked(store: FakeWriter, spool: SpoolDirectory, tmp_path: Path) -> None:
-    tree = make_writable(store, spool=spool, dirty_max=65536)
-    file = await tree.create(FILE, exclusive=True)
-    await file.write(0, BIG)
+    tree, file = await written(store, spool)
     await tree.unlink(FILE)
     assert bytes(await file.read(0, len(BIG))) == BIG
     assert await killed(tree, spool, tmp_path) == {}
@@ -227,9 +229,7 @@ async def test_killed_after_it_was_replaced(store: FakeWriter, spool: SpoolDirec
 
 
 async def test_killed_after_fsync_and_more(store: FakeWriter, spool: SpoolDirectory, tmp_path: Path) -> None:
-    tree = make_writable(store, spool=spool, dirty_max=65536)
-    file = await tree.create(FILE, exclusive=True)
-    await file.write(0, BIG)
+    tree, file = await written(store, spool)
     await file.fsync()
     store.lost = True
     await file.write(len(BIG), b"!")
@@ -239,9 +239,7 @@ async def test_killed_after_fsync_and_more(store: FakeWriter, spool: SpoolDirect
 async def test_killed_while_a_delivered_file_is_open(
     store: FakeWriter, spool: SpoolDirectory, tmp_path: Path
 ) -> None:
-    tree = make_writable(store, spool=spool, dirty_max=65536)
-    file = await tree.create(FILE, exclusive=True)
-    await file.write(0, BIG)
+    tree, file = await written(store, spool)
     await file.fsync()
     assert await killed(tree, spool, tmp_path) == {}
 
