@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from mavftpfs.cache.context import Context
-from mavftpfs.cache.files import FileHandle
+from mavftpfs.cache.filehandle import FileHandle
 from mavftpfs.cache.nodes import Node
 from mavftpfs.shared.errors import FileChanged, FtpNak, IsADirectory, LocalProtocolError, NotFound
 from mavftpfs.shared.model import EntryKind
@@ -40,8 +40,10 @@ async def open_node(context: Context, node: Node) -> FileHandle:
                     raise  # else it got its lasting hidden name meanwhile
 
 
-async def read_base(context: Context, node: Node, start: int, stop: int) -> bytes | memoryview:
-    """Return bytes of the vehicle's file that a node's draft lies over.
+async def read_base(
+    context: Context, node: Node, start: int, stop: int, *, sure: bool = False
+) -> bytes | memoryview:
+    """Return bytes of the vehicle's file that a node's draft lies over; sure: as FileHandle.read.
 
     Raises:
         FileChanged: it is another file by now. DataUnproven: they may be another file's. Else as open_base
@@ -61,7 +63,7 @@ async def read_base(context: Context, node: Node, start: int, stop: int) -> byte
         if node.draft is not None and base.size < stop:
             raise FileChanged(f"{node.path!r} became shorter on the vehicle")
         try:
-            data = await base.read(start, stop - start)
+            data = await base.read(start, stop - start, sure=sure)
         except (FileChanged, LocalProtocolError):
             if node.base is base:
                 raise  # else we changed it there ourselves meanwhile, but not these bytes
@@ -70,11 +72,21 @@ async def read_base(context: Context, node: Node, start: int, stop: int) -> byte
     return data
 
 
-def require_not_lost(node: Node) -> None:
-    """Raise FileChanged if the file below the draft is known to be another one by now: what was changed here
-    of the old one is not to be changed there."""
-    if node.base is not None:
-        node.base.require_not_lost()
+async def require_same(node: Node) -> None:
+    """Check that the file below a draft is not another one by now, as far as is known, or since the vehicle
+    restarted: what was changed here of the old one is not to be changed there. The caller has the lock.
+
+    What we changed there ourselves since cannot be compared.
+
+    Raises:
+        FileChanged. Else as FileHandle.require_same.
+    """
+    if node.base is None:
+        return
+    node.base.require_not_lost()
+    if node.draft is not None and not node.draft.touched:
+        with node.looking():
+            await node.base.require_same()
 
 
 def outdate(context: Context, node: Node) -> None:
@@ -85,14 +97,15 @@ def outdate(context: Context, node: Node) -> None:
 
 
 async def fill(context: Context, node: Node) -> None:
-    """Fetch what only the vehicle has, so that the draft is whole.
+    """Fetch what only the vehicle has, so that the draft is whole; the caller has the node's lock.
 
     Raises:
         NoSpace; else as read_base.
     """
     draft = node.draft
     assert draft is not None
-    for start, stop in draft.missing_base():
-        for at in range(start, stop, STEP):
-            end = min(at + STEP, stop)
-            draft.fill(at, await read_base(context, node, at, end))
+    with node.looking():
+        for start, stop in draft.missing_base():
+            for at in range(start, stop, STEP):
+                end = min(at + STEP, stop)
+                draft.fill(at, await read_base(context, node, at, end, sure=True))

@@ -62,8 +62,10 @@ class Context:
         node = self.nodes.get(path)
         if node is None:
             return False
-        begun = node.lock.locked() or node.attempt is not None or node.error is not None
-        return begun or (node.draft is not None and (node.draft.touched or node.draft.ruined))
+        draft, begun = node.draft, node.lock.locked() or node.attempt is not None or node.error is not None
+        if draft is not None and (draft.touched or draft.ruined or draft.placed):
+            return True
+        return begun and not node.looked_at
 
     def hide(self, node: Node, path: bytes) -> None:
         """An unlinked file's node is called `path`, a reserved name, from now on."""

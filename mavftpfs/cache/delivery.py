@@ -225,7 +225,7 @@ class Deliverer:
         draft.remote_cut(draft.size)
 
     async def _cut(self, node: Node, size: int) -> None:
-        base.require_not_lost(node)
+        await base.require_same(node)
         await self._context.writer.truncate(node.path, size)
         self._context.dentries.note_unsized(node.path)
         base.outdate(self._context, node)
@@ -326,8 +326,9 @@ class Deliverer:
         Raises:
             FileChanged: it grew or shrank, or is another one.
         """
-        base.require_not_lost(node)
-        size, most = await self.verifier.size(node.path), draft.remote_end
+        with node.looking():
+            size, most = await self.verifier.size(node.path), draft.remote_end
+        await base.require_same(node)
         if most is not None and not draft.base_limit <= size <= max(most, draft.stretched):
             raise FileChanged(f"{node.path!r} has {size} bytes now, {most} when it was changed here")
         return size

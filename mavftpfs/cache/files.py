@@ -22,17 +22,16 @@ from itertools import islice
 
 from mavftpfs.cache.blocks import BlockCache, FileBlocks
 from mavftpfs.cache.directories import Directories
+from mavftpfs.cache.filehandle import FileHandle
 from mavftpfs.cache.flights import Flights
 from mavftpfs.cache.keeper import Keeper
 from mavftpfs.cache.options import MIB
-from mavftpfs.cache.readahead import Pace, Readahead
-from mavftpfs.cache.readonly import ReadOnlyHandle
+from mavftpfs.cache.readahead import Pace
 from mavftpfs.cache.remote import RemoteStore
-from mavftpfs.cache.reopens import Reopens
+from mavftpfs.cache.reopens import Reopens, is_unsettled
 from mavftpfs.cache.restarts import Restarts
-from mavftpfs.cache.versions import MAX_RESTARTS, Fetcher, Version, became_another
+from mavftpfs.cache.versions import Fetcher, Version, became_another
 from mavftpfs.shared.errors import (
-    DataUnproven,
     FileTooLarge,
     LocalProtocolError,
     VehicleLost,
@@ -78,7 +77,7 @@ class Files:
         self._on_size = on_size
         self._invalidate = invalidate
         self.fetcher = Fetcher(store, cache, on_distrust=self._distrust, on_changed=self._kill)
-        self.recheck = Restarts(self.fetcher, self._facts, on_changed=self._kill).recheck
+        self.restarts = Restarts(self.fetcher, self._facts, on_changed=self._kill)
         self.reopens = Reopens(
             self.fetcher,
             directories,
@@ -247,9 +246,11 @@ class Files:
     # --- we changed the file ourselves
 
     def cached(self, path: bytes) -> FileBlocks | None:
-        """Return what is cached of a path's present version."""
+        """Return what is cached of a path's present version, if all that is surely of one file."""
         version = self._current.get(path)
-        return None if version is None or version.dead is not None else version.blocks
+        if version is None or version.dead is not None or version.recheck or is_unsettled(version):
+            return None
+        return version.blocks
 
     def was_lost(self, path: bytes) -> bool:
         """Return whether somebody has a version of the path open, and is to read nothing more."""
@@ -326,75 +327,3 @@ class Files:
     def _forget(self, version: Version) -> None:
         version.blocks.clear()
         del self._current[version.path]
-
-
-class FileHandle(ReadOnlyHandle):
-    """One open() of a regular file (see cache.tree.OpenFile)."""
-
-    def __init__(self, files: Files, version: Version, *, keep_cache: bool, direct_io: bool) -> None:
-        self._files = files
-        self._version = version
-        self._readahead = Readahead(version.size)
-        self._closed = False
-        self.size = version.size
-        self.keep_cache = keep_cache
-        self.direct_io = direct_io
-
-    async def read(self, offset: int, size: int) -> bytes | memoryview:
-        """Return `size` bytes at `offset`, fewer only at the end of the opened size.
-
-        Raises:
-            FileChanged, DataUnproven, RequestTimeout, VehicleLost, FtpNak.
-        """
-        if self._closed:
-            raise LocalProtocolError("read of a closed handle")
-        stop = min(offset + size, self.size)
-        if offset >= stop:
-            return b""
-        version, reopens, at_end = self._version, self._files.reopens, stop == self.size
-        for _ in range(MAX_RESTARTS):
-            await self._files.recheck(version)
-            boot = version.boot
-            data = await self._read_range(offset, stop)
-            if boot != version.boot or version.recheck:
-                continue
-            if not reopens.due(version, at_end=at_end):
-                version.blocks.on_given(offset, stop)
-                return data
-            await reopens.compare(version)
-            at_end = False
-        raise DataUnproven(f"the vehicle restarts again and again while {version.path!r} is read")
-
-    def require_not_lost(self) -> None:
-        """Raise FileChanged if the file became another one by somebody else's doing."""
-        if self._version.lost:
-            self._version.require_alive()
-
-    async def _read_range(self, offset: int, stop: int) -> bytes | memoryview:
-        if stop - offset <= self._files.piece:
-            return await self._read_piece(offset, stop)
-        step = self._files.piece
-        pieces = [await self._read_piece(at, min(at + step, stop)) for at in range(offset, stop, step)]
-        return b"".join(pieces)
-
-    def close(self) -> None:
-        """Release the handle."""
-        if not self._closed:
-            self._closed = True
-            self._files.release(self._version)
-
-    async def _read_piece(self, start: int, stop: int) -> bytes | memoryview:
-        files, version = self._files, self._version
-        files.on_read(version)
-        pace = files.pace()
-        plan = self._readahead.on_read(start, stop, limit=pace.limit, small=pace.small)
-        if plan.seeked and version.reader is not None:
-            version.reader.drop_readahead()
-        data = version.blocks.get(start, stop)
-        if data is None:
-            files.misses += 1
-            return await files.fetcher.fetch(version, start, stop, plan)
-        files.hits += 1
-        if version.reader is not None and plan.start < plan.stop:
-            version.reader.want(plan.start, plan.stop, demand=False)
-        return data

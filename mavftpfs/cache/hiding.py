@@ -112,8 +112,9 @@ class Hider:
         """
         with trio.move_on_after(self._context.options.op_deadline) as scope:
             try:
-                while node.handles and not self.keep_content(node):
-                    await (self._copy(node) if node.draft is None else self._complete(node, node.draft))
+                with node.looking():
+                    while node.handles and not self.keep_content(node):
+                        await (self._copy(node) if node.draft is None else self._complete(node, node.draft))
             except (RequestTimeout, LinkError):
                 raise
             except MavftpfsError as error:
@@ -124,7 +125,7 @@ class Hider:
             raise FileBusy(f"{node.path!r} is open, and the rest of it did not come in time")
 
     async def _complete(self, node: Node, draft: Draft) -> None:
-        await self._fill(node, draft, partial(read_base, self._context, node))
+        await self._fill(node, draft, partial(read_base, self._context, node, sure=True))
 
     async def _copy(self, node: Node) -> None:
         """Make a draft of what nobody changed, unless somebody is about to."""
@@ -135,7 +136,7 @@ class Hider:
         async def read(start: int, stop: int) -> bytes | memoryview:
             content.settle()  # of a part of it even less than of a copy
             self._require_same(node)
-            return await handle.read(start, stop - start)
+            return await handle.read(start, stop - start, sure=True)
 
         try:
             await self._fill(node, draft, read)

@@ -14,7 +14,7 @@ import trio
 
 from mavftpfs.cache.asides import Places
 from mavftpfs.cache.draft import Draft
-from mavftpfs.cache.files import FileHandle
+from mavftpfs.cache.filehandle import FileHandle
 from mavftpfs.cache.plan import Plan
 from mavftpfs.cache.remote import Upload
 from mavftpfs.cache.sending import Sending
@@ -64,6 +64,7 @@ class Node:
     it may begin by itself; start_after: not before.
     base: reads the vehicle's file. delivered_at: when the vehicle last had it all. doomed: how many changes
     that take its name away have the lock, or are about to, or empty it: no delivery begins or goes on.
+    looked_at: who has the lock changes nothing on the vehicle just now.
     """
 
     path: bytes
@@ -85,6 +86,7 @@ class Node:
     lock: trio.Lock = field(default_factory=trio.Lock)
     quiet: trio.Event = field(default_factory=trio.Event)
     doomed: int = 0
+    looked_at: int = 0
     _delivery: trio.CancelScope | None = None
     _firm: int = 0
 
@@ -133,6 +135,16 @@ class Node:
         finally:
             self._firm -= 1
             self._heed()
+
+    @contextmanager
+    def looking(self) -> Iterator[None]:
+        """The body has the lock and changes nothing on the vehicle: what is found there is as others left it,
+        or as it was changed by us before."""
+        self.looked_at += 1
+        try:
+            yield
+        finally:
+            self.looked_at -= 1
 
     @contextmanager
     def dooming(self) -> Iterator[None]:

@@ -24,10 +24,11 @@ async def fetch_endangered(context: Context, node: Node, plan: Plan) -> None:
     assert draft is not None
     if plan is not Plan.IN_PLACE:
         return
-    for start, stop in context.writer.endangered(node.path):
-        for where, a, b in draft.segments(start, stop):
-            if where is Where.BASE:
-                draft.fill(a, await read_base(context, node, a, b))
+    with node.looking():
+        for start, stop in context.writer.endangered(node.path):
+            for where, a, b in draft.segments(start, stop):
+                if where is Where.BASE:
+                    draft.fill(a, await read_base(context, node, a, b, sure=True))
 
 
 def overwritten(upload: Upload, draft: Draft) -> list[tuple[int, int]]:

@@ -48,11 +48,11 @@ class Reopens:
         self._comparing: Flights[Version, None] = Flights()
         directories.on_listed = self._on_listed
 
-    def due(self, version: Version, *, at_end: bool) -> bool:
-        """Return whether a version has to be compared before more of it is given out; `at_end`: the last."""
+    def due(self, version: Version, *, now: bool) -> bool:
+        """Return whether a version has to be compared before more of it is given out; `now`: if ever."""
         if not is_unsettled(version) or self._is_changing(version.path):
             return False
-        return at_end or self._clock() >= version.blocks.openings.look_at
+        return now or self._clock() >= version.blocks.openings.look_at
 
     async def compare(self, version: Version) -> None:
         """Compare an open version with a listing that begins after its file was opened on the vehicle.

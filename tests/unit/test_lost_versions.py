@@ -9,7 +9,7 @@ import trio
 
 from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.tree import Tree
-from mavftpfs.shared.errors import FileChanged
+from mavftpfs.shared.errors import FileChanged, VehicleLost
 from tests.support.fake_writer import KINDS, FakeWriter, make_writable
 
 FILE = b"/d/file"
@@ -165,3 +165,47 @@ async def test_changes_of_a_lost_file_do_not_go_to_the_new_one(
     await writer.write(0, b"whole")
     await writer.release()
     assert store.files[FILE].data == b"whole"
+
+
+@pytest.mark.parametrize("failed", [False, True])
+@pytest.mark.parametrize("cut", [False, True])
+@pytest.mark.parametrize("mtime", [1, None])
+async def test_changes_that_waited_over_a_restart_go_to_the_very_file_only(
+    store: FakeWriter, autojump_clock: object, failed: bool, cut: bool, mtime: int | None
+) -> None:
+    """Nobody read in between, which would have shown that the card is another one."""
+    store.add(FILE, OLD, mtime)
+    tree = make_writable(store, inplace=True)
+    writer = await tree.open(FILE, write=True)
+    assert bytes(await writer.read(0, 9)) == OLD[:9]
+    await (writer.truncate(500) if cut else writer.write(0, b"mid"))
+    if failed:
+        store.lost = True
+        with pytest.raises(VehicleLost):
+            await writer.fsync()
+        store.lost = False
+    store.add(FILE, NEW, None if mtime is None else 2)
+    tree.rebooted()
+    for _ in range(2):
+        with pytest.raises(FileChanged):
+            await writer.fsync()
+        await trio.sleep(60.0)
+    assert store.files[FILE].data == NEW
+    await writer.truncate(0)
+    await writer.write(0, b"whole")
+    await writer.release()
+    assert store.files[FILE].data == b"whole"
+
+
+@pytest.mark.parametrize("mtime", [1, None])
+async def test_changes_that_waited_over_a_restart_are_delivered(
+    store: FakeWriter, autojump_clock: object, mtime: int | None
+) -> None:
+    store.add(FILE, OLD, mtime)
+    tree = make_writable(store, inplace=True)
+    writer = await tree.open(FILE, write=True)
+    assert bytes(await writer.read(0, 9)) == OLD[:9]
+    await writer.write(0, b"mid")
+    tree.rebooted()
+    await writer.release()
+    assert store.files[FILE].data == b"mid" + OLD[3:]
