@@ -7,6 +7,7 @@ A lost request goes out again with the same bytes at the same offset, so executi
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
 from typing import Protocol
 
 from mavftpfs.protocol.payload import MAX_DATA, NakCode, Opcode, Payload
@@ -59,6 +60,8 @@ class WriteTransfer(Operation):
     Args:
         session: id of the file open for writing. chunk: most bytes of a request, 1..239.
         in_flight: the most requests unanswered at once, None as the engine's window allows; 1 = strict order.
+        on_starved: called when the source has nothing more, which after a full window shows only once all of
+            that was answered.
 
     Attributes:
         acked_bytes: written so far. failed_at: offset of the request that was refused, if that ended it.
@@ -73,7 +76,13 @@ class WriteTransfer(Operation):
     bulk = _WRITE
 
     def __init__(
-        self, session: int, source: ChunkSource, chunk: int = MAX_DATA, *, in_flight: int | None = None
+        self,
+        session: int,
+        source: ChunkSource,
+        chunk: int = MAX_DATA,
+        *,
+        in_flight: int | None = None,
+        on_starved: Callable[[], None] = lambda: None,
     ) -> None:
         super().__init__()
         if not 1 <= chunk <= MAX_DATA:
@@ -84,6 +93,7 @@ class WriteTransfer(Operation):
         self.failed_at: int | None = None
         self._source = source
         self._in_flight = in_flight
+        self._on_starved = on_starved
         self._rest: deque[tuple[int, bytes]] = deque()
         self._unanswered: dict[Request, None] = {}
         self._paused = False
@@ -162,6 +172,7 @@ class WriteTransfer(Operation):
         piece = self._source.next_chunk(limit)
         if piece is None:
             self._starved = True
+            self._on_starved()
             return None
         offset, size = piece[0], len(piece[1])
         if not 1 <= size <= limit or not 0 <= offset <= MAX_OFFSET - size:

@@ -154,7 +154,7 @@ class Writer:
         rearms, self._filled = 0, False
         self.turns.set_writing(self._disarmed_by_paths)
         while True:
-            transfer = WriteTransfer(session.id, upload.feed, self._chunk)
+            transfer = WriteTransfer(session.id, upload.feed, self._chunk, on_starved=self._holder.wake)
             stop = await self._drive(upload, session, transfer)
             if transfer.acked_bytes and rearms:
                 self._disarmed_by_paths = True
