@@ -17,7 +17,7 @@ from mavftpfs.link.messages import Address
 from mavftpfs.protocol.payload import MAX_DATA, NakCode, Opcode
 from mavftpfs.sim import ardupilotops
 from mavftpfs.sim.ardupilotops import NOBODY, Session
-from mavftpfs.sim.firmware import Firmware
+from mavftpfs.sim.firmware import Firmware, Refusal
 from mavftpfs.sim.profiles import Profile
 from mavftpfs.sim.storage import StaleErrno, Storage
 from mavftpfs.sim.wire import ACK, FULL_FRAME, NAK, Reply, Request, frame_size, parse
@@ -197,7 +197,7 @@ class ArduPilot(Firmware):
             return
         try:
             cost = self._ops.execute(slot, request, self._reply, self.now)
-        except ardupilotops.Refusal as refusal:
+        except Refusal as refusal:
             self._nak(refusal.code)
         except OSError as exc:
             self._fail(exc)
@@ -264,14 +264,14 @@ class ArduPilot(Firmware):
             for index in range(self.profile.burst_packets):
                 data = ardupilotops.read(slot, request.offset + index * size, size)
                 if not data:
-                    raise ardupilotops.Refusal(NakCode.EOF)
+                    raise Refusal(NakCode.EOF)
                 self._fill(reply, request.offset + index * size, data, size, index)
                 yield from self._push(slot)
                 if self.profile.exact_eof_offset or len(data) < size:
                     reply.offset += len(data)
                 reply.seq += 1
                 yield self.now + self._interval(size)
-        except ardupilotops.Refusal as refusal:
+        except Refusal as refusal:
             self._nak(refusal.code)
         except OSError as exc:
             self._fail(exc)

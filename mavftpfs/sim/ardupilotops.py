@@ -10,20 +10,13 @@ from mavftpfs.link.messages import Address
 from mavftpfs.protocol.payload import MAX_DATA, NakCode, Opcode
 from mavftpfs.sim import profiles
 from mavftpfs.sim.filesystem import Entry, Kind, Stat, fail
+from mavftpfs.sim.firmware import Refusal
 from mavftpfs.sim.profiles import Profile
 from mavftpfs.sim.storage import OpenFile, StaleErrno, Storage
 from mavftpfs.sim.wire import Reply, Request, c_string, u32
 
 NOBODY = Address(0, 0)
 _MAX_OFFSET = 2**31
-
-
-class Refusal(Exception):
-    """A NAK that does not come from errno."""
-
-    def __init__(self, code: int) -> None:
-        super().__init__(code)
-        self.code = code
 
 
 @dataclass(slots=True)

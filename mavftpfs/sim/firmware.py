@@ -20,6 +20,14 @@ from mavftpfs.sim.wire import FULL_FRAME, frame_size
 Room = Callable[[], int]
 
 
+class Refusal(Exception):
+    """A NAK with a code of the server's own, which does not come from errno."""
+
+    def __init__(self, code: int) -> None:
+        super().__init__(code)
+        self.code = code
+
+
 class Firmware(ABC):
     """One server's code. Subclasses decide; this class keeps time and the outbox."""
 

@@ -15,9 +15,8 @@ from collections.abc import Callable, Sequence
 from mavftpfs.link.messages import Address
 from mavftpfs.protocol.payload import MAX_DATA, NakCode, Opcode
 from mavftpfs.sim import px4ops
-from mavftpfs.sim.firmware import Firmware
+from mavftpfs.sim.firmware import Firmware, Refusal
 from mavftpfs.sim.profiles import Profile
-from mavftpfs.sim.px4ops import Refusal
 from mavftpfs.sim.px4rows import NOT_KEPT, read_row, write_row
 from mavftpfs.sim.px4stream import Stream
 from mavftpfs.sim.storage import OpenFile, StaleErrno, Storage

@@ -9,6 +9,7 @@ from typing import Protocol
 from mavftpfs.protocol.payload import MAX_DATA, NakCode, Opcode
 from mavftpfs.sim import profiles
 from mavftpfs.sim.filesystem import Entry, Kind, fail
+from mavftpfs.sim.firmware import Refusal
 from mavftpfs.sim.profiles import Profile
 from mavftpfs.sim.storage import OpenFile, StaleErrno, Storage
 from mavftpfs.sim.wire import Request, c_string, u32
@@ -16,14 +17,6 @@ from mavftpfs.sim.wire import Request, c_string, u32
 _WORK_BUFFER = 256
 _RENAME_LIMIT = 255
 _COPY_BLOCK = 256
-
-
-class Refusal(Exception):
-    """A NAK with a code of PX4's own; its errno stays what it was."""
-
-    def __init__(self, code: int) -> None:
-        super().__init__(code)
-        self.code = code
 
 
 class Server(Protocol):

@@ -13,21 +13,13 @@ from dataclasses import dataclass
 from mavftpfs.link.messages import Address
 from mavftpfs.protocol.payload import MAX_DATA, NakCode, Opcode
 from mavftpfs.sim.filesystem import Entry, Kind
-from mavftpfs.sim.firmware import Firmware
+from mavftpfs.sim.firmware import Firmware, Refusal
 from mavftpfs.sim.profiles import Profile
 from mavftpfs.sim.storage import OpenFile, Storage
 from mavftpfs.sim.wire import ACK, FULL_FRAME, NAK, Reply, Request, c_string, parse, u32
 
 _BURST_PACKETS = 100
 _CODES = {errno.ENOENT: NakCode.FILE_NOT_FOUND, errno.EEXIST: NakCode.FILE_EXISTS}
-
-
-class SpecNak(Exception):
-    """A refusal with one of the guide's codes."""
-
-    def __init__(self, code: int) -> None:
-        super().__init__(code)
-        self.code = code
 
 
 @dataclass(slots=True)
@@ -124,7 +116,7 @@ class Spec(Firmware):
         )
         try:
             data = self._execute(request, reply)
-        except SpecNak as nak:
+        except Refusal as nak:
             data = bytes([nak.code])
         except OSError as exc:
             data = _errno_data(exc)
@@ -138,12 +130,12 @@ class Spec(Firmware):
 
     def _execute(self, request: Request, reply: Reply) -> bytes | None:
         if request.size > MAX_DATA:
-            raise SpecNak(NakCode.INVALID_DATA_SIZE)
+            raise Refusal(NakCode.INVALID_DATA_SIZE)
         if request.opcode in (Opcode.OPEN_FILE_RO, Opcode.OPEN_FILE_WO, Opcode.CREATE_FILE):
             return self._open(request, reply)
         handler = self._handlers.get(request.opcode)
         if handler is None:
-            raise SpecNak(NakCode.UNKNOWN_COMMAND)
+            raise Refusal(NakCode.UNKNOWN_COMMAND)
         return handler(request)
 
     # -- requests ----------------------------------------------------------------------------
@@ -151,13 +143,13 @@ class Spec(Firmware):
     def _session(self, request: Request) -> _Session:
         session = self._sessions.get(request.session)
         if session is None:
-            raise SpecNak(NakCode.INVALID_SESSION)
+            raise Refusal(NakCode.INVALID_SESSION)
         return session
 
     def _open(self, request: Request, reply: Reply) -> bytes:
         free = [i for i in range(1, self.profile.sessions + 1) if i not in self._sessions]
         if not free:
-            raise SpecNak(NakCode.NO_SESSIONS_AVAILABLE)
+            raise Refusal(NakCode.NO_SESSIONS_AVAILABLE)
         path, write = _path(request), request.opcode != Opcode.OPEN_FILE_RO
         create = request.opcode == Opcode.CREATE_FILE
         opened = self.storage.open(path, write=write, create=write, truncate=create)
@@ -184,7 +176,7 @@ class Spec(Firmware):
     def _list(self, request: Request) -> bytes:
         with_time = request.opcode == Opcode.LIST_DIRECTORY_WITH_TIME
         if with_time and not self.profile.list_with_time:
-            raise SpecNak(NakCode.UNKNOWN_COMMAND)
+            raise Refusal(NakCode.UNKNOWN_COMMAND)
         entries = [entry for entry in self.storage.entries(_path(request)) if _shown(entry)]
         page = bytearray()
         for entry in entries[request.offset :]:
@@ -193,19 +185,19 @@ class Spec(Firmware):
                 break
             page += text
         if not page:
-            raise SpecNak(NakCode.EOF)
+            raise Refusal(NakCode.EOF)
         return bytes(page)
 
     def _read(self, request: Request) -> bytes:
         data = self._session(request).file.read(request.offset, request.size)
         if not data and request.size:
-            raise SpecNak(NakCode.EOF)
+            raise Refusal(NakCode.EOF)
         return data
 
     def _write(self, request: Request) -> bytes:
         session = self._session(request)
         if not session.writing:
-            raise SpecNak(NakCode.FAIL)
+            raise Refusal(NakCode.FAIL)
         return u32(session.file.write(request.offset, request.data[: request.size]))
 
     def _rename(self, request: Request) -> bytes:
