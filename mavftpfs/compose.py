@@ -28,6 +28,7 @@ from mavftpfs.keeping import MakeKeeper, keeper_for
 from mavftpfs.link.opening import open_link
 from mavftpfs.link.uri import LinkSpec
 from mavftpfs.session.connection import Connection, ConnectOptions, connected
+from mavftpfs.session.driver import PayloadTrace
 from mavftpfs.shared.errnos import errno_for
 from mavftpfs.shared.errors import (
     FtpNak,
@@ -39,7 +40,7 @@ from mavftpfs.shared.errors import (
     VehicleLost,
 )
 from mavftpfs.shared.model import ROOT
-from mavftpfs.trace import JsonTrace, PayloadSink, Tee, TextTrace, TlogWriter
+from mavftpfs.trace import JsonTrace, Tee, TextTrace, TlogWriter
 
 MIB = 1 << 20
 KEY_SIZE = 32
@@ -70,7 +71,7 @@ class Attached:
 class Sinks:
     """Where what goes over the link is recorded: FTP payloads, and whole frames."""
 
-    payload: PayloadSink | None = None
+    payload: PayloadTrace | None = None
     frame: Callable[[bytes], None] | None = None
 
 
@@ -85,7 +86,7 @@ def open_sinks(options: MountOptions, *, debug: bool) -> Iterator[Sinks]:
         UsageError: a file cannot be created.
     """
     with ExitStack() as stack:
-        payload: list[PayloadSink] = []
+        payload: list[PayloadTrace] = []
         if debug:
             payload.append(TextTrace(lambda line: print(line, file=sys.stderr)))
         if options.trace is not None:

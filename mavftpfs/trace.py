@@ -20,9 +20,10 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
-from typing import BinaryIO, Protocol, Self
+from typing import BinaryIO, Self
 
 from mavftpfs.protocol.payload import HEADER_SIZE, PAYLOAD_SIZE, NakCode, Opcode, Payload, decode_request
+from mavftpfs.session.driver import PayloadTrace
 from mavftpfs.shared.errors import UsageError
 
 REQUEST = "request"
@@ -34,14 +35,6 @@ _OPCODES = {opcode.value: opcode.name for opcode in Opcode}
 _NAK_CODES = {code.value: code.name for code in NakCode}
 _timestamp = struct.Struct(">Q").pack
 _log = logging.getLogger(__name__)
-
-
-class PayloadSink(Protocol):
-    """What the session layer calls."""
-
-    def payload(self, now: float, direction: str, wire: bytes, note: str = "") -> None:
-        """Record 251 bytes; direction is "request" or "reply"."""
-        ...
 
 
 class _File:
@@ -108,7 +101,7 @@ class JsonTrace(_File):
         self._data_limit = data_limit
 
     def payload(self, now: float, direction: str, wire: bytes, note: str = "") -> None:
-        """See PayloadSink."""
+        """See PayloadTrace."""
         record = describe(direction, wire, data_limit=self._data_limit)
         if note:
             record["note"] = note
@@ -145,18 +138,18 @@ class TextTrace:
         self._write = write
 
     def payload(self, now: float, direction: str, wire: bytes, note: str = "") -> None:
-        """See PayloadSink."""
+        """See PayloadTrace."""
         self._write(f"{now:.6f} {text_line(direction, wire)}{f' ({note})' if note else ''}")
 
 
 class Tee:
     """Hands each payload to several sinks."""
 
-    def __init__(self, sinks: Sequence[PayloadSink]) -> None:
+    def __init__(self, sinks: Sequence[PayloadTrace]) -> None:
         self._sinks = tuple(sinks)
 
     def payload(self, now: float, direction: str, wire: bytes, note: str = "") -> None:
-        """See PayloadSink."""
+        """See PayloadTrace."""
         for sink in self._sinks:
             sink.payload(now, direction, wire, note)
 
