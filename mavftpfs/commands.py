@@ -23,7 +23,7 @@ from mavftpfs.fuse.options import MountOptions, parse_options, with_root
 from mavftpfs.link.uri import LinkSpec, parse_source
 from mavftpfs.mountpoint import canonical, check_fuse, check_mountpoint, is_ours, unmount
 from mavftpfs.shared.errors import UsageError
-from mavftpfs.shared.readable import readable
+from mavftpfs.shared.readable import printable, readable
 
 if TYPE_CHECKING:
     from mavftpfs.oneshot import Target
@@ -277,7 +277,7 @@ def get(args: argparse.Namespace) -> int:
     local = Path(args.to)
 
     def tell(fetched: oneshot.Fetched) -> None:
-        name = report.printable(os.fsdecode(fetched.remote))
+        name = printable(os.fsdecode(fetched.remote))
         print(f"{name}: {report.readable_size(fetched.size)}, verified by {fetched.proof}")
 
     with report.transfer_meter() as meter:
@@ -296,7 +296,7 @@ def put(args: argparse.Namespace) -> int:
     (path,), component = oneshot.parse_paths([args.path])
 
     def tell(sent: oneshot_writing.Sent) -> None:
-        print(f"{report.printable(os.fsdecode(sent.remote))}: {report.readable_size(sent.size)}, delivered")
+        print(f"{printable(os.fsdecode(sent.remote))}: {report.readable_size(sent.size)}, delivered")
 
     with report.transfer_meter() as meter:
         _run(
@@ -351,12 +351,12 @@ def mv(args: argparse.Namespace) -> int:
 
 def crc(args: argparse.Namespace) -> int:
     """Print checksums the vehicle computed, as cksum's relatives do: number, two blanks, name."""
-    from mavftpfs import oneshot, report
+    from mavftpfs import oneshot
 
     paths, component = oneshot.parse_paths(args.paths)
 
     def tell(path: bytes, number: int) -> None:
-        print(f"{number:08x}  {report.printable(os.fsdecode(path))}")
+        print(f"{number:08x}  {printable(os.fsdecode(path))}")
 
     _run(args, lambda target: oneshot.checksum_paths(target, paths, tell), component)
     return ExitCode.OK

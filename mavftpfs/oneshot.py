@@ -34,7 +34,7 @@ from mavftpfs.shared.errors import (
     VehicleLost,
 )
 from mavftpfs.shared.model import EntryKind, is_virtual, join, normalise, split
-from mavftpfs.shared.readable import autopilot_name
+from mavftpfs.shared.readable import autopilot_name, name_text
 
 if TYPE_CHECKING:  # rich is slow to import and not needed here
     from mavftpfs.report import Meter
@@ -88,7 +88,7 @@ async def _list_path(tree: Tree, path: bytes) -> Listing:
     if found.kind is EntryKind.FILE:
         return None, [_entry(path, split(path)[1], found)]
     below = sorted(await tree.list(path), key=lambda entry: entry[0])
-    return _text(path), [_entry(join(path, name), name, stat) for name, stat in below]
+    return name_text(path), [_entry(join(path, name), name, stat) for name, stat in below]
 
 
 def _entry(path: bytes, name: bytes, found: Stat) -> Entry:
@@ -106,7 +106,7 @@ async def checksum_paths(target: Target, paths: list[bytes], tell: Callable[[byt
     async with target.attached() as vehicle:
         for path in paths:
             if (await vehicle.tree.stat(path)).kind is not EntryKind.FILE:
-                raise IsADirectory(f"{_text(path)} is a directory")
+                raise IsADirectory(f"{name_text(path)} is a directory")
             tell(path, await vehicle.tree.crc32(path))
 
 
@@ -131,7 +131,7 @@ async def get_paths(
         for path in paths:
             found = await tree.stat(path)
             if found.kind is EntryKind.DIRECTORY and not recursive:
-                raise IsADirectory(f"{_text(path)} is a directory; get it with -r")
+                raise IsADirectory(f"{name_text(path)} is a directory; get it with -r")
             place = _local_name(local, path, single=len(paths) == 1)
             await getter.get_tree(path, place, found, tell)
 
@@ -192,7 +192,7 @@ class _Getter:
         file = await self.tree.open(remote)
         try:
             with part.open("wb") as out:
-                crc = await _copy(file, out, self.meter.start(_text(remote), file.size))
+                crc = await _copy(file, out, self.meter.start(name_text(remote), file.size))
         finally:
             file.close()
         return file.size, await self._prove(remote, crc, file.size)
@@ -215,7 +215,7 @@ class _Getter:
             return "size (the vehicle did not answer the checksum request)"
         if theirs != crc:
             raise DataUnproven(
-                f"{_text(remote)}: {size} bytes came with CRC32 {crc:08x}, the vehicle has {theirs:08x}"
+                f"{name_text(remote)}: {size} bytes came with CRC32 {crc:08x}, the vehicle has {theirs:08x}"
             )
         return "size and CRC32"
 
@@ -324,7 +324,3 @@ def _plain_path(text: str) -> bytes:
         return normalise(os.fsencode(text))
     except LocalProtocolError as exc:
         raise UsageError(str(exc)) from exc
-
-
-def _text(path: bytes) -> str:
-    return path.decode("utf-8", "backslashreplace")

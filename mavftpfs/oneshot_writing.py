@@ -24,6 +24,7 @@ from mavftpfs.shared.errors import (
     UsageError,
 )
 from mavftpfs.shared.model import ROOT, EntryKind, join, split
+from mavftpfs.shared.readable import name_text
 
 if TYPE_CHECKING:  # rich is slow to import and not needed here
     from mavftpfs.report import Meter
@@ -102,7 +103,7 @@ async def put_paths(
     async with target.attached(writing=True) as vehicle:
         into = await _is_directory(vehicle.tree, path)
         if not into and len(batches) > 1:
-            raise NotADirectory(f"{_text(path)} is no directory, so only one thing can be put there")
+            raise NotADirectory(f"{name_text(path)} is no directory, so only one thing can be put there")
         putter = _Putter(vehicle.tree, meter, tell)
         for local, pieces in batches:
             place = join(path, os.fsencode(local.absolute().name)) if into else path
@@ -130,13 +131,13 @@ class _Putter:
             raise UsageError(f"{piece.local}: {exc.strerror}") from exc
         except MavftpfsError as exc:
             done = f"; {self.delivered} file(s) before it are there" if self.delivered else ""
-            raise NotDelivered(f"{_text(remote)} was not delivered: {exc}{done}") from exc
+            raise NotDelivered(f"{name_text(remote)} was not delivered: {exc}{done}") from exc
         self.delivered += 1
         self.tell(Sent(remote, size))
 
     async def _send(self, source: BinaryIO, remote: bytes) -> int:
         total = os.fstat(source.fileno()).st_size
-        advance = self.meter.start(_text(remote), total)
+        advance = self.meter.start(name_text(remote), total)
         file = await _emptied(self.tree, remote)
         try:
             offset = 0
@@ -219,7 +220,7 @@ async def remove_paths(target: Target, paths: Sequence[bytes], *, recursive: boo
         found = [(path, await vehicle.tree.stat(path)) for path in paths]
         for path, stat in found:
             if stat.kind is EntryKind.DIRECTORY and not recursive:
-                raise IsADirectory(f"{_text(path)} is a directory; remove it with -r")
+                raise IsADirectory(f"{name_text(path)} is a directory; remove it with -r")
         for path, stat in found:
             await _remove(vehicle.tree, path, stat)
 
@@ -248,7 +249,7 @@ async def move_paths(target: Target, paths: Sequence[bytes], to: bytes) -> None:
     async with target.attached(writing=True) as vehicle:
         into = await _is_directory(vehicle.tree, to)
         if not into and len(paths) > 1:
-            raise NotADirectory(f"{_text(to)} is no directory, so only one thing can be moved there")
+            raise NotADirectory(f"{name_text(to)} is no directory, so only one thing can be moved there")
         for path in paths:
             await _move(vehicle.tree, path, join(to, split(path)[1]) if into else to)
 
@@ -283,7 +284,3 @@ async def _copy(tree: Tree, old: bytes, new: bytes) -> None:
             file.close()
     finally:
         source.close()
-
-
-def _text(path: bytes) -> str:
-    return path.decode("utf-8", "backslashreplace")

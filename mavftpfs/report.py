@@ -20,7 +20,7 @@ from rich.progress import TransferSpeedColumn as SpeedColumn
 from rich.table import Table
 from rich.text import Text
 
-from mavftpfs.shared.readable import autopilot_name
+from mavftpfs.shared.readable import autopilot_name, printable
 
 WATCH_PERIOD = 1.0
 
@@ -82,11 +82,6 @@ def transfer_meter() -> Iterator[Meter]:
     )
     with Progress(*columns, console=console) as progress:
         yield _BarMeter(progress)
-
-
-def printable(name: str) -> str:
-    """Return a name without control characters and undecodable bytes."""
-    return "".join(character if character.isprintable() else "?" for character in name)
 
 
 def print_status(statuses: Sequence[Mapping[str, Any]]) -> None:

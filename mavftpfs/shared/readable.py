@@ -7,6 +7,9 @@ import re
 
 _BYTES = re.compile(r"""\bb('(?:[^'\\]|\\.)*'|"(?:[^"\\]|\\.)*")""")
 
+_CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]")
+"""All but tabs and the ends of lines."""
+
 _AUTOPILOTS = {3: "ArduPilot", 12: "PX4", 0: "generic autopilot"}
 """MAV_AUTOPILOT values people meet."""
 
@@ -14,9 +17,19 @@ _AUTOPILOTS = {3: "ArduPilot", 12: "PX4", 0: "generic autopilot"}
 def readable(message: str) -> str:
     """Return a message in which names, which are bytes, are text: `b'/Fl\\xc3\\xbcge'` is `'/Flüge'`.
 
-    What is no UTF-8 stays escaped; what a terminal would obey is `?`.
+    What is no UTF-8 stays escaped; what a terminal would obey is `?`, whoever put it there.
     """
-    return _BYTES.sub(_as_text, message)
+    return _CONTROL.sub("?", _BYTES.sub(_as_text, message))
+
+
+def name_text(name: bytes) -> str:
+    """Return a name or path as text: what is no UTF-8 is escaped."""
+    return name.decode("utf-8", "backslashreplace")
+
+
+def printable(text: str) -> str:
+    """Return a text without control characters and undecodable bytes."""
+    return "".join(character if character.isprintable() else "?" for character in text)
 
 
 def autopilot_name(number: int) -> str:
@@ -29,5 +42,4 @@ def _as_text(quoted: re.Match[str]) -> str:
         name: bytes = ast.literal_eval(quoted[0])
     except (SyntaxError, ValueError):  # somebody's path or words
         return quoted[0]
-    text = name.decode("utf-8", "backslashreplace")
-    return "'" + "".join(character if character.isprintable() else "?" for character in text) + "'"
+    return f"'{printable(name_text(name))}'"

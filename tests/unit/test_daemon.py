@@ -187,3 +187,8 @@ def test_what_the_child_reports_shows_names_as_they_are_read(tmp_path: Path) -> 
 @pytest.mark.parametrize("text", ["cannot open /tmp/b'ü'", "no b'\\x' here", "b'one\ntwo'"])
 def test_what_only_looks_like_a_name_is_left_alone(text: str) -> None:
     assert readable(text) == text
+
+
+def test_what_a_terminal_would_obey_is_shown_by_no_message() -> None:
+    """A name may be in it as text already, as a vehicle listed it."""
+    assert readable("/log\x1b[2J\x9b: one\r\n\ttwo") == "/log?[2J?: one?\n\ttwo"

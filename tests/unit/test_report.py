@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from mavftpfs.report import describe, printable, readable_size, rows
+from mavftpfs.report import describe, readable_size, rows
+from mavftpfs.shared.readable import printable
 
 
 @pytest.mark.parametrize(
