@@ -18,13 +18,11 @@ import trio.testing
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mavftpfs.cache.asides import is_reserved
 from mavftpfs.cache.spool import SpoolDirectory
 from mavftpfs.cache.tree import Tree
 from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.shared.errors import FtpNak, MavftpfsError, RequestTimeout, VehicleLost
-from mavftpfs.shared.model import split
-from tests.support.fake_writer import KINDS, FakeWriter, make_writable
+from tests.support.fake_writer import KINDS, FakeWriter, litter, make_writable
 from tests.support.filemodel import START, Model, calls
 
 EXAMPLES = 100
@@ -136,7 +134,7 @@ async def check_after_power_cut(
         tree = make_writable(store, spool=spool, seed=9)
         for path in (b"/d", b"/d/sub", b"/d"):
             await tree.list(path)
-        assert [path for path in store.files if is_reserved(split(path)[1])] == []
+        assert litter(store) == []
         for path, data in confirmed.items():
             file = world.names.get(path)
             if data is not None and path not in touched and file is not None and file.confirmed == data:

@@ -15,6 +15,7 @@ from typing import Any
 import pytest
 import trio
 
+from mavftpfs.cache.asides import is_reserved
 from mavftpfs.cache.options import CacheOptions
 from mavftpfs.cache.remote import FREE_FOR, Overwrite, ReadSink, UploadSource
 from mavftpfs.cache.spool import SpoolDirectory
@@ -382,6 +383,18 @@ async def write_file(tree: Tree, path: bytes, data: bytes, step: int = 128 * 102
         await file.release()
     finally:
         file.close()
+
+
+def litter(store: FakeWriter) -> list[bytes]:
+    """Return which files under names of ours are left."""
+    return [path for path in store.files if is_reserved(split(path)[1])]
+
+
+async def list_all(store: FakeWriter, tree: Tree) -> None:
+    """List every directory anew, twice over."""
+    tree.forget_caches()
+    for directory in [*store.directories, *store.directories]:
+        await tree.list(directory)
 
 
 def _maybe_lose(lost: bool) -> None:

@@ -11,14 +11,13 @@ from typing import TypeVar
 import pytest
 import trio
 
-from mavftpfs.cache.asides import is_reserved
 from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.tree import Tree
 from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.shared.errors import AlreadyExists, FtpNak, MavftpfsError, NotFound, RequestTimeout
 from mavftpfs.shared.model import Listing, split
 from tests.support.deliveries import in_the_middle
-from tests.support.fake_writer import CHUNK, KINDS, FakeWriter, Kind, make_writable, write_file
+from tests.support.fake_writer import CHUNK, KINDS, FakeWriter, Kind, litter, make_writable, write_file
 
 FILE, NEW, OTHER = b"/card/dir/file.txt", b"/card/dir/new", b"/card/dir/other"
 OLD = bytes(range(256)) * 20
@@ -48,10 +47,6 @@ async def begun(tree: Tree, store: FakeWriter, path: bytes, data: bytes = DATA) 
     store.write_delay = 0.1
     await file.write(0, data)
     return file
-
-
-def litter(store: FakeWriter) -> list[bytes]:
-    return [path for path in store.files if is_reserved(split(path)[1])]
 
 
 @pytest.mark.parametrize("error", [DENIED, SILENCE])

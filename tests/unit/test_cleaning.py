@@ -7,14 +7,14 @@ from collections.abc import AsyncIterator
 import pytest
 import trio
 
-from mavftpfs.cache.asides import Kind, Reserved, is_reserved
+from mavftpfs.cache.asides import Kind, Reserved
 from mavftpfs.cache.cleaning import Cleaner
 from mavftpfs.cache.context import Context
 from mavftpfs.cache.dentries import Directory
 from mavftpfs.cache.tree import Tree
-from mavftpfs.shared.model import DirEntry, EntryKind, split
+from mavftpfs.shared.model import DirEntry, EntryKind
 from tests.support.fake_store import read_file
-from tests.support.fake_writer import KINDS, FakeWriter, make_writable
+from tests.support.fake_writer import KINDS, FakeWriter, litter, make_writable
 
 OLD = bytes(range(256)) * 4
 DIRECTORY = b"/card/dir"
@@ -38,10 +38,6 @@ def parts(tree: Tree) -> tuple[Context, Cleaner]:
 def reserved(tree: Tree, kind: Kind, target: bytes | None = b"file.txt") -> bytes:
     """A name that this mount left behind."""
     return Reserved(parts(tree)[0].namer.owner, kind, b"sss", target).name
-
-
-def litter(store: FakeWriter) -> list[bytes]:
-    return [path for path in store.files if is_reserved(split(path)[1])]
 
 
 async def test_a_name_that_is_about_to_be_made_is_not_given_an_old_file(

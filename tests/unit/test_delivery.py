@@ -31,7 +31,7 @@ from mavftpfs.shared.errors import (
 )
 from mavftpfs.shared.model import split
 from tests.support.fake_store import read_file
-from tests.support.fake_writer import CHUNK, KINDS, FakeWriter, Kind, card, make_writable, write_file
+from tests.support.fake_writer import CHUNK, KINDS, FakeWriter, Kind, card, litter, make_writable, write_file
 
 OLD = bytes(range(256)) * 4
 NEW = b"new content " * 100
@@ -42,10 +42,6 @@ store = card({FILE: OLD})
 
 
 any_store = card({FILE: OLD}, kinds=sorted(KINDS))
-
-
-def litter(store: FakeWriter) -> list[bytes]:
-    return [path for path in store.files if is_reserved(split(path)[1])]
 
 
 async def change(tree: Tree, path: bytes, offset: int, data: bytes) -> None:

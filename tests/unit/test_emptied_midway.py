@@ -11,13 +11,11 @@ from contextlib import suppress
 import pytest
 import trio
 
-from mavftpfs.cache.asides import is_reserved
 from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.tree import Tree
 from mavftpfs.shared.errors import Armed, FileBusy, LinkError, RequestTimeout
-from mavftpfs.shared.model import split
 from tests.support.deliveries import in_the_middle
-from tests.support.fake_writer import KINDS, FakeWriter, make_writable
+from tests.support.fake_writer import KINDS, FakeWriter, litter, make_writable
 
 FOLDER = b"/card/dir"
 FILE, NEW = FOLDER + b"/file.txt", FOLDER + b"/new"
@@ -60,7 +58,7 @@ async def left(tree: Tree, store: FakeWriter) -> set[bytes]:
     for _ in range(2):
         await trio.sleep(60)
         await tree.list(FOLDER)
-    assert not any(is_reserved(split(path)[1]) for path in store.files)
+    assert litter(store) == []
     return set(store.files)
 
 
@@ -163,7 +161,7 @@ async def test_what_nobody_waits_for_leaves_the_old_file_until_there_is_another(
     if not store.kind.renames:
         return  # what overwrites it in place emptied it
     await trio.sleep(3.0)
-    assert any(is_reserved(split(path)[1]) for path in store.files)  # on its way again
+    assert litter(store)  # on its way again
     before = trio.current_time()
     other = await by_opening(tree, FILE, file)
     assert trio.current_time() - before < PROMPT

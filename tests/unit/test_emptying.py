@@ -9,12 +9,11 @@ from random import Random
 import pytest
 import trio
 
-from mavftpfs.cache.asides import DELETED_AFTER, STALE_AFTER, is_reserved, new_owner
+from mavftpfs.cache.asides import DELETED_AFTER, STALE_AFTER, new_owner
 from mavftpfs.cache.tree import Tree
 from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.shared.errors import FileBusy, FtpNak, PathTooLong
-from mavftpfs.shared.model import split
-from tests.support.fake_writer import KINDS, FakeWriter, make_writable
+from tests.support.fake_writer import KINDS, FakeWriter, litter, make_writable
 
 
 @pytest.fixture
@@ -82,7 +81,7 @@ async def test_a_directory_replaced_by_a_rename_gives_up_unlinked_files_first(st
     await tree.rename(b"/d/other", b"/d/empty", noreplace=False)
     assert bytes(await reading.read(0, 100)) == b"read on"
     await reading.release()
-    assert not [path for path in store.files if is_reserved(split(path)[1])]
+    assert litter(store) == []
 
 
 async def test_a_name_that_could_not_be_moved_up_is_not_kept_alive(store: FakeWriter) -> None:

@@ -10,7 +10,7 @@ from itertools import count
 import pytest
 import trio
 
-from mavftpfs.cache.asides import STALE_AFTER, Kind, Reserved, is_reserved
+from mavftpfs.cache.asides import STALE_AFTER, Kind, Reserved
 from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.shared.errors import (
     AlreadyExists,
@@ -27,7 +27,7 @@ from mavftpfs.shared.errors import (
 )
 from mavftpfs.shared.model import split
 from tests.support.fake_store import read_file
-from tests.support.fake_writer import KINDS, FakeWriter, make_writable, write_file
+from tests.support.fake_writer import KINDS, FakeWriter, litter, make_writable, write_file
 
 
 @pytest.fixture(params=sorted(KINDS))
@@ -158,7 +158,7 @@ async def test_long_paths_are_renamed_in_two_steps(fat: FakeWriter) -> None:
     await write_file(tree, long + b"3", b"3")
     await tree.rename(long + b"2", long + b"3")
     assert fat.files[long + b"3"].data == b"1"
-    assert not [path for path in fat.files if is_reserved(split(path)[1])]
+    assert litter(fat) == []
 
 
 @pytest.mark.parametrize(("kind", "refused"), [("littlefs", -1), ("fat", 0), ("fat", 1)])
@@ -423,7 +423,7 @@ async def test_a_reader_of_a_file_that_is_renamed_over_reads_on(store: FakeWrite
     assert {name for name, _ in await tree.list(b"/d")} == {b"b", b"empty", b"full", b"long"}
     await file.release()
     file.close()
-    assert not [path for path in store.files if is_reserved(split(path)[1])]
+    assert litter(store) == []
 
 
 @pytest.mark.parametrize("kind", [name for name in sorted(KINDS) if KINDS[name].renames])
@@ -446,4 +446,4 @@ async def test_power_lost_while_an_open_file_is_renamed_over_loses_neither(
     await next_mount.list(b"/d")
     assert store.files[b"/d/long"].data in (old, b"A")
     assert b"A" in (store.files[b"/d/long"].data, store.files.get(b"/d/a", store.files[b"/d/b"]).data)
-    assert not [path for path in store.files if is_reserved(split(path)[1])]
+    assert litter(store) == []

@@ -15,7 +15,7 @@ from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.shared.errors import FtpNak, RequestTimeout, VehicleLost
 from mavftpfs.shared.model import split
 from tests.support.fake_store import read_file
-from tests.support.fake_writer import KINDS, FakeWriter, make_writable, write_file
+from tests.support.fake_writer import KINDS, FakeWriter, list_all, litter, make_writable, write_file
 
 OLD = bytes(range(256)) * 4
 NEW = b"new content " * 100
@@ -36,12 +36,6 @@ async def store(nursery: trio.Nursery, autojump_clock: object) -> AsyncIterator[
 
 def renames(store: FakeWriter) -> int:
     return sum(entry[0] == "rename" for entry in store.log)
-
-
-async def list_all(store: FakeWriter, tree: Tree) -> None:
-    tree.forget_caches()
-    for directory in [*store.directories, *store.directories]:
-        await tree.list(directory)
 
 
 @pytest.mark.parametrize("number", [errno.EACCES, errno.EROFS, errno.ENOSPC])
@@ -137,9 +131,9 @@ async def test_the_same_when_it_is_listed_before(store: FakeWriter, tree: Tree) 
 
     store.before_request = keep
     await write_file(tree, FILE, NEW)
-    assert [path for path in store.files if is_reserved(split(path)[1])]
+    assert litter(store)
     await list_all(store, tree)
-    assert not [path for path in store.files if is_reserved(split(path)[1])]
+    assert litter(store) == []
     assert await read_file(tree, FILE) == NEW
 
 
@@ -170,7 +164,7 @@ async def test_what_is_refused_a_name_again_and_again_does_not_fill_the_card(
         renames_left = refused
         with suppress(FtpNak):
             await file.flush()
-        assert [path for path in store.files if is_reserved(split(path)[1])] == []
+        assert litter(store) == []
         if not tree.undelivered():
             await file.write(0, b"x")
     await file.release()
@@ -186,5 +180,5 @@ async def test_a_temporary_that_was_not_made_leaves_nothing_beside_it(store: Fak
     with pytest.raises(FtpNak):
         await write_file(tree, LONG, NEW)
     assert store.log[3][0] == "open"
-    assert [path for path in store.files if is_reserved(split(path)[1])] == []
+    assert litter(store) == []
     assert store.files[LONG].data == OLD

@@ -9,7 +9,7 @@ from random import Random
 import pytest
 import trio
 
-from mavftpfs.cache.asides import Group, Kind, is_reserved, repair
+from mavftpfs.cache.asides import Group, Kind, repair
 from mavftpfs.cache.background import FIRST_PAUSE
 from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.spool import SpoolDirectory
@@ -18,7 +18,7 @@ from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.shared.errors import Armed, FtpNak, MavftpfsError, RequestTimeout, VehicleLost
 from mavftpfs.shared.model import split
 from tests.support.fake_store import read_file
-from tests.support.fake_writer import KINDS, FakeWriter, make_writable, write_file
+from tests.support.fake_writer import KINDS, FakeWriter, list_all, litter, make_writable, write_file
 
 OLD = bytes(range(256)) * 4
 NEW = b"new content " * 100
@@ -67,10 +67,6 @@ def lose(store: FakeWriter, tree: Tree) -> None:
 def arm(store: FakeWriter, tree: Tree, *, armed: bool) -> None:
     store.armed = armed
     tree.armed_changed(armed)
-
-
-def litter(store: FakeWriter) -> list[bytes]:
-    return [path for path in store.files if is_reserved(split(path)[1])]
 
 
 def come_back(store: FakeWriter, tree: Tree) -> None:
@@ -298,7 +294,7 @@ async def test_removing_a_torn_file_removes_it(store: FakeWriter, tree: Tree, lo
     assert litter(store) == []
     assert tree._writing is not None
     assert tree._writing._context.torn == {}
-    await listed(store, tree)
+    await list_all(store, tree)
     assert path not in store.files
     assert not [name for name in store.files if b"recovered" in name]
 
@@ -353,12 +349,6 @@ LONG_FITTING = deep(115, b"a"), deep(115, b"b")
 """One rename takes them, but not by the names that tell where they belong."""
 
 
-async def listed(store: FakeWriter, tree: Tree) -> None:
-    tree.forget_caches()
-    for directory in [*store.directories, *store.directories]:
-        await tree.list(directory)
-
-
 @pytest.mark.parametrize("paths", [(LONG_OLD, LONG_NEW), LONG_FITTING])
 @pytest.mark.parametrize("kind", ["posix", "fat"])
 async def test_power_lost_in_a_long_move_over_a_file(
@@ -382,7 +372,7 @@ async def test_power_lost_in_a_long_move_over_a_file(
             spool.close()
             store.revive()
             again = SpoolDirectory(tmp_path / f"{number}", Random(99))
-            await listed(store, make_writable(store, spool=again, seed=2))
+            await list_all(store, make_writable(store, spool=again, seed=2))
             again.close()
             files = {path: file.data for path, file in store.files.items()}
             assert files in ({old: NEW, new: OLD}, {new: NEW}), number
@@ -414,7 +404,7 @@ async def test_a_long_move_that_was_stopped_is_undone(
         assert store.files[LONG_NEW].data == (NEW if number == 3 else OLD)
         assert number == 3 or store.files[LONG_OLD].data == NEW
         arm(store, tree, armed=False)
-    await listed(store, tree)
+    await list_all(store, tree)
     files = {path: file.data for path, file in store.files.items() if path in (LONG_OLD, LONG_NEW)}
     assert files in ({LONG_OLD: NEW, LONG_NEW: OLD}, {LONG_NEW: NEW})
     assert litter(store) == []

@@ -25,7 +25,7 @@ from mavftpfs.shared.errors import (
     VehicleLost,
 )
 from mavftpfs.shared.model import split
-from tests.support.fake_writer import CHUNK, KINDS, FakeWriter, card, make_writable
+from tests.support.fake_writer import CHUNK, KINDS, FakeWriter, card, litter, make_writable
 
 OLD = bytes(range(256)) * 4
 FILE = b"/card/dir/file.txt"
@@ -115,10 +115,6 @@ async def append_and_take_back(store: FakeWriter, tree: Tree) -> OpenFile:
     assert litter(store), "it was to begin beside the program"
     await file.truncate(len(OLD))
     return file
-
-
-def litter(store: FakeWriter) -> list[bytes]:
-    return [path for path in store.files if is_reserved(split(path)[1])]
 
 
 @pytest.mark.parametrize("end", ["flush", "release", "close"])

@@ -8,13 +8,12 @@ from random import Random
 import pytest
 import trio
 
-from mavftpfs.cache.asides import STALE_AFTER, Group, Kind, Reserved, is_reserved, repair
+from mavftpfs.cache.asides import STALE_AFTER, Group, Kind, Reserved, repair
 from mavftpfs.cache.tree import Tree
 from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.shared.errors import FileChanged, FtpNak
-from mavftpfs.shared.model import split
 from tests.support.fake_store import FakeReader
-from tests.support.fake_writer import KINDS, FakeWriter, card, make_writable, write_file
+from tests.support.fake_writer import KINDS, FakeWriter, card, litter, make_writable, write_file
 from tests.unit.test_draft import draft_over
 
 OLD = bytes(range(256)) * 4
@@ -36,7 +35,7 @@ async def test_who_has_a_replaced_file_open_never_reads_its_successor(store: Fak
     assert store.files[FILE].data == b"Z" * len(OLD)
     await file.release()
     file.close()
-    assert not [path for path in store.files if is_reserved(split(path)[1])]
+    assert litter(store) == []
 
 
 def test_bytes_written_after_a_cut_do_not_overtake_those_cut_off_in_flight() -> None:
