@@ -6,7 +6,7 @@ from mavftpfs.shared.errors import LocalProtocolError
 
 
 class ReadOnlyHandle:
-    """What cache.tree.OpenFile asks of handles opened for reading: there is nothing to deliver."""
+    """What cache.openfile.OpenFile asks of handles opened for reading: there is nothing to deliver."""
 
     writable = False
 

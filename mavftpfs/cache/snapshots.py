@@ -1,4 +1,4 @@
-"""Whole contents of `@` files, and handles on them. Layer: cache."""
+"""Whole contents of `@` files, and handles on them. Layer: cache; pure."""
 
 from __future__ import annotations
 

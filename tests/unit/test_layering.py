@@ -47,8 +47,12 @@ PURE_MODULES = {
     "link.signing",
     "link.uri",
     "session.identity",
+    "session.notes",
     "session.policy",
+    "session.vehicle",
+    "cache.attributes",
     "cache.dentries",
+    "cache.options",
     "cache.readahead",
     "cache.asides",
     "cache.draft",
@@ -57,9 +61,11 @@ PURE_MODULES = {
     "cache.plan",
     "cache.sending",
     "cache.shortnames",
+    "cache.snapshots",
     "cache.times",
     "fuse.inodes",
     "fuse.handles",
+    "fuse.keeping",
     "fuse.optionhelp",
     "fuse.options",
 }
@@ -226,6 +232,25 @@ def test_imports_point_down() -> None:
 
 def test_pure_modules_have_no_clock_and_no_io() -> None:
     assert impurities(load_package()) == []
+
+
+def headline(module: Module) -> str:
+    """Return the first paragraph of a module's docstring."""
+    return (ast.get_docstring(module.tree) or "").partition("\n\n")[0]
+
+
+def test_each_module_says_its_layer_and_whether_it_is_pure() -> None:
+    modules = [
+        module for module in load_package().values() if module.name not in {*LAYERS, "__init__", "__main__"}
+    ]
+    lost = [module.name for module in modules if f"Layer: {layer_name(module)}" not in headline(module)]
+    assert lost == []
+    assert [module.name for module in modules if "; pure" in headline(module) and not is_pure(module)] == []
+
+
+def layer_name(module: Module) -> str:
+    """Return how a docstring names a module's layer."""
+    return module.layer if module.layer in LAYERS else "top"
 
 
 def test_each_dependency_is_known_in_one_place() -> None:
