@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from contextlib import suppress
 from dataclasses import fields
+from pathlib import Path
 
 import pytest
 from hypothesis import given
@@ -213,6 +214,55 @@ def test_help_says_what_each_option_is_for() -> None:
     assert [line.split()[0] for line in lines] == option_names()
     assert set(HELP) == set(option_names())
     assert all(len(line) <= 78 and len(line.split()) > 1 for line in lines)
+
+
+OPTION_ROWS = [
+    [cell.strip() for cell in line.split("|")[1:3]]
+    for line in (Path(__file__).parents[2] / "README.md")
+    .read_text()
+    .partition("## Options")[2]
+    .partition("\n## ")[0]
+    .splitlines()
+    if line.startswith("| `")
+]
+"""README.md's table: names and defaults, as written there."""
+
+
+def test_readme_has_a_place_for_each_option() -> None:
+    named = [name.strip("` ") for names, _ in OPTION_ROWS for name in names.split(",")]
+    assert sorted(name.partition("=")[0] for name in named) == sorted(
+        name.strip("=") for name in option_names()
+    )
+    assert {name.partition("=")[0] for name in named if "=" in name} == set(VALUES)
+
+
+def told_defaults() -> list[tuple[str, str]]:
+    """Return each default that README.md or --help names, by option."""
+    told = [(name.strip("="), text.rpartition(": ")[2]) for name, text in HELP.items() if ": " in text]
+    for names, defaults in OPTION_ROWS:
+        options = [name.strip("` ").partition("=")[0] for name in names.split(",")]
+        values = [value.strip("` ").removesuffix(" s") for value in defaults.split(", ")]
+        told += zip(options, values * (len(options) if len(values) == 1 else 1), strict=False)
+    return [(name, value) for name, value in told if name in VALUES]
+
+
+def test_readme_and_help_tell_the_real_defaults() -> None:
+    checked = set()
+    for name, value in told_defaults():
+        with suppress(ValueError):
+            parsed, default = VALUES[name](value), getattr(MountOptions(), name)
+            if default is not None or value == "auto":
+                assert (name, parsed) == (name, default)
+                checked.add(name)
+    assert {
+        "dir_timeout",
+        "negative_timeout",
+        "cache_size",
+        "spool_max",
+        "verify_max",
+        "local",
+        "chunk",
+    } <= checked
 
 
 def test_help_names_every_option_but_the_one_that_is_always_on() -> None:
