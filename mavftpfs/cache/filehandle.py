@@ -65,12 +65,14 @@ class FileHandle(ReadOnlyHandle):
         raise DataUnproven(f"{version.path!r} is opened anew again and again while it is read")
 
     async def require_same(self) -> None:
-        """Compare what was read of the file with what is there, if the vehicle restarted since.
+        """Compare what was read of the file with what is there, if that is in doubt.
 
         Raises:
-            FileChanged: it became another one. Else as Restarts.recheck.
+            FileChanged: it became another one. Else as Restarts.recheck and Reopens.compare.
         """
         await self._files.restarts.recheck(self._version)
+        if self._files.reopens.due(self._version, now=True):
+            await self._files.reopens.compare(self._version)
 
     def require_not_lost(self) -> None:
         """Raise FileChanged if the file became another one by somebody else's doing."""

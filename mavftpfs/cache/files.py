@@ -157,6 +157,7 @@ class Files:
             return False
         same_size = entry.size in (None, version.size)
         if fresh and entry.size == version.size and entry.mtime is not None and entry.mtime == version.mtime:
+            version.sure |= newer
             version.proven_at = max(version.proven_at, listed_at)
             return True
         recent = self._clock() - version.proven_at < self._dir_timeout
@@ -255,6 +256,12 @@ class Files:
     def was_lost(self, path: bytes) -> bool:
         """Return whether somebody has a version of the path open, and is to read nothing more."""
         return any(v.path == path and v.lost for v in self._open_versions)
+
+    def end_doubted(self, path: bytes) -> None:
+        """What we are about to write there must not be given to who may have another file open."""
+        for version in [v for v in self._open_versions if v.path == path and v.blocks.given]:
+            if version.blocks.openings.doubted:
+                self._kill(version)
 
     def was_replaced(self, path: bytes) -> bool:
         """Return whether somebody who is to read on has a version open that is not the vehicle's any more."""

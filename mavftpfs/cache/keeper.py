@@ -94,7 +94,7 @@ class Keeper:
             blocks.clear()
             return None  # listed anew, or changed by us, while the disk was read
         self.revived += 1
-        version = Version(path, kept.key.mtime, blocks, proven_at, kept=kept)
+        version = Version(path, kept.key.mtime, blocks, proven_at, sure=True, kept=kept)
         self._watched[version] = kept
         return version
 

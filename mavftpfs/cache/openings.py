@@ -37,6 +37,15 @@ class Openings:
         if first:
             self.proven = self.count
 
+    @property
+    def doubted(self) -> bool:
+        """Whether a listing shows what may be another file."""
+        return self.proven < 0
+
+    def on_doubted(self) -> None:
+        """A listing shows what may be another file."""
+        self.proven, self.look_at = -1, float("-inf")
+
     def on_compared(self, count: int, took: float, now: float) -> None:
         """A listing that began after the first `count` of them shows the file still."""
         self.proven = max(self.proven, count)

@@ -5,11 +5,13 @@ others may replace the file by one of the same size. So where listings tell mtim
 after the reopening is compared before more of the file is given out, also what came meanwhile:
 - the size and mtime are those it was opened with, or it only grew: it goes on;
 - nothing of it was given out yet: all is read from what is there now;
+- no listing since it was opened showed the time it should have, because it had just replaced another file:
+  the vehicle's CRC32 must be that of the bytes held and the rest;
 - else old handles get FileChanged.
 Where readers take turns, each turn is a reopening: then the comparison is put off (`openings`), but for the
 read that reaches the end of the file. Without mtimes the size in the open ACK alone decides.
 
-Any listing that shows another mtime ends the open versions of that file, too, reopened or not.
+Any listing that shows another mtime has the open versions of that file end, too, reopened or not.
 """
 
 from __future__ import annotations
@@ -76,11 +78,16 @@ class Reopens:
         else:
             another = entry.kind is not EntryKind.FILE or became_another(version, entry)
         if not another:
+            version.sure |= entry is not None and entry.mtime == version.mtime
             openings.on_compared(count, directory.ended_at - directory.listed_at, self._clock())
-        elif entry is None or entry.size != version.size or version.blocks.given:
+        elif entry is None or entry.size != version.size or entry.kind is not EntryKind.FILE:
             self._on_changed(version)
-        else:
+        elif not version.blocks.given:
             await self._start_over(version, entry)
+        elif not version.sure and await self._fetcher.prove(version):
+            version.mtime, version.kept = entry.mtime, None
+        else:
+            self._on_changed(version)
 
     async def _start_over(self, version: Version, entry: DirEntry) -> None:
         """Nothing was given out: the version is of the file that is there now, opened once more for that."""
@@ -89,7 +96,7 @@ class Reopens:
         version.kept = None
         version.close_reader()
         version.blocks.start_over()
-        version.mtime = entry.mtime
+        version.mtime, version.sure = entry.mtime, False
         reader = await self._fetcher.reopen(version)
         if reader.size != version.size:
             version.mtime = None
@@ -101,9 +108,14 @@ class Reopens:
             entry = directory.entries.get(name) if parent == path else None
             if entry is None or version.mtime is None or directory.listed_at <= version.proven_at:
                 continue
-            ours = self._is_changing(version.path)
-            if version.blocks.given and became_another(version, entry) and not ours:
-                self._on_changed(version)
+            if entry.mtime == version.mtime and entry.size == version.size:
+                version.sure = True
+            elif became_another(version, entry) and not self._is_changing(version.path):
+                if version.blocks.given and (version.sure or entry.size != version.size):
+                    self._on_changed(version)
+                else:
+                    version.blocks.openings.on_doubted()
+                    self._fetcher.on_distrust(version)
 
 
 def is_unsettled(version: Version) -> bool:

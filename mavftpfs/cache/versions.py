@@ -42,11 +42,12 @@ PROVE_SECONDS = 60.0
 class Version:
     """A file as it was when it was opened.
 
-    mtime: None if not known to belong to this size. proven_at: when it was last known to be what the
-    vehicle holds. handles: how many are open. shown: whether the kernel may hold pages of it and all of
-    them are good. boot: how often the vehicle restarted while it was open. proven_boot: the one of these
-    after which it was proven to be the same file still. dead: why it is not the path's file any more; lost:
-    somebody else changed that. kept: its part on the local disk, if it may have one.
+    mtime: None if not known to belong to this size. A listing of before it was opened told it, so it may be
+    that of a predecessor until it is sure. proven_at: when it was last known to be what the vehicle holds.
+    handles: how many are open. shown: whether the kernel may hold pages of it and all of them are good.
+    boot: how often the vehicle restarted while it was open. proven_boot: the one of these after which it was
+    proven to be the same file still. dead: why it is not the path's file any more; lost: somebody else
+    changed that. kept: its part on the local disk, if it may have one.
     """
 
     path: bytes
@@ -54,6 +55,7 @@ class Version:
     blocks: FileBlocks
     proven_at: float
     reader: Reader | None = None
+    sure: bool = False
     handles: int = 0
     shown: bool = False
     boot: int = 0
@@ -111,6 +113,7 @@ class Fetcher:
 
     Attributes:
         paths: whose names are being changed by us: nothing is opened meanwhile.
+        on_distrust: the kernel may hold bytes of a version that are in doubt now.
     """
 
     def __init__(
@@ -124,7 +127,7 @@ class Fetcher:
         """`on_distrust` hears that bytes were dropped, `on_changed` that the file became another."""
         self._store = store
         self._cache = cache
-        self._on_distrust = on_distrust
+        self.on_distrust = on_distrust
         self._on_changed = on_changed
         self.paths = PathLocks(cache.patience)
         self._opening: Flights[Version, Reader] = Flights()
@@ -224,7 +227,7 @@ class Fetcher:
             return True
         version.close_reader()
         version.blocks.drop_unproven()
-        self._on_distrust(version)
+        self.on_distrust(version)
         return False
 
     async def _agrees(self, version: Version) -> bool:

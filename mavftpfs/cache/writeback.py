@@ -168,6 +168,7 @@ class Writeback:
         return node
 
     def _new_draft(self, node: Node, size: int | None) -> None:
+        self._context.files.end_doubted(node.path)
         node.content = self._new_content(node)
         node.draft = Draft(node.content, size)
 

@@ -65,8 +65,8 @@ async def test_what_may_be_of_two_files_is_not_kept_of_one_that_is_unlinked(
         card.replace()
         for at in range(STEP, len(OLD) - STEP, STEP):
             await reader.read(at, STEP)
-        while not version.blocks.complete:
-            await trio.sleep(0.1)
+        await trio.sleep(IDLE)
+        assert version.blocks.complete
         await tree.unlink(card.path)
         with pytest.raises(FileChanged):
             await reader.read(0, len(OLD))

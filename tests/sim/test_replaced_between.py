@@ -188,3 +188,49 @@ async def test_the_end_of_a_copy_by_turns_is_compared(profile: str, autojump: Mo
         card.replace()
         with pytest.raises(FileChanged):
             await read_on(handle, 200_000)
+
+
+@pytest.mark.parametrize("looks", ["listed", "read on", "listed and read on"])
+@pytest.mark.parametrize("profile", TIMED)
+async def test_one_that_was_replaced_before_it_was_opened_is_read_on(
+    profile: str, looks: str, autojump: MockClock
+) -> None:
+    """The remembered listing tells the time of its predecessor."""
+    card = Card(profile)
+    async with card.world.connection() as connection:
+        tree = mounted(connection)
+        assert (await tree.stat(card.path)).mtime == THEN
+        card.replace()
+        handle = await tree.open(card.path)
+        assert await handle.read(0, STEP) == NEW[:STEP]
+        await trio.sleep(30.0)
+        if "listed" in looks:
+            assert (await tree.stat(card.path)).mtime == THEN + 100
+        if "read on" in looks:
+            assert await read_on(handle, STEP) == NEW[STEP : len(OLD)]
+        assert await handle.read(0, STEP) == NEW[:STEP]
+        await trio.sleep(30.0)
+        card.replace(NEW[-len(OLD) :], THEN + 200)
+        assert (await tree.stat(card.path)).mtime == THEN + 200
+        with pytest.raises(FileChanged):
+            await handle.read(0, STEP)
+        handle.close()
+
+
+@pytest.mark.parametrize("profile", TIMED)
+async def test_one_that_was_replaced_again_after_it_was_opened_is_not(
+    profile: str, autojump: MockClock
+) -> None:
+    card = Card(profile)
+    async with card.world.connection() as connection:
+        tree = mounted(connection)
+        assert (await tree.stat(card.path)).mtime == THEN
+        card.replace()
+        handle = await tree.open(card.path)
+        assert await handle.read(0, STEP) == NEW[:STEP]
+        await trio.sleep(IDLE)
+        card.replace(NEW[-len(OLD) :], THEN + 200)
+        with pytest.raises(FileChanged):
+            await read_on(handle, STEP)
+        handle.close()
+        assert await copy(tree, card.path) == NEW[-len(OLD) :]
