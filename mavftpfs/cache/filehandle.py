@@ -13,7 +13,8 @@ from mavftpfs.shared.errors import DataUnproven, LocalProtocolError
 
 
 class Shelf(Protocol):
-    """What a handle asks of files.Files."""
+    """What a handle asks of files.Files. piece: bytes of a read that are served at once. hits, misses: reads
+    that found all they wanted in the cache, and others."""
 
     fetcher: Fetcher
     restarts: Restarts
@@ -28,7 +29,7 @@ class Shelf(Protocol):
 
 
 class FileHandle(ReadOnlyHandle):
-    """One open() of a regular file (see cache.tree.OpenFile)."""
+    """One open() of a regular file (see cache.openfile.OpenFile)."""
 
     def __init__(self, files: Shelf, version: Version, *, keep_cache: bool, direct_io: bool) -> None:
         self._files = files
@@ -73,6 +74,11 @@ class FileHandle(ReadOnlyHandle):
         await self._files.restarts.recheck(self._version)
         if self._files.reopens.due(self._version, now=True):
             await self._files.reopens.compare(self._version)
+
+    @property
+    def lost(self) -> bool:
+        """Whether the file became another one by somebody else's doing."""
+        return self._version.lost
 
     def require_not_lost(self) -> None:
         """Raise FileChanged if the file became another one by somebody else's doing."""

@@ -64,7 +64,7 @@ class Snapshots:
 
 
 class SnapshotHandle(ReadOnlyHandle):
-    """One open() of an `@` file (see cache.tree.OpenFile)."""
+    """One open() of an `@` file (see cache.openfile.OpenFile)."""
 
     direct_io = True
     keep_cache = False

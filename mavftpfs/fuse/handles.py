@@ -27,7 +27,7 @@ class Stat(Protocol):
 
 
 class OpenFile(Protocol):
-    """A file open for reading, as cache.tree gives it."""
+    """A file open for reading; cache.openfile.OpenFile says more. size in bytes."""
 
     @property
     def size(self) -> int: ...
