@@ -67,6 +67,17 @@ class Context:
             return True
         return begun and not node.looked_at
 
+    def part(self, path: bytes) -> None:
+        """Who has a file open that somebody else replaced, and changed nothing of it, keeps it to himself:
+        the name is the new file's."""
+        node = self.nodes.get(path)
+        if node is None or node.base is None or not node.base.lost or node.undelivered:
+            return
+        if node.attempt is None and not node.lock.locked():
+            node.parted = True
+            node.lose_name()
+            self.nodes.detach(node)
+
     def hide(self, node: Node, path: bytes) -> None:
         """An unlinked file's node is called `path`, a reserved name, from now on."""
         self.hidden.pop(node.path, None)

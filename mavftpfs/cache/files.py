@@ -257,10 +257,11 @@ class Files:
         """Return whether somebody has a version of the path open, and is to read nothing more."""
         return any(v.path == path and v.lost for v in self._open_versions)
 
-    def end_doubted(self, path: bytes) -> None:
-        """What we are about to write there must not be given to who may have another file open."""
-        for version in [v for v in self._open_versions if v.path == path and v.blocks.given]:
-            if version.blocks.openings.doubted:
+    def end(self, path: bytes, *, doubted: bool) -> None:
+        """What we are about to write there must not be given to who has another file open, or may have one
+        (`doubted`)."""
+        for version in [v for v in self._open_versions if v.path == path and v.dead is None]:
+            if not doubted or (version.blocks.given and version.blocks.openings.doubted):
                 self._kill(version)
 
     def was_replaced(self, path: bytes) -> bool:

@@ -64,7 +64,7 @@ class Node:
     it may begin by itself; start_after: not before.
     base: reads the vehicle's file. delivered_at: when the vehicle last had it all. doomed: how many changes
     that take its name away have the lock, or are about to, or empty it: no delivery begins or goes on.
-    looked_at: who has the lock changes nothing on the vehicle just now.
+    looked_at: who has the lock changes nothing on the vehicle just now. parted: its name is another file's.
     """
 
     path: bytes
@@ -87,6 +87,7 @@ class Node:
     quiet: trio.Event = field(default_factory=trio.Event)
     doomed: int = 0
     looked_at: int = 0
+    parted: bool = False
     _delivery: trio.CancelScope | None = None
     _firm: int = 0
 
@@ -171,6 +172,11 @@ class Node:
         """Raise FileChanged if its path may be another file's: it was replaced or removed, not hidden."""
         if self.removed and not self.hidden:
             raise FileChanged(f"what was {self.path!r} is not on the vehicle any more")
+
+    def require_not_parted(self) -> None:
+        """Raise FileChanged if nothing that is written to it would come to the vehicle, or be kept."""
+        if self.parted:
+            raise FileChanged(f"{self.path!r} is another file by now")
 
     def close_base(self) -> None:
         """The vehicle's file is another one, or is not needed."""

@@ -51,6 +51,7 @@ class Overlay:
             raise NotFound(f"{path!r} is a name of our own")
         if self.local.owns(path):
             return self.local.stat(path)
+        self._context.part(path)
         node = self._context.nodes.get(path)
         if node is None or node.draft is None:
             return None

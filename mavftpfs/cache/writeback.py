@@ -125,6 +125,7 @@ class Writeback:
         self.overlay.require_new(path)
         wire_path(path)
         async with self._context.paths.hold(path, shared=True):
+            self._context.part(path)
             entry = await self._namespace.entry(path)
             other = None if entry is not None else await self._namespace.other_spelling(path)
             if entry is None and other is None:
@@ -142,6 +143,7 @@ class Writeback:
     async def _need_draft(self, path: bytes, *, truncate: bool) -> Node:
         """Return the node of a file that exists, with a draft."""
         context, base, size = self._context, None, None
+        context.part(path)
         node = context.nodes.get(path)
         if node is None or node.draft is None:
             self.overlay.require_free(path)
@@ -168,7 +170,7 @@ class Writeback:
         return node
 
     def _new_draft(self, node: Node, size: int | None) -> None:
-        self._context.files.end_doubted(node.path)
+        self._context.files.end(node.path, doubted=size is not None)
         node.content = self._new_content(node)
         node.draft = Draft(node.content, size)
 
@@ -188,6 +190,7 @@ class Writeback:
         if offset + len(data) > MAX_FILE:
             raise FileTooLarge(f"no vehicle takes files of more than {MAX_FILE} bytes")
         await self._admission.may_write(node)
+        node.require_not_parted()
         assert node.draft is not None
         node.draft.write(offset, data)
         self._on_written(node)
@@ -202,6 +205,7 @@ class Writeback:
             await self._admission.may_empty(node)
         else:
             await self._admission.may_write(node)
+        node.require_not_parted()
         if size != node.draft.size:
             node.draft.truncate(size)
             self._background.on_cut(node)

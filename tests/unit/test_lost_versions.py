@@ -209,3 +209,54 @@ async def test_changes_that_waited_over_a_restart_are_delivered(
     tree.rebooted()
     await writer.release()
     assert store.files[FILE].data == b"mid" + OLD[3:]
+
+
+@pytest.mark.parametrize("look", ["stat", "read", "write", "empty", "make"])
+async def test_a_new_file_is_opened_though_a_writer_has_the_lost_one(
+    store: FakeWriter, autojump_clock: object, look: str
+) -> None:
+    """That one changed nothing of it, and cannot any more; nobody is told that this came to the vehicle."""
+    tree = make_writable(store, inplace=True)
+    writer = await tree.open(FILE, write=True)
+    assert bytes(await writer.read(0, 9)) == OLD[:9]
+    store.add(FILE, NEW[:-100], 2)
+    tree.rebooted()
+    await require_lost(writer)
+    expected = NEW[:-100]
+    if look == "stat":
+        assert (await tree.stat(FILE)).size == len(expected)
+    elif look == "make":
+        assert (await tree.create(FILE, exclusive=False)).size == len(expected)
+    else:
+        file = await tree.open(FILE, write=look != "read", truncate=look == "empty")
+        expected = b"" if look == "empty" else expected
+        assert bytes(await file.read(0, 2000)) == expected
+        await file.release()
+    await require_lost(writer)
+    with pytest.raises(FileChanged):
+        await writer.write(0, b"mid")
+    with pytest.raises(FileChanged):
+        await writer.truncate(0)
+    await writer.fsync()
+    await writer.release()
+    assert store.files[FILE].data == expected
+    assert tree.undelivered() == []
+
+
+async def test_who_has_a_file_open_that_others_removed_does_not_get_the_next_one(
+    store: FakeWriter, autojump_clock: object
+) -> None:
+    tree = make_writable(store, inplace=True)
+    reader = await tree.open(FILE)
+    assert bytes(await reader.read(0, 9)) == OLD[:9]
+    del store.files[FILE]
+    tree.forget_caches()
+    writer = await tree.create(FILE, exclusive=True)
+    await writer.write(0, NEW)
+    await require_lost(reader)
+    await writer.fsync()
+    await require_lost(reader)
+    assert bytes(await writer.read(0, 900)) == NEW
+    for file in (writer, reader):
+        await file.release()
+    assert store.files[FILE].data == NEW
