@@ -69,7 +69,7 @@ class Trains:
         times.append(now)
 
     def learn(self, rate: float) -> None:
-        """Requests that left together were answered at this pace (per second); of a round that is not over."""
+        """Requests that left together were answered at this pace (per second); the round is not over yet."""
         if not self._rounds:
             self.rate = rate
             self.proven = True
