@@ -11,7 +11,6 @@ from __future__ import annotations
 from mavftpfs.session.kit import Kit
 from mavftpfs.session.opening import TERMINATE_LIMIT
 from mavftpfs.session.upload import QueuedUpload
-from mavftpfs.session.vehicle import BOOT_NEWS_AGE
 from mavftpfs.shared.errors import MavftpfsError
 
 
@@ -24,8 +23,8 @@ async def close_written(kit: Kit, upload: QueuedUpload, limit: float) -> bool:
     vehicle = kit.vehicle
     heard_at, reboots = kit.driver.last_reply_at, vehicle.reboots
     ours = await kit.holder.close(limit)
-    alive_at = max(heard_at, vehicle.boot_heard_at)
-    upload.usurped |= not upload.create and kit.clock() - alive_at > BOOT_NEWS_AGE
+    away = vehicle.identity.away_since(heard_at, kit.clock())
+    upload.usurped |= away and not upload.create
     return ours and vehicle.reboots == reboots
 
 

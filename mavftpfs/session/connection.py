@@ -13,7 +13,7 @@ from typing import Any, Literal
 import trio
 
 from mavftpfs.link.base import Link
-from mavftpfs.link.framing import Framer
+from mavftpfs.link.framing import AUTOPILOT_VERSION_ID, STORAGE_INFORMATION_ID, SYSTEM_TIME_ID, Framer
 from mavftpfs.link.messages import (
     MAV_AUTOPILOT_INVALID,
     MAV_TYPE_GCS,
@@ -33,9 +33,6 @@ from mavftpfs.shared.errors import MavftpfsError, VehicleLost
 
 log = logging.getLogger("mavftpfs.session")
 
-AUTOPILOT_VERSION_ID = 148
-STORAGE_INFORMATION_ID = 261
-
 SIGNING_EPOCH = 1_420_070_400
 """2015-01-01 UTC in seconds since 1970 (MAVLink guide, "Message Signing")."""
 
@@ -52,6 +49,7 @@ _OLD_WAY_FROM = 2
 """The try from which AUTOPILOT_VERSION is also asked for in the way that older firmware understands."""
 
 _IDENTITY_PERIOD = 0.5
+_TIME_TRIES = 5
 _STRANGER_PERIOD = 5.0
 _ANOTHER = "another vehicle answers as %d/%d: nothing is read from it or written to it; mount it anew"
 
@@ -343,7 +341,7 @@ async def _watch_link(connection: Connection) -> None:
 
 
 async def _ask_about_vehicle(connection: Connection) -> None:
-    """Ask for AUTOPILOT_VERSION and STORAGE_INFORMATION a few times; neither is needed to work."""
+    """Ask for AUTOPILOT_VERSION, STORAGE_INFORMATION and SYSTEM_TIME a few times; none is needed to work."""
     vehicle, driver = connection.vehicle, connection.driver
     await connection._first_heartbeat.wait()
     for attempt in range(_INFO_TRIES):
@@ -352,9 +350,9 @@ async def _ask_about_vehicle(connection: Connection) -> None:
             wanted.append(AUTOPILOT_VERSION_ID)
         if vehicle.storage is None:
             wanted.append(STORAGE_INFORMATION_ID)
-        for message_id in wanted:
-            if vehicle.address is not None:
-                driver.send(driver.framer.encode_request_message(vehicle.address, message_id))
+        if not vehicle.tells_boot_time:
+            wanted.append(SYSTEM_TIME_ID)
+        _ask_for(connection, *wanted)
         if not wanted:
             return
         if attempt >= _OLD_WAY_FROM and vehicle.version is None and vehicle.address is not None:
@@ -362,17 +360,26 @@ async def _ask_about_vehicle(connection: Connection) -> None:
         await trio.sleep(_INFO_PERIOD)
 
 
+def _ask_for(connection: Connection, *message_ids: int) -> None:
+    driver, address = connection.driver, connection.vehicle.address
+    for message_id in message_ids:
+        if address is not None:
+            driver.send(driver.framer.encode_request_message(address, message_id))
+
+
 async def _ask_who_it_is(connection: Connection) -> None:
-    """Have the vehicle tell its unique id again each time it may have become another one."""
+    """Have the vehicle tell its boot time and its unique id each time it may have restarted or become another
+    one. The boot time first: nothing is asked before the id, and then a restart is known."""
     vehicle, driver, identity = connection.vehicle, connection.driver, connection.vehicle.identity
     while True:
         await connection._doubted.wait()
         connection._doubted = trio.Event()
         warned = False
         asked = 0
-        while (not asked or not identity.trusted) and vehicle.address is not None:
-            asked_at = connection.clock()
-            driver.send(driver.framer.encode_request_message(vehicle.address, AUTOPILOT_VERSION_ID))
+        while vehicle.address is not None and _is_unsure(vehicle, asked, asked_at := connection.clock()):
+            if vehicle.lacks_boot_time(asked_at):
+                _ask_for(connection, SYSTEM_TIME_ID)
+            _ask_for(connection, AUTOPILOT_VERSION_ID)
             if asked >= _OLD_WAY_FROM:
                 driver.send(driver.framer.encode_request_capabilities(vehicle.address))
             asked += 1
@@ -383,3 +390,9 @@ async def _ask_who_it_is(connection: Connection) -> None:
             elif identity.heard_since(asked_at):
                 identity.unanswered()
                 driver.kick()
+
+
+def _is_unsure(vehicle: Vehicle, asked: int, now: float) -> bool:
+    """Return whether there is something to ask; asked: how often that was done."""
+    lacks_time = asked < _TIME_TRIES and vehicle.lacks_boot_time(now)
+    return not asked or lacks_time or not vehicle.identity.trusted

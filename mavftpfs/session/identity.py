@@ -15,8 +15,8 @@ from enum import Enum
 from mavftpfs.link.messages import AutopilotVersion
 
 ABSENCE = 2.5
-"""Seconds of silence in which one vehicle may have been exchanged for another: no autopilot starts faster. (A
-cable that is moved reopens the link, which is told.)"""
+"""Seconds of silence in which a vehicle may have restarted, or have been exchanged for another: no autopilot
+starts faster. (A cable that is moved reopens the link, which is told.)"""
 
 PATIENCE = 20
 """Questions that a vehicle which is heard leaves unanswered before it is believed to be the same one: some
@@ -36,7 +36,7 @@ class Identity:
 
     Attributes:
         standing: of who answers now; only a trusted one is asked for files.
-        on_doubt: it is to be asked for its unique id again.
+        on_doubt: it may have restarted, or be another one: it is to be asked.
         on_settled: called with whether it was a stranger meanwhile: it is trusted again.
     """
 
@@ -49,6 +49,7 @@ class Identity:
         self._mute = False
         self._unanswered = 0
         self._heard_at: float | None = None
+        self._back_at = float("-inf")
 
     @property
     def trusted(self) -> bool:
@@ -70,7 +71,17 @@ class Identity:
         """Something came from the vehicle's address."""
         before, self._heard_at = self._heard_at, now
         if before is not None and now - before > ABSENCE:
-            self.doubt()
+            self.back(now)
+
+    def back(self, now: float) -> None:
+        """It was away since it was heard last, or may have been: the link was reopened."""
+        self._back_at = now
+        self.doubt()
+
+    def away_since(self, when: float, now: float) -> bool:
+        """Return whether it was away after that, so that it may have restarted."""
+        silent = self._heard_at is not None and now - self._heard_at > ABSENCE
+        return silent or self._back_at > when
 
     def heard_since(self, when: float) -> bool:
         """Return whether something came from it after that."""
@@ -78,9 +89,8 @@ class Identity:
 
     def doubt(self) -> None:
         """It may be another one since now: it restarted, or was silent."""
-        if self._known is None:
-            return
-        if not self._mute and self.standing is not Standing.DOUBTED:
+        tells = self._known is not None and not self._mute
+        if tells and self.standing is not Standing.DOUBTED:
             self._strange |= self.stranger
             self.standing = Standing.DOUBTED
             self._unanswered = 0

@@ -29,10 +29,6 @@ from mavftpfs.shared.errors import VehicleLost
 SILENCE_LIMIT = 5.0
 """Seconds without heartbeats after which one timed-out request means that the vehicle is lost."""
 
-BOOT_NEWS_AGE = 2.5
-"""Seconds since the vehicle told its boot time, which it does every second, after which it may have restarted
-without our knowing. No autopilot restarts faster."""
-
 FOREIGN_MEMORY = 10.0
 """Seconds for which an FTP client that was heard counts as present."""
 
@@ -76,7 +72,7 @@ class Vehicle:
     heard: dict[Address, Heartbeat] = field(default_factory=dict)
     _armed: bool | None = None
     _boot_ms: int | None = None
-    boot_heard_at: float = 0.0
+    boot_heard_at: float = float("-inf")
     _held_back: bool = False
     _timed_out: bool = False
 
@@ -113,8 +109,17 @@ class Vehicle:
         return self.foreign_at is not None and now - self.foreign_at < FOREIGN_MEMORY
 
     def restart_possible(self, now: float) -> bool:
-        """Return whether a restart may have gone unnoticed: the boot time was told before, but not lately."""
-        return self._boot_ms is not None and now - self.boot_heard_at > BOOT_NEWS_AGE
+        """Return whether a restart may have gone unnoticed: it was away since it told its boot time."""
+        return self.tells_boot_time and self.identity.away_since(self.boot_heard_at, now)
+
+    @property
+    def tells_boot_time(self) -> bool:
+        """Whether it told it at all; some do only when they are asked (ArduCopter)."""
+        return self.boot_heard_at > float("-inf")
+
+    def lacks_boot_time(self, now: float) -> bool:
+        """Return whether its boot time is worth asking for again."""
+        return self.restart_possible(now) or (self.tells_boot_time and self._boot_ms is None)
 
     def believes_reply(self, now: float) -> bool:
         """Something of the vehicle's FTP came: return whether it is known to be the vehicle."""

@@ -16,6 +16,7 @@ from mavftpfs.link.framing import (
     MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES,
     MAV_CMD_REQUEST_MESSAGE,
     STORAGE_INFORMATION_ID,
+    SYSTEM_TIME_ID,
     Framer,
 )
 from mavftpfs.link.messages import (
@@ -55,6 +56,9 @@ class SimVehicle:
         stream: whether `receive` gets pieces of a byte stream rather than datagrams.
         armed: state at the start; also after a reboot it is disarmed.
         signing_key: as for Framer.
+
+    Attributes:
+        tells_time: sends its boot time unasked; ArduCopter does not, unless somebody wants its EXTRA3.
     """
 
     def __init__(
@@ -76,6 +80,7 @@ class SimVehicle:
         self.address = address
         self.telemetry = telemetry
         self.armed = armed
+        self.tells_time = True
         self.heard: dict[Address, Heartbeat] = {}
         self.commands = 0
         self._uid = rng.getrandbits(64)
@@ -193,8 +198,8 @@ class SimVehicle:
         frames.append(
             self.framer.encode_heartbeat(_TYPE_QUADROTOR, _AUTOPILOT_TYPE[self.profile.family], mode, status)
         )
-        boot_ms = self._boot_ms(now)
-        frames.append(self.framer.encode_system_time(_UNIX_AT_START * 1_000_000 + boot_ms * 1000, boot_ms))
+        if self.tells_time:
+            frames.append(self._system_time(now))
         self._next_beat = now + HEARTBEAT_PERIOD
 
     def _add_telemetry(self, frames: list[bytes], now: float) -> None:
@@ -219,12 +224,18 @@ class SimVehicle:
             asks and wanted == AUTOPILOT_VERSION_ID
         ):
             frame = self._version()
+        elif asks and wanted == SYSTEM_TIME_ID:
+            frame = self._system_time(now)
         elif asks and wanted == STORAGE_INFORMATION_ID:
             frame = self.framer.encode_storage_information(self._boot_ms(now), CAPACITY_MIB, CAPACITY_MIB / 4)
         result = _UNSUPPORTED if frame is None else _ACCEPTED
         self._ready.append(self.framer.encode_command_ack(command.command, result, command.source))
         if frame is not None:
             self._ready.append(frame)
+
+    def _system_time(self, now: float) -> bytes:
+        boot_ms = self._boot_ms(now)
+        return self.framer.encode_system_time(_UNIX_AT_START * 1_000_000 + boot_ms * 1000, boot_ms)
 
     def _version(self) -> bytes:
         # MAVSDK's server never says that it speaks FTP (servers.md 5).

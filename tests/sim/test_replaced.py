@@ -73,11 +73,16 @@ async def test_the_end_of_a_copy_waits_for_the_news_of_a_reboot(profile: str, au
         assert connection.vehicle.reboots == 1
 
 
+@pytest.mark.parametrize("unasked", [True, False])
 @pytest.mark.parametrize("size", [0, 200_000, 260_000])
 @pytest.mark.parametrize("profile", taking_turns(PROFILES))
-async def test_a_copy_over_a_reboot_is_of_one_version(profile: str, size: int, autojump: MockClock) -> None:
-    """size: of the successor; 0 = the file stays."""
+async def test_a_copy_over_a_reboot_is_of_one_version(
+    profile: str, size: int, unasked: bool, autojump: MockClock
+) -> None:
+    """size: of the successor; 0 = the file stays. unasked: the vehicle tells its boot time so."""
     here = World(profile, LinkSettings(rate=20_000.0, delay=0.02))
+    here.vehicle.tells_time = unasked
+    here.vehicle.reboot(-100.0)
     path = ROOTS.get(profile, b"") + b"/big"
     here.tree.add(path, OLD, 1_700_000_000)
     async with here.connection() as connection, trio.open_nursery() as nursery:

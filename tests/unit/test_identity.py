@@ -54,8 +54,21 @@ def test_a_vehicle_that_never_told_is_never_doubted(first: AutopilotVersion | No
     identity.heard(1000.0)
     identity.doubt()
     assert identity.trusted
-    assert identity.doubts == 0
     assert identity.settled == []
+
+
+def test_it_may_have_restarted_while_it_was_away() -> None:
+    identity = Watched()
+    identity.heard(10.0)
+    assert not identity.away_since(10.0, 10.0 + ABSENCE)
+    assert identity.away_since(10.0, 10.1 + ABSENCE)
+    identity.heard(20.0)
+    assert identity.doubts == 1
+    assert identity.away_since(10.0, 20.0)
+    assert not identity.away_since(20.0, 20.0)
+    identity.back(20.5)  # the link was reopened
+    assert identity.doubts == 2
+    assert identity.away_since(20.0, 20.5)
 
 
 def test_nothing_is_asked_into_a_silence() -> None:
