@@ -18,7 +18,7 @@ FIRST_WANT = 0.05
 """Seconds an opened file is kept open for its first read although another file waits."""
 
 BOOT_NEWS = 2.5
-"""Seconds to wait after a reopen for the vehicle to tell its boot time; less than the 3 s after which
+"""Seconds to wait after a reopen for the boot time of a vehicle that was away; less than the 3 s after which
 ArduPilot gives an idle session away."""
 
 REOPENS = 5
