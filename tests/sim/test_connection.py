@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+from itertools import pairwise
 
 import pytest
 import trio
@@ -22,12 +23,13 @@ from mavftpfs.link.uri import parse_source
 from mavftpfs.protocol.payload import decode_request
 from mavftpfs.session.connection import ConnectOptions, connected
 from mavftpfs.shared.errors import VehicleLost
-from mavftpfs.sim.linkmodel import LinkModel, LinkSettings
+from mavftpfs.sim.linkmodel import Duplex, LinkModel, LinkSettings
 from mavftpfs.sim.memory import MemoryLink
 from mavftpfs.sim.memorytree import MemoryTree
 from mavftpfs.sim.profiles import PROFILES
 from mavftpfs.sim.vehicle import SimVehicle
-from tests.support.worlds import World, read_file
+from tests.support.uploads import put
+from tests.support.worlds import World, path, read_file, world
 
 KEY = bytes(range(32))
 DATA = random.Random(5).randbytes(30_000)
@@ -87,6 +89,42 @@ class OldFirmware(SimVehicle):
             super()._on_command(command, now)
 
 
+US = Address(254, 191)
+
+
+class Diary(dict[Address, Heartbeat]):
+    """What a vehicle heard last of whom, and when it heard us."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.times: list[float] = []
+
+    def __setitem__(self, source: Address, heartbeat: Heartbeat) -> None:
+        if source == US:
+            self.times.append(trio.current_time())
+        super().__setitem__(source, heartbeat)
+
+
+@pytest.mark.parametrize("profile", ["px4", "px4-nuttx", "ardupilot", "mavsdk"])
+@pytest.mark.parametrize("what", ["window", "burst", "write"])
+async def test_heartbeats_go_out_beside_a_copy(what: str, profile: str, autojump: MockClock) -> None:
+    """A radio that cannot do both at a time, with a short queue: what we send must not starve them."""
+    radio = LinkSettings(rate=5760.0, duplex=Duplex.HALF, queue=4096, delay=0.05)
+    here = world(profile, radio, f=DATA * 2)
+    here.vehicle.heard = diary = Diary()
+    options = ConnectOptions(read_mode="burst" if what == "burst" else "window")
+    async with here.connection(options) as connection:
+        began = trio.current_time()
+        if what == "write":
+            await put(connection, path(profile, "new"), DATA * 2)
+        else:
+            assert await read_file(connection, path(profile, "f")) == DATA * 2
+        took = trio.current_time() - began
+    heard = [time for time in diary.times if began <= time <= began + took]
+    assert len(heard) >= took - 2
+    assert max(later - time for time, later in pairwise(heard)) < 2.5
+
+
 async def test_old_firmware_is_asked_for_its_capabilities_in_the_old_way(autojump: MockClock) -> None:
     vehicle = OldFirmware(MemoryTree(), PROFILES["px4"], rng=random.Random(1))
     link = MemoryLink(vehicle, LinkModel(random.Random(2), LinkSettings(delay=0.01)))
@@ -113,8 +151,7 @@ async def test_what_we_say_we_are(options: ConnectOptions, said: int | None, aut
     here.tree.add(b"/f", DATA)
     async with here.connection(options) as connection:
         await trio.sleep(3)
-        us = Address(254, 191)
-        heard = {} if said is None else {us: Heartbeat(us, said, MAV_AUTOPILOT_INVALID, 0, 4)}
+        heard = {} if said is None else {US: Heartbeat(US, said, MAV_AUTOPILOT_INVALID, 0, 4)}
         assert here.vehicle.heard == heard
         assert await read_file(connection, b"/f") == DATA
 
