@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Awaitable, Callable
+from typing import Literal
 
 import pytest
 import trio
 from trio.testing import MockClock
 
+from mavftpfs.protocol.crc import crc32
 from mavftpfs.protocol.operations import Simple
 from mavftpfs.protocol.payload import Opcode
 from mavftpfs.session.connection import Connection, ConnectOptions
 from mavftpfs.session.store import Store
-from mavftpfs.shared.errors import FileChanged, FtpNak, PathTooLong, RequestTimeout
+from mavftpfs.shared.errors import Armed, FileChanged, FtpNak, PathTooLong, RequestTimeout
 from mavftpfs.shared.model import join
 from mavftpfs.sim.filesystem import Kind
 from mavftpfs.sim.linkmodel import LinkSettings
@@ -407,3 +409,25 @@ async def test_who_looks_misses_no_name_because_we_take_others_away(
         for name in names[:taken]:
             await connection.store.remove(join(directory, name))
     assert shown >= set(names[taken:])
+
+
+@pytest.mark.parametrize("when_armed", ["ro", "ok"])
+async def test_no_checksum_is_asked_for_in_flight(
+    when_armed: Literal["ro", "ok"], autojump: MockClock
+) -> None:
+    """The vehicle reads the whole file for it (promise 9)."""
+    here = world("px4", file=b"content")
+    faults = Faults(here)
+
+    async def fly(armed: bool) -> None:
+        (here.vehicle.arm if armed else here.vehicle.disarm)()
+        here.link.kick()
+        await trio.sleep(0.5)
+
+    async with here.connection(ConnectOptions(when_armed=when_armed)) as connection:
+        await fly(True)
+        with pytest.raises(Armed):
+            await connection.store.crc32(b"/d/file")
+        assert Opcode.CALC_FILE_CRC32 not in faults.requests
+        await fly(False)
+        assert await connection.store.crc32(b"/d/file") == crc32(b"content")
