@@ -132,7 +132,7 @@ class Driver:
     def _take(self, chunks: list[bytes], now: float) -> None:
         if not chunks:
             self.framer.reset()
-            self.vehicle.identity.back(now)  # or another one, at the other end
+            self.vehicle.identity.reopened(now)
             return
         self._heard_at = now
         feed = self.framer.feed_runs

@@ -36,6 +36,7 @@ class Identity:
 
     Attributes:
         standing: of who answers now; only a trusted one is asked for files.
+        left_at: when it was heard last before it was away, the last time.
         on_doubt: it may have restarted, or be another one: it is to be asked.
         on_settled: called with whether it was a stranger meanwhile: it is trusted again.
     """
@@ -49,7 +50,7 @@ class Identity:
         self._mute = False
         self._unanswered = 0
         self._heard_at: float | None = None
-        self._back_at = float("-inf")
+        self._back_at = self.left_at = float("-inf")
 
     @property
     def trusted(self) -> bool:
@@ -71,11 +72,13 @@ class Identity:
         """Something came from the vehicle's address."""
         before, self._heard_at = self._heard_at, now
         if before is not None and now - before > ABSENCE:
-            self.back(now)
+            self.left_at, self._back_at = before, now
+            self.doubt()
 
-    def back(self, now: float) -> None:
-        """It was away since it was heard last, or may have been: the link was reopened."""
-        self._back_at = now
+    def reopened(self, now: float) -> None:
+        """The link was: it may have been away for less than that, or be another one."""
+        if self._heard_at is not None:
+            self.left_at, self._back_at = self._heard_at, now
         self.doubt()
 
     def away_since(self, when: float, now: float) -> bool:

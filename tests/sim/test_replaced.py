@@ -82,7 +82,7 @@ async def test_a_copy_over_a_reboot_is_of_one_version(
     """size: of the successor; 0 = the file stays. unasked: the vehicle tells its boot time so."""
     here = World(profile, LinkSettings(rate=20_000.0, delay=0.02))
     here.vehicle.tells_time = unasked
-    here.vehicle.reboot(-100.0)
+    here.vehicle.reboot(-5.0)
     path = ROOTS.get(profile, b"") + b"/big"
     here.tree.add(path, OLD, 1_700_000_000)
     async with here.connection() as connection, trio.open_nursery() as nursery:

@@ -66,7 +66,7 @@ def test_it_may_have_restarted_while_it_was_away() -> None:
     assert identity.doubts == 1
     assert identity.away_since(10.0, 20.0)
     assert not identity.away_since(20.0, 20.0)
-    identity.back(20.5)  # the link was reopened
+    identity.reopened(20.5)
     assert identity.doubts == 2
     assert identity.away_since(20.0, 20.5)
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pytest
+
 from mavftpfs.link.messages import (
     MAV_AUTOPILOT_INVALID,
     Address,
@@ -156,6 +158,20 @@ def test_a_reboot_during_a_long_outage_is_seen_by_the_time_that_is_missing() -> 
     assert reboots == []
     vehicle.on_message(SystemTime(PILOT, 0, 700_000), 1226.0)
     assert reboots == [1]
+
+
+@pytest.mark.parametrize(("restarts", "told"), [(True, 8_000), (False, 40_000), (False, 24_000)])
+def test_a_restart_of_who_told_its_boot_time_long_ago_is_seen(restarts: bool, told: int) -> None:
+    """It was heard all the time, and had counted on; perhaps at half the speed, as a simulator."""
+    vehicle = listener()
+    vehicle.on_message(heartbeat(PILOT), 0.0)
+    vehicle.on_message(SystemTime(PILOT, 0, 5_000), 0.0)
+    for second in [*range(21), 35]:
+        vehicle.on_message(heartbeat(PILOT), float(second))
+    assert vehicle.restart_possible(35.0)
+    vehicle.on_message(SystemTime(PILOT, 0, told), 35.0)
+    assert vehicle.reboots == restarts
+    assert not vehicle.restart_possible(35.0)
 
 
 def test_facts_are_taken_from_the_target_alone() -> None:
