@@ -37,7 +37,7 @@ from mavftpfs.shared.errors import (
     SpoolFailed,
     VerificationFailed,
 )
-from mavftpfs.shared.model import DirEntry, EntryKind, split
+from mavftpfs.shared.model import DirEntry, EntryKind, folded, split
 
 log = logging.getLogger("mavftpfs.cache")
 
@@ -316,7 +316,7 @@ class Deliverer:
             return None
         parent, name = split(path)
         known = self._context.dentries.known(parent)
-        if known is None or not known.complete or name.lower() in map(bytes.lower, known.entries):
+        if known is None or not known.complete or folded(name) in map(folded, known.entries):
             return float("-inf")
         return known.listed_at
 

@@ -20,7 +20,7 @@ from mavftpfs.cache.remote import FREE_FOR
 from mavftpfs.cache.shortnames import is_short
 from mavftpfs.shared.errnos import errno_for
 from mavftpfs.shared.errors import FtpNak, LocalProtocolError, MavftpfsError
-from mavftpfs.shared.model import DirEntry, EntryKind, join, split
+from mavftpfs.shared.model import DirEntry, EntryKind, folded, join, split
 
 log = logging.getLogger("mavftpfs.cache")
 
@@ -89,8 +89,8 @@ class Names:
         """Refuse a new name that the card would take for another one, of which it would change the file.
 
         FatFs drops dots and blanks at the end of every name (its create_name), NuttX the dot behind a short
-        one only (its fat_parsesfname): files of our own show it. It is looked, too, whether the name opens a
-        file although no listing shows it.
+        one only (its fat_parsesfname): files of our own show it. Where a file has a name like it (`folded`),
+        it is looked, too, whether the new one opens it although no listing shows that.
 
         Raises:
             LocalProtocolError. Else as entry and WriteStore.create_empty, stat_size; PathTooLong.
@@ -100,10 +100,12 @@ class Names:
         if name in entries:
             return
         plain = _without_end(name)
-        alike = any(_without_end(n) == plain and n.lower() != name.lower() for n in entries)
-        dropped = len(plain) < len(name) and await self._drops_end(path)
-        if dropped or (alike and await self._opens(path)):
+        if len(plain) < len(name) and await self._drops_end(path):
             raise LocalProtocolError(f"this card drops dots and blanks at the end of names as {name!r}")
+        files = [n for n, entry in entries.items() if entry.kind is EntryKind.FILE]
+        alike = any(_without_end(n) == plain and n.lower() != name.lower() for n in files)
+        if alike and await self._opens(path):
+            raise LocalProtocolError(f"this card takes {name!r} for the name of another file")
 
     # --- inside
 
@@ -200,4 +202,4 @@ class Names:
 
 
 def _without_end(name: bytes) -> bytes:
-    return name.rstrip(b". ").lower()
+    return folded(name.rstrip(b". "))

@@ -115,6 +115,15 @@ def require_listable(path: bytes) -> None:
         raise LocalProtocolError(f"{name!r} holds a tab, so no listing could show it")
 
 
+_ONE_LETTER = bytes(range(128)) + b"\x80" * 128
+
+
+def folded(name: bytes) -> bytes:
+    """Return what names, or paths, have in common that a card may take for one: letters in any case, and
+    beyond ASCII whatever a code page makes of them (by page 850 FatFs folds the UTF-8 of ä and å)."""
+    return name.lower().translate(_ONE_LETTER)
+
+
 def usable_name(name: bytes) -> bool:
     """Return whether a listed name may enter the tree (promise 10)."""
     return bool(name) and name not in (b".", b"..") and b"/" not in name and b"\0" not in name

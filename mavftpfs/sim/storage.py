@@ -253,8 +253,15 @@ class Storage:
             return name
         if name in names:
             return name
+        if self._fold:
+            return next((other for other in names if _in_page_850(other) == _in_page_850(name)), name)
         alike = (other for other in names if other.lower() == name.lower())
-        return next((other for other in alike if self._fold or self._is_short(other)), name)
+        return next((other for other in alike if self._is_short(other)), name)
+
+
+def _in_page_850(name: bytes) -> str:
+    """Return a name in capitals as FatFs has it, to which its bytes are code page 850 (servers.md 9)."""
+    return "".join(c.upper() if len(c.upper()) == 1 else c for c in name.decode("cp850"))
 
 
 class _FatFile:
