@@ -209,7 +209,7 @@ def test_reading_to_eof_over_a_bad_link(name: str) -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_side_effects_happen_once(name: str) -> None:
-    """A mkdir whose reply is lost is replayed where servers do that, else refused so that it says "perhaps done"."""
+    """A mkdir whose reply is lost is replayed where servers do that, else its refusal says "perhaps done"."""
     rig = Rig(name, LinkSettings(delay=0.02, loss=0.3), seed=3)
     root = b"/fs/microsd/" if rig.profile.writable_root else b"/"
     rig.tree.add_directory(root)
