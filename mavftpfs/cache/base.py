@@ -92,6 +92,7 @@ async def require_same(node: Node) -> None:
 def outdate(context: Context, node: Node) -> None:
     """We changed the vehicle's file: who reads it opens it anew, which is no change of somebody else's."""
     node.generation += 1
+    node.mtime = None
     node.close_base()
     context.files.on_written(node.path)
 

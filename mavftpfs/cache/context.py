@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import trio
 
 from mavftpfs.cache.asides import Namer
-from mavftpfs.cache.dentries import Dentries
+from mavftpfs.cache.dentries import Dentries, Directory
 from mavftpfs.cache.directories import Directories
 from mavftpfs.cache.files import Files
 from mavftpfs.cache.nodes import Node, Nodes
@@ -16,6 +16,7 @@ from mavftpfs.cache.options import CacheOptions
 from mavftpfs.cache.pathlocks import PathLocks
 from mavftpfs.cache.remote import RemoteStore, WriteStore
 from mavftpfs.shared.errors import Armed, FileBusy
+from mavftpfs.shared.model import split
 
 
 @dataclass(slots=True)
@@ -71,12 +72,33 @@ class Context:
         """Who has a file open that somebody else replaced, and changed nothing of it, keeps it to himself:
         the name is the new file's."""
         node = self.nodes.get(path)
-        if node is None or node.base is None or not node.base.lost or node.undelivered:
+        if node is not None and node.base is not None and node.base.lost:
+            self._part(node)
+
+    def on_listed(self, path: bytes, directory: Directory) -> None:
+        """A directory was listed: part with what we delivered and others replaced since."""
+        for node in self.nodes:
+            parent, name = split(node.path)
+            entry = directory.entries.get(name) if parent == path else None
+            if entry is None or not float("-inf") < node.delivered_at < directory.listed_at:
+                continue
+            if node.draft is None or self.is_changing(node.path):
+                continue
+            same_size = entry.size in (None, node.draft.size)
+            if same_size and node.mtime is None:
+                node.mtime = entry.mtime
+            elif same_size and entry.mtime in (None, node.mtime):
+                continue
+            elif same_size or (entry.size or 0) < node.draft.size:  # a larger one only grew
+                self._part(node)
+
+    def _part(self, node: Node) -> None:
+        if node.undelivered or node.attempt is not None or node.lock.locked():
             return
-        if node.attempt is None and not node.lock.locked():
-            node.parted = True
-            node.lose_name()
-            self.nodes.detach(node)
+        node.parted = True
+        node.lose_name()
+        self.nodes.detach(node)
+        self.files.distrust(node.path)
 
     def hide(self, node: Node, path: bytes) -> None:
         """An unlinked file's node is called `path`, a reserved name, from now on."""

@@ -218,6 +218,13 @@ class Files:
                 one.end(f"{one.path!r} changed on the vehicle after it was opened")
                 self._invalidate(one.path)
 
+    def distrust(self, path: bytes) -> None:
+        """The kernel may hold bytes of a file that had the path before."""
+        current = self._current.get(path)
+        if current is not None:
+            current.shown = False
+        self._invalidate(path)
+
     def _distrust(self, version: Version) -> None:
         """Bytes of it were dropped as doubtful: the kernel may hold copies."""
         version.shown = False

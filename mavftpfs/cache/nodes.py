@@ -65,6 +65,7 @@ class Node:
     base: reads the vehicle's file. delivered_at: when the vehicle last had it all. doomed: how many changes
     that take its name away have the lock, or are about to, or empty it: no delivery begins or goes on.
     looked_at: who has the lock changes nothing on the vehicle just now. parted: its name is another file's.
+    mtime: what the first listing told since delivered_at.
     """
 
     path: bytes
@@ -88,6 +89,7 @@ class Node:
     doomed: int = 0
     looked_at: int = 0
     parted: bool = False
+    mtime: int | None = None
     _delivery: trio.CancelScope | None = None
     _firm: int = 0
 
@@ -174,7 +176,8 @@ class Node:
             raise FileChanged(f"what was {self.path!r} is not on the vehicle any more")
 
     def require_not_parted(self) -> None:
-        """Raise FileChanged if nothing that is written to it would come to the vehicle, or be kept."""
+        """Raise FileChanged if its name is another file's: what is written would not come to the vehicle, and
+        what is read would get among the kernel's pages of that."""
         if self.parted:
             raise FileChanged(f"{self.path!r} is another file by now")
 

@@ -81,6 +81,7 @@ class _Reading:
 
     async def _read(self, offset: int, size: int) -> bytes | memoryview:
         node = self._node
+        node.require_not_parted()
         if self._handle is not None:
             self._handle.require_not_lost()
         if node.draft is not None:

@@ -10,7 +10,7 @@ import trio
 from mavftpfs.cache.asides import Namer, new_owner
 from mavftpfs.cache.cleaning import Cleaner
 from mavftpfs.cache.context import Context
-from mavftpfs.cache.dentries import Dentries
+from mavftpfs.cache.dentries import Dentries, Directory
 from mavftpfs.cache.directories import Directories
 from mavftpfs.cache.files import Files
 from mavftpfs.cache.options import CacheOptions
@@ -65,4 +65,11 @@ def make_writeback(
     cleaner = Cleaner(context, Sure(context), dead)
     directories.on_swept = cleaner.on_swept
     files.is_changing = context.is_changing
+    compare = directories.on_listed
+
+    def on_listed(path: bytes, directory: Directory) -> None:
+        compare(path, directory)
+        context.on_listed(path, directory)
+
+    directories.on_listed = on_listed
     return Writeback(context, spool, throttle, cleaner)

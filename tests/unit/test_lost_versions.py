@@ -260,3 +260,49 @@ async def test_who_has_a_file_open_that_others_removed_does_not_get_the_next_one
     for file in (writer, reader):
         await file.release()
     assert store.files[FILE].data == NEW
+
+
+@pytest.mark.parametrize("smaller", [False, True])
+async def test_what_is_held_of_a_lost_file_does_not_get_among_the_pages_of_the_new_one(
+    store: FakeWriter, autojump_clock: object, smaller: bool
+) -> None:
+    """The kernel keeps what it was given by one name, whoever asked."""
+    tree = make_writable(store, inplace=True)
+    writer = await tree.open(FILE, write=True)
+    await writer.write(0, b"mid")
+    await writer.fsync()
+    held = b"mid" + OLD[3:]
+    assert bytes(await writer.read(0, 900)) == held
+    if not smaller:
+        store.files[FILE].mtime = 5
+        await trio.sleep(30.0)
+        await tree.list(b"/d")
+        assert bytes(await writer.read(0, 900)) == held
+    new = NEW[:-100] if smaller else NEW
+    store.add(FILE, new, 6)
+    await trio.sleep(30.0)
+    await tree.list(b"/d")
+    assert (await tree.stat(FILE)).size == len(new)
+    assert FILE in store.invalidated
+    reader = await tree.open(FILE)
+    await require_lost(writer)
+    with pytest.raises(FileChanged):
+        await writer.write(0, b"more")
+    assert bytes(await reader.read(0, 900)) == new
+    for file in (writer, reader):
+        await file.release()
+
+
+async def test_a_file_that_grew_after_it_was_written_stays_who_wrote_it_has_open(
+    store: FakeWriter, autojump_clock: object
+) -> None:
+    tree = make_writable(store, inplace=True)
+    writer = await tree.open(FILE, write=True)
+    await writer.write(0, b"mid")
+    await writer.fsync()
+    for _ in range(2):
+        await trio.sleep(30.0)
+        store.files[FILE].data += b"more"
+        await tree.list(b"/d")
+    assert bytes(await writer.read(0, 900)) == b"mid" + OLD[3:]
+    await writer.release()
