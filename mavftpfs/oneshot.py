@@ -102,7 +102,11 @@ def _entry(path: bytes, name: bytes, found: Stat) -> Entry:
 
 
 async def checksum_paths(target: Target, paths: list[bytes], tell: Callable[[bytes, int], None]) -> None:
-    """Have the vehicle compute CRC32s; `tell(path, crc)` for each."""
+    """Have the vehicle compute CRC32s; `tell(path, crc)` for each.
+
+    Raises:
+        IsADirectory. Else as Tree.stat and crc32.
+    """
     async with target.attached() as vehicle:
         for path in paths:
             if (await vehicle.tree.stat(path)).kind is not EntryKind.FILE:

@@ -182,7 +182,11 @@ async def make_directory(tree: Tree, path: bytes, *, may_exist: bool) -> None:
 
 
 async def make_directories(target: Target, paths: Sequence[bytes], *, parents: bool) -> None:
-    """Make directories; with `parents` also those above them, and what is there already is fine."""
+    """Make directories; with `parents` also those above them, and what is there already is fine.
+
+    Raises:
+        As make_directory and Tree.mkdir.
+    """
     async with target.attached(writing=True) as vehicle:
         for path in paths:
             for above in ancestors(path) if parents else ():
@@ -201,7 +205,11 @@ def ancestors(path: bytes) -> list[bytes]:
 
 
 async def remove_directories(target: Target, paths: Sequence[bytes]) -> None:
-    """Remove empty directories."""
+    """Remove empty directories.
+
+    Raises:
+        As Tree.rmdir.
+    """
     async with target.attached(writing=True) as vehicle:
         for path in paths:
             await vehicle.tree.rmdir(path)

@@ -106,6 +106,7 @@ class MountOptions:
 
 
 Parser = Callable[[str], Any]
+"""Parses the text of a value; raises ValueError, which says what it should have been."""
 
 
 def _or_auto(parse: Parser) -> Parser:

@@ -242,7 +242,11 @@ class Operation:
 
     @property
     def port(self) -> Port:
-        """The engine; only while started."""
+        """The engine.
+
+        Raises:
+            LocalProtocolError: the operation was not started.
+        """
         if self._port is None:
             raise LocalProtocolError("the operation was not started")
         return self._port
@@ -263,7 +267,11 @@ class Operation:
         return False
 
     def attach(self, port: Port, now: float) -> None:
-        """Called by the engine when it takes the operation on."""
+        """Called by the engine when it takes the operation on.
+
+        Raises:
+            LocalProtocolError: it was taken on before.
+        """
         if self._port is not None:
             raise LocalProtocolError("an operation runs once")
         self._port = port
