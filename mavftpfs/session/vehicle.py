@@ -71,6 +71,7 @@ class Vehicle:
     identity: Identity = field(default_factory=Identity)
     heard: dict[Address, Heartbeat] = field(default_factory=dict)
     _armed: bool | None = None
+    _disarmed_at: float = float("-inf")
     _boot_ms: int | None = None
     boot_heard_at: float = float("-inf")
     _held_back: bool = False
@@ -164,7 +165,9 @@ class Vehicle:
         if self.address is None and self._is_wanted(heartbeat):
             self.address = self._target_of(heartbeat)
         if heartbeat.is_autopilot and self.address and heartbeat.source.system == self.address.system:
-            self._on_armed(heartbeat.armed)
+            self._disarmed_at = float("-inf") if heartbeat.armed else now
+            if heartbeat.armed or self.identity.trusted:  # else it may be another one, and ours fly
+                self._on_armed(heartbeat.armed)
         if not self._proves_life(heartbeat.source):
             return
         self.heartbeat_at = now
@@ -183,6 +186,8 @@ class Vehicle:
             self._boot_ms = None
             self.reboots += 1
             self.on_reboot()
+        elif self._disarmed_at > self.identity.left_at:  # it was this one that said so
+            self._on_armed(False)
         self._on_alive()
 
     def _on_armed(self, armed: bool) -> None:

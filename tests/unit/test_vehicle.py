@@ -79,6 +79,37 @@ def test_arming_is_told_once_each_way() -> None:
     assert news == [False, True, False]
 
 
+def test_who_may_be_another_vehicle_does_not_disarm_ours() -> None:
+    vehicle = listener()
+    ours = AutopilotVersion(PILOT, 0x20, 1, b"", 1, b"")
+    vehicle.on_message(heartbeat(PILOT, armed=True), 0.0)
+    vehicle.on_message(ours, 0.0)
+    vehicle.on_message(heartbeat(PILOT), 10.0)
+    assert vehicle.armed
+    vehicle.on_message(ours, 20.0)  # it is back, and flies
+    assert vehicle.identity.trusted
+    assert vehicle.armed
+    vehicle.on_message(heartbeat(PILOT), 21.0)
+    assert not vehicle.armed
+    vehicle.on_message(heartbeat(PILOT, armed=True), 31.0)
+    assert vehicle.armed
+
+
+def test_a_vehicle_that_is_seldom_heard_is_disarmed_when_it_tells_who_it_is() -> None:
+    vehicle = listener()
+    ours = AutopilotVersion(PILOT, 0x20, 1, b"", 1, b"")
+    vehicle.on_message(heartbeat(PILOT, armed=True), 0.0)
+    vehicle.on_message(ours, 0.0)
+    vehicle.on_message(heartbeat(PILOT), 4.0)
+    assert vehicle.armed
+    vehicle.on_message(ours, 4.1)
+    assert not vehicle.armed
+    vehicle.on_message(heartbeat(PILOT), 8.0)
+    vehicle.on_message(heartbeat(PILOT, armed=True), 8.1)
+    vehicle.on_message(ours, 8.2)
+    assert vehicle.armed
+
+
 def test_a_component_cannot_disarm_the_autopilot() -> None:
     news: list[bool] = []
     companion = Address(1, 100)
