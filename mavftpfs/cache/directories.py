@@ -42,7 +42,11 @@ class Found:
 
 
 class Directories:
-    """Listings of the vehicle's directories. All paths are the vehicle's, normalised."""
+    """Listings of the vehicle's directories. All paths are the vehicle's, normalised.
+
+    Attributes:
+        tells_times: whether any listing told an mtime.
+    """
 
     def __init__(
         self,
@@ -63,6 +67,7 @@ class Directories:
         self.on_swept: Callable[[bytes, Directory], Awaitable[None]] | None = None
         self.on_listed: Callable[[bytes, Directory], None] = lambda path, directory: None
         self.lost = False
+        self.tells_times = False
         self.sweeps = 0
         self.served_stale = 0
 
@@ -138,6 +143,7 @@ class Directories:
 
     def rebooted(self) -> None:
         """What was learnt of the server's ways may no longer hold."""
+        self.tells_times = False
         self._root_proven = self._root == ROOT
         self._dot_refused = False
 
@@ -190,6 +196,7 @@ class Directories:
         except BaseException:
             self._dentries.abandon(sweep)
             raise
+        self.tells_times |= any(entry.mtime is not None for entry in listing.entries)
         directory = self._dentries.finish(sweep, listing, self._clock())
         if not sweep.void:
             self.on_listed(path, directory)

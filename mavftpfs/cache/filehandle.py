@@ -55,6 +55,8 @@ class FileHandle(ReadOnlyHandle):
         version, reopens = self._version, self._files.reopens
         for _ in range(MAX_RESTARTS):
             await self._files.restarts.recheck(version)
+            if reopens.is_undated(version):
+                await reopens.date(version)
             boot = version.boot
             data = await self._read_range(offset, stop)
             if boot != version.boot or version.recheck:

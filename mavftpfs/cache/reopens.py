@@ -11,6 +11,9 @@ after the reopening is compared before more of the file is given out, also what 
 Where readers take turns, each turn is a reopening: then the comparison is put off (`openings`), but for the
 read that reaches the end of the file. Without mtimes the size in the open ACK alone decides.
 
+What was opened without a known mtime (we had changed it, or it had another size than in the last listing)
+could not be told from a successor of its size: the first read has it listed, and opened anew behind that.
+
 Any listing that shows another mtime has the open versions of that file end, too, reopened or not.
 """
 
@@ -23,7 +26,7 @@ from mavftpfs.cache.dentries import Directory
 from mavftpfs.cache.directories import Directories
 from mavftpfs.cache.flights import Flights
 from mavftpfs.cache.versions import Fetcher, Version, became_another
-from mavftpfs.shared.model import DirEntry, EntryKind, split
+from mavftpfs.shared.model import DirEntry, EntryKind, join, split
 
 
 class Reopens:
@@ -56,6 +59,35 @@ class Reopens:
             return False
         return now or self._clock() >= version.blocks.openings.look_at
 
+    def is_undated(self, version: Version) -> bool:
+        """Return whether a version lacks the mtime that a listing would tell; nothing was given out yet."""
+        if version.mtime is not None or version.dated or version.blocks.given:
+            return False
+        return self._directories.tells_times and not self._is_changing(version.path)
+
+    async def date(self, version: Version) -> None:
+        """Find out the mtime of a version of which nothing was given out, and open its file behind that.
+
+        Raises:
+            As compare.
+        """
+        await self._comparing.run(version, partial(self._date_once, version))
+        version.require_alive()
+
+    async def _date_once(self, version: Version) -> None:
+        version.dated = True
+        parent, name = split(version.path)
+        directory = await self._directories.recent(parent)
+        if not _dates(directory.entries.get(name), version):
+            directory = await self._directories.ask(parent)
+        async with self._fetcher.paths.steady(lambda: version.path) as path:
+            entry = directory.entries.get(name)
+            if path != join(parent, name) or self._is_changing(path) or version.blocks.given:
+                version.dated = False
+                return
+        if entry is not None and _dates(entry, version):
+            await self._start_over(version, entry)
+
     async def compare(self, version: Version) -> None:
         """Compare an open version with a listing that begins after its file was opened on the vehicle.
 
@@ -66,13 +98,13 @@ class Reopens:
         version.require_alive()
 
     async def _compare_once(self, version: Version) -> None:
-        openings = version.blocks.openings
-        count, parent = openings.count, split(version.path)[0]
+        openings, path = version.blocks.openings, version.path
+        count, (parent, name) = openings.count, split(path)
         directory = await self._directories.recent(parent, began=openings.latest)
-        async with self._fetcher.paths.steady(lambda: version.path) as path:
-            entry = directory.entries.get(split(path)[1])
-            if split(path)[0] != parent or self._is_changing(path):
-                return
+        async with self._fetcher.paths.steady(lambda: version.path) as present:
+            entry = directory.entries.get(name)
+            if present != path or self._is_changing(path):
+                return  # who reads on has it compared under its new name
         if entry is None:
             another = directory.complete
         else:
@@ -116,6 +148,11 @@ class Reopens:
                 else:
                     version.blocks.openings.on_doubted()
                     self._fetcher.on_distrust(version)
+
+
+def _dates(entry: DirEntry | None, version: Version) -> bool:
+    """Return whether an entry tells the mtime of a file of that size."""
+    return entry is not None and entry.size == version.size and entry.mtime is not None
 
 
 def is_unsettled(version: Version) -> bool:
