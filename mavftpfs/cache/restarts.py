@@ -11,6 +11,7 @@ is compared before more of it is given out, also what a read under way brought:
 from __future__ import annotations
 
 from collections.abc import Awaitable, Callable
+from contextlib import suppress
 from functools import partial
 
 from mavftpfs.cache.flights import Flights
@@ -46,13 +47,14 @@ class Restarts:
         version.require_alive()
 
     async def _recheck_once(self, version: Version) -> None:
-        boot = version.boot
-        try:
-            entry = await self._facts(version.path)
-        except (NotFound, NotADirectory):
-            self._on_changed(version)
-            return
-        if became_another(version, entry):
+        boot, path = version.boot, version.path
+        entry: DirEntry | None = None
+        with suppress(NotFound, NotADirectory):
+            entry = await self._facts(path)
+        async with self._fetcher.paths.steady(lambda: version.path) as present:
+            if present != path:
+                return  # who reads on has it compared under its new name
+        if entry is None or became_another(version, entry):
             self._on_changed(version)
         elif _is_the_same(version, entry):
             version.proven_boot = boot
