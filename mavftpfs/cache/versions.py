@@ -43,9 +43,9 @@ class Version:
     """A file as it was when it was opened.
 
     mtime: None if not known to belong to this size. A listing of before it was opened told it, so it may be
-    that of a predecessor until it is sure. dated: whether an unknown one was asked for. proven_at: when it was
-    last known to be what the vehicle holds. handles: how many are open. shown: whether the kernel may hold
-    pages of it and all of them are good. boot: how often the vehicle restarted while it was open.
+    that of a predecessor until it is sure. dated: whether an unknown one was asked for. proven_at: when it
+    was last known to be what the vehicle holds. handles: how many are open. shown: whether the kernel may
+    hold pages of it and all of them are good. boot: how often the vehicle restarted while it was open.
     proven_boot: the one of these after which it was proven to be the same file still. dead: why it is not the
     path's file any more; lost: somebody else changed that. kept: its part on the local disk, if it may have
     one.
