@@ -27,7 +27,7 @@ class Context:
     was changed by us. live: reserved paths in use right now; hidden: unlinked files by their reserved path.
     garbage: reserved paths that could not be removed yet -> the path they belong to.
     torn: paths that may be missing on the vehicle though nobody removed them -> where their files lie.
-    armed: nothing may be changed.
+    parted: files that are open and whose names are others'. armed: nothing may be changed.
     """
 
     store: RemoteStore
@@ -46,6 +46,7 @@ class Context:
     hidden: dict[bytes, Node] = field(default_factory=dict)
     garbage: dict[bytes, bytes] = field(default_factory=dict)
     torn: dict[bytes, bytes] = field(default_factory=dict)
+    parted: list[Node] = field(default_factory=list)
     armed: bool = False
 
     @property
@@ -75,6 +76,10 @@ class Context:
         if node is not None and node.base is not None and node.base.lost:
             self._part(node)
 
+    def has_another(self, path: bytes) -> bool:
+        """Return whether somebody has a file open that had this path, and is to read nothing of what has."""
+        return self.files.was_lost(path) or any(n.path == path and n.handles for n in self.parted)
+
     def on_listed(self, path: bytes, directory: Directory) -> None:
         """A directory was listed: part with what we delivered and others replaced since."""
         for node in self.nodes:
@@ -96,6 +101,7 @@ class Context:
         if node.undelivered or node.attempt is not None or node.lock.locked():
             return
         node.parted = True
+        self.parted = [other for other in self.parted if other.handles] + [node]
         node.lose_name()
         self.nodes.detach(node)
         self.files.distrust(node.path)

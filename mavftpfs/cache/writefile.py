@@ -53,7 +53,7 @@ class _Reading:
     @property
     def direct_io(self) -> bool:
         """Whether the kernel's pages could come from, or go to, who has another file of the path open."""
-        if self._context.files.was_lost(self._node.path):
+        if self._context.has_another(self._node.path):
             return True
         return self._node.draft is None and self._handle is not None and self._handle.direct_io
 
