@@ -51,14 +51,18 @@ async def test_several_files_at_once_share_the_session(profile: str, autojump: M
     files = {f"f{index}": content(20_000, index) for index in range(5)}
     here = world(profile, BAD, **files)
     got: dict[str, bytes] = {}
+    most_open = 0
     async with here.connection() as connection, trio.open_nursery() as nursery:
 
         async def fetch(name: str) -> None:
+            nonlocal most_open
             got[name] = await read_file(connection, path(profile, name))
+            most_open = max(most_open, here.vehicle.server.open_sessions)
 
         for name in files:
             nursery.start_soon(fetch, name)
     assert got == files
+    assert most_open == 1, "also where the server has more"
     assert here.vehicle.server.open_sessions == 0
 
 
