@@ -50,7 +50,7 @@ _OLD_WAY_FROM = 2
 
 _IDENTITY_PERIOD = 0.5
 _TIME_TRIES = 5
-_STRANGER_PERIOD = 5.0
+_SELDOM = 5.0
 _ANOTHER = "another vehicle answers as %d/%d: nothing is read from it or written to it; mount it anew"
 
 
@@ -374,16 +374,18 @@ async def _ask_who_it_is(connection: Connection) -> None:
     while True:
         await connection._doubted.wait()
         connection._doubted = trio.Event()
-        warned = False
-        asked = 0
-        while vehicle.address is not None and _is_unsure(vehicle, asked, asked_at := connection.clock()):
-            if vehicle.lacks_boot_time(asked_at):
-                _ask_for(connection, SYSTEM_TIME_ID)
-            _ask_for(connection, AUTOPILOT_VERSION_ID)
-            if asked >= _OLD_WAY_FROM:
-                driver.send(driver.framer.encode_request_capabilities(vehicle.address))
-            asked += 1
-            await trio.sleep(_STRANGER_PERIOD if identity.stranger else _IDENTITY_PERIOD)
+        asked, asked_at, warned = 0, float("-inf"), False
+        while vehicle.address is not None and _is_unsure(vehicle, asked, now := connection.clock()):
+            # It may be gone again: then, and of a stranger, it has time.
+            soon = identity.heard_since(asked_at) and not identity.stranger
+            if soon or now - asked_at >= _SELDOM:
+                if vehicle.lacks_boot_time(now):
+                    _ask_for(connection, SYSTEM_TIME_ID)
+                _ask_for(connection, AUTOPILOT_VERSION_ID)
+                if asked >= _OLD_WAY_FROM:
+                    driver.send(driver.framer.encode_request_capabilities(vehicle.address))
+                asked, asked_at = asked + 1, now
+            await trio.sleep(_IDENTITY_PERIOD)
             if identity.stranger and not warned:
                 warned = True
                 log.warning(_ANOTHER, *vehicle.address)

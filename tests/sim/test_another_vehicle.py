@@ -161,3 +161,20 @@ async def test_ours_is_known_again_though_nobody_was_silent(autojump: MockClock)
         await swap(scene.world, scene.ours, gap=0.5)
         await trio.sleep(10.0)
         assert await read_file(tree, scene.file) == OURS
+
+
+async def test_a_vehicle_that_is_gone_again_is_seldom_asked(
+    autojump: MockClock, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A radio at the edge of its range: it was heard for a moment, and did not answer."""
+    scene = Scene("px4", LinkSettings(delay=0.02))
+    link = scene.world.link
+    async with scene.mounted():
+        monkeypatch.setattr(scene.ours, "_on_command", lambda command, now: None)
+        await swap(scene.world, scene.ours, gap=4.0)
+        await trio.sleep(1.5)
+        link.cut()
+        await trio.sleep(10.0)
+        sent = link.stats.sent_chunks
+        await trio.sleep(100.0)
+        assert link.stats.sent_chunks - sent <= 170, "100 of them are heartbeats"
