@@ -521,11 +521,14 @@ async def test_power_lost_after_any_request(
     total, final, good = await count_requests(KINDS[kind], name, FILE)
     for number in range(total + 1):
         async with trio.open_nursery() as nursery:
-            store = scene(KINDS[kind], nursery)
-            spool = SpoolDirectory(tmp_path / f"{number}", Random(number))
-            store.freeze_at = number
-            done = await attempt(job, make_writable(store, spool=spool))
-            spool.close()
+            async with trio.open_nursery() as cut_off:  # or it would go on when the power is back
+                store = scene(KINDS[kind], cut_off)
+                spool = SpoolDirectory(tmp_path / f"{number}", Random(number))
+                store.freeze_at = number
+                done = await attempt(job, make_writable(store, spool=spool))
+                spool.close()
+                cut_off.cancel_scope.cancel()
+            store.nursery = nursery
             store.revive()
             await check_mended(store, tmp_path / f"{number}", allowed)
             if done:
@@ -620,12 +623,16 @@ async def test_power_lost_while_a_long_path_is_replaced(
     number = 0
     while True:
         async with trio.open_nursery() as nursery:
-            store = FakeWriter(KINDS[kind], nursery)
-            store.add(path, OLD)
-            spool = SpoolDirectory(tmp_path / f"{number}", Random(number))
-            store.freeze_at = number
-            done = await attempt(lambda tree: write_file(tree, path, NEW), make_writable(store, spool=spool))
-            spool.close()
+            async with trio.open_nursery() as cut_off:
+                store = FakeWriter(KINDS[kind], cut_off)
+                store.add(path, OLD)
+                spool = SpoolDirectory(tmp_path / f"{number}", Random(number))
+                store.freeze_at = number
+                tree = make_writable(store, spool=spool)
+                done = await attempt(lambda tree: write_file(tree, path, NEW), tree)
+                spool.close()
+                cut_off.cancel_scope.cancel()
+            store.nursery = nursery
             store.revive()
             again = SpoolDirectory(tmp_path / f"{number}", Random(99))
             tree = make_writable(store, spool=again, seed=2)

@@ -431,16 +431,19 @@ async def test_a_reader_of_a_file_that_is_renamed_over_reads_on(store: FakeWrite
 async def test_power_lost_while_an_open_file_is_renamed_over_loses_neither(
     kind: str, requests: int, nursery: trio.Nursery, autojump_clock: object
 ) -> None:
-    store = scene(FakeWriter(KINDS[kind], nursery))
     old = bytes(range(256)) * 2000
-    store.add(b"/d/long", old)
-    tree = make_writable(store)
-    file = await tree.open(b"/d/long")
-    await file.read(0, 10)
-    store.freeze_at = requests
-    with suppress(VehicleLost):
-        await tree.rename(b"/d/a", b"/d/long")
-    file.close()
+    async with trio.open_nursery() as cut_off:  # or it would go on when the power is back
+        store = scene(FakeWriter(KINDS[kind], cut_off))
+        store.add(b"/d/long", old)
+        tree = make_writable(store)
+        file = await tree.open(b"/d/long")
+        await file.read(0, 10)
+        store.freeze_at = requests
+        with suppress(VehicleLost):
+            await tree.rename(b"/d/a", b"/d/long")
+        file.close()
+        cut_off.cancel_scope.cancel()
+    store.nursery = nursery
     store.revive()
     next_mount = make_writable(store)  # of the same name, so that what is left is nobody's
     await next_mount.list(b"/d")

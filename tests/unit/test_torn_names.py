@@ -359,17 +359,20 @@ async def test_power_lost_in_a_long_move_over_a_file(
     number, done = 0, False
     while not done:
         async with trio.open_nursery() as nursery:
-            store = FakeWriter(KINDS[kind], nursery)
-            store.add(old, NEW)
-            store.add(new, OLD)
-            spool = SpoolDirectory(tmp_path / f"{number}", Random(number))
-            store.freeze_at = number
-            try:
-                await make_writable(store, spool=spool).rename(old, new)
-                done = True
-            except MavftpfsError:
-                pass
-            spool.close()
+            async with trio.open_nursery() as cut_off:  # or it would go on when the power is back
+                store = FakeWriter(KINDS[kind], cut_off)
+                store.add(old, NEW)
+                store.add(new, OLD)
+                spool = SpoolDirectory(tmp_path / f"{number}", Random(number))
+                store.freeze_at = number
+                try:
+                    await make_writable(store, spool=spool).rename(old, new)
+                    done = True
+                except MavftpfsError:
+                    pass
+                spool.close()
+                cut_off.cancel_scope.cancel()
+            store.nursery = nursery
             store.revive()
             again = SpoolDirectory(tmp_path / f"{number}", Random(99))
             await list_all(store, make_writable(store, spool=again, seed=2))
