@@ -6,7 +6,7 @@ from mavftpfs.cache.context import Context
 from mavftpfs.cache.filehandle import FileHandle
 from mavftpfs.cache.nodes import Node
 from mavftpfs.shared.errors import FileChanged, FtpNak, IsADirectory, LocalProtocolError, NotFound
-from mavftpfs.shared.model import EntryKind
+from mavftpfs.shared.model import EntryKind, split
 
 STEP = 128 * 1024
 
@@ -40,6 +40,35 @@ async def open_node(context: Context, node: Node) -> FileHandle:
                     raise  # else it got its lasting hidden name meanwhile
 
 
+async def _open_below(context: Context, node: Node) -> FileHandle:
+    """Open what a node's draft lies over; if we wrote it, it has to be as we left it, as far as is known.
+
+    Raises:
+        FileChanged. Else as open_node and Directories.ask.
+    """
+    handle = await open_node(context, node)
+    try:
+        if node.mtime is not None:
+            await context.directories.recent(split(node.path)[0], began=context.clock())
+            _require_as_left(context, node)
+    except BaseException:
+        handle.close()
+        raise
+    return handle
+
+
+def _changed_by_us(node: Node) -> bool:
+    return node.draft is None or node.draft.touched or node.draft.placed
+
+
+def _require_as_left(context: Context, node: Node) -> None:
+    """Raise FileChanged if the last listing shows that others replaced what we wrote."""
+    node.require_not_parted()
+    told = context.dentries.mtime_since(node.path, node.delivered_at)
+    if not _changed_by_us(node) and node.mtime is not None and told not in (None, node.mtime):
+        raise FileChanged(f"{node.path!r} became another file after it was written here")
+
+
 async def read_base(
     context: Context, node: Node, start: int, stop: int, *, sure: bool = False
 ) -> bytes | memoryview:
@@ -54,7 +83,7 @@ async def read_base(
     data: bytes | memoryview | None = None
     while data is None:
         if node.base is None:
-            handle = await open_node(context, node)
+            handle = await _open_below(context, node)
             if node.base is None:
                 node.base = handle
             else:
@@ -72,7 +101,7 @@ async def read_base(
     return data
 
 
-async def require_same(node: Node) -> None:
+async def require_same(context: Context, node: Node) -> None:
     """Check that the file below a draft is not another one by now, as far as is known, or since the vehicle
     restarted: what was changed here of the old one is not to be changed there. The caller has the lock.
 
@@ -81,10 +110,11 @@ async def require_same(node: Node) -> None:
     Raises:
         FileChanged. Else as FileHandle.require_same.
     """
+    _require_as_left(context, node)
     if node.base is None:
         return
     node.base.require_not_lost()
-    if node.draft is not None and not node.draft.touched:
+    if not _changed_by_us(node):
         with node.looking():
             await node.base.require_same()
 

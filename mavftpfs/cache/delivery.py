@@ -156,7 +156,7 @@ class Deliverer:
         if attempt.plan is Plan.NEW and not attempt.upload.begun:
             self._context.dentries.expire(split(node.path)[0], self._context.clock())  # it shows the file
         elif attempt.path == node.path:
-            self._context.dentries.note_unsized(node.path)
+            self._context.dentries.note_unsized(node.path, made=attempt.plan is Plan.NEW)
 
     # --- planning
 
@@ -225,7 +225,7 @@ class Deliverer:
         draft.remote_cut(draft.size)
 
     async def _cut(self, node: Node, size: int) -> None:
-        await base.require_same(node)
+        await base.require_same(self._context, node)
         await self._context.writer.truncate(node.path, size)
         self._context.dentries.note_unsized(node.path)
         base.outdate(self._context, node)
@@ -253,11 +253,12 @@ class Deliverer:
 
     async def _send(self, node: Node, plan: Plan) -> None:
         attempt = await self._attempt(node, plan)
-        draft, told = _draft(node), 0
+        draft, told, ended_at = _draft(node), 0, float("inf")
         if not attempt.ended:
             await self._finish(attempt)
             if draft.ruined and attempt.plan is Plan.IN_PLACE:
                 raise FileChanged(f"{node.path!r} was emptied on the vehicle while it was changed here")
+            ended_at = self._context.clock()
             told = await self.verifier.check_sent(attempt.path, draft, attempt.upload)
         async with node.firmly():
             if not attempt.committing:
@@ -267,7 +268,7 @@ class Deliverer:
                 await self._commit(node, attempt)
                 await self.verifier.check_replaced(node.path, draft, attempt.upload, told)
             node.attempt = None
-            self._on_delivered(node, draft)
+            self._on_delivered(node, draft, ended_at)
 
     async def _attempt(self, node: Node, plan: Plan) -> Attempt:
         """Return the attempt under way if it still fits, else a new one."""
@@ -328,7 +329,7 @@ class Deliverer:
         """
         with node.looking():
             size, most = await self.verifier.size(node.path), draft.remote_end
-        await base.require_same(node)
+        await base.require_same(self._context, node)
         if most is not None and not draft.base_limit <= size <= max(most, draft.stretched):
             raise FileChanged(f"{node.path!r} has {size} bytes now, {most} when it was changed here")
         return size
@@ -365,19 +366,16 @@ class Deliverer:
 
     # --- after
 
-    def _on_delivered(self, node: Node, draft: Draft) -> None:
+    def _on_delivered(self, node: Node, draft: Draft, ended_at: float = float("inf")) -> None:
         """The vehicle has it: listings, blocks and checksums follow."""
         context = self._context
-        known = context.dentries.known(split(node.path)[0])
-        entry = DirEntry(split(node.path)[1], EntryKind.FILE, draft.size)
-        if known is not None and entry.name in known.entries:
-            context.dentries.note_resized(node.path, draft.size)
-        else:
-            context.dentries.note_created(node.path, entry)
+        mtime = context.dentries.mtime_since(node.path, ended_at)
+        context.dentries.note_written(node.path, draft.size)
         context.dentries.note_proven(node.path, context.clock())
         draft.delivered()
         node.delivered_at = context.clock()
         base.outdate(context, node)
+        node.mtime = mtime
         context.on_changed(node.path)
         self.delivered += 1
 

@@ -16,7 +16,7 @@ from collections import OrderedDict
 from dataclasses import dataclass, field, replace
 
 from mavftpfs.cache.attributes import tidy
-from mavftpfs.shared.model import DirEntry, Listing, split, usable_name
+from mavftpfs.shared.model import DirEntry, EntryKind, Listing, split, usable_name
 
 COST_FACTOR = 50
 """A listing that took T seconds is fresh for at least COST_FACTOR * T: it costs at most 2 % of the link."""
@@ -179,6 +179,14 @@ class Dentries:
             if now is not None and before is not None and size > before:
                 directory.growing[name] = now
 
+    def mtime_since(self, path: bytes, since: float) -> int | None:
+        """Return what a listing that began then or later told of a path's mtime, None if there is none."""
+        parent, name = split(path)
+        directory = self._directories.get(parent)
+        if directory is None or directory.listed_at < since or name not in directory.entries:
+            return None
+        return directory.entries[name].mtime
+
     def note_proven(self, path: bytes, now: float) -> None:
         """The path is what its listing shows, as an answer of just now (`now`) proved."""
         parent, name = split(path)
@@ -207,6 +215,13 @@ class Dentries:
         self._absent.pop(path, None)
         self._change(path, entry, reshapes=True)
 
+    def note_written(self, path: bytes, size: int) -> None:
+        """We wrote a file, which is listed perhaps: its size in bytes."""
+        if self._entry(path) is None:
+            self.note_created(path, DirEntry(split(path)[1], EntryKind.FILE, size))
+        else:
+            self.note_resized(path, size)
+
     def note_removed(self, path: bytes) -> None:
         """We removed a file or directory."""
         self.forget(path)
@@ -231,11 +246,14 @@ class Dentries:
         else:
             self._doubt(split(path)[0])
 
-    def note_unsized(self, path: bytes) -> None:
-        """We are writing a file, or gave up: its size is unknown, and growth says nothing of others."""
-        entry = self._entry(path)
+    def note_unsized(self, path: bytes, *, made: bool = False) -> None:
+        """We are writing a file, or gave up: its size is unknown, and growth says nothing of others. made: by
+        us, perhaps after what a listing since our beginning shows."""
+        entry, name = self._entry(path), split(path)[1]
         if entry is not None:
             self._change(path, replace(entry, size=None, mtime=None), reshapes=False)
+        elif made:
+            self.note_created(path, DirEntry(name, EntryKind.FILE, None))
 
     # --- inside
 

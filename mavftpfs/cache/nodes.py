@@ -65,7 +65,7 @@ class Node:
     base: reads the vehicle's file. delivered_at: when the vehicle last had it all. doomed: how many changes
     that take its name away have the lock, or are about to, or empty it: no delivery begins or goes on.
     looked_at: who has the lock changes nothing on the vehicle just now. parted: its name is another file's.
-    mtime: what the first listing told since delivered_at.
+    mtime: what the listing by which its delivery was checked told, or the first one since.
     """
 
     path: bytes
