@@ -8,6 +8,7 @@ from contextlib import suppress
 import pytest
 import trio
 
+from mavftpfs.cache.background import START_AT
 from mavftpfs.cache.remote import FREE_FOR
 from mavftpfs.cache.tree import Tree
 from mavftpfs.protocol.payload import NakCode, Opcode
@@ -238,3 +239,21 @@ async def test_a_copy_of_small_files_lists_once(
     await trio.sleep(FREE_FOR + 0.1)
     await write_file(tree, b"/card/late", b"content")
     assert store.looks == 1
+
+
+async def test_a_listing_of_before_it_was_made_does_not_leave_it_there(
+    autojump_clock: object, store: FakeWriter, tree: Tree
+) -> None:
+    """Its delivery had begun, but it came to the vehicle only after that."""
+    store.write_delay = 0.5
+    file = await tree.create(NEW, exclusive=True)
+    await file.write(0, bytes(START_AT))
+    await trio.sleep(0.1)
+    tree.forget_caches()
+    assert [name for name, _ in await tree.list(b"/card")] == [b"new"]
+    await trio.sleep(1.0)
+    assert NEW in store.files
+    await tree.unlink(NEW)
+    await file.release()
+    assert NEW not in store.files
+    assert await tree.list(b"/card") == []
