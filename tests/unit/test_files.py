@@ -11,6 +11,7 @@ import trio.testing
 from trio.testing import MockClock
 
 from mavftpfs.cache.blocks import BLOCK_SIZE, BlockCache, FileBlocks
+from mavftpfs.cache.filehandle import FileHandle
 from mavftpfs.cache.files import MAX_CLOSED
 from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.tree import Tree
@@ -334,6 +335,20 @@ async def test_a_smaller_file_is_another_one(store: FakeStore, tree: Tree, autoj
     assert await new.read(0, 100) == b"short"
     with pytest.raises(FileChanged):
         await old.read(0, 100)
+
+
+async def test_a_file_that_is_smaller_when_it_is_opened_anew_is_another_one(
+    store: FakeStore, tree: Tree, autojump_clock: MockClock
+) -> None:
+    """To compare it, that is: what was listed tells nothing of what shrank since."""
+    handle = await tree.open(LOG)
+    assert isinstance(handle, FileHandle)
+    store.add(LOG, b"short", 1_700_000_000)
+    with pytest.raises(FileChanged):
+        await handle._files.fetcher.reopen(handle._version)
+    with pytest.raises(FileChanged):
+        await handle.read(0, 100)
+    handle.close()
 
 
 async def test_a_smaller_ack_is_another_file_even_if_the_listing_is_old(
