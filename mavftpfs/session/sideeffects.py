@@ -196,8 +196,14 @@ class SideEffects:
                 return
 
     def _may_be_doubled(self, nak: FtpNak) -> bool:
-        """Whether a refusal may answer the second execution of a request that was sent once."""
-        return self._scheduler.stats.strays > 0 and nak.code in _SECOND.get(Opcode(nak.opcode), ())
+        """Whether a refusal may answer the second execution of a request that was sent once.
+
+        A rename is looked at even on a link that was not seen to double requests yet: its names were looked
+        up just before, and one that is refused for nothing may count as proof that the server renames none.
+        """
+        opcode = Opcode(nak.opcode)
+        seen = self._scheduler.stats.strays > 0 or opcode == Opcode.RENAME
+        return seen and nak.code in _SECOND.get(opcode, ())
 
     async def _settle(self, nak: FtpNak, verify: Verdict, *, twice: bool, last: bool) -> bool:
         """Return True if the request was carried out after all, False to try it once more; else raise.

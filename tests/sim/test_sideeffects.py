@@ -375,6 +375,22 @@ async def test_a_request_doubled_by_the_network_whose_first_answer_is_lost(
     assert names(here) == left[act]
 
 
+@pytest.mark.parametrize("profile", RENAMING)
+async def test_a_rename_is_the_first_request_that_the_network_doubles(
+    profile: str, autojump: MockClock
+) -> None:
+    """Refused for nothing it would count as proof that the server renames none, and no file is replaced."""
+    here = world(profile, file=b"content")
+    faults = Faults(here)
+    async with here.connection() as connection:
+        await connection.store.stat_size(path(profile, "file"))
+        faults.lose_reply_to(Opcode.RENAME)
+        faults.at(Opcode.RENAME, lambda: setattr(here.model, "settings", LinkSettings(delay=0.01)))
+        here.model.settings = DOUBLING  # until both copies of it are there
+        await connection.store.rename(path(profile, "file"), path(profile, "renamed"))
+    assert names(here) == [b"renamed"]
+
+
 async def test_a_refusal_on_a_link_that_doubles_nothing_costs_no_listing(autojump: MockClock) -> None:
     here = world("mavsdk", file=b"content")
     faults = Faults(here)
