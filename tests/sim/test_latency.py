@@ -22,6 +22,7 @@ FRAME = 266
 SMALL_FRAME = 40
 
 RADIO = LinkSettings(rate=5760.0, delay=0.03, duplex=Duplex.HALF, queue=8192)
+NEAR = LinkSettings(rate=100_000.0, delay=0.015, queue=50_000)
 SLOW = LinkSettings(rate=100_000.0, delay=0.05, queue=50_000)
 FAST = LinkSettings(rate=250_000.0, delay=0.015, queue=125_000)
 FASTER = LinkSettings(rate=1e6, delay=0.015, queue=500_000)
@@ -33,6 +34,7 @@ CASES = [
         )
         for profile in sorted(PROFILES)
     ),
+    pytest.param("px4-nuttx", NEAR, id="px4-nuttx-near"),
     pytest.param("px4", FAST, id="px4-fast"),
     pytest.param("ardupilot", FAST, marks=pytest.mark.soak, id="ardupilot-fast"),
     *(
