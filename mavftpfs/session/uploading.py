@@ -184,7 +184,8 @@ class Uploading:
         try:
             if not self._is_complete_already(upload):
                 self.check_may_write()
-                await self._let_stragglers_pass(upload)
+                if self._lets_stragglers_pass(upload):
+                    return
                 session = await self._open(upload)
                 await self._let_go(upload, await self._write(upload, session))
         except SessionLost as lost:
@@ -213,12 +214,13 @@ class Uploading:
         self.written.begin(session.path, session.seq, Span(0, size), None, made=True)
         self._written, self._written_at = None, self._clock()
 
-    async def _let_stragglers_pass(self, upload: QueuedUpload) -> None:
-        """Wait until what is left of the file before is dead."""
-        rest = self._feared_until(self._written_at) - self._clock()
-        if upload is not self._written and rest > 0.0:
-            await self._holder.close_quietly()
-            await trio.sleep(rest)
+    def _lets_stragglers_pass(self, upload: QueuedUpload) -> bool:
+        """Whether it is not its turn before what is left of the file before is dead; readers go on."""
+        until = self._feared_until(self._written_at)
+        if upload is self._written or until <= self._clock():
+            return False
+        upload.retry_at = until
+        return True
 
     def _is_complete_already(self, upload: QueuedUpload) -> bool:
         """Whether there is nothing to send; an empty file has to be created once."""

@@ -23,7 +23,7 @@ from tests.sim.test_late_writes import change
 from tests.support.mounting import mounted
 from tests.support.takingturns import taking_turns
 from tests.support.uploads import append, put
-from tests.support.worlds import World, content, path, world
+from tests.support.worlds import World, content, path, read_file, world
 
 DOUBLING = LinkSettings(delay=0.02, duplicate=1.0, reorder=0.1)
 LATE = 0.1
@@ -274,3 +274,22 @@ async def test_a_rename_as_late_as_others_were_does_not_take_the_next_file(
         await rename_late(here, connection, VERY_LATE, nursery)
     assert here.tree.data(b"/d/new") == FIRST
     assert here.tree.data(b"/d/old") == SECOND
+
+
+@pytest.mark.parametrize("profile", taking_turns(sorted(PROFILES)))
+async def test_readers_do_not_wait_for_copies_to_be_dead(profile: str, autojump: MockClock) -> None:
+    """The next file is not opened to be written for ten seconds; who reads has the session meanwhile."""
+    here, root = world(profile, LinkSettings(delay=0.02, rate=5760.0), read=FIRST), path(profile, "")[:-1]
+    async with trio.open_nursery() as nursery, here.connection() as connection:
+        await show(here, connection, root, 8.0, nursery)
+        await put(connection, root + b"/first", content(60_000))
+        async with trio.open_nursery() as writing:
+            writing.start_soon(put, connection, root + b"/second", SECOND)
+            await trio.sleep(1.0)
+            for _ in range(3):
+                began = trio.current_time()
+                assert await read_file(connection, root + b"/read") == FIRST
+                assert trio.current_time() - began < 1.0
+                await trio.sleep(2.0)
+            assert b"second" not in [entry.name for entry in here.tree.entries(root)]
+    assert here.tree.data(root + b"/second") == SECOND
