@@ -215,11 +215,13 @@ class Uploading:
         self._written, self._written_at = None, self._clock()
 
     def _lets_stragglers_pass(self, upload: QueuedUpload) -> bool:
-        """Whether it is not its turn before what is left of the file before is dead; readers go on."""
+        """Whether it is not its turn before what is left of the file before is dead; readers go on, but not
+        the upload of that file, or there would be more of it each time."""
         until = self._feared_until(self._written_at)
         if upload is self._written or until <= self._clock():
             return False
-        upload.retry_at = until
+        for waiting in self.uploads:
+            waiting.retry_at = max(waiting.retry_at, until)
         return True
 
     def _is_complete_already(self, upload: QueuedUpload) -> bool:

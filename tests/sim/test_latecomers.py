@@ -70,8 +70,7 @@ async def test_a_late_write_does_not_hide_that_reopening_empties_files(
                 nursery.start_soon(put, connection, name, data)
         assert copy.late is not None
         assert copy.late < QUIET[1]
-        # Where the late write blurred what was seen, it is not known, and the file is sent whole.
-        assert connection.store.traits.wo_truncates is not False
+        assert connection.store.traits.wo_truncates is True
     for name, data in files.items():
         assert here.tree.data(name) == data
 
