@@ -70,6 +70,7 @@ class Uploading:
         self.written = WriteLog(kit.engine.stats, lambda: kit.engine.traits, kit.clock, chunk)
         self._written: QueuedUpload | None = None
         self._written_at = float("-inf")
+        self._heir: QueuedUpload | None = None  # waits for what is left of that to be dead, and is next
 
     @property
     def turns(self) -> Turns:
@@ -161,7 +162,9 @@ class Uploading:
         if not self.may_write:
             return []
         lost = self._vehicle.lost(now)
-        return [upload for upload in self.uploads if upload.is_due(now) and (upload.finishing or not lost)]
+        due = [upload for upload in self.uploads if upload.is_due(now) and (upload.finishing or not lost)]
+        # Before the one it waited for, which may have more to send each time.
+        return [u for u in due if u is self._heir and not self._holder.claimed(u.path)] or due
 
     def next_time(self, now: float) -> float:
         """When one becomes due that is not so now, infinite if none will by itself."""
@@ -218,8 +221,13 @@ class Uploading:
         """Whether it is not its turn before what is left of the file before is dead; readers go on, but not
         the upload of that file, or there would be more of it each time."""
         until = self._feared_until(self._written_at)
-        if upload is self._written or until <= self._clock():
+        if until <= self._clock():
+            self._heir = None
             return False
+        if self._heir is None:
+            if upload is self._written:
+                return False
+            self._heir = upload
         for waiting in self.uploads:
             waiting.retry_at = max(waiting.retry_at, until)
         return True

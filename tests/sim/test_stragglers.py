@@ -14,6 +14,7 @@ from trio.testing import MockClock
 from mavftpfs.link.messages import Address
 from mavftpfs.protocol.payload import Opcode
 from mavftpfs.session.connection import Connection
+from mavftpfs.session.upload import QueuedUpload
 from mavftpfs.shared.model import split
 from mavftpfs.sim.linkmodel import LinkSettings
 from mavftpfs.sim.profiles import PROFILES
@@ -21,8 +22,9 @@ from tests.sim.test_arming_replacement import NEW, Scene, replace
 from tests.sim.test_doubted_bytes import CLEAN, KEEPING
 from tests.sim.test_late_writes import change
 from tests.support.mounting import mounted
+from tests.support.sources import MemorySource
 from tests.support.takingturns import taking_turns
-from tests.support.uploads import append, probe, put
+from tests.support.uploads import append, probe, put, start
 from tests.support.worlds import World, content, path, read_file, world
 
 DOUBLING = LinkSettings(delay=0.02, duplicate=1.0, reorder=0.1)
@@ -313,3 +315,34 @@ async def test_a_small_file_gets_its_turn_beside_a_long_copy_where_copies_come_l
     assert here.tree.data(path(profile, "small")) == SECOND
     if connection.store.traits.wo_truncates is False:  # else a copy that is interrupted begins again
         assert took < 5.0
+
+
+@pytest.mark.parametrize("pause", [0.2, 2.0])
+@pytest.mark.parametrize("waits", [True, False])
+@pytest.mark.parametrize("profile", ["px4", "ardupilot", "mavsdk"])
+async def test_a_small_file_gets_its_turn_beside_a_log_where_copies_come_late(
+    profile: str, waits: bool, pause: float, autojump: MockClock
+) -> None:
+    """Each line of it leaves copies to wait for. waits: the log's writer asks for each line to be there."""
+    here, root = world(profile, CLEAN), path(profile, "")[:-1]
+
+    async def write_lines(upload: QueuedUpload, source: MemorySource) -> None:
+        while True:
+            source.add(b"line\n")
+            upload.wake()
+            if waits:
+                await upload.finish()
+            await trio.sleep(pause)
+
+    async with trio.open_nursery() as nursery, here.connection() as connection:
+        await probe(connection, profile)
+        await show(here, connection, root, 8.0, nursery)
+        source = MemorySource(FIRST)
+        upload = await start(connection, profile, source, "log")
+        await upload.finish()
+        nursery.start_soon(write_lines, upload, source)
+        await trio.sleep(5.0)
+        with trio.fail_after(40.0):
+            await put(connection, root + b"/small", SECOND)
+        nursery.cancel_scope.cancel()
+    assert here.tree.data(root + b"/small") == SECOND
