@@ -13,7 +13,7 @@ Random loss does not matter, because it takes the same share of both.
 
 from __future__ import annotations
 
-from math import inf
+from math import inf, sqrt
 
 _FEW = 24
 _MANY = 96
@@ -24,6 +24,9 @@ _WORTH = 0.5
 
 _SHY = 0.8
 _UNUSUAL_LOSS = 0.04
+_UNLIKELY = 1.5
+"""Standard deviations beyond that: a queue that a raise of a quarter overflows loses a fifth more."""
+
 _ALARMING_LOSS = 0.2
 _SMOOTHING = 0.3
 _HOLD = 20.0
@@ -57,6 +60,7 @@ class Pacer:
         "_lost",
         "_queued",
         "_raise",
+        "_seen",
         "_since",
         "_starved",
         "_tokens",
@@ -76,6 +80,7 @@ class Pacer:
         self._raise = _BOLD
         self._best = 0.0  # answers per second of the last trial that was worth it
         self._base_loss = 0.0
+        self._seen = 0  # requests that taught it
         self._base_rtt = inf
         self._least_rtt = inf
         self._hold_until = -inf
@@ -201,11 +206,21 @@ class Pacer:
 
     def _accept(self, answers: float, loss: float) -> None:
         self._best, self._doubted = answers, False
-        self._base_loss += (loss - self._base_loss) * _SMOOTHING
+        self._learn(loss)
+
+    def _learn(self, loss: float) -> None:
+        """This is usual."""
+        self._base_loss += (loss - self._base_loss) * (_SMOOTHING if self._seen else 1.0)
+        self._seen = min(_MANY, self._seen + self._answered + self._lost)
+
+    def _scatter(self, loss: float) -> float:
+        """Return by how much the loss of a trial differs from the usual one by mere chance."""
+        either = max(loss, self._base_loss)
+        return sqrt(either * (1.0 - either) * (1.0 / (self._answered + self._lost) + 1.0 / self._seen))
 
     def _settle(self, answers: float, loss: float, now: float) -> None:
         best = max(answers, self._best)
-        overflowed = loss > self._base_loss + _UNUSUAL_LOSS
+        overflowed = loss - self._base_loss > _UNUSUAL_LOSS + _UNLIKELY * self._scatter(loss)
         self.rate = best / (1.0 - self._base_loss) * (_SHY if overflowed else 1.0)
         self._doubted = False
         if overflowed or self._queued:
@@ -219,7 +234,7 @@ class Pacer:
         if self.rate is not None and loss > self._base_loss + _ALARMING_LOSS:
             self.rate *= _SHY
         else:
-            self._base_loss += (loss - self._base_loss) * _SMOOTHING
+            self._learn(loss)
 
     def _widen(self, loss: float) -> None:
         if self.rate is not None:

@@ -30,7 +30,7 @@ def test_a_radio_of_57600_baud(profile: str, rtt: float, loss: float) -> None:
 
 @pytest.mark.parametrize(
     ("rtt", "loss"),
-    [(0.1, 0.05), *(pytest.param(*case, marks=pytest.mark.soak) for case in [(0.01, 0.0), (0.3, 0.1)])],
+    [(0.1, 0.05), (0.3, 0.1), pytest.param(0.01, 0.0, marks=pytest.mark.soak)],
 )
 @pytest.mark.parametrize("profile", ["px4", "px4-nuttx", "ardupilot", "mavsdk"])
 def test_a_hundred_kilobytes_per_second(profile: str, rtt: float, loss: float) -> None:
