@@ -166,7 +166,8 @@ class Vehicle:
             self.address = self._target_of(heartbeat)
         if heartbeat.is_autopilot and self.address and heartbeat.source.system == self.address.system:
             self._disarmed_at = float("-inf") if heartbeat.armed else now
-            if heartbeat.armed or self.identity.trusted:  # else it may be another one, and ours fly
+            # Who may be another one does not say that ours is on the ground.
+            if heartbeat.armed or self.identity.may_be_asked(now):
                 self._on_armed(heartbeat.armed)
         if not self._proves_life(heartbeat.source):
             return

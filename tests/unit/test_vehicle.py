@@ -95,6 +95,22 @@ def test_who_may_be_another_vehicle_does_not_disarm_ours() -> None:
     assert vehicle.armed
 
 
+@pytest.mark.parametrize("beats", [True, False])
+def test_nor_does_the_autopilot_beside_a_component_that_may_be_another_ones(beats: bool) -> None:
+    """The target is a component; beats: it sends heartbeats of its own."""
+    target = Address(PILOT.system, 191)
+    vehicle = listener(component=191)
+    ours = AutopilotVersion(target, 0x20, 1, b"", 1, b"")
+    vehicle.on_message(heartbeat(PILOT, armed=True), 0.0)
+    if beats:
+        vehicle.on_message(heartbeat(target, autopilot=8), 0.0)
+    vehicle.on_message(ours, 0.0)
+    vehicle.on_message(heartbeat(PILOT), 10.0)
+    assert vehicle.armed
+    vehicle.on_message(ours, 10.1)
+    assert not vehicle.armed
+
+
 def test_a_vehicle_that_is_seldom_heard_is_disarmed_when_it_tells_who_it_is() -> None:
     vehicle = listener()
     ours = AutopilotVersion(PILOT, 0x20, 1, b"", 1, b"")
