@@ -145,6 +145,7 @@ async def attached(
                 try:
                     yield Attached(connection, tree, notice)
                 finally:
+                    connection.news.clear()  # the tree can begin nothing while the session is closed
                     if spool is not None and not tree.undelivered():
                         spool.discard()
 
