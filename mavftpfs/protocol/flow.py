@@ -171,8 +171,8 @@ class Flow:
         reserve = self._reserve(now, paced)
         room = self.window - in_flight + reserve
         if self._pacer is None:
-            # A queue that holds a reserve is no short one: what a pause lost of it goes out again at once.
-            at_once = room <= 0 or (reserve > 0 and not self._bridging)
+            # What a pause lost of a reserve goes out at once, but no window, which drowns a small buffer.
+            at_once = room <= 0 or (room <= reserve and not self._bridging)
             return room if at_once else min(room, self._trains.room(now))
         room += self.alone and not self._hurried  # one more fits a short queue of our own (servers.md 3)
         self._pacer.blocked = False

@@ -2,7 +2,7 @@
 
 A card that is busy for a tenth of a second (PX4 on NuttX) leaves a slow link idle for as long, unless
 answers wait in the link's queue. So once such a pause cost more than it should, some more requests are
-kept on the way, up to 0.2 s and half a round trip worth, which is what others then wait for the link at
+kept on the way, up to 0.25 s and half a round trip worth, which is what others then wait for the link at
 most; fewer while others are about, and fewer again when pauses have become rare. Where the server and not
 the link is the slowest part, no answers wait in a link, and more requests only overflow the server's buffer:
 so if pauses take as long with a reserve as they did without, there is none for a while. Chance decides that
@@ -18,8 +18,8 @@ from __future__ import annotations
 
 from math import inf
 
-MOST = 0.2
-_MOST_ON_A_LONG_WAY = 0.35
+MOST = 0.25
+_MOST_ON_A_LONG_WAY = 0.4
 BESIDE_OTHERS = 0.1
 _LATELY = 10.0
 """Seconds for which others are expected to come again."""

@@ -106,3 +106,16 @@ async def test_nobody_waits_long_beside_a_copy(
     async with copy.world.connection() as connection:
         waits = await copy.waits(connection, kind)
     assert p95(waits) <= copy.allowed(frames)
+
+
+@pytest.mark.parametrize("profile", ["px4", "px4-nuttx"])
+async def test_a_copy_that_goes_on_leaves_room_for_who_comes_next(profile: str, autojump: MockClock) -> None:
+    """A window for 300 ms is far more than PX4 on NuttX holds: sent at once, it drowned the next request.
+
+    The session may just be moving back to the copy, so they may have to wait for one answer more.
+    """
+    far = LinkSettings(rate=100_000.0, delay=0.15, queue=50_000)
+    copy = Copy(profile, far)
+    async with copy.world.connection() as connection:
+        waits = await copy.waits(connection, "read")
+    assert p95(waits) <= copy.allowed(3) + 2 * far.delay

@@ -39,7 +39,7 @@ def test_steady_answers_need_no_reserve() -> None:
     assert stalls.reserve == 0.0
 
 
-@pytest.mark.parametrize(("rtt", "most"), [(0.01, 0.205), (0.1, 0.25), (0.3, 0.35), (2.0, 0.35), (inf, 0.35)])
+@pytest.mark.parametrize(("rtt", "most"), [(0.01, 0.255), (0.1, 0.3), (0.3, 0.4), (2.0, 0.4), (inf, 0.4)])
 def test_a_longer_way_allows_a_longer_queue(rtt: float, most: float) -> None:
     """Who lists a directory meanwhile may wait three round trips and 0.3 s (design section 5)."""
     stalls = Stalls()
