@@ -47,7 +47,6 @@ _FASTEST_LINK = 6000.0
 _OFTEN = 5
 _MORE_LOSS = 0.15
 _QUEUE_SECONDS = 0.005
-_FULL = 0.8
 _ROUNDS_REMEMBERED = 10
 _PLATEAU_ROUNDS = 2
 _TELLING_ROUND = 16
@@ -57,7 +56,7 @@ _TELLING_SILENCE = 3
 class Flow:
     """The in-flight window, in requests. serial: small receive buffers are likely, so start at 1 and
     find out by `survival` what they hold. limit: the most that may ever be in flight, None for the
-    default; cap: that may be now. budget: the user's. alone: no other client was heard lately."""
+    default. budget: the user's. alone: no other client of the server was heard lately."""
 
     __slots__ = (
         "_app_limited",
@@ -66,6 +65,7 @@ class Flow:
         "_best_rate",
         "_brake",
         "_bridging",
+        "_cap",
         "_collapsed",
         "_easing",
         "_flights",
@@ -88,7 +88,6 @@ class Flow:
         "_trains",
         "alone",
         "budget",
-        "cap",
         "loss",
         "window",
     )
@@ -100,8 +99,8 @@ class Flow:
         self.alone = False
         self._limit = max(1, limit or (SERIAL_CAP if serial else DEFAULT_CAP))
         self._survival = Survival(self._limit) if serial else None
-        self.cap = self._limit
-        self.window = min(1 if serial else FIRST, self.cap)
+        self._cap = self._limit
+        self.window = min(1 if serial else FIRST, self._cap)
         self.loss = 0.0
         self._starting = not serial
         self._rates: deque[float] = deque(maxlen=_ROUNDS_REMEMBERED)
@@ -126,15 +125,20 @@ class Flow:
         self._overflow = Overflow()
         self._app_limited = False
 
+    @property
+    def cap(self) -> int:
+        """The most requests that may ever be in flight."""
+        return self._cap
+
     def set_queue_limit(self, limit: int | None) -> None:
         """Never have more in flight than the server queues; None if it is not known to be limited."""
-        self.cap = self._limit if limit is None else max(1, min(limit, self._limit))
-        self.window = min(self.window, self.cap)
-        self._goal = min(self._goal, self.cap)
-        if limit is None or self.cap == self._limit:
+        self._cap = self._limit if limit is None else max(1, min(limit, self._limit))
+        self.window = min(self.window, self._cap)
+        self._goal = min(self._goal, self._cap)
+        if limit is None or self._cap == self._limit:
             self._pacer = None
-        elif self._pacer is None or self._pacer.queue != self.cap:
-            self._pacer = Pacer(self.cap, self._limit)
+        elif self._pacer is None or self._pacer.queue != self._cap:
+            self._pacer = Pacer(self._cap, self._limit)
 
     def begin(self) -> None:
         """It is looked at anew who has something to send: `room` follows for each."""
@@ -150,8 +154,6 @@ class Flow:
         """Return how many requests may go out now. paced: also beyond what the server queues, if evenly."""
         if urgent:
             self._hurried = True
-            if in_flight > 0:
-                self._stalls.on_others(now)
         elif self._hurried:  # an answer that somebody waits for should not queue behind our slack
             in_flight += min(_SLACK, self.window // 2)
         room = self._room(in_flight, now, paced)
@@ -168,17 +170,17 @@ class Flow:
         return self.budget is not None and self.budget.held
 
     def _room(self, in_flight: int, now: float, paced: bool) -> int:
-        reserve = self._reserve(now, paced)
-        room = self.window - in_flight + reserve
+        room = self.window - in_flight + self._reserve(now, paced) + self._spare()
         if self._pacer is None:
-            # What a pause lost of a reserve goes out at once, but no window, which drowns a small buffer.
-            at_once = room <= 0 or (room <= reserve and not self._bridging)
-            return room if at_once else min(room, self._trains.room(now))
-        room += self.alone and not self._hurried  # one more fits a short queue of our own (servers.md 3)
+            return min(room, self._trains.room(now)) if room > 0 else room
         self._pacer.blocked = False
         # How evenly others send is not ours to say: beside them the queue is all there is.
         beyond = paced and room <= 0 and self.alone
         return self._pacer.room(in_flight, now) if beyond else room
+
+    def _spare(self) -> int:
+        """Return how many more a short queue takes that is not shared with anybody (servers.md 3)."""
+        return int(self.alone and not self._hurried and self._pacer is not None)
 
     def _reserve(self, now: float, paced: bool) -> int:
         """Return how many more bridge the pauses of a server; none where its buffers are small, or while
@@ -196,7 +198,7 @@ class Flow:
         cannot bridge: hundreds of them would only overflow the sockets at both ends."""
         if self._best_rate > _FASTEST_LINK:
             return 0
-        return max(0, min(int(reserve), _MOST_RESERVE, self.cap - self.window))
+        return max(0, min(int(reserve), _MOST_RESERVE, self._cap - self.window))
 
     def next_room_at(self) -> float:
         """Return when there will be room without an answer; inf if that does not depend on time."""
@@ -232,7 +234,7 @@ class Flow:
         if self._pacer is not None:
             self._pacer.on_reply(now, rtt, order, next_order)
         if self._collapsed:
-            self.window, self._collapsed = min(self.cap, self._collapsed), 0
+            self.window, self._collapsed = min(self._cap, self._collapsed), 0
         if order >= self._round_end:
             self._end_round(now, order, next_order)
         elif self._starting and order >= self._flights.due:
@@ -259,8 +261,7 @@ class Flow:
         self._trains.on_replies(answers, now)
         if now != self._heard_at:  # what comes at once has no pauses
             self._heard_at = now
-            full = not self._starting or _FULL * self._trains.rate < self._best_rate
-            self._stalls.on_reply(now, self._best_rate if full else 0.0, self._base_rtt)
+            self._stalls.on_reply(now, 0.0 if self._starting else self._best_rate, self._base_rtt)
         if rtt is not None and rtt < self._round_least:
             self._round_least = rtt
 
@@ -296,7 +297,7 @@ class Flow:
         leap = flights.end(order, now - self._round_start, self._base_rtt)
         if flights.measured:
             self._trains.learn(flights.rate)
-            self._goal = int(min(self.cap, leap * self.window, self._filling(flights.rate)))
+            self._goal = int(min(self._cap, leap * self.window, self._filling(flights.rate)))
             self.window = max(self.window, self._goal)
 
     def _end_round(self, now: float, order: int, next_order: int) -> None:
@@ -313,7 +314,6 @@ class Flow:
         overflowed = self._overflow.judge(self._replies, self._losses)
         total = self._replies + self._losses
         self.loss += (self._losses / total - self.loss) * 0.2
-        self._stalls.on_round(now, self._losses / total)
         reserve = self._bounded(self._stalls.reserve * self._best_rate)
         self._base_rtt = self._base.learn(self._round_least, self.window + reserve)
         took = now - self._round_start
@@ -331,7 +331,7 @@ class Flow:
             window = self._survival.end_round(
                 self._replies, self._losses, took, now, queued=self._queued(2.0)
             )
-            self.window = min(self.cap, window)
+            self.window = min(self._cap, window)
         elif self._starting and overflowed:
             self._starting = False
             self._goal = 0
@@ -368,14 +368,14 @@ class Flow:
     def _leaves_start(self, grown: bool) -> bool:
         few = self._replies + self._losses < _TELLING_ROUND and self.window + 1 < self._held(inf)
         self._plateau = 0 if grown or few else self._plateau + 1
-        if self._plateau >= _PLATEAU_ROUNDS or self.window >= self.cap or self._queued(1.25):
+        if self._plateau >= _PLATEAU_ROUNDS or self.window >= self._cap or self._queued(1.25):
             self._starting = False
         return not self._starting
 
     def _next_goal(self) -> int:
         if not self._trains.proven or self._flights.rate < self._trains.rate / 2:  # it was that of a bunch
-            return min(self.cap, self.window * 2)
-        return int(min(self.cap, self.window * _LEAP, self._held(inf)))
+            return min(self._cap, self.window * 2)
+        return int(min(self._cap, self.window * _LEAP, self._held(inf)))
 
     def _held(self, rate: float) -> float:
         """Return how many requests fill the path, with some to find out whether it holds more.
@@ -397,4 +397,4 @@ class Flow:
 
     def _approach(self, target: float) -> None:
         # So few are no load, and fewer find losses slowly.
-        self.window = min(self.cap, max(INITIAL, round(target)))
+        self.window = min(self._cap, max(INITIAL, round(target)))

@@ -132,6 +132,17 @@ def test_a_megabyte_over_a_bad_link(name: str, strategy: Strategy) -> None:
     assert rig.nothing_is_open()
 
 
+@pytest.mark.parametrize("delay", [0.001, 0.01])
+def test_a_card_that_pauses_is_not_flooded_over_a_fast_link(delay: float) -> None:
+    """Where the server is slower than the link, as over USB, more on the way only overflows its buffer."""
+    rig = Rig("px4-nuttx", LinkSettings(delay=delay))
+    content = random.Random(5).randbytes(1_000_000)
+    rig.tree.add(b"/big", content)
+    assert rig.read(b"/big", "window") == content
+    asked = rig.link.engine.stats.by_opcode[Opcode.READ_FILE]
+    assert asked <= 1.3 * (-(-len(content) // CHUNK))
+
+
 @pytest.mark.parametrize("rate", [5_760.0, 57_600.0])
 @pytest.mark.parametrize("name", NAMES)
 def test_a_radio_is_used(name: str, rate: float) -> None:

@@ -40,15 +40,6 @@ def test_a_hundred_kilobytes_per_second(profile: str, rtt: float, loss: float) -
     assert measure(case, SHORT).share >= target - START
 
 
-@pytest.mark.parametrize(
-    "rtt", [0.1, pytest.param(0.01, marks=pytest.mark.soak), pytest.param(0.3, marks=pytest.mark.soak)]
-)
-def test_the_pauses_of_a_card_hardly_cost_a_reader_anything(rtt: float) -> None:
-    """The link was idle in a third of all pauses: 0.94, and 0.84 to 0.89 where chance made the reserve that
-    bridges them seem useless."""
-    assert measure(Case("px4-nuttx", 100_000.0, rtt, 0.0), LONG).share >= 0.97
-
-
 def test_a_short_shared_queue_does_not_empty_a_long_way() -> None:
     """ArduPilot, 300 ms away: five at a time would be 3.9 kB/s, its bursts 30; evenly asked it is more."""
     case = Case("ardupilot", 100_000.0, 0.3, 0.0)

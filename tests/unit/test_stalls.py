@@ -8,7 +8,7 @@ from math import inf
 import pytest
 
 from mavftpfs.protocol.flow import Flow
-from mavftpfs.protocol.stalls import BESIDE_OTHERS, MOST, Stalls
+from mavftpfs.protocol.stalls import MOST, Stalls
 
 RATE = 400.0
 
@@ -39,7 +39,7 @@ def test_steady_answers_need_no_reserve() -> None:
     assert stalls.reserve == 0.0
 
 
-@pytest.mark.parametrize(("rtt", "most"), [(0.01, 0.255), (0.1, 0.3), (0.3, 0.4), (2.0, 0.4), (inf, 0.4)])
+@pytest.mark.parametrize(("rtt", "most"), [(0.01, 0.155), (0.1, 0.2), (0.3, 0.3), (2.0, 0.3), (inf, 0.3)])
 def test_a_longer_way_allows_a_longer_queue(rtt: float, most: float) -> None:
     """Who lists a directory meanwhile may wait three round trips and 0.3 s (design section 5)."""
     stalls = Stalls()
@@ -47,7 +47,7 @@ def test_a_longer_way_allows_a_longer_queue(rtt: float, most: float) -> None:
     while now < 60.0:
         now += 1 / RATE
         if now - since > 1.0:
-            now += max(0.0, (0.15 if now < 20.0 else 0.5) - stalls.reserve)
+            now += max(0.0, (0.15 if now < 20.0 else 0.4) - stalls.reserve)
             since = now
         stalls.on_reply(now, RATE, rtt)
     assert stalls.reserve == pytest.approx(most)
@@ -62,70 +62,12 @@ def test_pauses_that_cost_are_bridged_and_forgotten_when_they_end() -> None:
 
 
 def test_where_the_server_is_slower_than_its_link_no_reserve_bridges_anything() -> None:
-    """Pauses take as long with it as without: it is given up, and tried again more and more seldom."""
+    """Pauses take as long with it as without: it is given up, and tried again only now and then."""
     stalls = Stalls()
-    now = 0.0
-    kept: list[bool] = []
-    for _ in range(120):
-        now = run(stalls, 1.0, start=now, every=0.3, pause=0.2, bridged=False)
-        kept.append(stalls.reserve > 0.0)
-    assert sum(kept) < 0.2 * len(kept)
-    assert not any(kept[-40:])
-
-
-def test_a_reserve_is_whole_after_the_first_pause() -> None:
-    """It grew by 0.05 s at the end of every other second: five of them were bridged by half."""
-    stalls = Stalls()
-    now = run(stalls, 0.5)
-    stalls.on_reply(now + 0.1, RATE)
-    assert stalls.reserve == MOST
-
-
-def test_a_reserve_that_helps_is_not_given_up_for_long_by_chance() -> None:
-    """One short pause was all that was known of them without a reserve: two longer ones stopped it for two
-    minutes, and the card's pauses cost 0.11 to 0.16 of a link of 100 kB/s."""
-    stalls = Stalls()
-    now = run(stalls, 4.5, every=2.5, pause=0.06)
-    kept = 0.0
-    for _ in range(40):
-        for pause in (0.3, 0.3, 0.12, 0.1):  # of which up to 0.2 s are bridged
-            now = run(stalls, 1.0, start=now) + max(0.02, pause - stalls.reserve)
-            stalls.on_reply(now, RATE)
-            kept += stalls.reserve > 0.0
-    assert kept > 0.9 * 160
-
-
-def test_beside_others_there_is_less_of_it_and_for_a_while() -> None:
-    """They waited for it, and for the next pause besides: a tenth of all longer than they may."""
-    stalls = Stalls()
-    now = run(stalls, 20.0, every=1.0, pause=0.25)
-    stalls.on_others(now)
-    assert stalls.reserve == BESIDE_OTHERS
-    now = run(stalls, 8.0, start=now, every=1.0, pause=0.25)
-    assert stalls.reserve == pytest.approx(BESIDE_OTHERS)
-    run(stalls, 8.0, start=now, every=1.0, pause=0.25)
-    assert stalls.reserve > 0.9 * MOST
-
-
-def test_a_reserve_in_whose_every_round_much_is_lost_is_given_up_at_once() -> None:
-    """Where the server is slower than the link it only overflows the server's buffer."""
-    stalls = Stalls()
-    now = run(stalls, 20.0, every=1.0, pause=0.25)
-    for _ in range(20):
-        now += 0.1
-        stalls.on_round(now, 0.5)
+    now = run(stalls, 20.0, every=0.3, pause=0.2, bridged=False)
     assert stalls.reserve == 0.0
-    run(stalls, 60.0, start=now, every=1.0, pause=0.25)
+    run(stalls, 90.0, start=now, every=0.3, pause=0.2, bridged=False)
     assert stalls.reserve == 0.0
-
-
-def test_a_round_without_much_loss_between_pauses_keeps_a_reserve() -> None:
-    stalls = Stalls()
-    now = run(stalls, 20.0, every=1.0, pause=0.25)
-    for number in range(100):
-        now += 0.2
-        stalls.on_round(now, 0.5 if number % 5 else 0.05)
-    assert stalls.reserve > 0.0
 
 
 def test_short_pauses_are_not_worth_a_queue() -> None:
