@@ -25,8 +25,38 @@ def heartbeat(source: Address, *, autopilot: int = 12, armed: bool = False) -> H
     return Heartbeat(source, 2, autopilot, 0x80 if armed else 0, 4)
 
 
+def version(source: Address) -> AutopilotVersion:
+    return AutopilotVersion(source, 0x20, 1, b"", 1, b"")
+
+
+OURS = version(PILOT)
+
+
 def listener(system: int = 0, component: int = 0) -> Vehicle:
     return Vehicle(system, component, OWN)
+
+
+def in_flight() -> Vehicle:
+    """Return one that is armed, and told which it is."""
+    vehicle = listener()
+    vehicle.on_message(heartbeat(PILOT, armed=True), 0.0)
+    vehicle.on_message(OURS, 0.0)
+    return vehicle
+
+
+def counting_reboots() -> tuple[Vehicle, list[int]]:
+    """Return one that was heard, and what gets an item at each reboot."""
+    reboots: list[int] = []
+    vehicle = listener()
+    vehicle.on_reboot = lambda: reboots.append(1)
+    vehicle.on_message(heartbeat(PILOT), 0.0)
+    return vehicle, reboots
+
+
+def tell_boot_times(vehicle: Vehicle, *times: tuple[float, int]) -> None:
+    """Have it tell at each of these times how many milliseconds ago it booted."""
+    for now, boot_ms in times:
+        vehicle.on_message(SystemTime(PILOT, 0, boot_ms), now)
 
 
 def test_the_first_autopilot_becomes_the_target_and_others_do_not_replace_it() -> None:
@@ -80,13 +110,10 @@ def test_arming_is_told_once_each_way() -> None:
 
 
 def test_who_may_be_another_vehicle_does_not_disarm_ours() -> None:
-    vehicle = listener()
-    ours = AutopilotVersion(PILOT, 0x20, 1, b"", 1, b"")
-    vehicle.on_message(heartbeat(PILOT, armed=True), 0.0)
-    vehicle.on_message(ours, 0.0)
+    vehicle = in_flight()
     vehicle.on_message(heartbeat(PILOT), 10.0)
     assert vehicle.armed
-    vehicle.on_message(ours, 20.0)  # it is back, and flies
+    vehicle.on_message(OURS, 20.0)  # it is back, and flies
     assert vehicle.identity.trusted
     assert vehicle.armed
     vehicle.on_message(heartbeat(PILOT), 21.0)
@@ -100,7 +127,7 @@ def test_nor_does_the_autopilot_beside_a_component_that_may_be_another_ones(beat
     """The target is a component; beats: it sends heartbeats of its own."""
     target = Address(PILOT.system, 191)
     vehicle = listener(component=191)
-    ours = AutopilotVersion(target, 0x20, 1, b"", 1, b"")
+    ours = version(target)
     vehicle.on_message(heartbeat(PILOT, armed=True), 0.0)
     if beats:
         vehicle.on_message(heartbeat(target, autopilot=8), 0.0)
@@ -112,17 +139,14 @@ def test_nor_does_the_autopilot_beside_a_component_that_may_be_another_ones(beat
 
 
 def test_a_vehicle_that_is_seldom_heard_is_disarmed_when_it_tells_who_it_is() -> None:
-    vehicle = listener()
-    ours = AutopilotVersion(PILOT, 0x20, 1, b"", 1, b"")
-    vehicle.on_message(heartbeat(PILOT, armed=True), 0.0)
-    vehicle.on_message(ours, 0.0)
+    vehicle = in_flight()
     vehicle.on_message(heartbeat(PILOT), 4.0)
     assert vehicle.armed
-    vehicle.on_message(ours, 4.1)
+    vehicle.on_message(OURS, 4.1)
     assert not vehicle.armed
     vehicle.on_message(heartbeat(PILOT), 8.0)
     vehicle.on_message(heartbeat(PILOT, armed=True), 8.1)
-    vehicle.on_message(ours, 8.2)
+    vehicle.on_message(OURS, 8.2)
     assert vehicle.armed
 
 
@@ -159,51 +183,35 @@ def test_ftp_of_others_is_foreign_and_our_own_replies_are_not() -> None:
 
 
 def test_boot_time_going_back_is_a_reboot_and_reordering_is_not() -> None:
-    reboots: list[int] = []
-    vehicle = listener()
-    vehicle.on_reboot = lambda: reboots.append(1)
-    vehicle.on_message(heartbeat(PILOT), 0.0)
-    for boot_ms in (5000, 4500, 6000, 600_000, 1200):
-        vehicle.on_message(SystemTime(PILOT, 0, boot_ms), 0.0)
+    vehicle, reboots = counting_reboots()
+    tell_boot_times(vehicle, (0.0, 5000), (0.0, 4500), (0.0, 6000), (0.0, 600_000), (0.0, 1200))
     assert reboots == [1]
     vehicle.on_message(SystemTime(Address(8, 1), 0, 10), 0.0)
     assert reboots == [1]
 
 
 def test_a_message_that_was_held_back_is_no_reboot() -> None:
-    reboots: list[int] = []
-    vehicle = listener()
-    vehicle.on_reboot = lambda: reboots.append(1)
-    vehicle.on_message(heartbeat(PILOT), 0.0)
-    for now, boot_ms in ((0.0, 60_000), (4.0, 64_000), (4.1, 61_000), (5.0, 65_000), (8.0, 62_000)):
-        vehicle.on_message(SystemTime(PILOT, 0, boot_ms), now)
+    vehicle, reboots = counting_reboots()
+    tell_boot_times(vehicle, (0.0, 60_000), (4.0, 64_000), (4.1, 61_000), (5.0, 65_000), (8.0, 62_000))
     assert reboots == []
     assert vehicle.boot_heard_at == 5.0
-    vehicle.on_message(SystemTime(PILOT, 0, 69_000), 9.0)
+    tell_boot_times(vehicle, (9.0, 69_000))
     assert reboots == []
-    vehicle.on_message(SystemTime(PILOT, 0, 900), 12.0)
+    tell_boot_times(vehicle, (12.0, 900))
     assert reboots == [1]
 
 
 def test_a_clock_that_stays_behind_is_one_of_another_boot() -> None:
-    reboots: list[int] = []
-    vehicle = listener()
-    vehicle.on_reboot = lambda: reboots.append(1)
-    vehicle.on_message(heartbeat(PILOT), 0.0)
-    for now, boot_ms in ((0.0, 900_000), (1.0, 60_000), (2.0, 61_000), (3.0, 62_000)):
-        vehicle.on_message(SystemTime(PILOT, 0, boot_ms), now)
+    vehicle, reboots = counting_reboots()
+    tell_boot_times(vehicle, (0.0, 900_000), (1.0, 60_000), (2.0, 61_000), (3.0, 62_000))
     assert reboots == [1]
 
 
 def test_a_reboot_during_a_long_outage_is_seen_by_the_time_that_is_missing() -> None:
-    reboots: list[int] = []
-    vehicle = listener()
-    vehicle.on_reboot = lambda: reboots.append(1)
-    vehicle.on_message(heartbeat(PILOT), 0.0)
-    for now, boot_ms in ((10.0, 20_000), (25.0, 21_000), (26.0, 36_000), (626.0, 636_000)):
-        vehicle.on_message(SystemTime(PILOT, 0, boot_ms), now)
+    vehicle, reboots = counting_reboots()
+    tell_boot_times(vehicle, (10.0, 20_000), (25.0, 21_000), (26.0, 36_000), (626.0, 636_000))
     assert reboots == []
-    vehicle.on_message(SystemTime(PILOT, 0, 700_000), 1226.0)
+    tell_boot_times(vehicle, (1226.0, 700_000))
     assert reboots == [1]
 
 
@@ -212,11 +220,11 @@ def test_a_restart_of_who_told_its_boot_time_long_ago_is_seen(restarts: bool, to
     """It was heard all the time, and had counted on; perhaps at half the speed, as a simulator."""
     vehicle = listener()
     vehicle.on_message(heartbeat(PILOT), 0.0)
-    vehicle.on_message(SystemTime(PILOT, 0, 5_000), 0.0)
+    tell_boot_times(vehicle, (0.0, 5_000))
     for second in [*range(21), 35]:
         vehicle.on_message(heartbeat(PILOT), float(second))
     assert vehicle.restart_possible(35.0)
-    vehicle.on_message(SystemTime(PILOT, 0, told), 35.0)
+    tell_boot_times(vehicle, (35.0, told))
     assert vehicle.reboots == restarts
     assert not vehicle.restart_possible(35.0)
 
@@ -224,9 +232,9 @@ def test_a_restart_of_who_told_its_boot_time_long_ago_is_seen(restarts: bool, to
 def test_facts_are_taken_from_the_target_alone() -> None:
     vehicle = listener()
     vehicle.on_message(heartbeat(PILOT), 0.0)
-    vehicle.on_message(AutopilotVersion(Address(3, 1), 0x20, 1, b"", 1, b""), 0.0)
+    vehicle.on_message(version(Address(3, 1)), 0.0)
     assert vehicle.ftp_flag is None
-    vehicle.on_message(AutopilotVersion(PILOT, 0x20, 1, b"", 1, b""), 0.0)
+    vehicle.on_message(OURS, 0.0)
     assert vehicle.ftp_flag is True
     vehicle.on_message(StorageInformation(PILOT, 2, 2, 2, 8.0, 1.0, 7.0), 0.0)
     vehicle.on_message(StorageInformation(PILOT, 1, 2, 2, 16.0, 1.0, 15.0), 0.0)
