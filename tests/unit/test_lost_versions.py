@@ -26,10 +26,16 @@ async def store(request: pytest.FixtureRequest, nursery: trio.Nursery) -> AsyncI
     assert store.crimes == []
 
 
+async def opened(tree: Tree, *, write: bool = False) -> OpenFile:
+    """Return who got bytes of the old file."""
+    file = await tree.open(FILE, write=write)
+    assert bytes(await file.read(0, 9)) == OLD[:9]
+    return file
+
+
 async def reader_of_another(store: FakeWriter, tree: Tree) -> OpenFile:
     """Return a reader that got bytes of a file which somebody else replaced afterwards."""
-    reader = await tree.open(FILE)
-    assert bytes(await reader.read(0, 9)) == OLD[:9]
+    reader = await opened(tree)
     store.add(FILE, NEW, 2)
     tree.forget_caches()
     return reader
@@ -102,8 +108,7 @@ async def test_the_kernel_keeps_no_pages_of_the_new_file_while_the_old_one_is_op
 
 async def test_all_older_versions_are_lost(store: FakeWriter, tree: Tree, autojump_clock: object) -> None:
     """Also the one that was opened before the file grew."""
-    first = await tree.open(FILE)
-    assert bytes(await first.read(0, 9)) == OLD[:9]
+    first = await opened(tree)
     store.add(FILE, OLD + OLD, 2)
     tree.forget_caches()
     second = await tree.open(FILE)
@@ -146,47 +151,8 @@ async def test_what_we_write_ourselves_loses_nobody(store: FakeWriter, autojump_
     assert store.files[FILE].data == b"new" + OLD[3:100] + b"newer" + OLD[105:500]
 
 
-@pytest.mark.parametrize("cut", [False, True])
-async def test_changes_of_a_lost_file_do_not_go_to_the_new_one(
-    store: FakeWriter, autojump_clock: object, cut: bool
-) -> None:
-    """The vehicle restarted with another card; only what is written whole replaces what is there."""
-    tree = make_writable(store, inplace=True)
-    writer = await tree.open(FILE, write=True)
-    assert bytes(await writer.read(0, 9)) == OLD[:9]
-    store.add(FILE, NEW, 2)
-    tree.rebooted()
-    await require_lost(writer)
-    await (writer.truncate(500) if cut else writer.write(0, b"mid"))
-    for _ in range(2):
-        with pytest.raises(FileChanged):
-            await writer.fsync()
-    assert store.files[FILE].data == NEW
-    await writer.truncate(0)
-    await writer.write(0, b"whole")
-    await writer.release()
-    assert store.files[FILE].data == b"whole"
-
-
-@pytest.mark.parametrize("failed", [False, True])
-@pytest.mark.parametrize("cut", [False, True])
-@pytest.mark.parametrize("mtime", [1, None])
-async def test_changes_that_waited_over_a_restart_go_to_the_very_file_only(
-    store: FakeWriter, autojump_clock: object, failed: bool, cut: bool, mtime: int | None
-) -> None:
-    """Nobody read in between, which would have shown that the card is another one."""
-    store.add(FILE, OLD, mtime)
-    tree = make_writable(store, inplace=True)
-    writer = await tree.open(FILE, write=True)
-    assert bytes(await writer.read(0, 9)) == OLD[:9]
-    await (writer.truncate(500) if cut else writer.write(0, b"mid"))
-    if failed:
-        store.lost = True
-        with pytest.raises(VehicleLost):
-            await writer.fsync()
-        store.lost = False
-    store.add(FILE, NEW, None if mtime is None else 2)
-    tree.rebooted()
+async def require_only_the_whole_goes(store: FakeWriter, writer: OpenFile) -> None:
+    """No change of the old file replaces the new one, now or later; what is written whole does."""
     for _ in range(2):
         with pytest.raises(FileChanged):
             await writer.fsync()
@@ -198,14 +164,48 @@ async def test_changes_that_waited_over_a_restart_go_to_the_very_file_only(
     assert store.files[FILE].data == b"whole"
 
 
+@pytest.mark.parametrize("cut", [False, True])
+async def test_changes_of_a_lost_file_do_not_go_to_the_new_one(
+    store: FakeWriter, autojump_clock: object, cut: bool
+) -> None:
+    """The vehicle restarted with another card."""
+    tree = make_writable(store, inplace=True)
+    writer = await opened(tree, write=True)
+    store.add(FILE, NEW, 2)
+    tree.rebooted()
+    await require_lost(writer)
+    await (writer.truncate(500) if cut else writer.write(0, b"mid"))
+    await require_only_the_whole_goes(store, writer)
+
+
+@pytest.mark.parametrize("failed", [False, True])
+@pytest.mark.parametrize("cut", [False, True])
+@pytest.mark.parametrize("mtime", [1, None])
+async def test_changes_that_waited_over_a_restart_go_to_the_very_file_only(
+    store: FakeWriter, autojump_clock: object, failed: bool, cut: bool, mtime: int | None
+) -> None:
+    """Nobody read in between, which would have shown that the card is another one."""
+    store.add(FILE, OLD, mtime)
+    tree = make_writable(store, inplace=True)
+    writer = await opened(tree, write=True)
+    await (writer.truncate(500) if cut else writer.write(0, b"mid"))
+    if failed:
+        store.lost = True
+        with pytest.raises(VehicleLost):
+            await writer.fsync()
+        store.lost = False
+    store.add(FILE, NEW, None if mtime is None else 2)
+    tree.rebooted()
+    await require_only_the_whole_goes(store, writer)
+
+
 @pytest.mark.parametrize("mtime", [1, None])
 async def test_changes_that_waited_over_a_restart_are_delivered(
     store: FakeWriter, autojump_clock: object, mtime: int | None
 ) -> None:
     store.add(FILE, OLD, mtime)
     tree = make_writable(store, inplace=True)
-    writer = await tree.open(FILE, write=True)
-    assert bytes(await writer.read(0, 9)) == OLD[:9]
+    writer = await opened(tree, write=True)
     await writer.write(0, b"mid")
     tree.rebooted()
     await writer.release()
@@ -218,8 +218,7 @@ async def test_a_new_file_is_opened_though_a_writer_has_the_lost_one(
 ) -> None:
     """That one changed nothing of it, and cannot any more; nobody is told that this came to the vehicle."""
     tree = make_writable(store, inplace=True)
-    writer = await tree.open(FILE, write=True)
-    assert bytes(await writer.read(0, 9)) == OLD[:9]
+    writer = await opened(tree, write=True)
     store.add(FILE, NEW[:-100], 2)
     tree.rebooted()
     await require_lost(writer)
@@ -248,8 +247,7 @@ async def test_who_has_a_file_open_that_others_removed_does_not_get_the_next_one
     store: FakeWriter, autojump_clock: object
 ) -> None:
     tree = make_writable(store, inplace=True)
-    reader = await tree.open(FILE)
-    assert bytes(await reader.read(0, 9)) == OLD[:9]
+    reader = await opened(tree)
     del store.files[FILE]
     tree.forget_caches()
     writer = await tree.create(FILE, exclusive=True)
@@ -321,8 +319,7 @@ async def test_a_name_that_goes_while_a_reader_compares_costs_him_nothing(
 ) -> None:
     """The listing that he asked for shows the file by another name than it has by the end of it."""
     tree = make_writable(store, inplace=True)
-    reader = await tree.open(FILE)
-    assert bytes(await reader.read(0, 9)) == OLD[:9]
+    reader = await opened(tree)
     blocks = reader._handle._version.blocks  # type: ignore[attr-defined]
     await trio.sleep(3.0)
     if restarted:
