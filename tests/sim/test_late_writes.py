@@ -51,6 +51,21 @@ async def make(tree: Tree, name: bytes, data: bytes) -> None:
         file.close()
 
 
+async def overtaken(
+    here: World, tree: Tree, name: bytes, *changes: bytes, at: int = 1000, late: float = LONG
+) -> Latecomer:
+    """Change the bytes from `at` on in turn, and let time pass; the first of these comes once more with the
+    next WriteFile."""
+    await change(tree, name, 1, b"x")
+    await trio.sleep(LONG)
+    copy = Latecomer(here, Opcode.WRITE_FILE, after=Opcode.WRITE_FILE, first=True, nth=99)
+    for data in changes:
+        await change(tree, name, at, data)
+    await trio.sleep(late)
+    copy.rearm(Opcode.WRITE_FILE)
+    return copy
+
+
 @pytest.mark.parametrize("profile", taking_turns(KEEPING))
 async def test_what_was_tried_out_is_not_written_to_the_users_file(profile: str, autojump: MockClock) -> None:
     """On a link that was seen to double: the few bytes are fetched before, and written back."""
@@ -100,12 +115,7 @@ async def test_another_files_bytes_are_never_kept_silently(
     here = world(profile, link, f=old, g=old)
     f, g = path(profile, "f"), path(profile, "g")
     async with mounted(here, path(profile, "")[:-1]) as (_, tree):
-        await change(tree, f, 1, b"x")
-        await trio.sleep(LONG)
-        copy = Latecomer(here, Opcode.WRITE_FILE, after=Opcode.WRITE_FILE, first=True, nth=99)
-        await change(tree, f, 1000, b"of f" * 500)
-        await trio.sleep(LONG)
-        copy.rearm(Opcode.WRITE_FILE)
+        copy = await overtaken(here, tree, f, b"of f" * 500)
         with pytest.raises(DataUnproven):
             await change(tree, g, 9000, b"of g")
         assert copy.late is not None
@@ -135,24 +145,12 @@ async def test_a_file_that_is_sent_whole_is_right(
         assert here.tree.data(two) == content(size, 2)
 
 
-async def overtaken(here: World, tree: Tree, name: bytes, *changes: bytes) -> Latecomer:
-    """Change the bytes from 1000 on in turn; the first of these comes once more with the next WriteFile."""
-    await change(tree, name, 1, b"x")
-    await trio.sleep(LONG)
-    copy = Latecomer(here, Opcode.WRITE_FILE, after=Opcode.WRITE_FILE, first=True, nth=99)
-    for data in changes:
-        await change(tree, name, 1000, data)
-    await trio.sleep(20)
-    copy.rearm(Opcode.WRITE_FILE)
-    return copy
-
-
 @pytest.mark.parametrize("profile", taking_turns(KEEPING))
 async def test_an_earlier_change_of_the_same_file_harms_nothing(profile: str, autojump: MockClock) -> None:
     old, name = content(20_000), path(profile, "f")
     here = world(profile, CLEAN, f=old)
     async with mounted(here, path(profile, "")[:-1]) as (_, tree):
-        copy = await overtaken(here, tree, name, b"1" * 100)
+        copy = await overtaken(here, tree, name, b"1" * 100, late=20.0)
         await change(tree, name, 1050, b"2" * 10)
         assert copy.late is not None
         new = old[:1] + b"x" + old[2:1000] + b"1" * 50 + b"2" * 10 + b"1" * 40 + old[1100:]
@@ -165,7 +163,7 @@ async def test_a_change_that_was_overtaken_is_an_error(profile: str, autojump: M
     name = path(profile, "f")
     here = world(profile, CLEAN, f=content(20_000))
     async with mounted(here, path(profile, "")[:-1]) as (_, tree):
-        copy = await overtaken(here, tree, name, b"1" * 100, b"2" * 100)
+        copy = await overtaken(here, tree, name, b"1" * 100, b"2" * 100, late=20.0)
         with pytest.raises(DataUnproven):
             await change(tree, name, 5000, b"3")
         assert copy.late is not None
@@ -182,12 +180,7 @@ async def test_a_file_that_a_copy_made_longer_gets_its_size_back(
     f, g = path(profile, "f"), path(profile, "g")
     inplace = profile == "littlefs"  # it can neither cut nor rename
     async with mounted(here, path(profile, "")[:-1], verify=verify, inplace=inplace) as (_, tree):
-        await change(tree, f, 1, b"x")
-        await trio.sleep(LONG)
-        copy = Latecomer(here, Opcode.WRITE_FILE, after=Opcode.WRITE_FILE, first=True, nth=99)
-        await change(tree, f, 900, b"of f" * 50)
-        await trio.sleep(LONG)
-        copy.rearm(Opcode.WRITE_FILE)
+        copy = await overtaken(here, tree, f, b"of f" * 50, at=900)
         await change(tree, g, 20, b"of g" * 245)
         assert copy.late is not None
         assert here.tree.data(g) == old[:20] + b"of g" * 245

@@ -20,11 +20,16 @@ def exchange(lateness: Lateness, answer: int, sent: float, answered: float) -> N
     lateness.on_answered(sent, answered)
 
 
-def test_a_copy_is_late_since_it_was_overtaken() -> None:
+def after_exchanges(count: int) -> Lateness:
+    """Return what saw so many exchanges, one every 0.2 s; each took 0.1 s."""
     lateness = Lateness()
-    exchange(lateness, 1, 0.0, 0.1)
-    exchange(lateness, 2, 0.2, 0.3)
-    exchange(lateness, 3, 0.4, 0.5)
+    for number in range(count):
+        exchange(lateness, 1 + number, 0.2 * number, 0.2 * number + 0.1)
+    return lateness
+
+
+def test_a_copy_is_late_since_it_was_overtaken() -> None:
+    lateness = after_exchanges(3)
     lateness.on_stray(1, 3.3)
     assert lateness.seen(3.3) == pytest.approx(3.0)
 
@@ -40,10 +45,7 @@ def test_what_nothing_overtook_is_not_late() -> None:
 
 
 def test_the_longest_counts_and_is_forgotten() -> None:
-    lateness = Lateness()
-    exchange(lateness, 1, 0.0, 0.1)
-    exchange(lateness, 2, 0.2, 0.3)
-    exchange(lateness, 3, 0.4, 0.5)
+    lateness = after_exchanges(3)
     lateness.on_stray(1, 2.3)
     lateness.on_stray(2, 1.0)
     assert lateness.seen(3.0) == pytest.approx(2.0)
@@ -51,9 +53,7 @@ def test_the_longest_counts_and_is_forgotten() -> None:
 
 
 def test_answers_of_others_tell_nothing() -> None:
-    lateness = Lateness()
-    exchange(lateness, 1, 0.0, 0.1)
-    exchange(lateness, 2, 0.2, 0.3)
+    lateness = after_exchanges(2)
     lateness.on_stray(77, 1.0)
     lateness.on_stray(1, 0.3 + LONGEST + 1)
     assert lateness.seen(12.0) == 0.0
