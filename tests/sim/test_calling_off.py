@@ -36,6 +36,8 @@ from tests.support.deliveries import (
     at_each_request,
     change,
     create,
+    in_the_middle,
+    long_file,
     names_on_card,
     names_shown,
     replace,
@@ -190,22 +192,13 @@ async def test_a_name_goes_in_a_few_round_trips_whatever_the_size(
     if (profile, take) == (NO_RENAME, "rename"):
         return
     for moment in MOMENTS:
-        world = World(profile, SLOW)
-        path = ROOTS.get(profile, b"") + b"/d/file"
-        world.tree.add(path + b".other", OTHER)
-        async with mounted(world) as (_, tree):
-            file = await tree.create(path, exclusive=True)
-            await file.write(0, LONG)
-            began = trio.current_time()
-            async with trio.open_nursery() as nursery:
-                for _ in range(3):  # one delivers, the others wait for their turn
-                    nursery.start_soon(file.fsync)
-                await trio.sleep(moment)
+        async with long_file(profile, other=OTHER) as (_, tree, path, file):
+            async with in_the_middle(file, waiting=3, after=moment):
+                began = trio.current_time()
                 await TAKES[take][0](tree, path)
-                assert trio.current_time() - began - moment < PROMPT
-            assert trio.current_time() - began - moment < PROMPT
+                assert trio.current_time() - began < PROMPT
+            assert trio.current_time() - began < PROMPT
             assert bytes(await file.read(0, len(LONG) + 1)) == LONG
-            await file.release()
 
 
 @pytest.mark.parametrize(

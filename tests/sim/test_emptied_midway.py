@@ -32,6 +32,8 @@ from tests.support.deliveries import (
     at_each_request,
     change,
     create,
+    in_the_middle,
+    long_file,
     names_on_card,
     names_shown,
     replace,
@@ -148,22 +150,13 @@ async def test_emptying_costs_no_more_whatever_the_size(
     profile: str, empty: Callable[[Tree, bytes], Awaitable[None]], autojump: MockClock
 ) -> None:
     for moment in MOMENTS:
-        world = World(profile, SLOW)
-        path = ROOTS.get(profile, b"") + b"/d/file"
-        world.tree.add(path + b".other", b"")
-        async with mounted(world) as (_, tree):
-            file = await tree.create(path, exclusive=True)
-            await file.write(0, LONG)
-            async with trio.open_nursery() as nursery:
-                for _ in range(3):  # one delivers, the others wait for their turn
-                    nursery.start_soon(file.fsync)
-                await trio.sleep(moment)
+        async with long_file(profile) as (world, tree, path, file):
+            async with in_the_middle(file, waiting=3, after=moment):
                 began = trio.current_time()
                 await empty(tree, path)
                 assert trio.current_time() - began < PROMPT
             assert trio.current_time() - began < 2 * PROMPT
             assert world.tree.data(path) == b""
-            await file.release()
 
 
 @pytest.mark.parametrize("profile", [name for name in PROFILES if name != NO_RENAME])

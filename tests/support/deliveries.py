@@ -12,8 +12,9 @@ from mavftpfs.cache.asides import is_reserved
 from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.tree import Tree
 from mavftpfs.sim.linkmodel import LinkSettings
+from tests.support.mounting import mounted
 from tests.support.trees import content
-from tests.support.worlds import World
+from tests.support.worlds import ROOTS, World
 
 OLD, NEW = content("old", 3000), content("new", 3500)
 GOOD = LinkSettings(rate=50_000.0, delay=0.02)
@@ -78,13 +79,31 @@ async def at_each_request(
 
 
 @asynccontextmanager
-async def in_the_middle(file: OpenFile, waiting: int = 1) -> AsyncIterator[None]:
-    """Enter when so many wait for the delivery, which takes some seconds; leaving waits for its end."""
+async def in_the_middle(file: OpenFile, waiting: int = 1, *, after: float = 1.05) -> AsyncIterator[None]:
+    """Enter when so many waited for the delivery for so many seconds; leaving waits for its end."""
     async with trio.open_nursery() as nursery:
-        for _ in range(waiting):
+        for _ in range(waiting):  # one delivers, the others wait for their turn
             nursery.start_soon(file.fsync)
-        await trio.sleep(1.05)
+        await trio.sleep(after)
         yield
+
+
+@asynccontextmanager
+async def long_file(
+    profile: str, *, other: bytes = b""
+) -> AsyncIterator[tuple[World, Tree, bytes, OpenFile]]:
+    """Mount a vehicle over the slow link, and write a new file there (LONG); nothing of it is delivered.
+
+    other: what another file holds, whose path is the same and `.other`.
+    """
+    world = World(profile, SLOW)
+    path = ROOTS.get(profile, b"") + b"/d/file"
+    world.tree.add(path + b".other", other)
+    async with mounted(world) as (_, tree):
+        file = await tree.create(path, exclusive=True)
+        await file.write(0, LONG)
+        yield world, tree, path, file
+        await file.release()
 
 
 def names_on_card(world: World, folder: bytes) -> set[bytes]:
