@@ -5,8 +5,9 @@ from __future__ import annotations
 from mavftpfs.cache.context import Context
 from mavftpfs.cache.filehandle import FileHandle
 from mavftpfs.cache.nodes import Node
+from mavftpfs.cache.versions import became_another
 from mavftpfs.shared.errors import FileChanged, FtpNak, IsADirectory, LocalProtocolError, NotFound
-from mavftpfs.shared.model import EntryKind, split
+from mavftpfs.shared.model import DirEntry, EntryKind, split
 
 STEP = 128 * 1024
 
@@ -50,7 +51,7 @@ async def _open_below(context: Context, node: Node) -> FileHandle:
     try:
         if node.mtime is not None:
             await context.directories.recent(split(node.path)[0], began=context.clock())
-            _require_as_left(context, node)
+            _require_as_known(context, node)
     except BaseException:
         handle.close()
         raise
@@ -61,12 +62,22 @@ def _changed_by_us(node: Node) -> bool:
     return node.draft is None or node.draft.touched or node.draft.placed
 
 
-def _require_as_left(context: Context, node: Node) -> None:
-    """Raise FileChanged if the last listing shows that others replaced what we wrote."""
+def _require_as_known(context: Context, node: Node) -> None:
+    """Raise FileChanged if the last listing shows that others replaced what was opened or written here."""
     node.require_not_parted()
-    told = context.dentries.mtime_since(node.path, node.delivered_at)
-    if not _changed_by_us(node) and node.mtime is not None and told not in (None, node.mtime):
-        raise FileChanged(f"{node.path!r} became another file after it was written here")
+    entry = context.dentries.listed_since(node.path, node.known_at)
+    if entry is not None and not _changed_by_us(node) and _is_another(node, entry):
+        raise FileChanged(f"{node.path!r} became another file after it was opened or written here")
+
+
+def _is_another(node: Node, entry: DirEntry) -> bool:
+    draft = node.draft
+    if draft is None or draft.remote_end is None:
+        return False
+    shorter = entry.size is not None and entry.size < draft.remote_end
+    if shorter and (node.may_be_cut or entry.size == draft.size):
+        return False  # it was cut by us, or just as it was to be
+    return became_another(draft.remote_end, node.mtime, entry)
 
 
 async def read_base(
@@ -101,22 +112,26 @@ async def read_base(
     return data
 
 
-async def require_same(context: Context, node: Node) -> None:
-    """Check that the file below a draft is not another one by now, as far as is known, or since the vehicle
-    restarted: what was changed here of the old one is not to be changed there. The caller has the lock.
+async def require_same(context: Context, node: Node, since: float) -> None:
+    """Check that the file below a draft is not another one by now: what was changed here of the old one is
+    not to be changed there. The caller has the lock.
 
-    What we changed there ourselves since cannot be compared.
+    A listing that began at `since` or later has to show the mtime that is known of the file, or of what was
+    read of it. What we changed there ourselves meanwhile cannot be compared.
 
     Raises:
-        FileChanged. Else as FileHandle.require_same.
+        FileChanged. Else as Directories.recent and FileHandle.require_same.
     """
-    _require_as_left(context, node)
-    if node.base is None:
-        return
-    node.base.require_not_lost()
     if not _changed_by_us(node):
         with node.looking():
-            await node.base.require_same()
+            if node.mtime is not None or (node.base is not None and node.base.comparable):
+                await context.directories.recent(split(node.path)[0], began=since)
+            _require_as_known(context, node)
+            if node.base is not None:
+                await node.base.require_same()
+    node.require_not_parted()
+    if node.base is not None:
+        node.base.require_not_lost()
 
 
 def outdate(context: Context, node: Node) -> None:

@@ -15,6 +15,7 @@ from mavftpfs.cache.nodes import Node, Nodes
 from mavftpfs.cache.options import CacheOptions
 from mavftpfs.cache.pathlocks import PathLocks
 from mavftpfs.cache.remote import RemoteStore, WriteStore
+from mavftpfs.cache.versions import became_another
 from mavftpfs.shared.errors import Armed, FileBusy
 from mavftpfs.shared.model import split
 
@@ -81,21 +82,19 @@ class Context:
         return self.files.was_lost(path) or any(n.path == path and n.handles for n in self.parted)
 
     def on_listed(self, path: bytes, directory: Directory) -> None:
-        """A directory was listed: part with what we delivered and others replaced since."""
+        """A directory was listed: part with what others replaced since it was opened or delivered."""
         for node in self.nodes:
             parent, name = split(node.path)
             entry = directory.entries.get(name) if parent == path else None
-            if entry is None or not float("-inf") < node.delivered_at < directory.listed_at:
+            if entry is None or not float("-inf") < node.known_at < directory.listed_at:
                 continue
-            if node.draft is None or self.is_changing(node.path):
+            size = None if node.draft is None else node.draft.remote_end
+            if size is None or self.is_changing(node.path):
                 continue
-            same_size = entry.size in (None, node.draft.size)
-            if same_size and node.mtime is None:
-                node.mtime = entry.mtime
-            elif same_size and entry.mtime in (None, node.mtime):
-                continue
-            elif same_size or (entry.size or 0) < node.draft.size:  # a larger one only grew
+            if became_another(size, node.mtime, entry):
                 self._part(node)
+            elif node.mtime is None and entry.size == size:
+                node.mtime = entry.mtime
 
     def _part(self, node: Node) -> None:
         if node.undelivered or node.attempt is not None or node.lock.locked():

@@ -15,6 +15,7 @@ import trio
 
 from mavftpfs.cache import base, overwritten
 from mavftpfs.cache.context import Context
+from mavftpfs.cache.dating import Dater
 from mavftpfs.cache.draft import Draft
 from mavftpfs.cache.nodes import Attempt, Node
 from mavftpfs.cache.plan import SENDING, Plan, Rules, choose
@@ -37,7 +38,7 @@ from mavftpfs.shared.errors import (
     SpoolFailed,
     VerificationFailed,
 )
-from mavftpfs.shared.model import DirEntry, EntryKind, folded, split
+from mavftpfs.shared.model import DirEntry, EntryKind, split
 
 log = logging.getLogger("mavftpfs.cache")
 
@@ -63,6 +64,7 @@ class Deliverer:
         self.replacer = Replacer(context, sure)
         self.verifier = Verifier(context, sure)
         self._prober = Prober(context)
+        self.dater = Dater(context)
         self.delivered = 0
         self.on_undelivered: Callable[[], None] = lambda: None
 
@@ -212,8 +214,10 @@ class Deliverer:
             async with node.firmly():
                 await self._create_empty(node.path, draft)
         else:
+            since = self._context.clock()
             if (size := await self.verifier.size(node.path)) < draft.size:  # it would be filled up with zeros
                 raise FileChanged(f"{node.path!r} has {size} bytes on the vehicle now: nothing to cut")
+            await base.require_same(self._context, node, since)
             await self._cut(node, draft.size)
         await self.verifier.check(node.path, draft)
         self._on_delivered(node, draft)
@@ -225,7 +229,7 @@ class Deliverer:
         draft.remote_cut(draft.size)
 
     async def _cut(self, node: Node, size: int) -> None:
-        await base.require_same(self._context, node)
+        node.may_be_cut = True
         await self._context.writer.truncate(node.path, size)
         self._context.dentries.note_unsized(node.path)
         base.outdate(self._context, node)
@@ -313,13 +317,7 @@ class Deliverer:
 
     def _free_at(self, path: bytes, draft: Draft) -> float | None:
         """Return when a listing last showed the name of a new file to be free, None if it need not be."""
-        if draft.on_vehicle:
-            return None
-        parent, name = split(path)
-        known = self._context.dentries.known(parent)
-        if known is None or not known.complete or folded(name) in map(folded, known.entries):
-            return float("-inf")
-        return known.listed_at
+        return None if draft.on_vehicle else self._context.dentries.free_at(path)
 
     async def _require_base(self, node: Node, draft: Draft) -> int:
         """Return the size on the vehicle of a file of which a part is to stay.
@@ -327,9 +325,10 @@ class Deliverer:
         Raises:
             FileChanged: it grew or shrank, or is another one.
         """
+        since = self._context.clock()
         with node.looking():
             size, most = await self.verifier.size(node.path), draft.remote_end
-        await base.require_same(self._context, node)
+        await base.require_same(self._context, node, since)
         if most is not None and not draft.base_limit <= size <= max(most, draft.stretched):
             raise FileChanged(f"{node.path!r} has {size} bytes now, {most} when it was changed here")
         return size
@@ -369,13 +368,12 @@ class Deliverer:
     def _on_delivered(self, node: Node, draft: Draft, ended_at: float = float("inf")) -> None:
         """The vehicle has it: listings, blocks and checksums follow."""
         context = self._context
-        mtime = context.dentries.mtime_since(node.path, ended_at)
+        shown = context.dentries.listed_since(node.path, ended_at)
         context.dentries.note_written(node.path, draft.size)
         context.dentries.note_proven(node.path, context.clock())
         draft.delivered()
-        node.delivered_at = context.clock()
         base.outdate(context, node)
-        node.mtime = mtime
+        self.dater.on_known(node, shown)
         context.on_changed(node.path)
         self.delivered += 1
 

@@ -16,7 +16,7 @@ from collections import OrderedDict
 from dataclasses import dataclass, field, replace
 
 from mavftpfs.cache.attributes import tidy
-from mavftpfs.shared.model import DirEntry, EntryKind, Listing, split, usable_name
+from mavftpfs.shared.model import DirEntry, EntryKind, Listing, folded, split, usable_name
 
 COST_FACTOR = 50
 """A listing that took T seconds is fresh for at least COST_FACTOR * T: it costs at most 2 % of the link."""
@@ -179,13 +179,22 @@ class Dentries:
             if now is not None and before is not None and size > before:
                 directory.growing[name] = now
 
-    def mtime_since(self, path: bytes, since: float) -> int | None:
-        """Return what a listing that began then or later told of a path's mtime, None if there is none."""
+    def free_at(self, path: bytes) -> float:
+        """Return when a complete listing last showed that nothing has the name, whatever its case; -inf if
+        none did."""
+        parent, name = split(path)
+        known = self.known(parent)
+        if known is None or not known.complete or folded(name) in map(folded, known.entries):
+            return float("-inf")
+        return known.listed_at
+
+    def listed_since(self, path: bytes, since: float) -> DirEntry | None:
+        """Return what a listing that began then or later shows of a path, None if there is none."""
         parent, name = split(path)
         directory = self._directories.get(parent)
-        if directory is None or directory.listed_at < since or name not in directory.entries:
+        if directory is None or directory.listed_at < since:
             return None
-        return directory.entries[name].mtime
+        return directory.entries.get(name)
 
     def note_proven(self, path: bytes, now: float) -> None:
         """The path is what its listing shows, as an answer of just now (`now`) proved."""

@@ -78,6 +78,16 @@ class FileHandle(ReadOnlyHandle):
             await self._files.reopens.compare(self._version)
 
     @property
+    def mtime(self) -> int | None:
+        """The file's mtime, if a listing told it since it was opened on the vehicle."""
+        return self._version.mtime if self._version.sure else None
+
+    @property
+    def comparable(self) -> bool:
+        """Whether bytes of it were given out, and a listing can tell whether they are of another file."""
+        return self._version.mtime is not None and self._version.blocks.given
+
+    @property
     def lost(self) -> bool:
         """Whether the file became another one by somebody else's doing."""
         return self._version.lost

@@ -152,7 +152,7 @@ class Files:
         if version.dead is not None or version.recheck:
             return False
         newer = listed_at > version.proven_at
-        if newer and became_another(version, entry):
+        if newer and became_another(version.size, version.mtime, entry):
             self._kill(version)
             return False
         same_size = entry.size in (None, version.size)

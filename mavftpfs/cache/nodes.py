@@ -62,10 +62,12 @@ class Node:
     error: why it could not be delivered. quiet: no delivery is under way, so it may be written. lock: held to
     deliver it and to change its path. starting: a background upload is about to begin. background: whether
     it may begin by itself; start_after: not before.
-    base: reads the vehicle's file. delivered_at: when the vehicle last had it all. doomed: how many changes
-    that take its name away have the lock, or are about to, or empty it: no delivery begins or goes on.
+    base: reads the vehicle's file. known_at: when the vehicle was last known to have it all. doomed: how
+    many changes that take its name away have the lock, or are about to, or empty it: no delivery begins or
+    goes on.
     looked_at: who has the lock changes nothing on the vehicle just now. parted: its name is another file's.
-    mtime: what the listing by which its delivery was checked told, or the first one since.
+    mtime: what a listing since then told, None before there is one. dating: somebody sees to that.
+    may_be_cut: we may have cut it since then.
     """
 
     path: bytes
@@ -83,13 +85,15 @@ class Node:
     starting: bool = False
     background: bool = True
     start_after: float = float("-inf")
-    delivered_at: float = float("-inf")
+    known_at: float = float("-inf")
     lock: trio.Lock = field(default_factory=trio.Lock)
     quiet: trio.Event = field(default_factory=trio.Event)
     doomed: int = 0
     looked_at: int = 0
     parted: bool = False
     mtime: int | None = None
+    dating: bool = False
+    may_be_cut: bool = False
     _delivery: trio.CancelScope | None = None
     _firm: int = 0
 

@@ -108,7 +108,7 @@ class Reopens:
         if entry is None:
             another = directory.complete
         else:
-            another = entry.kind is not EntryKind.FILE or became_another(version, entry)
+            another = entry.kind is not EntryKind.FILE or became_another(version.size, version.mtime, entry)
         if not another:
             version.sure |= entry is not None and entry.mtime == version.mtime
             openings.on_compared(count, directory.ended_at - directory.listed_at, self._clock())
@@ -142,7 +142,7 @@ class Reopens:
                 continue
             if entry.mtime == version.mtime and entry.size == version.size:
                 version.sure = True
-            elif became_another(version, entry) and not self._is_changing(version.path):
+            elif became_another(version.size, version.mtime, entry) and not self._is_changing(version.path):
                 if version.blocks.given and (version.sure or entry.size != version.size):
                     self._on_changed(version)
                 else:

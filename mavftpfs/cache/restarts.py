@@ -54,7 +54,7 @@ class Restarts:
         async with self._fetcher.paths.steady(lambda: version.path) as present:
             if present != path:
                 return  # who reads on has it compared under its new name
-        if entry is None or became_another(version, entry):
+        if entry is None or became_another(version.size, version.mtime, entry):
             self._on_changed(version)
         elif _is_the_same(version, entry):
             version.proven_boot = boot

@@ -267,10 +267,10 @@ def _want(reader: Reader, plan: Plan, gaps: Gaps) -> None:
         reader.want(plan.start, plan.stop, demand=False)
 
 
-def became_another(version: Version, entry: DirEntry) -> bool:
-    """Return whether a listing newer than the version's proof contradicts it (a larger file only grew)."""
-    if entry.size is None or entry.size > version.size:
+def became_another(size: int, mtime: int | None, entry: DirEntry) -> bool:
+    """Return whether a newer listing contradicts what is known of a file (a larger one only grew)."""
+    if entry.size is None or entry.size > size:
         return False
-    if entry.size < version.size:
+    if entry.size < size:
         return True
-    return entry.mtime is not None and version.mtime is not None and entry.mtime != version.mtime
+    return entry.mtime is not None and mtime is not None and entry.mtime != mtime

@@ -107,6 +107,7 @@ class Writeback:
         self._context.require_disarmed()
         async with self._context.paths.hold(path, shared=True):
             file = WriteFile(self, self._context, await self._need_draft(path, truncate=truncate))
+            self._deliverer.dater.watch(file.node)
         if truncate:
             try:
                 await file.truncate(0)
@@ -163,6 +164,8 @@ class Writeback:
                 node = context.nodes.need(path)
                 if node.draft is None:
                     self._new_draft(node, size)
+                    if base is not None:
+                        node.known_at, node.mtime = context.clock(), base.mtime
                     node.base, base = base, node.base
             finally:
                 if base is not None:
@@ -247,12 +250,12 @@ class Writeback:
             self._background.settle(node)
             return
         fits = 0 < draft.size <= context.options.cache_size // ADOPTED_PART
-        recent = context.clock() - node.delivered_at < context.options.dir_timeout
+        recent = context.clock() - node.known_at < context.options.dir_timeout
         if fits and recent and draft.whole:
             starts = range(0, draft.size, STEP)
             pieces = ((at, draft.local_bytes(at, min(at + STEP, draft.size))) for at in starts)
             with suppress(SpoolFailed):  # the local disk does not give it back: it is on the vehicle
-                context.files.adopt(node.path, draft.size, pieces, proven_at=node.delivered_at)
+                context.files.adopt(node.path, draft.size, pieces, proven_at=node.known_at)
         self._background.settle(node)
 
     # --- names

@@ -132,3 +132,118 @@ async def test_what_is_written_after_a_delivery_does_not_go_into_a_successor(
         await writer.write(0, b"whole")
         await writer.release()
         assert card.world.tree.data(card.path) == b"whole"
+
+
+@pytest.mark.parametrize("many", [False, True], ids=["few names", "many names"])
+@pytest.mark.parametrize("profile", TIMED)
+async def test_what_only_writes_puts_no_part_into_a_successor(
+    profile: str, many: bool, autojump: MockClock
+) -> None:
+    """Nothing was read that could be compared: the time at which it was opened decides."""
+    card = Card(profile, others=many)
+    async with mounted(card.world) as (_, tree):
+        writer = await tree.open(card.path, write=True)
+        await trio.sleep(IDLE)
+        card.replace()
+        await writer.write(100, MID)
+        for _ in range(2):
+            with pytest.raises(FileChanged):
+                await writer.fsync()
+        assert card.world.tree.data(card.path) == CHANGED
+        writer.give_up()
+
+
+@pytest.mark.parametrize("many", [False, True], ids=["few names", "many names"])
+@pytest.mark.parametrize("profile", TIMED)
+async def test_what_waits_here_does_not_go_into_a_successor(
+    profile: str, many: bool, autojump: MockClock
+) -> None:
+    card = Card(profile, others=many)
+    async with mounted(card.world) as (_, tree):
+        writer = await tree.open(card.path, write=True)
+        await writer.write(100, MID)
+        await trio.sleep(IDLE)
+        card.replace()
+        with pytest.raises(FileChanged):
+            await writer.fsync()
+        assert card.world.tree.data(card.path) == CHANGED
+        writer.give_up()
+
+
+@pytest.mark.parametrize("part", [False, True], ids=["cut", "cut and changed"])
+@pytest.mark.parametrize("successor", [CHANGED, CHANGED[:2000]], ids=["as long", "shorter"])
+@pytest.mark.parametrize("profile", TIMED)
+async def test_a_successor_is_not_cut(
+    profile: str, successor: bytes, part: bool, autojump: MockClock
+) -> None:
+    card = Card(profile, others=True)
+    async with mounted(card.world) as (_, tree):
+        writer = await tree.open(card.path, write=True)
+        await trio.sleep(IDLE)
+        card.replace(successor)
+        await writer.truncate(1000)
+        await writer.write(100, MID * part)
+        with pytest.raises(FileChanged):
+            await writer.fsync()
+        assert card.world.tree.data(card.path) == successor
+        writer.give_up()
+
+
+@pytest.mark.parametrize("profile", TIMED)
+async def test_what_is_written_after_a_delivery_among_many_names(profile: str, autojump: MockClock) -> None:
+    """Its delivery was verified without a listing."""
+    card = Card(profile, others=True)
+    async with mounted(card.world) as (_, tree):
+        writer = await tree.open(card.path, write=True)
+        await writer.write(100, MID)
+        await writer.fsync()
+        await trio.sleep(IDLE)
+        card.replace()
+        await writer.write(300, MID)
+        with pytest.raises(FileChanged):
+            await writer.fsync()
+        assert card.world.tree.data(card.path) == CHANGED
+        writer.give_up()
+
+
+@pytest.mark.parametrize("profile", TIMED)
+async def test_what_was_read_from_the_cache_decides_nothing_about_a_successor(
+    profile: str, autojump: MockClock
+) -> None:
+    """The cache may be older than the file by dir_timeout; what is written by it is for the old one."""
+    card = Card(profile, others=True)
+    async with mounted(card.world) as (_, tree):
+        reader = await tree.open(card.path)
+        assert bytes(await reader.read(0, STEP)) == OLD[:STEP]
+        await reader.release()
+        await trio.sleep(IDLE)
+        card.replace()
+        writer = await tree.open(card.path, write=True)
+        try:
+            assert bytes(await writer.read(0, STEP)) == OLD[:STEP]
+        except FileChanged:
+            pass
+        else:
+            await writer.write(100, MID)
+            with pytest.raises(FileChanged):
+                await writer.fsync()
+        assert card.world.tree.data(card.path) == CHANGED
+        writer.give_up()
+
+
+@pytest.mark.parametrize("many", [False, True], ids=["few names", "many names"])
+@pytest.mark.parametrize("profile", TIMED)
+async def test_what_was_replaced_before_it_was_opened_is_changed(
+    profile: str, many: bool, autojump: MockClock
+) -> None:
+    """The listing is of the file before, and says nothing against the one that was opened."""
+    card = Card(profile, others=many)
+    async with mounted(card.world, card.folder) as (_, tree):
+        card.replace()
+        writer = await tree.open(card.path, write=True)
+        for at in (100, 300):
+            await writer.write(at, MID)
+            await writer.fsync()
+            await trio.sleep(IDLE)
+        await writer.release()
+        assert card.world.tree.data(card.path) == CHANGED[:100] + MID + CHANGED[103:300] + MID + CHANGED[303:]

@@ -31,12 +31,15 @@ UNTIMED = ["px4", "mavsdk-old"]
 
 
 class Card:
-    """One vehicle with one file."""
+    """One vehicle with one file, and with `others` beside it, so that a listing takes several requests."""
 
-    def __init__(self, profile: str) -> None:
+    def __init__(self, profile: str, *, others: bool = False) -> None:
         self.world = World(profile, LINK)
+        self.folder = ROOTS.get(profile, b"") or b"/"
         self.path = ROOTS.get(profile, b"") + b"/big"
         self.world.tree.add(self.path, OLD, THEN)
+        for number in range(30 * others):
+            self.world.tree.add(b"%s-%d" % (self.path, number), b"", THEN)
 
     def replace(self, data: bytes = NEW[: len(OLD)], mtime: int = THEN + 100) -> None:
         """Move another file over it, as others would."""
