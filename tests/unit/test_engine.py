@@ -47,6 +47,14 @@ def mkdir(session: int | None = None) -> Simple:
     return Simple(Opcode.CREATE_DIRECTORY, b"/d", session=session)
 
 
+def asked(engine: Engine) -> tuple[Simple, Payload]:
+    """Return an operation and the request that went out for it."""
+    op = mkdir()
+    engine.start(op, 0.0)
+    (request,) = sent(engine, 0.0)
+    return op, request
+
+
 # --- sequence numbers
 
 
@@ -123,9 +131,7 @@ def test_the_rest_of_an_abandoned_burst_does_not_repeat_a_side_effect() -> None:
     (burst,) = sent(engine, 0.0)
     engine.receive(packet(burst, 0, bytes(239)), 0.0)
     engine.cancel(transfer, 0.0)
-    op = mkdir()
-    engine.start(op, 0.0)
-    (request,) = sent(engine, 0.0)
+    op, request = asked(engine)
     for index in range(1, 20_000):
         engine.receive(packet(burst, index, bytes(239)), 0.0)
         assert sent(engine, 0.0) == []
@@ -221,9 +227,7 @@ def test_a_stale_replay_is_asked_again_under_a_new_seq_and_only_so_often(opcode:
 
 def test_the_first_reply_counts_its_duplicates_do_not() -> None:
     engine = make()
-    op = mkdir()
-    engine.start(op, 0.0)
-    (request,) = sent(engine, 0.0)
+    op, request = asked(engine)
     engine.receive(ack(request), 0.1)
     engine.receive(nak(request, 8), 0.2)
     assert op.done
@@ -239,9 +243,7 @@ def test_the_first_reply_counts_its_duplicates_do_not() -> None:
 def test_requests_carry_the_engines_session_and_are_repeated_when_it_changed() -> None:
     engine = make()
     engine.session = 5
-    op = mkdir()
-    engine.start(op, 0.0)
-    (request,) = sent(engine, 0.0)
+    op, request = asked(engine)
     assert request.session == 5
     engine.session = 6
     engine.receive(nak(request, NakCode.INVALID_SESSION), 0.1)
@@ -279,9 +281,7 @@ def test_a_session_that_changes_all_the_time_ends_somewhere() -> None:
 
 def test_a_late_refusal_under_an_old_session_does_not_repeat_twice() -> None:
     engine = make()
-    op = mkdir()
-    engine.start(op, 0.0)
-    (request,) = sent(engine, 0.0)
+    op, request = asked(engine)
     engine.on_deadline(1.0)
     engine.session = 9
     engine.receive(nak(request, NakCode.INVALID_SESSION), 1.1)
@@ -298,9 +298,7 @@ def test_a_late_refusal_under_an_old_session_does_not_repeat_twice() -> None:
 
 def test_a_side_effect_goes_out_again_under_the_same_seq_with_growing_waits() -> None:
     engine = make()
-    op = mkdir()
-    engine.start(op, 0.0)
-    (request,) = sent(engine, 0.0)
+    op, request = asked(engine)
     now, times = 0.0, []
     while not op.done:
         deadline = engine.next_deadline()
@@ -323,9 +321,7 @@ def test_a_side_effect_goes_out_again_under_the_same_seq_with_growing_waits() ->
 
 def test_a_late_reply_to_a_side_effect_is_taken_but_not_timed() -> None:
     engine = make()
-    op = mkdir()
-    engine.start(op, 0.0)
-    (request,) = sent(engine, 0.0)
+    op, request = asked(engine)
     engine.on_deadline(1.0)
     assert len(sent(engine, 1.0)) == 1
     engine.receive(ack(request), 1.05)
@@ -696,9 +692,7 @@ def bursting(engine: Engine) -> tuple[ReadTransfer, Payload]:
 def test_timers_stand_still_while_burst_packets_come() -> None:
     engine = make()
     _, burst = bursting(engine)
-    op = mkdir()
-    engine.start(op, 0.0)
-    (request,) = sent(engine, 0.0)
+    op, request = asked(engine)
     for index in range(30):
         now = 0.2 * (index + 1)
         engine.receive(packet(burst, index, bytes(239)), now)
@@ -737,9 +731,7 @@ def test_a_server_that_answers_between_packets_is_noticed() -> None:
 def test_an_answer_that_may_be_to_the_first_of_two_equal_requests_proves_nothing() -> None:
     engine = make()
     _, burst = bursting(engine)
-    op = mkdir()
-    engine.start(op, 0.0)
-    (request,) = sent(engine, 0.0)
+    op, request = asked(engine)
     engine.on_deadline(1.0)
     assert sent(engine, 1.0) == [request]
     engine.receive(packet(burst, 0, bytes(239)), 1.1)

@@ -63,6 +63,14 @@ class Reader:
         self.engine.on_deadline(self.now)
 
 
+def bursting(*, block: int = 239, limit: int = 4, traits: Traits | None = None) -> tuple[Reader, Payload]:
+    """Return who reads all of it in a burst, and the request for that."""
+    reader = Reader(strategy="burst", block=block, limit=limit, traits=traits)
+    reader.transfer.want(0, SIZE, True)
+    (request,) = reader.sent()
+    return reader, request
+
+
 def ranges(requests: list[Payload]) -> list[tuple[int, int]]:
     return [(request.offset, request.offset + request.size) for request in requests]
 
@@ -262,9 +270,7 @@ def stream(reader: Reader, request: Payload, indices: list[int], *, complete: in
 
 
 def test_a_whole_file_in_one_burst() -> None:
-    reader = Reader(strategy="burst")
-    reader.transfer.want(0, SIZE, True)
-    (request,) = reader.sent()
+    reader, request = bursting()
     assert (request.opcode, request.offset, request.size) == (Opcode.BURST_READ_FILE, 0, 239)
     assert reader.transfer.bursting
     assert not reader.transfer.idle
@@ -291,9 +297,7 @@ def test_a_burst_begins_at_the_first_missing_wanted_byte_and_brings_more() -> No
 
 
 def test_gaps_are_filled_by_reads_when_the_burst_is_over() -> None:
-    reader = Reader(strategy="burst")
-    reader.transfer.want(0, SIZE, True)
-    (request,) = reader.sent()
+    reader, request = bursting()
     stream(reader, request, [0, 1, 4, 5, 6, 9])
     assert reader.sent() == []
     reader.engine.receive(burst_nak(request, 10, NakCode.EOF), reader.now)
@@ -311,9 +315,7 @@ def test_gaps_are_filled_by_reads_when_the_burst_is_over() -> None:
 
 
 def test_a_burst_that_goes_quiet_is_over_but_not_early() -> None:
-    reader = Reader(strategy="burst")
-    reader.transfer.want(0, SIZE, True)
-    (request,) = reader.sent()
+    reader, request = bursting()
     stream(reader, request, [0, 1, 2])
     heard = reader.now
     while reader.transfer.bursting:
@@ -337,9 +339,7 @@ def test_the_flag_and_a_short_quiet_end_it() -> None:
 
 
 def test_a_spurious_flag_does_not_end_it() -> None:
-    reader = Reader(strategy="burst")
-    reader.transfer.want(0, SIZE, True)
-    (request,) = reader.sent()
+    reader, request = bursting()
     stream(reader, request, list(range(41)), complete=3)
     assert bytes(reader.sink.data) == CONTENT
     assert reader.engine.stats.by_opcode == {Opcode.BURST_READ_FILE: 1}
@@ -377,9 +377,7 @@ def test_two_bursts_without_data_are_enough() -> None:
 
 @pytest.mark.parametrize("code", [1, 2, 3, 6, 7])
 def test_a_refused_burst_gives_way_to_reads(code: int) -> None:
-    reader = Reader(strategy="burst")
-    reader.transfer.want(0, SIZE, True)
-    (request,) = reader.sent()
+    reader, request = bursting()
     reader.engine.receive(burst_nak(request, 0, code), 0.1)
     assert reader.transfer.strategy == "window"
     reader.finish()
@@ -398,9 +396,7 @@ def test_a_burst_without_session(code: int) -> None:
 
 @pytest.mark.parametrize("kind", ["empty", "nak"])
 def test_an_endless_stream_must_be_terminated(kind: str) -> None:
-    reader = Reader(strategy="burst")
-    reader.transfer.want(0, SIZE, True)
-    (request,) = reader.sent()
+    reader, request = bursting()
     stream(reader, request, [0, 1])
     for index in (2, 3):
         reply = burst_nak(request, index, 1)
@@ -412,9 +408,7 @@ def test_an_endless_stream_must_be_terminated(kind: str) -> None:
 
 
 def test_px4_sends_239_whatever_was_asked() -> None:
-    reader = Reader(strategy="burst", block=110)
-    reader.transfer.want(0, SIZE, True)
-    (request,) = reader.sent()
+    reader, request = bursting(block=110)
     assert request.size == 110
     stream(reader, request, list(range(41)))
     assert bytes(reader.sink.data) == CONTENT
@@ -432,11 +426,7 @@ def test_one_short_packet_says_nothing_about_sizes() -> None:
 
 @pytest.mark.parametrize("echoes", [None, True, False])
 def test_a_long_burst_is_kept_alive_where_bursts_do_not_count(echoes: bool | None) -> None:
-    reader = Reader(
-        strategy="burst", traits=Traits(ack_carries_own_session=echoes, answers_during_burst=True)
-    )
-    reader.transfer.want(0, SIZE, True)
-    (request,) = reader.sent()
+    reader, request = bursting(traits=Traits(ack_carries_own_session=echoes, answers_during_burst=True))
     sent_at: list[float] = []
     for index in range(41):
         reader.now += 0.25
@@ -457,9 +447,7 @@ def test_a_long_burst_is_kept_alive_where_bursts_do_not_count(echoes: bool | Non
 
 
 def test_a_keep_alive_that_finds_no_room_does_not_spin() -> None:
-    reader = Reader(strategy="burst", limit=1, traits=Traits(ack_carries_own_session=False))
-    reader.transfer.want(0, SIZE, True)
-    (request,) = reader.sent()
+    reader, request = bursting(limit=1, traits=Traits(ack_carries_own_session=False))
     reader.engine.start(Simple(Opcode.NONE), 0.0)
     reader.sent()
     for index in range(8):
@@ -472,9 +460,7 @@ def test_a_keep_alive_that_finds_no_room_does_not_spin() -> None:
 
 
 def test_packets_after_the_transfer_ended_are_dropped() -> None:
-    reader = Reader(strategy="burst")
-    reader.transfer.want(0, SIZE, True)
-    (request,) = reader.sent()
+    reader, request = bursting()
     reader.engine.receive(burst_nak(request, 0, NakCode.EOF), 0.1)
     assert not reader.transfer.on_burst(packet(request, 0, CONTENT[:239]), 0.2)
     assert reader.sink.held.empty
