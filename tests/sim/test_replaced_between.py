@@ -56,6 +56,18 @@ class Card:
             yield tree, handle
             handle.close()
 
+    @asynccontextmanager
+    async def opened_late(self) -> AsyncIterator[tuple[Tree, OpenFile]]:
+        """Mount it and list the file; open it, and read its head, right after it was replaced."""
+        async with self.world.connection() as connection:
+            tree = mounted(connection)
+            assert (await tree.stat(self.path)).mtime == THEN
+            self.replace()
+            handle = await tree.open(self.path)
+            assert await handle.read(0, STEP) == NEW[:STEP]
+            yield tree, handle
+            handle.close()
+
 
 async def read_head(handle: OpenFile) -> None:
     """Read the first bytes, and wait until the session is closed."""
@@ -200,12 +212,7 @@ async def test_one_that_was_replaced_before_it_was_opened_is_read_on(
 ) -> None:
     """The remembered listing tells the time of its predecessor."""
     card = Card(profile)
-    async with card.world.connection() as connection:
-        tree = mounted(connection)
-        assert (await tree.stat(card.path)).mtime == THEN
-        card.replace()
-        handle = await tree.open(card.path)
-        assert await handle.read(0, STEP) == NEW[:STEP]
+    async with card.opened_late() as (tree, handle):
         await trio.sleep(30.0)
         if "listed" in looks:
             assert (await tree.stat(card.path)).mtime == THEN + 100
@@ -217,7 +224,6 @@ async def test_one_that_was_replaced_before_it_was_opened_is_read_on(
         assert (await tree.stat(card.path)).mtime == THEN + 200
         with pytest.raises(FileChanged):
             await handle.read(0, STEP)
-        handle.close()
 
 
 @pytest.mark.parametrize("profile", TIMED)
@@ -225,12 +231,7 @@ async def test_one_that_was_replaced_again_after_it_was_opened_is_not(
     profile: str, autojump: MockClock
 ) -> None:
     card = Card(profile)
-    async with card.world.connection() as connection:
-        tree = mounted(connection)
-        assert (await tree.stat(card.path)).mtime == THEN
-        card.replace()
-        handle = await tree.open(card.path)
-        assert await handle.read(0, STEP) == NEW[:STEP]
+    async with card.opened_late() as (tree, handle):
         await trio.sleep(IDLE)
         card.replace(NEW[-len(OLD) :], THEN + 200)
         with pytest.raises(FileChanged):
