@@ -68,27 +68,29 @@ def cost(part: Part) -> float:
 
 def read_parts() -> dict[str, float]:
     """Return the microseconds per chunk of each part of reading."""
-    replies = [_read_reply(n, n * MAX_DATA) for n in range(CHUNKS)]
-    requests = [_read_request(n, n * MAX_DATA) for n in range(CHUNKS)]
-    return {
-        "receive (system call)": cost(_receiving(replies)),
-        "find and check frames": cost(_decoding(replies)),
-        "engine and transfer": cost(_engine_reading),
-        "placing in the cache": cost(_placing),
-        "build frames": cost(_encoding(requests)),
-        "send (system call)": cost(_sending(requests)),
-    }
+    return _costs(_read_request, _read_reply, _engine_reading, "placing in the cache", _placing)
 
 
 def write_parts() -> dict[str, float]:
     """Return the microseconds per chunk of each part of writing."""
-    replies = [_write_reply(n, n * MAX_DATA) for n in range(CHUNKS)]
-    requests = [_write_request(n, n * MAX_DATA) for n in range(CHUNKS)]
+    return _costs(_write_request, _write_reply, _engine_writing, "taking from the spool", _drafting)
+
+
+def _costs(
+    request: Callable[[int, int], bytes],
+    reply: Callable[[int, int], bytes],
+    engine: Part,
+    keeping: str,
+    keep: Part,
+) -> dict[str, float]:
+    """request, reply: of a seq and an offset. keep: what is done with the bytes here, called `keeping`."""
+    replies = [reply(n, n * MAX_DATA) for n in range(CHUNKS)]
+    requests = [request(n, n * MAX_DATA) for n in range(CHUNKS)]
     return {
         "receive (system call)": cost(_receiving(replies)),
         "find and check frames": cost(_decoding(replies)),
-        "engine and transfer": cost(_engine_writing),
-        "taking from the spool": cost(_drafting),
+        "engine and transfer": cost(engine),
+        keeping: cost(keep),
         "build frames": cost(_encoding(requests)),
         "send (system call)": cost(_sending(requests)),
     }

@@ -15,6 +15,7 @@ import trio
 from trio.testing import MockClock
 
 from mavftpfs.cache.asides import is_reserved
+from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.spool import SpoolDirectory
 from mavftpfs.cache.tree import Tree
 from mavftpfs.session.connection import Connection, ConnectOptions
@@ -34,35 +35,29 @@ NO_RENAME = "littlefs"
 """Without rename nothing can be replaced in one step: whoever mounts it inplace has chosen that."""
 
 
-async def replace(tree: Tree, path: bytes) -> None:
-    """What cp does to a file that exists."""
-    file = await tree.open(path, write=True, truncate=True)
+async def bring(file: OpenFile, at: int, data: bytes) -> None:
+    """Write, and close, which fails if the card does not get it."""
     try:
-        await file.write(0, NEW)
+        await file.write(at, data)
         await file.flush()
     finally:
         await file.release()
+
+
+async def replace(tree: Tree, path: bytes) -> None:
+    """What cp does to a file that exists."""
+    await bring(await tree.open(path, write=True, truncate=True), 0, NEW)
 
 
 async def create(tree: Tree, path: bytes) -> None:
     """What cp does to a new file; it never had another content than none or this."""
     await tree.unlink(path)
-    file = await tree.create(path, exclusive=True)
-    try:
-        await file.write(0, NEW)
-        await file.flush()
-    finally:
-        await file.release()
+    await bring(await tree.create(path, exclusive=True), 0, NEW)
 
 
 async def change(tree: Tree, path: bytes) -> None:
     """A few bytes in the middle."""
-    file = await tree.open(path, write=True)
-    try:
-        await file.write(200, NEW[:100])
-        await file.flush()
-    finally:
-        await file.release()
+    await bring(await tree.open(path, write=True), 200, NEW[:100])
 
 
 async def cut(tree: Tree, path: bytes) -> None:
