@@ -44,11 +44,13 @@ async def test_none_where_it_is_closed_sooner_or_no_times_are_told(profile: str,
     faults = Faults(card.world)
     async with mounted(card.world, card.folder) as (_, tree):
         listings(faults)
+        reader = await tree.open(card.path)
         file = await tree.open(card.path, write=True)
         await trio.sleep(HOUR if profile in UNTIMED else 1.0)
         await file.release()
         await trio.sleep(HOUR)
         assert listings(faults) == 0
+        await reader.release()
 
 
 @pytest.mark.parametrize("profile", TIMED)
