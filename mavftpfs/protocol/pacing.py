@@ -9,6 +9,11 @@ How often the server looks is not known, so the rate is raised while that helps:
 answers per second with those of the trial before. Where a raise brings next to nothing, the server or the
 link is the limit: if more was lost than before it was the queue, of which a fifth is then left to others.
 Random loss does not matter, because it takes the same share of both.
+
+The window holds what is on its way at that rate and hardly more, by the least round trip that was seen: what
+a raise leaves in a link's queue must not pass for the way. So where the way becomes longer, the link slower
+or the loss much larger, all begins again with as few requests as at first: no queue of ours falsifies what
+they tell.
 """
 
 from __future__ import annotations
@@ -29,6 +34,9 @@ _UNLIKELY = 1.5
 
 _ALARMING_LOSS = 0.2
 _SMOOTHING = 0.3
+_SHORT = 0.7
+"""Share of what should be answered below which the link is slower than it was, or the way longer."""
+
 _HOLD = 20.0
 _SHORT_HOLD = 2.0
 _STANDING = 1.3
@@ -80,7 +88,7 @@ class Pacer:
         self._raise = _BOLD
         self._best = 0.0  # answers per second of the last trial that was worth it
         self._base_loss = 0.0
-        self._seen = 0  # requests that taught it
+        self._seen = 0.0  # so many requests would tell it as well
         self._base_rtt = inf
         self._least_rtt = inf
         self._hold_until = -inf
@@ -137,7 +145,7 @@ class Pacer:
             self._since = now  # the first answer begins the measurement and is none of it
         else:
             self._answered += 1
-            if self._answered + self._lost >= self._enough() and now > self._since:
+            if self._answered >= self._enough() and now > self._since:
                 self._end_trial(now, self._since, next_order)
 
     def on_loss(self, order: int) -> None:
@@ -151,10 +159,17 @@ class Pacer:
         self.blocked = False
 
     def on_silence(self) -> None:
-        """Nothing was heard for a time-out: begin again."""
+        """Nothing was heard for a time-out."""
+        self._begin_again()
+
+    def _begin_again(self) -> None:
         self.rate, self.window, self.blocked = None, self.queue, False
         self._raise = _BOLD
         self._hold_until = -inf
+        # What was usual need not be so any more, and the few that are sent now find no queue of ours.
+        self._base_loss = self._seen = 0.0
+        self._base_rtt = self._least_rtt = inf
+        self._starved = True
 
     # --- trials
 
@@ -165,7 +180,7 @@ class Pacer:
         self._starved = self._limited = False
 
     def _enough(self) -> int:
-        """Return how many requests tell something: few of a doubling, many of a small raise."""
+        """Return how many answers tell something: few of a doubling, many of a small raise."""
         if self.rate is None:
             return 3 * self.queue
         return _FEW if self._raise == _BOLD else _MANY
@@ -173,7 +188,7 @@ class Pacer:
     def _end_trial(self, now: float, since: float, next_order: int) -> None:
         answers = self._answered / (now - since)
         loss = self._lost / (self._answered + self._lost)
-        self._base_rtt = min(self._least_rtt, 1.05 * self._base_rtt)
+        self._base_rtt = min(self._least_rtt, self._base_rtt)
         self._queued = self._least_rtt > _STANDING * self._base_rtt
         self._least_rtt = inf
         if self._base_rtt < inf:
@@ -210,17 +225,22 @@ class Pacer:
 
     def _learn(self, loss: float) -> None:
         """This is usual."""
-        self._base_loss += (loss - self._base_loss) * (_SMOOTHING if self._seen else 1.0)
-        self._seen = min(_MANY, self._seen + self._answered + self._lost)
+        new = _SMOOTHING if self._seen else 1.0
+        self._base_loss += (loss - self._base_loss) * new
+        before = (1.0 - new) ** 2 / self._seen if self._seen else 0.0
+        self._seen = 1.0 / (before + new**2 / (self._answered + self._lost))
 
     def _scatter(self, loss: float) -> float:
         """Return by how much the loss of a trial differs from the usual one by mere chance."""
         either = max(loss, self._base_loss)
         return sqrt(either * (1.0 - either) * (1.0 / (self._answered + self._lost) + 1.0 / self._seen))
 
+    def _is_overflow(self, loss: float) -> bool:
+        return loss - self._base_loss > _UNUSUAL_LOSS + _UNLIKELY * self._scatter(loss)
+
     def _settle(self, answers: float, loss: float, now: float) -> None:
         best = max(answers, self._best)
-        overflowed = loss - self._base_loss > _UNUSUAL_LOSS + _UNLIKELY * self._scatter(loss)
+        overflowed = self._is_overflow(loss)
         self.rate = best / (1.0 - self._base_loss) * (_SHY if overflowed else 1.0)
         self._doubted = False
         if overflowed or self._queued:
@@ -230,11 +250,16 @@ class Pacer:
             self._raise = _BOLD
 
     def _watch(self, answers: float, loss: float) -> None:
-        """While holding: somebody else may have come, or the server may have become slower."""
-        if self.rate is not None and loss > self._base_loss + _ALARMING_LOSS:
-            self.rate *= _SHY
-        else:
+        """While holding: somebody else may have come, the server or the link become slower, the way longer,
+        or all of it worse. Which of these, only those tell that are sent as at first."""
+        expected = (self.rate or 0.0) * (1.0 - loss)
+        if loss <= self._base_loss + _ALARMING_LOSS and answers >= _SHORT * expected:
+            self._doubted = False
             self._learn(loss)
+        elif not self._doubted:
+            self._doubted = True
+        else:
+            self._begin_again()
 
     def _widen(self, loss: float) -> None:
         if self.rate is not None:
