@@ -7,6 +7,8 @@ from typing import Generic, TypeVar
 
 import trio
 
+from mavftpfs.shared.errors import RequestTimeout
+
 K = TypeVar("K", bound=Hashable)
 T = TypeVar("T")
 
@@ -45,17 +47,21 @@ class Flights(Generic[K, T]):
     async def run(self, key: K, work: Callable[[], Awaitable[T]]) -> T:
         """Return what `work` returns, or what the work already under way for `key` returns.
 
+        Who came while it was under way did not wait as long: its time-out is not his, and he begins anew.
+
         Raises:
             Exception: what the work raised; all who share it get the same object.
         """
+        older = key in self._running
         while True:
             flight = self._running.get(key)
             if flight is None:
                 flight = await self._start(key, work)
             if not flight.landed.is_set():
                 await flight.landed.wait()
-            if not flight.abandoned:
+            if not flight.abandoned and not (older and isinstance(flight.error, RequestTimeout)):
                 return flight.outcome()
+            older = False
             await trio.lowlevel.checkpoint()
 
     async def _start(self, key: K, work: Callable[[], Awaitable[T]]) -> _Flight[T]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Awaitable, Callable
+
 import pytest
 import trio
 import trio.testing
@@ -196,13 +198,13 @@ async def test_an_expensive_listing_is_kept_longer(
 async def test_a_sweep_error_reaches_all_and_is_not_remembered(
     store: FakeStore, tree: Tree, autojump_clock: MockClock
 ) -> None:
-    store.fail["list", b"/"] = [RequestTimeout("silence")]
+    store.fail["list", b"/"] = [FtpNak(Opcode.LIST_DIRECTORY, NakCode.FAIL)]
     errors = []
 
     async def ask() -> None:
         try:
             await tree.list(b"/")
-        except RequestTimeout as error:
+        except FtpNak as error:
             errors.append(error)
 
     async with trio.open_nursery() as askers:
@@ -591,6 +593,45 @@ async def test_a_bug_in_shared_work_reaches_everyone_and_nothing_stays(autojump_
         askers.start_soon(ask)
     assert len(caught) == 2
     assert len(flights) == 0
+
+
+async def test_who_came_later_gets_no_time_out_of_who_was_there(autojump_clock: MockClock) -> None:
+    """He waited a moment, and the vehicle may be back."""
+    flights: Flights[str, int] = Flights()
+    begun: list[float] = []
+
+    async def work() -> int:
+        begun.append(trio.current_time())
+        await trio.sleep(30)
+        if len(begun) == 1:
+            raise RequestTimeout("silence")
+        return 1
+
+    async with trio.open_nursery() as nursery:
+        nursery.start_soon(times_out, flights, work)
+        await trio.sleep(29)
+        assert await flights.run("key", work) == 1
+    assert begun == [0, 30]
+
+
+async def test_who_came_later_hears_of_a_second_time_out(autojump_clock: MockClock) -> None:
+    flights: Flights[str, int] = Flights()
+
+    async def work() -> int:
+        await trio.sleep(30)
+        raise RequestTimeout("silence")
+
+    async with trio.open_nursery() as nursery:
+        nursery.start_soon(times_out, flights, work)
+        for pause in (1, 2):
+            await trio.sleep(pause)
+            nursery.start_soon(times_out, flights, work)
+    assert trio.current_time() == 60
+
+
+async def times_out(flights: Flights[str, int], work: Callable[[], Awaitable[int]]) -> None:
+    with pytest.raises(RequestTimeout):
+        await flights.run("key", work)
 
 
 async def test_keys_do_not_wait_for_each_other(autojump_clock: MockClock) -> None:
