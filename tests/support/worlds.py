@@ -20,9 +20,18 @@ from mavftpfs.sim.vehicle import SimVehicle
 
 GOOD_LINK = LinkSettings()
 DEFAULTS = ConnectOptions()
+EPOCH = 1_700_000_000.0
 
 ROOTS = {"px4-nuttx": b"/fs/microsd"}
 """Where a profile's files may be written; the root elsewhere."""
+
+
+def wall() -> float:
+    """Return the card's time of day: it goes on with the test's clock, so a write changes the mtime."""
+    try:
+        return EPOCH + trio.current_time()
+    except RuntimeError:  # it is made before the test's clock runs
+        return EPOCH
 
 
 @dataclass
@@ -33,7 +42,7 @@ class World:
     settings: LinkSettings = GOOD_LINK
     seed: int = 1
     telemetry: float = 0.0
-    tree: MemoryTree = field(default_factory=MemoryTree)
+    tree: MemoryTree = field(default_factory=lambda: MemoryTree(clock=wall))
 
     def __post_init__(self) -> None:
         rng = random.Random(self.seed)
