@@ -103,6 +103,13 @@ class SessionHolder:
         except MavftpfsError:
             return False
 
+    async def made_room(self, path: bytes) -> bool:
+        """Close another file that was only read; return whether there was one and it is closed."""
+        if self.session is None or self.session.writing or self.session.path == path:
+            return False
+        self.switches += 1
+        return await self.close_quietly()
+
     def require(self, session: OpenSession) -> None:
         """Raise SessionLost if this one is not believed in any more."""
         if self.session is not session:

@@ -63,10 +63,13 @@ class Reading:
         if self._transfer is not None:
             self._driver.cancel(self._transfer)
 
-    async def serve(self, stream: FileStream) -> None:
-        """Read for a stream. Its errors are told to the stream."""
+    async def serve(self, stream: FileStream) -> bool:
+        """Read for a stream. Its errors are told to the stream. False: only another file was closed for it,
+        and who came meanwhile may be next."""
         try:
             self._queue.require_link()
+            if await self._holder.made_room(stream.path):
+                return False
             if await self._ensure_open(stream):
                 await self._await_first_want(stream)
             if stream.has_demand or stream.has_ahead:
@@ -76,6 +79,7 @@ class Reading:
             self._on_session_lost(stream, error)
         except MavftpfsError as error:
             stream.fail(error)
+        return True
 
     async def _ensure_open(self, stream: FileStream) -> bool:
         """Have the stream's file open; return whether its opener was waiting for that."""

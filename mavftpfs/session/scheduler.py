@@ -282,8 +282,7 @@ class Scheduler:
                 elif isinstance(user, QueuedUpload):
                     await self._uploading.serve(user)
                     user.ticket = next(self._tickets)
-                else:
-                    await self._reading.serve(user)
+                elif await self._reading.serve(user):
                     user.ticket = None
                     self._take_ticket(user)
             except MavftpfsError:

@@ -122,10 +122,11 @@ async def test_nor_after_minutes_of_it(autojump: MockClock) -> None:
 async def test_a_copy_that_goes_on_leaves_room_for_who_comes_next(profile: str, autojump: MockClock) -> None:
     """A window for 300 ms is far more than PX4 on NuttX holds: sent at once, it drowned the next request.
 
-    The session may just be moving back to the copy, so they may have to wait for one answer more.
+    And the session went back to the copy although the next had come while the last one's file was closed: it
+    had to be closed and opened, as if nobody had waited.
     """
     far = LinkSettings(rate=100_000.0, delay=0.15, queue=50_000)
     copy = Copy(profile, far)
     async with copy.world.connection() as connection:
         waits = await copy.waits(connection, "read")
-    assert p95(waits) <= copy.allowed(3) + 2 * far.delay
+    assert p95(waits) <= copy.allowed(3)
