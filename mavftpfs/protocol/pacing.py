@@ -231,9 +231,8 @@ class Pacer:
         self._seen = 1.0 / (before + new**2 / (self._answered + self._lost))
 
     def _scatter(self, loss: float) -> float:
-        """Return by how much the loss of a trial differs from the usual one by mere chance."""
-        either = max(loss, self._base_loss)
-        return sqrt(either * (1.0 - either) * (1.0 / (self._answered + self._lost) + 1.0 / self._seen))
+        """Return by how much a trial's loss, the larger one, differs from the usual one by mere chance."""
+        return sqrt(loss * (1.0 - loss) * (1.0 / (self._answered + self._lost) + 1.0 / self._seen))
 
     def _is_overflow(self, loss: float) -> bool:
         return loss - self._base_loss > _UNUSUAL_LOSS + _UNLIKELY * self._scatter(loss)

@@ -168,3 +168,11 @@ def test_who_begins_again_knows_nothing_of_before() -> None:
     pacer._answered, pacer._lost = 9, 3
     pacer._learn(0.25)
     assert pacer._base_loss == 0.25
+
+
+def test_where_nothing_overflowed_the_next_raise_is_a_bold_one_and_soon() -> None:
+    pacer = holding()
+    pacer._raise = 1.25
+    pacer._settle(400.0, 0.0, 10.0)
+    pacer._judge(400.0, 0.0, 13.0)
+    assert pacer.rate == 800.0
