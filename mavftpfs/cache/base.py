@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Awaitable, Callable
+
 from mavftpfs.cache.context import Context
 from mavftpfs.cache.filehandle import FileHandle
 from mavftpfs.cache.nodes import Node
@@ -132,6 +134,23 @@ async def require_same(context: Context, node: Node, since: float) -> None:
     node.require_not_parted()
     if node.base is not None:
         node.base.require_not_lost()
+
+
+async def require_stays(context: Context, node: Node, ask: Callable[[bytes], Awaitable[int]]) -> int:
+    """Return the size on the vehicle of a file of which a part is to stay, as `ask` tells it; the caller has
+    the lock.
+
+    Raises:
+        FileChanged: it grew or shrank, or is another one. Else as `ask` and require_same.
+    """
+    draft, since = node.draft, context.clock()
+    assert draft is not None
+    with node.looking():
+        size, most = await ask(node.path), draft.remote_end
+    await require_same(context, node, since)
+    if most is not None and not draft.base_limit <= size <= max(most, draft.stretched):
+        raise FileChanged(f"{node.path!r} has {size} bytes now, {most} when it was changed here")
+    return size
 
 
 def outdate(context: Context, node: Node) -> None:

@@ -21,6 +21,7 @@ from mavftpfs.cache.nodes import Attempt, Node
 from mavftpfs.cache.plan import SENDING, Plan, Rules, choose
 from mavftpfs.cache.probes import Prober
 from mavftpfs.cache.recovery import describe
+from mavftpfs.cache.remote import FREE_FOR
 from mavftpfs.cache.replacing import Present, Replacer
 from mavftpfs.cache.sure import Sure, may_have_made
 from mavftpfs.cache.throttle import Throttle
@@ -224,7 +225,7 @@ class Deliverer:
 
     async def _cut_first(self, node: Node, draft: Draft) -> None:
         """Cut a file of which a part is to be changed, too."""
-        await self._require_base(node, draft)
+        await base.require_stays(self._context, node, self.verifier.size)
         await self._cut(node, draft.size)
         draft.remote_cut(draft.size)
 
@@ -264,6 +265,8 @@ class Deliverer:
                 raise FileChanged(f"{node.path!r} was emptied on the vehicle while it was changed here")
             ended_at = self._context.clock()
             told = await self.verifier.check_sent(attempt.path, draft, attempt.upload)
+        if attempt.places is not None and not attempt.committing:
+            await self._require_old(node, draft, attempt)
         async with node.firmly():
             if not attempt.committing:
                 attempt.ended = True
@@ -281,9 +284,9 @@ class Deliverer:
         if attempt is not None and attempt.fits(plan, draft):
             return attempt
         await self.abandon(node)
-        least = 0
+        least, begun_at = 0, self._context.clock()
         if not draft.fresh and not draft.ruined:
-            least = await self._require_base(node, draft)
+            least = await base.require_stays(self._context, node, self.verifier.size)
         path, places = node.path, None
         if plan is Plan.REPLACE:
             places = self._context.namer.places(node.path)
@@ -312,26 +315,22 @@ class Deliverer:
             if places is not None:
                 self.replacer.release(places)
             raise
-        node.attempt = Attempt(plan, path, sending, upload, places)
+        node.attempt = Attempt(plan, path, sending, upload, places, begun_at=begun_at)
         return node.attempt
 
     def _free_at(self, path: bytes, draft: Draft) -> float | None:
         """Return when a listing last showed the name of a new file to be free, None if it need not be."""
         return None if draft.on_vehicle else self._context.dentries.free_at(path)
 
-    async def _require_base(self, node: Node, draft: Draft) -> int:
-        """Return the size on the vehicle of a file of which a part is to stay.
+    async def _require_old(self, node: Node, draft: Draft, attempt: Attempt) -> None:
+        """Check that what a part was changed of did not become another file while all of it was sent.
 
         Raises:
-            FileChanged: it grew or shrank, or is another one.
+            As base.require_stays.
         """
-        since = self._context.clock()
-        with node.looking():
-            size, most = await self.verifier.size(node.path), draft.remote_end
-        await base.require_same(self._context, node, since)
-        if most is not None and not draft.base_limit <= size <= max(most, draft.stretched):
-            raise FileChanged(f"{node.path!r} has {size} bytes now, {most} when it was changed here")
-        return size
+        lasted = self._context.clock() - attempt.begun_at
+        if lasted > FREE_FOR and not draft.fresh and not draft.ruined:
+            await base.require_stays(self._context, node, self.verifier.size)
 
     async def _finish(self, attempt: Attempt) -> None:
         attempt.sending.growing = False

@@ -27,7 +27,8 @@ class Attempt:
     """One try to deliver a draft.
 
     path: where its bytes go. places: the reserved names, for a replacement. ended: verified, and the upload
-    is over, or nobody waits for that. committing: the renames may have begun, too.
+    is over, or nobody waits for that. committing: the renames may have begun, too. begun_at: when that was
+    known of which a part is to stay.
     """
 
     plan: Plan
@@ -37,6 +38,7 @@ class Attempt:
     places: Places | None = None
     ended: bool = False
     committing: bool = False
+    begun_at: float = float("-inf")
 
     def fits(self, plan: Plan, draft: Draft) -> bool:
         """Return whether going on ends with the draft's content on the vehicle, by that plan."""

@@ -9,9 +9,12 @@ import pytest
 import trio
 from trio.testing import MockClock
 
+from mavftpfs.cache.asides import is_reserved
+from mavftpfs.protocol.payload import Opcode
 from mavftpfs.shared.errors import FileChanged
 from tests.sim.test_replaced import STEP
 from tests.sim.test_replaced_between import IDLE, NEW, OLD, TIMED, Card
+from tests.support.faults import Faults
 from tests.support.mounting import mounted
 
 MID = b"mid"
@@ -228,6 +231,27 @@ async def test_what_was_read_from_the_cache_decides_nothing_about_a_successor(
             with pytest.raises(FileChanged):
                 await writer.fsync()
         assert card.world.tree.data(card.path) == CHANGED
+        writer.give_up()
+
+
+@pytest.mark.parametrize("successor", [CHANGED, OLD + b"more"], ids=["as long", "grown"])
+@pytest.mark.parametrize("many", [False, True], ids=["few names", "many names"])
+async def test_one_that_comes_while_the_whole_file_is_sent_is_not_replaced(
+    many: bool, successor: bytes, autojump: MockClock
+) -> None:
+    """The server truncates what it opens, so a part that is changed means to send all of it."""
+    card = Card("mavsdk", others=many)
+    faults = Faults(card.world)
+    async with mounted(card.world, card.folder) as (_, tree):
+        writer = await tree.open(card.path, write=True)
+        assert bytes(await writer.read(0, len(OLD))) == OLD
+        await writer.write(100, MID)
+        await trio.sleep(IDLE)
+        faults.at(Opcode.WRITE_FILE, lambda: faults.after(500, lambda: card.replace(successor)))
+        with pytest.raises(FileChanged):
+            await writer.fsync()
+        assert card.world.tree.data(card.path) == successor
+        assert not [entry for entry in card.world.tree.entries(card.folder) if is_reserved(entry.name)]
         writer.give_up()
 
 
