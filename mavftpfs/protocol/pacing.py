@@ -65,8 +65,8 @@ class Pacer:
         "_least_rtt",
         "_limit",
         "_limited",
+        "_longer",
         "_lost",
-        "_queued",
         "_raise",
         "_seen",
         "_since",
@@ -93,7 +93,7 @@ class Pacer:
         self._least_rtt = inf
         self._hold_until = -inf
         self._doubted = False
-        self._queued = False
+        self._longer = 1.0  # the quickest of the last trial took so many least round trips
         self._tokens = 0.0
         self._tokens_at = 0.0
         self._from = 0  # the trial: of transmissions from here on, timed from the first answer
@@ -189,7 +189,7 @@ class Pacer:
         answers = self._answered / (now - since)
         loss = self._lost / (self._answered + self._lost)
         self._base_rtt = min(self._least_rtt, self._base_rtt)
-        self._queued = self._least_rtt > _STANDING * self._base_rtt
+        self._longer = self._least_rtt / self._base_rtt if self._base_rtt > 0.0 else 1.0
         self._least_rtt = inf
         if self._base_rtt < inf:
             self._judge(answers, loss, now)
@@ -203,6 +203,8 @@ class Pacer:
             self.rate = answers / (1.0 - loss) * self._raise
         elif now < self._hold_until:
             self._watch(answers, loss)
+        elif self._hold_until > -inf and self._longer > self.queue + 2:
+            self._begin_again()  # before the slowest link so few make no such queue: the way is longer
         elif self._hold_until > -inf:
             self._hold_until = -inf  # the last trial of a hold is what the next raise is compared with
             self._accept(answers, loss)
@@ -242,7 +244,7 @@ class Pacer:
         overflowed = self._is_overflow(loss)
         self.rate = best / (1.0 - self._base_loss) * (_SHY if overflowed else 1.0)
         self._doubted = False
-        if overflowed or self._queued:
+        if overflowed or self._longer > _STANDING:
             self._hold_until = now + _HOLD
         else:  # no reason is seen why it should not be faster: chance may have spoken
             self._hold_until = now + _SHORT_HOLD

@@ -176,3 +176,12 @@ def test_where_nothing_overflowed_the_next_raise_is_a_bold_one_and_soon() -> Non
     pacer._settle(400.0, 0.0, 10.0)
     pacer._judge(400.0, 0.0, 13.0)
     assert pacer.rate == 800.0
+
+
+def test_a_way_that_became_longer_during_a_raise_is_not_too_short_for_good() -> None:
+    """Then the few that the window let through were all that was expected: 6 a second from then on."""
+    server = Server(base=0.6)
+    server.run(30.0)
+    server.pacer._base_rtt, server.pacer._best, server.pacer.rate = 0.02, 6.0, 6.0
+    server.run(80.0)
+    assert server.run(20.0) > 0.4 * QUEUED
