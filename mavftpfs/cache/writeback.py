@@ -165,7 +165,8 @@ class Writeback:
                 if node.draft is None:
                     self._new_draft(node, size)
                     if base is not None:
-                        node.known_at, node.mtime = context.clock(), base.mtime
+                        node.known_at = context.clock()
+                        node.mtime = base.mtime if base.comparable else None
                     node.base, base = base, node.base
             finally:
                 if base is not None:

@@ -255,6 +255,25 @@ async def test_one_that_comes_while_the_whole_file_is_sent_is_not_replaced(
         writer.give_up()
 
 
+@pytest.mark.parametrize("profile", [name for name in TIMED if name != "mavsdk"])
+async def test_what_was_replaced_after_it_was_listed_is_changed(profile: str, autojump: MockClock) -> None:
+    """It is opened without asking, since somebody has it open, who read nothing; nor is the rest read."""
+    card = Card(profile)
+    async with mounted(card.world, card.folder) as (_, tree):
+        await trio.sleep(19.0)
+        reader = await tree.open(card.path)
+        await trio.sleep(2.0)
+        await tree.list(card.folder)  # it is as it was
+        card.replace()
+        writer = await tree.open(card.path, write=True)
+        await writer.write(100, MID)
+        await writer.release()
+        assert card.world.tree.data(card.path) == CHANGED[:100] + MID + CHANGED[103:]
+        await tree.truncate(card.path, 1000)
+        assert card.world.tree.data(card.path) == (CHANGED[:100] + MID + CHANGED[103:])[:1000]
+        await reader.release()
+
+
 @pytest.mark.parametrize("many", [False, True], ids=["few names", "many names"])
 @pytest.mark.parametrize("profile", TIMED)
 async def test_what_was_replaced_before_it_was_opened_is_changed(
