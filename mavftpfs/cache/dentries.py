@@ -243,6 +243,7 @@ class Dentries:
         if entry is None:
             self.forget(new)
             self._absent.pop(new, None)
+            self.note_unsized(new)  # it is not what is remembered
             self._doubt(split(new)[0])
         else:
             self.note_created(new, replace(entry, name=split(new)[1]))

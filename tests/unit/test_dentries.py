@@ -326,6 +326,14 @@ def test_a_doubtful_rename_during_a_listing_spoils_it() -> None:
     assert not dentries.finish(sweep, Listing((), 0), 1).complete
 
 
+def test_what_an_unknown_file_took_the_place_of_is_not_taken_for_it() -> None:
+    dentries = make()
+    put(dentries, b"/d", file(b"a", 7, 70))
+    dentries.note_renamed(b"/unknown", b"/d/a")
+    assert dentries.listed_since(b"/d/a", 0.0) == file(b"a", None, None)
+    assert dentries.fresh(b"/d", 0.0) is None
+
+
 def test_changes_elsewhere_or_before_do_not_matter() -> None:
     dentries = make()
     dentries.note_created(b"/a", file(b"a"))
