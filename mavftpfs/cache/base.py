@@ -52,8 +52,7 @@ async def _open_below(context: Context, node: Node) -> FileHandle:
     handle = await open_node(context, node)
     try:
         if node.mtime is not None:
-            await context.directories.recent(split(node.path)[0], began=context.clock())
-            _require_as_known(context, node)
+            await _require_as_listed(context, node, context.clock())
     except BaseException:
         handle.close()
         raise
@@ -64,10 +63,24 @@ def _changed_by_us(node: Node) -> bool:
     return node.draft is None or node.draft.touched or node.draft.placed
 
 
-def _require_as_known(context: Context, node: Node) -> None:
-    """Raise FileChanged if the last listing shows that others replaced what was opened or written here."""
+async def _require_as_listed(context: Context, node: Node, since: float) -> None:
+    """Raise FileChanged if a listing that began at `since` or later shows that others replaced what was
+    opened or written here; asks for one if there is none.
+
+    Raises:
+        As Directories.recent.
+    """
+    path = node.path
+    parent, name = split(path)
+    directory = await context.directories.recent(parent, began=since)
+    if node.path == path and directory.listed_at >= node.known_at:  # it may not be the one that is kept
+        _require_as_known(node, directory.entries.get(name))
+    _require_as_known(node, context.dentries.listed_since(node.path, node.known_at))
+
+
+def _require_as_known(node: Node, entry: DirEntry | None) -> None:
+    """Raise FileChanged if a listing shows that others replaced what was opened or written here."""
     node.require_not_parted()
-    entry = context.dentries.listed_since(node.path, node.known_at)
     if entry is not None and not _changed_by_us(node) and _is_another(node, entry):
         raise FileChanged(f"{node.path!r} became another file after it was opened or written here")
 
@@ -127,8 +140,9 @@ async def require_same(context: Context, node: Node, since: float) -> None:
     if not _changed_by_us(node):
         with node.looking():
             if node.mtime is not None or (node.base is not None and node.base.comparable):
-                await context.directories.recent(split(node.path)[0], began=since)
-            _require_as_known(context, node)
+                await _require_as_listed(context, node, since)
+            else:
+                _require_as_known(node, context.dentries.listed_since(node.path, node.known_at))
             if node.base is not None:
                 await node.base.require_same()
     node.require_not_parted()

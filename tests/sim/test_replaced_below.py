@@ -156,6 +156,28 @@ async def test_what_only_writes_puts_no_part_into_a_successor(
         writer.give_up()
 
 
+@pytest.mark.parametrize("profile", TIMED)
+async def test_a_listing_that_is_not_kept_tells_as_much(profile: str, autojump: MockClock) -> None:
+    """Other deliveries in that directory ask for newer ones while it is under way."""
+    card = Card(profile, others=True)
+    faults = Faults(card.world)
+    async with mounted(card.world, card.folder) as (_, tree):
+
+        def others_ask() -> None:
+            tree._dentries.expire(card.folder, trio.current_time())
+            faults.at(Opcode.LIST_DIRECTORY_WITH_TIME, others_ask)
+
+        writer = await tree.open(card.path, write=True)
+        await trio.sleep(IDLE)
+        card.replace()
+        await writer.write(100, MID)
+        others_ask()
+        with pytest.raises(FileChanged):
+            await writer.fsync()
+        assert card.world.tree.data(card.path) == CHANGED
+        writer.give_up()
+
+
 @pytest.mark.parametrize("many", [False, True], ids=["few names", "many names"])
 @pytest.mark.parametrize("profile", TIMED)
 async def test_what_waits_here_does_not_go_into_a_successor(
