@@ -4,6 +4,9 @@ Uploads begin while the program still writes; one that cannot begin is tried aga
 link is back. What a close could not deliver is tried again, too, ever more seldom, until the vehicle has it
 or refuses it: a link that fails and returns between two looks at its heartbeats is no news to anybody. Nor is
 room on a card that was full: it is asked again after minutes, and then hours.
+
+What was sent in place, or of a new file, is delivered when its program writes nothing more for a while: by
+the next write its name may be another file's, which is only seen of what was delivered (`base.require_same`).
 """
 
 from __future__ import annotations
@@ -18,8 +21,9 @@ import trio
 
 from mavftpfs.cache.context import Context
 from mavftpfs.cache.delivery import PASSING, Deliverer
-from mavftpfs.cache.nodes import Node
+from mavftpfs.cache.nodes import Attempt, Node
 from mavftpfs.cache.plan import Plan
+from mavftpfs.cache.sending import FULL
 from mavftpfs.cache.throttle import Throttle
 from mavftpfs.shared.errnos import errno_for
 from mavftpfs.shared.errors import MavftpfsError
@@ -34,6 +38,9 @@ START_PAUSE = 5.0
 
 FIRST_PAUSE, LONGEST_PAUSE = 2.0, 30.0
 """Seconds between two attempts to deliver what nobody has open."""
+
+REST = 2.0
+"""Seconds without a write after which what was sent of a file that stays open is delivered."""
 
 ROOM_PAUSES = (120.0, 3600.0)
 """The same for what the card had no room for: most of a file may travel before that shows again."""
@@ -130,6 +137,7 @@ class Background:
                         await self._deliverer.abandon(node)
                     else:
                         self.kick(node)
+                        self._watch(node)
         except MavftpfsError as error:
             node.start_after = self._context.clock() + START_PAUSE
             log.info("%r is not sent just now: %s", node.path, error)
@@ -137,6 +145,45 @@ class Background:
             node.starting = False
             self._throttle.let_go()
         self._context.nodes.maybe_forget(node)
+
+    def _watch(self, node: Node) -> None:
+        """An upload began: see that it does not go on after a rest, if that may be in another file."""
+        attempt, nursery = node.attempt, self._context.nursery
+        if attempt is None or nursery is None or not self._context.directories.tells_times:
+            return
+        goes_on = self._context.writer.traits.wo_truncates is False
+        if attempt.plan is Plan.IN_PLACE or (attempt.plan is Plan.NEW and goes_on):
+            nursery.start_soon(self._rest, node, attempt)
+
+    async def _rest(self, node: Node, attempt: Attempt) -> None:
+        while node.attempt is attempt and node.writers:
+            if (rest := node.written_at + REST - self._context.clock()) > 0.0:
+                await trio.sleep(rest)
+            else:
+                if attempt.sending.unacked < FULL:
+                    await self._deliver_resting(node, attempt)
+                await trio.sleep(REST)
+
+    async def _deliver_resting(self, node: Node, attempt: Attempt) -> None:
+        """Deliver a file unless its program goes on, which does not wait for that, or did so meanwhile."""
+        with trio.CancelScope() as scope:
+            node.resting = scope
+            try:
+                async with node.lock:
+                    if not node.doomed and node.attempt is attempt and self._goes_on(node, attempt):
+                        await self._deliverer.deliver_locked(node)
+            except MavftpfsError as error:
+                log.debug("%r is not delivered while its program rests: %s", node.path, error)
+            finally:
+                node.resting = None
+
+    def _goes_on(self, node: Node, attempt: Attempt) -> bool:
+        """Return whether an attempt is still the way of a file: one that was emptied stays so here."""
+        if node.draft is None or not node.undelivered:
+            return False
+        with suppress(MavftpfsError):
+            return attempt.fits(self._deliverer.plan(node), node.draft)
+        return False
 
     async def _call_off(self, node: Node) -> None:
         async with node.lock:

@@ -69,7 +69,8 @@ class Node:
     goes on.
     looked_at: who has the lock changes nothing on the vehicle just now. parted: its name is another file's.
     mtime: what a listing since then told, None before there is one. dating: somebody sees to that.
-    may_be_cut: we may have cut it since then.
+    may_be_cut: we may have cut it since then. written_at: when a program changed it last. resting: delivers
+    what was sent so far while no program writes; who writes cancels it.
     """
 
     path: bytes
@@ -96,6 +97,8 @@ class Node:
     mtime: int | None = None
     dating: bool = False
     may_be_cut: bool = False
+    written_at: float = float("-inf")
+    resting: trio.CancelScope | None = None
     _delivery: trio.CancelScope | None = None
     _firm: int = 0
 

@@ -239,7 +239,7 @@ class Writeback:
         self._context.nodes.maybe_forget(node)
 
     def _on_written(self, node: Node) -> None:
-        node.copied = False
+        node.copied, node.written_at = False, self._context.clock()
         if not node.removed:
             self.overlay.on_written(node.path)
             self._background.kick(node)
