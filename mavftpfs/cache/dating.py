@@ -3,7 +3,8 @@
 A program that only writes reads nothing by which a successor of its file could be told. So where listings
 tell mtimes, and a file was opened or delivered a while ago, one listing is asked for: what the file has then
 is what it has to have when a part of it is changed (`base.require_same`). Files that are closed sooner, as
-most are, cost nothing more.
+most are, cost nothing more. One that is delivered again and again has its directory listed for this at most
+every 50 times what that takes (`dentries.COST_FACTOR`), which matters where that is long: on a radio.
 """
 
 from __future__ import annotations
@@ -13,8 +14,9 @@ import logging
 import trio
 
 from mavftpfs.cache.context import Context
+from mavftpfs.cache.dentries import COST_FACTOR
 from mavftpfs.cache.nodes import Node
-from mavftpfs.shared.errors import MavftpfsError
+from mavftpfs.shared.errors import LinkError, MavftpfsError, RequestTimeout, SessionBusy
 from mavftpfs.shared.model import DirEntry, split
 
 log = logging.getLogger("mavftpfs.cache")
@@ -30,6 +32,7 @@ class Dater:
 
     def __init__(self, context: Context) -> None:
         self._context = context
+        self._not_before: dict[Node, float] = {}
 
     def on_known(self, node: Node, entry: DirEntry | None) -> None:
         """The vehicle is known to have a file as it is; entry: what a listing since then shows of it."""
@@ -56,7 +59,8 @@ class Dater:
         try:
             while self._is_wanted(node):
                 known_at = node.known_at
-                await trio.sleep(max(pause, known_at + DATE_AFTER - context.clock()))
+                begin = max(known_at + DATE_AFTER, self._not_before.get(node, known_at))
+                await trio.sleep(max(pause, begin - context.clock()))
                 pause = 0.0
                 if not self._is_wanted(node) or node.known_at != known_at:
                     continue
@@ -68,12 +72,18 @@ class Dater:
             node.dating = False
 
     async def _ask(self, node: Node) -> bool:
-        """Return whether a listing showed the file as it was last known; Context.on_listed heeds it."""
-        known_at = node.known_at
+        """Return whether no more is to be asked: a listing showed the file as it was last known, which
+        Context.on_listed heeds, or there is none."""
+        known_at, now = node.known_at, self._context.clock()
         try:
-            await self._context.directories.recent(split(node.path)[0], began=self._context.clock())
-        except MavftpfsError as error:
-            log.debug("when %r was changed last is not known: %s", node.path, error)
+            directory = await self._context.directories.recent(split(node.path)[0], began=now)
+        except (RequestTimeout, LinkError, SessionBusy) as error:
+            log.debug("when %r was changed last is not known yet: %s", node.path, error)
             await trio.sleep(RETRY_PAUSE)
             return False
+        except MavftpfsError as error:
+            log.debug("when %r was changed last is not known: %s", node.path, error)
+            return True
+        self._not_before = {other: at for other, at in self._not_before.items() if at > now}
+        self._not_before[node] = now + COST_FACTOR * (directory.ended_at - directory.listed_at)
         return node.known_at == known_at and not self._context.is_changing(node.path)

@@ -6,14 +6,18 @@ import pytest
 import trio
 from trio.testing import MockClock
 
+from mavftpfs.cache.dentries import COST_FACTOR
 from mavftpfs.protocol.payload import Opcode
 from mavftpfs.shared.errors import FileChanged
+from mavftpfs.shared.model import split
+from mavftpfs.sim.linkmodel import Duplex, LinkSettings
 from tests.sim.test_replaced_between import TIMED, UNTIMED, Card
 from tests.support.faults import Faults
 from tests.support.mounting import mounted
 
 LISTINGS = (Opcode.LIST_DIRECTORY, Opcode.LIST_DIRECTORY_WITH_TIME)
 HOUR = 3600.0
+RADIO = LinkSettings(rate=5760.0, delay=0.05, duplex=Duplex.HALF)
 
 
 def listings(faults: Faults) -> int:
@@ -88,3 +92,39 @@ async def test_a_listing_asked_for_by_others_is_enough(profile: str, autojump: M
         await again.release()
         assert card.world.tree.data(card.path)[100:103] == b"mid"
         file.give_up()
+
+
+@pytest.mark.parametrize("profile", TIMED)
+async def test_who_delivers_again_and_again_over_a_radio(profile: str, autojump: MockClock) -> None:
+    """A listing that takes long is asked for the more seldom: twice in 50 times as long, or so."""
+    card = Card(profile, others=True, link=RADIO)
+    card.world.tree.add(card.path, bytes(1000))
+    faults = Faults(card.world)
+    async with mounted(card.world, card.folder) as (_, tree):
+        listed = tree._dentries.known(card.folder)
+        assert listed is not None
+        whole, took = listings(faults), listed.ended_at - listed.listed_at
+        file = await tree.open(card.path, write=True)
+        while trio.current_time() < HOUR:
+            await file.write(0, b"mid")
+            await file.fsync()
+            await trio.sleep(4.0)
+        assert listings(faults) < 3 * whole * HOUR / (COST_FACTOR * took)
+        await file.release()
+
+
+@pytest.mark.parametrize("profile", TIMED)
+async def test_a_directory_that_is_gone_is_not_asked_for_again(profile: str, autojump: MockClock) -> None:
+    card = Card(profile)
+    path = card.folder.rstrip(b"/") + b"/d/file"
+    card.world.tree.add(path, bytes(1000))
+    faults = Faults(card.world)
+    async with mounted(card.world, card.folder) as (_, tree):
+        file = await tree.open(path, write=True)
+        card.world.tree.remove(path)
+        card.world.tree.rmdir(split(path)[0])
+        await trio.sleep(60.0)
+        listings(faults)
+        await trio.sleep(HOUR)
+        assert listings(faults) == 0
+        await file.release()

@@ -33,8 +33,8 @@ UNTIMED = ["px4", "mavsdk-old"]
 class Card:
     """One vehicle with one file, and with `others` beside it, so that a listing takes several requests."""
 
-    def __init__(self, profile: str, *, others: bool = False) -> None:
-        self.world = World(profile, LINK)
+    def __init__(self, profile: str, *, others: bool = False, link: LinkSettings = LINK) -> None:
+        self.world = World(profile, link)
         self.folder = ROOTS.get(profile, b"") or b"/"
         self.path = ROOTS.get(profile, b"") + b"/big"
         self.world.tree.add(self.path, OLD, THEN)
