@@ -56,7 +56,7 @@ _TELLING_SILENCE = 3
 class Flow:
     """The in-flight window, in requests. serial: small receive buffers are likely, so start at 1 and
     find out by `survival` what they hold. limit: the most that may ever be in flight, None for the
-    default. budget: the user's. alone: no other client of the server was heard lately."""
+    default; cap: that may be now. budget: the user's. alone: no other client was heard lately."""
 
     __slots__ = (
         "_app_limited",
@@ -65,7 +65,6 @@ class Flow:
         "_best_rate",
         "_brake",
         "_bridging",
-        "_cap",
         "_collapsed",
         "_easing",
         "_flights",
@@ -88,6 +87,7 @@ class Flow:
         "_trains",
         "alone",
         "budget",
+        "cap",
         "loss",
         "window",
     )
@@ -96,11 +96,11 @@ class Flow:
         self, *, serial: bool = False, limit: int | None = None, budget: Budget | None = None
     ) -> None:
         self.budget = budget
-        self.alone = False
+        self.alone = self._bridging = self._hurried = self._app_limited = False
         self._limit = max(1, limit or (SERIAL_CAP if serial else DEFAULT_CAP))
         self._survival = Survival(self._limit) if serial else None
-        self._cap = self._limit
-        self.window = min(1 if serial else FIRST, self._cap)
+        self.cap = self._limit
+        self.window = min(1 if serial else FIRST, self.cap)
         self.loss = 0.0
         self._starting = not serial
         self._rates: deque[float] = deque(maxlen=_ROUNDS_REMEMBERED)
@@ -111,34 +111,25 @@ class Flow:
         self._trains = Trains()
         self._pacer: Pacer | None = None
         self._stalls = Stalls()
-        self._bridging = False
         self._heard_at = -inf
-        self._hurried = False
         self._brake = 1.0
         self._plateau = self._collapsed = 0
         self._round_end = -1
         self._round_start = 0.0
         self._round_least = inf
-        self._replies = self._losses = 0
-        self._goal = 0
+        self._replies = self._losses = self._goal = 0
         self._flights = Flights()
         self._overflow = Overflow()
-        self._app_limited = False
-
-    @property
-    def cap(self) -> int:
-        """The most requests that may ever be in flight."""
-        return self._cap
 
     def set_queue_limit(self, limit: int | None) -> None:
         """Never have more in flight than the server queues; None if it is not known to be limited."""
-        self._cap = self._limit if limit is None else max(1, min(limit, self._limit))
-        self.window = min(self.window, self._cap)
-        self._goal = min(self._goal, self._cap)
-        if limit is None or self._cap == self._limit:
+        self.cap = self._limit if limit is None else max(1, min(limit, self._limit))
+        self.window = min(self.window, self.cap)
+        self._goal = min(self._goal, self.cap)
+        if limit is None or self.cap == self._limit:
             self._pacer = None
-        elif self._pacer is None or self._pacer.queue != self._cap:
-            self._pacer = Pacer(self._cap, self._limit)
+        elif self._pacer is None or self._pacer.queue != self.cap:
+            self._pacer = Pacer(self.cap, self._limit)
 
     def begin(self) -> None:
         """It is looked at anew who has something to send: `room` follows for each."""
@@ -170,17 +161,14 @@ class Flow:
         return self.budget is not None and self.budget.held
 
     def _room(self, in_flight: int, now: float, paced: bool) -> int:
-        room = self.window - in_flight + self._reserve(now, paced) + self._spare()
+        room = self.window - in_flight + self._reserve(now, paced)
         if self._pacer is None:
             return min(room, self._trains.room(now)) if room > 0 else room
+        room += self.alone and not self._hurried  # one more fits a short queue of our own (servers.md 3)
         self._pacer.blocked = False
         # How evenly others send is not ours to say: beside them the queue is all there is.
         beyond = paced and room <= 0 and self.alone
         return self._pacer.room(in_flight, now) if beyond else room
-
-    def _spare(self) -> int:
-        """Return how many more a short queue takes that is not shared with anybody (servers.md 3)."""
-        return int(self.alone and not self._hurried and self._pacer is not None)
 
     def _reserve(self, now: float, paced: bool) -> int:
         """Return how many more bridge the pauses of a server; none where its buffers are small, or while
@@ -198,7 +186,7 @@ class Flow:
         cannot bridge: hundreds of them would only overflow the sockets at both ends."""
         if self._best_rate > _FASTEST_LINK:
             return 0
-        return max(0, min(int(reserve), _MOST_RESERVE, self._cap - self.window))
+        return max(0, min(int(reserve), _MOST_RESERVE, self.cap - self.window))
 
     def next_room_at(self) -> float:
         """Return when there will be room without an answer; inf if that does not depend on time."""
@@ -234,7 +222,7 @@ class Flow:
         if self._pacer is not None:
             self._pacer.on_reply(now, rtt, order, next_order)
         if self._collapsed:
-            self.window, self._collapsed = min(self._cap, self._collapsed), 0
+            self.window, self._collapsed = min(self.cap, self._collapsed), 0
         if order >= self._round_end:
             self._end_round(now, order, next_order)
         elif self._starting and order >= self._flights.due:
@@ -297,7 +285,7 @@ class Flow:
         leap = flights.end(order, now - self._round_start, self._base_rtt)
         if flights.measured:
             self._trains.learn(flights.rate)
-            self._goal = int(min(self._cap, leap * self.window, self._filling(flights.rate)))
+            self._goal = int(min(self.cap, leap * self.window, self._filling(flights.rate)))
             self.window = max(self.window, self._goal)
 
     def _end_round(self, now: float, order: int, next_order: int) -> None:
@@ -331,7 +319,7 @@ class Flow:
             window = self._survival.end_round(
                 self._replies, self._losses, took, now, queued=self._queued(2.0)
             )
-            self.window = min(self._cap, window)
+            self.window = min(self.cap, window)
         elif self._starting and overflowed:
             self._starting = False
             self._goal = 0
@@ -368,14 +356,14 @@ class Flow:
     def _leaves_start(self, grown: bool) -> bool:
         few = self._replies + self._losses < _TELLING_ROUND and self.window + 1 < self._held(inf)
         self._plateau = 0 if grown or few else self._plateau + 1
-        if self._plateau >= _PLATEAU_ROUNDS or self.window >= self._cap or self._queued(1.25):
+        if self._plateau >= _PLATEAU_ROUNDS or self.window >= self.cap or self._queued(1.25):
             self._starting = False
         return not self._starting
 
     def _next_goal(self) -> int:
         if not self._trains.proven or self._flights.rate < self._trains.rate / 2:  # it was that of a bunch
-            return min(self._cap, self.window * 2)
-        return int(min(self._cap, self.window * _LEAP, self._held(inf)))
+            return min(self.cap, self.window * 2)
+        return int(min(self.cap, self.window * _LEAP, self._held(inf)))
 
     def _held(self, rate: float) -> float:
         """Return how many requests fill the path, with some to find out whether it holds more.
@@ -397,4 +385,4 @@ class Flow:
 
     def _approach(self, target: float) -> None:
         # So few are no load, and fewer find losses slowly.
-        self.window = min(self._cap, max(INITIAL, round(target)))
+        self.window = min(self.cap, max(INITIAL, round(target)))
