@@ -213,6 +213,7 @@ class Node:
             self.content.close()
         self.draft = self.content = self.attempt = self.error = None
         self.background, self.copied = True, False
+        self.known_at, self.mtime, self.may_be_cut = float("-inf"), None, False
 
 
 class Nodes:

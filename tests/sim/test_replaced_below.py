@@ -13,7 +13,7 @@ from mavftpfs.cache.asides import is_reserved
 from mavftpfs.protocol.payload import Opcode
 from mavftpfs.shared.errors import FileChanged
 from tests.sim.test_replaced import STEP
-from tests.sim.test_replaced_between import IDLE, NEW, OLD, TIMED, Card
+from tests.sim.test_replaced_between import IDLE, NEW, OLD, THEN, TIMED, Card
 from tests.support.faults import Faults
 from tests.support.mounting import mounted
 
@@ -293,6 +293,29 @@ async def test_what_was_replaced_after_it_was_listed_is_changed(profile: str, au
         assert card.world.tree.data(card.path) == CHANGED[:100] + MID + CHANGED[103:]
         await tree.truncate(card.path, 1000)
         assert card.world.tree.data(card.path) == (CHANGED[:100] + MID + CHANGED[103:])[:1000]
+        await reader.release()
+
+
+@pytest.mark.parametrize("profile", TIMED)
+async def test_what_was_known_of_a_file_before_is_not_of_the_next(profile: str, autojump: MockClock) -> None:
+    """Who has the old one open to read keeps what is remembered of its name."""
+    card = Card(profile)
+    async with mounted(card.world, card.folder) as (_, tree):
+        reader = await tree.open(card.path)
+        await trio.sleep(30.0)
+        await tree.list(card.folder)
+        assert bytes(await reader.read(0, STEP)) == OLD[:STEP]
+        card.replace()
+        with pytest.raises(FileChanged):
+            await tree.truncate(card.path, 1000)
+        card.replace(b"", THEN + 200)
+        await trio.sleep(30.0)
+        writer = await tree.open(card.path, write=True, truncate=True)
+        await trio.sleep(30.0)
+        await tree.list(card.folder)
+        await writer.write(0, MID)
+        await writer.release()
+        assert card.world.tree.data(card.path) == MID
         await reader.release()
 
 
