@@ -22,11 +22,16 @@ _NEWS = 1.25
 
 
 class BaseRtt:
-    """Keeps the least round trip until it is proven to be gone."""
+    """Keeps the least round trip until it is proven to be gone.
 
-    __slots__ = ("_after", "_base", "_longer", "_narrow", "_ours", "_wide_least", "_wide_window")
+    Attributes:
+        most: so many may be in flight until the round is over, infinite if that does not matter.
+    """
+
+    __slots__ = ("_after", "_base", "_longer", "_narrow", "_ours", "_wide_least", "_wide_window", "most")
 
     def __init__(self) -> None:
+        self.most = inf
         self._base = inf
         self._wide_window = 0
         self._wide_least = inf
@@ -52,16 +57,25 @@ class BaseRtt:
             self._wide_window, self._wide_least = in_flight, least
         return self._base
 
+    def beyond(self, least: float, window: float, rate: float) -> float:
+        """Return for how many seconds the quickest answer of a round waited, other than behind a window that
+        is answered at this rate; infinite if none was timed."""
+        if least == inf or rate == 0.0:
+            return inf
+        return max(0.0, least - max(self._base, window / rate))
+
     def next_window(self, target: float, beside: int) -> float:
         """Return the window for the next round, which wants to be `target`; called after rounds in which
         there was always something to send. beside: requests that are in flight besides."""
+        self.most = inf
         if not self._wide_window or self._wide_least < _MUCH_LONGER * self._base:
             return target
         if self._after > _FIRST_AFTER and self._wide_least > _NEWS * self._ours:
             self._after, self._longer = _FIRST_AFTER, 0
         self._longer += 1
         if self._longer == self._after + 1:
-            return min(target, _NARROW * self._wide_window - beside)
+            self.most = _NARROW * self._wide_window
+            return min(target, max(1.0, self.most - beside))
         if self._longer > self._after + 2:
             self._settle()  # nothing was learned
         return target

@@ -44,9 +44,13 @@ _MOST_RESERVE = 512
 _FASTEST_LINK = 6000.0
 """Answers per second (1.4 MB/s) beyond which no radio is on the way."""
 
+_SHORT_WAY = 0.03
+"""Seconds for which a small buffer has work for the server; who goes on in a pause there only floods it."""
+
 _OFTEN = 5
 _MORE_LOSS = 0.15
 _QUEUE_SECONDS = 0.005
+_FULL = 0.8
 _ROUNDS_REMEMBERED = 10
 _PLATEAU_ROUNDS = 2
 _TELLING_ROUND = 16
@@ -145,6 +149,8 @@ class Flow:
         """Return how many requests may go out now. paced: also beyond what the server queues, if evenly."""
         if urgent:
             self._hurried = True
+            if in_flight > 0:
+                self._stalls.reserve.on_others(now)
         elif self._hurried:  # an answer that somebody waits for should not queue behind our slack
             in_flight += min(_SLACK, self.window // 2)
         room = self._room(in_flight, now, paced)
@@ -161,9 +167,12 @@ class Flow:
         return self.budget is not None and self.budget.held
 
     def _room(self, in_flight: int, now: float, paced: bool) -> int:
-        room = self.window - in_flight + self._reserve(now, paced)
+        reserve = self._reserve(now, paced)
+        room = self.window - in_flight + reserve
         if self._pacer is None:
-            return min(room, self._trains.room(now)) if room > 0 else room
+            # What a pause lost of a reserve goes out at once, but no window, which drowns a small buffer.
+            at_once = room <= 0 or (room <= reserve and not self._bridging)
+            return room if at_once else min(room, self._trains.room(now))
         room += self.alone and not self._hurried  # one more fits a short queue of our own (servers.md 3)
         self._pacer.blocked = False
         # How evenly others send is not ours to say: beside them the queue is all there is.
@@ -175,8 +184,8 @@ class Flow:
         somebody waits for an answer that would have to queue behind them."""
         if self._hurried or self._survival or self._pacer or self._best_rate > _FASTEST_LINK:
             return 0
-        seconds = self._stalls.reserve if paced else 0.0
-        self._bridging = not seconds
+        seconds = self._stalls.reserve.seconds if paced else 0.0
+        self._bridging = not seconds and self._base_rtt > _SHORT_WAY
         if self._bridging:
             seconds = self._stalls.silence(now, self._best_rate)
         return self._bounded(seconds * self._best_rate) if seconds else 0
@@ -184,9 +193,8 @@ class Flow:
     def _bounded(self, reserve: float) -> int:
         """Never beyond the limit; and on a fast path a pause is ours or a busy computer's, which requests
         cannot bridge: hundreds of them would only overflow the sockets at both ends."""
-        if self._best_rate > _FASTEST_LINK:
-            return 0
-        return max(0, min(int(reserve), _MOST_RESERVE, self.cap - self.window))
+        most = _MOST_RESERVE if self._best_rate <= _FASTEST_LINK else 0
+        return int(max(0, min(reserve, most, min(self.cap, self._base.most) - self.window)))
 
     def next_room_at(self) -> float:
         """Return when there will be room without an answer; inf if that does not depend on time."""
@@ -249,7 +257,8 @@ class Flow:
         self._trains.on_replies(answers, now)
         if now != self._heard_at:  # what comes at once has no pauses
             self._heard_at = now
-            self._stalls.on_reply(now, 0.0 if self._starting else self._best_rate, self._base_rtt)
+            full = not self._starting or _FULL * self._trains.rate < self._best_rate
+            self._stalls.on_reply(now, self._best_rate if full else 0.0, self._base_rtt)
         if rtt is not None and rtt < self._round_least:
             self._round_least = rtt
 
@@ -302,7 +311,8 @@ class Flow:
         overflowed = self._overflow.judge(self._replies, self._losses)
         total = self._replies + self._losses
         self.loss += (self._losses / total - self.loss) * 0.2
-        reserve = self._bounded(self._stalls.reserve * self._best_rate)
+        waited = self._base.beyond(self._round_least, self.window * (1.0 - self.loss), self._best_rate)
+        reserve = self._bounded(min(self._stalls.reserve.seconds, waited) * self._best_rate)
         self._base_rtt = self._base.learn(self._round_least, self.window + reserve)
         took = now - self._round_start
         rate = self._replies / took if took > 0 else 0.0
@@ -313,6 +323,7 @@ class Flow:
         self._best_rate = max(self._rates, default=0.0)
         if self._app_limited:
             return
+        self._stalls.reserve.on_round(now, waited)
         self._learn_congestion()
         self._trains.end_round(self._replies, rate)
         if self._survival is not None:
@@ -334,7 +345,7 @@ class Flow:
                 loss, self._easing.ceiling = 0.0, inf
             self._approach(self._easing.next_window(self._target(), loss, next_order))
             if self._pacer is None:
-                self.window = max(1, int(self._base.next_window(self.window, reserve)))
+                self.window = int(self._base.next_window(self.window, reserve))
 
     def _excused(self) -> bool:
         """Whether pauses explain what was lost: it is no more than comes in them, or who wrote went on, and
@@ -351,7 +362,8 @@ class Flow:
     def _queued(self, factor: float) -> bool:
         """Whether even the quickest answer of the round took `factor` times the base, and a little; an answer
         queues behind a reserve, too."""
-        return factor * self._base_rtt + self._stalls.reserve + _QUEUE_SECONDS < self._round_least < inf
+        usual = factor * self._base_rtt + self._stalls.reserve.seconds + _QUEUE_SECONDS
+        return usual < self._round_least < inf
 
     def _leaves_start(self, grown: bool) -> bool:
         few = self._replies + self._losses < _TELLING_ROUND and self.window + 1 < self._held(inf)

@@ -14,12 +14,17 @@ from mavftpfs.protocol.operations import Simple
 from mavftpfs.protocol.payload import Opcode
 
 
+def keep_a_reserve(flow: Flow) -> None:
+    reserve = flow._stalls.reserve
+    reserve.seconds = reserve.wanted = reserve._held = 0.15
+
+
 def test_a_pause_on_a_fast_path_lets_no_thousands_loose() -> None:
     flow = Flow()
     path = Path(flow, rate=50_000.0, base=0.001)
     for _ in range(40):
         path.round()
-    flow._stalls.reserve = 0.15  # as after many pauses of a card, or of a busy computer
+    keep_a_reserve(flow)  # as after many pauses of a card, or of a busy computer
     flow._trains.proven = False  # answers come in bunches there
     assert flow.room(0, path.now, paced=True) == flow.window
     assert Flow(limit=8).room(0, 0.0, paced=True) <= 8
@@ -29,7 +34,7 @@ def test_pauses_of_a_link_as_fast_as_radios_are_bridged_by_some_hundreds() -> No
     flow = Flow()
     path = Path(flow, rate=4000.0, base=0.030)
     path.rounds(40)
-    flow._stalls.reserve = 0.15
+    keep_a_reserve(flow)
     flow._trains.proven = False
     room = flow.room(0, path.now, paced=True)
     assert flow.window + 300 < room <= flow.window + 512
@@ -59,11 +64,13 @@ def test_a_queue_of_our_reserve_is_no_longer_way() -> None:
     path = Path(flow, rate=2000.0, base=0.030)
     path.rounds(40)
     before = flow.window
-    flow._stalls.reserve = 0.15
-    path.waiting = 300
-    path.rounds(3)
-    path.rounds(3, lost=5)  # brakes: a narrower window, but the reserve makes nearly all of the queue
-    path.rounds(20)
+    keep_a_reserve(flow)
+    sent = flow._reserve(path.now, True)
+    for number in range(26):
+        before_that, sent = sent, flow._reserve(path.now, True)
+        path.waiting = min(before_that, sent)  # the first answers are to what was sent a round ago
+        # What is lost brakes: a narrower window, but the reserve makes nearly all of the queue.
+        path.round(lost=5 if 3 <= number < 6 else 0)
     assert flow.window <= 1.1 * before
 
 
@@ -72,7 +79,8 @@ def test_losses_in_pauses_do_not_brake_for_the_queue_of_our_reserve() -> None:
     path = Path(flow, rate=400.0, base=0.1)
     path.rounds(40)
     before = flow.window
-    flow._stalls.reserve, flow._stalls._calm = 0.15, 0
+    keep_a_reserve(flow)
+    flow._stalls._calm = 0
     flow._stalls._watched = -1e9  # so it stays
     path.waiting = 60
     path.rounds(40, lost=4)
