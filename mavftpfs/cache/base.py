@@ -175,6 +175,24 @@ def outdate(context: Context, node: Node) -> None:
     context.files.on_written(node.path)
 
 
+async def cut(context: Context, node: Node, size: int) -> None:
+    """Cut the vehicle's file; if that fails it may have been cut nevertheless, which nobody else did.
+
+    Raises:
+        As WriteStore.truncate.
+    """
+    node.may_be_cut = done = True
+    try:
+        await context.writer.truncate(node.path, size)
+    except FtpNak:
+        done = False
+        raise
+    finally:  # also if who waits for it gives up
+        if done:
+            context.dentries.note_unsized(node.path)
+            outdate(context, node)
+
+
 async def fill(context: Context, node: Node) -> None:
     """Fetch what only the vehicle has, so that the draft is whole; the caller has the node's lock.
 

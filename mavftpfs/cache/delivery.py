@@ -219,21 +219,15 @@ class Deliverer:
             if (size := await self.verifier.size(node.path)) < draft.size:  # it would be filled up with zeros
                 raise FileChanged(f"{node.path!r} has {size} bytes on the vehicle now: nothing to cut")
             await base.require_same(self._context, node, since)
-            await self._cut(node, draft.size)
+            await base.cut(self._context, node, draft.size)
         await self.verifier.check(node.path, draft)
         self._on_delivered(node, draft)
 
     async def _cut_first(self, node: Node, draft: Draft) -> None:
         """Cut a file of which a part is to be changed, too."""
         await base.require_stays(self._context, node, self.verifier.size)
-        await self._cut(node, draft.size)
+        await base.cut(self._context, node, draft.size)
         draft.remote_cut(draft.size)
-
-    async def _cut(self, node: Node, size: int) -> None:
-        node.may_be_cut = True
-        await self._context.writer.truncate(node.path, size)
-        self._context.dentries.note_unsized(node.path)
-        base.outdate(self._context, node)
 
     async def _create_empty(self, path: bytes, draft: Draft) -> None:
         try:

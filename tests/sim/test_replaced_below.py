@@ -297,6 +297,25 @@ async def test_what_was_replaced_after_it_was_listed_is_changed(profile: str, au
 
 
 @pytest.mark.parametrize("profile", TIMED)
+async def test_our_own_cut_is_nobody_elses(profile: str, autojump: MockClock) -> None:
+    """Who waited for it went before its reply came."""
+    card = Card(profile)
+    faults = Faults(card.world)
+    async with mounted(card.world, card.folder) as (_, tree):
+        writer = await tree.open(card.path, write=True)
+        assert bytes(await writer.read(0, STEP)) == OLD[:STEP]
+        await writer.truncate(300_000)
+        with trio.CancelScope() as scope:
+            faults.at(Opcode.TRUNCATE_FILE, scope.cancel)
+            await writer.fsync()
+        assert scope.cancelled_caught
+        await trio.sleep(IDLE)
+        await writer.write(100, MID)
+        await writer.release()
+        assert card.world.tree.data(card.path) == OLD[:100] + MID + OLD[103:300_000]
+
+
+@pytest.mark.parametrize("profile", TIMED)
 async def test_what_was_known_of_a_file_before_is_not_of_the_next(profile: str, autojump: MockClock) -> None:
     """Who has the old one open to read keeps what is remembered of its name."""
     card = Card(profile)
