@@ -30,7 +30,7 @@ _WORKING = frozenset(("slow", "work"))
 
 _TELLING = frozenset((Opcode.WRITE_FILE, Opcode.OPEN_FILE_RO, Opcode.OPEN_FILE_WO, Opcode.CREATE_FILE))
 _MIN_REORDER = 2
-"""So many later answers tell that a request is lost: it keeps one of a short queue's few places until then."""
+"""So many later answers tell that a request is lost: it keeps one of a short queue's places until then."""
 
 _MAX_REORDER = 64
 _MOST_QUICK_SENDS = 20
