@@ -30,8 +30,7 @@ class Admission:
         idle_since = self._context.clock()
         while True:
             self._context.require_disarmed()
-            if node.resting is not None:
-                node.resting.cancel()  # nobody waits for that delivery
+            node.end_rest()
             await node.quiet.wait()
             if not node.quiet.is_set():
                 continue  # the next delivery began while we woke up

@@ -158,6 +158,11 @@ class Node:
         finally:
             self.looked_at -= 1
 
+    def end_rest(self) -> None:
+        """Its program goes on: what delivers it for nobody is called off, unless it is all but done."""
+        if self.resting is not None and not self._firm:
+            self.resting.cancel()
+
     @contextmanager
     def dooming(self) -> Iterator[None]:
         """The body takes the lock, and then the name away: what is being delivered of it is called off."""
