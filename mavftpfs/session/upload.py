@@ -37,6 +37,9 @@ class Feed:
         self._source = source
         self._chunk = chunk
         self._held: tuple[int, bytes] | None = None
+        self._sample: tuple[int, bytes] | None = None
+        self._proof: tuple[int, bytes] | None = None
+        self._handed_to = 0
         self._furthest = 0
         self._furthest_before = 0
 
@@ -52,16 +55,19 @@ class Feed:
 
     def next_chunk(self, limit: int) -> tuple[int, bytes] | None:
         """See protocol.writing.ChunkSource."""
-        if self._held is not None:
-            held, self._held = self._held, None
-            self.span.add(held[0], held[0] + len(held[1]))
-            return held
-        try:
-            found = self._source.next_chunk(limit)
-        except MavftpfsError:
-            return None
+        found, self._held = self._held, None
+        if found is None:
+            try:
+                found = self._source.next_chunk(limit)
+            except MavftpfsError:
+                return None
         if found is not None:
-            self.span.add(found[0], found[0] + len(found[1]))
+            start, stop = found[0], found[0] + len(found[1])
+            self.span.add(start, stop)
+            if start >= self._handed_to:
+                self._sample, self._handed_to = found, stop
+            else:
+                self._doubt_samples(start, stop)
         return found
 
     def on_acked(self, offset: int, count: int) -> None:
@@ -76,6 +82,7 @@ class Feed:
 
     def on_unsent(self, offset: int, count: int) -> None:
         """See protocol.writing.ChunkSource."""
+        self._doubt_samples(offset, offset + count)
         self._source.on_unsent(offset, count)
 
     def put_back(self) -> None:
@@ -89,22 +96,45 @@ class Feed:
         self.proven = True
         self.unproven = 0
         self._proven_to = self.reached
+        self._proof = self._sample or self._proof
         self._source.on_checkpoint()
 
     def roll_back(self, *, everything: bool) -> None:
         """What was ACKed since the last checkpoint, or everything, has to be sent again."""
         self.put_back()
+        self._sample = None
         if everything:
-            self.proven = False
+            self.proven, self._proof = False, None
             self._proven_to = 0
         self.reached = self._proven_to
         self.unproven = 0
         self._source.on_rollback(everything)
 
+    @property
+    def proof(self) -> tuple[int, bytes] | None:
+        """Some bytes that were proven to be in the file and sent but once, with their offset; None if there
+        are none."""
+        return self._proof
+
+    def forget_proof(self) -> None:
+        """What was proven may not be there any more, though nobody else changed it."""
+        self._sample = self._proof = None
+
+    def _doubt_samples(self, start: int, stop: int) -> None:
+        """These bytes go out once more, perhaps others."""
+        if self._sample is not None and _overlaps(self._sample, start, stop):
+            self._sample = None
+        if self._proof is not None and _overlaps(self._proof, start, stop):
+            self._proof = None
+
     def got_further(self) -> bool:
         """Whether more of the file was reached than when this was asked before."""
         before, self._furthest_before = self._furthest_before, self._furthest
         return self._furthest > before
+
+
+def _overlaps(chunk: tuple[int, bytes], start: int, stop: int) -> bool:
+    return chunk[0] < stop and start < chunk[0] + len(chunk[1])
 
 
 class UploadHost(Protocol):
@@ -149,6 +179,7 @@ class QueuedUpload:
             on. opened: it was opened before. free_at: see WriteStore. begun: see Upload.
         asked_at: since when who waits for its end sees nothing happen. filled_in: seconds it took to send
             all there was, last time. tried: it was reopened to see what OpenFileWO does.
+        left_at: when its file was closed last, long ago where nobody knows.
         anew: nothing that was proven counts any more. usurped: the server closed the session by itself,
             or may have.
     """
@@ -178,6 +209,7 @@ class QueuedUpload:
         self.restarts = 0
         self.filled_in = 0.0
         self.created_at: float | None = None
+        self.left_at = float("-inf")
         self.tried = self.anew = False
         self.refused_at: int | None = None
         self.retry_at = 0.0

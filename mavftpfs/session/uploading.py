@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+from typing import NoReturn
 
 import trio
 
@@ -12,6 +13,7 @@ from mavftpfs.session.closing import close_refused, close_written
 from mavftpfs.session.copies import Span, WriteLog
 from mavftpfs.session.echoes import feared_for
 from mavftpfs.session.kit import Kit, Queue
+from mavftpfs.session.occupants import is_same, require_free
 from mavftpfs.session.opening import TERMINATE_LIMIT, OpenSession
 from mavftpfs.session.turns import Turns
 from mavftpfs.session.upload import Feed, QueuedUpload
@@ -152,6 +154,7 @@ class Uploading:
         """Perhaps it is another vehicle: what was proven of a new file is not there, whatever its size."""
         for upload in self.uploads:
             upload.anew = True
+            upload.feed.forget_proof()
         self.written.forget()
         self.writer.on_reboot()
 
@@ -257,7 +260,7 @@ class Uploading:
         if feed.proven or feed.unproven:
             feed.roll_back(everything=True)
         if upload.free_at is not None and self._clock() - upload.free_at > FREE_FOR:
-            await self._require_free(upload.path)
+            await require_free(self._holder, upload.path)
         if upload.aborted:  # its owner was told that nothing was begun
             raise LocalProtocolError("the upload was given up before its file was made")
         upload.free_at, upload.begun = None, True  # what is there from now on may be ours
@@ -294,24 +297,11 @@ class Uploading:
         """Return the size of the file, asked before OpenFileWO, which makes missing ones (servers.md 8)."""
         return (await self._holder.open(upload.path, Opcode.OPEN_FILE_RO)).size
 
-    async def _require_free(self, path: bytes) -> None:
-        """Find out by one request that CreateFile empties nothing, under no other spelling either.
-
-        Raises:
-            AlreadyExists. FtpNak: it is there perhaps.
-        """
-        try:
-            await self._holder.open(path, Opcode.OPEN_FILE_RO)
-        except FtpNak as nak:
-            if errno_for(nak) != errno.ENOENT:
-                raise
-        else:
-            await self._holder.close()
-            raise AlreadyExists(f"{path!r} was made by somebody else in the meantime")
-
     async def _reopen(self, upload: QueuedUpload, least: int) -> OpenSession:
         """Open a file that is to keep what it has, unless it has less than `least` bytes: then what was to
-        stay is gone, and what is written behind it would leave a hole."""
+        stay is gone, and what is written behind it would leave a hole; or if it is another one."""
+        if not await is_same(self._kit, upload):
+            await self._part_with(upload, f"{upload.path!r} became another file while it was changed here")
         try:
             size = await self._size(upload) if upload.opened and not self._wo_tells_size else None
             with self._echoes.noted(upload.path, opens=True):
@@ -325,9 +315,11 @@ class Uploading:
             size = session.size if size is None else size
             if size is None or size >= least:
                 return session
+        await self._part_with(upload, f"{upload.path!r} has {size} bytes now, not {least}")
+
+    async def _part_with(self, upload: QueuedUpload, problem: str) -> NoReturn:
         upload.feed.roll_back(everything=True)
         await self._holder.close()
-        problem = f"{upload.path!r} has {size} bytes now, not {least}"
         if upload.create:
             raise SessionLost(problem, by_server=True)
         raise FileChanged(problem)
@@ -347,6 +339,7 @@ class Uploading:
         if not ours:
             raise SessionLost("the vehicle had closed the session before", by_server=True)
         feed.check_point()
+        upload.left_at = self._clock()
         if stop is Stop.ARMED:
             upload.fail(Armed("the vehicle was armed"), self._clock())
         elif stop in (Stop.FINISHED, Stop.STARVED):
