@@ -281,6 +281,8 @@ class Deliverer:
         least, begun_at = 0, self._context.clock()
         if not draft.fresh and not draft.ruined:
             least = await base.require_stays(self._context, node, self.verifier.size)
+        elif draft.ruined and not draft.placed:
+            await self._require_ruin(node, draft)
         path, places = node.path, None
         if plan is Plan.REPLACE:
             places = self._context.namer.places(node.path)
@@ -315,6 +317,13 @@ class Deliverer:
     def _free_at(self, path: bytes, draft: Draft) -> float | None:
         """Return when a listing last showed the name of a new file to be free, None if it need not be."""
         return None if draft.on_vehicle else self._context.dentries.free_at(path)
+
+    async def _require_ruin(self, node: Node, draft: Draft) -> None:
+        """Raise FileChanged (or as Verifier.size) if a file lacks nothing: it is a successor, which stays."""
+        with node.looking():
+            size = await self.verifier.size(node.path)
+        if draft.remote_size is not None and size >= draft.remote_size:
+            raise FileChanged(f"{node.path!r} became another file while it was changed here")
 
     async def _require_old(self, node: Node, draft: Draft, attempt: Attempt) -> None:
         """Check that what a part was changed of did not become another file while all of it was sent.

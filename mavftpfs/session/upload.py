@@ -65,9 +65,10 @@ class Feed:
             start, stop = found[0], found[0] + len(found[1])
             self.span.add(start, stop)
             if start >= self._handed_to:
-                self._sample, self._handed_to = found, stop
+                self._sample = start, found[1][: self._chunk]
             else:
                 self._doubt_samples(start, stop)
+            self._handed_to = max(self._handed_to, stop)
         return found
 
     def on_acked(self, offset: int, count: int) -> None:

@@ -14,7 +14,8 @@ import trio
 from trio.testing import MockClock
 
 from mavftpfs.cache.tree import OpenFile, Tree
-from mavftpfs.protocol.payload import Opcode
+from mavftpfs.link.messages import Address
+from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.shared.errors import FileChanged
 from mavftpfs.sim.linkmodel import LinkSettings
 from tests.sim.test_doubted_bytes import KEEPING
@@ -22,6 +23,7 @@ from tests.sim.test_replaced_between import NEW, OLD, Card
 from tests.support.faults import Faults
 from tests.support.mounting import mounted
 from tests.support.takingturns import taking_turns
+from tests.support.worlds import World
 
 PART = random.Random(4).randbytes(300_000)
 SUCCESSOR = NEW[: len(OLD)]
@@ -37,14 +39,14 @@ class Copying:
         self.other = self.card.folder.rstrip(b"/") + b"/another"
         self.card.world.tree.add(self.other, OLD)
 
-    async def change(self, tree: Tree, meanwhile: Callable[[], None]) -> OpenFile:
+    async def change(self, tree: Tree, meanwhile: Callable[[], None], data: bytes = PART) -> OpenFile:
         """Write it; `meanwhile` when the other one is opened for the first time."""
         writer = await tree.open(self.card.path, write=True)
         async with trio.open_nursery() as nursery:
             nursery.start_soon(self._copy, tree, meanwhile)
             with suppress(FileChanged):  # a write that waits for room hears of it, too
-                await writer.write(0, PART)
-                await writer.write(len(PART) - 1, PART[-1:])
+                await writer.write(0, data)
+                await writer.write(len(data) - 1, data[-1:])
         return writer
 
     async def _copy(self, tree: Tree, meanwhile: Callable[[], None]) -> None:
@@ -112,3 +114,70 @@ async def test_what_is_written_again_and_again_is_taken_for_ours(
         await writer.release()
         nursery.cancel_scope.cancel()
     assert both.card.world.tree.data(both.card.path) == model
+
+
+@pytest.mark.parametrize("profile", KEEPING)
+async def test_a_successor_of_a_file_that_is_written_all_over_stays(
+    profile: str, autojump: MockClock
+) -> None:
+    both = Copying(profile)
+    async with mounted(both.card.world, both.card.folder) as (_, tree):
+        writer = await both.change(tree, lambda: both.card.replace(SUCCESSOR), NEW[-len(OLD) :])
+        for _ in range(2):
+            with pytest.raises(FileChanged):
+                await writer.fsync()
+        assert both.card.world.tree.data(both.card.path) == SUCCESSOR
+        writer.give_up()
+
+
+def answer_reads(world: World, change: Callable[[bytes], bytes]) -> None:
+    """Have the answers to ReadFile changed."""
+    server = world.vehicle.server
+    outgoing = server.outgoing
+
+    def changed(now: float) -> list[tuple[Address, bytes]]:
+        return [(to, change(w) if w[5] == Opcode.READ_FILE else w) for to, w in outgoing(now)]
+
+    server.outgoing = changed  # type: ignore[method-assign]
+
+
+def cut_short(wire: bytes) -> bytes:
+    """Answer with at most 100 bytes."""
+    return wire if wire[4] <= 100 else wire[:4] + bytes([100]) + wire[5:112] + bytes(139)
+
+
+@pytest.mark.parametrize("profile", KEEPING)
+async def test_a_server_that_sends_less_than_is_asked_for(profile: str, autojump: MockClock) -> None:
+    both = Copying(profile)
+    answer_reads(both.card.world, cut_short)
+    async with mounted(both.card.world, both.card.folder) as (_, tree):
+        writer = await both.change(tree, lambda: None)
+        await writer.release()
+        assert both.card.world.tree.data(both.card.path) == PART + OLD[len(PART) :]
+
+
+@pytest.mark.parametrize("profile", KEEPING)
+async def test_a_session_that_is_gone_before_the_look_is_opened_anew(
+    profile: str, autojump: MockClock
+) -> None:
+    both = Copying(profile)
+    path, refused = both.card.path, list[bytes]()
+
+    def refuse(wire: bytes) -> bytes:
+        session = connection.scheduler.session
+        awaited = any(upload.finishing for upload in connection.scheduler.uploads)
+        if refused or not awaited or session is None or session.path != path:
+            return wire
+        refused.append(wire)
+        return wire[:3] + bytes([Opcode.NAK, 1]) + wire[5:12] + bytes([NakCode.INVALID_SESSION]) + bytes(238)
+
+    answer_reads(both.card.world, refuse)
+    mount = mounted(both.card.world, both.card.folder)
+    async with mount as (connection, tree), trio.open_nursery() as nursery:
+        nursery.start_soon(both.copy_for, tree, 60.0)
+        writer = await tree.open(path, write=True)
+        await writer.write(0, PART)
+        await writer.release()
+        nursery.cancel_scope.cancel()
+        assert both.card.world.tree.data(path) == PART + OLD[len(PART) :]
+    assert refused
