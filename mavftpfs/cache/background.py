@@ -156,13 +156,16 @@ class Background:
             nursery.start_soon(self._rest, node, attempt)
 
     async def _rest(self, node: Node, attempt: Attempt) -> None:
+        pause = REST
         while node.attempt is attempt and node.writers:
             if (rest := node.written_at + REST - self._context.clock()) > 0.0:
+                pause = REST
                 await trio.sleep(rest)
             else:
                 if attempt.sending.unacked < FULL:
                     await self._deliver_resting(node, attempt)
-                await trio.sleep(REST)
+                await trio.sleep(pause)
+                pause = min(2 * pause, LONGEST_PAUSE)
 
     async def _deliver_resting(self, node: Node, attempt: Attempt) -> None:
         """Deliver a file unless its program goes on, which does not wait for that, or did so meanwhile."""

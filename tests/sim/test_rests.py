@@ -13,8 +13,9 @@ import trio
 from trio.testing import MockClock
 
 from mavftpfs.cache.background import START_AT
+from mavftpfs.cache.delivery import Deliverer
 from mavftpfs.protocol.payload import Opcode
-from mavftpfs.shared.errors import FileChanged
+from mavftpfs.shared.errors import FileChanged, RequestTimeout
 from tests.sim.test_replaced_between import NEW, OLD, THEN, TIMED, UNTIMED, Card
 from tests.support.faults import Faults
 from tests.support.mounting import mounted
@@ -163,3 +164,26 @@ async def test_who_writes_does_not_wait_for_that_delivery(profile: str, autojump
         await trio.sleep(REST)
         await writer.release()
         assert card.world.tree.data(card.path)[300_000:300_003] == MID
+
+
+async def test_what_fails_is_tried_ever_more_seldom(
+    autojump: MockClock, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    card, tries = Card("spec"), 0
+
+    async def fail(*_: object) -> bool:
+        nonlocal tries
+        tries += 1
+        raise RequestTimeout("silence")
+
+    async with mounted(card.world, card.folder) as (_, tree):
+        writer = await tree.open(card.path, write=True)
+        await writer.write(1000, MID)
+        await writer.fsync()  # what OpenFileWO does is known from now on
+        monkeypatch.setattr(Deliverer, "deliver_locked", fail)
+        await writer.write(1000, BYTES)
+        await trio.sleep(600.0)
+        assert 3 <= tries <= 30
+        monkeypatch.undo()
+        await writer.release()
+        assert card.world.tree.data(card.path)[1000 : 1000 + len(BYTES)] == BYTES
