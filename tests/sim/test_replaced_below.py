@@ -10,6 +10,7 @@ import trio
 from trio.testing import MockClock
 
 from mavftpfs.cache.asides import is_reserved
+from mavftpfs.cache.tree import OpenFile
 from mavftpfs.protocol.payload import Opcode
 from mavftpfs.shared.errors import FileChanged
 from tests.sim.test_replaced import STEP
@@ -19,6 +20,15 @@ from tests.support.mounting import mounted
 
 MID = b"mid"
 CHANGED = NEW[: len(OLD)]
+
+
+async def require_refused(card: Card, writer: OpenFile, successor: bytes = CHANGED) -> None:
+    """What was changed is not delivered, however often that is tried, and the successor stays as it is."""
+    for _ in range(2):
+        with pytest.raises(FileChanged):
+            await writer.fsync()
+    assert card.world.tree.data(card.path) == successor
+    writer.give_up()
 
 
 @pytest.mark.parametrize("profile", TIMED)
@@ -149,11 +159,7 @@ async def test_what_only_writes_puts_no_part_into_a_successor(
         await trio.sleep(IDLE)
         card.replace()
         await writer.write(100, MID)
-        for _ in range(2):
-            with pytest.raises(FileChanged):
-                await writer.fsync()
-        assert card.world.tree.data(card.path) == CHANGED
-        writer.give_up()
+        await require_refused(card, writer)
 
 
 @pytest.mark.parametrize("profile", TIMED)
@@ -172,10 +178,7 @@ async def test_a_listing_that_is_not_kept_tells_as_much(profile: str, autojump: 
         card.replace()
         await writer.write(100, MID)
         others_ask()
-        with pytest.raises(FileChanged):
-            await writer.fsync()
-        assert card.world.tree.data(card.path) == CHANGED
-        writer.give_up()
+        await require_refused(card, writer)
 
 
 @pytest.mark.parametrize("many", [False, True], ids=["few names", "many names"])
@@ -189,10 +192,7 @@ async def test_what_waits_here_does_not_go_into_a_successor(
         await writer.write(100, MID)
         await trio.sleep(IDLE)
         card.replace()
-        with pytest.raises(FileChanged):
-            await writer.fsync()
-        assert card.world.tree.data(card.path) == CHANGED
-        writer.give_up()
+        await require_refused(card, writer)
 
 
 @pytest.mark.parametrize("part", [False, True], ids=["cut", "cut and changed"])
@@ -208,10 +208,7 @@ async def test_a_successor_is_not_cut(
         card.replace(successor)
         await writer.truncate(1000)
         await writer.write(100, MID * part)
-        with pytest.raises(FileChanged):
-            await writer.fsync()
-        assert card.world.tree.data(card.path) == successor
-        writer.give_up()
+        await require_refused(card, writer, successor)
 
 
 @pytest.mark.parametrize("profile", TIMED)
@@ -225,10 +222,7 @@ async def test_what_is_written_after_a_delivery_among_many_names(profile: str, a
         await trio.sleep(IDLE)
         card.replace()
         await writer.write(300, MID)
-        with pytest.raises(FileChanged):
-            await writer.fsync()
-        assert card.world.tree.data(card.path) == CHANGED
-        writer.give_up()
+        await require_refused(card, writer)
 
 
 @pytest.mark.parametrize("profile", TIMED)
