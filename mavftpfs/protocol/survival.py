@@ -26,7 +26,10 @@ _SUDDEN = 0.2
 _SECOND_THOUGHT = 2.5
 _REMEMBERED = 60.0
 _GROWN = 1.1
-_OVERSHOT = 3
+_OVERSHOT = 2
+"""By so much it grew while the first loss was not known. To go back further costs a long way many seconds: it
+comes back by comparing."""
+
 _SETTLING = 2
 _WATCHED = 40
 _FEWEST = 8
@@ -128,7 +131,6 @@ class Survival:
         """Nothing was lost so far."""
         self._careful = lost > 0 and self._cap > 1
         if self._careful:
-            # It grew while the first loss was not known yet.
             self._settled = low = max(1, self.window - _OVERSHOT)
             self._compare(low, low + 1)
         elif not queued or rate > _GROWN * self._best_rate:

@@ -42,13 +42,14 @@ class World:
     settings: LinkSettings = GOOD_LINK
     seed: int = 1
     telemetry: float = 0.0
+    serial: bool = False
     tree: MemoryTree = field(default_factory=lambda: MemoryTree(clock=wall))
 
     def __post_init__(self) -> None:
         rng = random.Random(self.seed)
         self.vehicle = SimVehicle(self.tree, PROFILES[self.profile], rng=rng, telemetry=self.telemetry)
         self.model = LinkModel(random.Random(self.seed + 1), self.settings)
-        self.link = MemoryLink(self.vehicle, self.model)
+        self.link = MemoryLink(self.vehicle, self.model, is_serial=self.serial)
 
     @asynccontextmanager
     async def connection(
