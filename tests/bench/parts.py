@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 
 import trio
+from pymavlink.dialects.v20 import ardupilotmega as dialect
 from trio.testing import MockClock
 
 from mavftpfs.cache.blocks import BlockCache, FileBlocks
@@ -74,6 +75,21 @@ def read_parts() -> dict[str, float]:
 def write_parts() -> dict[str, float]:
     """Return the microseconds per chunk of each part of writing."""
     return _costs(_write_request, _write_reply, _engine_writing, "taking from the spool", _drafting)
+
+
+def codec_costs() -> dict[str, tuple[float, float]]:
+    """Return the microseconds that one frame takes us, and pymavlink, whose bytes are compared with ours."""
+    found = {}
+    for name, make in (("build a ReadFile", _read_request), ("build a WriteFile", _write_request)):
+        payloads = [make(n, n * MAX_DATA) for n in range(CHUNKS)]
+        assert _packed_by_pymavlink(payloads) == _frames(payloads, _CLIENT, _VEHICLE)
+        found[name] = cost(_encoding(payloads)), cost(_timed(_packed_by_pymavlink, payloads))
+    for name, make in (("parse a chunk", _read_reply), ("parse an ACK", _write_reply)):
+        payloads = [make(n, n * MAX_DATA) for n in range(CHUNKS)]
+        datagrams = _datagrams(payloads)
+        assert _parsed_by_pymavlink(datagrams) == payloads
+        found[name] = cost(_decoding(payloads)), cost(_timed(_parsed_by_pymavlink, datagrams))
+    return found
 
 
 def _costs(
@@ -152,6 +168,28 @@ def _encoding(payloads: list[bytes]) -> Part:
                 framer.encode_ftp_run(_VEHICLE, payloads[at : at + WINDOW])
 
     return run
+
+
+def _timed(work: Callable[[list[bytes]], object], data: list[bytes]) -> Part:
+    def run(meter: Meter) -> None:
+        with meter.on():
+            work(data)
+
+    return run
+
+
+def _packed_by_pymavlink(payloads: list[bytes]) -> list[bytes]:
+    mav = dialect.MAVLink(None, *_CLIENT)
+    frames = []
+    for payload in payloads:
+        frames.append(mav.file_transfer_protocol_encode(0, *_VEHICLE, list(payload)).pack(mav))
+        mav.seq = (mav.seq + 1) & 0xFF
+    return frames
+
+
+def _parsed_by_pymavlink(datagrams: list[bytes]) -> list[bytes]:
+    mav = dialect.MAVLink(None, *_CLIENT)
+    return [bytes(message.payload) for datagram in datagrams for message in mav.parse_buffer(datagram)]
 
 
 @contextmanager
