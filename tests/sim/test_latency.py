@@ -58,9 +58,8 @@ class Copy:
         self.root = ROOTS.get(profile, b"") + b"/d"
         self.before = before
         self.size = int((27 + before) * link.rate)
-        self.world.tree.add(
-            self.root + b"/big", random.Random(2).randbytes(self.size)
-        )  # zeros would not be sent
+        self.data = random.Random(2).randbytes(self.size)  # zeros would not be sent
+        self.world.tree.add(self.root + b"/big", self.data)
         for number in range(SAMPLES):
             self.world.tree.add(self.root + b"/fresh%d/f" % number, b"%d" % number * 100)
         self.rng = random.Random(5)
@@ -91,6 +90,7 @@ class Copy:
         copied = sink.have.total
         await trio.sleep(2.0)
         assert sink.have.total > copied, "the copy goes on"
+        assert all(sink.data[start:stop] == self.data[start:stop] for start, stop in sink.have)
         reader.close()
         return sorted(waits)
 
