@@ -57,6 +57,21 @@ def test_a_reserve_keeps_to_what_the_links_queue_holds(queue: int) -> None:
     assert result.requests <= 1.4
 
 
+@pytest.mark.parametrize("loss", [0.0, 0.05])
+@pytest.mark.parametrize(("rate", "rtt", "seconds"), [(5760.0, 0.3, LONG), (100_000.0, 0.1, 10.0)])
+@pytest.mark.parametrize("profile", ["px4", "ardupilot"])
+def test_telemetry_gets_through_beside_a_copy(
+    profile: str, rate: float, rtt: float, seconds: float, loss: float
+) -> None:
+    """It shares a short queue with the answers, which must not fill it."""
+    case = Case(profile, rate, rtt, loss)
+    target = case.target
+    assert target is not None
+    result = measure(case, seconds, queue=4096, telemetry=20.0)
+    assert result.dropped <= 2
+    assert result.share >= target - START
+
+
 def test_a_short_shared_queue_does_not_empty_a_long_way() -> None:
     """ArduPilot, 300 ms away: five at a time would be 3.9 kB/s, its bursts 30; evenly asked it is more."""
     case = Case("ardupilot", 100_000.0, 0.3, 0.0)
