@@ -73,8 +73,7 @@ class Engine:
         self._ops: list[Operation] = []
         self._finished: list[Operation] = []
         self._timers = Timers()
-        self._due = inf
-        self._heard_at = -inf
+        self._due, self._heard_at = inf, -inf
         self._bursts = BurstWatch()
         self._apply_queue_limit()
 
@@ -191,11 +190,10 @@ class Engine:
         return malformed
 
     def _believe_run(self, run: Run, now: float) -> None:
-        request = run[0][0]
-        op = request.op
+        op = run[0][0].op
         self.stats.replies += len(run)
         self._heard_at = op.progress_at = now
-        rtt = self._timers.sample(request, now)
+        rtt = self._timers.sample(run[0][0], now)
         self.flow.on_replies(now, rtt, [request.order for request, _ in run], self._ledger.order)
         for lost in self._ledger.lose_outrun():
             self.flow.on_loss(lost.order)
@@ -384,7 +382,9 @@ class Engine:
         if not self.traits.answers_during_burst:
             # ArduPilot answers nothing else during a burst: silence proves nothing then.
             since = max(since, self._bursts.heard_at)
-        return since + self._timers.wait(request)
+        due = since + self._timers.wait(request)
+        pauses = request.manner.ordered and self._ledger.in_flight > _FEW
+        return max(due, self._heard_at + self.flow.patience) if pauses else due
 
     def _expire(self, request: Request, now: float) -> None:
         """A timer ran out: ask again, or give up the operation when this one request took too long."""

@@ -27,7 +27,7 @@ from mavftpfs.protocol.overflow import Overflow
 from mavftpfs.protocol.pacing import Pacer
 from mavftpfs.protocol.stalls import Stalls
 from mavftpfs.protocol.survival import Survival
-from mavftpfs.protocol.trains import Trains
+from mavftpfs.protocol.trains import GAIN, Trains
 
 FIRST = 8
 INITIAL = 4
@@ -40,13 +40,11 @@ _CURIOSITY = 6
 _LEAP = 4
 _FAST_PATH_SECONDS = 0.010
 _FAST_PATH_WINDOW = 192
-_MOST_RESERVE = 512
+_MOST_RESERVE = 1024
 _FASTEST_LINK = 6000.0
 """Answers per second (1.4 MB/s) beyond which no radio is on the way."""
 
-_SHORT_WAY = 0.03
-"""Seconds for which a small buffer has work for the server; who goes on in a pause there only floods it."""
-
+_REFILL = 2.0
 _OFTEN = 5
 _MORE_LOSS = 0.15
 _QUEUE_SECONDS = 0.005
@@ -68,7 +66,6 @@ class Flow:
         "_base_rtt",
         "_best_rate",
         "_brake",
-        "_bridging",
         "_collapsed",
         "_easing",
         "_flights",
@@ -100,7 +97,7 @@ class Flow:
         self, *, serial: bool = False, limit: int | None = None, budget: Budget | None = None
     ) -> None:
         self.budget = budget
-        self.alone = self._bridging = self._hurried = self._app_limited = False
+        self.alone = self._hurried = self._app_limited = False
         self._limit = max(1, limit or (SERIAL_CAP if serial else DEFAULT_CAP))
         self._survival = Survival(self._limit) if serial else None
         self.cap = self._limit
@@ -166,13 +163,18 @@ class Flow:
         """Whether somebody was only held back by the user's budget, so that waiting is no silence."""
         return self.budget is not None and self.budget.held
 
+    @property
+    def patience(self) -> float:
+        """Seconds of silence that prove no loss while much is in flight, but to a port that loses windows."""
+        return 0.0 if self._survival else self._stalls.patience
+
     def _room(self, in_flight: int, now: float, paced: bool) -> int:
         reserve = self._reserve(now, paced)
         room = self.window - in_flight + reserve
         if self._pacer is None:
-            # What a pause lost of a reserve goes out at once, but no window, which drowns a small buffer.
-            at_once = room <= 0 or (room <= reserve and not self._bridging)
-            return room if at_once else min(room, self._trains.room(now))
+            # What a pause took of a reserve must come back before the next one, but drowns a buffer at once.
+            gain = _REFILL if room <= reserve else GAIN
+            return min(room, self._trains.room(now, gain)) if room > 0 else room
         room += self.alone and not self._hurried  # one more fits a short queue of our own (servers.md 3)
         self._pacer.blocked = False
         # How evenly others send is not ours to say: beside them the queue is all there is.
@@ -184,11 +186,8 @@ class Flow:
         somebody waits for an answer that would have to queue behind them."""
         if self._hurried or self._survival or self._pacer or self._best_rate > _FASTEST_LINK:
             return 0
-        seconds = self._stalls.reserve.seconds if paced else 0.0
-        self._bridging = not seconds and self._base_rtt > _SHORT_WAY
-        if self._bridging:
-            seconds = self._stalls.silence(now, self._best_rate)
-        return self._bounded(seconds * self._best_rate) if seconds else 0
+        seconds = self._stalls.to_bridge(now, self._best_rate, self._base_rtt, kept=paced)
+        return self._bounded(seconds * self._best_rate)
 
     def _bounded(self, reserve: float) -> int:
         """Never beyond the limit; and on a fast path a pause is ours or a busy computer's, which requests
@@ -265,6 +264,7 @@ class Flow:
     def on_loss(self, order: int, sends: int = 1) -> None:
         """The transmission numbered `order` is taken to be lost, the `sends`th of its request."""
         self._losses += 1
+        self._stalls.on_loss(self._best_rate)
         if self._survival is not None and sends >= _OFTEN:
             self.window = 1  # it may always come second to a buffer for one: let it go alone
         self._easing.count(order, lost=True)
@@ -350,7 +350,7 @@ class Flow:
     def _excused(self) -> bool:
         """Whether pauses explain what was lost: it is no more than comes in them, or who wrote went on, and
         the server takes more than the link brings."""
-        quick = self._bridging and self._trains.rate > 1.5 * self._best_rate
+        quick = self._stalls.bridging and self._trains.rate > 1.5 * self._best_rate
         return self._stalls.usual and (quick or self.loss < self._stalls.share + _MORE_LOSS)
 
     def _learn_congestion(self) -> None:

@@ -26,7 +26,7 @@ _LEAST = 0.035
 """Fewer are none: as long may the small buffer of a quick server make them wait."""
 
 _WAITS = 0.75
-_DOUBTFUL_ROUNDS = 7
+_DOUBTFUL_ROUNDS = 20
 """In a row, since pauses that follow each other empty the queue for some."""
 
 _BOLDLY = 2.0
@@ -34,14 +34,14 @@ _CAREFULLY = 1.1
 _FADE = 0.985
 
 _MEMORY = 0.9
-_TELLING = 1.0
+_TELLING = 1.5
 """Seconds of pauses to expect before it is judged whether a reserve shortens them."""
 
 _USELESS = 0.75
 _BEARABLE = 0.1
 """The share of the time that pauses are expected to take at least: few were seen, perhaps by chance."""
 
-_FIRST_HOLD = 8.0
+_FIRST_HOLD = 6.0
 _LONGEST_HOLD = 960.0
 
 

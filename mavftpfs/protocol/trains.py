@@ -18,7 +18,7 @@ _TELLING_ROUND = _LENGTH + 2
 _ROUNDS_REMEMBERED = 10
 _DENSE = 1.5
 _SAME = 1.1
-_GAIN = 1.1
+GAIN = 1.1
 _DEPTH = 4.0
 _DEPTH_SECONDS = 0.004
 _PLENTY = 1 << 16
@@ -37,6 +37,7 @@ class Trains:
         "_answers",
         "_blocked",
         "_densest",
+        "_gain",
         "_rounds",
         "_seconds",
         "_times",
@@ -55,6 +56,7 @@ class Trains:
         self._times = deque([-inf] * _LENGTH, maxlen=_LENGTH)
         self._rounds: deque[float] = deque(maxlen=_ROUNDS_REMEMBERED)
         self._blocked = False
+        self._gain = GAIN
         self._tokens = 0.0
         self._tokens_at = 0.0
 
@@ -106,11 +108,12 @@ class Trains:
         """It is looked at anew who wants to send: nobody was held back yet."""
         self._blocked = False
 
-    def room(self, now: float) -> int:
-        """Return how many requests may go out now."""
+    def room(self, now: float, gain: float = GAIN) -> int:
+        """Return how many requests may go out now. gain: so many times the pace that was seen."""
         if not self.proven:
             return _PLENTY
-        pace = _GAIN * self.rate
+        self._gain = gain
+        pace = gain * self.rate
         deepest = max(_DEPTH, pace * _DEPTH_SECONDS)
         self._tokens = min(deepest, self._tokens + (now - self._tokens_at) * pace)
         self._tokens_at = now
@@ -122,7 +125,7 @@ class Trains:
         """Return when there will be room for one more, if there is none now; else infinite."""
         if not self._blocked or not self.proven:
             return inf
-        return self._tokens_at + (1.0 - self._tokens) / (_GAIN * self.rate) + 1e-6
+        return self._tokens_at + (1.0 - self._tokens) / (self._gain * self.rate) + 1e-6
 
     def on_sent(self, count: int) -> None:
         """So many requests go out."""

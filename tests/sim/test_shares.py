@@ -49,6 +49,20 @@ def test_the_pauses_of_a_card_hardly_cost_a_reader_anything(rtt: float) -> None:
     assert measure(Case("px4-nuttx", 100_000.0, rtt, 0.0), LONG).share >= 0.97
 
 
+@pytest.mark.parametrize(
+    ("rate", "rtt", "share", "requests"),
+    [
+        (1_000_000.0, 0.01, 0.96, 1.4),  # 0.94: what waited was asked for again in each pause, and sent twice
+        (1_000_000.0, 0.1, 0.945, 2.2),  # 0.93: the next pause found nothing new on the way
+        (250_000.0, 0.1, 0.82, 1.6),  # 0.72: the reserve never came back before the next pause
+    ],
+)
+def test_a_card_that_pauses_is_kept_busy(rate: float, rtt: float, share: float, requests: float) -> None:
+    result = measure(Case("px4-nuttx", rate, rtt, 0.0), SHORT)
+    assert result.share >= share
+    assert result.requests <= requests
+
+
 @pytest.mark.parametrize("queue", [10_000, 4096])
 def test_a_reserve_keeps_to_what_the_links_queue_holds(queue: int) -> None:
     """0.25 s would be 25 kB: most of it was lost, and asked for again, twice for each chunk."""

@@ -771,6 +771,33 @@ def test_a_burst_that_fails_is_finished() -> None:
     assert engine.take_finished() == [transfer]
 
 
+# --- pauses of the server
+
+
+@pytest.mark.parametrize(("others", "patient"), [(8, True), (2, False)])
+def test_silence_proves_nothing_while_the_server_pauses_but_a_lone_requests_does(
+    others: int, patient: bool
+) -> None:
+    """What waits in its buffer would be executed twice."""
+    engine = make(limit=1 + others)
+    reading(engine)
+    first = sent(engine, 0.0)
+    for request in first:
+        engine.receive(chunk(request, bytes(SIZE)), 0.05)
+    engine.flow.window = 1 + others
+    stalls = engine.flow._stalls
+    stalls._calm, stalls._longest = 0, 0.3
+    waiting = sent(engine, 0.05)
+    assert len(waiting) == 1 + others
+    engine.receive(chunk(waiting[0], bytes(SIZE)), 0.1)
+    stalls._calm, stalls._longest = 0, 0.3
+    sent(engine, 0.1)
+    engine.on_deadline(0.35)
+    assert (engine.stats.retransmissions == 0 and not engine._ledger.again) is patient
+    engine.on_deadline(0.45)
+    assert engine._ledger.again or sent(engine, 0.45)
+
+
 # --- facts
 
 

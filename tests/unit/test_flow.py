@@ -37,7 +37,7 @@ def test_pauses_of_a_link_as_fast_as_radios_are_bridged_by_some_hundreds() -> No
     keep_a_reserve(flow)
     flow._trains.proven = False
     room = flow.room(0, path.now, paced=True)
-    assert flow.window + 300 < room <= flow.window + 512
+    assert flow.window + 300 < room <= flow.window + 1024
 
 
 def test_what_a_busy_computer_answers_late_is_no_longer_way() -> None:

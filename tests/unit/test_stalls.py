@@ -103,6 +103,81 @@ def test_writes_go_on_while_answers_pause_but_not_for_long() -> None:
     assert flow.room(full, now + 0.1, paced=False) <= 0, "who waits for an answer waits behind it"
 
 
+def test_what_was_sent_in_a_pause_is_a_bridge_until_it_is_known_to_be_lost() -> None:
+    """The next pause came before, and found the window full of it: nothing was sent in that one."""
+    flow = Flow()
+    now = at_work_with_pauses(flow)
+    flow._base_rtt = 0.3
+    full = flow.window
+    before = flow.room(full, now, paced=False)
+    now += 0.15
+    flow.on_reply(now, None, 4000, 4001)
+    sent = flow.room(full, now, paced=False)
+    assert sent == pytest.approx(before + 0.15 * RATE, rel=0.1)
+    assert flow.room(full, now + 0.1, paced=False) == pytest.approx(sent + 0.1 * RATE, rel=0.1)
+    for order in range(30):
+        flow.on_loss(order)
+    assert flow.room(full, now, paced=False) == pytest.approx(sent - 30, abs=1)
+    flow._base_rtt = 0.1
+    for order in range(60):
+        now += 1 / RATE
+        flow.on_reply(now, None, 4001 + order, 4100)
+    assert flow.room(flow.window, now, paced=False) == 0, "a round trip later all of that is answered or lost"
+
+
+def test_bridges_of_pauses_that_follow_each_other_are_bounded() -> None:
+    stalls = Stalls()
+    now = run(stalls, 10.0, every=0.5, pause=0.15)
+    for _ in range(6):
+        now += 0.38
+        stalls.on_reply(now, RATE)
+    assert stalls.to_bridge(now + 0.38, RATE, 10.0, kept=False) == pytest.approx(0.8)
+
+
+def test_reads_go_on_when_their_reserve_is_used_up() -> None:
+    flow = Flow()
+    now = at_work_with_pauses(flow)
+    full = flow.window
+    flow._stalls.reserve.seconds = 0.1
+    usual = flow.room(full, now, paced=True)
+    assert flow.room(full, now + 0.1, paced=True) == pytest.approx(usual + 0.1 * RATE, rel=0.1)
+
+
+def test_what_a_pause_took_of_a_reserve_comes_back_fast_but_not_at_once() -> None:
+    """All at once overflowed the server's buffer again; at the pace of the link it never came back."""
+    flow = Flow()
+    now = at_work_with_pauses(flow)
+    flow._stalls.reserve.seconds = flow._stalls.reserve.wanted = flow._stalls.reserve._held = 0.25
+    flow._stalls._bridges.clear()
+    flow._trains.proven, flow._trains.rate = True, RATE
+    sent = 0
+    for step in range(100):
+        flow.begin()
+        room = flow.room(flow.window + sent, now + step / 1000, paced=True)
+        assert room <= 4
+        flow.on_sent(room, now + step / 1000)
+        sent += room
+    assert sent == pytest.approx(2 * RATE * 0.1, rel=0.15)
+
+
+def test_the_longest_pause_of_late_is_no_sign_of_losses() -> None:
+    stalls = Stalls()
+    assert stalls.patience == 0.0
+    now = run(stalls, 20.0, every=0.5, pause=0.15)
+    assert stalls.patience == pytest.approx(0.15, rel=0.2)
+    stalls.on_reply(now + 30.0, RATE)
+    assert stalls.patience <= 0.5, "that was the link"
+
+
+def test_patience_ends_with_the_pauses() -> None:
+    stalls = Stalls()
+    now = run(stalls, 20.0, every=0.5, pause=0.15)
+    for _ in range(int(60 * RATE)):
+        now += 1 / RATE
+        stalls.on_reply(now, RATE)
+    assert stalls.patience == 0.0
+
+
 def test_reads_go_on_too_where_a_reserve_would_only_overflow_the_servers_buffer() -> None:
     flow = Flow()
     flow._stalls.reserve._until = 1e9  # it was found useless

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from math import inf
 
+import pytest
+
 from mavftpfs.protocol.trains import Trains
 
 RATE = 400.0
@@ -104,3 +106,14 @@ def test_who_was_not_held_back_need_not_be_woken() -> None:
     assert trains.next_room_at() < 10.1
     trains.begin()
     assert trains.next_room_at() == inf
+
+
+def test_a_higher_pace_is_kept_as_well() -> None:
+    trains = known()
+    trains.room(0.0)
+    trains.on_sent(100)
+    trains.begin()
+    assert trains.room(1.0, 2.0) == 4
+    trains.on_sent(4)
+    assert trains.room(1.0, 2.0) == 0
+    assert trains.next_room_at() == pytest.approx(1.0 + 1.0 / (2.0 * RATE), rel=0.01)
