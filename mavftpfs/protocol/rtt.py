@@ -9,21 +9,27 @@ link would otherwise cost 1 s, and there is always half a round trip of slack ab
 from __future__ import annotations
 
 INITIAL_RTO = 1.0
+"""Seconds to wait while no round trip is known, if nothing better is (see `timers`)."""
+
 LONGEST_BACK_OFF = 3.0
 _FREE_SILENCES = 2
 _MAX_DOUBLINGS = 7
 
 
 class RttEstimator:
-    """Smoothed round-trip time, its variation, and the retransmission timeout; all in seconds."""
+    """Smoothed round-trip time, its variation, and the retransmission timeout; all in seconds.
+
+    Args:
+        floor: least timeout. first: the timeout before the first sample, if the floor is not more.
+    """
 
     __slots__ = ("_floor", "_silences", "rto", "samples", "smoothed", "unfloored", "variation")
 
-    def __init__(self, floor: float) -> None:
+    def __init__(self, floor: float, first: float = INITIAL_RTO) -> None:
         self._floor = floor
         self._silences = 0
-        self.unfloored = INITIAL_RTO
-        self.rto = max(INITIAL_RTO, floor)
+        self.unfloored = first
+        self.rto = max(first, floor)
         """How long to wait for a reply before it is asked again.
 
         Backed off to at most LONGEST_BACK_OFF: a link that comes back should not wait longer for us.

@@ -9,6 +9,13 @@ from mavftpfs.protocol.rtt import INITIAL_RTO, RttEstimator
 
 _LONGEST_WAIT = 5.0
 
+_FIRST_WAITS = {"list": 0.5}
+"""Seconds to wait while no round trip is known, where that is not INITIAL_RTO.
+
+A mount begins with a listing, whose loss somebody waits for. Each transmission of one has its own seq: where
+it is repeated in vain its answer tells the round trip all the same, and a second execution changes nothing.
+"""
+
 _WORK = "work"
 _NO_WORK = 0.1
 """Seconds of work that count as none: what takes no longer times the way and the server's readiness."""
@@ -28,7 +35,10 @@ class Timers:
     __slots__ = ("_at", "_manner", "_pace", "_sent_at", "of")
 
     def __init__(self) -> None:
-        self.of = {family: RttEstimator(floor) for family, floor in FLOORS.items()}
+        self.of = {
+            family: RttEstimator(floor, _FIRST_WAITS.get(family, INITIAL_RTO))
+            for family, floor in FLOORS.items()
+        }
         self._at = self._sent_at = -inf
         self._manner: Manner | None = None
         self._pace: dict[int, float] = {}

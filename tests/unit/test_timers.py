@@ -26,6 +26,23 @@ def test_nothing_known() -> None:
     assert Timers().wait(sent(Opcode.OPEN_FILE_RO)) == INITIAL_RTO
 
 
+def test_a_lost_first_listing_does_not_cost_a_second() -> None:
+    assert Timers().wait(sent(Opcode.LIST_DIRECTORY_WITH_TIME)) == 0.5
+
+
+def test_nor_are_listings_piled_up_where_nothing_is_known() -> None:
+    request, waits = sent(Opcode.LIST_DIRECTORY), []
+    for request.sends in range(1, 6):
+        waits.append(Timers().wait(request))
+    assert waits == [0.5, 1.0, 2.0, 4.0, 5.0]
+
+
+def test_a_first_listing_that_takes_longer_is_not_waited_for_less_than_it_takes() -> None:
+    timers = Timers()
+    answered(timers, Opcode.LIST_DIRECTORY, 0.8)
+    assert timers.wait(sent(Opcode.LIST_DIRECTORY)) == pytest.approx(2.4)
+
+
 @pytest.mark.parametrize(("rtt", "wait"), [(0.03, 0.1), (0.1, 0.3), (0.3, 0.9), (0.6, 1.0)])
 def test_an_open_waits_as_long_as_listings_took_and_not_a_second(rtt: float, wait: float) -> None:
     timers = Timers()
