@@ -126,6 +126,11 @@ class ReadTransfer(Operation):
         self.strategy = strategy
 
     @property
+    def in_flight(self) -> int:
+        """How many ReadFile requests are on their way, or lost and to be repeated."""
+        return len(self._unanswered)
+
+    @property
     def bursting(self) -> bool:
         """Whether a burst is running (ArduPilot answers nothing else until it ends)."""
         return self._burst is not None

@@ -25,55 +25,15 @@ STARVING = 3.0
 RELIEF = 0.5
 """Seconds of service that ends starving."""
 
-WORTH_A_BURST = 32 * 1024
-"""Bytes of sequential want below which a burst gains nothing over a window of reads."""
 
-BURST_GAIN = 1.3
-"""How much faster than the window a burst must be to be chosen: it cannot always be stopped."""
+def choose_strategy(mode: ReadMode, *, others_ask: bool) -> Strategy:
+    """Return how to read from here on; a burst that runs is not broken off.
 
-
-@dataclass(frozen=True, slots=True)
-class ReadFacts:
-    """What the choice of a read strategy may depend on; rates in bytes/s, times in seconds.
-
-    wanted: contiguous bytes wanted from here on.
-    in_flight_limit: requests the server may be sent at once, None where no limit is known.
-    window_rate, burst_rate: measured goodput, None before it was tried.
-    burst_stoppable: False where requests are not answered during a burst (ArduPilot), None unknown.
+    Bursts are for who asked for them: they are no gain for "auto" (ARCHITECTURE.md, "Bursts"). While others
+    wait for an answer no burst follows the last one: PX4 fills what the link holds with them, answers find no
+    room there, and while packets come nothing is asked again: a listing was given up after 30 s.
     """
-
-    mode: ReadMode
-    wanted: int
-    rtt: float | None
-    chunk: int
-    in_flight_limit: int | None
-    window_rate: float | None
-    burst_rate: float | None
-    burst_stoppable: bool | None
-    others_waiting: bool
-
-
-def choose_strategy(facts: ReadFacts) -> Strategy:
-    """Return how to read next.
-
-    A window of ReadFile requests is the rule: it can be stopped, it fills gaps as it goes, and on PX4 and
-    MAVSDK it is the faster way by far (servers.md 15). A burst wins only where the server's queue caps the
-    window and the round trip is long, so that w * chunk / RTT stays below the pace of a burst. None is begun
-    only to be measured: ArduPilot's cannot be stopped for 3 to 280 s, is paced to a third of the link, and
-    requests that are spread evenly (protocol.pacing) fill a long way better.
-    """
-    if facts.mode != "auto":
-        return facts.mode
-    if facts.wanted < WORTH_A_BURST or facts.others_waiting:
-        return "window"
-    if facts.burst_rate is None or facts.in_flight_limit is None:
-        return "window"
-    window_rate = facts.window_rate
-    if window_rate is None:
-        if facts.rtt is None:
-            return "window"
-        window_rate = facts.in_flight_limit * facts.chunk / max(facts.rtt, 1e-3)
-    return "burst" if facts.burst_rate > BURST_GAIN * window_rate else "window"
+    return "burst" if mode == "burst" and not others_ask else "window"
 
 
 def quantum(rtt: float | None) -> float:

@@ -152,7 +152,7 @@ class Reading:
     def _steer(self, transfer: ReadTransfer, stream: FileStream) -> bool:
         """Choose how to read from here on; return whether somebody else waits."""
         others = self._queue.rival_use(stream) is not None
-        self._steering.steer(transfer, stream.contiguous_want(), others_waiting=others)
+        self._steering.steer(transfer)
         return others
 
     def _go_on(self, stream: FileStream, transfer: ReadTransfer, started: float) -> bool:

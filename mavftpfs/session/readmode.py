@@ -1,15 +1,15 @@
-"""Remembers what reading cost and steers transfers by the policy. Layer: session."""
+"""Remembers how fast reading was and steers transfers by the policy. Layer: session."""
 
 from __future__ import annotations
 
 from mavftpfs.protocol.engine import Engine
 from mavftpfs.protocol.payload import MAX_DATA
 from mavftpfs.protocol.transfers import ReadTransfer
-from mavftpfs.session.policy import ReadFacts, ReadMode, Strategy, choose_strategy
+from mavftpfs.session.policy import ReadMode, Strategy, choose_strategy
 
 
 class ReadSteering:
-    """Chooses strategy and chunk for each transfer from what earlier ones measured.
+    """Chooses strategy and chunk for each transfer, and remembers what they measured.
 
     chunk: bytes a request asks for, 1..239; None = the most that fits.
     """
@@ -23,7 +23,7 @@ class ReadSteering:
         self._chosen: Strategy | None = None
 
     def status(self) -> dict[str, object]:
-        """Return what was chosen last and why; rates in bytes per second, None for what was not measured."""
+        """Return how files are read, and how fast; bytes per second, None for what was not measured."""
         return {
             "reading_by": self._chosen,
             "window": self._engine.flow.window,
@@ -34,22 +34,12 @@ class ReadSteering:
             "burst_rate": self._burst_rate,
         }
 
-    def steer(self, transfer: ReadTransfer, wanted: int, *, others_waiting: bool) -> None:
+    def steer(self, transfer: ReadTransfer) -> None:
         """Let a running transfer go on by what is the better strategy now."""
         self.learn(transfer)
-        traits = self._engine.traits
-        facts = ReadFacts(
-            mode=self.mode,
-            wanted=wanted,
-            rtt=self._engine.rtt,
-            chunk=self.chunk,
-            in_flight_limit=traits.queue_limit,
-            window_rate=self._window_rate,
-            burst_rate=self._burst_rate,
-            burst_stoppable=traits.answers_during_burst,
-            others_waiting=others_waiting,
-        )
-        strategy = self._chosen = choose_strategy(facts)
+        # A keep-alive of a burst counts for a moment, too, which costs nothing.
+        others_ask = self._engine.in_flight > transfer.in_flight
+        strategy = self._chosen = choose_strategy(self.mode, others_ask=others_ask)
         if strategy != transfer.strategy:
             transfer.set_strategy(strategy)
 

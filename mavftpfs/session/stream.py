@@ -176,14 +176,6 @@ class FileStream:
     def _gone(self) -> FileChanged:
         return FileChanged(f"{self.path!r} was removed or replaced")
 
-    def contiguous_want(self) -> int:
-        """Return the length of the first wanted run, demand and readahead taken together."""
-        both = self._demand.copy()
-        for start, stop in self._ahead:
-            both.add(start, stop)
-        first = both.first()
-        return 0 if first is None else first[1] - first[0]
-
     def _unmet(self, wanted: ExtentSet) -> ExtentSet:
         unmet = ExtentSet()
         for start, stop in wanted:

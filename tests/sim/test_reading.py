@@ -21,8 +21,8 @@ from mavftpfs.shared.errors import (
     RequestTimeout,
     VehicleLost,
 )
-from mavftpfs.sim.linkmodel import LinkSettings
-from tests.support.worlds import MemorySink, World, begin_to_read, read_file
+from mavftpfs.sim.linkmodel import Duplex, LinkSettings
+from tests.support.worlds import ROOTS, MemorySink, World, begin_to_read, content, read_file, world
 
 
 async def test_a_reboot_between_open_and_first_read_is_bridged(autojump: MockClock) -> None:
@@ -243,3 +243,25 @@ async def test_bursts_through_the_caches(profile: str, autojump: MockClock) -> N
         assert stats.by_opcode[Opcode.BURST_READ_FILE] >= 5
         assert stats.by_opcode[Opcode.READ_FILE] < 500_000 / 239 / 2
     assert here.vehicle.server.open_sessions == 0
+
+
+@pytest.mark.parametrize("profile", ["mavsdk", "px4", "px4-nuttx"])
+async def test_beside_bursts_that_fill_the_radio_a_listing_is_answered(
+    profile: str, autojump: MockClock
+) -> None:
+    """One burst after the other left no room for the answer in a short queue, and nothing was asked again."""
+    radio = LinkSettings(rate=5760.0, delay=0.025, duplex=Duplex.HALF, queue=2048)
+    data = content(300_000)
+    here = world(profile, radio, big=data)
+    root = ROOTS.get(profile, b"") + b"/d"
+    for number in range(20):
+        here.tree.add(root + b"/fresh%d/f" % number, b"small")
+    async with here.connection(ConnectOptions(read_mode="burst")) as connection:
+        reader, sink = await begin_to_read(connection, root + b"/big", 0)
+        for _ in range(4):
+            listing = await connection.store.list_directory(root)
+            assert len(listing.entries) == 21
+            await trio.sleep(0.7)
+        assert await sink.wait_for(0, len(data)) == data
+        assert connection.engine.stats.by_opcode[Opcode.BURST_READ_FILE] >= 5
+        reader.close()

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import pytest
 
 from mavftpfs.session.policy import (
@@ -12,47 +10,28 @@ from mavftpfs.session.policy import (
     RELIEF,
     STARVING,
     USE_MEMORY,
-    ReadFacts,
+    ReadMode,
     Service,
     choose_strategy,
     quantum,
     should_switch,
 )
 
-LONG_ROUND_TRIP = ReadFacts(
-    mode="auto",
-    wanted=1_000_000,
-    rtt=0.3,
-    chunk=239,
-    in_flight_limit=4,
-    window_rate=None,
-    burst_rate=40_000.0,
-    burst_stoppable=False,
-    others_waiting=False,
-)
-
 
 @pytest.mark.parametrize(
-    ("change", "strategy"),
+    ("mode", "others_ask", "strategy"),
     [
-        ({}, "burst"),
-        ({"mode": "window"}, "window"),
-        ({"rtt": 0.005}, "window"),
-        ({"wanted": 4096}, "window"),
-        ({"others_waiting": True}, "window"),
-        ({"burst_rate": None}, "window"),
-        ({"in_flight_limit": None}, "window"),
-        ({"rtt": None}, "window"),
-        ({"window_rate": 38_000.0}, "window"),
-        ({"window_rate": 3_000.0}, "burst"),
-        ({"mode": "burst", "burst_rate": None, "wanted": 1}, "burst"),
+        ("auto", False, "window"),
+        ("auto", True, "window"),
+        ("window", False, "window"),
+        ("burst", False, "burst"),
+        ("burst", True, "window"),
     ],
 )
-def test_a_burst_is_chosen_only_where_the_window_is_capped_and_the_way_is_long(
-    change: dict[str, object], strategy: str
+def test_a_burst_is_for_who_asked_for_it_and_while_nobody_else_asks(
+    mode: ReadMode, others_ask: bool, strategy: str
 ) -> None:
-    facts = dataclasses.replace(LONG_ROUND_TRIP, **change)  # type: ignore[arg-type]
-    assert choose_strategy(facts) == strategy
+    assert choose_strategy(mode, others_ask=others_ask) == strategy
 
 
 def test_quantum_grows_with_the_round_trip_within_bounds() -> None:
