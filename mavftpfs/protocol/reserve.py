@@ -30,7 +30,12 @@ _DOUBTFUL_ROUNDS = 20
 """In a row, since pauses that follow each other empty the queue for some."""
 
 _BOLDLY = 2.0
-_CAREFULLY = 1.1
+_CAREFULLY = 1.15
+_FALL = 0.6
+"""At most at once where some of it waited: pauses in a row look like a short queue for a while."""
+
+_SOME = 0.3
+
 _FADE = 0.985
 
 _MEMORY = 0.9
@@ -112,7 +117,8 @@ class Reserve:
         self._waited = max(self._waited, waited)
         if self._rounds < _DOUBTFUL_ROUNDS:
             return
-        self._held, self._overfull = self._waited, True
+        least = _FALL * self.seconds if self._waited > _SOME * self.seconds else 0.0
+        self._held, self._overfull = max(self._waited, least), True
         self._rounds, self._waited = 0, 0.0
         if self._held < _LEAST:
             self._give_up(now)

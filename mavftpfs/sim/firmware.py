@@ -20,6 +20,9 @@ from mavftpfs.sim.wire import FULL_FRAME, frame_size
 Room = Callable[[], int]
 
 
+_PAUSES_KEPT = 1 << 18
+
+
 class Refusal(Exception):
     """A NAK with a code of the server's own, which does not come from errno."""
 
@@ -40,8 +43,7 @@ class Firmware(ABC):
         self.dropped_requests = 0
         self.dropped_replies = 0
         self.replays = 0
-        self._card_uses = 0
-        self._pauses = 0.0
+        self.pauses: deque[float] = deque(maxlen=_PAUSES_KEPT)
         self.now = float("-inf")
         self._ready: list[tuple[Address, bytes]] = []
         self._ready_bytes = 0
@@ -99,15 +101,9 @@ class Firmware(ABC):
         return wake
 
     def note_pause(self, seconds: float) -> float:
-        """Count a read or write that the card made wait so long, 0 included; return it."""
-        self._card_uses += 1
-        self._pauses += seconds
+        """Note that the card made a read or write wait so long, 0 included; return it."""
+        self.pauses.append(seconds)
         return seconds
-
-    @property
-    def paused(self) -> float:
-        """Seconds that the card made reads and writes wait, on average of all."""
-        return self._pauses / max(1, self._card_uses)
 
     def forget_outbox(self) -> None:
         """Drop what was not sent yet."""

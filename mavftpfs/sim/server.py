@@ -141,9 +141,9 @@ class FtpServer:
         return self._firmware.dropped_replies
 
     @property
-    def paused(self) -> float:
-        """Seconds that a slow card made reads and writes wait, on average of all."""
-        return self._firmware.paused
+    def pauses(self) -> Sequence[float]:
+        """Seconds for which a slow card made each of the last reads and writes wait, 0 included."""
+        return self._firmware.pauses
 
     @property
     def replays(self) -> int:

@@ -1,16 +1,18 @@
 """What is measured: conditions, and the limit that design section 5 sets for them.
 
 The limit is the link's, and at most the server's ceiling, which for PX4 and MAVSDK is whatever they answer. A
-PX4 whose card pauses (px4-nuttx) answers a read later, and the answers that wait in the link meanwhile bridge
-that: only where the server is slower than the link do pauses lower the limit. Of writes it has room for five,
-and what a full link brings beyond them is never answered. How many pauses there are is chance, a tenth more
-or less in a minute, so a run is compared with what its own pauses allowed. The window that a receive buffer
-survives is the limit of a serial port only, which these links are not: six writes a round trip would be
-4.8 kB/s at 300 ms, of which a share says nothing where 75 kB/s are reached.
+PX4 whose card pauses (px4-nuttx) answers a read later, and answers that wait in the link meanwhile bridge
+that: for 0.25 s and a round trip at most, because whoever lists a directory beside it waits behind them, and
+section 5 has a bound for that. Of writes it has room for five, and what a full link brings beyond them is
+never answered. How many pauses there are is chance, a tenth more or less in a minute, so a run is compared
+with what its own pauses allowed. The window that a receive buffer survives is the limit of a serial port
+only, which these links are not: six writes a round trip would be 4.8 kB/s at 300 ms, of which a share says
+nothing where 75 kB/s are reached.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -31,6 +33,10 @@ ARDUPILOT_WINDOW = 5
 
 ARDUPILOT_POLL = 0.010
 
+WAITING = 0.25
+MOST_WAITING = 0.45
+"""Seconds of answers, with the round trip, that may wait in a link for the pauses of a card."""
+
 TARGETS = {
     "read": {0.0: 0.97, 0.01: 0.93, 0.05: 0.85, 0.1: 0.75},
     "write": {0.0: 0.95, 0.01: 0.90, 0.05: 0.80, 0.1: 0.70},
@@ -50,12 +56,12 @@ class Case:
 
     @property
     def limit(self) -> float:
-        """Bytes per second that could be read or written at best, with as many pauses as usual."""
+        """Bytes per second that could be read or written at best, were all pauses of a card alike."""
         profile = PROFILES[self.profile]
-        return self.limit_beside(profile.stall_chance * sum(profile.stall) / 2)
+        return self.limit_beside([profile.stall_chance * sum(profile.stall) / 2] * 1000)
 
-    def limit_beside(self, pause: float) -> float:
-        """Return the same where the card made each request wait for `pause` seconds on average."""
+    def limit_beside(self, pauses: Sequence[float]) -> float:
+        """Return the same where the card made one request after the other wait for so many seconds."""
         limit = self.rate * MAX_DATA / FRAME * (1 - self.loss)
         if self.profile.startswith(("ardupilot", "littlefs")):
             # What a lone request takes from the moment it is handed to the link until it is answered.
@@ -68,11 +74,24 @@ class Case:
         if profile.family is not Family.PX4:
             return limit
         link = MAX_DATA / limit
-        if self.direction == "write":
-            # What a full link brings meanwhile is lost, but for what the server's input buffer holds.
-            held = profile.stall_chance * (profile.rx_buffer // FRAME) * link
-            link += max(0.0, pause - held)
-        return MAX_DATA / max(link, profile.request_cost + pause)
+        if not any(pauses):
+            return MAX_DATA / max(link, profile.request_cost)
+        pause = sum(pauses) / len(pauses)
+        if self.direction == "read":
+            return MAX_DATA / self._answered(pauses, link)
+        # What a full link brings meanwhile is lost, but for what the server's input buffer holds.
+        held = profile.stall_chance * (profile.rx_buffer // FRAME) * link
+        return MAX_DATA / max(link + max(0.0, pause - held), profile.request_cost + pause)
+
+    def _answered(self, pauses: Sequence[float], link: float) -> float:
+        """Return seconds for each answer where the server always has work, but while so many of them wait."""
+        most = min(WAITING + self.rtt, MOST_WAITING)
+        cost = PROFILES[self.profile].request_cost
+        answered = brought = 0.0
+        for pause in pauses:
+            answered = max(answered, brought - most) + cost + pause
+            brought = max(brought, answered) + link
+        return brought / len(pauses)
 
     @property
     def target(self) -> float | None:

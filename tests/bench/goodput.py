@@ -56,7 +56,7 @@ def measure(case: Case, seconds: float, *, queue: int | None = None, telemetry: 
                 took = await transfer(world, connection, data)
         requests = connection.engine.stats.requests * MAX_DATA / len(data)
         dropped = sum(world.model.counters(direction).dropped for direction in LinkDirection)
-        limit = case.limit_beside(world.vehicle.server.paused)
+        limit = case.limit_beside(world.vehicle.server.pauses)
         return Result(case, limit, len(data) / took / limit, requests, dropped)
 
     return trio.run(run, clock=MockClock(autojump_threshold=0))

@@ -46,13 +46,24 @@ def test_limit_is_what_design_says() -> None:
 def test_a_card_that_pauses_costs_where_nothing_bridges_it() -> None:
     """A request takes 0.5 ms and every 500th pauses for 175 ms on average."""
     link, always_busy = 100_000 * 239 / 266, 239 / 0.00085
-    assert Case("px4-nuttx", 1e6, 0.1, 0.0, "read").limit == pytest.approx(always_busy)
+    assert Case("px4-nuttx", 1e6, 0.1, 0.0, "read").limit == pytest.approx(always_busy, rel=0.001)
     assert Case("px4-nuttx", 1e6, 0.1, 0.0, "write").limit == pytest.approx(always_busy)
-    assert Case("px4-nuttx", 1e5, 0.1, 0.0, "read").limit == pytest.approx(link), "answers wait in the link"
+    assert Case("px4-nuttx", 1e5, 0.1, 0.0, "read").limit == pytest.approx(link, rel=0.001), (
+        "answers wait in the link"
+    )
     write = Case("px4-nuttx", 1e5, 0.1, 0.0, "write")
     assert 239 / (0.00266 + 0.00035) < write.limit < link, "five writes wait, the others are lost"
-    assert write.limit_beside(0.0007) < write.limit < write.limit_beside(0.0)
-    assert Case("px4", 1e5, 0.1, 0.0, "write").limit_beside(0.0) == pytest.approx(link)
+    assert write.limit_beside([0.0007]) < write.limit < write.limit_beside([0.0])
+    assert Case("px4", 1e5, 0.1, 0.0, "write").limit_beside([0.0]) == pytest.approx(link)
+
+
+def test_pauses_come_one_at_a_time_and_only_so_much_may_wait_for_them() -> None:
+    link, pauses = 250_000 * 239 / 266, ([0.0] * 499 + [0.175]) * 20
+    read = Case("px4-nuttx", 250_000.0, 0.1, 0.0)
+    assert read.limit_beside(pauses) == pytest.approx(link, rel=0.02), "0.35 s wait"
+    long = ([0.0] * 999 + [0.35]) * 10
+    assert Case("px4-nuttx", 250_000.0, 0.01, 0.0).limit_beside(long) == pytest.approx(0.92 * link, rel=0.01)
+    assert read.limit_beside([0.3] * 10) == pytest.approx(239 / 0.3005, rel=0.01), "it does nothing else"
 
 
 def test_a_row_has_the_median_and_its_shares() -> None:

@@ -55,6 +55,26 @@ def test_of_what_a_small_buffer_loses_no_more_is_tried() -> None:
     assert path.most <= 0.06
 
 
+def test_pauses_in_a_row_do_not_take_it_all() -> None:
+    path = Path(lambda seconds: seconds)
+    path.run(PERIOD)
+    for _ in range(2):
+        before = path.reserve.seconds
+        for _ in range(20):
+            path.reserve.on_round(path.now, 0.4 * before)
+        assert path.reserve.seconds == pytest.approx(0.6 * before)
+    path.run(4 * PERIOD)
+    assert path.reserve.seconds > 0.2
+
+
+def test_a_buffer_that_is_far_smaller_is_seen_at_once() -> None:
+    path = Path(lambda seconds: seconds)
+    path.run(PERIOD)
+    for _ in range(20):
+        path.reserve.on_round(path.now, 0.05)
+    assert path.reserve.seconds == pytest.approx(0.05)
+
+
 def test_no_more_than_a_short_queue_of_the_link_holds() -> None:
     path = Path(lambda seconds: min(seconds, 0.1), bridges=False)
     path.reserve._expected = 1e9  # it helps
