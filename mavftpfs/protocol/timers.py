@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from math import inf
 
+from mavftpfs.protocol.payload import Opcode
 from mavftpfs.protocol.requests import FLOORS, Manner, Request
 from mavftpfs.protocol.rtt import INITIAL_RTO, RttEstimator
 
@@ -22,6 +23,14 @@ _NO_WORK = 0.1
 _PACE_MARGIN = 4.0
 """A card may be so much slower than it was seen to be: others use it, and it stops to erase."""
 _LEAST_PACE = 0.05
+_USUAL_PACE = 0.1
+"""Cards read a megabyte per second and more: of a server never seen at work, a checksum is asked for again
+when one of those would have had it. It is under the same seq: PX4 and ArduPilot, which may be slower, replay
+their answer (servers.md 2), and MAVSDK, which works again, is a computer."""
+
+_USUAL_SENDS = 2
+"""Transmissions that may go out so; then the slowest card gets its time."""
+
 _FORGETTING = 0.125
 
 
@@ -91,7 +100,7 @@ class Timers:
         patient = request.sends >= manner.patient_after
         if patient and manner.family == _WORK:
             # The way and the work take their times one after the other.
-            wait = rto = rto + manner.patience * self._pace_of(request.opcode)
+            wait = rto = rto + self._work_of(request)
         # Under the same seq no repetition tells the round trip: where that is not known, it may be longer.
         free = manner.free_sends if timer.known or not manner.same_seq else 1
         doublings = request.sends - free
@@ -105,7 +114,12 @@ class Timers:
         last = self._pace.get(request.opcode, seen)
         self._pace[request.opcode] = max(seen, last + (seen - last) * _FORGETTING)
 
-    def _pace_of(self, opcode: int) -> float:
-        """Return the share of the slowest server's time to wait for the work of this one."""
-        seen = self._pace.get(opcode)
-        return 1.0 if seen is None else min(1.0, max(_LEAST_PACE, seen * _PACE_MARGIN))
+    def _work_of(self, request: Request) -> float:
+        """Return how long to wait for the work of this server, in seconds; the slowest takes `patience`."""
+        patience = request.manner.patience
+        seen = self._pace.get(request.opcode)
+        if seen is not None:
+            return patience * min(1.0, max(_LEAST_PACE, seen * _PACE_MARGIN))
+        if request.opcode == Opcode.CALC_FILE_CRC32 and request.sends <= _USUAL_SENDS:
+            return max(patience * _USUAL_PACE, min(patience, _NO_WORK))
+        return patience
