@@ -22,6 +22,9 @@ MAX_QUANTUM = 4.0
 STARVING = 3.0
 """Seconds of waiting after which a bulk reader is not passed over any more."""
 
+STARVING_TRIPS = 20.0
+"""The same in round trips, for an upload: opening its file again takes up to four."""
+
 RELIEF = 0.5
 """Seconds of service that ends starving."""
 
@@ -59,10 +62,10 @@ class Service:
         return self.seconds * faded
 
 
-def is_starving(waited: float) -> bool:
+def is_starving(waited: float, rtt: float | None = None) -> bool:
     """Return whether who waited so long (seconds) goes before newcomers: one small file after another must
-    slow a copy down, not stop it."""
-    return waited >= STARVING
+    slow a copy down, not stop it. rtt: where that depends on it, for an upload."""
+    return waited >= max(STARVING, STARVING_TRIPS * (rtt or 0.0))
 
 
 def should_switch(

@@ -280,8 +280,8 @@ class Scheduler:
                 if isinstance(user, SessionJob):
                     await self._serve_job(user)
                 elif isinstance(user, QueuedUpload):
-                    await self._uploading.serve(user)
-                    user.ticket = next(self._tickets)
+                    if await self._uploading.serve(user):
+                        user.ticket = next(self._tickets)
                 elif await self._reading.serve(user):
                     user.ticket = None
                     self._take_ticket(user)
@@ -330,8 +330,9 @@ class Scheduler:
                 readahead = stream
         for upload in self._uploading.due(now):
             if not self._claimed(upload.path):
-                heavy = upload.use.recent(now) >= LIGHT_USE
-                waiting.append(((heavy, not heavy, upload.ticket), upload))
+                starving = self._uploading.writer.starves(upload)
+                heavy = upload.use.recent(now) >= LIGHT_USE and not starving
+                waiting.append(((heavy, not heavy and not starving, upload.ticket), upload))
         if waiting:
             return min(waiting, key=lambda item: item[0])[1]
         return readahead

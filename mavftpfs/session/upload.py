@@ -180,6 +180,7 @@ class QueuedUpload:
             on. opened: it was opened before. free_at: see WriteStore. begun: see Upload.
         asked_at: since when who waits for its end sees nothing happen. filled_in: seconds it took to send
             all there was, last time. tried: it was reopened to see what OpenFileWO does.
+        waits_since: when it had something to send and no turn, perhaps with the wait after a failure.
         left_at: when its file was closed last, long ago where nobody knows.
         anew: nothing that was proven counts any more. usurped: the server closed the session by itself,
             or may have.
@@ -198,7 +199,7 @@ class QueuedUpload:
         self.free_at: float | None = None
         self.begun = False
         self.ticket = ticket
-        self.asked_at = self._since = asked_at
+        self.asked_at = self.waits_since = self._since = asked_at
         self.usurped = False
         self.use = Service()
         self.error: MavftpfsError | None = None
@@ -236,6 +237,7 @@ class QueuedUpload:
 
     def wake(self) -> None:
         """The source has more."""
+        self._note_waiting()
         self._woken = True
         self.clean = False
         self._host.on_news(self)
@@ -250,6 +252,7 @@ class QueuedUpload:
 
     async def _finish(self) -> None:
         self._host.check_may_write()
+        self._note_waiting()
         self._begin_again()
         if not self.finishing:
             self.asked_at = self._host.now()
@@ -303,6 +306,16 @@ class QueuedUpload:
     def finishing(self) -> bool:
         """Whether somebody waits for the end."""
         return any(call > self._completed for call in self._pending)
+
+    def _note_waiting(self) -> None:
+        """There is something to do; if there was before, it has waited since then."""
+        now = self._host.now()
+        if not self.is_due(now):
+            self.waits_since = now
+
+    def waited_until(self, now: float) -> float:
+        """Return for how many seconds it could have sent something and had no turn."""
+        return now - max(self.waits_since, self.retry_at)
 
     def is_due(self, now: float) -> bool:
         """Whether there is something to do for it now."""

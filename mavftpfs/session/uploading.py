@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import errno
-from typing import NoReturn
-
 import trio
 
 from mavftpfs.cache.remote import FREE_FOR, UploadSource
@@ -13,13 +10,13 @@ from mavftpfs.session.closing import close_refused, close_written
 from mavftpfs.session.copies import Span, WriteLog
 from mavftpfs.session.echoes import feared_for
 from mavftpfs.session.kit import Kit, Queue
-from mavftpfs.session.occupants import is_same, require_free
+from mavftpfs.session.occupants import require_free
 from mavftpfs.session.opening import TERMINATE_LIMIT, OpenSession
+from mavftpfs.session.reopening import Reopening
 from mavftpfs.session.turns import Turns
 from mavftpfs.session.upload import Feed, QueuedUpload
 from mavftpfs.session.vehicle import FOREIGN_MEMORY
 from mavftpfs.session.writing import Stop, Writer
-from mavftpfs.shared.errnos import errno_for
 from mavftpfs.shared.errors import (
     AlreadyExists,
     Armed,
@@ -67,8 +64,8 @@ class Uploading:
         self._op_deadline = op_deadline
         self._chunk = chunk
         self._when_armed_ok = when_armed_ok
-        self._wo_tells_size = False
         self._engine = kit.engine
+        self._reopening = Reopening(kit, queue, self.writer, self.outlast_copies)
         self.written = WriteLog(kit.engine.stats, lambda: kit.engine.traits, kit.clock, chunk)
         self._written: QueuedUpload | None = None
         self._written_at = float("-inf")
@@ -183,17 +180,16 @@ class Uploading:
             if upload.finishing and not upload.running and upload.asked_at < oldest:
                 upload.fail(error, now)
 
-    async def serve(self, upload: QueuedUpload) -> None:
-        """Use the session for an upload. Its errors are told to the upload."""
+    async def serve(self, upload: QueuedUpload) -> bool:
+        """Use the session for an upload. Its errors are told to the upload. False: it sent nothing, for who
+        waited, or may have come while another file was closed for it, goes first."""
         started = self._clock()
-        upload.running = True
+        upload.running = served = True
         try:
             if not self._is_complete_already(upload):
                 self.check_may_write()
-                if self._lets_stragglers_pass(upload):
-                    return
-                session = await self._open(upload)
-                await self._let_go(upload, await self._write(upload, session))
+                if not self._lets_stragglers_pass(upload):
+                    served = await self._serve(upload)
         except SessionLost as lost:
             self._on_lost(upload, lost)
         except MavftpfsError as error:
@@ -201,9 +197,26 @@ class Uploading:
         finally:
             now = self._clock()
             upload.running = False
-            upload.asked_at = now
+            if served:
+                upload.asked_at = upload.waits_since = now
+            else:
+                upload.feed.put_back()
             upload.use.add(now - started, now)
             upload.tell()
+        return served
+
+    async def _serve(self, upload: QueuedUpload) -> bool:
+        """Open, write and close; return False if it was somebody else's turn before it could write.
+
+        Opening takes up to four round trips, and who came meanwhile would wait for all of them.
+        """
+        if not self.writer.starves(upload) and await self._holder.made_room(upload.path):
+            return False
+        session = await self._open(upload)
+        if session is None:
+            return False
+        await self._let_go(upload, await self._write(upload, session))
+        return True
 
     async def _write(self, upload: QueuedUpload, session: OpenSession) -> Stop:
         try:
@@ -246,7 +259,8 @@ class Uploading:
 
     # --- opening
 
-    async def _open(self, upload: QueuedUpload) -> OpenSession:
+    async def _open(self, upload: QueuedUpload) -> OpenSession | None:
+        """None: it gave way."""
         feed = upload.feed
         if not upload.create and not self.writer.resumable:
             raise LocalProtocolError("how the vehicle opens a file for writing is not known (any more)")
@@ -254,9 +268,9 @@ class Uploading:
             feed.roll_back(everything=True)
         upload.anew = False
         if feed.proven and self.writer.may_try(upload):
-            await self._try_reopening(upload)
+            await self._reopening.find_out(upload)
         if self.writer.resumable and (feed.proven or not upload.create):
-            return await self._reopen(upload, max(feed.reached, upload.least))
+            return await self._reopening.reopen(upload, max(feed.reached, upload.least))
         if feed.proven or feed.unproven:
             feed.roll_back(everything=True)
         if upload.free_at is not None and self._clock() - upload.free_at > FREE_FOR:
@@ -270,59 +284,6 @@ class Uploading:
             upload.created_at = self._clock()
         upload.opened = True
         return session
-
-    async def _try_reopening(self, upload: QueuedUpload) -> None:
-        """Find out on a file of our own making what OpenFileWO does (servers.md 8): the size tells, asked
-        afterwards, since the reply to OpenFileWO may say what it was before.
-
-        Where requests come twice that is looked at twice: a late WriteFile fills a file that was emptied.
-        """
-        traits, reached = self._queue.write_traits, upload.feed.reached
-        upload.tried = True
-        await self.outlast_copies(upload.created_at)  # a late CreateFile empties it, too
-        for _ in range(2):
-            try:
-                await self._holder.open(upload.path, Opcode.OPEN_FILE_WO)
-                size = await self._size(upload)
-            except FtpNak:
-                return  # it is refused, or somebody removed the file: what is not seen stays unknown
-            if size is None or size < reached:
-                traits.wo_truncates = True if size == 0 else traits.wo_truncates
-                return
-            if not self._engine.stats.strays:
-                break
-        traits.wo_truncates = False
-
-    async def _size(self, upload: QueuedUpload) -> int | None:
-        """Return the size of the file, asked before OpenFileWO, which makes missing ones (servers.md 8)."""
-        return (await self._holder.open(upload.path, Opcode.OPEN_FILE_RO)).size
-
-    async def _reopen(self, upload: QueuedUpload, least: int) -> OpenSession:
-        """Open a file that is to keep what it has, unless it has less than `least` bytes: then what was to
-        stay is gone, and what is written behind it would leave a hole; or if it is another one."""
-        if not await is_same(self._kit, upload):
-            await self._part_with(upload, f"{upload.path!r} became another file while it was changed here")
-        try:
-            size = await self._size(upload) if upload.opened and not self._wo_tells_size else None
-            with self._echoes.noted(upload.path, opens=True):
-                session = await self._holder.open(upload.path, Opcode.OPEN_FILE_WO)
-        except FtpNak as nak:
-            if not upload.create or errno_for(nak) != errno.ENOENT:
-                raise
-            size, session = 0, None
-        if session is not None:
-            upload.opened, self._wo_tells_size = True, session.size is not None
-            size = session.size if size is None else size
-            if size is None or size >= least:
-                return session
-        await self._part_with(upload, f"{upload.path!r} has {size} bytes now, not {least}")
-
-    async def _part_with(self, upload: QueuedUpload, problem: str) -> NoReturn:
-        upload.feed.roll_back(everything=True)
-        await self._holder.close()
-        if upload.create:
-            raise SessionLost(problem, by_server=True)
-        raise FileChanged(problem)
 
     # --- letting go
 

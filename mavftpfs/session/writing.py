@@ -17,7 +17,7 @@ from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.protocol.writing import WriteTransfer
 from mavftpfs.session.kit import Kit, Queue
 from mavftpfs.session.opening import OpenSession
-from mavftpfs.session.policy import should_switch
+from mavftpfs.session.policy import is_starving, should_switch
 from mavftpfs.session.turns import Turns
 from mavftpfs.session.upload import QueuedUpload
 from mavftpfs.shared.errors import FtpNak, MavftpfsError
@@ -134,6 +134,17 @@ class Writer:
         """Whether reopening its file is to tell what OpenFileWO does: at most its own bytes go again."""
         unknown = self._queue.write_traits.wo_truncates is None
         return unknown and upload.create and not upload.tried and upload.feed.reached > 0
+
+    def starves(self, upload: QueuedUpload) -> bool:
+        """Whether others are not to go before it any more."""
+        return is_starving(upload.waited_until(self._clock()), self._engine.rtt)
+
+    def gives_way(self, upload: QueuedUpload) -> bool:
+        """Whether it is somebody else's turn before its file is open. Once it is, a window goes out at least:
+        one small read after another must slow it down, not stop it."""
+        if self.starves(upload):
+            return False
+        return self._is_turn_over(upload, 0.0, self._queue.rival_use(upload))
 
     # --- writing
 

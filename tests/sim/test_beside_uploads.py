@@ -92,13 +92,14 @@ async def test_a_close_and_a_read_beside_a_trickling_writer(profile: str, autoju
 async def test_a_read_and_a_close_beside_a_copy_that_lasts(profile: str, autojump: MockClock) -> None:
     place = Place(profile, SLOW)
     data = random.Random(4).randbytes(600_000)
-    async with place.mounted() as (connection, tree), trio.open_nursery() as nursery:
-        nursery.start_soon(place.copy, tree, b"big", data)
-        await trio.sleep(10)
-        with trio.fail_after(5):
-            assert await read_file(connection, place.root + b"/other") == b"q" * 3000
-        with trio.fail_after(10):
-            await place.copy(tree, b"small", b"b" * 1000)
+    async with place.mounted() as (connection, tree):
+        async with trio.open_nursery() as nursery:
+            nursery.start_soon(place.copy, tree, b"big", data)
+            await trio.sleep(10)
+            with trio.fail_after(5):
+                assert await read_file(connection, place.root + b"/other") == b"q" * 3000
+            with trio.fail_after(10):
+                await place.copy(tree, b"small", b"b" * 1000)
         assert connection.store.traits.wo_truncates is False, "learnt on the way"
     assert place.data(b"big") == data
     assert place.data(b"small") == b"b" * 1000
