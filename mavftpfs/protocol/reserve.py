@@ -27,7 +27,9 @@ _LEAST = 0.035
 
 _WAITS = 0.75
 _DOUBTFUL_ROUNDS = 20
-"""In a row, since pauses that follow each other empty the queue for some."""
+_TRIAL_ROUNDS = 7
+"""In a row, since pauses that follow each other empty the queue for some; where nothing was ever seen to
+wait the server's buffer overflows in each of them."""
 
 _BOLDLY = 2.0
 _CAREFULLY = 1.15
@@ -115,7 +117,7 @@ class Reserve:
             return
         self._rounds += 1
         self._waited = max(self._waited, waited)
-        if self._rounds < _DOUBTFUL_ROUNDS:
+        if self._rounds < (_DOUBTFUL_ROUNDS if self._held > _TRIAL else _TRIAL_ROUNDS):
             return
         least = _FALL * self.seconds if self._waited > _SOME * self.seconds else 0.0
         self._held, self._overfull = max(self._waited, least), True
