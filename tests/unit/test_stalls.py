@@ -169,6 +169,18 @@ def test_the_longest_pause_of_late_is_no_sign_of_losses() -> None:
     assert stalls.patience <= 0.5, "that was the link"
 
 
+def test_at_the_end_of_a_transfer_no_newer_answer_would_tell_of_a_loss() -> None:
+    """Who waits for an upload's last answers, to read something between, must not wait for a pause more."""
+    flow = Flow()
+    at_work_with_pauses(flow)
+    assert flow.patience == pytest.approx(0.15, rel=0.2)
+    flow.on_starved()
+    assert flow.patience == 0.0
+    serial = Flow(serial=True)
+    serial._stalls = flow._stalls
+    assert serial.patience == 0.0
+
+
 def test_patience_ends_with_the_pauses() -> None:
     stalls = Stalls()
     now = run(stalls, 20.0, every=0.5, pause=0.15)
