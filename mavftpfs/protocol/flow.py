@@ -165,7 +165,7 @@ class Flow:
 
     @property
     def patience(self) -> float:
-        """Seconds of silence that prove no loss, where newer answers will (and no port loses whole windows)."""
+        """Seconds of silence that prove no loss where newer answers will, and no port loses windows."""
         return 0.0 if self._survival or self._app_limited else self._stalls.patience
 
     def _room(self, in_flight: int, now: float, paced: bool) -> int:
