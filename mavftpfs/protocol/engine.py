@@ -383,8 +383,8 @@ class Engine:
             # ArduPilot answers nothing else during a burst: silence proves nothing then.
             since = max(since, self._bursts.heard_at)
         due = since + self._timers.wait(request)
-        pauses = request.manner.ordered and self._ledger.in_flight > _FEW
-        return max(due, self._heard_at + self.flow.patience) if pauses else due
+        patience = self.flow.patience if request.manner.ordered and self._ledger.in_flight > _FEW else 0.0
+        return max(due, min(due, self._heard_at) + patience)  # a stream of other answers is no pause
 
     def _expire(self, request: Request, now: float) -> None:
         """A timer ran out: ask again, or give up the operation when this one request took too long."""

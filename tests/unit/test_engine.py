@@ -798,6 +798,22 @@ def test_silence_proves_nothing_while_the_server_pauses_but_a_lone_requests_does
     assert engine._ledger.again or sent(engine, 0.45)
 
 
+def test_answers_to_others_do_not_put_a_timer_off_for_ever() -> None:
+    """Where the path reorders, and after many losses, only its timer repeats a request."""
+    engine = make(limit=9)
+    reading(engine)
+    for request in sent(engine, 0.0):
+        engine.receive(chunk(request, bytes(SIZE)), 0.05)
+    engine.flow.window = 9
+    assert len(sent(engine, 0.05)) == 9
+    stalls = engine.flow._stalls
+    stalls._calm, stalls._longest = 0, 0.3
+    for step in range(1, 30):
+        engine._heard_at = 0.05 + step / 50
+        engine.on_deadline(engine._heard_at)
+    assert len(engine._ledger.again) == 9
+
+
 # --- facts
 
 
