@@ -257,7 +257,7 @@ class Flow:
         if now != self._heard_at:  # what comes at once has no pauses
             self._heard_at = now
             full = not self._starting or _FULL * self._trains.rate < self._best_rate
-            self._stalls.on_reply(now, self._best_rate if full else 0.0, self._base_rtt, rtt or 0.0)
+            self._stalls.on_reply(now, self._best_rate if full else 0.0, self._base_rtt)
         if rtt is not None and rtt < self._round_least:
             self._round_least = rtt
 

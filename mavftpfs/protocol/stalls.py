@@ -71,9 +71,8 @@ class Stalls:
         self._watched = 0.0
         self._paused = 0.0
 
-    def on_reply(self, now: float, rate: float, rtt: float = 0.0, took: float = inf) -> None:
-        """A request was answered. rate: answers per second at best, 0 if unknown. rtt: least round trip.
-        took: its own; where that began in the silence the server did not pause: all before was lost."""
+    def on_reply(self, now: float, rate: float, rtt: float = 0.0) -> None:
+        """A request was answered. rate: answers per second at best, 0 if unknown. rtt: least round trip."""
         last, self._last = self._last, now
         if last is None:
             return
@@ -81,8 +80,7 @@ class Stalls:
         self._watched += gap
         if rate > 0.0 and gap > _LEAST_PAUSE + _INTERVALS / rate:
             self._paused += gap
-            if took >= gap:  # else patience would prolong the silence from which it is learned
-                self._longest = max(self._longest, min(gap, _LONGEST))
+            self._longest = max(self._longest, min(gap, _LONGEST))
             self._bridges.append((now, min(gap, _BRIDGED)))
             if self.reserve.wanted == 0.0:
                 self.reserve.want(now, rtt)
