@@ -165,8 +165,8 @@ class Flow:
 
     @property
     def patience(self) -> float:
-        """Seconds of silence that prove no loss where newer answers will, and no port loses windows."""
-        return 0.0 if self._survival or self._app_limited else self._stalls.patience
+        """Seconds of silence that prove no loss: newer answers will, where more than a few are in flight."""
+        return 0.0 if self._survival or self._pacer or self._app_limited else self._stalls.patience
 
     def _room(self, in_flight: int, now: float, paced: bool) -> int:
         reserve = self._reserve(now, paced)

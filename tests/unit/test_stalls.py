@@ -176,9 +176,15 @@ def test_at_the_end_of_a_transfer_no_newer_answer_would_tell_of_a_loss() -> None
     assert flow.patience == pytest.approx(0.15, rel=0.2)
     flow.on_starved()
     assert flow.patience == 0.0
-    serial = Flow(serial=True)
-    serial._stalls = flow._stalls
-    assert serial.patience == 0.0
+
+
+def test_where_few_may_be_in_flight_a_silence_is_all_of_them_lost() -> None:
+    queued, serial = Flow(), Flow(serial=True)
+    for flow in (queued, serial):
+        at_work_with_pauses(flow)
+        assert flow._stalls.patience > 0.1
+    queued.set_queue_limit(5)
+    assert queued.patience == serial.patience == 0.0
 
 
 def test_patience_ends_with_the_pauses() -> None:
