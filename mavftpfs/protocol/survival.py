@@ -3,11 +3,11 @@
 Theory. PX4 takes requests from a serial port by a receiver thread that also executes them, so what arrives
 meanwhile must fit a small buffer, and what does not is lost without a word (servers.md 3). Such losses look
 like those of a bad radio, but they grow with the window and bring nothing: where the buffer holds n, n + 1
-in flight are answered no faster than n. So the window grows by one a round until something is lost; from
-then on neighbouring windows are *compared*: each is kept for some rounds, and the wider one must bring at
-least half of the answers per second that it promises, or a little where no more is lost. How many requests
-tell that depends on how many are lost anyhow. Random loss takes the same share of both, so it moves the
-window nowhere; and where the link and not the buffer is the limit, a wider window brings nothing either.
+in flight are answered no faster than n. So the window grows by half a round, at least by one, until something
+is lost; from then on neighbouring windows are *compared*: each is kept for some rounds, and the wider one has
+to bring at least half of the answers per second that it promises, or a little where no more is lost. How many
+requests tell that depends on how many are lost anyhow. Random loss takes the same share of both, so it moves
+the window nowhere; and where the link and not the buffer is the limit, a wider window brings nothing either.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ _SECOND_THOUGHT = 2.5
 _REMEMBERED = 60.0
 _GROWN = 1.1
 _OVERSHOT = 2
-"""By so much it grew while the first loss was not known. To go back further costs a long way many seconds: it
-comes back by comparing."""
+"""At the first loss it goes back so far, or by what it grew in a round: it grew while the loss was not known.
+To go back further costs a long way many seconds: it comes back by comparing."""
 
 _SETTLING = 2
 _WATCHED = 40
@@ -72,6 +72,7 @@ class Survival:
     """Finds a small window, growing from 1 to `cap` at most. window: the one in use."""
 
     __slots__ = (
+        "_before",
         "_best_rate",
         "_cap",
         "_careful",
@@ -94,6 +95,7 @@ class Survival:
     def __init__(self, cap: int) -> None:
         self.window = 1
         self._cap = cap
+        self._before = 1  # the window of the round before, while nothing is lost
         self._careful = False
         self._settled = 1  # the best one so far
         self._held = 0  # the last one that was held
@@ -131,10 +133,11 @@ class Survival:
         """Nothing was lost so far."""
         self._careful = lost > 0 and self._cap > 1
         if self._careful:
-            self._settled = low = max(1, self.window - _OVERSHOT)
+            self._settled = low = max(1, min(self.window - _OVERSHOT, self._before))
             self._compare(low, low + 1)
         elif not queued or rate > _GROWN * self._best_rate:
-            self.window = self._settled = min(self.window + 1, self._cap)
+            self._before = self.window
+            self.window = self._settled = min(self.window + max(1, self.window // 2), self._cap)
         self._best_rate = max(rate, self._best_rate)
 
     def _enough(self) -> int:

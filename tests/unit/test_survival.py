@@ -10,6 +10,7 @@ import pytest
 from mavftpfs.link.messages import Address
 from mavftpfs.protocol.flow import SERIAL_CAP, Flow
 from mavftpfs.protocol.payload import MAX_DATA, Opcode, decode_request
+from mavftpfs.protocol.survival import Survival
 from mavftpfs.protocol.writing import WriteTransfer
 from mavftpfs.sim.linkmodel import LinkSettings
 from tests.support.replies import ack
@@ -106,6 +107,17 @@ def test_it_settles_at_what_is_survived(holds: int | None, loss: float) -> None:
         overflow += port.lost / port.arrived / len(SEEDS)
     assert rate >= 0.85 * best(holds, loss)
     assert overflow <= 0.35  # a wider window is tried now and then
+
+
+def test_a_long_way_is_full_after_few_rounds_and_the_first_loss_takes_back_one() -> None:
+    """One more each round took fifteen of them: 4.5 s over 300 ms."""
+    survival = Survival(SERIAL_CAP)
+    windows = [survival.end_round(survival.window, 0, 0.3, 0.0, queued=False) for _ in range(7)]
+    assert windows == [2, 3, 4, 6, 9, 13, 16]
+    survival = Survival(SERIAL_CAP)
+    for _ in range(5):
+        survival.end_round(survival.window, 0, 0.3, 0.0, queued=False)
+    assert survival.end_round(8, 1, 0.3, 0.0, queued=False) == 6
 
 
 def test_a_limit_of_one_is_kept() -> None:
