@@ -76,7 +76,7 @@ def share_against(results: Results, x: str, fixed: dict[str, float]) -> dict[str
 
 def plot_goodput(results: Results, x: str, path: Path) -> None:
     """Draw share of the limit against `x` (loss or rtt), reading and writing beside each other."""
-    rate = max(run["case"]["rate"] for run in results)
+    rate = middle(results, "rate")
     other = {"rtt": middle(results, "rtt")} if x == "loss" else {"loss": lossy(results)}
     said = f"RTT {other['rtt'] * 1000:g} ms" if x == "loss" else f"{other['loss'] * 100:g} % loss"
 

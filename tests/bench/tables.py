@@ -92,6 +92,34 @@ def cost_table(rows: Sequence[Row], server: str, link: str) -> str:
     return markdown(head, lines)
 
 
+def goodput_table(results: Sequence[dict[str, Any]]) -> str:
+    """Return the least share of the limit over all round trips, by profile, rate, direction and loss.
+
+    In italics where one of these is below its target.
+    """
+    cells: dict[tuple[str, float], dict[tuple[str, float], list[dict[str, Any]]]] = {}
+    for run in results:
+        case = run["case"]
+        cells.setdefault((case["profile"], case["rate"]), {}).setdefault(
+            (case["direction"], case["loss"]), []
+        ).append(run)
+    columns = sorted({column for found in cells.values() for column in found})
+    head = [f"{direction}, {loss * 100:g} %" for direction, loss in columns]
+    lines = [
+        [profile, f"{rate / 1000:g}", *(_least_share(found.get(column, [])) for column in columns)]
+        for (profile, rate), found in cells.items()
+    ]
+    return markdown(["profile", "kB/s", *head], lines)
+
+
+def _least_share(runs: Sequence[dict[str, Any]]) -> str:
+    if not runs:
+        return ""
+    text = f"{min(run['share'] for run in runs):.2f}"
+    missed = any(run["target"] is not None and run["share"] < run["target"] for run in runs)
+    return f"*{text}*" if missed else text
+
+
 def caption(section: dict[str, Any]) -> str:
     """Return what made a section, and on what; a machine that was busy with other things is called that."""
     made = f"{section['date']}, {section['cpus']} CPUs".removeprefix(", ")
@@ -102,11 +130,16 @@ def caption(section: dict[str, Any]) -> str:
 
 def tables(sections: dict[str, dict[str, Any]]) -> dict[str, str]:
     """Return the tables by the name of their mark."""
-    if "mount" not in sections:
-        return {}
-    rows = [row_from_json(fields) for fields in sections["mount"]["results"]["rows"]]
-    peers = f"{peers_table(rows)}\n\n{caption(sections['mount'])}"
-    return {"peers": peers, "cost": cost_table(rows, "px4", "unshaped")}
+    found = {}
+    if "goodput" in sections:
+        section = sections["goodput"]
+        made = f"`{section['command']}`, {section['date']}; on virtual time, so the same on any machine."
+        found["goodput"] = f"{goodput_table(section['results'])}\n\n{made}"
+    if "mount" in sections:
+        rows = [row_from_json(fields) for fields in sections["mount"]["results"]["rows"]]
+        found["peers"] = f"{peers_table(rows)}\n\n{caption(sections['mount'])}"
+        found["cost"] = cost_table(rows, "px4", "unshaped")
+    return found
 
 
 def filled_in(text: str, sections: dict[str, dict[str, Any]]) -> str:

@@ -214,7 +214,7 @@ def sections() -> dict[str, dict[str, Any]]:
         {
             "case": {"profile": profile, "rate": 1e5, "rtt": rtt, "loss": loss, "direction": direction},
             "share": 0.9 - loss,
-            "target": 0.8,
+            "target": 0.86,
         }
         for profile in ("px4", "ardupilot")
         for rtt in (0.01, 0.1, 0.3)
@@ -226,7 +226,8 @@ def sections() -> dict[str, dict[str, Any]]:
     runs += [run("gone", None, outcome) for outcome in (Outcome.TIMEOUT, Outcome.FAILED)]
     rows = [as_json(row) for row in summarise(runs, TIMEOUTS)]
     mount = {"command": "scripts/bench mount", "cpus": 2, "date": "2026-01-02", "load": 0.9}
-    return {"goodput": {"results": goodput_runs}, "mount": {**mount, "results": {"rows": rows}}}
+    goodput = {"command": "scripts/bench goodput --rates 100000", "date": "2026-01-02"}
+    return {"goodput": {**goodput, "results": goodput_runs}, "mount": {**mount, "results": {"rows": rows}}}
 
 
 def test_lines_are_those_of_the_fixed_conditions() -> None:
@@ -266,7 +267,8 @@ def test_plots_need_results(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
 
 
 def test_tables_go_between_their_marks() -> None:
-    text = "a\n<!-- bench: peers -->old<!-- bench: end -->\nb\n<!-- bench: cost --><!-- bench: end -->\nc"
+    marks = [f"<!-- bench: {name} -->old<!-- bench: end -->\n" for name in ("goodput", "peers", "cost")]
+    text = "a\n" + "b\n".join(marks) + "c"
     filled = tables.filled_in(text, sections())
     assert filled == tables.filled_in(filled, sections())
     assert "old" not in filled
@@ -275,8 +277,19 @@ def test_tables_go_between_their_marks() -> None:
     assert "| PX4, Wi-Fi, 5 % loss, read | **500** | 500 (1.00) | failed | 500 (1.00) |" in filled
     assert "| mavftpfs | 0.500 / – | 120 / – | – / – |" in filled
     assert "`scripts/bench mount`, 2026-01-02, 2 CPUs.\n" in filled
-    with pytest.raises(ValueError, match="peers"):
+    with pytest.raises(ValueError, match="goodput"):
         tables.filled_in("no marks", sections())
+
+
+def test_a_share_below_the_target_over_any_round_trip_shows() -> None:
+    runs = [found for found in sections()["goodput"]["results"] if found["case"]["profile"] == "px4"]
+    runs[-1] = {**runs[-1], "share": 0.3}  # writing, 5 %, 300 ms
+    head, _, line = tables.goodput_table(runs).splitlines()
+    assert head == (
+        "| profile | kB/s | read, 0 % | read, 1 % | read, 5 % | write, 0 % | write, 1 % | write, 5 % |"
+    )
+    assert line == "| px4 | 100 | 0.90 | 0.89 | *0.85* | 0.90 | 0.89 | *0.30* |"
+    assert "|  |" in tables.goodput_table([*runs, {**runs[0], "case": {**runs[0]["case"], "rate": 1e6}}])
 
 
 def test_a_busy_machine_is_called_that() -> None:
