@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+from collections.abc import Sequence
 from itertools import pairwise
 
 import pytest
@@ -20,7 +21,7 @@ from mavftpfs.link.messages import (
 )
 from mavftpfs.link.opening import open_link
 from mavftpfs.link.uri import parse_source
-from mavftpfs.protocol.payload import decode_request
+from mavftpfs.protocol.payload import MAX_DATA, decode_request
 from mavftpfs.session.connection import ConnectOptions, connected
 from mavftpfs.shared.errors import VehicleLost
 from mavftpfs.sim.linkmodel import Duplex, LinkModel, LinkSettings
@@ -123,6 +124,29 @@ async def test_heartbeats_go_out_beside_a_copy(what: str, profile: str, autojump
     heard = [time for time in diary.times if began <= time <= began + took]
     assert len(heard) >= took - 2
     assert max(later - time for time, later in pairwise(heard)) < 2.5
+
+
+@pytest.mark.parametrize("write", [False, True])
+async def test_requests_go_out_in_batches(
+    write: bool, autojump: MockClock, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Frames that are handed to the link one by one become a datagram, or a write, each."""
+    here = world("px4", LinkSettings(delay=0.02), f=DATA * 2)
+    batches: list[int] = []
+    send = here.link.send_nowait
+
+    def send_nowait(frames: Sequence[bytes]) -> None:
+        batches.append(len(frames))
+        send(frames)
+
+    monkeypatch.setattr(here.link, "send_nowait", send_nowait)
+    async with here.connection() as connection:
+        if write:
+            await put(connection, path("px4", "new"), DATA * 2)
+        else:
+            assert await read_file(connection, path("px4", "f")) == DATA * 2
+    assert sum(batches) > len(DATA) * 2 / MAX_DATA
+    assert sum(batches) > 6 * len(batches)
 
 
 async def test_old_firmware_is_asked_for_its_capabilities_in_the_old_way(autojump: MockClock) -> None:

@@ -7,7 +7,7 @@ import os
 import socket
 import tty
 from collections.abc import AsyncIterator, Callable, Iterator
-from contextlib import asynccontextmanager, closing, contextmanager
+from contextlib import AbstractAsyncContextManager, asynccontextmanager, closing, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -575,6 +575,34 @@ async def test_serial_carries_every_byte_both_ways() -> None:
             await trio.lowlevel.wait_readable(master)
             got += os.read(master, 4096)
         assert got == data
+
+
+@asynccontextmanager
+async def opened_tcp() -> AsyncIterator[tuple[StreamLink, int]]:
+    """Open a link to which somebody connected; also returns the other end."""
+    async with opened(f"tcpin:{HOST}:0") as link:
+        assert isinstance(link, StreamLink)
+        with socket.create_connection((HOST, parse_source(link.description).port)) as peer:
+            peer.sendall(b"x")
+            await link.receive()
+            peer.setblocking(False)
+            yield link, peer.fileno()
+
+
+@pytest.mark.parametrize("opened_stream", [opened_pty, opened_tcp])
+async def test_frames_that_go_out_together_are_one_write(
+    opened_stream: Callable[[], AbstractAsyncContextManager[tuple[StreamLink, int]]],
+) -> None:
+    """A system call for each frame is a tenth of what a chunk costs."""
+    frames = [bytes([n]) * 266 for n in range(10)]
+    async with opened_stream() as (link, other):
+        link.send_nowait(frames)
+        assert (link.stats.sent_chunks, link.stats.sent_bytes) == (1, 10 * 266)
+        got = b""
+        while len(got) < 10 * 266:
+            await trio.lowlevel.wait_readable(other)
+            got += os.read(other, 4096)
+        assert got == b"".join(frames)
 
 
 async def test_serial_waits_without_spinning() -> None:
