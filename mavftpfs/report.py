@@ -38,6 +38,9 @@ _WORDS = {
 _FIRST = ("bytes_held", "files_undelivered", "transfers", "errors")
 """What people look for in `cache`: a small terminal that shows the status again and again cuts its end."""
 
+_DETAILS = {"write_traits", "kernel"}
+"""Facts for programs: --json."""
+
 _SECONDS = {"rtt", "heartbeat_age", "uptime", "eta"}
 
 
@@ -137,9 +140,11 @@ def rows(facts: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
 
 
 def _rows(facts: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
-    """Flatten nested facts; a group's name goes before the names in it."""
+    """Flatten nested facts, but for those that say nothing; a group's name goes before the names in it."""
     for key, value in facts.items():
         name = prefix + _WORDS.get(key, key.replace("_", " "))
+        if key in _DETAILS or (key not in _SAID and not isinstance(value, bool) and not value):
+            continue
         if isinstance(value, Mapping) and value:
             yield from _rows(value, f"{name}: ")
         else:
@@ -190,6 +195,9 @@ _WRITTEN: dict[str, Callable[[Any], str]] = {
     "vehicle": lambda value: "system {}, component {}".format(*value),
 }
 """Facts that are no sentence by themselves."""
+
+_SAID = {*_FIRST, *_WRITTEN} - {"uploads"}
+"""Facts that are told even if they are none."""
 
 
 def readable_size(count: float) -> str:

@@ -66,9 +66,19 @@ def test_what_a_person_looks_for_comes_first() -> None:
     }
     names = [name for name, _ in rows(facts)]
     first = ["cache: bytes held", "cache: transfers", "cache: errors: /x"]
-    assert names == [*first, "process", *names[4:6], "cache: bytes cached", "cache: hits", "kernel: inodes"]
+    assert names == [*first, "process", "connection: round trip", "cache: bytes cached", "cache: hits"]
     assert [name for name, _ in rows({"problem": "gone"})] == ["problem"]
     assert [name for name, _ in rows({"cache": "gone"})] == ["cache"]
+
+
+def test_what_says_nothing_is_left_to_programs() -> None:
+    link = {"rtt": None, "reboots": 0, "lost": False, "uploads": [], "session_open": None, "vehicle": None}
+    facts = {"connection": {**link, "write_traits": {"renames": True}}, "cache": {"bytes_held": 0, "hits": 0}}
+    assert dict(rows(facts)) == {
+        "cache: bytes held": "0 B",
+        "connection: lost": "no",
+        "connection: vehicle": "unknown",
+    }
 
 
 def test_sizes_and_names() -> None:
