@@ -102,7 +102,8 @@ class Case:
 @dataclass(frozen=True, slots=True)
 class Result:
     """limit: the case's, with the pauses that the card really made. share: goodput over it. requests: per
-    chunk of data. dropped: frames that found the link's queue full, both ways."""
+    chunk of data. dropped: frames that found the link's queue full, both ways, and
+    replies that the server threw away because they would have."""
 
     case: Case
     limit: float

@@ -12,7 +12,7 @@ import json
 import random
 import sys
 from collections.abc import Iterator
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from itertools import product
 from pathlib import Path
 
@@ -38,7 +38,7 @@ PIECE = 128 * 1024
 
 def measure(case: Case, seconds: float, *, queue: int | None = None, telemetry: float = 0.0) -> Result:
     """Read or write for about `seconds` of link time; queue: bytes that wait for the link's transmitter;
-    telemetry: messages per second that the vehicle sends beside it.
+    telemetry: bytes per second that the vehicle sends beside it.
 
     Raises:
         AssertionError: the bytes differ.
@@ -55,8 +55,10 @@ def measure(case: Case, seconds: float, *, queue: int | None = None, telemetry: 
             with trio.fail_after(seconds * PATIENCE):
                 took = await transfer(world, connection, data)
         requests = connection.engine.stats.requests * MAX_DATA / len(data)
+        server = world.vehicle.server
         dropped = sum(world.model.counters(direction).dropped for direction in LinkDirection)
-        limit = case.limit_beside(world.vehicle.server.pauses)
+        dropped += server.dropped_replies
+        limit = replace(case, rate=case.rate - telemetry).limit_beside(server.pauses)
         return Result(case, limit, len(data) / took / limit, requests, dropped)
 
     return trio.run(run, clock=MockClock(autojump_threshold=0))

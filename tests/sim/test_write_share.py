@@ -50,13 +50,15 @@ def test_the_pauses_of_a_card_cost_their_time_once(rtt: float, seconds: float, s
 
 
 @pytest.mark.parametrize("loss", [0.0, 0.05])
-@pytest.mark.parametrize(("rate", "rtt", "seconds"), [(5760.0, 0.3, 60.0), (100_000.0, 0.1, 10.0)])
+@pytest.mark.parametrize(
+    ("rate", "rtt", "seconds", "telemetry"), [(5760.0, 0.3, 60.0, 400.0), (100_000.0, 0.1, 10.0, 4000.0)]
+)
 @pytest.mark.parametrize("profile", ["px4", "ardupilot"])
 def test_a_short_queue_does_not_overflow_and_telemetry_gets_through(
-    profile: str, rate: float, rtt: float, seconds: float, loss: float
+    profile: str, rate: float, rtt: float, seconds: float, telemetry: float, loss: float
 ) -> None:
     case = Case(profile, rate, rtt, loss, "write")
-    result = measure(case, seconds, queue=SHORT_QUEUE, telemetry=20.0)
+    result = measure(case, seconds, queue=SHORT_QUEUE, telemetry=telemetry)
     assert result.dropped <= 2
     assert result.share > 0.7
 
