@@ -20,6 +20,7 @@ import trio
 
 from mavftpfs.cache.context import Context
 from mavftpfs.cache.draft import Draft
+from mavftpfs.cache.nodes import Node
 from mavftpfs.cache.overwritten import overwritten
 from mavftpfs.cache.readback import agrees
 from mavftpfs.cache.remote import Upload
@@ -38,7 +39,8 @@ from mavftpfs.shared.model import split
 log = logging.getLogger("mavftpfs.cache")
 
 SMALL_LISTING = 5
-"""A directory of so few names is listed in one request, which tells more than opening the file."""
+"""A directory of so few names is listed in one request, which tells more than opening the file, if what lies
+above it was listed lately: after a long upload it was not, and each part of its path is a round trip."""
 
 
 QUICKLY_READ = 64 * 1024
@@ -68,6 +70,11 @@ def doubted(upload: Upload, draft: Draft) -> list[tuple[int, int]]:
         for start, stop in [] if sending.whole else upload.again:
             found += draft.changed.intersection(start, stop)
     return found
+
+
+def _writes(node: Node, path: bytes) -> bool:
+    """Return whether a path is that of a node's file, or of what is sent to become it."""
+    return node.path == path or (node.attempt is not None and node.attempt.path == path)
 
 
 class Verifier:
@@ -198,12 +205,22 @@ class Verifier:
         Raises:
             As WriteStore.stat_size.
         """
-        known = self._context.dentries.known(split(path)[0])
-        if known is not None and len(known.entries) <= SMALL_LISTING:
+        if self._is_listed_sooner(path):
             entry = await self._sure.entry(path)
             if entry is not None and entry.size is not None:
                 return entry.size
         return await self._context.writer.stat_size(path)
+
+    def _is_listed_sooner(self, path: bytes) -> bool:
+        """Return whether to list a directory rather than open a file in it, which needs the one session: who
+        writes another file has to give it up for that, or keeps it to its end where he cannot."""
+        context = self._context
+        directory = split(path)[0]
+        known = context.dentries.known(directory)
+        small = known is not None and len(known.entries) <= SMALL_LISTING
+        if any(node.undelivered and not _writes(node, path) for node in context.nodes):
+            return small or context.writer.traits.wo_truncates is not False
+        return small and context.directories.in_reach(directory)
 
     async def _crc_agrees(self, path: bytes, draft: Draft, verify: str, *, limited: bool = True) -> bool:
         """Return whether the CRC32 was compared.
