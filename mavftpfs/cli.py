@@ -72,7 +72,13 @@ def _run(words: list[str]) -> int:
     if not words:
         parser.print_help(sys.stderr)
         return ExitCode.USAGE
-    return commands.mount(parser.parse_args(words))
+    try:
+        args = parser.parse_args(words)
+    except UsageError:
+        if name.startswith("-") or ":" in name or "/" in name:
+            raise
+        raise UsageError(f"{name!r} is no command and no SOURCE; try: {parser.prog} --help") from None
+    return commands.mount(args)
 
 
 # -- parsers --------------------------------------------------------------------------------------
@@ -131,7 +137,7 @@ def _source_parser(name: str, description: str) -> Parser:
 
 def _paths_parser(name: str, description: str, least: str = "+") -> Parser:
     parser = _source_parser(name, description)
-    parser.add_argument("paths", metavar="PATH", nargs=least, help="a path on the vehicle, or an mftp:// URL")
+    parser.add_argument("paths", metavar="PATH", nargs=least, default=[], help="a path on the vehicle, or an mftp:// URL")
     return parser
 
 

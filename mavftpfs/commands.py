@@ -103,7 +103,7 @@ def _start_logging(options: MountOptions, *, foreground: bool, debug: bool) -> N
         else:
             daemon.log_in_background(control.own_directories()[-1] / "mavftpfs.log", level)
     except OSError as exc:
-        raise UsageError(f"cannot open the log: {exc}") from exc
+        raise UsageError(f"cannot write the log {exc.filename}: {exc.strerror}") from exc
 
 
 def _control_path(mountpoint: str) -> Path | None:

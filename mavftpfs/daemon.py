@@ -16,7 +16,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import NoReturn
 
-from mavftpfs.exits import SIGNALLED, ExitCode
+from mavftpfs.exits import SIGNALLED, ExitCode, exit_code_for
+from mavftpfs.shared.errors import MavftpfsError
 from mavftpfs.shared.readable import readable
 
 Report = Callable[[int, str], None]
@@ -63,6 +64,9 @@ def _be_child(write_end: int, work: Callable[[Report], int]) -> NoReturn:
         os.setsid()
         code = work(reporter)
         reporter(code, "")
+    except MavftpfsError as exc:
+        code = exit_code_for(exc)
+        reporter(code, str(exc))
     except BaseException as exc:
         # Nothing above us: a bug must reach the log and the waiting parent, not vanish with the process.
         logging.getLogger("mavftpfs").exception("the daemon failed")

@@ -48,6 +48,8 @@ def _serial_reason(spec: LinkSpec, problem: OSError) -> str:
         return f"no permission for {spec.device}; {remedy}"
     if problem.errno in (errno.EBUSY, errno.EAGAIN, errno.EWOULDBLOCK):
         return f"{spec.device} is in use by another program (a ground station? ModemManager?)"
+    if problem.errno in (errno.ENOTTY, errno.EISDIR):
+        return f"{spec.device} is no serial port"
     return _text(problem)
 
 

@@ -53,6 +53,10 @@ def _open_port(spec: LinkSpec) -> Pipe:
         port = serial.Serial(spec.device, spec.baud, timeout=0, exclusive=True)
     except ValueError as exc:
         raise OSError(0, f"the port refuses {spec.baud} baud: {exc}") from exc
+    except serial.SerialException as exc:
+        if exc.errno is None and isinstance(exc.__context__, termios.error):
+            raise OSError(*exc.__context__.args) from exc
+        raise
     try:
         _make_reads_tell_empty_from_gone(port.fileno())
     except termios.error as exc:

@@ -23,13 +23,13 @@ class DirectoryTree:
     """Serves the directory `root`; symlinks and `..` that lead out of it are refused with EACCES.
 
     Raises:
-        OSError: `root` is not a directory.
+        OSError: `root` is no directory, or not there.
     """
 
     def __init__(self, root: str | os.PathLike[str]) -> None:
         self._root = os.path.realpath(os.fsencode(root))
         if not os.path.isdir(self._root):
-            raise fail(errno.ENOTDIR, self._root)
+            raise fail(errno.ENOTDIR if os.path.exists(self._root) else errno.ENOENT, self._root)
 
     def entries(self, path: bytes) -> list[Entry]:
         """See Tree."""

@@ -44,6 +44,12 @@ def test_a_wrong_option_is_named(mountpoint: Path, option: str) -> None:
     assert option.partition("=")[0] in line
 
 
+@pytest.mark.parametrize("option", ["log_file", "trace", "tlog"])
+def test_a_file_that_cannot_be_written_is_named(mountpoint: Path, option: str) -> None:
+    line = mavftpfs(NOBODY, mountpoint, "-o", f"{option}=/proc/none/file", code=1)
+    assert "/proc/none/file" in line
+
+
 @pytest.mark.parametrize("source", ["warp:somewhere", "udpin:127.0.0.1:notaport", "udpin:127.0.0.1:99999"])
 def test_a_wrong_source_is_named(mountpoint: Path, source: str) -> None:
     assert source in mavftpfs(source, mountpoint, code=1)

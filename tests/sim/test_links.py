@@ -402,6 +402,13 @@ async def test_busy_serial_port() -> None:
                 pytest.fail("it opened")
 
 
+@pytest.mark.parametrize("device", ["/dev/null", "/proc"])
+async def test_what_is_no_serial_port(device: str) -> None:
+    with pytest.raises(LinkClosed, match=f"{device} is no serial port"):
+        async with opened(device):
+            pytest.fail("it opened")
+
+
 @pytest.mark.parametrize("source", [f"udpin:{HOST}:0", f"tcpin:{HOST}:0"])
 async def test_an_error_of_the_body_comes_out_as_itself(source: str) -> None:
     with pytest.raises(KeyError):

@@ -74,6 +74,8 @@ def test_the_documented_numbers() -> None:
     ("words", "named"),
     [
         ((SOURCE,), "MOUNTPOINT"),
+        (("lss", SOURCE, "/"), "'lss' is no command"),
+        (("ls",), "required: SOURCE; try"),
         ((SOURCE, "/mnt", "extra"), "extra"),
         ((SOURCE, "/mnt", "-o", "frobnicate"), "frobnicate"),
         ((SOURCE, "/mnt", "-o"), "-o"),

@@ -60,6 +60,15 @@ def test_failure_is_the_parent_s_exit_code_and_line(tmp_path: Path) -> None:
     assert (done.returncode, done.stderr) == (2, "mavftpfs: no vehicle on that link\n")
 
 
+def test_an_error_of_ours_is_no_bug(tmp_path: Path) -> None:
+    work = """
+        from mavftpfs.shared.errors import UsageError
+        raise UsageError("cannot write that log")
+    """
+    done = run(work, tmp_path)
+    assert (done.returncode, done.stderr) == (1, "mavftpfs: cannot write that log\n")
+
+
 def test_a_child_that_returns_without_a_word_gives_its_code(tmp_path: Path) -> None:
     done = run("return 4", tmp_path)
     assert (done.returncode, done.stderr) == (4, "")
