@@ -137,7 +137,9 @@ def _source_parser(name: str, description: str) -> Parser:
 
 def _paths_parser(name: str, description: str, least: str = "+") -> Parser:
     parser = _source_parser(name, description)
-    parser.add_argument("paths", metavar="PATH", nargs=least, default=[], help="a path on the vehicle, or an mftp:// URL")
+    parser.add_argument(
+        "paths", metavar="PATH", nargs=least, default=[], help="a path on the vehicle, or an mftp:// URL"
+    )
     return parser
 
 
