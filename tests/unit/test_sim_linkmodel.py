@@ -129,6 +129,25 @@ def test_long_frames_are_damaged_more_often() -> None:
     assert 0.02 <= link.counters(DOWN).lost / 10_000 <= 0.04
 
 
+def test_frames_beyond_a_limit_never_arrive() -> None:
+    link = model(mtu=100)
+    frames = [bytes(99), bytes(100), bytes(101), bytes(1)]
+    for frame in frames:
+        link.push(UP, frame, 0.0)
+    assert [len(frame) for frame in link.pop(UP, 1.0)] == [99, 100, 1]
+    assert link.counters(UP).lost == 1
+
+
+def test_a_frame_is_lost_with_any_piece_of_it() -> None:
+    link = model(piece=64, piece_loss=0.1)
+    for i in range(10_000):
+        link.push(UP, bytes(266), float(i))
+        link.push(DOWN, bytes(64), float(i))
+    link.pop(UP, 1e6)
+    assert 0.39 <= link.counters(UP).lost / 10_000 <= 0.43
+    assert 0.09 <= link.counters(DOWN).lost / 10_000 <= 0.11
+
+
 def test_burst_loss_comes_in_runs() -> None:
     def runs(**fields: float) -> float:
         link = model(**fields)
