@@ -52,7 +52,7 @@ class Readahead:
         limit: the largest window now; small: files up to this size are wanted whole (see `Pace`).
         """
         if self._next is None:
-            return self._first(start, stop, small)
+            return self._first(start, stop, limit, small)
         if stop == self._last_start:  # the kernel has two requests under way; the earlier one came late
             return NOTHING
         follows = 0 <= start - self._next <= stop - start
@@ -61,10 +61,12 @@ class Readahead:
             return self._seek()
         return self._advance(start, stop, limit)
 
-    def _first(self, start: int, stop: int, small: int) -> Plan:
+    def _first(self, start: int, stop: int, limit: int, small: int) -> Plan:
         self._last_start, self._next = start, stop
-        if start != 0 or self._size > small:
+        if start != 0:
             return NOTHING
+        if self._size > small:  # who begins with so much at once reads on
+            return self._advance(start, stop, limit) if stop >= FIRST_WINDOW else NOTHING
         self._asked = self._size
         return Plan(min(stop, self._size), self._size)
 

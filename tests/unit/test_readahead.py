@@ -29,8 +29,15 @@ def read(ahead: Readahead, start: int, size: int = 128 * KIB, limit: int = MAX_W
 
 def test_the_second_sequential_read_opens_a_window() -> None:
     ahead = Readahead(BIG)
-    assert read(ahead, 0) == NOTHING
-    assert read(ahead, 128 * KIB) == Plan(256 * KIB, 256 * KIB + FIRST_WINDOW)
+    assert read(ahead, 0, 64 * KIB) == NOTHING
+    assert read(ahead, 64 * KIB, 64 * KIB) == Plan(128 * KIB, 128 * KIB + FIRST_WINDOW)
+
+
+def test_so_does_a_first_one_of_so_much() -> None:
+    """The kernel asks for the next only when the first is there: a round trip without anything to send."""
+    assert read(Readahead(BIG), 0) == Plan(128 * KIB, 128 * KIB + FIRST_WINDOW)
+    assert read(Readahead(BIG), 0, limit=17 * KIB) == Plan(128 * KIB, 145 * KIB)
+    assert read(Readahead(BIG), 4 * KIB) == NOTHING
 
 
 def test_the_window_doubles_as_it_is_used_up() -> None:
@@ -64,7 +71,7 @@ def test_the_window_never_passes_the_end() -> None:
 
 def test_the_last_bytes_are_asked_even_if_they_are_few() -> None:
     ahead = Readahead(385 * KIB)
-    read(ahead, 0)
+    read(ahead, 64 * KIB, 64 * KIB)
     assert read(ahead, 128 * KIB).stop == 384 * KIB
     assert read(ahead, 256 * KIB, 4 * KIB) == Plan(384 * KIB, 385 * KIB)
 
@@ -87,7 +94,7 @@ def test_random_reads_ask_nothing() -> None:
 
 def test_the_kernel_may_swap_two_reads() -> None:
     ahead = Readahead(BIG)
-    read(ahead, 0)
+    read(ahead, 4 * KIB, 124 * KIB)
     later, earlier = read(ahead, 256 * KIB), read(ahead, 128 * KIB)
     assert later == Plan(384 * KIB, 512 * KIB)
     assert earlier == NOTHING
