@@ -138,7 +138,7 @@ class Flow:
         self._trains.begin()
         self._stalls.wake = inf
         if self._pacer is not None:
-            self._pacer.blocked = False
+            self._pacer.begin()
         if self.budget is not None:
             self.budget.begin()
 
@@ -150,7 +150,7 @@ class Flow:
                 self._stalls.reserve.on_others(now)
         elif self._hurried:  # an answer that somebody waits for should not queue behind our slack
             in_flight += min(_SLACK, self.window // 2)
-        room = self._room(in_flight, now, paced)
+        room = self._room(in_flight, now, paced, urgent)
         if self.budget is None or room <= 0:
             return room
         allowed = self.budget.room(now, urgent=urgent)
@@ -168,7 +168,7 @@ class Flow:
         """Seconds of silence that prove no loss: newer answers will, where more than a few are in flight."""
         return 0.0 if self._survival or self._pacer or self._app_limited else self._stalls.patience
 
-    def _room(self, in_flight: int, now: float, paced: bool) -> int:
+    def _room(self, in_flight: int, now: float, paced: bool, urgent: bool) -> int:
         reserve = self._reserve(now, paced)
         room = self.window - in_flight + reserve
         if self._pacer is None:
@@ -178,8 +178,8 @@ class Flow:
         room += self.alone and not self._hurried  # one more fits a short queue of our own (servers.md 3)
         self._pacer.blocked = False
         # How evenly others send is not ours to say: beside them the queue is all there is.
-        beyond = paced and room <= 0 and self.alone
-        return self._pacer.room(in_flight, now) if beyond else room
+        beyond = self._pacer.room_for_urgent if urgent else self._pacer.room
+        return beyond(in_flight, now) if paced and room <= 0 and self.alone else room
 
     def _reserve(self, now: float, paced: bool) -> int:
         """Return how many more bridge the pauses of a server; none where its buffers are small, or while

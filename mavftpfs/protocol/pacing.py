@@ -69,10 +69,12 @@ class Pacer:
         "_lost",
         "_raise",
         "_seen",
+        "_sent_at",
         "_since",
         "_starved",
         "_tokens",
         "_tokens_at",
+        "_urgent_at",
         "blocked",
         "queue",
         "rate",
@@ -85,6 +87,8 @@ class Pacer:
         self.rate: float | None = None
         self.window = queue
         self.blocked = False
+        self._sent_at = -inf
+        self._urgent_at = -inf
         self._raise = _BOLD
         self._best = 0.0  # answers per second of the last trial that was worth it
         self._base_loss = 0.0
@@ -105,6 +109,10 @@ class Pacer:
 
     # --- sending
 
+    def begin(self) -> None:
+        """It is looked at anew who has something to send."""
+        self.blocked, self._urgent_at = False, -inf
+
     def room(self, in_flight: int, now: float) -> int:
         """Return how many requests may go out now although the server's queue may be full."""
         if self.rate is None or in_flight >= self.window:
@@ -115,14 +123,26 @@ class Pacer:
         self._limited = self._limited or self.blocked
         return min(tokens, self.window - in_flight)
 
+    def room_for_urgent(self, in_flight: int, now: float) -> int:
+        """Return whether one may go out that somebody waits for: a little later than what was sent last, for
+        it would be dropped by the queue that is full of that. Until then nothing else goes out."""
+        if self.rate is None or in_flight >= self.window:
+            return 0
+        due = self._sent_at + self.queue / self._best
+        self._urgent_at = due if now < due else -inf
+        return int(now >= due)
+
     def next_at(self) -> float:
         """Return when there will be room for one that has to wait for its time; inf if none has to."""
+        if self._urgent_at > -inf:
+            return self._urgent_at
         if self.rate is None or not self.blocked:
             return inf
         return self._tokens_at + (1.0 - self._tokens) / self.rate + 1e-6
 
     def on_sent(self, count: int, now: float) -> None:
         """Any requests go out."""
+        self._sent_at = now
         if self.rate is not None:
             self._refill(self.rate, now)
             self._tokens = max(-float(self.queue), self._tokens - count)

@@ -139,6 +139,22 @@ def test_requests_go_out_one_by_one() -> None:
     assert pacer.room(QUEUE, now + 5.0) == 2, "what was not used is not made up for at once"
 
 
+def test_who_is_waited_for_does_not_come_to_a_full_queue() -> None:
+    pacer = Pacer(QUEUE, 2048)
+    assert pacer.room_for_urgent(QUEUE, 0.0) == 0, "no rate is known"
+    for order in range(200):
+        pacer.on_sent(1, order * 0.01)
+        pacer.on_reply(order * 0.01, 0.3, order, order + QUEUE)
+    pacer.on_sent(QUEUE + 1, 3.0)
+    assert pacer.room_for_urgent(QUEUE, 3.001) == 0
+    due = pacer.next_at()
+    assert 3.0 + 0.9 * QUEUE * 0.01 < due < 3.0 + 1.5 * QUEUE * 0.01, "the time the server takes for a queue"
+    assert pacer.room_for_urgent(QUEUE, due) == 1
+    assert pacer.room_for_urgent(10_000, due) == 0
+    pacer.begin()
+    assert pacer.next_at() == inf
+
+
 def test_a_flow_uses_it_where_the_server_queues_little_and_for_whom_it_suits() -> None:
     flow = Flow()
     assert flow.room(10, 0.0, paced=True) < 0
