@@ -29,7 +29,7 @@ class Manner(NamedTuple):
     offset. free_sends: transmissions before the waits double. patient_after: from so many transmissions
     on, wait at least `patience` seconds (a slow server executes every one of them, servers.md 14.38); of the
     family "work", what the slowest server needs, of which one that was seen to be faster gets less.
-    once: never repeated, and its loss matters to nobody.
+    once: never repeated, and the engine tells nobody of its loss.
     """
 
     family: str
@@ -47,6 +47,7 @@ FLOORS = {"data": 0.05, "write": 0.05, "list": 0.25, "path": 0.1, "slow": 10.0, 
 
 READ_MANNER = Manner("data", same_seq=False, ordered=True, echoes_offset=True, free_sends=20)
 WRITE_MANNER = Manner("write", same_seq=False, ordered=True, free_sends=20)
+LAST_WRITE_MANNER = WRITE_MANNER._replace(once=True)
 KEEP_ALIVE_MANNER = Manner("path", same_seq=False, once=True)
 _LIST = Manner("list", same_seq=False, ordered=True, patient_after=4, patience=2.5)
 _PATH = Manner("path", same_seq=True, free_sends=4)
@@ -146,7 +147,7 @@ class Request:
         if traits.ack_carries_own_session and reply.session != self.session and not self.follows:
             return False
         if reply.opcode == Opcode.ACK:
-            echoed = self.manner.echoes_offset or (self.manner is WRITE_MANNER and traits.write_ack_offset)
+            echoed = self.manner.echoes_offset or (self.manner.family == "write" and traits.write_ack_offset)
             return reply.offset == self.offset or not echoed
         return reply.opcode == Opcode.NAK
 

@@ -11,7 +11,15 @@ from collections.abc import Callable
 from typing import Protocol
 
 from mavftpfs.protocol.payload import MAX_DATA, NakCode, Opcode, Payload
-from mavftpfs.protocol.requests import WRITE_MANNER, Operation, Priority, Request, Run, nak_of
+from mavftpfs.protocol.requests import (
+    LAST_WRITE_MANNER,
+    WRITE_MANNER,
+    Operation,
+    Priority,
+    Request,
+    Run,
+    nak_of,
+)
 from mavftpfs.shared.errors import (
     FtpNak,
     LocalProtocolError,
@@ -65,6 +73,7 @@ class WriteTransfer(Operation):
 
     Attributes:
         acked_bytes: written so far. failed_at: offset of the request that was refused, if that ended it.
+        trailing: see `repeat_nothing`.
 
     Fails with SessionLost (from the FtpNak that showed it), FtpNak or RequestTimeout; what was not ACKed was
     then given back by on_unsent, ascending.
@@ -97,6 +106,7 @@ class WriteTransfer(Operation):
         self._rest: deque[tuple[int, bytes]] = deque()
         self._unanswered: dict[Request, None] = {}
         self._paused = False
+        self.trailing = False
         self._starved = False
         self._barren = 0
         self._usual: bytes | None = None  # what says that a full chunk was written
@@ -115,6 +125,12 @@ class WriteTransfer(Operation):
         """Go on."""
         self._paused = False
 
+    def repeat_nothing(self) -> None:
+        """The file is closed behind what is on its way: what of it is lost stays so until `stop`."""
+        self._paused = self.trailing = True
+        for request in self._unanswered:
+            request.manner = LAST_WRITE_MANNER
+
     def stop(self) -> None:
         """End now: give back what was not ACKed. Its late effects are those of a repetition."""
         if not self.done:
@@ -130,6 +146,11 @@ class WriteTransfer(Operation):
     def drained(self) -> bool:
         """Whether nothing is on its way."""
         return not self._unanswered
+
+    @property
+    def all_out(self) -> bool:
+        """Whether nothing of what is unanswered waits to go out again."""
+        return all(request.flying for request in self._unanswered)
 
     @property
     def starved(self) -> bool:

@@ -92,20 +92,29 @@ class Driver:
                 self._take(chunks, now)
             self._settle(now)
 
-    async def run(self, operation: Operation) -> None:
-        """Carry an operation out; a cancelled caller takes its operation with it.
+    async def run(self, *operations: Operation) -> None:
+        """Carry operations out, each sent without an answer to the one before; a cancelled caller takes them
+        with it.
 
         Raises:
-            MavftpfsError: the operation's error.
+            MavftpfsError: the error of the first that failed.
         """
         finished = trio.Event()
-        self.start(operation, finished.set)
+
+        def on_finished() -> None:
+            if all(operation.done for operation in operations):
+                finished.set()
+
         try:
+            for operation in operations:
+                self.start(operation, on_finished)
             await finished.wait()
         finally:
-            self.cancel(operation)
-        if operation.error is not None:
-            raise operation.error
+            for operation in operations:
+                self.cancel(operation)
+        for operation in operations:
+            if operation.error is not None:
+                raise operation.error
 
     def start(self, operation: Operation, on_finished: Callable[[], None]) -> None:
         """Begin an operation; `on_finished` is called from the pump when it is done or failed."""

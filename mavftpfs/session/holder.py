@@ -71,15 +71,34 @@ class SessionHolder:
         """
         self._opening = path  # from now on nobody may change that name, also while the other file is closed
         try:
-            if self.session is not None:
-                close = self.close if self.session.writing else self.close_quietly
-                await close()
-                self.switches += 1
+            await self._make_way()
             self.session = await self.opener.open(path, opcode)
         finally:
             self._opening = None
             self._tell()
         return self.session
+
+    async def _make_way(self) -> None:
+        if self.session is not None:
+            close = self.close if self.session.writing else self.close_quietly
+            await close()
+            self.switches += 1
+
+    async def size_of(self, path: bytes) -> int | None:
+        """Return a file's size as OpenFileRO tells it; it may be open after that, or nothing is.
+
+        Raises:
+            As open.
+        """
+        self._opening = path
+        try:
+            await self._make_way()
+            if self.opener.may_peek:
+                return await self.opener.peek(path)
+        finally:
+            self._opening = None
+            self._tell()
+        return (await self.open(path)).size
 
     async def close(self, limit: float | None = None) -> bool:
         """Terminate; True if there was nothing to do or it was we who closed it (SessionOpener.close).

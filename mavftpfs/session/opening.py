@@ -129,6 +129,41 @@ class SessionOpener:
                     raise last
                 raise SessionBusy("the vehicle's only FTP session is in use by another client")
 
+    @property
+    def may_peek(self) -> bool:
+        """Whether `peek` harms nobody and proves something: Terminate names a session that can only be ours,
+        and what goes out in a row comes in a row."""
+        if self._server_assigns is not False or self._engine.stats.strays or self.doubtful_paths:
+            return False
+        return not self._vehicle.foreign_client(self._clock())
+
+    async def peek(self, path: bytes) -> int | None:
+        """Return a file's size as the ACK to OpenFileRO says, whose Terminate goes out right behind it: that
+        is a round trip less. Only where `may_peek`.
+
+        Raises:
+            As open.
+        """
+        session = self._engine.home_session
+        opening, closing = OpenFile(Opcode.OPEN_FILE_RO, wire_path(path), session), Terminate(session)
+        self._doubt(session, path)
+        try:
+            async with self._gate.passing():
+                await self._driver.run(opening, closing)
+        except FtpNak as nak:
+            if opening.error is not None and not self._looks_taken(nak, path):
+                raise
+        finally:
+            self._note_asked(opening, path)
+        if opening.error is not None:
+            return (await self.open(path)).size
+        in_order = not opening.retransmitted and opening.progress_at <= closing.progress_at
+        if in_order and closing.error is None and opening.session == session:
+            self._trust(session)
+        else:  # it may have come after its Terminate: the next open closes it first
+            self._doubt(opening.session, path)
+        return opening.size
+
     async def close(self, session: OpenSession, limit: float = TERMINATE_LIMIT) -> bool:
         """Terminate and check the answer; return False if the server had closed it before, by itself.
 

@@ -99,7 +99,7 @@ class Reopening:
 
     async def _size(self, upload: QueuedUpload) -> int | None:
         """Return the size of the file, asked before OpenFileWO, which makes missing ones (servers.md 8)."""
-        return (await self._holder.open(upload.path, Opcode.OPEN_FILE_RO)).size
+        return await self._holder.size_of(upload.path)
 
     async def _part_with(self, upload: QueuedUpload, problem: str) -> NoReturn:
         upload.feed.roll_back(everything=True)

@@ -70,6 +70,7 @@ class Uploading:
         self._written: QueuedUpload | None = None
         self._written_at = float("-inf")
         self._heir: QueuedUpload | None = None  # waits for what is left of that to be dead, and is next
+        self._dead_at = float("-inf")
 
     @property
     def turns(self) -> Turns:
@@ -159,7 +160,7 @@ class Uploading:
 
     def due(self, now: float) -> list[QueuedUpload]:
         """Return the uploads for which there is something to do now."""
-        if not self.may_write:
+        if not self.may_write or now < self._held_until:
             return []
         lost = self._vehicle.lost(now)
         due = [upload for upload in self.uploads if upload.is_due(now) and (upload.finishing or not lost)]
@@ -170,8 +171,8 @@ class Uploading:
         """When one becomes due that is not so now, infinite if none will by itself."""
         if not self.may_write:
             return float("inf")
-        later = [upload.retry_at for upload in self.uploads if upload.wanted and upload.retry_at > now]
-        return min(later, default=float("inf"))
+        times = [max(upload.retry_at, self._held_until) for upload in self.uploads if upload.wanted]
+        return min((time for time in times if time > now), default=float("inf"))
 
     def expire(self, oldest: float, error: MavftpfsError) -> None:
         """Tell those who have waited since before `oldest` for an upload that got no turn."""
@@ -188,8 +189,7 @@ class Uploading:
         try:
             if not self._is_complete_already(upload):
                 self.check_may_write()
-                if not self._lets_stragglers_pass(upload):
-                    served = await self._serve(upload)
+                served = not self._lets_stragglers_pass(upload) and await self._serve(upload)
         except SessionLost as lost:
             self._on_lost(upload, lost)
         except MavftpfsError as error:
@@ -213,18 +213,18 @@ class Uploading:
         if not self.writer.starves(upload) and await self._holder.made_room(upload.path):
             return False
         session = await self._open(upload)
-        if session is None:
-            return False
-        await self._let_go(upload, await self._write(upload, session))
-        return True
+        if session is not None:
+            await self._write(upload, session)
+        return session is not None
 
-    async def _write(self, upload: QueuedUpload, session: OpenSession) -> Stop:
+    async def _write(self, upload: QueuedUpload, session: OpenSession) -> None:
         try:
             upload.again = upload.again or self.written.lately(upload.path, upload.overwrites)
             made = upload.create and not upload.feed.proven
             self.written.begin(upload.path, session.seq, upload.feed.span, upload.overwrites, made=made)
-            return await self.writer.run(upload, session)
+            await self._let_go(upload, await self.writer.run(upload, session))
         finally:
+            self.writer.end()
             self.written.end()
             self._written, self._written_at = upload, self._clock()
 
@@ -244,9 +244,13 @@ class Uploading:
             if upload is self._written:
                 return False
             self._heir = upload
-        for waiting in self.uploads:
-            waiting.retry_at = max(waiting.retry_at, until)
+        self._dead_at = until
         return True
+
+    @property
+    def _held_until(self) -> float:
+        """When what is left is dead that the next upload waits for."""
+        return float("-inf") if self._heir is None else self._dead_at
 
     def _is_complete_already(self, upload: QueuedUpload) -> bool:
         """Whether there is nothing to send; an empty file has to be created once."""
@@ -297,7 +301,8 @@ class Uploading:
             ours = await close_written(self._kit, upload, limit)
         except RequestTimeout as error:
             raise SessionLost(str(error)) from error
-        if not ours:
+        last = self.writer.end()
+        if not ours or isinstance(last, SessionLost):
             raise SessionLost("the vehicle had closed the session before", by_server=True)
         feed.check_point()
         upload.left_at = self._clock()

@@ -1,9 +1,10 @@
 """Drives the write transfer of one upload until there is a reason to let go of the session. Layer: session.
 
-Where OpenFileWO was seen to keep a file's content an upload can be interrupted at any time: drain the window,
-Terminate, and later OpenFileWO. Where it was seen to empty files that would begin the file anew, so the
-upload keeps the session until its source has nothing more (design section 4). Where neither was seen yet, a
-file that the upload itself made is interrupted when somebody waits, and reopening it tells.
+Where OpenFileWO was seen to keep a file's content an upload can be interrupted at any time: Terminate right
+behind the window, and later OpenFileWO and what of that was not ACKed. Where it was seen to empty files that
+would begin the file anew, so the upload keeps the session until its source has nothing more (design section
+4). Where neither was seen yet, a file that the upload itself made is interrupted when somebody waits, and
+reopening it tells.
 """
 
 from __future__ import annotations
@@ -87,6 +88,7 @@ class Writer:
         self._may_write = may_write
         self._disarmed_by_paths = False
         self._transfer: WriteTransfer | None = None
+        self._last: WriteTransfer | None = None
         self._starved_at: float | None = None
         self._filled = False
         self._disturbed_at = -inf
@@ -149,7 +151,8 @@ class Writer:
     # --- writing
 
     async def run(self, upload: QueuedUpload, session: OpenSession) -> Stop:
-        """Write until there is a reason to stop; nothing is in flight then, and the session is still open.
+        """Write until there is a reason to stop; the session is still open then, and what is in flight waits
+        for nothing but its answers: `end` follows when the session is closed.
 
         Raises:
             SessionLost, FtpNak, RequestTimeout, RemoteProtocolError: what the transfer failed with.
@@ -165,7 +168,13 @@ class Writer:
         rearms, self._filled = 0, False
         self.turns.set_writing(self._disarmed_by_paths)
         while True:
-            transfer = WriteTransfer(session.id, upload.feed, self._chunk, on_starved=self._holder.wake)
+            transfer = WriteTransfer(
+                session.id,
+                upload.feed,
+                self._chunk,
+                in_flight=self._most_in_flight(upload),
+                on_starved=self._holder.wake,
+            )
             stop = await self._drive(upload, session, transfer)
             if transfer.acked_bytes and rearms:
                 self._disarmed_by_paths = True
@@ -183,6 +192,10 @@ class Writer:
             await self.turns.give(0.0)
             await self._rearm(upload.path)
 
+    def _most_in_flight(self, upload: QueuedUpload) -> int | None:
+        """Beside somebody who waits a short queue keeps a place for the Terminate."""
+        return None if self._queue.rival_use(upload) is None else self._engine.traits.queue_limit
+
     async def _drive(
         self, upload: QueuedUpload, session: OpenSession, transfer: WriteTransfer
     ) -> Stop | None:
@@ -193,9 +206,19 @@ class Writer:
             async with self._gate.passing():
                 return await self._watch(upload, session, transfer)
         finally:
-            self._transfer = None
-            transfer.stop()
-            self._driver.cancel(transfer)
+            self._transfer, self._last = None, transfer
+            if not transfer.trailing:
+                self.end()
+
+    def end(self) -> MavftpfsError | None:
+        """The session is closed, or lost: what was not ACKed goes back to the source. Return what failed of
+        the last requests, which were on their way when it was closed."""
+        transfer, self._last = self._last, None
+        if transfer is None:
+            return None
+        transfer.stop()
+        self._driver.cancel(transfer)
+        return transfer.error
 
     async def _watch(
         self, upload: QueuedUpload, session: OpenSession, transfer: WriteTransfer
@@ -208,7 +231,7 @@ class Writer:
                 stop = Stop.DOUBT
             if stop is not None:
                 transfer.pause()
-                if transfer.drained or stop in _ABRUPT:
+                if transfer.drained or stop in _ABRUPT or self._trails(upload, stop, transfer):
                     upload.mark()
                     return stop
             elif self.turns.wanted:
@@ -218,6 +241,15 @@ class Writer:
             self._queue.expire_waiters()
             await self._holder.sleep(self._nap(upload, transfer))
         return None
+
+    def _trails(self, upload: QueuedUpload, stop: Stop, transfer: WriteTransfer) -> bool:
+        """Whether the Terminate goes out right behind the last requests: a round trip less for who waits.
+        Servers carry them out in order; what gets lost is sent when the file is open again."""
+        if stop is not Stop.YIELD or not self.resumable or self._holder.claimed(upload.path):
+            return False
+        if transfer.all_out:
+            transfer.repeat_nothing()
+        return transfer.trailing
 
     def _nap(self, upload: QueuedUpload, transfer: WriteTransfer) -> float:
         """How long nothing needs to be looked at, unless there is news."""

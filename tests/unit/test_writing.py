@@ -191,6 +191,33 @@ def test_stop_gives_back_and_ends() -> None:
     transfer.stop()
 
 
+def test_what_is_closed_behind_is_not_repeated() -> None:
+    engine = make()
+    transfer, source = writing(engine, in_flight=4)
+    requests = sent(engine, 0.0)
+    transfer.repeat_nothing()
+    for one in (requests[0], requests[3]):
+        engine.receive(ack(one), 0.1)
+    while engine.in_flight:
+        engine.on_deadline(engine.next_deadline() or 0.1)
+        assert sent(engine, 1.0) == []
+    assert list(source.in_flight) == [(239, 717)]
+    transfer.stop()
+    assert source.dirty.covers(239, 717)
+
+
+def test_what_waits_to_be_repeated_is_not_all_out() -> None:
+    engine = make()
+    transfer, _ = writing(engine, in_flight=4)
+    requests = sent(engine, 0.0)
+    transfer.pause()
+    assert transfer.all_out
+    engine.receive(ack(requests[3]), 0.1)
+    assert not transfer.all_out
+    sent(engine, 0.1)
+    assert transfer.all_out
+
+
 def test_strict_order_has_one_in_flight() -> None:
     engine = make()
     transfer, _ = writing(engine, in_flight=1)
