@@ -308,28 +308,28 @@ class Flow:
         self._app_limited = False
 
     def _learn(self, now: float, next_order: int) -> None:
-        overflowed = self._overflow.judge(self._replies, self._losses)
-        total = self._replies + self._losses
-        self.loss += (self._losses / total - self.loss) * 0.2
+        answered, lost, survival = self._replies, self._losses, self._survival
+        overflowed = self._overflow.judge(answered, lost)
+        self.loss += (lost / (answered + lost) - self.loss) * 0.2
         waited = self._base.beyond(self._round_least, self.window * (1.0 - self.loss), self._best_rate)
         reserve = self._bounded(min(self._stalls.reserve.seconds, waited) * self._best_rate)
         self._base_rtt = self._base.learn(self._round_least, self.window + reserve)
         took = now - self._round_start
-        rate = self._replies / took if took > 0 else 0.0
+        rate = answered / took if took > 0 else 0.0
         # What the window was doubled for shows two rounds later.
         grown = len(self._rates) < 2 or rate > 1.25 * self._rates[-2]
         if rate > self._best_rate or not self._app_limited:
             self._rates.append(rate)
         self._best_rate = max(self._rates, default=0.0)
         if self._app_limited:
+            if survival is not None:
+                self.window = min(self.cap, survival.end_idle_round(next_order - self._round_end, lost))
             return
         self._stalls.reserve.on_round(now, waited)
         self._learn_congestion()
-        self._trains.end_round(self._replies, rate)
-        if self._survival is not None:
-            window = self._survival.end_round(
-                self._replies, self._losses, took, now, queued=self._queued(2.0)
-            )
+        self._trains.end_round(answered, rate)
+        if survival is not None:
+            window = survival.end_round(answered, lost, took, now, queued=self._queued(2.0))
             self.window = min(self.cap, window)
         elif self._starting and overflowed:
             self._starting = False

@@ -120,7 +120,7 @@ class Survival:
         total = answered + lost
         self._loss += (lost / total - self._loss) * min(1.0, total / _REMEMBERED)
         if not self._careful:
-            self._grow(answered / seconds if seconds > 0 else 0.0, lost, queued)
+            self._grow(answered / seconds if seconds > 0 else 0.0, lost, queued=queued)
         elif self._settling:
             self._settling -= 1
         else:
@@ -129,7 +129,14 @@ class Survival:
                 self._judge(now)
         return self.window
 
-    def _grow(self, rate: float, lost: int, queued: bool) -> None:
+    def end_idle_round(self, sent: int, lost: int) -> int:
+        """Return the window after a round in which there was not always something to send. sent: so many were
+        on their way at its end, which tells as much if it is all that the window allows."""
+        if sent >= self.window and not lost and not self._careful:
+            self._grow(0.0, 0, queued=False)
+        return self.window
+
+    def _grow(self, rate: float, lost: int, *, queued: bool) -> None:
         """Nothing was lost so far."""
         self._careful = lost > 0 and self._cap > 1
         if self._careful:

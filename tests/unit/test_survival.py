@@ -132,3 +132,13 @@ def test_a_buffer_that_shrank_is_noticed() -> None:
     port.holds = 1
     write(flow, port, 0.0)
     assert flow.window <= 3
+
+
+def test_it_grows_where_little_is_asked_for_by_what_was_in_flight_at_once() -> None:
+    """Listings and an open had been answered, and the first read, and the window was still one."""
+    survival = Survival(SERIAL_CAP)
+    assert [survival.end_idle_round(sent, 0) for sent in (1, 1, 2, 2, 2)] == [2, 2, 3, 3, 3]
+    assert survival.end_idle_round(3, 1) == 3  # a lost one says nothing of a buffer there
+    assert survival.end_round(3, 0, 0.3, 0.0, queued=False) == 4
+    assert survival.end_round(4, 1, 0.3, 0.0, queued=False) == 2
+    assert survival.end_idle_round(16, 0) == 2  # from here on it compares
