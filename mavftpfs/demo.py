@@ -338,7 +338,7 @@ def conclude(tour: Tour) -> int:
         Panel(
             f"{verdict} The drone is unmounted and everything is cleaned up.\n\n"
             "With a real one:\n"
-            "  mavftpfs udpin:0.0.0.0:14550 ~/drone        [dim]# telemetry over Wi-Fi or from a router[/]\n"
+            "  mavftpfs udpin:0.0.0.0:14550 ~/drone        [dim]# Wi-Fi, or a router[/]\n"
             "  mavftpfs /dev/ttyACM0 ~/drone               [dim]# USB cable[/]\n"
             "  mavftpfs /dev/ttyUSB0,57600 ~/drone         [dim]# telemetry radio[/]",
             border_style="green" if good else "red",

@@ -1,9 +1,9 @@
 """All measurements: scripts/bench [PART] [--quick] [--json FILE] [--date DATE] [options of the part].
 
 goodput   share of a link's limit, reading and writing, on virtual time (the same figures on every machine)
-mount     a real mount beside the clients that people use now, over real sockets
 requests  requests per command
 cost      CPU time and memory of the hot path
+mount     a real mount beside the clients that people use now, over real sockets
 plots     draw what README shows from the file of --json
 all       everything, in this order; the default
 

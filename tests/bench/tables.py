@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from typing import Any
 
 from tests.bench.figures import BARE, US, Outcome, Row, row_from_json
+from tests.support.requests import Cost
 
 BUSY = 0.5
 """Load for each CPU, before a measurement, above which rates are too low."""
@@ -20,6 +22,27 @@ _LINKS = {
     "wifi-5%": "Wi-Fi, 5 % loss",
     "57600": "57,600 baud",
 }
+_COMMANDS = (
+    "ls -l cold",
+    "ls -l cached",
+    "cat cold",
+    "cat warm",
+    "stat known names",
+    "stat unknown names",
+    "find cold",
+    "cp 10 files from it",
+    "touch old",
+    "echo > new",
+    "echo >>",
+    "mv",
+    "rm",
+    "vim save",
+    "cp 10 files to it",
+    "rsync unchanged",
+    "git status again",
+)
+"""Whose requests are shown."""
+
 _FAILURES = {Outcome.TIMEOUT: "not in time", Outcome.CORRUPT: "wrong bytes"}
 
 
@@ -120,6 +143,44 @@ def _least_share(runs: Sequence[dict[str, Any]]) -> str:
     return f"*{text}*" if missed else text
 
 
+def requests_table(results: Sequence[dict[str, Any]]) -> str:
+    """Return how many requests a command is on each server, and of which kinds on the first of them."""
+    found = {(run["profile"], run["command"]): run["requests"] for run in results}
+    profiles = list(dict.fromkeys(run["profile"] for run in results))
+    lines = []
+    for name in _COMMANDS:
+        totals = [str(sum(found[key].values())) if (key := (at, name)) in found else "" for at in profiles]
+        lines.append([name, *totals, Cost(Counter(found.get((profiles[0], name)))).text()])
+    return markdown(["command", *profiles, f"on {profiles[0]}"], lines)
+
+
+_FRAMES = {
+    "read": ("build a ReadFile", "parse a chunk"),
+    "write": ("build a WriteFile", "parse an ACK"),
+}
+"""The two frames that go and come for each packet of data."""
+
+
+def parts_table(results: dict[str, Any]) -> str:
+    """Return what each part of a packet costs, what frames cost pymavlink, and the memory of large files."""
+    parts = [results["parts"][direction] for direction in _FRAMES]
+    lines = [
+        [name, *(f"{costs[name]:.2f}" if name in costs else "" for costs in parts)]
+        for name in dict.fromkeys(name for costs in parts for name in costs)
+    ]
+    lines.append(["all of these", *(f"{sum(costs.values()):.2f}" for costs in parts)])
+    for what, whose in (("frames alone", 0), ("frames alone, pymavlink", 1)):
+        sums = [sum(results["codec"][frame][whose] for frame in frames) for frames in _FRAMES.values()]
+        lines.append([what, *(f"{cost:.2f}" for cost in sums)])
+    table = markdown(["CPU, µs a packet", *_FRAMES], lines)
+    peaks = [
+        f"{peak['size'] / 1e6:,.0f} MB {peak['what']} through the mount:"
+        f" {peak['peak'] / 1e6:.0f} MB of memory at most ({peak['allowed'] / 1e6:.0f} allowed)."
+        for peak in results["memory"]
+    ]
+    return "\n\n".join([table, *([" ".join(peaks)] if peaks else [])])
+
+
 def caption(section: dict[str, Any]) -> str:
     """Return what made a section, and on what; a machine that was busy with other things is called that."""
     made = f"{section['date']}, {section['cpus']} CPUs".removeprefix(", ")
@@ -135,6 +196,12 @@ def tables(sections: dict[str, dict[str, Any]]) -> dict[str, str]:
         section = sections["goodput"]
         made = f"`{section['command']}`, {section['date']}; on virtual time, so the same on any machine."
         found["goodput"] = f"{goodput_table(section['results'])}\n\n{made}"
+    if "requests" in sections:
+        section = sections["requests"]
+        made = f"`{section['command']}`, {section['date']}; exact."
+        found["requests"] = f"{requests_table(section['results'])}\n\n{made}"
+    if "cost" in sections:
+        found["parts"] = f"{parts_table(sections['cost']['results'])}\n\n{caption(sections['cost'])}"
     if "mount" in sections:
         rows = [row_from_json(fields) for fields in sections["mount"]["results"]["rows"]]
         found["peers"] = f"{peers_table(rows)}\n\n{caption(sections['mount'])}"

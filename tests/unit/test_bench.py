@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import re
+from collections import Counter
+from itertools import product
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -14,11 +16,14 @@ from mavftpfs.link.framing import Framer
 from mavftpfs.link.messages import Address
 from mavftpfs.protocol.payload import Opcode, request
 from tests.bench import __main__ as entry
-from tests.bench import bare, mount, plots, tables
+from tests.bench import bare, goodput, mount, plots, requests, tables
 from tests.bench.cases import Case
 from tests.bench.figures import BARE, LINKS, US, Outcome, Row, Run, as_json, limit, row_from_json, summarise
 from tests.bench.record import Record
 from tests.bench.shaper import frames_of
+from tests.support.request_cases import CASES
+from tests.support.request_costs import MOUNT, PROFILES, expected
+from tests.support.requests import Cost
 
 PROJECT = Path(__file__).parents[2]
 TIMEOUTS = {"wifi-5%": 20.0, "unshaped": 10.0}
@@ -41,6 +46,11 @@ def test_limit_is_what_design_says() -> None:
     shape = LINKS["wifi"]
     assert shape is not None
     assert limit("ardupilot", "wifi", "write") == Case("ardupilot", 625_000, 0.030, 0.0, "write").limit
+
+
+def test_cases_are_measured_at_once_and_listed_in_order() -> None:
+    chosen = [Case("px4", 1e5, 0.01, loss, "write") for loss in (0.0, 0.1)]
+    assert goodput.everything(chosen, 1.0) == [goodput.measure(case, 1.0) for case in chosen]
 
 
 def test_a_card_that_pauses_costs_where_nothing_bridges_it() -> None:
@@ -290,6 +300,60 @@ def test_a_share_below_the_target_over_any_round_trip_shows() -> None:
     )
     assert line == "| px4 | 100 | 0.90 | 0.89 | *0.85* | 0.90 | 0.89 | *0.30* |"
     assert "|  |" in tables.goodput_table([*runs, {**runs[0], "case": {**runs[0]["case"], "rate": 1e6}}])
+
+
+def test_requests_are_counted_by_server_and_named_for_the_first() -> None:
+    runs = [
+        {"profile": "px4", "command": "rm", "requests": {"remove": 1, "look": 1, "list": 2}, "payload": 0},
+        {"profile": "mavsdk", "command": "rm", "requests": {"remove": 1}, "payload": 0},
+        {"profile": "px4", "command": "cat warm", "requests": {}, "payload": 0},
+    ]
+    head, _, *lines = tables.requests_table(runs).splitlines()
+    assert head == "| command | px4 | mavsdk | on px4 |"
+    assert "| rm | 4 | 1 | list 2, look 1, remove 1 |" in lines
+    assert "| cat warm | 0 |  | 0 |" in lines
+
+
+def test_parts_of_a_packet_and_the_memory_of_large_files() -> None:
+    costs = {
+        "parts": {"read": {"receive": 0.25, "placing": 0.5}, "write": {"receive": 1.0}},
+        "codec": {
+            "build a ReadFile": [0.5, 12.0],
+            "parse a chunk": [0.25, 7.0],
+            "build a WriteFile": [0.3, 7.0],
+            "parse an ACK": [0.4, 8.5],
+        },
+        "memory": [{"what": "read", "size": 10**9, "peak": 112_300_000, "allowed": 138_000_000}],
+    }
+    table = tables.parts_table(costs)
+    assert table.splitlines()[2:7] == [
+        "| receive | 0.25 | 1.00 |",
+        "| placing | 0.50 |  |",
+        "| all of these | 0.75 | 1.00 |",
+        "| frames alone | 0.75 | 0.70 |",
+        "| frames alone, pymavlink | 19.00 | 15.50 |",
+    ]
+    assert table.endswith("\n\n1,000 MB read through the mount: 112 MB of memory at most (138 allowed).")
+    assert tables.parts_table({**costs, "memory": []}).endswith("15.50 |")
+
+
+def test_counts_of_a_busy_machine_are_marked_and_none_that_differ_are_written() -> None:
+    calm = Cost(Counter({"open": 1, "look": 0}), seconds=1.5)
+    busy = Cost(Counter({"open": 2}), repeats=1)
+    assert [requests.text_of(cost) for cost in (calm, busy)] == ["open 1", "open 2 (asked again: 1)"]
+    assert not requests.is_exact(Cost(late=True))
+    assert requests.as_json({"px4": {"cat cold": calm}}) == [
+        {"profile": "px4", "command": "cat cold", "requests": {"open": 1}, "payload": 0}
+    ]
+
+
+def test_the_requests_recorded_are_those_that_tests_hold() -> None:
+    found = Record(plots.RESULTS).sections()["requests"]["results"]
+    wanted = set(product(PROFILES, [MOUNT, *(case.name for case in CASES)]))
+    assert {(run["profile"], run["command"]) for run in found} == wanted
+    for run in found:
+        cost = Cost(Counter(run["requests"]), payload=run["payload"])
+        assert cost.text() in expected(run["profile"], run["command"]), f"{run}: scripts/bench requests"
 
 
 def test_a_busy_machine_is_called_that() -> None:
