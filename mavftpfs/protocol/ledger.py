@@ -286,9 +286,15 @@ class Ledger:
     # --- by operation
 
     def take_again(self, op: Operation) -> Request | None:
-        """Remove and return the oldest lost request of `op`, or None."""
-        for index, request in enumerate(self.again):
-            if request.op is op:
+        """Remove and return the oldest lost request of `op` that is to go out again, or None."""
+        index = 0
+        while index < len(self.again):
+            request = self.again[index]
+            if request.op is not op:
+                index += 1
+            elif op.takes_back(request):
+                self.forget(request)
+            else:
                 return self.again.pop(index)
         return None
 

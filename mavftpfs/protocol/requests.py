@@ -307,6 +307,10 @@ class Operation:
         """Take believed ACKs to requests with the opcode `bulk`, in the order in which they came."""
         raise NotImplementedError
 
+    def takes_back(self, request: Request) -> bool:
+        """One was lost; return whether its bytes are asked for by other requests in its place."""
+        return False
+
     def on_burst_sent(self, request: Request, now: float) -> int:
         """A BurstReadFile of this operation went out under request.seq; return how many packets may come."""
         return 0

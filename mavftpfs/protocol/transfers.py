@@ -6,11 +6,11 @@ from math import inf
 from typing import Literal, Protocol
 
 from mavftpfs.protocol.burst import Burst
+from mavftpfs.protocol.chunked import Chunked
 from mavftpfs.protocol.payload import MAX_DATA, NakCode, Opcode, Payload
 from mavftpfs.protocol.requests import (
     KEEP_ALIVE_MANNER,
     READ_MANNER,
-    Operation,
     Priority,
     Request,
     Run,
@@ -18,7 +18,7 @@ from mavftpfs.protocol.requests import (
     nak_of,
 )
 from mavftpfs.protocol.toeof import ReadToEof
-from mavftpfs.shared.errors import FileChanged, FtpNak, LocalProtocolError, MavftpfsError, SessionLost
+from mavftpfs.shared.errors import FileChanged, FtpNak, MavftpfsError, SessionLost
 from mavftpfs.shared.extents import ExtentSet
 
 __all__ = ["DataSink", "ReadToEof", "ReadTransfer", "Strategy"]
@@ -51,7 +51,7 @@ class DataSink(Protocol):
         ...
 
 
-class ReadTransfer(Operation):
+class ReadTransfer(Chunked):
     """Reads wanted ranges of an open regular file for as long as its owner likes.
 
     Args:
@@ -71,12 +71,9 @@ class ReadTransfer(Operation):
     def __init__(
         self, session: int, size: int, sink: DataSink, chunk: int = MAX_DATA, strategy: Strategy = "window"
     ) -> None:
-        super().__init__()
-        if not 1 <= chunk <= MAX_DATA:
-            raise LocalProtocolError(f"a chunk of {chunk} bytes is not within 1..{MAX_DATA}")
+        super().__init__(chunk)
         self.session = session
         self.size = size
-        self.chunk = chunk
         self.strategy: Strategy = strategy
         self.received_bytes = 0
         self._sink = sink
@@ -189,6 +186,7 @@ class ReadTransfer(Operation):
         """Return ReadFile requests for a row of chunks, or what `next_request` says."""
         if self._burst is not None or self._filling or self.strategy == "burst":
             return super().next_requests(most, now)
+        most = self.measure_row(most, now)
         chunk, session = self.chunk, self.session
         row = self._demand.take_first(most * chunk) or self._ahead.take_first(most * chunk)
         if row is None:
@@ -242,6 +240,7 @@ class ReadTransfer(Operation):
         if reply.opcode == _NAK:
             self._on_nak(request, nak_of(request, reply))
             return
+        self.count_answered(request, 1, now)
         data = reply.data
         count = len(data)
         if count != request.size:
@@ -257,6 +256,7 @@ class ReadTransfer(Operation):
     def on_run(self, run: Run, now: float) -> None:
         """Place chunks, those in a row together."""
         unanswered = self._unanswered
+        self.count_answered(run[0][0], len(run), now)
         self._window_seconds += now - self._window_mark
         self._window_mark = now
         pieces: list[bytes] = []
@@ -293,7 +293,7 @@ class ReadTransfer(Operation):
             # A server that never sends more than this (servers.md 7) should not be asked for more.
             self._shorts[count] = self._shorts.get(count, 0) + 1
             if self._shorts[count] >= _SHORTS_TO_LEARN:
-                self.chunk = count
+                self.limit_chunk(count)
 
     def _on_nak(self, request: Request, nak: FtpNak) -> None:
         self._demand.add(request.offset, request.offset + request.size)
@@ -313,6 +313,11 @@ class ReadTransfer(Operation):
         if nak.code in _SESSION_CODES or nak.code in _DOUBTFUL_CODES or nak.server_errno == _EBADF:
             return SessionLost(str(nak), by_server=True)
         return nak
+
+    def take_back(self, request: Request) -> None:
+        """See Chunked."""
+        del self._unanswered[request]
+        self._demand.add(request.offset, request.offset + request.size)
 
     def fail(self, error: MavftpfsError) -> None:
         """End; what was on its way is wanted again."""

@@ -10,11 +10,11 @@ from collections import deque
 from collections.abc import Callable
 from typing import Protocol
 
+from mavftpfs.protocol.chunked import Chunked
 from mavftpfs.protocol.payload import MAX_DATA, NakCode, Opcode, Payload
 from mavftpfs.protocol.requests import (
     LAST_WRITE_MANNER,
     WRITE_MANNER,
-    Operation,
     Priority,
     Request,
     Run,
@@ -62,7 +62,7 @@ class ChunkSource(Protocol):
         ...
 
 
-class WriteTransfer(Operation):
+class WriteTransfer(Chunked):
     """Writes what a source has for as long as its owner likes.
 
     Args:
@@ -93,11 +93,8 @@ class WriteTransfer(Operation):
         in_flight: int | None = None,
         on_starved: Callable[[], None] = lambda: None,
     ) -> None:
-        super().__init__()
-        if not 1 <= chunk <= MAX_DATA:
-            raise LocalProtocolError(f"a chunk of {chunk} bytes is not within 1..{MAX_DATA}")
+        super().__init__(chunk)
         self.session = session
-        self.chunk = chunk
         self.acked_bytes = 0
         self.failed_at: int | None = None
         self._source = source
@@ -174,11 +171,15 @@ class WriteTransfer(Operation):
             most = min(most, self._in_flight - len(self._unanswered))
         if self._paused or most <= 0:
             return []
-        piece = self._rest.popleft() if self._rest else self._next_piece(min(most, _ROW) * self.chunk)
+        most = self.measure_row(min(most, _ROW), now)
+        session, chunk = self.session, self.chunk
+        piece = self._rest.popleft() if self._rest else self._next_piece(most * chunk)
         if piece is None:
             return []
         offset, data = piece
-        session, chunk = self.session, self.chunk
+        if len(data) > most * chunk:  # it went out in longer ones before
+            self._rest.appendleft((offset + most * chunk, data[most * chunk :]))
+            data = data[: most * chunk]
         requests = [
             Request(self, _WRITE, WRITE_MANNER, session, offset + at, chunk, data[at : at + chunk])
             for at in range(0, len(data), chunk)
@@ -211,10 +212,11 @@ class WriteTransfer(Operation):
             self.fail(self._meaning(nak_of(request, reply)))
             return
         del self._unanswered[request]
+        self.count_answered(request, 1, now)
         if reply.offset and reply.offset == request.offset:
             self.port.traits.write_ack_offset = True
         count = request.size
-        if reply.data != self._usual or count != self.chunk:
+        if reply.data != self._usual or count != self.most:
             count = self._written(request, reply.data)
         if count:
             self._barren = 0
@@ -225,14 +227,15 @@ class WriteTransfer(Operation):
 
     def on_run(self, run: Run, now: float) -> None:
         """Tell the source what was written, in a row at once."""
-        unanswered, usual, chunk = self._unanswered, self._usual, self.chunk
+        unanswered, usual, full = self._unanswered, self._usual, self.most
         start = stop = run[0][0].offset
+        self.count_answered(run[0][0], len(run), now)
         if run[-1][0].offset:  # a run's answers have the offsets of their requests
             self.port.traits.write_ack_offset = True
         for request, data in run:
             offset, count = request.offset, request.size
             del unanswered[request]
-            if data != usual or count != chunk:
+            if data != usual or count != full:
                 count = self._written(request, data)
                 usual = self._usual
             if offset != stop:
@@ -262,7 +265,7 @@ class WriteTransfer(Operation):
             return request.size
         traits.write_ack_counts = True
         count = int.from_bytes(data, "little")
-        if count == self.chunk == request.size:
+        if count == self.most == request.size:
             self._usual = data
         # More than was sent: an answer to something else. Nothing is proven, so it goes again.
         return count if count <= request.size else 0
@@ -281,6 +284,15 @@ class WriteTransfer(Operation):
             lost.__cause__ = nak
             return lost
         return nak
+
+    def take_back(self, request: Request) -> None:
+        """See Chunked."""
+        del self._unanswered[request]
+        offset, data = request.offset, request.data
+        if self._rest and self._rest[-1][0] + len(self._rest[-1][1]) == offset:
+            offset, before = self._rest.pop()
+            data = before + data
+        self._rest.append((offset, data))
 
     def fail(self, error: MavftpfsError) -> None:
         """End; what was not ACKed goes back to the source."""

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
+from mavftpfs.protocol.chunks import Chunks
 from mavftpfs.protocol.engine import Engine
 from mavftpfs.session.driver import Driver
 from mavftpfs.session.echoes import Echoes
@@ -17,7 +18,7 @@ from mavftpfs.shared.traits import WriteTraits
 
 @dataclass(frozen=True, slots=True)
 class Kit:
-    """The session and what it runs on."""
+    """The session and what it runs on. write_chunks: chooses the size of WriteFiles, unless it was given."""
 
     holder: SessionHolder
     driver: Driver
@@ -26,6 +27,7 @@ class Kit:
     gate: Gate
     clock: Callable[[], float]
     echoes: Echoes
+    write_chunks: Chunks | None
 
 
 class Queue(Protocol):

@@ -123,7 +123,8 @@ class Reading:
         session = self._holder.session
         if session is None:  # the vehicle restarted since it was opened
             return
-        transfer = ReadTransfer(session.id, stream.size, stream, self._steering.chunk)
+        transfer = ReadTransfer(session.id, stream.size, stream, self._steering.most)
+        transfer.chunks = self._steering.chunks
         started = self._clock()
         self.active, self._transfer, self._seen_bytes = stream, transfer, 0
         stream.attach(transfer)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from mavftpfs.protocol.chunks import Chunks
 from mavftpfs.protocol.engine import Engine
 from mavftpfs.protocol.payload import MAX_DATA
 from mavftpfs.protocol.transfers import ReadTransfer
@@ -11,16 +12,30 @@ from mavftpfs.session.policy import ReadMode, Strategy, choose_strategy
 class ReadSteering:
     """Chooses strategy and chunk for each transfer, and remembers what they measured.
 
-    chunk: bytes a request asks for, 1..239; None = the most that fits.
+    chunk: bytes a request asks for, 1..239; None = the most that fits, or less where that brings more.
+
+    Attributes:
+        most: bytes of the longest chunk. chunks, write_chunks: choose their size, None where it was given.
     """
 
     def __init__(self, engine: Engine, mode: ReadMode = "auto", chunk: int | None = None) -> None:
         self.mode: ReadMode = mode
-        self.chunk = MAX_DATA if chunk is None else chunk
+        self.most = MAX_DATA if chunk is None else chunk
+        auto = chunk is None
+        self.chunks = Chunks() if auto else None
+        self.write_chunks = Chunks(self._has_room) if auto else None
         self._engine = engine
         self._window_rate: float | None = None
         self._burst_rate: float | None = None
         self._chosen: Strategy | None = None
+
+    @property
+    def chunk(self) -> int:
+        """Bytes that a ReadFile asks for."""
+        return self.most if self.chunks is None else self.chunks.size
+
+    def _has_room(self) -> bool:
+        return self._engine.flow.window < self._engine.flow.cap
 
     def status(self) -> dict[str, object]:
         """Return how files are read, and how fast; bytes per second, None for what was not measured."""

@@ -83,10 +83,10 @@ class Scheduler:
         self._streams: set[FileStream] = set()
         self._suspicion = Suspicion(clock)
         self._jobs: list[SessionJob] = []
-        kit = Kit(self._holder, driver, engine, vehicle, self.gate, clock, self.echoes)
+        kit = Kit(self._holder, driver, engine, vehicle, self.gate, clock, self.echoes, steering.write_chunks)
         self._reading = Reading(kit, self, steering)
         self._uploading = Uploading(
-            kit, self, op_deadline=op_deadline, chunk=steering.chunk, when_armed_ok=when_armed_ok
+            kit, self, op_deadline=op_deadline, chunk=steering.most, when_armed_ok=when_armed_ok
         )
         writer = self._uploading.writer
         self.written, self.on_probed = self._uploading.written, self._uploading.on_probed

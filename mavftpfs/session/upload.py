@@ -55,6 +55,8 @@ class Feed:
 
     def next_chunk(self, limit: int) -> tuple[int, bytes] | None:
         """See protocol.writing.ChunkSource."""
+        if self._held is not None and len(self._held[1]) > limit:
+            self.put_back()
         found, self._held = self._held, None
         if found is None:
             try:

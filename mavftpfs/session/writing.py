@@ -84,7 +84,7 @@ class Writer:
         self._gate = kit.gate
         self._clock = kit.clock
         self._queue = queue
-        self._chunk = chunk
+        self._chunk, self._chunks = chunk, kit.write_chunks
         self._may_write = may_write
         self._disarmed_by_paths = False
         self._transfer: WriteTransfer | None = None
@@ -200,6 +200,7 @@ class Writer:
         self, upload: QueuedUpload, session: OpenSession, transfer: WriteTransfer
     ) -> Stop | None:
         """Run a transfer until there is a reason to let go, or it failed (None)."""
+        transfer.chunks = self._chunks
         self._transfer, self._starved_at = transfer, None
         self._driver.start(transfer, self._holder.wake)
         try:
