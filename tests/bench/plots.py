@@ -171,20 +171,23 @@ def paint_bars(axes: Axes, rows: Sequence[Row], names: Sequence[str]) -> None:
 
 
 def share_of(row: Row) -> float:
-    """Return the length of a bar."""
-    share = row.of_bare if row.of_limit is None else row.of_limit
-    return share if share is not None and row.outcome is Outcome.OK else 0.0
+    """Return the length of a bar: none for who failed or was cut off."""
+    return (reached(row) or 0.0) if row.outcome is Outcome.OK else 0.0
+
+
+def reached(row: Row) -> float | None:
+    """Return the share of the limit, on the loopback of the bare loop; an upper bound for who was cut off."""
+    return row.of_bare if row.of_limit is None else row.of_limit
 
 
 def note_of(row: Row) -> str:
     """Return what stands beside a bar."""
-    if row.outcome is not Outcome.OK:
-        return {Outcome.TIMEOUT: "not in time", Outcome.CORRUPT: "wrong bytes"}.get(
-            row.outcome, str(row.outcome)
-        )
-    if row.of_limit is None and row.of_bare is None:
+    share = reached(row)
+    if row.outcome not in (Outcome.OK, Outcome.TIMEOUT):
+        return tables.failure(row.outcome)
+    if share is None:
         return "no bare loop to compare with"
-    return f"{share_of(row):.2f}"
+    return f"{'< ' if row.at_most else ''}{share:.2f}"
 
 
 # -- the command ------------------------------------------------------------------------------------

@@ -43,8 +43,6 @@ _COMMANDS = (
 )
 """Whose requests are shown."""
 
-_FAILURES = {Outcome.TIMEOUT: "not in time", Outcome.CORRUPT: "wrong bytes"}
-
 
 def server_name(server: str) -> str:
     """Return how a server is called in print."""
@@ -83,12 +81,18 @@ def rate_text(row: Row | None) -> str:
     """Return one cell of that table."""
     if row is None:
         return ""
-    if row.rate is None or row.outcome is not Outcome.OK:
-        return _FAILURES.get(row.outcome, str(row.outcome))
-    rate = _digits(row.rate / 1000)
+    if row.rate is None or row.outcome not in (Outcome.OK, Outcome.TIMEOUT):
+        return failure(row.outcome)
+    bound = "< " if row.at_most else ""
+    rate = f"{bound}{_digits(row.rate / 1000)}"
     if row.client == US:
         return f"**{rate}**"
-    return rate if row.of_us is None else f"{rate} ({_digits(row.of_us)})"
+    return rate if row.of_us is None else f"{rate} ({bound}{_digits(row.of_us)})"
+
+
+def failure(outcome: Outcome) -> str:
+    """Return why there is no rate."""
+    return "wrong bytes" if outcome is Outcome.CORRUPT else str(outcome)
 
 
 def _digits(value: float) -> str:

@@ -266,9 +266,19 @@ def test_pictures_are_drawn_and_the_same_each_time(tmp_path: Path) -> None:
 
 
 def test_a_bar_says_why_it_is_missing() -> None:
-    rows = summarise([run(US, 2.0, link="unshaped"), run("slow", None, Outcome.TIMEOUT)], TIMEOUTS)
-    assert [plots.note_of(row) for row in rows] == ["no bare loop to compare with", "not in time"]
-    assert [plots.share_of(row) for row in rows] == [0.0, 0.0]
+    runs = [
+        run(US, 2.0, link="unshaped"),
+        run("slow", None, Outcome.TIMEOUT),
+        run("bad", None, Outcome.CORRUPT),
+    ]
+    rows = summarise(runs, TIMEOUTS)
+    assert [plots.note_of(row) for row in rows] == ["no bare loop to compare with", "< 0.09", "wrong bytes"]
+    assert [plots.share_of(row) for row in rows] == [0.0, 0.0, 0.0]
+
+
+def test_who_was_cut_off_shows_how_fast_it_was_at_most() -> None:
+    rows = summarise([run(US, 2.0), run("slow", None, Outcome.TIMEOUT)], TIMEOUTS)
+    assert [tables.rate_text(row) for row in rows] == ["**500**", "< 50.0 (< 0.10)"]
 
 
 def test_plots_need_results(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
