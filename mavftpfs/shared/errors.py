@@ -136,6 +136,38 @@ class VerificationFailed(MavftpfsError):
     """What is on the card is not what was written, and sending it again did not help (EIO)."""
 
 
+_REQUESTS = {
+    1: "close the file",
+    3: "list the directory",
+    4: "open the file",
+    5: "read the file",
+    6: "create the file",
+    7: "write the file",
+    8: "remove the file",
+    9: "make the directory",
+    10: "remove the directory",
+    11: "open the file for writing",
+    12: "truncate the file",
+    13: "rename it",
+    14: "compute the checksum",
+    15: "read the file by bursts",
+    16: "list the directory with times",
+}
+_REASONS = {
+    1: "it failed",
+    2: "its system reports an error",
+    3: "wrong size of the request",
+    4: "no such session",
+    5: "no session is free",
+    6: "nothing is there",
+    7: "unknown command",
+    8: "the name exists",
+    9: "it is protected",
+    10: "it does not exist",
+}
+"""What people are told, by opcode and NAK code; the numbers stand behind it."""
+
+
 class FtpNak(MavftpfsError):
     """The server refused a request.
 
@@ -150,8 +182,9 @@ class FtpNak(MavftpfsError):
     def __init__(
         self, opcode: int, code: int, server_errno: int | None = None, *, retransmitted: bool = False
     ) -> None:
-        errno_text = "" if server_errno is None else f", errno {server_errno}"
-        super().__init__(f"the vehicle refused opcode {opcode} with NAK {code}{errno_text}")
+        numbers = f"opcode {opcode}, NAK {code}" + ("" if server_errno is None else f", errno {server_errno}")
+        what, why = _REQUESTS.get(opcode, "do that"), _REASONS.get(code, "without a known reason")
+        super().__init__(f"the vehicle refused to {what}: {why} ({numbers})")
         self.opcode = opcode
         self.code = code
         self.server_errno = server_errno

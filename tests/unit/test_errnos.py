@@ -160,3 +160,17 @@ def test_a_full_card_is_told() -> None:
 def test_opcodes_that_old_servers_lack(opcode: int, code: int) -> None:
     assert nak(opcode, code) == errno.EOPNOTSUPP
     assert os.strerror(nak(opcode, code))
+
+
+def test_a_refusal_is_told_in_words_and_numbers() -> None:
+    told = str(errors.FtpNak(Opcode.WRITE_FILE, NakCode.FILE_PROTECTED))
+    assert told == "the vehicle refused to write the file: it is protected (opcode 7, NAK 9)"
+    told = str(errors.FtpNak(Opcode.RENAME, NakCode.FAIL_ERRNO, 13))
+    assert (
+        told == "the vehicle refused to rename it: its system reports an error (opcode 13, NAK 2, errno 13)"
+    )
+    assert str(errors.FtpNak(99, 99)).startswith("the vehicle refused to do that: without a known reason (")
+    for opcode in set(Opcode) - {Opcode.NONE, Opcode.RESET_SESSIONS, Opcode.ACK, Opcode.NAK}:
+        assert "do that" not in str(errors.FtpNak(opcode, NakCode.FAIL)), "each has its words"
+    for code in set(NakCode) - {NakCode.NONE}:
+        assert "without" not in str(errors.FtpNak(Opcode.READ_FILE, code))
