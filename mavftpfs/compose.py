@@ -110,7 +110,8 @@ async def attached(
 
     writing: the tree may be changed, if the options do not forbid it; what it holds then lies in a spool that
     survives the process. rescue_for: what earlier mounts left there is moved to a recovery directory that is
-    named after this SOURCE, when `Attached.notice` is called: not before there is somebody to be told.
+    named after this SOURCE, when `Attached.notice` is called: not before there is somebody to be told. Without
+    it nothing is left there by this one either: what a command did not deliver is still where it came from.
 
     Raises:
         LinkClosed, VehicleLost, NoFtp: within connect_timeout, with the reason.
@@ -146,7 +147,7 @@ async def attached(
                     yield Attached(connection, tree, notice)
                 finally:
                     connection.news.clear()  # the tree can begin nothing while the session is closed
-                    if spool is not None and not tree.undelivered():
+                    if spool is not None and (rescue_for is None or not tree.undelivered()):
                         spool.discard()
 
 

@@ -379,3 +379,15 @@ def test_a_put_that_does_not_arrive_is_exit_4(field: Field, data: Path) -> None:
     assert len(done.stderr.splitlines()) == 1
     assert "armed" in done.stderr
     assert list(card.iterdir()) == []
+
+
+def test_a_put_that_is_refused_leaves_nothing_behind(field: Field, data: Path) -> None:
+    """The file is here already: no mount has to find another copy of it."""
+    vehicle = field.sim(field.local("card"), "px4-nuttx")
+    state = field.local("state")
+    argv = [sys.executable, "-m", "mavftpfs", "put", vehicle.source, str(data), "/outside-its-card"]
+    environment = {**os.environ, "XDG_STATE_HOME": str(state)}
+    done = subprocess.run(argv, capture_output=True, text=True, timeout=60, check=False, env=environment)
+    assert done.returncode == 4
+    assert "protected" in done.stderr
+    assert [path for path in state.rglob("*") if path.is_file() and path.name != "owner"] == []
