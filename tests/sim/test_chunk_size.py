@@ -1,4 +1,4 @@
-"""Which chunk size reads most over a link that damages bytes, on virtual time: chunk=auto is always 239."""
+"""Which chunk size reads most over a link that damages bytes, on virtual time: chunk=auto begins with 239."""
 
 from __future__ import annotations
 
@@ -42,5 +42,5 @@ def test_none_are_better_than_full_ones_up_to_a_tenth_of_them_lost(byte_loss: fl
 
 
 def test_smaller_ones_win_where_two_of_five_full_ones_are_lost() -> None:
-    """So bad is no link that anybody flies with; the model does show what chunk= is there for."""
+    """So bad is no link that anybody flies with; the model does show what smaller ones are there for."""
     assert goodput(110, 2e-3, Duplex.FULL) > 1.1 * goodput(MAX_DATA, 2e-3, Duplex.FULL)
