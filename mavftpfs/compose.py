@@ -110,8 +110,8 @@ async def attached(
 
     writing: the tree may be changed, if the options do not forbid it; what it holds then lies in a spool that
     survives the process. rescue_for: what earlier mounts left there is moved to a recovery directory that is
-    named after this SOURCE, when `Attached.notice` is called: not before there is somebody to be told. Without
-    it nothing is left there by this one either: what a command did not deliver is still where it came from.
+    named after this SOURCE, when `Attached.notice` is called: not before there is somebody to be told.
+    Without it nothing is left there by this one either: what was not delivered is still where it came from.
 
     Raises:
         LinkClosed, VehicleLost, NoFtp: within connect_timeout, with the reason.
