@@ -348,10 +348,8 @@ class Flow:
                 self.window = int(self._base.next_window(self.window, reserve))
 
     def _excused(self) -> bool:
-        """Whether pauses explain what was lost: it is no more than comes in them, or who wrote went on, and
-        the server takes more than the link brings."""
-        quick = self._stalls.bridging and self._trains.rate > 1.5 * self._best_rate
-        return self._stalls.usual and (quick or self.loss < self._stalls.share + _MORE_LOSS)
+        """Whether pauses explain what was lost: it is no more than comes in them, and on a bad link."""
+        return self._stalls.usual and self.loss < self._stalls.share + _MORE_LOSS
 
     def _learn_congestion(self) -> None:
         if self._losses and self._queued(2.0):

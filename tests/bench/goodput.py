@@ -42,9 +42,11 @@ PIECE = 128 * 1024
 TABLE_WIDTH = 100
 
 
-def measure(case: Case, seconds: float, *, queue: int | None = None, telemetry: float = 0.0) -> Result:
+def measure(
+    case: Case, seconds: float, *, queue: int | None = None, telemetry: float = 0.0, seed: int = 1
+) -> Result:
     """Read or write for about `seconds` of link time; queue: bytes that wait for the link's transmitter;
-    telemetry: bytes per second that the vehicle sends beside it.
+    telemetry: bytes per second that the vehicle sends beside it; seed: of chance.
 
     Raises:
         AssertionError: the bytes differ.
@@ -52,7 +54,7 @@ def measure(case: Case, seconds: float, *, queue: int | None = None, telemetry: 
     """
     room = int(max(4096, case.rate / 2)) if queue is None else queue
     settings = LinkSettings(rate=case.rate, delay=case.rtt / 2, loss=case.loss, queue=room)
-    world = World(case.profile, settings, telemetry=telemetry)
+    world = World(case.profile, settings, seed=seed, telemetry=telemetry)
     data = random.Random(1).randbytes(int(case.limit * seconds))
     transfer = _read if case.direction == "read" else _write
 

@@ -187,6 +187,17 @@ def test_where_few_may_be_in_flight_a_silence_is_all_of_them_lost() -> None:
     assert queued.patience == serial.patience == 0.0
 
 
+def test_pauses_excuse_no_more_losses_than_come_in_them() -> None:
+    """Also where the server takes far more than the link brings: half of a window then finds a queue full."""
+    flow = Flow()
+    at_work_with_pauses(flow)
+    flow._trains.rate, flow._stalls.bridging = 10 * RATE, True
+    flow.loss = flow._stalls.share + 0.1
+    assert flow._excused()
+    flow.loss = flow._stalls.share + 0.3
+    assert not flow._excused()
+
+
 def test_patience_ends_with_the_pauses() -> None:
     stalls = Stalls()
     now = run(stalls, 20.0, every=0.5, pause=0.15)
