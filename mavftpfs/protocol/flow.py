@@ -304,8 +304,7 @@ class Flow:
         self._flights.begin(order, next_order, self.window)
         self._round_start = now
         self._round_least = inf
-        self._replies = self._losses = 0
-        self._app_limited = False
+        self._replies, self._losses, self._app_limited = 0, 0, False
 
     def _learn(self, now: float, next_order: int) -> None:
         answered, lost, survival = self._replies, self._losses, self._survival
@@ -329,11 +328,12 @@ class Flow:
         self._learn_congestion()
         self._trains.end_round(answered, rate)
         if survival is not None:
-            window = survival.end_round(answered, lost, took, now, queued=self._queued(2.0))
+            disturbed = self._stalls.reserve.others_at > self._round_start - took
+            most = self._target() if self._queued(2.0) else inf
+            window = survival.end_round(answered, lost, took, now, most=most, disturbed=disturbed)
             self.window = min(self.cap, window)
         elif self._starting and overflowed:
-            self._starting = False
-            self._goal = 0
+            self._starting, self._goal = False, 0
             self._easing.ceiling = max(INITIAL, self._held(self._best_rate))
             self._approach(self._easing.ceiling)
         elif self._starting and not self._leaves_start(grown):

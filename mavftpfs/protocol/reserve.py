@@ -58,6 +58,7 @@ class Reserve:
     Attributes:
         seconds: of answers to keep in the link's queue.
         wanted: as many would bridge the pauses; 0 if there are none.
+        others_at: when somebody last waited for an answer beside a transfer.
     """
 
     __slots__ = (
@@ -66,12 +67,12 @@ class Reserve:
         "_expected",
         "_held",
         "_hold",
-        "_others_at",
         "_overfull",
         "_rounds",
         "_seen",
         "_until",
         "_waited",
+        "others_at",
         "seconds",
         "wanted",
     )
@@ -86,7 +87,7 @@ class Reserve:
         self._bare_paused = 0.0  # seconds of pauses without a reserve, lately
         self._bare_seconds = 1.0
         self._expected = self._seen = 0.0  # seconds of pauses with it: as without it, and really
-        self._others_at = -inf
+        self.others_at = -inf
         self._until = -inf  # there is none before
         self._hold = _FIRST_HOLD
 
@@ -94,13 +95,13 @@ class Reserve:
         """The server pauses. rtt: least round trip."""
         if now < self._until:
             return
-        alone = now >= self._others_at + _LATELY
+        alone = now >= self.others_at + _LATELY
         self.wanted = min(MOST + rtt, _MOST_ON_A_LONG_WAY) if alone else BESIDE_OTHERS
         self._settle()
 
     def on_others(self, now: float) -> None:
         """Somebody waits for an answer beside a transfer, and may again soon."""
-        self._others_at = now
+        self.others_at = now
         self.wanted = min(self.wanted, BESIDE_OTHERS)
         self._settle()
 

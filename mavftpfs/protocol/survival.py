@@ -7,10 +7,13 @@ in flight are answered no faster than n. So the window grows by half a round, at
 is lost; from then on neighbouring windows are *compared*: each is kept for some rounds, and the wider one has
 to bring at least half of the answers per second that it promises, or a little where no more is lost. How many
 requests tell that depends on how many are lost anyhow. Random loss takes the same share of both, so it moves
-the window nowhere; and where the link and not the buffer is the limit, a wider window brings nothing either.
+the window nowhere; and where the link and not the buffer is the limit, a wider window brings nothing either
+but a queue in which others wait: what fills the way is the most.
 """
 
 from __future__ import annotations
+
+from math import inf
 
 _WORTH = 0.5
 """The share of a step's promise that must show in the answers for the wider window to be kept."""
@@ -43,17 +46,18 @@ _LONGEST_HOLD = 16.0
 class _Sample:
     """What became of the requests of some rounds with one window."""
 
-    __slots__ = ("answered", "lost", "seconds")
+    __slots__ = ("answered", "lost", "queued", "seconds")
 
     def __init__(self) -> None:
         self.answered = 0
         self.lost = 0
-        self.seconds = 0.0
+        self.seconds = self.queued = 0.0
 
-    def add(self, answered: int, lost: int, seconds: float) -> None:
+    def add(self, answered: int, lost: int, seconds: float, *, queued: bool) -> None:
         self.answered += answered
         self.lost += lost
         self.seconds += seconds
+        self.queued += seconds * queued
 
     @property
     def total(self) -> int:
@@ -84,6 +88,7 @@ class Survival:
         "_hold_until",
         "_loss",
         "_low",
+        "_most",
         "_sample",
         "_second",
         "_settled",
@@ -95,6 +100,7 @@ class Survival:
     def __init__(self, cap: int) -> None:
         self.window = 1
         self._cap = cap
+        self._most = inf  # so many fill the way
         self._before = 1  # the window of the round before, while nothing is lost
         self._careful = False
         self._settled = 1  # the best one so far
@@ -111,20 +117,35 @@ class Survival:
         self._hold = _SHORTEST_HOLD
         self._hold_until = 0.0
 
-    def end_round(self, answered: int, lost: int, seconds: float, now: float, *, queued: bool) -> int:
+    def end_round(
+        self,
+        answered: int,
+        lost: int,
+        seconds: float,
+        now: float,
+        *,
+        most: float = inf,
+        disturbed: bool = False,
+    ) -> int:
         """Return the window for the next round.
 
         answered, lost, seconds: of the round that ended, in which there was always something to send.
-        queued: even the quickest answer had to wait, so that a wider window would only lengthen a queue.
+        most: if even the quickest answer had to wait, so that a wider window would only lengthen a queue: so
+        many fill the way, if the quickest answers ever tell its length; else infinite.
+        disturbed: others waited for an answer, to whom the window gave way.
         """
+        if disturbed and self._careful:
+            return self.window  # that compares with nothing
+        if queued := most < inf:
+            self._most = most
         total = answered + lost
         self._loss += (lost / total - self._loss) * min(1.0, total / _REMEMBERED)
         if not self._careful:
-            self._grow(answered / seconds if seconds > 0 else 0.0, lost, queued=queued)
+            self._grow(answered / seconds if seconds > 0 else 0.0, lost, most, now)
         elif self._settling:
             self._settling -= 1
         else:
-            self._sample.add(answered, lost, seconds)
+            self._sample.add(answered, lost, seconds, queued=queued)
             if self._sample.total >= self._enough():
                 self._judge(now)
         return self.window
@@ -133,18 +154,21 @@ class Survival:
         """Return the window after a round in which there was not always something to send. sent: so many were
         on their way at its end, which tells as much if it is all that the window allows."""
         if sent >= self.window and not lost and not self._careful:
-            self._grow(0.0, 0, queued=False)
+            self._grow(0.0, 0, inf, 0.0)
         return self.window
 
-    def _grow(self, rate: float, lost: int, *, queued: bool) -> None:
+    def _grow(self, rate: float, lost: int, most: float, now: float) -> None:
         """Nothing was lost so far."""
         self._careful = lost > 0 and self._cap > 1
         if self._careful:
             self._settled = low = max(1, min(self.window - _OVERSHOT, self._before))
             self._compare(low, low + 1)
-        elif not queued or rate > _GROWN * self._best_rate:
+        elif most == inf or rate > _GROWN * self._best_rate:
             self._before = self.window
             self.window = self._settled = min(self.window + max(1, self.window // 2), self._cap)
+        elif self.window > most:
+            self._careful = True
+            self._keep(max(1, int(most)), _Sample(), now)
         self._best_rate = max(rate, self._best_rate)
 
     def _enough(self) -> int:
@@ -194,7 +218,7 @@ class Survival:
     def _widen(self, wide: _Sample, now: float) -> None:
         """The wider one is better: go on, by larger steps, if it is wider than what was settled for."""
         step, window = self._high - self._low, self._high
-        if window > self._settled and window < self._cap:
+        if self._settled < window < self._cap and not self._only_queues(wide, window + 1):
             self._settled = window
             self._compare(window, window + max(1, min(2 * step, window // 2)), wide)
         else:
@@ -223,11 +247,17 @@ class Survival:
     # --- holding
 
     def _watch(self, now: float) -> None:
-        """Look again when it is time, or when much more is lost than before (writes are larger)."""
-        loss = self._sample.loss
-        if loss > self._usual_loss + _SUDDEN and self.window > 1:
-            self._compare(self.window - 1, self.window)
-        elif now >= self._hold_until and self.window < self._cap:
-            self._compare(self.window, self.window + 1, self._sample)
+        """Look again when it is time, when much more is lost than before (writes are larger), or where a
+        queue stands in which others wait: perhaps fewer bring as much."""
+        sample, window = self._sample, self.window
+        suspect = sample.loss > self._usual_loss + _SUDDEN or self._only_queues(sample, window)
+        if suspect and window > 1:
+            self._compare(window - 1, window)
+        elif now >= self._hold_until and window < self._cap and not self._only_queues(sample, window + 1):
+            self._compare(window, window + 1, sample)
         else:
             self._sample = _Sample()
+
+    def _only_queues(self, sample: _Sample, window: int) -> bool:
+        """Whether a queue stood most of the time, which so wide a window would only lengthen."""
+        return window > self._most and sample.queued > sample.seconds / 2

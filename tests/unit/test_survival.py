@@ -112,26 +112,12 @@ def test_it_settles_at_what_is_survived(holds: int | None, loss: float) -> None:
 def test_a_long_way_is_full_after_few_rounds_and_the_first_loss_takes_back_one() -> None:
     """One more each round took fifteen of them: 4.5 s over 300 ms."""
     survival = Survival(SERIAL_CAP)
-    windows = [survival.end_round(survival.window, 0, 0.3, 0.0, queued=False) for _ in range(7)]
+    windows = [survival.end_round(survival.window, 0, 0.3, 0.0) for _ in range(7)]
     assert windows == [2, 3, 4, 6, 9, 13, 16]
     survival = Survival(SERIAL_CAP)
     for _ in range(5):
-        survival.end_round(survival.window, 0, 0.3, 0.0, queued=False)
-    assert survival.end_round(8, 1, 0.3, 0.0, queued=False) == 6
-
-
-def test_a_limit_of_one_is_kept() -> None:
-    flow = Flow(serial=True, limit=1)
-    write(flow, Port(None), 0.2)
-    assert flow.window == 1
-
-
-def test_a_buffer_that_shrank_is_noticed() -> None:
-    flow, port = Flow(serial=True), Port(8)
-    write(flow, port, 0.0)
-    port.holds = 1
-    write(flow, port, 0.0)
-    assert flow.window <= 3
+        survival.end_round(survival.window, 0, 0.3, 0.0)
+    assert survival.end_round(8, 1, 0.3, 0.0) == 6
 
 
 def test_it_grows_where_little_is_asked_for_by_what_was_in_flight_at_once() -> None:
@@ -139,6 +125,19 @@ def test_it_grows_where_little_is_asked_for_by_what_was_in_flight_at_once() -> N
     survival = Survival(SERIAL_CAP)
     assert [survival.end_idle_round(sent, 0) for sent in (1, 1, 2, 2, 2)] == [2, 2, 3, 3, 3]
     assert survival.end_idle_round(3, 1) == 3  # a lost one says nothing of a buffer there
-    assert survival.end_round(3, 0, 0.3, 0.0, queued=False) == 4
-    assert survival.end_round(4, 1, 0.3, 0.0, queued=False) == 2
+    assert survival.end_round(3, 0, 0.3, 0.0) == 4
+    assert survival.end_round(4, 1, 0.3, 0.0) == 2
     assert survival.end_idle_round(16, 0) == 2  # from here on it compares
+
+
+def test_where_a_queue_stands_it_holds_what_fills_the_way() -> None:
+    """Nine had half a second of answers before them where three fill the way."""
+    survival = Survival(SERIAL_CAP)
+    for rate in (9.0, 18.0, 27.0, 36.0, 38.0):
+        survival.end_round(survival.window, 0, survival.window / rate, 0.0)
+    assert survival.window == 9
+    assert survival.end_round(9, 0, 9 / 38.0, 0.0, most=5.4) == 5
+    held = [survival.end_round(5, 0, 5 / 38.0, 1.0) for _ in range(20)]
+    assert held == [5] * 20
+    later = [survival.end_round(5, 0, survival.window / 38.0, 9.0) for _ in range(60)]
+    assert set(later) == {5, 6}  # it looks again now and then
