@@ -89,11 +89,6 @@ class Engine:
         """Requests on their way, those of cancelled operations included."""
         return self._ledger.in_flight
 
-    @property
-    def loss(self) -> float:
-        """Share of request/reply pairs lost lately, 0..1."""
-        return self.flow.loss
-
     def timeout(self, family: str) -> float:
         """Return the present retransmission timeout of a family of opcodes, in seconds."""
         return self._timers.timeout(family)
@@ -289,10 +284,15 @@ class Engine:
             return True
         ledger = self._ledger
         # Metadata may use one slot more than bulk work: a full window must not make it wait.
-        in_flight = ledger.in_flight - (op.priority is Priority.METADATA)
-        room = self.flow.room(in_flight, now, paced=op.paced, urgent=op.priority is Priority.METADATA)
+        urgent = op.priority is Priority.METADATA
+        in_flight = ledger.in_flight - urgent
+        room = self.flow.room(in_flight, now, paced=op.paced, urgent=urgent)
         if room <= 0 and in_flight <= _FEW and (unheard := ledger.unheard()):
             room = self.flow.room(in_flight - unheard, now, paced=op.paced)
+        if room <= 0 and urgent and in_flight < self.flow.most_beside:
+            # Nor must a window that was full when it shrank, of what may be answered late or never.
+            others = sum(other.sent and other.priority is Priority.METADATA for other in self._ops)
+            room = self.flow.room(others, now, paced=op.paced, urgent=True)
         left = room
         while left > 0:
             again = ledger.take_again(op) if ledger.again else None

@@ -1,17 +1,15 @@
 """How many requests may be in flight. Layer: protocol; pure.
 
-Theory. A window of W answered requests per round trip is a rate; beyond what the path carries, more of
-them only wait in a queue, ours and everybody else's. So the window aims at what the path holds:
-bandwidth (the best recent rate of answers) times base round trip (the least one seen), up to a quarter
-more to find out when the path improves, and a few requests of slack: so few that a short queue in front of
-the slowest part holds them. Bandwidth is at most what `trains` saw, or losses in such a queue would excuse
-the window that causes them. Random loss does not shrink it, because
-loss alone changes neither product; loss *with* a standing queue (the round's least round trip well over
-the base) is congestion, and brakes by a third at most once a round. A silent time-out round falls back
-to a probe of two. Start: double each round while the rate grows by a quarter; once the path's own pace is
-known, go to what it holds, at that pace.
-
-A round is the time until a request sent after the round's start is answered.
+Theory. A window of W answered requests per round trip is a rate; beyond what the path carries, more of them
+only wait in a queue, ours and everybody else's. So the window aims at what the path holds: bandwidth (the
+best recent rate of answers) times base round trip (the least one seen), up to a quarter more to find out when
+the path improves, and a few requests of slack: so few that a short queue in front of the slowest part holds
+them. Bandwidth is at most what `trains` saw, or losses in such a queue would excuse the window that causes
+them. Random loss does not shrink it, because loss alone changes neither product; loss *with* a standing queue
+(the round's least round trip well over the base) is congestion, and brakes by a third at most once a round. A
+silent time-out round falls back to a probe of two. Start: double each round while the rate grows by a
+quarter; once the path's own pace is known, go to what it holds, at that pace. A round is the time until a
+request sent after the round's start is answered.
 """
 
 from __future__ import annotations
@@ -108,8 +106,7 @@ class Flow:
         self._best_rate = 0.0
         self._base = BaseRtt()
         self._base_rtt = inf
-        self._easing = Easing()
-        self._trains = Trains()
+        self._easing, self._trains = Easing(), Trains()
         self._pacer: Pacer | None = None
         self._stalls = Stalls()
         self._heard_at = -inf
@@ -119,8 +116,7 @@ class Flow:
         self._round_start = 0.0
         self._round_least = inf
         self._replies = self._losses = self._goal = 0
-        self._flights = Flights()
-        self._overflow = Overflow()
+        self._flights, self._overflow = Flights(), Overflow()
 
     def set_queue_limit(self, limit: int | None) -> None:
         """Never have more in flight than the server queues; None if it is not known to be limited."""
@@ -154,14 +150,18 @@ class Flow:
         if self.budget is None or room <= 0:
             return room
         allowed = self.budget.room(now, urgent=urgent)
-        if allowed < room:
-            self._app_limited = True
+        self._app_limited |= allowed < room
         return min(allowed, room)
 
     @property
     def held(self) -> bool:
         """Whether somebody was only held back by the user's budget, so that waiting is no silence."""
         return self.budget is not None and self.budget.held
+
+    @property
+    def most_beside(self) -> int:
+        """How many may be in flight if somebody waits: none more where a server holds but a few of them."""
+        return self.cap if self._survival is None and self._pacer is None else 0
 
     @property
     def patience(self) -> float:

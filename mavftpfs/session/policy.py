@@ -58,7 +58,7 @@ class Service:
 
     def recent(self, now: float) -> float:
         """Return the service that still counts; it fades linearly within USE_MEMORY."""
-        faded = max(0.0, 1.0 - (now - self.until) / USE_MEMORY)
+        faded = min(1.0, max(0.0, 1.0 - (now - self.until) / USE_MEMORY))
         return self.seconds * faded
 
 

@@ -145,8 +145,7 @@ class Reading:
             stream.detach()
             self._driver.cancel(transfer)
             self._steering.learn(transfer)
-            now = self._clock()
-            stream.use.add(now - started, now)
+            stream.on_served(started, self._clock())
         if transfer.error is not None:
             raise transfer.error
 
@@ -168,7 +167,7 @@ class Reading:
         return not should_switch(
             current_has_demand=stream.has_demand,
             current_slice=now - started,
-            current_use=stream.use.recent(now),
+            current_use=stream.used(now),
             waiting_use=waiting_use,
             rtt=self._engine.rtt,
             current_waited=started - stream.asked_at,

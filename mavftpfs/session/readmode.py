@@ -44,7 +44,7 @@ class ReadSteering:
             "window": self._engine.flow.window,
             "in_flight": self._engine.in_flight,
             "chunk": self.chunk,
-            "loss": round(self._engine.loss, 4),
+            "loss": round(self._engine.flow.loss, 4),
             "window_rate": self._window_rate,
             "burst_rate": self._burst_rate,
         }

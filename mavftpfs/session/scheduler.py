@@ -324,14 +324,14 @@ class Scheduler:
             if self._claimed(stream.path):
                 continue
             if stream.has_demand:
-                heavy = stream.use.recent(now) >= LIGHT_USE and not is_starving(now - stream.asked_at)
+                heavy = stream.used(now) >= LIGHT_USE and not is_starving(now - stream.asked_at)
                 waiting.append(((heavy, False, stream.ticket or 0), stream))
             elif stream.has_ahead and (readahead is None or self._is_open(stream)):
                 readahead = stream
         for upload in self._uploading.due(now):
             if not self._claimed(upload.path):
                 starving = self._uploading.writer.starves(upload)
-                heavy = upload.use.recent(now) >= LIGHT_USE and not starving
+                heavy = upload.used(now) >= LIGHT_USE and not starving
                 waiting.append(((heavy, not heavy and not starving, upload.ticket), upload))
         if waiting:
             return min(waiting, key=lambda item: item[0])[1]
@@ -353,7 +353,7 @@ class Scheduler:
         rivals: list[FileStream | QueuedUpload] = [*waiting]
         rivals += [upload for upload in self._uploading.due(now) if upload is not user]
         # Nobody makes room for who could not use it yet, or both would be asked for ever.
-        others = [rival.use.recent(now) for rival in rivals if not self._claimed(rival.path)]
+        others = [rival.used(now) for rival in rivals if not self._claimed(rival.path)]
         return min(others, default=None)
 
     def expire_waiters(self) -> None:

@@ -41,6 +41,15 @@ class FileStream:
         self._orphaned = False
         self._transfer: ReadTransfer | None = None
 
+    def used(self, now: float) -> float:
+        """Return the seconds of service that still count. While it waits they do not fade: who is passed over
+        again and again would pass for somebody who wants little."""
+        return self.use.recent(now if self.ticket is None else min(now, self.asked_at))
+
+    def on_served(self, started: float, now: float) -> None:
+        """It had the session from `started` until now."""
+        self.use = Service(self.used(started) + now - started, now)
+
     # --- the cache's side
 
     @property

@@ -319,6 +319,11 @@ class QueuedUpload:
         """Return for how many seconds it could have sent something and had no turn."""
         return now - max(self.waits_since, self.retry_at)
 
+    def used(self, now: float) -> float:
+        """Return the seconds of service that still count; they fade although it waits: what it gets between
+        small reads is but a window."""
+        return self.use.recent(now)
+
     def is_due(self, now: float) -> bool:
         """Whether there is something to do for it now."""
         return self.wanted and now >= self.retry_at

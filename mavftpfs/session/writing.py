@@ -297,7 +297,7 @@ class Writer:
         return (self.resumable or self.may_try(upload)) and should_switch(
             current_has_demand=True,
             current_slice=slice_,
-            current_use=upload.use.recent(self._clock()),
+            current_use=upload.used(self._clock()),
             waiting_use=waiting_use,
             rtt=self._engine.rtt,
         )

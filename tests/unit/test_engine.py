@@ -581,6 +581,19 @@ def test_metadata_goes_first_and_has_a_slot_of_its_own() -> None:
     assert engine.in_flight == 5
 
 
+def test_metadata_does_not_wait_for_what_a_wider_window_sent() -> None:
+    """All answers were lost in a pause of the server: a Terminate went out 3 s later, when the last of these
+    was given up, which each silence put off."""
+    engine = make()
+    transfer, _ = reading(engine)
+    assert len(sent(engine, 0.0)) == 8
+    engine.cancel(transfer, 0.0)
+    engine.flow.on_silence()
+    assert engine.flow.window < 8
+    engine.start(mkdir(), 0.1)
+    assert [request.opcode for request in sent(engine, 0.1)] == [Opcode.CREATE_DIRECTORY]
+
+
 def test_demand_goes_before_readahead() -> None:
     engine = make(limit=1)
     ahead = ReadTransfer(1, SIZE, MemorySink(SIZE))
@@ -820,7 +833,7 @@ def test_answers_to_others_do_not_put_a_timer_off_for_ever() -> None:
 def test_facts() -> None:
     engine = make()
     assert engine.rtt is None
-    assert engine.loss == 0.0
+    assert engine.flow.loss == 0.0
     assert engine.timeout("data") == 1.0
     engine.start(mkdir(), 0.0)
     engine.receive(ack(sent(engine, 0.0)[0]), 0.1)
