@@ -25,6 +25,7 @@ class Chunked(Operation):
             raise LocalProtocolError(f"a chunk of {chunk} bytes is not within 1..{MAX_DATA}")
         self.chunk = self.most = chunk
         self.chunks: Chunks | None = None
+        self._now = 0.0
 
     def limit_chunk(self, size: int) -> None:
         """The server never has more: so much it is from now on."""
@@ -44,11 +45,16 @@ class Chunked(Operation):
         if self.chunks is not None:
             self.chunks.on_answered(request.size, count, now)
 
+    def waits(self, now: float) -> bool:
+        """See Operation; asked before anything goes out."""
+        self._now = now
+        return super().waits(now)
+
     def takes_back(self, request: Request) -> bool:
         """See Operation: a lost one that is too long goes out in pieces."""
         if self.chunks is None or request.opcode != self.bulk:
             return False
-        split = self.chunks.on_lost(request.size, request.sent_at)
+        split = self.chunks.on_lost(request.size, self._now)
         if split:
             self.take_back(request)
         return split

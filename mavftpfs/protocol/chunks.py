@@ -29,7 +29,7 @@ _BAD = 0.4
 _SUSPICIOUS = 0.8
 """The sum of what blocks lost more than that."""
 
-_SILENCES = ((12, 1.0), (5, 3.0))
+_SILENCES = ((12, 1.0), (6, 3.0))
 """So many losses in a row over so many seconds: of a window, or of a single request."""
 
 _PROVEN = 4
@@ -137,13 +137,13 @@ class Chunks:
             self._large.answered += count
         self._judge(now)
 
-    def on_lost(self, size: int, sent_at: float) -> bool:
-        """A request for `size` bytes, sent then, was lost; return whether it is to be split."""
+    def on_lost(self, size: int, now: float) -> bool:
+        """A request for `size` bytes is to be repeated now; return whether it is to be split."""
         self._turn = size > SMALLEST  # the other one is next, also where there is one request at a time
         if not self._tried:
             self._seen.lost += 1
             if size > SMALLEST:
-                self._note_silence(size, sent_at)
+                self._note_silence(size, now)
         elif size <= SMALLEST:
             self._small.lost += 1
         elif size <= self._tried and self._small.answered:  # before, there may be no link
@@ -165,12 +165,12 @@ class Chunks:
         if self._score >= _SUSPICIOUS and now >= self._again_at:
             self._search(SMALLEST, MAX_DATA + 1, MAX_DATA)
 
-    def _note_silence(self, size: int, sent_at: float) -> None:
+    def _note_silence(self, size: int, now: float) -> None:
         if not self._unheard:
-            self._silent_since, self._longest = sent_at, size
+            self._silent_since, self._longest = now, size
         self._unheard += 1
         self._longest = max(self._longest, size)
-        silence = sent_at - self._silent_since
+        silence = now - self._silent_since
         if any(self._unheard >= count and silence >= seconds for count, seconds in _SILENCES):
             self._search(SMALLEST, self._longest + 1, self._longest)
             self._silent = True

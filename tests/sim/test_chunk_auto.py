@@ -67,6 +67,21 @@ async def test_a_file_is_written_where_no_full_frame_passes(
     assert here.vehicle.server.open_sessions == 0
 
 
+@pytest.mark.parametrize("profile", PROFILES)
+async def test_it_is_soon_found_where_many_requests_were_lost_at_once(
+    profile: str, autojump: MockClock
+) -> None:
+    """After a read the window is wide: what is lost of it waits for long to be repeated."""
+    data = content(100_000)
+    here = world(profile, replace(RADIO, rate=57_600.0, delay=0.02, mtu=150), file=data)
+    async with here.connection() as connection:
+        assert await read_file(connection, path(profile, "file")) == data
+        began = trio.current_time()
+        await put(connection, path(profile, "new"), data)
+        assert trio.current_time() - began < 20.0
+    assert here.tree.data(path(profile, "new")) == data
+
+
 async def test_a_file_of_one_chunk_passes_too(autojump: MockClock) -> None:
     here = world("px4", replace(RADIO, mtu=150), small=content(200))
     async with here.connection() as connection:
