@@ -24,8 +24,8 @@ DEFAULT_QUEUE = 8192
 EPILOG = """\
 The link is given as the vehicle sees it: udpout:127.0.0.1:14550 pushes to a ground station on this computer,
 as PX4's simulator does; udpin:0.0.0.0:14550 waits to be spoken to; tcpin:127.0.0.1:5760 is what ArduPilot's
-simulator does; pty makes a serial port and prints its name. With any of --rate, --delay, --jitter, --loss,
---burst-loss, --dup, --corrupt or --reorder, frames go through the model of a bad link.
+simulator does; pty makes a serial port and prints its name. With any of --rate, --mtu, --delay, --jitter,
+--loss, --burst-loss, --dup, --corrupt or --reorder, frames go through the model of a bad link.
 
 Signals: SIGUSR1 arms or disarms, SIGUSR2 cuts or mends the link, SIGHUP reboots, SIGINT and SIGTERM end.
 """
@@ -85,6 +85,7 @@ def link_settings(args: argparse.Namespace) -> LinkSettings:
     return LinkSettings(
         rate=args.rate,
         queue=args.queue,
+        mtu=args.mtu,
         duplex=Duplex(args.duplex),
         delay=args.delay,
         jitter=args.jitter,
@@ -105,6 +106,7 @@ def _add_model_arguments(group: argparse._ArgumentGroup) -> None:
         metavar="B",
         help=f"bytes that wait for the transmitter (default {DEFAULT_QUEUE})",
     )
+    group.add_argument("--mtu", type=_size, metavar="B", help="longer frames are lost; without it, none")
     group.add_argument(
         "--duplex", choices=[d.value for d in Duplex], default="full", help="half: directions share the rate"
     )
