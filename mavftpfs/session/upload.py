@@ -185,7 +185,7 @@ class QueuedUpload:
         waits_since: when it had something to send and no turn, perhaps with the wait after a failure.
         left_at: when its file was closed last, long ago where nobody knows.
         anew: nothing that was proven counts any more. usurped: the server closed the session by itself,
-            or may have.
+            or may have. refused_behind: what was sent right before the Terminate was refused the last time.
     """
 
     def __init__(
@@ -214,7 +214,7 @@ class QueuedUpload:
         self.filled_in = 0.0
         self.created_at: float | None = None
         self.left_at = float("-inf")
-        self.tried = self.anew = False
+        self.tried = self.anew = self.refused_behind = False
         self.refused_at: int | None = None
         self.retry_at = 0.0
         self._woken = True

@@ -16,7 +16,7 @@ from mavftpfs.session.reopening import Reopening
 from mavftpfs.session.turns import Turns
 from mavftpfs.session.upload import Feed, QueuedUpload
 from mavftpfs.session.vehicle import FOREIGN_MEMORY
-from mavftpfs.session.writing import Stop, Writer
+from mavftpfs.session.writing import Stop, Writer, is_disarmed
 from mavftpfs.shared.errors import (
     AlreadyExists,
     Armed,
@@ -302,10 +302,13 @@ class Uploading:
         except RequestTimeout as error:
             raise SessionLost(str(error)) from error
         last = self.writer.end()
+        upload.refused_behind = last is not None
         if not ours or isinstance(last, SessionLost):
-            raise SessionLost("the vehicle had closed the session before", by_server=True)
+            raise SessionLost("the vehicle had closed the session before", by_server=True) from last
         feed.check_point()
         upload.left_at = self._clock()
+        if isinstance(last, REFUSALS) and not is_disarmed(last):
+            raise last
         if stop is Stop.ARMED:
             upload.fail(Armed("the vehicle was armed"), self._clock())
         elif stop in (Stop.FINISHED, Stop.STARVED):

@@ -183,7 +183,7 @@ class Writer:
             if stop is not None and error is None:
                 return stop
             assert error is not None
-            if not _is_disarmed(error) or rearms > 0:
+            if not is_disarmed(error) or rearms > 0:
                 self._note_refusal(upload, session, transfer.failed_at, error)
                 raise error
             rearms += 1
@@ -217,6 +217,8 @@ class Writer:
         transfer, self._last = self._last, None
         if transfer is None:
             return None
+        if transfer.trailing and not transfer.drained:
+            self._engine.stats.retransmissions += 1  # it goes again, and the first may come later than that
         transfer.stop()
         self._driver.cancel(transfer)
         return transfer.error
@@ -245,8 +247,11 @@ class Writer:
 
     def _trails(self, upload: QueuedUpload, stop: Stop, transfer: WriteTransfer) -> bool:
         """Whether the Terminate goes out right behind the last requests: a round trip less for who waits.
-        Servers carry them out in order; what gets lost is sent when the file is open again."""
+        Servers carry them out in order; what gets lost is sent when the file is open again. After a refusal,
+        and where others' paths cause such, the answers are waited for: that alone sets it right."""
         if stop is not Stop.YIELD or not self.resumable or self._holder.claimed(upload.path):
+            return False
+        if upload.refused_behind or self._disarmed_by_paths:
             return False
         if transfer.all_out:
             transfer.repeat_nothing()
@@ -361,5 +366,6 @@ def storage_root(path: bytes) -> bytes:
     return split(path)[0] or ROOT
 
 
-def _is_disarmed(error: MavftpfsError) -> bool:
+def is_disarmed(error: MavftpfsError) -> bool:
+    """Whether this is how PX4 refuses to write after it was asked for a path beyond its whitelist."""
     return isinstance(error, FtpNak) and error.opcode == Opcode.WRITE_FILE and error.code in _REFUSED_ARM

@@ -16,6 +16,7 @@ from trio.testing import MockClock
 from mavftpfs.link.messages import Address
 from mavftpfs.protocol.payload import Opcode
 from mavftpfs.session.connection import Connection
+from mavftpfs.shared.errors import FtpNak
 from mavftpfs.sim.linkmodel import LinkSettings
 from mavftpfs.sim.profiles import PROFILES
 from tests.support.sources import MemorySource
@@ -139,6 +140,54 @@ async def test_each_of_these_may_get_lost(opcode: Opcode, autojump: MockClock) -
             place.lose = [int(opcode)] * (1 + number % 2)
     assert not place.lose
     assert place.world.vehicle.server.open_sessions == 0
+
+
+@pytest.mark.parametrize("profile", taking_turns(KEEPING))
+async def test_a_full_card_is_told_though_somebody_reads_all_the_time(
+    profile: str, autojump: MockClock
+) -> None:
+    """What was refused behind the Terminate was sent again, and refused again, for ever."""
+    place = Place(profile, LINK)
+    place.world.tree.capacity = place.world.tree.used + 20_400
+    async with place.world.connection() as connection, trio.open_nursery() as nursery:
+        nursery.start_soon(_read_always, place, connection)
+        with trio.fail_after(200), pytest.raises(FtpNak):
+            await place.upload(connection, b"new", random.Random(1).randbytes(SIZE))
+        nursery.cancel_scope.cancel()
+
+
+async def _read_always(place: Place, connection: Connection) -> None:
+    while True:
+        await place.small(connection)
+
+
+async def test_listings_beside_a_reader_do_not_halve_what_is_written(autojump: MockClock) -> None:
+    """PX4 on NuttX refuses writes once it was asked for another path, which only an answer tells."""
+    place = Place("px4-nuttx", LINK)
+    async with place.world.connection() as connection, trio.open_nursery() as nursery:
+
+        async def list_always() -> None:
+            while True:
+                await connection.store.list_directory(b"/")
+
+        nursery.start_soon(_read_always, place, connection)
+        nursery.start_soon(list_always)
+        with trio.fail_after(100):
+            await place.upload(connection, b"new", random.Random(1).randbytes(20_000))
+        nursery.cancel_scope.cancel()
+
+
+async def test_what_goes_again_counts_as_repeated(autojump: MockClock) -> None:
+    """It may come late, over what was written there since: that is compared where requests are repeated."""
+    place = Place("px4", LINK)
+    async with place.world.connection() as connection, trio.open_nursery() as nursery:
+        nursery.start_soon(place.upload, connection, b"new", random.Random(2).randbytes(SIZE))
+        await trio.sleep(1.5)
+        place.lose = [int(Opcode.WRITE_FILE)]
+        (upload,) = connection.scheduler.uploads
+        assert not upload.repeats
+        await place.small(connection)
+        assert upload.repeats
 
 
 @pytest.mark.parametrize("link", BAD)
