@@ -350,10 +350,11 @@ class Scheduler:
             return 0.0
         now = self._clock()
         waiting = [stream for stream in self._streams if stream is not user and stream.has_demand]
-        rivals: list[FileStream | QueuedUpload] = [*waiting]
-        rivals += [upload for upload in self._uploading.due(now) if upload is not user]
         # Nobody makes room for who could not use it yet, or both would be asked for ever.
-        others = [rival.used(now) for rival in rivals if not self._claimed(rival.path)]
+        others = [stream.used(now) for stream in waiting if not self._claimed(stream.path)]
+        writing = isinstance(user, QueuedUpload)
+        rivals = [upload for upload in self._uploading.due(now) if upload is not user]
+        others += [up.used(now, beside_upload=writing) for up in rivals if not self._claimed(up.path)]
         return min(others, default=None)
 
     def expire_waiters(self) -> None:

@@ -319,10 +319,10 @@ class QueuedUpload:
         """Return for how many seconds it could have sent something and had no turn."""
         return now - max(self.waits_since, self.retry_at)
 
-    def used(self, now: float) -> float:
+    def used(self, now: float, *, beside_upload: bool = False) -> float:
         """Return the seconds of service that still count; they fade although it waits: what it gets between
-        small reads is but a window."""
-        return self.use.recent(now)
+        small reads is but a window. Beside an upload they do not, or of several each would get but that."""
+        return self.use.recent(min(now, self.waits_since) if beside_upload else now)
 
     def is_due(self, now: float) -> bool:
         """Whether there is something to do for it now."""

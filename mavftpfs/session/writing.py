@@ -18,7 +18,7 @@ from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.protocol.writing import WriteTransfer
 from mavftpfs.session.kit import Kit, Queue
 from mavftpfs.session.opening import OpenSession
-from mavftpfs.session.policy import is_starving, should_switch
+from mavftpfs.session.policy import LIGHT_USE, is_starving, should_switch
 from mavftpfs.session.turns import Turns
 from mavftpfs.session.upload import QueuedUpload
 from mavftpfs.shared.errors import FtpNak, MavftpfsError
@@ -193,8 +193,9 @@ class Writer:
             await self._rearm(upload.path)
 
     def _most_in_flight(self, upload: QueuedUpload) -> int | None:
-        """Beside somebody who waits a short queue keeps a place for the Terminate."""
-        return None if self._queue.rival_use(upload) is None else self._engine.traits.queue_limit
+        """Beside somebody who is to wait for a window only a short queue keeps a place for the Terminate."""
+        use = self._queue.rival_use(upload)
+        return None if use is None or use >= LIGHT_USE else self._engine.traits.queue_limit
 
     async def _drive(
         self, upload: QueuedUpload, session: OpenSession, transfer: WriteTransfer
