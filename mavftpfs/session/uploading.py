@@ -149,9 +149,10 @@ class Uploading:
         self._holder.wake()
 
     def on_reboot(self) -> None:
-        """Perhaps it is another vehicle: what was proven of a new file is not there, whatever its size."""
+        """Perhaps it is another vehicle: what was proven of a new file is not there, whatever its size, and what
+        OpenFileWO does was forgotten: each file may tell it once more, or others wait until it is finished."""
         for upload in self.uploads:
-            upload.anew = True
+            upload.anew, upload.tried = True, False
             upload.feed.forget_proof()
         self.written.forget()
         self.writer.on_reboot()

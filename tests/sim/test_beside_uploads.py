@@ -105,6 +105,31 @@ async def test_a_read_and_a_close_beside_a_copy_that_lasts(profile: str, autojum
     assert place.data(b"small") == b"b" * 1000
 
 
+@pytest.mark.parametrize("profile", KEEPING)
+async def test_a_copy_that_was_tried_can_be_interrupted_after_a_reboot_too(
+    profile: str, autojump: MockClock
+) -> None:
+    """What OpenFileWO does is not known any more then: the same file tells once more."""
+    place = Place(profile, SLOW)
+    data = random.Random(4).randbytes(400_000)
+    async with place.mounted() as (connection, tree), trio.open_nursery() as nursery:
+        nursery.start_soon(place.copy, tree, b"big", data)
+        await trio.sleep(10)
+        assert await read_file(connection, place.root + b"/other") == b"q" * 3000  # the trial
+        await trio.sleep(2)
+        assert connection.store.traits.wo_truncates is False
+        place.world.vehicle.reboot(trio.current_time(), downtime=4.0)
+        place.world.link.kick()
+        await trio.sleep(15)
+        assert connection.store.traits.wo_truncates is None
+        with trio.fail_after(10):
+            assert await read_file(connection, place.root + b"/other") == b"q" * 3000
+        with trio.fail_after(10):
+            await place.copy(tree, b"small", b"b" * 1000)
+    assert place.data(b"big") == data
+    assert place.data(b"small") == b"b" * 1000
+
+
 @pytest.mark.parametrize("profile", TRUNCATING)
 async def test_where_it_empties_files_the_second_waits_and_is_told(profile: str, autojump: MockClock) -> None:
     """The bytes stay held, and are brought when the vehicle has time."""
