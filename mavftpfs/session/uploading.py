@@ -149,8 +149,10 @@ class Uploading:
         self._holder.wake()
 
     def on_reboot(self) -> None:
-        """Perhaps it is another vehicle: what was proven of a new file is not there, whatever its size, and what
-        OpenFileWO does was forgotten: each file may tell it once more, or others wait until it is finished."""
+        """Perhaps it is another vehicle: what was proven of a new file is not there, whatever its size.
+
+        What OpenFileWO does was forgotten: a file may tell it once more, or others wait for its end.
+        """
         for upload in self.uploads:
             upload.anew, upload.tried = True, False
             upload.feed.forget_proof()
@@ -203,6 +205,8 @@ class Uploading:
             else:
                 upload.feed.put_back()
             upload.use.add(now - started, now)
+            if not self.may_write and upload.finishing and upload.error is None:
+                upload.fail(Armed("the vehicle was armed"), now)  # while its file was opened or closed
             upload.tell()
         return served
 
