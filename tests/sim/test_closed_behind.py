@@ -16,7 +16,7 @@ from trio.testing import MockClock
 from mavftpfs.link.messages import Address
 from mavftpfs.protocol.payload import Opcode
 from mavftpfs.session.connection import Connection
-from mavftpfs.shared.errors import FtpNak
+from mavftpfs.shared.errors import Armed, FtpNak
 from mavftpfs.sim.linkmodel import LinkSettings
 from mavftpfs.sim.profiles import PROFILES
 from tests.support.sources import MemorySource
@@ -159,6 +159,27 @@ async def test_a_full_card_is_told_though_somebody_reads_all_the_time(
 async def _read_always(place: Place, connection: Connection) -> None:
     while True:
         await place.small(connection)
+
+
+@pytest.mark.parametrize("profile", taking_turns(KEEPING))
+async def test_arming_while_it_is_closed_is_told(profile: str, autojump: MockClock) -> None:
+    """Who waits for an upload was told nothing before the vehicle was disarmed (promise 9)."""
+    place = Place(profile, LINK)
+    vehicle, handle = place.world.vehicle, place.world.vehicle.server.handle
+
+    def on_request(wire: bytes, source: Address, now: float) -> None:
+        closing = wire[OPCODE] == Opcode.TERMINATE_SESSION and place.came[-1] == Opcode.WRITE_FILE
+        if closing and now > 3.0 and not vehicle.armed:
+            vehicle.arm()  # that is heard before it is closed
+        else:
+            handle(wire, source, now)
+
+    vehicle.server.handle = on_request  # type: ignore[method-assign]
+    async with place.world.connection() as connection, trio.open_nursery() as nursery:
+        nursery.start_soon(_read_always, place, connection)
+        with trio.fail_after(60), pytest.raises(Armed):
+            await place.upload(connection, b"new", random.Random(1).randbytes(SIZE))
+        nursery.cancel_scope.cancel()
 
 
 async def test_listings_beside_a_reader_do_not_halve_what_is_written(autojump: MockClock) -> None:
