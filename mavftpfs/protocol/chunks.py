@@ -69,7 +69,8 @@ class Chunks:
     """The size of chunks of one direction, for all its transfers.
 
     roomy: whether more requests may be on their way than now; else their number is the limit, and a smaller
-    chunk must make up for its size by its losses alone.
+    chunk must make up for its size by its losses alone. explained: whether many losses have another reason,
+    the pauses of a card, in which its buffer overflows whatever the size.
 
     Attributes:
         size: bytes to ask for at once, as far as it is settled.
@@ -78,6 +79,7 @@ class Chunks:
     __slots__ = (
         "_again_at",
         "_block_at",
+        "_explained",
         "_hi",
         "_hold",
         "_large",
@@ -97,9 +99,11 @@ class Chunks:
         "size",
     )
 
-    def __init__(self, roomy: Callable[[], bool] = lambda: True) -> None:
+    def __init__(
+        self, roomy: Callable[[], bool] = lambda: True, explained: Callable[[], bool] = lambda: False
+    ) -> None:
         self.size = self._settled = MAX_DATA
-        self._roomy = roomy
+        self._roomy, self._explained = roomy, explained
         self._tried = 0  # the size that is tried beside the smallest; 0: none is
         self._turn = self._silent = False
         self._lo, self._hi = SMALLEST, MAX_DATA + 1  # passes; never does
@@ -160,7 +164,8 @@ class Chunks:
         seen.answered += count
         if seen.total < _BLOCK or now - self._block_at < _BLOCK_SECONDS:
             return
-        self._score = min(_SUSPICIOUS, max(0.0, self._score + seen.lost / seen.total - _BAD))
+        beyond = -_BAD if self._explained() else seen.lost / seen.total - _BAD
+        self._score = min(_SUSPICIOUS, max(0.0, self._score + beyond))
         self._seen = _Tally()
         if self._score >= _SUSPICIOUS and now >= self._again_at:
             self._search(SMALLEST, MAX_DATA + 1, MAX_DATA)

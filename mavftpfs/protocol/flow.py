@@ -25,7 +25,7 @@ from mavftpfs.protocol.overflow import Overflow
 from mavftpfs.protocol.pacing import Pacer
 from mavftpfs.protocol.stalls import Stalls
 from mavftpfs.protocol.survival import Survival
-from mavftpfs.protocol.trains import GAIN, Trains
+from mavftpfs.protocol.trains import FASTEST_LINK, GAIN, Trains
 
 FIRST = 8
 INITIAL = 4
@@ -39,9 +39,6 @@ _LEAP = 4
 _FAST_PATH_SECONDS = 0.010
 _FAST_PATH_WINDOW = 192
 _MOST_RESERVE = 1024
-_FASTEST_LINK = 6000.0
-"""Answers per second (1.4 MB/s) beyond which no radio is on the way."""
-
 _REFILL = 2.0
 _OFTEN = 5
 _MORE_LOSS = 0.15
@@ -56,7 +53,8 @@ _TELLING_SILENCE = 3
 class Flow:
     """The in-flight window, in requests. serial: small receive buffers are likely, so start at 1 and
     find out by `survival` what they hold. limit: the most that may ever be in flight, None for the
-    default; cap: that may be now. budget: the user's. alone: no other client was heard lately."""
+    default; cap: that may be now. budget: the user's. alone: no other client was heard lately. stalls: the
+    server's pauses."""
 
     __slots__ = (
         "_app_limited",
@@ -80,7 +78,6 @@ class Flow:
         "_round_end",
         "_round_least",
         "_round_start",
-        "_stalls",
         "_starting",
         "_survival",
         "_trains",
@@ -88,6 +85,7 @@ class Flow:
         "budget",
         "cap",
         "loss",
+        "stalls",
         "window",
     )
 
@@ -108,7 +106,7 @@ class Flow:
         self._base_rtt = inf
         self._easing, self._trains = Easing(), Trains()
         self._pacer: Pacer | None = None
-        self._stalls = Stalls()
+        self.stalls = Stalls()
         self._heard_at = -inf
         self._brake = 1.0
         self._plateau = self._collapsed = 0
@@ -132,7 +130,7 @@ class Flow:
         """It is looked at anew who has something to send: `room` follows for each."""
         self._hurried = False
         self._trains.begin()
-        self._stalls.wake = inf
+        self.stalls.wake = inf
         if self._pacer is not None:
             self._pacer.begin()
         if self.budget is not None:
@@ -143,7 +141,7 @@ class Flow:
         if urgent:
             self._hurried = True
             if in_flight > 0:
-                self._stalls.reserve.on_others(now)
+                self.stalls.reserve.on_others(now)
         elif self._hurried:  # an answer that somebody waits for should not queue behind our slack
             in_flight += min(_SLACK, self.window // 2)
         room = self._room(in_flight, now, paced, urgent)
@@ -166,7 +164,7 @@ class Flow:
     @property
     def patience(self) -> float:
         """Seconds of silence that prove no loss: newer answers will, where more than a few are in flight."""
-        return 0.0 if self._survival or self._pacer or self._app_limited else self._stalls.patience
+        return 0.0 if self._survival or self._pacer or self._app_limited else self.stalls.patience
 
     def _room(self, in_flight: int, now: float, paced: bool, urgent: bool) -> int:
         reserve = self._reserve(now, paced)
@@ -184,15 +182,15 @@ class Flow:
     def _reserve(self, now: float, paced: bool) -> int:
         """Return how many more bridge the pauses of a server; none where its buffers are small, or while
         somebody waits for an answer that would have to queue behind them."""
-        if self._hurried or self._survival or self._pacer or self._best_rate > _FASTEST_LINK:
+        if self._hurried or self._survival or self._pacer or self._best_rate > FASTEST_LINK:
             return 0
-        seconds = self._stalls.to_bridge(now, self._best_rate, self._base_rtt, kept=paced)
+        seconds = self.stalls.to_bridge(now, self._best_rate, self._base_rtt, kept=paced)
         return self._bounded(seconds * self._best_rate)
 
     def _bounded(self, reserve: float) -> int:
         """Never beyond the limit; and on a fast path a pause is ours or a busy computer's, which requests
         cannot bridge: hundreds of them would only overflow the sockets at both ends."""
-        most = _MOST_RESERVE if self._best_rate <= _FASTEST_LINK else 0
+        most = _MOST_RESERVE if self._best_rate <= FASTEST_LINK else 0
         return int(max(0, min(reserve, most, min(self.cap, self._base.most) - self.window)))
 
     def next_room_at(self) -> float:
@@ -200,7 +198,7 @@ class Flow:
         if self.budget is not None and self.budget.next_room_at() < inf:
             return self.budget.next_room_at()  # before that, nothing goes out in any case
         paced_at = self._trains.next_room_at() if self._pacer is None else self._pacer.next_at()
-        return min(paced_at, self._stalls.wake)
+        return min(paced_at, self.stalls.wake)
 
     def on_sent(self, count: int, now: float) -> None:
         """So many requests, at least one, go out, which there was room for."""
@@ -214,7 +212,7 @@ class Flow:
         """There was room in the window and nothing to send: this round's rate says little."""
         self._app_limited = True
         self._heard_at = -inf
-        self._stalls.interrupt()
+        self.stalls.interrupt()
         if self._pacer is not None:
             self._pacer.on_starved()
 
@@ -257,14 +255,14 @@ class Flow:
         if now != self._heard_at:  # what comes at once has no pauses
             self._heard_at = now
             full = not self._starting or _FULL * self._trains.rate < self._best_rate
-            self._stalls.on_reply(now, self._best_rate if full else 0.0, self._base_rtt)
+            self.stalls.on_reply(now, self._best_rate if full else 0.0, self._base_rtt)
         if rtt is not None and rtt < self._round_least:
             self._round_least = rtt
 
     def on_loss(self, order: int, sends: int = 1) -> None:
         """The transmission numbered `order` is taken to be lost, the `sends`th of its request."""
         self._losses += 1
-        self._stalls.on_loss(self._best_rate)
+        self.stalls.on_loss(self._best_rate)
         if self._survival is not None and sends >= _OFTEN:
             self.window = 1  # it may always come second to a buffer for one: let it go alone
         self._easing.count(order, lost=True)
@@ -282,7 +280,7 @@ class Flow:
             return
         if not self._collapsed:
             # What a small buffer survived it will survive again: there a silence is a few losses in a row.
-            kept = self._survival or self._stalls.usual  # so is a pause of a server that makes them
+            kept = self._survival or self.stalls.usual  # so is a pause of a server that makes them
             self._collapsed = self.window if kept else max(1, self.window // 2)
             self._goal = 0
             self.window = min(2, self.window)
@@ -311,7 +309,7 @@ class Flow:
         overflowed = self._overflow.judge(answered, lost)
         self.loss += (lost / (answered + lost) - self.loss) * 0.2
         waited = self._base.beyond(self._round_least, self.window * (1.0 - self.loss), self._best_rate)
-        reserve = self._bounded(min(self._stalls.reserve.seconds, waited) * self._best_rate)
+        reserve = self._bounded(min(self.stalls.reserve.seconds, waited) * self._best_rate)
         self._base_rtt = self._base.learn(self._round_least, self.window + reserve)
         took = now - self._round_start
         rate = answered / took if took > 0 else 0.0
@@ -324,11 +322,11 @@ class Flow:
             if survival is not None:
                 self.window = min(self.cap, survival.end_idle_round(next_order - self._round_end, lost))
             return
-        self._stalls.reserve.on_round(now, waited)
+        self.stalls.reserve.on_round(now, waited)
         self._learn_congestion()
         self._trains.end_round(answered, rate)
         if survival is not None:
-            disturbed = self._stalls.reserve.others_at > self._round_start - took
+            disturbed = self.stalls.reserve.others_at > self._round_start - took
             most = self._target() if self._queued(2.0) else inf
             window = survival.end_round(answered, lost, took, now, most=most, disturbed=disturbed)
             self.window = min(self.cap, window)
@@ -349,7 +347,7 @@ class Flow:
 
     def _excused(self) -> bool:
         """Whether pauses explain what was lost: it is no more than comes in them, and on a bad link."""
-        return self._stalls.usual and self.loss < self._stalls.share + _MORE_LOSS
+        return self.stalls.usual and self.loss < self.stalls.share + _MORE_LOSS
 
     def _learn_congestion(self) -> None:
         if self._losses and self._queued(2.0):
@@ -360,7 +358,7 @@ class Flow:
     def _queued(self, factor: float) -> bool:
         """Whether even the quickest answer of the round took `factor` times the base, and a little; an answer
         queues behind a reserve, too."""
-        usual = factor * self._base_rtt + self._stalls.reserve.seconds + _QUEUE_SECONDS
+        usual = factor * self._base_rtt + self.stalls.reserve.seconds + _QUEUE_SECONDS
         return usual < self._round_least < inf
 
     def _leaves_start(self, grown: bool) -> bool:
@@ -391,7 +389,8 @@ class Flow:
         rate, base = self._best_rate, self._base_rtt
         if base == inf or rate == 0.0:
             return INITIAL
-        return self._brake * max(self._held(rate), min(rate * _FAST_PATH_SECONDS, _FAST_PATH_WINDOW))
+        held = self._trains.widen(self._held(rate), rate)
+        return self._brake * max(held, min(rate * _FAST_PATH_SECONDS, _FAST_PATH_WINDOW))
 
     def _approach(self, target: float) -> None:
         # So few are no load, and fewer find losses slowly.

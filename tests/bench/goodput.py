@@ -43,17 +43,23 @@ TABLE_WIDTH = 100
 
 
 def measure(
-    case: Case, seconds: float, *, queue: int | None = None, telemetry: float = 0.0, seed: int = 1
+    case: Case,
+    seconds: float,
+    *,
+    queue: int | None = None,
+    telemetry: float = 0.0,
+    jitter: float = 0.0,
+    seed: int = 1,
 ) -> Result:
     """Read or write for about `seconds` of link time; queue: bytes that wait for the link's transmitter;
-    telemetry: bytes per second that the vehicle sends beside it; seed: of chance.
+    telemetry: bytes per second that the vehicle sends beside it; jitter: of the link; seed: of chance.
 
     Raises:
         AssertionError: the bytes differ.
         trio.TooSlowError: it took PATIENCE times the ideal.
     """
     room = int(max(4096, case.rate / 2)) if queue is None else queue
-    settings = LinkSettings(rate=case.rate, delay=case.rtt / 2, loss=case.loss, queue=room)
+    settings = LinkSettings(rate=case.rate, delay=case.rtt / 2, jitter=jitter, loss=case.loss, queue=room)
     world = World(case.profile, settings, seed=seed, telemetry=telemetry)
     data = random.Random(1).randbytes(int(case.limit * seconds))
     transfer = _read if case.direction == "read" else _write

@@ -135,3 +135,11 @@ def test_best_sizes() -> None:
     assert sizes == sorted(sizes, reverse=True)
     assert (sizes[0], sizes[1], sizes[-1]) == (MAX_DATA, MAX_DATA, SMALLEST)
     assert best_size(2e-3, roomy=False) == MAX_DATA
+
+
+def test_losses_that_have_another_reason_are_none_of_its_business() -> None:
+    """A card that pauses lost half of what was written, whatever its size: 4.4 requests a chunk."""
+    requests = Requests(Chunks(explained=lambda: True), lambda size, now: 0.6)
+    assert set(requests.send(600.0)) == {MAX_DATA}
+    requests = Requests(Chunks(explained=lambda: False), lambda size, now: 0.6)
+    assert set(requests.send(600.0)) != {MAX_DATA}

@@ -15,7 +15,7 @@ from mavftpfs.protocol.payload import Opcode
 
 
 def keep_a_reserve(flow: Flow) -> None:
-    reserve = flow._stalls.reserve
+    reserve = flow.stalls.reserve
     reserve.seconds = reserve.wanted = reserve._held = 0.15
 
 
@@ -80,8 +80,8 @@ def test_losses_in_pauses_do_not_brake_for_the_queue_of_our_reserve() -> None:
     path.rounds(40)
     before = flow.window
     keep_a_reserve(flow)
-    flow._stalls._calm = 0
-    flow._stalls._watched = -1e9  # so it stays
+    flow.stalls._calm = 0
+    flow.stalls._watched = -1e9  # so it stays
     path.waiting = 60
     path.rounds(40, lost=4)
     assert flow.window >= before

@@ -72,7 +72,14 @@ def test_what_a_person_looks_for_comes_first() -> None:
 
 
 def test_what_says_nothing_is_left_to_programs() -> None:
-    link = {"rtt": None, "reboots": 0, "lost": False, "uploads": [], "session_open": None, "vehicle": None}
+    link: dict[str, object] = {
+        "rtt": None,
+        "reboots": 0,
+        "lost": False,
+        "uploads": [],
+        "session_open": None,
+        "vehicle": None,
+    }
     facts = {"connection": {**link, "write_traits": {"renames": True}}, "cache": {"bytes_held": 0, "hits": 0}}
     assert dict(rows(facts)) == {
         "cache: bytes held": "0 B",

@@ -138,7 +138,7 @@ def test_reads_go_on_when_their_reserve_is_used_up() -> None:
     flow = Flow()
     now = at_work_with_pauses(flow)
     full = flow.window
-    flow._stalls.reserve.seconds = 0.1
+    flow.stalls.reserve.seconds = 0.1
     usual = flow.room(full, now, paced=True)
     assert flow.room(full, now + 0.1, paced=True) == pytest.approx(usual + 0.1 * RATE, rel=0.1)
 
@@ -147,8 +147,8 @@ def test_what_a_pause_took_of_a_reserve_comes_back_fast_but_not_at_once() -> Non
     """All at once overflowed the server's buffer again; at the pace of the link it never came back."""
     flow = Flow()
     now = at_work_with_pauses(flow)
-    flow._stalls.reserve.seconds = flow._stalls.reserve.wanted = flow._stalls.reserve._held = 0.25
-    flow._stalls._bridges.clear()
+    flow.stalls.reserve.seconds = flow.stalls.reserve.wanted = flow.stalls.reserve._held = 0.25
+    flow.stalls._bridges.clear()
     flow._trains.proven, flow._trains.rate = True, RATE
     sent = 0
     for step in range(100):
@@ -182,7 +182,7 @@ def test_where_few_may_be_in_flight_a_silence_is_all_of_them_lost() -> None:
     queued, serial = Flow(), Flow(serial=True)
     for flow in (queued, serial):
         at_work_with_pauses(flow)
-        assert flow._stalls.patience > 0.1
+        assert flow.stalls.patience > 0.1
     queued.set_queue_limit(5)
     assert queued.patience == serial.patience == 0.0
 
@@ -191,10 +191,10 @@ def test_pauses_excuse_no_more_losses_than_come_in_them() -> None:
     """Also where the server takes far more than the link brings: half of a window then finds a queue full."""
     flow = Flow()
     at_work_with_pauses(flow)
-    flow._trains.rate, flow._stalls.bridging = 10 * RATE, True
-    flow.loss = flow._stalls.share + 0.1
+    flow._trains.rate, flow.stalls.bridging = 10 * RATE, True
+    flow.loss = flow.stalls.share + 0.1
     assert flow._excused()
-    flow.loss = flow._stalls.share + 0.3
+    flow.loss = flow.stalls.share + 0.3
     assert not flow._excused()
 
 
@@ -209,7 +209,7 @@ def test_patience_ends_with_the_pauses() -> None:
 
 def test_reads_go_on_too_where_a_reserve_would_only_overflow_the_servers_buffer() -> None:
     flow = Flow()
-    flow._stalls.reserve._until = 1e9  # it was found useless
+    flow.stalls.reserve._until = 1e9  # it was found useless
     now = at_work_with_pauses(flow)
     full = flow.window
     assert flow.room(full, now, paced=True) == 0
