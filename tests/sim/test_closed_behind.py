@@ -259,24 +259,23 @@ async def test_of_two_uploads_none_waits_for_ever(autojump: MockClock) -> None:
         nursery.cancel_scope.cancel()
 
 
+async def seconds_for(count: int, link: LinkSettings) -> float:
+    """Return how long so many uploads to ArduPilot take that begin together."""
+    place = Place("ardupilot", link)
+    began = trio.current_time()
+    async with place.world.connection() as connection, trio.open_nursery() as nursery:
+        for number in range(count):
+            data = random.Random(number).randbytes(60_000)
+            nursery.start_soon(place.upload, connection, b"%d" % number, data)
+    return trio.current_time() - began
+
+
 async def test_three_uploads_alternate_by_more_than_a_window(autojump: MockClock) -> None:
     """Who waited for the two others longer than service counts passed for a light user: each turn was as
     long as opening the file again (347 s where it takes 176 by now)."""
-    place = Place("ardupilot", replace(LINK, delay=0.3, loss=0.01, duplicate=0.02))
-    began = trio.current_time()
-    async with place.world.connection() as connection, trio.open_nursery() as nursery:
-        for number in range(3):
-            data = random.Random(number).randbytes(60_000)
-            nursery.start_soon(place.upload, connection, b"%d" % number, data)
-    assert trio.current_time() - began < 230
+    assert await seconds_for(3, replace(LINK, delay=0.3, loss=0.01, duplicate=0.02)) < 230
 
 
 async def test_a_short_queue_is_filled_beside_another_upload(autojump: MockClock) -> None:
     """The place for the Terminate was kept free through whole turns: a fifth less was written."""
-    place = Place("ardupilot", replace(LINK, delay=0.15, loss=0.01))
-    began = trio.current_time()
-    async with place.world.connection() as connection, trio.open_nursery() as nursery:
-        for number in range(2):
-            data = random.Random(number).randbytes(60_000)
-            nursery.start_soon(place.upload, connection, b"%d" % number, data)
-    assert trio.current_time() - began < 46
+    assert await seconds_for(2, replace(LINK, delay=0.15, loss=0.01)) < 46

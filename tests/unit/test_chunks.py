@@ -8,7 +8,10 @@ from collections.abc import Callable
 import pytest
 
 from mavftpfs.protocol.chunks import SMALLEST, Chunks, best_size
+from mavftpfs.protocol.engine import Engine
+from mavftpfs.protocol.flow import Flow
 from mavftpfs.protocol.payload import MAX_DATA
+from mavftpfs.session.readmode import ReadSteering
 
 PACE = 0.05
 
@@ -143,3 +146,14 @@ def test_losses_that_have_another_reason_are_none_of_its_business() -> None:
     assert set(requests.send(600.0)) == {MAX_DATA}
     requests = Requests(Chunks(explained=lambda: False), lambda size, now: 0.6)
     assert set(requests.send(600.0)) != {MAX_DATA}
+
+
+@pytest.mark.parametrize("pauses", [True, False])
+def test_the_pauses_of_a_card_are_such_a_reason(pauses: bool) -> None:
+    engine = Engine(random.Random(1), Flow())
+    engine.flow.stalls._calm = 0 if pauses else 1000
+    steering = ReadSteering(engine)
+    for chunks in (steering.chunks, steering.write_chunks):
+        assert chunks is not None
+        sizes = set(Requests(chunks, lambda size, now: 0.6).send(600.0))
+        assert (sizes == {MAX_DATA}) is pauses
