@@ -69,8 +69,8 @@ class Chunks:
     """The size of chunks of one direction, for all its transfers.
 
     roomy: whether more requests may be on their way than now; else their number is the limit, and a smaller
-    chunk must make up for its size by its losses alone. explained: whether many losses have another reason,
-    the pauses of a card, in which its buffer overflows whatever the size.
+    chunk must make up for its size by its losses alone. explained: the share of what is sent that is lost for
+    another reason: in the pauses of a card its buffer overflows, whatever the size.
 
     Attributes:
         size: bytes to ask for at once, as far as it is settled.
@@ -100,7 +100,7 @@ class Chunks:
     )
 
     def __init__(
-        self, roomy: Callable[[], bool] = lambda: True, explained: Callable[[], bool] = lambda: False
+        self, roomy: Callable[[], bool] = lambda: True, explained: Callable[[], float] = lambda: 0.0
     ) -> None:
         self.size = self._settled = MAX_DATA
         self._roomy, self._explained = roomy, explained
@@ -164,7 +164,7 @@ class Chunks:
         seen.answered += count
         if seen.total < _BLOCK or now - self._block_at < _BLOCK_SECONDS:
             return
-        beyond = -_BAD if self._explained() else seen.lost / seen.total - _BAD
+        beyond = seen.lost / seen.total - _BAD - self._explained()
         self._score = min(_SUSPICIOUS, max(0.0, self._score + beyond))
         self._seen = _Tally()
         if self._score >= _SUSPICIOUS and now >= self._again_at:

@@ -22,8 +22,8 @@ class ReadSteering:
         self.mode: ReadMode = mode
         self.most = MAX_DATA if chunk is None else chunk
         auto = chunk is None
-        self.chunks = Chunks(explained=self._has_pauses) if auto else None
-        self.write_chunks = Chunks(self._has_room, self._has_pauses) if auto else None
+        self.chunks = Chunks(explained=self._lost_in_pauses) if auto else None
+        self.write_chunks = Chunks(self._has_room, self._lost_in_pauses) if auto else None
         self._engine = engine
         self._window_rate: float | None = None
         self._burst_rate: float | None = None
@@ -37,8 +37,8 @@ class ReadSteering:
     def _has_room(self) -> bool:
         return self._engine.flow.window < self._engine.flow.cap
 
-    def _has_pauses(self) -> bool:
-        return self._engine.flow.stalls.usual
+    def _lost_in_pauses(self) -> float:
+        return self._engine.flow.stalls.share
 
     def status(self) -> dict[str, object]:
         """Return how files are read, and how fast; bytes per second, None for what was not measured."""

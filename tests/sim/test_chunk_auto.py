@@ -110,6 +110,17 @@ async def test_a_link_that_recovers_gets_full_chunks_back(profile: str, autojump
         assert connection.engine.stats.requests - requests < 1.02 * (600_000 / MAX_DATA)
 
 
+@pytest.mark.parametrize("profile", ["px4", "px4-nuttx"])
+async def test_fades_do_not_hide_that_long_frames_suffer(profile: str, autojump: MockClock) -> None:
+    """Each is a pause, as a card makes them, but explains no more than was lost in it."""
+    fades = tuple((8.0 * n + 2.0, 8.0 * n + 2.4) for n in range(400))
+    data = content(1_000_000)
+    here = world(profile, replace(RADIO, rate=57_600.0, piece_loss=0.13, cuts=fades), file=data)
+    async with here.connection() as connection:
+        assert await read_file(connection, path(profile, "file")) == data
+        assert sizes(connection)[0] < 200
+
+
 async def take_both_ways(profile: str, settings: LinkSettings, options: ConnectOptions) -> object:
     """Read and write a file; return what that cost."""
     data = content(300_000)
