@@ -26,6 +26,7 @@ from mavftpfs.protocol.pacing import Pacer
 from mavftpfs.protocol.stalls import Stalls
 from mavftpfs.protocol.survival import Survival
 from mavftpfs.protocol.trains import FASTEST_LINK, GAIN, Trains
+from mavftpfs.protocol.widening import Widening
 
 FIRST = 8
 INITIAL = 4
@@ -81,6 +82,7 @@ class Flow:
         "_starting",
         "_survival",
         "_trains",
+        "_widening",
         "alone",
         "budget",
         "cap",
@@ -104,7 +106,7 @@ class Flow:
         self._best_rate = 0.0
         self._base = BaseRtt()
         self._base_rtt = inf
-        self._easing, self._trains = Easing(), Trains()
+        self._easing, self._trains, self._widening = Easing(), Trains(), Widening()
         self._pacer: Pacer | None = None
         self.stalls = Stalls()
         self._heard_at = -inf
@@ -325,6 +327,7 @@ class Flow:
         self.stalls.reserve.on_round(now, waited)
         self._learn_congestion()
         self._trains.end_round(answered, rate)
+        self._widening.end_round(answered, lost, bunched=self._trains.rate == inf)
         if survival is not None:
             disturbed = self.stalls.reserve.others_at > self._round_start - took
             most = self._target() if self._queued(2.0) else inf
@@ -389,7 +392,7 @@ class Flow:
         rate, base = self._best_rate, self._base_rtt
         if base == inf or rate == 0.0:
             return INITIAL
-        held = self._trains.widen(self._held(rate), rate)
+        held = self._widening.window(self._held(rate), rate)
         return self._brake * max(held, min(rate * _FAST_PATH_SECONDS, _FAST_PATH_WINDOW))
 
     def _approach(self, target: float) -> None:

@@ -22,8 +22,6 @@ GAIN = 1.1
 _DEPTH = 4.0
 _DEPTH_SECONDS = 0.004
 _PLENTY = 1 << 16
-_MOST_WIDER = 2.0
-_BUNCH_SECONDS = 0.05
 
 FASTEST_LINK = 6000.0
 """Answers per second (1.4 MB/s) beyond which no radio is on the way."""
@@ -106,18 +104,6 @@ class Trains:
             self.proven = self.rate < inf and (dense or self.rate <= _SAME * before < inf)
         self._answers, self._seconds = 0, 0.0
         self._densest = inf
-
-    def widen(self, held: float, rate: float) -> float:
-        """Return a window for a way that holds so many by its least round trip at so many answers per second.
-
-        Where answers come in bunches the usual round trip is longer than the least, by the time it takes to
-        gather them or by what each packet is held up (Wi-Fi): the window that fills the way only without that
-        fills a third of it, brings a third of the rate, and so stays. What is too much of the wider one waits
-        for so long in a queue.
-        """
-        if self.rate < inf or rate > FASTEST_LINK:
-            return held
-        return held + min(_MOST_WIDER * held, rate * _BUNCH_SECONDS)
 
     # --- pacing
 

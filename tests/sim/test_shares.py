@@ -92,6 +92,16 @@ def test_a_link_that_holds_each_packet_up_is_filled_too(
     assert result.requests <= 1.1
 
 
+@pytest.mark.parametrize("direction", ["read", "write"])
+@pytest.mark.parametrize("rate", [625_000.0, 1e6])
+def test_nor_does_that_flood_a_short_queue(rate: float, direction: Direction) -> None:
+    """A window three times as wide lost 60 % of what it asked for, and everybody else's packets with it."""
+    queue = int(rate * 0.014)
+    result = measure(Case("px4", rate, 0.03, 0.0, direction), SHORT, jitter=0.01, queue=queue)
+    assert result.share >= 0.9
+    assert result.requests <= 1.35
+
+
 @pytest.mark.parametrize(("loss", "in_vain"), [(0.0, 0.001), (0.05, 0.01)])
 @pytest.mark.parametrize(
     ("rate", "rtt", "seconds", "telemetry"), [(5760.0, 0.3, LONG, 400.0), (100_000.0, 0.1, 10.0, 4000.0)]
