@@ -18,6 +18,7 @@ from collections import deque
 from math import inf, sqrt
 
 from mavftpfs.protocol.basertt import BaseRtt
+from mavftpfs.protocol.brake import Brake
 from mavftpfs.protocol.budget import Budget
 from mavftpfs.protocol.easing import Easing
 from mavftpfs.protocol.flights import Flights
@@ -110,7 +111,7 @@ class Flow:
         self._pacer: Pacer | None = None
         self.stalls = Stalls()
         self._heard_at = -inf
-        self._brake = 1.0
+        self._brake = Brake()
         self._plateau = self._collapsed = 0
         self._round_end = -1
         self._round_start = 0.0
@@ -325,9 +326,9 @@ class Flow:
                 self.window = min(self.cap, survival.end_idle_round(next_order - self._round_end, lost))
             return
         self.stalls.reserve.on_round(now, waited)
-        self._learn_congestion()
+        self._brake.end_round(congested=lost > 0 and self._queued(2.0))
         self._trains.end_round(answered, rate)
-        self._widening.end_round(answered, lost, bunched=self._trains.rate == inf)
+        self._widening.end_round(answered, lost, bunched=self._bunched())
         if survival is not None:
             disturbed = self.stalls.reserve.others_at > self._round_start - took
             most = self._target() if self._queued(2.0) else inf
@@ -348,15 +349,14 @@ class Flow:
             if self._pacer is None:
                 self.window = int(self._base.next_window(self.window, reserve))
 
+    def _bunched(self) -> bool:
+        if self._trains.rate < inf and (self._starting or self.stalls.usual):
+            return False  # less comes than could for another reason
+        return self._trains.bunched(self._best_rate / (1.0 - self.loss))
+
     def _excused(self) -> bool:
         """Whether pauses explain what was lost: it is no more than comes in them, and on a bad link."""
         return self.stalls.usual and self.loss < self.stalls.share + _MORE_LOSS
-
-    def _learn_congestion(self) -> None:
-        if self._losses and self._queued(2.0):
-            self._brake = max(0.4, self._brake * 0.7)
-        else:
-            self._brake = min(1.0, self._brake * 1.05)
 
     def _queued(self, factor: float) -> bool:
         """Whether even the quickest answer of the round took `factor` times the base, and a little; an answer
@@ -393,7 +393,7 @@ class Flow:
         if base == inf or rate == 0.0:
             return INITIAL
         held = self._widening.window(self._held(rate), rate)
-        return self._brake * max(held, min(rate * _FAST_PATH_SECONDS, _FAST_PATH_WINDOW))
+        return self._brake.factor * max(held, min(rate * _FAST_PATH_SECONDS, _FAST_PATH_WINDOW))
 
     def _approach(self, target: float) -> None:
         # So few are no load, and fewer find losses slowly.

@@ -22,6 +22,7 @@ GAIN = 1.1
 _DEPTH = 4.0
 _DEPTH_SECONDS = 0.004
 _PLENTY = 1 << 16
+_SCANT = 0.75
 
 FASTEST_LINK = 6000.0
 """Answers per second (1.4 MB/s) beyond which no radio is on the way."""
@@ -104,6 +105,10 @@ class Trains:
             self.proven = self.rate < inf and (dense or self.rate <= _SAME * before < inf)
         self._answers, self._seconds = 0, 0.0
         self._densest = inf
+
+    def bunched(self, rate: float) -> bool:
+        """Whether answers come in much denser rows than so many per second, which were got at best."""
+        return rate < _SCANT * self.rate
 
     # --- pacing
 

@@ -49,17 +49,20 @@ def measure(
     queue: int | None = None,
     telemetry: float = 0.0,
     jitter: float = 0.0,
+    reorder: float = 0.0,
     seed: int = 1,
 ) -> Result:
     """Read or write for about `seconds` of link time; queue: bytes that wait for the link's transmitter;
-    telemetry: bytes per second that the vehicle sends beside it; jitter: of the link; seed: of chance.
+    telemetry: bytes per second that the vehicle sends beside it; jitter, reorder: of the link; seed: chance.
 
     Raises:
         AssertionError: the bytes differ.
         trio.TooSlowError: it took PATIENCE times the ideal.
     """
     room = int(max(4096, case.rate / 2)) if queue is None else queue
-    settings = LinkSettings(rate=case.rate, delay=case.rtt / 2, jitter=jitter, loss=case.loss, queue=room)
+    settings = LinkSettings(
+        rate=case.rate, delay=case.rtt / 2, jitter=jitter, reorder=reorder, loss=case.loss, queue=room
+    )
     world = World(case.profile, settings, seed=seed, telemetry=telemetry)
     data = random.Random(1).randbytes(int(case.limit * seconds))
     transfer = _read if case.direction == "read" else _write

@@ -93,6 +93,17 @@ def test_a_link_that_holds_each_packet_up_is_filled_too(
 
 
 @pytest.mark.parametrize("direction", ["read", "write"])
+@pytest.mark.parametrize(("reorder", "share", "requests"), [(0.1, 0.9, 1.1), (0.5, 0.75, 1.3)])
+def test_so_is_one_that_mixes_packets(
+    reorder: float, share: float, requests: float, direction: Direction
+) -> None:
+    """Those that are held back by 20 ms make the usual round trip longer than the least: half was reached."""
+    result = measure(Case("px4", 625_000.0, 0.03, 0.0, direction), SHORT, reorder=reorder)
+    assert result.share >= share
+    assert result.requests <= requests
+
+
+@pytest.mark.parametrize("direction", ["read", "write"])
 @pytest.mark.parametrize("rate", [625_000.0, 1e6])
 def test_nor_does_that_flood_a_short_queue(rate: float, direction: Direction) -> None:
     """A window three times as wide lost 60 % of what it asked for, and everybody else's packets with it."""
