@@ -20,6 +20,10 @@ _DENSE = 1.5
 _SAME = 1.1
 GAIN = 1.1
 _DEPTH = 4.0
+_FEWEST = 2.0
+_LONGEST_ROW = 0.1
+"""Seconds of the path that more than _FEWEST may take which leave in one go: others wait behind them."""
+
 _DEPTH_SECONDS = 0.004
 _PLENTY = 1 << 16
 _SCANT = 0.75
@@ -122,7 +126,7 @@ class Trains:
             return _PLENTY
         self._gain = gain
         pace = gain * self.rate
-        deepest = max(_DEPTH, pace * _DEPTH_SECONDS)
+        deepest = max(_FEWEST, min(_DEPTH, pace * _LONGEST_ROW), pace * _DEPTH_SECONDS)
         self._tokens = min(deepest, self._tokens + (now - self._tokens_at) * pace)
         self._tokens_at = now
         room = int(self._tokens)

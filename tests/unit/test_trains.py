@@ -96,6 +96,17 @@ def test_no_more_goes_out_than_the_path_takes() -> None:
     assert 1.05 * 2.0 * RATE < len(sends) < 1.15 * 2.0 * RATE
 
 
+def test_what_leaves_in_one_go_takes_no_slow_path_for_long() -> None:
+    """Four frames of a radio of 57600 baud are 0.18 s, which whoever came next waited for."""
+    trains = Trains()
+    answer(trains, 0.0, 8, 0.046)
+    trains.rate, trains.proven = 1 / 0.046, True
+    assert trains.room(10.0) == 2
+    trains.on_sent(2)
+    assert trains.room(10.0) == 0
+    assert trains.next_room_at() < 10.046
+
+
 def test_who_was_not_held_back_need_not_be_woken() -> None:
     trains = known()
     trains.begin()
