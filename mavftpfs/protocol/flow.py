@@ -328,7 +328,7 @@ class Flow:
         self.stalls.reserve.on_round(now, waited)
         self._brake.end_round(congested=lost > 0 and self._queued(2.0))
         self._trains.end_round(answered, rate)
-        self._widening.end_round(answered, lost, bunched=self._bunched())
+        self._widening.end_round(answered, lost, bunched=survival is None and self._bunched())
         if survival is not None:
             disturbed = self.stalls.reserve.others_at > self._round_start - took
             most = self._target() if self._queued(2.0) else inf
