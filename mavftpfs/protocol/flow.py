@@ -114,8 +114,7 @@ class Flow:
         self._brake = Brake()
         self._plateau = self._collapsed = 0
         self._round_end = -1
-        self._round_start = 0.0
-        self._round_least = inf
+        self._round_start, self._round_least = 0.0, inf
         self._replies = self._losses = self._goal = 0
         self._flights, self._overflow = Flights(), Overflow()
 
@@ -175,7 +174,8 @@ class Flow:
         if self._pacer is None:
             # What a pause took of a reserve must come back before the next one, but drowns a buffer at once.
             gain = _REFILL if room <= reserve else GAIN
-            return min(room, self._trains.room(now, gain)) if room > 0 else room
+            briefly = self.stalls.reserve.beside_others(now)
+            return min(room, self._trains.room(now, gain, briefly=briefly)) if room > 0 else room
         room += self.alone and not self._hurried  # one more fits a short queue of our own (servers.md 3)
         self._pacer.blocked = False
         # How evenly others send is not ours to say: beside them the queue is all there is.

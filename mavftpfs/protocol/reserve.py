@@ -95,9 +95,13 @@ class Reserve:
         """The server pauses. rtt: least round trip."""
         if now < self._until:
             return
-        alone = now >= self.others_at + _LATELY
-        self.wanted = min(MOST + rtt, _MOST_ON_A_LONG_WAY) if alone else BESIDE_OTHERS
+        most = min(MOST + rtt, _MOST_ON_A_LONG_WAY)
+        self.wanted = BESIDE_OTHERS if self.beside_others(now) else most
         self._settle()
+
+    def beside_others(self, now: float) -> bool:
+        """Whether somebody may soon wait for an answer beside a transfer, as lately."""
+        return now < self.others_at + _LATELY
 
     def on_others(self, now: float) -> None:
         """Somebody waits for an answer beside a transfer, and may again soon."""

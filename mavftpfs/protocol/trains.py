@@ -120,13 +120,16 @@ class Trains:
         """It is looked at anew who wants to send: nobody was held back yet."""
         self._blocked = False
 
-    def room(self, now: float, gain: float = GAIN) -> int:
-        """Return how many requests may go out now. gain: so many times the pace that was seen."""
+    def room(self, now: float, gain: float = GAIN, *, briefly: bool = False) -> int:
+        """Return how many requests may go out now. gain: so many times the pace that was seen. briefly: what
+        goes out together must not take long, since others may come."""
         if not self.proven:
             return _PLENTY
         self._gain = gain
         pace = gain * self.rate
-        deepest = max(_FEWEST, min(_DEPTH, pace * _LONGEST_ROW), pace * _DEPTH_SECONDS)
+        deepest = max(_DEPTH, pace * _DEPTH_SECONDS)
+        if briefly:
+            deepest = max(_FEWEST, min(deepest, pace * _LONGEST_ROW))
         self._tokens = min(deepest, self._tokens + (now - self._tokens_at) * pace)
         self._tokens_at = now
         room = int(self._tokens)

@@ -21,7 +21,6 @@ SECONDS = 0.05
 
 _STEP = 0.2
 _CUT = 0.85
-_FADE = 0.98
 _MORE_LOSS = 0.05
 _SMOOTHING = 0.4
 _ROUNDS_REMEMBERED = 48
@@ -47,7 +46,7 @@ class Widening:
         self._loss += (loss - self._loss) * (_SMOOTHING if self._losses else 1.0)
         self._losses.append(self._loss)
         if not bunched:
-            self.share *= _FADE
+            self.share = 0.0
         elif self._loss > min(self._losses) + _MORE_LOSS:
             self.share *= _CUT
         else:

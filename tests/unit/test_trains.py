@@ -96,14 +96,15 @@ def test_no_more_goes_out_than_the_path_takes() -> None:
     assert 1.05 * 2.0 * RATE < len(sends) < 1.15 * 2.0 * RATE
 
 
-def test_what_leaves_in_one_go_takes_no_slow_path_for_long() -> None:
+def test_what_leaves_in_one_go_takes_no_slow_path_for_long_beside_others() -> None:
     """Four frames of a radio of 57600 baud are 0.18 s, which whoever came next waited for."""
     trains = Trains()
     answer(trains, 0.0, 8, 0.046)
     trains.rate, trains.proven = 1 / 0.046, True
-    assert trains.room(10.0) == 2
+    assert trains.room(10.0) == 4
+    assert trains.room(10.0, briefly=True) == 2
     trains.on_sent(2)
-    assert trains.room(10.0) == 0
+    assert trains.room(10.0, briefly=True) == 0
     assert trains.next_room_at() < 10.046
 
 

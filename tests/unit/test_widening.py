@@ -51,8 +51,8 @@ def test_losses_that_stay_without_it_are_not_its_own() -> None:
     assert after(60, 20, widening) == 1.0
 
 
-def test_it_fades_without_bunches() -> None:
+def test_it_ends_with_the_bunches() -> None:
+    """What stayed on a slow link took long to go: `ls` waited 0.95 s of 0.61 for it beside an upload."""
     widening = Widening()
     after(20, 0, widening)
-    assert 0.8 < after(5, 0, widening, bunched=False) < 1.0
-    assert after(300, 0, widening, bunched=False) < 0.01
+    assert after(1, 0, widening, bunched=False) == 0.0
