@@ -34,7 +34,7 @@ from mavftpfs.fuse.options import MountOptions, fuse_words
 from mavftpfs.fuse.writing import WritingOperations
 from mavftpfs.kernelnews import Invalidator
 from mavftpfs.link.uri import LinkSpec
-from mavftpfs.mountpoint import is_ours, stderr_of, unmount
+from mavftpfs.mountpoint import is_ours, stderr_of, unmount, unmount_what_is_left
 from mavftpfs.shared.errors import MavftpfsError
 
 log = logging.getLogger("mavftpfs.mount")
@@ -266,7 +266,7 @@ class _Life:
     def _end_at_once(self) -> None:
         if self.mounted:
             try:
-                unmount(self.request.mountpoint, lazy=True)
+                unmount_what_is_left(self.request.mountpoint)
             except MavftpfsError as exc:
                 log.warning("%s", exc)
         os._exit(ExitCode.MOUNT_FAILED)
@@ -300,7 +300,7 @@ def kernel_mount(operations: Operations, request: MountRequest, invalidator: Inv
     finally:
         if invalidator.busy:
             # A thread is still inside the library; freeing the library's session would pull it away.
-            unmount(request.mountpoint, lazy=True)
+            unmount_what_is_left(request.mountpoint)
         else:
             pyfuse3.close(unmount=True)
 

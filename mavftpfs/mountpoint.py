@@ -112,6 +112,19 @@ def unmount(path: str, *, lazy: bool = False) -> None:
         raise MountFailed(_describe_unmount(path, said))
 
 
+def unmount_what_is_left(path: str) -> None:
+    """Unmount lazily what somebody else may be unmounting, or has unmounted, just now.
+
+    Raises:
+        MountFailed: it is still mounted; with what fusermount3 said.
+    """
+    try:
+        unmount(path, lazy=True)
+    except MountFailed:
+        if path in mounted_types():
+            raise
+
+
 def _said_by(words: list[str], path: str) -> str | None:
     """Return what an unmounting program complained of, None if it succeeded."""
     try:

@@ -18,6 +18,7 @@ from mavftpfs.mountpoint import (
     mounted_types,
     stderr_of,
     unmount,
+    unmount_what_is_left,
 )
 
 
@@ -114,6 +115,20 @@ def test_stderr_is_caught_from_children_and_given_back(capfd: pytest.CaptureFixt
 def test_unmounting_what_is_not_mounted_says_why(tmp_path: Path) -> None:
     with pytest.raises(MountFailed, match=str(tmp_path)):
         unmount(str(tmp_path))
+
+
+def test_what_somebody_else_has_unmounted_is_gone(tmp_path: Path) -> None:
+    """After `fusermount3 -u` a mount ended with 3, `Invalid argument`, if a thread of it was still busy."""
+    unmount_what_is_left(str(tmp_path))
+
+
+def test_what_is_still_mounted_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    program = tmp_path / "fusermount3"
+    program.write_text("#!/bin/sh\necho 'fusermount3: not permitted' >&2\nexit 1\n")
+    program.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
+    with pytest.raises(MountFailed, match="not permitted"):
+        unmount_what_is_left("/")
 
 
 def test_unmounting_what_is_busy_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
