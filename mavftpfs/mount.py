@@ -27,6 +27,7 @@ from mavftpfs.compose import NO_SINKS, Sinks, attached
 from mavftpfs.control import ControlServer, Reply
 from mavftpfs.exits import ExitCode, MountFailed, exit_code_for
 from mavftpfs.farewell import Holder, say_goodbye
+from mavftpfs.fuse.device import never_blocking
 from mavftpfs.fuse.handles import WritableTree
 from mavftpfs.fuse.inodes import InodeTable
 from mavftpfs.fuse.operations import Operations, Presentation, Space
@@ -275,7 +276,8 @@ class _Life:
 async def fuse_loop() -> None:
     """Serve the kernel until the mount is gone, from inside or outside."""
     try:
-        await pyfuse3.main(min_tasks=MIN_TASKS, max_tasks=MAX_TASKS)
+        with never_blocking():
+            await pyfuse3.main(min_tasks=MIN_TASKS, max_tasks=MAX_TASKS)
     except* OSError as group:
         # Reading from /dev/fuse fails when the connection was aborted (`umount -f`, fusectl).
         log.warning("the kernel ended the mount: %s", group.exceptions[0])

@@ -73,7 +73,7 @@ IMPURE_MODULES = {"sim.endpoints", "sim.memory", "sim.command"}
 IMPURE_IMPORTS = {"trio", "time", "socket", "logging", "pyfuse3"}
 
 SOLE_IMPORTERS = {
-    "pyfuse3": {"fuse.operations", "fuse.writing", "mount"},
+    "pyfuse3": {"fuse.device", "fuse.operations", "fuse.writing", "mount"},
     "pymavlink": {"link.framing"},
     "serial": {"link.serial"},
     "rich": {"cli", "demo", "report"},
