@@ -155,7 +155,7 @@ class Engine:
             if req_opcode == _BURST and self._bursts.running:
                 self.stats.incoherent += 1
             else:
-                self.stats.on_unknown(seq, now)
+                self.stats.on_unknown(reply, now, explained=self._ledger.repeats.explain(seq, now))
                 self.on_unknown(reply)
         elif req_opcode != request.opcode:
             self._on_stale(request)
@@ -202,7 +202,7 @@ class Engine:
         self._heard_at = now
         rtt, flow = None, self.flow
         if not self._ledger.settle(request, reply.seq, now):
-            self.stats.spurious += 1
+            self.stats.on_spurious(request)
             flow.on_spurious()
         if self._bursts.heard_at >= request.sent_at:
             self._bursts.on_answer(request, self.traits, self.timeout(request.manner.family))

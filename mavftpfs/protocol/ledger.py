@@ -14,7 +14,8 @@ from itertools import islice
 
 from mavftpfs.protocol.lateness import Lateness
 from mavftpfs.protocol.payload import MAX_DATA, Fields, Opcode, Payload
-from mavftpfs.protocol.requests import Operation, Request, Run, Transmission
+from mavftpfs.protocol.repeats import Repeats
+from mavftpfs.protocol.requests import WORKING, Operation, Request, Run, Transmission
 from mavftpfs.shared.errors import LocalProtocolError
 
 LAST_SEQ = 65534
@@ -25,9 +26,6 @@ FURTHEST_JUMP = LAST_SEQ + 1 - 2 * BURST_JUMP
 """Further on come the seqs just used, whose late replies may still be about."""
 
 _ACK = int(Opcode.ACK)
-_WORKING = frozenset(("slow", "work"))
-"""Families of requests whose answers come after those to newer ones by themselves."""
-
 _TELLING = frozenset((Opcode.WRITE_FILE, Opcode.OPEN_FILE_RO, Opcode.OPEN_FILE_WO, Opcode.CREATE_FILE))
 _MIN_REORDER = 2
 """So many later answers tell that a request is lost: it keeps one of a short queue's places until then."""
@@ -66,6 +64,7 @@ class Ledger:
         newest_answered: order of the last transmission that was answered. first: no older one may be lost.
         order: number of the next transmission.
         reorder: how many transmissions later an answer must be to prove a loss; grows when that was wrong.
+        repeats: what is still to come of what was sent more than once.
     """
 
     __slots__ = (
@@ -80,11 +79,13 @@ class Ledger:
         "newest_answered",
         "order",
         "reorder",
+        "repeats",
     )
 
     def __init__(self, next_seq: int, lateness: Lateness) -> None:
         self._seq = next_seq
         self._lateness = lateness
+        self.repeats = Repeats(lateness.overtaken)
         self._table: dict[int, Request] = {}
         self._flying: dict[int, Request] = {}
         self.find = self._table.get
@@ -122,6 +123,7 @@ class Ledger:
         while seq > LAST_SEQ or seq + 1 in table:  # bounded: the table is far smaller than 65535
             seq = 0 if seq > LAST_SEQ else seq + 1
         self._seq = seq + 1
+        self._lateness.on_passed(1)
         return seq
 
     def jump(self, packets: int) -> None:
@@ -129,6 +131,7 @@ class Ledger:
         the rest of it may come long after it was given up (servers.md 14.3)."""
         distance = min(max(BURST_JUMP, 2 * packets), FURTHEST_JUMP)
         self._seq = (self._seq + distance) % (LAST_SEQ + 1)
+        self._lateness.on_passed(distance)
 
     def launch(self, requests: Sequence[Request], now: float, timer: float) -> None:
         """Number requests that go out for the first time, and note that they are on their way."""
@@ -149,7 +152,8 @@ class Ledger:
             table[seq + 1] = flying[order] = request
             order += 1
         self.order = order
-        if requests[0].manner.family not in _WORKING:
+        self._lateness.on_passed(len(requests))
+        if requests[0].manner.family not in WORKING:
             self._lateness.on_sent(requests[0].seq + 1, now)
 
     def number(self, request: Request, now: float) -> None:
@@ -172,7 +176,7 @@ class Ledger:
         request.sent_at = now
         request.sends += 1
         self.order += 1
-        if request.manner.family not in _WORKING and request.opcode != Opcode.BURST_READ_FILE:
+        if request.manner.family not in WORKING and request.opcode != Opcode.BURST_READ_FILE:
             self._lateness.on_sent(request.seq + 1, now)
 
     def enter(self, request: Request) -> None:
@@ -217,14 +221,15 @@ class Ledger:
     def settle(self, request: Request, seq: int, now: float) -> bool:
         """Take out a request answered under `seq`; return False if that was an alias.
 
-        Its order, sent_at and single are those of the answered transmission from then on.
+        Its order, sent_at, single and outrun are those of the answered transmission from then on.
         """
-        outrun = request.outrun
-        self.forget(request)
+        if request.sends > 1:
+            self.repeats.on_answered(request, seq, now)
+        self._remove(request)
         current = seq == request.seq + 1
         if not current and request.aliases is not None:
-            request.order, request.sent_at, request.single, outrun = request.aliases[seq]
-        if outrun:
+            request.order, request.sent_at, request.single, request.outrun = request.aliases[seq]
+        if request.outrun:
             # What later answers seemed to prove lost is answered after all: the path reorders.
             self.reorder = min(self.reorder * 2, _MAX_REORDER)
         elif current and request.sends > 1 and self.reorder > _MIN_REORDER:
@@ -238,7 +243,12 @@ class Ledger:
         return current
 
     def forget(self, request: Request) -> None:
-        """Take an answered or hopeless request out of everything."""
+        """Give up a request that was not answered."""
+        self.repeats.on_given_up(request)
+        self._remove(request)
+
+    def _remove(self, request: Request) -> None:
+        """Take a request out of everything."""
         table = self._table
         table.pop(request.seq + 1, None)
         if request.aliases is not None:

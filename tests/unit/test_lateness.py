@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import random
+from collections.abc import Callable
 
 import pytest
 
 from mavftpfs.protocol.engine import Engine
 from mavftpfs.protocol.flow import Flow
 from mavftpfs.protocol.lateness import LONGEST, MEMORY, Lateness
+from mavftpfs.protocol.ledger import Ghost, Ledger
 from mavftpfs.protocol.operations import Simple
 from mavftpfs.protocol.payload import Opcode, Payload
+from mavftpfs.protocol.requests import READ_MANNER, Request
 from tests.support.replies import ack, sent
 
 
@@ -67,6 +70,43 @@ def test_little_is_remembered() -> None:
     assert lateness.seen(10_000.0) == 0.0
     lateness.on_stray(9_995, 10_000.0)
     assert lateness.seen(10_000.0) == pytest.approx(3.5)
+
+
+def test_a_seq_that_was_used_again_tells_nothing() -> None:
+    """Of a row of requests the first is remembered only: a fast transfer comes round in less than 10 s."""
+    lateness = after_exchanges(3)
+    lateness.on_passed(65_535)
+    lateness.on_stray(1, 3.3)
+    assert lateness.seen(3.3) == 0.0
+
+
+def burst(ledger: Ledger) -> None:
+    for _ in range(16):
+        ledger.jump(4096)
+
+
+def singly(ledger: Ledger) -> None:
+    for _ in range(65_535):
+        ledger.take_seq()
+
+
+def in_rows(ledger: Ledger) -> None:
+    for _ in range(33):
+        row = [Request(Ghost(), Opcode.READ_FILE, READ_MANNER, 0, 0, 239) for _ in range(2000)]
+        ledger.launch(row, 0.5, 1.0)
+        for request in row:
+            ledger.forget(request)
+
+
+@pytest.mark.parametrize("use", [burst, singly, in_rows])
+def test_the_engine_counts_its_seqs(use: Callable[[Ledger], None]) -> None:
+    engine = Engine(random.Random(1), Flow())
+    first = ack(ask(engine, Opcode.CREATE_DIRECTORY, 0.0))
+    engine.receive(first, 0.1)
+    use(engine._ledger)
+    engine.receive(ack(ask(engine, Opcode.REMOVE_DIRECTORY, 1.0)), 1.1)
+    engine.receive(first, 4.1)
+    assert engine.stats.lateness.seen(4.1) == 0.0
 
 
 def ask(engine: Engine, opcode: Opcode, now: float) -> Payload:

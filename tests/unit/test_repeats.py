@@ -1,0 +1,198 @@
+"""Which answers tell that a path doubles, holds back or mixes, and which only that we asked twice.
+
+Where it does, names rest and files wait for each other (session.echoes, session.uploading): a card that
+pauses for a moment must not bring that about for good.
+"""
+
+from __future__ import annotations
+
+import random
+
+from mavftpfs.protocol.engine import Engine
+from mavftpfs.protocol.flow import Flow
+from mavftpfs.protocol.operations import Simple
+from mavftpfs.protocol.payload import Opcode, Payload
+from mavftpfs.protocol.transfers import ReadTransfer
+from tests.support.replies import ack, chunk, packet, sent
+from tests.support.virtual import MemorySink
+
+SIZE = 4 * 239
+CONTENT = bytes(SIZE)
+
+
+def make() -> Engine:
+    return Engine(random.Random(1), Flow(limit=8))
+
+
+def reading(engine: Engine) -> ReadTransfer:
+    """Begin to read a file of four chunks."""
+    transfer = ReadTransfer(0, SIZE, MemorySink(SIZE))
+    engine.start(transfer, 0.0)
+    transfer.want(0, SIZE, True)
+    return transfer
+
+
+def ask(engine: Engine, opcode: Opcode, now: float) -> Payload:
+    """Send a request of a kind, and return it."""
+    engine.start(Simple(opcode, b"/d"), now)
+    (request,) = sent(engine, now)
+    return request
+
+
+def again(engine: Engine, now: float) -> list[Payload]:
+    """Let timers run out, and return what goes out once more."""
+    engine.on_deadline(now)
+    return sent(engine, now)
+
+
+def asked_twice(engine: Engine) -> Payload:
+    """Ask at 0 and at 1 s for something that has the same seq again."""
+    first = ask(engine, Opcode.CREATE_DIRECTORY, 0.0)
+    assert again(engine, 1.0) == [first]
+    return first
+
+
+def test_a_card_that_pauses_is_no_bad_path() -> None:
+    engine = make()
+    reading(engine)
+    asked = sent(engine, 0.0)
+    for now in (1.0, 2.0):
+        asked += again(engine, now)
+    assert len(asked) > 6
+    for request in asked:
+        engine.receive(chunk(request, CONTENT), 3.0)
+    assert engine.stats.spurious
+    assert engine.stats.unknown
+    assert engine.stats.strays == 0
+
+
+def test_nor_is_one_of_which_nobody_wants_the_answer_any_more() -> None:
+    engine = make()
+    transfer = reading(engine)
+    asked = sent(engine, 0.0)
+    asked += again(engine, 1.0)
+    engine.on_deadline(2.0)  # lost, and not sent again before it is forgotten
+    engine.cancel(transfer, 2.0)
+    for request in asked:
+        engine.receive(chunk(request, CONTENT), 3.0)
+    assert engine.stats.unknown
+    assert engine.stats.strays == 0
+
+
+def test_nor_what_comes_of_a_burst_that_was_given_up() -> None:
+    engine = make()
+    transfer = reading(engine)
+    transfer.set_strategy("burst")
+    (burst,) = sent(engine, 0.0)
+    engine.cancel(transfer, 0.0)
+    engine.receive(packet(burst, 0, bytes(239)), 0.1)
+    assert engine.stats.unknown
+    assert engine.stats.strays == 0
+
+
+def test_two_answers_to_two_requests() -> None:
+    engine = make()
+    request = asked_twice(engine)
+    engine.receive(ack(request), 1.1)
+    engine.receive(ack(request), 1.2)
+    assert engine.stats.strays == 0
+    engine.receive(ack(request), 1.3)
+    assert engine.stats.strays == 1
+
+
+def test_two_answers_to_one_request() -> None:
+    engine = make()
+    request = ask(engine, Opcode.CREATE_DIRECTORY, 0.0)
+    engine.receive(ack(request), 0.1)
+    engine.receive(ack(request), 0.1)
+    assert engine.stats.strays == 1
+
+
+def test_two_answers_to_one_of_two_requests() -> None:
+    engine = make()
+    reading(engine)
+    first = sent(engine, 0.0)[0]
+    second = again(engine, 1.0)[0]
+    assert second.offset == first.offset
+    engine.receive(chunk(second, CONTENT), 1.1)
+    assert engine.stats.strays == 0
+    engine.receive(chunk(second, CONTENT), 1.1)
+    assert engine.stats.strays == 1
+
+
+def test_two_answers_to_one_of_three_requests() -> None:
+    engine = make()
+    reading(engine)
+    first = sent(engine, 0.0)[0]
+    second = again(engine, 1.0)[0]
+    again(engine, 3.0)
+    assert 0 in [request.offset for request in again(engine, 9.0)]
+    for request in (first, second):
+        engine.receive(chunk(request, CONTENT), 9.1)
+    assert engine.stats.strays == 0
+    engine.receive(chunk(second, CONTENT), 9.1)
+    assert engine.stats.strays == 1
+
+
+def test_an_answer_that_newer_requests_overtook() -> None:
+    engine = make()
+    request = asked_twice(engine)
+    engine.receive(ack(request), 1.1)
+    engine.receive(ack(ask(engine, Opcode.REMOVE_DIRECTORY, 1.1)), 1.2)
+    engine.receive(ack(request), 1.2)
+    assert engine.stats.strays == 1
+
+
+def test_an_answer_that_was_held_back_while_nothing_was_asked() -> None:
+    engine = make()
+    request = asked_twice(engine)
+    engine.receive(ack(request), 1.1)
+    engine.receive(ack(request), 1.0 + 2 * 1.1 + 0.01)
+    assert engine.stats.strays == 1
+
+
+def test_work_may_take_its_time() -> None:
+    engine = make()
+    request = ask(engine, Opcode.CALC_FILE_CRC32, 0.0)
+    assert again(engine, 20.0) == [request]
+    engine.receive(ack(request, bytes(4)), 20.1)
+    engine.receive(ack(ask(engine, Opcode.CREATE_DIRECTORY, 20.2)), 20.3)
+    engine.receive(ack(request, bytes(4)), 35.0)
+    assert engine.stats.unknown
+    assert engine.stats.strays == 0
+
+
+def test_a_path_that_mixes() -> None:
+    engine = make()
+    reading(engine)
+    asked = sent(engine, 0.0)
+    for request in asked[1:]:
+        engine.receive(chunk(request, CONTENT), 0.1)
+    (repeated,) = sent(engine, 0.1)
+    assert repeated.offset == 0
+    engine.receive(chunk(asked[0], CONTENT), 0.12)
+    assert engine.stats.spurious == 1
+    assert engine.stats.strays == 1
+
+
+def test_a_path_that_brings_an_old_answer_first_when_newer_ones_came() -> None:
+    engine = make()
+    reading(engine)
+    first = sent(engine, 0.0)[0]
+    again(engine, 1.0)
+    engine.receive(ack(ask(engine, Opcode.CREATE_DIRECTORY, 1.0)), 1.1)
+    engine.receive(chunk(first, CONTENT), 1.2)
+    assert engine.stats.spurious == 1
+    assert engine.stats.strays == 1
+
+
+def test_little_is_remembered() -> None:
+    engine = make()
+    request = asked_twice(engine)
+    engine.receive(ack(request), 1.1)
+    for number in range(1100):
+        now = 10.0 * (number + 1)
+        other = ask(engine, Opcode.CREATE_DIRECTORY, now)
+        again(engine, now + 5.0)
+        engine.receive(ack(other), now + 5.1)
+    assert len(engine._ledger.repeats._rests) == 1024
