@@ -216,19 +216,21 @@ class Mount:
         process.send_signal(number)
         return process.wait(END_TIMEOUT)
 
+    def _unmounted(self) -> bool:
+        """Try to unmount: programs in it may be ending still (`git gc`)."""
+        command = ["fusermount3", "-u", str(self.path)]
+        if mounted_at(self.path):
+            subprocess.run(command, check=False, timeout=END_TIMEOUT, capture_output=True)
+        return not mounted_at(self.path)
+
     def finish(self) -> None:
         """Unmount if mounted; then the daemon must have ended with 0 and a clean log."""
         process, self.process = self.process, None
         if process is None:
             return
         try:
-            if mounted_at(self.path) and process.running:
-                subprocess.run(
-                    ["fusermount3", "-u", str(self.path)],
-                    check=False,
-                    timeout=END_TIMEOUT,
-                    capture_output=True,
-                )
+            if process.running:
+                wait_until("nobody uses the mount any more", self._unmounted)
             code = process.wait(END_TIMEOUT)
         finally:
             abort_mount(self.path)
