@@ -42,6 +42,9 @@ SMALL_LISTING = 5
 """A directory of so few names is listed in one request, which tells more than opening the file, if what lies
 above it was listed lately: after a long upload it was not, and each part of its path is a round trip."""
 
+LARGE_LISTING = 50
+"""A directory of more names is not listed for each of many files that are written at once: that takes time by
+the square of their number. Whose uploads are interrupted for it is known after the first."""
 
 QUICKLY_READ = 64 * 1024
 """Of so much every vehicle computes the CRC32 so fast that nothing waits long behind it."""
@@ -217,9 +220,11 @@ class Verifier:
         context = self._context
         directory = split(path)[0]
         known = context.dentries.known(directory)
-        small = known is not None and len(known.entries) <= SMALL_LISTING
+        names = len(known.entries) if known is not None else 0
+        small = known is not None and names <= SMALL_LISTING
         if any(node.undelivered and not _writes(node, path) for node in context.nodes):
-            return small or context.writer.traits.wo_truncates is not False
+            truncates = context.writer.traits.wo_truncates
+            return small or truncates is True or (truncates is None and names <= LARGE_LISTING)
         return small and context.directories.in_reach(directory)
 
     async def _crc_agrees(self, path: bytes, draft: Draft, verify: str, *, limited: bool = True) -> bool:

@@ -9,7 +9,7 @@ import trio
 from trio.testing import MockClock
 
 from mavftpfs.cache.tree import Tree
-from mavftpfs.cache.verify import SMALL_LISTING
+from mavftpfs.cache.verify import LARGE_LISTING, SMALL_LISTING
 from mavftpfs.protocol.payload import Opcode
 from mavftpfs.sim.linkmodel import LinkSettings
 from tests.support.mounting import mounted
@@ -26,7 +26,7 @@ async def write(tree: Tree, target: bytes, data: bytes) -> None:
     await file.release()
 
 
-@pytest.mark.parametrize("names", [0, 2 * SMALL_LISTING])
+@pytest.mark.parametrize("names", [0, 2 * SMALL_LISTING, 2 * LARGE_LISTING])
 async def test_a_file_is_closed_while_another_is_written_that_cannot_be_interrupted(
     names: int, autojump: MockClock
 ) -> None:
@@ -54,3 +54,24 @@ async def test_after_a_long_upload_its_path_is_not_walked_again(profile: str, au
     assert sum(asked[opcode] for opcode in LISTINGS) == 0
     assert asked[Opcode.OPEN_FILE_RO] == 1
     assert vehicle.tree.data(path(profile, "new")) == data
+
+
+@pytest.mark.parametrize("profile", ["px4-nuttx", "ardupilot5", "mavsdk"])
+async def test_files_written_at_once_do_not_list_a_large_directory_each(
+    profile: str, autojump: MockClock
+) -> None:
+    """50 beside 250 others (PX4 on NuttX): each had all of them listed, 0.6 s, and the last ones failed."""
+    files = 30
+    old = {f"old{number}": b"x" for number in range(2 * LARGE_LISTING)}
+    vehicle = world(profile, LinkSettings(rate=1e6, delay=0.001, queue=100_000), **old)
+    async with mounted(vehicle, path(profile, "")[:-1], verify="size") as (session, tree):
+        before = Counter(session.engine.stats.by_opcode)
+        async with trio.open_nursery() as nursery:
+            for number in range(files):
+                nursery.start_soon(write, tree, path(profile, f"new{number}"), content(500, number))
+        asked = Counter(session.engine.stats.by_opcode) - before
+    for number in range(files):
+        assert vehicle.tree.data(path(profile, f"new{number}")) == content(500, number)
+    assert asked[Opcode.OPEN_FILE_RO] >= files or profile == "mavsdk"
+    # PX4 on NuttX has the storage's root listed after a path operation between two writes.
+    assert sum(asked[opcode] for opcode in LISTINGS) < (2 * files if profile != "mavsdk" else 20 * files)
