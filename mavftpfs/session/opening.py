@@ -52,7 +52,7 @@ _SURELY_OPEN = 8.0
 @dataclass(frozen=True, slots=True)
 class OpenSession:
     """The server's session, open on a file. size: as the open ACK said, None where it said nothing. seq: of
-    that ACK."""
+    that ACK. repeated: the request was sent more than once."""
 
     path: bytes
     id: int
@@ -60,6 +60,7 @@ class OpenSession:
     opened_at: float
     writing: bool = False
     seq: int = -1
+    repeated: bool = False
 
 
 class SessionOpener:
@@ -266,8 +267,8 @@ class SessionOpener:
         self._server_assigns = operation.session != asked
         self._engine.session = operation.session
         writing = opcode != Opcode.OPEN_FILE_RO
-        seq = operation.reply.seq
-        return OpenSession(path, operation.session, operation.size, self._clock(), writing, seq)
+        seq, repeated = operation.reply.seq, operation.retransmitted
+        return OpenSession(path, operation.session, operation.size, self._clock(), writing, seq, repeated)
 
     def _note_asked(self, operation: OpenFile, path: bytes) -> None:
         self._asked_at = self._clock()

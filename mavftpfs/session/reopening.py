@@ -7,7 +7,6 @@ upload gives way.
 from __future__ import annotations
 
 import errno
-from collections.abc import Awaitable, Callable
 from typing import NoReturn
 
 from mavftpfs.protocol.payload import Opcode
@@ -21,22 +20,12 @@ from mavftpfs.shared.errors import FileChanged, FtpNak, SessionLost
 
 
 class Reopening:
-    """OpenFileWO, with all that has to be known before and after it.
+    """OpenFileWO, with all that has to be known before and after it."""
 
-    outlast_copies: waits until no second CreateFile, of one sent then, comes late.
-    """
-
-    def __init__(
-        self,
-        kit: Kit,
-        queue: Queue,
-        writer: Writer,
-        outlast_copies: Callable[[float | None], Awaitable[None]],
-    ) -> None:
+    def __init__(self, kit: Kit, queue: Queue, writer: Writer) -> None:
         self._kit = kit
         self._queue = queue
         self._writer = writer
-        self._outlast_copies = outlast_copies
         self._holder = kit.holder
         self._wo_tells_size = False
 
@@ -48,7 +37,7 @@ class Reopening:
         """
         traits, reached = self._queue.write_traits, upload.feed.reached
         upload.tried = True
-        await self._outlast_copies(upload.created_at)  # a late CreateFile empties it, too
+        await upload.outlast_copies()  # a late CreateFile empties it, too
         for _ in range(2):
             try:
                 await self._holder.open(upload.path, Opcode.OPEN_FILE_WO)

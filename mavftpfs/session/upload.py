@@ -155,8 +155,9 @@ class UploadHost(Protocol):
         """Return whether this link was seen to lose, double or hold back requests or replies."""
         ...
 
-    async def outlast_copies(self, created_at: float | None) -> None:
-        """Wait until no second CreateFile comes late and empties what was created then."""
+    async def outlast_copies(self, created_at: float | None, *, repeated: bool) -> None:
+        """Wait until no second CreateFile comes late and empties what was created then; repeated: we asked
+        more than once."""
 
     def heard_stranger(self, since: float) -> bool:
         """Return whether another FTP client was heard since then, or shortly before."""
@@ -184,6 +185,7 @@ class QueuedUpload:
             all there was, last time. tried: it was reopened to see what OpenFileWO does.
         waits_since: when it had something to send and no turn, perhaps with the wait after a failure.
         left_at: when its file was closed last, long ago where nobody knows.
+        created_twice: its CreateFile may have been sent more than once.
         anew: nothing that was proven counts any more. usurped: the server closed the session by itself,
             or may have. refused_behind: what was sent right before the Terminate was refused the last time.
     """
@@ -214,7 +216,7 @@ class QueuedUpload:
         self.filled_in = 0.0
         self.created_at: float | None = None
         self.left_at = float("-inf")
-        self.tried = self.anew = self.refused_behind = False
+        self.tried = self.anew = self.refused_behind = self.created_twice = False
         self.refused_at: int | None = None
         self.retry_at = 0.0
         self._woken = True
@@ -250,7 +252,7 @@ class QueuedUpload:
             raise LocalProtocolError("the upload was aborted")
         if not self.clean or self.feed.has_more():
             await self._finish()
-        await self._host.outlast_copies(self.created_at)
+        await self.outlast_copies()
 
     async def _finish(self) -> None:
         self._host.check_may_write()
@@ -280,7 +282,11 @@ class QueuedUpload:
         finally:
             self._host.forget(self)
         self.feed.put_back()
-        await self._host.outlast_copies(self.created_at)  # or what is removed next comes back empty
+        await self.outlast_copies()  # or what is removed next comes back empty
+
+    async def outlast_copies(self) -> None:
+        """Wait until no copy of its CreateFile comes late any more."""
+        await self._host.outlast_copies(self.created_at, repeated=self.created_twice)
 
     def _begin_again(self) -> None:
         self.clean = False

@@ -65,7 +65,7 @@ class Uploading:
         self._chunk = chunk
         self._when_armed_ok = when_armed_ok
         self._engine = kit.engine
-        self._reopening = Reopening(kit, queue, self.writer, self.outlast_copies)
+        self._reopening = Reopening(kit, queue, self.writer)
         self.written = WriteLog(kit.engine.stats, lambda: kit.engine.traits, kit.clock, chunk)
         self._written: QueuedUpload | None = None
         self._written_at = float("-inf")
@@ -107,19 +107,20 @@ class Uploading:
         stats = self._engine.stats
         return stats.strays + stats.retransmissions > 0
 
-    async def outlast_copies(self, created_at: float | None) -> None:
+    async def outlast_copies(self, created_at: float | None, *, repeated: bool) -> None:
         """See UploadHost. What is verified after that stays as it is."""
         if created_at is not None:
-            rest = self._feared_until(created_at) - self._clock()
+            rest = self._feared_until(created_at, repeated=repeated) - self._clock()
             if rest > 0.0:
                 await trio.sleep(rest)
 
-    def _feared_until(self, sent_at: float) -> float:
-        """Return until when a copy of a request may still come, if this link was seen to be of that kind.
+    def _feared_until(self, sent_at: float, *, repeated: bool = False) -> float:
+        """Return until when a copy of a request may still come, if this link was seen to be of that kind, or
+        we made one ourselves.
 
         A WriteFile names no file: a late one would be written to the next.
         """
-        if not self._engine.stats.strays:
+        if not self._engine.stats.strays and not repeated:
             return sent_at
         return sent_at + feared_for(self._engine, self._clock())
 
@@ -287,11 +288,15 @@ class Uploading:
         if upload.aborted:  # its owner was told that nothing was begun
             raise LocalProtocolError("the upload was given up before its file was made")
         upload.free_at, upload.begun = None, True  # what is there from now on may be ours
+        upload.created_twice = True  # for all that is known, if this fails
         try:
             session = await self._holder.open(upload.path, Opcode.CREATE_FILE)
+        except FtpNak as nak:
+            upload.created_twice = nak.retransmitted
+            raise
         finally:
             upload.created_at = self._clock()
-        upload.opened = True
+        upload.opened, upload.created_twice = True, session.repeated
         return session
 
     # --- letting go

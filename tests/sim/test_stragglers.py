@@ -79,6 +79,29 @@ def double(
     server.handle = watch  # type: ignore[method-assign]
 
 
+def hold_back_the_create(here: World, start: Callable[..., object]) -> None:
+    """Have the first CreateFile come five round trips after the second one; its answer is lost."""
+    server = here.vehicle.server
+    handle = server.handle
+    kept: list[bytes] = []
+
+    async def arrive_late(source: Address) -> None:
+        await trio.sleep(2 * LATE)
+        handle(kept[0], source, trio.current_time())
+        server.outgoing(trio.current_time())
+        here.link.kick()
+
+    def watch(wire: bytes, source: Address, now: float) -> None:
+        if wire[3] == Opcode.CREATE_FILE:
+            kept.append(wire)
+            if len(kept) == 1:
+                return
+            start(arrive_late, source)
+        handle(wire, source, now)
+
+    server.handle = watch  # type: ignore[method-assign]
+
+
 async def rename_late(here: World, connection: Connection, late: float, nursery: trio.Nursery) -> None:
     """Rename a file and make another one of its old name, with the rename coming once more."""
     double(here, Opcode.RENAME, late, nursery.start_soon)
@@ -117,6 +140,21 @@ async def test_a_link_that_keeps_the_order_costs_no_wait(autojump: MockClock) ->
         await put(connection, b"/d/first", FIRST)
         await put(connection, b"/d/second", SECOND)
         assert trio.current_time() - began < 8 * 0.04
+
+
+@pytest.mark.parametrize("profile", sorted(PROFILES))
+async def test_a_create_that_was_repeated_is_dead_before_its_file_counts_as_written(
+    profile: str, autojump: MockClock
+) -> None:
+    """On a link that was not seen to hold anything back: the first CreateFile comes after all, much later
+    than the second one, and its answer is lost."""
+    here, name = world(profile, CLEAN), path(profile, "first")
+    async with trio.open_nursery() as nursery, here.connection() as connection:
+        hold_back_the_create(here, nursery.start_soon)
+        await put(connection, name, FIRST)
+        verified = here.tree.data(name)
+        await trio.sleep(5.0)
+        assert here.tree.data(name) == verified
 
 
 @pytest.mark.parametrize("profile", ["mavsdk", "ardupilot", "px4"])
