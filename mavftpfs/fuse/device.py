@@ -6,7 +6,9 @@ when what it was to interrupt is answered. Then nothing at all goes on, the link
 for something else; and who waits for an answer does not. So the descriptor is made non-blocking, it is looked
 at once more right before each read, and a worker that found nothing after all begins anew.
 
-The seam is the one that pyfuse3's own asyncio support uses: what it takes for the module `trio`.
+The seam is the one that pyfuse3's own asyncio support uses: what it takes for the module `trio`. A worker
+that begins anew loses its buffer, which pyfuse3 would have freed: 1 MiB of addresses, of which little was
+touched, in some 25 kills of programs that do nothing but ask. Looking once more keeps that rare.
 """
 
 from __future__ import annotations
