@@ -8,7 +8,7 @@ are: close what may be our own, then silence, then, if nobody else is about, Res
 from __future__ import annotations
 
 from collections.abc import Awaitable, Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import trio
@@ -114,11 +114,13 @@ class SessionOpener:
             await self._close_doubtful()
         remedies = [self._close_own, *[self._close_again] * _MORE_LOST_ACKS, self._fall_silent, self._reset]
         last: FtpNak | None = None
+        repeated = False
         while True:
             try:
-                return await self._open_undisturbed(path, opcode)
+                session = await self._open_undisturbed(path, opcode)
+                return replace(session, repeated=session.repeated or repeated)
             except FtpNak as nak:
-                last = nak
+                last, repeated = nak, repeated or nak.retransmitted
                 if not self._looks_taken(nak, path):
                     raise
             while remedies:

@@ -288,15 +288,15 @@ class Uploading:
         if upload.aborted:  # its owner was told that nothing was begun
             raise LocalProtocolError("the upload was given up before its file was made")
         upload.free_at, upload.begun = None, True  # what is there from now on may be ours
-        upload.created_twice = True  # for all that is known, if this fails
+        before, upload.created_twice = upload.created_twice, True  # for all that is known, if this fails
         try:
             session = await self._holder.open(upload.path, Opcode.CREATE_FILE)
         except FtpNak as nak:
-            upload.created_twice = nak.retransmitted
+            upload.created_twice = before or nak.retransmitted
             raise
         finally:
             upload.created_at = self._clock()
-        upload.opened, upload.created_twice = True, session.repeated
+        upload.opened, upload.created_twice = True, before or session.repeated
         return session
 
     # --- letting go

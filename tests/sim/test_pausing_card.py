@@ -2,39 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
-
 import pytest
 import trio
 from trio.testing import MockClock
 
-from mavftpfs.cache.tree import Tree
-from mavftpfs.session.connection import Connection
 from mavftpfs.sim.linkmodel import LinkSettings
-from tests.support.mounting import writable_tree
+from tests.sim.test_late_writes import make
+from tests.support.mounting import mounted
 from tests.support.trees import content
 from tests.support.worlds import World
 
 FOLDER = b"/fs/microsd/"
 LINKS = {"usb": LinkSettings(rate=1e6, delay=0.001, queue=100_000), "far": LinkSettings(rate=1e5, delay=0.03)}
 FILES = 20
-
-
-@asynccontextmanager
-async def mounted(here: World) -> AsyncIterator[tuple[Connection, Tree]]:
-    """Connect, as a mount does."""
-    async with here.connection() as connection, trio.open_nursery() as nursery:
-        yield connection, writable_tree(connection, nursery)
-        nursery.cancel_scope.cancel()
-
-
-async def put(tree: Tree, name: bytes, data: bytes) -> None:
-    """Write a file and close it."""
-    file = await tree.create(FOLDER + name, exclusive=True)
-    await file.write(0, data)
-    await file.flush()
-    file.close()
 
 
 @pytest.mark.parametrize("link", LINKS)
@@ -45,13 +25,13 @@ async def test_small_files_do_not_wait_for_each_other(link: str, autojump: MockC
         file = await tree.open(FOLDER + b"log")
         assert await file.read(0, 400_000) == content("log", 400_000)
         file.close()
-        await put(tree, b"large", content("large", 400_000))
+        await make(tree, FOLDER + b"large", content("large", 400_000))
         stats = connection.engine.stats
         assert stats.unknown + stats.spurious > 0
         assert stats.strays == 0
         begun = trio.current_time()
         for number in range(FILES):
-            await put(tree, b"%d" % number, content(f"small {number}", 500))
+            await make(tree, FOLDER + b"%d" % number, content(f"small {number}", 500))
         took = trio.current_time() - begun
         assert stats.strays == 0
     for number in range(FILES):

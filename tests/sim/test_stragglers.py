@@ -15,6 +15,7 @@ from mavftpfs.link.messages import Address
 from mavftpfs.protocol.payload import Opcode
 from mavftpfs.session.connection import Connection
 from mavftpfs.session.upload import QueuedUpload
+from mavftpfs.shared.errors import RequestTimeout
 from mavftpfs.shared.model import split
 from mavftpfs.sim.linkmodel import LinkSettings
 from mavftpfs.sim.profiles import PROFILES
@@ -79,8 +80,9 @@ def double(
     server.handle = watch  # type: ignore[method-assign]
 
 
-def hold_back_the_create(here: World, start: Callable[..., object]) -> None:
-    """Have the first CreateFile come five round trips after the second one; its answer is lost."""
+def hold_back_the_create(here: World, start: Callable[..., object], *, until: float = 0.0) -> None:
+    """Have the first CreateFile come five round trips after the second one (the first after `until`), and
+    those between get lost; its answer is lost, too."""
     server = here.vehicle.server
     handle = server.handle
     kept: list[bytes] = []
@@ -94,7 +96,7 @@ def hold_back_the_create(here: World, start: Callable[..., object]) -> None:
     def watch(wire: bytes, source: Address, now: float) -> None:
         if wire[3] == Opcode.CREATE_FILE:
             kept.append(wire)
-            if len(kept) == 1:
+            if len(kept) == 1 or now < until:
                 return
             start(arrive_late, source)
         handle(wire, source, now)
@@ -152,6 +154,20 @@ async def test_a_create_that_was_repeated_is_dead_before_its_file_counts_as_writ
     async with trio.open_nursery() as nursery, here.connection() as connection:
         hold_back_the_create(here, nursery.start_soon)
         await put(connection, name, FIRST)
+        verified = here.tree.data(name)
+        await trio.sleep(5.0)
+        assert here.tree.data(name) == verified
+
+
+@pytest.mark.parametrize("profile", sorted(PROFILES))
+async def test_nor_does_one_of_an_attempt_that_failed_empty_it(profile: str, autojump: MockClock) -> None:
+    here, name = world(profile, CLEAN), path(profile, "first")
+    async with trio.open_nursery() as nursery, here.connection() as connection:
+        hold_back_the_create(here, nursery.start_soon, until=trio.current_time() + 30.0)
+        upload = await connection.store.open_upload(name, MemorySource(FIRST), create=True)
+        with pytest.raises(RequestTimeout):
+            await upload.finish()
+        await upload.finish()
         verified = here.tree.data(name)
         await trio.sleep(5.0)
         assert here.tree.data(name) == verified

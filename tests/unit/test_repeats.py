@@ -108,12 +108,18 @@ def test_two_answers_to_one_request() -> None:
     assert engine.stats.strays == 1
 
 
-def test_two_answers_to_one_of_two_requests() -> None:
-    engine = make()
+def read_twice(engine: Engine) -> tuple[Payload, Payload]:
+    """Ask at 0 and at 1 s for the first chunk of a file; each time the seq is another."""
     reading(engine)
     first = sent(engine, 0.0)[0]
     second = again(engine, 1.0)[0]
     assert second.offset == first.offset
+    return first, second
+
+
+def test_two_answers_to_one_of_two_requests() -> None:
+    engine = make()
+    _, second = read_twice(engine)
     engine.receive(chunk(second, CONTENT), 1.1)
     assert engine.stats.strays == 0
     engine.receive(chunk(second, CONTENT), 1.1)
@@ -122,9 +128,7 @@ def test_two_answers_to_one_of_two_requests() -> None:
 
 def test_two_answers_to_one_of_three_requests() -> None:
     engine = make()
-    reading(engine)
-    first = sent(engine, 0.0)[0]
-    second = again(engine, 1.0)[0]
+    first, second = read_twice(engine)
     again(engine, 3.0)
     assert 0 in [request.offset for request in again(engine, 9.0)]
     for request in (first, second):
@@ -177,9 +181,7 @@ def test_a_path_that_mixes() -> None:
 
 def test_a_path_that_brings_an_old_answer_first_when_newer_ones_came() -> None:
     engine = make()
-    reading(engine)
-    first = sent(engine, 0.0)[0]
-    again(engine, 1.0)
+    first, _ = read_twice(engine)
     engine.receive(ack(ask(engine, Opcode.CREATE_DIRECTORY, 1.0)), 1.1)
     engine.receive(chunk(first, CONTENT), 1.2)
     assert engine.stats.spurious == 1
