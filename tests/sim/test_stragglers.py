@@ -26,7 +26,7 @@ from tests.support.mounting import mounted
 from tests.support.sources import MemorySource
 from tests.support.takingturns import taking_turns
 from tests.support.uploads import append, probe, put, start
-from tests.support.worlds import World, content, path, read_file, world
+from tests.support.worlds import World, begin_to_read, content, path, read_file, world
 
 DOUBLING = LinkSettings(delay=0.02, duplicate=1.0, reorder=0.1)
 LATE = 0.1
@@ -80,15 +80,17 @@ def double(
     server.handle = watch  # type: ignore[method-assign]
 
 
-def hold_back_the_create(here: World, start: Callable[..., object], *, until: float = 0.0) -> None:
-    """Have the first CreateFile come five round trips after the second one (the first after `until`), and
-    those between get lost; its answer is lost, too."""
+def hold_back_the_create(
+    here: World, start: Callable[..., object], *, until: float = 0.0, late: float = 2 * LATE
+) -> None:
+    """Have the first CreateFile come so much later than the second one (the first after `until`), and those
+    between get lost; its answer is lost, too."""
     server = here.vehicle.server
     handle = server.handle
     kept: list[bytes] = []
 
     async def arrive_late(source: Address) -> None:
-        await trio.sleep(2 * LATE)
+        await trio.sleep(late)
         handle(kept[0], source, trio.current_time())
         server.outgoing(trio.current_time())
         here.link.kick()
@@ -98,7 +100,8 @@ def hold_back_the_create(here: World, start: Callable[..., object], *, until: fl
             kept.append(wire)
             if len(kept) == 1 or now < until:
                 return
-            start(arrive_late, source)
+            if len(kept) == 2 or until:
+                start(arrive_late, source)
         handle(wire, source, now)
 
     server.handle = watch  # type: ignore[method-assign]
@@ -171,6 +174,22 @@ async def test_nor_does_one_of_an_attempt_that_failed_empty_it(profile: str, aut
         verified = here.tree.data(name)
         await trio.sleep(5.0)
         assert here.tree.data(name) == verified
+
+
+async def test_nor_does_one_that_was_refused_the_second_time(autojump: MockClock) -> None:
+    """The session was a killed client's: what closes it is followed by another CreateFile, sent once."""
+    here = world("px4", CLEAN, old=content(50_000))
+    async with here.connection(seed=3) as connection:
+        await begin_to_read(connection, b"/d/old", 1000)
+        here.link.cut()  # so that the farewell does not arrive: kill -9
+    here.link.restore()
+    async with trio.open_nursery() as nursery, here.connection(seed=4) as connection:
+        hold_back_the_create(here, nursery.start_soon, late=0.3)
+        await put(connection, b"/d/first", FIRST)
+        verified = here.tree.data(b"/d/first")
+        assert connection.engine.stats.naks
+        await trio.sleep(5.0)
+        assert here.tree.data(b"/d/first") == verified
 
 
 @pytest.mark.parametrize("profile", ["mavsdk", "ardupilot", "px4"])
