@@ -44,7 +44,7 @@ above it was listed lately: after a long upload it was not, and each part of its
 
 LARGE_LISTING = 50
 """A directory of more names is not listed for each of many files that are written at once: that takes time by
-the square of their number. Whose uploads are interrupted for it is known after the first."""
+the square of their number. Opening the first instead may interrupt an upload, and tells what that costs."""
 
 QUICKLY_READ = 64 * 1024
 """Of so much every vehicle computes the CRC32 so fast that nothing waits long behind it."""
