@@ -1,6 +1,6 @@
 """Finding out on a temporary of our own what a server does when it is written to. Layer: session.
 
-Only at first need, never in flight (design section 4). What is not answered, and what the paths are too long
+Only at first need, never in flight. What is not answered, and what the paths are too long
 for, stays unknown. The names are the mount's own and used once, so two mounts never meet in one, and what an
 interruption leaves is removed at the next listing like any other leftover.
 """

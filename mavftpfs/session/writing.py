@@ -2,9 +2,8 @@
 
 Where OpenFileWO was seen to keep a file's content an upload can be interrupted at any time: Terminate right
 behind the window, and later OpenFileWO and what of that was not ACKed. Where it was seen to empty files that
-would begin the file anew, so the upload keeps the session until its source has nothing more (design section
-4). Where neither was seen yet, a file that the upload itself made is interrupted when somebody waits, and
-reopening it tells.
+would begin the file anew, so the upload keeps the session until its source has nothing more. Where neither
+was seen yet, a file that the upload itself made is interrupted when somebody waits, and reopening it tells.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Firmware profiles: what a simulated server is, as data. Layer: sim; pure.
 
-The profiles named in design.md section 6 and a few odd variants. Sources of the numbers: servers.md, PX4
+The firmwares that are simulated, and a few odd variants. Sources of the numbers: servers.md, PX4
 `mavlink_ftp.cpp`, ArduPilot `GCS_FTP.cpp`, MAVSDK `mavlink_ftp_server.cpp`, and the recordings in tests/data.
 """
 

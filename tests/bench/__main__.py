@@ -4,7 +4,7 @@ goodput   share of a link's limit, reading and writing, on virtual time (the sam
 requests  requests per command
 cost      CPU time and memory of the hot path
 mount     a real mount beside the clients that people use now, over real sockets
-plots     draw what README shows from the file of --json
+plots     draw what docs/benchmarks.md shows from the file of --json
 all       everything, in this order; the default
 
 Options that are not named here go to the part: scripts/bench PART --help. With --json, each part replaces its

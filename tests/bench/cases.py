@@ -1,9 +1,9 @@
-"""What is measured: conditions, and the limit that design section 5 sets for them.
+"""What is measured: conditions, and the limit that docs/benchmarks.md gives for them.
 
 The limit is the link's, and at most the server's ceiling, which for PX4 and MAVSDK is whatever they answer. A
 PX4 whose card pauses (px4-nuttx) answers a read later, and answers that wait in the link meanwhile bridge
 that: for 0.25 s and a round trip at most, because whoever lists a directory beside it waits behind them, and
-section 5 has a bound for that. Of writes it has room for five, and what a full link brings beyond them is
+that page has a bound for it. Of writes it has room for five, and what a full link brings beyond them is
 never answered. How many pauses there are is chance, a tenth more or less in a minute, so a run is compared
 with what its own pauses allowed. The window that a receive buffer survives is the limit of a serial port
 only, which these links are not: six writes a round trip would be 4.8 kB/s at 300 ms, of which a share says
@@ -41,7 +41,7 @@ TARGETS = {
     "read": {0.0: 0.97, 0.01: 0.93, 0.05: 0.85, 0.1: 0.75},
     "write": {0.0: 0.95, 0.01: 0.90, 0.05: 0.80, 0.1: 0.70},
 }
-"""Share of the limit to reach, by direction and loss (design section 5)."""
+"""Share of the limit to reach, by direction and loss (docs/benchmarks.md)."""
 
 
 @dataclass(frozen=True, slots=True)

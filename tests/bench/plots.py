@@ -1,7 +1,7 @@
-"""Draws what README shows: scripts/bench plots [--json FILE] [--readme FILE].
+"""Draws what docs/benchmarks.md shows: scripts/bench plots [--json FILE] [--page FILE].
 
 The pictures (SVG) go beside the JSON file, and are the same for the same file. Their colours can be read on
-white and on black; the ground is transparent. `--readme` puts the tables of `tables` between the marks there.
+white and on black; the ground is transparent. `--page` puts the tables of `tables` between the marks there.
 """
 
 from __future__ import annotations
@@ -208,11 +208,13 @@ def plot_all(sections: dict[str, dict[str, Any]], folder: Path) -> list[Path]:
 
 
 def main(argv: Sequence[str]) -> int:
-    """Draw, and fill in README's tables if asked to."""
-    parser = argparse.ArgumentParser(prog="scripts/bench plots", description="draw what README shows")
+    """Draw, and fill in the page's tables if asked to."""
+    parser = argparse.ArgumentParser(
+        prog="scripts/bench plots", description="draw what docs/benchmarks.md shows"
+    )
     parser.add_argument("--json", type=Path, default=RESULTS, metavar="FILE", help="what --json wrote before")
     parser.add_argument(
-        "--readme", type=Path, metavar="FILE", help="put the tables between the marks in this file"
+        "--page", type=Path, metavar="FILE", help="put the tables between the marks in this file"
     )
     args = parser.parse_args(argv)
     sections = Record(args.json).sections()
@@ -221,6 +223,6 @@ def main(argv: Sequence[str]) -> int:
         return 1
     for path in plot_all(sections, args.json.parent):
         print(path)
-    if args.readme is not None:
-        args.readme.write_text(tables.filled_in(args.readme.read_text(), sections))
+    if args.page is not None:
+        args.page.write_text(tables.filled_in(args.page.read_text(), sections))
     return 0

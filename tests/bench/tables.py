@@ -1,4 +1,4 @@
-"""The bench's figures as README shows them: Markdown, between marks that are kept. Pure."""
+"""The bench's figures as docs/benchmarks.md shows them: Markdown, between marks that are kept. Pure."""
 
 from __future__ import annotations
 

@@ -85,7 +85,7 @@ def came_at(place: Place, opcode: Opcode) -> list[float]:
 
 @pytest.mark.parametrize("profile", ["px4", "px4-nuttx"])
 async def test_no_answer_is_waited_for_before_it(profile: str, autojump: MockClock) -> None:
-    """A small read takes four round trips else: 1.2 s where 1.21 are allowed for all (design section 5). In a
+    """A small read takes four round trips else: 1.2 s where 1.21 are allowed for all. In a
     short queue there may be no place for it before an answer came."""
     place = Place(profile, LINK)
     async with place.world.connection() as connection, trio.open_nursery() as nursery:

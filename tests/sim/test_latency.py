@@ -1,4 +1,4 @@
-"""What a cold `ls` or a small read waits during a bulk copy, on virtual time (design section 5, promise 7).
+"""What a cold `ls` or a small read waits during a bulk copy, on virtual time (docs/benchmarks.md, promise 7).
 
 p95 <= 3 round trips + 0.3 s + bytes asked for / rate, for every server, on links of every kind.
 """

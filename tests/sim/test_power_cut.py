@@ -1,6 +1,6 @@
 """The power, or the link and the mount, go after any request of a change, on every simulated server.
 
-The next mount finds the old file or the new one, whole, and leaves nothing of ours behind (design section 4).
+The next mount finds the old file or the new one, whole, and leaves nothing of ours behind.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What others wait beside a copy by a telemetry radio on a serial port (design section 5, promise 7).
+"""What others wait beside a copy by a telemetry radio on a serial port (docs/benchmarks.md, promise 7).
 
 There the window grew until nothing was answered any faster, and stayed as wide: a listing waited in its
 queue, 0.74 s beside a download and 1.56 s beside an upload.

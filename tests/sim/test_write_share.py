@@ -1,6 +1,6 @@
 """How much of a link writing uses, from open to close, and what it leaves to others, on virtual time.
 
-The targets are those of design section 5; scripts/bench measures all of them.
+The targets are those of docs/benchmarks.md; scripts/bench measures all of them.
 """
 
 from __future__ import annotations

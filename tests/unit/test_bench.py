@@ -1,4 +1,4 @@
-"""The bench's own arithmetic: limits, medians, ratios, its JSON file, its pictures and README's tables."""
+"""The bench's own arithmetic: limits, medians, ratios, its JSON file, its pictures and tables."""
 
 from __future__ import annotations
 
@@ -371,11 +371,11 @@ def test_a_busy_machine_is_called_that() -> None:
     assert tables.caption(busy).startswith("`scripts/bench mount`, 2 CPUs, busy with other things (load 1.1)")
 
 
-def test_readme_shows_what_was_recorded() -> None:
-    page = (PROJECT / "README.md").read_text()
+def test_the_page_shows_what_was_recorded() -> None:
+    page = (PROJECT / "docs/benchmarks.md").read_text()
     recorded = Record(plots.RESULTS).sections()
-    assert tables.filled_in(page, recorded) == page, "scripts/bench plots --readme README.md"
-    pictures = re.findall(r"\]\((tests/bench/\S+\.svg)\)", page)
+    assert tables.filled_in(page, recorded) == page, "scripts/bench plots --page docs/benchmarks.md"
+    pictures = re.findall(r"\]\(\.\./(tests/bench/\S+\.svg)\)", page)
     assert len(pictures) == 3
     assert [name for name in pictures if not (PROJECT / name).is_file()] == []
     for section in recorded.values():

@@ -33,7 +33,7 @@ def test_steady_answers_need_no_reserve() -> None:
 
 @pytest.mark.parametrize(("rtt", "most"), [(0.01, 0.26), (0.1, 0.35), (0.3, 0.45), (2.0, 0.45)])
 def test_the_first_pause_calls_for_one_that_a_longer_way_allows_to_be_larger(rtt: float, most: float) -> None:
-    """Who lists a directory meanwhile may wait three round trips and 0.3 s (design section 5)."""
+    """Who lists a directory meanwhile may wait three round trips and 0.3 s (docs/benchmarks.md)."""
     stalls = Stalls()
     now = run(stalls, 0.5)
     stalls.on_reply(now + 0.1, RATE, rtt)
