@@ -23,7 +23,7 @@ from mavftpfs.fuse.options import MountOptions, parse_options, with_root
 from mavftpfs.link.uri import LinkSpec, parse_source
 from mavftpfs.mountpoint import canonical, check_fuse, check_mountpoint, is_ours, unmount
 from mavftpfs.shared.errors import UsageError
-from mavftpfs.shared.readable import printable, readable
+from mavftpfs.shared.readable import printable, readable, readable_size
 
 if TYPE_CHECKING:
     from mavftpfs.oneshot import Target
@@ -278,7 +278,7 @@ def get(args: argparse.Namespace) -> int:
 
     def tell(fetched: oneshot.Fetched) -> None:
         name = printable(os.fsdecode(fetched.remote))
-        print(f"{name}: {report.readable_size(fetched.size)}, verified by {fetched.proof}")
+        print(f"{name}: {readable_size(fetched.size)}, verified by {fetched.proof}")
 
     with report.transfer_meter() as meter:
         _run(
@@ -296,7 +296,7 @@ def put(args: argparse.Namespace) -> int:
     (path,), component = oneshot.parse_paths([args.path])
 
     def tell(sent: oneshot_writing.Sent) -> None:
-        print(f"{printable(os.fsdecode(sent.remote))}: {report.readable_size(sent.size)}, delivered")
+        print(f"{printable(os.fsdecode(sent.remote))}: {readable_size(sent.size)}, delivered")
 
     with report.transfer_meter() as meter:
         _run(

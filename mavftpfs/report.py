@@ -20,7 +20,7 @@ from rich.progress import TransferSpeedColumn as SpeedColumn
 from rich.table import Table
 from rich.text import Text
 
-from mavftpfs.shared.readable import autopilot_name, printable
+from mavftpfs.shared.readable import autopilot_name, printable, readable_size
 
 WATCH_PERIOD = 1.0
 
@@ -198,15 +198,6 @@ _WRITTEN: dict[str, Callable[[Any], str]] = {
 
 _SAID = {*_FIRST, *_WRITTEN} - {"uploads"}
 """Facts that are told even if they are none."""
-
-
-def readable_size(count: float) -> str:
-    """Return a number of bytes with a unit."""
-    for unit in ("B", "KiB", "MiB"):
-        if count < 1024:
-            return f"{count:.0f} {unit}" if unit == "B" else f"{count:.1f} {unit}"
-        count /= 1024
-    return f"{count:.1f} GiB"
 
 
 def print_listings(

@@ -37,6 +37,28 @@ def autopilot_name(number: int) -> str:
     return _AUTOPILOTS.get(number, f"autopilot type {number}")
 
 
+def readable_size(count: float) -> str:
+    """Return a number of bytes with a unit; kB = 1000 bytes, everywhere that people read."""
+    for unit in ("B", "kB", "MB"):
+        if round(count, 0 if unit == "B" else 1) < 1000:
+            return f"{count:.0f} {unit}" if unit == "B" else f"{count:.1f} {unit}"
+        count /= 1000
+    return f"{count:.1f} GB"
+
+
+def readable_time(seconds: float) -> str:
+    """Return a duration as people say it: 40 ms, 12 s, 3 min 20 s, 2 h 5 min."""
+    if seconds < 1:
+        return f"{seconds * 1000:.0f} ms"
+    whole = round(seconds)
+    if whole < 60:
+        return f"{seconds:.1f} s" if seconds < 9.95 else f"{whole} s"
+    minutes, rest = divmod(whole, 60)
+    if minutes < 60:
+        return f"{minutes} min {rest} s"
+    return f"{minutes // 60} h {minutes % 60} min"
+
+
 def _as_text(quoted: re.Match[str]) -> str:
     try:
         name: bytes = ast.literal_eval(quoted[0])

@@ -59,7 +59,7 @@ def test_ls(vehicle: SimVehicle, small_tree: Path) -> None:
 def test_get_is_verified(vehicle: SimVehicle, small_tree: Path, tmp_path: Path) -> None:
     out, _ = mavftpfs("get", vehicle.source, "/sizes/35850.bin", "/README.txt", "--to", tmp_path)
     assert [line.partition(": ")[2] for line in out.splitlines()] == [
-        "35.0 KiB, verified by size and CRC32",
+        "35.9 kB, verified by size and CRC32",
         f"{(small_tree / 'README.txt').stat().st_size} B, verified by size and CRC32",
     ]
     assert (tmp_path / "35850.bin").read_bytes() == (small_tree / "sizes/35850.bin").read_bytes()

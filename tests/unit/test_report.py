@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from mavftpfs.report import describe, readable_size, rows
-from mavftpfs.shared.readable import printable
+from mavftpfs.report import describe, rows
+from mavftpfs.shared.readable import printable, readable_size, readable_time
 
 
 @pytest.mark.parametrize(
@@ -13,14 +13,14 @@ from mavftpfs.shared.readable import printable
     [
         ("rtt", 0.02, "20 ms"),
         ("uptime", 12.34, "12.3 s"),
-        ("bytes_held", 1536, "1.5 KiB"),
+        ("bytes_held", 1536, "1.5 kB"),
         ("armed", True, "yes"),
         ("anything", None, "unknown"),
         ("anything", [], "none"),
         ("transfers", [], "none"),
         ("anything", {}, "none"),
         ("names", ["a", "b"], "a, b"),
-        ("window_rate", 5120.4, "5.0 KiB/s"),
+        ("window_rate", 5120.4, "5.1 kB/s"),
         ("rate", None, "unknown"),
         ("loss", 0.052, "5.2 %"),
         ("session_open", None, "none"),
@@ -32,7 +32,7 @@ from mavftpfs.shared.readable import printable
         ("autopilot", None, "unknown"),
         ("vehicle", [1, 191], "system 1, component 191"),
         ("vehicle", None, "unknown"),
-        ("dirty_max", 65536, "64.0 KiB"),
+        ("dirty_max", 65536, "65.5 kB"),
         ("uploads", [], "none"),
     ],
 )
@@ -44,7 +44,7 @@ def test_transfers_show_how_far_they_are() -> None:
     sending = {"path": "/a", "size": 4096, "bytes_left": 1024, "sending": True, "eta": 3.4}
     waiting = {"path": "/b", "size": 0, "bytes_left": 0, "sending": False, "eta": None}
     assert describe("transfers", [sending, waiting]) == (
-        "/a sending, 75 % of 4.0 KiB, 3 s left; /b waiting, empty of 0 B"
+        "/a sending, 75 % of 4.1 kB, 3 s left; /b waiting, empty of 0 B"
     )
 
 
@@ -52,7 +52,7 @@ def test_uploads_show_how_far_they_are() -> None:
     upload = {"path": "/a", "running": True, "reached": 2048, "unproven": 512, "clean": True, "error": None}
     waiting = {**upload, "path": "/b", "running": False, "reached": 0, "error": "the vehicle is armed"}
     assert describe("uploads", [upload, waiting]) == (
-        "/a running, 2.0 KiB sent; /b waiting, 0 B sent (the vehicle is armed)"
+        "/a running, 2.0 kB sent; /b waiting, 0 B sent (the vehicle is armed)"
     )
 
 
@@ -89,11 +89,8 @@ def test_what_says_nothing_is_left_to_programs() -> None:
 
 
 def test_sizes_and_names() -> None:
-    assert [readable_size(n) for n in (0, 1023, 1024, 1 << 20, 5 << 30)] == [
-        "0 B",
-        "1023 B",
-        "1.0 KiB",
-        "1.0 MiB",
-        "5.0 GiB",
-    ]
+    sizes = [readable_size(n) for n in (0, 999, 999.7, 1000, 999_949, 999_999, 5e9)]
+    assert sizes == ["0 B", "999 B", "1.0 kB", "1.0 kB", "999.9 kB", "1.0 MB", "5.0 GB"]
+    times = [readable_time(s) for s in (0.0401, 1, 9.97, 59.4, 59.9, 200, 7500)]
+    assert times == ["40 ms", "1.0 s", "10 s", "59 s", "1 min 0 s", "3 min 20 s", "2 h 5 min"]
     assert printable("a\x1b[31mb") == "a?[31mb"
