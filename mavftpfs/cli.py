@@ -60,6 +60,26 @@ def _complain(message: str, code: int) -> int:
     return code
 
 
+def mount_helper() -> int:
+    """Entry point of mount.mavftpfs, which mount(8) runs for `-t mavftpfs`; returns the exit code."""
+    parser = Parser("mount.mavftpfs", description="What mount(8) runs; see mavftpfs --help.")
+    parser.add_argument("source")
+    parser.add_argument("mountpoint")
+    _add_options(parser)
+    for letter, meaning in (("f", "only check"), ("n", "ignored"), ("s", "ignored"), ("v", "ignored")):
+        parser.add_argument(f"-{letter}", action="store_true", help=meaning)
+    parser.add_argument("-t", metavar="TYPE", help="ignored")
+    try:
+        args = parser.parse_args()
+        words = [args.source, args.mountpoint, *(f"-o{text}" for text in args.options)]
+        if args.f:
+            commands.connection_of(args)
+            return ExitCode.OK
+    except MavftpfsError as exc:
+        return _complain(str(exc), exit_code_for(exc))
+    return main(["mount", *words])
+
+
 Run = Callable[[argparse.Namespace], int]
 
 

@@ -18,8 +18,9 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import trio
 
 from mavftpfs import control, daemon
+from mavftpfs import mountpoint as mounting
 from mavftpfs.exits import ExitCode, MountFailed
-from mavftpfs.fuse.options import MountOptions, parse_options, with_root
+from mavftpfs.fuse.options import MountOptions, parse_options, split_words, with_root
 from mavftpfs.link.uri import LinkSpec, parse_source
 from mavftpfs.mountpoint import canonical, check_fuse, check_mountpoint, is_ours, unmount
 from mavftpfs.shared.errors import UsageError
@@ -42,6 +43,9 @@ _PATH_OPTIONS = ("cache_dir", "signing_key", "log_file", "trace", "tlog")
 
 def mount(args: argparse.Namespace) -> int:
     """Mount; in the background unless told otherwise."""
+    words = list(split_words(args.options))
+    if "remount" in words:
+        return remount(canonical(args.mountpoint), words)
     options, spec = connection_of(args)
     options = absolute_paths(options)
     mountpoint = canonical(args.mountpoint)
@@ -51,6 +55,26 @@ def mount(args: argparse.Namespace) -> int:
     if args.foreground or args.debug:
         return work(_report_in_foreground)
     return daemon.in_background(work)
+
+
+def remount(mountpoint: str, words: list[str]) -> int:
+    """Do what `mount -o remount` asks for: make a mount read-only, or writable again.
+
+    mount(8) adds the options that the mount has, and those of fstab; only ro and rw can change.
+
+    Raises:
+        MountFailed: no vehicle is mounted there, it was mounted with ro, or the kernel refuses.
+    """
+    if not is_ours(mountpoint):
+        raise MountFailed(f"no vehicle is mounted on {mountpoint}")
+    wanted = [word for word in words if word in ("ro", "rw")]
+    if not wanted:
+        raise UsageError("remount changes only ro and rw; for other options unmount and mount anew")
+    read_only = wanted[-1] == "ro"
+    if not read_only and _status_of(mountpoint).get("read_only"):
+        raise MountFailed(f"{mountpoint} was mounted with ro: unmount it, and mount it without")
+    mounting.remount(mountpoint, read_only=read_only)
+    return ExitCode.OK
 
 
 def connection_of(args: argparse.Namespace) -> tuple[MountOptions, LinkSpec]:
@@ -183,7 +207,11 @@ def status(args: argparse.Namespace) -> int:
 
 
 def _one_status(mountpoint: str) -> list[Mapping[str, Any]]:
-    return [_ask_status(control.find_socket(mountpoint, control.own_directories()))]
+    return [_status_of(mountpoint)]
+
+
+def _status_of(mountpoint: str) -> Mapping[str, Any]:
+    return _ask_status(control.find_socket(mountpoint, control.own_directories()))
 
 
 def all_statuses() -> list[Mapping[str, Any]]:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import errno
 import hashlib
+import os
+import stat
 import sys
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import ExitStack, asynccontextmanager, contextmanager, nullcontext
@@ -275,12 +277,17 @@ def read_key(path: str) -> bytes:
     A passphrase becomes a key by SHA-256, as ground stations do it.
 
     Raises:
-        UsageError: it cannot be read, or is empty.
+        UsageError: it cannot be read, is empty, or others can read it too (the same rule as ssh has).
     """
     try:
-        content = Path(path).read_bytes()
+        with Path(path).open("rb") as file:
+            facts = os.fstat(file.fileno())
+            content = file.read()
     except OSError as exc:
         raise UsageError(f"signing_key={path}: {exc.strerror}") from exc
+    if facts.st_mode & (0o077 if facts.st_uid == os.getuid() else 0o007):
+        mode = f"{stat.S_IMODE(facts.st_mode):04o}"
+        raise UsageError(f"signing_key={path}: mode {mode} lets others use the key; run: chmod 600 {path}")
     if len(content) == KEY_SIZE:
         return content
     text = content.strip()

@@ -234,6 +234,7 @@ class _Life:
             "source": self.request.source,
             "pid": os.getpid(),
             "version": mavftpfs.__version__,
+            "read_only": self.request.options.read_only,
             "uptime": round(time.time() - self._started, 1),
             **content.status(),
             "kernel": operations.counts(),

@@ -112,6 +112,18 @@ def unmount(path: str, *, lazy: bool = False) -> None:
         raise MountFailed(_describe_unmount(path, said))
 
 
+def remount(path: str, *, read_only: bool) -> None:
+    """Have the kernel make a mount read-only, or writable again; only root may.
+
+    Raises:
+        MountFailed: with what mount(8) said.
+    """
+    # -i: not by way of our own helper, which would come here again.
+    said = _said_by(["mount", "-i", "-n", "-o", f"remount,{'ro' if read_only else 'rw'}", "--", path], path)
+    if said is not None:
+        raise MountFailed(f"cannot remount {path}: {_first_line(said)}")
+
+
 def unmount_what_is_left(path: str) -> None:
     """Unmount lazily what somebody else may be unmounting, or has unmounted, just now.
 
@@ -126,11 +138,11 @@ def unmount_what_is_left(path: str) -> None:
 
 
 def _said_by(words: list[str], path: str) -> str | None:
-    """Return what an unmounting program complained of, None if it succeeded."""
+    """Return what a program that mounts or unmounts complained of, None if it succeeded."""
     try:
         done = subprocess.run(words, capture_output=True, text=True, timeout=UNMOUNT_PATIENCE, check=False)
     except (OSError, subprocess.TimeoutExpired) as exc:
-        raise MountFailed(f"cannot unmount {path}: {exc}") from exc
+        raise MountFailed(f"{words[0]} {path}: {exc}") from exc
     return done.stderr.strip() if done.returncode != 0 else None
 
 
@@ -179,8 +191,11 @@ def _describe_mounted(path: str) -> str:
 def _describe_unmount(path: str, said: str) -> str:
     if _is_busy(said):
         return f"{path} is in use; close what has it open (fuser -vm {path}) and try again"
-    first_line = said.splitlines()[0] if said else "no reason given"
-    return f"cannot unmount {path}: {first_line}"
+    return f"cannot unmount {path}: {_first_line(said)}"
+
+
+def _first_line(said: str) -> str:
+    return said.splitlines()[0] if said else "no reason given"
 
 
 def _unescape(text: str) -> str:

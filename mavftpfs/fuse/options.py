@@ -15,8 +15,8 @@ from typing import Any, TypeVar
 from mavftpfs.shared.errors import MavftpfsError, UsageError
 from mavftpfs.shared.model import ROOT, normalise
 
-SUBTYPE = "mavftp"
-"""The mount shows as type fuse.mavftp."""
+SUBTYPE = "mavftpfs"
+"""The mount's type is fuse.mavftpfs: the same word that fstab has."""
 
 KERNEL_WORDS = frozenset(
     {"dev", "nodev", "suid", "nosuid", "exec", "noexec", "atime", "noatime", "sync", "async", "dirsync"}
@@ -189,8 +189,11 @@ def remote_path(text: str) -> bytes:
 
 
 def patterns(text: str) -> tuple[str, ...]:
-    """Parse colon-separated name patterns; none switches the feature off."""
-    return tuple(part for part in text.split(":") if part)
+    """Parse colon-separated name patterns: a bare list replaces the defaults, `+` before it adds to them,
+    and an empty one switches the feature off."""
+    added = text.startswith("+")
+    given = tuple(part for part in text.removeprefix("+").split(":") if part)
+    return (*DEFAULT_LOCAL, *given) if added else given
 
 
 _SIZE_MAX = 1 << 40
@@ -254,7 +257,7 @@ def parse_options(texts: Iterable[str]) -> MountOptions:
     """
     values: dict[str, Any] = {}
     words: list[str] = []
-    for word in _words(texts):
+    for word in split_words(texts):
         _take(word, values, words)
     return MountOptions(**values, kernel_words=tuple(words))
 
@@ -332,7 +335,7 @@ def _parse(name: str, value: str, *, given: bool) -> Any:
         raise UsageError(f"option {name}={value}: {exc}") from exc
 
 
-def _words(texts: Iterable[str]) -> Iterator[str]:
+def split_words(texts: Iterable[str]) -> Iterator[str]:
     """Yield the words of comma-separated lists; a backslash protects a comma, as in mount(8)."""
     for text in texts:
         word = ""

@@ -140,7 +140,10 @@ def _parse_host_port(text: str, source: str, kind: LinkKind) -> tuple[str, int]:
         raise UsageError(f"SOURCE {source!r}: a host comes before the port; write for example {example}")
     if not host and not listens:
         raise UsageError(f"SOURCE {source!r} names no host; write for example {example}")
-    port = _number(port_text) if port_text else default
+    if not port_text:
+        shown = f"[{host}]" if ":" in host else host or "0.0.0.0"
+        raise UsageError(f"SOURCE {source!r} names no port; write for example {kind.value}:{shown}:{default}")
+    port = _number(port_text)
     if port is None or not 0 <= port <= 65535 or (port == 0 and not listens):
         raise UsageError(f"SOURCE {source!r}: {port_text!r} is no port; write for example {example}")
     return (host or "0.0.0.0", port)

@@ -39,7 +39,7 @@ def test_kernel_shows_source_and_type(field: Field, small_tree: Path) -> None:
     mount = field.mount(vehicle.source, "noatime", "nosuid", "nodev")
     words = mount_line(mount.path)
     assert words[0] == vehicle.source
-    assert words[2] == "fuse.mavftp"
+    assert words[2] == "fuse.mavftpfs"
     assert {"noatime", "nosuid", "nodev", "default_permissions"} <= set(words[3].split(","))
 
 
@@ -232,7 +232,7 @@ def test_mount_8_and_umount_8(field: Field, small_tree: Path, tmp_path: Path) ->
     done = mount_8(mount, small_tree, tmp_path / "bin", words)
     assert done.returncode == 0, done.stderr
     line, owner = done.stdout.splitlines()
-    assert line.split()[:3] == [mount.source, str(mount.path), "fuse.mavftp"]
+    assert line.split()[:3] == [mount.source, str(mount.path), "fuse.mavftpfs"]
     assert {"ro", "noatime"} <= set(line.split()[3].split(","))
     assert owner == "uid 1000"
     wait_until("the daemon ended", lambda: not processes_in(mount.path))
@@ -244,6 +244,58 @@ def test_mount_8_names_an_unknown_option(field: Field, small_tree: Path, tmp_pat
     assert done.returncode not in (0, 90)
     assert "frobnicate" in done.stderr
     assert not processes_in(mount.path)
+
+
+# The same for `-t mavftpfs`, whose helper mount(8) wants in /sbin; then the mount as other tools see it.
+MOUNT_BY_HELPER = """
+mount -t overlay none -o "lowerdir=$1:/usr/sbin" /usr/sbin || exit 90
+mount -t mavftpfs "$2" "$3" -o "$4" || exit
+df -t fuse.mavftpfs --output=target | grep -x "$3"
+findmnt -n -t fuse.mavftpfs -o TARGET | grep -x "$3"
+mount -t fuse.mavftpfs | grep -c " on $3 type "
+mount -o remount,ro "$3" && touch "$3/new" 2>&1
+mount -o remount,rw "$3" && touch "$3/new" && echo written
+umount "$3"
+"""
+
+
+def helper_in(folder: Path) -> Path:
+    """Make a directory with mount.mavftpfs and the program, as an installation has them."""
+    folder.mkdir()
+    for name, function in (("mavftpfs", "main"), ("mount.mavftpfs", "mount_helper")):
+        program = folder / name
+        program.write_text(
+            f"#!{sys.executable}\nimport sys\nfrom mavftpfs import cli\nsys.exit(cli.{function}())\n"
+        )
+        program.chmod(0o755)
+    return folder
+
+
+def test_mount_by_its_own_type_and_remount(field: Field, tmp_path: Path) -> None:
+    card = field.local("card")
+    mount = field.prepare(field.sim(card).source)
+    places = (helper_in(tmp_path / "sbin"), mount.source, mount.path, "nofail,_netdev")
+    done = mount.run("unshare", "--mount", "sh", "-c", MOUNT_BY_HELPER, "sh", *map(str, places), code=None)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines() == [
+        str(mount.path),
+        str(mount.path),
+        "1",
+        f"touch: cannot touch '{mount.path}/new': Read-only file system",
+        "written",
+    ]
+    assert [path.name for path in card.iterdir()] == ["new"]
+    wait_until("the daemon ended", lambda: not processes_in(mount.path))
+
+
+def test_what_a_remount_cannot_do_is_said(field: Field, small_tree: Path) -> None:
+    mount = field.mount(field.sim(small_tree).source, "ro")
+    for words, said in (
+        ("remount,rw", "was mounted with ro: unmount it, and mount it without"),
+        ("remount,dir_timeout=3", "remount changes only ro and rw; for other options unmount and mount anew"),
+    ):
+        argv = (sys.executable, "-m", "mavftpfs", mount.source, mount.path, "-o", words)
+        assert mount.run(*argv, code=None).stderr.strip().endswith(said)
 
 
 def clears(field: Field, source: str) -> bool:

@@ -368,11 +368,25 @@ def test_umount_of_what_is_not_mounted(
 def test_signing_keys(tmp_path: Path, content: bytes, key: bytes) -> None:
     path = tmp_path / "key"
     path.write_bytes(content)
+    path.chmod(0o600)
     assert compose.read_key(str(path)) == key
+
+
+@pytest.mark.parametrize("mode", [0o640, 0o604, 0o644, 0o602])
+def test_a_key_that_others_can_use_is_refused(
+    tmp_path: Path, mode: int, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "key"
+    path.write_bytes(bytes(32))
+    path.chmod(mode)
+    code, line = complaint(capsys, "crc", SOURCE, "/x", "-o", f"signing_key={path}")
+    assert code == ExitCode.USAGE
+    assert line.endswith(f"mode {mode:04o} lets others use the key; run: chmod 600 {path}")
 
 
 def test_an_empty_key_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "key"
     path.write_text("\n")
+    path.chmod(0o600)
     with pytest.raises(UsageError, match="empty"):
         compose.read_key(str(path))

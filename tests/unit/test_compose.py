@@ -56,6 +56,7 @@ def test_every_option_is_passed_on(name: str, tmp_path: Path) -> None:
     if name == "signing_key":
         value = str(tmp_path / "key")
         (tmp_path / "key").write_bytes(bytes(32))
+        (tmp_path / "key").chmod(0o600)
     elif name == "cache_size":
         value = 77 << 20
     assert value != getattr(defaults, name)

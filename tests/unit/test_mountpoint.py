@@ -34,14 +34,14 @@ LINE = "36 35 98:0 / {} rw,noatime shared:1 - {} udpin:0 rw,user_id=0"
 def test_the_table_is_read_with_its_escapes_and_the_last_mount_wins(tmp_path: Path) -> None:
     path = table(
         tmp_path,
-        LINE.format("/mnt/my\\040drone\\134x", "fuse.mavftp"),
+        LINE.format("/mnt/my\\040drone\\134x", "fuse.mavftpfs"),
         LINE.format("/mnt/a", "autofs"),
-        LINE.format("/mnt/a", "fuse.mavftp"),
-        LINE.format("/mnt/b", "fuse.mavftp"),
+        LINE.format("/mnt/a", "fuse.mavftpfs"),
+        LINE.format("/mnt/b", "fuse.mavftpfs"),
         LINE.format("/mnt/b", "ext4"),
         "garbage",
     )
-    assert mounted_types(path)["/mnt/my drone\\x"] == "fuse.mavftp"
+    assert mounted_types(path)["/mnt/my drone\\x"] == "fuse.mavftpfs"
     assert is_ours("/mnt/a", table=path)
     assert not is_ours("/mnt/b", table=path)
     assert not is_ours("/mnt/c", table=path)
@@ -76,7 +76,7 @@ def test_what_stat_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number:
 
 
 def test_a_mount_of_ours_is_not_covered_by_another(tmp_path: Path) -> None:
-    path = table(tmp_path, LINE.format(tmp_path, "fuse.mavftp"))
+    path = table(tmp_path, LINE.format(tmp_path, "fuse.mavftpfs"))
     with pytest.raises(MountFailed, match="already mounted"):
         check_mountpoint(str(tmp_path), table=path)
 

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from mavftpfs.fuse.optionhelp import HELP, option_help
 from mavftpfs.fuse.options import (
+    DEFAULT_LOCAL,
     FLAGS,
     IGNORED_WORDS,
     KERNEL_WORDS,
@@ -80,6 +81,7 @@ def test_words_for_others_are_ignored(word: str) -> None:
         ("force", "force", True),
         ("local=*.tmp:.x*", "local", ("*.tmp", ".x*")),
         ("local=", "local", ()),
+        ("local=+*.tmp:.x*", "local", (*DEFAULT_LOCAL, "*.tmp", ".x*")),
         ("log_file=a=b", "log_file", "a=b"),
         (r"fsname=/dev/ttyUSB0\,57600", "fsname", "/dev/ttyUSB0,57600"),
         ("allow_other", "allow_other", True),
@@ -154,7 +156,7 @@ def test_what_goes_to_fuse() -> None:
     words = fuse_words(parse_options(["ro,allow_other,auto_unmount,noexec"]), "udpin:0.0.0.0:14550")
     assert words == {
         "fsname=udpin:0.0.0.0:14550",
-        "subtype=mavftp",
+        "subtype=mavftpfs",
         "default_permissions",
         "noexec",
         "ro",
