@@ -153,29 +153,33 @@ class Upload(Protocol):
 
     @property
     def begun(self) -> bool:
-        """Whether the request that makes the file may have been sent."""
+        """Whether CreateFile may have been sent."""
+        ...
+
+    @property
+    def resent(self) -> bool:
+        """Whether CreateFile was sent more than once: a copy of it may come late and empty the file, so its
+        size is to be compared once more after it was renamed."""
         ...
 
     @property
     def repeats(self) -> bool:
-        """Whether a request may reach the vehicle twice, the second time after newer ones."""
+        """Deprecated."""
         ...
 
     @property
     def again(self) -> Sequence[tuple[int, int]]:
-        """Which bytes of this file another upload wrote so lately that copies of that may still come."""
+        """Deprecated."""
         ...
 
     @property
     def shared(self) -> bool:
-        """Whether the server's session may have been another client's for a while, or nobody's, so that what
-        was ACKed was perhaps written to another file (servers.md 1), or lost with the vehicle's memory."""
+        """Deprecated: see WriteStore.doubted_since."""
         ...
 
     @property
     def overwrites(self) -> Sequence[Overwrite]:
-        """Where a WriteFile that was meant for another file, or for this one before, came late and may have
-        been written to this one. Known when finish returns, if the network keeps the order of the answers."""
+        """Deprecated."""
         ...
 
     def wake(self) -> None:
@@ -188,8 +192,7 @@ class Upload(Protocol):
         It may be called again: after an error to go on where it stopped, after success if there is more.
 
         Raises:
-            FtpNak, RequestTimeout, VehicleLost, SessionBusy, Armed; FileChanged and AlreadyExists as
-            WriteStore.open_upload says.
+            FtpNak, RequestTimeout, VehicleLost, SessionBusy, Armed, FileChanged.
         """
         ...
 
@@ -201,9 +204,9 @@ class Upload(Protocol):
 class WriteStore(Protocol):
     """How the caches change the vehicle's files.
 
-    Nothing here checks types or targets: who calls did. A refusal after a retransmission, which may mean that
-    the first request worked, is verified by listing. RequestTimeout means: not known to have happened.
-    All raise FtpNak, RequestTimeout, VehicleLost, SessionBusy, PathTooLong and, while armed, Armed.
+    Nothing here checks types or targets: who calls did. All methods raise FtpNak, RequestTimeout,
+    VehicleLost, SessionBusy, PathTooLong and, while armed, Armed; then the change did not happen. Only
+    OutcomeUnknown says that nobody knows: a request was not answered, and no listing could tell.
     """
 
     @property
@@ -211,31 +214,36 @@ class WriteStore(Protocol):
         """What the server was seen to do; a new object after a reboot."""
         ...
 
+    def in_doubt(self) -> bool:
+        """Return whether something of the last ten minutes says that a file may hold other bytes than the
+        ACKs say: a late copy of a request, another FTP client, a lost session, a restart."""
+        ...
+
+    def doubted_since(self, at: float) -> bool:
+        """Return whether such a thing was noticed after that time (the caches' clock)."""
+        ...
+
     async def open_upload(
         self,
         path: bytes,
         source: UploadSource,
         *,
-        create: bool,
+        create: bool = True,
         least: int = 0,
         free_at: float | None = None,
     ) -> Upload:
-        """Open a file: by CreateFile (empties it), else OpenFileWO (only where wo_truncates is False).
+        """Make a file by CreateFile and write it. Sends nothing before the source has something.
 
-        least: bytes the file has whenever it is opened to be written on. One that has fewer is not written:
-        the source is told on_rollback(everything=True), and finish raises FileChanged.
-        free_at: when the name was last seen to be free (the caches' clock); if that is over FREE_FOR ago when
-        the file is about to be made, it is looked for, and finish raises AlreadyExists. None: whatever is
-        there may be emptied.
+        `path` is a temporary of ours, or, on cards that cannot rename, a name that is known to be free. An
+        upload that was interrupted goes on by OpenFileWO where that was seen to keep what the file has, else
+        the source is told on_rollback(everything=True).
+
+        create, least, free_at: deprecated.
         """
         ...
 
     async def create_empty(self, path: bytes, *, free_at: float | None = None) -> None:
-        """Make a file, or empty it: CreateFile + Terminate. free_at: as for open_upload.
-
-        Raises:
-            AlreadyExists: it was to be a new file.
-        """
+        """Make an empty file, or empty it: CreateFile + Terminate. free_at: deprecated."""
         ...
 
     async def truncate(self, path: bytes, size: int) -> None:
@@ -260,17 +268,17 @@ class WriteStore(Protocol):
         ...
 
     async def stat_size(self, path: bytes) -> int:
-        """Return a file's size by a fresh OpenFileRO + Terminate."""
+        """Return a file's size by a fresh OpenFileRO + Terminate.
+
+        Raises:
+            FtpNak: with a code that errnos maps to ENOENT if there is none.
+        """
         ...
 
     def endangered(self, path: bytes) -> list[tuple[int, int]]:
-        """Return the few bytes of this file that late copies of what was just tried out would hit,
-        where requests are seen to come twice."""
+        """Deprecated."""
         ...
 
     async def probe_open_for_write(self, first: bytes, second: bytes) -> None:
-        """Find out by temporaries of our own what OpenFileWO does, and fill the traits.
-
-        first, second: reserved paths in one directory where nothing is; they are removed at the end.
-        """
+        """Deprecated."""
         ...

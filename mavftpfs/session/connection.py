@@ -289,7 +289,7 @@ def _build(
 
     def on_foreign() -> None:
         flow.alone = False
-        scheduler.on_suspect("another FTP client is active")
+        scheduler.doubt.raise_it("another FTP client is active")
 
     vehicle.on_foreign = on_foreign
     vehicle.on_heartbeat = connection._on_heartbeat

@@ -8,6 +8,7 @@ from typing import Protocol
 
 from mavftpfs.protocol.chunks import Chunks
 from mavftpfs.protocol.engine import Engine
+from mavftpfs.session.doubt import Doubt
 from mavftpfs.session.driver import Driver
 from mavftpfs.session.echoes import Echoes
 from mavftpfs.session.gate import Gate
@@ -28,6 +29,7 @@ class Kit:
     clock: Callable[[], float]
     echoes: Echoes
     write_chunks: Chunks | None
+    doubt: Doubt
 
 
 class Queue(Protocol):

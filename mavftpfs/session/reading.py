@@ -39,6 +39,7 @@ class Reading:
         self._gate = kit.gate
         self._clock = kit.clock
         self._vehicle = kit.vehicle
+        self._doubt = kit.doubt
         self._queue = queue
         self._steering = steering
         self._transfer: ReadTransfer | None = None
@@ -182,6 +183,7 @@ class Reading:
         """Reopen and go on at the same offset (promise 5); what the lost session read is provisional."""
         self._holder.abandon()
         if error.by_server:
+            self._doubt.raise_it(str(error))
             stream.on_suspect(str(error))
         stream.clean_failures += 1
         if stream.clean_failures > REOPENS:

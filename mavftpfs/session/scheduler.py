@@ -15,9 +15,10 @@ import trio
 from mavftpfs.cache.remote import ReadSink, UploadSource
 from mavftpfs.protocol.engine import Engine
 from mavftpfs.protocol.operations import Operation
-from mavftpfs.protocol.payload import Opcode
+from mavftpfs.protocol.payload import Opcode, Payload
 from mavftpfs.protocol.transfers import ReadToEof
 from mavftpfs.session.copies import Written
+from mavftpfs.session.doubt import Doubt
 from mavftpfs.session.driver import Driver
 from mavftpfs.session.echoes import Echoes
 from mavftpfs.session.gate import Gate
@@ -73,6 +74,7 @@ class Scheduler:
         self.op_deadline = op_deadline
         self.stats = engine.stats
         self.echoes = Echoes(engine, clock)
+        self.doubt = Doubt(clock)
         self._holder = SessionHolder(self.opener, op_deadline)
         self._driver = driver
         self._vehicle = vehicle
@@ -83,7 +85,17 @@ class Scheduler:
         self._streams: set[FileStream] = set()
         self._suspicion = Suspicion(clock)
         self._jobs: list[SessionJob] = []
-        kit = Kit(self._holder, driver, engine, vehicle, self.gate, clock, self.echoes, steering.write_chunks)
+        kit = Kit(
+            self._holder,
+            driver,
+            engine,
+            vehicle,
+            self.gate,
+            clock,
+            self.echoes,
+            steering.write_chunks,
+            self.doubt,
+        )
         self._reading = Reading(kit, self, steering)
         self._uploading = Uploading(
             kit, self, op_deadline=op_deadline, chunk=steering.most, when_armed_ok=when_armed_ok
@@ -91,7 +103,10 @@ class Scheduler:
         writer = self._uploading.writer
         self.written, self.on_probed = self._uploading.written, self._uploading.on_probed
         news = (self._on_session_taken, writer.on_emptied, writer.on_disturbed, self.written.on_late)
-        engine.on_unknown = Strays(self._holder, self._others_about, *news).on_unknown
+        self._strays = Strays(self._holder, self._others_about, *news)
+        self._strays_seen = 0
+        engine.on_unknown = self._on_unknown
+        self.doubt.on_raised = self._on_doubt
 
     @property
     def session(self) -> OpenSession | None:
@@ -235,13 +250,20 @@ class Scheduler:
         self._reading.on_batch(now)
         self._uploading.writer.on_batch()
 
-    def on_suspect(self, reason: str) -> None:
-        """Another FTP client was heard: what was read lately is provisional, also of files closed since."""
+    def _on_doubt(self, reason: str) -> None:
+        """What was read lately is provisional, also of files closed since."""
         self._suspicion.tell(self._streams, self._reading.active, reason)
+
+    def _on_unknown(self, reply: Payload) -> None:
+        """An answer came that nobody waits for."""
+        if self.stats.strays > self._strays_seen:
+            self._strays_seen = self.stats.strays
+            self.doubt.raise_it("an answer came that no request of ours explains")
+        self._strays.on_unknown(reply)
 
     def _on_session_taken(self, reason: str) -> None:
         """What is open over there is another file than we think."""
-        self.on_suspect(reason)
+        self.doubt.raise_it(reason)
         self._reading.cut_off()
         self._uploading.writer.cut_off()
         self._holder.abandon()
@@ -252,6 +274,7 @@ class Scheduler:
 
     def on_reboot(self) -> None:
         """The vehicle restarted, perhaps as another one: nothing is open, nothing is known of it."""
+        self.doubt.raise_it("the vehicle restarted")
         self.write_traits = WriteTraits()
         self._holder.forget()
         self._reading.cut_off()

@@ -21,7 +21,7 @@ from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.session.foresight import Foresight
 from mavftpfs.session.scheduler import Scheduler
 from mavftpfs.session.stale import StaleSessions
-from mavftpfs.shared.errors import FtpNak, MavftpfsError, PathTooLong, RequestTimeout
+from mavftpfs.shared.errors import FtpNak, MavftpfsError, OutcomeUnknown, PathTooLong, RequestTimeout
 from mavftpfs.shared.model import ROOT, DirEntry, EntryKind, Listing, split, wire_path
 
 RENAME_LIMIT = 238
@@ -161,7 +161,7 @@ class SideEffects:
         with trio.move_on_after(self._scheduler.op_deadline + VERIFY_LIMIT) as scope:
             yield
         if scope.cancelled_caught:
-            raise _checked(RequestTimeout("the vehicle did not get round to it in time"))
+            raise _checked(OutcomeUnknown("the vehicle did not get round to it in time"))
 
     @asynccontextmanager
     async def _changing(
@@ -189,9 +189,12 @@ class SideEffects:
                 if await self._settle(nak, verify, twice=twice, last=last):
                     return
             except RequestTimeout as silence:
-                if await self._after_silence(verify) is not Outcome.DONE:
-                    raise _checked(silence) from None
-                return
+                outcome = await self._after_silence(verify)
+                if outcome is Outcome.DONE:
+                    return
+                if outcome is Outcome.UNKNOWN:
+                    raise _checked(OutcomeUnknown(str(silence))) from None
+                raise _checked(silence) from None
             else:
                 return
 
@@ -222,6 +225,8 @@ class SideEffects:
             return await verify()
         except FtpNak:
             raise _checked(nak) from None  # there is not even a parent to list
+        except RequestTimeout as silence:
+            raise _checked(OutcomeUnknown(f"{nak}; whether it was done is not known")) from silence
 
     async def _after_silence(self, verify: Verdict) -> Outcome:
         with trio.move_on_after(VERIFY_LIMIT):

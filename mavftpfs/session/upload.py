@@ -230,6 +230,11 @@ class QueuedUpload:
     # --- the owner's side
 
     @property
+    def resent(self) -> bool:
+        """See cache.remote.Upload."""
+        return self.created_twice
+
+    @property
     def repeats(self) -> bool:
         """See cache.remote.Upload."""
         return self._host.repeats()

@@ -341,6 +341,8 @@ class Uploading:
             return
         self._roll_back(upload)
         upload.usurped |= lost.by_server
+        if lost.by_server:
+            self._kit.doubt.raise_it(str(lost))
         now = self._clock()
         failures = 1 if upload.feed.got_further() else upload.failures + 1
         if not self.may_write:

@@ -46,12 +46,20 @@ class WriteStore:
         """See cache.remote.WriteStore."""
         return self._scheduler.write_traits
 
+    def in_doubt(self) -> bool:
+        """See cache.remote.WriteStore."""
+        return self._scheduler.doubt.active
+
+    def doubted_since(self, at: float) -> bool:
+        """See cache.remote.WriteStore."""
+        return self._scheduler.doubt.arose_since(at)
+
     async def open_upload(
         self,
         path: bytes,
         source: UploadSource,
         *,
-        create: bool,
+        create: bool = True,
         least: int = 0,
         free_at: float | None = None,
     ) -> QueuedUpload:

@@ -52,6 +52,10 @@ class RequestTimeout(MavftpfsError):
     """No answer, or no progress, within the deadline."""
 
 
+class OutcomeUnknown(RequestTimeout):
+    """A change of the card was not answered, and no listing could tell whether it happened."""
+
+
 class NotFound(MavftpfsError):
     """No such name, by a fresh and complete listing (ENOENT)."""
 

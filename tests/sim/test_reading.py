@@ -192,7 +192,7 @@ async def test_what_was_read_shortly_before_is_under_suspicion_though_closed(
         assert connection.vehicle.foreign_at is not None
         assert bool(sink.suspicions) is doubted
         await trio.sleep(11)
-        connection.scheduler.on_suspect("once more")
+        connection.scheduler.doubt.raise_it("once more")
         assert len(sink.suspicions) <= 2  # it was heard twice: question and answer
         assert not connection.scheduler._suspicion._closed
 

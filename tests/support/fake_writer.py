@@ -111,6 +111,7 @@ class FakeWriter(FakeStore):
         self.looks = 0
         self.aliases: dict[bytes, bytes] = {}
         self.before_request: Callable[..., object] | None = None
+        self.doubted_at: float | None = None
 
     # --- what requests go through
 
@@ -179,7 +180,7 @@ class FakeWriter(FakeStore):
         path: bytes,
         source: UploadSource,
         *,
-        create: bool,
+        create: bool = True,
         least: int = 0,
         free_at: float | None = None,
     ) -> FakeUpload:
@@ -194,6 +195,12 @@ class FakeWriter(FakeStore):
         lost = await self.request("create", path)
         self._create(path)
         _maybe_lose(lost)
+
+    def in_doubt(self) -> bool:
+        return self.doubted_at is not None
+
+    def doubted_since(self, at: float) -> bool:
+        return self.doubted_at is not None and self.doubted_at > at
 
     def endangered(self, path: bytes) -> list[tuple[int, int]]:
         """See WriteStore."""
@@ -423,7 +430,7 @@ class FakeUpload:
         self._least = least
         self._free_at = free_at
         self.begun = False
-        self.repeats = self.shared = False
+        self.repeats = self.shared = self.resent = False
         self.overwrites: list[Overwrite] = []
         self.again: list[tuple[int, int]] = []
         self._open = False

@@ -46,6 +46,7 @@ PURE_MODULES = {
     "link.problems",
     "link.signing",
     "link.uri",
+    "session.doubt",
     "session.identity",
     "session.notes",
     "session.policy",

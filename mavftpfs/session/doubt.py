@@ -1,0 +1,65 @@
+"""Doubt: one flag with a time. Layer: session; pure.
+
+Servers share session ids between clients, requests name a session and no file, and some links deliver a
+request twice, the second time late. Whatever shows that this happened raises the same doubt: an answer that
+nothing outstanding and no repetition of ours explains, another FTP client, a session that vanished under us,
+a restart of the vehicle. For ten minutes from then on the caches compare what was written, and a name is not
+changed twice within the time by which requests were seen to be late.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from math import inf
+
+LASTS = 600.0
+"""Seconds for which a doubt lasts: a second radio or another client stays for a while."""
+
+LEAST_LATE = 1.0
+MOST_LATE = 10.0
+"""Seconds by which a copy of a request is taken to be late at least, and at most."""
+
+
+class Doubt:
+    """Whether, and since when, what was ACKed is not believed without a look.
+
+    Attributes:
+        reason: of the latest doubt, for people.
+        on_raised: called with the reason each time.
+    """
+
+    def __init__(self, clock: Callable[[], float]) -> None:
+        self.reason = ""
+        self.on_raised: Callable[[str], None] = lambda reason: None
+        self._clock = clock
+        self._at = -inf
+        self._late = LEAST_LATE
+        self._late_at = -inf
+
+    def raise_it(self, reason: str) -> None:
+        """Something was noticed now."""
+        self.reason = reason
+        self._at = self._clock()
+        self.on_raised(reason)
+
+    @property
+    def active(self) -> bool:
+        """Whether something was noticed in the last ten minutes."""
+        return self._clock() - self._at <= LASTS
+
+    def arose_since(self, at: float) -> bool:
+        """Return whether something was noticed after that time."""
+        return self._at > at
+
+    def note_late(self, seconds: float) -> None:
+        """A copy of a request was answered so long after the request was sent first."""
+        now = self._clock()
+        if seconds >= self._late or now - self._late_at > LASTS:
+            self._late, self._late_at = min(MOST_LATE, max(LEAST_LATE, seconds)), now
+
+    @property
+    def lateness(self) -> float:
+        """Seconds for which a copy of a request may still come; 0 while there is no doubt."""
+        if not self.active:
+            return 0.0
+        return self._late if self._clock() - self._late_at <= LASTS else LEAST_LATE
