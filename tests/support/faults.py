@@ -27,6 +27,7 @@ class Faults:
         self._deaf: set[int] = set()
         self._counted: dict[int, Callable[[], None]] = {}
         self._hooks: list[tuple[int, Callable[[], None]]] = []
+        self._repeated: set[int] = set()
         server = world.vehicle.server
         self._handle, self._outgoing = server.handle, server.outgoing
         server.handle = self._on_request  # type: ignore[method-assign]
@@ -52,7 +53,17 @@ class Faults:
         """Do something when `count` more requests came to the server, before the last of them is executed."""
         self._counted[len(self.requests) + count] = action
 
+    def repeat(self, count: int) -> None:
+        """Have the request arrive twice that comes after `count` - 1 more ones."""
+        self._repeated.add(len(self.requests) + count)
+
     def _on_request(self, wire: bytes, source: Address, now: float) -> None:
+        self._execute(wire, source, now)
+        if len(self.requests) in self._repeated:
+            self._repeated.remove(len(self.requests))
+            self._execute(wire, source, now)
+
+    def _execute(self, wire: bytes, source: Address, now: float) -> None:
         if self._is_cut() or wire[_OPCODE] in self._deaf:
             return
         self.requests.append(wire[_OPCODE])

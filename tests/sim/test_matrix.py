@@ -1,0 +1,390 @@
+"""Each operation meets each event at each of its requests, on each server; a model of a local disk judges.
+
+What must hold, whatever happens and whenever:
+- A call that succeeds did all of it: the card shows that at once.
+- A call that fails did all or nothing, and what a failed close holds is delivered when the event is over.
+- In the end the card holds what a local disk would hold, nothing of ours beside it, and no session is open.
+- Each call ends in time.
+
+The daily run takes a few requests of each cell, the soak all of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Awaitable, Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from itertools import count as counted
+from zlib import crc32
+
+import pytest
+import trio
+from trio.testing import MockClock
+
+from mavftpfs.cache.tree import Tree
+from mavftpfs.compose import subscribe
+from mavftpfs.link.messages import Address
+from mavftpfs.protocol.payload import Opcode, request
+from mavftpfs.session.connection import Connection, ConnectOptions
+from mavftpfs.shared.errors import MavftpfsError
+from mavftpfs.sim.filesystem import Kind
+from mavftpfs.sim.profiles import PROFILES, Storage
+from tests.support.faults import Faults
+from tests.support.mounting import writable_tree
+from tests.support.takingturns import taking_turns
+from tests.support.trees import content
+from tests.support.worlds import ROOTS, World
+
+State = dict[bytes, bytes | None]
+"""What is in the directory: contents of files by name, None for a directory."""
+
+OLD, OTHER, NEW = content("old", 900), content("other", 400), content("new", 700)
+BEFORE: State = {b"file": OLD, b"other": OTHER, b"sub": None}
+QUICK = ConnectOptions(op_deadline=8.0)
+IN_TIME = 60.0
+"""Virtual seconds. A call makes a few requests, each of which may take the deadline and 4 s to find out."""
+DAILY = 2
+"""Requests of each cell that the daily run takes."""
+LEAKS = ("spec",)
+"""Servers that give ids which nobody learns if the answer is lost."""
+
+Call = Callable[[Tree, bytes], Awaitable[None]]
+
+
+# --- operations
+
+
+async def write(tree: Tree, path: bytes, offset: int, data: bytes, *, truncate: bool = False) -> None:
+    """Open, write, close: what a program does that checks its close()."""
+    file = await tree.open(path, write=True, truncate=truncate)
+    try:
+        await file.write(offset, data)
+        await file.flush()
+    finally:
+        await file.release()
+
+
+async def list_names(tree: Tree, folder: bytes) -> None:
+    """Run ls."""
+    assert {name for name, _ in await tree.list(folder)} == set(BEFORE)
+
+
+async def read(tree: Tree, folder: bytes) -> None:
+    """Run cat."""
+    file = await tree.open(folder + b"/file")
+    try:
+        assert bytes(await file.read(0, 2000)) == OLD
+    finally:
+        await file.release()
+
+
+async def create(tree: Tree, folder: bytes) -> None:
+    """Run cp to a new name."""
+    file = await tree.create(folder + b"/new", exclusive=False)
+    try:
+        await file.flush()  # as a shell does before a program writes
+        await file.write(0, NEW)
+        await file.flush()
+    finally:
+        await file.release()
+
+
+async def touch(tree: Tree, folder: bytes) -> None:
+    """Make an empty file."""
+    await (await tree.create(folder + b"/new", exclusive=True)).release()
+
+
+async def replace(tree: Tree, folder: bytes) -> None:
+    """Run cp over a file."""
+    await write(tree, folder + b"/file", 0, NEW, truncate=True)
+
+
+async def change(tree: Tree, folder: bytes) -> None:
+    """Write some bytes in the middle."""
+    await write(tree, folder + b"/file", 200, NEW[:100])
+
+
+async def append(tree: Tree, folder: bytes) -> None:
+    """Run echo >> file."""
+    await write(tree, folder + b"/file", len(OLD), NEW)
+
+
+async def truncate(tree: Tree, folder: bytes) -> None:
+    """Run truncate -s."""
+    await tree.truncate(folder + b"/file", 300)
+
+
+async def rename(tree: Tree, folder: bytes) -> None:
+    """Run mv to a free name."""
+    await tree.rename(folder + b"/file", folder + b"/new")
+
+
+async def rename_over(tree: Tree, folder: bytes) -> None:
+    """Run mv over a file."""
+    await tree.rename(folder + b"/file", folder + b"/other")
+
+
+async def unlink(tree: Tree, folder: bytes) -> None:
+    """Run rm."""
+    await tree.unlink(folder + b"/file")
+
+
+async def mkdir(tree: Tree, folder: bytes) -> None:
+    """Run mkdir."""
+    await tree.mkdir(folder + b"/new")
+
+
+async def rmdir(tree: Tree, folder: bytes) -> None:
+    """Run rmdir."""
+    await tree.rmdir(folder + b"/sub")
+
+
+def changed(**files: bytes | None) -> State:
+    """Return the directory with these names put into it."""
+    return BEFORE | {name.encode(): data for name, data in files.items()}
+
+
+def without(name: bytes, **files: bytes | None) -> State:
+    """Return the directory without a name, and with others put into it."""
+    return {key: data for key, data in changed(**files).items() if key != name}
+
+
+OPERATIONS: dict[Call, State] = {
+    list_names: BEFORE,
+    read: BEFORE,
+    create: changed(new=NEW),
+    touch: changed(new=b""),
+    replace: changed(file=NEW),
+    change: changed(file=OLD[:200] + NEW[:100] + OLD[300:]),
+    append: changed(file=OLD + NEW),
+    truncate: changed(file=OLD[:300]),
+    rename: without(b"file", new=OLD),
+    rename_over: without(b"file", other=OLD),
+    unlink: without(b"file"),
+    mkdir: changed(new=None),
+    rmdir: without(b"sub"),
+}
+"""What the directory holds after each."""
+
+RENAMES = (rename, rename_over)
+
+
+# --- events
+
+
+@dataclass
+class Scene:
+    """What an event may touch."""
+
+    world: World
+    faults: Faults
+    nursery: trio.Nursery
+    caller: trio.CancelScope
+
+    def later(self, seconds: float, action: Callable[[], None]) -> None:
+        """Do something after some virtual seconds."""
+
+        async def wait() -> None:
+            await trio.sleep(seconds)
+            action()
+
+        self.nursery.start_soon(wait)
+
+
+def lose_answer(scene: Scene, count: int) -> None:
+    """Lose the answer to a request."""
+    scene.faults.after(count, lambda: scene.faults.lose_reply_to(Opcode(scene.faults.requests[-1])))
+
+
+def arrive_twice(scene: Scene, count: int) -> None:
+    """Have a request arrive twice."""
+    scene.faults.repeat(count)
+
+
+def cut(scene: Scene, count: int) -> None:
+    """Cut the link for 4 s."""
+
+    def action() -> None:
+        scene.world.link.cut()
+        scene.later(4.0, scene.world.link.restore)
+
+    scene.faults.after(count, action)
+
+
+def silence(scene: Scene, count: int) -> None:
+    """Lose everything for 40 s: no request can be repeated in time."""
+
+    def action() -> None:
+        scene.faults.cut_after(0)
+        scene.later(40.0, lambda: scene.faults.cut_after(None))
+
+    scene.faults.after(count, action)
+
+
+def reboot(scene: Scene, count: int) -> None:
+    """Restart the vehicle."""
+
+    def action() -> None:
+        scene.world.vehicle.reboot(trio.current_time(), 2.0)
+        scene.world.link.kick()
+
+    scene.faults.after(count, action)
+
+
+def arm(scene: Scene, count: int) -> None:
+    """Take off, and land 20 s later."""
+
+    def action() -> None:
+        scene.world.vehicle.arm()
+        scene.world.link.kick()
+        scene.later(20.0, scene.world.vehicle.disarm)
+
+    scene.faults.after(count, action)
+
+
+def rival(scene: Scene, count: int) -> None:
+    """Have another ground station reset the sessions, as QGroundControl does."""
+
+    def action() -> None:
+        wire = request(77, Opcode.RESET_SESSIONS).encode()
+        scene.world.vehicle.foreign_request(wire, Address(255, 190), trio.current_time())
+        scene.world.link.kick()
+
+    scene.faults.after(count, lambda: scene.later(0.0, action))
+
+
+def give_up(scene: Scene, count: int) -> None:
+    """Cancel the call, as a handler's deadline does."""
+    scene.faults.after(count, scene.caller.cancel)
+
+
+def nothing(scene: Scene, count: int) -> None:
+    """Let it be."""
+
+
+EVENTS = (lose_answer, arrive_twice, cut, silence, reboot, arm, rival, give_up)
+
+
+# --- judging
+
+
+def on_card(world: World, folder: bytes) -> State:
+    """Return what is in the directory on the card, litter included."""
+    found: State = {}
+    for entry in world.tree.entries(folder):
+        if entry.name not in (b".", b".."):
+            is_file = entry.stat.kind is Kind.FILE
+            found[entry.name] = world.tree.data(folder + b"/" + entry.name) if is_file else None
+    return found
+
+
+@contextmanager
+def in_time() -> Iterator[None]:
+    """Hold a call to its bound."""
+    began = trio.current_time()
+    yield
+    assert trio.current_time() - began <= IN_TIME
+
+
+async def meet(profile: str, operation: Call, event: Callable[[Scene, int], None], count: int) -> int:
+    """Have the event come at request `count` of an operation; return how many requests it made."""
+    world = World(profile)
+    folder = ROOTS.get(profile, b"") + b"/d"
+    for name, data in BEFORE.items():
+        path = folder + b"/" + name
+        world.tree.add_directory(path) if data is None else world.tree.add(path, data)
+    faults = Faults(world)
+    async with world.connection(QUICK) as connection, trio.open_nursery() as nursery:
+        inplace = PROFILES[profile].storage is Storage.LITTLEFS
+        tree = writable_tree(connection, nursery, inplace=inplace, op_deadline=8.0)
+        subscribe(connection, tree)
+        await tree.list(folder)
+        await trio.sleep(3.0)
+        began, done = len(faults.requests), False
+        with trio.CancelScope() as caller:
+            event(Scene(world, faults, nursery, caller), count)
+            done = await attempt(operation, tree, folder)
+        if done:
+            assert_done(world, folder, OPERATIONS[operation])
+        made = len(faults.requests) - began
+        await settle(connection, tree, world, folder, operation, done)
+        nursery.cancel_scope.cancel()
+    assert profile in LEAKS or world.vehicle.server.open_sessions == 0
+    return made
+
+
+async def attempt(operation: Call, tree: Tree, folder: bytes) -> bool:
+    """Make the call; return whether it succeeded."""
+    with in_time():
+        try:
+            await operation(tree, folder)
+        except MavftpfsError:
+            return False
+    return True
+
+
+def assert_done(world: World, folder: bytes, after: State) -> None:
+    """A call that succeeded did all of it: under each name lies what shall be there."""
+    found = on_card(world, folder)
+    assert {name: found.get(name, b"absent") for name in after} == after
+    assert [name for name in BEFORE if name not in after and name in found] == []
+
+
+async def settle(
+    connection: Connection, tree: Tree, world: World, folder: bytes, operation: Call, done: bool
+) -> None:
+    """Wait until the event is over: the card and the tree show the same, which is before or after, whole."""
+    await trio.sleep(60.0)
+    assert await tree.drain(300.0) == []
+    for _ in range(3):  # listings, and time to clean up what they show
+        tree.forget_caches()
+        await tree.list(folder)
+        await trio.sleep(15.0)
+    after = OPERATIONS[operation]
+    card = on_card(world, folder)
+    assert card == after if done else card in (BEFORE, after)
+    shown = {name: stat.size for name, stat in await tree.list(folder)}
+    assert set(shown) == set(card)
+    assert all(shown[name] == len(data) for name, data in card.items() if data is not None)
+    assert connection.vehicle is not None
+
+
+def sampled(profile: str, operation: Call, event: Callable[[Scene, int], None], total: int) -> list[int]:
+    """Return the requests that the daily run takes of a cell, other ones in each."""
+    start = crc32(f"{profile} {operation.__name__} {event.__name__}".encode())
+    step = max(1, total // DAILY)
+    return sorted({1 + (start + index * step) % total for index in range(min(DAILY, total))})
+
+
+def can(profile: str, operation: Call) -> bool:
+    """Return whether a server can do it at all."""
+    return operation not in RENAMES or PROFILES[profile].storage is not Storage.LITTLEFS
+
+
+CELLS = [
+    pytest.param(turn.values[0], operation, event, id=f"{turn.id}-{operation.__name__}-{event.__name__}",
+                 marks=turn.marks)
+    for turn in taking_turns(sorted(PROFILES))
+    for operation in OPERATIONS
+    for event in EVENTS
+    if can(turn.values[0], operation)
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("profile", "operation", "event"), CELLS)
+async def test_all_or_nothing_and_no_lie(
+    profile: str, operation: Call, event: Callable[[Scene, int], None], autojump: MockClock
+) -> None:
+    total = await meet(profile, operation, nothing, 0)
+    for count in sampled(profile, operation, event, total) if total else ():
+        await meet(profile, operation, event, count)
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize(("profile", "operation", "event"), CELLS)
+async def test_at_every_request(
+    profile: str, operation: Call, event: Callable[[Scene, int], None], autojump: MockClock
+) -> None:
+    for count in counted(1):
+        if await meet(profile, operation, event, count) < count:
+            return
