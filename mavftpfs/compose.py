@@ -34,6 +34,7 @@ from mavftpfs.session.driver import PayloadTrace
 from mavftpfs.shared.errnos import errno_for
 from mavftpfs.shared.errors import (
     FtpNak,
+    ListingIncomplete,
     NotADirectory,
     NotFound,
     RequestTimeout,
@@ -179,6 +180,8 @@ async def _list_root(connection: Connection, tree: Tree, deadline: float, option
         with trio.move_on_at(deadline):
             await tree.list(ROOT)
             return
+    except ListingIncomplete:
+        return  # who lists it is told
     except (RequestTimeout, VehicleLost):
         pass  # the same to the user: no answer
     except SessionBusy:

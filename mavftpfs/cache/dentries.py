@@ -18,6 +18,9 @@ from dataclasses import dataclass, field, replace
 from mavftpfs.cache.attributes import tidy
 from mavftpfs.shared.model import DirEntry, EntryKind, Listing, folded, split, usable_name
 
+DIR_TIMEOUT = 20.0
+"""Seconds that a listing is fresh where the user did not say it."""
+
 COST_FACTOR = 50
 """A listing that took T seconds is fresh for at least COST_FACTOR * T: it costs at most 2 % of the link."""
 
@@ -36,7 +39,7 @@ class Directory:
     growing: when a file was last seen to be larger than before, though we did not write it.
     listed_at: when the sweep began, ended_at: when it was done; fresh_until: after that it proves nothing.
     proven: when an entry was last shown to be what it is by other means than this listing.
-    complete: whether a name that is not in it is absent.
+    complete: whether a name that is not in it is absent. cut_short: the vehicle did not list it to its end.
     """
 
     entries: dict[bytes, DirEntry]
@@ -47,6 +50,7 @@ class Directory:
     growing: dict[bytes, float] = field(default_factory=dict)
     ended_at: float = float("-inf")
     proven: dict[bytes, float] = field(default_factory=dict)
+    cut_short: bool = False
 
     def size_of(self, name: bytes) -> int | None:
         """Return the best known size of a listed name in bytes, None if nothing told it."""
@@ -72,7 +76,8 @@ class Sweep:
 class Dentries:
     """Listings by path, least recently used ones dropped when more than `max_entries` names are held."""
 
-    def __init__(self, *, dir_timeout: float, max_entries: int) -> None:
+    def __init__(self, *, dir_timeout: float | None, max_entries: int) -> None:
+        """`dir_timeout`: seconds that a listing is fresh; None: DIR_TIMEOUT, or longer if it took long."""
         self._dir_timeout = dir_timeout
         self._max_entries = max_entries
         self._directories: OrderedDict[bytes, Directory] = OrderedDict()
@@ -133,9 +138,12 @@ class Dentries:
         for name, entry in sweep.changes.items():
             _put(entries, name, entry)
         complete = listing.complete and not sweep.reshaped
-        life = max(self._dir_timeout, COST_FACTOR * listing.took)
+        life = self._dir_timeout
+        if life is None:
+            life = max(DIR_TIMEOUT, COST_FACTOR * listing.took)
         doubtful = sweep.reshaped or sweep.void
         directory = Directory(entries, sweep.began, now if doubtful else now + life, complete)
+        directory.cut_short = not listing.complete
         directory.growing, directory.ended_at = self._growing(sweep, directory, now), now
         if not sweep.void:
             self._store(sweep.path, directory)
@@ -209,8 +217,16 @@ class Dentries:
         directory = self._directories.get(parent)
         return directory is not None and now - directory.growing.get(name, float("-inf")) < STILL_GROWING
 
+    def note_found(self, path: bytes, entry: DirEntry) -> None:
+        """An open found a file that its directory's incomplete listing lacks."""
+        parent, name = split(path)
+        directory = self._directories.get(parent)
+        if directory is not None and name not in directory.entries:
+            directory.entries[name] = entry
+            self._weight += 1
+
     def note_absent(self, path: bytes, until: float) -> None:
-        """A probe found that the path does not exist."""
+        """An open found that the path does not exist."""
         self._absent[path] = until
         self._absent.move_to_end(path)
         if len(self._absent) > MAX_ABSENT:

@@ -6,6 +6,8 @@ Only a path that its parent's listing shows as a directory is listed: listing a 
 
 from __future__ import annotations
 
+import errno
+import logging
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from functools import partial
@@ -15,8 +17,11 @@ import trio
 from mavftpfs.cache.dentries import Dentries, Directory
 from mavftpfs.cache.flights import Flights
 from mavftpfs.cache.remote import RemoteStore
+from mavftpfs.shared.errnos import errno_for
 from mavftpfs.shared.errors import FtpNak, NotADirectory, NotFound, PathTooLong, VehicleLost
 from mavftpfs.shared.model import ROOT, DirEntry, EntryKind, Listing, join, split
+
+log = logging.getLogger("mavftpfs.cache")
 
 DOT = b"."
 """The working directory of a server that runs as a process (ArduPilot SITL)."""
@@ -56,7 +61,10 @@ class Directories:
         *,
         clock: Callable[[], float],
         nursery: trio.Nursery | None = None,
+        ask_size: Callable[[bytes], Awaitable[int]],
     ) -> None:
+        """`ask_size` opens a file and returns its size."""
+        self.ask_size = ask_size
         self._store = store
         self._dentries = dentries
         self._root = root
@@ -74,20 +82,37 @@ class Directories:
     async def find(self, path: bytes) -> Found:
         """Return what is known of a path below the root.
 
+        A name that an incomplete listing lacks is asked for by opening it as a file: there is no other way.
+
         Raises:
-            NotFound: its parent's listing does not show it. An incomplete listing (a cap ended it) proves
-                no absence, so nobody may remember the answer, but there is no other way to ask: opening
-                what is not known to be a file is forbidden.
-            NotADirectory: a part of it is a file. Else as RemoteStore.list_directory.
+            NotFound: its parent's listing does not show it.
+            NotADirectory: a part of it is a file. Else as RemoteStore.list_directory and open_reader.
         """
         if path.count(b"/") > MAX_DEPTH:
             raise PathTooLong(f"path of {len(path)} bytes has more parts than a vehicle takes")
         parent, name = split(path)
         directory = await self.get(parent)
         entry = directory.entries.get(name)
+        if entry is None and directory.cut_short and name:
+            entry = await self._ask_for(path)
+            self._dentries.note_found(path, entry)
         if entry is None:
             raise NotFound(f"{path!r} does not exist")
         return Found(entry, directory)
+
+    async def _ask_for(self, path: bytes) -> DirEntry:
+        """Open a file that an incomplete listing lacks.
+
+        Raises:
+            NotFound: the vehicle says that there is none. Else as RemoteStore.open_reader.
+        """
+        try:
+            size = await self.ask_size(path)
+        except FtpNak as nak:
+            if errno_for(nak) != errno.ENOENT:
+                raise
+            raise NotFound(f"{path!r} does not exist") from nak
+        return DirEntry(split(path)[1], EntryKind.FILE, size)
 
     async def get(self, path: bytes) -> Directory:
         """Return a directory's listing: fresh, else swept, else (the vehicle being lost) expired.
@@ -203,6 +228,13 @@ class Directories:
         except BaseException:
             self._dentries.abandon(sweep)
             raise
+        known = self._dentries.known(path)
+        if not (listing.complete or (known is not None and known.cut_short)):
+            log.warning(
+                "%r was not listed to its end: %d names of it are known, and reading it is an error",
+                path,
+                len(listing.entries),
+            )
         self.tells_times |= any(entry.mtime is not None for entry in listing.entries)
         directory = self._dentries.finish(sweep, listing, self._clock())
         if not sweep.void:

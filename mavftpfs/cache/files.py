@@ -32,11 +32,13 @@ from mavftpfs.cache.reopens import Reopens, is_unsettled
 from mavftpfs.cache.restarts import Restarts
 from mavftpfs.cache.versions import Fetcher, Version, became_another
 from mavftpfs.shared.errors import (
+    DataUnproven,
     FileTooLarge,
     LocalProtocolError,
+    NotFound,
     VehicleLost,
 )
-from mavftpfs.shared.model import DirEntry
+from mavftpfs.shared.model import DirEntry, split
 
 MAX_CLOSED = 4096
 """How many files that nobody has open are remembered with their blocks."""
@@ -173,12 +175,34 @@ class Files:
         old = self._current.get(path)
         if old is not None and old.size > reader.size:
             self._kill(old)
+        if entry.size is not None and reader.size < entry.size and not self.is_changing(path):
+            try:
+                entry = await self._require_listed(path, reader.size)
+            except BaseException:
+                reader.close()
+                raise
         mtime = entry.mtime if entry.size in (None, reader.size) else None
         version = Version(path, mtime, blocks, self._clock(), reader)
         self._replace(path, version)
         if entry.size != reader.size:
             self._on_size(path, reader.size)
         return version
+
+    async def _require_listed(self, path: bytes, size: int) -> DirEntry:
+        """Return what a listing that begins now shows of a file whose open reply told this size.
+
+        A reply with a size that is too small would make a copy too short, without an error.
+
+        Raises:
+            DataUnproven: it shows another size. NotFound; else as RemoteStore.list_directory.
+        """
+        parent, name = split(path)
+        entry = (await self._directories.recent(parent, began=self._clock())).entries.get(name)
+        if entry is None:
+            raise NotFound(f"{path!r} does not exist any more")
+        if entry.size != size:
+            raise DataUnproven(f"{path!r} has {entry.size} bytes as listed, and {size} as opened")
+        return entry
 
     def _replace(self, path: bytes, version: Version) -> None:
         old = self._current.pop(path, None)

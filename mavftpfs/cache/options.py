@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields
 
+from mavftpfs.cache.dentries import DIR_TIMEOUT
 from mavftpfs.shared.errors import UsageError
 from mavftpfs.shared.model import ROOT, normalise
 
@@ -24,7 +25,8 @@ class CacheOptions:
     """Times in seconds, sizes in bytes.
 
     root: the vehicle's directory that is the mount's `/`.
-    dir_timeout: how long a listing (and the proof that a cached file is the vehicle's) holds.
+    dir_timeout: how long a listing (and the proof that a cached file is the vehicle's) holds; None: 20 s,
+    and a listing that is expensive longer.
     attr_timeout, negative_timeout: how long the kernel may keep attributes, and an absence.
     cache_size: budget for file blocks; max_entries: directory entries remembered over all listings.
     at_file_limit: largest `@` file that is read; at_cache_size: how much of such snapshots is kept.
@@ -45,7 +47,7 @@ class CacheOptions:
     """
 
     root: bytes = ROOT
-    dir_timeout: float = 20.0
+    dir_timeout: float | None = None
     attr_timeout: float = 1.0
     negative_timeout: float = 2.0
     cache_size: int = 64 * MIB
@@ -65,6 +67,11 @@ class CacheOptions:
     inplace: bool = False
     local: tuple[str, ...] = DEFAULT_LOCAL
     local_max: int = 16 * MIB
+
+    @property
+    def proof_time(self) -> float:
+        """How long in seconds what the vehicle told of a file holds."""
+        return DIR_TIMEOUT if self.dir_timeout is None else self.dir_timeout
 
     def __post_init__(self) -> None:
         for field in fields(self):

@@ -30,7 +30,7 @@ from mavftpfs.cache.spool import SpoolDirectory
 from mavftpfs.cache.virtual import VirtualTrees, is_snapshot
 from mavftpfs.cache.writeback import Writeback
 from mavftpfs.cache.writing import make_writeback
-from mavftpfs.shared.errors import FtpNak, IsADirectory, ReadOnly
+from mavftpfs.shared.errors import FtpNak, IsADirectory, ListingIncomplete, ReadOnly
 from mavftpfs.shared.model import ROOT, DirEntry, EntryKind, is_virtual, join, normalise
 
 __all__ = ["OpenFile", "Stat", "Tree"]
@@ -68,12 +68,14 @@ class Tree:
         self._clock = clock
         self._tell_kernel = invalidate
         self._dentries = Dentries(dir_timeout=options.dir_timeout, max_entries=options.max_entries)
-        self._directories = Directories(store, self._dentries, options.root, clock=clock, nursery=nursery)
+        self._directories = Directories(
+            store, self._dentries, options.root, clock=clock, nursery=nursery, ask_size=self._ask_size
+        )
         self._blocks = BlockCache(options.cache_size, clock=clock, patience=options.op_deadline)
         self._files = Files(
             store,
             self._blocks,
-            dir_timeout=options.dir_timeout,
+            dir_timeout=options.proof_time,
             directories=self._directories,
             on_size=self._on_size,
             invalidate=self._invalidate,
@@ -89,7 +91,7 @@ class Tree:
             nursery=nursery,
         )
         self._learning: Flights[bytes, int] = Flights()
-        self._checksums = Checksums(store, clock=clock, lifetime=options.dir_timeout)
+        self._checksums = Checksums(store, clock=clock, lifetime=options.proof_time)
         self._writing: Writeback | None = None
         if writer is not None:
             self._writing = make_writeback(
@@ -144,7 +146,8 @@ class Tree:
         """Return a directory's entries without `.` and `..`.
 
         Raises:
-            NotFound, NotADirectory; else as RemoteStore.list_directory.
+            ListingIncomplete: it holds what is known. NotFound, NotADirectory; else as
+                RemoteStore.list_directory.
         """
         remote = self._remote(path)
         if is_snapshot(remote):
@@ -160,6 +163,8 @@ class Tree:
         shown = {name: self._listed_stat(join(remote, name), found) for name, found in founds.items()}
         if self._writing is not None:
             shown = self._writing.overlay.overlay(remote, shown)
+        if directory.cut_short:
+            raise ListingIncomplete(f"{remote!r} was not listed to its end", list(shown.items()))
         return list(shown.items())
 
     async def open(self, path: bytes, *, write: bool = False, truncate: bool = False) -> OpenFile:
@@ -384,6 +389,9 @@ class Tree:
             size = 0
         self._dentries.learn_size(remote, size)
         return size
+
+    async def _ask_size(self, remote: bytes) -> int:
+        return await self._files.learn_size(remote)
 
     def _on_size(self, remote: bytes, size: int) -> None:
         """An open told another size than the listing: what the kernel was told is wrong."""

@@ -27,12 +27,13 @@ from mavftpfs.shared.errors import (
     FtpNak,
     IsADirectory,
     LinkError,
+    ListingIncomplete,
     NotADirectory,
     NotFound,
     RequestTimeout,
     SessionBusy,
 )
-from mavftpfs.shared.model import ROOT, DirEntry, EntryKind, is_virtual, join
+from mavftpfs.shared.model import ROOT, DirEntry, EntryKind, is_virtual, join, split
 
 UNLISTABLE: dict[bytes, tuple[bytes, ...]] = {
     b"@PARAM": (b"param.pck",),
@@ -134,10 +135,11 @@ class VirtualTrees:
         """Return the entries that can be opened, with true sizes as far as they are known in time.
 
         Raises:
-            NotFound, NotADirectory; else as RemoteStore.list_directory.
+            As Tree.list.
         """
         tree = tree_of(path)
         founds: dict[bytes, Found | None]
+        cut_short = False
         if tree in UNLISTABLE:
             if path != b"/" + tree:
                 raise NotADirectory(f"{path!r} is not a directory")
@@ -145,10 +147,14 @@ class VirtualTrees:
             founds = dict.fromkeys(UNLISTABLE[tree])
         else:
             directory = await self._directories.get(path)
+            cut_short = directory.cut_short
             founds = {name: Found(entry, directory) for name, entry in directory.entries.items()}
         by_path = {join(path, name): found for name, found in founds.items()}
         await self._probe(by_path)
-        return [(p.rpartition(b"/")[2], self.listed_stat(p, f)) for p, f in by_path.items() if self._shows(p)]
+        shown = [(split(p)[1], self.listed_stat(p, f)) for p, f in by_path.items() if self._shows(p)]
+        if cut_short:
+            raise ListingIncomplete(f"{path!r} was not listed to its end", shown)
+        return shown
 
     async def open(self, path: bytes) -> SnapshotHandle:
         """Read the file whole, unless that was just done.
@@ -296,7 +302,7 @@ class VirtualTrees:
                 self._refused(path, nak)
             raise
         now = self._clock()
-        life = max(self._options.dir_timeout, COST_FACTOR * (now - began))
+        life = max(self._options.proof_time, COST_FACTOR * (now - began))
         snapshot = Snapshot(data, now + life)
         shown = self.snapshots.size_of(path)
         self.snapshots.put(path, snapshot)
@@ -311,7 +317,7 @@ class VirtualTrees:
             NotFound: it does.
         """
         if tree_of(path) in UNLISTABLE:
-            self._dentries.note_absent(path, self._clock() + self._options.dir_timeout)
+            self._dentries.note_absent(path, self._clock() + self._options.proof_time)
         elif nak.code == _FILE_NOT_FOUND:
             self._unlisted.add(path)
         else:

@@ -251,7 +251,7 @@ class Writeback:
             self._background.settle(node)
             return
         fits = 0 < draft.size <= context.options.cache_size // ADOPTED_PART
-        recent = context.clock() - node.known_at < context.options.dir_timeout
+        recent = context.clock() - node.known_at < context.options.proof_time
         if fits and recent and draft.whole:
             starts = range(0, draft.size, STEP)
             pieces = ((at, draft.local_bytes(at, min(at + STEP, draft.size))) for at in starts)

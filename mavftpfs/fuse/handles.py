@@ -96,10 +96,14 @@ class FileHandle:
 
 @dataclass(slots=True)
 class DirectoryHandle:
-    """One opendir(). `entries` is the snapshot that its offsets count in: entry i has offset i + 1."""
+    """One opendir(). `entries` is the snapshot that its offsets count in: entry i has offset i + 1.
+
+    cut_short: they are not all that the directory has.
+    """
 
     ino: int
     entries: Sequence[tuple[bytes, Stat]] = field(default_factory=list)
+    cut_short: bool = False
 
 
 HandleT = TypeVar("HandleT")

@@ -33,7 +33,7 @@ from mavftpfs.fuse.handles import (
 )
 from mavftpfs.fuse.inodes import ROOT_INO, Inode, InodeTable
 from mavftpfs.shared.errnos import errno_for
-from mavftpfs.shared.errors import Armed, MavftpfsError, NotFound
+from mavftpfs.shared.errors import Armed, ListingIncomplete, MavftpfsError, NotFound
 from mavftpfs.shared.model import MAX_WIRE_PATH, EntryKind, join, split
 
 log = logging.getLogger("mavftpfs.fuse")
@@ -191,8 +191,9 @@ class Operations(pyfuse3.Operations):
 
     @handler
     async def opendir(self, inode: int, ctx: RequestContext) -> int:
-        """Open a directory; it is listed by the first readdir."""
-        self._path(inode)
+        """Open a directory, if it is still there; it is listed by the first readdir."""
+        if (await self._tree.stat(self._path(inode))).kind is not EntryKind.DIRECTORY:
+            raise FUSEError(errno.ENOTDIR)
         return self.directories.add(DirectoryHandle(inode))
 
     @handler
@@ -200,11 +201,14 @@ class Operations(pyfuse3.Operations):
         """Reply with entries and attributes, as many as the kernel takes.
 
         Offsets count in a snapshot, so a change of the directory in the meantime neither skips nor
-        repeats a name; rewinding takes a new one.
+        repeats a name; rewinding takes a new one. What is known of a directory that could not be listed to
+        its end is shown, and then the program gets an error: `rsync --delete` believes what it sees.
         """
         handle = self._directory(fh)
         if start_id == 0:
-            handle.entries = await self._tree.list(self._path(handle.ino))
+            await self._take_snapshot(handle)
+        elif start_id >= len(handle.entries) and handle.cut_short:
+            raise FUSEError(errno.EIO)
         path = self._path(handle.ino)
         for offset, (name, found) in enumerate(handle.entries[start_id:], start_id + 1):
             inode = self.inodes.reserve(join(path, name))
@@ -212,6 +216,25 @@ class Operations(pyfuse3.Operations):
                 self.inodes.discard(inode)
                 return
             self.inodes.count(inode)
+
+    async def _take_snapshot(self, handle: DirectoryHandle) -> None:
+        """List a directory.
+
+        Raises:
+            FUSEError: EIO in place of ENOENT, which the C library takes for the end of the directory.
+        """
+        handle.cut_short = False
+        try:
+            handle.entries = await self._tree.list(self._path(handle.ino))
+        except ListingIncomplete as incomplete:
+            handle.entries, handle.cut_short = incomplete.entries, True
+            if not handle.entries:
+                raise
+        except MavftpfsError as error:
+            if errno_for(error) != errno.ENOENT:
+                raise
+            log.debug("readdir: %s", error)
+            raise FUSEError(errno.EIO) from error
 
     @handler
     async def releasedir(self, fh: int) -> None:

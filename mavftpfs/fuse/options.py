@@ -66,7 +66,7 @@ class MountOptions:
     heartbeat: str = "onboard"
     baud: int | None = None
     signing_key: str | None = None
-    dir_timeout: float = 20.0
+    dir_timeout: float | None = None
     attr_timeout: float = 1.0
     negative_timeout: float = 2.0
     cache_size: int = 64 << 20

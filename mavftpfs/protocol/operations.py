@@ -187,6 +187,8 @@ class ListDirectory(Operation):
         self._early_reply: Payload | None = None
         self._asked = False
         self._pages = 0
+        self._first_page = b""
+        self._first_page_again = 0
         self._stale_pages = 0
         self._empty_pages = 0
 
@@ -228,6 +230,10 @@ class ListDirectory(Operation):
             self._on_empty_page()
             return
         self._empty_pages = 0
+        if self.strings == 0:
+            self._first_page = reply.data
+        elif reply.data == self._first_page:
+            self._on_first_page_again()
         self.strings += page.strings
         self.hidden += page.hidden
         self._take(page.entries)
@@ -237,6 +243,16 @@ class ListDirectory(Operation):
             or self._stale_pages > _MAX_STALE_PAGES
         ):
             self._cut_short()
+
+    def _on_first_page_again(self) -> None:
+        """The server seems to ignore the offset, so what is behind its first page is not known.
+
+        MAVSDK repeats a first page, too, where it leaves out more entries than it shows (servers.md 6); that
+        is told from this by a page with much room left that comes twice only.
+        """
+        self._first_page_again += 1
+        if self._first_page_again > 1 or len(self._first_page) > MAX_DATA // 2:
+            self.complete = False
 
     def _take(self, entries: list[DirEntry]) -> None:
         fresh = [entry for entry in entries if entry.name not in self._names]

@@ -101,6 +101,7 @@ _BY_CLASS: dict[type[BaseException], int] = {
     errors.RequestTimeout: errno.ETIMEDOUT,
     errors.NotFound: errno.ENOENT,
     errors.NotADirectory: errno.ENOTDIR,
+    errors.ListingIncomplete: errno.EIO,
     errors.IsADirectory: errno.EISDIR,
     errors.FileChanged: errno.ESTALE,
     errors.DataUnproven: errno.EIO,

@@ -5,6 +5,9 @@ Every error that leaves a layer is one of these; `shared.errnos` turns them into
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Any
+
 
 class MavftpfsError(Exception):
     """Base of every error this package raises on purpose; its text is one line for a person.
@@ -62,6 +65,18 @@ class NotFound(MavftpfsError):
 
 class NotADirectory(MavftpfsError):
     """A directory was needed and the path is a file, or runs through one (ENOTDIR)."""
+
+
+class ListingIncomplete(MavftpfsError):
+    """The vehicle did not list a directory to its end (EIO).
+
+    Attributes:
+        entries: (name, attributes) of what is known to be in it.
+    """
+
+    def __init__(self, reason: str, entries: Sequence[tuple[bytes, Any]]) -> None:
+        super().__init__(reason)
+        self.entries = entries
 
 
 class IsADirectory(MavftpfsError):

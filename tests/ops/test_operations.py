@@ -26,7 +26,7 @@ from mavftpfs.fuse.operations import (
     Presentation,
     Space,
 )
-from mavftpfs.shared.errors import Armed, FtpNak, NotFound, PathTooLong, RequestTimeout
+from mavftpfs.shared.errors import Armed, FtpNak, ListingIncomplete, NotFound, PathTooLong, RequestTimeout
 from tests.ops.faketree import MTIME, FakeTree
 
 CTX = cast(RequestContext, None)
@@ -204,6 +204,36 @@ async def test_readdir_offsets_are_stable_while_the_directory_changes(
     listing.taken.clear()
     await listing.read(ops, fh, 0)
     assert listing.names == [b"f01", b"f02", b"f03", b"f03x", b"f04"]
+
+
+@pytest.mark.parametrize("error", [NotFound("gone"), FtpNak(3, 10)])
+async def test_a_refused_listing_is_no_empty_directory(
+    error: BaseException, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tree, listing = some_tree(), Listing(monkeypatch)
+    ops = operations(tree)
+    fh = await ops.opendir(ROOT_INO, CTX)
+    tree.error = error
+    assert await failure(listing.read(ops, fh, 0)) == errno.EIO  # by ENOENT the C library ends without one
+    assert await failure(ops.opendir(ROOT_INO, CTX)) == errno.ENOENT
+
+
+async def test_an_incomplete_listing_is_shown_and_then_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    tree, listing = some_tree(), Listing(monkeypatch, 1)
+    ops = operations(tree)
+    fh = await ops.opendir(ROOT_INO, CTX)
+    tree.error = ListingIncomplete("cut short", (await some_tree().list(b"/"))[:2])
+    offset = await listing.read(ops, fh, 0)
+    offset = await listing.read(ops, fh, offset)
+    assert await failure(listing.read(ops, fh, offset)) == errno.EIO
+    assert listing.names == [b"a.txt", b"empty"]
+    tree.error = ListingIncomplete("nothing came", [])
+    assert await failure(listing.read(ops, fh, 0)) == errno.EIO
+    tree.error = None
+    offset = 0
+    while offset >= 0:
+        offset = await listing.read(ops, fh, offset)
+    assert listing.names[-1] == b"log"
 
 
 # -- files ----------------------------------------------------------------------------------------

@@ -47,10 +47,16 @@ def test_a_listing_is_fresh_for_dir_timeout() -> None:
 
 
 def test_a_listing_that_was_expensive_is_fresh_for_longer() -> None:
-    dentries = make()
+    dentries = Dentries(dir_timeout=None, max_entries=10)
     put(dentries, b"/", took=2)
     assert dentries.fresh(b"/", 99.9) is not None
     assert dentries.fresh(b"/", 100) is None
+
+
+def test_a_dir_timeout_that_a_user_set_is_the_bound() -> None:
+    dentries = Dentries(dir_timeout=0, max_entries=10)
+    put(dentries, b"/", took=2)
+    assert dentries.fresh(b"/", 0) is None
 
 
 def test_the_listing_is_as_old_as_its_first_page() -> None:
@@ -58,7 +64,7 @@ def test_the_listing_is_as_old_as_its_first_page() -> None:
     sweep = dentries.begin(b"/", 3)
     directory = dentries.finish(sweep, Listing((), 4.0), 7)
     assert directory.listed_at == 3
-    assert directory.fresh_until == 7 + 200
+    assert directory.fresh_until == 7 + 20
 
 
 def test_a_fresh_complete_listing_proves_absence() -> None:

@@ -257,7 +257,7 @@ def test_readme_and_help_tell_the_real_defaults() -> None:
                 assert (name, parsed) == (name, default)
                 checked.add(name)
     assert {
-        "dir_timeout",
+        "attr_timeout",
         "negative_timeout",
         "cache_size",
         "spool_max",

@@ -21,6 +21,7 @@ from mavftpfs.shared.errors import (
     Armed,
     FtpNak,
     IsADirectory,
+    ListingIncomplete,
     LocalProtocolError,
     NotADirectory,
     NotFound,
@@ -99,6 +100,10 @@ async def test_an_incomplete_listing_proves_no_absence(
     with pytest.raises(NotFound):
         await tree.stat(b"/none")
     assert store.count("list") == 1
+    assert store.count("open", b"/none") == 2
+    with pytest.raises(ListingIncomplete) as error:
+        await tree.list(b"/")
+    assert {name for name, _ in error.value.entries} == {b"fs", b"top"}
 
 
 async def test_a_file_is_never_listed(store: FakeStore, tree: Tree, autojump_clock: MockClock) -> None:

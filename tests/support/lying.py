@@ -1,0 +1,176 @@
+"""A vehicle whose answers can be changed, over any link, and frames for forgers.
+
+`LyingServer` is a simulated server with two hooks. `lie_for` puts one into a `World` (in memory, on the
+test's clock); `LyingVehicle` runs one in a thread and speaks UDP or TCP, as a vehicle of the mount tier does.
+`frame`, `heartbeat` and `ftp` build MAVLink by hand, for a socket that pretends to be the vehicle.
+"""
+
+from __future__ import annotations
+
+import random
+import struct
+import threading
+from collections.abc import Callable, Iterable, Sequence
+from types import TracebackType
+from typing import Any, Self
+
+import trio
+from fastcrc import crc16
+
+from mavftpfs.link.messages import Address
+from mavftpfs.protocol.payload import NakCode, Opcode, Payload, decode_reply, decode_request
+from mavftpfs.sim.endpoints import Endpoint, client_source, open_endpoint
+from mavftpfs.sim.filesystem import Tree
+from mavftpfs.sim.profiles import PROFILES
+from mavftpfs.sim.server import FtpServer
+from mavftpfs.sim.vehicle import SimVehicle
+from tests.support.worlds import World
+
+_FTP = (110, 84)
+_HEARTBEAT = (0, 50)
+_ACTIVE = 4
+AUTOPILOT = Address(1, 1)
+
+Change = Callable[[Payload, Payload], Iterable[Payload]]
+Answer = Callable[[Payload], Iterable[Payload] | None]
+
+
+class LyingServer(FtpServer):
+    """Answers as its profile does, but for the hooks. Both may be set at any time, also to None.
+
+    Attributes:
+        change: called with a request and one honest reply to it; what it returns is sent instead.
+        answer: called with each request; returns the replies to send, or None where the server is to answer.
+    """
+
+    change: Change | None = None
+    answer: Answer | None = None
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self._asked: dict[int, Payload] = {}
+        self._forged: list[tuple[Address, bytes]] = []
+
+    def handle(self, wire: bytes, source: Address, now: float) -> None:
+        """Take a request."""
+        request = decode_request(wire)
+        self._asked[request.seq] = request
+        replies = None if self.answer is None else self.answer(request)
+        if replies is None:
+            super().handle(wire, source, now)
+        else:
+            self._forged += [(source, reply.encode()) for reply in replies]
+
+    def handle_run(self, wires: Sequence[bytes], source: Address, now: float) -> None:
+        """Take requests."""
+        for wire in wires:
+            self.handle(wire, source, now)
+
+    def outgoing(self, now: float) -> list[tuple[Address, bytes]]:
+        """Return the replies to send now, as the hooks want them."""
+        forged, self._forged = self._forged, []
+        out = forged
+        for target, wire in super().outgoing(now):
+            reply = decode_reply(wire)
+            request = self._asked.get((reply.seq - 1) & 0xFFFF)
+            if self.change is None or request is None:
+                out.append((target, wire))
+            else:
+                out += [(target, changed.encode()) for changed in self.change(request, reply)]
+        return out
+
+    def next_deadline(self) -> float | None:
+        """Return when something is to be sent."""
+        return float("-inf") if self._forged else super().next_deadline()
+
+
+def lie_for(world: World) -> LyingServer:
+    """Put a lying server in the place of a world's own, before anything was asked, and return it."""
+    vehicle = world.vehicle
+    server = LyingServer(world.tree, vehicle.profile, rng=random.Random(world.seed), address=vehicle.address)
+    server.tx_room = vehicle.server.tx_room
+    vehicle.server = server
+    return server
+
+
+class LyingVehicle:
+    """A simulated vehicle in a thread of this process: `with LyingVehicle(tree, "udpout:127.0.0.1:14550")`.
+
+    link: as the vehicle writes it (`udpin:`, `udpout:`, `tcpin:`, `tcp:`). seed: two vehicles with different
+    seeds have different unique ids.
+
+    Attributes:
+        server: its hooks may be set while it runs.
+        source: SOURCE for mavftpfs.
+        vehicle: its state may be read; change it only by `do`.
+    """
+
+    def __init__(self, tree: Tree, link: str, *, profile: str = "px4", seed: int = 1) -> None:
+        rng = random.Random(seed)
+        self.vehicle = SimVehicle(tree, PROFILES[profile], rng=rng)
+        self.server = LyingServer(tree, PROFILES[profile], rng=rng)
+        self.vehicle.server = self.server
+        self.source = ""
+        self._link = link
+        self._ready = threading.Event()
+        self._thread = threading.Thread(target=trio.run, args=(self._serve,))
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        assert self._ready.wait(30.0)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.do(self._scope.cancel)
+        self._thread.join()
+
+    def do(self, function: Callable[[], object]) -> None:
+        """Have something done in the vehicle's thread, and then what follows from it sent."""
+
+        def call() -> None:
+            function()
+            self._endpoint.kick()
+
+        trio.from_thread.run_sync(call, trio_token=self._token)
+
+    async def _serve(self) -> None:
+        with trio.CancelScope() as self._scope:
+            async with open_endpoint(self._link) as link:
+                self.vehicle.set_stream(link.is_stream)
+                self._endpoint = Endpoint(self.vehicle, link)
+                self._token = trio.lowlevel.current_trio_token()
+                self.source = client_source(link)
+                self._ready.set()
+                await self._endpoint.run()
+
+
+def ack(request: Payload, data: bytes) -> Payload:
+    """Return an ACK of a request."""
+    seq = (request.seq + 1) & 0xFFFF
+    return Payload(seq, request.session, Opcode.ACK, len(data), request.opcode, 0, request.offset, data)
+
+
+def nak(request: Payload, code: int = NakCode.FAIL) -> Payload:
+    """Return a NAK of a request."""
+    return ack(request, bytes([code]))._replace(opcode=Opcode.NAK)
+
+
+def frame(seq: int, source: Address, message: tuple[int, int], body: bytes) -> bytes:
+    """Return an unsigned MAVLink 2 frame; message: its id and its extra CRC byte."""
+    number, extra = message
+    body = body.rstrip(b"\0") or b"\0"
+    head = struct.pack("<BBBBBB", len(body), 0, 0, seq & 0xFF, *source) + number.to_bytes(3, "little")
+    return b"\xfd" + head + body + struct.pack("<H", crc16.mcrf4xx(head + body + bytes([extra])))
+
+
+def heartbeat(seq: int = 0, source: Address = AUTOPILOT, *, armed: bool = False) -> bytes:
+    """Return the heartbeat of a PX4 quadrotor."""
+    mode = 0x41 | (0x80 if armed else 0)
+    return frame(seq, source, _HEARTBEAT, struct.pack("<IBBBBB", 0, 2, 12, mode, _ACTIVE, 3))
+
+
+def ftp(payload: bytes, target: Address, seq: int = 0, source: Address = AUTOPILOT) -> bytes:
+    """Return a FILE_TRANSFER_PROTOCOL frame with a payload of 251 bytes."""
+    return frame(seq, source, _FTP, bytes([0, *target]) + payload)
