@@ -126,6 +126,9 @@ class StreamLink:
 
     def replace(self, pipe: Pipe) -> None:
         """Go on with another pipe (the peer came back on a new connection)."""
+        if self._closed:
+            pipe.close()
+            return
         self._drop()
         self._pipe = pipe
         self._heard_at = trio.current_time()

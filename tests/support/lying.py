@@ -29,7 +29,7 @@ from tests.support.worlds import World
 _FTP = (110, 84)
 _HEARTBEAT = (0, 50)
 _ACTIVE = 4
-AUTOPILOT = Address(1, 1)
+_VEHICLE = Address(1, 1)
 
 Change = Callable[[Payload, Payload], Iterable[Payload]]
 Answer = Callable[[Payload], Iterable[Payload] | None]
@@ -50,6 +50,7 @@ class LyingServer(FtpServer):
         super().__init__(*args, **kwargs)
         self._asked: dict[int, Payload] = {}
         self._forged: list[tuple[Address, bytes]] = []
+        self._forged_at = 0.0
 
     def handle(self, wire: bytes, source: Address, now: float) -> None:
         """Take a request."""
@@ -60,6 +61,7 @@ class LyingServer(FtpServer):
             super().handle(wire, source, now)
         else:
             self._forged += [(source, reply.encode()) for reply in replies]
+            self._forged_at = now
 
     def handle_run(self, wires: Sequence[bytes], source: Address, now: float) -> None:
         """Take requests."""
@@ -81,7 +83,7 @@ class LyingServer(FtpServer):
 
     def next_deadline(self) -> float | None:
         """Return when something is to be sent."""
-        return float("-inf") if self._forged else super().next_deadline()
+        return self._forged_at if self._forged else super().next_deadline()
 
 
 def lie_for(world: World) -> LyingServer:
@@ -113,7 +115,7 @@ class LyingVehicle:
         self.source = ""
         self._link = link
         self._ready = threading.Event()
-        self._thread = threading.Thread(target=trio.run, args=(self._serve,))
+        self._thread = threading.Thread(target=trio.run, args=(self._serve,), daemon=True)
 
     def __enter__(self) -> Self:
         self._thread.start()
@@ -127,13 +129,13 @@ class LyingVehicle:
         self._thread.join()
 
     def do(self, function: Callable[[], object]) -> None:
-        """Have something done in the vehicle's thread, and then what follows from it sent."""
+        """Have something done in the vehicle's thread, soon, and then what follows from it sent."""
 
         def call() -> None:
             function()
             self._endpoint.kick()
 
-        trio.from_thread.run_sync(call, trio_token=self._token)
+        self._token.run_sync_soon(call)
 
     async def _serve(self) -> None:
         with trio.CancelScope() as self._scope:
@@ -165,12 +167,12 @@ def frame(seq: int, source: Address, message: tuple[int, int], body: bytes) -> b
     return b"\xfd" + head + body + struct.pack("<H", crc16.mcrf4xx(head + body + bytes([extra])))
 
 
-def heartbeat(seq: int = 0, source: Address = AUTOPILOT, *, armed: bool = False) -> bytes:
+def heartbeat(seq: int = 0, source: Address = _VEHICLE, *, armed: bool = False) -> bytes:
     """Return the heartbeat of a PX4 quadrotor."""
     mode = 0x41 | (0x80 if armed else 0)
     return frame(seq, source, _HEARTBEAT, struct.pack("<IBBBBB", 0, 2, 12, mode, _ACTIVE, 3))
 
 
-def ftp(payload: bytes, target: Address, seq: int = 0, source: Address = AUTOPILOT) -> bytes:
+def ftp(payload: bytes, target: Address, seq: int = 0, source: Address = _VEHICLE) -> bytes:
     """Return a FILE_TRANSFER_PROTOCOL frame with a payload of 251 bytes."""
     return frame(seq, source, _FTP, bytes([0, *target]) + payload)
