@@ -1,3 +1,3 @@
 """mavftpfs mounts a drone's files, served over MAVLink FTP, as a local directory."""
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"

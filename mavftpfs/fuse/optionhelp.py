@@ -1,4 +1,4 @@
-"""What each mount option is for, in a line: for --help. Layer: fuse; pure. README.md has more."""
+"""What each mount option is for, in a line: for --help. Layer: fuse; pure. docs/guide.md has more."""
 
 from __future__ import annotations
 

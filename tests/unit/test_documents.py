@@ -8,6 +8,8 @@ from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
+import mavftpfs
+
 PROJECT = Path(__file__).parents[2]
 
 CITED = re.compile(r"[\w./-]*\w\.md\b")
@@ -88,3 +90,13 @@ def test_a_missing_page_and_a_broken_link_are_seen() -> None:
         "README.md: docs/none.md",
         "README.md: #nothing",
     ]
+
+
+def test_the_newest_entry_of_the_changes_is_this_version() -> None:
+    versions = re.findall(r"^## (\S+)", (PROJECT / "CHANGELOG.md").read_text(), re.MULTILINE)
+    assert versions[0] == mavftpfs.__version__
+    assert len(versions) == len(set(versions))
+
+
+def test_readme_stays_short() -> None:
+    assert len((PROJECT / "README.md").read_text().split()) <= 1500

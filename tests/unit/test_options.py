@@ -220,17 +220,17 @@ def test_help_says_what_each_option_is_for() -> None:
 
 OPTION_ROWS = [
     [cell.strip() for cell in line.split("|")[1:3]]
-    for line in (Path(__file__).parents[2] / "README.md")
+    for line in (Path(__file__).parents[2] / "docs/guide.md")
     .read_text()
     .partition("## Options")[2]
     .partition("\n## ")[0]
     .splitlines()
     if line.startswith("| `")
 ]
-"""README.md's table: names and defaults, as written there."""
+"""The guide's table: names and defaults, as written there."""
 
 
-def test_readme_has_a_place_for_each_option() -> None:
+def test_the_guide_has_a_place_for_each_option() -> None:
     named = [name.strip("` ") for names, _ in OPTION_ROWS for name in names.split(",")]
     assert sorted(name.partition("=")[0] for name in named) == sorted(
         name.strip("=") for name in option_names()
@@ -239,7 +239,7 @@ def test_readme_has_a_place_for_each_option() -> None:
 
 
 def told_defaults() -> list[tuple[str, str]]:
-    """Return each default that README.md or --help names, by option."""
+    """Return each default that the guide or --help names, by option."""
     told = [(name.strip("="), text.rpartition(": ")[2]) for name, text in HELP.items() if ": " in text]
     for names, defaults in OPTION_ROWS:
         options = [name.strip("` ").partition("=")[0] for name in names.split(",")]
@@ -248,7 +248,7 @@ def told_defaults() -> list[tuple[str, str]]:
     return [(name, value) for name, value in told if name in VALUES]
 
 
-def test_readme_and_help_tell_the_real_defaults() -> None:
+def test_guide_and_help_tell_the_real_defaults() -> None:
     checked = set()
     for name, value in told_defaults():
         with suppress(ValueError):

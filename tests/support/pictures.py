@@ -1,0 +1,163 @@
+"""Draws README's pictures: scripts/pictures [FOLDER] makes demo.svg and status.svg there (docs/pictures).
+
+The commands run for real, in a pseudo-terminal of 100 columns. What they print goes through a small model of
+a terminal and becomes an SVG.
+"""
+
+from __future__ import annotations
+
+import os
+import pty
+import re
+import select
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+
+from rich.console import Console
+from rich.text import Text
+
+from tests.support.vehicles import free_udp_port
+
+COLUMNS, ROWS = 100, 50
+FOLDER = Path(__file__).parents[2] / "docs" / "pictures"
+PATIENCE = 90.0
+"""Seconds for each command."""
+
+_CONTROL = re.compile(r"\x1b\[([0-9;?]*)([A-Za-z])|\r|\n")
+_MAVFTPFS = [sys.executable, "-m", "mavftpfs"]
+
+
+def in_terminal(command: Sequence[str], folder: Path | None = None) -> str:
+    """Return everything a command writes to a terminal, which it must end well with."""
+    ours, its = pty.openpty()
+    environment = {**os.environ, "TERM": "xterm-256color", "COLUMNS": str(COLUMNS), "LINES": str(ROWS)}
+    child = subprocess.Popen(
+        command, cwd=folder, env=environment, stdin=subprocess.DEVNULL, stdout=its, stderr=its
+    )
+    os.close(its)
+    try:
+        text = b"".join(_arriving(ours)).decode(errors="replace")
+        if child.wait(PATIENCE):
+            raise RuntimeError(f"{' '.join(command)} ended with {child.returncode}: {text[-500:]}")
+        return text
+    finally:
+        os.close(ours)
+        if child.poll() is None:
+            child.kill()
+            child.wait()
+
+
+def _arriving(terminal: int) -> Iterator[bytes]:
+    """Yield what arrives until the other side is closed."""
+    deadline = time.monotonic() + PATIENCE
+    while time.monotonic() < deadline:
+        if not select.select([terminal], [], [], 1.0)[0]:
+            continue
+        try:
+            data = os.read(terminal, 65536)
+        except OSError:  # EIO: nobody has the other side open any more
+            return
+        if not data:
+            return
+        yield data
+
+
+def screen(output: str) -> list[str]:
+    """Return the lines that stand on a terminal in the end, with their colours.
+
+    Knows what rich's live displays do: they go up some lines, erase these, and print them again from their
+    beginning.
+    """
+    lines, row, done = [""], 0, 0
+    for match in _CONTROL.finditer(output):
+        lines[row] += output[done : match.start()]
+        done = match.end()
+        if match[0] == "\n":
+            row += 1
+            if row == len(lines):
+                lines.append("")
+        elif match[2] == "A":
+            row = max(row - int(match[1] or 1), 0)
+        elif match[2] == "K":
+            lines[row] = ""
+        elif match[2] == "m":
+            lines[row] += match[0]
+    lines[row] += output[done:]
+    return lines
+
+
+def draw(lines: Sequence[str], title: str, path: Path) -> None:
+    """Write lines of a terminal as an SVG."""
+    with open(os.devnull, "w") as nowhere:
+        console = Console(record=True, width=COLUMNS, file=nowhere, force_terminal=True)
+        console.print(Text.from_ansi("\n".join(lines).strip("\n"), no_wrap=True))
+        path.write_text(console.export_svg(title=title))
+
+
+@contextmanager
+def running(*words: str, ready: str) -> Iterator[None]:
+    """Run `mavftpfs words`; the body begins when it printed `ready`."""
+    with subprocess.Popen(
+        [*_MAVFTPFS, *words], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    ) as process:
+        try:
+            assert process.stdout is not None
+            for line in process.stdout:
+                if ready in line:
+                    break
+            else:
+                raise RuntimeError(f"mavftpfs {' '.join(words)} said no {ready!r}")
+            yield
+        finally:
+            process.terminate()
+
+
+def draw_demo(path: Path) -> None:
+    """Draw the tour from mounting to the comparison."""
+    lines = screen(in_terminal([*_MAVFTPFS, "demo"]))
+    plain = [Text.from_ansi(line).plain for line in lines]
+    first = next(number for number, line in enumerate(plain) if line.startswith("$ mavftpfs"))
+    draw(lines[first:], "scripts/demo", path)
+
+
+def draw_status(path: Path) -> None:
+    """Draw `mavftpfs status` while a log is copied over a radio."""
+    with ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="mavftpfs-pictures-")))
+        log = folder / "card/fs/microsd/log/2026-11-20/10_32_15.ulg"
+        log.parent.mkdir(parents=True)
+        log.write_bytes(os.urandom(400_000))
+        (folder / "drone").mkdir()
+        port = free_udp_port()
+        link = ("--rate", "40000", "--delay", "0.03", "--jitter", "0.01", "--loss", "0.02")
+        vehicle = ("sim", str(folder / "card"), "--link", f"udpout:127.0.0.1:{port}", *link)
+        stack.enter_context(running(*vehicle, ready="MOUNTPOINT"))
+        source = f"udpin:127.0.0.1:{port}"
+        stack.enter_context(running(source, str(folder / "drone"), "-f", ready="mounted"))
+        with subprocess.Popen(["cp", folder / "drone" / log.relative_to(folder / "card"), "/dev/null"]):
+            time.sleep(5)
+            shown = in_terminal([*_MAVFTPFS, "status", str(folder / "drone")])
+    lines = [
+        "$ mavftpfs status ~/drone",
+        *shown.replace(str(folder / "drone"), "/home/me/drone").split("\r\n"),
+    ]
+    draw(lines, "mavftpfs status", path)
+
+
+def main(argv: Sequence[str]) -> int:
+    """Draw both."""
+    folder = Path(argv[0]) if argv else FOLDER
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, make in (("demo.svg", draw_demo), ("status.svg", draw_status)):
+        make(folder / name)
+        print(folder / name)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
