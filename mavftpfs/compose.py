@@ -245,7 +245,7 @@ def connect_options(options: MountOptions) -> ConnectOptions:
         heartbeat=cast(Literal["onboard", "gcs", "none"], options.heartbeat),
         signing_key=None if options.signing_key is None else read_key(options.signing_key),
         op_deadline=options.op_deadline,
-        read_mode=cast(Literal["auto", "burst", "window"], options.read_mode),
+        read_mode=cast(Literal["window", "burst"], options.read_mode),
         chunk=options.chunk,
         window=options.window,
         when_armed=cast(Literal["ro", "ok"], options.when_armed),

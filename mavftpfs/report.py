@@ -32,8 +32,7 @@ _WORDS = {
     "other_ftp_client": "another FTP client heard",
     "pid": "process",
     "window": "requests at a time",
-    "window_rate": "rate by requests",
-    "burst_rate": "rate by bursts",
+    "read_mode": "reading by",
 }
 _FIRST = ("bytes_held", "files_undelivered", "transfers", "errors")
 """What people look for in `cache`: a small terminal that shows the status again and again cuts its end."""

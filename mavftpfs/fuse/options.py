@@ -76,7 +76,7 @@ class MountOptions:
     rmw_max: int = 64 << 20
     op_deadline: float = 30.0
     connect_timeout: float = 30.0
-    read_mode: str = "auto"
+    read_mode: str = "window"
     chunk: int | None = None
     window: int | None = None
     bwlimit: int | None = None
@@ -223,7 +223,7 @@ VALUES: dict[str, Parser] = {
     "rmw_max": size(0, _SIZE_MAX),
     "op_deadline": seconds(1, 3600),
     "connect_timeout": seconds(1, 3600),
-    "read_mode": choice("auto", "burst", "window"),
+    "read_mode": choice("window", "burst"),
     "chunk": number(16, 239, auto=True),
     "window": number(1, 256, auto=True),
     "bwlimit": size(100, _SIZE_MAX),

@@ -1,8 +1,15 @@
-"""One BurstReadFile stream: which packets belong to it, and when it is over. Layer: protocol; pure.
+"""Reading an open file by bursts (`read_mode=burst`). Layer: protocol; pure.
 
-A packet belongs when seq and offset agree: offset == start + k * packet size and seq == request seq + 1
-+ k (mod 2^16). The packet size is what the server sends, not what was asked (PX4 ignores that). The end
-is an EOF NAK, the end of the file, `burst_complete` followed by quiet, or quiet alone (servers.md 14.15):
+One BurstReadFile brings many packets of data, which saves the uplink of a half-duplex radio. `BurstTransfer`
+asks for a burst where the first wanted byte is missing. What a burst left out, and everything while others
+wait for answers, it reads by a window of ReadFile requests, as ReadTransfer does; never both at once, because
+a ReadFile during a burst moves MAVSDK's stream. A burst that was asked for cannot be stopped: ArduPilot sends
+500 to 2000 packets, and answers nothing else until then.
+
+`Burst` follows one stream. A packet belongs when seq and offset agree: offset == start + k * packet size and
+seq == request seq + 1 + k (mod 2^16). The packet size is what the server sends, not what was asked (PX4
+ignores that). The end is an EOF NAK, the end of the file, `burst_complete` followed by quiet, or quiet alone
+(servers.md 14.15):
 the flag may be garbage, the NAK's offset may be wrong, and MAVSDK sends no NAK.
 """
 
@@ -10,13 +17,20 @@ from __future__ import annotations
 
 from math import inf
 
+from mavftpfs.protocol.chunking import ChunkSize
 from mavftpfs.protocol.payload import MAX_DATA, NakCode, Opcode, Payload
+from mavftpfs.protocol.reading import SESSION_CODES, DataSink, ReadTransfer
+from mavftpfs.protocol.requests import Request, manner_of
+from mavftpfs.shared.errors import MavftpfsError, SessionLost
+from mavftpfs.shared.extents import ExtentSet
 
 _MOST_PACKETS = 40_000
 _MIN_QUIET = 1.0
 _SLOW_PACKET = 0.03
 _SLOW_QUIET = 2.0
 _INTERVALS = 8
+_BARREN_BURSTS = 2
+"""After so many bursts without data the rest is read by requests."""
 
 
 class Burst:
@@ -35,7 +49,6 @@ class Burst:
         "over",
         "packet",
         "packets",
-        "received",
         "rto",
         "sent_at",
         "seq",
@@ -52,7 +65,6 @@ class Burst:
         self.rto = rto
         self.packet = 0
         self.packets = 0
-        self.received = 0
         self.highest = start
         self.first_at = inf
         self.last_at = now
@@ -126,7 +138,6 @@ class Burst:
             data = data[: max(0, self.size - offset)]
             stop = self.size
         self.highest = max(self.highest, stop)
-        self.received += len(data)
         return data
 
     def _fits(self, ahead: int, count: int, index: int, *, at_end: bool) -> bool:
@@ -150,3 +161,108 @@ class Burst:
         else:
             self.first_at = now
         self.last_at = now
+
+
+class BurstTransfer(ReadTransfer):
+    """A ReadTransfer that reads by bursts.
+
+    Attributes:
+        by_requests: read by ReadFile requests from the next safe point on, which is the end of a running
+        burst.
+    """
+
+    def __init__(self, session: int, size: int, sink: DataSink, chunks: ChunkSize | None = None) -> None:
+        super().__init__(session, size, sink, chunks)
+        self.by_requests = False
+        self._burst: Burst | None = None
+        self._gaps = ExtentSet()
+        self._barren_bursts = 0
+        self._gave_up = False
+
+    @property
+    def bursting(self) -> bool:
+        """Whether a burst is running."""
+        return self._burst is not None
+
+    @property
+    def idle(self) -> bool:
+        """Whether nothing is wanted, on its way or streaming."""
+        return self._burst is None and super().idle
+
+    def next_requests(self, most: int, now: float) -> list[Request]:
+        """Return the BurstReadFile that is due, or ReadFiles: for what the last burst left out, or for
+        all."""
+        if self._burst is not None:
+            return []
+        if self.by_requests or self._gave_up:
+            return super().next_requests(most, now)
+        gap = self._gaps.take_first(self.chunks.size)
+        if gap is not None:
+            self._forget_want(*gap)
+            return self._requests_for(*gap, self.chunks.size)
+        first = self._demand.first() or self._ahead.first()
+        if self._unanswered or first is None:
+            return []
+        opcode = Opcode.BURST_READ_FILE
+        return [Request(self, opcode, manner_of(opcode), self.session, first[0], self.chunks.size)]
+
+    def on_burst_sent(self, request: Request, now: float) -> int:
+        """Begin to follow the burst; return how many packets it may bring (MAVSDK: all the rest)."""
+        rto = self.port.timeout("data")
+        self._burst = burst = Burst(request.seq, request.offset, self.size, request.size, now, rto)
+        self.timer = burst.quiet_deadline()
+        return (self.size - request.offset) // request.size + 2
+
+    def on_burst(self, reply: Payload, now: float) -> bool:
+        """Place a packet of the running burst."""
+        burst = self._burst
+        data = None if burst is None else burst.take(reply, now)
+        if burst is None or data is None:
+            return False
+        if data:
+            self._forget_want(reply.offset, reply.offset + len(data))
+            self._place(reply.offset, [data])
+        if burst.endless:
+            self.fail(SessionLost("the vehicle repeats itself in a burst", by_server=True))
+        elif burst.over:
+            self._end_burst(burst)
+        elif burst.complete_seen or burst.packets == 1:  # from here on it is over sooner
+            self.timer = burst.quiet_deadline()
+        return True
+
+    def on_timer(self, now: float) -> None:
+        """End a burst that went quiet; packets that came meanwhile only moved the deadline."""
+        burst = self._burst
+        if burst is None or now < burst.quiet_deadline():
+            self.timer = inf if burst is None else burst.quiet_deadline()
+        else:
+            self._end_burst(burst)
+
+    def drop_readahead(self) -> None:
+        """Forget wants that nobody waits for; what is on its way still arrives."""
+        super().drop_readahead()
+        self._gaps = ExtentSet(
+            part for start, stop in self._gaps for part in self._demand.intersection(start, stop)
+        )
+
+    def fail(self, error: MavftpfsError) -> None:
+        """End; what was on its way is wanted again."""
+        self._burst = None
+        super().fail(error)
+
+    def _forget_want(self, start: int, stop: int) -> None:
+        self._demand.discard(start, stop)
+        self._ahead.discard(start, stop)
+
+    def _end_burst(self, burst: Burst) -> None:
+        self._burst, self.timer = None, inf
+        self._gaps = ExtentSet(self.wants.intersection(0, burst.highest))
+        if burst.packets:
+            self._barren_bursts = 0
+            return
+        # Lost, refused, or the session is gone. ReadFile answers more clearly.
+        self._barren_bursts += 1
+        if burst.nak in SESSION_CODES:
+            self.fail(SessionLost(f"a burst was refused with NAK {burst.nak}", by_server=True))
+        elif burst.nak is not None or self._barren_bursts >= _BARREN_BURSTS:
+            self._gave_up = True

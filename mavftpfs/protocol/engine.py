@@ -16,7 +16,6 @@ from collections.abc import Callable, Sequence
 from math import inf
 from operator import attrgetter
 
-from mavftpfs.protocol.burstwatch import BurstWatch
 from mavftpfs.protocol.flow import Flow
 from mavftpfs.protocol.ledger import LAST_SEQ, Ledger
 from mavftpfs.protocol.payload import NakCode, Opcode, Payload, reply_of, split_run
@@ -74,7 +73,8 @@ class Engine:
         self._finished: list[Operation] = []
         self._timers = Timers()
         self._due, self._heard_at = inf, -inf
-        self._bursts = BurstWatch()
+        self._burst_op: Operation | None = None  # whose the burst packets may be
+        self._burst_heard_at = -inf  # believed or not: an abandoned burst of ArduPilot goes on
         self._apply_queue_limit()
 
     # --- facts
@@ -134,7 +134,8 @@ class Engine:
 
     def _release(self, op: Operation) -> None:
         self._ledger.release(op)
-        self._bursts.release(op)
+        if op is self._burst_op:
+            self._burst_op = None
 
     def _retire(self) -> None:
         """Move ended operations to the finished ones."""
@@ -152,7 +153,7 @@ class Engine:
             return
         request = self._ledger.find(seq)
         if request is None:
-            if req_opcode == _BURST and self._bursts.running:
+            if req_opcode == _BURST and self._burst_op is not None and self._burst_op.bursting:
                 self.stats.incoherent += 1
             else:
                 self.stats.on_unknown(reply, now, explained=self._ledger.repeats.explain(seq, now))
@@ -173,7 +174,7 @@ class Engine:
         replies = split_run(wires)
         at, malformed = 0, 0
         while at < len(replies):
-            run = self._ledger.settle_run(replies, at, self._bursts.heard_at, now)
+            run = self._ledger.settle_run(replies, at, self._burst_heard_at, now)
             try:
                 if run:
                     self._believe_run(run, now)
@@ -204,9 +205,7 @@ class Engine:
         if not self._ledger.settle(request, reply.seq, now):
             self.stats.on_spurious(request)
             flow.on_spurious()
-        if self._bursts.heard_at >= request.sent_at:
-            self._bursts.on_answer(request, self.traits, self.timeout(request.manner.family))
-        elif request.single:
+        if request.single and request.sent_at > self._burst_heard_at:
             rtt = self._timers.sample(request, now)
         flow.on_reply(now, rtt, request.order, self._ledger.order)
         for lost in self._ledger.lose_outrun():
@@ -243,16 +242,14 @@ class Engine:
     # --- bursts
 
     def _on_burst(self, reply: Payload, now: float) -> bool:
-        bursts = self._bursts
-        bursts.heard_at = now
-        op = bursts.op
+        self._burst_heard_at = now
+        op = self._burst_op
         if op is None or not op.on_burst(reply, now):
             return False
         self.stats.replies += 1
         self.stats.naks += reply.opcode == _NAK
         self._heard_at = now
         op.progress_at = now
-        bursts.on_packet(self.traits)
         if op.done:
             self._retire()
         return True
@@ -295,7 +292,7 @@ class Engine:
             room = self.flow.room(others, now, paced=op.paced, urgent=True)
         left = room
         while left > 0:
-            again = ledger.take_again(op) if ledger.again else None
+            again = ledger.take_again(op, now) if ledger.again else None
             requests = op.next_requests(left, now) if again is None else [again]
             if not requests:
                 break
@@ -328,7 +325,7 @@ class Engine:
         request.op.sent = True
         self.stats.retransmissions += request.sends > 1
         if request.opcode == _BURST:
-            self._bursts.begin(request)
+            self._burst_op = request.op
             # Whatever the burst's packets use as seq must not be a seq of ours (servers.md 2, collision).
             self._ledger.jump(request.op.on_burst_sent(request, now))
         else:
@@ -378,10 +375,8 @@ class Engine:
 
     def _reconsidered(self, request: Request) -> float:
         """Return when this transmission is overdue by what is known now: round trips may have grown."""
-        since = request.sent_at
-        if not self.traits.answers_during_burst:
-            # ArduPilot answers nothing else during a burst: silence proves nothing then.
-            since = max(since, self._bursts.heard_at)
+        # ArduPilot answers nothing else during a burst: silence proves nothing then (servers.md 4).
+        since = max(request.sent_at, self._burst_heard_at)
         due = since + self._timers.wait(request)
         patience = self.flow.patience if request.manner.ordered and self._ledger.in_flight > _FEW else 0.0
         return max(due, min(due, self._heard_at) + patience)  # a stream of other answers is no pause

@@ -295,14 +295,14 @@ class Ledger:
 
     # --- by operation
 
-    def take_again(self, op: Operation) -> Request | None:
+    def take_again(self, op: Operation, now: float) -> Request | None:
         """Remove and return the oldest lost request of `op` that is to go out again, or None."""
         index = 0
         while index < len(self.again):
             request = self.again[index]
             if request.op is not op:
                 index += 1
-            elif op.takes_back(request):
+            elif op.takes_back(request, now):
                 self.forget(request)
             else:
                 return self.again.pop(index)

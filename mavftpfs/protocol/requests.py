@@ -51,7 +51,6 @@ WORKING = frozenset(("slow", "work"))
 READ_MANNER = Manner("data", same_seq=False, ordered=True, echoes_offset=True, free_sends=20)
 WRITE_MANNER = Manner("write", same_seq=False, ordered=True, free_sends=20)
 LAST_WRITE_MANNER = WRITE_MANNER._replace(once=True)
-KEEP_ALIVE_MANNER = Manner("path", same_seq=False, once=True)
 _LIST = Manner("list", same_seq=False, ordered=True, patient_after=4, patience=2.5)
 _PATH = Manner("path", same_seq=True, free_sends=4)
 _SLOW = Manner("slow", same_seq=True, patient_after=2, patience=40.0)
@@ -310,7 +309,7 @@ class Operation:
         """Take believed ACKs to requests with the opcode `bulk`, in the order in which they came."""
         raise NotImplementedError
 
-    def takes_back(self, request: Request) -> bool:
+    def takes_back(self, request: Request, now: float) -> bool:
         """One was lost; return whether its bytes are asked for by other requests in its place."""
         return False
 

@@ -10,8 +10,8 @@ from collections import deque
 from collections.abc import Callable
 from typing import Protocol
 
-from mavftpfs.protocol.chunked import Chunked
-from mavftpfs.protocol.payload import MAX_DATA, NakCode, Opcode, Payload
+from mavftpfs.protocol.chunking import Chunked, ChunkSize
+from mavftpfs.protocol.payload import NakCode, Opcode, Payload
 from mavftpfs.protocol.requests import (
     LAST_WRITE_MANNER,
     WRITE_MANNER,
@@ -66,7 +66,7 @@ class WriteTransfer(Chunked):
     """Writes what a source has for as long as its owner likes.
 
     Args:
-        session: id of the file open for writing. chunk: most bytes of a request, 1..239.
+        session: id of the file open for writing. chunks: the size of requests.
         in_flight: the most requests unanswered at once, None as the engine's window allows; 1 = strict order.
         on_starved: called when the source has nothing more, which after a full window shows only once all of
             that was answered.
@@ -88,12 +88,12 @@ class WriteTransfer(Chunked):
         self,
         session: int,
         source: ChunkSource,
-        chunk: int = MAX_DATA,
+        chunks: ChunkSize | None = None,
         *,
         in_flight: int | None = None,
         on_starved: Callable[[], None] = lambda: None,
     ) -> None:
-        super().__init__(chunk)
+        super().__init__(chunks)
         self.session = session
         self.acked_bytes = 0
         self.failed_at: int | None = None
@@ -161,18 +161,14 @@ class WriteTransfer(Chunked):
 
     # --- requests
 
-    def next_request(self, now: float) -> Request | None:
-        """Return the next WriteFile."""
-        return next(iter(self.next_requests(1, now)), None)
-
     def next_requests(self, most: int, now: float) -> list[Request]:
         """Return WriteFile requests for bytes in a row."""
         if self._in_flight is not None:
             most = min(most, self._in_flight - len(self._unanswered))
         if self._paused or most <= 0:
             return []
-        most = self.measure_row(min(most, _ROW), now)
-        session, chunk = self.session, self.chunk
+        session = self.session
+        chunk, most = self.next_row(min(most, _ROW), now)
         piece = self._rest.popleft() if self._rest else self._next_piece(most * chunk)
         if piece is None:
             return []
@@ -212,11 +208,11 @@ class WriteTransfer(Chunked):
             self.fail(self._meaning(nak_of(request, reply)))
             return
         del self._unanswered[request]
-        self.count_answered(request, 1, now)
+        self.chunks.on_answered(request.size, 1, now)
         if reply.offset and reply.offset == request.offset:
             self.port.traits.write_ack_offset = True
         count = request.size
-        if reply.data != self._usual or count != self.most:
+        if reply.data != self._usual or count != self.chunks.most:
             count = self._written(request, reply.data)
         if count:
             self._barren = 0
@@ -227,9 +223,9 @@ class WriteTransfer(Chunked):
 
     def on_run(self, run: Run, now: float) -> None:
         """Tell the source what was written, in a row at once."""
-        unanswered, usual, full = self._unanswered, self._usual, self.most
+        unanswered, usual, full = self._unanswered, self._usual, self.chunks.most
         start = stop = run[0][0].offset
-        self.count_answered(run[0][0], len(run), now)
+        self.chunks.on_answered(run[0][0].size, len(run), now)
         if run[-1][0].offset:  # a run's answers have the offsets of their requests
             self.port.traits.write_ack_offset = True
         for request, data in run:
@@ -265,7 +261,7 @@ class WriteTransfer(Chunked):
             return request.size
         traits.write_ack_counts = True
         count = int.from_bytes(data, "little")
-        if count == self.most == request.size:
+        if count == self.chunks.most == request.size:
             self._usual = data
         # More than was sent: an answer to something else. Nothing is proven, so it goes again.
         return count if count <= request.size else 0

@@ -25,7 +25,6 @@ from mavftpfs.protocol.engine import Engine
 from mavftpfs.protocol.flow import Flow
 from mavftpfs.session.driver import Driver, PayloadTrace
 from mavftpfs.session.policy import ReadMode
-from mavftpfs.session.readmode import ReadSteering
 from mavftpfs.session.scheduler import Scheduler
 from mavftpfs.session.store import Store
 from mavftpfs.session.vehicle import Vehicle
@@ -69,7 +68,7 @@ class ConnectOptions:
     heartbeat: Literal["onboard", "gcs", "none"] = "onboard"
     signing_key: bytes | None = None
     op_deadline: float = 30.0
-    read_mode: ReadMode = "auto"
+    read_mode: ReadMode = "window"
     chunk: int | None = None
     window: int | None = None
     when_armed: Literal["ro", "ok"] = "ro"
@@ -88,7 +87,6 @@ class Connection:
     link: Link
     options: ConnectOptions
     clock: Callable[[], float]
-    steering: ReadSteering
     was_lost: bool = False
     news: list[Callable[[str], None]] = field(default_factory=list)
     _first_heartbeat: trio.Event = field(default_factory=trio.Event)
@@ -126,7 +124,13 @@ class Connection:
             "reboots": vehicle.reboots,
             "other_ftp_client": vehicle.foreign_client(now),
             "rtt": self.engine.rtt,
-            "speed": self.steering.status(),
+            "speed": {
+                "read_mode": self.scheduler.read_mode,
+                "window": self.engine.flow.window,
+                "in_flight": self.engine.in_flight,
+                "chunk": self.scheduler.read_chunks.size,
+                "loss": round(self.engine.flow.loss, 4),
+            },
             "session_open": None
             if self.scheduler.session is None
             else self.scheduler.session.path.decode("utf-8", "replace"),
@@ -263,26 +267,24 @@ def _build(
     flow = Flow(serial=link.is_serial, limit=options.window, budget=budget)
     engine = Engine(rng, flow, op_deadline=options.op_deadline)
     driver = Driver(link, framer, engine, vehicle, clock=clock, trace=trace)
-    mode = options.read_mode if budget is None else "window"
-    steering = ReadSteering(engine, mode, options.chunk)
     scheduler = Scheduler(
         driver,
         engine,
         vehicle,
-        steering,
         clock=clock,
         op_deadline=options.op_deadline,
         when_armed_ok=options.when_armed == "ok",
+        read_mode=options.read_mode if budget is None else "window",
+        chunk=options.chunk,
     )
     store = Store(scheduler, vehicle, clock=clock, op_deadline=options.op_deadline)
-    connection = Connection(store, vehicle, scheduler, engine, driver, link, options, clock, steering)
+    connection = Connection(store, vehicle, scheduler, engine, driver, link, options, clock)
     driver.on_batch = scheduler.on_batch
 
     def on_reboot() -> None:
         engine.forget_server()
         scheduler.on_reboot()
         store.forget_traits()
-        steering.forget()
         connection._tell("reboot")
 
     vehicle.on_reboot = on_reboot

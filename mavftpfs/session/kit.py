@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
-from mavftpfs.protocol.chunks import Chunks
+from mavftpfs.protocol.chunking import ChunkSize
 from mavftpfs.protocol.engine import Engine
 from mavftpfs.session.doubt import Doubt
 from mavftpfs.session.driver import Driver
@@ -19,7 +19,7 @@ from mavftpfs.shared.traits import WriteTraits
 
 @dataclass(frozen=True, slots=True)
 class Kit:
-    """The session and what it runs on. write_chunks: chooses the size of WriteFiles, unless it was given."""
+    """The session and what it runs on. write_chunks: the size of WriteFiles."""
 
     holder: SessionHolder
     driver: Driver
@@ -28,7 +28,7 @@ class Kit:
     gate: Gate
     clock: Callable[[], float]
     echoes: Echoes
-    write_chunks: Chunks | None
+    write_chunks: ChunkSize
     doubt: Doubt
 
 

@@ -57,8 +57,7 @@ async def is_same(kit: Kit, upload: QueuedUpload) -> bool:
 
 
 async def _holds(kit: Kit, path: bytes, offset: int, expected: bytes) -> bool:
-    if kit.write_chunks is not None:
-        expected = expected[: kit.write_chunks.size]  # longer frames may not pass
+    expected = expected[: kit.write_chunks.size]  # longer frames may not pass
     session = await kit.holder.open(path, Opcode.OPEN_FILE_RO)
     operation = Simple(Opcode.READ_FILE, session=session.id, offset=offset, size=len(expected))
     try:

@@ -5,8 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-Strategy = Literal["window", "burst"]
-ReadMode = Literal["auto", "window", "burst"]
+ReadMode = Literal["window", "burst"]
 
 LIGHT_USE = 0.3
 """Seconds of service in the recent past below which a file counts as an interactive one."""
@@ -27,16 +26,6 @@ STARVING_TRIPS = 20.0
 
 RELIEF = 0.5
 """Seconds of service that ends starving."""
-
-
-def choose_strategy(mode: ReadMode, *, others_ask: bool) -> Strategy:
-    """Return how to read from here on; a burst that runs is not broken off.
-
-    Bursts are for who asked for them: they are no gain for "auto" (ARCHITECTURE.md, "Bursts"). While others
-    wait for an answer no burst follows the last one: PX4 fills what the link holds with them, answers find no
-    room there, and while packets come nothing is asked again: a listing was given up after 30 s.
-    """
-    return "burst" if mode == "burst" and not others_ask else "window"
 
 
 def quantum(rtt: float | None) -> float:

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import trio
 
-from mavftpfs.protocol.transfers import ReadTransfer
+from mavftpfs.protocol.burst import BurstTransfer
+from mavftpfs.protocol.chunking import ChunkSize
+from mavftpfs.protocol.reading import ReadTransfer
 from mavftpfs.session.kit import Kit, Queue
-from mavftpfs.session.policy import should_switch
-from mavftpfs.session.readmode import ReadSteering
+from mavftpfs.session.policy import ReadMode, should_switch
 from mavftpfs.session.stream import FileStream
 from mavftpfs.shared.errors import FileChanged, MavftpfsError, RemoteProtocolError, SessionLost
 
@@ -29,9 +30,9 @@ _BOOT_POLL = 0.05
 
 
 class Reading:
-    """Runs read transfers."""
+    """Runs read transfers. mode: by which requests. chunks: their size."""
 
-    def __init__(self, kit: Kit, queue: Queue, steering: ReadSteering) -> None:
+    def __init__(self, kit: Kit, queue: Queue, mode: ReadMode, chunks: ChunkSize) -> None:
         self.active: FileStream | None = None
         self._holder = kit.holder
         self._driver = kit.driver
@@ -41,7 +42,8 @@ class Reading:
         self._vehicle = kit.vehicle
         self._doubt = kit.doubt
         self._queue = queue
-        self._steering = steering
+        self._mode: ReadMode = mode
+        self._chunks = chunks
         self._transfer: ReadTransfer | None = None
         self._seen_bytes = 0
         self._boot_unheard: float | None = None
@@ -124,16 +126,17 @@ class Reading:
         session = self._holder.session
         if session is None:  # the vehicle restarted since it was opened
             return
-        transfer = ReadTransfer(session.id, stream.size, stream, self._steering.most)
-        transfer.chunks = self._steering.chunks
+        kind = BurstTransfer if self._mode == "burst" else ReadTransfer
+        transfer = kind(session.id, stream.size, stream, self._chunks)
         started = self._clock()
         self.active, self._transfer, self._seen_bytes = stream, transfer, 0
         stream.attach(transfer)
-        self._steer(transfer, stream)
+        self._give_way(transfer)
         self._driver.start(transfer, self._holder.wake)
         try:
             while self._go_on(stream, transfer, started):
-                others = self._steer(transfer, stream)
+                others = self._queue.rival_use(stream) is not None
+                self._give_way(transfer)
                 # What woke us may be a new want, and with nothing in flight no answer would send for it.
                 self._driver.kick()
                 await self._holder.sleep(_OFTEN if others else STALL / 2)
@@ -145,16 +148,15 @@ class Reading:
                 stream.on_idle()
             stream.detach()
             self._driver.cancel(transfer)
-            self._steering.learn(transfer)
             stream.on_served(started, self._clock())
         if transfer.error is not None:
             raise transfer.error
 
-    def _steer(self, transfer: ReadTransfer, stream: FileStream) -> bool:
-        """Choose how to read from here on; return whether somebody else waits."""
-        others = self._queue.rival_use(stream) is not None
-        self._steering.steer(transfer)
-        return others
+    def _give_way(self, transfer: ReadTransfer) -> None:
+        """Let no burst follow another while somebody else waits for an answer: PX4 fills with a burst what
+        the link holds, and the answer finds no room there."""
+        if isinstance(transfer, BurstTransfer):
+            transfer.by_requests = self._engine.in_flight > transfer.in_flight
 
     def _go_on(self, stream: FileStream, transfer: ReadTransfer, started: float) -> bool:
         if transfer.done or transfer.idle or stream.closed or self._holder.session is None:

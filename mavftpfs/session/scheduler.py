@@ -13,10 +13,11 @@ from itertools import count
 import trio
 
 from mavftpfs.cache.remote import ReadSink, UploadSource
+from mavftpfs.protocol.chunking import ChunkSize
 from mavftpfs.protocol.engine import Engine
 from mavftpfs.protocol.operations import Operation
 from mavftpfs.protocol.payload import Opcode, Payload
-from mavftpfs.protocol.transfers import ReadToEof
+from mavftpfs.protocol.reading import ReadToEof
 from mavftpfs.session.copies import Written
 from mavftpfs.session.doubt import Doubt
 from mavftpfs.session.driver import Driver
@@ -26,9 +27,8 @@ from mavftpfs.session.holder import SessionHolder
 from mavftpfs.session.jobs import SessionJob
 from mavftpfs.session.kit import Kit
 from mavftpfs.session.opening import OpenSession, SessionOpener
-from mavftpfs.session.policy import LIGHT_USE, is_starving
+from mavftpfs.session.policy import LIGHT_USE, ReadMode, is_starving
 from mavftpfs.session.reading import Reading
-from mavftpfs.session.readmode import ReadSteering
 from mavftpfs.session.strays import Strays
 from mavftpfs.session.stream import FileStream
 from mavftpfs.session.suspicion import Suspicion
@@ -54,7 +54,10 @@ class Scheduler:
     """Serialises all use of the server session.
 
     op_deadline: seconds after which who waits for the session is told that it is not to be had.
-    when_armed_ok: write in flight, too.
+    when_armed_ok: write in flight, too. chunk: bytes that a request carries, 1..239; None: see ChunkSize.
+
+    Attributes:
+        read_chunks, write_chunks: the size of requests.
     """
 
     def __init__(
@@ -62,11 +65,12 @@ class Scheduler:
         driver: Driver,
         engine: Engine,
         vehicle: Vehicle,
-        steering: ReadSteering,
         *,
         clock: Callable[[], float],
         op_deadline: float = 30.0,
         when_armed_ok: bool = False,
+        read_mode: ReadMode = "window",
+        chunk: int | None = None,
     ) -> None:
         self.gate = Gate()
         self.opener = SessionOpener(driver, engine, vehicle, self.gate, clock)
@@ -78,7 +82,8 @@ class Scheduler:
         self._holder = SessionHolder(self.opener, op_deadline)
         self._driver = driver
         self._vehicle = vehicle
-        self._steering = steering
+        self.read_mode: ReadMode = read_mode
+        self.read_chunks, self.write_chunks = ChunkSize(chunk), ChunkSize(chunk)
         self._clock = clock
         self._used_at = clock()
         self._tickets = count(1)
@@ -93,13 +98,11 @@ class Scheduler:
             self.gate,
             clock,
             self.echoes,
-            steering.write_chunks,
+            self.write_chunks,
             self.doubt,
         )
-        self._reading = Reading(kit, self, steering)
-        self._uploading = Uploading(
-            kit, self, op_deadline=op_deadline, chunk=steering.most, when_armed_ok=when_armed_ok
-        )
+        self._reading = Reading(kit, self, read_mode, self.read_chunks)
+        self._uploading = Uploading(kit, self, op_deadline=op_deadline, when_armed_ok=when_armed_ok)
         writer = self._uploading.writer
         self.written, self.on_probed = self._uploading.written, self._uploading.on_probed
         news = (self._on_session_taken, writer.on_emptied, writer.on_disturbed, self.written.on_late)
@@ -163,7 +166,7 @@ class Scheduler:
         async def read(session: OpenSession) -> None:
             nonlocal data
             foreign_at = self._vehicle.foreign_at
-            operation = ReadToEof(session.id, self._steering.chunk, limit)
+            operation = ReadToEof(session.id, self.read_chunks.size, limit)
             await self._run_beside(operation)
             self._holder.require(session)
             if self._vehicle.foreign_at != foreign_at:

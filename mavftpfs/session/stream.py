@@ -11,7 +11,7 @@ from collections.abc import Callable
 import trio
 
 from mavftpfs.cache.remote import ReadSink
-from mavftpfs.protocol.transfers import ReadTransfer
+from mavftpfs.protocol.reading import ReadTransfer
 from mavftpfs.session.policy import Service
 from mavftpfs.shared.errors import FileChanged, MavftpfsError
 from mavftpfs.shared.extents import ExtentSet

@@ -5,7 +5,7 @@ from __future__ import annotations
 import trio
 
 from mavftpfs.cache.remote import FREE_FOR, UploadSource
-from mavftpfs.protocol.payload import MAX_DATA, Opcode
+from mavftpfs.protocol.payload import Opcode
 from mavftpfs.session.closing import close_refused, close_written
 from mavftpfs.session.copies import Span, WriteLog
 from mavftpfs.session.echoes import feared_for
@@ -40,7 +40,7 @@ REOPENS = 5
 class Uploading:
     """Queues uploads and serves one at a time.
 
-    op_deadline: seconds to wait for the Terminate that ends a file. chunk: most bytes of a request.
+    op_deadline: seconds to wait for the Terminate that ends a file.
     when_armed_ok: write in flight, too.
     """
 
@@ -50,11 +50,10 @@ class Uploading:
         queue: Queue,
         *,
         op_deadline: float = 30.0,
-        chunk: int = MAX_DATA,
         when_armed_ok: bool = False,
     ) -> None:
         self.uploads: list[QueuedUpload] = []
-        self.writer = Writer(kit, queue, chunk, lambda: self.may_write)
+        self.writer = Writer(kit, queue, lambda: self.may_write)
         self._holder = kit.holder
         self._kit = kit
         self._queue = queue
@@ -62,11 +61,10 @@ class Uploading:
         self._clock = kit.clock
         self._echoes = kit.echoes
         self._op_deadline = op_deadline
-        self._chunk = chunk
         self._when_armed_ok = when_armed_ok
         self._engine = kit.engine
         self._reopening = Reopening(kit, queue, self.writer)
-        self.written = WriteLog(kit.engine.stats, lambda: kit.engine.traits, kit.clock, chunk)
+        self.written = WriteLog(kit.engine.stats, lambda: kit.engine.traits, kit.clock, kit.write_chunks.most)
         self._written: QueuedUpload | None = None
         self._written_at = float("-inf")
         self._heir: QueuedUpload | None = None  # waits for what is left of that to be dead, and is next
@@ -81,7 +79,7 @@ class Uploading:
 
     def add(self, path: bytes, source: UploadSource, *, create: bool, ticket: int) -> QueuedUpload:
         """Queue an upload."""
-        feed = Feed(source, self._chunk)
+        feed = Feed(source, self._kit.write_chunks.most)
         upload = QueuedUpload(self, path, feed, create=create, ticket=ticket, asked_at=self._clock())
         self.uploads.append(upload)
         self._holder.wake()

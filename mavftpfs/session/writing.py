@@ -66,13 +66,13 @@ _ABRUPT = frozenset((Stop.DOUBT, Stop.ARMED, Stop.ABORTED))
 class Writer:
     """Runs write transfers.
 
-    chunk: most bytes of a request. may_write: whether the vehicle may be written to now.
+    may_write: whether the vehicle may be written to now.
 
     Attributes:
         current: the upload being run. rearms: how often PX4's scratch buffer had to be set right.
     """
 
-    def __init__(self, kit: Kit, queue: Queue, chunk: int, may_write: Callable[[], bool]) -> None:
+    def __init__(self, kit: Kit, queue: Queue, may_write: Callable[[], bool]) -> None:
         self.turns = Turns(kit.holder.wake)
         self.rearms = 0
         self.current: QueuedUpload | None = None
@@ -83,7 +83,7 @@ class Writer:
         self._gate = kit.gate
         self._clock = kit.clock
         self._queue = queue
-        self._chunk, self._chunks = chunk, kit.write_chunks
+        self._chunks = kit.write_chunks
         self._may_write = may_write
         self._disarmed_by_paths = False
         self._transfer: WriteTransfer | None = None
@@ -170,7 +170,7 @@ class Writer:
             transfer = WriteTransfer(
                 session.id,
                 upload.feed,
-                self._chunk,
+                self._chunks,
                 in_flight=self._most_in_flight(upload),
                 on_starved=self._holder.wake,
             )
@@ -200,7 +200,6 @@ class Writer:
         self, upload: QueuedUpload, session: OpenSession, transfer: WriteTransfer
     ) -> Stop | None:
         """Run a transfer until there is a reason to let go, or it failed (None)."""
-        transfer.chunks = self._chunks
         self._transfer, self._starved_at = transfer, None
         self._driver.start(transfer, self._holder.wake)
         try:

@@ -20,16 +20,12 @@ class Traits:
         ack_carries_own_session: an Open ACK carried the non-zero id we had asked for (servers.md 14.6);
             then every reply echoes the request's session, and it is checked.
         queue_limit: the most requests that may be in flight; None where no limit is known.
-        burst_size_honoured: burst packets had the size asked for (False: PX4 always sends 239).
-        answers_during_burst: another request was answered between the packets of a burst.
         write_ack_counts: WriteFile ACKs say how many bytes were written.
         write_ack_offset: they say where (MAVSDK's say 0), and are believed only if that is the place.
     """
 
     ack_carries_own_session: bool | None = None
     queue_limit: int | None = None
-    burst_size_honoured: bool | None = None
-    answers_during_burst: bool | None = None
     write_ack_counts: bool | None = None
     write_ack_offset: bool | None = None
 

@@ -25,7 +25,7 @@ from mavftpfs.link.udp import UdpLink
 from mavftpfs.protocol.engine import Engine
 from mavftpfs.protocol.flow import Flow
 from mavftpfs.protocol.payload import MAX_DATA, Opcode, Payload, decode_request
-from mavftpfs.protocol.transfers import ReadTransfer
+from mavftpfs.protocol.reading import ReadTransfer
 from mavftpfs.protocol.writing import WriteTransfer
 from mavftpfs.session.upload import Feed
 

@@ -164,7 +164,7 @@ def test_status_tells_about_vehicle_and_link(field: Field, small_tree: Path) -> 
     assert vehicle.source in text
     assert "retransmissions" in text
     speed = status["connection"]["speed"]
-    assert (speed["reading_by"], speed["chunk"]) == ("window", 239)
+    assert (speed["read_mode"], speed["chunk"]) == ("window", 239)
     assert speed["loss"] == 0.0 or status["connection"]["retransmissions"], "an answer may have come late"
     assert speed["window"] >= 1
     shown = mavftpfs("status", mount.path)

@@ -8,6 +8,7 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from mavftpfs.link.messages import Address
+from mavftpfs.protocol.burst import BurstTransfer
 from mavftpfs.protocol.crc import crc32
 from mavftpfs.protocol.engine import Engine
 from mavftpfs.protocol.flow import Flow
@@ -21,7 +22,7 @@ from mavftpfs.protocol.payload import (
     decode_reply,
     decode_request,
 )
-from mavftpfs.protocol.transfers import ReadToEof, ReadTransfer, Strategy
+from mavftpfs.protocol.reading import ReadToEof, ReadTransfer
 from mavftpfs.shared.errors import MavftpfsError, RemoteProtocolError
 from mavftpfs.shared.extents import ExtentSet
 from mavftpfs.shared.model import usable_name
@@ -129,10 +130,10 @@ def test_an_extent_set_is_a_set_of_ints(
 CONTENT = random.Random(3).randbytes(MAX_DATA * 9 + 50)
 
 
-def busy_engine(seed: int, strategy: Strategy) -> tuple[Engine, list[Operation], MemorySink]:
+def busy_engine(seed: int, kind: type[ReadTransfer]) -> tuple[Engine, list[Operation], MemorySink]:
     engine = Engine(random.Random(seed), Flow(limit=12))
     sink = MemorySink(len(CONTENT))
-    transfer = ReadTransfer(0, len(CONTENT), sink, strategy=strategy)
+    transfer = kind(0, len(CONTENT), sink)
     operations = [
         transfer,
         OpenFile(Opcode.OPEN_FILE_RO, b"/f", 7),
@@ -150,13 +151,13 @@ def busy_engine(seed: int, strategy: Strategy) -> tuple[Engine, list[Operation],
 @settings(max_examples=200, deadline=None)
 @given(
     st.integers(0, 2**32),
-    st.sampled_from(["window", "burst"]),
+    st.sampled_from([ReadTransfer, BurstTransfer]),
     st.lists(st.tuples(PAYLOADS, st.integers(-3, 20), st.floats(0, 3, allow_nan=False)), max_size=60),
 )
 def test_receive_never_raises(
-    seed: int, strategy: Strategy, replies: list[tuple[Payload, int, float]]
+    seed: int, kind: type[ReadTransfer], replies: list[tuple[Payload, int, float]]
 ) -> None:
-    engine, operations, sink = busy_engine(seed, strategy)
+    engine, operations, sink = busy_engine(seed, kind)
     now, newest = 0.0, 0
     for reply, ahead, pause in replies:
         for request in sent(engine, now):
@@ -214,7 +215,7 @@ class Vandal:
 @settings(max_examples=120, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(
     st.sampled_from(sorted(PROFILES)),
-    st.sampled_from(["window", "burst"]),
+    st.sampled_from([ReadTransfer, BurstTransfer]),
     st.integers(0, 2**32),
     st.sampled_from([0.0, 0.02, 0.1, 0.2]),
     st.sampled_from([0.0, 0.02, 0.1]),
@@ -224,7 +225,7 @@ class Vandal:
 )
 def test_a_transfer_ends_with_the_right_bytes_or_an_error(
     name: str,
-    strategy: Strategy,
+    kind: type[ReadTransfer],
     seed: int,
     loss: float,
     duplicate: float,
@@ -246,7 +247,7 @@ def test_a_transfer_ends_with_the_right_bytes_or_an_error(
     link.engine.session = opened.session
     link.server = Vandal(server, rng, spoil)
     sink = MemorySink(size)
-    transfer = ReadTransfer(opened.session, size, sink, strategy=strategy)
+    transfer = kind(opened.session, size, sink)
     link.engine.start(transfer, link.now)
     before = link.engine.stats.requests
     for _ in range(3):
@@ -254,7 +255,8 @@ def test_a_transfer_ends_with_the_right_bytes_or_an_error(
         transfer.want(start, start + rng.randrange(size + 1), rng.random() < 0.7)
         transfer.want(0, size // 2, False)
         link.run_until(lambda: transfer.idle or transfer.done, 2000.0)
-        transfer.set_strategy(rng.choice(("window", "burst")))
+        if isinstance(transfer, BurstTransfer):
+            transfer.by_requests = rng.random() < 0.5
     transfer.want(0, size, True)
     link.run_until(lambda: transfer.idle or transfer.done, 2000.0)
     for start, stop in sink.held:

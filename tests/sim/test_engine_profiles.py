@@ -6,10 +6,12 @@ import random
 
 import pytest
 
+from mavftpfs.protocol.burst import BurstTransfer
+from mavftpfs.protocol.chunking import ChunkSize
 from mavftpfs.protocol.crc import crc32
 from mavftpfs.protocol.operations import ListDirectory, OpenFile, Simple, Terminate
 from mavftpfs.protocol.payload import NakCode, Opcode
-from mavftpfs.protocol.transfers import ReadToEof, ReadTransfer, Strategy
+from mavftpfs.protocol.reading import ReadToEof, ReadTransfer
 from mavftpfs.shared.errors import FtpNak, SessionLost
 from mavftpfs.sim.linkmodel import Direction, LinkSettings
 from mavftpfs.sim.memorytree import MemoryTree
@@ -21,7 +23,7 @@ CHUNK = 239
 BAD = LinkSettings(delay=0.02, loss=0.2, duplicate=0.02, reorder=0.05)
 SIZES = (0, 1, 5, 238, 239, 240, 478, 4096, 35_850, 40_152, 119_500, 131_073)
 NAMES = sorted(PROFILES)
-STRATEGIES: tuple[Strategy, ...] = ("window", "burst")
+KINDS = [ReadTransfer, BurstTransfer]
 
 
 class Rig:
@@ -65,17 +67,17 @@ class Rig:
         self.link.engine.session = self.link.engine.home_session
 
     def start(
-        self, path: bytes, strategy: Strategy = "window", chunk: int = CHUNK
+        self, path: bytes, kind: type[ReadTransfer] = ReadTransfer, chunk: int = CHUNK
     ) -> tuple[ReadTransfer, MemorySink]:
         """Open a file, and return a transfer that wants nothing yet, and where its bytes go."""
         size = self.open(path)
         sink = MemorySink(size)
-        transfer = ReadTransfer(self.session, size, sink, chunk, strategy)
+        transfer = kind(self.session, size, sink, ChunkSize(chunk))
         self.link.engine.start(transfer, self.link.now)
         return transfer, sink
 
-    def read(self, path: bytes, strategy: Strategy, *, chunk: int = CHUNK) -> bytes:
-        transfer, sink = self.start(path, strategy, chunk)
+    def read(self, path: bytes, kind: type[ReadTransfer], *, chunk: int = CHUNK) -> bytes:
+        transfer, sink = self.start(path, kind, chunk)
         size = transfer.size
         transfer.want(0, size, True)
         self.link.run_until(lambda: transfer.idle or transfer.done, 3600.0)
@@ -96,14 +98,14 @@ class Rig:
         return op.error is None
 
 
-@pytest.mark.parametrize("strategy", STRATEGIES)
+@pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("name", NAMES)
-def test_every_size_comes_whole(name: str, strategy: Strategy) -> None:
+def test_every_size_comes_whole(name: str, kind: type[ReadTransfer]) -> None:
     rig = Rig(name, LinkSettings(delay=0.005))
     for size in SIZES:
         rig.tree.add(b"/s%d" % size, random.Random(size).randbytes(size))
     for size in SIZES:
-        assert rig.read(b"/s%d" % size, strategy) == random.Random(size).randbytes(size)
+        assert rig.read(b"/s%d" % size, kind) == random.Random(size).randbytes(size)
 
 
 @pytest.mark.parametrize("chunk", [1, 80, 110])
@@ -112,20 +114,18 @@ def test_other_chunk_sizes(name: str, chunk: int) -> None:
     rig = Rig(name, LinkSettings(delay=0.005))
     content = random.Random(2).randbytes(chunk * 30 + 7)
     rig.tree.add(b"/f", content)
-    for strategy in STRATEGIES:
-        assert rig.read(b"/f", strategy, chunk=chunk) == content
-    if chunk > 1:  # else everything fits one packet of PX4's, which tells no size
-        assert rig.link.engine.traits.burst_size_honoured is (rig.profile.family is not Family.PX4)
+    for kind in KINDS:
+        assert rig.read(b"/f", kind, chunk=chunk) == content
 
 
-@pytest.mark.parametrize("strategy", STRATEGIES)
+@pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("name", NAMES)
-def test_a_megabyte_over_a_bad_link(name: str, strategy: Strategy) -> None:
+def test_a_megabyte_over_a_bad_link(name: str, kind: type[ReadTransfer]) -> None:
     size = 1_000_000
     content = random.Random(5).randbytes(size)
     rig = Rig(name, BAD)
     rig.tree.add(b"/big", content)
-    assert rig.read(b"/big", strategy) == content
+    assert rig.read(b"/big", kind) == content
     stats = rig.link.engine.stats
     asked = stats.by_opcode.get(Opcode.READ_FILE, 0) + stats.by_opcode.get(Opcode.BURST_READ_FILE, 0)
     assert asked <= 1.5 * (-(-size // CHUNK)) / (1 - BAD.loss) ** 2
@@ -138,7 +138,7 @@ def test_a_card_that_pauses_is_not_flooded_over_a_fast_link(delay: float) -> Non
     rig = Rig("px4-nuttx", LinkSettings(delay=delay))
     content = random.Random(5).randbytes(1_000_000)
     rig.tree.add(b"/big", content)
-    assert rig.read(b"/big", "window") == content
+    assert rig.read(b"/big", ReadTransfer) == content
     asked = rig.link.engine.stats.by_opcode[Opcode.READ_FILE]
     assert asked <= 1.3 * (-(-len(content) // CHUNK))
 
@@ -148,7 +148,7 @@ def test_a_card_that_pauses_is_not_asked_twice_over_usb() -> None:
     rig = Rig("px4-nuttx", LinkSettings(delay=0.001))
     content = random.Random(5).randbytes(4_000_000)
     rig.tree.add(b"/big", content)
-    assert rig.read(b"/big", "window") == content
+    assert rig.read(b"/big", ReadTransfer) == content
     asked = rig.link.engine.stats.by_opcode[Opcode.READ_FILE]
     assert asked <= 1.25 * (-(-len(content) // CHUNK))
 
@@ -162,7 +162,7 @@ def test_a_radio_is_used(name: str, rate: float) -> None:
     rig = Rig(name, LinkSettings(rate=rate, delay=0.02, loss=0.05))
     rig.tree.add(b"/big", content)
     started = rig.link.now
-    assert rig.read(b"/big", "window") == content
+    assert rig.read(b"/big", ReadTransfer) == content
     limit = rate * 239 / 266 * 0.95
     if rig_is_slow(name):
         limit = min(limit, 4 * 239 / 0.08)
@@ -259,14 +259,14 @@ def test_a_checksum(name: str) -> None:
     assert op.reply.data == crc32(content).to_bytes(4, "little")
 
 
-@pytest.mark.parametrize("strategy", STRATEGIES)
+@pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("name", NAMES)
-def test_a_cut_link_comes_back(name: str, strategy: Strategy) -> None:
+def test_a_cut_link_comes_back(name: str, kind: type[ReadTransfer]) -> None:
     """Five seconds of nothing in the middle: the same transfer goes on."""
     rig = Rig(name, LinkSettings(rate=57_600.0, delay=0.02, cuts=((100.5, 105.5),)))
     content = random.Random(7).randbytes(60_000)
     rig.tree.add(b"/big", content)
-    assert rig.read(b"/big", strategy) == content
+    assert rig.read(b"/big", kind) == content
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -299,7 +299,7 @@ def test_a_slow_link_that_becomes_fast_is_used() -> None:
     data = random.Random(3).randbytes(4_000_000)
     rig.tree.add(b"/f", data)
     link, size = rig.link, rig.open(b"/f")
-    transfer = ReadTransfer(rig.session, size, MemorySink(size), CHUNK)
+    transfer = ReadTransfer(rig.session, size, MemorySink(size))
     link.engine.start(transfer, link.now)
     transfer.want(0, size, True)
     for rate in (100_000.0, 5760.0):

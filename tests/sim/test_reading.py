@@ -100,8 +100,7 @@ async def test_bursts_of_exact_multiples_end(autojump: MockClock) -> None:
     here = World("ardupilot", LinkSettings(delay=0.02, loss=0.02))
     here.tree.add(b"/f", data)
     here.tree.add(b"/g", data[: 500 * 239])
-    async with here.connection() as connection:
-        connection.scheduler._steering.mode = "burst"
+    async with here.connection(ConnectOptions(read_mode="burst")) as connection:
         assert await read_file(connection, b"/f") == data
         assert await read_file(connection, b"/g") == data[: 500 * 239]
         assert connection.engine.stats.by_opcode[Opcode.BURST_READ_FILE] >= 3

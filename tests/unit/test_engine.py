@@ -6,12 +6,14 @@ import random
 
 import pytest
 
+from mavftpfs.protocol.burst import BurstTransfer
+from mavftpfs.protocol.chunking import ChunkSize
 from mavftpfs.protocol.engine import Engine
 from mavftpfs.protocol.flow import Flow
 from mavftpfs.protocol.ledger import BURST_JUMP, FURTHEST_JUMP, Ghost
 from mavftpfs.protocol.operations import ListDirectory, OpenFile, Operation, Simple
 from mavftpfs.protocol.payload import NakCode, Opcode, Payload
-from mavftpfs.protocol.transfers import ReadTransfer
+from mavftpfs.protocol.reading import ReadTransfer
 from mavftpfs.shared.errors import FtpNak, LocalProtocolError, RequestTimeout
 from mavftpfs.shared.traits import Traits
 from tests.support.replies import ack, burst_nak, chunk, nak, packet, sent
@@ -35,9 +37,11 @@ def make(first_seq: int = 1000, *, limit: int | None = None, traits: Traits | No
     return Engine(StuckRandom(first_seq), Flow(limit=limit), traits=traits)
 
 
-def reading(engine: Engine, size: int = SIZE) -> tuple[ReadTransfer, MemorySink]:
+def reading(
+    engine: Engine, size: int = SIZE, kind: type[ReadTransfer] = ReadTransfer
+) -> tuple[ReadTransfer, MemorySink]:
     sink = MemorySink(size)
-    transfer = ReadTransfer(0, size, sink)
+    transfer = kind(0, size, sink)
     engine.start(transfer, 0.0)
     transfer.want(0, size, True)
     return transfer, sink
@@ -104,8 +108,7 @@ def test_a_seq_that_is_still_out_is_left_out() -> None:
 def test_the_counter_jumps_at_a_burst(packets: int, jump: int) -> None:
     """Beyond twice what the burst may send, because the rest of an abandoned one still comes."""
     engine = make(10)
-    transfer, _ = reading(engine, 239 * packets)
-    transfer.set_strategy("burst")
+    reading(engine, 239 * packets, BurstTransfer)
     (burst,) = sent(engine, 0.0)
     assert (burst.seq, burst.opcode) == (10, Opcode.BURST_READ_FILE)
     engine.start(mkdir(), 0.0)
@@ -115,7 +118,7 @@ def test_the_counter_jumps_at_a_burst(packets: int, jump: int) -> None:
 
 def test_a_burst_in_small_packets_has_more_of_them() -> None:
     engine = make(10)
-    transfer = ReadTransfer(3, 50_000, MemorySink(50_000), 10, "burst")
+    transfer = BurstTransfer(3, 50_000, MemorySink(50_000), ChunkSize(10))
     engine.start(transfer, 0.0)
     transfer.want(10_000, 50_000, True)
     sent(engine, 0.0)
@@ -126,8 +129,7 @@ def test_a_burst_in_small_packets_has_more_of_them() -> None:
 def test_the_rest_of_an_abandoned_burst_does_not_repeat_a_side_effect() -> None:
     """A server that sends the whole file, whatever is asked meanwhile (MAVSDK before 2022)."""
     engine = make(10)
-    transfer, _ = reading(engine, 239 * 20_000)
-    transfer.set_strategy("burst")
+    transfer, _ = reading(engine, 239 * 20_000, BurstTransfer)
     (burst,) = sent(engine, 0.0)
     engine.receive(packet(burst, 0, bytes(239)), 0.0)
     engine.cancel(transfer, 0.0)
@@ -695,8 +697,7 @@ def test_an_idle_transfer_waits_for_ever() -> None:
 
 
 def bursting(engine: Engine) -> tuple[ReadTransfer, Payload]:
-    transfer, _ = reading(engine)
-    transfer.set_strategy("burst")
+    transfer, _ = reading(engine, kind=BurstTransfer)
     (request,) = sent(engine, 0.0)
     return transfer, request
 
@@ -714,44 +715,7 @@ def test_timers_stand_still_while_burst_packets_come() -> None:
     engine.receive(ack(request), 6.21)
     assert op.done
     assert not op.retransmitted
-    assert engine.traits.answers_during_burst is False
     assert engine.rtt is None
-
-
-def test_a_server_that_answers_between_packets_is_noticed() -> None:
-    engine = make()
-    _, burst = bursting(engine)
-    engine.receive(packet(burst, 0, bytes(239)), 0.1)
-    engine.start(mkdir(), 0.1)
-    (request,) = sent(engine, 0.1)
-    engine.receive(packet(burst, 1, bytes(239)), 0.2)
-    engine.receive(ack(request), 0.2)
-    for index in range(2, 5):
-        assert engine.traits.answers_during_burst is None
-        engine.receive(packet(burst, index, bytes(239)), 0.3)
-    assert engine.traits.answers_during_burst is True
-    engine.start(mkdir(), 0.4)
-    (request,) = sent(engine, 0.4)
-    engine.receive(packet(burst, 5, bytes(239)), 1.4)
-    engine.on_deadline(1.45)
-    assert [again.seq for again in sent(engine, 1.45)] == [request.seq]
-    engine.receive(packet(burst, 6, bytes(239)), 1.5)
-    engine.receive(ack(request), 1.5)
-    assert engine.traits.answers_during_burst is True
-
-
-def test_an_answer_that_may_be_to_the_first_of_two_equal_requests_proves_nothing() -> None:
-    engine = make()
-    _, burst = bursting(engine)
-    op, request = asked(engine)
-    engine.on_deadline(1.0)
-    assert sent(engine, 1.0) == [request]
-    engine.receive(packet(burst, 0, bytes(239)), 1.1)
-    engine.receive(ack(request), 1.1)
-    for index in range(1, 8):
-        engine.receive(packet(burst, index, bytes(239)), 1.2)
-    assert op.done
-    assert engine.traits.answers_during_burst is None
 
 
 def test_packets_of_an_abandoned_burst_hold_timers_and_land_nowhere() -> None:

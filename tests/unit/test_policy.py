@@ -10,28 +10,10 @@ from mavftpfs.session.policy import (
     RELIEF,
     STARVING,
     USE_MEMORY,
-    ReadMode,
     Service,
-    choose_strategy,
     quantum,
     should_switch,
 )
-
-
-@pytest.mark.parametrize(
-    ("mode", "others_ask", "strategy"),
-    [
-        ("auto", False, "window"),
-        ("auto", True, "window"),
-        ("window", False, "window"),
-        ("burst", False, "burst"),
-        ("burst", True, "window"),
-    ],
-)
-def test_a_burst_is_for_who_asked_for_it_and_while_nobody_else_asks(
-    mode: ReadMode, others_ask: bool, strategy: str
-) -> None:
-    assert choose_strategy(mode, others_ask=others_ask) == strategy
 
 
 def test_quantum_grows_with_the_round_trip_within_bounds() -> None:

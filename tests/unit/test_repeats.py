@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import random
 
+from mavftpfs.protocol.burst import BurstTransfer
 from mavftpfs.protocol.engine import Engine
 from mavftpfs.protocol.flow import Flow
 from mavftpfs.protocol.operations import Simple
 from mavftpfs.protocol.payload import Opcode, Payload
-from mavftpfs.protocol.transfers import ReadTransfer
+from mavftpfs.protocol.reading import ReadTransfer
 from tests.support.replies import ack, chunk, packet, sent
 from tests.support.virtual import MemorySink
 
@@ -24,9 +25,9 @@ def make() -> Engine:
     return Engine(random.Random(1), Flow(limit=8))
 
 
-def reading(engine: Engine) -> ReadTransfer:
+def reading(engine: Engine, kind: type[ReadTransfer] = ReadTransfer) -> ReadTransfer:
     """Begin to read a file of four chunks."""
-    transfer = ReadTransfer(0, SIZE, MemorySink(SIZE))
+    transfer = kind(0, SIZE, MemorySink(SIZE))
     engine.start(transfer, 0.0)
     transfer.want(0, SIZE, True)
     return transfer
@@ -81,8 +82,7 @@ def test_nor_is_one_of_which_nobody_wants_the_answer_any_more() -> None:
 
 def test_nor_what_comes_of_a_burst_that_was_given_up() -> None:
     engine = make()
-    transfer = reading(engine)
-    transfer.set_strategy("burst")
+    transfer = reading(engine, BurstTransfer)
     (burst,) = sent(engine, 0.0)
     engine.cancel(transfer, 0.0)
     engine.receive(packet(burst, 0, bytes(239)), 0.1)

@@ -20,7 +20,6 @@ from mavftpfs.shared.readable import printable, readable_size, readable_time
         ("transfers", [], "none"),
         ("anything", {}, "none"),
         ("names", ["a", "b"], "a, b"),
-        ("window_rate", 5120.4, "5.1 kB/s"),
         ("rate", None, "unknown"),
         ("loss", 0.052, "5.2 %"),
         ("session_open", None, "none"),

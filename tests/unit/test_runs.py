@@ -11,7 +11,7 @@ from mavftpfs.protocol.engine import Engine
 from mavftpfs.protocol.flow import Flow
 from mavftpfs.protocol.operations import Operation
 from mavftpfs.protocol.payload import MAX_DATA, Opcode, Payload, decode_reply
-from mavftpfs.protocol.transfers import ReadTransfer
+from mavftpfs.protocol.reading import ReadTransfer
 from mavftpfs.protocol.writing import WriteTransfer
 from mavftpfs.shared.errors import RemoteProtocolError
 from mavftpfs.shared.traits import Traits

@@ -9,7 +9,7 @@ import pytest
 from mavftpfs.protocol.engine import Engine
 from mavftpfs.protocol.flow import Flow
 from mavftpfs.protocol.payload import NakCode, Payload
-from mavftpfs.protocol.transfers import ReadToEof
+from mavftpfs.protocol.reading import ReadToEof
 from mavftpfs.shared.errors import DataUnproven, FtpNak, LocalProtocolError, MavftpfsError, SessionLost
 from tests.support.replies import ack, chunk, nak, sent
 

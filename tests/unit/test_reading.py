@@ -6,12 +6,13 @@ import random
 
 import pytest
 
+from mavftpfs.protocol.burst import BurstTransfer
+from mavftpfs.protocol.chunking import ChunkSize
 from mavftpfs.protocol.engine import Engine
 from mavftpfs.protocol.flow import Flow
-from mavftpfs.protocol.operations import Simple
 from mavftpfs.protocol.payload import NakCode, Opcode, Payload
+from mavftpfs.protocol.reading import ReadTransfer
 from mavftpfs.protocol.requests import Priority
-from mavftpfs.protocol.transfers import ReadTransfer, Strategy
 from mavftpfs.shared.errors import FileChanged, FtpNak, LocalProtocolError, MavftpfsError, SessionLost
 from mavftpfs.shared.extents import ExtentSet
 from mavftpfs.shared.traits import Traits
@@ -28,7 +29,7 @@ class Reader:
     def __init__(
         self,
         *,
-        strategy: Strategy = "window",
+        bursts: bool = False,
         size: int = SIZE,
         block: int = 239,
         traits: Traits | None = None,
@@ -36,7 +37,8 @@ class Reader:
     ) -> None:
         self.engine = Engine(random.Random(1), Flow(limit=limit), traits=traits)
         self.sink = MemorySink(size)
-        self.transfer = ReadTransfer(0, size, self.sink, block, strategy)
+        kind = BurstTransfer if bursts else ReadTransfer
+        self.transfer = kind(0, size, self.sink, ChunkSize(block))
         self.engine.start(self.transfer, 0.0)
         self.now = 0.0
 
@@ -65,7 +67,7 @@ class Reader:
 
 def bursting(*, block: int = 239, limit: int = 4, traits: Traits | None = None) -> tuple[Reader, Payload]:
     """Return who reads all of it in a burst, and the request for that."""
-    reader = Reader(strategy="burst", block=block, limit=limit, traits=traits)
+    reader = Reader(bursts=True, block=block, limit=limit, traits=traits)
     reader.transfer.want(0, SIZE, True)
     (request,) = reader.sent()
     return reader, request
@@ -128,7 +130,7 @@ def test_readahead_can_be_dropped() -> None:
 
 
 def test_gaps_nobody_waits_for_any_more_are_dropped() -> None:
-    reader = Reader(strategy="burst", limit=1)
+    reader = Reader(bursts=True, limit=1)
     reader.transfer.want(0, 478, True)
     reader.transfer.want(478, 956, False)
     (request,) = reader.sent()
@@ -150,7 +152,7 @@ def test_readahead_that_is_wanted_twice_is_asked_once() -> None:
 @pytest.mark.parametrize("block", [0, 240])
 def test_chunk_sizes(block: int) -> None:
     with pytest.raises(LocalProtocolError):
-        ReadTransfer(0, 1, MemorySink(1), block)
+        ReadTransfer(0, 1, MemorySink(1), ChunkSize(block))
 
 
 # --- replies to ReadFile
@@ -165,29 +167,6 @@ def test_a_short_reply_is_asked_for_again() -> None:
     assert ranges([rest]) == [(100, 239)]
     reader.answer(rest)
     assert bytes(reader.sink.data[:239]) == CONTENT[:239]
-
-
-def test_a_server_with_small_replies_is_asked_for_less() -> None:
-    reader = Reader(limit=1)
-    reader.transfer.want(0, 239 * 8, True)
-    sizes = []
-    while out := reader.sent():
-        (request,) = out
-        sizes.append(request.size)
-        reader.engine.receive(ack(request, CONTENT[request.offset :][: min(request.size, 48)]), 0.1)
-    assert bytes(reader.sink.data[: 239 * 8]) == CONTENT[: 239 * 8]
-    assert reader.transfer.chunk == 48
-    assert set(sizes[4:-1]) == {48}
-
-
-def test_a_short_reply_to_a_short_request_teaches_nothing() -> None:
-    reader = Reader(limit=1, size=100)
-    reader.transfer.want(0, 100, True)
-    for _ in range(10):
-        (request,) = reader.sent()
-        reader.engine.receive(ack(request, CONTENT[request.offset :][:10]), 0.1)
-    assert bytes(reader.sink.data) == CONTENT[:100]
-    assert reader.transfer.chunk == 239
 
 
 def test_an_over_long_reply_is_clipped() -> None:
@@ -240,24 +219,6 @@ def test_other_refusals_are_asked_again_a_few_times() -> None:
     assert error.server_errno == 5
 
 
-def test_rates() -> None:
-    reader = Reader(limit=1)
-    assert reader.transfer.window_rate is None
-    assert reader.transfer.burst_rate is None
-    reader.transfer.want(0, SIZE, True)
-    while out := reader.sent():
-        reader.now += 0.1
-        reader.answer(out[0])
-    assert reader.transfer.window_rate == pytest.approx(SIZE / 4.1)
-    reader.now += 100.0
-    reader.sink.held.clear()
-    reader.transfer.want(0, 239, True)
-    reader.sent()
-    reader.now += 0.1
-    reader.engine.receive(Payload(1, 0, 128, 0), reader.now)
-    assert reader.transfer.window_rate == pytest.approx(SIZE / 4.1)
-
-
 # --- bursts
 
 
@@ -278,14 +239,12 @@ def test_a_whole_file_in_one_burst() -> None:
     stream(reader, request, list(range(41)))
     assert bytes(reader.sink.data) == CONTENT
     assert reader.transfer.idle
-    assert reader.transfer.burst_rate == pytest.approx(SIZE / 0.041)
-    assert reader.engine.traits.burst_size_honoured is True
     reader.engine.receive(burst_nak(request, 41, NakCode.EOF), reader.now)
     assert reader.engine.stats.unknown == 1
 
 
 def test_a_burst_begins_at_the_first_missing_wanted_byte_and_brings_more() -> None:
-    reader = Reader(strategy="burst")
+    reader = Reader(bursts=True)
     reader.transfer.want(1000, 2000, True)
     (request,) = reader.sent()
     assert request.offset == 1000
@@ -327,7 +286,7 @@ def test_a_burst_that_goes_quiet_is_over_but_not_early() -> None:
 
 
 def test_the_flag_and_a_short_quiet_end_it() -> None:
-    reader = Reader(strategy="burst")
+    reader = Reader(bursts=True)
     reader.engine._timers.of["data"].sample(0.05)
     reader.transfer.want(0, SIZE, True)
     (request,) = reader.sent()
@@ -346,31 +305,31 @@ def test_a_spurious_flag_does_not_end_it() -> None:
 
 
 def test_a_burst_waits_for_reads_and_reads_for_the_burst() -> None:
-    reader = Reader()
+    reader = Reader(bursts=True)
+    assert isinstance(reader.transfer, BurstTransfer)
+    reader.transfer.by_requests = True
     reader.transfer.want(0, SIZE, True)
     out = reader.sent()
-    reader.transfer.set_strategy("burst")
-    assert reader.transfer.strategy == "burst"
+    reader.transfer.by_requests = False
     for item in out[:-1]:
         reader.answer(item)
         assert reader.sent() == []
     reader.answer(out[-1])
     (burst,) = reader.sent()
     assert (burst.opcode, burst.offset) == (Opcode.BURST_READ_FILE, 956)
-    reader.transfer.set_strategy("window")
+    reader.transfer.by_requests = True
     assert reader.sent() == []
     reader.engine.receive(burst_nak(burst, 0, NakCode.EOF), 0.2)
     assert {item.opcode for item in reader.sent()} == {Opcode.READ_FILE}
 
 
 def test_two_bursts_without_data_are_enough() -> None:
-    reader = Reader(strategy="burst")
+    reader = Reader(bursts=True)
     reader.transfer.want(0, SIZE, True)
     for _ in range(2):
         (request,) = reader.sent()
         assert request.opcode == Opcode.BURST_READ_FILE
         reader.pass_quiet()
-    assert reader.transfer.strategy == "window"
     reader.finish()
     assert bytes(reader.sink.data) == CONTENT
 
@@ -379,14 +338,13 @@ def test_two_bursts_without_data_are_enough() -> None:
 def test_a_refused_burst_gives_way_to_reads(code: int) -> None:
     reader, request = bursting()
     reader.engine.receive(burst_nak(request, 0, code), 0.1)
-    assert reader.transfer.strategy == "window"
     reader.finish()
     assert bytes(reader.sink.data) == CONTENT
 
 
 @pytest.mark.parametrize("code", [4, 10])
 def test_a_burst_without_session(code: int) -> None:
-    reader = Reader(strategy="burst")
+    reader = Reader(bursts=True)
     reader.transfer.want(0, SIZE, True)
     reader.engine.receive(burst_nak(reader.sent()[0], 0, code), 0.1)
     assert isinstance(reader.transfer.error, SessionLost)
@@ -412,51 +370,6 @@ def test_px4_sends_239_whatever_was_asked() -> None:
     assert request.size == 110
     stream(reader, request, list(range(41)))
     assert bytes(reader.sink.data) == CONTENT
-    assert reader.engine.traits.burst_size_honoured is False
-
-
-def test_one_short_packet_says_nothing_about_sizes() -> None:
-    reader = Reader(strategy="burst", size=100)
-    reader.transfer.want(0, 100, True)
-    (request,) = reader.sent()
-    reader.engine.receive(packet(request, 0, CONTENT[:100]), 0.1)
-    assert reader.transfer.idle
-    assert reader.engine.traits.burst_size_honoured is None
-
-
-@pytest.mark.parametrize("echoes", [None, True, False])
-def test_a_long_burst_is_kept_alive_where_bursts_do_not_count(echoes: bool | None) -> None:
-    reader, request = bursting(traits=Traits(ack_carries_own_session=echoes, answers_during_burst=True))
-    sent_at: list[float] = []
-    for index in range(41):
-        reader.now += 0.25
-        reader.engine.on_deadline(reader.now)
-        for extra in reader.sent():
-            assert (extra.opcode, extra.session, extra.size) == (Opcode.NONE, 0, 0)
-            sent_at.append(reader.now)
-            if len(sent_at) == 1:
-                reader.engine.receive(ack(extra), reader.now)
-        data = CONTENT[index * 239 : index * 239 + 239]
-        reader.engine.receive(packet(request, index, data)._replace(session=0), reader.now)
-    assert bytes(reader.sink.data) == CONTENT
-    assert sent_at == ([3.0, 6.0, 9.0] if echoes is False else [])
-    reader.now += 10.0
-    reader.engine.on_deadline(reader.now)
-    assert reader.engine.in_flight == 0
-    assert reader.sent() == []
-
-
-def test_a_keep_alive_that_finds_no_room_does_not_spin() -> None:
-    reader, request = bursting(limit=1, traits=Traits(ack_carries_own_session=False))
-    reader.engine.start(Simple(Opcode.NONE), 0.0)
-    reader.sent()
-    for index in range(8):
-        reader.now += 0.5
-        stream(reader, request, [index])
-    while (deadline := reader.engine.next_deadline()) is not None and deadline <= reader.now:
-        reader.engine.on_deadline(reader.now)
-        reader.sent()
-    assert reader.transfer.bursting
 
 
 def test_packets_after_the_transfer_ended_are_dropped() -> None:

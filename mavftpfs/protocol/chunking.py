@@ -1,0 +1,141 @@
+"""How many bytes of a file one request carries. Layer: protocol; pure.
+
+A chunk is 239 bytes, the most that fits a payload. Some radios and modems pass short frames and drop all long
+ones. So when every full chunk is lost for a while, full and short chunks go out in turn. If only the short
+ones are answered, chunks stay short for five minutes; then full ones get another chance."""
+
+from __future__ import annotations
+
+from mavftpfs.protocol.payload import MAX_DATA
+from mavftpfs.protocol.requests import Operation, Request
+from mavftpfs.shared.errors import LocalProtocolError
+
+SHORT = 64
+"""Bytes of a short chunk: its frame is hardly longer than that of a request with a path, which must pass
+too."""
+
+SHORT_SECONDS = 300.0
+"""For how long chunks stay short."""
+
+SUSPICIOUS_LOSSES = 12
+"""So many full chunks lost in a row are no chance: one in 200,000 where a third of all round trips fails."""
+
+LONE_LOSSES = 6
+LONE_SECONDS = 3.0
+"""Fewer will do over three seconds: with one request outstanding, twelve losses would take too long."""
+
+PROOF = 8
+"""So many answered short chunks, and lost full ones beside them, prove that only short ones pass."""
+
+
+class ChunkSize:
+    """The size of chunks of one direction, for all its transfers.
+
+    Args:
+        fixed: the size that the user asked for, in bytes; None to choose it.
+
+    Attributes:
+        most: bytes of the longest chunk.
+
+    Raises:
+        LocalProtocolError: a fixed size that is not within 1..239.
+    """
+
+    __slots__ = (
+        "_answered",
+        "_first_lost_at",
+        "_least",
+        "_lost",
+        "_short_until",
+        "_shortest_lost",
+        "_turn",
+        "most",
+        "trying",
+    )
+
+    def __init__(self, fixed: int | None = None) -> None:
+        if fixed is not None and not 1 <= fixed <= MAX_DATA:
+            raise LocalProtocolError(f"a chunk of {fixed} bytes is not within 1..{MAX_DATA}")
+        self.most = MAX_DATA if fixed is None else fixed
+        self._least = SHORT if fixed is None else fixed
+        self.trying = False
+        """Whether full and short chunks take turns, so that each request needs a size of its own."""
+        self._short_until: float | None = None
+        self._lost = 0  # full chunks in a row; while trying: since the first short one was answered
+        self._first_lost_at = 0.0
+        self._shortest_lost = 0  # bytes: what is shorter proves nothing when it is answered
+        self._answered = 0  # short chunks, while trying
+        self._turn = False
+
+    @property
+    def size(self) -> int:
+        """Bytes of a chunk as far as that is settled."""
+        return self.most if self._short_until is None else self._least
+
+    def next_size(self, now: float) -> int:
+        """Return the bytes of the next chunk."""
+        if self.trying:
+            self._turn = not self._turn
+            return self._least if self._turn else self.most
+        if self._short_until is not None and now >= self._short_until:
+            self._short_until, self._lost = None, 0
+        return self.size
+
+    def on_answered(self, size: int, count: int, now: float) -> None:
+        """So many requests for `size` bytes each were answered."""
+        if size > self._least:
+            if size >= self._shortest_lost:
+                self.trying, self._lost = False, 0
+        elif self.trying:
+            if not self._answered:
+                self._lost = 0  # before that the whole link may have been away
+            self._answered += count
+            self._settle(now)
+
+    def on_lost(self, size: int, now: float) -> bool:
+        """A request for `size` bytes is to be repeated; return whether its bytes go out in other chunks."""
+        if size > self._least:
+            if not self._lost and not self.trying:
+                self._first_lost_at, self._shortest_lost = now, size
+            self._shortest_lost = min(self._shortest_lost, size)
+            self._lost += 1
+            self._turn = False  # a short one is next, also where there is one request at a time
+            self._settle(now)
+        return size > self._least and (self.trying or size > self.size)
+
+    def _settle(self, now: float) -> None:
+        if self.trying:
+            if self._answered >= PROOF and self._lost >= PROOF:
+                self.trying, self._short_until = False, now + SHORT_SECONDS
+        elif self._lost >= SUSPICIOUS_LOSSES or (
+            self._lost >= LONE_LOSSES and now - self._first_lost_at >= LONE_SECONDS
+        ):
+            self.trying, self._answered = True, 0
+
+
+class Chunked(Operation):
+    """Moves a file in chunks.
+
+    Args:
+        chunks: chooses their size; None for a choice of its own.
+    """
+
+    def __init__(self, chunks: ChunkSize | None = None) -> None:
+        super().__init__()
+        self.chunks = ChunkSize() if chunks is None else chunks
+
+    def next_row(self, most: int, now: float) -> tuple[int, int]:
+        """Return the size of the next chunks, and how many of that size may go out, at most `most`."""
+        size = self.chunks.next_size(now)
+        return size, 1 if self.chunks.trying else most
+
+    def takes_back(self, request: Request, now: float) -> bool:
+        """See Operation: the bytes of one that was too long go out in other chunks."""
+        again = request.opcode == self.bulk and self.chunks.on_lost(request.size, now)
+        if again:
+            self.take_back(request)
+        return again
+
+    def take_back(self, request: Request) -> None:
+        """Have the bytes of a request asked for anew."""
+        raise NotImplementedError

@@ -1,0 +1,310 @@
+"""Reading an open file by a window of ReadFile requests. Layer: protocol; pure.
+
+ReadTransfer reads wanted ranges of a file whose size is known. ReadToEof reads an `@` file, whose size is a
+lie, from its beginning until the server says that it ends."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+from mavftpfs.protocol.chunking import Chunked, ChunkSize
+from mavftpfs.protocol.payload import MAX_DATA, NakCode, Opcode, Payload
+from mavftpfs.protocol.requests import READ_MANNER, Operation, Priority, Request, Run, nak_of
+from mavftpfs.shared.errors import (
+    DataUnproven,
+    FileChanged,
+    FtpNak,
+    LocalProtocolError,
+    MavftpfsError,
+    SessionLost,
+)
+from mavftpfs.shared.extents import ExtentSet
+
+SESSION_CODES = frozenset((NakCode.INVALID_SESSION, NakCode.FILE_NOT_FOUND))
+"""Refusals that mean "no file is open" (servers.md 1)."""
+
+_DOUBTFUL_CODES = frozenset((NakCode.FAIL, NakCode.FILE_EXISTS))
+"""Refusals that may mean it: MAVSDK says 1, PX4 says 8 for everything after one "file exists" (servers.md
+12)."""
+
+_READ = int(Opcode.READ_FILE)
+_NAK = int(Opcode.NAK)
+_EBADF = 9
+_ERRORS_TOLERATED = 2
+_BLOCKS_AHEAD = 3
+
+
+class DataSink(Protocol):
+    """Where the bytes go."""
+
+    def missing(self, start: int, stop: int) -> list[tuple[int, int]]:
+        """Return the parts of [start, stop) not yet held."""
+        ...
+
+    def on_data(self, offset: int, data: bytes) -> None:
+        """Take bytes, which may be more than was wanted; what is already held must not be overwritten."""
+        ...
+
+
+class ReadTransfer(Chunked):
+    """Reads wanted ranges of an open regular file for as long as its owner likes.
+
+    Args:
+        session: id of the open file. size: as the open ACK said; nothing beyond is ever asked for.
+        sink: takes the data. chunks: the size of requests.
+
+    Attributes:
+        received_bytes: delivered to the sink so far.
+
+    Fails with SessionLost (reopen, and start another with `wants`), FileChanged (the file ends before its
+    size), FtpNak, or RequestTimeout. `wants` stays valid after a failure.
+    """
+
+    bulk = _READ
+
+    def __init__(self, session: int, size: int, sink: DataSink, chunks: ChunkSize | None = None) -> None:
+        super().__init__(chunks)
+        self.session = session
+        self.size = size
+        self.received_bytes = 0
+        self._sink = sink
+        self._demand = ExtentSet()
+        self._ahead = ExtentSet()
+        self._unanswered: dict[Request, None] = {}
+        self._errors = 0
+
+    # --- what the owner says and sees
+
+    def want(self, start: int, stop: int, demand: bool) -> None:
+        """Ask for what the sink lacks of [start, stop), clamped to the size, if it is not on its way."""
+        asked = ExtentSet((request.offset, request.offset + request.size) for request in self._unanswered)
+        for gap_start, gap_stop in self._sink.missing(start, min(stop, self.size)):
+            for piece_start, piece_stop in asked.missing(gap_start, gap_stop):
+                self._want_piece(piece_start, piece_stop, demand)
+
+    def _want_piece(self, start: int, stop: int, demand: bool) -> None:
+        if demand:
+            self._demand.add(start, stop)
+            self._ahead.discard(start, stop)
+        else:
+            for ahead_start, ahead_stop in self._demand.missing(start, stop):
+                self._ahead.add(ahead_start, ahead_stop)
+
+    def drop_readahead(self) -> None:
+        """Forget wants that nobody waits for; what is on its way still arrives."""
+        self._ahead.clear()
+
+    @property
+    def in_flight(self) -> int:
+        """How many ReadFile requests are on their way, or lost and to be repeated."""
+        return len(self._unanswered)
+
+    @property
+    def wants(self) -> ExtentSet:
+        """What is wanted and has not come, requests on their way included."""
+        wants = self._demand.copy()
+        for start, stop in self._ahead:
+            wants.add(start, stop)
+        for request in self._unanswered:
+            wants.add(request.offset, request.offset + request.size)
+        return wants
+
+    @property
+    def idle(self) -> bool:
+        """Whether nothing is wanted or on its way."""
+        return not self._unanswered and self._demand.empty and self._ahead.empty
+
+    @property
+    def priority(self) -> Priority:
+        """DEMAND while somebody waits."""
+        return Priority.READAHEAD if self._demand.empty else Priority.DEMAND
+
+    # --- requests
+
+    def next_requests(self, most: int, now: float) -> list[Request]:
+        """Return ReadFile requests for a row of chunks; what somebody waits for goes first."""
+        chunk, most = self.next_row(most, now)
+        row = self._demand.take_first(most * chunk) or self._ahead.take_first(most * chunk)
+        return [] if row is None else self._requests_for(*row, chunk)
+
+    def _requests_for(self, start: int, stop: int, chunk: int) -> list[Request]:
+        session = self.session
+        requests = [
+            Request(self, _READ, READ_MANNER, session, offset, chunk) for offset in range(start, stop, chunk)
+        ]
+        requests[-1].size = stop - requests[-1].offset
+        self._unanswered.update(dict.fromkeys(requests))
+        return requests
+
+    # --- replies to ReadFile
+
+    def on_reply(self, request: Request, reply: Payload, now: float) -> None:
+        """Place a chunk, or find out what a refusal means."""
+        del self._unanswered[request]
+        if reply.opcode == _NAK:
+            self._on_nak(request, nak_of(request, reply))
+            return
+        self.chunks.on_answered(request.size, 1, now)
+        data = reply.data
+        count = len(data)
+        if count != request.size:
+            data = data[: request.size]
+            count = len(data)
+            if count < request.size:
+                self._on_short(request, count)
+        if count:
+            self.received_bytes += count
+            self._sink.on_data(request.offset, data)
+
+    def on_run(self, run: Run, now: float) -> None:
+        """Place chunks, those in a row together."""
+        unanswered = self._unanswered
+        self.chunks.on_answered(run[0][0].size, len(run), now)
+        pieces: list[bytes] = []
+        start = stop = run[0][0].offset
+        for request, data in run:
+            offset, size = request.offset, request.size
+            del unanswered[request]
+            if offset != stop:
+                self._place(start, pieces)
+                pieces, start = [], offset
+            if len(data) != size:
+                data = data[:size]
+                if len(data) < size:
+                    self._on_short(request, len(data))
+            pieces.append(data)
+            stop = offset + len(data)
+            if self.done:
+                break
+        self._place(start, pieces)
+
+    def _place(self, offset: int, pieces: list[bytes]) -> None:
+        data = pieces[0] if len(pieces) == 1 else b"".join(pieces)
+        if data:
+            self.received_bytes += len(data)
+            self._sink.on_data(offset, data)
+
+    def _on_short(self, request: Request, count: int) -> None:
+        start = request.offset + count
+        self._demand.add(start, request.offset + request.size)
+        if count == 0:
+            self.fail(FileChanged(f"the file ends at {start}, before its size of {self.size}"))
+
+    def _on_nak(self, request: Request, nak: FtpNak) -> None:
+        self._demand.add(request.offset, request.offset + request.size)
+        error = self._meaning(request, nak)
+        if error is not nak or self._errors >= _ERRORS_TOLERATED:
+            self.fail(error)
+        else:
+            self._errors += 1
+
+    def _meaning(self, request: Request, nak: FtpNak) -> MavftpfsError:
+        """Return what a refused ReadFile within the size means (servers.md 1, 7, 12)."""
+        if nak.code == NakCode.EOF:
+            if self.port.traits.ack_carries_own_session:
+                return FileChanged(f"the file ends at or before {request.offset}, not at {self.size}")
+            # MAVSDK says EOF when another client has closed the file; a reopen tells which it is.
+            return SessionLost(f"end of file at {request.offset}, before {self.size}", by_server=True)
+        if nak.code in SESSION_CODES or nak.code in _DOUBTFUL_CODES or nak.server_errno == _EBADF:
+            return SessionLost(str(nak), by_server=True)
+        return nak
+
+    def take_back(self, request: Request) -> None:
+        """See Chunked."""
+        del self._unanswered[request]
+        self._demand.add(request.offset, request.offset + request.size)
+
+    def fail(self, error: MavftpfsError) -> None:
+        """End; what was on its way is wanted again."""
+        for request in self._unanswered:
+            self._demand.add(request.offset, request.offset + request.size)
+        self._unanswered.clear()
+        super().fail(error)
+
+
+class ReadToEof(Operation):
+    """Reads an `@` file from 0 to its end by one constant block size, never clamped (servers.md 14.13).
+
+    The end is NAK EOF (or an ACK of size 0) on the block behind the last; only the last block may be short.
+
+    Attributes:
+        data: the whole content, once done without error.
+
+    Fails with DataUnproven (longer than `limit`, or a short block in the middle), SessionLost, FtpNak.
+    """
+
+    rank = Priority.DEMAND
+
+    def __init__(self, session: int, chunk: int, limit: int) -> None:
+        super().__init__()
+        if not 1 <= chunk <= MAX_DATA:
+            raise LocalProtocolError(f"a chunk of {chunk} bytes is not within 1..{MAX_DATA}")
+        self.data = b""
+        self._session = session
+        self._chunk = chunk
+        self._limit = limit
+        self._blocks: dict[int, bytes] = {}
+        self._whole = 0  # blocks 0.._whole-1 are there
+        self._next = 0
+        self._end: int | None = None  # lowest index known to hold nothing
+        self._last: int | None = None  # index of a short block
+
+    def next_request(self, now: float) -> Request | None:
+        """Return the request for the next block; at most a few ahead of what is known to exist."""
+        if self._next > self._whole + _BLOCKS_AHEAD or not self._plausible(self._next):
+            return None
+        offset = self._next * self._chunk
+        self._next += 1
+        return Request(self, _READ, READ_MANNER, self._session, offset, self._chunk)
+
+    def on_reply(self, request: Request, reply: Payload, now: float) -> None:
+        """Keep a block, or learn where the end is."""
+        index = request.offset // self._chunk
+        if reply.opcode == _NAK:
+            nak = nak_of(request, reply)
+            ended = nak.code == NakCode.FILE_EXISTS and self._ends_short(index)
+            if nak.code == NakCode.EOF or ended:
+                self._on_end(index)
+            elif nak.code in (NakCode.INVALID_SESSION, NakCode.FILE_NOT_FOUND, NakCode.FAIL):
+                self.fail(SessionLost(str(nak), by_server=True))
+            else:
+                self.fail(nak)
+        elif not reply.data:
+            self._on_end(index)
+        else:
+            self._on_block(index, reply.data[: self._chunk])
+
+    def _plausible(self, index: int) -> bool:
+        """Whether a block may still be found there, or its absence is still to be proven."""
+        if self._end is not None and index >= self._end:
+            return False
+        return self._last is None or index <= self._last + 1
+
+    def _ends_short(self, index: int) -> bool:
+        # PX4 may say 8 for EOF (sticky EEXIST): believed only behind a short block.
+        return 0 < len(self._blocks.get(index - 1, b"")) < self._chunk
+
+    def _on_block(self, index: int, block: bytes) -> None:
+        self._blocks[index] = block
+        if index * self._chunk + len(block) > self._limit:
+            self.fail(DataUnproven(f"longer than the limit of {self._limit} bytes"))
+            return
+        if len(block) < self._chunk and (self._last is None or index < self._last):
+            self._last = index
+        while self._whole in self._blocks:
+            self._whole += 1
+        self._maybe_finish()
+
+    def _on_end(self, index: int) -> None:
+        if self._end is None or index < self._end:
+            self._end = index
+        self._maybe_finish()
+
+    def _maybe_finish(self) -> None:
+        end, last = self._end, self._last
+        newest = max(self._blocks, default=-1)
+        if (end is not None and newest >= end) or (last is not None and newest > last):
+            self.fail(DataUnproven("blocks of different lengths of the file do not fit together"))
+        elif end is not None and self._whole == end:
+            self.data = b"".join(self._blocks[index] for index in range(end))
+            self.finish()

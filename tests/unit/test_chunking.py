@@ -1,0 +1,160 @@
+"""Chunks become short where no full one passes, and full again after five minutes."""
+
+from __future__ import annotations
+
+import random
+
+import pytest
+
+from mavftpfs.protocol.chunking import LONE_LOSSES, LONE_SECONDS, SHORT, SHORT_SECONDS, ChunkSize
+from mavftpfs.protocol.engine import Engine
+from mavftpfs.protocol.flow import Flow
+from mavftpfs.protocol.payload import MAX_DATA, Opcode, Payload
+from mavftpfs.protocol.reading import ReadTransfer
+from mavftpfs.protocol.writing import WriteTransfer
+from mavftpfs.shared.errors import LocalProtocolError
+from tests.support.replies import ack, chunk, sent
+from tests.support.sources import MemorySource
+from tests.support.virtual import MemorySink
+
+CONTENT = random.Random(8).randbytes(MAX_DATA * 40)
+WINDOW = 4
+
+
+def use(chunks: ChunkSize, passing: int, *, seconds: float, now: float = 0.0, step: float = 0.05) -> set[int]:
+    """Send one request after the other over a link that loses what is longer; return the sizes that went
+    out."""
+    sizes = set()
+    end = now + seconds
+    while now < end:
+        size = chunks.next_size(now)
+        sizes.add(size)
+        if size > passing:
+            chunks.on_lost(size, now)
+        else:
+            chunks.on_answered(size, 1, now)
+        now += step
+    return sizes
+
+
+def test_full_ones_at_first_and_while_any_passes() -> None:
+    chunks = ChunkSize()
+    rng = random.Random(1)
+    for step in range(100_000):
+        assert chunks.next_size(step * 0.01) == MAX_DATA
+        if rng.random() < 0.36:  # a fifth is lost each way
+            chunks.on_lost(MAX_DATA, step * 0.01)
+        else:
+            chunks.on_answered(MAX_DATA, 1, step * 0.01)
+    assert not chunks.trying
+
+
+def test_short_ones_where_only_they_pass_and_full_ones_again_after_five_minutes() -> None:
+    chunks = ChunkSize()
+    use(chunks, 100, seconds=3.0)
+    assert chunks.size == SHORT
+    assert use(chunks, 100, seconds=200.0, now=3.0) == {SHORT}
+    assert chunks.next_size(3.0 + SHORT_SECONDS) == MAX_DATA
+    assert use(chunks, MAX_DATA, seconds=600.0, now=303.0) == {MAX_DATA}
+
+
+def test_a_lone_request_needs_fewer_losses() -> None:
+    chunks = ChunkSize()
+    for _ in range(LONE_LOSSES):
+        assert not chunks.trying
+        chunks.on_lost(MAX_DATA, 1.0)
+    chunks.on_lost(MAX_DATA, 1.0 + LONE_SECONDS)
+    assert chunks.trying
+
+
+def test_a_link_that_was_away_changes_nothing() -> None:
+    chunks = ChunkSize()
+    use(chunks, 0, seconds=60.0)
+    assert chunks.trying
+    assert MAX_DATA in use(chunks, MAX_DATA, seconds=0.2, now=60.0)
+    assert chunks.size == MAX_DATA
+    assert not chunks.trying
+
+
+def test_the_size_that_a_user_asked_for_stays() -> None:
+    chunks = ChunkSize(110)
+    assert use(chunks, 0, seconds=60.0) == {110}
+    assert chunks.most == chunks.size == 110
+
+
+@pytest.mark.parametrize("size", [0, 240])
+def test_a_size_out_of_range_is_a_bug(size: int) -> None:
+    with pytest.raises(LocalProtocolError):
+        ChunkSize(size)
+
+
+class Transfers:
+    """A transfer over a link on which no frame with more than `passing` bytes of data comes through."""
+
+    def __init__(self, *, writes: bool, passing: int) -> None:
+        self.engine = Engine(random.Random(1), Flow(limit=WINDOW))
+        self.sink, self.source = MemorySink(len(CONTENT)), MemorySource(CONTENT)
+        self.chunks, self.passing, self.now = ChunkSize(), passing, 0.0
+        self.file = bytearray(len(CONTENT))
+        self.late: list[Payload] = []
+        if writes:
+            self.engine.start(WriteTransfer(0, self.source, self.chunks), 0.0)
+        else:
+            transfer = ReadTransfer(0, len(CONTENT), self.sink, self.chunks)
+            transfer.want(0, len(CONTENT), True)
+            self.engine.start(transfer, 0.0)
+
+    def answer(self, request: Payload) -> None:
+        self.now += 0.01
+        if request.opcode == Opcode.READ_FILE:
+            self.engine.receive(chunk(request, CONTENT), self.now)
+        else:
+            self.file[request.offset : request.offset + request.size] = request.data
+            self.engine.receive(ack(request, request.size.to_bytes(4, "little")), self.now)
+
+    def finish(self) -> None:
+        while (out := sent(self.engine, self.now)) or self.engine.in_flight:
+            assert self.engine.in_flight <= WINDOW
+            for request in out:
+                if request.size <= self.passing:
+                    self.answer(request)
+                else:
+                    self.late.append(request)
+            if not out:
+                self.now = max(self.now, self.engine.next_deadline() or 0.0)
+                self.engine.on_deadline(self.now)
+
+
+def test_a_file_is_read_by_short_chunks() -> None:
+    reads = Transfers(writes=False, passing=100)
+    reads.finish()
+    assert reads.sink.data == CONTENT
+    assert reads.chunks.size == SHORT
+    assert reads.engine.in_flight == 0
+
+
+def test_a_file_is_written_by_short_chunks() -> None:
+    writes = Transfers(writes=True, passing=100)
+    writes.finish()
+    assert writes.file == CONTENT
+    assert writes.source.acked.covers(0, len(CONTENT))
+    assert writes.source.in_flight.empty
+    assert writes.chunks.size == SHORT
+
+
+@pytest.mark.parametrize("writes", [False, True], ids=["read", "write"])
+def test_a_late_answer_to_a_long_request_changes_nothing(writes: bool) -> None:
+    transfers = Transfers(writes=writes, passing=100)
+    transfers.finish()
+    unknown = transfers.engine.stats.unknown
+    for request in transfers.late:
+        transfers.answer(request)
+    assert transfers.engine.stats.unknown == unknown + len(transfers.late)
+
+
+def test_a_write_ack_that_counts_a_full_chunk_is_no_answer_to_a_short_one() -> None:
+    writes = Transfers(writes=True, passing=0)
+    writes.chunks.most = 100
+    (first, *_) = sent(writes.engine, 0.0)
+    writes.engine.receive(ack(first, MAX_DATA.to_bytes(4, "little")), 0.1)
+    assert writes.source.acked.empty
