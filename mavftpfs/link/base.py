@@ -8,7 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Protocol
+
+from mavftpfs.link.addresses import NetAddress
 
 
 @dataclass(slots=True)
@@ -66,19 +68,18 @@ class Link(Protocol):
         """
         ...
 
-    async def aclose(self) -> None:
-        """Flush what can be flushed at once and close."""
+    def sender(self, index: int) -> NetAddress | None:
+        """Return who sent a chunk of the list that `receive` returned last; None where only one can."""
         ...
 
+    def answer(self, address: NetAddress) -> None:
+        """From now on send to this address. Only a link that hears several senders has a choice."""
+        ...
 
-@runtime_checkable
-class PinsPeer(Protocol):
-    """A link that may hear several senders on one port and answers the latest until told whom to answer."""
+    def dismiss(self) -> None:
+        """Let whoever waits for the present peer's place have it, though the peer is not silent."""
+        ...
 
-    def pin_peer(self, chunk_index: int) -> None:
-        """From now on send to whoever sent this chunk of the list `receive` returned last.
-
-        Call again with each heartbeat of the vehicle, so that the link follows a vehicle whose
-        address changes and nobody else. An index out of range is ignored.
-        """
+    async def aclose(self) -> None:
+        """Flush what can be flushed at once and close."""
         ...

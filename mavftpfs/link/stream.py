@@ -14,6 +14,7 @@ from typing import Protocol
 
 import trio
 
+from mavftpfs.link.addresses import NetAddress
 from mavftpfs.link.base import LinkStats
 from mavftpfs.link.outbox import Outbox
 from mavftpfs.shared.errors import LinkClosed
@@ -63,6 +64,8 @@ class StreamLink:
         self._was_open = pipe is not None
         self._fresh = False
         self._closed = False
+        self._peer: NetAddress | None = None
+        self._dismissed = False
         self._heard_at = trio.current_time()
         self._outbox = Outbox(outbox_limit)
         self._work = trio.Event()
@@ -124,13 +127,27 @@ class StreamLink:
         if self._outbox.size:
             self._work.set()
 
-    def replace(self, pipe: Pipe) -> None:
-        """Go on with another pipe (the peer came back on a new connection)."""
+    def sender(self, index: int) -> NetAddress | None:
+        """Return the peer that connected; None where we opened the stream."""
+        return self._peer
+
+    def answer(self, address: NetAddress) -> None:
+        """Nothing to choose: what we send goes to the peer."""
+
+    def dismiss(self) -> None:
+        """Let the next peer have the place of this one, as soon as there is one."""
+        self._dismissed = True
+        self._notify()
+
+    def replace(self, pipe: Pipe, peer: NetAddress | None = None) -> None:
+        """Go on with another pipe (a new connection). peer: who opened it, if not we."""
         if self._closed:
             pipe.close()
             return
         self._drop()
         self._pipe = pipe
+        self._peer = peer
+        self._dismissed = False
         self._heard_at = trio.current_time()
         self._fresh = self._was_open
         if self._was_open:
@@ -139,8 +156,8 @@ class StreamLink:
         self._notify()
 
     async def wait_replaceable(self, patience: float) -> None:
-        """Wait until there is no pipe, or it has been silent for `patience` seconds."""
-        while self.connected and (left := patience - self.silence) > 0:
+        """Wait until there is no pipe, or it was dismissed, or silent for `patience` seconds."""
+        while self.connected and not self._dismissed and (left := patience - self.silence) > 0:
             with trio.move_on_after(left):
                 await self._changed.wait()
 

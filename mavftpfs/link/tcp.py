@@ -14,6 +14,7 @@ from dataclasses import replace
 
 import trio
 
+from mavftpfs.link.addresses import PATIENCE
 from mavftpfs.link.lifetime import background
 from mavftpfs.link.problems import cannot_open
 from mavftpfs.link.stream import Pipe, StreamLink
@@ -21,9 +22,6 @@ from mavftpfs.link.uri import LinkSpec
 
 CONNECT_TIMEOUT = 5.0
 """Seconds for each attempt."""
-
-PEER_PATIENCE = 5.0
-"""Seconds of silence after which a new peer replaces the present one, which may be a dead connection."""
 
 _OUTBOX_LIMIT = 64 * 1024
 _SOCKET_BUFFER = 1 << 20
@@ -129,16 +127,17 @@ async def _accept_peers(listener: socket.socket, link: StreamLink) -> None:
     while True:
         await trio.lowlevel.wait_readable(listener)
         try:
-            peer, _ = listener.accept()
+            peer, address = listener.accept()
         except OSError:  # it went away again before we looked
             await trio.sleep(_PAUSE)
             continue
         try:
-            await link.wait_replaceable(PEER_PATIENCE)
+            await link.wait_replaceable(PATIENCE)
         except BaseException:
             peer.close()
             raise
-        link.replace(_configure(peer))
+        # Each connection has a port of its own: who comes back has the same host.
+        link.replace(_configure(peer), address[:1])
 
 
 def _configure(sock: socket.socket) -> socket.socket:

@@ -1,7 +1,7 @@
 """UDP links. Layer: link.
 
-`udpin` binds a port and answers whoever spoke last, until `pin_peer` names the vehicle's address (several
-senders on one port must not steal the answers). `udpout` speaks first, to one host, from one source port
+`udpin` binds a port and answers whoever spoke last, until `answer` names the vehicle's address. `udpout`
+speaks first, to one host, from one source port
 for the life of the process (PX4 answers only the first address it heard, servers.md 5). The socket is never
 connected, so that ICMP "port unreachable" of a vehicle that reboots is not an error.
 """
@@ -15,10 +15,10 @@ import sys
 from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import replace
-from typing import Any
 
 import trio
 
+from mavftpfs.link.addresses import NetAddress
 from mavftpfs.link.base import LinkStats
 from mavftpfs.link.lifetime import background
 from mavftpfs.link.outbox import Outbox, pack
@@ -38,8 +38,6 @@ _UDP_SEGMENT = 103
 _MOST_SEGMENTS = 40
 _NO_SEGMENTS = frozenset((errno.EIO, errno.EINVAL, errno.EMSGSIZE, errno.EOPNOTSUPP, errno.ENOPROTOOPT))
 
-_SockAddr = tuple[Any, ...]
-
 
 class UdpLink:
     """A bound UDP socket; implements link.base.Link. Made by `open_udp`.
@@ -52,14 +50,14 @@ class UdpLink:
     is_stream = False
     is_serial = False
 
-    def __init__(self, sock: socket.socket, description: str, peer: _SockAddr | None = None) -> None:
+    def __init__(self, sock: socket.socket, description: str, peer: NetAddress | None = None) -> None:
         self.stats = LinkStats()
         self.description = description
         self._sock = sock
         self._peer = peer
         self._only_host = None if peer is None else peer[0]
         self._pinned = False
-        self._senders: list[_SockAddr] = []
+        self._senders: list[NetAddress] = []
         # Received into, then copied: a bytes object of the largest size for each would riddle the heap.
         self._buffer = memoryview(bytearray(_LARGEST))
         self._outbox = Outbox(_OUTBOX_LIMIT)
@@ -73,7 +71,7 @@ class UdpLink:
         return self._outbox.size
 
     @property
-    def local_address(self) -> _SockAddr:
+    def local_address(self) -> NetAddress:
         """The bound address; its second item is the port."""
         return self._sock.getsockname()  # type: ignore[no-any-return]
 
@@ -113,11 +111,18 @@ class UdpLink:
                 else:
                     self.stats.dropped_sends += 1
 
-    def pin_peer(self, chunk_index: int) -> None:
-        """From now on send to whoever sent this chunk of the last batch (see base.PinsPeer)."""
-        if self._only_host is None and 0 <= chunk_index < len(self._senders):
-            self._peer = self._senders[chunk_index]
+    def sender(self, index: int) -> NetAddress | None:
+        """Return who sent a chunk of the last batch."""
+        return self._senders[index]
+
+    def answer(self, address: NetAddress) -> None:
+        """From now on send to this address; udpout goes on sending to the one it was given."""
+        if self._only_host is None:
+            self._peer = address
             self._pinned = True
+
+    def dismiss(self) -> None:
+        """Nothing to do: nobody waits, all are heard."""
 
     async def run_writer(self) -> None:
         """Send what had to wait for the kernel; runs until cancelled."""
@@ -145,7 +150,7 @@ class UdpLink:
         """Take what is there. Errors of the socket are other people's ICMP messages: go on."""
         receive, buffer = self._sock.recvfrom_into, self._buffer
         chunks: list[bytes] = []
-        senders: list[_SockAddr] = []
+        senders: list[NetAddress] = []
         for _ in range(MAX_CHUNKS):
             try:
                 count, sender = receive(buffer)
@@ -235,7 +240,7 @@ async def open_udp(spec: LinkSpec) -> AsyncIterator[UdpLink]:
         yield link
 
 
-async def _resolve(spec: LinkSpec) -> tuple[socket.AddressFamily, _SockAddr]:
+async def _resolve(spec: LinkSpec) -> tuple[socket.AddressFamily, NetAddress]:
     try:
         found = await trio.socket.getaddrinfo(spec.host, spec.port, type=socket.SOCK_DGRAM)
     except OSError as exc:
@@ -253,7 +258,7 @@ def _configure(sock: socket.socket) -> None:
         sock.setsockopt(socket.SOL_SOCKET, option, _SOCKET_BUFFER)  # the kernel caps it silently
 
 
-def _bind(sock: socket.socket, spec: LinkSpec, address: _SockAddr) -> None:
+def _bind(sock: socket.socket, spec: LinkSpec, address: NetAddress) -> None:
     try:
         sock.bind(address)
     except OSError as exc:

@@ -12,6 +12,7 @@ from typing import Any, Literal
 
 import trio
 
+from mavftpfs.link.addresses import readable_address
 from mavftpfs.link.base import Link
 from mavftpfs.link.framing import AUTOPILOT_VERSION_ID, STORAGE_INFORMATION_ID, SYSTEM_TIME_ID, Framer
 from mavftpfs.link.messages import (
@@ -114,6 +115,7 @@ class Connection:
         stats = self.engine.stats
         return {
             "source": self.link.description,
+            "address": None if self.driver.peer is None else readable_address(self.driver.peer),
             "vehicle": None if vehicle.address is None else list(vehicle.address),
             "autopilot": None if vehicle.heartbeat is None else vehicle.heartbeat.autopilot,
             "armed": vehicle.armed,

@@ -7,12 +7,14 @@ and a time-out per request cost more than the rest of a chunk together).
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from typing import Protocol
 
 import trio
 
-from mavftpfs.link.base import Link, PinsPeer
+from mavftpfs.link.addresses import AddressBook, NetAddress, readable_address
+from mavftpfs.link.base import Link
 from mavftpfs.link.framing import Framer
 from mavftpfs.link.messages import Address, FtpRun, Message, singly
 from mavftpfs.protocol.engine import Engine
@@ -21,6 +23,11 @@ from mavftpfs.protocol.payload import decode_reply
 from mavftpfs.session.notes import Remarks
 from mavftpfs.session.vehicle import Vehicle
 from mavftpfs.shared.errors import RemoteProtocolError, RequestTimeout
+
+log = logging.getLogger("mavftpfs.session")
+
+_MOVED = "the vehicle is not heard at %s any more; asking who it is at %s"
+_IGNORED = "%s says that it is %d/%d, too: ignored as long as the vehicle is heard where it was"
 
 QUIET = 0.5
 """Seconds of silence in mid-frame after which a stream's unfinished frame is not waited for. TCP may pause
@@ -42,7 +49,11 @@ class PayloadTrace(Protocol):
 
 
 class Driver:
-    """Moves payloads between one link and one engine, and everything else to the vehicle."""
+    """Moves payloads between one link and one engine, and everything else to the vehicle.
+
+    Attributes:
+        peer: the network address that the vehicle is known by; None where the link has only one.
+    """
 
     def __init__(
         self,
@@ -60,13 +71,15 @@ class Driver:
         self.engine = engine
         self.vehicle = vehicle
         self.bad_payloads = 0
+        self.peer: NetAddress | None = None
         self.last_reply_at = clock()
         self._heard_at = clock()
         self.on_batch = on_batch
         self._clock = clock
         self._trace = trace
         self._remarks = Remarks(engine.stats)
-        self._pins = link if isinstance(link, PinsPeer) else None
+        self._addresses = AddressBook()
+        self._impostor_at: float | None = None
         self._scope: trio.CancelScope | None = None
         self._waiting: dict[Operation, Callable[[], None]] = {}
         self._budget = engine.flow.budget
@@ -85,7 +98,7 @@ class Driver:
             if scope.cancelled_caught:
                 self.engine.on_deadline(now)
                 if now >= self._quiet_at:
-                    self._handle(self.framer.give_up(), now)
+                    self._handle(self.framer.give_up(), now, self.link.sender(-1))
                     self._pass_on(now)
                     self.on_batch(now)
             else:
@@ -146,24 +159,26 @@ class Driver:
         self._heard_at = now
         feed = self.framer.feed_runs
         for index, chunk in enumerate(chunks):
-            self._handle(feed(chunk), now, index)
+            self._handle(feed(chunk), now, self.link.sender(index))
             if len(self._gathered) >= REFILL_AT:
                 self._pass_on(now)
                 self._refill(now)
         self._pass_on(now)
         self.on_batch(now)
 
-    def _handle(self, messages: list[Message | FtpRun], now: float, index: int = -1) -> None:
+    def _handle(self, messages: list[Message | FtpRun], now: float, sender: NetAddress | None) -> None:
         """Gather replies, and tell the vehicle everything else, in its turn."""
         vehicle = self.vehicle
         for message in messages:
+            if sender is not None and not self._is_from(message.source, sender, now):
+                continue
             ours = (vehicle.address, vehicle.own)
             if type(message) is FtpRun and (message.source, message.target) == ours:
                 self._gathered += message.payloads
             else:
                 self._pass_on(now)
                 for single in singly([message]):
-                    self._on_other(single, now, index)
+                    self._on_other(single, now, sender)
 
     def _pass_on(self, now: float) -> None:
         """Give the engine the gathered replies."""
@@ -201,11 +216,56 @@ class Driver:
         self.engine.receive(reply, now)
         trace.payload(now, "reply", wire, self._remarks.after_reply(reply))
 
-    def _on_other(self, message: Message, now: float, index: int) -> None:
-        self.vehicle.on_message(message, now)
-        # Of a target without heartbeats of its own the vehicle takes its system's autopilot's.
-        if self._pins is not None and message is self.vehicle.heartbeat:
-            self._pins.pin_peer(index)
+    def _on_other(self, message: Message, now: float, sender: NetAddress | None) -> None:
+        vehicle = self.vehicle
+        vehicle.on_message(message, now)
+        if sender is None or vehicle.address is None:
+            return
+        if message is vehicle.heartbeat:
+            # A target without heartbeats of its own is where its system's autopilot is.
+            if vehicle.address in self._addresses:
+                self._is_from(vehicle.address, sender, now)
+            else:
+                self._send_to(sender)
+        if vehicle.identity.stranger:
+            self._addresses.distrusted = self.peer
+            self.link.dismiss()
+        else:
+            self._addresses.distrusted = None
+
+    def _is_from(self, source: Address, sender: NetAddress, now: float) -> bool:
+        """Return whether a message counts that came from a network address; follow the vehicle that moves."""
+        is_vehicle = source == self.vehicle.address
+        moves = is_vehicle and source in self._addresses
+        if not self._addresses.accepts(source, sender, now):
+            if is_vehicle:
+                self._on_impostor(source, sender, now)
+            return False
+        if is_vehicle and sender != self.peer:
+            self._pass_on(now)
+            if moves:
+                self._on_moved(sender, now)
+            self._send_to(sender)
+        return True
+
+    def _on_impostor(self, source: Address, sender: NetAddress, now: float) -> None:
+        """Say once that somebody else claims to be the vehicle. Its own new address is not, so wait until the
+        vehicle was heard again where it was."""
+        if self._impostor_at is None:
+            self._impostor_at = now
+        elif self.vehicle.identity.heard_since(self._impostor_at):
+            self._impostor_at = float("inf")
+            log.warning(_IGNORED, readable_address(sender), *source)
+
+    def _on_moved(self, sender: NetAddress, now: float) -> None:
+        self._impostor_at = None
+        if self.peer is not None:
+            log.warning(_MOVED, readable_address(self.peer), readable_address(sender))
+            self.vehicle.identity.moved(now)
+
+    def _send_to(self, address: NetAddress) -> None:
+        self.peer = address
+        self.link.answer(address)
 
     def _refill(self, now: float) -> None:
         target = self.vehicle.address

@@ -48,6 +48,7 @@ class Identity:
         self._known: AutopilotVersion | None = None
         self._strange = False
         self._mute = False
+        self._moved = False
         self._unanswered = 0
         self._heard_at: float | None = None
         self._back_at = self.left_at = float("-inf")
@@ -65,7 +66,7 @@ class Identity:
     def may_be_asked(self, now: float) -> bool:
         """Whether requests may go out now: not into a silence either, at whose end another one may hear."""
         if self._known is None or self._heard_at is None:
-            return True
+            return self.trusted
         return self.trusted and now - self._heard_at <= ABSENCE
 
     def heard(self, now: float) -> None:
@@ -80,6 +81,11 @@ class Identity:
         if self._heard_at is not None:
             self.left_at, self._back_at = self._heard_at, now
         self.doubt()
+
+    def moved(self, now: float) -> None:
+        """Its network address is another one: only who it is makes it believed there, if it ever told."""
+        self.reopened(now)
+        self.standing, self._moved, self._unanswered = Standing.DOUBTED, True, 0
 
     def away_since(self, when: float, now: float) -> bool:
         """Return whether it was away after that, so that it may have restarted."""
@@ -103,9 +109,7 @@ class Identity:
         """It told who it is; return whether it is the same as ever."""
         self._mute = False
         if self._known is not None and is_another(self._known, version):
-            was_trusted, self.standing = self.trusted, Standing.STRANGER
-            if was_trusted:  # nobody asks, and ours may come back without a silence
-                self.on_doubt()
+            self._is_stranger()
             return False
         if self._known is None and (version.uid or any(version.uid2)):
             self._known = version
@@ -115,15 +119,24 @@ class Identity:
     def unanswered(self) -> None:
         """It was heard, but did not tell who it is though it was asked."""
         self._unanswered += 1
-        if self._unanswered >= PATIENCE and self.standing is Standing.DOUBTED:
+        if self._unanswered < PATIENCE or self.standing is not Standing.DOUBTED:
+            return
+        if self._moved and self._known is not None and not self._mute:
+            self._is_stranger()
+        else:
             self._mute = True
             self._settle()
+
+    def _is_stranger(self) -> None:
+        was_trusted, self.standing = self.trusted, Standing.STRANGER
+        if was_trusted:  # nobody asks, and ours may come back without a silence
+            self.on_doubt()
 
     def _settle(self) -> None:
         if self.trusted:
             return
         strange = self._strange or self.stranger
-        self.standing, self._strange = Standing.TRUSTED, False
+        self.standing, self._strange, self._moved = Standing.TRUSTED, False, False
         self.on_settled(strange)
 
 

@@ -13,6 +13,7 @@ from itertools import pairwise
 
 import trio
 
+from mavftpfs.link.addresses import NetAddress
 from mavftpfs.link.base import LinkStats
 from mavftpfs.shared.errors import LinkClosed
 from mavftpfs.sim.linkmodel import Direction, LinkModel
@@ -114,8 +115,15 @@ class MemoryLink:
                 self._deliver(frame, now)
         self._notify()
 
-    def pin_peer(self, chunk_index: int) -> None:
+    def sender(self, index: int) -> NetAddress | None:
+        """Nobody else is heard."""
+        return None
+
+    def answer(self, address: NetAddress) -> None:
         """Nothing to choose from."""
+
+    def dismiss(self) -> None:
+        """Nobody waits."""
 
     async def aclose(self) -> None:
         """See link.base.Link."""

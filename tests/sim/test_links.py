@@ -16,7 +16,7 @@ import trio
 import trio.testing
 from pymavlink import mavutil
 
-from mavftpfs.link.base import Link, PinsPeer
+from mavftpfs.link.base import Link
 from mavftpfs.link.framing import Framer
 from mavftpfs.link.messages import Address, FtpFrame, Heartbeat, Message
 from mavftpfs.link.opening import open_link
@@ -268,9 +268,8 @@ async def test_cancelling_receive_loses_nothing() -> None:
         assert [int.from_bytes(c, "big") for c in got] == list(range(200))
 
 
-async def test_answers_the_latest_sender_until_the_vehicle_is_pinned() -> None:
+async def test_answers_the_latest_sender_until_told_whom() -> None:
     async with udpin() as (link, port):
-        assert isinstance(link, PinsPeer)
         with udp_socket() as vehicle, udp_socket() as stranger:
             vehicle.sendto(b"beat", (HOST, port))
             stranger.sendto(b"noise", (HOST, port))
@@ -282,19 +281,16 @@ async def test_answers_the_latest_sender_until_the_vehicle_is_pinned() -> None:
             stranger.sendto(b"noise", (HOST, port))
             await trio.sleep(0.05)
             assert await link.receive() == [b"beat", b"noise"]
-            link.pin_peer(0)
-            link.pin_peer(7)  # nobody
-            link.send_nowait([b"to the pinned"])
-            assert vehicle.recv(100) == b"to the pinned"
+            senders = [link.sender(0), link.sender(1)]
+            assert senders == [vehicle.getsockname(), stranger.getsockname()]
+            link.answer(vehicle.getsockname())
+            link.send_nowait([b"to the vehicle"])
+            assert vehicle.recv(100) == b"to the vehicle"
 
             stranger.sendto(b"noise", (HOST, port))
             assert await link.receive() == [b"noise"]
             link.send_nowait([b"still"])
             assert vehicle.recv(100) == b"still"
-
-            link.pin_peer(0)  # the vehicle's heartbeat came from there: it moved
-            link.send_nowait([b"moved"])
-            assert stranger.recv(100) == b"moved"
 
 
 async def test_sends_before_anybody_was_heard_are_dropped() -> None:
@@ -511,7 +507,7 @@ async def test_tcpin_serves_one_peer_and_then_the_next() -> None:
 
 
 async def test_tcpin_leaves_a_silent_peer_for_a_new_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mavftpfs.link.tcp.PEER_PATIENCE", 0.2)
+    monkeypatch.setattr("mavftpfs.link.tcp.PATIENCE", 0.2)
     async with opened(f"tcpin:{HOST}:0") as link:
         address = (HOST, parse_source(link.description).port)
         with socket.create_connection(address) as dead:

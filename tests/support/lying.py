@@ -17,10 +17,12 @@ from typing import Any, Self
 import trio
 from fastcrc import crc16
 
+from mavftpfs.link.addresses import NetAddress
 from mavftpfs.link.messages import Address
 from mavftpfs.protocol.payload import NakCode, Opcode, Payload, decode_reply, decode_request
 from mavftpfs.sim.endpoints import Endpoint, client_source, open_endpoint
 from mavftpfs.sim.filesystem import Tree
+from mavftpfs.sim.memory import MemoryLink
 from mavftpfs.sim.profiles import PROFILES
 from mavftpfs.sim.server import FtpServer
 from mavftpfs.sim.vehicle import SimVehicle
@@ -93,6 +95,55 @@ def lie_for(world: World) -> LyingServer:
     server.tx_room = vehicle.server.tx_room
     vehicle.server = server
     return server
+
+
+class CrowdedLink(MemoryLink):
+    """A UDP port in memory: the vehicle speaks from `address`, and so may others.
+
+    Attributes:
+        address: where the vehicle is now; what is sent elsewhere it does not hear.
+        mirrors: further addresses that everything the vehicle says comes from, too.
+        answered: where our frames go.
+    """
+
+    def __init__(self, world: World, address: NetAddress) -> None:
+        super().__init__(world.vehicle, world.model)
+        self.address = address
+        self.mirrors: list[NetAddress] = []
+        self.answered: NetAddress | None = None
+        self._queue: list[tuple[NetAddress, bytes]] = []
+        self._senders: list[NetAddress] = []
+        world.link = self
+
+    def intrude(self, address: NetAddress, frame: bytes) -> None:
+        """Let somebody else send a datagram."""
+        self._queue.append((address, frame))
+        self._inbox.append(frame)
+        self.kick()
+
+    def sender(self, index: int) -> NetAddress | None:
+        """See link.base.Link."""
+        return self._senders[index]
+
+    def answer(self, address: NetAddress) -> None:
+        """See link.base.Link."""
+        self.answered = address
+
+    def send_nowait(self, frames: Sequence[bytes]) -> None:
+        """See link.base.Link."""
+        if self.answered in (None, self.address, *self.mirrors):
+            super().send_nowait(frames)
+
+    def _arrive(self, frame: bytes) -> None:
+        for address in (self.address, *self.mirrors):
+            self._queue.append((address, frame))
+            self._inbox.append(frame)
+
+    def _take(self) -> list[bytes]:
+        chunks = super()._take()
+        taken, self._queue = self._queue[: len(chunks)], self._queue[len(chunks) :]
+        self._senders = [address for address, _ in taken]
+        return chunks
 
 
 class LyingVehicle:

@@ -38,6 +38,7 @@ SIM_USERS = {"cli", "demo"}
 
 PURE_LAYERS = {"shared", "protocol", "sim"}
 PURE_MODULES = {
+    "link.addresses",
     "link.framing",
     "link.fastframe",
     "link.messages",

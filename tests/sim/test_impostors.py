@@ -1,0 +1,255 @@
+"""Somebody else says that he is the vehicle: it does not count, and the vehicle is not lost by it."""
+
+from __future__ import annotations
+
+import random
+import socket
+from collections.abc import Callable, Iterable
+
+import pytest
+import trio
+from trio.testing import MockClock
+
+from mavftpfs.link.messages import MAV_AUTOPILOT_INVALID, Address
+from mavftpfs.link.opening import open_link
+from mavftpfs.link.udp import UdpLink
+from mavftpfs.link.uri import parse_source
+from mavftpfs.protocol.payload import Opcode, Payload
+from mavftpfs.session.connection import Connection, ConnectOptions, connected
+from mavftpfs.shared.errors import VehicleLost
+from mavftpfs.sim import vehicle as sim_vehicle
+from mavftpfs.sim.linkmodel import LinkSettings
+from mavftpfs.sim.memorytree import MemoryTree
+from mavftpfs.sim.profiles import PROFILES, Family
+from mavftpfs.sim.vehicle import SimVehicle
+from tests.support.lying import CrowdedLink, LyingVehicle, ack, ftp, heartbeat
+from tests.support.vehicles import HOST, free_udp_port
+from tests.support.worlds import World, read_file
+
+HERE = ("10.0.0.1", 14550)
+THERE = ("10.0.0.2", 14550)
+OURS = random.Random(1).randbytes(20_000)
+THEIRS = random.Random(2).randbytes(20_000)
+
+
+class Scene:
+    """A vehicle at HERE. other: another one with a file of that name."""
+
+    def __init__(self) -> None:
+        self.world = World("px4", LinkSettings(delay=0.02))
+        self.world.tree.add(b"/f", OURS)
+        self.link = CrowdedLink(self.world, HERE)
+        self.ours = self.world.vehicle
+        tree = MemoryTree()
+        tree.add(b"/f", THEIRS)
+        self.other = SimVehicle(tree, PROFILES["px4"], rng=random.Random(99))
+
+    def move(self, vehicle: SimVehicle, address: tuple[str, int]) -> None:
+        """From now on this vehicle speaks, and from this address."""
+        self.link.vehicle = vehicle
+        self.link.address = address
+        self.link.kick()
+
+    async def beat(self, address: tuple[str, int]) -> None:
+        """Send ten heartbeats a second in the vehicle's name, for ever."""
+        for seq in range(1 << 20):
+            self.link.intrude(address, heartbeat(seq))
+            await trio.sleep(0.1)
+
+
+async def told(connection: Connection) -> None:
+    """Wait until the vehicle has told who it is."""
+    await trio.sleep(5.0)
+    assert connection.vehicle.version is not None
+
+
+async def test_heartbeats_from_elsewhere_do_not_move_the_vehicle(
+    autojump: MockClock, caplog: pytest.LogCaptureFixture
+) -> None:
+    scene = Scene()
+    async with scene.world.connection() as connection, trio.open_nursery() as nursery:
+        await told(connection)
+        nursery.start_soon(scene.beat, THERE)
+        for _ in range(10):
+            assert await read_file(connection, b"/f") == OURS
+            await trio.sleep(1.0)
+        assert connection.status()["address"] == "10.0.0.1:14550"
+        nursery.cancel_scope.cancel()
+    assert [line for line in caplog.messages if "10.0.0.2:14550" in line] == [
+        "10.0.0.2:14550 says that it is 1/1, too: ignored as long as the vehicle is heard where it was"
+    ]
+
+
+async def test_a_vehicle_whose_address_changes_is_found_again(
+    autojump: MockClock, caplog: pytest.LogCaptureFixture
+) -> None:
+    scene = Scene()
+    async with scene.world.connection() as connection:
+        await told(connection)
+        assert await read_file(connection, b"/f") == OURS
+        scene.move(scene.ours, THERE)
+        await trio.sleep(10.0)
+        assert await read_file(connection, b"/f") == OURS
+        assert connection.status()["address"] == "10.0.0.2:14550"
+        assert not connection.vehicle.lost(trio.current_time())
+    assert [line for line in caplog.messages if "10.0.0.2:14550" in line] == [
+        "the vehicle is not heard at 10.0.0.1:14550 any more; asking who it is at 10.0.0.2:14550"
+    ]
+
+
+@pytest.mark.parametrize("tells", [True, False])
+async def test_another_vehicle_that_takes_the_address_is_not_read(
+    tells: bool, autojump: MockClock, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One that does not tell who it is neither, though ours would be believed in the end."""
+    scene = Scene()
+    if not tells:
+        monkeypatch.setattr(scene.other, "_on_command", lambda command, now: None)
+    async with scene.world.connection() as connection, trio.open_nursery() as nursery:
+        await told(connection)
+        scene.move(scene.other, THERE)
+        await trio.sleep(60.0)
+        with pytest.raises(VehicleLost, match="another vehicle answers"):
+            await read_file(connection, b"/f")
+        assert scene.other.server.requests.total() == 0
+        nursery.start_soon(scene.beat, THERE)  # it stays
+        scene.move(scene.ours, HERE)
+        await trio.sleep(5.0)
+        assert await read_file(connection, b"/f") == OURS
+        nursery.cancel_scope.cancel()
+
+
+async def test_nothing_is_asked_at_a_new_address_before_it_told(
+    autojump: MockClock, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of a vehicle that never told who it is, too."""
+    scene = Scene()
+    monkeypatch.setattr(scene.ours, "_on_command", lambda command, now: None)
+    monkeypatch.setattr(scene.other, "_on_command", lambda command, now: None)
+    async with scene.world.connection() as connection:
+        assert await read_file(connection, b"/f") == OURS
+        scene.move(scene.other, THERE)
+        with trio.move_on_after(12.0):
+            await read_file(connection, b"/f")
+        assert connection.status()["address"] == "10.0.0.2:14550"
+        assert scene.other.server.requests.total() == 0
+
+
+async def test_two_links_to_one_vehicle_do_no_harm(
+    autojump: MockClock, caplog: pytest.LogCaptureFixture
+) -> None:
+    scene = Scene()
+    scene.link.mirrors = [THERE]
+    async with scene.world.connection() as connection:
+        for _ in range(5):
+            assert await read_file(connection, b"/f") == OURS
+            await trio.sleep(3.0)
+        assert connection.status()["address"] == "10.0.0.1:14550"
+        scene.link.address, scene.link.mirrors = THERE, []  # one of them ends
+        await trio.sleep(10.0)
+        assert await read_file(connection, b"/f") == OURS
+    assert connection.vehicle.reboots == 0
+
+
+async def test_a_companion_has_an_address_of_its_own(
+    autojump: MockClock, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Our target is not the autopilot, whose heartbeats come from elsewhere and say whether it is armed."""
+    monkeypatch.setitem(sim_vehicle._AUTOPILOT_TYPE, Family.MAVSDK, MAV_AUTOPILOT_INVALID)
+    scene = Scene()
+    scene.world.vehicle = SimVehicle(
+        scene.world.tree, PROFILES["mavsdk"], rng=random.Random(1), address=Address(1, 191)
+    )
+    link = CrowdedLink(scene.world, HERE)
+    async with trio.open_nursery() as nursery:
+
+        async def autopilot() -> None:
+            for seq in range(1 << 20):
+                link.intrude(THERE, heartbeat(seq, armed=True))
+                await trio.sleep(1.0)
+
+        nursery.start_soon(autopilot)
+        async with scene.world.connection(ConnectOptions(target_component=191)) as connection:
+            await trio.sleep(2.0)
+            assert await read_file(connection, b"/f") == OURS
+            assert connection.vehicle.identity.trusted
+            assert connection.vehicle.armed
+            await trio.sleep(10.0)
+            assert await read_file(connection, b"/f") == OURS
+            assert connection.status()["address"] == "10.0.0.1:14550"
+        nursery.cancel_scope.cancel()
+
+
+async def test_a_target_without_heartbeats_moves_with_its_autopilot(
+    autojump: MockClock, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene = Scene()
+    scene.world.vehicle = SimVehicle(
+        scene.world.tree, PROFILES["mavsdk"], rng=random.Random(1), address=Address(1, 191)
+    )
+    monkeypatch.setattr(
+        scene.world.vehicle,
+        "_beat",
+        lambda frames, now: scene.world.vehicle.__setattr__("_next_beat", now + 1),
+    )
+    link = CrowdedLink(scene.world, HERE)
+    async with trio.open_nursery() as nursery:
+
+        async def autopilot() -> None:
+            for seq in range(1 << 20):
+                link.intrude(link.address, heartbeat(seq))
+                await trio.sleep(1.0)
+
+        nursery.start_soon(autopilot)
+        async with scene.world.connection(ConnectOptions(target_component=191)) as connection:
+            assert await read_file(connection, b"/f") == OURS
+            link.address = THERE
+            await trio.sleep(20.0)
+            assert await read_file(connection, b"/f") == OURS
+            assert connection.status()["address"] == "10.0.0.2:14550"
+        nursery.cancel_scope.cancel()
+
+
+# -- on real links ---------------------------------------------------------------------------------
+
+
+def forge(request: Payload) -> bytes:
+    """Return the ACK of a read with everything right but the bytes."""
+    return ftp(ack(request, b"\xee" * request.size).encode(), Address(254, 191))
+
+
+@pytest.mark.parametrize("kind", ["udpin", "udpout", "tcpin"])
+async def test_a_forged_reply_from_another_socket_is_not_believed(kind: str) -> None:
+    """Each read is answered by the forger first. kind: our end of the link."""
+    tree = MemoryTree()
+    tree.add(b"/f", OURS)
+    ends = {"udpin": "udpout", "udpout": "udpin", "tcpin": "tcp"}
+    port = free_udp_port()
+    stream = kind == "tcpin"
+    with (
+        LyingVehicle(tree, f"{ends[kind]}:{HOST}:{port}") as vehicle,
+        socket.socket(socket.AF_INET, socket.SOCK_STREAM if stream else socket.SOCK_DGRAM) as forger,
+    ):
+        async with (
+            open_link(parse_source(f"{kind}:{HOST}:{port}")) as link,
+            connected(link, ConnectOptions()) as made,
+        ):
+            await made.ready(30.0)
+            assert await read_file(made, b"/f") == OURS
+            if isinstance(link, UdpLink):
+                port = link.local_address[1]
+            forger.connect((HOST, port))
+            vehicle.server.change = forging(forger.send)
+            for _ in range(20):
+                assert await read_file(made, b"/f") == OURS
+
+
+def forging(send: Callable[[bytes], object]) -> Callable[[Payload, Payload], Iterable[Payload]]:
+    """Return a hook that sends a forged reply to each read before the true one."""
+
+    def change(request: Payload, reply: Payload) -> Iterable[Payload]:
+        if request.opcode == Opcode.READ_FILE:
+            send(heartbeat() + forge(request))
+        return [reply]
+
+    return change
