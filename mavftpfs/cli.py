@@ -147,16 +147,18 @@ def _sources_and_options() -> str:
     return "\n".join([_SOURCES, "", "mount options, as -o ro,cache_size=1G:", *option_help()])
 
 
-def _source_parser(name: str, description: str) -> Parser:
-    parser = Parser(f"mavftpfs {name}", description=description, epilog=_SOURCES)
-    parser.add_argument("source", metavar="SOURCE", help="how to reach the vehicle")
+def _source_parser(name: str, description: str, *, short_help: bool = True) -> Parser:
+    parser = Parser(f"mavftpfs {name}", description=description, epilog=_SOURCES, add_help=False)
+    help_words = ("-h", "--help") if short_help else ("--help",)
+    parser.add_argument(*help_words, action="help", help="show this and exit")
+    parser.add_argument("source", metavar="SOURCE", help="how to reach the vehicle, or where it is mounted")
     _add_options(parser)
     parser.add_argument("-d", "--debug", action="store_true", help="print every payload, decoded")
     return parser
 
 
-def _paths_parser(name: str, description: str, least: str = "+") -> Parser:
-    parser = _source_parser(name, description)
+def _paths_parser(name: str, description: str, least: str = "+", *, short_help: bool = True) -> Parser:
+    parser = _source_parser(name, description, short_help=short_help)
     parser.add_argument(
         "paths", metavar="PATH", nargs=least, default=[], help="a path on the vehicle, or an mftp:// URL"
     )
@@ -170,16 +172,61 @@ def _scan_parser(name: str) -> Parser:
 
 
 def _ls_parser(name: str) -> Parser:
-    parser = _paths_parser(name, "List directories of the vehicle.", least="*")
-    parser.add_argument("-l", dest="detailed", action="store_true", help="with sizes and times")
+    # -h is what it is in ls.
+    parser = _paths_parser(name, "List directories of the vehicle.", least="*", short_help=False)
+    parser.add_argument("-l", dest="detailed", action="store_true", help="with sizes and times (UTC)")
+    parser.add_argument("-h", dest="units", action="store_true", help="with -l: sizes as 1.2 MB")
+    parser.add_argument("-t", dest="by_time", action="store_true", help="the newest first")
+    parser.add_argument("-R", dest="recursive", action="store_true", help="directories below too")
     parser.add_argument("--json", action="store_true", help="print JSON")
     return parser
 
 
+def _sync_parser(name: str) -> Parser:
+    parser = _source_parser(name, "Bring the vehicle's logs into a local directory, the newest first.")
+    parser.add_argument("local", metavar="LOCAL", help="the local directory; it is made if need be")
+    parser.add_argument(
+        "--from", dest="place", metavar="PATH", help="the vehicle's log directory; default: found by itself"
+    )
+    parser.add_argument("--newest", metavar="N", type=_count, help="only the N newest logs")
+    parser.add_argument("--since", metavar="DATE", help="only logs since then: 2026-05-01, 2026-05-01T14:30")
+    parser.add_argument("-n", "--dry-run", action="store_true", help="only say what would be fetched")
+    parser.add_argument("--json", action="store_true", help="print JSON")
+    _add_verify(parser)
+    return parser
+
+
+def _count(text: str) -> int:
+    if not text.isascii() or not text.isdigit() or int(text) == 0:
+        raise argparse.ArgumentTypeError(f"{text!r} is no number of logs")
+    return int(text)
+
+
+def _add_verify(parser: Parser) -> None:
+    parser.add_argument(
+        "--verify",
+        choices=("auto", "all", "none"),
+        default="auto",
+        help="compare with the vehicle's CRC32: auto is up to 16 MB; what was resumed is always compared",
+    )
+
+
 def _get_parser(name: str) -> Parser:
-    parser = _paths_parser(name, "Fetch files and verify them by size and CRC32.")
-    parser.add_argument("--to", metavar="LOCAL", default=".", help="directory, or new name of a single file")
+    parser = _paths_parser(name, "Fetch files, and verify them by size and CRC32.")
+    parser.add_argument(
+        "--to", metavar="LOCAL", default=".", help="directory, new name of a single file, or - for stdout"
+    )
     parser.add_argument("-r", dest="recursive", action="store_true", help="directories too")
+    parser.add_argument(
+        "--no-resume", dest="resume", action="store_false", help="do not go on with an earlier NAME.part"
+    )
+    _add_verify(parser)
+    return parser
+
+
+def _cat_parser(name: str) -> Parser:
+    parser = _paths_parser(name, "Write files of the vehicle to stdout.")
+    _add_verify(parser)
     return parser
 
 
@@ -260,19 +307,33 @@ def _demo(args: argparse.Namespace) -> int:
     return run()
 
 
+def _verb(name: str) -> Run:
+    """Return the command of that name without a mount."""
+
+    def run(args: argparse.Namespace) -> int:
+        from mavftpfs.oneshot import verbs
+
+        command: Run = getattr(verbs, name)
+        return command(args)
+
+    return run
+
+
 _COMMANDS: dict[str, tuple[Callable[[str], Parser], Run]] = {
     "mount": (_mount_parser, commands.mount),
     "umount": (_umount_parser, commands.umount),
     "status": (_status_parser, commands.status),
-    "scan": (_scan_parser, commands.scan),
-    "ls": (_ls_parser, commands.ls),
-    "get": (_get_parser, commands.get),
-    "put": (_put_parser, commands.put),
-    "rm": (_rm_parser, commands.rm),
-    "mkdir": (_mkdir_parser, commands.mkdir),
-    "rmdir": (_rmdir_parser, commands.rmdir),
-    "mv": (_mv_parser, commands.mv),
-    "crc": (_crc_parser, commands.crc),
+    "sync": (_sync_parser, _verb("sync")),
+    "scan": (_scan_parser, _verb("scan")),
+    "ls": (_ls_parser, _verb("ls")),
+    "get": (_get_parser, _verb("get")),
+    "cat": (_cat_parser, _verb("cat")),
+    "put": (_put_parser, _verb("put")),
+    "rm": (_rm_parser, _verb("rm")),
+    "mkdir": (_mkdir_parser, _verb("mkdir")),
+    "rmdir": (_rmdir_parser, _verb("rmdir")),
+    "mv": (_mv_parser, _verb("mv")),
+    "crc": (_crc_parser, _verb("crc")),
     "sim": (_sim_parser, _sim),
     "demo": (_demo_parser, _demo),
 }

@@ -1,21 +1,17 @@
-"""What each command does; `cli` parses the words. Layer: top."""
+"""What mount, umount and status do; `cli` parses the words. Layer: top."""
 
 from __future__ import annotations
 
 import argparse
-import json
 import logging
 import os
 import select
-import signal
 import sys
-from collections.abc import Callable, Coroutine, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
-
-import trio
+from typing import Any
 
 from mavftpfs import control, daemon
 from mavftpfs import mountpoint as mounting
@@ -24,10 +20,7 @@ from mavftpfs.fuse.options import MountOptions, parse_options, split_words, with
 from mavftpfs.link.uri import LinkSpec, parse_source
 from mavftpfs.mountpoint import canonical, check_fuse, check_mountpoint, is_ours, unmount
 from mavftpfs.shared.errors import UsageError
-from mavftpfs.shared.readable import printable, readable, readable_size
-
-if TYPE_CHECKING:
-    from mavftpfs.oneshot import Target
+from mavftpfs.shared.readable import readable
 
 STATUS_PATIENCE = 10.0
 DELIVERY_PATIENCE = 3600.0
@@ -228,175 +221,3 @@ def all_statuses() -> list[Mapping[str, Any]]:
 def _ask_status(path: Path) -> Mapping[str, Any]:
     facts: Mapping[str, Any] = control.ask(path, {"command": "status"}, timeout=STATUS_PATIENCE)["status"]
     return facts
-
-
-# -- without a mount ------------------------------------------------------------------------------
-
-
-ResultT = TypeVar("ResultT")
-
-
-def _run(
-    args: argparse.Namespace,
-    function: Callable[[Target], Coroutine[Any, Any, ResultT]],
-    component: int | None = None,
-) -> ResultT:
-    """Run a one-shot command; Ctrl-C ends it in order, so that the vehicle's session is closed."""
-    from mavftpfs.compose import open_sinks
-    from mavftpfs.oneshot import Target
-
-    options, spec = connection_of(args)
-    if component is not None:
-        options = replace(options, target_component=component)
-    daemon.log_to_stderr(logging.DEBUG if args.debug else logging.WARNING)
-    if not args.debug:  # whatever the caches warn of is raised, too, and errors are one line
-        logging.getLogger("mavftpfs.cache").setLevel(logging.ERROR)
-    with open_sinks(options, debug=args.debug) as sinks:
-        return trio.run(until_interrupted, partial(function, Target(spec, options, sinks)))
-
-
-async def until_interrupted(function: Callable[[], Coroutine[Any, Any, ResultT]]) -> ResultT:
-    """Return the function's result.
-
-    Raises:
-        KeyboardInterrupt: SIGINT or SIGTERM came first; the function was cancelled and has cleaned up.
-        MavftpfsError, OSError: the function's own.
-    """
-    results: list[ResultT] = []
-    errors: list[Exception] = []
-    with trio.open_signal_receiver(signal.SIGINT, signal.SIGTERM) as signals:
-        async with trio.open_nursery() as nursery:
-
-            async def watch() -> None:
-                async for _ in signals:
-                    nursery.cancel_scope.cancel()
-
-            nursery.start_soon(watch)
-            try:
-                results.append(await function())
-            except Exception as exc:  # raised again outside of the nursery, which would wrap it in a group
-                errors.append(exc)
-            nursery.cancel_scope.cancel()
-    if errors:
-        raise errors[0]
-    if not results:
-        raise KeyboardInterrupt
-    return results[0]
-
-
-def ls(args: argparse.Namespace) -> int:
-    """List directories."""
-    from mavftpfs import oneshot, report
-
-    paths, component = oneshot.parse_paths(args.paths or ["/"])
-    listings = _run(args, lambda target: oneshot.list_paths(target, paths), component)
-    if args.json:
-        print(json.dumps([entry for _, entries in listings for entry in entries], indent=2))
-    else:
-        report.print_listings(listings, detailed=args.detailed)
-    return ExitCode.OK
-
-
-def get(args: argparse.Namespace) -> int:
-    """Fetch files."""
-    from mavftpfs import oneshot, report
-
-    paths, component = oneshot.parse_paths(args.paths)
-    local = Path(args.to)
-
-    def tell(fetched: oneshot.Fetched) -> None:
-        name = printable(os.fsdecode(fetched.remote))
-        print(f"{name}: {readable_size(fetched.size)}, verified by {fetched.proof}")
-
-    with report.transfer_meter() as meter:
-        _run(
-            args,
-            lambda target: oneshot.get_paths(target, paths, local, meter, tell, recursive=args.recursive),
-            component,
-        )
-    return ExitCode.OK
-
-
-def put(args: argparse.Namespace) -> int:
-    """Put files on the vehicle."""
-    from mavftpfs import oneshot, oneshot_writing, report
-
-    (path,), component = oneshot.parse_paths([args.path])
-
-    def tell(sent: oneshot_writing.Sent) -> None:
-        print(f"{printable(os.fsdecode(sent.remote))}: {readable_size(sent.size)}, delivered")
-
-    with report.transfer_meter() as meter:
-        _run(
-            args,
-            lambda target: oneshot_writing.put_paths(
-                target, args.locals, path, meter, tell, recursive=args.recursive
-            ),
-            component,
-        )
-    return ExitCode.OK
-
-
-def rm(args: argparse.Namespace) -> int:
-    """Remove files."""
-    from mavftpfs import oneshot, oneshot_writing
-
-    paths, component = oneshot.parse_paths(args.paths)
-    _run(
-        args, lambda target: oneshot_writing.remove_paths(target, paths, recursive=args.recursive), component
-    )
-    return ExitCode.OK
-
-
-def mkdir(args: argparse.Namespace) -> int:
-    """Make directories."""
-    from mavftpfs import oneshot, oneshot_writing
-
-    paths, component = oneshot.parse_paths(args.paths)
-    _run(
-        args, lambda target: oneshot_writing.make_directories(target, paths, parents=args.parents), component
-    )
-    return ExitCode.OK
-
-
-def rmdir(args: argparse.Namespace) -> int:
-    """Remove empty directories."""
-    from mavftpfs import oneshot, oneshot_writing
-
-    paths, component = oneshot.parse_paths(args.paths)
-    _run(args, lambda target: oneshot_writing.remove_directories(target, paths), component)
-    return ExitCode.OK
-
-
-def mv(args: argparse.Namespace) -> int:
-    """Rename or move."""
-    from mavftpfs import oneshot, oneshot_writing
-
-    (*paths, to), component = oneshot.parse_paths([*args.paths, args.target])
-    _run(args, lambda target: oneshot_writing.move_paths(target, paths, to), component)
-    return ExitCode.OK
-
-
-def crc(args: argparse.Namespace) -> int:
-    """Print checksums the vehicle computed, as cksum's relatives do: number, two blanks, name."""
-    from mavftpfs import oneshot
-
-    paths, component = oneshot.parse_paths(args.paths)
-
-    def tell(path: bytes, number: int) -> None:
-        print(f"{number:08x}  {printable(os.fsdecode(path))}")
-
-    _run(args, lambda target: oneshot.checksum_paths(target, paths, tell), component)
-    return ExitCode.OK
-
-
-def scan(args: argparse.Namespace) -> int:
-    """Show who answers on a link."""
-    from mavftpfs import oneshot, report
-
-    found = _run(args, oneshot.scan)
-    if args.json:
-        print(json.dumps(found, indent=2, default=str))
-    else:
-        report.print_scan(found)
-    return ExitCode.OK

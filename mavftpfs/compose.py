@@ -192,9 +192,14 @@ async def _list_root(connection: Connection, tree: Tree, deadline: float, option
         raise UsageError(
             f"{options.root.decode(errors='replace')} is not a directory of the vehicle"
         ) from exc
+    raise no_answer(connection, options)
+
+
+def no_answer(connection: Connection, options: MountOptions) -> NoFtp:
+    """Return what is said when no FTP request was answered within connect_timeout."""
     if connection.store.kept_out:
-        raise NoFtp(f"another client keeps the only FTP session of {_vehicle(connection)} in use")
-    raise NoFtp(
+        return NoFtp(f"another client keeps the only FTP session of {_vehicle(connection)} in use")
+    return NoFtp(
         f"{_vehicle(connection)} sends heartbeats but did not answer MAVLink FTP "
         f"within {options.connect_timeout:g} s ({_flag(connection)})"
     )

@@ -30,6 +30,7 @@ class ExitCode(IntEnum):
     OK = 0
     USAGE = 1
     NO_VEHICLE = 2
+    INCOMPLETE = 2  # of several things some failed
     MOUNT_FAILED = 3
     UNDELIVERED = 4
     BUG = 70

@@ -72,12 +72,14 @@ class MountedTree(WritableTree, Holder, Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Content:
-    """What is behind a mount. notice: called once it is up, gives a line for whoever mounts, or ""."""
+    """What is behind a mount. notice: called once it is up, gives a line for whoever mounts, or "". forget:
+    has what is cached asked for again."""
 
     tree: MountedTree
     status: Callable[[], dict[str, Any]] = dict
     space: Callable[[], Space | None] = lambda: None
     notice: Callable[[], str] = str
+    forget: Callable[[], None] = lambda: None
 
 
 Attach = Callable[[Callable[[bytes], None]], AbstractAsyncContextManager[Content]]
@@ -98,7 +100,7 @@ def run_mount(request: MountRequest, report: Report) -> int:
             rescue_for=request.source,
         )
         async with vehicle as up:
-            yield Content(up.tree, up.status, up.space, up.notice)
+            yield Content(up.tree, up.status, up.space, up.notice, up.tree.forget_caches)
 
     return trio.run(serve_mount, request, attach, report)
 
@@ -168,7 +170,9 @@ class _Life:
             try:
                 with kernel_mount(operations, self.request, invalidator):
                     self.mounted = True
-                    await self._start_control(lambda: self.status(content, operations), nursery)
+                    await self._start_control(
+                        lambda: self.status(content, operations), content.forget, nursery
+                    )
                     await self._serve(invalidator, content.notice)
             finally:
                 await self._leave(content)
@@ -197,14 +201,21 @@ class _Life:
 
     # -- control ----------------------------------------------------------------------------------
 
-    async def _start_control(self, facts: Callable[[], dict[str, Any]], nursery: trio.Nursery) -> None:
+    async def _start_control(
+        self, facts: Callable[[], dict[str, Any]], drop: Callable[[], None], nursery: trio.Nursery
+    ) -> None:
         if self.request.control is None:
             return
 
         async def status(_: Reply) -> Reply:
             return {"status": facts()}
 
-        server = ControlServer(self.request.control, {"status": status, "umount": self._umount})
+        async def forget(_: Reply) -> Reply:
+            drop()
+            return {}
+
+        commands = {"status": status, "umount": self._umount, "forget": forget}
+        server = ControlServer(self.request.control, commands)
         try:
             await nursery.start(server.run)
         except OSError as exc:
@@ -232,6 +243,7 @@ class _Life:
         return {
             "mountpoint": self.request.mountpoint,
             "source": self.request.source,
+            "root": os.fsdecode(self.request.options.root),
             "pid": os.getpid(),
             "version": mavftpfs.__version__,
             "read_only": self.request.options.read_only,

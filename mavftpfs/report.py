@@ -1,4 +1,4 @@
-"""Tables, progress bars and listings for people. Layer: top; with demo and cli the only user of rich.
+"""Tables of facts for people. Layer: top; uses rich.
 
 Names come from the vehicle, so nothing reaches the terminal that could be an escape sequence.
 """
@@ -6,17 +6,12 @@ Names come from the vehicle, so nothing reaches the terminal that could be an es
 from __future__ import annotations
 
 import json
-import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from datetime import UTC, datetime
-from typing import Any, Protocol
+from typing import Any
 
 from rich.console import Console, Group, RenderableType
 from rich.live import Live
-from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn
-from rich.progress import TransferSpeedColumn as SpeedColumn
 from rich.table import Table
 from rich.text import Text
 
@@ -41,49 +36,6 @@ _DETAILS = {"write_traits", "kernel"}
 """Facts for programs: --json."""
 
 _SECONDS = {"rtt", "heartbeat_age", "uptime", "eta"}
-
-
-class Meter(Protocol):
-    """Is told how a transfer goes."""
-
-    def start(self, name: str, total: int) -> Callable[[int], None]:
-        """Begin a file of `total` bytes; returns what to call with the bytes that came."""
-        ...
-
-
-class SilentMeter:
-    """For output that is not a terminal."""
-
-    def start(self, name: str, total: int) -> Callable[[int], None]:
-        """Begin a file."""
-        return lambda count: None
-
-
-class _BarMeter:
-    def __init__(self, progress: Progress) -> None:
-        self._progress = progress
-
-    def start(self, name: str, total: int) -> Callable[[int], None]:
-        task = self._progress.add_task(printable(name), total=total)
-        return lambda count: self._progress.advance(task, count)
-
-
-@contextmanager
-def transfer_meter() -> Iterator[Meter]:
-    """Show progress bars on stderr during the body, if it is a terminal."""
-    console = Console(stderr=True)
-    if not console.is_terminal:
-        yield SilentMeter()
-        return
-    columns = (
-        TextColumn("{task.description}", markup=False),
-        BarColumn(),
-        DownloadColumn(),
-        SpeedColumn(),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns, console=console) as progress:
-        yield _BarMeter(progress)
 
 
 def print_status(statuses: Sequence[Mapping[str, Any]]) -> None:
@@ -197,49 +149,3 @@ _WRITTEN: dict[str, Callable[[Any], str]] = {
 
 _SAID = {*_FIRST, *_WRITTEN} - {"uploads"}
 """Facts that are told even if they are none."""
-
-
-def print_listings(
-    listings: Sequence[tuple[str | None, Sequence[Mapping[str, Any]]]], *, detailed: bool
-) -> None:
-    """Print several paths as ls does: files (no directory) first, then directories with headings."""
-    files = [entry for directory, entries in listings if directory is None for entry in entries]
-    print_names(files, detailed=detailed)
-    apart = bool(files)
-    for directory, entries in listings:
-        if directory is None:
-            continue
-        if len(listings) > 1:
-            _print_line("\n" * apart + _shown(directory) + ":")
-        print_names(entries, detailed=detailed)
-        apart = True
-
-
-def print_names(entries: Sequence[Mapping[str, Any]], *, detailed: bool) -> None:
-    """Print a listing: one name a line, directories with a slash; detailed with size and time."""
-    for entry in entries:
-        name = _shown(entry["name"]) + ("/" if entry["kind"] == "directory" else "")
-        if detailed:
-            when = datetime.fromtimestamp(entry["mtime"], UTC).strftime("%Y-%m-%d %H:%M")
-            name = f"{entry['size']:>12} {when} {name}"
-        _print_line(name)
-    sys.stdout.flush()
-
-
-def _shown(name: str) -> str:
-    """Return a name as the terminal may get it; in a pipe it is the name."""
-    return printable(name) if sys.stdout.isatty() else name
-
-
-def _print_line(line: str) -> None:
-    sys.stdout.buffer.write(line.encode("utf-8", "surrogateescape") + b"\n")
-
-
-def print_scan(found: Sequence[Mapping[str, Any]]) -> None:
-    """Print who answered on a link."""
-    table = Table()
-    for heading in ("system/component", "what it is", "FTP"):
-        table.add_column(heading)
-    for peer in found:
-        table.add_row(f"{peer['system']}/{peer['component']}", Text(peer["what"]), Text(peer["ftp"]))
-    Console().print(table)

@@ -109,11 +109,16 @@ def test_files_that_are_made_when_opened(module_field: Field, small_tree: Path, 
 def test_scan_shows_who_answers(vehicle: SimVehicle) -> None:
     out, _ = mavftpfs("scan", "--json", vehicle.source)
     found: list[dict[str, Any]] = json.loads(out)
-    assert [(peer["system"], peer["component"], peer["what"]) for peer in found] == [(1, 1, "PX4, disarmed")]
+    assert [(peer["system"], peer["component"], peer["what"]) for peer in found] == [
+        (1, 1, "PX4 quadrotor, disarmed")
+    ]
     assert (found[0]["ftp"], found[0]["answers"], found[0]["facts"]["ftp_flag"]) == ("answers", True, True)
     out, _ = mavftpfs("scan", vehicle.source)
-    assert "1/1" in out
-    assert "answers" in out
+    (line,) = out.splitlines()  # as a program reads it: no boxes
+    address, what, firmware, uid, ftp = line.split("\t")
+    assert (address, what, firmware) == ("1/1", "PX4 quadrotor, disarmed", found[0]["firmware"])
+    assert uid == found[0]["uid"] != "-"
+    assert ftp.startswith("answers, in ")
 
 
 def test_scan_of_a_vehicle_without_ftp(field: Field) -> None:

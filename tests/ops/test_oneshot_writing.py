@@ -1,22 +1,18 @@
-"""oneshot_writing: put, rm, mkdir, rmdir and mv, on a tree in memory."""
+"""oneshot: put, rm, mkdir, rmdir and mv, on a tree in memory."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
-from dataclasses import dataclass
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any, cast
+from typing import cast
 
 import pytest
 
-from mavftpfs import oneshot_writing
 from mavftpfs.exits import ExitCode, NotDelivered, exit_code_for
-from mavftpfs.oneshot import Target
-from mavftpfs.oneshot_writing import Sent
-from mavftpfs.report import SilentMeter
+from mavftpfs.oneshot import names
+from mavftpfs.oneshot.files import Files, Session
+from mavftpfs.oneshot.progress import Progress
+from mavftpfs.oneshot.put import Put, Sent, collect, put_paths
 from mavftpfs.shared.errors import (
     AlreadyExists,
     CrossDevice,
@@ -59,22 +55,8 @@ class Card(FakeTree):
         await super().rename(old, new, noreplace=noreplace)
 
 
-@dataclass
-class FakeTarget:
-    """A vehicle that is always there; counts how often it was called up."""
-
-    tree: Card
-    attached_times: int = 0
-
-    @asynccontextmanager
-    async def attached(self, *, writing: bool) -> AsyncIterator[Any]:
-        assert writing
-        self.attached_times += 1
-        yield SimpleNamespace(tree=self.tree)
-
-
-def target_of(tree: Card) -> Target:
-    return cast(Target, FakeTarget(tree))
+def session_of(tree: Card) -> Session:
+    return Session(cast(Files, tree))
 
 
 @pytest.fixture
@@ -91,9 +73,10 @@ def local(tmp_path: Path) -> Path:
 
 async def put(tree: Card, *locals_: Path, to: bytes, recursive: bool = False) -> list[Sent]:
     told: list[Sent] = []
-    await oneshot_writing.put_paths(
-        target_of(tree), locals_, to, SilentMeter(), told.append, recursive=recursive
-    )
+    batches = [(local, collect(local, recursive=recursive)) for local in locals_]
+    counts, progress = Put(), Progress()
+    await put_paths(session_of(tree), batches, to, progress, told.append, counts)
+    assert (counts.done, counts.at_work, progress.done) == (len(told), None, progress.total)
     assert all(file.closed for file in tree.opened)
     return told
 
@@ -146,9 +129,7 @@ async def test_a_file_in_the_way_of_a_directory(local: Path) -> None:
 
 
 @pytest.mark.parametrize("what", ["directory", "missing", "fifo", "link to a directory"])
-async def test_what_cannot_be_put_is_said_before_anything_is_sent(
-    local: Path, tmp_path: Path, what: str
-) -> None:
+def test_what_cannot_be_put_is_said_before_anything_is_sent(local: Path, tmp_path: Path, what: str) -> None:
     place = local
     match what:
         case "missing":
@@ -157,18 +138,9 @@ async def test_what_cannot_be_put_is_said_before_anything_is_sent(
             os.mkfifo(place := tmp_path / "fifo")
         case "link to a directory":
             (local / "e" / "link").symlink_to(local)
-    target = FakeTarget(Card({}, {b"/to"}))
     with pytest.raises(UsageError) as caught:
-        await oneshot_writing.put_paths(
-            cast(Target, target),
-            [local / "a", place],
-            b"/to",
-            SilentMeter(),
-            lambda sent: None,
-            recursive=what == "link to a directory",
-        )
+        collect(place, recursive=what == "link to a directory")
     assert "directory" in str(caught.value) or "not there" in str(caught.value)
-    assert target.attached_times == 0
 
 
 async def test_several_files_need_a_directory(local: Path) -> None:
@@ -198,7 +170,7 @@ async def test_what_does_not_arrive_is_undelivered(local: Path, call: str) -> No
 
 
 async def mkdir(tree: Card, *paths: bytes, parents: bool = False) -> None:
-    await oneshot_writing.make_directories(target_of(tree), paths, parents=parents)
+    await names.make_directories(session_of(tree), paths, parents=parents)
 
 
 async def test_mkdir() -> None:
@@ -220,14 +192,14 @@ async def test_mkdir_with_parents() -> None:
 
 async def test_rmdir() -> None:
     tree = Card({b"/full/f": b""}, {b"/empty"})
-    await oneshot_writing.remove_directories(target_of(tree), [b"/empty"])
+    await names.remove_directories(session_of(tree), [b"/empty"])
     assert tree.directories == set()
     with pytest.raises(DirectoryNotEmpty):
-        await oneshot_writing.remove_directories(target_of(tree), [b"/full"])
+        await names.remove_directories(session_of(tree), [b"/full"])
 
 
 async def rm(tree: Card, *paths: bytes, recursive: bool = False) -> None:
-    await oneshot_writing.remove_paths(target_of(tree), paths, recursive=recursive)
+    await names.remove_paths(session_of(tree), paths, recursive=recursive)
 
 
 async def test_rm_of_files_and_of_all_below() -> None:
@@ -255,7 +227,7 @@ async def test_rm_looks_before_it_removes(
 
 
 async def mv(tree: Card, *paths: bytes, to: bytes) -> None:
-    await oneshot_writing.move_paths(target_of(tree), paths, to)
+    await names.move_paths(session_of(tree), paths, to)
 
 
 async def test_mv_to_a_name_and_into_a_directory() -> None:

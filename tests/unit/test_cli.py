@@ -20,6 +20,7 @@ import trio
 from mavftpfs import cli, commands, compose, control, daemon
 from mavftpfs.exits import ExitCode, MountFailed, NoFtp, NotDelivered, exit_code_for
 from mavftpfs.fuse.options import MountOptions
+from mavftpfs.oneshot.verbs import until_interrupted
 from mavftpfs.shared import errors
 from mavftpfs.shared.errors import LinkClosed, MavftpfsError, UsageError, VehicleLost
 
@@ -228,7 +229,7 @@ def test_an_interrupted_command_cleans_up() -> None:
             steps.append("cleaned")
 
     with pytest.raises(KeyboardInterrupt):
-        trio.run(commands.until_interrupted, work)
+        trio.run(until_interrupted, work)
     assert steps == ["cleaned"]
 
 
@@ -239,7 +240,7 @@ def test_errors_of_a_command_are_not_wrapped() -> None:
         raise VehicleLost("gone")
 
     with pytest.raises(VehicleLost, match="gone"):
-        trio.run(commands.until_interrupted, work)
+        trio.run(until_interrupted, work)
 
 
 # -- status and umount ----------------------------------------------------------------------------

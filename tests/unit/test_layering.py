@@ -65,6 +65,8 @@ PURE_MODULES = {
     "cache.shortnames",
     "cache.snapshots",
     "cache.times",
+    "oneshot.paths",
+    "oneshot.plan",
     "fuse.inodes",
     "fuse.handles",
     "fuse.keeping",
@@ -78,7 +80,7 @@ SOLE_IMPORTERS = {
     "pyfuse3": {"fuse.device", "fuse.operations", "fuse.writing", "mount"},
     "pymavlink": {"link.framing"},
     "serial": {"link.serial"},
-    "rich": {"cli", "demo", "report"},
+    "rich": {"cli", "demo", "report", "oneshot.progress"},
 }
 
 MAX_FUNCTION_LINES = 60

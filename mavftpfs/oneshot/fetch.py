@@ -1,0 +1,298 @@
+"""Fetching one file so that it can go on after an interruption, and is proven. Layer: top.
+
+What came lies beside the final name as NAME.part; the final name is given only to a whole file. A .part that
+an earlier run left is gone on with, and then the vehicle's CRC32 of the whole file must agree.
+"""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import trio
+
+from mavftpfs.cache.virtual import is_snapshot
+from mavftpfs.oneshot.files import READ_SIZE, File, Session
+from mavftpfs.oneshot.plan import LEAST_READ, Verify, next_read_size, proof_needed
+from mavftpfs.oneshot.progress import Progress
+from mavftpfs.protocol.crc import crc32
+from mavftpfs.shared.errors import (
+    Armed,
+    DataUnproven,
+    LinkError,
+    MavftpfsError,
+    RequestTimeout,
+    UsageError,
+)
+from mavftpfs.shared.readable import name_text, readable_size
+
+PART_SUFFIX = ".part"
+
+
+class LocalDiskFull(UsageError):
+    """Nothing more can be written on the local disk."""
+
+
+class StillGrowing(MavftpfsError):
+    """The vehicle writes the file; what came so far is kept as its .part."""
+
+
+class NotProvenYet(MavftpfsError):
+    """All bytes are in the .part, but some are of an earlier run and nothing proves them now."""
+
+
+@dataclass(frozen=True, slots=True)
+class Wanted:
+    """A file to fetch. name: for people; size: as listed; mtime: seconds UTC, None if unknown.
+
+    keep_old: a local file of that name that is not the beginning of this one is renamed to NAME.~1~.
+    """
+
+    remote: bytes
+    local: Path
+    name: str
+    size: int
+    mtime: int | None
+    keep_old: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Fetched:
+    """A file that was fetched. resumed: bytes that were here already; proof: how it was verified."""
+
+    remote: bytes
+    local: Path
+    name: str
+    size: int
+    resumed: int
+    proof: str
+
+
+def part_of(local: Path) -> Path:
+    """Return where a file lies until it is whole."""
+    return local.with_name(local.name + PART_SUFFIX)
+
+
+@contextmanager
+def local_disk(place: Path) -> Iterator[None]:
+    """Turn what the local disk refuses into an error that says so in a line."""
+    try:
+        yield
+    except OSError as exc:
+        full = exc.errno in (errno.ENOSPC, errno.EDQUOT)
+        raise (LocalDiskFull if full else UsageError)(f"{place}: {exc.strerror}") from exc
+
+
+class Part:
+    """A .part, locked against a second program that fetches the same."""
+
+    def __init__(self, local: Path) -> None:
+        """Raises: UsageError: it is no file, or is in use. OSError."""
+        self.local = local
+        self.path = part_of(local)
+        fd = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)
+        self._file = os.fdopen(fd, "r+b")
+        try:
+            fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            self._file.close()
+            raise UsageError(f"{self.path} is being written by another program") from None
+
+    @property
+    def size(self) -> int:
+        """Bytes that are here."""
+        return os.fstat(self._file.fileno()).st_size
+
+    def cut(self, size: int) -> None:
+        """Keep the first `size` bytes only."""
+        self._file.truncate(size)
+
+    def checksum(self) -> int:
+        """Return the CRC32 of what is here."""
+        crc = 0
+        self._file.seek(0)
+        while data := self._file.read(READ_SIZE):
+            crc = crc32(data, crc)
+        return crc
+
+    def append(self, data: bytes | memoryview) -> None:
+        """Add bytes; they are in the file when this returns, so that nothing is lost by a kill."""
+        self._file.seek(0, os.SEEK_END)
+        self._file.write(data)
+        self._file.flush()
+
+    def commit(self, mtime: int | None, *, keep_old: bool) -> None:
+        """Give the file its name, once it is on the disk. mtime: None leaves the present."""
+        os.fsync(self._file.fileno())
+        if mtime is not None:
+            os.utime(self.path, (mtime, mtime))
+        if keep_old and self.local.exists() and not self._begins_like(self.local):
+            self.local.rename(_free_name(self.local))
+        self.path.replace(self.local)
+
+    def _begins_like(self, old: Path) -> bool:
+        """Return whether all of another file is at the beginning of this one."""
+        self._file.seek(0)
+        with old.open("rb") as other:
+            while theirs := other.read(READ_SIZE):
+                if self._file.read(len(theirs)) != theirs:
+                    return False
+        return True
+
+    def drop(self) -> None:
+        """Remove it."""
+        self.path.unlink(missing_ok=True)
+
+    def close(self) -> None:
+        """Leave it for the next run, unless it is empty or has its name."""
+        if self.size == 0:
+            self.drop()
+        self._file.close()
+
+
+def _free_name(local: Path) -> Path:
+    """Return NAME.~1~, or the first such name that is free, as cp --backup makes them."""
+    number = 1
+    while (place := local.with_name(f"{local.name}.~{number}~")).exists():
+        number += 1
+    return place
+
+
+@dataclass(frozen=True, slots=True)
+class Fetcher:
+    """Fetches files of one session, one after the other."""
+
+    session: Session
+    progress: Progress
+    verify: Verify = "auto"
+    resume: bool = True
+
+    async def fetch(self, wanted: Wanted, *, beginning: Path | None = None) -> Fetched:
+        """Fetch a file. beginning: a local file that may hold its first bytes, where there is no .part.
+
+        Raises:
+            DataUnproven: size or checksum disagreed twice. StillGrowing, NotProvenYet: its .part stays.
+            UsageError: the local disk does not take it. Else as Files.open and OpenFile.read.
+        """
+        if wanted.local.is_dir():
+            raise UsageError(f"{wanted.local} is a directory")
+        with local_disk(wanted.local):
+            part = Part(wanted.local)
+            try:
+                if not self.resume or part.size > wanted.size:
+                    part.cut(0)
+                if beginning is not None and part.size == 0:
+                    await trio.to_thread.run_sync(shutil.copyfile, beginning, part.path)
+                return await self._fetch_and_commit(wanted, part)
+            except DataUnproven:
+                part.drop()
+                raise
+            finally:
+                part.close()
+
+    async def _fetch_and_commit(self, wanted: Wanted, part: Part) -> Fetched:
+        resumed = part.size
+        try:
+            size, proof = await self._attempt(wanted, part)
+        except DataUnproven:
+            self.session.files.forget_caches()
+            part.cut(0)
+            resumed = 0
+            size, proof = await self._attempt(wanted, part)
+        await trio.to_thread.run_sync(lambda: part.commit(wanted.mtime, keep_old=wanted.keep_old))
+        return Fetched(wanted.remote, wanted.local, wanted.name, size, resumed, proof)
+
+    async def _attempt(self, wanted: Wanted, part: Part) -> tuple[int, str]:
+        """Fetch what is missing, and prove the whole; returns its size, and how it was proven."""
+        here = part.size
+        self.progress.begin(wanted.name, wanted.size, here)
+        crc = await trio.to_thread.run_sync(part.checksum) if here else 0
+        size = wanted.size
+        if here == 0 or here < wanted.size:
+            file = await self.session.files.open(wanted.remote)
+            try:
+                size = file.size
+                if here > size:
+                    raise DataUnproven(f"{wanted.name} has shrunk from {here} to {size} bytes")
+                crc = await self._copy(file, part, here, crc)
+            finally:
+                file.close()
+        self.progress.check()
+        return size, await self._prove(wanted, size, crc, resumed=here > 0)
+
+    async def _copy(self, file: File, part: Part, offset: int, crc: int) -> int:
+        """Append the rest of a file and return the CRC32 of all of it."""
+        size = LEAST_READ
+        while offset < file.size:
+            began = trio.current_time()
+            data = await file.read(offset, size)
+            if not data:
+                raise DataUnproven(f"the file ended at {offset} of {file.size} bytes")
+            size = next_read_size(size, trio.current_time() - began)
+            part.append(data)
+            crc = crc32(data, crc)
+            offset += len(data)
+            self.progress.at(offset)
+        return crc
+
+    async def _prove(self, wanted: Wanted, size: int, crc: int, *, resumed: bool) -> str:
+        """Compare with the vehicle's checksum where that is wanted and can be had; returns what was proven.
+
+        Raises:
+            DataUnproven: they differ, or what was resumed can only be had by fetching all of it again.
+            StillGrowing, NotProvenYet.
+        """
+        if is_snapshot(self.session.on_vehicle(wanted.remote)):
+            if resumed:
+                raise DataUnproven(f"{wanted.name} is made anew at each opening, so it cannot be resumed")
+            return "size (generated at each opening, so a checksum proves nothing)"
+        if not proof_needed(self.verify, resumed=resumed, size=size):
+            await self._require_size(wanted, size)
+            return "size"
+        try:
+            theirs = await self.session.files.crc32(wanted.remote)
+        except LinkError:
+            raise
+        except (Armed, RequestTimeout) as exc:
+            why = "no checksums while armed" if isinstance(exc, Armed) else "the vehicle did not answer"
+            await self._require_size(wanted, size)
+            if resumed:
+                raise NotProvenYet(
+                    f"{wanted.name}: all of it is here, as {part_of(wanted.local)}, but what an earlier run "
+                    f"fetched is not proven ({why}); the next run tries again"
+                ) from exc
+            return f"size ({why})"
+        except MavftpfsError as exc:
+            await self._require_size(wanted, size)
+            if resumed:
+                raise DataUnproven(f"{wanted.name}: the vehicle computes no checksum: {exc}") from exc
+            return "size (the vehicle refused to compute a checksum)"
+        if theirs != crc:
+            await self._require_size(wanted, size)
+            raise DataUnproven(
+                f"{wanted.name}: {size} bytes came with CRC32 {crc:08x}, the vehicle has {theirs:08x}"
+            )
+        return "size and CRC32"
+
+    async def _require_size(self, wanted: Wanted, size: int) -> None:
+        """Ask for the size again: no checksum says that the file was whole.
+
+        Raises:
+            StillGrowing: it has become larger. DataUnproven: it has become smaller.
+        """
+        files = self.session.files
+        files.forget_caches()
+        now = (await files.stat(wanted.remote)).size
+        if now > size:
+            raise StillGrowing(
+                f"{wanted.name} is still growing: its first {readable_size(size)} are here, as "
+                f"{part_of(wanted.local)}"
+            )
+        if now < size:
+            raise DataUnproven(f"{name_text(wanted.remote)} has shrunk from {size} to {now} bytes")

@@ -1,0 +1,204 @@
+"""Who is on a link, and whose files can be had. Layer: top; prints nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import trio
+
+from mavftpfs.compose import connect_options
+from mavftpfs.fuse.options import MountOptions
+from mavftpfs.link.base import Link
+from mavftpfs.link.messages import MAV_TYPE_GCS, Address, AutopilotVersion, Heartbeat
+from mavftpfs.link.opening import open_link
+from mavftpfs.oneshot.mounted import mount_status
+from mavftpfs.oneshot.session import Target
+from mavftpfs.session.connection import Connection, connected
+from mavftpfs.shared.errors import FtpNak, MavftpfsError, VehicleLost
+from mavftpfs.shared.readable import autopilot_name, readable_time
+
+Entry = dict[str, Any]
+
+LISTEN_TIME = 3.0
+"""Seconds in which every component sends its heartbeat at least twice."""
+PROBE_TIME = 6.0
+"""Seconds that a component has at most to answer a listing."""
+LEAST_PROBE = 1.5
+"""Seconds that each has at least, however many there are."""
+_TICK = 0.1
+
+_COMPONENTS = {
+    1: "autopilot",
+    68: "telemetry radio",
+    **dict.fromkeys(range(100, 106), "camera"),
+    154: "gimbal",
+    158: "peripheral",
+    190: "mission planner",
+    191: "companion computer",
+    **dict.fromkeys(range(192, 195), "companion computer"),
+    240: "MAVLink router",
+}
+_TYPES = {
+    **{1: "fixed wing", 2: "quadrotor", 3: "coaxial helicopter", 4: "helicopter", 5: "antenna tracker"},
+    **{7: "airship", 8: "balloon", 9: "rocket", 10: "rover", 11: "boat", 12: "submarine"},
+    **{13: "hexarotor", 14: "octorotor", 15: "tricopter", 29: "dodecarotor"},
+    **dict.fromkeys(range(19, 26), "VTOL"),
+    **{6: "ground station", 18: "companion computer", 26: "gimbal", 27: "ADS-B receiver", 30: "camera"},
+    **{33: "gimbal", 34: "battery", 36: "battery", 35: "parachute", 37: "telemetry radio"},
+}
+"""MAV_COMPONENT and MAV_TYPE values people meet."""
+_RELEASES = ((255, ""), (192, " rc"), (128, " beta"), (64, " alpha"), (0, " dev"))
+
+
+async def scan(target: Target) -> list[Entry]:
+    """Return who sends heartbeats on a link, and who of them answers MAVLink FTP.
+
+    It ends within connect_timeout, or LEAST_PROBE for each component if they are many; sooner if all answer.
+
+    Raises:
+        VehicleLost: nobody at all within connect_timeout.
+    """
+    mounted = await target.mounted()
+    if mounted is not None:
+        assert mounted.mountpoint is not None
+        return [_of_mount(await mount_status(mounted.mountpoint))]
+    assert target.spec is not None
+    options = target.options
+    deadline = trio.current_time() + options.connect_timeout
+    async with open_link(target.spec) as link:
+        heard = await _listen(link, options)
+        found = []
+        for left, address in zip(range(len(heard), 0, -1), sorted(heard), strict=True):
+            share = (deadline - trio.current_time()) / left
+            patience = min(PROBE_TIME, max(LEAST_PROBE, share))
+            found.append(await _probe(link, options, heard[address], patience))
+        return found
+
+
+async def _listen(link: Link, options: MountOptions) -> dict[Address, Heartbeat]:
+    """Return who is heard in LISTEN_TIME after the first heartbeat, whoever sends it."""
+    anybody = replace(connect_options(options), target_system=0, target_component=0)
+    async with connected(link, anybody) as connection:
+        for _ in range(round(options.connect_timeout / _TICK)):
+            if connection.vehicle.heard:
+                await trio.sleep(min(LISTEN_TIME, options.connect_timeout / 2))
+                break
+            await trio.sleep(_TICK)
+        if not connection.vehicle.heard:
+            await connection.ready(0)  # it knows what to say
+        return dict(connection.vehicle.heard)
+
+
+async def _probe(link: Link, options: MountOptions, heartbeat: Heartbeat, patience: float) -> Entry:
+    address = heartbeat.source
+    entry: Entry = {
+        "system": address.system,
+        "component": address.component,
+        "what": describe_peer(heartbeat),
+        "autopilot": heartbeat.autopilot,
+        "type": heartbeat.vehicle_type,
+        "armed": heartbeat.armed,
+        "firmware": None,
+        "uid": None,
+        "ftp": "not asked (a ground station)",
+        "answers": None,
+        "seen": [],
+    }
+    if heartbeat.vehicle_type == MAV_TYPE_GCS:
+        return entry
+    wanted = replace(
+        connect_options(options), target_system=address.system, target_component=address.component
+    )
+    async with connected(link, wanted) as connection:
+        answer = "no answer"
+        try:
+            with trio.move_on_after(patience):
+                await connection.ready(patience)
+                await connection.store.list_directory(options.root)
+                answer = "answers"
+        except FtpNak as exc:
+            answer = f"answers, but: {exc}"
+        except VehicleLost:
+            answer = "no answer (it is not heard any more)"
+        except MavftpfsError as exc:
+            answer = f"no answer ({exc})"
+        answers = answer.startswith("answers")
+        version = connection.vehicle.version
+        entry.update(
+            ftp=answer,
+            seen=_seen(connection, answers=answers),
+            answers=answers,
+            firmware=None if version is None else firmware(version),
+            uid=None if version is None else unique_id(version),
+            facts=connection.status(),
+        )
+    return entry
+
+
+def _seen(connection: Connection, *, answers: bool) -> list[str]:
+    """Return what was learnt of its FTP beside that it answers."""
+    facts = []
+    flag = connection.vehicle.ftp_flag
+    if flag is not None and flag is not answers:
+        facts.append("says it supports FTP" if flag else "says it does not support FTP")
+    if answers:
+        if connection.engine.rtt is not None:
+            facts.append(f"in {readable_time(connection.engine.rtt)}")
+        times = connection.store.lists_times
+        if times is not None:
+            facts.append("listings with times" if times else "listings without times")
+    if connection.vehicle.foreign_client(connection.clock()):
+        facts.append("another FTP client is heard")
+    return facts
+
+
+def _of_mount(status: Mapping[str, Any]) -> Entry:
+    """Return what a mount knows of its vehicle; nobody else can be asked while it has the link."""
+    facts = status["connection"]
+    system, component = facts["vehicle"] or (0, 0)
+    kind = "unknown" if facts["autopilot"] is None else autopilot_name(facts["autopilot"])
+    return {
+        "system": system,
+        "component": component,
+        "what": f"{kind}, {'armed' if facts['armed'] else 'disarmed'}",
+        "autopilot": facts["autopilot"],
+        "armed": facts["armed"],
+        "firmware": None,
+        "uid": None,
+        "ftp": f"mounted on {status['mountpoint']}",
+        "answers": not facts["lost"],
+        "seen": ["the vehicle is silent"] if facts["lost"] else [],
+        "facts": facts,
+    }
+
+
+def describe_peer(heartbeat: Heartbeat) -> str:
+    """Return what a heartbeat says its sender is."""
+    kind = _TYPES.get(heartbeat.vehicle_type)
+    if heartbeat.vehicle_type == MAV_TYPE_GCS:
+        return "ground station"
+    if not heartbeat.is_autopilot:
+        return (
+            kind
+            or _COMPONENTS.get(heartbeat.source.component)
+            or f"component of type {heartbeat.vehicle_type}"
+        )
+    words = [autopilot_name(heartbeat.autopilot), *([kind] if kind else [])]
+    return f"{' '.join(words)}, {'armed' if heartbeat.armed else 'disarmed'}"
+
+
+def firmware(version: AutopilotVersion) -> str:
+    """Return the flight stack's version: major.minor.patch and the kind of release, as MAVLink packs them."""
+    number = version.flight_sw_version
+    kind = number & 0xFF
+    release = next(word for least, word in _RELEASES if kind >= least)
+    return f"{number >> 24}.{number >> 16 & 0xFF}.{number >> 8 & 0xFF}{release}"
+
+
+def unique_id(version: AutopilotVersion) -> str | None:
+    """Return the board's unique id in hex, the long one where it is told; None if it tells none."""
+    if any(version.uid2):
+        return version.uid2.hex()
+    return f"{version.uid:016x}" if version.uid else None

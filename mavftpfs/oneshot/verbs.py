@@ -1,0 +1,381 @@
+"""What each one-shot verb does with its words, and what it prints; `cli` parses them. Layer: top."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+import os
+import signal
+import sys
+from collections.abc import Callable, Coroutine, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from datetime import datetime
+from functools import partial
+from pathlib import Path
+from typing import Any, TypeVar
+
+import trio
+
+from mavftpfs import daemon
+from mavftpfs.commands import connection_of
+from mavftpfs.compose import open_sinks
+from mavftpfs.exits import ExitCode, exit_code_for
+from mavftpfs.fuse.options import parse_options
+from mavftpfs.oneshot import get as getting
+from mavftpfs.oneshot import listing, names, paths, progress
+from mavftpfs.oneshot import put as putting
+from mavftpfs.oneshot import scan as scanning
+from mavftpfs.oneshot import sync as syncing
+from mavftpfs.oneshot.fetch import Fetched, Fetcher
+from mavftpfs.oneshot.files import Session
+from mavftpfs.oneshot.mounted import mountpoint_of
+from mavftpfs.oneshot.plan import Step
+from mavftpfs.oneshot.session import Target
+from mavftpfs.shared.errors import MavftpfsError, UsageError
+from mavftpfs.shared.readable import name_text, printable, readable, readable_size
+
+ResultT = TypeVar("ResultT")
+Args = argparse.Namespace
+
+STDOUT = "-"
+
+
+# -- running --------------------------------------------------------------------------------------
+
+
+def _target(args: Args, component: int | None) -> Target:
+    mount = mountpoint_of(args.source)
+    if mount is not None:
+        return Target(None, parse_options(args.options), mount=mount)
+    if os.path.isdir(args.source):
+        raise UsageError(f"no vehicle is mounted on {args.source}")
+    options, spec = connection_of(args)
+    if component is not None:
+        options = replace(options, target_component=component)
+    return Target(spec, options)
+
+
+def _run(
+    args: Args,
+    function: Callable[[Target], Coroutine[Any, Any, ResultT]],
+    component: int | None = None,
+) -> ResultT:
+    """Run a verb; Ctrl-C ends it in order, so that the vehicle's session is closed."""
+    target = _target(args, component)
+    daemon.log_to_stderr(logging.DEBUG if args.debug else logging.WARNING)
+    if not args.debug:  # whatever the caches warn of is raised, too, and errors are one line
+        logging.getLogger("mavftpfs.cache").setLevel(logging.ERROR)
+    with open_sinks(target.options, debug=args.debug) as sinks:
+        return trio.run(until_interrupted, partial(function, replace(target, sinks=sinks)))
+
+
+def _with_session(
+    args: Args,
+    function: Callable[[Session], Coroutine[Any, Any, ResultT]],
+    component: int | None = None,
+    *,
+    writing: bool = False,
+) -> ResultT:
+    async def work(target: Target) -> ResultT:
+        async with target.session(writing=writing) as session:
+            return await function(session)
+
+    return _run(args, work, component)
+
+
+async def until_interrupted(function: Callable[[], Coroutine[Any, Any, ResultT]]) -> ResultT:
+    """Return the function's result.
+
+    Raises:
+        KeyboardInterrupt: SIGINT or SIGTERM came first; the function was cancelled and has cleaned up.
+        MavftpfsError, OSError: the function's own.
+    """
+    results: list[ResultT] = []
+    errors: list[Exception] = []
+    with trio.open_signal_receiver(signal.SIGINT, signal.SIGTERM) as signals:
+        async with trio.open_nursery() as nursery:
+
+            async def watch() -> None:
+                async for _ in signals:
+                    nursery.cancel_scope.cancel()
+
+            nursery.start_soon(watch)
+            try:
+                results.append(await function())
+            except Exception as exc:  # raised again outside of the nursery, which would wrap it in a group
+                errors.append(exc)
+            nursery.cancel_scope.cancel()
+    if errors:
+        raise errors[0]
+    if not results:
+        raise KeyboardInterrupt
+    return results[0]
+
+
+def _say(line: str) -> None:
+    print(f"mavftpfs: {readable(line)}", file=sys.stderr, flush=True)
+
+
+def _complain(error: MavftpfsError) -> None:
+    _say(str(error))
+
+
+@contextmanager
+def _on_interrupt(line: Callable[[], str]) -> Iterator[None]:
+    """Say in a line what is there and what is not, when Ctrl-C ends the body."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        _say(f"interrupted: {line()}")
+        raise
+
+
+def _name(path: bytes) -> str:
+    return printable(os.fsdecode(path))
+
+
+# -- sync -----------------------------------------------------------------------------------------
+
+
+def sync(args: Args) -> int:
+    """Bring the vehicle's logs into a local directory."""
+    component, place = None, None
+    if args.place is not None:
+        (place,), component = paths.parse_paths([args.place])
+    since = None if args.since is None else parse_date(args.since)
+    wish = syncing.Wish(Path(args.local), place, args.newest, since, args.dry_run)
+    outcome = syncing.Outcome()
+    error: MavftpfsError | None = None
+
+    def tell(fetched: Fetched) -> None:
+        if not args.json:
+            print(_fetched_line(fetched), flush=True)
+
+    bar = progress.Progress()
+
+    async def work(session: Session) -> None:
+        fetcher = Fetcher(session, bar, args.verify)
+        await syncing.sync(session, wish, fetcher, outcome, tell, _say)
+
+    with _on_interrupt(lambda: f"{_here(outcome)}; the next run goes on where this one stopped"):
+        try:
+            with progress.shown(bar):
+                _with_session(args, work, component)
+        except MavftpfsError as exc:
+            if not outcome.tasks:
+                raise
+            error = exc
+    if args.json:
+        print(json.dumps(outcome.facts(), indent=2))
+    elif wish.dry_run:
+        _print_plan(outcome)
+    else:
+        print(_sync_summary(outcome))
+    if error is not None:
+        _say(f"{error}; {_here(outcome)}, the next run goes on where this one stopped")
+        return max(exit_code_for(error), ExitCode.INCOMPLETE)
+    return ExitCode.OK if outcome.complete else ExitCode.INCOMPLETE
+
+
+def _fetched_line(fetched: Fetched) -> str:
+    resumed = f", resumed at {readable_size(fetched.resumed)}" if fetched.resumed else ""
+    return f"{printable(fetched.name)}: {readable_size(fetched.size)}{resumed}, verified by {fetched.proof}"
+
+
+def _here(outcome: syncing.Outcome) -> str:
+    wanted = len(outcome.tasks)
+    return f"{wanted - len(outcome.to_fetch) + len(outcome.fetched)} of {wanted} logs are here"
+
+
+def _sync_summary(outcome: syncing.Outcome) -> str:
+    new, size = len(outcome.fetched), sum(fetched.size - fetched.resumed for fetched in outcome.fetched)
+    before = len(outcome.tasks) - len(outcome.to_fetch)
+    line = f"{new} new ({readable_size(size)}), {before} here already, from {_name(outcome.place)}"
+    if outcome.missing:
+        line += f"; {len(outcome.missing)} not here"
+    if outcome.undated:
+        line += f"; {outcome.undated} without a time were not left out by --since"
+    return line
+
+
+def _print_plan(outcome: syncing.Outcome) -> None:
+    for task in outcome.to_fetch:
+        on = f", {readable_size(task.there)} of it here" if task.step is not Step.FETCH else ""
+        print(f"{_name(task.log.below)}: {readable_size(task.log.size)}{on}")
+    left = sum(task.log.size - task.there for task in outcome.to_fetch)
+    before = len(outcome.tasks) - len(outcome.to_fetch)
+    print(
+        f"would fetch {len(outcome.to_fetch)} ({readable_size(left)}), {before} here already, "
+        f"from {_name(outcome.place)}"
+    )
+
+
+def parse_date(text: str) -> float:
+    """Return seconds UTC of a date, or a date and time, which is local if it names no zone.
+
+    Raises:
+        UsageError: it is none.
+    """
+    try:
+        return datetime.fromisoformat(text).timestamp()
+    except (ValueError, OverflowError, OSError):
+        raise UsageError(
+            f"--since {text!r} is no date; write for example 2026-05-01, or 2026-05-01T14:30"
+        ) from None
+
+
+# -- get and cat ----------------------------------------------------------------------------------
+
+
+def get(args: Args) -> int:
+    """Fetch files."""
+    if args.to == STDOUT:
+        if args.recursive:
+            raise UsageError("directories cannot be written to stdout; leave out -r or --to -")
+        return cat(args)
+    wanted, component = paths.parse_paths(args.paths)
+    got, bar = getting.Got(), progress.Progress()
+
+    def tell(fetched: Fetched) -> None:
+        print(_fetched_line(fetched), flush=True)
+
+    async def work(session: Session) -> None:
+        fetcher = Fetcher(session, bar, args.verify, args.resume)
+        await getting.get_paths(
+            fetcher, wanted, Path(args.to), tell, _complain, got, recursive=args.recursive
+        )
+
+    def stopped() -> str:
+        begun = f"; what came of {printable(bar.name)} is kept, to go on with" if bar.name else ""
+        return f"{got.done} of {got.planned} files are here{begun}"
+
+    with _on_interrupt(stopped), progress.shown(bar):
+        _with_session(args, work, component)
+    return ExitCode.INCOMPLETE if got.failed else ExitCode.OK
+
+
+def cat(args: Args) -> int:
+    """Write files to stdout."""
+    wanted, component = paths.parse_paths(args.paths)
+    got = getting.Got()
+
+    async def work(session: Session) -> None:
+        await getting.cat_paths(session, wanted, sys.stdout.buffer, args.verify, _complain, got)
+
+    _with_session(args, work, component)
+    return ExitCode.INCOMPLETE if got.failed else ExitCode.OK
+
+
+# -- put and names --------------------------------------------------------------------------------
+
+
+def put(args: Args) -> int:
+    """Put files on the vehicle."""
+    (path,), component = paths.parse_paths([args.path])
+    batches = [(local, putting.collect(local, recursive=args.recursive)) for local in args.locals]
+    counts, bar = putting.Put(), progress.Progress()
+
+    def tell(sent: putting.Sent) -> None:
+        print(f"{_name(sent.remote)}: {readable_size(sent.size)}, delivered", flush=True)
+
+    async def work(session: Session) -> None:
+        await putting.put_paths(session, batches, path, bar, tell, counts)
+
+    def stopped() -> str:
+        line = f"{counts.done} of {counts.planned} files are on the vehicle"
+        if counts.at_work is None:
+            return line
+        return f"{line}; {name_text(counts.at_work)} is not, and what was there under that name still is"
+
+    with _on_interrupt(stopped), progress.shown(bar):
+        _with_session(args, work, component, writing=True)
+    return ExitCode.OK
+
+
+def rm(args: Args) -> int:
+    """Remove files."""
+    wanted, component = paths.parse_paths(args.paths)
+    names.refuse_root(wanted)
+    remove = partial(names.remove_paths, paths=wanted, recursive=args.recursive)
+    _with_session(args, remove, component, writing=True)
+    return ExitCode.OK
+
+
+def mkdir(args: Args) -> int:
+    """Make directories."""
+    wanted, component = paths.parse_paths(args.paths)
+    make = partial(names.make_directories, paths=wanted, parents=args.parents)
+    _with_session(args, make, component, writing=True)
+    return ExitCode.OK
+
+
+def rmdir(args: Args) -> int:
+    """Remove empty directories."""
+    wanted, component = paths.parse_paths(args.paths)
+    _with_session(args, partial(names.remove_directories, paths=wanted), component, writing=True)
+    return ExitCode.OK
+
+
+def mv(args: Args) -> int:
+    """Rename or move."""
+    (*wanted, to), component = paths.parse_paths([*args.paths, args.target])
+    _with_session(args, partial(names.move_paths, paths=wanted, to=to), component, writing=True)
+    return ExitCode.OK
+
+
+# -- looking --------------------------------------------------------------------------------------
+
+
+def ls(args: Args) -> int:
+    """List directories."""
+    wanted, component = paths.parse_paths(args.paths or ["/"])
+    work = partial(listing.list_paths, paths=wanted, recursive=args.recursive, by_time=args.by_time)
+    listings = _with_session(args, work, component)
+    if args.json:
+        print(json.dumps([entry for _, entries in listings for entry in entries], indent=2))
+        return ExitCode.OK
+    look = listing.Look(detailed=args.detailed, units=args.units, terminal=sys.stdout.isatty())
+    for line in listing.lines(listings, look):
+        sys.stdout.buffer.write(line.encode("utf-8", "surrogateescape") + b"\n")
+    sys.stdout.flush()
+    return ExitCode.OK
+
+
+def crc(args: Args) -> int:
+    """Print checksums the vehicle computed, as cksum's relatives do: number, two blanks, name."""
+    wanted, component = paths.parse_paths(args.paths)
+
+    def tell(path: bytes, number: int) -> None:
+        print(f"{number:08x}  {_name(path)}")
+
+    _with_session(args, partial(names.checksum_paths, paths=wanted, tell=tell), component)
+    return ExitCode.OK
+
+
+def scan(args: Args) -> int:
+    """Show who answers on a link."""
+    found = _run(args, scanning.scan)
+    if args.json:
+        print(json.dumps(found, indent=2, default=str))
+    else:
+        for line in scan_lines(found, tabs=not sys.stdout.isatty()):
+            print(line)
+    return ExitCode.OK
+
+
+def scan_lines(found: Sequence[scanning.Entry], *, tabs: bool) -> Iterator[str]:
+    """Yield a line for each component; in a pipe its parts stand between tabs, `-` for what is not known."""
+    for peer in found:
+        address = f"{peer['system']}/{peer['component']}"
+        ftp = ", ".join([peer["ftp"], *peer["seen"]])
+        facts = (address, peer["what"], peer["firmware"], peer["uid"], ftp)
+        if tabs:
+            yield "\t".join("-" if fact is None else printable(fact) for fact in facts)
+            continue
+        about = [printable(peer["what"])]
+        about += [f"firmware {peer['firmware']}"] if peer["firmware"] else []
+        about += [f"id {peer['uid']}"] if peer["uid"] else []
+        yield f"{address:<8} {', '.join(about)}"
+        yield f"{'':<8} FTP: {printable(ftp)}"

@@ -1,0 +1,530 @@
+"""oneshot: fetch, get and sync on a tree in memory, whose answers can be spoilt."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import cast
+
+import pytest
+import trio
+
+from mavftpfs.oneshot import sync as syncing
+from mavftpfs.oneshot.fetch import Fetched, Fetcher, NotProvenYet, StillGrowing, Wanted, part_of
+from mavftpfs.oneshot.files import Files, Session
+from mavftpfs.oneshot.get import Got, get_paths, local_name
+from mavftpfs.oneshot.plan import PROVEN_BY_DEFAULT, Verify, known_time
+from mavftpfs.oneshot.progress import Progress
+from mavftpfs.oneshot.sync import Outcome, Wish
+from mavftpfs.shared.errors import (
+    Armed,
+    DataUnproven,
+    FtpNak,
+    IsADirectory,
+    MavftpfsError,
+    NotFound,
+    RequestTimeout,
+    UsageError,
+    VehicleLost,
+)
+from tests.ops.faketree import MTIME, FakeFile, FakeTree
+
+BIG = bytes(range(251)) * 2000
+
+
+class SpoiltTree(FakeTree):
+    """A tree that can hand out wrong bytes, refuse checksums, and of which dropping the caches is counted.
+
+    grows: what is appended to a file each time the caches are dropped.
+    """
+
+    bad = 0
+    forgotten = 0
+    grows = b""
+    crc_error: Exception | None = None
+    reads = 0
+
+    async def open(self, path: bytes, *, write: bool = False, truncate: bool = False) -> FakeFile:
+        file = await super().open(path)
+        self.reads += 1
+        if self.bad:
+            self.bad -= 1
+            file.content = bytes([file.content[0] ^ 1]) + file.content[1:]
+        return file
+
+    async def crc32(self, path: bytes) -> int:
+        if self.crc_error is not None:
+            raise self.crc_error
+        return await super().crc32(path)
+
+    def forget_caches(self) -> None:
+        self.forgotten += 1
+        for path in self.files:
+            self.files[path] += self.grows
+
+
+def fetcher_of(tree: FakeTree, root: bytes = b"/", verify: Verify = "auto", resume: bool = True) -> Fetcher:
+    return Fetcher(Session(cast(Files, tree), root), Progress(), verify, resume)
+
+
+def names_in(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+def wanted(tree: FakeTree, path: bytes, local: Path) -> Wanted:
+    found = tree.stat_now(path)
+    return Wanted(path, local, path.decode(errors="replace"), found.size, known_time(found.mtime))
+
+
+async def get(tree: FakeTree, path: bytes, local: Path, verify: Verify = "auto") -> Fetched:
+    return await fetcher_of(tree, verify=verify).fetch(wanted(tree, path, local))
+
+
+async def test_a_file_arrives_proven_with_its_time(tmp_path: Path) -> None:
+    tree = SpoiltTree({b"/big": BIG})
+    fetched = await get(tree, b"/big", tmp_path / "big")
+    assert (tmp_path / "big").read_bytes() == BIG
+    assert int((tmp_path / "big").stat().st_mtime) == MTIME
+    assert (fetched.size, fetched.resumed, fetched.proof) == (len(BIG), 0, "size and CRC32")
+    assert all(file.closed for file in tree.opened)
+    assert names_in(tmp_path) == ["big"]
+
+
+async def test_a_file_without_a_time_is_of_the_present(tmp_path: Path) -> None:
+    tree = SpoiltTree({b"/a": b"1"}, times={b"/a": 315_532_800})
+    before = time.time() - 1
+    await get(tree, b"/a", tmp_path / "a")
+    assert (tmp_path / "a").stat().st_mtime > before
+
+
+async def test_an_empty_file(tmp_path: Path) -> None:
+    await get(SpoiltTree({b"/none": b""}), b"/none", tmp_path / "none")
+    assert (tmp_path / "none").read_bytes() == b""
+    assert names_in(tmp_path) == ["none"]
+
+
+async def test_wrong_bytes_are_fetched_again_without_the_caches(tmp_path: Path) -> None:
+    tree = SpoiltTree({b"/big": BIG})
+    tree.bad = 1
+    await get(tree, b"/big", tmp_path / "big")
+    assert (tmp_path / "big").read_bytes() == BIG
+    assert tree.forgotten
+
+
+async def test_wrong_bytes_twice_leave_nothing_and_keep_the_old_file(tmp_path: Path) -> None:
+    tree = SpoiltTree({b"/big": BIG})
+    tree.bad = 2
+    (tmp_path / "big").write_bytes(b"old")
+    with pytest.raises(DataUnproven, match=r"/big.*CRC32"):
+        await get(tree, b"/big", tmp_path / "big")
+    assert (tmp_path / "big").read_bytes() == b"old"
+    assert names_in(tmp_path) == ["big"]
+
+
+# -- going on -------------------------------------------------------------------------------------
+
+
+async def test_an_interrupted_file_is_gone_on_with_and_proven(tmp_path: Path) -> None:
+    tree = SpoiltTree({b"/big": BIG})
+    reads = 0
+
+    def interrupt(name: str, path: bytes) -> None:
+        nonlocal reads
+        reads += name == "read"
+        if reads == 4:
+            raise KeyboardInterrupt
+
+    tree.on_call = interrupt
+    with pytest.raises(KeyboardInterrupt):
+        await get(tree, b"/big", tmp_path / "big")
+    assert names_in(tmp_path) == ["big.part"]
+    came = (tmp_path / "big.part").read_bytes()
+    assert came
+    assert BIG.startswith(came)
+    tree.on_call = lambda name, path: None
+    tree.calls.clear()
+    fetched = await get(tree, b"/big", tmp_path / "big", "none")
+    assert (fetched.resumed, fetched.proof) == (len(came), "size and CRC32")
+    assert ("crc32", b"/big") in tree.calls
+    assert (tmp_path / "big").read_bytes() == BIG
+    assert names_in(tmp_path) == ["big"]
+
+
+async def test_a_part_of_another_file_is_found_out(tmp_path: Path) -> None:
+    tree = SpoiltTree({b"/big": BIG})
+    (tmp_path / "big.part").write_bytes(b"x" * 1000)
+    fetched = await get(tree, b"/big", tmp_path / "big")
+    assert (tmp_path / "big").read_bytes() == BIG
+    assert fetched.resumed == 0
+
+
+async def test_a_part_that_is_longer_than_the_file(tmp_path: Path) -> None:
+    (tmp_path / "a.part").write_bytes(b"12345")
+    await get(SpoiltTree({b"/a": b"123"}), b"/a", tmp_path / "a")
+    assert (tmp_path / "a").read_bytes() == b"123"
+
+
+async def test_a_whole_part_is_only_proven(tmp_path: Path) -> None:
+    tree = SpoiltTree({b"/big": BIG})
+    (tmp_path / "big.part").write_bytes(BIG)
+    await get(tree, b"/big", tmp_path / "big")
+    assert (tmp_path / "big").read_bytes() == BIG
+    assert tree.reads == 0
+
+
+async def test_no_resume_begins_anew(tmp_path: Path) -> None:
+    tree = SpoiltTree({b"/big": BIG})
+    (tmp_path / "big.part").write_bytes(BIG[:1000])
+    fetched = await fetcher_of(tree, resume=False).fetch(wanted(tree, b"/big", tmp_path / "big"))
+    assert fetched.resumed == 0
+
+
+@pytest.mark.parametrize("error", [Armed("x"), RequestTimeout("x")])
+async def test_what_was_resumed_waits_for_its_proof(tmp_path: Path, error: Exception) -> None:
+    tree = SpoiltTree({b"/big": BIG})
+    tree.crc_error = error
+    (tmp_path / "big.part").write_bytes(BIG[:1000])
+    with pytest.raises(NotProvenYet, match="next run"):
+        await get(tree, b"/big", tmp_path / "big")
+    assert names_in(tmp_path) == ["big.part"]
+    assert (tmp_path / "big.part").read_bytes() == BIG
+    tree.crc_error = None
+    await get(tree, b"/big", tmp_path / "big")
+    assert names_in(tmp_path) == ["big"]
+
+
+async def test_where_no_checksum_can_be_had_all_is_fetched_anew(tmp_path: Path) -> None:
+    tree = SpoiltTree({b"/big": BIG})
+    tree.crc_error = FtpNak(14, 7)
+    (tmp_path / "big.part").write_bytes(b"x" * 1000)
+    fetched = await get(tree, b"/big", tmp_path / "big")
+    assert (fetched.resumed, (tmp_path / "big").read_bytes()) == (0, BIG)
+
+
+@pytest.mark.parametrize("begun", [b"", BIG[:1000]])
+async def test_a_growing_file_stays_a_part_and_is_said(tmp_path: Path, begun: bytes) -> None:
+    tree = SpoiltTree({b"/big": BIG})
+    if begun:
+        (tmp_path / "big.part").write_bytes(begun)
+    tree.grows = b"more"
+
+    async def grown(path: bytes) -> int:
+        tree.files[path] += b"more"
+        return 0
+
+    tree.crc32 = grown  # type: ignore[method-assign]
+    with pytest.raises(StillGrowing, match=r"/big is still growing: its first 502.0 kB"):
+        await get(tree, b"/big", tmp_path / "big")
+    assert (tmp_path / "big.part").read_bytes() == BIG
+    assert names_in(tmp_path) == ["big.part"]
+
+
+async def test_growth_is_seen_without_a_checksum_too(tmp_path: Path) -> None:
+    tree = SpoiltTree({b"/big": BIG})
+    tree.crc_error, tree.grows = Armed("x"), b"more"
+    with pytest.raises(StillGrowing):
+        await get(tree, b"/big", tmp_path / "big")
+
+
+@pytest.mark.parametrize(
+    ("error", "words"),
+    [(Armed("x"), "armed"), (FtpNak(14, 7), "refused"), (RequestTimeout("x"), "did not answer")],
+)
+async def test_without_a_checksum_it_says_what_was_proven(
+    tmp_path: Path, error: Exception, words: str
+) -> None:
+    tree = SpoiltTree({b"/big": BIG})
+    tree.crc_error = error
+    fetched = await get(tree, b"/big", tmp_path / "big")
+    assert fetched.proof.startswith("size (")
+    assert words in fetched.proof
+
+
+async def test_a_large_file_is_proven_on_demand_only(tmp_path: Path) -> None:
+    tree = SpoiltTree({b"/huge": bytes(PROVEN_BY_DEFAULT + 1)})
+    assert (await get(tree, b"/huge", tmp_path / "a")).proof == "size"
+    assert (await get(tree, b"/huge", tmp_path / "b", "all")).proof == "size and CRC32"
+
+
+@pytest.mark.parametrize(
+    ("path", "root", "proven"),
+    [(b"/@SYS/uarts.txt", b"/", False), (b"/uarts.txt", b"/@SYS", False), (b"/@MAV_LOG/1.ulg", b"/", True)],
+)
+async def test_what_is_made_anew_at_each_opening_is_not_proven(
+    tmp_path: Path, path: bytes, root: bytes, proven: bool
+) -> None:
+    tree = SpoiltTree({path: b"now"})
+    fetched = await fetcher_of(tree, root).fetch(wanted(tree, path, tmp_path / "x"))
+    assert (tmp_path / "x").read_bytes() == b"now"
+    assert (("crc32", path) in tree.calls) is proven
+    assert ("generated" in fetched.proof) is not proven
+
+
+async def test_a_read_that_ends_early_is_no_file(tmp_path: Path) -> None:
+    tree = SpoiltTree({b"/big": BIG})
+    tree.short_read = 0
+    with pytest.raises(DataUnproven, match="ended"):
+        await get(tree, b"/big", tmp_path / "big")
+    assert names_in(tmp_path) == []
+
+
+async def test_two_programs_do_not_write_one_part(tmp_path: Path) -> None:
+    tree = SpoiltTree({b"/big": BIG})
+    tree.delays["read"] = 0.05
+    async with trio.open_nursery() as nursery:
+        nursery.start_soon(get, tree, b"/big", tmp_path / "big")
+        await trio.sleep(0.06)
+        with pytest.raises(UsageError, match="another program"):
+            await get(tree, b"/big", tmp_path / "big")
+    assert (tmp_path / "big").read_bytes() == BIG
+
+
+async def test_no_link_is_followed_for_a_part(tmp_path: Path) -> None:
+    (tmp_path / "victim").write_bytes(b"mine")
+    part_of(tmp_path / "big").symlink_to(tmp_path / "victim")
+    with pytest.raises(UsageError):
+        await get(SpoiltTree({b"/big": BIG}), b"/big", tmp_path / "big")
+    assert (tmp_path / "victim").read_bytes() == b"mine"
+
+
+# -- get ------------------------------------------------------------------------------------------
+
+
+async def get_all(tree: FakeTree, *paths: bytes, to: Path, recursive: bool = True) -> tuple[Got, list[str]]:
+    got, said = Got(), list[str]()
+    await get_paths(
+        fetcher_of(tree),
+        paths,
+        to,
+        lambda _: None,
+        lambda error: said.append(str(error)),
+        got,
+        recursive=recursive,
+    )
+    return got, said
+
+
+async def test_what_the_local_disk_refuses_is_told_in_a_line(tmp_path: Path) -> None:
+    tree = SpoiltTree({b"/d/a": b"1"})
+    (tmp_path / "file").write_bytes(b"in the way")
+    with pytest.raises(UsageError, match=f"^{tmp_path / 'none' / 'a'}: No such file"):
+        await get_all(tree, b"/d/a", to=tmp_path / "none" / "a")
+    with pytest.raises(UsageError, match=f"^{tmp_path / 'file'}: File exists"):
+        await get_all(tree, b"/d", to=tmp_path / "file")
+    assert (tmp_path / "file").read_bytes() == b"in the way"
+
+
+async def test_a_directory_with_all_below(tmp_path: Path) -> None:
+    files = {b"/d/a": b"1", b"/d/e/b": b"2", b"/d/e/f/\xff": b"3"}
+    got, said = await get_all(SpoiltTree(dict(files), {b"/d/empty"}), b"/d", to=tmp_path / "d")
+    found = {path for path in (tmp_path / "d").rglob("*") if path.is_file()}
+    assert {bytes(path.relative_to(tmp_path)): path.read_bytes() for path in found} == {
+        path[1:]: content for path, content in files.items()
+    }
+    assert (tmp_path / "d" / "empty").is_dir()
+    assert (got.planned, got.done, got.failed, said) == (3, 3, 0, [])
+
+
+def refusing(name: str, path: bytes) -> Callable[[str, bytes], None]:
+    """Return what makes one call on one path fail."""
+
+    def refuse(called: str, at: bytes) -> None:
+        if (called, at) == (name, path):
+            raise RequestTimeout("no answer")
+
+    return refuse
+
+
+@pytest.mark.parametrize("call", [("open", b"/d/b"), ("list", b"/d/b")])
+async def test_a_directory_goes_on_after_what_fails(tmp_path: Path, call: tuple[str, bytes]) -> None:
+    inner = b"/d/b/x" if call[0] == "list" else b"/d/b"
+    tree = SpoiltTree({b"/d/a": b"1", inner: b"2", b"/d/c": b"3"})
+    tree.on_call = refusing(*call)
+    got, said = await get_all(tree, b"/d", to=tmp_path / "d")
+    assert (got.done, got.failed, said) == (2, 1, ["no answer"])
+    assert (tmp_path / "d" / "c").read_bytes() == b"3"
+
+
+async def test_of_several_paths_the_others_go_on(tmp_path: Path) -> None:
+    tree = SpoiltTree({b"/a": b"1", b"/d/x": b"2"})
+    got, said = await get_all(tree, b"/none", b"/d", b"/a", to=tmp_path, recursive=False)
+    assert (got.done, got.failed) == (1, 2)
+    assert "/none" in said[0]
+    assert "-r" in said[1]
+    assert names_in(tmp_path) == ["a"]
+
+
+async def test_a_single_path_raises_its_error(tmp_path: Path) -> None:
+    tree = SpoiltTree({b"/d/x": b"2"})
+    for path, error in ((b"/none", NotFound), (b"/d", IsADirectory)):
+        with pytest.raises(error):
+            await get_all(tree, path, to=tmp_path, recursive=False)
+
+
+async def test_a_lost_vehicle_ends_it_at_once(tmp_path: Path) -> None:
+    tree = SpoiltTree({b"/d/a": b"1", b"/d/b": b"2"})
+    tree.error = None
+
+    def lose(name: str, path: bytes) -> None:
+        if name == "open":
+            raise VehicleLost("gone")
+
+    tree.on_call = lose
+    with pytest.raises(VehicleLost):
+        await get_all(tree, b"/d", to=tmp_path / "d")
+    assert [call for call in tree.calls if call[0] == "open"] == [("open", b"/d/a")]
+
+
+@pytest.mark.parametrize(
+    ("local", "single", "expected"),
+    [(".", True, "./f"), (".", False, "./f"), ("new", True, "new"), ("new", False, "new/f")],
+)
+def test_local_names(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, local: str, single: bool, expected: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert local_name(Path(local), b"/a/f", single=single) == Path(expected)
+
+
+# -- sync -----------------------------------------------------------------------------------------
+
+LOGS = {
+    b"/fs/microsd/log/d/1.ulg": b"one",
+    b"/fs/microsd/log/d/2.ulg": b"second",
+    b"/fs/microsd/x": b"no log",
+}
+
+
+async def sync(
+    tree: FakeTree, local: Path, *, newest: int | None = None, dry_run: bool = False, root: bytes = b"/"
+) -> tuple[Outcome, list[str], list[str]]:
+    outcome, told, said = Outcome(), list[str](), list[str]()
+    fetcher = fetcher_of(tree, root)
+    wish = Wish(local, newest=newest, dry_run=dry_run)
+    try:
+        await syncing.sync(
+            fetcher.session, wish, fetcher, outcome, lambda fetched: told.append(fetched.name), said.append
+        )
+    except MavftpfsError as exc:
+        said.append(repr(exc))
+    return outcome, told, said
+
+
+async def test_new_logs_come_newest_first_and_once(tmp_path: Path) -> None:
+    tree = SpoiltTree(dict(LOGS))
+    outcome, told, said = await sync(tree, tmp_path / "logs")
+    assert (told, said, outcome.complete) == (["d/2.ulg", "d/1.ulg"], [], True)
+    assert (tmp_path / "logs/d/2.ulg").read_bytes() == b"second"
+    assert names_in(tmp_path / "logs" / "d") == ["1.ulg", "2.ulg"]
+    reads = tree.reads
+    outcome, told, said = await sync(tree, tmp_path / "logs")
+    assert (told, said, outcome.complete, tree.reads) == ([], [], True, reads)
+
+
+@pytest.mark.parametrize(
+    ("files", "root", "place"),
+    [
+        (LOGS, b"/", b"/fs/microsd/log"),
+        ({b"/APM/LOGS/1.BIN": b"1"}, b"/", b"/APM/LOGS"),
+        ({b"/logs/1.BIN": b"1"}, b"/", b"/logs"),
+        ({b"/log/d/1.ulg": b"1"}, b"/", b"/log"),
+        ({b"/@MAV_LOG/1.ulg": b"1", b"/log/d/1.ulg": b"1"}, b"/", b"/log"),
+        ({b"/@MAV_LOG/1.ulg": b"1"}, b"/", b"/@MAV_LOG"),
+        ({b"/log/d/1.ulg": b"1"}, b"/fs/microsd", b"/fs/microsd/log"),
+        ({b"/1.ulg": b"1"}, b"/fs/microsd/log/sess001", b"/fs/microsd/log/sess001"),
+    ],
+)
+async def test_the_logs_are_found(
+    tmp_path: Path, files: dict[bytes, bytes], root: bytes, place: bytes
+) -> None:
+    outcome, told, _ = await sync(SpoiltTree(dict(files)), tmp_path, root=root)
+    assert outcome.place == place
+    assert told
+
+
+async def test_an_empty_log_directory_is_no_error(tmp_path: Path) -> None:
+    outcome, told, said = await sync(SpoiltTree({b"/x": b""}, {b"/APM/LOGS"}), tmp_path)
+    assert (outcome.place, told, said, outcome.complete) == (b"/APM/LOGS", [], [], True)
+
+
+async def test_a_vehicle_without_logs(tmp_path: Path) -> None:
+    _, _, said = await sync(SpoiltTree({b"/x": b""}), tmp_path)
+    assert "--from" in said[0]
+
+
+async def test_a_dry_run_reads_nothing(tmp_path: Path) -> None:
+    tree = SpoiltTree(dict(LOGS))
+    outcome, _, _ = await sync(tree, tmp_path / "logs", dry_run=True)
+    assert [task.log.below for task in outcome.to_fetch] == [b"d/2.ulg", b"d/1.ulg"]
+    assert tree.reads == 0
+    assert not (tmp_path / "logs").exists()
+
+
+async def test_the_newest_only(tmp_path: Path) -> None:
+    _, told, _ = await sync(SpoiltTree(dict(LOGS)), tmp_path, newest=1)
+    assert told == ["d/2.ulg"]
+
+
+async def test_a_log_that_grew_since_is_gone_on_with(tmp_path: Path) -> None:
+    tree = SpoiltTree({b"/log/1": BIG[:2000]})
+    await sync(tree, tmp_path)
+    tree.files[b"/log/1"] = BIG
+    outcome, _, _ = await sync(tree, tmp_path)
+    assert (outcome.fetched[0].resumed, (tmp_path / "1").read_bytes()) == (2000, BIG)
+    assert names_in(tmp_path) == ["1"]
+
+
+@pytest.mark.parametrize("new", [b"other and longer", b"x"])
+async def test_another_log_of_that_name_does_not_destroy_the_old_one(tmp_path: Path, new: bytes) -> None:
+    """ArduPilot counts from 1 again after its logs were erased."""
+    tree = SpoiltTree({b"/APM/LOGS/1.BIN": b"flight of May"})
+    await sync(tree, tmp_path)
+    tree.files[b"/APM/LOGS/1.BIN"] = new
+    outcome, _, _ = await sync(tree, tmp_path)
+    assert outcome.complete
+    assert (tmp_path / "1.BIN").read_bytes() == new
+    assert (tmp_path / "1.BIN.~1~").read_bytes() == b"flight of May"
+
+
+async def test_one_that_fails_does_not_stop_the_others(tmp_path: Path) -> None:
+    tree = SpoiltTree(dict(LOGS))
+    tree.on_call = refusing("open", b"/fs/microsd/log/d/2.ulg")
+    outcome, told, said = await sync(tree, tmp_path)
+    assert (told, said, outcome.complete) == (["d/1.ulg"], ["d/2.ulg: no answer"], False)
+    states = {file["path"]: file["state"] for file in outcome.facts()["files"]}
+    assert states == {"/fs/microsd/log/d/2.ulg": "failed", "/fs/microsd/log/d/1.ulg": "fetched"}
+
+
+async def test_a_directory_that_cannot_be_listed_is_said(tmp_path: Path) -> None:
+    tree = SpoiltTree({**LOGS, b"/fs/microsd/log/e/3.ulg": b"3"})
+    tree.on_call = refusing("list", b"/fs/microsd/log/d")
+    outcome, told, said = await sync(tree, tmp_path)
+    assert (told, said, outcome.complete) == (["e/3.ulg"], ["/fs/microsd/log/d: no answer"], False)
+    tree.on_call = lambda name, path: None
+    outcome, told, said = await sync(tree, tmp_path)
+    assert (len(told), said, outcome.complete) == (2, [], True)
+
+
+async def test_a_name_that_a_directory_has_here(tmp_path: Path) -> None:
+    (tmp_path / "1").mkdir()
+    outcome, told, said = await sync(SpoiltTree({b"/log/1": b"x", b"/log/0": b"y"}), tmp_path)
+    assert (told, outcome.complete) == (["0"], False)
+    assert "is a directory" in said[0]
+
+
+async def test_a_lost_vehicle_leaves_a_part_and_an_honest_outcome(tmp_path: Path) -> None:
+    tree = SpoiltTree({b"/log/2": BIG, b"/log/1": b"x"})
+    reads = 0
+
+    def lose(name: str, path: bytes) -> None:
+        nonlocal reads
+        reads += name == "read"
+        if reads == 3:
+            raise VehicleLost("gone")
+
+    tree.on_call = lose
+    outcome, told, said = await sync(tree, tmp_path)
+    assert (told, outcome.complete) == ([], False)
+    assert "VehicleLost" in said[0]
+    assert names_in(tmp_path) == ["2.part"]

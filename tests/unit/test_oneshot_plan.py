@@ -1,0 +1,168 @@
+"""oneshot.plan, paths and scan: what to fetch, skip, resume and prove; what words mean."""
+
+from __future__ import annotations
+
+import pytest
+
+from mavftpfs.link.messages import Address, AutopilotVersion, Heartbeat
+from mavftpfs.link.uri import parse_source
+from mavftpfs.oneshot import plan
+from mavftpfs.oneshot.mounted import same_link
+from mavftpfs.oneshot.paths import parse_paths
+from mavftpfs.oneshot.plan import Log, Step, Verify
+from mavftpfs.oneshot.scan import describe_peer, firmware, unique_id
+from mavftpfs.oneshot.verbs import parse_date
+from mavftpfs.shared.errors import UsageError
+
+MAY, JUNE = 1_714_566_896, 1_717_245_296
+
+
+@pytest.mark.parametrize(
+    ("here", "part", "step"),
+    [
+        (None, None, Step.FETCH),
+        (100, None, Step.SKIP),
+        (100, 40, Step.SKIP),
+        (None, 40, Step.RESUME),
+        (None, 100, Step.RESUME),
+        (None, 101, Step.FETCH),
+        (None, 0, Step.FETCH),
+        (60, None, Step.EXTEND),
+        (60, 80, Step.RESUME),
+        (0, None, Step.FETCH),
+        (101, None, Step.FETCH),
+    ],
+)
+def test_what_to_do_about_a_file_of_100_bytes(here: int | None, part: int | None, step: Step) -> None:
+    assert plan.decide(100, here, part) is step
+
+
+def test_an_empty_file_that_is_here_is_skipped() -> None:
+    assert plan.decide(0, 0, None) is Step.SKIP
+    assert plan.decide(0, None, None) is Step.FETCH
+
+
+@pytest.mark.parametrize(
+    ("verify", "resumed", "size", "needed"),
+    [
+        ("auto", False, plan.PROVEN_BY_DEFAULT, True),
+        ("auto", False, plan.PROVEN_BY_DEFAULT + 1, False),
+        ("auto", True, plan.PROVEN_BY_DEFAULT + 1, True),
+        ("all", False, plan.PROVEN_BY_DEFAULT + 1, True),
+        ("none", False, 1, False),
+        ("none", True, 1, True),
+    ],
+)
+def test_what_is_proven(verify: Verify, resumed: bool, size: int, needed: bool) -> None:
+    assert plan.proof_needed(verify, resumed=resumed, size=size) is needed
+
+
+def log(below: bytes, mtime: int | None = None) -> Log:
+    return Log(b"/log/" + below, below, 1, mtime)
+
+
+def test_the_newest_come_first_by_time_then_by_number() -> None:
+    logs = [log(b"s/log9"), log(b"a", MAY), log(b"s/log10"), log(b"b", JUNE), log(b"c", MAY)]
+    assert [one.below for one in plan.newest_first(logs)] == [b"b", b"c", b"a", b"s/log10", b"s/log9"]
+
+
+def test_numbers_are_compared_as_numbers_wherever_they_stand() -> None:
+    names = [b"10.BIN", b"9.BIN", b"a1b2", b"a1b10", b"a", b"", b"00000002.BIN"]
+    ordered = [b"", b"00000002.BIN", b"9.BIN", b"10.BIN", b"a", b"a1b2", b"a1b10"]
+    assert sorted(names, key=plan.natural) == ordered
+
+
+def test_which_logs_are_wished_for() -> None:
+    logs = plan.newest_first([log(b"a", MAY), log(b"b", JUNE), log(b"c")])
+    assert [one.below for one in plan.select(logs, newest=1, since=None)] == [b"b"]
+    since = plan.select(logs, newest=None, since=MAY + 1)
+    assert [one.below for one in since] == [b"b", b"c"]  # c may be a new one
+    assert plan.select(logs, newest=9, since=None) == logs
+
+
+def test_a_clock_that_was_not_set_tells_nothing() -> None:
+    assert plan.known_time(315_532_800) is None
+    assert plan.known_time(MAY) == MAY
+
+
+def test_reads_take_about_a_second() -> None:
+    assert plan.next_read_size(4096, 0.1) == 8192
+    assert plan.next_read_size(plan.LARGEST_READ, 0.1) == plan.LARGEST_READ
+    assert plan.next_read_size(8192, 0.5) == 8192
+    assert plan.next_read_size(8192, 3.0) == 4096
+    assert plan.next_read_size(plan.LEAST_READ, 3.0) == plan.LEAST_READ
+
+
+@pytest.mark.parametrize(
+    ("texts", "expected"),
+    [
+        (["/a//b/", "c"], ([b"/a/b", b"/c"], None)),
+        (["mftp://comp=5:/a", "mftp://[;comp=5]b", "/c"], ([b"/a", b"/b", b"/c"], 5)),
+        (["mftp://@SYS/x"], ([b"/@SYS/x"], None)),
+    ],
+)
+def test_paths(texts: list[str], expected: tuple[list[bytes], int | None]) -> None:
+    assert parse_paths(texts) == expected
+
+
+@pytest.mark.parametrize("text", ["../x", "/a/../b", "a\0b", "mftp://comp=0:/x"])
+def test_paths_that_cannot_be(text: str) -> None:
+    with pytest.raises(UsageError):
+        parse_paths([text])
+
+
+def test_dates() -> None:
+    assert parse_date("2024-05-01T12:34:56+00:00") == MAY
+    assert parse_date("2024-05-02") - parse_date("2024-05-01") == 86_400
+    with pytest.raises(UsageError, match="2026-05-01"):
+        parse_date("yesterday")
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "same"),
+    [
+        ("udpin:0.0.0.0:14550", "udpin://127.0.0.1:14550", True),
+        ("udpin:0.0.0.0:14550", "udpin:0.0.0.0:14551", False),
+        ("udpin:0.0.0.0:14550#/fs", "udpin:0.0.0.0:14550", True),
+        ("udpout:10.0.0.1:14550", "udpout:10.0.0.2:14550", False),
+        ("udpin:127.0.0.1:14550", "udpout:127.0.0.1:14550", False),
+        ("/dev/null,57600", "/dev/../dev/null,921600", True),
+        ("/dev/null", "/dev/zero", False),
+    ],
+)
+def test_the_same_link(one: str, other: str, same: bool) -> None:
+    assert same_link(parse_source(one), parse_source(other)) is same
+
+
+@pytest.mark.parametrize(
+    ("kind", "component", "autopilot", "mode", "words"),
+    [
+        (2, 1, 12, 0x80, "PX4 quadrotor, armed"),
+        (12, 1, 3, 0, "ArduPilot submarine, disarmed"),
+        (6, 190, 8, 0, "ground station"),
+        (30, 100, 8, 0, "camera"),
+        (0, 154, 8, 0, "gimbal"),
+        (18, 191, 8, 0, "companion computer"),
+        (77, 200, 8, 0, "component of type 77"),
+        (99, 1, 99, 0, "autopilot type 99, disarmed"),
+    ],
+)
+def test_what_a_heartbeat_says(kind: int, component: int, autopilot: int, mode: int, words: str) -> None:
+    assert describe_peer(Heartbeat(Address(1, component), kind, autopilot, mode, 4)) == words
+
+
+@pytest.mark.parametrize(
+    ("number", "words"),
+    [
+        (0x010F04FF, "1.15.4"),
+        (0x04060080, "4.6.0 beta"),
+        (0x010E00C0, "1.14.0 rc"),
+        (0x01100000, "1.16.0 dev"),
+    ],
+)
+def test_firmware_and_board(number: int, words: str) -> None:
+    version = AutopilotVersion(Address(1, 1), 0, number, b"", 0x1234, bytes(18))
+    assert firmware(version) == words
+    assert unique_id(version) == "0000000000001234"
+    assert unique_id(AutopilotVersion(Address(1, 1), 0, number, b"", 1, b"\1" * 18)) == "01" * 18
+    assert unique_id(AutopilotVersion(Address(1, 1), 0, number, b"", 0, bytes(18))) is None
