@@ -261,7 +261,7 @@ def find_socket(mountpoint: str, directories: list[Path]) -> Path:
     """
     for directory in directories:
         path = directory / socket_name(mountpoint)
-        if path.is_socket():
+        if _is_socket(path):
             return path
     raise NobodyThere(f"no vehicle of yours is mounted on {mountpoint}")
 
@@ -269,4 +269,17 @@ def find_socket(mountpoint: str, directories: list[Path]) -> Path:
 def all_sockets(directories: list[Path]) -> Iterator[Path]:
     """Yield the sockets of all mounts of this user, the dead ones too."""
     for directory in directories:
-        yield from sorted(path for path in directory.glob(f"*{_SUFFIX}") if path.is_socket())
+        try:
+            names = sorted(os.listdir(directory))
+        except OSError:
+            continue
+        paths = [directory / name for name in names if name.endswith(_SUFFIX)]
+        yield from filter(_is_socket, paths)
+
+
+def _is_socket(path: Path) -> bool:
+    """Return whether there is a socket, and we may look: another user's directories are as good as none."""
+    try:
+        return path.is_socket()
+    except OSError:
+        return False

@@ -13,11 +13,13 @@ import signal
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from io import TextIOWrapper
 from pathlib import Path
 from typing import NoReturn
 
 from mavftpfs.exits import SIGNALLED, ExitCode, exit_code_for
 from mavftpfs.shared.errors import MavftpfsError
+from mavftpfs.shared.private import make_private_directory, open_private
 from mavftpfs.shared.readable import readable
 
 Report = Callable[[int, str], None]
@@ -163,15 +165,20 @@ def log_to_stderr(level: int) -> None:
     _install(logging.StreamHandler(), "mavftpfs: %(message)s", level)
 
 
+class _PrivateFile(logging.handlers.RotatingFileHandler):
+    """Adds to a file that is made 0600. Without maxBytes it is never turned."""
+
+    def _open(self) -> TextIOWrapper:
+        return open(open_private(self.baseFilename, os.O_WRONLY | os.O_APPEND), "a", encoding="utf-8")
+
+
 def log_to_file(path: str, level: int) -> None:
-    """Log to a file of the user's choice.
+    """Log to a file of the user's choice, made 0600 if it is not there.
 
     Raises:
-        OSError: it cannot be opened.
+        OSError: it cannot be opened, or is a symbolic link.
     """
-    _install(
-        logging.FileHandler(path, encoding="utf-8"), "%(asctime)s %(levelname)s %(name)s: %(message)s", level
-    )
+    _install(_PrivateFile(path), "%(asctime)s %(levelname)s %(name)s: %(message)s", level)
 
 
 def log_in_background(fallback: Path, level: int, *, socket: str = SYSLOG_SOCKET) -> None:
@@ -181,10 +188,8 @@ def log_in_background(fallback: Path, level: int, *, socket: str = SYSLOG_SOCKET
     if Path(socket).is_socket():  # the handler itself says nothing about a missing one
         handler = logging.handlers.SysLogHandler(socket)
     else:
-        fallback.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        handler = logging.handlers.RotatingFileHandler(
-            fallback, maxBytes=_LOG_SIZE, backupCount=1, encoding="utf-8"
-        )
+        make_private_directory(fallback.parent)
+        handler = _PrivateFile(fallback, maxBytes=_LOG_SIZE, backupCount=1)
         form = f"%(asctime)s {form}"
     _install(handler, form, level)
 

@@ -98,7 +98,11 @@ def spool_base(environment: Mapping[str, str], vehicle: Address | None) -> Path:
 def left_by_killed_mounts(environment: Mapping[str, str]) -> list[Path]:
     """Return what killed mounts of this user hold that no vehicle has; the next mount of each offers it."""
     spools = state_directory(environment) / "mavftpfs" / "spool"
-    return [data for slot in sorted(spools.glob("*/slot*")) for data in left_in(slot)]
+    try:
+        slots = sorted(spools.glob("*/slot*"))
+    except OSError:  # another user's, who left us his environment
+        return []
+    return [data for slot in slots for data in left_in(slot)]
 
 
 @contextmanager
@@ -106,8 +110,6 @@ def spool_for(vehicle: Address | None) -> Iterator[SpoolDirectory | None]:
     """Claim a spool directory for the length of the body; None if this user can have none."""
     base = spool_base(os.environ, vehicle)
     try:
-        base.parent.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        base.parent.mkdir(mode=0o700, exist_ok=True)
         spool = SpoolDirectory(base, SystemRandom())
     except OSError as exc:
         log.warning("what waits for the vehicle will not survive this process: %s: %s", base, exc)

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import json
 import logging
+import os
 import struct
 import time
 from collections.abc import Callable, Sequence
@@ -25,6 +26,7 @@ from typing import BinaryIO, Self
 from mavftpfs.protocol.payload import HEADER_SIZE, PAYLOAD_SIZE, NakCode, Opcode, Payload, decode_request
 from mavftpfs.session.driver import PayloadTrace
 from mavftpfs.shared.errors import UsageError
+from mavftpfs.shared.private import open_private
 
 REQUEST = "request"
 REPLY = "reply"
@@ -48,7 +50,8 @@ class _File:
         self._path = path
         self._flushed_at = 0.0
         try:
-            self._file: BinaryIO | None = Path(path).open("wb")  # noqa: SIM115 (closed by close)
+            descriptor = open_private(path, os.O_WRONLY | os.O_TRUNC)
+            self._file: BinaryIO | None = open(descriptor, "wb")  # noqa: SIM115 (closed by close)
         except OSError as exc:
             raise UsageError(f"cannot write {path}: {exc.strerror}") from exc
 

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import json
 import logging
+import os
 from collections.abc import Callable, Iterable
 from pathlib import Path
+from typing import BinaryIO
 
 from mavftpfs.cache.draft import Draft
 from mavftpfs.cache.nodes import Node
 from mavftpfs.cache.rescuing import free_name
 from mavftpfs.shared.errors import SpoolFailed
+from mavftpfs.shared.private import make_private_directory, open_private
 
 log = logging.getLogger("mavftpfs.cache")
 
@@ -35,7 +38,7 @@ def recover(nodes: Iterable[Node], directory: Path, wall: Callable[[], float]) -
     for node in nodes:
         if node.draft is None:
             continue
-        directory.mkdir(mode=0o700, parents=True, exist_ok=True)
+        make_private_directory(directory)
         name = node.path.decode(errors="surrogateescape").strip("/").replace("/", "__")
         path = free_name(directory, name)
         facts = {"file": path.name, **describe(node, node.draft, wall)}
@@ -50,7 +53,8 @@ def recover(nodes: Iterable[Node], directory: Path, wall: Callable[[], float]) -
     if failed and not copied:
         raise failed[0]
     if copied:
-        free_name(directory, MANIFEST).write_text(json.dumps(manifest, indent=1))
+        with _created(free_name(directory, MANIFEST)) as file:
+            file.write(json.dumps(manifest, indent=1).encode())
     for node, _ in copied:
         node.drop_draft()  # the spool need not offer it again
     return [path for _, path in copied]
@@ -70,8 +74,12 @@ def describe(node: Node, draft: Draft, wall: Callable[[], float]) -> dict[str, o
     }
 
 
+def _created(path: Path) -> BinaryIO:
+    return open(open_private(path, os.O_WRONLY | os.O_EXCL), "wb")
+
+
 def _copy(draft: Draft, path: Path) -> None:
-    with path.open("xb") as file:
+    with _created(path) as file:
         for start, stop in draft.held:
             file.seek(start)
             for at in range(start, stop, PIECE):

@@ -20,6 +20,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from mavftpfs.shared.errors import NoSpace, SpoolFailed
+from mavftpfs.shared.private import make_private_directory, open_private
 
 log = logging.getLogger("mavftpfs.cache")
 
@@ -42,7 +43,7 @@ def write_facts(data: Path, facts: Mapping[str, object], *, durable: bool) -> No
     """
     path = data.with_suffix(".json")
     draft = path.with_suffix(".new")
-    with draft.open("wb") as file:
+    with open(open_private(draft, os.O_WRONLY | os.O_TRUNC), "wb") as file:
         file.write(json.dumps(facts, indent=1).encode())
         file.flush()
         if durable:
@@ -144,7 +145,7 @@ def _is_needed(data: Path, facts: Mapping[str, object]) -> bool:
 
 def _move(data: Path, facts: Mapping[str, object], recovery: Path) -> Path:
     """Move a spooled file and its description; return its new path."""
-    recovery.mkdir(mode=0o700, parents=True, exist_ok=True)
+    make_private_directory(recovery)
     target = free_name(recovery, _name_for(data, facts))
     try:
         shutil.move(data, target)

@@ -29,6 +29,7 @@ from mavftpfs.cache.asides import new_owner
 from mavftpfs.cache.fulldisk import FullDisk
 from mavftpfs.shared.errors import NoSpace, SpoolFailed
 from mavftpfs.shared.extents import ExtentSet
+from mavftpfs.shared.private import make_private_directory
 
 log = logging.getLogger("mavftpfs.cache")
 
@@ -53,7 +54,7 @@ class SpoolDirectory:
         Raises:
             OSError: it cannot be made, or every slot is taken.
         """
-        base.mkdir(mode=0o700, parents=True, exist_ok=True)
+        make_private_directory(base)
         self._locks: dict[Path, int] = {}
         self.dead_owners: frozenset[bytes] = frozenset()
         free = [slot for slot in (base / f"slot{number}" for number in range(SLOTS)) if self._lock(slot)]

@@ -52,12 +52,14 @@ _CRC_EXTRA: dict[int, int] = {number: kind.crc_extra for number, kind in dialect
 @dataclass(slots=True)
 class FramerStats:
     """Plain sums. frames: all accepted; other: those of them that are `Other`; unreadable: whole and
-    valid, but their fields made no sense; bad_signature also counts unsigned frames refused."""
+    valid, but their fields made no sense; bad_signature also counts unsigned frames refused, and
+    bad_time those of them that the right key signed, but too long ago."""
 
     frames: int = 0
     other: int = 0
     bad_crc: int = 0
     bad_signature: int = 0
+    bad_time: int = 0
     unreadable: int = 0
     garbage_bytes: int = 0
 
@@ -242,7 +244,9 @@ class Framer:
     def _authentic(self, frame: bytes, message_id: int, signed: bool, source: Address) -> bool:
         if self._check is None or message_id in _UNSIGNED_ALLOWED:
             return True
-        return signed and self._check.accept(frame, source)
+        accepted = signed and self._check.accept(frame, source)
+        self.stats.bad_time = self._check.bad_times
+        return accepted
 
     # ------------------------------------------------------------------ sending
 

@@ -29,6 +29,9 @@ class SignatureCheck:
         key: 32 bytes.
         clock: present time as a signing timestamp; without one, time is what signed frames say.
 
+    Attributes:
+        bad_times: frames with the right key and a time that is too old.
+
     Raises:
         UsageError: the key has another length.
     """
@@ -36,6 +39,7 @@ class SignatureCheck:
     def __init__(self, key: bytes, clock: Callable[[], int] | None = None) -> None:
         if len(key) != KEY_SIZE:
             raise UsageError(f"a signing key has {KEY_SIZE} bytes, this one has {len(key)}")
+        self.bad_times = 0
         self._key = key
         self._clock = clock
         self._newest = 0
@@ -54,6 +58,7 @@ class SignatureCheck:
         stream = (frame[-SIGNATURE_BLOCK], source)
         timestamp = int.from_bytes(frame[-12:-6], "little")
         if timestamp <= self._streams.get(stream, self.now - _ONE_MINUTE - 1):
+            self.bad_times += 1
             return False
         if stream not in self._streams and len(self._streams) >= _MAX_STREAMS:
             return False

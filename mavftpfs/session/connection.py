@@ -152,7 +152,12 @@ class Connection:
 
     def _heard(self) -> str:
         heard = sorted(self.vehicle.heard)
-        bad_signatures = self.driver.framer.stats.bad_signature
+        bad_signatures, bad_times = self.driver.framer.stats.bad_signature, self.driver.framer.stats.bad_time
+        if not heard and bad_times:
+            return (
+                f": heard only {bad_times} frames with the right key and a signature that is too old; "
+                "compare the clocks of the vehicle and of this computer"
+            )
         if not heard and bad_signatures:
             return f": heard only {bad_signatures} frames with no or a bad signature; check signing_key"
         if not heard:

@@ -79,6 +79,18 @@ async def test_signing_both_ways(autojump: MockClock) -> None:
             await connection.ready(5)
 
 
+async def test_a_vehicle_whose_clock_is_behind_is_said_to_be(
+    autojump: MockClock, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It has the right key, and does not take the time from us."""
+    vehicle = SimVehicle(MemoryTree(), PROFILES["px4"], rng=random.Random(1), signing_key=KEY)
+    monkeypatch.setattr(vehicle, "receive", lambda data, now: None)
+    link = MemoryLink(vehicle, LinkModel(random.Random(2), LinkSettings(delay=0.01)))
+    async with connected(link, ConnectOptions(signing_key=KEY), rng=random.Random(3)) as connection:
+        with pytest.raises(VehicleLost, match="compare the clocks"):
+            await connection.ready(5)
+
+
 class OldFirmware(SimVehicle):
     """Knows no MAV_CMD_REQUEST_MESSAGE."""
 

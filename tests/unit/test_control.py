@@ -18,7 +18,16 @@ import trio
 import trio.testing
 
 from mavftpfs import control
-from mavftpfs.control import Command, ControlError, ControlServer, NobodyThere, Reply, ask
+from mavftpfs.control import (
+    Command,
+    ControlError,
+    ControlServer,
+    NobodyThere,
+    Reply,
+    all_sockets,
+    ask,
+    find_socket,
+)
 from mavftpfs.shared.errors import UsageError
 
 
@@ -228,3 +237,18 @@ def test_names_differ_by_mountpoint_and_take_any_bytes() -> None:
     names = {control.socket_name(path) for path in ("/a", "/b", "/ü", os.fsdecode(b"/\xff"))}
     assert len(names) == 4
     assert all(len(name) == len(control.socket_name("")) for name in names)
+
+
+def test_the_directory_of_another_user_holds_no_socket_of_ours(tmp_path: Path) -> None:
+    """sudo and su leave HOME and XDG_RUNTIME_DIR as they were."""
+    closed = tmp_path / "closed"
+    closed.mkdir(mode=0)
+    user = os.geteuid()
+    try:
+        if user == 0:
+            os.seteuid(65534)
+        with pytest.raises(NobodyThere, match="no vehicle of yours"):
+            find_socket("/mnt/drone", [closed / "mavftpfs"])
+        assert list(all_sockets([closed / "mavftpfs"])) == []
+    finally:
+        os.seteuid(user)

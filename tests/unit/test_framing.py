@@ -362,6 +362,7 @@ def test_with_a_key_only_right_signatures_pass() -> None:
     bad = ftp() + heartbeat() + heartbeat(force_mavlink1=True) + heartbeat(signer(key=bytes(32)))
     assert framer.feed(good + bad + heartbeat(mav)) == [FTP, HEARTBEAT, HEARTBEAT]
     assert framer.stats.bad_signature == 4
+    assert framer.stats.bad_time == 0
 
 
 def test_a_radios_own_report_needs_no_signature() -> None:
@@ -376,6 +377,7 @@ def test_replayed_frames_are_refused() -> None:
     assert framer.feed(frame) == [HEARTBEAT]
     assert framer.feed(frame + heartbeat(signer(timestamp=999))) == []
     assert framer.stats.bad_signature == 2
+    assert framer.stats.bad_time == 2
 
 
 def test_a_new_stream_may_be_a_minute_old_but_not_older() -> None:

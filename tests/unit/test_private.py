@@ -1,0 +1,81 @@
+"""What a mount leaves on the local disk: nobody else may read it, and no symbolic link leads it elsewhere."""
+
+from __future__ import annotations
+
+import logging
+import stat
+from collections.abc import Callable
+from pathlib import Path
+from random import Random
+
+import pytest
+from trio.testing import MockClock
+
+from mavftpfs.cache.spool import PAGE, Spool, SpoolDirectory
+from mavftpfs.daemon import log_to_file
+from mavftpfs.farewell import keep_the_rest
+from mavftpfs.trace import JsonTrace, TlogWriter
+from tests.support.mounting import mounted
+from tests.support.worlds import world
+from tests.unit.test_daemon import restored_logging
+
+__all__ = ["restored_logging"]
+
+
+def trace(path: Path) -> None:
+    JsonTrace(path).close()
+
+
+def tlog(path: Path) -> None:
+    TlogWriter(path).close()
+
+
+def log(path: Path) -> None:
+    log_to_file(str(path), logging.INFO)
+
+
+def exposed(directory: Path) -> list[Path]:
+    """Return what others may read, or even see, below a directory and of itself."""
+    return [
+        path
+        for path in (directory, *directory.rglob("*"))
+        if stat.S_IMODE(path.lstat().st_mode) != (0o700 if path.is_dir() else 0o600)
+    ]
+
+
+@pytest.mark.usefixtures("restored_logging")
+@pytest.mark.parametrize("write", [trace, tlog, log])
+def test_traces_and_logs_are_private_and_follow_no_link(
+    write: Callable[[Path], None], tmp_path: Path
+) -> None:
+    write(tmp_path / "file")
+    assert stat.S_IMODE((tmp_path / "file").stat().st_mode) == 0o600
+    (tmp_path / "link").symlink_to(tmp_path / "precious")
+    with pytest.raises(Exception, match="symbolic link"):
+        write(tmp_path / "link")
+    assert not (tmp_path / "precious").exists()
+
+
+def test_what_a_killed_mount_left_is_private(tmp_path: Path) -> None:
+    state = tmp_path / "state"
+    killed = SpoolDirectory(state / "spool" / "1-1", Random(1))
+    content = Spool(memory_max=lambda: PAGE, spool_max=PAGE, directory=killed.path).content()
+    content.put(0, b"precious")
+    content.persist({"path": "/card/a", "size": 8})
+    assert exposed(state) == []
+    killed.close()
+    again = SpoolDirectory(state / "spool" / "1-1", Random(2))
+    assert again.rescue(state / "recovered" / "now")
+    assert exposed(state) == []
+    again.close()
+
+
+async def test_what_could_not_be_delivered_is_private(autojump_clock: MockClock, tmp_path: Path) -> None:
+    state, made = tmp_path / "state", world("px4")
+    async with mounted(made) as (_, tree):
+        file = await tree.create(b"/d/f", exclusive=True)
+        await file.write(0, b"precious")
+        made.link.cut()
+        assert "kept in" in keep_the_rest(tree, lambda: state / "recovered" / "now")
+        assert len(list(state.rglob("*"))) == 4
+        assert exposed(state) == []
