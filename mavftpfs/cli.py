@@ -277,9 +277,10 @@ def _umount_parser(name: str) -> Parser:
 
 def _status_parser(name: str) -> Parser:
     parser = Parser(f"mavftpfs {name}", description="Show what mounts are doing.")
-    parser.add_argument("mountpoint", metavar="MOUNTPOINT", nargs="?", help="default: all of this user")
+    parser.add_argument("mountpoint", metavar="MOUNTPOINT", nargs="?", help="default: all that you may ask")
     parser.add_argument("--json", action="store_true", help="print JSON")
     parser.add_argument("--watch", action="store_true", help="again each second")
+    parser.add_argument("-v", "--verbose", action="store_true", help="everything the mount tells")
     return parser
 
 

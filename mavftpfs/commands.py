@@ -1,4 +1,4 @@
-"""What mount, umount and status do; `cli` parses the words. Layer: top."""
+"""The commands that make, ask and end mounts: mount, umount, status; `cli` parses the words. Layer: top."""
 
 from __future__ import annotations
 
@@ -6,27 +6,27 @@ import argparse
 import logging
 import os
 import select
+import shutil
 import sys
-from collections.abc import Mapping
+import time
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
-from mavftpfs import control, daemon
-from mavftpfs import mountpoint as mounting
+from mavftpfs import control, daemon, mountpoint, statuses
 from mavftpfs.exits import ExitCode, MountFailed
 from mavftpfs.fuse.options import MountOptions, parse_options, split_words, with_root
 from mavftpfs.link.uri import LinkSpec, parse_source
-from mavftpfs.mountpoint import canonical, check_fuse, check_mountpoint, is_ours, unmount
+from mavftpfs.mountpoint import DeadMount, canonical, is_ours
 from mavftpfs.shared.errors import UsageError
-from mavftpfs.shared.readable import readable
+from mavftpfs.shared.readable import readable, readable_time
 
-STATUS_PATIENCE = 10.0
 DELIVERY_PATIENCE = 3600.0
 """Seconds for `umount`: what is held has to travel first, perhaps over a radio."""
 END_PATIENCE = 5.0
 """Seconds for a mount's process to end after its last word."""
+SAY_AGAIN = 10.0
+"""Seconds between two lines about a delivery, where these go to a file."""
 
 _PATH_OPTIONS = ("cache_dir", "signing_key", "log_file", "trace", "tlog")
 
@@ -36,21 +36,24 @@ _PATH_OPTIONS = ("cache_dir", "signing_key", "log_file", "trace", "tlog")
 
 def mount(args: argparse.Namespace) -> int:
     """Mount; in the background unless told otherwise."""
+    place = canonical(args.mountpoint)
     words = list(split_words(args.options))
     if "remount" in words:
-        return remount(canonical(args.mountpoint), words)
+        return remount(place, words)
     options, spec = connection_of(args)
     options = absolute_paths(options)
-    mountpoint = canonical(args.mountpoint)
-    check_fuse()
-    check_mountpoint(mountpoint)
-    work = partial(_serve, args, options, spec, mountpoint)
+    mountpoint.check_fuse()
+    try:
+        mountpoint.check_mountpoint(place)
+    except DeadMount as exc:
+        raise DeadMount("; ".join(filter(None, (str(exc), _left_by_killed_mounts())))) from exc
+    work = partial(_serve, args, options, spec, place)
     if args.foreground or args.debug:
         return work(_report_in_foreground)
     return daemon.in_background(work)
 
 
-def remount(mountpoint: str, words: list[str]) -> int:
+def remount(place: str, words: list[str]) -> int:
     """Do what `mount -o remount` asks for: make a mount read-only, or writable again.
 
     mount(8) adds the options that the mount has, and those of fstab; only ro and rw can change.
@@ -58,15 +61,15 @@ def remount(mountpoint: str, words: list[str]) -> int:
     Raises:
         MountFailed: no vehicle is mounted there, it was mounted with ro, or the kernel refuses.
     """
-    if not is_ours(mountpoint):
-        raise MountFailed(f"no vehicle is mounted on {mountpoint}")
+    if not is_ours(place):
+        raise MountFailed(f"no vehicle is mounted on {place}")
     wanted = [word for word in words if word in ("ro", "rw")]
     if not wanted:
         raise UsageError("remount changes only ro and rw; for other options unmount and mount anew")
     read_only = wanted[-1] == "ro"
-    if not read_only and _status_of(mountpoint).get("read_only"):
-        raise MountFailed(f"{mountpoint} was mounted with ro: unmount it, and mount it without")
-    mounting.remount(mountpoint, read_only=read_only)
+    if not read_only and statuses.status_of(place).get("read_only"):
+        raise MountFailed(f"{place} was mounted with ro: unmount it, and mount it without")
+    mountpoint.remount(place, read_only=read_only)
     return ExitCode.OK
 
 
@@ -89,7 +92,7 @@ def absolute_paths(options: MountOptions) -> MountOptions:
 
 
 def _serve(
-    args: argparse.Namespace, options: MountOptions, spec: LinkSpec, mountpoint: str, report: daemon.Report
+    args: argparse.Namespace, options: MountOptions, spec: LinkSpec, place: str, report: daemon.Report
 ) -> int:
     from mavftpfs.compose import open_sinks
     from mavftpfs.mount import MountRequest, run_mount
@@ -97,9 +100,7 @@ def _serve(
     foreground = args.foreground or args.debug
     _start_logging(options, foreground=foreground, debug=args.debug)
     with open_sinks(options, debug=args.debug) as sinks:
-        request = MountRequest(
-            args.source, spec, mountpoint, options, control=_control_path(mountpoint), sinks=sinks
-        )
+        request = MountRequest(args.source, spec, place, options, control=_control_path(place), sinks=sinks)
         return run_mount(request, report)
 
 
@@ -123,50 +124,109 @@ def _start_logging(options: MountOptions, *, foreground: bool, debug: bool) -> N
         raise UsageError(f"cannot write the log {exc.filename}: {exc.strerror}") from exc
 
 
-def _control_path(mountpoint: str) -> Path | None:
+def _control_path(place: str) -> Path | None:
     try:
         directory = control.usable_directory(control.own_directories())
     except control.ControlError as exc:
         logging.getLogger("mavftpfs").warning("%s", exc)
         return None
-    return directory / control.socket_name(mountpoint)
+    return directory / control.socket_name(place)
 
 
-# -- umount and status ----------------------------------------------------------------------------
+# -- umount ---------------------------------------------------------------------------------------
 
 
 def umount(args: argparse.Namespace) -> int:
     """Have a mount's process deliver and unmount; a mount whose process is gone is just taken away."""
-    mountpoint = canonical(args.mountpoint)
+    place = canonical(args.mountpoint)
     try:
-        socket = control.find_socket(mountpoint, control.own_directories())
+        socket = statuses.find_socket(place)
+        progress = _Delivery(socket)
         request = {"command": "umount", "lazy": args.lazy}
-        reply = control.ask(socket, request, timeout=DELIVERY_PATIENCE)
+        try:
+            reply = control.ask(socket, request, timeout=DELIVERY_PATIENCE, meanwhile=progress.show)
+        finally:
+            progress.end()
     except control.NobodyThere as exc:
-        if not is_ours(mountpoint):
-            raise MountFailed(f"no vehicle is mounted on {mountpoint}") from exc
-        unmount(mountpoint, lazy=args.lazy)
+        if not is_ours(place):
+            raise MountFailed(f"no vehicle is mounted on {place}") from exc
+        mountpoint.unmount(place, lazy=args.lazy)
         return _after_a_killed_mount()
+    except KeyboardInterrupt:
+        print("mavftpfs: the mount goes on delivering, and then ends; see: mavftpfs status", file=sys.stderr)
+        return ExitCode.INTERRUPTED
     _wait_for_end(int(reply["pid"]))
     if reply.get("message"):
         print(f"mavftpfs: {reply['message']}", file=sys.stderr)
     return int(reply["exit_code"])
 
 
+class _Delivery:
+    """Says on stderr what a mount that ends waits for."""
+
+    def __init__(self, socket: Path) -> None:
+        self._socket = socket
+        self._said_at: float | None = None
+        self._in_place = sys.stderr.isatty()
+
+    def show(self) -> None:
+        """Ask the mount, and say what it delivers; called about each second."""
+        from mavftpfs.statustext import delivery_line
+
+        try:
+            status = control.ask(self._socket, {"command": "status"}, timeout=statuses.PATIENCE)["status"]
+        except control.ControlError:
+            return  # it ends just now
+        line = delivery_line(status)
+        now = time.monotonic()
+        if not line or (not self._in_place and self._said_at is not None and now < self._said_at + SAY_AGAIN):
+            return
+        if self._said_at is None:
+            self._explain()
+        self._said_at = now
+        if self._in_place:
+            shown = line[: shutil.get_terminal_size().columns - 1]
+            print(f"\r\x1b[K{shown}", end="", file=sys.stderr, flush=True)
+        else:
+            print(f"mavftpfs: {line}", file=sys.stderr, flush=True)
+
+    def end(self) -> None:
+        """Leave the line."""
+        if self._in_place and self._said_at is not None:
+            print(file=sys.stderr)
+
+    def _explain(self) -> None:
+        from mavftpfs.farewell import DRAIN_LIMIT, recovered_directory
+
+        print(
+            "mavftpfs: not everything is on the vehicle yet. This takes at most "
+            f"{readable_time(DRAIN_LIMIT)}; what is left then is kept in {recovered_directory(os.environ)}. "
+            "Ctrl-C ends only the waiting, not the delivery.",
+            file=sys.stderr,
+        )
+
+
 def _after_a_killed_mount() -> int:
     """Nobody delivers what it held: say so."""
+    line = _left_by_killed_mounts()
+    if not line:
+        return ExitCode.OK
+    print(f"mavftpfs: {line}", file=sys.stderr)
+    return ExitCode.UNDELIVERED
+
+
+def _left_by_killed_mounts() -> str:
+    """Return a line about what killed mounts held, or ""."""
     from mavftpfs.farewell import left_by_killed_mounts
 
     left = left_by_killed_mounts(os.environ)
     if not left:
-        return ExitCode.OK
+        return ""
     places = ", ".join(sorted({str(data.parent) for data in left}))
-    print(
-        f"mavftpfs: {len(left)} file(s) did not reach the vehicle when a mount was killed; they lie "
-        f"in {places} until it is mounted again, which moves them to a recovery directory",
-        file=sys.stderr,
+    return (
+        f"{len(left)} file(s) did not reach the vehicle when a mount was killed; they lie in {places} "
+        "until it is mounted again, which moves them to a recovery directory"
     )
-    return ExitCode.UNDELIVERED
 
 
 def _wait_for_end(pid: int) -> None:
@@ -182,42 +242,27 @@ def _wait_for_end(pid: int) -> None:
         os.close(process)
 
 
+# -- status ---------------------------------------------------------------------------------------
+
+
 def status(args: argparse.Namespace) -> int:
-    """Show what one mount, or all mounts of this user, are doing."""
+    """Show what one mount, or all mounts that this user may ask, are doing."""
+    from mavftpfs import statustext
+
     if args.mountpoint is None:
-        fetch = all_statuses
+        fetch = statuses.all_statuses
     else:
-        fetch = partial(_one_status, canonical(args.mountpoint))
-    from mavftpfs import report
+        place = canonical(args.mountpoint)
+
+        def fetch() -> list[statuses.Status]:
+            return [statuses.status_of(place)]
 
     if args.json:
-        report.print_json(fetch, single=args.mountpoint is not None, watch=args.watch)
-    elif args.watch:
-        report.watch_status(fetch)
-    else:
-        report.print_status(fetch())
-    return ExitCode.OK
-
-
-def _one_status(mountpoint: str) -> list[Mapping[str, Any]]:
-    return [_status_of(mountpoint)]
-
-
-def _status_of(mountpoint: str) -> Mapping[str, Any]:
-    return _ask_status(control.find_socket(mountpoint, control.own_directories()))
-
-
-def all_statuses() -> list[Mapping[str, Any]]:
-    """Return the status of each living mount; sockets of dead ones are removed."""
-    found = []
-    for path in control.all_sockets(control.own_directories()):
-        try:
-            found.append(_ask_status(path))
-        except control.NobodyThere:
-            path.unlink(missing_ok=True)
-    return found
-
-
-def _ask_status(path: Path) -> Mapping[str, Any]:
-    facts: Mapping[str, Any] = control.ask(path, {"command": "status"}, timeout=STATUS_PATIENCE)["status"]
-    return facts
+        statustext.print_json(fetch, single=args.mountpoint is not None, watch=args.watch)
+        return ExitCode.OK
+    if args.watch:
+        statustext.watch_status(fetch, verbose=args.verbose)
+    found = fetch()
+    statustext.print_status(found, verbose=args.verbose)
+    unanswered = args.mountpoint is not None and found[0].get("problem")
+    return ExitCode.MOUNT_FAILED if unanswered else ExitCode.OK

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from random import SystemRandom
-from typing import Any, Literal, cast
+from typing import Literal, cast
 
 import trio
 
@@ -56,10 +56,6 @@ class Attached:
     connection: Connection
     tree: Tree
     notice: Callable[[], str] = str
-
-    def status(self) -> dict[str, Any]:
-        """Return facts about the connection and the caches; JSON-able."""
-        return {"connection": self.connection.status(), "cache": self.tree.status()}
 
     def space(self) -> Space | None:
         """Return what STORAGE_INFORMATION said, if it was sent."""

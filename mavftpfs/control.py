@@ -12,6 +12,7 @@ import json
 import logging
 import os
 import pwd
+import select
 import socket
 import stat
 import time
@@ -37,6 +38,8 @@ MAX_CLIENTS = 16
 """Clients served at a time; more wait in the kernel, where they cost this process no descriptors."""
 ACCEPT_PAUSE = 0.25
 """Seconds to wait where a client cannot be taken (no descriptors left): the mount must not end with it."""
+MEANWHILE = 1.0
+"""Seconds between two calls of `meanwhile`."""
 _QUEUE_PAUSE = 0.05
 _MAX_SOCKET_PATH = 107
 _SUFFIX = ".sock"
@@ -216,8 +219,8 @@ async def _receive_line(stream: trio.SocketStream) -> bytes:
 # -- the command's side ---------------------------------------------------------------------------
 
 
-def ask(path: Path, request: Reply, *, timeout: float) -> Reply:
-    """Send one request and return the reply.
+def ask(path: Path, request: Reply, *, timeout: float, meanwhile: Callable[[], None] | None = None) -> Reply:
+    """Send one request and return the reply; `meanwhile` is called about each second while there is none.
 
     Raises:
         NobodyThere: the process is gone.
@@ -227,6 +230,11 @@ def ask(path: Path, request: Reply, *, timeout: float) -> Reply:
         with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as client:
             _connect(client, path, timeout)
             client.sendall(json.dumps(request).encode() + b"\n")
+            deadline = time.monotonic() + timeout
+            while meanwhile is not None and time.monotonic() < deadline:
+                if select.select([client], [], [], MEANWHILE)[0]:
+                    break
+                meanwhile()
             with client.makefile("rb") as lines:
                 line = lines.readline(MAX_LINE)
         reply = json.loads(line)

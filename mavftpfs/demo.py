@@ -30,7 +30,7 @@ from rich.table import Table
 
 from mavftpfs import control
 from mavftpfs.daemon import signals_held
-from mavftpfs.mountpoint import mounted_types
+from mavftpfs.mountpoint import mounts
 
 HOST = "127.0.0.1"
 PROFILE = "px4"
@@ -188,7 +188,7 @@ def fill_card(card: Path) -> None:
 
 def is_mounted(path: Path) -> bool:
     """Return whether something is mounted there, without asking it."""
-    return str(path) in mounted_types()
+    return str(path) in mounts()
 
 
 def introduce(tour: Tour) -> None:

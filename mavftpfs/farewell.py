@@ -37,11 +37,16 @@ def state_directory(environment: Mapping[str, str]) -> Path:
     return Path(given) if given.startswith("/") else Path.home() / ".local" / "state"
 
 
+def recovered_directory(environment: Mapping[str, str]) -> Path:
+    """Return where all mounts of this user leave what did not reach a vehicle."""
+    return state_directory(environment) / "mavftpfs" / "recovered"
+
+
 def recovery_directory(environment: Mapping[str, str], source: str, at: float) -> Path:
     """Return a new name for what one mount leaves behind; `at` is seconds since 1970."""
     when = time.strftime("%Y%m%d-%H%M%S", time.localtime(at))
     what = re.sub(r"[^A-Za-z0-9._-]+", "_", source)[:60]
-    return state_directory(environment) / "mavftpfs" / "recovered" / f"{when}-{os.getpid()}-{what}"
+    return recovered_directory(environment) / f"{when}-{os.getpid()}-{what}"
 
 
 async def deliver(holder: Holder, limit: float = DRAIN_LIMIT) -> None:

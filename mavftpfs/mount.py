@@ -12,7 +12,7 @@ import logging
 import os
 import signal
 import time
-from collections.abc import AsyncIterator, Callable, Iterator
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 from contextlib import AbstractAsyncContextManager, asynccontextmanager, contextmanager
 from dataclasses import dataclass
 from functools import partial
@@ -37,6 +37,7 @@ from mavftpfs.kernelnews import Invalidator
 from mavftpfs.link.uri import LinkSpec
 from mavftpfs.mountpoint import is_ours, stderr_of, unmount, unmount_what_is_left
 from mavftpfs.shared.errors import MavftpfsError
+from mavftpfs.snapshot import Watcher, snapshot
 
 log = logging.getLogger("mavftpfs.mount")
 
@@ -72,14 +73,15 @@ class MountedTree(WritableTree, Holder, Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Content:
-    """What is behind a mount. notice: called once it is up, gives a line for whoever mounts, or "". forget:
-    has what is cached asked for again."""
+    """What is behind a mount. notice: called once it is up, gives a line for whoever mounts, or "".
+    forget: has what is cached asked for again. watch: runs beside it until the end."""
 
     tree: MountedTree
     status: Callable[[], dict[str, Any]] = dict
     space: Callable[[], Space | None] = lambda: None
     notice: Callable[[], str] = str
     forget: Callable[[], None] = lambda: None
+    watch: Callable[[], Awaitable[None]] = trio.sleep_forever
 
 
 Attach = Callable[[Callable[[bytes], None]], AbstractAsyncContextManager[Content]]
@@ -100,7 +102,15 @@ def run_mount(request: MountRequest, report: Report) -> int:
             rescue_for=request.source,
         )
         async with vehicle as up:
-            yield Content(up.tree, up.status, up.space, up.notice, up.tree.forget_caches)
+            read_only_armed = request.options.when_armed == "ro" and not request.options.read_only
+            watcher = Watcher(up.connection.status, read_only_when_armed=read_only_armed)
+
+            def status() -> dict[str, Any]:
+                connection, cache = up.connection.status(), up.tree.status()
+                facts = snapshot(connection, cache, watcher.traffic, when_armed=request.options.when_armed)
+                return {**facts, "connection": connection, "cache": cache}
+
+            yield Content(up.tree, status, up.space, up.notice, up.tree.forget_caches, watcher.run)
 
     return trio.run(serve_mount, request, attach, report)
 
@@ -158,6 +168,7 @@ class _Life:
         inodes = InodeTable()
         invalidator = Invalidator(inodes, pyfuse3.invalidate_inode)
         async with attach(invalidator.on_changed) as content:
+            nursery.start_soon(content.watch)
             kind = Operations if self.request.options.read_only else WritingOperations
             operations: Operations = kind(
                 content.tree,
@@ -242,6 +253,8 @@ class _Life:
         """Return facts for people and scripts; JSON-able."""
         return {
             "mountpoint": self.request.mountpoint,
+            "state": "unmounting" if self._let_go else "mounted",
+            "problem": None,
             "source": self.request.source,
             "root": os.fsdecode(self.request.options.root),
             "pid": os.getpid(),

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import errno
 import os
+import re
 import shutil
 import stat
 import subprocess
@@ -15,12 +16,14 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 
 from mavftpfs.exits import MountFailed
 from mavftpfs.fuse.options import SUBTYPE
 
 FUSE_DEVICE = "/dev/fuse"
+OUR_TYPE = f"fuse.{SUBTYPE}"
 MOUNT_TABLE = "/proc/self/mountinfo"
 UNMOUNT_PATIENCE = 60.0
 """Seconds for an unmount: it waits for the last flush."""
@@ -30,24 +33,29 @@ ended a moment after its parent was told, and desktop services look at what is n
 _BUSY_PAUSE = 0.1
 
 
+class DeadMount(MountFailed):
+    """What is mounted there has lost its program."""
+
+
 def canonical(path: str) -> str:
     """Return the absolute path without symbolic links on the way; a trailing link is followed too.
 
     Only the parents of the mountpoint are looked at, for the mountpoint itself may be a mount that hangs.
     """
     absolute = os.path.abspath(path)
-    if absolute in mounted_types():
+    if absolute in mounts():
         return absolute
     parent, name = os.path.split(absolute)
     candidate = os.path.join(os.path.realpath(parent), name)
-    return candidate if candidate in mounted_types() else os.path.realpath(candidate)
+    return candidate if candidate in mounts() else os.path.realpath(candidate)
 
 
 def check_mountpoint(path: str, *, table: str = MOUNT_TABLE) -> None:
     """Check that a file system can be mounted on `path`.
 
     Raises:
-        MountFailed: and what to do about it.
+        DeadMount: a mount that was killed is still there.
+        MountFailed: anything else, and what to do about it.
     """
     if is_ours(path, table=table):
         raise MountFailed(_describe_mounted(path))
@@ -76,19 +84,31 @@ def check_fuse(device: str = FUSE_DEVICE, *, uid: int | None = None) -> None:
         raise MountFailed("fusermount3 is missing, which mounts for users: install the package fuse3")
 
 
+@dataclass(frozen=True, slots=True)
+class Mounted:
+    """What the kernel's table says of a mount. uid: who mounted it, None if that is not told."""
+
+    type: str
+    source: str
+    uid: int | None
+
+
 def is_ours(path: str, *, table: str = MOUNT_TABLE) -> bool:
     """Return whether the topmost mount on `path` is of this program."""
-    return mounted_types(table).get(path, "") == f"fuse.{SUBTYPE}"
+    mount = mounts(table).get(path)
+    return mount is not None and mount.type == OUR_TYPE
 
 
-def mounted_types(table: str = MOUNT_TABLE) -> dict[str, str]:
-    """Return mountpoint -> file system type of the mount on top, from the kernel's table."""
-    found: dict[str, str] = {}
+def mounts(table: str = MOUNT_TABLE) -> dict[str, Mounted]:
+    """Return mountpoint -> the mount on top of it, from the kernel's table."""
+    found: dict[str, Mounted] = {}
     for line in Path(table).read_text(errors="surrogateescape").splitlines():
         left, _, right = line.partition(" - ")
         columns = left.split(" ")
         if len(columns) > 4:
-            found[_unescape(columns[4])] = right.split(" ")[0]
+            kind, source, words = [*right.split(" "), "", ""][:3]
+            uid = re.search(r"(?:^|,)user_id=(\d+)", words)
+            found[_unescape(columns[4])] = Mounted(kind, _unescape(source), int(uid[1]) if uid else None)
     return found
 
 
@@ -133,7 +153,7 @@ def unmount_what_is_left(path: str) -> None:
     try:
         unmount(path, lazy=True)
     except MountFailed:
-        if path in mounted_types():
+        if path in mounts():
             raise
 
 
@@ -173,7 +193,7 @@ def stderr_of() -> Iterator[Callable[[], str]]:
 
 def _describe(path: str, exc: OSError) -> str:
     if exc.errno == errno.ENOTCONN:
-        return f"mountpoint {path} is a dead mount whose program is gone; run: fusermount3 -u {path}"
+        return f"mountpoint {path} is a dead mount whose program is gone; run: mavftpfs umount {path}"
     if exc.errno == errno.ENOENT:
         return f"mountpoint {path} does not exist; run: mkdir -p {path}"
     return f"mountpoint {path}: {os.strerror(exc.errno or errno.EIO)}"
@@ -184,7 +204,7 @@ def _describe_mounted(path: str) -> str:
         os.stat(path)
     except OSError as exc:
         if exc.errno == errno.ENOTCONN:
-            return _describe(path, exc)
+            raise DeadMount(_describe(path, exc)) from exc
     return f"a vehicle is already mounted on {path}; run: mavftpfs umount {path}"
 
 

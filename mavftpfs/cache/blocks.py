@@ -115,6 +115,8 @@ class FileBlocks:
         self._pins: dict[int, int] = {}
         self._waiters: list[_Waiter] = []
         self._arrived = 0
+        self.received = 0
+        self.received_at = float("-inf")
         self.intact = True
         self.openings = Openings()
         self._pristine = True
@@ -127,6 +129,16 @@ class FileBlocks:
     def empty(self) -> bool:
         """Whether no byte is held."""
         return not self._blocks
+
+    @property
+    def waited_for(self) -> bool:
+        """Whether somebody waits for bytes."""
+        return bool(self._waiters)
+
+    @property
+    def done(self) -> int:
+        """How many of the file's bytes came, or are held from before."""
+        return min(self.size, max(self.received, self._present.total))
 
     @property
     def complete(self) -> bool:
@@ -172,6 +184,8 @@ class FileBlocks:
     def on_batch(self) -> None:
         """Wake those whose range is complete; give those whose range grew more time."""
         if self._arrived:
+            self.received += self._arrived
+            self.received_at = self._cache.clock()
             self._cache.meter.on_bytes(self._arrived, self._cache.clock())
             self._arrived = 0
         for waiter in self._waiters:

@@ -46,6 +46,9 @@ MAX_CLOSED = 4096
 WRAP = 1 << 32
 """Open replies tell sizes modulo this, and no request reaches beyond it; MAVSDK lists true sizes."""
 
+READING = 3.0
+"""Seconds for which a file of which bytes came counts as being read."""
+
 MAX_PIECE = MIB
 """A read is served in pieces of at most so many bytes (or a quarter of the cache)."""
 
@@ -218,6 +221,15 @@ class Files:
         """Return counters."""
         kept = {} if self.keeper is None else self.keeper.status()
         return {"hits": self.hits, "misses": self.misses, "reads_unproven": self.fetcher.unproven, **kept}
+
+    def reads(self) -> list[dict[str, object]]:
+        """Return the files that are being fetched: path, size and done in bytes."""
+        recent = self._clock() - READING
+        return [
+            {"path": v.path.decode(errors="replace"), "size": v.size, "done": v.blocks.done}
+            for v in self._open_versions
+            if v.blocks.waited_for or (v.blocks.received_at > recent and v.blocks.done < v.size)
+        ]
 
     def pace(self) -> Pace:
         """Return the bounds for readahead now."""

@@ -354,8 +354,6 @@ class Writeback:
         if armed == context.armed:
             return
         context.armed = armed
-        if not context.options.write_armed:
-            log.warning("armed: nothing is written" if armed else "disarmed: writing again")
         self._throttle.let_go()
         self.retry()
 

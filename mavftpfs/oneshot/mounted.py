@@ -22,7 +22,7 @@ from mavftpfs.cache.attributes import Stat
 from mavftpfs.fuse.operations import XATTR_CRC32, XATTR_STATUS
 from mavftpfs.fuse.options import MountOptions
 from mavftpfs.link.uri import LinkKind, LinkSpec, parse_source
-from mavftpfs.mountpoint import canonical, is_ours, mounted_types
+from mavftpfs.mountpoint import canonical, is_ours, mounts
 from mavftpfs.oneshot.files import Session, Transfers
 from mavftpfs.shared import errors
 from mavftpfs.shared.errnos import errno_for
@@ -49,7 +49,7 @@ def mountpoint_of(source: str) -> tuple[str, bytes] | None:
 
 async def find_mount(spec: LinkSpec, options: MountOptions) -> Session | None:
     """Return the files of the mount that holds this link now, if one is up and may be read by us."""
-    for mountpoint in [path for path in mounted_types() if is_ours(path)]:
+    for mountpoint in [path for path in mounts() if is_ours(path)]:
         with suppress(errors.MavftpfsError, ValueError, KeyError, TypeError):
             status = await _status(mountpoint)
             vehicle = status["connection"]["vehicle"]

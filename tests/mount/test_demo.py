@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from mavftpfs.mountpoint import mounted_types
+from mavftpfs.mountpoint import mounts
 from tests.support.logs import suspects
 from tests.support.mounts import abort_mount, processes_in, wait_until
 from tests.support.vehicles import PROJECT
@@ -31,7 +31,7 @@ def place(tmp_path: Path) -> Iterator[Path]:
 
 def mounts_in(place: Path) -> list[str]:
     """Return what is mounted below a directory."""
-    return [path for path in mounted_types() if path.startswith(f"{place}/")]
+    return [path for path in mounts() if path.startswith(f"{place}/")]
 
 
 def start_demo(place: Path) -> subprocess.Popen[str]:

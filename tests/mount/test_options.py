@@ -168,6 +168,8 @@ def test_status_tells_about_vehicle_and_link(field: Field, small_tree: Path) -> 
     assert speed["loss"] == 0.0 or status["connection"]["retransmissions"], "an answer may have come late"
     assert speed["window"] >= 1
     shown = mavftpfs("status", mount.path)
+    assert shown.startswith(f"{mount.path}: PX4 1/1, disarmed, link fine: RTT ")
+    shown = mavftpfs("status", "--verbose", mount.path)
     assert vehicle.source in shown
     assert "reading by" in shown
     code = "import os, sys; print(os.getxattr(sys.argv[1], 'user.mavftpfs.status').decode())"

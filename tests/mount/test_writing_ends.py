@@ -106,9 +106,10 @@ def test_arming_in_mid_copy_refuses_and_disarming_delivers(field: Field, profile
     wait_until("what was held is delivered", lambda: place.read_bytes() == expected)
     mount.run("sh", "-c", f"echo new > {mount.path}/APM/new.txt")
     assert (card / "APM" / "new.txt").read_text() == "new\n"
+    wait_until("the log says so", lambda: "is disarmed" in mount.alive().text())
     assert [line for line in mount.alive().text().splitlines() if "armed" in line] == [
-        "mavftpfs: armed: nothing is written",
-        "mavftpfs: disarmed: writing again",
+        "mavftpfs: vehicle 1/1 is armed: nothing is written to it until it is disarmed",
+        "mavftpfs: vehicle 1/1 is disarmed",
     ]
 
 

@@ -17,12 +17,13 @@ from typing import Any
 import pytest
 import trio
 
-from mavftpfs import cli, commands, compose, control, daemon
+from mavftpfs import cli, commands, compose, control, daemon, statuses
 from mavftpfs.exits import ExitCode, MountFailed, NoFtp, NotDelivered, exit_code_for
 from mavftpfs.fuse.options import MountOptions
 from mavftpfs.oneshot.verbs import until_interrupted
 from mavftpfs.shared import errors
 from mavftpfs.shared.errors import LinkClosed, MavftpfsError, UsageError, VehicleLost
+from mavftpfs.snapshot import snapshot
 
 SOURCE = "udpin:127.0.0.1:0"
 
@@ -280,6 +281,7 @@ def sockets(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     directory = tmp_path / "run"
     directory.mkdir()
     monkeypatch.setattr(control, "own_directories", lambda: [directory])
+    monkeypatch.setattr(statuses, "mounts", dict)  # not those of other tests that run just now
     return directory
 
 
@@ -289,6 +291,7 @@ def fake_mount(sockets: Path, tmp_path: Path) -> Iterator[FakeMount]:
     ended = subprocess.Popen(["true"])
     ended.wait()
     facts = {"mountpoint": str(tmp_path / "mnt"), "source": SOURCE, "connection": {"rtt": 0.02}}
+    facts |= snapshot({"rtt": 0.02, "vehicle": [1, 1], "armed": False}, {}, None, when_armed="ro")
     replies: dict[str, dict[str, Any]] = {
         "status": {"ok": True, "status": facts},
         "umount": {"ok": True, "exit_code": 4, "pid": ended.pid},
@@ -306,11 +309,13 @@ def test_status_json(fake_mount: FakeMount, tmp_path: Path, capsys: pytest.Captu
     assert [facts["source"] for facts in json.loads(capsys.readouterr().out)] == [SOURCE]
 
 
-def test_status_as_a_table(fake_mount: FakeMount, capsys: pytest.CaptureFixture[str]) -> None:
+def test_status_for_people(fake_mount: FakeMount, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["status"]) == 0
     out = capsys.readouterr().out
-    assert SOURCE in out
-    assert "20 ms" in out
+    assert out.startswith(f"{tmp_path}/mnt: vehicle 1/1, disarmed, link fine: RTT 20 ms\n")
+    assert SOURCE not in out
+    assert cli.main(["status", "--verbose"]) == 0
+    assert f"  source: {SOURCE}\n" in capsys.readouterr().out
 
 
 def test_status_of_nothing(sockets: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

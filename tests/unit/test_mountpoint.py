@@ -11,11 +11,12 @@ import pytest
 
 from mavftpfs.exits import MountFailed
 from mavftpfs.mountpoint import (
+    Mounted,
     canonical,
     check_fuse,
     check_mountpoint,
     is_ours,
-    mounted_types,
+    mounts,
     stderr_of,
     unmount,
     unmount_what_is_left,
@@ -41,14 +42,14 @@ def test_the_table_is_read_with_its_escapes_and_the_last_mount_wins(tmp_path: Pa
         LINE.format("/mnt/b", "ext4"),
         "garbage",
     )
-    assert mounted_types(path)["/mnt/my drone\\x"] == "fuse.mavftpfs"
+    assert mounts(path)["/mnt/my drone\\x"] == Mounted("fuse.mavftpfs", "udpin:0", 0)
     assert is_ours("/mnt/a", table=path)
     assert not is_ours("/mnt/b", table=path)
     assert not is_ours("/mnt/c", table=path)
 
 
 def test_the_real_table_knows_the_root() -> None:
-    assert "/proc" in mounted_types()
+    assert "/proc" in mounts()
 
 
 def test_a_good_mountpoint(tmp_path: Path) -> None:
@@ -63,7 +64,7 @@ def test_a_bad_mountpoint(tmp_path: Path, name: str, reason: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("number", "reason"), [(errno.ENOTCONN, "fusermount3 -u"), (errno.EACCES, "Permission denied")]
+    ("number", "reason"), [(errno.ENOTCONN, "mavftpfs umount"), (errno.EACCES, "Permission denied")]
 )
 def test_what_stat_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int, reason: str) -> None:
     def fail(path: str) -> os.stat_result:

@@ -1,0 +1,154 @@
+"""statustext: facts as a person reads them, and as many of them as a terminal has room for."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from mavftpfs.shared.readable import printable, readable_size, readable_time
+from mavftpfs.snapshot import snapshot
+from mavftpfs.statustext import NOTHING, delivery_line, panel, rows, status_lines
+
+CONNECTION = {
+    "vehicle": [1, 1],
+    "autopilot": 12,
+    "armed": False,
+    "heartbeat_age": 0.4,
+    "rtt": 0.04,
+    "speed": {"loss": 0.0},
+    "link": {"received_bytes": 9000, "sent_bytes": 1000},
+}
+READ = {"path": "/fs/microsd/log/2026-11-20/10_32_15.ulg", "size": 3_400_000, "done": 1_190_000}
+WRITE = {"path": "/a", "size": 4096, "bytes_left": 1024, "sending": True, "eta": 3.4}
+
+
+def status(
+    connection: dict[str, Any] | None = None, cache: dict[str, Any] | None = None, **more: Any
+) -> dict[str, Any]:
+    """Return a status as a mount gives it."""
+    facts = snapshot({**CONNECTION, **(connection or {})}, cache or {}, 5100.0, when_armed="ro")
+    return {"mountpoint": "/mnt/drone", "state": "mounted", "problem": None, **facts, **more}
+
+
+def lines(*args: Any, **more: Any) -> list[str]:
+    return [line.fitted() for line in status_lines(status(*args, **more))]
+
+
+@pytest.mark.parametrize(
+    ("facts", "line"),
+    [
+        ({}, "PX4 1/1, disarmed, link fine: RTT 40 ms, loss 0 %, 5.1 kB/s"),
+        ({"rtt": None, "autopilot": 3}, "ArduPilot 1/1, disarmed, link fine: loss 0 %, 5.1 kB/s"),
+        ({"armed": True}, "PX4 1/1, ARMED (read-only), link fine: RTT 40 ms, loss 0 %, 5.1 kB/s"),
+        ({"speed": {"loss": 0.2}}, "PX4 1/1, disarmed, link lossy: RTT 40 ms, loss 20 %, 5.1 kB/s"),
+        ({"heartbeat_age": 12.0}, "PX4 1/1, disarmed, LOST: last heard 12 s ago"),
+        ({"lost": True, "heartbeat_age": 80}, "PX4 1/1, disarmed, LOST: last heard 1 min 20 s ago"),
+        ({"another_vehicle": True}, "PX4 1/1, disarmed, LOST: another vehicle answers in its place"),
+        (
+            {"other_ftp_client": True},
+            "PX4 1/1, disarmed, link fine: RTT 40 ms, loss 0 %, 5.1 kB/s, another FTP client is heard",
+        ),
+    ],
+)
+def test_the_first_line_is_for_a_pilot(facts: dict[str, Any], line: str) -> None:
+    assert lines(facts)[0] == f"/mnt/drone: {line}"
+
+
+def test_what_moves_comes_next_and_then_what_is_held_back() -> None:
+    waiting = {"path": "/b", "size": 0, "bytes_left": 0, "sending": False, "eta": 9.0}
+    cache = {
+        "reads": [READ],
+        "rate": 5100.0,
+        "transfers": [WRITE, waiting],
+        "write_rate": 300.0,
+        "files_undelivered": 3,
+        "bytes_held": 4096,
+        "errors": {"/b": "the card is full", "/c": "no"},
+    }
+    assert lines({"armed": True}, cache)[1:] == [
+        "  reading /fs/microsd/log/2026-11-20/10_32_15.ulg: 35 % of 3.4 MB, 5.1 kB/s, 7 min 13 s left",
+        "  sending /a: 75 % of 4.1 kB, 300 B/s, 3.4 s left",
+        "  waiting /b: empty, the card is full",
+        "  held back: 3 files, 4.1 kB, until the vehicle is disarmed",
+        "  failed /c: no",
+    ]
+
+
+def test_nothing_held_back_is_said_where_it_can_be_written() -> None:
+    assert lines()[1:] == ["  nothing is held back: all that was written is on the vehicle"]
+    assert lines(read_only=True)[1:] == []
+
+
+def test_a_mount_that_cannot_be_asked_is_a_line() -> None:
+    dead = {"mountpoint": "/mnt/a", "source": "udpin:0", "state": "dead", "problem": "DEAD: gone"}
+    assert [line.fitted() for line in status_lines(dead, verbose=True)] == ["/mnt/a: DEAD: gone"]
+
+
+def test_a_delivery_says_what_it_waits_for() -> None:
+    cache = {"transfers": [WRITE], "write_rate": 300.0, "files_undelivered": 1, "bytes_held": 4096}
+    assert delivery_line(status(None, cache)) == "delivering 1 file, 3.1 kB of 4.1 kB, 300 B/s, 3.4 s left"
+    lost = delivery_line(status({"lost": True}, {**cache, "transfers": [{**WRITE, "sending": False}]}))
+    assert lost == "delivering 1 file, 3.1 kB of 4.1 kB, until the vehicle is back"
+    assert delivery_line(status()) == ""
+
+
+@pytest.mark.parametrize(("width", "height"), [(80, 24), (200, 50), (40, 5), (20, 2)])
+@pytest.mark.parametrize("mounts", [1, 2, 7])
+def test_a_panel_fits_the_terminal(width: int, height: int, mounts: int) -> None:
+    cache = {"reads": [READ] * 9, "rate": 5100.0, "files_undelivered": 2, "bytes_held": 4096}
+    statuses = [{**status(None, cache), "mountpoint": f"/mnt/{'x' * 30}/{n}"} for n in range(mounts)]
+    shown = panel(statuses, width, height)
+    assert len(shown) <= height
+    assert all(len(line) <= width for line in shown)
+    heads = [line for line in shown if "PX4 1/1" in line or "more mounts" in line or width == 20]
+    assert len(heads) >= min(mounts, height)
+
+
+def test_two_busy_mounts_share_a_terminal() -> None:
+    cache = {"reads": [READ] * 9, "rate": 5100.0}
+    shown = panel([status(None, cache), status(None, cache)], 80, 24)
+    assert len(shown) == 22  # each whole: the first line, nine files, and that nothing is held back
+    assert sum("10_32_15.ulg: 35 %" in line for line in shown) == 18
+    assert (
+        panel([status(None, {**cache, "reads": [READ] * 40})] * 2, 80, 24)[11::12]
+        == ["  … and 31 more lines"] * 2
+    )
+    assert panel([], 80, 24) == [NOTHING]
+
+
+def test_a_path_that_is_too_long_keeps_its_end() -> None:
+    line = status_lines(status(None, {"reads": [READ], "rate": 5100.0}))[1].fitted(67)
+    assert line == "  reading …/10_32_15.ulg: 35 % of 3.4 MB, 5.1 kB/s, 7 min 13 s left"
+
+
+def test_everything_else_is_for_who_asks_for_it() -> None:
+    facts = {
+        "connection": {"rtt": 0.1, "uploads": [], "write_traits": {"renames": True}},
+        "pid": 7,
+        "uptime": 75.2,
+    }
+    named = dict(rows(facts))
+    assert named == {
+        "connection: rtt": "100 ms",
+        "connection: write traits: renames": "yes",
+        "pid": "7",
+        "uptime": "1 min 15 s",
+    }
+    assert dict(rows({"bytes_held": 1536, "window_rate": 5120.4, "loss": 0.052, "names": ["a", "b"]})) == {
+        "bytes held": "1.5 kB",
+        "window rate": "5.1 kB/s",
+        "loss": "5 %",
+        "names": "a, b",
+    }
+    verbose = [line.fitted() for line in status_lines(status(source="udpin:0", pid=7), verbose=True)]
+    assert "  pid: 7" in verbose
+    assert "  source: udpin:0" in verbose
+
+
+def test_sizes_times_and_names() -> None:
+    sizes = [readable_size(n) for n in (0, 999, 999.7, 1000, 999_949, 999_999, 5e9)]
+    assert sizes == ["0 B", "999 B", "1.0 kB", "1.0 kB", "999.9 kB", "1.0 MB", "5.0 GB"]
+    times = [readable_time(s) for s in (0.0401, 1, 9.97, 59.4, 59.9, 200, 7500)]
+    assert times == ["40 ms", "1.0 s", "10 s", "59 s", "1 min 0 s", "3 min 20 s", "2 h 5 min"]
+    assert printable("a\x1b[31mb") == "a?[31mb"
