@@ -235,7 +235,7 @@ def watch_status(fetch: Callable[[], Sequence[Status]], *, verbose: bool) -> Non
             size = shutil.get_terminal_size()
             lines = panel(statuses, size.columns, size.lines, verbose=verbose)
             shown = (line if line.startswith(" ") else f"\x1b[1m{line}\x1b[m" for line in lines)
-            sys.stdout.write("\x1b[H" + "\x1b[K\r\n".join(shown) + "\x1b[J")
+            sys.stdout.write("\x1b[H" + "\x1b[K\n".join(shown) + "\x1b[J")
             sys.stdout.flush()
             time.sleep(WATCH_PERIOD)
     finally:

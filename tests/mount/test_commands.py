@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -130,28 +129,3 @@ def test_scan_of_a_vehicle_without_ftp(field: Field) -> None:
     (peer,) = json.loads(out)
     assert peer["answers"] is False
     assert peer["ftp"].startswith("no answer")
-
-
-def test_status_can_be_watched(field: Field, small_tree: Path) -> None:
-    mount = field.mount(field.sim(small_tree).source)
-    terminal, theirs = os.openpty()
-    argv = [sys.executable, "-m", "mavftpfs", "status", "--watch", str(mount.path)]
-    with subprocess.Popen(argv, stdout=theirs, cwd=PROJECT, env={**os.environ, "TERM": "xterm"}) as watch:
-        os.close(theirs)
-        shown = b""
-        while shown.count(b"uptime") < 3:  # drawn again and again
-            shown += os.read(terminal, 65536)
-        watch.send_signal(signal.SIGINT)
-        assert watch.wait(COMMAND_TIMEOUT) == 130
-    os.close(terminal)
-
-
-def test_status_can_be_followed_by_a_program(field: Field, small_tree: Path) -> None:
-    mount = field.mount(field.sim(small_tree).source)
-    argv = [sys.executable, "-m", "mavftpfs", "status", "--json", "--watch", str(mount.path)]
-    with subprocess.Popen(argv, stdout=subprocess.PIPE, cwd=PROJECT) as watch:
-        assert watch.stdout is not None
-        first, second = (json.loads(watch.stdout.readline()) for _ in range(2))
-        assert second["uptime"] > first["uptime"] >= 0
-        watch.send_signal(signal.SIGINT)
-        assert watch.wait(COMMAND_TIMEOUT) == 130

@@ -171,7 +171,7 @@ def test_status_tells_about_vehicle_and_link(field: Field, small_tree: Path) -> 
     assert shown.startswith(f"{mount.path}: PX4 1/1, disarmed, link fine: RTT ")
     shown = mavftpfs("status", "--verbose", mount.path)
     assert vehicle.source in shown
-    assert "reading by" in shown
+    assert "read mode: window" in shown
     code = "import os, sys; print(os.getxattr(sys.argv[1], 'user.mavftpfs.status').decode())"
     assert vehicle.source in mount.python(code, mount.path)
 

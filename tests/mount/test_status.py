@@ -1,0 +1,233 @@
+"""What a mount tells of itself, as a person and a script ask for it: `status`, and the log."""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import re
+import signal
+import struct
+import subprocess
+import sys
+import termios
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from mavftpfs.exits import ExitCode
+from tests.mount.conftest import Field
+from tests.support.mounts import COMMAND_TIMEOUT, Mount, abort_mount, wait_until
+from tests.support.vehicles import PROJECT, Process, free_udp_port
+
+STATUS = (sys.executable, "-m", "mavftpfs", "status")
+NOBODY = ("setpriv", "--reuid=65534", "--regid=65534", "--clear-groups")
+SLOW = ("--rate", "20000")
+
+
+def logged(mount: Mount, text: str) -> None:
+    """Wait until the mount's log holds a text."""
+    wait_until(f"{text!r} in the log", lambda: text in mount.alive().text())
+
+
+def news(mount: Mount) -> list[str]:
+    """Return the log's lines about the vehicle, without durations."""
+    lines = mount.alive().text().splitlines()
+    return [re.sub(r" (for|after) [0-9].*", r" \1 TIME", line) for line in lines if "vehicle" in line]
+
+
+def test_the_log_has_one_line_for_each_thing_that_happens(field: Field, small_tree: Path) -> None:
+    vehicle = field.sim(small_tree)
+    mount = field.mount(vehicle.source)
+    vehicle.send_signal(signal.SIGUSR1)
+    logged(mount, "is armed")
+    vehicle.send_signal(signal.SIGUSR1)
+    logged(mount, "1/1 is disarmed")
+    vehicle.send_signal(signal.SIGUSR2)
+    logged(mount, "is lost")
+    assert ": PX4 1/1, disarmed, LOST: last heard " in mount.run(*STATUS, mount.path).stdout
+    vehicle.send_signal(signal.SIGUSR2)
+    logged(mount, "is back")
+    vehicle.send_signal(signal.SIGHUP)
+    logged(mount, "restarted")
+    assert news(mount) == [
+        "mavftpfs: vehicle 1/1 is armed: nothing is written to it until it is disarmed",
+        "mavftpfs: vehicle 1/1 is disarmed",
+        "mavftpfs: vehicle 1/1 is lost: no heartbeat for TIME",
+        "mavftpfs: vehicle 1/1 is back after TIME",
+        "mavftpfs: vehicle 1/1 restarted",
+    ]
+
+
+def test_the_log_tells_of_another_vehicle(field: Field, small_tree: Path) -> None:
+    vehicle = field.sim(small_tree, options=("--seed", "1"))
+    mount = field.mount(vehicle.source)
+    vehicle.kill()
+    logged(mount, "is lost")
+    vehicle.options = ("--seed", "2")
+    vehicle.start()
+    logged(mount, "another vehicle")
+    assert ", LOST: another vehicle answers in its place\n" in mount.run(*STATUS, mount.path).stdout
+    assert len([line for line in news(mount) if "another vehicle" in line]) == 1
+    assert not [line for line in news(mount) if "is back" in line]
+
+
+def test_the_log_tells_of_another_ftp_client(field: Field, small_tree: Path) -> None:
+    vehicle = field.sim(small_tree)
+    ports = (vehicle.vehicle_port, free_udp_port(), free_udp_port())
+    words = [sys.executable, "-m", "tests.support.fanout", *map(str, ports)]
+    fanout = Process("fanout", words, field.local("fanout"))
+    try:
+        mount = field.mount(f"udpin:127.0.0.1:{ports[1]}")
+        other = (sys.executable, "-m", "mavftpfs", "ls", f"udpin:127.0.0.1:{ports[2]}", "/")
+        mount.run(*other, "-o", "source_component=77")
+        logged(mount, "another FTP client of vehicle 1/1 is heard")
+        assert len([line for line in news(mount) if "FTP client" in line]) == 1
+        mount.finish()
+    finally:
+        fanout.stop()
+
+
+@contextmanager
+def watched(columns: int, rows: int, *words: str | Path) -> Iterator[int]:
+    """Run `status --watch` on a terminal of that size; gives our end of it."""
+    terminal, theirs = os.openpty()
+    fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", rows, columns, 0, 0))
+    environment = {key: value for key, value in os.environ.items() if key not in ("COLUMNS", "LINES")}
+    argv = [*STATUS, "--watch", *words]
+    # get_terminal_size looks at stdout of the interpreter
+    with subprocess.Popen(argv, stdout=theirs, cwd=PROJECT, env={**environment, "TERM": "xterm"}) as watch:
+        os.close(theirs)
+        try:
+            yield terminal
+            watch.send_signal(signal.SIGINT)
+            assert watch.wait(COMMAND_TIMEOUT) == 130
+        finally:
+            watch.kill()
+            os.close(terminal)
+
+
+def screens(terminal: int, count: int) -> list[list[str]]:
+    """Return the lines of so many whole screens that were drawn, without colours."""
+    drawn = b""
+    while drawn.count(b"\x1b[J") < count:
+        drawn += os.read(terminal, 65536)
+    whole = drawn.decode().split("\x1b[J")[:count]
+    texts = [re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", screen.partition("\x1b[H")[2]) for screen in whole]
+    return [text.split("\r\n") for text in texts]
+
+
+@pytest.mark.parametrize(("columns", "rows"), [(80, 24), (200, 50)])
+def test_two_busy_mounts_fit_a_terminal(field: Field, columns: int, rows: int) -> None:
+    card = field.local("card")
+    name = "log/2026-11-20-with-a-rather-long-name-for-a-folder/10_32_15.ulg"
+    (card / name).parent.mkdir(parents=True)
+    (card / name).write_bytes(os.urandom(3_000_000))
+    mounts = [field.mount(field.sim(card, options=SLOW).source) for _ in range(2)]
+    with mounts[0].started("cat", mounts[0].path / name), mounts[1].started("cat", mounts[1].path / name):
+        for mount in mounts:
+            asked = (*STATUS, "--json", mount.path)
+            wait_until("it is read", lambda asked=asked: _reads(asked) > 0)  # type: ignore[misc]
+        with watched(columns, rows) as terminal:
+            shown = screens(terminal, 3)[-1]
+    assert len(shown) <= rows
+    assert all(len(line) <= columns for line in shown)
+    heads = [line for line in shown if "PX4 1/1, disarmed, link " in line]
+    reading = [
+        line
+        for line in shown
+        if re.match(r"  reading .*10_32_15.ulg: \d+ % of 3.0 MB, .* kB/s, .* left$", line)
+    ]
+    assert (len(heads), len(reading)) == (2, 2), shown
+
+
+def _reads(argv: tuple[str | Path, ...]) -> int:
+    done = subprocess.run(list(map(str, argv)), capture_output=True, text=True, timeout=60, check=True)
+    return sum(transfer["done"] for transfer in json.loads(done.stdout)["transfers"])
+
+
+def test_status_can_be_followed_by_a_program(field: Field, small_tree: Path) -> None:
+    mount = field.mount(field.sim(small_tree).source)
+    argv = [*STATUS, "--json", "--watch", str(mount.path)]
+    with subprocess.Popen(argv, stdout=subprocess.PIPE, cwd=PROJECT) as watch:
+        assert watch.stdout is not None
+        first, second = (json.loads(watch.stdout.readline()) for _ in range(2))
+        assert second["uptime"] > first["uptime"] >= 0
+        watch.send_signal(signal.SIGINT)
+        assert watch.wait(COMMAND_TIMEOUT) == 130
+
+
+def test_piped_status_and_scan_are_plain_text(field: Field, small_tree: Path) -> None:
+    vehicle = field.sim(small_tree)
+    scan = subprocess.run(
+        [sys.executable, "-m", "mavftpfs", "scan", vehicle.source], capture_output=True, text=True, check=True
+    )
+    mount = field.mount(vehicle.source)
+    shown = mount.run(*STATUS, mount.path).stdout
+    assert re.sub(r"RTT \d+ ms|loss [0-9<]+ %|, [0-9.]+ k?B/s", "", shown).splitlines() == [
+        f"{mount.path}: PX4 1/1, disarmed, link fine: , ",
+        "  nothing is held back: all that was written is on the vehicle",
+    ]
+    for text in (shown, scan.stdout, mount.run(*STATUS, "--verbose", mount.path).stdout):
+        assert text.isascii(), text  # no boxes, no colours
+        assert "\x1b" not in text
+
+
+def test_the_json_has_what_the_guide_lists(field: Field, small_tree: Path) -> None:
+    mount = field.mount(field.sim(small_tree).source)
+    facts = json.loads(mount.run(*STATUS, "--json", mount.path).stdout)
+    keys = {key: sorted(facts[key]) for key in ("vehicle", "link", "held")}
+    mount_facts = [
+        "mountpoint",
+        "state",
+        "problem",
+        "source",
+        "root",
+        "pid",
+        "version",
+        "read_only",
+        "uptime",
+    ]
+    parts = ["vehicle", "link", "transfers", "held", "connection", "cache", "kernel"]
+    assert sorted(facts) == sorted([*mount_facts, *parts])
+    vehicle = ["system", "component", "autopilot", "armed", "when_armed"]
+    link = ["source", "peer", "state", "rtt", "loss", "rate", "other_ftp_client", "received_bytes"]
+    assert keys == {
+        "vehicle": sorted([*vehicle, "heartbeat_age", "says_ftp", "restarts"]),
+        "link": sorted([*link, "sent_bytes", "requests", "retransmissions", "reopened"]),
+        "held": sorted(["files", "bytes", "bytes_on_disk", "errors"]),
+    }
+
+
+def test_a_dead_mount_is_said_to_be_dead(field: Field, small_tree: Path) -> None:
+    vehicle = field.sim(small_tree)
+    vehicle.left_alone = True
+    mount = field.mount(vehicle.source)
+    mount.kill()
+    try:
+        line = f"{mount.path}: DEAD: its program is gone; run: mavftpfs umount {mount.path}"
+        assert mount.run(*STATUS, mount.path, code=ExitCode.MOUNT_FAILED).stdout == f"{line}\n"
+        assert line in mount.run(*STATUS).stdout.splitlines()
+        facts = json.loads(mount.run(*STATUS, "--json", mount.path).stdout)
+        assert (facts["state"], facts["source"]) == ("dead", vehicle.source)
+        mount.run(sys.executable, "-m", "mavftpfs", "umount", mount.path)
+        assert str(mount.path) not in mount.run(*STATUS).stdout
+    finally:
+        abort_mount(mount.path)
+
+
+def test_a_user_sees_another_users_mount_if_he_may_read_it(field: Field, small_tree: Path) -> None:
+    seen = {}
+    for options in (("allow_other",), ()):
+        mount = field.mount(field.sim(small_tree).source, *options)
+        path = mount.path
+        while path != Path("/tmp"):  # pytest makes directories that only their owner enters
+            path.chmod(0o755) if path != mount.path else None
+            path = path.parent
+        shown = mount.run(*NOBODY, *STATUS, cwd=Path("/")).stdout
+        seen[options] = str(mount.path) in shown
+        refused = mount.run(*NOBODY, *STATUS, mount.path, cwd=Path("/"), code=None)
+        assert refused.returncode == (ExitCode.OK if options else ExitCode.MOUNT_FAILED), refused.stderr
+    assert seen == {("allow_other",): True, (): False}
