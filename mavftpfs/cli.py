@@ -288,12 +288,44 @@ def _demo_parser(name: str) -> Parser:
     return Parser(f"mavftpfs {name}", description="A short tour with a simulated drone.")
 
 
+def _install_parser(name: str) -> Parser:
+    parser = Parser(
+        f"mavftpfs {name}",
+        description="Put man pages, completions and the systemd unit into place; as root for everybody, "
+        "with the udev rule that mounts a plugged-in autopilot.",
+    )
+    what = parser.add_mutually_exclusive_group()
+    what.add_argument("--print", action="store_true", help="show what would be written")
+    what.add_argument("--remove", action="store_true", help="take it away again")
+    parser.add_argument("--root", metavar="DIR", help="below this directory, for packagers (as root)")
+    return parser
+
+
 def _sim_parser(name: str) -> Parser:
     from mavftpfs.sim.command import add_arguments
 
     parser = Parser(f"mavftpfs {name}", description="Run a simulated vehicle.")
     add_arguments(parser)
     return parser
+
+
+def whole_parser() -> argparse.ArgumentParser:
+    """Return one parser of all commands, for their documentation."""
+    parser = argparse.ArgumentParser("mavftpfs", description=_DESCRIPTION)
+    parser.add_argument("-V", "--version", action="store_true", help="print the version")
+    commands_of = parser.add_subparsers(metavar="COMMAND")
+    for name, (make_parser, _) in _COMMANDS.items():
+        made = make_parser(name)
+        commands_of.add_parser(
+            name, parents=[made], add_help=False, description=made.description, help=made.description
+        )
+    return parser
+
+
+def _install(args: argparse.Namespace) -> int:
+    from mavftpfs.install import run
+
+    return run(args, whole_parser())
 
 
 def _sim(args: argparse.Namespace) -> int:
@@ -337,4 +369,5 @@ _COMMANDS: dict[str, tuple[Callable[[str], Parser], Run]] = {
     "crc": (_crc_parser, _verb("crc")),
     "sim": (_sim_parser, _sim),
     "demo": (_demo_parser, _demo),
+    "install": (_install_parser, _install),
 }

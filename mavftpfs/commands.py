@@ -95,7 +95,11 @@ def _serve(
     args: argparse.Namespace, options: MountOptions, spec: LinkSpec, place: str, report: daemon.Report
 ) -> int:
     from mavftpfs.compose import open_sinks
-    from mavftpfs.mount import MountRequest, run_mount
+
+    try:
+        from mavftpfs.mount import MountRequest, run_mount
+    except ImportError as exc:  # libfuse3 went away, or another version of it came, since pyfuse3 was built
+        raise MountFailed(f"{exc}; install libfuse3 and mavftpfs anew (pipx reinstall mavftpfs)") from exc
 
     foreground = args.foreground or args.debug
     _start_logging(options, foreground=foreground, debug=args.debug)

@@ -37,6 +37,17 @@ class ExitCode(IntEnum):
     INTERRUPTED = 130
 
 
+EXIT_CODES = {
+    ExitCode.OK: "fine",
+    ExitCode.USAGE: "wrong usage, or not possible with the files as they are",
+    ExitCode.NO_VEHICLE: "no vehicle, no FTP, or no right answer from it",
+    ExitCode.MOUNT_FAILED: "mounting or unmounting failed",
+    ExitCode.UNDELIVERED: "data could not be delivered to the card; the message names where it lies",
+    ExitCode.BUG: "a bug of ours",
+    ExitCode.INTERRUPTED: "interrupted; 128 and the number of the signal for others",
+}
+"""What each means, for the man page."""
+
 SIGNALLED = 128
 """Plus a signal's number: that signal ended it, as shells say it."""
 

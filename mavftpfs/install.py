@@ -1,0 +1,156 @@
+"""`mavftpfs install`: puts man pages, completions, the systemd unit and the udev rule into place. Layer: top.
+
+For one user, or as root for everybody. Nothing else is touched: `--print` shows what would be written, and
+`--remove` takes the same files away.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from importlib.resources import files
+from pathlib import Path
+
+from mavftpfs import manual
+from mavftpfs.exits import ExitCode
+from mavftpfs.shared.errors import UsageError
+
+SYSTEMD_RUNS = Path("/run/systemd/system")
+
+
+@dataclass(frozen=True, slots=True)
+class Piece:
+    """One file to install. text: its content; link: what it points to, for a symbolic link."""
+
+    path: Path
+    text: str = ""
+    link: Path | None = None
+
+    def shown(self) -> str:
+        """Return path and content for `--print`."""
+        if self.link is not None:
+            return f"# {self.path} -> {self.link}\n"
+        return f"# {self.path}\n{self.text}"
+
+    def put(self) -> None:
+        """Write it, in place of an older one."""
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        if self.link is None:
+            self.path.write_text(self.text)
+        elif not self.is_there():
+            self.path.symlink_to(self.link)
+
+    def is_there(self) -> bool:
+        """Return whether something has its path; a symbolic link that leads nowhere counts."""
+        return os.path.lexists(self.path)
+
+
+def run(args: argparse.Namespace, parser: argparse.ArgumentParser) -> int:
+    """Install, show or remove, for this user or, as root, for everybody.
+
+    Raises:
+        UsageError: a file cannot be written or removed.
+    """
+    program = own_program()
+    everybody = os.geteuid() == 0
+    root = Path(args.root) if args.root else Path("/")
+    pieces = list(
+        for_everybody(parser, program, root) if everybody else for_user(parser, program, os.environ)
+    )
+    if args.print:
+        print("\n".join(piece.shown() for piece in pieces), end="")
+        return ExitCode.OK
+    for piece in pieces:
+        if args.remove and not piece.is_there():
+            continue
+        try:
+            (piece.path.unlink if args.remove else piece.put)()
+        except OSError as exc:
+            raise UsageError(f"{piece.path}: {exc.strerror}") from exc
+        print(f"{'removed' if args.remove else 'wrote'} {piece.path}")
+    if not args.root:
+        _tell_systemd(everybody)
+    if not args.remove:
+        print("\n".join(_hints(everybody)))
+    return ExitCode.OK
+
+
+def own_program() -> Path:
+    """Return the path by which this program is called."""
+    name = sys.argv[0]
+    found = name if os.sep in name else shutil.which(name)
+    if found is None or not os.access(found, os.X_OK):
+        found = shutil.which("mavftpfs") or name
+    return Path(os.path.abspath(found))
+
+
+def for_user(
+    parser: argparse.ArgumentParser, program: Path, environment: Mapping[str, str]
+) -> Iterator[Piece]:
+    """Yield what one user gets."""
+    home = Path(environment.get("HOME") or os.path.expanduser("~"))
+    data = Path(environment.get("XDG_DATA_HOME") or home / ".local/share")
+    config = Path(environment.get("XDG_CONFIG_HOME") or home / ".config")
+    yield Piece(data / "man/man1/mavftpfs.1", manual.man_page(parser))
+    yield from _completions(parser, data, config / "fish/completions")
+    yield Piece(config / "systemd/user/mavftpfs@.service", _unit(program))
+
+
+def for_everybody(parser: argparse.ArgumentParser, program: Path, root: Path) -> Iterator[Piece]:
+    """Yield what root installs; root: where the file system begins, for packagers."""
+    data = root / "usr/local/share"
+    yield Piece(data / "man/man1/mavftpfs.1", manual.man_page(parser))
+    yield Piece(data / "man/man8/mount.mavftpfs.8", _data("mount.mavftpfs.8"))
+    yield from _completions(parser, data, data / "fish/vendor_completions.d")
+    yield Piece(root / "usr/local/lib/systemd/user/mavftpfs@.service", _unit(program))
+    yield Piece(root / "etc/udev/rules.d/70-mavftpfs.rules", _data("70-mavftpfs.rules"))
+    yield Piece(root / "sbin/mount.mavftpfs", link=program.with_name("mount.mavftpfs"))
+    if program.parent != Path("/usr/local/bin"):
+        yield Piece(root / "usr/local/bin/mavftpfs", link=program)
+
+
+def _completions(parser: argparse.ArgumentParser, data: Path, fish: Path) -> Iterator[Piece]:
+    places = {
+        "bash": data / "bash-completion/completions/mavftpfs",
+        "zsh": data / "zsh/site-functions/_mavftpfs",
+        "fish": fish / "mavftpfs.fish",
+    }
+    for shell in manual.SHELLS:
+        yield Piece(places[shell], manual.completion(parser, shell))
+
+
+def _data(name: str) -> str:
+    return files("mavftpfs").joinpath("data", name).read_text()
+
+
+def _unit(program: Path) -> str:
+    """Return the unit; systemd reads % as a specifier, and takes quotes around blanks."""
+    command = str(program).replace("%", "%%")
+    return _data("mavftpfs@.service").replace("@MAVFTPFS@", f'"{command}"' if " " in command else command)
+
+
+def _tell_systemd(everybody: bool) -> None:
+    """Have systemd and udev read what changed; without them there is nothing to tell."""
+    if not SYSTEMD_RUNS.is_dir():
+        return
+    manager = () if everybody else ("--user",)
+    commands = [("systemctl", *manager, "daemon-reload")]
+    if everybody:
+        commands.append(("udevadm", "control", "--reload"))
+    for command in commands:
+        if shutil.which(command[0]):
+            subprocess.run(command, check=False, capture_output=True, timeout=30)
+
+
+def _hints(everybody: bool) -> Iterator[str]:
+    yield "systemctl --user start mavftpfs@ttyACM0 mounts /dev/ttyACM0 on ~/drone-ttyACM0"
+    if everybody:
+        yield "an autopilot that is plugged in is mounted there by itself"
+    else:
+        yield "zsh looks for completions in $fpath: add ~/.local/share/zsh/site-functions"
+        yield "as root: a udev rule that mounts what is plugged in, and mount -t mavftpfs"

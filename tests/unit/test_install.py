@@ -1,0 +1,178 @@
+"""What `mavftpfs install` puts into place, and that the programs it is for can read it."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from mavftpfs import cli, install, manual
+from mavftpfs.exits import EXIT_CODES, ExitCode
+from mavftpfs.fuse.options import option_names
+from mavftpfs.shared.errors import UsageError
+
+COMMANDS = [name for name in cli._COMMANDS if name != "mount"]
+
+
+@pytest.fixture
+def pieces(tmp_path: Path) -> dict[str, install.Piece]:
+    """What root would install, by the last part of its path and the one before."""
+    program = Path("/opt/py thon/100%/mavftpfs")
+    found = install.for_everybody(cli.whole_parser(), program, tmp_path)
+    return {piece.path.relative_to(tmp_path).as_posix(): piece for piece in found}
+
+
+def run_install(*words: str) -> int:
+    """Run the command."""
+    return cli.main(["install", *words])
+
+
+def checked(*command: str | Path) -> str:
+    """Run a checker and return what it says; it must be content."""
+    result = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert result.returncode == 0, result.stderr
+    return result.stdout + result.stderr
+
+
+def test_what_is_written_is_removed_again(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_install("--root", str(tmp_path)) == 0
+    written = {path.relative_to(tmp_path) for path in tmp_path.rglob("*") if not path.is_dir()}
+    said = capsys.readouterr().out
+    assert len(written) >= 8
+    assert all(str(tmp_path / path) in said for path in written)
+    assert run_install("--root", str(tmp_path)) == 0, "twice is fine"
+    assert run_install("--root", str(tmp_path), "--remove") == 0
+    assert [path for path in tmp_path.rglob("*") if not path.is_dir()] == []
+    assert run_install("--root", str(tmp_path), "--remove") == 0, "nothing is there any more"
+
+
+def test_print_writes_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run_install("--root", str(tmp_path), "--print") == 0
+    assert list(tmp_path.iterdir()) == []
+    said = capsys.readouterr().out
+    assert "\nExecStart=" in said
+    assert "\n.SH NAME\n" in said
+
+
+def test_a_user_needs_no_root(tmp_path: Path) -> None:
+    parser = cli.whole_parser()
+    found = list(install.for_user(parser, Path("/home/me/.local/bin/mavftpfs"), {"HOME": "/home/me"}))
+    paths = [piece.path.as_posix() for piece in found]
+    assert all(path.startswith("/home/me/") for path in paths)
+    assert "/home/me/.config/systemd/user/mavftpfs@.service" in paths
+    assert not any("udev" in path for path in paths)
+    moved = {"HOME": "/home/me", "XDG_DATA_HOME": "/data", "XDG_CONFIG_HOME": "/config"}
+    for piece in install.for_user(parser, Path("/usr/bin/mavftpfs"), moved):
+        assert piece.path.as_posix().startswith(("/data/", "/config/"))
+
+
+def test_where_nothing_can_be_written_is_an_error(tmp_path: Path) -> None:
+    (tmp_path / "usr").write_text("in the way")
+    with pytest.raises(UsageError, match="usr"):
+        cli._run(["install", "--root", str(tmp_path)])
+
+
+def test_the_man_page_has_every_command_option_and_exit_code(pieces: dict[str, install.Piece]) -> None:
+    page = pieces["usr/local/share/man/man1/mavftpfs.1"].text.replace("\\", "")
+    for name in COMMANDS:
+        assert f"\n.SS mavftpfs {name}\n" in page
+    for option in option_names():
+        assert f"\n.B {option}\n" in page
+    assert set(EXIT_CODES) == set(ExitCode)
+    assert not re.search(r"^[.'](?!TH|SH|SS|B|BR|I|TP|PP|br|nf|fi)", page, re.MULTILINE)
+
+
+@pytest.mark.skipif(shutil.which("man") is None, reason="no man here")
+def test_man_reads_the_pages_without_a_warning(pieces: dict[str, install.Piece], tmp_path: Path) -> None:
+    for name in ("man1/mavftpfs.1", "man8/mount.mavftpfs.8"):
+        page = tmp_path / Path(name).name
+        page.write_text(pieces[f"usr/local/share/man/{name}"].text)
+        said = checked("man", "--warnings", "--encoding=UTF-8", "--local-file", page)
+        assert "warning" not in said
+        assert "drone" in said
+
+
+def test_the_escapes_of_man() -> None:
+    assert manual._escaped(r".x \n -o 100%%") == r"\&.x \en \-o 100%"
+
+
+@pytest.mark.parametrize("shell", manual.SHELLS)
+def test_completions_can_be_read_and_know_the_commands(shell: str, tmp_path: Path) -> None:
+    text = manual.completion(cli.whole_parser(), shell)
+    assert all(name in text for name in COMMANDS)
+    if shutil.which(shell) is not None:
+        path = tmp_path / "mavftpfs"
+        path.write_text(text)
+        assert checked(shell, "-n", path) == ""
+
+
+def test_bash_completes_commands_and_options(tmp_path: Path) -> None:
+    path = tmp_path / "mavftpfs"
+    path.write_text(manual.completion(cli.whole_parser(), "bash"))
+    script = (
+        'source "$1"; COMP_WORDS=(mavftpfs "${@:2}"); COMP_CWORD=$(($# - 1)); '
+        '_shtab_mavftpfs mavftpfs "${!#}" mavftpfs; printf "%s\\n" "${COMPREPLY[@]}"'
+    )
+    assert checked("bash", "-c", script, "-", path, "sta").split() == ["status"]
+    assert "--json" in checked("bash", "-c", script, "-", path, "scan", "--").split()
+
+
+def test_the_unit_calls_this_program(pieces: dict[str, install.Piece]) -> None:
+    unit = pieces["usr/local/lib/systemd/user/mavftpfs@.service"].text
+    assert '\nExecStart="/opt/py thon/100%%/mavftpfs" /dev/%I ' in unit
+    assert "@MAVFTPFS@" not in unit
+
+
+@pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="no systemd here")
+def test_systemd_finds_nothing_wrong_with_the_unit(tmp_path: Path) -> None:
+    assert complaints_about(tmp_path, install._unit(Path("/bin/true"))) == ""
+    wrong = install._unit(Path("/bin/true")).replace("Type=forking", "Type=spoon")
+    assert "spoon" in complaints_about(tmp_path, wrong)
+
+
+def complaints_about(folder: Path, unit: str) -> str:
+    """Return what systemd says of the unit."""
+    path = folder / "mavftpfs@.service"
+    path.write_text(unit)
+    return subprocess.run(
+        ["systemd-analyze", "verify", "--user", "--man=no", path],
+        env={"XDG_RUNTIME_DIR": str(folder), "PATH": "/usr/bin:/bin", "HOME": str(folder)},
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    ).stderr
+
+
+RULE = re.compile(r'(\w+)(\{\w+\})?(==|!=|\+=|=)"([^"]*)"$')
+MATCHES = {"ACTION", "SUBSYSTEM", "KERNEL", "ENV"}
+SETS = {"GOTO", "LABEL", "TAG", "ENV"}
+
+
+def test_every_word_of_the_udev_rule_is_one(pieces: dict[str, install.Piece], tmp_path: Path) -> None:
+    text = pieces["etc/udev/rules.d/70-mavftpfs.rules"].text
+    lines = [line for line in text.splitlines() if line and not line.startswith("#")]
+    labels = re.findall(r'LABEL="(\w+)"', text)
+    for line in lines:
+        for word in line.split(", "):
+            match = RULE.match(word)
+            assert match, word
+            assert match[1] in (MATCHES if match[3] in ("==", "!=") else SETS), word
+            assert match[1] != "GOTO" or match[4] in labels, word
+    verify = (
+        subprocess.run(["udevadm", "verify", "--help"], capture_output=True, check=False)
+        if has_udev()
+        else None
+    )
+    if verify is not None and verify.returncode == 0:  # systemd 254 and newer
+        path = tmp_path / "70-mavftpfs.rules"
+        path.write_text(text)
+        checked("udevadm", "verify", path)
+
+
+def has_udev() -> bool:
+    """Return whether udevadm is here."""
+    return shutil.which("udevadm") is not None
