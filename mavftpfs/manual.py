@@ -32,7 +32,8 @@ def completion(parser: argparse.ArgumentParser, shell: str) -> str:
         for action in each._actions:
             if action.dest in _PLACES:
                 action.complete = _PLACES[action.dest]  # type: ignore[attr-defined]  # shtab's way
-    return shtab.complete(parser, shell)
+    script: str = shtab.complete(parser, shell)
+    return script
 
 
 def man_page(parser: argparse.ArgumentParser) -> str:
