@@ -3,7 +3,8 @@
     python -m tests.support.counted_sim DIR PROFILE LINK JOURNAL
 
 Each line of JOURNAL is a JSON object: opcode by name, session, offset, size (bytes of payload data), and the
-path where the request carries one. It is written before the request is worked on.
+path where the request carries one. It is written before the request is worked on. JOURNAL.sessions holds how
+many sessions are open at the server.
 """
 
 from __future__ import annotations
@@ -36,6 +37,8 @@ class JournalServer(FtpServer):
     """Keeps a journal of what it is asked."""
 
     journal: TextIO
+    sessions: Path
+    written = 0
 
     def handle(self, wire: bytes, source: Address, now: float) -> None:
         """Write the request down, then do as it says."""
@@ -47,6 +50,14 @@ class JournalServer(FtpServer):
         """Write each request down, too."""
         for wire in wires:
             self.handle(wire, source, now)
+
+    def outgoing(self, now: float) -> list[tuple[Address, bytes]]:
+        """Write down how many sessions are open before the replies that tell of it go out."""
+        replies = super().outgoing(now)
+        if self.open_sessions != self.written:
+            self.written = self.open_sessions
+            self.sessions.write_text(str(self.written))
+        return replies
 
 
 def described(wire: bytes) -> dict[str, object]:
@@ -64,12 +75,12 @@ def described(wire: bytes) -> dict[str, object]:
     return facts
 
 
-async def serve(root: Path, profile: str, link_text: str, journal: TextIO) -> None:
+async def serve(root: Path, profile: str, link_text: str, journal: TextIO, sessions: Path) -> None:
     """Serve until SIGTERM or SIGINT."""
     tree, rng = DirectoryTree(root), random.Random(0)
     vehicle = SimVehicle(tree, PROFILES[profile], rng=rng)
     server = JournalServer(tree, PROFILES[profile], rng=rng)
-    server.journal = journal
+    server.journal, server.sessions = journal, sessions
     vehicle.server = server
     with trio.open_signal_receiver(signal.SIGTERM, signal.SIGINT) as arriving:
         async with open_endpoint(link_text) as link:
@@ -92,7 +103,8 @@ def main() -> int:
     parser.add_argument("journal", type=Path)
     args = parser.parse_args()
     with args.journal.open("a") as journal:
-        trio.run(serve, args.directory, args.profile, args.link, journal)
+        sessions = args.journal.with_suffix(".sessions")
+        trio.run(serve, args.directory, args.profile, args.link, journal, sessions)
     return 0
 
 

@@ -132,6 +132,13 @@ class CountedVehicle(SimVehicle):
         except FileNotFoundError:
             return 0
 
+    def sessions(self) -> int:
+        """Return how many sessions its server has open."""
+        try:
+            return int(self.journal.with_suffix(".sessions").read_text() or 1)  # empty: it is being written
+        except FileNotFoundError:
+            return 0
+
     def cost_since(self, mark: int) -> Cost:
         """Return the requests that came after the first `mark`."""
         cost = Cost()
@@ -210,7 +217,8 @@ class Counting:
             now = self.vehicle.asked()
             # A vehicle that had no time yet to take what was sent has not counted it.
             quiet = SETTLED if now >= status["connection"]["requests"] else LOST
-            if now != seen or not self._idle(status):
+            # The mount's own word is not enough: a Terminate that comes later counts for the next case.
+            if now != seen or not self._idle(status) or self.vehicle.sessions():
                 seen, since = now, time.monotonic()
             time.sleep(0.05)
 
