@@ -1,0 +1,62 @@
+"""The commands that README and the guide show can be parsed, and lead to a link that can be opened."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from mavftpfs import cli
+from mavftpfs.fuse.options import parse_options
+from mavftpfs.link.uri import parse_source
+
+PROJECT = Path(__file__).parents[2]
+PAGES = ("README.md", "docs/guide.md", "docs/benchmarks.md")
+
+BLOCK_LINE = re.compile(r"^    (\S.*)$", re.MULTILINE)
+TABLE_ROW = re.compile(r"^\| `(mavftpfs [^`]*)`", re.MULTILINE)
+PLACEHOLDERS = {"SOURCE": "udpin:0.0.0.0:14550", "[PATH...]": "/a", "PATH...": "/a", "LOCAL...": "a"}
+"""What stands for something in the guide's table of commands."""
+
+
+def shown() -> Iterator[str]:
+    """Yield every command line of the pages that begins with mavftpfs, without its comment."""
+    for page in PAGES:
+        text = (PROJECT / page).read_text()
+        for line in (*BLOCK_LINE.findall(text), *TABLE_ROW.findall(text)):
+            command = line.partition("  #")[0].strip().removeprefix("sudo ")
+            if command.startswith("mavftpfs "):
+                yield command
+
+
+def words_of(command: str) -> list[str]:
+    """Return the arguments, with something in the place of each placeholder, and optional ones left out."""
+    for mark, value in PLACEHOLDERS.items():
+        command = command.replace(mark, value)
+    return shlex.split(re.sub(r"\[[^\]]*\]", "", command))[1:]
+
+
+@pytest.mark.parametrize("command", sorted(set(shown())))
+def test_it_can_be_parsed(command: str) -> None:
+    words = words_of(command)
+    if words == ["--version"]:
+        return
+    name = words[0] if words[0] in cli._COMMANDS else "mount"
+    args = cli._COMMANDS[name][0](name).parse_args(words[words[0] == name :])
+    parse_options(getattr(args, "options", []))
+    source = getattr(args, "source", "")
+    if source and not source.startswith("~/"):
+        parse_source(source)
+
+
+def test_enough_of_them_are_found() -> None:
+    assert len(set(shown())) > 20
+
+
+def test_every_command_has_a_row_in_the_guide() -> None:
+    text = (PROJECT / "docs/guide.md").read_text()
+    rows = {row.split()[1] for row in TABLE_ROW.findall(text)}
+    assert set(cli._COMMANDS) - {"mount"} <= rows
