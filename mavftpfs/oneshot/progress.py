@@ -22,6 +22,8 @@ from mavftpfs.shared.readable import printable, readable_size, readable_time
 RATE_SPAN = 10.0
 """Seconds over which the rate is measured."""
 _REFRESH = 5
+_ROOM = 4
+"""Columns that stay free: the terminal's ^C would else begin a line of which rich does not know."""
 _BAR = 40
 _SAMPLE = 0.2
 
@@ -98,7 +100,7 @@ def totals(progress: Progress) -> str:
     if progress.rate is not None:
         parts.append(f"{readable_size(progress.rate)}/s")
     if progress.time_left is not None and progress.done < progress.total:
-        parts.append(f"{readable_time(progress.time_left)} left")
+        parts.append(f"{readable_time(max(1.0, progress.time_left))} left")
     return ", ".join(parts)
 
 
@@ -132,7 +134,7 @@ class _Screen:
         bar = ProgressBar(total=1.0, completed=share, width=max(8, min(_BAR, width - len(line) - 8)))
         row = Table.grid(padding=(0, 1))
         row.add_row(bar, Text(f"{share * 100:3.0f} %"), Text(line, no_wrap=True))
-        return Group(row, Text(current(progress, width - 1), no_wrap=True))
+        return Group(row, Text(current(progress, width - _ROOM), no_wrap=True))
 
 
 @contextmanager

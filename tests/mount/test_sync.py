@@ -1,0 +1,461 @@
+"""`mavftpfs sync`, and get and put on slow links: as processes, on each server, beside a mount too."""
+
+from __future__ import annotations
+
+import filecmp
+import json
+import os
+import random
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from mavftpfs.link.framing import Framer
+from mavftpfs.link.messages import MAV_AUTOPILOT_INVALID, MAV_TYPE_GCS, Address
+from tests.mount.conftest import Field
+from tests.support import terminal
+from tests.support.logs import suspects
+from tests.support.mounts import COMMAND_TIMEOUT, wait_until
+from tests.support.places import REAL, start_place
+from tests.support.vehicles import HOST, PROJECT, UdpVehicle, free_udp_port
+
+LOG_FOLDERS = {"px4": "log", "px4-nuttx": "fs/microsd/log", "ardupilot": "APM/LOGS", REAL: "logs"}
+KINDS = list(LOG_FOLDERS)
+SLOW = ("--rate", "100000", "--delay", "0.01")
+READS = ("READ_FILE", "BURST_READ_FILE")
+
+
+def argv(*words: object) -> list[str]:
+    return [sys.executable, "-m", "mavftpfs", *map(str, words)]
+
+
+def run(*words: object, code: int = 0) -> tuple[str, str]:
+    """Run a command that must end with `code`; return what it said on stdout and stderr."""
+    done = subprocess.run(
+        argv(*words), capture_output=True, text=True, timeout=COMMAND_TIMEOUT, cwd=PROJECT, check=False
+    )
+    assert done.returncode == code, f"{words}: exit {done.returncode}\n{done.stdout}{done.stderr}"
+    assert suspects(done.stderr) == []
+    return done.stdout, done.stderr
+
+
+def sync(*words: object, code: int = 0) -> dict[str, Any]:
+    """Run `sync --json`; return what it says."""
+    facts: dict[str, Any] = json.loads(run("sync", "--json", *words, code=code)[0])
+    return facts
+
+
+def states(facts: dict[str, Any]) -> dict[str, str]:
+    return {Path(file["path"]).name: file["state"] for file in facts["files"]}
+
+
+def write_log(path: Path, size: int, seed: int, day: int) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(random.Random(seed).randbytes(size))
+    when = 1_714_521_600 + day * 86_400
+    os.utime(path, (when, when))
+
+
+def logs_of(folder: Path) -> list[Path]:
+    """Make three logs, the youngest last."""
+    paths = [folder / "2024-05-01" / "10_00_00.ulg", folder / "2024-05-02" / "09_00_00.ulg"]
+    paths.append(folder / "2024-05-02" / "11_00_00.ulg")
+    for number, path in enumerate(paths):
+        write_log(path, 60_000 + number, number, number + 1)
+    return paths
+
+
+def requests_in(trace: Path) -> list[str]:
+    """Return the opcodes of all requests in a trace."""
+    return [
+        entry["opcode"] for entry in map(json.loads, trace.read_text().splitlines()) if entry["dir"] == "out"
+    ]
+
+
+def local_files(folder: Path) -> set[str]:
+    return {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}
+
+
+@contextmanager
+def started(*words: object) -> Iterator[subprocess.Popen[str]]:
+    """Run a command beside the test's own steps."""
+    with subprocess.Popen(
+        argv(*words), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=PROJECT
+    ) as child:
+        try:
+            yield child
+        finally:
+            child.kill()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_new_logs_come_newest_first_and_a_second_run_moves_nothing(
+    field: Field, tmp_path: Path, kind: str
+) -> None:
+    place = start_place(field, kind)
+    card = place.vehicle.root / LOG_FOLDERS[kind]
+    logs = logs_of(card)
+    local = tmp_path / "logs"
+    planned, _ = run("sync", "--dry-run", place.vehicle.source, local)
+    assert planned.splitlines()[-1].startswith("would fetch 3 (180.0 kB)")
+    out, _ = run("sync", place.vehicle.source, local)
+    *lines, summary = out.splitlines()
+    youngest_first = [str(path.relative_to(card)) for path in reversed(logs)]
+    assert [line.partition(":")[0] for line in lines] == youngest_first
+    assert all(line.endswith("verified by size and CRC32") for line in lines)
+    assert summary.startswith("3 new (180.0 kB), 0 here already, from /")
+    assert local_files(local) == set(youngest_first)
+    assert all(filecmp.cmp(card / name, local / name, shallow=False) for name in youngest_first)
+    trace = tmp_path / "trace"
+    facts = sync(place.vehicle.source, local, "-o", f"trace={trace}")
+    assert (facts["complete"], facts["bytes_fetched"]) == (True, 0)
+    assert set(states(facts).values()) == {"here"}
+    assert not set(READS) & set(requests_in(trace))
+    write_log(card / "2024-05-03" / "08_00_00.ulg", 1000, 9, 9)
+    assert states(sync(place.vehicle.source, local, "--newest", 1)) == {"08_00_00.ulg": "fetched"}
+
+
+@contextmanager
+def interrupted_sync(vehicle: UdpVehicle, local: Path, *words: object) -> Iterator[subprocess.Popen[str]]:
+    """Run sync until a part of a file is here."""
+    with started("sync", vehicle.source, local, *words) as child:
+        part = local / "big.bin.part"
+        wait_until("a part is here", lambda: part.exists() and part.stat().st_size > 0)
+        yield child
+
+
+def assert_goes_on(vehicle: UdpVehicle, card: Path, local: Path) -> None:
+    """Nothing has a final name yet; the next run goes on with the part, and proves the whole."""
+    assert local_files(local) == {"big.bin.part"}
+    came = (local / "big.bin.part").read_bytes()
+    assert (card / "big.bin").read_bytes().startswith(came)
+    (file,) = sync(vehicle.source, local, "--verify=none")["files"]
+    assert (file["state"], file["resumed_at"], file["proof"]) == ("fetched", len(came), "size and CRC32")
+    assert (local / "big.bin").read_bytes() == (card / "big.bin").read_bytes()
+    assert local_files(local) == {"big.bin"}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_ctrl_c_leaves_a_part_and_the_next_run_goes_on(field: Field, tmp_path: Path, kind: str) -> None:
+    place = start_place(field, kind, () if kind == REAL else SLOW)
+    card, local = place.vehicle.root / LOG_FOLDERS[kind], tmp_path / "logs"
+    write_log(card / "big.bin", 700_000, 1, 1)
+    slow = ("-o", "bwlimit=50000") if kind == REAL else ()
+    with interrupted_sync(place.vehicle, local, *slow) as child:
+        child.send_signal(signal.SIGINT)
+        out, err = child.communicate(timeout=COMMAND_TIMEOUT)
+    assert (child.returncode, out) == (130, "")
+    assert err == "mavftpfs: interrupted: 0 of 1 logs are here; the next run goes on where this one stopped\n"
+    assert_goes_on(place.vehicle, card, local)
+
+
+def test_a_killed_run_leaves_nothing_wrong(field: Field, tmp_path: Path) -> None:
+    vehicle = field.sim(field.local("card"), "px4", SLOW)
+    vehicle.left_alone = True
+    card, local = vehicle.root / "log", tmp_path / "logs"
+    write_log(card / "big.bin", 700_000, 1, 1)
+    with interrupted_sync(vehicle, local) as child:
+        child.kill()
+        child.wait()
+    assert_goes_on(vehicle, card, local)
+
+
+def test_a_lost_link_leaves_a_part_and_the_next_run_goes_on(field: Field, tmp_path: Path) -> None:
+    vehicle = field.sim(field.local("card"), "px4", SLOW)
+    card, local = vehicle.root / "log", tmp_path / "logs"
+    write_log(card / "big.bin", 700_000, 1, 1)
+    with interrupted_sync(vehicle, local, "-o", "op_deadline=3") as child:
+        vehicle.kill()
+        out, err = child.communicate(timeout=COMMAND_TIMEOUT)
+    assert child.returncode == 2
+    assert out.splitlines()[-1].endswith("1 not here")
+    assert "big.bin" in err or "0 of 1 logs are here" in err
+    vehicle.start()
+    assert_goes_on(vehicle, card, local)
+
+
+def test_a_growing_log_is_fetched_as_far_as_it_goes(field: Field, tmp_path: Path) -> None:
+    vehicle = field.sim(field.local("card"))
+    card, local = vehicle.root / "log", tmp_path / "logs"
+    write_log(card / "old.ulg", 30_000, 1, 1)
+    write_log(card / "now.ulg", 100_000, 2, 2)
+    grow = threading.Event()
+
+    def append() -> None:
+        while not grow.wait(0.01):
+            with (card / "now.ulg").open("ab") as file:
+                file.write(b"x" * 100)
+
+    writer = threading.Thread(target=append)
+    writer.start()
+    try:
+        facts = sync(vehicle.source, local, code=2)
+    finally:
+        grow.set()
+        writer.join()
+    assert states(facts) == {"now.ulg": "growing", "old.ulg": "fetched"}
+    assert "still growing" in next(file["error"] for file in facts["files"] if file["error"])
+    assert local_files(local) == {"now.ulg.part", "old.ulg"}
+    came = (local / "now.ulg.part").read_bytes()
+    assert len(came) >= 100_000
+    assert (card / "now.ulg").read_bytes().startswith(came)
+    facts = sync(vehicle.source, local)
+    assert {file["resumed_at"] for file in facts["files"] if file["proof"]} == {len(came)}
+    assert (local / "now.ulg").read_bytes() == (card / "now.ulg").read_bytes()
+
+
+def test_an_armed_vehicle_is_not_asked_for_checksums(field: Field, tmp_path: Path) -> None:
+    vehicle = field.sim(field.local("card"), "ardupilot", ("--armed",))
+    card, local = vehicle.root / "APM/LOGS", tmp_path / "logs"
+    write_log(card / "1.BIN", 20_000, 1, 1)
+    write_log(card / "2.BIN", 20_000, 2, 2)
+    local.mkdir()
+    (local / "2.BIN.part").write_bytes((card / "2.BIN").read_bytes()[:5000])
+    trace = tmp_path / "trace"
+    facts = sync(vehicle.source, local, "-o", f"trace={trace}", code=2)
+    assert states(facts) == {"2.BIN": "failed", "1.BIN": "fetched"}
+    proofs = {Path(file["path"]).name: file["proof"] for file in facts["files"]}
+    assert proofs["1.BIN"] == "size (no checksums while armed)"
+    assert "CALC_FILE_CRC32" not in requests_in(trace)
+    assert local_files(local) == {"2.BIN.part", "1.BIN"}  # what was resumed is always proven
+
+
+def test_what_is_wished_for(field: Field, tmp_path: Path) -> None:
+    vehicle = field.sim(field.local("card"))
+    logs_of(vehicle.root / "elsewhere")
+    _, err = run("sync", vehicle.source, tmp_path / "logs", code=1)
+    assert "--from" in err
+    facts = sync(
+        vehicle.source, tmp_path / "logs", "--from", "/elsewhere", "--since", "2024-05-02T10:00+00:00"
+    )
+    assert list(states(facts)) == ["11_00_00.ulg", "09_00_00.ulg", "10_00_00.ulg"]  # no times: none left out
+    for words, said in ((("--newest", 0), "no number"), (("--since", "soon"), "no date")):
+        assert said in run("sync", vehicle.source, tmp_path, *words, code=1)[1]
+
+
+# -- beside a mount -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", ["px4", "ardupilot"])
+def test_verbs_use_the_mount_that_is_up(field: Field, tmp_path: Path, kind: str) -> None:
+    place = start_place(field, kind)
+    card = place.vehicle.root / LOG_FOLDERS[kind]
+    logs = logs_of(card)
+    mount = field.mount(place.vehicle.source)
+    folder = f"/{place.folder}" if place.folder else ""
+    for source in (place.vehicle.source, mount.path):
+        local = tmp_path / f"logs{len(str(source))}"
+        assert sync(source, local)["complete"]
+        assert len(local_files(local)) == len(logs)
+        assert sync(source, local)["bytes_fetched"] == 0
+        assert "No such file" in run("ls", source, "/none", code=1)[1]
+    (tmp_path / "new").write_bytes(b"new" * 1000)
+    source = place.vehicle.source
+    run("put", source, tmp_path / "new", f"{folder}/new")
+    assert (place.card / "new").read_bytes() == b"new" * 1000
+    run("mv", source, f"{folder}/new", f"{folder}/newer")
+    assert run("cat", source, f"{folder}/newer")[0] == "new" * 1000
+    assert run("crc", source, f"{folder}/newer")[0].endswith(f"  {folder}/newer\n")
+    run("rm", source, f"{folder}/newer")
+    run("mkdir", source, f"{folder}/d")
+    run("rmdir", source, f"{folder}/d")
+    assert not (place.card / "newer").exists()
+    assert not (place.card / "d").exists()
+    assert str(mount.path) in run("scan", source)[0]
+
+
+def test_a_mounted_subtree_and_what_lies_outside_of_it(field: Field, tmp_path: Path) -> None:
+    vehicle = field.sim(field.local("card"))
+    logs_of(vehicle.root / "log")
+    (vehicle.root / "other").write_bytes(b"x")
+    mount = field.mount(f"{vehicle.source}#/log")
+    assert run("ls", vehicle.source, "/log")[0] == run("ls", mount.path)[0] == "2024-05-01/\n2024-05-02/\n"
+    assert run("ls", f"{vehicle.source}#/log/2024-05-01")[0] == "10_00_00.ulg\n"
+    assert run("ls", f"{mount.path}#/2024-05-01")[0] == "10_00_00.ulg\n"
+    assert "outside" in run("cat", vehicle.source, "/other", code=1)[1]
+    assert sync(vehicle.source, tmp_path / "a")["complete"]
+    assert sync(mount.path, tmp_path / "b")["complete"]
+    assert local_files(tmp_path / "a") == local_files(tmp_path / "b")
+
+
+def test_a_growing_log_is_seen_through_a_mount_too(field: Field, tmp_path: Path) -> None:
+    vehicle = field.sim(field.local("card"), "px4", ("--armed",))
+    card, local = vehicle.root / "log", tmp_path / "logs"
+    write_log(card / "now.ulg", 100_000, 2, 2)
+    field.mount(vehicle.source, "when_armed=ro")
+    grow = threading.Event()
+
+    def append() -> None:
+        while not grow.wait(0.01):
+            with (card / "now.ulg").open("ab") as file:
+                file.write(b"x" * 100)
+
+    writer = threading.Thread(target=append)
+    writer.start()
+    try:
+        facts = sync(vehicle.source, local, code=2)
+    finally:
+        grow.set()
+        writer.join()
+    assert states(facts) == {"now.ulg": "growing"}
+
+
+def test_a_directory_that_is_no_mountpoint(tmp_path: Path) -> None:
+    assert f"no vehicle is mounted on {tmp_path}" in run("ls", tmp_path, "/", code=1)[1]
+
+
+# -- several things, stdout -----------------------------------------------------------------------
+
+
+def test_of_several_files_the_others_go_on(field: Field, tmp_path: Path) -> None:
+    vehicle = field.sim(field.local("card"))
+    for name in ("a", "c"):
+        (vehicle.root / name).write_bytes(name.encode() * 5000)
+    out, err = run("get", vehicle.source, "/a", "/none", "/c", "--to", tmp_path, code=2)
+    assert [line.partition(":")[0] for line in out.splitlines()] == ["/a", "/c"]
+    assert err == "mavftpfs: '/none' does not exist\n"
+    out, err = run("cat", vehicle.source, "/a", "/none", "/c", code=2)
+    assert out == "a" * 5000 + "c" * 5000
+    assert run("get", vehicle.source, "/a", "--to", "-")[0] == "a" * 5000
+
+
+def test_get_goes_on_with_a_part_unless_told_not_to(field: Field, tmp_path: Path) -> None:
+    vehicle = field.sim(field.local("card"))
+    write_log(vehicle.root / "a", 50_000, 1, 1)
+    part = tmp_path / "a.part"
+    for words, said in (((), ", resumed at 10.0 kB"), (("--no-resume",), "")):
+        part.write_bytes((vehicle.root / "a").read_bytes()[:10_000])
+        out, _ = run("get", vehicle.source, "/a", "--to", tmp_path, *words)
+        assert out == f"/a: 50.0 kB{said}, verified by size and CRC32\n"
+        assert filecmp.cmp(vehicle.root / "a", tmp_path / "a", shallow=False)
+        assert not part.exists()
+
+
+def test_a_file_without_a_time_is_of_the_present(field: Field, tmp_path: Path) -> None:
+    vehicle = field.sim(field.local("card"))
+    write_log(vehicle.root / "a", 100, 1, 1)
+    before = time.time() - 2
+    run("get", vehicle.source, "/a", "--to", tmp_path)
+    assert (tmp_path / "a").stat().st_mtime > before
+
+
+# -- who does not answer --------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("words", [("ls",), ("get", "/a"), ("sync", "LOCAL"), ("put", "pyproject.toml", "/")])
+def test_nobody_answers_ftp(field: Field, tmp_path: Path, words: Sequence[str]) -> None:
+    """The same words as a mount has, and not only after the 30 s that a request may take."""
+    vehicle = field.hostile("mute")
+    named = [str(tmp_path) if word == "LOCAL" else word for word in words[1:]]
+    _, err = run(words[0], "-o", "connect_timeout=3", vehicle.source, *named, code=2)
+    (line,) = err.splitlines()
+    assert line.startswith(
+        "mavftpfs: vehicle 1/1 sends heartbeats but did not answer MAVLink FTP within 3 s ("
+    )
+
+
+# -- terminals ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("columns", "rows"), [(80, 24), (200, 50)])
+def test_progress_has_one_total_and_the_file_at_work(
+    field: Field, tmp_path: Path, columns: int, rows: int
+) -> None:
+    vehicle = field.sim(field.local("card"), "px4", SLOW)
+    for number in range(30):  # more than a small terminal has rows
+        write_log(vehicle.root / "log" / f"{number:02}{'_long' * 12}.ulg", 9000, number, number)
+    screen = terminal.mavftpfs("sync", vehicle.source, tmp_path / "logs", columns=columns, rows=rows)
+    assert screen.finish() == 0
+    assert max(map(len, screen.lines)) <= columns
+    totals = [line for line in screen.lines if "/30 files" in line]
+    assert "0/30 files" in totals[0]
+    assert any("kB/s" in line and "left" in line for line in totals)
+    assert screen.lines[-1].startswith("30 new (270.0 kB), 0 here already")
+    assert screen.raw.count("verified by") == 30
+
+
+def test_put_counts_what_was_acknowledged_then_checks(field: Field, tmp_path: Path) -> None:
+    vehicle = field.sim(field.local("card"), "px4", SLOW)
+    write_log(tmp_path / "big", 500_000, 1, 1)
+    screen = terminal.mavftpfs("put", vehicle.source, tmp_path / "big", "/big")
+
+    def half(_: terminal.Terminal) -> bool:
+        return any(f" {percent} %" in screen.raw for percent in range(30, 70))
+
+    screen.read_until(half)
+    there = sum(path.stat().st_size for path in vehicle.root.iterdir())
+    assert 100_000 < there < 450_000  # all of it was taken from us long ago
+    screen.read_until(lambda _: "checking" in screen.raw)
+    assert screen.finish() == 0
+    assert (vehicle.root / "big").read_bytes() == (tmp_path / "big").read_bytes()
+
+
+def test_ctrl_c_says_what_is_on_the_vehicle(field: Field, tmp_path: Path) -> None:
+    vehicle = field.sim(field.local("card"), "px4", SLOW)
+    for name, size in (("a", 1000), ("b", 700_000)):
+        write_log(tmp_path / "d" / name, size, 1, 1)
+    screen = terminal.mavftpfs("put", "-r", vehicle.source, tmp_path / "d", "/")
+    screen.read_until(lambda _: "/d/a: 1.0 kB, delivered" in screen.raw and "kB/s" in screen.raw)
+    screen.interrupt()
+    assert screen.finish() == 130
+    said = "".join(screen.lines[-2:])
+    assert "interrupted: 1 of 2 files are on the vehicle; /d/b is not" in said
+
+
+def test_ls_on_a_terminal_and_in_a_pipe(field: Field) -> None:
+    vehicle = field.sim(field.local("card"), "ardupilot5")
+    write_log(vehicle.root / "APM" / "LOGS" / "2.BIN", 1_234_567, 1, 5)
+    write_log(vehicle.root / "APM" / "LOGS" / "10.BIN", 10, 1, 3)
+    screen = terminal.mavftpfs("ls", "-R", vehicle.source, "/APM")
+    assert screen.finish() == 0
+    assert "\x1b[1;34mLOGS\x1b[0m/" in screen.raw
+    assert screen.lines == ["/APM:", "LOGS/", "/APM/LOGS:", "10.BIN", "2.BIN"]
+    assert run("ls", "-R", vehicle.source, "/APM")[0] == "/APM:\nLOGS/\n\n/APM/LOGS:\n10.BIN\n2.BIN\n"
+    by_time = run("ls", "-lht", vehicle.source, "/APM/LOGS")[0].splitlines()
+    assert by_time[0].split()[:2] == ["1.2", "MB"]
+    assert [line.split()[-1] for line in by_time] == ["2.BIN", "10.BIN"]
+
+
+# -- scan -----------------------------------------------------------------------------------------
+
+
+@contextmanager
+def heartbeats(port: int, *senders: tuple[Address, int]) -> Iterator[None]:
+    """Have components that know nothing but heartbeats speak to a port; each is (address, MAV_TYPE)."""
+    over = threading.Event()
+    sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    framers = [(Framer(address, stream=False), kind) for address, kind in senders]
+
+    def speak() -> None:
+        while not over.wait(0.3):
+            for framer, kind in framers:
+                sock.sendto(framer.encode_heartbeat(kind, MAV_AUTOPILOT_INVALID), (HOST, port))
+
+    speaker = threading.Thread(target=speak)
+    speaker.start()
+    try:
+        yield
+    finally:
+        over.set()
+        speaker.join()
+        sock.close()
+
+
+def test_scan_of_a_camera_and_a_ground_station_ends_in_its_time() -> None:
+    """No autopilot is there, and connect_timeout is not waited for where somebody else is heard."""
+    port = free_udp_port()
+    with heartbeats(port, (Address(1, 100), 30), (Address(255, 190), MAV_TYPE_GCS)):
+        out, _ = run("scan", "-o", "connect_timeout=3000", f"udpin:{HOST}:{port}")
+    camera, station = (line.split("\t") for line in out.splitlines())
+    assert camera[:4] == ["1/100", "camera", "-", "-"]
+    assert camera[4].startswith("no answer")
+    assert station == ["255/190", "ground station", "-", "-", "not asked (a ground station)"]
