@@ -19,14 +19,14 @@ import trio
 
 from mavftpfs.cache.blocks import BlockCache
 from mavftpfs.cache.dentries import Dentries
-from mavftpfs.cache.keeper import Keeper
+from mavftpfs.cache.kept import KeptCache
 from mavftpfs.cache.options import CacheOptions
 from mavftpfs.cache.tree import Tree
 from mavftpfs.exits import NoFtp
 from mavftpfs.farewell import rescue, spool_for
 from mavftpfs.fuse.operations import Space
 from mavftpfs.fuse.options import MountOptions
-from mavftpfs.keeping import MakeKeeper, keeper_for
+from mavftpfs.keeping import MakeKept, kept_for
 from mavftpfs.link.opening import open_link
 from mavftpfs.link.uri import LinkSpec
 from mavftpfs.session.connection import Connection, ConnectOptions, connected
@@ -122,7 +122,7 @@ async def attached(
     async with open_link(spec) as link, connected(link, settings, trace=sinks.payload) as connection:
         connection.driver.framer.on_frame = sinks.frame
         await connection.ready(options.connect_timeout)
-        keep = await keeper_for(options, connection)
+        keep = await kept_for(options, connection)
         async with _nursery() as nursery:
             with spool_for(connection.vehicle.address) if writing else nullcontext() as spool:
                 notice: Callable[[], str] = str
@@ -137,7 +137,7 @@ async def attached(
                     writer=connection.store if writing else None,
                     spool=spool,
                     rng=SystemRandom(),
-                    keep=None if keep is None else partial(_start_keeper, keep, nursery),
+                    keep=None if keep is None else partial(_start_kept, keep, nursery),
                 )
                 subscribe(connection, tree)
                 if list_root:
@@ -150,10 +150,10 @@ async def attached(
                         spool.discard()
 
 
-def _start_keeper(make: MakeKeeper, nursery: trio.Nursery, cache: BlockCache, dentries: Dentries) -> Keeper:
-    keeper = make(cache, dentries)
-    nursery.start_soon(keeper.run)
-    return keeper
+def _start_kept(make: MakeKept, nursery: trio.Nursery, cache: BlockCache, dentries: Dentries) -> KeptCache:
+    kept = make(cache, dentries)
+    nursery.start_soon(kept.run)
+    return kept
 
 
 @asynccontextmanager

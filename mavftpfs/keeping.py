@@ -9,17 +9,16 @@ from pathlib import Path
 
 import trio
 
-from mavftpfs.cache.blockdirectory import BlockDirectory
 from mavftpfs.cache.blocks import BlockCache
 from mavftpfs.cache.dentries import Dentries
-from mavftpfs.cache.keeper import Facts, Keeper
-from mavftpfs.cache.persistent import vehicle_identity
+from mavftpfs.cache.kept import Facts, KeptCache, vehicle_identity
+from mavftpfs.cache.kept_disk import KeptDisk
 from mavftpfs.fuse.options import MountOptions
 from mavftpfs.session.connection import Connection
 from mavftpfs.shared.errors import UsageError
 from mavftpfs.shared.model import DirEntry, split
 
-MakeKeeper = Callable[[BlockCache, Dentries], Keeper]
+MakeKept = Callable[[BlockCache, Dentries], KeptCache]
 
 DISK_PART = 16
 """The directory may hold about so many times cache_size: 1 GB, if that is not changed."""
@@ -30,8 +29,8 @@ PATIENCE = 5.0
 _POLL = 0.02
 
 
-async def keeper_for(options: MountOptions, connection: Connection) -> MakeKeeper | None:
-    """Return what makes the keeper of a tree, None without cache_dir; waits until the vehicle said who it is.
+async def kept_for(options: MountOptions, connection: Connection) -> MakeKept | None:
+    """Return what makes a tree's kept cache, None without cache_dir; waits until the vehicle said who it is.
 
     Raises:
         UsageError: the directory cannot be used.
@@ -39,7 +38,7 @@ async def keeper_for(options: MountOptions, connection: Connection) -> MakeKeepe
     if options.cache_dir is None:
         return None
     try:
-        directory = BlockDirectory(Path(options.cache_dir), DISK_PART * options.cache_size)
+        directory = KeptDisk(Path(options.cache_dir), DISK_PART * options.cache_size)
     except OSError as exc:
         raise UsageError(f"cache_dir={options.cache_dir}: {exc.strerror}") from exc
 
@@ -47,7 +46,7 @@ async def keeper_for(options: MountOptions, connection: Connection) -> MakeKeepe
         while connection.vehicle.version is None:  # noqa: ASYNC110 (asked for once per mount)
             await trio.sleep(_POLL)
 
-    def make(cache: BlockCache, dentries: Dentries) -> Keeper:
+    def make(cache: BlockCache, dentries: Dentries) -> KeptCache:
         facts = Facts(
             identity=partial(identity, connection),
             remembered=partial(_remembered, dentries),
@@ -55,8 +54,9 @@ async def keeper_for(options: MountOptions, connection: Connection) -> MakeKeepe
             crc32=connection.store.crc32,
             crc_limit=partial(crc_limit, options, connection),
             wall=time.time,
+            clock=cache.clock,
         )
-        return Keeper(directory, cache, facts)
+        return KeptCache(directory, facts)
 
     return make
 

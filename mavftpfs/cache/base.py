@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Awaitable, Callable
 
 from mavftpfs.cache.context import Context
-from mavftpfs.cache.filehandle import FileHandle
+from mavftpfs.cache.files import FileHandle
 from mavftpfs.cache.nodes import Node
 from mavftpfs.cache.versions import became_another
 from mavftpfs.shared.errors import FileChanged, FtpNak, IsADirectory, LocalProtocolError, NotFound

@@ -4,27 +4,22 @@
 `FileBlocks` holds one version of one file; it is the sink that a remote reader fills, and wakes readers
 once per batch. Code between awaits is atomic (trio); nothing here awaits while state is half changed.
 
-Proven and provisional bytes (promise 1). Servers share session ids between clients, so perfectly matching
-replies can carry another file. When the session layer notices that this may have happened (`on_suspect`),
-every byte that came since the current reader was opened is provisional, and so is what still comes, until
-`accept` (size and CRC32 agreed) or `drop_unproven`. Provisional bytes are never returned. Bytes returned
-before the suspicion arose cannot be taken back; but as long as all of them are held (`intact`), a CRC32 of
-the file still tells whether they are its bytes.
+Doubtful bytes (promise 1). Servers share session ids between clients, so perfectly matching replies can carry
+another file. When the session layer notices that this may have happened (`on_suspect`), every byte that came
+since the present reader was opened is dropped, and what still comes from it is ignored: who wants such bytes
+asks again, by a new reader.
 """
 
 from __future__ import annotations
 
-import zlib
-from collections import OrderedDict
+from collections import OrderedDict, deque
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 
 import trio
 
-from mavftpfs.cache.openings import Openings
 from mavftpfs.cache.readahead import Pace, RateMeter
-from mavftpfs.cache.room import Room
 from mavftpfs.shared.errors import RequestTimeout
 from mavftpfs.shared.extents import ExtentSet
 
@@ -33,6 +28,47 @@ BLOCK_SIZE = 128 * 1024
 kernel asks for 256 KiB), left a quarter of the cache's size in unusable holes."""
 
 Gaps = list[tuple[int, int]]
+
+
+class Room:
+    """First come, first served admission of pinned bytes, so that waiting readers cannot fill the memory."""
+
+    def __init__(self, limit: int) -> None:
+        """`limit`: bytes."""
+        self._limit = limit
+        self._queue: deque[tuple[int, trio.Event]] = deque()
+        self.used = 0
+
+    async def enter(self, count: int) -> None:
+        """Wait for `count` bytes; one that is larger than the limit goes alone."""
+        if not self._queue and self._fits(count):
+            self.used += count
+            return
+        ticket = (count, trio.Event())
+        self._queue.append(ticket)
+        try:
+            await ticket[1].wait()
+        except BaseException:
+            if ticket[1].is_set():
+                self.leave(count)
+            else:
+                self._queue.remove(ticket)
+                self._admit()
+            raise
+
+    def leave(self, count: int) -> None:
+        """Give `count` bytes back."""
+        self.used -= count
+        self._admit()
+
+    def _admit(self) -> None:
+        while self._queue and self._fits(self._queue[0][0]):
+            count, event = self._queue.popleft()
+            self.used += count
+            event.set()
+
+    def _fits(self, count: int) -> bool:
+        return self.used == 0 or self.used + count <= self._limit
 
 
 class BlockCache:
@@ -48,11 +84,6 @@ class BlockCache:
         self.bytes_cached = 0
         self.evictions = 0
         self._blocks: OrderedDict[tuple[FileBlocks, int], int] = OrderedDict()
-
-    @property
-    def provable(self) -> int:
-        """The largest file that can be held whole beside the others, in bytes."""
-        return self.budget // 2
 
     def pace(self, streams: int) -> Pace:
         """Return the bounds for readahead while `streams` files are being read."""
@@ -101,25 +132,37 @@ class _Waiter:
     error: Exception | None = None
 
 
+def _do_nothing() -> None:
+    """Nobody is to be told."""
+
+
 class FileBlocks:
-    """The cached bytes of one version of a file; implements cache.remote.ReadSink."""
+    """The cached bytes of one version of a file; implements cache.remote.ReadSink.
+
+    Attributes:
+        given: whether a program got any of the bytes.
+        opened_at: when the server opened the file for the session that bytes come from now.
+        doubted: what comes from the present reader is ignored; cleared by `begin_reading`.
+        drops: how often bytes were dropped because they were in doubt.
+        on_dropped: called when that happens: the kernel may hold copies.
+    """
 
     def __init__(self, cache: BlockCache, size: int = 0) -> None:
-        self._cache = cache
         self.size = size
-        self.suspicion: str | None = None
+        self.given = False
+        self.opened_at = float("-inf")
+        self.doubted = False
+        self.drops = 0
+        self.on_dropped: Callable[[], None] = _do_nothing
+        self._cache = cache
         self._blocks: dict[int, bytearray] = {}
         self._present = ExtentSet()
-        self._proven = ExtentSet()  # INVARIANT: a subset of _present
-        self._given = ExtentSet()
+        self._earlier = ExtentSet()  # held before the present reader; INVARIANT: a subset of _present
         self._pins: dict[int, int] = {}
         self._waiters: list[_Waiter] = []
         self._arrived = 0
         self.received = 0
         self.received_at = float("-inf")
-        self.intact = True
-        self.openings = Openings()
-        self._pristine = True
 
     def __contains__(self, index: int) -> bool:
         """Return whether the block is held."""
@@ -142,13 +185,8 @@ class FileBlocks:
 
     @property
     def complete(self) -> bool:
-        """Whether every byte is held, none of them provisional."""
-        return self._usable(0, self.size)
-
-    @property
-    def given(self) -> bool:
-        """Whether a program got any of the bytes."""
-        return not self._given.empty
+        """Whether every byte is held."""
+        return self._present.covers(0, self.size)
 
     # --- the sink
 
@@ -158,10 +196,12 @@ class FileBlocks:
 
     def on_opened(self, at: float) -> None:
         """What comes from now on is of the file that was opened at that time."""
-        self.openings.on_opened(at, first=self._pristine and not self.given)
+        self.opened_at = at
 
     def on_data(self, offset: int, data: bytes | memoryview) -> None:
         """Keep what is not held yet; what lies beyond the opened size is dropped."""
+        if self.doubted:
+            return
         count = len(data)
         block = self._blocks.get(offset // BLOCK_SIZE)
         at = offset % BLOCK_SIZE
@@ -197,9 +237,13 @@ class FileBlocks:
             waiter.lacking = lacking
 
     def on_suspect(self, reason: str) -> None:
-        """Bytes that came since the reader was opened, and that still come, are provisional."""
-        if self.suspicion is None:
-            self.suspicion = reason
+        """Drop what came since the reader was opened; whoever waits asks again."""
+        if self.doubted:
+            return
+        self.doubted = True
+        self.drops += 1
+        self._forget_but(self._earlier)
+        self.on_dropped()
 
     def on_failed(self, error: Exception) -> None:
         """Those who wait get the error; later reads ask again."""
@@ -217,36 +261,12 @@ class FileBlocks:
 
     def begin_reading(self) -> None:
         """A reader is about to be opened: what is held now did not come from it."""
-        if self.suspicion is None:
-            self._proven = self._present.copy()
-
-    def accept(self) -> None:
-        """Everything held is the vehicle's: size and CRC32 agreed."""
-        self.suspicion = None
-        self._proven = self._present.copy()
-
-    def on_given(self, start: int, stop: int) -> None:
-        """A program, or the kernel for it, got [start, stop)."""
-        self._given.add(start, stop)
+        self.doubted = False
+        self._earlier = self._present.copy()
 
     def start_over(self) -> None:
-        """Forget every byte, proven or not; whoever waits starts anew."""
-        self._proven.clear()
-        self.drop_unproven()
-        self._pristine = True
-
-    def drop_unproven(self) -> None:
-        """Forget provisional bytes; whoever waits starts anew."""
-        self.suspicion = None
-        self._present = self._proven.copy()
-        self.intact = self.intact and all(self._present.covers(*extent) for extent in self._given)
-        for index in list(self._blocks):
-            if self._present.overlaps(*self._extent(index)):
-                self._blocks[index] = bytearray(self._blocks[index])  # a view of the old one may be in use
-            else:
-                self._forget_block(index)
-        for waiter in self._waiters:
-            waiter.done.set()
+        """Forget every byte; whoever waits asks again."""
+        self._forget_but(ExtentSet())
 
     def clear(self) -> None:
         """Forget every block that no reader waits on."""
@@ -264,21 +284,19 @@ class FileBlocks:
         """Forget a block."""
         self._forget_block(index)
         start, stop = self._extent(index)
-        self.intact = self.intact and not self._given.overlaps(start, stop)
         self._present.discard(start, stop)
-        self._proven.discard(start, stop)
+        self._earlier.discard(start, stop)
 
     # --- reading
 
     def get(self, start: int, stop: int) -> bytes | memoryview | None:
-        """Return [start, stop) if it is held and not provisional. 0 <= start < stop <= size."""
-        return self._view(start, stop) if self._usable(start, stop) else None
+        """Return [start, stop) if it is held. 0 <= start < stop <= size."""
+        return self._view(start, stop) if self._present.covers(start, stop) else None
 
     async def fill(self, start: int, stop: int, want: Callable[[Gaps], None]) -> None:
         """Ask `want` for what is missing of [start, stop), which must be held, and wait for it.
 
-        `get` may find nothing afterwards: the bytes came provisional, or were dropped. `want` is called
-        before anything is awaited.
+        `get` may find nothing afterwards: the bytes were dropped. `want` is called before the first await.
 
         Raises:
             RequestTimeout: none of the missing bytes came for `patience` seconds. Else what on_failed got.
@@ -322,18 +340,10 @@ class FileBlocks:
                 self._unpin(index)
             self._cache.room.leave(count)
 
-    async def crc32(self) -> int:
-        """Return the CRC32 (start value 0, no final xor: servers.md 10) of all bytes, which must be held."""
-        value = 0xFFFFFFFF
-        for index in sorted(self._blocks):
-            value = zlib.crc32(self._blocks[index], value)
-            await trio.lowlevel.checkpoint()
-        return value ^ 0xFFFFFFFF
-
     def check_invariants(self) -> None:
         """Raise AssertionError if the books are wrong (for tests)."""
         assert self._present.end <= self.size
-        for start, stop in self._proven:
+        for start, stop in self._earlier:
             assert self._present.covers(start, stop)
         for start, stop in self._present:
             assert all(i in self._blocks for i in range(start // BLOCK_SIZE, -(-stop // BLOCK_SIZE)))
@@ -341,8 +351,15 @@ class FileBlocks:
 
     # --- inside
 
-    def _usable(self, start: int, stop: int) -> bool:
-        return (self._present if self.suspicion is None else self._proven).covers(start, stop)
+    def _forget_but(self, kept: ExtentSet) -> None:
+        """Forget all bytes that are not in `kept`."""
+        self._present, self._earlier = kept.copy(), kept.copy()
+        for index in list(self._blocks):
+            if self._present.overlaps(*self._extent(index)):
+                self._blocks[index] = bytearray(self._blocks[index])  # a view of the old one may be in use
+            else:
+                self._forget_block(index)
+        self.ask_again()
 
     def _lacking(self, start: int, stop: int) -> int:
         return sum(end - begin for begin, end in self._present.missing(start, stop))
@@ -365,7 +382,6 @@ class FileBlocks:
             start = end
 
     def _new_block(self, index: int) -> bytearray:
-        self._pristine = False
         start, stop = self._extent(index)
         self._cache.add(self, index, stop - start)
         block = self._blocks[index] = bytearray(stop - start)

@@ -15,8 +15,8 @@ from functools import partial
 import trio
 
 from mavftpfs.cache.dentries import Dentries, Directory
-from mavftpfs.cache.flights import Flights
 from mavftpfs.cache.remote import RemoteStore
+from mavftpfs.cache.singleflight import SingleFlight
 from mavftpfs.shared.errnos import errno_for
 from mavftpfs.shared.errors import FtpNak, NotADirectory, NotFound, PathTooLong, VehicleLost
 from mavftpfs.shared.model import ROOT, DirEntry, EntryKind, Listing, join, split
@@ -69,7 +69,7 @@ class Directories:
         self._dentries = dentries
         self._root = root
         self._clock = clock
-        self._flights: Flights[bytes, Directory] = Flights(nursery)
+        self._sweeping: SingleFlight[bytes, Directory] = SingleFlight(nursery)
         self._root_proven = root == ROOT
         self._dot_refused = False
         self.on_swept: Callable[[bytes, Directory], Awaitable[None]] | None = None
@@ -129,7 +129,7 @@ class Directories:
             return stale
         try:
             await self._require_directory(path)
-            directory = await self._flights.run(path, partial(self._sweep, path))
+            directory = await self._sweeping.run(path, partial(self._sweep, path))
         except VehicleLost:
             if stale is None:
                 raise
@@ -206,7 +206,7 @@ class Directories:
     async def _listed(self, path: bytes) -> Directory:
         """Return the listing of a directory on the way to the root."""
         fresh = self._dentries.fresh(path, self._clock())
-        return fresh or await self._flights.run(path, partial(self._sweep, path))
+        return fresh or await self._sweeping.run(path, partial(self._sweep, path))
 
     async def _sweep(self, path: bytes) -> Directory:
         """List until no change of ours came between."""

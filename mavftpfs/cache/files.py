@@ -2,15 +2,19 @@
 
 At open it is decided whether what is cached of the path is still the vehicle's file:
 - size and mtime of a fresh listing are known and equal the version's, or
-- the version was proven (by an open ACK, a CRC32 or a listing) less than `dir_timeout` ago and no later
-  listing says otherwise: it is kept, and nothing is asked;
-- else the file is opened on the vehicle and a new version starts with the size in the ACK, because equal
+- the version was known to be the vehicle's (by an open reply or a listing) less than `dir_timeout` ago and no
+  later listing says otherwise: it is used, and nothing is asked;
+- else the file is opened on the vehicle and a new version starts with the size in the reply, because equal
   sizes without an mtime prove nothing.
-Old handles of a file that turned out smaller, or of the same size with another mtime, get FileChanged, for
-good (`Version.lost`) unless that came of what we are changing there; of one that is larger they go on at the
-size they opened: logs grow. The kernel has one page cache for all handles of a path, so a new version
-bypasses it (direct_io) while handles of an older one are open. What a restart of the vehicle does to open
-files says `restarts`, and `reopens` what the end of the server's session on one does.
+
+While a file is open the server's session on it is closed and opened again: after losses, restarts, and turns
+of other files. Then size and mtime are compared (`FileHandle.read`): equal, or larger, means the same file,
+because logs grow; else readers that were given bytes get FileChanged, and others go on with the file that is
+there now. The open reply tells the size; the mtime takes a listing that began after the reopening, where
+listings tell any.
+
+The kernel has one page cache for all handles of a path, so a new version bypasses it (direct_io) while
+handles of an older one are open.
 """
 
 from __future__ import annotations
@@ -21,24 +25,23 @@ from functools import partial
 from itertools import islice
 
 from mavftpfs.cache.blocks import BlockCache, FileBlocks
+from mavftpfs.cache.dentries import COST_FACTOR, Directory
 from mavftpfs.cache.directories import Directories
-from mavftpfs.cache.filehandle import FileHandle
-from mavftpfs.cache.flights import Flights
-from mavftpfs.cache.keeper import Keeper
+from mavftpfs.cache.kept import KeptCache
+from mavftpfs.cache.openfile import ReadOnlyHandle
 from mavftpfs.cache.options import MIB
-from mavftpfs.cache.readahead import Pace
+from mavftpfs.cache.readahead import Pace, Readahead
 from mavftpfs.cache.remote import RemoteStore
-from mavftpfs.cache.reopens import Reopens, is_unsettled
-from mavftpfs.cache.restarts import Restarts
-from mavftpfs.cache.versions import Fetcher, Version, became_another
+from mavftpfs.cache.singleflight import SingleFlight
+from mavftpfs.cache.versions import MAX_TRIES, Fetcher, Version, became_another
 from mavftpfs.shared.errors import (
     DataUnproven,
     FileTooLarge,
     LocalProtocolError,
+    NotADirectory,
     NotFound,
-    VehicleLost,
 )
-from mavftpfs.shared.model import DirEntry, split
+from mavftpfs.shared.model import DirEntry, EntryKind, split
 
 MAX_CLOSED = 4096
 """How many files that nobody has open are remembered with their blocks."""
@@ -52,12 +55,19 @@ READING = 3.0
 MAX_PIECE = MIB
 """A read is served in pieces of at most so many bytes (or a quarter of the cache)."""
 
+COMPARE_PAUSE = 2.0
+"""Seconds between two listings that only compare one file; 50 times what the last one took where that is
+more. A read that reaches the end of the file waits for neither."""
+
 
 class Files:
     """All regular files that are open or cached. Paths are the vehicle's.
 
     Attributes:
         is_changing: whether we are changing what the vehicle has of a path, or may have done so in part.
+        kept: the cache on the local disk, if there is one.
+        piece: bytes of a read that are served at once.
+        hits, misses: reads that found all they wanted in the cache, and others.
     """
 
     def __init__(
@@ -65,39 +75,33 @@ class Files:
         store: RemoteStore,
         cache: BlockCache,
         *,
-        dir_timeout: float,
+        proof_time: float,
         directories: Directories,
         on_size: Callable[[bytes, int], None],
         invalidate: Callable[[bytes], None],
     ) -> None:
-        """`on_size` hears sizes that open ACKs told and listings did not."""
-        self.keeper: Keeper | None = None
+        """`proof_time`: seconds that what is known of a file holds; `on_size` hears sizes that open replies
+        told and listings did not."""
+        self.kept: KeptCache | None = None
         self.is_changing: Callable[[bytes], bool] = lambda path: False
         self._store = store
         self._cache = cache
         self._clock = cache.clock
-        self._dir_timeout = dir_timeout
-        self._rebooted_at = float("-inf")
+        self._proof_time = proof_time
+        self._restarted_at = float("-inf")
         self._directories = directories
         self._on_size = on_size
         self._invalidate = invalidate
-        self.fetcher = Fetcher(store, cache, on_distrust=self._distrust, on_changed=self._kill)
-        self.restarts = Restarts(self.fetcher, self._facts, on_changed=self._kill)
-        self.reopens = Reopens(
-            self.fetcher,
-            directories,
-            clock=cache.clock,
-            opened=lambda: self._open_versions,
-            is_changing=lambda path: self.is_changing(path),
-            on_changed=self._kill,
-        )
+        self.fetcher = Fetcher(store, patience=cache.patience, on_changed=self._kill)
         self.piece = min(MAX_PIECE, cache.budget // 4)
         self._current: OrderedDict[bytes, Version] = OrderedDict()
         self._open_versions: dict[Version, None] = {}
-        self._opening: Flights[bytes, tuple[Version, bool]] = Flights()
+        self._opening: SingleFlight[bytes, tuple[Version, bool]] = SingleFlight()
+        self._comparing: SingleFlight[Version, None] = SingleFlight()
         self.open_count = 0
         self.hits = 0
         self.misses = 0
+        directories.on_listed = self._on_listed
 
     # --- opening
 
@@ -105,11 +109,11 @@ class Files:
         """Open a path that a listing (begun at `listed_at`, perhaps not `fresh` any more) shows as `entry`.
 
         Raises:
-            As RemoteStore.open_reader.
+            DataUnproven: the size in the reply is smaller than listed. Else as RemoteStore.open_reader.
         """
         work = partial(self._open_version, path, entry, listed_at, fresh)
-        version, kept = await self._opening.run(path, work)
-        keep_cache = kept and version.shown
+        version, same = await self._opening.run(path, work)
+        keep_cache = same and version.shown
         version.handles += 1
         version.shown = True
         self.open_count += 1
@@ -119,7 +123,7 @@ class Files:
         return FileHandle(self, version, keep_cache=keep_cache, direct_io=direct_io)
 
     async def learn_size(self, path: bytes) -> int:
-        """Return the size that an open ACK tells, for listings that tell none.
+        """Return the size that an open reply tells, for listings that tell none.
 
         Raises:
             As RemoteStore.open_reader.
@@ -136,25 +140,21 @@ class Files:
     ) -> tuple[Version, bool]:
         """Return the version to serve, and whether it is the one that was served before."""
         version = self._current.get(path)
-        if version is not None and not version.handles:
-            self._drop_doubtful(version)
         if version is not None and self._still_right(version, entry, listed_at, fresh):
             self._current.move_to_end(path)
-            if self.keeper is not None:
-                self.keeper.watch(version)
+            if self.kept is not None:
+                self.kept.watch(version)
             return version, True
-        kept = await self.keeper.revive(path, entry, listed_at) if fresh and self.keeper else None
-        if kept is not None:
-            self._replace(path, kept)
-            return kept, False
-        version = await self._start_version(path, entry)
-        if fresh and self.keeper is not None:
-            self.keeper.keep(version, entry)
+        version = await self._revive(path, entry) if fresh else None
+        if version is None:
+            version = await self._start_version(path, entry)
+            if fresh and self.kept is not None:
+                self.kept.keep(version, entry)
         return version, False
 
     def _still_right(self, version: Version, entry: DirEntry, listed_at: float, fresh: bool) -> bool:
         """Return whether a version is known to be what the vehicle holds now."""
-        if version.dead is not None or version.recheck:
+        if version.dead is not None:
             return False
         newer = listed_at > version.proven_at
         if newer and became_another(version.size, version.mtime, entry):
@@ -162,31 +162,42 @@ class Files:
             return False
         same_size = entry.size in (None, version.size)
         if fresh and entry.size == version.size and entry.mtime is not None and entry.mtime == version.mtime:
-            version.sure |= newer
             version.proven_at = max(version.proven_at, listed_at)
             return True
-        recent = self._clock() - version.proven_at < self._dir_timeout
+        recent = self._clock() - version.proven_at < self._proof_time
         return recent and (same_size or not newer)
 
+    async def _revive(self, path: bytes, entry: DirEntry) -> Version | None:
+        """Return a version of a freshly listed file of which the local disk has blocks, None if it has
+        none."""
+        kept = None if self.kept is None else await self.kept.find(path, entry)
+        if kept is None or self.kept is None:
+            return None
+        version = Version(path, entry.mtime, self._new_blocks(kept.key.size), self._clock(), kept=kept)
+        self._replace(version)
+        self.kept.watch(version)
+        return version
+
     async def _start_version(self, path: bytes, entry: DirEntry) -> Version:
-        blocks = FileBlocks(self._cache)
+        blocks = self._new_blocks()
         reader = await self._store.open_reader(path, blocks)
-        if entry.size is not None and entry.size >= WRAP and entry.size % WRAP == reader.size:
+        try:
+            if entry.size is not None and entry.size >= WRAP and entry.size % WRAP == reader.size:
+                raise FileTooLarge(f"{path!r} has {entry.size} bytes, more than an open reply can tell")
+            if entry.size is not None and reader.size < entry.size and not self.is_changing(path):
+                entry = await self._require_listed(path, reader.size)
+        except BaseException:
             reader.close()
-            raise FileTooLarge(f"{path!r} has {entry.size} bytes, more than an open reply can tell")
+            raise
         blocks.size = reader.size
         old = self._current.get(path)
         if old is not None and old.size > reader.size:
             self._kill(old)
-        if entry.size is not None and reader.size < entry.size and not self.is_changing(path):
-            try:
-                entry = await self._require_listed(path, reader.size)
-            except BaseException:
-                reader.close()
-                raise
         mtime = entry.mtime if entry.size in (None, reader.size) else None
         version = Version(path, mtime, blocks, self._clock(), reader)
-        self._replace(path, version)
+        if mtime is not None or not self._directories.tells_times:
+            version.same_at = blocks.opened_at
+        self._replace(version)
         if entry.size != reader.size:
             self._on_size(path, reader.size)
         return version
@@ -207,11 +218,16 @@ class Files:
             raise DataUnproven(f"{path!r} has {entry.size} bytes as listed, and {size} as opened")
         return entry
 
-    def _replace(self, path: bytes, version: Version) -> None:
-        old = self._current.pop(path, None)
+    def _new_blocks(self, size: int = 0) -> FileBlocks:
+        blocks = FileBlocks(self._cache, size)
+        blocks.on_dropped = partial(self._on_dropped, blocks)
+        return blocks
+
+    def _replace(self, version: Version) -> None:
+        old = self._current.pop(version.path, None)
         if old is not None and not old.handles:
             old.blocks.clear()
-        self._current[path] = version
+        self._current[version.path] = version
         if len(self._current) > MAX_CLOSED:
             closed = (v for v in self._current.values() if not v.handles and v is not version)
             for surplus in list(islice(closed, 1)):
@@ -219,8 +235,8 @@ class Files:
 
     def status(self) -> dict[str, object]:
         """Return counters."""
-        kept = {} if self.keeper is None else self.keeper.status()
-        return {"hits": self.hits, "misses": self.misses, "reads_unproven": self.fetcher.unproven, **kept}
+        kept = {} if self.kept is None else self.kept.status()
+        return {"hits": self.hits, "misses": self.misses, "reads_unproven": self.fetcher.dropped, **kept}
 
     def reads(self) -> list[dict[str, object]]:
         """Return the files that are being fetched: path, size and done in bytes."""
@@ -241,7 +257,74 @@ class Files:
         if current is not None and current is not version:
             current.shown = False
 
-    # --- the file changed
+    # --- is it the same file?
+
+    async def compare(self, version: Version, *, now: bool) -> None:
+        """Compare a version with a listing, if its file may have become another one since it was opened.
+
+        now: also if one was asked for to compare it just before.
+
+        Raises:
+            FileChanged: it is another one. Else as RemoteStore.list_directory.
+        """
+        waits = not now and self._clock() < version.compare_at
+        if not (waits or version.settled or self.is_changing(version.path)) and self._listings_tell(version):
+            await self._comparing.run(version, partial(self._compare_once, version))
+        version.require_alive()
+
+    def _listings_tell(self, version: Version) -> bool:
+        """Return whether a listing tells more than the size that each open reply tells."""
+        restarted = version.restarted_at > version.same_at
+        return restarted or version.mtime is not None or self._directories.tells_times
+
+    async def _compare_once(self, version: Version) -> None:
+        path = version.path
+        try:
+            directory = await self._directories.recent(split(path)[0], began=version.questioned_at)
+        except (NotFound, NotADirectory):
+            self._kill(version)
+            return
+        async with self.fetcher.paths.steady(lambda: version.path) as present:
+            if present != path or self.is_changing(path):
+                return  # who reads on has it compared under its new name
+        took = directory.ended_at - directory.listed_at
+        version.compare_at = self._clock() + max(COMPARE_PAUSE, COST_FACTOR * took)
+        self._judge(version, directory)
+
+    def _judge(self, version: Version, directory: Directory) -> None:
+        """Take what a listing shows that began after a version was opened."""
+        entry = directory.entries.get(split(version.path)[1])
+        if entry is None or entry.kind is not EntryKind.FILE:
+            if directory.complete or entry is not None:
+                self._kill(version)
+            return
+        another = became_another(version.size, version.mtime, entry)
+        if version.restarted_at > version.same_at:  # nobody went on writing the same log
+            another |= entry.size not in (None, version.size)
+        if not another:
+            self._on_same(version, entry, directory.listed_at)
+        elif version.blocks.given or (entry.size or 0) < version.size:
+            self._kill(version)
+        else:
+            mtime = entry.mtime if entry.size == version.size else None
+            version.start_over(mtime, directory.listed_at)
+            self._on_dropped(version.blocks)
+
+    def _on_same(self, version: Version, entry: DirEntry, listed_at: float) -> None:
+        """A listing shows the file as it was opened, or as it grew."""
+        if listed_at < version.questioned_at:
+            return
+        version.same_at = listed_at
+        if version.mtime is None and entry.size == version.size:
+            version.mtime = entry.mtime
+
+    def _on_listed(self, path: bytes, directory: Directory) -> None:
+        """A directory was listed, for whatever reason."""
+        for version in list(self._open_versions):
+            parent, name = split(version.path)
+            known = parent == path and name in directory.entries and version.dead is None
+            if known and directory.listed_at > version.proven_at and not self.is_changing(version.path):
+                self._judge(version, directory)
 
     def _kill(self, version: Version) -> None:
         """The path is another file now: none of those that were opened there up to this version."""
@@ -261,51 +344,40 @@ class Files:
             current.shown = False
         self._invalidate(path)
 
-    def _distrust(self, version: Version) -> None:
-        """Bytes of it were dropped as doubtful: the kernel may hold copies."""
-        version.shown = False
-        self._invalidate(version.path)
-
-    def _drop_doubtful(self, version: Version) -> None:
-        """Nobody has it open who could settle a suspicion."""
-        if version.blocks.suspicion is not None:
-            version.blocks.drop_unproven()
-            self._distrust(version)
+    def _on_dropped(self, blocks: FileBlocks) -> None:
+        """Bytes of a version were dropped: the kernel may hold copies."""
+        for version in dict.fromkeys((*self._current.values(), *self._open_versions)):
+            if version.blocks is blocks:
+                version.shown = False
+                self._invalidate(version.path)
 
     def rebooted(self) -> None:
-        """Nothing is proven any more; open files are compared with a listing before their next read."""
-        self._rebooted_at = self._clock()
+        """Nothing is proven any more; open files are compared before more of them is given out."""
+        self._restarted_at = self._clock()
         for version in self._current.values():
             version.proven_at = float("-inf")
         for version in self._open_versions:
-            version.boot += 1
-
-    async def _facts(self, path: bytes) -> DirEntry:
-        """Return an entry listed since the last reboot."""
-        found = await self._directories.find(path)
-        if found.directory.listed_at < self._rebooted_at:
-            raise VehicleLost("the vehicle restarted and does not answer yet")
-        return found.entry
+            version.restarted_at, version.compare_at = self._restarted_at, float("-inf")
 
     # --- we changed the file ourselves
 
     def cached(self, path: bytes) -> FileBlocks | None:
         """Return what is cached of a path's present version, if all that is surely of one file."""
         version = self._current.get(path)
-        if version is None or version.dead is not None or version.recheck or is_unsettled(version):
+        if version is None or version.dead is not None:
             return None
-        return version.blocks
+        return version.blocks if version.settled or not self._listings_tell(version) else None
 
     def was_lost(self, path: bytes) -> bool:
         """Return whether somebody has a version of the path open, and is to read nothing more."""
         return any(v.path == path and v.lost for v in self._open_versions)
 
-    def end(self, path: bytes, *, doubted: bool) -> None:
-        """What we are about to write there must not be given to who has another file open, or may have one
-        (`doubted`)."""
+    def end(self, path: bytes, *, doubted: bool = False) -> None:
+        """What we are about to write there must not be given to who has another file open."""
+        if doubted:
+            return
         for version in [v for v in self._open_versions if v.path == path and v.dead is None]:
-            if not doubted or (version.blocks.given and version.blocks.openings.doubted):
-                self._kill(version)
+            self._kill(version)
 
     def was_replaced(self, path: bytes) -> bool:
         """Return whether somebody who is to read on has a version open that is not the vehicle's any more."""
@@ -321,11 +393,11 @@ class Files:
     def adopt(self, path: bytes, size: int, pieces: Iterable[tuple[int, bytes]], *, proven_at: float) -> None:
         """Take over the content of a file we wrote: (offset, bytes) of all of it, then proven."""
         self.on_written(path)
-        if proven_at <= self._rebooted_at:
+        if proven_at <= self._restarted_at:
             return
-        blocks = FileBlocks(self._cache, size)
-        blocks.on_given(0, size)
-        self._replace(path, Version(path, None, blocks, proven_at, shown=True))
+        blocks = self._new_blocks(size)
+        blocks.given = True
+        self._replace(Version(path, None, blocks, proven_at, shown=True))
         for offset, data in pieces:
             blocks.preload(offset, data)
 
@@ -363,10 +435,9 @@ class Files:
         del self._open_versions[version]
         version.close_reader()
         version.blocks.on_failed(LocalProtocolError(f"{version.path!r} was closed while it was read"))
-        self._drop_doubtful(version)
         if self._current.get(version.path) is not version:
             version.blocks.clear()
-        elif version.dead is not None or version.recheck:
+        elif version.dead is not None or version.restarted_at > version.same_at:
             self._forget(version)
 
     def forget_closed(self) -> None:
@@ -378,3 +449,96 @@ class Files:
     def _forget(self, version: Version) -> None:
         version.blocks.clear()
         del self._current[version.path]
+
+
+class FileHandle(ReadOnlyHandle):
+    """One open() of a regular file (see openfile.OpenFile)."""
+
+    def __init__(self, files: Files, version: Version, *, keep_cache: bool, direct_io: bool) -> None:
+        self._files = files
+        self._version = version
+        self._readahead = Readahead(version.size)
+        self._closed = False
+        self.size = version.size
+        self.keep_cache = keep_cache
+        self.direct_io = direct_io
+
+    async def read(self, offset: int, size: int, *, sure: bool = False) -> bytes | memoryview:
+        """Return `size` bytes at `offset`, fewer only at the end of the opened size; sure: a comparison with
+        what the vehicle has is not put off.
+
+        Raises:
+            FileChanged, DataUnproven, RequestTimeout, VehicleLost, FtpNak.
+        """
+        if self._closed:
+            raise LocalProtocolError("read of a closed handle")
+        stop = min(offset + size, self.size)
+        if offset >= stop:
+            return b""
+        version = self._version
+        for _ in range(MAX_TRIES):
+            before = version.history
+            version.require_alive()
+            data = await self._read_range(offset, stop)
+            await self._files.compare(version, now=sure or stop == self.size)
+            if version.history == before:
+                version.blocks.given = True
+                return data
+        raise DataUnproven(f"{version.path!r} is doubted again and again while it is read")
+
+    async def require_same(self) -> None:
+        """Compare what was read of the file with what is there, if that is in doubt.
+
+        Raises:
+            FileChanged: it became another one. Else as Files.compare.
+        """
+        await self._files.compare(self._version, now=True)
+
+    @property
+    def mtime(self) -> int | None:
+        """The file's mtime in seconds UTC, None where no listing told it."""
+        return self._version.mtime
+
+    @property
+    def comparable(self) -> bool:
+        """Whether bytes of it were given out, and a listing can tell whether they are of another file."""
+        return self._version.mtime is not None and self._version.blocks.given
+
+    @property
+    def lost(self) -> bool:
+        """Whether the file became another one by somebody else's doing."""
+        return self._version.lost
+
+    def require_not_lost(self) -> None:
+        """Raise FileChanged if the file became another one by somebody else's doing."""
+        if self._version.lost:
+            self._version.require_alive()
+
+    def close(self) -> None:
+        """Release the handle."""
+        if not self._closed:
+            self._closed = True
+            self._files.release(self._version)
+
+    async def _read_range(self, offset: int, stop: int) -> bytes | memoryview:
+        step = self._files.piece
+        if stop - offset <= step:
+            return await self._read_piece(offset, stop)
+        pieces = [await self._read_piece(at, min(at + step, stop)) for at in range(offset, stop, step)]
+        return b"".join(pieces)
+
+    async def _read_piece(self, start: int, stop: int) -> bytes | memoryview:
+        files, version = self._files, self._version
+        files.on_read(version)
+        pace = files.pace()
+        plan = self._readahead.on_read(start, stop, limit=pace.limit, small=pace.small)
+        if plan.seeked and version.reader is not None:
+            version.reader.drop_readahead()
+        data = version.blocks.get(start, stop)
+        if data is None:
+            files.misses += 1
+            return await files.fetcher.fetch(version, start, stop, plan)
+        files.hits += 1
+        if version.reader is not None and plan.start < plan.stop:
+            version.reader.want(plan.start, plan.stop, demand=False)
+        return data

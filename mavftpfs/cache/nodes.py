@@ -14,7 +14,7 @@ import trio
 
 from mavftpfs.cache.asides import Places
 from mavftpfs.cache.draft import Draft
-from mavftpfs.cache.filehandle import FileHandle
+from mavftpfs.cache.files import FileHandle
 from mavftpfs.cache.plan import Plan
 from mavftpfs.cache.remote import Upload
 from mavftpfs.cache.sending import Sending

@@ -8,7 +8,9 @@ modules behind it name them as the vehicle does.
 from __future__ import annotations
 
 import time
+from collections import OrderedDict
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from random import Random
@@ -17,15 +19,14 @@ import trio
 
 from mavftpfs.cache.attributes import UNKNOWN_MTIME, Stat, shown_mtime
 from mavftpfs.cache.blocks import BlockCache
-from mavftpfs.cache.checksums import Checksums
 from mavftpfs.cache.dentries import Dentries
 from mavftpfs.cache.directories import Directories, Found
 from mavftpfs.cache.files import Files
-from mavftpfs.cache.flights import Flights
-from mavftpfs.cache.keeper import Keeper
+from mavftpfs.cache.kept import KeptCache
 from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.options import CacheOptions
 from mavftpfs.cache.remote import RemoteStore, WriteStore
+from mavftpfs.cache.singleflight import SingleFlight
 from mavftpfs.cache.spool import SpoolDirectory
 from mavftpfs.cache.virtual import VirtualTrees, is_snapshot
 from mavftpfs.cache.writeback import Writeback
@@ -34,6 +35,9 @@ from mavftpfs.shared.errors import FtpNak, IsADirectory, ListingIncomplete, Read
 from mavftpfs.shared.model import ROOT, DirEntry, EntryKind, is_virtual, join, normalise
 
 __all__ = ["OpenFile", "Stat", "Tree"]
+
+MAX_CHECKSUMS = 1024
+"""How many of the vehicle's checksums are remembered."""
 
 
 class Tree:
@@ -54,14 +58,14 @@ class Tree:
         spool: SpoolDirectory | None = None,
         wall: Callable[[], float] = time.time,
         rng: Random | None = None,
-        keep: Callable[[BlockCache, Dentries], Keeper] | None = None,
+        keep: Callable[[BlockCache, Dentries], KeptCache] | None = None,
     ) -> None:
         """`invalidate(path)`: the kernel's pages and attributes of a path are wrong; must not block.
 
         With a nursery, listings and snapshots under way survive the cancellation of who asked for them, and
         written bytes go to the vehicle while the program still writes. Without a writer all is read-only.
         `spool` keeps what is not delivered; `wall`: seconds since 1970; `rng` numbers our temporary names;
-        `keep` makes the keeper.
+        `keep` makes the cache on the local disk.
         """
         self._store = store
         self._options = options
@@ -75,12 +79,12 @@ class Tree:
         self._files = Files(
             store,
             self._blocks,
-            dir_timeout=options.proof_time,
+            proof_time=options.proof_time,
             directories=self._directories,
             on_size=self._on_size,
             invalidate=self._invalidate,
         )
-        self._files.keeper = None if keep is None else keep(self._blocks, self._dentries)
+        self._files.kept = None if keep is None else keep(self._blocks, self._dentries)
         self._virtual = VirtualTrees(
             store,
             self._directories,
@@ -90,8 +94,8 @@ class Tree:
             invalidate=self._invalidate,
             nursery=nursery,
         )
-        self._learning: Flights[bytes, int] = Flights()
-        self._checksums = Checksums(store, clock=clock, lifetime=options.proof_time)
+        self._learning: SingleFlight[bytes, int] = SingleFlight()
+        self._checksums = _Checksums(store, clock, options.proof_time)
         self._writing: Writeback | None = None
         if writer is not None:
             self._writing = make_writeback(
@@ -398,3 +402,57 @@ class Tree:
         """An open told another size than the listing: what the kernel was told is wrong."""
         self._dentries.learn_size(remote, size, self._clock())
         self._invalidate(remote)
+
+
+@dataclass(frozen=True, slots=True)
+class _Checksum:
+    size: int
+    mtime: int | None
+    value: int
+    asked_at: float
+
+
+class _Checksums:
+    """The vehicle's CRC32s by path, each good for the size and mtime it was asked at; where there is no
+    mtime, for `lifetime` seconds."""
+
+    def __init__(self, store: RemoteStore, clock: Callable[[], float], lifetime: float) -> None:
+        self._store = store
+        self._clock = clock
+        self._lifetime = lifetime
+        self._known: OrderedDict[bytes, _Checksum] = OrderedDict()
+        self._asking: SingleFlight[bytes, int] = SingleFlight()
+
+    async def get(self, path: bytes, found: Found) -> int:
+        """Return a listed file's checksum.
+
+        Raises:
+            As RemoteStore.crc32.
+        """
+        known = self._known.get(path)
+        if known is not None and self._still_holds(known, found):
+            return known.value
+        return await self._asking.run(path, partial(self._ask, path, found))
+
+    def _still_holds(self, known: _Checksum, found: Found) -> bool:
+        if (known.size, known.mtime) != (found.size, found.entry.mtime):
+            return False
+        return known.mtime is not None or self._clock() - known.asked_at < self._lifetime
+
+    def forget_below(self, path: bytes) -> None:
+        """The path, or what lies below it, changed."""
+        for known in [p for p in self._known if p == path or p.startswith(path + b"/")]:
+            del self._known[known]
+
+    def clear(self) -> None:
+        """Nothing known holds any more."""
+        self._known.clear()
+
+    async def _ask(self, path: bytes, found: Found) -> int:
+        value = await self._store.crc32(path, size=found.size)
+        if found.size is not None:
+            self._known.pop(path, None)
+            self._known[path] = _Checksum(found.size, found.entry.mtime, value, self._clock())
+        if len(self._known) > MAX_CHECKSUMS:
+            self._known.popitem(last=False)
+        return value

@@ -10,7 +10,9 @@ and the open that follows reuses it, so that stat, open and read agree and rsync
 from __future__ import annotations
 
 import zlib
+from collections import OrderedDict
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from functools import partial
 
 import trio
@@ -18,16 +20,17 @@ import trio
 from mavftpfs.cache.attributes import Stat, shown_mtime
 from mavftpfs.cache.dentries import Dentries
 from mavftpfs.cache.directories import Directories, Found
-from mavftpfs.cache.flights import Flights
+from mavftpfs.cache.openfile import ReadOnlyHandle
 from mavftpfs.cache.options import CacheOptions
 from mavftpfs.cache.remote import RemoteStore
-from mavftpfs.cache.snapshots import Snapshot, SnapshotHandle, Snapshots
+from mavftpfs.cache.singleflight import SingleFlight
 from mavftpfs.shared.errors import (
     DataUnproven,
     FtpNak,
     IsADirectory,
     LinkError,
     ListingIncomplete,
+    LocalProtocolError,
     NotADirectory,
     NotFound,
     RequestTimeout,
@@ -54,6 +57,9 @@ GRACE = 10.0
 """An open may use a snapshot for so many seconds after it ceased to answer stat: who asked for the size just
 before gets the bytes of that size."""
 
+MAX_SIZES = 4096
+"""Of how many files the true size is remembered."""
+
 _OPEN_FILE_RO = 4
 _FILE_NOT_FOUND = 10
 
@@ -66,6 +72,84 @@ def is_snapshot(path: bytes) -> bool:
 def tree_of(path: bytes) -> bytes:
     """Return the first part of an absolute path."""
     return path[1:].partition(b"/")[0]
+
+
+@dataclass(frozen=True, slots=True)
+class Snapshot:
+    """A whole `@` file. good_until: when it no longer answers stat."""
+
+    data: bytes
+    good_until: float
+
+
+class Snapshots:
+    """Remembered snapshots within a budget of bytes, and the true sizes of more."""
+
+    def __init__(self, budget: int) -> None:
+        self._budget = budget
+        self._snapshots: OrderedDict[bytes, Snapshot] = OrderedDict()
+        self._sizes: OrderedDict[bytes, int] = OrderedDict()
+        self.bytes_cached = 0
+
+    def get(self, path: bytes, now: float) -> Snapshot | None:
+        """Return a snapshot that is good at `now`."""
+        snapshot = self._snapshots.get(path)
+        return snapshot if snapshot is not None and now < snapshot.good_until else None
+
+    def size_of(self, path: bytes) -> int | None:
+        """Return the size that the last snapshot had, in bytes."""
+        return self._sizes.get(path)
+
+    def put(self, path: bytes, snapshot: Snapshot) -> None:
+        """Remember a snapshot; one that exceeds the budget leaves only its size."""
+        self._drop(path)
+        self._sizes.pop(path, None)
+        self._sizes[path] = len(snapshot.data)
+        if len(self._sizes) > MAX_SIZES:
+            self._drop(self._sizes.popitem(last=False)[0])
+        self._snapshots[path] = snapshot
+        self.bytes_cached += len(snapshot.data)
+        while self.bytes_cached > self._budget:
+            self._drop(next(iter(self._snapshots)))
+
+    def clear(self) -> None:
+        """Forget everything."""
+        self._snapshots.clear()
+        self._sizes.clear()
+        self.bytes_cached = 0
+
+    def _drop(self, path: bytes) -> None:
+        snapshot = self._snapshots.pop(path, None)
+        if snapshot is not None:
+            self.bytes_cached -= len(snapshot.data)
+
+
+class SnapshotHandle(ReadOnlyHandle):
+    """One open() of an `@` file (see openfile.OpenFile)."""
+
+    direct_io = True
+    keep_cache = False
+
+    def __init__(self, data: bytes, on_close: Callable[[], None]) -> None:
+        self._data = memoryview(data)
+        self._on_close: Callable[[], None] | None = on_close
+        self.size = len(data)
+
+    async def read(self, offset: int, size: int) -> bytes | memoryview:
+        """Return `size` bytes at `offset`, fewer only at the end.
+
+        Raises:
+            LocalProtocolError: the handle was closed.
+        """
+        if self._on_close is None:
+            raise LocalProtocolError("read of a closed handle")
+        return self._data[offset : offset + size]
+
+    def close(self) -> None:
+        """Release the handle."""
+        if self._on_close is not None:
+            self._on_close()
+            self._on_close = None
 
 
 class VirtualTrees:
@@ -88,7 +172,7 @@ class VirtualTrees:
         self._options = options
         self._clock = clock
         self._invalidate = invalidate
-        self._reading: Flights[bytes, Snapshot] = Flights(nursery)
+        self._reading: SingleFlight[bytes, Snapshot] = SingleFlight(nursery)
         self._param_opens: bool | None = None
         self._unlisted: set[bytes] = set()  # listed, but refused as not found: hidden until a reboot
         self._unread: set[bytes] = set()  # too slow or refused otherwise: listing does not try again

@@ -13,9 +13,9 @@ from typing import Protocol
 from mavftpfs.cache.base import open_node, read_base
 from mavftpfs.cache.context import Context
 from mavftpfs.cache.draft import Draft, Where
-from mavftpfs.cache.filehandle import FileHandle
+from mavftpfs.cache.files import FileHandle
 from mavftpfs.cache.nodes import Node
-from mavftpfs.cache.readonly import ReadOnlyHandle
+from mavftpfs.cache.openfile import ReadOnlyHandle
 from mavftpfs.shared.errors import FileChanged, LocalProtocolError
 
 TRIES = 3

@@ -34,7 +34,7 @@ class Step:
 
 steps = st.builds(
     Step,
-    st.sampled_from(["data", "data", "data", "evict", "begin", "suspect", "drop", "accept", "clear"]),
+    st.sampled_from(["data", "data", "data", "evict", "begin", "suspect", "clear"]),
     st.integers(0, 3 * BLOCK_SIZE),
     st.one_of(st.integers(0, 300), st.integers(0, 2 * BLOCK_SIZE)),
 )
@@ -42,11 +42,11 @@ steps = st.builds(
 
 @given(st.integers(0, 3 * BLOCK_SIZE), st.lists(steps, max_size=40), st.integers())
 def test_blocks_hold_what_came_first_and_only_that(size: int, script: list[Step], seed: int) -> None:
-    """After each step, what is readable equals a model of bytes and of which of them are proven."""
+    """After each step, what is readable equals a model of bytes, and of which came before the reader."""
     cache = BlockCache(2 * BLOCK_SIZE, clock=lambda: 0.0, patience=30)
     blocks = FileBlocks(cache, size)
     held: dict[int, int] = {}
-    proven: set[int] = set()
+    earlier: set[int] = set()
     rng = random.Random(seed)
     sample = sorted({0, size - 1, BLOCK_SIZE - 1, BLOCK_SIZE, *(rng.randrange(size or 1) for _ in range(30))})
     for number, step in enumerate(script):
@@ -55,33 +55,27 @@ def test_blocks_hold_what_came_first_and_only_that(size: int, script: list[Step]
             blocks.on_data(step.start, bytes([number]) * step.size)
             blocks.on_batch()
             for at in sample:
-                if step.start <= at < stop:
+                if step.start <= at < stop and not blocks.doubted:
                     held.setdefault(at, number)
         elif step.what == "begin":
             blocks.begin_reading()
-            proven = proven if blocks.suspicion else set(held)
+            earlier = set(held)
         elif step.what == "suspect":
             blocks.on_suspect("test")
-        elif step.what == "drop":
-            blocks.drop_unproven()
-            held = {at: byte for at, byte in held.items() if at in proven}
-        elif step.what == "accept":
-            blocks.accept()
-            proven = set(held)
+            held = {at: byte for at, byte in held.items() if at in earlier}
         elif step.what == "clear" or step.start // BLOCK_SIZE not in blocks:
             blocks.clear()
         else:
             blocks.evict(step.start // BLOCK_SIZE)
         gone = {at for at in held if at // BLOCK_SIZE not in blocks}
         held = {at: byte for at, byte in held.items() if at not in gone}
-        proven -= gone
+        earlier -= gone
         blocks.check_invariants()
         cache.check_invariants()
         for at in sample:
             if 0 <= at < size:
                 view = blocks.get(at, at + 1)
-                readable = at in held and (blocks.suspicion is None or at in proven)
-                assert (None if view is None else view[0]) == (held[at] if readable else None)
+                assert (None if view is None else view[0]) == held.get(at)
 
 
 # --- whole trees on virtual time

@@ -198,32 +198,11 @@ async def test_the_end_of_a_copy_by_turns_is_compared(profile: str, autojump: Mo
     async with card.opened() as (_, handle):
         await read_head(handle)
         assert await handle.read(200_000, STEP) == OLD[200_000 : 200_000 + STEP]
-        handle._version.blocks.openings.look_at = float("inf")  # type: ignore[attr-defined]
+        handle._version.compare_at = float("inf")  # type: ignore[attr-defined]
         await trio.sleep(IDLE)
         card.replace()
         with pytest.raises(FileChanged):
             await read_on(handle, 200_000)
-
-
-@pytest.mark.parametrize("looks", ["listed", "read on", "listed and read on"])
-@pytest.mark.parametrize("profile", TIMED)
-async def test_one_that_was_replaced_before_it_was_opened_is_read_on(
-    profile: str, looks: str, autojump: MockClock
-) -> None:
-    """The remembered listing tells the time of its predecessor."""
-    card = Card(profile)
-    async with card.opened_late() as (tree, handle):
-        await trio.sleep(30.0)
-        if "listed" in looks:
-            assert (await tree.stat(card.path)).mtime == THEN + 100
-        if "read on" in looks:
-            assert await read_on(handle, STEP) == NEW[STEP : len(OLD)]
-        assert await handle.read(0, STEP) == NEW[:STEP]
-        await trio.sleep(30.0)
-        card.replace(NEW[-len(OLD) :], THEN + 200)
-        assert (await tree.stat(card.path)).mtime == THEN + 200
-        with pytest.raises(FileChanged):
-            await handle.read(0, STEP)
 
 
 @pytest.mark.parametrize("profile", TIMED)

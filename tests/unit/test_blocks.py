@@ -11,7 +11,6 @@ import trio.testing
 from trio.testing import MockClock
 
 from mavftpfs.cache.blocks import BLOCK_SIZE, BlockCache, FileBlocks, Gaps
-from mavftpfs.protocol.crc import crc32
 from mavftpfs.shared.errors import RequestTimeout, VehicleLost
 
 KIB = 1024
@@ -377,77 +376,39 @@ async def test_a_reader_cancelled_just_when_it_was_admitted_gives_the_room_back(
     first.scope.cancel()
 
 
-# --- provisional bytes
+# --- doubtful bytes
 
 
-async def test_suspect_bytes_are_not_returned_but_older_ones_are(autojump_clock: MockClock) -> None:
-    blocks = FileBlocks(make_cache(), 100)
-    deliver(blocks, 0, content(50))
-    blocks.begin_reading()
-    deliver(blocks, 50, content(100)[50:])
-    blocks.on_suspect("first")
-    blocks.on_suspect("second")
-    assert blocks.suspicion == "first"
-    assert bytes(blocks.get(0, 50) or b"") == content(50)
-    assert blocks.get(49, 51) is None
-    assert not blocks.complete
-    assert await read(blocks, 0, 100) is None
-
-
-async def test_accepting_makes_them_good(autojump_clock: MockClock) -> None:
-    blocks = FileBlocks(make_cache(), 100)
-    deliver(blocks, 0, content(100))
-    blocks.on_suspect("test")
-    blocks.accept()
-    assert blocks.suspicion is None
-    assert blocks.complete
-    blocks.on_suspect("again")
-    assert blocks.complete
-
-
-async def test_dropping_keeps_only_what_was_proven(autojump_clock: MockClock) -> None:
-    cache = make_cache()
+async def test_doubtful_bytes_are_dropped_and_older_ones_are_not(autojump_clock: MockClock) -> None:
+    cache, told = make_cache(), []
     blocks = FileBlocks(cache, 3 * BLOCK_SIZE)
+    blocks.on_dropped = lambda: told.append(True)
     deliver(blocks, 0, content(10))
     blocks.begin_reading()
     deliver(blocks, 10, content(2 * BLOCK_SIZE))
     old = blocks.get(0, 20)
     assert old is not None
     before = bytes(old)
-    blocks.on_suspect("test")
-    blocks.drop_unproven()
-    assert blocks.suspicion is None
+    for _ in range(2):
+        blocks.on_suspect("test")
+    assert (blocks.drops, told) == (1, [True])
     assert blocks.missing(0, 3 * BLOCK_SIZE) == [(10, 3 * BLOCK_SIZE)]
     assert cache.bytes_cached == BLOCK_SIZE
+    deliver(blocks, 10, b"\xff" * 20)  # from the reader that is in doubt
+    assert blocks.get(10, 30) is None
+    blocks.begin_reading()
     deliver(blocks, 10, b"\xff" * 20)
     assert bytes(old) == before
     assert bytes(blocks.get(0, 30) or b"") == content(10) + b"\xff" * 20
     cache.check_invariants()
 
 
-async def test_dropping_wakes_those_who_wait(nursery: trio.Nursery, autojump_clock: MockClock) -> None:
+async def test_a_doubt_wakes_those_who_wait(nursery: trio.Nursery, autojump_clock: MockClock) -> None:
     blocks = FileBlocks(make_cache(), 100)
     reading = await start_read(nursery, blocks, 0, 100)
     blocks.on_suspect("test")
-    blocks.drop_unproven()
     await trio.testing.wait_all_tasks_blocked()
     assert reading.results == [None]
-
-
-async def test_a_reader_opened_under_suspicion_proves_nothing(autojump_clock: MockClock) -> None:
-    blocks = FileBlocks(make_cache(), 100)
-    deliver(blocks, 0, content(100))
-    blocks.on_suspect("test")
-    blocks.begin_reading()
-    assert not blocks.complete
-
-
-async def test_crc32_is_the_servers(autojump_clock: MockClock) -> None:
-    data = content(2 * BLOCK_SIZE + 5)
-    blocks = FileBlocks(make_cache(), len(data))
-    deliver(blocks, BLOCK_SIZE, data[BLOCK_SIZE:])
-    deliver(blocks, 0, data[:BLOCK_SIZE])
-    assert await blocks.crc32() == crc32(data)
 
 
 async def test_the_rate_is_measured_from_what_arrives(autojump_clock: MockClock) -> None:

@@ -10,11 +10,10 @@ import trio.testing
 from trio.testing import MockClock
 
 from mavftpfs.cache.attributes import UNKNOWN_MTIME
-from mavftpfs.cache.checksums import MAX_CHECKSUMS
 from mavftpfs.cache.directories import SWEEP_TRIES
-from mavftpfs.cache.flights import Flights
 from mavftpfs.cache.options import MIN_CACHE_SIZE, CacheOptions
-from mavftpfs.cache.tree import Stat, Tree
+from mavftpfs.cache.singleflight import SingleFlight
+from mavftpfs.cache.tree import MAX_CHECKSUMS, Stat, Tree
 from mavftpfs.protocol.crc import crc32
 from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.shared.errors import (
@@ -579,7 +578,7 @@ def test_right_options() -> None:
 
 
 async def test_a_bug_in_shared_work_reaches_everyone_and_nothing_stays(autojump_clock: MockClock) -> None:
-    flights: Flights[int, int] = Flights()
+    flights: SingleFlight[int, int] = SingleFlight()
 
     async def work() -> int:
         await trio.sleep(1)
@@ -602,7 +601,7 @@ async def test_a_bug_in_shared_work_reaches_everyone_and_nothing_stays(autojump_
 
 async def test_who_came_later_gets_no_time_out_of_who_was_there(autojump_clock: MockClock) -> None:
     """He waited a moment, and the vehicle may be back."""
-    flights: Flights[str, int] = Flights()
+    flights: SingleFlight[str, int] = SingleFlight()
     begun: list[float] = []
 
     async def work() -> int:
@@ -620,7 +619,7 @@ async def test_who_came_later_gets_no_time_out_of_who_was_there(autojump_clock: 
 
 
 async def test_who_came_later_hears_of_a_second_time_out(autojump_clock: MockClock) -> None:
-    flights: Flights[str, int] = Flights()
+    flights: SingleFlight[str, int] = SingleFlight()
 
     async def work() -> int:
         await trio.sleep(30)
@@ -634,13 +633,13 @@ async def test_who_came_later_hears_of_a_second_time_out(autojump_clock: MockClo
     assert trio.current_time() == 60
 
 
-async def times_out(flights: Flights[str, int], work: Callable[[], Awaitable[int]]) -> None:
+async def times_out(flights: SingleFlight[str, int], work: Callable[[], Awaitable[int]]) -> None:
     with pytest.raises(RequestTimeout):
         await flights.run("key", work)
 
 
 async def test_keys_do_not_wait_for_each_other(autojump_clock: MockClock) -> None:
-    flights: Flights[int, int] = Flights()
+    flights: SingleFlight[int, int] = SingleFlight()
 
     async def work() -> int:
         await trio.sleep(1)

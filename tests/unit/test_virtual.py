@@ -7,8 +7,8 @@ import trio
 import trio.testing
 from trio.testing import MockClock
 
-from mavftpfs.cache.snapshots import MAX_SIZES, Snapshot, Snapshots
 from mavftpfs.cache.tree import Tree
+from mavftpfs.cache.virtual import MAX_SIZES, Snapshot, Snapshots
 from mavftpfs.protocol.crc import crc32
 from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.shared.errors import (

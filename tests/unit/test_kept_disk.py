@@ -9,25 +9,15 @@ from pathlib import Path
 
 import pytest
 
-from mavftpfs.cache.blockdirectory import ABANDONED, NAME, BlockDirectory
-from mavftpfs.cache.persistent import (
-    CLOCK_SET,
-    SETTLED,
-    YOUNG,
-    BlockKey,
-    FileKey,
-    Settling,
-    Stored,
-    key_of,
-    surplus,
-    vehicle_identity,
-)
+from mavftpfs.cache.kept import CLOCK_SET, YOUNG, key_of, vehicle_identity
+from mavftpfs.cache.kept_disk import ABANDONED, NAME, BlockKey, FileKey, KeptDisk, Stored, surplus
 from mavftpfs.shared.model import DirEntry, EntryKind
 
 NOW = 1_800_000_000.0
 MTIME = 1_700_000_000
 VEHICLE = b"vehicle"
-KEY = FileKey(VEHICLE, b"/log/a", 100_000, MTIME)
+VERSION = f"mtime {MTIME}"
+KEY = FileKey(VEHICLE, b"/log/a", 100_000, VERSION)
 DATA = bytes(range(256)) * 256
 
 
@@ -40,8 +30,8 @@ def block(number: int, key: FileKey = KEY) -> BlockKey:
 
 
 @pytest.fixture
-def directory(tmp_path: Path) -> BlockDirectory:
-    return BlockDirectory(tmp_path / "deep" / "cache", 1 << 20)
+def directory(tmp_path: Path) -> KeptDisk:
+    return KeptDisk(tmp_path / "deep" / "cache", 1 << 20)
 
 
 def files_of(tmp_path: Path) -> list[Path]:
@@ -53,21 +43,21 @@ def files_of(tmp_path: Path) -> list[Path]:
 
 def test_each_part_of_the_key_makes_another_block() -> None:
     others = [
-        FileKey(b"other", KEY.path, KEY.size, KEY.mtime),
-        FileKey(KEY.vehicle, b"/log/b", KEY.size, KEY.mtime),
-        FileKey(KEY.vehicle, KEY.path, KEY.size + 1, KEY.mtime),
-        FileKey(KEY.vehicle, KEY.path, KEY.size, MTIME + 1),
-        FileKey(KEY.vehicle, KEY.path, KEY.size, None),
-        FileKey(KEY.vehicle + b"/", KEY.path[1:], KEY.size, KEY.mtime),  # parts do not run into each other
+        FileKey(b"other", KEY.path, KEY.size, KEY.version),
+        FileKey(KEY.vehicle, b"/log/b", KEY.size, KEY.version),
+        FileKey(KEY.vehicle, KEY.path, KEY.size + 1, KEY.version),
+        FileKey(KEY.vehicle, KEY.path, KEY.size, f"mtime {MTIME + 1}"),
+        FileKey(KEY.vehicle, KEY.path, KEY.size, ""),
+        FileKey(KEY.vehicle + b"/", KEY.path[1:], KEY.size, KEY.version),  # parts do not run into each other
     ]
     names = [block(0, key).name for key in [KEY, *others]] + [block(1).name, block(10).name]
     names += [KEY.block(0, 5).name, KEY.block(len(DATA), 3 * len(DATA)).name]  # blocks had another size once
     assert len(set(names)) == len(names)
-    assert block(0) == block(0, FileKey(VEHICLE, b"/log/a", 100_000, MTIME))
+    assert block(0) == block(0, FileKey(VEHICLE, b"/log/a", 100_000, VERSION))
 
 
 def test_what_may_not_be_kept_has_no_key() -> None:
-    assert key_of(VEHICLE, b"/a", entry(), NOW) == FileKey(VEHICLE, b"/a", 5, MTIME)
+    assert key_of(VEHICLE, b"/a", entry(), NOW) == FileKey(VEHICLE, b"/a", 5, VERSION)
     assert key_of(None, b"/a", entry(), NOW) is None
     assert key_of(VEHICLE, b"/@SYS/tasks.txt", entry(), NOW) is None
     assert key_of(VEHICLE, b"/a", entry(size=None), NOW) is None
@@ -80,7 +70,7 @@ def test_what_may_not_be_kept_has_no_key() -> None:
 
 @pytest.mark.parametrize("mtime", [None, 0, 315_532_800, CLOCK_SET - 1])
 def test_an_mtime_without_a_clock_tells_nothing(mtime: int | None) -> None:
-    assert key_of(VEHICLE, b"/a", entry(mtime=mtime), NOW) == FileKey(VEHICLE, b"/a", 5, None)
+    assert key_of(VEHICLE, b"/a", entry(mtime=mtime), NOW) == FileKey(VEHICLE, b"/a", 5, "")
 
 
 def test_a_vehicle_that_does_not_say_who_it_is_has_no_identity() -> None:
@@ -99,7 +89,7 @@ def test_a_vehicle_that_does_not_say_who_it_is_has_no_identity() -> None:
 # --- the disk
 
 
-def test_what_was_written_is_read(directory: BlockDirectory) -> None:
+def test_what_was_written_is_read(directory: KeptDisk) -> None:
     assert directory.read(block(0)) is None
     directory.write(block(0), DATA)
     assert directory.read(block(0)) == DATA
@@ -108,7 +98,7 @@ def test_what_was_written_is_read(directory: BlockDirectory) -> None:
 
 @pytest.mark.parametrize("place", [0, 20, 40, -1])
 def test_a_changed_byte_is_a_miss_and_the_block_is_gone(
-    directory: BlockDirectory, tmp_path: Path, place: int
+    directory: KeptDisk, tmp_path: Path, place: int
 ) -> None:
     directory.write(block(0), DATA)
     (file,) = files_of(tmp_path)
@@ -120,14 +110,14 @@ def test_a_changed_byte_is_a_miss_and_the_block_is_gone(
 
 
 @pytest.mark.parametrize("length", [0, 10, 33, 34, 65_536 + 32])
-def test_a_cut_block_is_a_miss(directory: BlockDirectory, tmp_path: Path, length: int) -> None:
+def test_a_cut_block_is_a_miss(directory: KeptDisk, tmp_path: Path, length: int) -> None:
     directory.write(block(0), DATA)
     (file,) = files_of(tmp_path)
     file.write_bytes(file.read_bytes()[:length])
     assert directory.read(block(0)) is None
 
 
-def test_a_block_under_a_wrong_name_is_a_miss(directory: BlockDirectory, tmp_path: Path) -> None:
+def test_a_block_under_a_wrong_name_is_a_miss(directory: KeptDisk, tmp_path: Path) -> None:
     directory.write(block(0), DATA)
     directory.write(block(1), DATA[::-1])
     first, second = files_of(tmp_path)
@@ -138,14 +128,14 @@ def test_a_block_under_a_wrong_name_is_a_miss(directory: BlockDirectory, tmp_pat
     assert directory.read(block(1)) is None
 
 
-def test_nobody_else_can_look_into_it(directory: BlockDirectory, tmp_path: Path) -> None:
+def test_nobody_else_can_look_into_it(directory: KeptDisk, tmp_path: Path) -> None:
     directory.write(block(0), DATA)
     parent = tmp_path / "deep" / "cache"
     path = parent / NAME
     assert stat.S_IMODE(path.stat().st_mode) == 0o700
     for each in (parent, path):
         each.chmod(0o755)
-    BlockDirectory(parent, 1)
+    KeptDisk(parent, 1)
     assert stat.S_IMODE(path.stat().st_mode) == 0o700
     assert stat.S_IMODE(parent.stat().st_mode) == 0o755  # the user's own: it may be /tmp
 
@@ -155,15 +145,15 @@ def test_a_directory_of_somebody_else_is_refused(tmp_path: Path, monkeypatch: py
     (tmp_path / "a").mkdir()
     (tmp_path / "a" / NAME).symlink_to(tmp_path / "linked")
     with pytest.raises(PermissionError):
-        BlockDirectory(tmp_path / "a", 1)
+        KeptDisk(tmp_path / "a", 1)
     uid = os.getuid()
     monkeypatch.setattr(os, "getuid", lambda: uid + 1)
     with pytest.raises(PermissionError):
-        BlockDirectory(tmp_path / "b", 1)
+        KeptDisk(tmp_path / "b", 1)
 
 
 def test_it_stays_within_its_budget_and_keeps_what_was_used(tmp_path: Path) -> None:
-    directory = BlockDirectory(tmp_path / "deep", 20 * len(DATA))
+    directory = KeptDisk(tmp_path / "deep", 20 * len(DATA))
     for index in range(60):
         directory.write(block(index), DATA)
         if index:
@@ -172,7 +162,7 @@ def test_it_stays_within_its_budget_and_keeps_what_was_used(tmp_path: Path) -> N
     assert total <= 22 * len(DATA)
 
 
-def test_what_a_killed_writer_left_goes_after_a_while(directory: BlockDirectory, tmp_path: Path) -> None:
+def test_what_a_killed_writer_left_goes_after_a_while(directory: KeptDisk, tmp_path: Path) -> None:
     directory.write(block(0), DATA)
     folder = files_of(tmp_path)[0].parent
     old, new = folder / ".new-1-0", folder / ".new-2-0"
@@ -186,7 +176,7 @@ def test_what_a_killed_writer_left_goes_after_a_while(directory: BlockDirectory,
     assert directory.read(block(0)) == DATA
 
 
-def test_a_failed_write_leaves_nothing_behind(directory: BlockDirectory, tmp_path: Path) -> None:
+def test_a_failed_write_leaves_nothing_behind(directory: KeptDisk, tmp_path: Path) -> None:
     place = tmp_path / "deep" / "cache" / NAME / block(0).name[:2] / block(0).name
     place.mkdir(parents=True)  # cannot be replaced by a file
     with pytest.raises(IsADirectoryError):
@@ -199,26 +189,3 @@ def test_the_least_recently_used_go_first() -> None:
     files = [Stored(str(age), 10, -age) for age in range(10)]
     assert surplus(files, 100) == []
     assert [file.name for file in surplus(files, 60)] == ["9", "8", "7", "6", "5"]
-
-
-# --- when
-
-
-def test_a_block_is_ripe_when_it_was_held_long_enough_and_only_once() -> None:
-    settling = Settling()
-    assert settling.ripe([0, 1], 100.0) == []
-    assert settling.waiting
-    assert settling.ripe([0, 1, 2], 100.0 + SETTLED) == [0, 1]
-    settling.on_kept(0)
-    settling.on_kept(1)
-    assert settling.ripe([0, 1, 2], 100.0 + 2 * SETTLED) == [2]
-    settling.on_kept(2)
-    assert not settling.waiting
-
-
-def test_a_block_that_was_dropped_meanwhile_starts_anew() -> None:
-    settling = Settling()
-    settling.ripe([0], 100.0)
-    settling.ripe([], 105.0)
-    assert settling.ripe([0], 100.0 + SETTLED) == []
-    assert settling.ripe([0], 100.0 + 2 * SETTLED) == [0]

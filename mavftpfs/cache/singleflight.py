@@ -1,0 +1,82 @@
+"""Concurrent callers who want the same thing share one execution. Layer: cache."""
+
+from __future__ import annotations
+
+from collections.abc import Awaitable, Callable, Hashable
+from typing import Generic, TypeVar
+
+import trio
+
+from mavftpfs.shared.errors import RequestTimeout
+
+K = TypeVar("K", bound=Hashable)
+T = TypeVar("T")
+
+
+class _Call(Generic[T]):
+    def __init__(self) -> None:
+        self.done = trio.Event()
+        self.results: list[T] = []  # one, or none after an error or a cancellation
+        self.error: Exception | None = None
+
+    def outcome(self) -> T:
+        if self.error is not None:
+            raise self.error.with_traceback(None)
+        return self.results[0]
+
+    @property
+    def abandoned(self) -> bool:
+        return self.error is None and not self.results
+
+
+class SingleFlight(Generic[K, T]):
+    """Runs at most one piece of work per key at a time; who comes meanwhile gets the same result or error.
+
+    With a nursery the work outlives the caller that started it: listing a large directory over a radio may
+    take longer than one system call may wait, and the retry finds it done. Without one the first caller runs
+    it; if that caller is cancelled, one of the others starts again.
+    """
+
+    def __init__(self, nursery: trio.Nursery | None = None) -> None:
+        self._nursery = nursery
+        self._running: dict[K, _Call[T]] = {}
+
+    def __len__(self) -> int:
+        return len(self._running)
+
+    async def run(self, key: K, work: Callable[[], Awaitable[T]]) -> T:
+        """Return what `work` returns, or what the work already under way for `key` returns.
+
+        A time-out of work that was under way before is not shared: who joined late starts anew.
+
+        Raises:
+            Exception: what the work raised; all who share it get the same object.
+        """
+        joined = key in self._running
+        while True:
+            call = self._running.get(key)
+            if call is None:
+                call = await self._start(key, work)
+            if not call.done.is_set():
+                await call.done.wait()
+            if not call.abandoned and not (joined and isinstance(call.error, RequestTimeout)):
+                return call.outcome()
+            joined = False
+            await trio.lowlevel.checkpoint()
+
+    async def _start(self, key: K, work: Callable[[], Awaitable[T]]) -> _Call[T]:
+        call = self._running[key] = _Call()
+        if self._nursery is None:
+            await self._run(key, call, work)
+        else:
+            self._nursery.start_soon(self._run, key, call, work)
+        return call
+
+    async def _run(self, key: K, call: _Call[T], work: Callable[[], Awaitable[T]]) -> None:
+        try:
+            call.results.append(await work())
+        except Exception as error:  # handed to everyone who waits, not swallowed
+            call.error = error
+        finally:
+            del self._running[key]
+            call.done.set()
