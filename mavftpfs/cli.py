@@ -284,6 +284,22 @@ def _status_parser(name: str) -> Parser:
     return parser
 
 
+def _recover_parser(name: str) -> Parser:
+    parser = Parser(
+        f"mavftpfs {name}",
+        description="List what mounts could not deliver, or put it where it belonged on the vehicle.",
+        epilog=_SOURCES,
+    )
+    parser.add_argument("source", metavar="SOURCE", nargs="?", help="put back to there; default: list")
+    parser.add_argument("names", metavar="FILE", nargs="*", help="a file or directory of the list")
+    parser.add_argument("--all", action="store_true", help="all files of the list")
+    parser.add_argument("--force", action="store_true", help="also over a file that was changed since")
+    parser.add_argument("--json", action="store_true", help="list as JSON")
+    _add_options(parser)
+    parser.add_argument("-d", "--debug", action="store_true", help="print every payload, decoded")
+    return parser
+
+
 def _demo_parser(name: str) -> Parser:
     return Parser(f"mavftpfs {name}", description="A short tour with a simulated drone.")
 
@@ -367,6 +383,7 @@ _COMMANDS: dict[str, tuple[Callable[[str], Parser], Run]] = {
     "rmdir": (_rmdir_parser, _verb("rmdir")),
     "mv": (_mv_parser, _verb("mv")),
     "crc": (_crc_parser, _verb("crc")),
+    "recover": (_recover_parser, _verb("recover")),
     "sim": (_sim_parser, _sim),
     "demo": (_demo_parser, _demo),
     "install": (_install_parser, _install),

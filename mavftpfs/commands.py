@@ -46,7 +46,7 @@ def mount(args: argparse.Namespace) -> int:
     try:
         mountpoint.check_mountpoint(place)
     except DeadMount as exc:
-        raise DeadMount("; ".join(filter(None, (str(exc), _left_by_killed_mounts())))) from exc
+        raise DeadMount("; ".join(filter(None, (str(exc), left_by_killed_mounts_line())))) from exc
     work = partial(_serve, args, options, spec, place)
     if args.foreground or args.debug:
         return work(_report_in_foreground)
@@ -212,14 +212,14 @@ class _Delivery:
 
 def _after_a_killed_mount() -> int:
     """Nobody delivers what it held: say so."""
-    line = _left_by_killed_mounts()
+    line = left_by_killed_mounts_line()
     if not line:
         return ExitCode.OK
     print(f"mavftpfs: {line}", file=sys.stderr)
     return ExitCode.UNDELIVERED
 
 
-def _left_by_killed_mounts() -> str:
+def left_by_killed_mounts_line() -> str:
     """Return a line about what killed mounts held, or ""."""
     from mavftpfs.farewell import left_by_killed_mounts
 

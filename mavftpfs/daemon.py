@@ -161,8 +161,9 @@ def _explain_death(pid: int) -> int:
 
 
 def log_to_stderr(level: int) -> None:
-    """Log to the terminal, for foreground runs."""
-    _install(logging.StreamHandler(), "mavftpfs: %(message)s", level)
+    """Log to the terminal, for foreground runs; with the time of day where it stands beside a trace (-d)."""
+    times = "%(asctime)s.%(msecs)03d " if level == logging.DEBUG else ""
+    _install(logging.StreamHandler(), f"{times}mavftpfs: %(message)s", level, times="%H:%M:%S")
 
 
 class _PrivateFile(logging.handlers.RotatingFileHandler):
@@ -206,8 +207,8 @@ class _Readable(logging.Formatter):
         return readable(super().formatMessage(record))
 
 
-def _install(handler: logging.Handler, form: str, level: int) -> None:
-    handler.setFormatter(_Readable(form))
+def _install(handler: logging.Handler, form: str, level: int, times: str | None = None) -> None:
+    handler.setFormatter(_Readable(form, times))
     root = logging.getLogger()
     for old in root.handlers[:]:
         root.removeHandler(old)

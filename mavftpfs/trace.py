@@ -4,10 +4,10 @@ A sink is handed to the session layer, which calls `payload` for each of the 251
 nothing is computed. A sink that cannot write any more (disk full) says so once and falls silent: a trace must
 never break what it watches.
 
-JSON lines: {"t", "dir", "seq", "session", "opcode", "size", "offset", "data"}, in replies also "req_opcode"
-and "burst_complete", and "note" if there is one (retransmit, dup, stale, dropped); opcodes by name, data in
-hex (the part that counts). The .tlog format is pymavlink's: 8 bytes big-endian microseconds since 1970, then
-the frame.
+JSON lines: {"t", "time", "dir", "seq", "session", "opcode", "size", "offset", "data"}, in replies also
+"req_opcode" and "burst_complete", and "note" if there is one (retransmit, dup, stale, dropped); opcodes by
+name, data in hex (the part that counts). "t" is in seconds of a clock that never jumps, "time" is UTC. The
+.tlog format is pymavlink's: 8 bytes big-endian microseconds since 1970, then the frame.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ import struct
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from datetime import UTC, datetime
 from pathlib import Path
 from types import TracebackType
 from typing import BinaryIO, Self
@@ -93,22 +94,30 @@ class _File:
 class JsonTrace(_File):
     """Payloads as JSON lines.
 
-    data_limit: most bytes of data to record for a payload, None = all.
+    data_limit: most bytes of data to record for a payload, None = all. wall_clock: seconds since 1970.
 
     Raises:
         UsageError: the file cannot be created.
     """
 
-    def __init__(self, path: str | Path, *, data_limit: int | None = None) -> None:
+    def __init__(
+        self,
+        path: str | Path,
+        *,
+        data_limit: int | None = None,
+        wall_clock: Callable[[], float] = time.time,
+    ) -> None:
         super().__init__(path)
         self._data_limit = data_limit
+        self._wall_clock = wall_clock
 
     def payload(self, now: float, direction: str, wire: bytes, note: str = "") -> None:
         """See PayloadTrace."""
         record = describe(direction, wire, data_limit=self._data_limit)
         if note:
             record["note"] = note
-        line = json.dumps({"t": round(now, 6), **record}, separators=(",", ":"))
+        wall = datetime.fromtimestamp(self._wall_clock(), UTC).isoformat(timespec="microseconds")
+        line = json.dumps({"t": round(now, 6), "time": wall, **record}, separators=(",", ":"))
         self._write(line.encode() + b"\n", now)
 
 
@@ -134,15 +143,17 @@ class TlogWriter(_File):
 class TextTrace:
     """Payloads as lines for a person.
 
-    write: takes a line without line end.
+    write: takes a line without line end; wall_clock: seconds since 1970.
     """
 
-    def __init__(self, write: Callable[[str], None]) -> None:
+    def __init__(self, write: Callable[[str], None], *, wall_clock: Callable[[], float] = time.time) -> None:
         self._write = write
+        self._wall_clock = wall_clock
 
     def payload(self, now: float, direction: str, wire: bytes, note: str = "") -> None:
         """See PayloadTrace."""
-        self._write(f"{now:.6f} {text_line(direction, wire)}{f' ({note})' if note else ''}")
+        time_of_day = datetime.fromtimestamp(self._wall_clock()).strftime("%H:%M:%S.%f")
+        self._write(f"{time_of_day} {text_line(direction, wire)}{f' ({note})' if note else ''}")
 
 
 class Tee:

@@ -19,13 +19,15 @@ from typing import Any, TypeVar
 import trio
 
 from mavftpfs import daemon
-from mavftpfs.commands import connection_of
+from mavftpfs.commands import connection_of, left_by_killed_mounts_line
 from mavftpfs.compose import open_sinks
 from mavftpfs.exits import ExitCode, exit_code_for
+from mavftpfs.farewell import recovered_directory
 from mavftpfs.fuse.options import parse_options
 from mavftpfs.oneshot import get as getting
 from mavftpfs.oneshot import listing, names, paths, progress
 from mavftpfs.oneshot import put as putting
+from mavftpfs.oneshot import recover as recovering
 from mavftpfs.oneshot import scan as scanning
 from mavftpfs.oneshot import sync as syncing
 from mavftpfs.oneshot.fetch import Fetched, Fetcher
@@ -323,6 +325,55 @@ def mv(args: Args) -> int:
     (*wanted, to), component = paths.parse_paths([*args.paths, args.target])
     _with_session(args, partial(names.move_paths, paths=wanted, to=to), component, writing=True)
     return ExitCode.OK
+
+
+# -- what did not arrive --------------------------------------------------------------------------
+
+
+def recover(args: Args) -> int:
+    """List what did not reach a vehicle, or put it where it belonged."""
+    base = recovered_directory(os.environ)
+    if args.source is None:
+        _list_kept(recovering.kept_below(base), as_json=args.json)
+        return ExitCode.OK
+    wanted = recovering.kept_below(base) if args.all else recovering.chosen(args.names, base)
+    if not wanted:
+        raise UsageError("say which files: their names as `mavftpfs recover` lists them, or --all")
+    bar = progress.Progress()
+
+    def tell(done: recovering.PutBack) -> None:
+        how = "was there already" if done.there_already else "is on the vehicle now, verified"
+        print(f"{_name(done.kept.path or b'')} {how}; the copy here is removed", flush=True)
+
+    async def work(session: Session) -> None:
+        await recovering.put_back(session, wanted, bar, tell, force=args.force)
+
+    with progress.shown(bar):
+        _with_session(args, work, writing=True)
+    return ExitCode.OK
+
+
+def _list_kept(found: Sequence[recovering.Kept], *, as_json: bool) -> None:
+    """Print what was kept by directory, and what still lies where a killed mount left it."""
+    if as_json:
+        print(json.dumps([kept.described() for kept in found], indent=2))
+        return
+    directory = None
+    for kept in found:
+        if kept.file.parent != directory:
+            directory = kept.file.parent
+            print(f"{directory}:")
+        belongs = "?" if kept.path is None else _name(kept.path)
+        at = kept.facts.get("at")
+        when = f", {datetime.fromtimestamp(at):%Y-%m-%d %H:%M}" if isinstance(at, int | float) else ""
+        reason = kept.hindrance or kept.facts.get("error") or ""
+        line = f"  {printable(kept.file.name)} for {belongs}, {readable_size(kept.size)}{when}"
+        print(printable(f"{line}: {reason}" if reason else line))
+    left = left_by_killed_mounts_line()
+    if left:
+        print(left)
+    elif not found:
+        print("everything that was written reached its vehicle")
 
 
 # -- looking --------------------------------------------------------------------------------------

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import signal
 import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -111,6 +113,8 @@ def test_debug_prints_every_payload_decoded(field: Field, small_tree: Path) -> N
     text = mount.alive_or_ended().text()
     for word in ("LIST_DIRECTORY", "OPEN_FILE_RO", "TERMINATE_SESSION", "/sizes/478.bin"):
         assert word in text
+    lines = [line for line in text.splitlines() if "/sizes/478.bin" in line or "mounted" in line]
+    assert [line for line in lines if not re.match(r"\d\d:\d\d:\d\d\.\d+ ", line)] == []
 
 
 def test_trace_holds_every_payload_decoded(field: Field, small_tree: Path, tmp_path: Path) -> None:
@@ -120,6 +124,9 @@ def test_trace_holds_every_payload_decoded(field: Field, small_tree: Path, tmp_p
     assert mount.unmount() == 0
     text = trace.read_text()
     records = [json.loads(line) for line in text.splitlines()]
+    times = [datetime.fromisoformat(record["time"]) for record in records]
+    assert sorted(times) == times
+    assert abs((datetime.now(UTC) - times[0]).total_seconds()) < 600
     opened = [record for record in records if record["opcode"] == "OPEN_FILE_RO"]
     assert {bytes.fromhex(record["data"]) for record in opened} == {b"/sizes/478.bin"}
     answered = {record.get("req_opcode") for record in records if record["dir"] == "reply"}

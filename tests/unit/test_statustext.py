@@ -150,5 +150,5 @@ def test_sizes_times_and_names() -> None:
     sizes = [readable_size(n) for n in (0, 999, 999.7, 1000, 999_949, 999_999, 5e9)]
     assert sizes == ["0 B", "999 B", "1.0 kB", "1.0 kB", "999.9 kB", "1.0 MB", "5.0 GB"]
     times = [readable_time(s) for s in (0.0401, 1, 9.97, 59.4, 59.9, 200, 7500)]
-    assert times == ["40 ms", "1.0 s", "10 s", "59 s", "1 min 0 s", "3 min 20 s", "2 h 5 min"]
+    assert times == ["40 ms", "1.0 s", "10 s", "59 s", "1 min", "3 min 20 s", "2 h 5 min"]
     assert printable("a\x1b[31mb") == "a?[31mb"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import re
 import struct
 from pathlib import Path
 
@@ -23,13 +24,18 @@ NAK = Payload(9, 0, Opcode.NAK, 2, Opcode.OPEN_FILE_RO, 0, 0, bytes([NakCode.FAI
 ODD = Payload(9, 0, 77, 239, 99, 0, 0, b"x" * 239).encode()
 
 
+WALL = 1795426200.25
+"""2026-11-23 09:30 UTC in seconds since 1970."""
+
+
 def test_json_lines(tmp_path: Path) -> None:
-    with JsonTrace(tmp_path / "trace", data_limit=3) as trace:
+    with JsonTrace(tmp_path / "trace", data_limit=3, wall_clock=lambda: WALL) as trace:
         trace.payload(1.5, REQUEST, READ, "retransmit")
         trace.payload(2.25, REPLY, DATA)
         trace.payload(3.0, REQUEST, OPEN)
         trace.payload(4.0, REPLY, b"short")
     lines = [json.loads(line) for line in (tmp_path / "trace").read_text().splitlines()]
+    assert {line.pop("time") for line in lines} == {"2026-11-23T09:30:00.250000+00:00"}
     common = {"session": 3, "offset": 478}
     assert lines == [
         {
@@ -89,9 +95,12 @@ def test_text(direction: str, wire: bytes, line: str) -> None:
 
 def test_text_trace_and_tee() -> None:
     lines: list[str] = []
-    sink = TextTrace(lines.append)
+    sink = TextTrace(lines.append, wall_clock=lambda: WALL)
     Tee([sink, sink]).payload(1.0, REQUEST, READ, "dup")
-    assert lines == ["1.000000 -> READ_FILE seq 7 session 3 offset 478 size 100 (dup)"] * 2
+    assert len(lines) == 2
+    assert re.fullmatch(
+        r"\d\d:\d0:00.250000 -> READ_FILE seq 7 session 3 offset 478 size 100 \(dup\)", lines[0]
+    )
 
 
 def test_tlog_is_readable_by_pymavlink(tmp_path: Path) -> None:

@@ -1,0 +1,242 @@
+"""What did not reach a vehicle: listing it, and putting it where it belonged. Layer: top; prints nothing.
+
+A mount that ends with undelivered files copies them below `recovered`, with a `manifest.json`
+(cache.recovery). What a killed mount held is moved there by the next mount, with a `NAME.json` beside each
+file (cache.rescuing). Nothing is put back by itself: nobody knows what happened to the file since.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from mavftpfs.exits import NotDelivered
+from mavftpfs.oneshot.files import READ_SIZE, Session
+from mavftpfs.oneshot.progress import Progress
+from mavftpfs.oneshot.put import Piece, Put, Sent, put_paths
+from mavftpfs.protocol.crc import crc32
+from mavftpfs.shared.errors import Armed, FtpNak, NotFound, NotSupported, RequestTimeout, UsageError
+from mavftpfs.shared.model import EntryKind, normalise
+from mavftpfs.shared.readable import name_text
+
+MANIFEST = "manifest.json"
+
+
+@dataclass(frozen=True, slots=True)
+class Kept:
+    """A file that did not reach the vehicle. facts: what was written down about it, as JSON holds it."""
+
+    file: Path
+    facts: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def path(self) -> bytes | None:
+        """Where it belongs on the vehicle, None if that was not written down."""
+        path = self.facts.get("path")
+        return normalise(os.fsencode(path)) if isinstance(path, str) and path else None
+
+    @property
+    def size(self) -> int:
+        """Bytes of the local copy."""
+        return self.file.stat().st_size
+
+    @property
+    def hindrance(self) -> str:
+        """Why it cannot be put back by us, or ""."""
+        if self.path is None:
+            return "where it belongs was not written down"
+        if self.facts.get("not_saved"):
+            return "the local disk did not keep all of it"
+        if self.facts.get("unfinished"):
+            return "a program was still writing it, so it may be a part only"
+        return "" if self.facts.get("whole") else "only the changed parts of it are here"
+
+    def described(self) -> dict[str, Any]:
+        """Return its facts for `--json`."""
+        path = None if self.path is None else name_text(self.path)
+        error, at = self.facts.get("error"), self.facts.get("at")
+        facts = {"file": str(self.file), "path": path, "size": self.size, "error": error, "at": at}
+        return {**facts, "hindrance": self.hindrance or None}
+
+
+# -- what there is --------------------------------------------------------------------------------
+
+
+def kept_below(base: Path) -> list[Kept]:
+    """Return all files in the recovery directories, the oldest directory first."""
+    try:
+        directories = sorted(path for path in base.iterdir() if path.is_dir())
+    except FileNotFoundError:
+        return []
+    return [kept for directory in directories for kept in kept_in(directory)]
+
+
+def kept_in(directory: Path) -> list[Kept]:
+    """Return the files in one recovery directory.
+
+    Raises:
+        UsageError: it cannot be read.
+    """
+    try:
+        paths = sorted(path for path in directory.iterdir() if path.is_file() and not path.is_symlink())
+    except OSError as exc:
+        raise UsageError(f"{directory}: {exc.strerror}") from exc
+    described, descriptions = {}, set()
+    for path in paths:
+        if path.name.startswith(MANIFEST):
+            for facts in _read_manifest(path):
+                described[str(facts["file"])] = facts
+                descriptions.add(path)
+        elif path.suffix == ".json" and path.with_suffix("") in paths:
+            described[path.stem] = _read_json(path, dict)
+            descriptions.add(path)
+    return [Kept(path, described.get(path.name, {})) for path in paths if path not in descriptions]
+
+
+def _read_manifest(path: Path) -> Iterator[dict[str, Any]]:
+    for facts in _read_json(path, list):
+        if isinstance(facts, dict) and "file" in facts:
+            yield facts
+
+
+def _read_json(path: Path, kind: Callable[[], Any]) -> Any:
+    """Return what a file holds if it is JSON of this kind, else an empty one."""
+    try:
+        found = json.loads(path.read_text())
+    except (OSError, ValueError, RecursionError):
+        return kind()
+    return found if isinstance(found, type(kind())) else kind()
+
+
+def chosen(names: Sequence[str], base: Path) -> list[Kept]:
+    """Return the files that a person named: by their paths, or by a directory for all that is in it.
+
+    Raises:
+        UsageError: there is no such file.
+    """
+    found: list[Kept] = []
+    for name in names:
+        path = Path(name) if os.path.exists(name) else base / name
+        if path.is_dir():
+            found += kept_in(path)
+            continue
+        if not path.is_file():
+            raise UsageError(f"{name} is nothing that was kept; `mavftpfs recover` lists what is")
+        found += [kept for kept in kept_in(path.parent) if kept.file.name == path.name]
+    return found
+
+
+# -- putting back ---------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class PutBack:
+    """A file that is on the vehicle now. there_already: nothing had to be sent."""
+
+    kept: Kept
+    there_already: bool
+
+
+async def put_back(
+    session: Session,
+    wanted: Sequence[Kept],
+    progress: Progress,
+    tell: Callable[[PutBack], None],
+    *,
+    force: bool,
+) -> None:
+    """Put files where they belonged; a copy that the vehicle provably has is removed here.
+
+    force: also over a file that is not the one they were to replace.
+
+    Raises:
+        UsageError: one of them cannot be put back; the text says why. NotDelivered: it did not arrive.
+    """
+    for kept in wanted:
+        if kept.hindrance:
+            raise UsageError(f"{kept.file}: {kept.hindrance}; look at it, and use `mavftpfs put`")
+    for kept in wanted:
+        path = _in_session(session, kept)
+        there_already = await _is_there(session, path, kept, force=force)
+        if not there_already:
+            piece = Piece(kept.file, b"", False, kept.size)
+            await put_paths(session, [(kept.file, [piece])], path, progress, _nobody, Put())
+            await _prove(session, path, kept)
+        _forget(kept)
+        tell(PutBack(kept, there_already))
+
+
+def _nobody(sent: Sent) -> None:
+    """Told of what was put: the caller is told when it is proven."""
+
+
+def _in_session(session: Session, kept: Kept) -> bytes:
+    """Return the path of a file below the session's root."""
+    assert kept.path is not None
+    root = session.root.rstrip(b"/")
+    if not kept.path.startswith(root + b"/"):
+        raise UsageError(f"{name_text(kept.path)} does not lie below {name_text(session.root)}")
+    return kept.path[len(root) :]
+
+
+async def _is_there(session: Session, path: bytes, kept: Kept, *, force: bool) -> bool:
+    """Return whether the vehicle has the file with exactly these bytes.
+
+    Raises:
+        UsageError: it has another one than that which was to be replaced.
+    """
+    try:
+        found = await session.files.stat(path)
+    except NotFound:
+        return False
+    if found.kind is not EntryKind.FILE:
+        raise UsageError(f"{name_text(path)} is a directory on the vehicle")
+    if found.size == kept.size and await _crc32(session, path) == _local_crc32(kept.file):
+        return True
+    before = kept.facts.get("size_on_vehicle")
+    if found.size not in (before, 0) and not force:  # an empty one holds nothing to lose
+        known = "nothing" if before is None else f"{before} bytes"
+        raise UsageError(
+            f"{name_text(path)} has {found.size} bytes on the vehicle, and had {known} when this was kept: "
+            "somebody changed it; --force replaces it"
+        )
+    return False
+
+
+async def _prove(session: Session, path: bytes, kept: Kept) -> None:
+    """Compare the vehicle's checksum with the copy, where it gives one; the size was compared before."""
+    theirs = await _crc32(session, path)
+    if theirs is not None and theirs != _local_crc32(kept.file):
+        raise NotDelivered(f"{name_text(path)} differs on the vehicle; the copy stays in {kept.file}")
+
+
+async def _crc32(session: Session, path: bytes) -> int | None:
+    try:
+        return await session.files.crc32(path)
+    except (Armed, FtpNak, NotSupported, RequestTimeout):
+        return None
+
+
+def _local_crc32(file: Path) -> int:
+    value = 0
+    with file.open("rb") as source:
+        while data := source.read(READ_SIZE):
+            value = crc32(data, value)
+    return value
+
+
+def _forget(kept: Kept) -> None:
+    """Remove a copy and its description, and the directory with the last one."""
+    directory = kept.file.parent
+    kept.file.unlink()
+    kept.file.with_name(f"{kept.file.name}.json").unlink(missing_ok=True)
+    if not kept_in(directory):
+        with suppress(OSError):
+            for manifest in directory.glob(f"{MANIFEST}*"):
+                manifest.unlink()
+            directory.rmdir()

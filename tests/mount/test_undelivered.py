@@ -1,0 +1,167 @@
+"""What people are told of bytes that are not on the vehicle, and how they bring them there."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from mavftpfs.exits import ExitCode
+from tests.mount.conftest import Field
+from tests.mount.test_writing_ends import QUICK, write_to_nobody
+from tests.support.mounts import Mount, abort_mount, wait_until
+from tests.support.trees import content
+from tests.support.vehicles import SimVehicle
+
+MAVFTPFS = (sys.executable, "-m", "mavftpfs")
+
+
+@pytest.fixture
+def data(tmp_path: Path) -> Path:
+    """A file that is written while nobody answers."""
+    path = tmp_path / "data"
+    path.write_bytes(content("lost", 60_000))
+    return path
+
+
+@pytest.fixture(autouse=True)
+def state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Where this test's mounts leave what is not delivered."""
+    path = tmp_path / "state"
+    path.mkdir()
+    monkeypatch.setenv("XDG_STATE_HOME", str(path))
+    return path / "mavftpfs/recovered"
+
+
+def run(*words: str | Path, code: int = 0) -> tuple[str, str]:
+    """Run mavftpfs; return stdout and stderr."""
+    argv = [*MAVFTPFS, *map(str, words)]
+    done = subprocess.run(argv, capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == code, f"{argv}: {done.returncode}\n{done.stdout}{done.stderr}"
+    return done.stdout, done.stderr
+
+
+def test_umount_says_what_it_waits_for_and_ctrl_c_ends_the_waiting_only(
+    field: Field, data: Path, state: Path
+) -> None:
+    card = field.local("card")
+    vehicle = field.sim(card)
+    mount = field.mount(vehicle.source, *QUICK)
+    write_to_nobody(mount, vehicle, data)
+    process = mount.alive()
+    with mount.started(*MAVFTPFS, "umount", mount.path) as child:
+        assert child.stderr is not None
+        first, second = child.stderr.readline(), child.stderr.readline()
+        assert first.startswith("mavftpfs: not everything is on the vehicle yet. This takes at most 5 min;")
+        assert f"kept in {state}. Ctrl-C ends only the waiting, not the delivery." in first
+        assert second == "mavftpfs: delivering 1 file, 0 B of 60.0 kB, until the vehicle is back\n"
+        child.send_signal(signal.SIGINT)
+        _, errors = child.communicate(timeout=60)
+        assert child.returncode == ExitCode.INTERRUPTED
+    assert errors == "mavftpfs: the mount goes on delivering, and then ends; see: mavftpfs status\n"
+    assert f"{mount.path}: being unmounted, PX4 1/1, disarmed, LOST" in run("status")[0]
+    mount.process = None
+    vehicle.resume()
+    assert process.wait() == 0
+    assert (card / "lost.bin").read_bytes() == data.read_bytes()
+
+
+def test_mounting_over_a_dead_mount_tells_what_it_held(field: Field, data: Path) -> None:
+    vehicle = field.sim(field.local("card"))
+    vehicle.left_alone = True
+    mount = field.mount(vehicle.source, *QUICK)
+    write_to_nobody(mount, vehicle, data)
+    mount.kill()
+    try:
+        _, said = run(vehicle.source, mount.path, code=ExitCode.MOUNT_FAILED)
+        gone = f"is a dead mount whose program is gone; run: mavftpfs umount {mount.path}"
+        assert f"{gone}; 1 file(s) did not reach the vehicle when a mount was killed" in said
+        assert "1 file(s) did not reach the vehicle when a mount was killed" in run("recover")[0]
+    finally:
+        abort_mount(mount.path)
+
+
+def left_behind(field: Field, data: Path) -> tuple[Mount, SimVehicle, Path]:
+    """Have a mount end with a file that is not delivered; return it, a vehicle that answers, and its card."""
+    card = field.local("card")
+    vehicle = field.sim(card)
+    vehicle.left_alone = True
+    mount = field.mount(vehicle.source, *QUICK)
+    write_to_nobody(mount, vehicle, data)
+    process, mount.process = mount.alive(), None
+    process.send_signal(signal.SIGTERM)
+    wait_until("it delivers before it ends", lambda: "delivering" in process.text())
+    process.send_signal(signal.SIGTERM)
+    assert process.wait() == 4
+    vehicle.kill()
+    vehicle.start()  # a paused one would still answer what it was asked before
+    return mount, vehicle, card
+
+
+def test_what_was_kept_is_listed_and_put_back_on_demand(field: Field, data: Path, state: Path) -> None:
+    assert run("recover")[0] == "everything that was written reached its vehicle\n"
+    _, vehicle, card = left_behind(field, data)
+    (directory,) = state.iterdir()
+    heading, line = run("recover")[0].splitlines()
+    assert heading == f"{directory}:"
+    assert line.startswith("  lost.bin for /lost.bin, 60.0 kB, 20")
+    (facts,) = json.loads(run("recover", "--json")[0])
+    assert (facts["file"], facts["path"], facts["size"]) == (f"{directory}/lost.bin", "/lost.bin", 60_000)
+    assert facts["hindrance"] is None
+    assert not (card / "lost.bin").exists(), "never by itself"
+    assert run("recover", vehicle.source, directory / "lost.bin")[0] == (
+        "/lost.bin is on the vehicle now, verified; the copy here is removed\n"
+    )
+    assert (card / "lost.bin").read_bytes() == data.read_bytes()
+    assert list(state.iterdir()) == []
+
+
+def test_a_file_that_was_changed_since_is_replaced_only_by_force(
+    field: Field, data: Path, state: Path
+) -> None:
+    _, vehicle, card = left_behind(field, data)
+    (card / "lost.bin").write_bytes(b"somebody else's")
+    _, said = run("recover", vehicle.source, "--all", code=ExitCode.USAGE)
+    assert "/lost.bin has 15 bytes on the vehicle, and had nothing when this was kept" in said
+    assert (card / "lost.bin").read_bytes() == b"somebody else's"
+    run("recover", vehicle.source, "--all", "--force")
+    assert (card / "lost.bin").read_bytes() == data.read_bytes()
+    assert list(state.iterdir()) == []
+
+
+def test_what_is_there_already_is_not_sent(field: Field, data: Path, state: Path) -> None:
+    _, vehicle, card = left_behind(field, data)
+    (card / "lost.bin").write_bytes(data.read_bytes())
+    os.utime(card / "lost.bin", (1, 1))
+    assert "was there already" in run("recover", vehicle.source, "--all")[0]
+    assert (card / "lost.bin").stat().st_mtime == 1
+    assert list(state.iterdir()) == []
+
+
+def test_a_part_of_a_file_is_not_put_back(field: Field, state: Path) -> None:
+    """What a killed mount held of a file that was being written, and of one that was changed in part."""
+    card = field.local("card")
+    directory = state / "20261123-120000-1-udpin"
+    directory.mkdir(parents=True)
+    for name, facts in (
+        ("being-written", {"path": "/being-written", "unfinished": True}),
+        ("changed", {"path": "/changed", "whole": False, "size_on_vehicle": 9}),
+        ("unknown", {}),
+    ):
+        (directory / name).write_bytes(b"part")
+        (directory / f"{name}.json").write_text(json.dumps(facts))
+    source = field.sim(card).source
+    for name, reason in (
+        ("being-written", "a program was still writing it"),
+        ("changed", "only the changed parts of it are here"),
+        ("unknown", "where it belongs was not written down"),
+    ):
+        assert reason in run("recover")[0]
+        assert reason in run("recover", source, directory / name, "--force", code=ExitCode.USAGE)[1]
+    assert list(card.iterdir()) == []
+    assert len(list(directory.iterdir())) == 6
