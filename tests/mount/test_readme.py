@@ -1,0 +1,145 @@
+"""README's commands, run as they stand there: only the vehicle's address is a simulated one's."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.mount.conftest import Field
+from tests.support.mounts import COMMAND_TIMEOUT, abort_mount, mounted_at
+from tests.support.vehicles import HOST, PROJECT
+
+README = (PROJECT / "README.md").read_text()
+LOG = "fs/microsd/log/2026-11-20/10_32_15.ulg"
+
+SOURCES = {
+    "udpin:0.0.0.0:14550": "",
+    "udpout:192.168.4.1:14550": "udpin",
+    "tcp:192.168.1.10:5760": "tcpin",
+    "/dev/ttyACM0": "pty",
+    "/dev/ttyUSB0,57600": "pty",
+}
+"""README's addresses, and the kind of link that a simulated vehicle waits on for each."""
+
+
+def block(heading: str) -> list[str]:
+    """Return the command lines of a section."""
+    section = README.partition(f"\n## {heading}\n")[2].partition("\n## ")[0]
+    return [line.partition("  #")[0].strip() for line in re.findall(r"^    (\S.*)$", section, re.MULTILINE)]
+
+
+MOUNTING = [line for line in block("Mounting") if line.startswith("mavftpfs") and line.endswith(" ~/drone")]
+MOUNTS = [line for line in MOUNTING if line.split()[1] in SOURCES]
+
+
+class Home:
+    """A user's home with a shell in it; `drone` is a vehicle's card."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.card = path / "card"
+        self.mountpoint = path / "drone"
+        (self.card / LOG).parent.mkdir(parents=True)
+        (self.card / LOG).write_bytes(os.urandom(30_000))
+        (self.card / "fs/microsd/etc").mkdir()
+        (self.card / "APM/scripts").mkdir(parents=True)
+        (self.card / "APM/scripts/hover.lua").write_text("return 1\n")
+        (path / "params.txt").write_text("param set COM_DISARM_LAND 2\n")
+        (path / "mavftpfs").write_text(f'#!/bin/sh\nexec {sys.executable} -m mavftpfs "$@"\n')
+        (path / "mavftpfs").chmod(0o755)
+
+    def run(self, line: str) -> str:
+        """Run a line of README in a shell and return its output; it must succeed."""
+        done = subprocess.run(
+            ["bash", "-c", line],
+            cwd=self.path,
+            env={**os.environ, "HOME": str(self.path), "PATH": f"{self.path}:{os.environ['PATH']}"},
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
+            timeout=COMMAND_TIMEOUT,
+            check=False,
+        )
+        assert done.returncode == 0, f"{line}: exit {done.returncode}\n{done.stdout}{done.stderr}"
+        return done.stdout
+
+
+@pytest.fixture
+def home(tmp_path: Path, field: Field) -> Iterator[Home]:
+    """A home; its mount is taken away before its vehicle ends."""
+    place = Home(tmp_path)
+    yield place
+    abort_mount(place.mountpoint)
+
+
+def with_vehicle(line: str, home: Home, field: Field, profile: str) -> str:
+    """Start the vehicle that a line of README speaks of, and return the line with its address."""
+    address = line.split()[1]
+    kind = SOURCES[address]
+    link = {"udpin": f"udpin:{HOST}:0", "tcpin": f"tcpin:{HOST}:0"}.get(kind, kind or None)
+    return line.replace(address, field.sim(home.card, profile, link=link).source)
+
+
+@pytest.mark.parametrize("line", MOUNTS)
+def test_mounting(line: str, home: Home, field: Field) -> None:
+    for command in block("Mounting"):
+        if command in MOUNTS:
+            if command == line:
+                home.run(with_vehicle(command, home, field, "px4"))
+                assert mounted_at(home.mountpoint)
+        else:
+            home.run(command)
+    assert not mounted_at(home.mountpoint)
+
+
+def test_all_ways_to_mount_are_tried() -> None:
+    assert [line.split()[1] for line in MOUNTS] == list(SOURCES)
+
+
+@pytest.mark.parametrize("number", range(3))
+def test_copying_the_logs(number: int, home: Home, field: Field) -> None:
+    line = block("Copying the logs")[number]
+    if line.split()[-2].startswith("~/drone"):
+        home.mountpoint.mkdir()
+        home.run(with_vehicle(MOUNTS[0], home, field, "px4"))
+        home.run(line)
+        home.run("mavftpfs umount ~/drone")
+    else:
+        words = line.split()
+        home.run(line.replace(words[2], with_vehicle(f"mavftpfs {words[2]}", home, field, "px4").split()[1]))
+    copy = home.path / "logs" / Path(LOG).relative_to("fs/microsd/log")
+    assert copy.read_bytes() == (home.card / LOG).read_bytes()
+
+
+def test_editing(home: Home, field: Field) -> None:
+    home.mountpoint.mkdir()
+    home.run(with_vehicle(MOUNTS[0], home, field, "ardupilot"))
+    vim, cp, cat = block("Editing")
+    home.run(vim.replace("vim ", "vim -es -u NONE -c 's/1/2/' -c wq "))
+    assert (home.card / "APM/scripts/hover.lua").read_text() == "return 2\n"
+    home.run(cp)
+    assert (home.card / "fs/microsd/etc/params.txt").read_text() == (home.path / "params.txt").read_text()
+    assert home.run(cat) != ""
+    home.run("mavftpfs umount ~/drone")
+
+
+def test_the_guides_json_keys_are_there(home: Home, field: Field) -> None:
+    """Each key that the guide's tables name for `status --json` is in it."""
+    home.mountpoint.mkdir()
+    home.run(with_vehicle(MOUNTS[0], home, field, "px4"))
+    status = json.loads(home.run("mavftpfs status --json ~/drone"))
+    guide = (PROJECT / "docs/guide.md").read_text().partition("\n## JSON\n")[2].partition("`sync --json")[0]
+    rows = dict(re.findall(r"^\| (`[^|]*`) \| (.*) \|$", guide, re.MULTILINE))
+    named = {name for row in rows for name in re.findall(r"`(\w+)`", row)}
+    assert named == set(status)
+    for group in ("vehicle", "link"):
+        inner = re.sub(r"\([^)]*\)", "", rows[f"`{group}`"])
+        assert set(re.findall(r"`(\w+)`", inner)) == set(status[group])
+    home.run("mavftpfs umount ~/drone")
