@@ -31,7 +31,7 @@ from mavftpfs.cache.spool import SpoolDirectory
 from mavftpfs.cache.virtual import VirtualTrees, is_snapshot
 from mavftpfs.cache.writeback import Writeback
 from mavftpfs.cache.writing import make_writeback
-from mavftpfs.shared.errors import FtpNak, IsADirectory, ListingIncomplete, ReadOnly
+from mavftpfs.shared.errors import FtpNak, IsADirectory, ListingIncomplete, NotDeliveredYet, ReadOnly
 from mavftpfs.shared.model import ROOT, DirEntry, EntryKind, is_virtual, join, normalise
 
 __all__ = ["OpenFile", "Stat", "Tree"]
@@ -195,14 +195,13 @@ class Tree:
         Of an `@` file it is that of the bytes a reader gets: these are made anew at every open.
 
         Raises:
-            NotFound, NotADirectory, IsADirectory, Armed; else as RemoteStore.crc32.
+            NotFound, NotADirectory, IsADirectory, Armed, NotDeliveredYet; else as RemoteStore.crc32.
         """
         remote = self._remote(path)
         if is_snapshot(remote):
             return await self._virtual.crc32(remote)
-        ours = None if self._writing is None else self._writing.crc32(remote)
-        if ours is not None:
-            return ours
+        if self._writing is not None and self._writing.holds(remote):
+            raise NotDeliveredYet(f"{remote!r} is not on the vehicle yet")
         return await self._checksums.get(remote, await self._find_file(remote))
 
     # --- changing (all raise ReadOnly on a tree without a writer, and below `@` directories)

@@ -181,11 +181,10 @@ class Writeback:
     def _new_content(self, node: Node) -> SpoolContent:
         return self._spool.content(node.spool_name)
 
-    def crc32(self, path: bytes) -> int | None:
-        """Return the checksum of what the vehicle does not have yet, None if it can be asked."""
+    def holds(self, path: bytes) -> bool:
+        """Return whether the vehicle lacks bytes of a file."""
         node = self._context.nodes.get(self.overlay.spelled(path))
-        draft = None if node is None or not node.undelivered else node.draft
-        return None if draft is None or not draft.whole else draft.crc32()
+        return node is not None and node.undelivered
 
     # --- what handles ask
 

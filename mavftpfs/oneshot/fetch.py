@@ -27,12 +27,20 @@ from mavftpfs.shared.errors import (
     DataUnproven,
     LinkError,
     MavftpfsError,
+    NotDeliveredYet,
     RequestTimeout,
     UsageError,
 )
 from mavftpfs.shared.readable import name_text, readable_size
 
 PART_SUFFIX = ".part"
+
+_WHY_NOT: dict[type[MavftpfsError], str] = {
+    Armed: "no checksums while armed",
+    NotDeliveredYet: "the vehicle is armed, or has not got all of it yet",
+    RequestTimeout: "the vehicle did not answer",
+}
+"""Why there is no checksum now, though there may be one later."""
 
 
 class LocalDiskFull(UsageError):
@@ -259,8 +267,8 @@ class Fetcher:
             theirs = await self.session.files.crc32(wanted.remote)
         except LinkError:
             raise
-        except (Armed, RequestTimeout) as exc:
-            why = "no checksums while armed" if isinstance(exc, Armed) else "the vehicle did not answer"
+        except (Armed, NotDeliveredYet, RequestTimeout) as exc:
+            why = next(words for kind, words in _WHY_NOT.items() if isinstance(exc, kind))
             await self._require_size(wanted, size)
             if resumed:
                 raise NotProvenYet(

@@ -23,6 +23,7 @@ from mavftpfs.shared.errors import (
     IsADirectory,
     LinkError,
     MavftpfsError,
+    NotDeliveredYet,
     NotSupported,
     RequestTimeout,
 )
@@ -171,7 +172,7 @@ async def _cat(session: Session, path: bytes, out: BinaryIO, verify: Verify) -> 
         return
     try:
         theirs = await session.files.crc32(path)
-    except (Armed, RequestTimeout, FtpNak, NotSupported):
+    except (Armed, NotDeliveredYet, RequestTimeout, FtpNak, NotSupported):
         return
     if theirs != crc:
         raise DataUnproven(

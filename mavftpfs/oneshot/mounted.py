@@ -132,7 +132,7 @@ _BY_ERRNO: dict[int, type[errors.MavftpfsError]] = {
     errno.ENOTCONN: errors.LinkClosed,  # the mount's process is gone
     errno.ECONNABORTED: errors.LinkClosed,
     errno.ENODEV: errors.LinkClosed,
-    errno.EAGAIN: errors.Armed,  # only the checksum says it
+    errno.EAGAIN: errors.NotDeliveredYet,  # only the checksum says it, also while armed
 }
 
 

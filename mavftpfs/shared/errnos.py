@@ -108,6 +108,7 @@ _BY_CLASS: dict[type[BaseException], int] = {
     errors.SessionBusy: errno.EBUSY,
     errors.SessionLost: errno.EIO,
     errors.Armed: errno.EROFS,
+    errors.NotDeliveredYet: errno.EAGAIN,
     errors.ReadOnly: errno.EROFS,
     errors.AlreadyExists: errno.EEXIST,
     errors.DirectoryNotEmpty: errno.ENOTEMPTY,

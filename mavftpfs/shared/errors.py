@@ -111,6 +111,10 @@ class Armed(MavftpfsError):
     """The vehicle is armed (or was never heard), and what was asked is not done in flight."""
 
 
+class NotDeliveredYet(MavftpfsError):
+    """The vehicle does not have all bytes of the file yet, so it cannot say their checksum (EAGAIN)."""
+
+
 class ReadOnly(MavftpfsError):
     """What was asked would change a tree, or a part of it, that is only read (EROFS)."""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 from contextlib import suppress
@@ -16,10 +17,13 @@ from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.spool import SpoolContent, SpoolDirectory
 from mavftpfs.cache.tree import Tree
 from mavftpfs.farewell import keep_the_rest
+from mavftpfs.protocol.crc import crc32
+from mavftpfs.shared.errnos import errno_for
 from mavftpfs.shared.errors import (
     FileBusy,
     FileTooLarge,
     MavftpfsError,
+    NotDeliveredYet,
     RequestTimeout,
     SpoolFailed,
     VehicleLost,
@@ -56,6 +60,19 @@ async def test_fsync_tells_a_reader_what_the_writer_left(autojump_clock: object,
     assert store.files[NEW].data == b"abc" * 100
     reader.close()
     assert tree.undelivered() == []
+
+
+async def test_a_checksum_is_the_vehicle_s_or_none(autojump_clock: object, store: FakeWriter) -> None:
+    """Never that of the bytes that are held here: who asks wants to know what is on the card."""
+    tree = make_writable(store)
+    file = await tree.open(FILE, write=True)
+    await file.write(0, b"new")
+    with pytest.raises(NotDeliveredYet) as caught:
+        await tree.crc32(FILE)
+    assert errno_for(caught.value) == errno.EAGAIN
+    await file.fsync()
+    assert await tree.crc32(FILE) == crc32(b"new" + OLD[3:])
+    file.close()
 
 
 # --- what nobody learnt of
