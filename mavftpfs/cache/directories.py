@@ -26,6 +26,9 @@ log = logging.getLogger("mavftpfs.cache")
 DOT = b"."
 """The working directory of a server that runs as a process (ArduPilot SITL)."""
 
+LOG_ALIAS = b"/@MAV_LOG"
+"""The standard's only alias: the directory of logs, which are real files."""
+
 MAX_DEPTH = 256
 """More components than any path that fits a request has."""
 
@@ -96,9 +99,22 @@ class Directories:
         if entry is None and directory.cut_short and name:
             entry = await self._ask_for(path)
             self._dentries.note_found(path, entry)
+        if entry is None and path == LOG_ALIAS and _announces_trees(directory):
+            entry = await self._find_log_alias()
         if entry is None:
             raise NotFound(f"{path!r} does not exist")
         return Found(entry, directory)
+
+    async def _find_log_alias(self) -> DirEntry | None:
+        """List `@MAV_LOG`, which newer ArduPilot has without showing it in `/` (servers.md 11)."""
+        if self._dentries.fresh(LOG_ALIAS, self._clock()) is None:
+            try:
+                await self._sweeping.run(LOG_ALIAS, partial(self._sweep, LOG_ALIAS))
+            except FtpNak as nak:
+                if errno_for(nak) != errno.ENOENT:
+                    raise
+                return None
+        return DirEntry(split(LOG_ALIAS)[1], EntryKind.DIRECTORY)
 
     async def _ask_for(self, path: bytes) -> DirEntry:
         """Open a file that an incomplete listing lacks.
@@ -270,6 +286,11 @@ class Directories:
             listing.complete and dot.complete,
             listing.hidden + dot.hidden,
         )
+
+
+def _announces_trees(root: Directory) -> bool:
+    """Return whether `/` shows other `@` trees: what shows none may not survive being asked for a list."""
+    return any(name.startswith(b"@") for name in root.entries)
 
 
 def _hides_files(listing: Listing) -> bool:

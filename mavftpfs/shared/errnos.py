@@ -99,6 +99,7 @@ _BY_CLASS: dict[type[BaseException], int] = {
     errors.PathTooLong: errno.ENAMETOOLONG,
     errors.RemoteProtocolError: errno.EIO,
     errors.RequestTimeout: errno.ETIMEDOUT,
+    errors.OutcomeUnknown: errno.ETIMEDOUT,
     errors.NotFound: errno.ENOENT,
     errors.NotADirectory: errno.ENOTDIR,
     errors.ListingIncomplete: errno.EIO,
