@@ -1,8 +1,9 @@
 """`mavftpfs demo`: a short tour with a simulated drone behind a bad radio. Layer: top, beside cli.
 
-It runs the same commands that a user would (`mavftpfs sim`, `mavftpfs SOURCE MOUNTPOINT`, ls, cat, cp, diff),
-each as its own process, in one temporary directory, and leaves nothing behind: no process, no mount, no file,
-also after Ctrl-C or an error. Exit code 0 only if every byte that arrived is the one on the vehicle's card.
+It runs the same commands that a user would (`mavftpfs sim`, `mavftpfs SOURCE MOUNTPOINT`, ls, cat, cp, sed,
+diff, `mavftpfs status`), each as its own process, in one temporary directory, and leaves nothing behind: no
+process, no mount, no file, also after Ctrl-C or an error. Exit code 0 only if every byte that arrived is the
+one on the vehicle's card.
 """
 
 from __future__ import annotations
@@ -17,18 +18,16 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 from rich.console import Console
 from rich.panel import Panel
 from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TransferSpeedColumn
-from rich.table import Table
 
-from mavftpfs import control
+from mavftpfs import control, statuses
 from mavftpfs.daemon import signals_held
 from mavftpfs.mountpoint import mounts
 
@@ -38,11 +37,11 @@ RADIO = ("--rate", "40000", "--delay", "0.05", "--jitter", "0.01", "--loss", "0.
 RADIO_WORDS = "40 kB/s, 100 ms there and back, 8 of 100 packets lost in each direction"
 
 LOG_SIZE = 300_000
-FILE_SHARE = 239 / 266
-"""Bytes of a file in each byte received: a frame of 266 carries 239."""
 STEP_TIMEOUT = 60.0
 """Seconds after which any step of the tour counts as failed."""
 END_TIMEOUT = 15.0
+
+PROGRAM = (sys.executable, "-m", "mavftpfs")
 
 LOG = "fs/microsd/log/2026-11-20/10_32_15.ulg"
 SCRIPT = "fs/microsd/etc/extras.txt"
@@ -52,6 +51,7 @@ mavlink start -d /dev/ttyS1 -b 57600
 camera_trigger start
 param set COM_DISARM_LAND 2
 """
+EDIT = ("57600", "115200")
 
 
 class DemoFailed(Exception):
@@ -87,7 +87,9 @@ class Tour:
     def command(self, *words: str) -> str:
         """Show and run a command in the temporary directory, and show and return its output."""
         self.show_command(*words)
-        with running(words, self.folder) as child:
+        program, *rest = words
+        argv = [*PROGRAM, *rest] if program == "mavftpfs" else words
+        with running(argv, self.folder) as child:
             try:
                 output, errors = child.communicate(timeout=STEP_TIMEOUT)
             except subprocess.TimeoutExpired:
@@ -132,7 +134,7 @@ def daemon(name: str, arguments: Sequence[str], folder: Path) -> Iterator[subpro
     try:
         with (folder / f"{name}.log").open("wb") as log, signals_held():
             process = subprocess.Popen(
-                [sys.executable, "-m", "mavftpfs", *arguments],
+                [*PROGRAM, *arguments],
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=log,
@@ -200,7 +202,7 @@ def introduce(tour: Tour) -> None:
             "radio there is. [bold]mavftpfs makes the drone a directory[/], so that every program you know "
             "can work with it.\n\n"
             f"This tour simulates a drone behind a bad radio ({RADIO_WORDS}), mounts it, reads it, "
-            "and checks every byte. It needs no hardware and leaves nothing behind.",
+            "edits it, and checks every byte. It needs no hardware and leaves nothing behind.",
             title="mavftpfs",
             border_style="cyan",
         )
@@ -243,82 +245,66 @@ def look_around(tour: Tour) -> None:
 
 
 def copy_log(tour: Tour) -> None:
-    """cp a log with a progress bar, then compare checksums."""
+    """Copy a log with a progress bar, then compare checksums."""
     tour.say(
         "Copying a flight log over the bad radio. Lost packets are asked for again while the rest flows:"
     )
     words = ("cp", f"drone/{LOG}", "flight.ulg")
     tour.show_command(*words)
     columns = (TextColumn("  flight.ulg"), BarColumn(), DownloadColumn(), TransferSpeedColumn())
-    before = find_fact(ask_status(tour), "received_bytes")
     deadline = time.monotonic() + STEP_TIMEOUT
     with Progress(*columns, console=tour.console) as progress, running(words, tour.folder) as child:
         bar = progress.add_task("", total=LOG_SIZE)
         while child.poll() is None and time.monotonic() < deadline:
-            # Not the copy's size: cp asks for 256 KiB at a time, so the bar would jump.
-            received = (find_fact(ask_status(tour), "received_bytes") - before) * FILE_SHARE
-            progress.update(bar, completed=min(received, LOG_SIZE))
+            progress.update(bar, completed=fetched_bytes(tour))
             time.sleep(0.1)
         if child.returncode == 0:
             progress.update(bar, completed=LOG_SIZE)
     if child.returncode != 0:
         raise DemoFailed(f"cp ended with {child.returncode}")
-    compare_checksums(tour, tour.folder / "flight.ulg")
+    there, here = (tour.card / LOG).read_bytes(), (tour.folder / "flight.ulg").read_bytes()
+    compare_checksums(tour, {"the drone": there, "here": here})
 
 
-def compare_checksums(tour: Tour, copy: Path) -> None:
-    """Show the SHA-256 of what the card holds and of what arrived."""
-    there = hashlib.sha256((tour.card / LOG).read_bytes()).hexdigest()
-    here = hashlib.sha256(copy.read_bytes()).hexdigest()
-    table = Table(title="SHA-256", title_justify="left")
-    table.add_column("where")
-    table.add_column("checksum")
-    table.add_row("on the drone's card", there)
-    table.add_row("what arrived here", here)
-    tour.console.print(table)
-    same = there == here
+def fetched_bytes(tour: Tour) -> int:
+    """Return how much of the log the mount has fetched so far.
+
+    Not the copy's size: cp asks for 256 KiB at a time, so the bar would jump.
+    """
+    try:
+        transfers = statuses.status_of(str(tour.drone))["transfers"]
+    except control.ControlError as error:
+        raise DemoFailed(f"no status: {error}") from error
+    return sum(transfer["done"] for transfer in transfers)
+
+
+def compare_checksums(tour: Tour, contents: Mapping[str, bytes]) -> None:
+    """Show the SHA-256 of the same file in two places, as sha256sum does."""
+    checksums = {where: hashlib.sha256(content).hexdigest() for where, content in contents.items()}
+    for where, checksum in checksums.items():
+        tour.console.print(f"{checksum}  {where}", highlight=False)
+    same = len(set(checksums.values())) == 1
     tour.prove(same)
     tour.console.print("[bold green]The same, byte for byte.[/]" if same else "[bold red]They differ.[/]")
 
 
-def show_link(tour: Tour) -> None:
-    """Say what the link did meanwhile, by the mount's own account."""
-    status = ask_status(tour)
-    table = Table(show_header=False)
-    table.add_row("requests sent", f"{find_fact(status, 'requests'):,}")
-    table.add_row("of these again, because something was lost", f"{find_fact(status, 'retransmissions'):,}")
-    table.add_row("there and back, measured", f"{1000 * find_fact(status, 'rtt'):.0f} ms")
-    table.add_row("received over the air", f"{find_fact(status, 'received_bytes'):,} bytes")
-    table.add_row("reading rate at the last file", f"{find_fact(status, 'rate') / 1000:.1f} kB/s")
-    tour.say("What the radio did meanwhile (from [bold]mavftpfs status drone[/]):")
-    tour.console.print(table, highlight=False)
+def edit_script(tour: Tour) -> None:
+    """Change a file on the drone with an ordinary program, and look at the card."""
+    tour.say(
+        "Changing a file is as simple. When the program has closed it, the whole new file is on the drone's "
+        "card and was compared with what was written:"
+    )
+    old, new = EDIT
+    tour.command("sed", "-i", f"s/{old}/{new}/", f"drone/{SCRIPT}")
+    tour.command("cat", f"card/{SCRIPT}")
+    there, wanted = (tour.card / SCRIPT).read_bytes(), SCRIPT_TEXT.replace(old, new).encode()
+    compare_checksums(tour, {"wanted": wanted, "the drone": there})
 
 
-def ask_status(tour: Tour) -> dict[str, Any]:
-    """Return what `mavftpfs status` would show."""
-    try:
-        path = control.find_socket(str(tour.drone), control.own_directories())
-        return control.ask(path, {"command": "status"}, timeout=STEP_TIMEOUT)
-    except control.ControlError as error:
-        raise DemoFailed(f"no status: {error}") from error
-
-
-def find_fact(facts: Any, name: str) -> Any:
-    """Return the first value called `name` in nested facts.
-
-    Raises:
-        DemoFailed: there is none.
-    """
-    layers = [facts]
-    while layers:
-        layer = layers.pop(0)
-        if isinstance(layer, dict):
-            if layer.get(name) is not None:
-                return layer[name]
-            layers += layer.values()
-        elif isinstance(layer, list):
-            layers += layer
-    raise DemoFailed(f"the status says nothing about {name}")
+def show_status(tour: Tour) -> None:
+    """Have the mount tell how the drone and the radio are."""
+    tour.say("How the drone, the radio and all transfers are doing, at any time:")
+    tour.command("mavftpfs", "status", "drone")
 
 
 def compare_all(tour: Tour) -> None:
@@ -330,7 +316,7 @@ def compare_all(tour: Tour) -> None:
 
 def conclude(tour: Tour) -> int:
     """Give the verdict and the way to a real vehicle; return the exit code."""
-    good = len(tour.proofs) == 3 and all(tour.proofs)
+    good = len(tour.proofs) == 4 and all(tour.proofs)
     verdict = (
         "[bold green]Every byte was right.[/]" if good else "[bold red]Something differed: this is a bug.[/]"
     )
@@ -355,7 +341,8 @@ def take_tour(tour: Tour) -> None:
             mount(tour, stack)
             look_around(tour)
             copy_log(tour)
-            show_link(tour)
+            show_status(tour)
+            edit_script(tour)
             compare_all(tour)
             tour.say("Done. Unmounting:")
             tour.show_command("fusermount3", "-u", "drone")

@@ -65,8 +65,14 @@ def test_the_demo_shows_the_tour_and_cleans_up(place: Path, tmp_path: Path) -> N
         "ls -l",
         "cat drone",
         "cp drone",
+        "mavftpfs status drone",
+        "PX4 1/1, disarmed, link ",
+        "sed -i",
+        "mavlink start -d /dev/ttyS1 -b 115200",
         "diff -r",
-        "SHA-256",
+        "  the drone\n",
+        "  here\n",
+        "  wanted\n",
         "10_32_15.ulg",
         "Every byte was right",
     ):
@@ -75,7 +81,7 @@ def test_the_demo_shows_the_tour_and_cleans_up(place: Path, tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-@pytest.mark.parametrize("moment", ["mavftpfs udpin", "cp drone"])
+@pytest.mark.parametrize("moment", ["mavftpfs udpin", "cp drone", "sed -i"])
 def test_a_demo_that_is_stopped_cleans_up(place: Path, number: signal.Signals, moment: str) -> None:
     demo = start_demo(place)
     assert demo.stdout is not None
