@@ -16,7 +16,7 @@ from typing import NoReturn
 import mavftpfs
 from mavftpfs import commands
 from mavftpfs.exits import ExitCode, exit_code_for
-from mavftpfs.fuse.optionhelp import option_help
+from mavftpfs.fuse.options import option_help
 from mavftpfs.shared.errors import MavftpfsError, UsageError
 from mavftpfs.shared.readable import readable
 

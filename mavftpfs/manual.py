@@ -10,8 +10,7 @@ import shtab
 
 import mavftpfs
 from mavftpfs.exits import EXIT_CODES
-from mavftpfs.fuse.optionhelp import HELP
-from mavftpfs.fuse.options import option_names
+from mavftpfs.fuse.options import HELP, option_names
 
 SHELLS = ("bash", "zsh", "fish")
 

@@ -7,8 +7,10 @@ may make a system call on the mountpoint: it would wait for itself.
 
 from __future__ import annotations
 
+import errno
 import gc
 import logging
+import math
 import os
 import signal
 import time
@@ -33,7 +35,6 @@ from mavftpfs.fuse.inodes import InodeTable
 from mavftpfs.fuse.operations import Operations, Presentation, Space
 from mavftpfs.fuse.options import MountOptions, fuse_words
 from mavftpfs.fuse.writing import WritingOperations
-from mavftpfs.kernelnews import Invalidator
 from mavftpfs.link.uri import LinkSpec
 from mavftpfs.mountpoint import is_ours, stderr_of, unmount, unmount_what_is_left
 from mavftpfs.shared.errors import MavftpfsError
@@ -135,6 +136,64 @@ async def serve_mount(request: MountRequest, attach: Attach, report: Report) -> 
                 await life.control.closed.wait()
         nursery.cancel_scope.cancel()
     return life.code
+
+
+class Invalidator:
+    """Tells the kernel that what it cached of files is old; `notify(ino, attr_only)` is its call.
+
+    That call runs in a worker thread: the kernel waits in it for pages that are being read, and those reads
+    are answered by the event loop.
+    """
+
+    def __init__(self, inodes: InodeTable, notify: Callable[[int, bool], None]) -> None:
+        self._inodes = inodes
+        self._notify = notify
+        self._pending: set[int] = set()
+        self._wake = trio.Event()
+        self._calls: set[object] = set()
+        # Without a limit: a call that queued and was cancelled would count as running.
+        self._limiter = trio.CapacityLimiter(math.inf)
+
+    @property
+    def busy(self) -> bool:
+        """Whether a thread is inside the kernel's call at this moment."""
+        return bool(self._calls)
+
+    def on_changed(self, path: bytes) -> None:
+        """The bytes at `path` are others now: have the kernel drop its pages and attributes."""
+        ino = self._inodes.known(path)
+        if ino is not None:
+            self._pending.add(ino)
+            self._wake.set()
+
+    async def run(self) -> None:
+        """Work until cancelled."""
+        while True:
+            await self._wake.wait()
+            self._wake = trio.Event()
+            pending, self._pending = self._pending, set()
+            for ino in pending:
+                await self._tell(ino, attr_only=False)
+
+    async def forget_attributes(self, ino: int) -> None:
+        """Have the kernel ask for attributes again; back when it has forgotten them."""
+        await self._tell(ino, attr_only=True)
+
+    async def _tell(self, ino: int, *, attr_only: bool) -> None:
+        await trio.lowlevel.checkpoint_if_cancelled()
+        call = object()
+        self._calls.add(call)
+        action = partial(self._in_thread, call, ino, attr_only)
+        await trio.to_thread.run_sync(action, abandon_on_cancel=True, limiter=self._limiter)
+
+    def _in_thread(self, call: object, ino: int, attr_only: bool) -> None:
+        try:
+            self._notify(ino, attr_only)
+        except OSError as exc:
+            if exc.errno != errno.ENOENT:  # the kernel forgot it by itself
+                log.warning("the kernel refused to drop its cache of inode %d: %s", ino, exc)
+        finally:
+            self._calls.discard(call)
 
 
 class _Life:

@@ -63,7 +63,7 @@ def _link(connection: Facts, traffic: float | None) -> dict[str, Any]:
     speed, counters = connection.get("speed", {}), connection.get("link", {})
     return {
         "source": connection.get("source"),
-        "peer": counters.get("peer"),
+        "address": connection.get("address"),
         "state": link_state(connection),
         "rtt": connection.get("rtt"),
         "loss": speed.get("loss"),

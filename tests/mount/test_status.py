@@ -193,7 +193,8 @@ def test_the_json_has_what_the_guide_lists(field: Field, small_tree: Path) -> No
     parts = ["vehicle", "link", "transfers", "held", "connection", "cache", "kernel"]
     assert sorted(facts) == sorted([*mount_facts, *parts])
     vehicle = ["system", "component", "autopilot", "armed", "when_armed"]
-    link = ["source", "peer", "state", "rtt", "loss", "rate", "other_ftp_client", "received_bytes"]
+    link = ["source", "address", "state", "rtt", "loss", "rate", "other_ftp_client", "received_bytes"]
+    assert facts["link"]["address"].startswith("127.0.0.1:")
     assert keys == {
         "vehicle": sorted([*vehicle, "heartbeat_age", "says_ftp", "restarts"]),
         "link": sorted([*link, "sent_bytes", "requests", "retransmissions", "reopened"]),

@@ -1,4 +1,4 @@
-"""kernelnews: the kernel is told from a thread, about inodes it knows."""
+"""mount.Invalidator: the kernel is told from a thread, about inodes it knows."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import trio
 import trio.testing
 
 from mavftpfs.fuse.inodes import InodeTable
-from mavftpfs.kernelnews import Invalidator
+from mavftpfs.mount import Invalidator
 
 
 class Kernel:

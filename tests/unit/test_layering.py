@@ -70,7 +70,6 @@ PURE_MODULES = {
     "fuse.inodes",
     "fuse.handles",
     "fuse.keeping",
-    "fuse.optionhelp",
     "fuse.options",
 }
 IMPURE_MODULES = {"sim.endpoints", "sim.memory", "sim.command"}

@@ -10,15 +10,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mavftpfs.fuse.optionhelp import HELP, option_help
 from mavftpfs.fuse.options import (
     DEFAULT_LOCAL,
     FLAGS,
+    HELP,
     IGNORED_WORDS,
     KERNEL_WORDS,
     VALUES,
     MountOptions,
     fuse_words,
+    option_help,
     option_names,
     parse_options,
     with_root,
