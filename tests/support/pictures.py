@@ -96,7 +96,7 @@ def draw(lines: Sequence[str], title: str, path: Path) -> None:
     with open(os.devnull, "w") as nowhere:
         console = Console(record=True, width=COLUMNS, file=nowhere, force_terminal=True)
         console.print(Text.from_ansi("\n".join(lines).strip("\n"), no_wrap=True))
-        path.write_text(console.export_svg(title=title))
+        path.write_text(console.export_svg(title=title, unique_id=path.stem))
 
 
 @contextmanager
