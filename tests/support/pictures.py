@@ -118,11 +118,12 @@ def running(*words: str, ready: str) -> Iterator[None]:
 
 
 def draw_demo(path: Path) -> None:
-    """Draw the tour from mounting to the comparison."""
+    """Draw the tour from mounting to the edited file."""
     lines = screen(in_terminal([*_MAVFTPFS, "demo"]))
     plain = [Text.from_ansi(line).plain for line in lines]
     first = next(number for number, line in enumerate(plain) if line.startswith("$ mavftpfs"))
-    draw(lines[first:], "scripts/demo", path)
+    last = max(number for number, line in enumerate(plain) if "byte for byte" in line)
+    draw(lines[first : last + 1], "scripts/demo", path)
 
 
 def draw_status(path: Path) -> None:
