@@ -203,10 +203,11 @@ class _Delivery:
         from mavftpfs.farewell import DRAIN_LIMIT, recovered_directory
 
         print(
-            "mavftpfs: not everything is on the vehicle yet. This takes at most "
-            f"{readable_time(DRAIN_LIMIT)}; what is left then is kept in {recovered_directory(os.environ)}. "
-            "Ctrl-C ends only the waiting, not the delivery.",
+            "mavftpfs: not everything is on the vehicle yet: it is delivered for at most "
+            f"{readable_time(DRAIN_LIMIT)}, then the rest is kept in {recovered_directory(os.environ)}\n"
+            "mavftpfs: Ctrl-C ends only the waiting, not the delivery",
             file=sys.stderr,
+            flush=True,
         )
 
 

@@ -34,7 +34,11 @@ def snapshot(connection: Facts, cache: Facts, traffic: float | None, *, when_arm
     return {
         "vehicle": _vehicle(connection, when_armed),
         "link": _link(connection, traffic),
-        "transfers": _transfers(cache, moving=link_state(connection) in ("fine", "lossy")),
+        "transfers": _transfers(
+            cache,
+            moving=link_state(connection) in ("fine", "lossy"),
+            writing=not connection.get("armed") or when_armed == "ok",
+        ),
         "held": {
             "files": cache.get("files_undelivered", 0),
             "bytes": cache.get("bytes_held", 0),
@@ -88,15 +92,18 @@ def link_state(connection: Facts) -> str:
     return "lossy" if loss >= LOSSY else "fine"
 
 
-def _transfers(cache: Facts, *, moving: bool) -> list[dict[str, Any]]:
-    """Return what is being read or written, what is sent before what waits; moving: not on a lost link."""
+def _transfers(cache: Facts, *, moving: bool, writing: bool) -> list[dict[str, Any]]:
+    """Return what is being read or written, what is sent before what waits.
+
+    moving: the vehicle is there; writing: and it may be written to.
+    """
     found = []
     for read in cache.get("reads", []):
         left, rate = read["size"] - read["done"], cache.get("rate") if moving else None
         eta = round(left / rate, 1) if rate else None
         found.append({"direction": "read", "state": "reading", **read, "rate": rate, "eta": eta})
     for write in cache.get("transfers", []):
-        sending = write["sending"] and moving
+        sending = write["sending"] and moving and writing
         found.append(
             {
                 "direction": "write",
@@ -105,7 +112,7 @@ def _transfers(cache: Facts, *, moving: bool) -> list[dict[str, Any]]:
                 "size": write["size"],
                 "done": max(0, write["size"] - write["bytes_left"]),
                 "rate": cache.get("write_rate") if sending else None,
-                "eta": write["eta"] if moving else None,
+                "eta": write["eta"] if moving and writing else None,
                 "error": cache.get("errors", {}).get(write["path"]),
             }
         )

@@ -219,6 +219,18 @@ def test_a_dead_mount_is_said_to_be_dead(field: Field, small_tree: Path) -> None
         abort_mount(mount.path)
 
 
+def test_a_mount_whose_socket_is_out_of_reach_is_asked_by_its_root(
+    field: Field, small_tree: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As root finds that of a user: each has a home, and a directory for sockets, of his own."""
+    mount = field.prepare(field.sim(small_tree).source)
+    with monkeypatch.context() as elsewhere:
+        for name in ("HOME", "XDG_RUNTIME_DIR"):
+            elsewhere.setenv(name, str(field.local(name)))
+        mount.start()
+    assert mount.run(*STATUS).stdout.count(f"{mount.path}: PX4 1/1, disarmed, link fine: RTT ") == 1
+
+
 def test_a_user_sees_another_users_mount_if_he_may_read_it(field: Field, small_tree: Path) -> None:
     seen = {}
     for options in (("allow_other",), ()):

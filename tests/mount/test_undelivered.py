@@ -56,10 +56,13 @@ def test_umount_says_what_it_waits_for_and_ctrl_c_ends_the_waiting_only(
     process = mount.alive()
     with mount.started(*MAVFTPFS, "umount", mount.path) as child:
         assert child.stderr is not None
-        first, second = child.stderr.readline(), child.stderr.readline()
-        assert first.startswith("mavftpfs: not everything is on the vehicle yet. This takes at most 5 min;")
-        assert f"kept in {state}. Ctrl-C ends only the waiting, not the delivery." in first
-        assert second == "mavftpfs: delivering 1 file, 0 B of 60.0 kB, until the vehicle is back\n"
+        first, second, third = (child.stderr.readline() for _ in range(3))
+        assert first == (
+            "mavftpfs: not everything is on the vehicle yet: it is delivered for at most 5 min, "
+            f"then the rest is kept in {state}\n"
+        )
+        assert second == "mavftpfs: Ctrl-C ends only the waiting, not the delivery\n"
+        assert third == "mavftpfs: delivering 1 file, 0 B of 60.0 kB, until the vehicle is back\n"
         child.send_signal(signal.SIGINT)
         _, errors = child.communicate(timeout=60)
         assert child.returncode == ExitCode.INTERRUPTED

@@ -66,12 +66,17 @@ def test_what_moves_comes_next_and_then_what_is_held_back() -> None:
         "bytes_held": 4096,
         "errors": {"/b": "the card is full", "/c": "no"},
     }
-    assert lines({"armed": True}, cache)[1:] == [
+    assert lines(None, cache)[1:] == [
         "  reading /fs/microsd/log/2026-11-20/10_32_15.ulg: 35 % of 3.4 MB, 5.1 kB/s, 7 min 13 s left",
         "  sending /a: 75 % of 4.1 kB, 300 B/s, 3.4 s left",
         "  waiting /b: empty, the card is full",
-        "  held back: 3 files, 4.1 kB, until the vehicle is disarmed",
+        "  held back: 3 files, 4.1 kB",
         "  failed /c: no",
+    ]
+    assert lines({"armed": True}, {**cache, "reads": []})[1:4] == [
+        "  waiting /a: 75 % of 4.1 kB",
+        "  waiting /b: empty, the card is full",
+        "  held back: 3 files, 4.1 kB, until the vehicle is disarmed",
     ]
 
 
