@@ -20,7 +20,15 @@ from mavftpfs.oneshot.files import READ_SIZE, Session
 from mavftpfs.oneshot.progress import Progress
 from mavftpfs.oneshot.put import Piece, Put, Sent, put_paths
 from mavftpfs.protocol.crc import crc32
-from mavftpfs.shared.errors import Armed, FtpNak, NotFound, NotSupported, RequestTimeout, UsageError
+from mavftpfs.shared.errors import (
+    Armed,
+    FtpNak,
+    NotDeliveredYet,
+    NotFound,
+    NotSupported,
+    RequestTimeout,
+    UsageError,
+)
 from mavftpfs.shared.model import EntryKind, normalise
 from mavftpfs.shared.readable import name_text
 
@@ -218,7 +226,7 @@ async def _prove(session: Session, path: bytes, kept: Kept) -> None:
 async def _crc32(session: Session, path: bytes) -> int | None:
     try:
         return await session.files.crc32(path)
-    except (Armed, FtpNak, NotSupported, RequestTimeout):
+    except (Armed, FtpNak, NotDeliveredYet, NotSupported, RequestTimeout):
         return None
 
 
