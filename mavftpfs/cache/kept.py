@@ -310,7 +310,7 @@ class KeptCache:
             self._broken = True
             log.warning("nothing more is kept in cache_dir: %s", error)
             return False
-        self.written += 1
+        self.written += bool(data)
         return True
 
 

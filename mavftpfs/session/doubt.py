@@ -25,7 +25,7 @@ class Doubt:
 
     Attributes:
         reason: of the latest doubt, for people.
-        on_raised: called with the reason each time.
+        on_raised: called with the reason each time that what was read is in doubt.
     """
 
     def __init__(self, clock: Callable[[], float]) -> None:
@@ -36,11 +36,12 @@ class Doubt:
         self._late = LEAST_LATE
         self._late_at = -inf
 
-    def raise_it(self, reason: str) -> None:
-        """Something was noticed now."""
+    def raise_it(self, reason: str, *, reads: bool = True) -> None:
+        """Something was noticed now; reads: what was read lately may be another file's, too."""
         self.reason = reason
         self._at = self._clock()
-        self.on_raised(reason)
+        if reads:
+            self.on_raised(reason)
 
     @property
     def active(self) -> bool:

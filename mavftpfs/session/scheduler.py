@@ -261,7 +261,8 @@ class Scheduler:
         """An answer came that nobody waits for."""
         if self.stats.strays > self._strays_seen:
             self._strays_seen = self.stats.strays
-            self.doubt.raise_it("an answer came that no request of ours explains")
+            # A chunk that comes twice is no other file's: what took the session is told by `_strays`.
+            self.doubt.raise_it("an answer came that no request of ours explains", reads=False)
         self._strays.on_unknown(reply)
 
     def _on_session_taken(self, reason: str) -> None:

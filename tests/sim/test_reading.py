@@ -22,6 +22,7 @@ from mavftpfs.shared.errors import (
     VehicleLost,
 )
 from mavftpfs.sim.linkmodel import Duplex, LinkSettings
+from tests.support.mounting import mounted
 from tests.support.worlds import ROOTS, MemorySink, World, begin_to_read, content, read_file, world
 
 
@@ -264,3 +265,49 @@ async def test_beside_bursts_that_fill_the_radio_a_listing_is_answered(
         assert await sink.wait_for(0, len(data)) == data
         assert connection.engine.stats.by_opcode[Opcode.BURST_READ_FILE] >= 5
         reader.close()
+
+
+@pytest.mark.parametrize("profile", ["px4", "ardupilot", "mavsdk", "px4-nuttx"])
+async def test_a_file_is_read_over_a_link_that_doubles_requests(profile: str, autojump: MockClock) -> None:
+    """Each doubled ReadFile brings an answer that nothing explains: a doubt, but no other file's bytes."""
+    here = World(profile, LinkSettings(rate=200_000.0, delay=0.02, duplicate=0.3))
+    target = ROOTS.get(profile, b"") + b"/f"
+    here.tree.add(target, content(300_000))
+    async with mounted(here) as (_, tree):
+        file = await tree.open(target)
+        assert bytes(await file.read(0, 300_000)) == content(300_000)
+        file.close()
+
+
+@pytest.mark.parametrize("profile", ["px4", "mavsdk", "ardupilot"])
+async def test_bytes_of_a_session_that_another_client_took_are_asked_for_again(
+    profile: str, autojump: MockClock
+) -> None:
+    """He takes it in mid-read, is heard a little later, and leaves."""
+    here = World(profile, LinkSettings(rate=100_000.0, delay=0.02))
+    root = ROOTS.get(profile, b"")
+    here.tree.add(root + b"/ours", content(300_000))
+    here.tree.add(root + b"/theirs", content(300_000, seed=9))
+    stranger = Address(255, 190)
+    async with mounted(here, root or b"/") as (connection, tree), trio.open_nursery() as nursery:
+        file = await tree.open(root + b"/ours")
+        first = bytes(await file.read(0, 1000))
+
+        async def rival() -> None:
+            await trio.sleep(0.5)
+            for seq, (opcode, path) in enumerate(
+                [(Opcode.RESET_SESSIONS, b""), (Opcode.OPEN_FILE_RO, root + b"/theirs")]
+            ):
+                wire = request(30_000 + 10 * seq, opcode, data=path).encode()
+                here.vehicle.foreign_request(wire, stranger, trio.current_time(), audible=False)
+            here.link.kick()
+            await trio.sleep(0.3)
+            wire = request(30_100, Opcode.TERMINATE_SESSION, session=0).encode()
+            here.vehicle.foreign_request(wire, stranger, trio.current_time())
+            here.link.kick()
+
+        nursery.start_soon(rival)
+        got = first + bytes(await file.read(1000, 299_000))
+        assert got == content(300_000)
+        assert connection.vehicle.foreign_at is not None
+        file.close()
