@@ -32,7 +32,7 @@ from mavftpfs.cache.virtual import VirtualTrees, is_snapshot
 from mavftpfs.cache.writeback import Writeback
 from mavftpfs.cache.writing import make_writeback
 from mavftpfs.shared.errors import FtpNak, IsADirectory, ListingIncomplete, NotDeliveredYet, ReadOnly
-from mavftpfs.shared.model import ROOT, DirEntry, EntryKind, is_virtual, join, normalise
+from mavftpfs.shared.model import ROOT, DirEntry, EntryKind, is_virtual, join, normalise, split
 
 __all__ = ["OpenFile", "Stat", "Tree"]
 
@@ -309,6 +309,10 @@ class Tree:
         self._files.forget_closed()
         self._virtual.snapshots.clear()
         self._checksums.clear()
+
+    def expire(self, path: bytes) -> None:
+        """Have the vehicle list a file's directory again before its size is told the next time."""
+        self._dentries.expire(split(self._remote(path))[0], self._clock())
 
     def status(self) -> dict[str, object]:
         """Return counters; bytes_... in bytes, rate in bytes per second or None."""

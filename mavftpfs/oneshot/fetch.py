@@ -10,7 +10,8 @@ import errno
 import fcntl
 import os
 import shutil
-from collections.abc import Iterator
+import stat
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -59,7 +60,8 @@ class NotProvenYet(MavftpfsError):
 class Wanted:
     """A file to fetch. name: for people; size: as listed; mtime: seconds UTC, None if unknown.
 
-    keep_old: a local file of that name that is not the beginning of this one is renamed to NAME.~1~.
+    part: where it lies until it is whole. keep_old: a local file of that name that is not the beginning of
+    this one is renamed to NAME.~1~.
     """
 
     remote: bytes
@@ -67,6 +69,7 @@ class Wanted:
     name: str
     size: int
     mtime: int | None
+    part: Path
     keep_old: bool = False
 
 
@@ -82,9 +85,10 @@ class Fetched:
     proof: str
 
 
-def part_of(local: Path) -> Path:
-    """Return where a file lies until it is whole."""
-    return local.with_name(local.name + PART_SUFFIX)
+def part_of(local: Path, finals: Collection[Path] = ()) -> Path:
+    """Return where a file lies until it is whole. finals: the final names of all files of the run."""
+    part = local.with_name(local.name + PART_SUFFIX)
+    return part if part not in finals else local.with_name(f"{local.name}.mavftpfs{PART_SUFFIX}")
 
 
 @contextmanager
@@ -100,17 +104,22 @@ def local_disk(place: Path) -> Iterator[None]:
 class Part:
     """A .part, locked against a second program that fetches the same."""
 
-    def __init__(self, local: Path) -> None:
+    def __init__(self, path: Path, local: Path) -> None:
         """Raises: UsageError: it is no file, or is in use. OSError."""
         self.local = local
-        self.path = part_of(local)
-        fd = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)
-        self._file = os.fdopen(fd, "r+b")
+        self.path = path
+        flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
+        fd = os.open(self.path, flags, 0o666)
         try:
+            if not stat.S_ISREG(os.fstat(fd).st_mode):
+                raise UsageError(f"{self.path} is no file")
             fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            self._file.close()
-            raise UsageError(f"{self.path} is being written by another program") from None
+        except BaseException as exc:
+            os.close(fd)
+            if isinstance(exc, BlockingIOError):
+                raise UsageError(f"{self.path} is being written by another program") from None
+            raise
+        self._file = os.fdopen(fd, "r+b")
 
     @property
     def size(self) -> int:
@@ -191,7 +200,7 @@ class Fetcher:
         if wanted.local.is_dir():
             raise UsageError(f"{wanted.local} is a directory")
         with local_disk(wanted.local):
-            part = Part(wanted.local)
+            part = Part(wanted.part, wanted.local)
             try:
                 if not self.resume or part.size > wanted.size:
                     part.cut(0)
@@ -272,7 +281,7 @@ class Fetcher:
             await self._require_size(wanted, size)
             if resumed:
                 raise NotProvenYet(
-                    f"{wanted.name}: all of it is here, as {part_of(wanted.local)}, but what an earlier run "
+                    f"{wanted.name}: all of it is here, as {wanted.part}, but what an earlier run "
                     f"fetched is not proven ({why}); the next run tries again"
                 ) from exc
             return f"size ({why})"
@@ -295,12 +304,11 @@ class Fetcher:
             StillGrowing: it has become larger. DataUnproven: it has become smaller.
         """
         files = self.session.files
-        files.forget_caches()
+        files.expire(wanted.remote)
         now = (await files.stat(wanted.remote)).size
         if now > size:
             raise StillGrowing(
-                f"{wanted.name} is still growing: its first {readable_size(size)} are here, as "
-                f"{part_of(wanted.local)}"
+                f"{wanted.name} is still growing: its first {readable_size(size)} are here, as {wanted.part}"
             )
         if now < size:
             raise DataUnproven(f"{name_text(wanted.remote)} has shrunk from {size} to {now} bytes")

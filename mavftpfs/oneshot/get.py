@@ -12,7 +12,7 @@ import trio
 
 from mavftpfs.cache.attributes import Stat
 from mavftpfs.cache.virtual import is_snapshot
-from mavftpfs.oneshot.fetch import Fetched, Fetcher, LocalDiskFull, Wanted, local_disk
+from mavftpfs.oneshot.fetch import Fetched, Fetcher, LocalDiskFull, Wanted, local_disk, part_of
 from mavftpfs.oneshot.files import READ_SIZE, Session
 from mavftpfs.oneshot.plan import Verify, known_time, proof_needed
 from mavftpfs.protocol.crc import crc32
@@ -50,7 +50,7 @@ class _Getter:
     complain: Complain
     got: Got
     keep_going: bool
-    wanted: list[Wanted] = field(default_factory=list)
+    found: list[tuple[bytes, Path, Stat]] = field(default_factory=list)
 
     def failed(self, error: MavftpfsError) -> None:
         """Say it and go on, or end where only one thing was asked for."""
@@ -72,7 +72,7 @@ class _Getter:
         while pending:
             remote, local, stat = pending.pop()
             if stat.kind is EntryKind.FILE:
-                self.wanted.append(_wanted(remote, local, stat))
+                self.found.append((remote, local, stat))
                 continue
             try:
                 with local_disk(local):
@@ -85,9 +85,15 @@ class _Getter:
             for name, below in reversed(entries):
                 pending.append((join(remote, name), local / os.fsdecode(name), below))
 
-
-def _wanted(remote: bytes, local: Path, found: Stat) -> Wanted:
-    return Wanted(remote, local, name_text(remote), found.size, known_time(found.mtime))
+    def wanted(self) -> list[Wanted]:
+        """Return what was found, as Fetcher takes it."""
+        finals = {local for _, local, _ in self.found}
+        return [
+            Wanted(
+                remote, local, name_text(remote), stat.size, known_time(stat.mtime), part_of(local, finals)
+            )
+            for remote, local, stat in self.found
+        ]
 
 
 async def get_paths(
@@ -110,9 +116,10 @@ async def get_paths(
     getter = _Getter(fetcher.session, recursive, complain, got, keep_going=len(paths) > 1)
     for path in paths:
         await getter.plan(path, local_name(local, path, single=len(paths) == 1))
-    got.planned = len(getter.wanted)
-    fetcher.progress.plan(got.planned, sum(wanted.size for wanted in getter.wanted))
-    for wanted in getter.wanted:
+    all_wanted = getter.wanted()
+    got.planned = len(all_wanted)
+    fetcher.progress.plan(got.planned, sum(wanted.size for wanted in all_wanted))
+    for wanted in all_wanted:
         try:
             fetched = await fetcher.fetch(wanted)
         except MavftpfsError as exc:

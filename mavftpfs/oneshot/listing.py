@@ -26,12 +26,13 @@ _LOGS = (".ulg", ".bin", ".tlog", ".log")
 
 @dataclass(frozen=True, slots=True)
 class Look:
-    """How names are printed. detailed: with size and time; units: sizes as 1.2 MB; terminal: with colours,
-    and without what a terminal would obey."""
+    """How names are printed. detailed: with size and time; units: sizes as 1.2 MB; terminal: without what a
+    terminal would obey; colours: directories and logs stand out."""
 
     detailed: bool = False
     units: bool = False
     terminal: bool = False
+    colours: bool = False
 
 
 async def list_paths(
@@ -92,7 +93,7 @@ def lines(listings: Sequence[Listing], look: Look) -> Iterator[str]:
 
 def _line(entry: Entry, look: Look) -> str:
     name = _shown(entry["name"], look)
-    if look.terminal:
+    if look.colours:
         name = _coloured(name, entry)
     if entry["kind"] == "directory":
         name += "/"

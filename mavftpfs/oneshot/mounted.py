@@ -252,6 +252,10 @@ class MountedFiles:
         source, target = self._place(old), self._place(new)
         await _in_thread(lambda: os.rename(source, target), old)
 
+    def expire(self, path: bytes) -> None:
+        """See files.Files."""
+        self.forget_caches()
+
     def forget_caches(self) -> None:
         """Have the mount ask the vehicle again; a mount of somebody else may go on with what it knows."""
         with suppress(errors.MavftpfsError):

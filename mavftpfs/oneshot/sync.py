@@ -51,6 +51,7 @@ class Task:
 
     log: Log
     local: Path
+    part: Path
     step: Step
     there: int
 
@@ -192,13 +193,18 @@ async def collect(files: Files, place: bytes, complain: Complain) -> list[Log]:
     return logs
 
 
-def look(log: Log, local: Path) -> Task:
-    """Compare a log with what is here, and say what to do."""
-    place = local / os.fsdecode(log.below)
-    here, part = _size(place), _size(part_of(place))
-    step = decide(log.size, here, part)
-    there = {Step.SKIP: log.size, Step.RESUME: part, Step.EXTEND: here}.get(step) or 0
-    return Task(log, place, step, there)
+def look(logs: Sequence[Log], local: Path) -> list[Task]:
+    """Compare logs with what is here, and say what to do."""
+    places = [local / os.fsdecode(log.below) for log in logs]
+    finals = set(places)
+    return [_look_at(log, place, part_of(place, finals)) for log, place in zip(logs, places, strict=True)]
+
+
+def _look_at(log: Log, place: Path, part: Path) -> Task:
+    here, begun = _size(place), _size(part)
+    step = decide(log.size, here, begun)
+    there = {Step.SKIP: log.size, Step.RESUME: begun, Step.EXTEND: here}.get(step) or 0
+    return Task(log, place, part, step, there)
 
 
 def _size(path: Path) -> int | None:
@@ -234,7 +240,7 @@ async def sync(
     outcome.place = session.on_vehicle(place)
     logs = newest_first(await collect(session.files, place, unlisted))
     chosen = select(logs, newest=wish.newest, since=wish.since)
-    outcome.tasks = [look(log, wish.local) for log in chosen]
+    outcome.tasks = look(chosen, wish.local)
     outcome.undated = 0 if wish.since is None else sum(log.mtime is None for log in chosen)
     if wish.dry_run:
         outcome.finished = True
@@ -265,7 +271,8 @@ async def _fetch(fetcher: Fetcher, task: Task) -> Fetched:
     log = task.log
     with local_disk(task.local):
         task.local.parent.mkdir(parents=True, exist_ok=True)
-    wanted = Wanted(log.path, task.local, name_text(log.below), log.size, log.mtime, keep_old=True)
+    name = name_text(log.below)
+    wanted = Wanted(log.path, task.local, name, log.size, log.mtime, task.part, keep_old=True)
     return await fetcher.fetch(wanted, beginning=task.local if task.step is Step.EXTEND else None)
 
 

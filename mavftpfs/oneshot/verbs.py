@@ -196,7 +196,7 @@ def _sync_summary(outcome: syncing.Outcome) -> str:
     before = len(outcome.tasks) - len(outcome.to_fetch)
     line = f"{new} new ({readable_size(size)}), {before} here already, from {_name(outcome.place)}"
     if outcome.missing:
-        line += f"; {len(outcome.missing)} not here"
+        line += f"; {len(outcome.missing)} not here, the next run goes on"
     if outcome.undated:
         line += f"; {outcome.undated} without a time were not left out by --since"
     return line
@@ -387,7 +387,9 @@ def ls(args: Args) -> int:
     if args.json:
         print(json.dumps([entry for _, entries in listings for entry in entries], indent=2))
         return ExitCode.OK
-    look = listing.Look(detailed=args.detailed, units=args.units, terminal=sys.stdout.isatty())
+    terminal = sys.stdout.isatty()
+    colours = terminal and not os.environ.get("NO_COLOR") and os.environ.get("TERM") != "dumb"
+    look = listing.Look(args.detailed, args.units, terminal, colours)
     for line in listing.lines(listings, look):
         sys.stdout.buffer.write(line.encode("utf-8", "surrogateescape") + b"\n")
     sys.stdout.flush()

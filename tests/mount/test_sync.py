@@ -177,7 +177,7 @@ def test_a_lost_link_leaves_a_part_and_the_next_run_goes_on(field: Field, tmp_pa
         vehicle.kill()
         out, err = child.communicate(timeout=COMMAND_TIMEOUT)
     assert child.returncode == 2
-    assert out.splitlines()[-1].endswith("1 not here")
+    assert out.splitlines()[-1].endswith("1 not here, the next run goes on")
     assert "big.bin" in err or "0 of 1 logs are here" in err
     vehicle.start()
     assert_goes_on(vehicle, card, local)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -36,7 +37,7 @@ BIG = bytes(range(251)) * 2000
 class SpoiltTree(FakeTree):
     """A tree that can hand out wrong bytes, refuse checksums, and of which dropping the caches is counted.
 
-    grows: what is appended to a file each time the caches are dropped.
+    grows: what is appended to a file each time that its size is to be asked for again.
     """
 
     bad = 0
@@ -58,10 +59,11 @@ class SpoiltTree(FakeTree):
             raise self.crc_error
         return await super().crc32(path)
 
+    def expire(self, path: bytes) -> None:
+        self.files[path] += self.grows
+
     def forget_caches(self) -> None:
         self.forgotten += 1
-        for path in self.files:
-            self.files[path] += self.grows
 
 
 def fetcher_of(tree: FakeTree, root: bytes = b"/", verify: Verify = "auto", resume: bool = True) -> Fetcher:
@@ -74,7 +76,8 @@ def names_in(folder: Path) -> list[str]:
 
 def wanted(tree: FakeTree, path: bytes, local: Path) -> Wanted:
     found = tree.stat_now(path)
-    return Wanted(path, local, path.decode(errors="replace"), found.size, known_time(found.mtime))
+    mtime = known_time(found.mtime)
+    return Wanted(path, local, path.decode(errors="replace"), found.size, mtime, part_of(local))
 
 
 async def get(tree: FakeTree, path: bytes, local: Path, verify: Verify = "auto") -> Fetched:
@@ -286,6 +289,24 @@ async def test_no_link_is_followed_for_a_part(tmp_path: Path) -> None:
     with pytest.raises(UsageError):
         await get(SpoiltTree({b"/big": BIG}), b"/big", tmp_path / "big")
     assert (tmp_path / "victim").read_bytes() == b"mine"
+
+
+async def test_names_that_end_in_part_are_the_vehicle_s_too(tmp_path: Path) -> None:
+    tree = SpoiltTree({b"/d/a": b"1", b"/d/a.part": b"22"})
+    tree.on_call = refusing("read", b"")
+    with pytest.raises(RequestTimeout):
+        await get(tree, b"/d/a", tmp_path / "a")
+    tree.on_call = lambda name, path: None
+    for _ in range(2):
+        await get_all(tree, b"/d", to=tmp_path)
+        assert names_in(tmp_path / "d") == ["a", "a.part"]
+        assert (tmp_path / "d/a.part").read_bytes() == b"22"
+
+
+async def test_no_pipe_is_taken_for_a_part(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "big.part")
+    with pytest.raises(UsageError, match=r"big.part is no file"):
+        await get(SpoiltTree({b"/big": BIG}), b"/big", tmp_path / "big")
 
 
 # -- get ------------------------------------------------------------------------------------------

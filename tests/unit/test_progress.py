@@ -1,0 +1,69 @@
+"""oneshot.progress: what is counted, and what the lines say."""
+
+from __future__ import annotations
+
+from mavftpfs.oneshot.progress import Progress, current, totals
+
+
+class Clock:
+    now = 100.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+def test_one_total_of_many_files() -> None:
+    clock = Clock()
+    progress = Progress(clock)
+    progress.plan(3, 3_000_000)
+    assert totals(progress) == "0/3 files, 0 B of 3.0 MB"
+    progress.begin("/a", 1_000_000)
+    for _ in range(10):
+        clock.now += 1
+        progress.at(progress.here + 100_000)
+    assert totals(progress) == "0/3 files, 1.0 MB of 3.0 MB, 100.0 kB/s, 20 s left"
+    assert current(progress, 80) == "/a  1.0 MB of 1.0 MB"
+    progress.check()
+    assert current(progress, 80) == "/a  checking"
+    progress.end(1_000_000)
+    assert (progress.done, current(progress, 80)) == (1_000_000, "")
+    assert totals(progress).startswith("1/3 files, 1.0 MB of 3.0 MB")
+
+
+def test_what_was_here_counts_as_done_but_not_as_speed() -> None:
+    clock = Clock()
+    progress = Progress(clock)
+    progress.plan(1, 1_000_000)
+    progress.begin("/a", 1_000_000, 900_000)
+    assert (progress.done, progress.rate) == (900_000, None)
+    clock.now += 2
+    progress.at(920_000)
+    assert totals(progress) == "920.0 kB of 1.0 MB, 10.0 kB/s, 8.0 s left"
+
+
+def test_a_file_that_begins_again_takes_back_what_it_had() -> None:
+    progress = Progress(Clock())
+    progress.plan(1, 1000)
+    progress.begin("/a", 1000)
+    progress.at(700)
+    progress.begin("/a", 1000)
+    assert progress.done == 0
+
+
+def test_a_file_that_grew_does_not_pass_the_total() -> None:
+    progress = Progress(Clock())
+    progress.plan(1, 1000)
+    progress.begin("/a", 1000)
+    progress.at(1500)
+    assert (progress.done, progress.size) == (1000, 1500)
+
+
+def test_the_end_of_a_long_name_is_shown_and_nothing_a_terminal_obeys() -> None:
+    progress = Progress(Clock())
+    progress.plan(2, 1000)
+    progress.begin("/x\x1b[31m" + "y" * 100 + "/log.ulg", 1000)
+    line = current(progress, 40)
+    assert len(line) == 40
+    assert line.startswith("…")
+    assert line.endswith("/log.ulg  0 B of 1.0 kB")
+    assert "\x1b" not in current(progress, 400)
