@@ -144,6 +144,7 @@ class Fetcher:
             if data is not None:
                 return data
             if blocks.drops != before:
+                version.close_reader()
                 drops += 1
                 if drops > MAX_DROPS:
                     break

@@ -24,8 +24,8 @@ from pyfuse3 import EntryAttributes, FileInfo, FUSEError, RequestContext, Setatt
 from mavftpfs.cache.attributes import Stat
 from mavftpfs.fuse.handles import FileHandle, WritableFile, WritableTree, closed_on_failure
 from mavftpfs.fuse.inodes import Inode
-from mavftpfs.fuse.keeping import NANO, Keeping
 from mavftpfs.fuse.operations import Operations, Presentation, handler
+from mavftpfs.fuse.userattributes import NANO, UserAttributeTable
 from mavftpfs.shared.errors import MavftpfsError
 from mavftpfs.shared.model import EntryKind, split
 
@@ -82,7 +82,7 @@ class WritingOperations(Operations):
     ) -> None:
         """`now_ns()`: the time of day, nanoseconds since 1970 UTC."""
         super().__init__(tree, presentation, **others)
-        self._keeping = Keeping()
+        self._set_by_users = UserAttributeTable()
         self._now_ns = now_ns
 
     def budget(self, name: str, args: Sequence[Any]) -> float:
@@ -195,7 +195,7 @@ class WritingOperations(Operations):
             await self._tree.truncate(self._path(ino), size)
 
     async def _keep(self, path: bytes, attr: EntryAttributes, fields: SetattrFields) -> None:
-        kept = self._keeping.at(path)
+        kept = self._set_by_users.at(path)
         if fields.update_mode:
             kept.mode = stat_bits.S_IMODE(attr.st_mode)
         if fields.update_uid:
@@ -230,7 +230,7 @@ class WritingOperations(Operations):
         """Make a directory."""
         path = self._child(parent_inode, name)
         await self._tree.mkdir(path)
-        self._keeping.entries_changed(path, self._now_ns())
+        self._set_by_users.entries_changed(path, self._now_ns())
         return await self._new_entry(path, mode)
 
     @handler
@@ -264,7 +264,7 @@ class WritingOperations(Operations):
         new = self._child(parent_inode_new, name_new)
         await self._tree.rename(old, new, noreplace=bool(flags & pyfuse3.RENAME_NOREPLACE))
         self.inodes.rename(old, new)
-        self._keeping.move(old, new)
+        self._set_by_users.move(old, new)
         self._entry_changed(old)
         self._entry_changed(new)
 
@@ -283,17 +283,17 @@ class WritingOperations(Operations):
 
     def _gone(self, path: bytes) -> None:
         self.inodes.unlink(path)
-        self._keeping.drop(path)
+        self._set_by_users.drop(path)
         self._entry_changed(path)
 
     def _made(self, path: bytes, mode: int) -> None:
-        kept = self._keeping.at(path)
+        kept = self._set_by_users.at(path)
         kept.mode, kept.atime_ns = stat_bits.S_IMODE(mode), self._now_ns()
         self._entry_changed(path)
 
     def _entry_changed(self, path: bytes) -> None:
         """A name came or went; the kernel asks for its directory's attributes again by itself."""
-        self._keeping.entries_changed(split(path)[0], self._now_ns())
+        self._set_by_users.entries_changed(split(path)[0], self._now_ns())
 
     async def _new_entry(self, path: bytes, mode: int) -> EntryAttributes:
         self._made(path, mode)
@@ -313,7 +313,7 @@ class WritingOperations(Operations):
 
     def _attributes(self, inode: Inode, found: Any) -> EntryAttributes:
         entry = super()._attributes(inode, found)
-        kept = None if inode.path is None else self._keeping.get(inode.path)
+        kept = None if inode.path is None else self._set_by_users.get(inode.path)
         if kept is None:
             return entry
         if kept.mode is not None:

@@ -69,7 +69,7 @@ PURE_MODULES = {
     "oneshot.plan",
     "fuse.inodes",
     "fuse.handles",
-    "fuse.keeping",
+    "fuse.userattributes",
     "fuse.options",
 }
 IMPURE_MODULES = {"sim.endpoints", "sim.memory", "sim.command"}

@@ -17,7 +17,7 @@ NANO = 1_000_000_000
 
 
 @dataclass(slots=True)
-class Kept:
+class UserAttributes:
     """None = not set. mode: permission bits; times in nanoseconds since 1970 UTC.
 
     changed_ns: when a directory's entries, or its times, were last changed through this mount.
@@ -42,22 +42,22 @@ class Kept:
         return changed if self.mtime_ns is None else self.mtime_ns, changed
 
 
-class Keeping:
-    """Kept attributes of a bounded number of paths; the least recently changed are forgotten first."""
+class UserAttributeTable:
+    """What was set on a bounded number of paths; the least recently changed are forgotten first."""
 
     def __init__(self, limit: int = MAX_KEPT) -> None:
         self._limit = limit
-        self._kept: OrderedDict[bytes, Kept] = OrderedDict()
+        self._kept: OrderedDict[bytes, UserAttributes] = OrderedDict()
 
-    def get(self, path: bytes) -> Kept | None:
+    def get(self, path: bytes) -> UserAttributes | None:
         """Return what was set on a path, or None."""
         return self._kept.get(path)
 
-    def at(self, path: bytes) -> Kept:
+    def at(self, path: bytes) -> UserAttributes:
         """Return what was set on a path, to be changed."""
         kept = self._kept.get(path)
         if kept is None:
-            kept = self._kept[path] = Kept()
+            kept = self._kept[path] = UserAttributes()
             if len(self._kept) > self._limit:
                 self._kept.popitem(last=False)
         self._kept.move_to_end(path)
