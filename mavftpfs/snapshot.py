@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 from collections import deque
 from collections.abc import Callable, Mapping
+from itertools import islice
 from typing import Any
 
 import trio
@@ -25,6 +26,10 @@ RATE_SPAN = 5
 """Looks over which the traffic on the link is averaged."""
 SILENCE = 5.0
 """Seconds without heartbeats after which the vehicle counts as lost for people."""
+MOST = 100
+"""Entries of each list: an extended attribute holds 64 KiB. `held` counts them all."""
+_TOLD = {"transfers", "errors", "reads"}
+"""What the cache tells that stands in the snapshot's own lists."""
 LOSSY = 0.1
 """From this share of lost packets on, the link is not called fine."""
 
@@ -43,8 +48,10 @@ def snapshot(connection: Facts, cache: Facts, traffic: float | None, *, when_arm
             "files": cache.get("files_undelivered", 0),
             "bytes": cache.get("bytes_held", 0),
             "bytes_on_disk": cache.get("bytes_held_on_disk", 0),
-            "errors": cache.get("errors", {}),
+            "errors": dict(islice(cache.get("errors", {}).items(), MOST)),
         },
+        "connection": connection,
+        "cache": {key: value for key, value in cache.items() if key not in _TOLD},
     }
 
 
@@ -116,7 +123,7 @@ def _transfers(cache: Facts, *, moving: bool, writing: bool) -> list[dict[str, A
                 "error": cache.get("errors", {}).get(write["path"]),
             }
         )
-    return found
+    return found[:MOST]
 
 
 class Watcher:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import errno
 import json
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, TypeVar
@@ -52,17 +52,16 @@ async def find_mount(spec: LinkSpec, options: MountOptions) -> Session | None:
     for mountpoint in [path for path in mounts() if is_ours(path)]:
         with suppress(errors.MavftpfsError, ValueError, KeyError, TypeError):
             status = await _status(mountpoint)
-            vehicle = status["connection"]["vehicle"]
-            if not _is_wanted(vehicle or (0, 0), options):
+            if not _is_wanted(status["vehicle"], options):
                 continue
             if same_link(parse_source(status["source"]), spec):
                 return session_on(mountpoint, _root_of(status), options.root)
     return None
 
 
-def _is_wanted(vehicle: Sequence[int], options: MountOptions) -> bool:
-    system, component = vehicle
-    return options.target_system in (0, system) and options.target_component in (0, component)
+def _is_wanted(vehicle: Mapping[str, Any], options: MountOptions) -> bool:
+    is_system = options.target_system in (0, vehicle["system"])
+    return is_system and options.target_component in (0, vehicle["component"])
 
 
 async def open_mount(mountpoint: str, subtree: bytes) -> Session:
@@ -79,8 +78,12 @@ def session_on(mountpoint: str, mounted: bytes, root: bytes) -> Session:
     """Return the files below `root` of the vehicle, of which `mounted` is on `mountpoint`."""
 
     async def transfers() -> Transfers:
-        found: Transfers = (await _status(mountpoint))["cache"]["transfers"]
-        return found
+        found = (await _status(mountpoint))["transfers"]
+        return [
+            {"path": facts["path"], "size": facts["size"], "bytes_left": facts["size"] - facts["done"]}
+            for facts in found
+            if facts["direction"] == "write"
+        ]
 
     return Session(MountedFiles(mountpoint, mounted, root), root, transfers, mountpoint)
 

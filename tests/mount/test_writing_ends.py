@@ -94,11 +94,12 @@ def test_arming_in_mid_copy_refuses_and_disarming_delivers(field: Field, profile
     assert mount.run("cat", mount.path / "APM/old.txt").stdout == "old\n"
     assert (card / "APM" / "old.txt").read_text() == "old\n"
     status = json.loads(mount.run(sys.executable, "-m", "mavftpfs", "status", mount.path, "--json").stdout)
-    assert status["connection"]["armed"] is True
-    assert status["cache"]["files_undelivered"] == 1
-    (transfer,) = status["cache"]["transfers"]
+    assert status["vehicle"]["armed"] is True
+    assert status["held"]["files"] == 1
+    (transfer,) = status["transfers"]
     assert (transfer["path"], transfer["size"]) == ("/APM/flight.bin", taken)
-    assert 0 < transfer["bytes_left"] <= taken
+    assert (transfer["direction"], transfer["state"]) == ("write", "waiting")
+    assert 0 <= transfer["done"] < taken
     assert "flight.bin" in mount.run(sys.executable, "-m", "mavftpfs", "status", mount.path).stdout
     vehicle.send_signal(signal.SIGUSR1)
     expected = BLOCK * (taken // len(BLOCK))
@@ -366,7 +367,7 @@ def test_the_background_parent_names_what_an_earlier_mount_left(
         status = json.loads(
             mount.run(sys.executable, "-m", "mavftpfs", "status", mount.path, "--json").stdout
         )
-        assert status["cache"]["files_undelivered"] == 0
+        assert status["held"]["files"] == 0
         mount.run(sys.executable, "-m", "mavftpfs", "umount", mount.path)
     finally:
         abort_mount(mount.path)

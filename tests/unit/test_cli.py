@@ -290,7 +290,7 @@ def fake_mount(sockets: Path, tmp_path: Path) -> Iterator[FakeMount]:
     """A mount on tmp_path/mnt whose process has ended by the time it says so."""
     ended = subprocess.Popen(["true"])
     ended.wait()
-    facts = {"mountpoint": str(tmp_path / "mnt"), "source": SOURCE, "connection": {"rtt": 0.02}}
+    facts = {"mountpoint": str(tmp_path / "mnt"), "source": SOURCE}
     facts |= snapshot({"rtt": 0.02, "vehicle": [1, 1], "armed": False}, {}, None, when_armed="ro")
     replies: dict[str, dict[str, Any]] = {
         "status": {"ok": True, "status": facts},
@@ -304,7 +304,7 @@ def fake_mount(sockets: Path, tmp_path: Path) -> Iterator[FakeMount]:
 
 def test_status_json(fake_mount: FakeMount, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["status", str(tmp_path / "mnt"), "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["connection"] == {"rtt": 0.02}
+    assert json.loads(capsys.readouterr().out)["link"]["rtt"] == 0.02
     assert cli.main(["status", "--json"]) == 0
     assert [facts["source"] for facts in json.loads(capsys.readouterr().out)] == [SOURCE]
 

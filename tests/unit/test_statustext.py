@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from typing import Any
 
 import pytest
@@ -78,6 +79,19 @@ def test_what_moves_comes_next_and_then_what_is_held_back() -> None:
         "  waiting /b: empty, the card is full",
         "  held back: 3 files, 4.1 kB, until the vehicle is disarmed",
     ]
+
+
+def test_a_status_of_many_files_fits_an_extended_attribute() -> None:
+    names = [f"/fs/microsd/log/2026-11-20/{number:05}.ulg" for number in range(5000)]
+    cache = {
+        "transfers": [{**WRITE, "path": name, "sending": False} for name in names],
+        "files_undelivered": len(names),
+        "errors": dict.fromkeys(names, "the vehicle is armed: nothing is written in flight (when_armed=ro)"),
+    }
+    facts = status(None, cache)
+    assert facts["held"]["files"] == 5000
+    assert len(facts["transfers"]) == len(facts["held"]["errors"]) == 100
+    assert len(json.dumps(facts)) < 50_000
 
 
 def test_nothing_held_back_is_said_where_it_can_be_written() -> None:
