@@ -1,16 +1,23 @@
-"""What a link is to the layers above. Layer: link.
+"""What a link is to the layers above, and what links share. Layer: link.
 
-A link moves bytes. It never interprets them, never raises for a peer that went away and came back
-(it reopens by itself and counts), and raises LinkClosed only when it can never work again.
+A link moves bytes and does not interpret them. When a peer goes away and comes back, the link reopens by
+itself and counts it. LinkClosed means that it will never work again.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import deque
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Sequence
+from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from typing import Protocol
 
+import trio
+
 from mavftpfs.link.addresses import NetAddress
+
+MAX_DATAGRAM = 1400
+"""Bytes: below any usual MTU, and far below PX4's receive chunk (31 frames in one datagram were cut)."""
 
 
 @dataclass(slots=True)
@@ -83,3 +90,82 @@ class Link(Protocol):
     async def aclose(self) -> None:
         """Flush what can be flushed at once and close."""
         ...
+
+
+def pack(frames: Sequence[bytes]) -> Iterable[bytes]:
+    """Yield datagrams of whole frames, in order, each up to 1400 bytes unless one frame is longer."""
+    if len(frames) == 1:
+        yield frames[0]
+        return
+    batch: list[bytes] = []
+    size = 0
+    for frame in frames:
+        if batch and size + len(frame) > MAX_DATAGRAM:
+            yield b"".join(batch)
+            batch, size = [], 0
+        batch.append(frame)
+        size += len(frame)
+    if batch:
+        yield b"".join(batch)
+
+
+class Outbox:
+    """What a link has accepted and the kernel has not: first in, first out, with a limit on the sum.
+
+    What does not fit is refused whole, so that a stream is never cut inside a frame.
+    """
+
+    def __init__(self, limit: int) -> None:
+        self.size = 0
+        self._limit = limit
+        self._items: deque[bytes] = deque()
+
+    def offer(self, item: bytes, *, force: bool = False) -> bool:
+        """Append an item; return False, changing nothing, where it does not fit and is not forced."""
+        if not force and self.size + len(item) > self._limit:
+            return False
+        self._items.append(item)
+        self.size += len(item)
+        return True
+
+    def head(self) -> bytes | None:
+        """Return the oldest item."""
+        return self._items[0] if self._items else None
+
+    def advance(self, sent: int) -> None:
+        """Drop the first `sent` bytes of the oldest item."""
+        item = self._items.popleft()
+        self.size -= min(sent, len(item))
+        if sent < len(item):
+            self._items.appendleft(item[sent:])
+
+    def clear(self) -> int:
+        """Drop everything; return how many items that were."""
+        count = len(self._items)
+        self._items.clear()
+        self.size = 0
+        return count
+
+
+@asynccontextmanager
+async def background(
+    task: Callable[[], Awaitable[None]], close: Callable[[], Awaitable[None]]
+) -> AsyncIterator[None]:
+    """Run `task` beside the body; when the body ends, `close` (shielded) and cancel the task.
+
+    An Exception of the body comes out as itself, not inside an ExceptionGroup as a bare nursery would
+    have it: callers catch LinkClosed by name.
+    """
+    failure: Exception | None = None
+    async with trio.open_nursery() as nursery:
+        nursery.start_soon(task)
+        try:
+            yield
+        except Exception as exc:
+            failure = exc
+        finally:
+            with trio.CancelScope(shield=True):
+                await close()
+            nursery.cancel_scope.cancel()
+    if failure is not None:
+        raise failure

@@ -28,9 +28,17 @@ from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
-from mavftpfs.link.decoding import DECODERS
 from mavftpfs.link.fastframe import FTP_MESSAGE_ID, FTP_PAYLOAD_SIZE, FtpFrameCodec, frame_crc
-from mavftpfs.link.messages import MAV_AUTOPILOT_INVALID, Address, FtpFrame, FtpRun, Message, Other, singly
+from mavftpfs.link.messages import (
+    DECODERS,
+    MAV_AUTOPILOT_INVALID,
+    Address,
+    FtpFrame,
+    FtpRun,
+    Message,
+    Other,
+    singly,
+)
 from mavftpfs.link.signing import SIGNATURE_BLOCK, SignatureCheck
 from mavftpfs.shared.errors import LocalProtocolError
 

@@ -13,10 +13,9 @@ from contextlib import asynccontextmanager
 import serial
 import trio
 
-from mavftpfs.link.lifetime import background
-from mavftpfs.link.problems import cannot_open
+from mavftpfs.link.base import background
 from mavftpfs.link.stream import Pipe, StreamLink
-from mavftpfs.link.uri import LinkSpec
+from mavftpfs.link.uri import LinkSpec, cannot_open
 
 _LEAST_OUTBOX = 4096
 

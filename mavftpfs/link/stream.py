@@ -1,9 +1,8 @@
 """Byte streams that come back by themselves: what TCP and serial links share. Layer: link.
 
-A `Pipe` is an open, non-blocking file descriptor. When it fails, reading and writing stop, what waited to
-be sent is dropped (and counted: a stale request is worse than a lost one), and the helper task asks the
-opener for a new one, with growing pauses, for ever. `receive` then returns an empty list once, so that the
-caller resets its parser.
+A `Pipe` is an open, non-blocking file descriptor. When it fails, what waited to be sent is dropped and
+counted: a stale request is worse than a lost one. A helper task then asks the opener for a new pipe until it
+gets one, with growing pauses. After that `receive` returns an empty list once: the caller resets its parser.
 """
 
 from __future__ import annotations
@@ -15,8 +14,7 @@ from typing import Protocol
 import trio
 
 from mavftpfs.link.addresses import NetAddress
-from mavftpfs.link.base import LinkStats
-from mavftpfs.link.outbox import Outbox
+from mavftpfs.link.base import LinkStats, Outbox
 from mavftpfs.shared.errors import LinkClosed
 
 MAX_READS = 64

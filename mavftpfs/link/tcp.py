@@ -15,10 +15,9 @@ from dataclasses import replace
 import trio
 
 from mavftpfs.link.addresses import PATIENCE
-from mavftpfs.link.lifetime import background
-from mavftpfs.link.problems import cannot_open
+from mavftpfs.link.base import background
 from mavftpfs.link.stream import Pipe, StreamLink
-from mavftpfs.link.uri import LinkSpec
+from mavftpfs.link.uri import LinkSpec, cannot_open
 
 CONNECT_TIMEOUT = 5.0
 """Seconds for each attempt."""

@@ -1,9 +1,9 @@
 """UDP links. Layer: link.
 
 `udpin` binds a port and answers whoever spoke last, until `answer` names the vehicle's address. `udpout`
-speaks first, to one host, from one source port
-for the life of the process (PX4 answers only the first address it heard, servers.md 5). The socket is never
-connected, so that ICMP "port unreachable" of a vehicle that reboots is not an error.
+speaks first, to one host. It keeps its source port for the life of the process: PX4 answers only the first
+address it heard (servers.md 5). The socket is never connected, so that the ICMP message "port unreachable" of
+a vehicle that reboots is not an error.
 """
 
 from __future__ import annotations
@@ -19,11 +19,8 @@ from dataclasses import replace
 import trio
 
 from mavftpfs.link.addresses import NetAddress
-from mavftpfs.link.base import LinkStats
-from mavftpfs.link.lifetime import background
-from mavftpfs.link.outbox import Outbox, pack
-from mavftpfs.link.problems import cannot_open
-from mavftpfs.link.uri import LinkKind, LinkSpec
+from mavftpfs.link.base import LinkStats, Outbox, background, pack
+from mavftpfs.link.uri import LinkKind, LinkSpec, cannot_open
 from mavftpfs.shared.errors import LinkClosed
 
 MAX_CHUNKS = 256

@@ -13,9 +13,8 @@ from contextlib import AbstractAsyncContextManager, asynccontextmanager
 
 import trio
 
-from mavftpfs.link.base import Link
+from mavftpfs.link.base import Link, background
 from mavftpfs.link.framing import Framer
-from mavftpfs.link.lifetime import background
 from mavftpfs.link.opening import open_link
 from mavftpfs.link.stream import Pipe, StreamLink
 from mavftpfs.link.tcp import open_tcp

@@ -16,11 +16,10 @@ import trio
 import trio.testing
 from pymavlink import mavutil
 
-from mavftpfs.link.base import Link
+from mavftpfs.link.base import MAX_DATAGRAM, Link, pack
 from mavftpfs.link.framing import Framer
 from mavftpfs.link.messages import Address, FtpFrame, Heartbeat, Message
 from mavftpfs.link.opening import open_link
-from mavftpfs.link.outbox import MAX_DATAGRAM, pack
 from mavftpfs.link.stream import StreamLink
 from mavftpfs.link.tcp import open_tcp
 from mavftpfs.link.udp import MAX_CHUNKS, UdpLink
