@@ -113,13 +113,13 @@ class Files:
         """
         work = partial(self._open_version, path, entry, listed_at, fresh)
         version, same = await self._opening.run(path, work)
-        keep_cache = same and version.shown
-        version.handles += 1
-        version.shown = True
-        self.open_count += 1
-        self._open_versions[version] = None
         others = (v for v in self._open_versions if v.path == path and v is not version)
         direct_io = any(v.dead is None or v.lost for v in others)
+        keep_cache = same and version.shown
+        version.shown = not direct_io  # who has an older version open may have the kernel fetch pages of that
+        version.handles += 1
+        self.open_count += 1
+        self._open_versions[version] = None
         return FileHandle(self, version, keep_cache=keep_cache, direct_io=direct_io)
 
     async def learn_size(self, path: bytes) -> int:
@@ -250,12 +250,6 @@ class Files:
     def pace(self) -> Pace:
         """Return the bounds for readahead now."""
         return self._cache.pace(len(self._open_versions))
-
-    def on_read(self, version: Version) -> None:
-        """The kernel gets bytes of a version: if it is an old one, they are wrong for the current one."""
-        current = self._current.get(version.path)
-        if current is not None and current is not version:
-            current.shown = False
 
     # --- is it the same file?
 
@@ -529,7 +523,6 @@ class FileHandle(ReadOnlyHandle):
 
     async def _read_piece(self, start: int, stop: int) -> bytes | memoryview:
         files, version = self._files, self._version
-        files.on_read(version)
         pace = files.pace()
         plan = self._readahead.on_read(start, stop, limit=pace.limit, small=pace.small)
         if plan.seeked and version.reader is not None:

@@ -14,19 +14,12 @@ T = TypeVar("T")
 
 
 class _Call(Generic[T]):
+    """done: it ended; results: one, or none after an error or a cancellation."""
+
     def __init__(self) -> None:
         self.done = trio.Event()
-        self.results: list[T] = []  # one, or none after an error or a cancellation
+        self.results: list[T] = []
         self.error: Exception | None = None
-
-    def outcome(self) -> T:
-        if self.error is not None:
-            raise self.error.with_traceback(None)
-        return self.results[0]
-
-    @property
-    def abandoned(self) -> bool:
-        return self.error is None and not self.results
 
 
 class SingleFlight(Generic[K, T]):
@@ -59,9 +52,11 @@ class SingleFlight(Generic[K, T]):
                 call = await self._start(key, work)
             if not call.done.is_set():
                 await call.done.wait()
-            if not call.abandoned and not (joined and isinstance(call.error, RequestTimeout)):
-                return call.outcome()
-            joined = False
+            if call.results:
+                return call.results[0]
+            if call.error is not None and not (joined and isinstance(call.error, RequestTimeout)):
+                raise call.error.with_traceback(None)
+            joined = False  # the caller that ran it was cancelled, or it timed out before we waited long
             await trio.lowlevel.checkpoint()
 
     async def _start(self, key: K, work: Callable[[], Awaitable[T]]) -> _Call[T]:
