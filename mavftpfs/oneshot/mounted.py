@@ -141,7 +141,8 @@ _BY_ERRNO: dict[int, type[errors.MavftpfsError]] = {
 
 def _translated(error: OSError, path: bytes) -> errors.MavftpfsError:
     kind = _BY_ERRNO.get(error.errno or 0, errors.MavftpfsError)
-    return kind(f"{name_text(path)}: {os.strerror(error.errno or errno.EIO)}")
+    hint = " (the vehicle is armed, or mounted with ro)" if kind is errors.ReadOnly else ""
+    return kind(f"{name_text(path)}: {os.strerror(error.errno or errno.EIO)}{hint}")
 
 
 async def _in_thread(function: Callable[[], ResultT], path: bytes) -> ResultT:

@@ -7,8 +7,9 @@ has acknowledged.
 from __future__ import annotations
 
 import os
+import secrets
 from collections.abc import AsyncIterator, Callable, Sequence
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
@@ -19,9 +20,12 @@ from mavftpfs.exits import NotDelivered
 from mavftpfs.oneshot.files import READ_SIZE, File, Session, is_directory
 from mavftpfs.oneshot.names import emptied, make_directory
 from mavftpfs.oneshot.progress import Progress
-from mavftpfs.shared.errors import MavftpfsError, NotADirectory, UsageError
-from mavftpfs.shared.model import join
+from mavftpfs.shared.errors import CrossDevice, MavftpfsError, NotADirectory, UsageError
+from mavftpfs.shared.model import join, split
 from mavftpfs.shared.readable import name_text
+
+WITHDRAWAL_TIME = 10.0
+"""Seconds to take back what a mount was given."""
 
 ASK_PERIOD = 0.25
 """Seconds between two looks at how much the vehicle has acknowledged."""
@@ -152,12 +156,36 @@ class _Putter:
         self.tell(Sent(remote, size))
 
     async def _send(self, source: BinaryIO, remote: bytes) -> int:
+        if self.session.mountpoint is not None:
+            try:
+                return await self._send_beside(source, remote)
+            except CrossDevice:  # this server cannot rename
+                source.seek(0)
         file = await emptied(self.session.files, remote)
         try:
             async with _watched(self.session, remote, self.progress):
                 return await _copy(source, file)
         finally:
             file.close()
+
+    async def _send_beside(self, source: BinaryIO, remote: bytes) -> int:
+        """Write a new file beside and rename it: of a put that was interrupted a mount would go on to deliver
+        what it was given."""
+        files = self.session.files
+        beside = join(split(remote)[0], b".put-" + secrets.token_hex(4).encode())
+        file = await files.create(beside, exclusive=True)
+        try:
+            async with _watched(self.session, beside, self.progress):
+                size = await _copy(source, file)
+            file.close()
+            await files.rename(beside, remote)
+        except BaseException:
+            with trio.move_on_after(WITHDRAWAL_TIME) as patience, suppress(MavftpfsError):
+                patience.shield = True
+                await files.unlink(beside)  # while it is open: closing delivers what has a name
+            file.close()
+            raise
+        return size
 
 
 async def _copy(source: BinaryIO, file: File) -> int:

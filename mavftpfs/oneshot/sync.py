@@ -23,9 +23,9 @@ from mavftpfs.shared.errors import LinkError, MavftpfsError, NotADirectory, NotF
 from mavftpfs.shared.model import EntryKind, join
 from mavftpfs.shared.readable import name_text
 
-LOG_PLACES = (b"/fs/microsd/log", b"/APM/LOGS", b"/logs", b"/log", b"/@MAV_LOG")
-"""Where vehicles keep logs: PX4, ArduPilot, ArduPilot's simulator, PX4's simulator, and the standard's alias,
-which shows one of the others again and so comes last."""
+LOG_PLACES = (b"/fs/microsd/log", b"/APM/LOGS", b"/logs", b"/log", b"/var/APM/logs", b"/@MAV_LOG")
+"""Where vehicles keep logs: PX4, ArduPilot, ArduPilot's simulator, PX4's simulator, ArduPilot on Linux, and
+the standard's alias, which shows one of the others again and so comes last."""
 
 MAX_TIMEOUTS = 2
 """Requests of so many files in a row that nobody answered end a run: the others would fare no better."""

@@ -273,6 +273,22 @@ def test_verbs_use_the_mount_that_is_up(field: Field, tmp_path: Path) -> None:
     assert str(mount.path) in run("scan", source)[0]
 
 
+def test_a_put_by_a_mount_that_is_interrupted_is_taken_back(field: Field, tmp_path: Path) -> None:
+    """The mount would go on to deliver what it was given."""
+    vehicle = field.sim(field.local("card"), "px4", SLOW)
+    (vehicle.root / "big").write_bytes(b"old")
+    write_log(tmp_path / "big", 500_000, 1, 1)
+    mount = field.mount(vehicle.source)
+    screen = terminal.mavftpfs("put", vehicle.source, tmp_path / "big", "/")
+    screen.read_until(lambda _: "kB/s" in screen.raw)
+    screen.interrupt()
+    assert screen.finish() == 130
+    assert "0 of 1 files are on the vehicle" in "".join(screen.lines[-3:])
+    assert mount.unmount() == 0
+    assert (vehicle.root / "big").read_bytes() == b"old"
+    assert local_files(vehicle.root) == {"big"}
+
+
 def test_a_mounted_subtree_and_what_lies_outside_of_it(field: Field, tmp_path: Path) -> None:
     vehicle = field.sim(field.local("card"))
     logs_of(vehicle.root / "log")

@@ -260,3 +260,37 @@ async def test_mv_keeps_the_old_file_until_the_new_one_is_there() -> None:
     with pytest.raises(RequestTimeout):
         await mv(tree, b"/a", to=b"/new")
     assert tree.files[b"/a"] == BIG
+
+
+# -- by a mount -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("renames", [True, False])
+async def test_by_a_mount_a_file_is_written_beside_where_the_server_can_rename(
+    local: Path, renames: bool
+) -> None:
+    tree = Card({b"/x": b"old"})
+    tree.renames = renames
+    session = Session(cast(Files, tree), mountpoint="/mnt/drone")
+    await put_paths(
+        session, [(local / "a", collect(local / "a", recursive=False))], b"/x", Progress(), print, Put()
+    )
+    assert tree.files == {b"/x": BIG}
+    opened = [path for name, path in tree.calls if name == "open"]
+    assert (b"/x" in opened) is not renames
+
+
+async def test_by_a_mount_what_was_interrupted_is_taken_back(local: Path) -> None:
+    tree = Card({b"/x": b"old"})
+
+    def interrupt(name: str, path: bytes) -> None:
+        if name == "fsync":
+            raise KeyboardInterrupt
+
+    tree.on_call = interrupt
+    session = Session(cast(Files, tree), mountpoint="/mnt/drone")
+    batch = (local / "a", collect(local / "a", recursive=False))
+    with pytest.raises(BaseException, match=r".*") as caught:
+        await put_paths(session, [batch], b"/x", Progress(), print, Put())
+    assert caught.group_contains(KeyboardInterrupt) or caught.type is KeyboardInterrupt
+    assert tree.files == {b"/x": b"old"}
