@@ -95,7 +95,8 @@ class Tour:
             except subprocess.TimeoutExpired:
                 raise DemoFailed(f"{words[0]} did not end within {STEP_TIMEOUT:.0f} s") from None
         text = output.decode(errors="replace") + errors.decode(errors="replace")
-        self.console.print(text.rstrip() or "[dim](no output)[/]", highlight=False, markup=not text.strip())
+        if text.strip():
+            self.console.print(text.rstrip(), highlight=False, markup=False)
         if child.returncode:
             raise DemoFailed(f"{words[0]} ended with {child.returncode}")
         return text
@@ -107,7 +108,7 @@ class Tour:
 
 @contextmanager
 def running(words: Sequence[str], folder: Path) -> Iterator[subprocess.Popen[bytes]]:
-    """Run a command that may read the mount; it is killed at the end.
+    """Run a command that may use the mount; it is ended with the body, gently first.
 
     It is not waited for long: a reader inside a mount ends only when the mount answers, and ending the mount
     is another step's business.
@@ -118,54 +119,40 @@ def running(words: Sequence[str], folder: Path) -> Iterator[subprocess.Popen[byt
     try:
         yield child
     finally:
-        if child.poll() is None:
-            child.kill()
-            with suppress(subprocess.TimeoutExpired):
-                child.wait(1)
+        for end_it in (child.terminate, child.kill):
+            if child.poll() is None:
+                end_it()
+                with suppress(subprocess.TimeoutExpired):
+                    child.wait(END_TIMEOUT / 5)
 
 
 @contextmanager
-def daemon(name: str, arguments: Sequence[str], folder: Path) -> Iterator[subprocess.Popen[bytes]]:
-    """Run `mavftpfs ARGUMENTS` beside the tour; end it with SIGTERM, in the end with SIGKILL.
+def vehicle(arguments: Sequence[str], folder: Path) -> Iterator[subprocess.Popen[bytes]]:
+    """Run `mavftpfs sim ARGUMENTS` beside the tour; end it with SIGTERM, in the end with SIGKILL.
 
     It gets a session of its own, so that Ctrl-C reaches only the tour, which then ends things in order.
     """
     process = None
     try:
-        with (folder / f"{name}.log").open("wb") as log, signals_held():
+        with (folder / "vehicle.log").open("wb") as log, signals_held():
+            argv = [*PROGRAM, "sim", *arguments]
             process = subprocess.Popen(
-                [*PROGRAM, *arguments],
-                stdin=subprocess.DEVNULL,
-                stdout=log,
-                stderr=log,
-                start_new_session=True,
+                argv, stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True
             )
         yield process
     finally:
-        if process is not None:
-            end(process)
-
-
-def end(process: subprocess.Popen[bytes]) -> None:
-    """End a daemon, gently first."""
-    if process.poll() is None:
-        process.terminate()
-        try:
-            process.wait(END_TIMEOUT)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait(END_TIMEOUT)
+        if process is not None and process.poll() is None:
+            process.terminate()
+            try:
+                process.wait(END_TIMEOUT)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait(END_TIMEOUT)
 
 
 def ignore_interrupts() -> None:
     """Let no further Ctrl-C stop the cleaning up half-way."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-
-
-def last_words(folder: Path, name: str) -> str:
-    """Return the last line that a daemon logged."""
-    lines = (folder / f"{name}.log").read_text(errors="replace").split("\n")
-    return next((line for line in reversed(lines) if line.strip()), "it said nothing")
 
 
 def free_port() -> int:
@@ -213,26 +200,18 @@ def mount(tour: Tour, stack: ExitStack) -> None:
     """Start the vehicle and mount it."""
     port = free_port()
     link = f"udpout:{HOST}:{port}"
-    vehicle = ["sim", str(tour.card), "--profile", PROFILE, "--link", link, *RADIO]
-    stack.enter_context(daemon("vehicle", vehicle, tour.folder))
-    tour.say("The drone is switched on. Now we mount it, over UDP, as a telemetry radio would hand it to us:")
-    source = f"udpin:{HOST}:{port}"
-    tour.show_command("mavftpfs", source, "drone")
-    process = stack.enter_context(daemon("mount", [source, str(tour.drone), "-f"], tour.folder))
-    deadline = time.monotonic() + STEP_TIMEOUT
-    while not is_mounted(tour.drone):
-        if process.poll() is not None or time.monotonic() > deadline:
-            raise DemoFailed(f"the drone could not be mounted: {last_words(tour.folder, 'mount')}")
-        time.sleep(0.05)
+    stack.enter_context(vehicle([str(tour.card), "--profile", PROFILE, "--link", link, *RADIO], tour.folder))
     stack.callback(release, tour.drone)
+    tour.say("The drone is switched on. Now we mount it, over UDP, as a telemetry radio would hand it to us:")
+    tour.command("mavftpfs", f"udpin:{HOST}:{port}", "drone")
 
 
 def release(path: Path) -> None:
-    """Take the mount away if the daemon could not."""
-    if is_mounted(path):
-        subprocess.run(
-            ["fusermount3", "-uz", str(path)], capture_output=True, timeout=END_TIMEOUT, check=False
-        )
+    """Unmount if that was not done; the last resort leaves the mount's program to end by itself."""
+    for words in ([*PROGRAM, "umount", str(path)], ["fusermount3", "-uz", str(path)]):
+        if is_mounted(path):
+            with suppress(subprocess.TimeoutExpired):
+                subprocess.run(words, capture_output=True, timeout=END_TIMEOUT, check=False)
 
 
 def look_around(tour: Tour) -> None:
@@ -345,7 +324,7 @@ def take_tour(tour: Tour) -> None:
             edit_script(tour)
             compare_all(tour)
             tour.say("Done. Unmounting:")
-            tour.show_command("fusermount3", "-u", "drone")
+            tour.command("mavftpfs", "umount", "drone")
         finally:
             ignore_interrupts()
 

@@ -25,7 +25,7 @@ def test_an_interrupt_while_a_process_is_being_started_leaves_none(
         return started[-1]
 
     monkeypatch.setattr(subprocess, "Popen", interrupted)
-    with pytest.raises(KeyboardInterrupt), demo.daemon("vehicle", ["sim", str(tmp_path)], tmp_path):
+    with pytest.raises(KeyboardInterrupt), demo.vehicle([str(tmp_path)], tmp_path):
         pytest.fail("it went on")
     (process,) = started
     try:
