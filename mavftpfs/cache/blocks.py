@@ -236,6 +236,11 @@ class FileBlocks:
                 waiter.scope.deadline = trio.current_time() + self._cache.patience
             waiter.lacking = lacking
 
+    def on_queued(self) -> None:
+        """The reader waits for its turn while the queue before it moves: those who wait get more time."""
+        for waiter in self._waiters:
+            waiter.scope.deadline = trio.current_time() + self._cache.patience
+
     def on_suspect(self, reason: str) -> None:
         """Drop what came since the reader was opened; whoever waits asks again."""
         if self.doubted:

@@ -113,6 +113,10 @@ class _Piece(ReadSink):
         """See ReadSink."""
         self._news.set()
 
+    def on_queued(self) -> None:
+        """See ReadSink."""
+        self._news.set()
+
     def on_suspect(self, reason: str) -> None:
         """See ReadSink."""
         self.suspect = True

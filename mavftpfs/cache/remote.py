@@ -50,6 +50,10 @@ class ReadSink(Protocol):
         """A batch of on_data calls ended: wake whoever waits. Called once per batch, never per packet."""
         ...
 
+    def on_queued(self) -> None:
+        """The reader waits for its turn, and the queue before it moved: this is no silence of the vehicle."""
+        ...
+
     def on_suspect(self, reason: str) -> None:
         """A session anomaly or a foreign FTP client was noticed while this file was read: all bytes
         that came since the reader was opened are provisional (promise 1). This alone may be heard of a

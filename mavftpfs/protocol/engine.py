@@ -47,7 +47,8 @@ class Engine:
     Attributes:
         session: the id that session-agnostic requests carry (the open one, else home_session).
         home_session: the id to ask for when opening, 1..255.
-        on_unknown: told of each answer that nobody waits for (of what was given up: to writes and opens).
+        on_stray: told of each answer that nobody waits for and that no repetition of ours explains, with the
+            seconds since its request went out (0 where that is not known).
     """
 
     def __init__(
@@ -64,9 +65,8 @@ class Engine:
         self.flow = flow
         self.traits = Traits() if traits is None else traits
         self.stats = EngineStats()
-        self.on_unknown: Callable[[Payload], None] = lambda reply: None
-        self._ledger = Ledger(rng.randrange(LAST_SEQ + 1), self.stats.lateness)
-        self._ledger.ghost.on_done = lambda reply: self.on_unknown(reply)
+        self.on_stray: Callable[[Payload, float], None] = lambda reply, late: None
+        self._ledger = Ledger(rng.randrange(LAST_SEQ + 1))
         self._op_deadline = op_deadline
         self._note = note
         self._ops: list[Operation] = []
@@ -156,8 +156,7 @@ class Engine:
             if req_opcode == _BURST and self._burst_op is not None and self._burst_op.bursting:
                 self.stats.incoherent += 1
             else:
-                self.stats.on_unknown(reply, now, explained=self._ledger.repeats.explain(seq, now))
-                self.on_unknown(reply)
+                self._on_unknown(reply, now)
         elif req_opcode != request.opcode:
             self._on_stale(request)
         elif opcode == _ACK and offset == request.offset and session == request.session:
@@ -203,7 +202,7 @@ class Engine:
         self._heard_at = now
         rtt, flow = None, self.flow
         if not self._ledger.settle(request, reply.seq, now):
-            self.stats.on_spurious(request)
+            self.stats.spurious += 1
             flow.on_spurious()
         if request.single and request.sent_at > self._burst_heard_at:
             rtt = self._timers.sample(request, now)
@@ -215,6 +214,14 @@ class Engine:
         op.on_reply(request, reply, now)
         if op.done:
             self._retire()
+
+    def _on_unknown(self, reply: Payload, now: float) -> None:
+        """An answer fits nothing outstanding. What comes of a burst that was given up is no news."""
+        self.stats.unknown += 1
+        duplicates = self._ledger.duplicates
+        if not duplicates.explains(reply.seq) and reply.req_opcode != _BURST:
+            self.stats.strays += 1
+            self.on_stray(reply, duplicates.late_by(reply.seq, now))
 
     def _on_stale(self, request: Request) -> None:
         """A replay of some earlier reply under this seq: this seq will never be answered (servers.md 2)."""

@@ -9,13 +9,12 @@ its place in the window, because the server still has it in its queue.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from itertools import islice
 
-from mavftpfs.protocol.lateness import Lateness
+from mavftpfs.protocol.duplicates import DuplicateDetector
 from mavftpfs.protocol.payload import MAX_DATA, Fields, Opcode, Payload
-from mavftpfs.protocol.repeats import Repeats
-from mavftpfs.protocol.requests import WORKING, Operation, Request, Run, Transmission
+from mavftpfs.protocol.requests import Operation, Request, Run, Transmission
 from mavftpfs.shared.errors import LocalProtocolError
 
 LAST_SEQ = 65534
@@ -26,7 +25,6 @@ FURTHEST_JUMP = LAST_SEQ + 1 - 2 * BURST_JUMP
 """Further on come the seqs just used, whose late replies may still be about."""
 
 _ACK = int(Opcode.ACK)
-_TELLING = frozenset((Opcode.WRITE_FILE, Opcode.OPEN_FILE_RO, Opcode.OPEN_FILE_WO, Opcode.CREATE_FILE))
 _MIN_REORDER = 2
 """So many later answers tell that a request is lost: it keeps one of a short queue's places until then."""
 
@@ -35,57 +33,44 @@ _MOST_QUICK_SENDS = 20
 
 
 class Ghost(Operation):
-    """Owns the requests of cancelled operations until they are answered or given up.
-
-    Attributes:
-        on_done: told of a WriteFile that was executed after all, perhaps in another file, and of an open.
-    """
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.on_done: Callable[[Payload], None] = lambda reply: None
+    """Owns the requests of cancelled operations until they are answered or given up."""
 
     def next_request(self, now: float) -> Request | None:
         """Never asked: a ghost is in no engine's list."""
         raise LocalProtocolError("a ghost asks for nothing")
 
     def on_reply(self, request: Request, reply: Payload, now: float) -> None:
-        """Nobody wants to know, but for what may have gone to another file, or put another in its place."""
-        if reply.req_opcode in _TELLING:
-            self.on_done(reply)
+        """Nobody wants to know."""
 
 
 class Ledger:
-    """The outstanding requests of one engine. next_seq: the first seq to use. lateness: told of what goes out
-    and is answered, of several at once that go out only of the first.
+    """The outstanding requests of one engine. next_seq: the first seq to use.
 
     Attributes:
         again: lost requests which go out again as soon as there is room.
         newest_answered: order of the last transmission that was answered. first: no older one may be lost.
         order: number of the next transmission.
         reorder: how many transmissions later an answer must be to prove a loss; grows when that was wrong.
-        repeats: what is still to come of what was sent more than once.
+        duplicates: knows which answers that nobody waits for are due to repetitions of ours.
     """
 
     __slots__ = (
         "_flying",
-        "_lateness",
         "_seq",
         "_table",
         "again",
+        "duplicates",
         "find",
         "first",
         "ghost",
         "newest_answered",
         "order",
         "reorder",
-        "repeats",
     )
 
-    def __init__(self, next_seq: int, lateness: Lateness) -> None:
+    def __init__(self, next_seq: int) -> None:
         self._seq = next_seq
-        self._lateness = lateness
-        self.repeats = Repeats(lateness.overtaken)
+        self.duplicates = DuplicateDetector()
         self._table: dict[int, Request] = {}
         self._flying: dict[int, Request] = {}
         self.find = self._table.get
@@ -123,7 +108,6 @@ class Ledger:
         while seq > LAST_SEQ or seq + 1 in table:  # bounded: the table is far smaller than 65535
             seq = 0 if seq > LAST_SEQ else seq + 1
         self._seq = seq + 1
-        self._lateness.on_passed(1)
         return seq
 
     def jump(self, packets: int) -> None:
@@ -131,7 +115,6 @@ class Ledger:
         the rest of it may come long after it was given up (servers.md 14.3)."""
         distance = min(max(BURST_JUMP, 2 * packets), FURTHEST_JUMP)
         self._seq = (self._seq + distance) % (LAST_SEQ + 1)
-        self._lateness.on_passed(distance)
 
     def launch(self, requests: Sequence[Request], now: float, timer: float) -> None:
         """Number requests that go out for the first time, and note that they are on their way."""
@@ -152,9 +135,7 @@ class Ledger:
             table[seq + 1] = flying[order] = request
             order += 1
         self.order = order
-        self._lateness.on_passed(len(requests))
-        if requests[0].manner.family not in WORKING:
-            self._lateness.on_sent(requests[0].seq + 1, now)
+        self.duplicates.on_sent(requests[0], now)
 
     def number(self, request: Request, now: float) -> None:
         """Give a request that goes out (again) its seq and order number."""
@@ -176,8 +157,7 @@ class Ledger:
         request.sent_at = now
         request.sends += 1
         self.order += 1
-        if request.manner.family not in WORKING and request.opcode != Opcode.BURST_READ_FILE:
-            self._lateness.on_sent(request.seq + 1, now)
+        self.duplicates.on_sent(request, now)
 
     def enter(self, request: Request) -> None:
         """Note that a numbered request is on its way."""
@@ -214,8 +194,6 @@ class Ledger:
                 newest = order
             run.append((request, data if size == MAX_DATA else data[:size]))
         self.newest_answered = newest
-        if run:
-            self._lateness.on_answered(sent_at, now)
         return run
 
     def settle(self, request: Request, seq: int, now: float) -> bool:
@@ -223,8 +201,7 @@ class Ledger:
 
         Its order, sent_at, single and outrun are those of the answered transmission from then on.
         """
-        if request.sends > 1:
-            self.repeats.on_answered(request, seq, now)
+        self.duplicates.on_answered(request, seq)
         self._remove(request)
         current = seq == request.seq + 1
         if not current and request.aliases is not None:
@@ -236,15 +213,11 @@ class Ledger:
             self.reorder -= 1
         if request.order > self.newest_answered:
             self.newest_answered = request.order
-        if not current:
-            self._lateness.on_stray(seq, now)
-        elif request.single:  # else it may answer an earlier transmission
-            self._lateness.on_answered(request.sent_at, now)
         return current
 
     def forget(self, request: Request) -> None:
         """Give up a request that was not answered."""
-        self.repeats.on_given_up(request)
+        self.duplicates.on_given_up(request)
         self._remove(request)
 
     def _remove(self, request: Request) -> None:

@@ -45,9 +45,6 @@ class Manner(NamedTuple):
 FLOORS = {"data": 0.05, "write": 0.05, "list": 0.25, "path": 0.1, "slow": 10.0, "work": 0.3}
 """Least retransmission timeout of each family in seconds."""
 
-WORKING = frozenset(("slow", "work"))
-"""Families of requests whose answers come after those to newer ones by themselves."""
-
 READ_MANNER = Manner("data", same_seq=False, ordered=True, echoes_offset=True, free_sends=20)
 WRITE_MANNER = Manner("write", same_seq=False, ordered=True, free_sends=20)
 LAST_WRITE_MANNER = WRITE_MANNER._replace(once=True)

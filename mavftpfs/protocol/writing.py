@@ -40,7 +40,9 @@ _ROW = 64
 """Most chunks to take from the source at once."""
 
 _BARREN_TOLERATED = 3
-_EBADF = 9
+_NO_FILE_ERRNOS = frozenset((0, 9))
+"""PX4 says errno 0, or EBADF, of a write to a session that somebody reset."""
+
 _SESSION_CODES = frozenset((NakCode.FAIL, NakCode.INVALID_SESSION, NakCode.FILE_NOT_FOUND))
 """Refusals of a write that mean "no file is open": MAVSDK says 1, PX4 4, ArduPilot 10 (servers.md 1). On
 MAVSDK 1 may be a full card, too: who reopens and fails at the same place again knows."""
@@ -275,7 +277,7 @@ class WriteTransfer(Chunked):
             self.fail(RemoteProtocolError(f"the vehicle ACKs writes at {request.offset} and writes nothing"))
 
     def _meaning(self, nak: FtpNak) -> MavftpfsError:
-        if nak.code in _SESSION_CODES or nak.server_errno == _EBADF:
+        if nak.code in _SESSION_CODES or nak.server_errno in _NO_FILE_ERRNOS:
             lost = SessionLost(str(nak), by_server=True)
             lost.__cause__ = nak
             return lost

@@ -8,6 +8,7 @@ and a time-out per request cost more than the rest of a chunk together).
 from __future__ import annotations
 
 import logging
+from collections import OrderedDict
 from collections.abc import Callable
 from typing import Protocol
 
@@ -19,8 +20,8 @@ from mavftpfs.link.framing import Framer
 from mavftpfs.link.messages import Address, FtpRun, Message, singly
 from mavftpfs.protocol.engine import Engine
 from mavftpfs.protocol.operations import Operation
-from mavftpfs.protocol.payload import decode_reply
-from mavftpfs.session.notes import Remarks
+from mavftpfs.protocol.payload import Payload, decode_reply
+from mavftpfs.protocol.stats import EngineStats
 from mavftpfs.session.vehicle import Vehicle
 from mavftpfs.shared.errors import RemoteProtocolError, RequestTimeout
 
@@ -38,6 +39,9 @@ REFILL_AT = 32
 
 BACKLOG_LIMIT = 16 * 1024
 """Bytes the link may hold unsent before the engine is asked for more: nothing overtakes what waits there."""
+
+
+_REMEMBERED_REQUESTS = 1024
 
 
 class PayloadTrace(Protocol):
@@ -307,3 +311,43 @@ class Driver:
         elif deadline is not None and not self._may_send(now):
             deadline = max(deadline, now + 0.05)  # nothing can go out, whatever is due
         return self._quiet_at if deadline is None else min(deadline, self._quiet_at)
+
+
+class Remarks:
+    """What a trace says of a request or a reply beside its bytes. Used only while somebody traces."""
+
+    def __init__(self, stats: EngineStats) -> None:
+        self._stats = stats
+        self._before = (0, 0, 0)
+        self._unanswered: OrderedDict[tuple[int, int, int, bytes], int] = OrderedDict()
+
+    def on_request(self, wire: bytes) -> str:
+        """Return "", or whether these 251 bytes were sent before and are not answered yet."""
+        seq, rest = int.from_bytes(wire[:2], "little"), (wire[2], wire[3], wire[4], wire[8:])
+        earlier = self._unanswered.get(rest)
+        self._unanswered[rest] = seq
+        if len(self._unanswered) > _REMEMBERED_REQUESTS:
+            self._unanswered.popitem(last=False)
+        if earlier is None:
+            return ""
+        return "retransmit" if earlier == seq else f"retransmit of {earlier}"
+
+    def before_reply(self) -> None:
+        """The engine is about to see a reply."""
+        stats = self._stats
+        self._before = (stats.unknown, stats.stale, stats.incoherent)
+
+    def after_reply(self, reply: Payload) -> str:
+        """Return "" for a believed reply, else why it was not."""
+        stats, (unknown, stale, incoherent) = self._stats, self._before
+        if stats.unknown > unknown:
+            return "late, duplicate or not ours"
+        if stats.stale > stale:
+            return "stale replay"
+        if stats.incoherent > incoherent:
+            return "does not fit its request"
+        asked = (reply.seq - 1) & 0xFFFF
+        for rest, seq in list(self._unanswered.items()):
+            if seq == asked:
+                del self._unanswered[rest]
+        return ""

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, Protocol
+
+from mavftpfs.shared.traits import WriteTraits
 
 ReadMode = Literal["window", "burst"]
 
@@ -26,6 +28,24 @@ STARVING_TRIPS = 20.0
 
 RELIEF = 0.5
 """Seconds of service that ends starving."""
+
+
+class Queue(Protocol):
+    """The others who want the session, as whoever has it sees them."""
+
+    write_traits: WriteTraits
+
+    def rival_use(self, user: object) -> float | None:
+        """Return how much the lightest of those who wait used of the session lately; None if nobody waits."""
+        ...
+
+    def expire_waiters(self) -> None:
+        """Fail those who have waited too long."""
+        ...
+
+    def require_link(self) -> None:
+        """Raise VehicleLost while the vehicle is silent."""
+        ...
 
 
 def quantum(rtt: float | None) -> float:

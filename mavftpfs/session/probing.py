@@ -9,9 +9,9 @@ from __future__ import annotations
 
 from mavftpfs.protocol.operations import Simple
 from mavftpfs.protocol.payload import NakCode, Opcode
+from mavftpfs.session.changes import RENAME_LIMIT, Changes
 from mavftpfs.session.opening import OpenSession
 from mavftpfs.session.scheduler import Scheduler
-from mavftpfs.session.sideeffects import SideEffects, fits_rename
 from mavftpfs.shared.errors import FtpNak, RequestTimeout
 from mavftpfs.shared.model import split, wire_path
 from mavftpfs.shared.traits import WriteTraits
@@ -28,7 +28,7 @@ SILENCE = 6.0
 _UNKNOWN = frozenset((NakCode.FAIL, NakCode.UNKNOWN_COMMAND))
 
 
-async def probe_writing(scheduler: Scheduler, effects: SideEffects, first: bytes, second: bytes) -> None:
+async def probe_writing(scheduler: Scheduler, effects: Changes, first: bytes, second: bytes) -> None:
     """Fill the traits that are unknown, by files at two free paths, and leave nothing behind.
 
     Raises:
@@ -38,7 +38,7 @@ async def probe_writing(scheduler: Scheduler, effects: SideEffects, first: bytes
 
 
 class _Probe:
-    def __init__(self, scheduler: Scheduler, effects: SideEffects, first: bytes, second: bytes) -> None:
+    def __init__(self, scheduler: Scheduler, effects: Changes, first: bytes, second: bytes) -> None:
         self._scheduler = scheduler
         self._effects = effects
         self._path = first
@@ -60,7 +60,10 @@ class _Probe:
             if self._traits.truncate_works is None:
                 await self._truncate(size)
             left = [self._path]
-            if self._traits.rename_works is None and fits_rename(self._path, self._second):
+            if (
+                self._traits.rename_works is None
+                and len(wire_path(self._path) + wire_path(self._second)) < RENAME_LIMIT
+            ):
                 left = await self._rename()
         except BaseException:
             await self._sweep_up()
@@ -70,7 +73,7 @@ class _Probe:
 
     async def _sweep_up(self) -> None:
         """One listing tells of both names."""
-        entries, _ = await self._effects.entries(split(self._path)[0])
+        entries, _ = await self._effects._entries(split(self._path)[0])
         names = [entry.name for entry in entries]
         for path in (self._path, self._second):
             if split(path)[1] in names:
@@ -83,7 +86,7 @@ class _Probe:
             if nak.code == NakCode.FILE_NOT_FOUND:
                 self._traits.wo_creates = False
             return
-        entry, _ = await self._effects.find(self._path)
+        entry, _ = await self._effects._find(self._path)
         self._traits.wo_creates = entry is not None
 
     async def _fill(self) -> None:
@@ -91,10 +94,7 @@ class _Probe:
 
     async def _write(self, session: OpenSession) -> None:
         operation = Simple(Opcode.WRITE_FILE, CONTENT, session=session.id)
-        try:
-            await self._scheduler.metadata(operation, disturbs=False)
-        finally:
-            self._scheduler.on_probed(session, len(CONTENT))
+        await self._scheduler.metadata(operation, disturbs=False)
 
     async def _open_existing(self) -> int | None:
         """Return the size afterwards."""
@@ -107,7 +107,7 @@ class _Probe:
             except FtpNak:
                 return len(CONTENT)
             size = await self._size()
-            sure = size in seen or not self._scheduler.stats.strays
+            sure = size in seen or not self._scheduler.doubt.active
             if sure and size in (0, len(CONTENT)):
                 self._traits.wo_truncates = size == 0
             if sure:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Awaitable, Callable
 from contextlib import AbstractAsyncContextManager
+from dataclasses import dataclass, field
 from itertools import count
 
 import trio
@@ -18,22 +19,14 @@ from mavftpfs.protocol.engine import Engine
 from mavftpfs.protocol.operations import Operation
 from mavftpfs.protocol.payload import Opcode, Payload
 from mavftpfs.protocol.reading import ReadToEof
-from mavftpfs.session.copies import Written
 from mavftpfs.session.doubt import Doubt
 from mavftpfs.session.driver import Driver
-from mavftpfs.session.echoes import Echoes
-from mavftpfs.session.gate import Gate
-from mavftpfs.session.holder import SessionHolder
-from mavftpfs.session.jobs import SessionJob
-from mavftpfs.session.kit import Kit
-from mavftpfs.session.opening import OpenSession, SessionOpener
+from mavftpfs.session.opening import Opener, OpenSession
 from mavftpfs.session.policy import LIGHT_USE, ReadMode, is_starving
-from mavftpfs.session.reading import Reading
-from mavftpfs.session.strays import Strays
-from mavftpfs.session.stream import FileStream
-from mavftpfs.session.suspicion import Suspicion
+from mavftpfs.session.reader import FileStream, Reading
+from mavftpfs.session.serversession import ServerSession, State
 from mavftpfs.session.upload import QueuedUpload
-from mavftpfs.session.uploading import Uploading
+from mavftpfs.session.uploads import Uploading
 from mavftpfs.session.vehicle import Vehicle
 from mavftpfs.shared.errors import DataUnproven, MavftpfsError, RequestTimeout, SessionLost
 from mavftpfs.shared.traits import WriteTraits
@@ -42,8 +35,34 @@ IDLE_CLOSE = 1.5
 """Seconds a file stays open on the server without being read. Below the 2 s after which PX4 frees its
 buffers and the 3 s after which ArduPilot gives the session away: so a session is never doubtful."""
 
-_DOUBT_RETRY = 5.0
-_User = SessionJob | FileStream | QueuedUpload
+RECENT = 10.0
+"""Seconds for which what was read stays provisional, also of files that were closed since: another client is
+noticed late, because servers answer it on its own link, and a router may pass on only some of that."""
+
+_UNSURE_RETRY = 5.0
+_OPENING = frozenset((Opcode.OPEN_FILE_RO, Opcode.OPEN_FILE_WO, Opcode.CREATE_FILE))
+
+
+@dataclass(eq=False)
+class _Job:
+    """One open, an action, one Terminate. ticket: its place in the queue."""
+
+    path: bytes
+    opcode: Opcode
+    action: Callable[[OpenSession], Awaitable[None]]
+    ticket: int
+    asked_at: float
+    session: OpenSession | None = None
+    error: MavftpfsError | None = None
+    finished: trio.Event = field(default_factory=trio.Event)
+
+    def fail(self, error: MavftpfsError) -> None:
+        """End it before it began."""
+        self.error = error
+        self.finished.set()
+
+
+_User = _Job | FileStream | QueuedUpload
 
 
 async def _do_nothing(session: OpenSession) -> None:
@@ -72,14 +91,11 @@ class Scheduler:
         read_mode: ReadMode = "window",
         chunk: int | None = None,
     ) -> None:
-        self.gate = Gate()
-        self.opener = SessionOpener(driver, engine, vehicle, self.gate, clock)
+        self.doubt = Doubt(clock)
+        self.opener = Opener(driver, engine, vehicle, self.doubt, clock)
+        self.server = ServerSession(self.opener, op_deadline)
         self.write_traits = WriteTraits()
         self.op_deadline = op_deadline
-        self.stats = engine.stats
-        self.echoes = Echoes(engine, clock)
-        self.doubt = Doubt(clock)
-        self._holder = SessionHolder(self.opener, op_deadline)
         self._driver = driver
         self._vehicle = vehicle
         self.read_mode: ReadMode = read_mode
@@ -88,38 +104,23 @@ class Scheduler:
         self._used_at = clock()
         self._tickets = count(1)
         self._streams: set[FileStream] = set()
-        self._suspicion = Suspicion(clock)
-        self._jobs: list[SessionJob] = []
-        kit = Kit(
-            self._holder,
-            driver,
-            engine,
-            vehicle,
-            self.gate,
-            clock,
-            self.echoes,
-            self.write_chunks,
-            self.doubt,
-        )
-        self._reading = Reading(kit, self, read_mode, self.read_chunks)
-        self._uploading = Uploading(kit, self, op_deadline=op_deadline, when_armed_ok=when_armed_ok)
-        writer = self._uploading.writer
-        self.written, self.on_probed = self._uploading.written, self._uploading.on_probed
-        news = (self._on_session_taken, writer.on_emptied, writer.on_disturbed, self.written.on_late)
-        self._strays = Strays(self._holder, self._others_about, *news)
-        self._strays_seen = 0
-        engine.on_unknown = self._on_unknown
+        self._closed_streams: list[FileStream] = []
+        self._jobs: list[_Job] = []
+        parts = (self.server, driver, engine, self, self.doubt, clock)
+        self._reading = Reading(*parts, read_mode, self.read_chunks)
+        self._uploading = Uploading(*parts, vehicle, self.write_chunks, when_armed_ok=when_armed_ok)
+        engine.on_stray = self._on_stray
         self.doubt.on_raised = self._on_doubt
 
     @property
     def session(self) -> OpenSession | None:
         """What is open on the server."""
-        return self._holder.session
+        return self.server.session
 
     @property
     def switches(self) -> int:
         """How often one file made room for another."""
-        return self._holder.switches
+        return self.server.switches
 
     @property
     def uploads(self) -> list[QueuedUpload]:
@@ -137,14 +138,10 @@ class Scheduler:
         """
         self.require_link()
         if not disturbs:
-            await self._run_beside(operation)
+            await self.opener.run(operation)
             return
         async with self._uploading.turns.path_operation():
-            await self._run_beside(operation)
-
-    async def _run_beside(self, operation: Operation) -> None:
-        async with self.gate.passing():
-            await self._driver.run(operation)
+            await self.opener.run(operation)
 
     def open_stream(self, path: bytes, sink: ReadSink, size: int | None) -> FileStream:
         """Register a reader; with size None it asks for an open ACK (await stream.wait_opened())."""
@@ -167,8 +164,8 @@ class Scheduler:
             nonlocal data
             foreign_at = self._vehicle.foreign_at
             operation = ReadToEof(session.id, self.read_chunks.size, limit)
-            await self._run_beside(operation)
-            self._holder.require(session)
+            await self.opener.run(operation)
+            self.server.require(session)
             if self._vehicle.foreign_at != foreign_at:
                 raise DataUnproven(f"another FTP client was active while {path!r} was read")
             data = operation.data
@@ -191,15 +188,15 @@ class Scheduler:
             VehicleLost, RequestTimeout, or what opening, the action or closing fail with.
         """
         self.require_link()
-        job = SessionJob(path, opcode, action, next(self._tickets), self._clock())
+        job = _Job(path, opcode, action, next(self._tickets), self._clock())
         self._jobs.append(job)
-        self._holder.wake()
+        self.server.wake()
         try:
             await job.finished.wait()
         finally:
             if job in self._jobs:
                 self._jobs.remove(job)
-            self._holder.wake()
+            self.server.wake()
         if job.error is not None:
             raise job.error
         assert job.session is not None
@@ -215,13 +212,13 @@ class Scheduler:
         Raises:
             RequestTimeout: what was open there could not be closed.
         """
-        return self._holder.claim(path, below=below, limit=self.op_deadline)
+        return self.server.claim(path, below=below, limit=self.op_deadline)
 
     def moved(self, old: bytes, new: bytes) -> None:
         """A file or directory was renamed: who reads or writes it, or in it, goes on under the new path."""
         prefix = old + b"/"
-        users: list[FileStream | QueuedUpload | Written] = [*self._streams, *self._uploading.uploads]
-        for user in [*users, *self.written.sessions]:
+        users: list[FileStream | QueuedUpload] = [*self._streams, *self._uploading.uploads]
+        for user in users:
             if user.path == old:
                 user.path = new
             elif user.path.startswith(prefix):
@@ -229,14 +226,9 @@ class Scheduler:
 
     def gone(self, path: bytes) -> None:
         """The file of this name was removed or replaced: what its readers still want cannot be had."""
-        self.written.gone(path)
         for stream in list(self._streams):
             if stream.path == path:
                 stream.orphan()
-
-    def seconds_since(self, when: float) -> float:
-        """Return how long ago a time of the caches' clock is."""
-        return self._clock() - when
 
     def require_link(self) -> None:
         """Raise VehicleLost while the vehicle is silent (promise 4: fail at once)."""
@@ -255,33 +247,33 @@ class Scheduler:
 
     def _on_doubt(self, reason: str) -> None:
         """What was read lately is provisional, also of files closed since."""
-        self._suspicion.tell(self._streams, self._reading.active, reason)
+        self._forget_closed()
+        for stream in [*self._streams, *self._closed_streams]:
+            if stream is self._reading.active or self._is_recent(stream):
+                stream.on_suspect(reason)
 
-    def _on_unknown(self, reply: Payload) -> None:
-        """An answer came that nobody waits for."""
-        if self.stats.strays > self._strays_seen:
-            self._strays_seen = self.stats.strays
-            # A chunk that comes twice is no other file's: what took the session is told by `_strays`.
-            self.doubt.raise_it("an answer came that no request of ours explains", reads=False)
-        self._strays.on_unknown(reply)
+    def _on_stray(self, reply: Payload, late: float) -> None:
+        """An answer came that no request of ours explains. An older open that was carried out once more may
+        have put its file in the place of ours (MAVSDK); all else is no other file's."""
+        opens = reply.opcode == Opcode.ACK and reply.req_opcode in _OPENING
+        other = opens and self.session is not None and self.session.seq != reply.seq
+        self.doubt.note_late(late)
+        self.doubt.raise_it("an answer came that no request of ours explains", reads=other)
+        if other:
+            self._end_session()
 
-    def _on_session_taken(self, reason: str) -> None:
-        """What is open over there is another file than we think."""
-        self.doubt.raise_it(reason)
+    def _end_session(self) -> None:
+        """What is open over there may be another file than we think, or nothing."""
         self._reading.cut_off()
         self._uploading.writer.cut_off()
-        self._holder.abandon()
-        self._holder.wake()
-
-    def _others_about(self) -> bool:
-        return self._vehicle.foreign_client(self._clock())
+        self.server.abandon()
 
     def on_reboot(self) -> None:
         """The vehicle restarted, perhaps as another one: nothing is open, nothing is known of it."""
         self.doubt.raise_it("the vehicle restarted")
         self.write_traits = WriteTraits()
-        self._holder.forget()
-        self._reading.cut_off()
+        self._end_session()
+        self.server.forget_server()
         self._uploading.on_reboot()
 
     def armed_changed(self, armed: bool) -> None:
@@ -290,7 +282,7 @@ class Scheduler:
 
     def on_link_back(self) -> None:
         """Heartbeats are heard again."""
-        self._holder.wake()
+        self.server.wake()
 
     # --- the one task
 
@@ -298,13 +290,13 @@ class Scheduler:
         """Run until cancelled."""
         while True:
             await trio.lowlevel.checkpoint()
-            await self._holder.honour_claims()
-            user = self._next()
+            await self.server.honour_claims()
+            user, began = self._next(), self._clock()
             try:
                 if user is None:
                     await self._idle()
                     continue
-                if isinstance(user, SessionJob):
+                if isinstance(user, _Job):
                     await self._serve_job(user)
                 elif isinstance(user, QueuedUpload):
                     if await self._uploading.serve(user):
@@ -314,25 +306,40 @@ class Scheduler:
                     self._take_ticket(user)
             except MavftpfsError:
                 # Closing the previous file failed; whoever wants something is asked again by _next.
-                self._holder.abandon()
+                self.server.abandon()
             self._used_at = self._clock()
+            if self._driver.last_reply_at >= began:
+                self._tell_queue(user)
+
+    def _tell_queue(self, served: _User | None) -> None:
+        """Somebody had a turn in which the vehicle answered: who waits for the next ones is not timed out."""
+        for stream in self._streams:
+            if stream is not served and stream.has_demand:
+                stream.on_queued()
 
     async def close(self) -> None:
         """Terminate the session, best effort; the caller bounds the wait and cancels `serve` first."""
-        await self._holder.close_quietly()
-        await self.opener.leave()
+        await self.server.close_quietly()
+        await self.server.close_unsure()
 
     def _on_want(self, stream: FileStream) -> None:
         if stream.closed:
             self._on_closed(stream)
         elif stream.ticket is None:
             self._take_ticket(stream)
-        self._holder.wake()
+        self.server.wake()
 
     def _on_closed(self, stream: FileStream) -> None:
         if stream in self._streams:
             self._streams.remove(stream)
-            self._suspicion.on_closed(stream)
+            self._closed_streams.append(stream)
+            self._forget_closed()
+
+    def _forget_closed(self) -> None:
+        self._closed_streams = [stream for stream in self._closed_streams if self._is_recent(stream)]
+
+    def _is_recent(self, stream: FileStream) -> bool:
+        return stream.last_data_at is not None and stream.last_data_at > self._clock() - RECENT
 
     def _take_ticket(self, stream: FileStream) -> None:
         if stream.has_demand:
@@ -365,7 +372,7 @@ class Scheduler:
         return readahead
 
     def _claimed(self, path: bytes) -> bool:
-        return self._holder.claimed(path)
+        return self.server.claimed(path)
 
     def _is_open(self, stream: FileStream) -> bool:
         session = self.session
@@ -403,24 +410,24 @@ class Scheduler:
         if self.session is not None:
             # Counted from the last use, not from the last news: there may always be news.
             left = max(0.0, self._used_at + IDLE_CLOSE - now)
-            if not await self._holder.sleep(min(left, until_upload)) and self._next() is None:
-                await self._holder.close()
-        elif self.opener.doubtful_paths and not self._vehicle.lost(now):
+            if not await self.server.sleep(min(left, until_upload)) and self._next() is None:
+                await self.server.close()
+        elif self.server.state is State.UNSURE and not self._vehicle.lost(now):
             # An open or a Terminate that was never answered: leave no orphan over there.
-            if not await self._holder.sleep(min(_DOUBT_RETRY, until_upload)):
-                await self._holder.close_doubtful()
+            if not await self.server.sleep(min(_UNSURE_RETRY, until_upload)):
+                await self.server.close_unsure()
         else:
-            await self._holder.sleep(until_upload)
+            await self.server.sleep(until_upload)
 
-    async def _serve_job(self, job: SessionJob) -> None:
+    async def _serve_job(self, job: _Job) -> None:
         self._jobs.remove(job)
         try:
             self.require_link()  # it may have died while others had the session
-            job.session = await self._holder.open(job.path, job.opcode)
+            job.session = await self.server.open(job.path, job.opcode)
             await job.action(job.session)
-            await self._holder.close()
+            await self.server.close()
         except MavftpfsError as error:
             job.error = error
-            await self._holder.close_quietly()
+            await self.server.close_quietly()
         finally:
             job.finished.set()

@@ -2,24 +2,25 @@
 
 from __future__ import annotations
 
+import errno
 from collections.abc import Callable
-from dataclasses import replace
 from functools import partial
 
 import trio
 
-from mavftpfs.cache.remote import ReadSink
+from mavftpfs.cache.remote import FREE_FOR, ReadSink, UploadSource
 from mavftpfs.protocol.operations import ListDirectory, Simple
 from mavftpfs.protocol.payload import NakCode, Opcode
-from mavftpfs.session.foresight import Foresight
+from mavftpfs.session.changes import COPY_RATE, Changes
+from mavftpfs.session.probing import probe_writing
+from mavftpfs.session.reader import FileStream
 from mavftpfs.session.scheduler import Scheduler
-from mavftpfs.session.sideeffects import DOT
-from mavftpfs.session.stale import StaleSessions
-from mavftpfs.session.stream import FileStream
+from mavftpfs.session.upload import QueuedUpload
 from mavftpfs.session.vehicle import Vehicle
-from mavftpfs.session.writestore import COPY_RATE, WriteStore
-from mavftpfs.shared.errors import Armed, FtpNak, RemoteProtocolError, RequestTimeout
-from mavftpfs.shared.model import ROOT, DirEntry, Listing, wire_path
+from mavftpfs.shared.errnos import errno_for
+from mavftpfs.shared.errors import AlreadyExists, Armed, FtpNak, RemoteProtocolError, RequestTimeout
+from mavftpfs.shared.model import DirEntry, Listing, wire_path
+from mavftpfs.shared.traits import WriteTraits
 
 TIME_PROBE_LIMIT = 2.5
 """Seconds of silence after which ListDirectory is tried in place of ListDirectoryWithTime."""
@@ -28,9 +29,6 @@ TIME_SILENCES = 2
 """How often that must happen, with ListDirectory answering, before opcode 16 counts as unknown: loss may
 look the same once."""
 
-SWEEPS = 3
-"""How often a directory is swept at most because names were taken away from it meanwhile."""
-
 CRC_PATIENCE = 120.0
 """Seconds a vehicle may need for a checksum (design promise 2)."""
 
@@ -38,8 +36,8 @@ CRC_TIME = 5.0
 """Seconds before a checksum is asked for again where the file's size is not known."""
 
 
-class Store(WriteStore):
-    """Reads, lists and checks remote files; WriteStore changes them."""
+class Store:
+    """Reads, lists, checks and changes remote files."""
 
     def __init__(
         self,
@@ -49,14 +47,19 @@ class Store(WriteStore):
         clock: Callable[[], float],
         op_deadline: float = 30.0,
     ) -> None:
-        self._stale = StaleSessions(scheduler, clock, op_deadline)
-        self._foresight = Foresight()
-        super().__init__(scheduler, self._list_steady, self._stale, self._foresight)
+        self._scheduler = scheduler
         self._op_deadline = op_deadline
         self._vehicle = vehicle
         self._clock = clock
         self._lists_times: bool | None = None
         self._time_silences = 0
+        self._changes = Changes(scheduler, self.list_directory, clock)
+        self.remove = self._changes.remove
+        self.make_directory = self._changes.make_directory
+        self.remove_directory = self._changes.remove_directory
+        self.rename = self._changes.rename
+        self.truncate = self._changes.truncate
+        """See cache.remote.WriteStore."""
 
     @property
     def lists_times(self) -> bool | None:
@@ -66,37 +69,20 @@ class Store(WriteStore):
     @property
     def kept_out(self) -> bool:
         """Whether the last listing was refused because of a session that is not ours."""
-        return self._stale.in_the_way
+        return self._scheduler.server.kept_out
 
     def forget_traits(self) -> None:
         """The vehicle rebooted, perhaps with other firmware."""
         self._lists_times = None
         self._time_silences = 0
-        self._foresight.forget()
 
     async def list_directory(self, path: bytes) -> Listing:
         """Sweep a directory (see RemoteStore)."""
         wire = wire_path(path)
         started = self._clock()
-        operation = await self._stale.outlast(partial(self._sweep_as_known, wire))
-        self._foresight.learn(wire, operation.strings)
+        operation = await self._scheduler.server.get_through(partial(self._sweep_as_known, wire))
         entries: tuple[DirEntry, ...] = tuple(operation.entries)
         return Listing(entries, self._clock() - started, operation.complete, operation.hidden)
-
-    async def _list_steady(self, path: bytes) -> Listing:
-        """As list_directory, again if we took names away meanwhile (the caches see to that themselves).
-
-        If they never stood still: what any of the sweeps saw, for each missed others.
-        """
-        wire = wire_path(ROOT if path == DOT else path)
-        seen: dict[bytes, DirEntry] = {}
-        for _ in range(SWEEPS):
-            before = self._foresight.moves(wire)
-            listing = await self.list_directory(path)
-            seen |= {entry.name: entry for entry in listing.entries}
-            if before is not None and before == self._foresight.moves(wire):
-                return listing
-        return replace(listing, entries=tuple(seen.values()))
 
     async def open_reader(
         self, path: bytes, sink: ReadSink, *, expected_size: int | None = None
@@ -131,7 +117,7 @@ class Store(WriteStore):
             await self._scheduler.metadata(operation, disturbs=False)
             return operation.reply.data
 
-        data = await self._stale.outlast(ask)
+        data = await self._scheduler.server.get_through(ask)
         if len(data) < 4:
             raise RemoteProtocolError("the vehicle's checksum reply holds no checksum")
         return int.from_bytes(data[:4], "little")
@@ -147,18 +133,17 @@ class Store(WriteStore):
         return await self._sweep_asking_times(wire)
 
     async def _sweep(self, wire: bytes, *, patience: float | None = None) -> ListDirectory:
-        operation = ListDirectory(wire, foreseen=self._foresight.strings(wire))
+        operation = ListDirectory(wire)
         operation.patience = patience
         await self._scheduler.metadata(operation)
         return operation
 
     async def _sweep_asking_times(self, wire: bytes) -> ListDirectory:
-        """Try opcode 16; a refusal or a silence counts only if opcode 3 then answers."""
+        """Try opcode 16; a refusal or a silence counts only if opcode 3 then answers (design section 4)."""
         began = self._clock()
         refused = False
         limit = float("inf") if self._lists_times else TIME_PROBE_LIMIT
-        foreseen = self._foresight.strings(wire) if self._lists_times else 0
-        asking = ListDirectory(wire, with_time=True, foreseen=foreseen)
+        asking = ListDirectory(wire, with_time=True)
         try:
             with trio.move_on_after(limit) as scope:
                 asking.on_page = partial(self._on_times, scope)
@@ -182,3 +167,68 @@ class Store(WriteStore):
         if refused or self._time_silences >= TIME_SILENCES:
             self._lists_times = False
         return operation
+
+    # --- changing files
+
+    @property
+    def traits(self) -> WriteTraits:
+        """See cache.remote.WriteStore."""
+        return self._scheduler.write_traits
+
+    def in_doubt(self) -> bool:
+        """See cache.remote.WriteStore."""
+        return self._scheduler.doubt.active
+
+    def doubted_since(self, at: float) -> bool:
+        """See cache.remote.WriteStore."""
+        return self._scheduler.doubt.arose_since(at)
+
+    async def open_upload(
+        self,
+        path: bytes,
+        source: UploadSource,
+        *,
+        create: bool = True,
+        least: int = 0,
+        free_at: float | None = None,
+    ) -> QueuedUpload:
+        """Queue an upload; nothing is sent before the source has something or finish is called."""
+        wire_path(path)
+        self._scheduler.check_may_write()
+        await self._changes.rest(path)
+        upload = self._scheduler.open_upload(path, source, create=create)
+        upload.least, upload.free_at = least, free_at
+        return upload
+
+    async def create_empty(self, path: bytes, *, free_at: float | None = None) -> None:
+        """See cache.remote.WriteStore."""
+        if free_at is not None and self._clock() - free_at > FREE_FOR:
+            await self._require_free(path)
+        await self._changes.create_empty(path)
+
+    async def stat_size(self, path: bytes) -> int:
+        """See cache.remote.WriteStore."""
+        wire_path(path)
+        session = await self._scheduler.use_session(path, Opcode.OPEN_FILE_RO)
+        if session.size is None:
+            raise RemoteProtocolError("the vehicle's open reply holds no size")
+        return session.size
+
+    async def probe_open_for_write(self, first: bytes, second: bytes) -> None:
+        """Deprecated."""
+        self._scheduler.check_may_write()
+        await probe_writing(self._scheduler, self._changes, first, second)
+
+    def endangered(self, path: bytes) -> list[tuple[int, int]]:
+        """Deprecated."""
+        return []
+
+    async def _require_free(self, path: bytes) -> None:
+        """Deprecated."""
+        try:
+            await self.stat_size(path)
+        except FtpNak as nak:
+            if errno_for(nak) != errno.ENOENT:
+                raise
+        else:
+            raise AlreadyExists(f"{path!r} was made by somebody else in the meantime")

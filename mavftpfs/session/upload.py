@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Protocol
 
 import trio
 
 from mavftpfs.cache.remote import Overwrite, UploadSource
-from mavftpfs.session.copies import Span
 from mavftpfs.session.policy import Service
 from mavftpfs.shared.errors import LocalProtocolError, MavftpfsError
 
 LONGEST_BACKOFF = 30.0
-_LONGEST_HOLD = 300.0
-_HOLD_FACTOR, _MOST_HELD = 10.0, 3600.0
+"""Most seconds between two attempts after a failure of the link."""
+
+LEAST_PAUSE, MOST_PAUSE = 60.0, 3600.0
+PAUSE_FACTOR = 10.0
+"""Seconds before a file is sent from its beginning again because more of it came, on servers that empty it.
+So many times as long as sending it took: then this takes a small part of the time."""
 
 
 class Feed:
@@ -25,7 +29,7 @@ class Feed:
     Attributes:
         proven: a Terminate was ACKed, so that the remote file holds at least what was ACKed before it.
         unproven: bytes ACKed since then. reached: end of the highest ACKed byte of this file; once the
-            session was lost, of the highest proven one. span: what was handed on.
+            session was lost, of the highest proven one.
     """
 
     def __init__(self, source: UploadSource, chunk: int) -> None:
@@ -33,13 +37,9 @@ class Feed:
         self.unproven = 0
         self.reached = 0
         self._proven_to = 0
-        self.span = Span()
         self._source = source
         self._chunk = chunk
         self._held: tuple[int, bytes] | None = None
-        self._sample: tuple[int, bytes] | None = None
-        self._proof: tuple[int, bytes] | None = None
-        self._handed_to = 0
         self._furthest = 0
         self._furthest_before = 0
 
@@ -63,14 +63,6 @@ class Feed:
                 found = self._source.next_chunk(limit)
             except MavftpfsError:
                 return None
-        if found is not None:
-            start, stop = found[0], found[0] + len(found[1])
-            self.span.add(start, stop)
-            if start >= self._handed_to:
-                self._sample = start, found[1][: self._chunk]
-            else:
-                self._doubt_samples(start, stop)
-            self._handed_to = max(self._handed_to, stop)
         return found
 
     def on_acked(self, offset: int, count: int) -> None:
@@ -85,7 +77,6 @@ class Feed:
 
     def on_unsent(self, offset: int, count: int) -> None:
         """See protocol.writing.ChunkSource."""
-        self._doubt_samples(offset, offset + count)
         self._source.on_unsent(offset, count)
 
     def put_back(self) -> None:
@@ -99,45 +90,22 @@ class Feed:
         self.proven = True
         self.unproven = 0
         self._proven_to = self.reached
-        self._proof = self._sample or self._proof
         self._source.on_checkpoint()
 
     def roll_back(self, *, everything: bool) -> None:
         """What was ACKed since the last checkpoint, or everything, has to be sent again."""
         self.put_back()
-        self._sample = None
         if everything:
-            self.proven, self._proof = False, None
+            self.proven = False
             self._proven_to = 0
         self.reached = self._proven_to
         self.unproven = 0
         self._source.on_rollback(everything)
 
-    @property
-    def proof(self) -> tuple[int, bytes] | None:
-        """Some bytes that were proven to be in the file and sent but once, with their offset; None if there
-        are none."""
-        return self._proof
-
-    def forget_proof(self) -> None:
-        """What was proven may not be there any more, though nobody else changed it."""
-        self._sample = self._proof = None
-
-    def _doubt_samples(self, start: int, stop: int) -> None:
-        """These bytes go out once more, perhaps others."""
-        if self._sample is not None and _overlaps(self._sample, start, stop):
-            self._sample = None
-        if self._proof is not None and _overlaps(self._proof, start, stop):
-            self._proof = None
-
     def got_further(self) -> bool:
         """Whether more of the file was reached than when this was asked before."""
         before, self._furthest_before = self._furthest_before, self._furthest
         return self._furthest > before
-
-
-def _overlaps(chunk: tuple[int, bytes], start: int, stop: int) -> bool:
-    return chunk[0] < stop and start < chunk[0] + len(chunk[1])
 
 
 class UploadHost(Protocol):
@@ -151,16 +119,8 @@ class UploadHost(Protocol):
         """Return the time."""
         ...
 
-    def repeats(self) -> bool:
-        """Return whether this link was seen to lose, double or hold back requests or replies."""
-        ...
-
-    async def outlast_copies(self, created_at: float | None, *, repeated: bool) -> None:
-        """Wait until no second CreateFile comes late and empties what was created then; repeated: we asked
-        more than once."""
-
-    def heard_stranger(self, since: float) -> bool:
-        """Return whether another FTP client was heard since then, or shortly before."""
+    def doubted_since(self, at: float) -> bool:
+        """Return whether there was a doubt since then."""
         ...
 
     def on_news(self, upload: QueuedUpload) -> None:
@@ -179,15 +139,12 @@ class QueuedUpload:
         error: why the last attempt failed, None while it goes well. Failures of the link are tried again in
             the background; refusals only when finish is called.
         running: the scheduler's task is at it. clean: everything given so far is ACKed and terminated.
-        retry_at: not to be touched before. least: bytes the file has to have when it is opened to be written
-            on. opened: it was opened before. free_at: see WriteStore. begun: see Upload.
-        asked_at: since when who waits for its end sees nothing happen. filled_in: seconds it took to send
-            all there was, last time. tried: it was reopened to see what OpenFileWO does.
+        retry_at: not to be touched before. begun, resent: see cache.remote.Upload.
+        asked_at: when who waits for its end asked, or it had its last turn. filled_in: seconds that it took
+            to send all there was, last time. tried: it was reopened to see what OpenFileWO does.
         waits_since: when it had something to send and no turn, perhaps with the wait after a failure.
-        left_at: when its file was closed last, long ago where nobody knows.
-        created_twice: its CreateFile may have been sent more than once.
-        anew: nothing that was proven counts any more. usurped: the server closed the session by itself,
-            or may have. refused_behind: what was sent right before the Terminate was refused the last time.
+        restarted: the vehicle did; what was proven does not count. refused_behind: what was sent right before
+            the Terminate was refused the last time.
     """
 
     def __init__(
@@ -196,15 +153,14 @@ class QueuedUpload:
         self.path = path
         self.feed = feed
         self.create = create
-        self.overwrites: list[Overwrite] = []
-        self.again: list[tuple[int, int]] = []
+        self.overwrites: Sequence[Overwrite] = ()
+        self.again: Sequence[tuple[int, int]] = ()
+        self.repeats = False
         self.least = 0
-        self.opened = False
         self.free_at: float | None = None
-        self.begun = False
+        self.begun = self.resent = False
         self.ticket = ticket
         self.asked_at = self.waits_since = self._since = asked_at
-        self.usurped = False
         self.use = Service()
         self.error: MavftpfsError | None = None
         self.running = False
@@ -212,11 +168,8 @@ class QueuedUpload:
         self.aborted = False
         self.refused = False
         self.failures = 0
-        self.restarts = 0
         self.filled_in = 0.0
-        self.created_at: float | None = None
-        self.left_at = float("-inf")
-        self.tried = self.anew = self.refused_behind = self.created_twice = False
+        self.tried = self.restarted = self.refused_behind = False
         self.refused_at: int | None = None
         self.retry_at = 0.0
         self._woken = True
@@ -230,19 +183,9 @@ class QueuedUpload:
     # --- the owner's side
 
     @property
-    def resent(self) -> bool:
-        """See cache.remote.Upload."""
-        return self.created_twice
-
-    @property
-    def repeats(self) -> bool:
-        """See cache.remote.Upload."""
-        return self._host.repeats()
-
-    @property
     def shared(self) -> bool:
-        """See cache.remote.Upload."""
-        return self.usurped or self._host.heard_stranger(self._since)
+        """Deprecated."""
+        return self._host.doubted_since(self._since)
 
     def wake(self) -> None:
         """The source has more."""
@@ -257,7 +200,6 @@ class QueuedUpload:
             raise LocalProtocolError("the upload was aborted")
         if not self.clean or self.feed.has_more():
             await self._finish()
-        await self.outlast_copies()
 
     async def _finish(self) -> None:
         self._host.check_may_write()
@@ -287,11 +229,6 @@ class QueuedUpload:
         finally:
             self._host.forget(self)
         self.feed.put_back()
-        await self.outlast_copies()  # or what is removed next comes back empty
-
-    async def outlast_copies(self) -> None:
-        """Wait until no copy of its CreateFile comes late any more."""
-        await self._host.outlast_copies(self.created_at, repeated=self.created_twice)
 
     def _begin_again(self) -> None:
         self.clean = False
@@ -359,12 +296,9 @@ class QueuedUpload:
         self.failures = 0
         self.tell()
 
-    def hold_restart(self, now: float) -> None:
-        """The next byte costs the whole file again, so let some gather: ever more, since a log may grow for
-        days, and at least so long that sending it all takes a small part of the time."""
-        self.restarts += 1
-        pause = min(_LONGEST_HOLD, 2.0 ** min(self.restarts, 10))
-        self.retry_at = now + max(pause, min(_MOST_HELD, _HOLD_FACTOR * self.filled_in))
+    def pause_restart(self, now: float) -> None:
+        """The next byte costs the whole file again, so let some gather first."""
+        self.retry_at = now + min(MOST_PAUSE, max(LEAST_PAUSE, PAUSE_FACTOR * self.filled_in))
 
     def fail(self, error: MavftpfsError, now: float, *, refused: bool = False) -> None:
         """Tell whoever waits; refused: asking again by ourselves is of no use."""

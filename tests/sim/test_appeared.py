@@ -7,7 +7,6 @@ import trio
 from trio.testing import MockClock
 
 from mavftpfs.cache.remote import FREE_FOR
-from mavftpfs.protocol.operations import Simple
 from mavftpfs.protocol.payload import Opcode
 from mavftpfs.shared.errors import AlreadyExists, FtpNak, MavftpfsError
 from mavftpfs.sim.linkmodel import LinkSettings
@@ -107,7 +106,7 @@ async def test_a_sticky_file_exists_does_not_look_like_a_file(profile: str, auto
         for name in ("new", "empty"):
             directory = path(profile, "")[:-1]
             with pytest.raises(FtpNak):
-                await connection.scheduler.metadata(Simple(Opcode.CREATE_DIRECTORY, directory))
+                await connection.store.make_directory(directory)
             target = path(profile, name)
             if name == "empty":
                 await connection.store.create_empty(target, free_at=LONG_AGO)

@@ -18,7 +18,6 @@ from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.tree import Tree
 from mavftpfs.cache.verify import SMALL_LISTING
 from mavftpfs.protocol.payload import Opcode
-from mavftpfs.session.echoes import QUIET
 from mavftpfs.shared.errors import CrossDevice
 from mavftpfs.sim.linkmodel import LinkSettings
 from tests.support.deliveries import (
@@ -43,7 +42,6 @@ from tests.support.deliveries import (
     replace,
 )
 from tests.support.faults import Faults
-from tests.support.latecomers import Latecomer
 from tests.support.mounting import mounted
 from tests.support.trees import content
 from tests.support.worlds import ROOTS, World
@@ -234,32 +232,3 @@ async def test_a_file_gets_another_name_while_it_is_written(profile: str, autoju
             await tree.rename(path, other)
             assert len(world.tree.data(other)) >= 2 * len(piece)
     assert world.tree.data(other) == 8 * piece
-
-
-@pytest.mark.parametrize("take", TAKES)
-@pytest.mark.parametrize("profile", PROFILES)
-async def test_what_made_the_file_is_dead_before_it_goes(
-    profile: str, take: str, autojump: MockClock
-) -> None:
-    """A CreateFile that came once more right after the removal would bring an empty file back."""
-    if (profile, take) == (NO_RENAME, "rename"):
-        return
-    world = World(profile, LinkSettings(rate=50_000.0, delay=0.02, duplicate=0.3))
-    path = ROOTS.get(profile, b"") + b"/d/file"
-    world.tree.add(path + b".other", OTHER)
-    faults = Faults(world)
-    async with mounted(world) as (_, tree), trio.open_nursery() as nursery:
-        await tree.list(path.rpartition(b"/")[0])  # answered twice
-        file = await tree.create(path, exclusive=True)
-        await file.write(0, NEW)
-        making = trio.Event()
-        faults.at(Opcode.CREATE_FILE, making.set)
-        copy = Latecomer(
-            world, Opcode.CREATE_FILE, after=Opcode.REMOVE_FILE if take == "unlink" else Opcode.RENAME
-        )
-        nursery.start_soon(file.fsync)
-        await making.wait()
-        await TAKES[take][0](tree, path)
-        assert copy.late is not None
-        assert copy.late >= QUIET[0]
-        await file.release()

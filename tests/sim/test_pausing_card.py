@@ -1,4 +1,4 @@
-"""A card that pauses makes us ask twice; that is no reason to fear the path (unit/test_repeats)."""
+"""A card that pauses makes us ask twice; that is no reason to fear the path (unit/test_duplicates)."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ import pytest
 import trio
 from trio.testing import MockClock
 
+from mavftpfs.cache.tree import Tree
 from mavftpfs.sim.linkmodel import LinkSettings
-from tests.sim.test_late_writes import make
 from tests.support.mounting import mounted
 from tests.support.trees import content
 from tests.support.worlds import World
@@ -15,6 +15,16 @@ from tests.support.worlds import World
 FOLDER = b"/fs/microsd/"
 LINKS = {"usb": LinkSettings(rate=1e6, delay=0.001, queue=100_000), "far": LinkSettings(rate=1e5, delay=0.03)}
 FILES = 20
+
+
+async def make(tree: Tree, name: bytes, data: bytes) -> None:
+    """Make a file, and close it."""
+    file = await tree.create(name, exclusive=True)
+    try:
+        await file.write(0, data)
+        await file.flush()
+    finally:
+        file.close()
 
 
 @pytest.mark.parametrize("link", LINKS)

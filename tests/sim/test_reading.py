@@ -12,10 +12,11 @@ from mavftpfs.cache.options import CacheOptions
 from mavftpfs.cache.tree import Tree
 from mavftpfs.link.framing import Framer
 from mavftpfs.link.messages import Address, FtpFrame
-from mavftpfs.protocol.payload import Opcode, Payload, request
+from mavftpfs.protocol.payload import NakCode, Opcode, Payload, request
 from mavftpfs.session.connection import Connection, ConnectOptions
 from mavftpfs.shared.errors import (
     DataUnproven,
+    FtpNak,
     MavftpfsError,
     RemoteProtocolError,
     RequestTimeout,
@@ -194,7 +195,7 @@ async def test_what_was_read_shortly_before_is_under_suspicion_though_closed(
         await trio.sleep(11)
         connection.scheduler.doubt.raise_it("once more")
         assert len(sink.suspicions) <= 2  # it was heard twice: question and answer
-        assert not connection.scheduler._suspicion._closed
+        assert not connection.scheduler._closed_streams
 
 
 async def test_times_that_could_not_be_asked_for_are_not_refused(autojump: MockClock) -> None:
@@ -204,8 +205,7 @@ async def test_times_that_could_not_be_asked_for_are_not_refused(autojump: MockC
     async with here.connection() as connection, trio.open_nursery() as nursery:
 
         async def keep_quiet() -> None:
-            async with connection.scheduler.gate.held_shut(30.0):
-                await trio.sleep(3.5)
+            await connection.scheduler.opener._be_silent(3.5, FtpNak(3, NakCode.INVALID_SESSION))
 
         for _ in range(3):
             nursery.start_soon(keep_quiet)

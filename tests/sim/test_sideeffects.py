@@ -416,7 +416,7 @@ async def test_who_looks_misses_no_name_because_we_take_others_away(
     async with here.connection() as connection, trio.open_nursery() as nursery:
 
         async def sweep() -> None:
-            entries, _ = await connection.store._effects.entries(directory)
+            entries, _ = await connection.store._changes._entries(directory)
             shown.update(entry.name for entry in entries)
 
         await connection.store.list_directory(directory)

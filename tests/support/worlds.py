@@ -86,6 +86,7 @@ class MemorySink:
         self.data = bytearray(size)
         self.have = ExtentSet()
         self.suspicions: list[str] = []
+        self.queued = 0
         self.openings: list[float] = []
         self.errors: list[Exception] = []
         self._news = trio.Event()
@@ -103,6 +104,9 @@ class MemorySink:
 
     def on_batch(self) -> None:
         self._tell()
+
+    def on_queued(self) -> None:
+        self.queued += 1
 
     def on_suspect(self, reason: str) -> None:
         self.suspicions.append(reason)

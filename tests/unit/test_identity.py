@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from mavftpfs.link.messages import Address, AutopilotVersion
-from mavftpfs.session.identity import ABSENCE, PATIENCE, Identity, is_another
+from mavftpfs.session.vehicle import ABSENCE, PATIENCE, Identity, is_another
 
 VEHICLE = Address(1, 1)
 

@@ -45,8 +45,6 @@ PURE_MODULES = {
     "link.signing",
     "link.uri",
     "session.doubt",
-    "session.identity",
-    "session.notes",
     "session.policy",
     "session.vehicle",
     "cache.attributes",

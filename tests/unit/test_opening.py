@@ -14,9 +14,9 @@ from mavftpfs.protocol.engine import Engine
 from mavftpfs.protocol.flow import Flow
 from mavftpfs.protocol.operations import OpenFile, Operation, Simple
 from mavftpfs.protocol.payload import NakCode, Opcode
+from mavftpfs.session.doubt import Doubt
 from mavftpfs.session.driver import Driver
-from mavftpfs.session.gate import Gate
-from mavftpfs.session.opening import SILENCE_ARDUPILOT, SILENCE_PX4, SessionOpener
+from mavftpfs.session.opening import SILENCE_ARDUPILOT, SILENCE_PATIENCE, SILENCE_PX4, Opener
 from mavftpfs.session.vehicle import Vehicle
 from mavftpfs.shared.errors import FtpNak, SessionBusy
 
@@ -37,11 +37,11 @@ class Refusing:
             raise FtpNak(operation.opcode, self.code, retransmitted=self.retransmitted)
 
 
-def opener(code: int) -> tuple[SessionOpener, Refusing, Vehicle]:
+def opener(code: int) -> tuple[Opener, Refusing, Vehicle]:
     engine = Engine(random.Random(1), Flow())
     vehicle = Vehicle(0, 0, Address(254, 191))
     driver = Refusing(code)
-    made = SessionOpener(cast(Driver, driver), engine, vehicle, Gate(), trio.current_time)
+    made = Opener(cast(Driver, driver), engine, vehicle, Doubt(trio.current_time), trio.current_time)
     return made, driver, vehicle
 
 
@@ -52,30 +52,47 @@ async def test_a_taken_session_is_waited_out_in_silence_then_reset_then_given_up
     with pytest.raises(SessionBusy):
         await made.open(b"/f")
     opcodes = [opcode for _, opcode in driver.log]
-    assert opcodes == [Opcode.OPEN_FILE_RO] * 2 + [Opcode.RESET_SESSIONS, Opcode.OPEN_FILE_RO]
-    assert driver.log[1][0] - driver.log[0][0] == pytest.approx(SILENCE_PX4)
+    assert opcodes == [Opcode.OPEN_FILE_RO] * 3 + [Opcode.RESET_SESSIONS, Opcode.OPEN_FILE_RO]
+    assert driver.log[1][0] - driver.log[0][0] == pytest.approx(SILENCE_ARDUPILOT)
+    assert driver.log[2][0] - driver.log[1][0] == pytest.approx(SILENCE_PX4)
+    assert not made.unsure
 
 
 async def test_sessions_are_not_reset_while_another_client_is_heard(autojump_clock: MockClock) -> None:
     made, driver, vehicle = opener(NakCode.INVALID_SESSION)
-    vehicle.foreign_at = trio.current_time() + SILENCE_ARDUPILOT
+    vehicle.foreign_at = trio.current_time() + SILENCE_PX4
     with pytest.raises(SessionBusy):
         await made.open(b"/f")
     assert made.resets == 0
-    assert driver.log[-1][0] - driver.log[0][0] == pytest.approx(SILENCE_ARDUPILOT)
+    assert driver.log[-1][0] - driver.log[0][0] == pytest.approx(SILENCE_ARDUPILOT + SILENCE_PX4)
 
 
-async def test_a_file_that_fails_plainly_costs_one_silence_and_no_reset(autojump_clock: MockClock) -> None:
+async def test_a_file_that_fails_plainly_costs_no_silence(autojump_clock: MockClock) -> None:
     made, driver, _ = opener(NakCode.FAIL)
-    for _ in range(3):
-        with pytest.raises(FtpNak):
-            await made.open(b"/f")
-    assert made.quiet_periods == 1
-    assert made.resets == 0
-    assert len([1 for _, opcode in driver.log if opcode is Opcode.OPEN_FILE_RO]) == 4
     with pytest.raises(FtpNak):
-        await made.open(b"/another")
-    assert made.quiet_periods == 2
+        await made.open(b"/f")
+    assert [opcode for _, opcode in driver.log] == [Opcode.OPEN_FILE_RO]
+    assert not made.unsure
+
+
+async def test_who_stays_for_long_does_not_keep_the_others_out(autojump_clock: MockClock) -> None:
+    made, _, _ = opener(0)
+    entered: list[float] = []
+
+    async def pass_through(stay: float) -> None:
+        async with made.passing():
+            entered.append(trio.current_time() - start)
+            await trio.sleep(stay)
+
+    async with trio.open_nursery() as nursery:
+        start = trio.current_time()
+        nursery.start_soon(pass_through, 100)
+        await trio.sleep(1)
+        nursery.start_soon(made._be_silent, 3.5, FtpNak(4, NakCode.INVALID_SESSION))
+        await trio.sleep(1)
+        nursery.start_soon(pass_through, 0)
+    assert entered == [0, 1 + SILENCE_PATIENCE]
+    assert made.quiet_periods == 0
 
 
 async def test_an_open_that_may_have_worked_the_first_time_is_terminated_before_anything_else(

@@ -1,22 +1,27 @@
-"""All uploads: which are due, how they open and close, and what becomes of their failures. Layer: session."""
+"""All uploads: which are due, how their files open and close, and what becomes of failures. Layer: session.
+
+A file is made by CreateFile. Where its upload was interrupted it goes on by OpenFileWO, if the server was
+seen to keep what a file has; else the file is sent anew. What was ACKed before an ACKed Terminate is written.
+"""
 
 from __future__ import annotations
 
-import trio
+import errno
+from collections.abc import Callable
 
 from mavftpfs.cache.remote import FREE_FOR, UploadSource
+from mavftpfs.protocol.chunking import ChunkSize
+from mavftpfs.protocol.engine import Engine
 from mavftpfs.protocol.payload import Opcode
-from mavftpfs.session.closing import close_refused, close_written
-from mavftpfs.session.copies import Span, WriteLog
-from mavftpfs.session.echoes import feared_for
-from mavftpfs.session.kit import Kit, Queue
-from mavftpfs.session.occupants import require_free
+from mavftpfs.session.doubt import Doubt
+from mavftpfs.session.driver import Driver
 from mavftpfs.session.opening import TERMINATE_LIMIT, OpenSession
-from mavftpfs.session.reopening import Reopening
-from mavftpfs.session.turns import Turns
+from mavftpfs.session.policy import Queue
+from mavftpfs.session.serversession import ServerSession
 from mavftpfs.session.upload import Feed, QueuedUpload
-from mavftpfs.session.vehicle import FOREIGN_MEMORY
-from mavftpfs.session.writing import Stop, Writer, is_disarmed
+from mavftpfs.session.vehicle import Vehicle
+from mavftpfs.session.writer import Stop, Turns, Writer, is_disarmed
+from mavftpfs.shared.errnos import errno_for
 from mavftpfs.shared.errors import (
     AlreadyExists,
     Armed,
@@ -38,37 +43,31 @@ REOPENS = 5
 
 
 class Uploading:
-    """Queues uploads and serves one at a time.
-
-    op_deadline: seconds to wait for the Terminate that ends a file.
-    when_armed_ok: write in flight, too.
-    """
+    """Queues uploads and serves one at a time. when_armed_ok: write in flight, too."""
 
     def __init__(
         self,
-        kit: Kit,
+        server: ServerSession,
+        driver: Driver,
+        engine: Engine,
         queue: Queue,
+        doubt: Doubt,
+        clock: Callable[[], float],
+        vehicle: Vehicle,
+        chunks: ChunkSize,
         *,
-        op_deadline: float = 30.0,
         when_armed_ok: bool = False,
     ) -> None:
         self.uploads: list[QueuedUpload] = []
-        self.writer = Writer(kit, queue, lambda: self.may_write)
-        self._holder = kit.holder
-        self._kit = kit
+        self.writer = Writer(server, driver, engine, vehicle, queue, clock, chunks, lambda: self.may_write)
+        self._server = server
+        self._driver = driver
         self._queue = queue
-        self._vehicle = kit.vehicle
-        self._clock = kit.clock
-        self._echoes = kit.echoes
-        self._op_deadline = op_deadline
+        self._vehicle = vehicle
+        self._doubt = doubt
+        self._clock = clock
+        self._chunk = chunks.most
         self._when_armed_ok = when_armed_ok
-        self._engine = kit.engine
-        self._reopening = Reopening(kit, queue, self.writer)
-        self.written = WriteLog(kit.engine.stats, lambda: kit.engine.traits, kit.clock, kit.write_chunks.most)
-        self._written: QueuedUpload | None = None
-        self._written_at = float("-inf")
-        self._heir: QueuedUpload | None = None  # waits for what is left of that to be dead, and is next
-        self._dead_at = float("-inf")
 
     @property
     def turns(self) -> Turns:
@@ -79,10 +78,10 @@ class Uploading:
 
     def add(self, path: bytes, source: UploadSource, *, create: bool, ticket: int) -> QueuedUpload:
         """Queue an upload."""
-        feed = Feed(source, self._kit.write_chunks.most)
+        feed = Feed(source, self._chunk)
         upload = QueuedUpload(self, path, feed, create=create, ticket=ticket, asked_at=self._clock())
         self.uploads.append(upload)
-        self._holder.wake()
+        self._server.wake()
         return upload
 
     @property
@@ -100,37 +99,14 @@ class Uploading:
         """See UploadHost."""
         return self._clock()
 
-    def repeats(self) -> bool:
+    def doubted_since(self, at: float) -> bool:
         """See UploadHost."""
-        stats = self._engine.stats
-        return stats.strays + stats.retransmissions > 0
-
-    async def outlast_copies(self, created_at: float | None, *, repeated: bool) -> None:
-        """See UploadHost. What is verified after that stays as it is."""
-        if created_at is not None:
-            rest = self._feared_until(created_at, repeated=repeated) - self._clock()
-            if rest > 0.0:
-                await trio.sleep(rest)
-
-    def _feared_until(self, sent_at: float, *, repeated: bool = False) -> float:
-        """Return until when a copy of a request may still come, if this link was seen to be of that kind, or
-        we made one ourselves.
-
-        A WriteFile names no file: a late one would be written to the next.
-        """
-        if not self._engine.stats.strays and not repeated:
-            return sent_at
-        return sent_at + feared_for(self._engine, self._clock())
-
-    def heard_stranger(self, since: float) -> bool:
-        """See UploadHost."""
-        foreign = self._vehicle.foreign_at
-        return foreign is not None and foreign > since - FOREIGN_MEMORY
+        return self._doubt.arose_since(at)
 
     def on_news(self, upload: QueuedUpload) -> None:
         """See UploadHost."""
         self.writer.on_more(upload)
-        self._holder.wake()
+        self._server.wake()
 
     def forget(self, upload: QueuedUpload) -> None:
         """See UploadHost."""
@@ -145,35 +121,28 @@ class Uploading:
                 upload.fail(Armed("the vehicle was armed"), now)
             if self.may_write:
                 upload.retry_at = now
-        self._holder.wake()
+        self._server.wake()
 
     def on_reboot(self) -> None:
-        """Perhaps it is another vehicle: what was proven of a new file is not there, whatever its size.
-
-        What OpenFileWO does was forgotten: a file may tell it once more, or others wait for its end.
-        """
+        """What was proven may not be there any more, and what OpenFileWO does was forgotten."""
         for upload in self.uploads:
-            upload.anew, upload.tried = True, False
-            upload.feed.forget_proof()
-        self.written.forget()
+            upload.restarted, upload.tried = True, False
         self.writer.on_reboot()
 
     # --- what the scheduler asks
 
     def due(self, now: float) -> list[QueuedUpload]:
         """Return the uploads for which there is something to do now."""
-        if not self.may_write or now < self._held_until:
+        if not self.may_write:
             return []
         lost = self._vehicle.lost(now)
-        due = [upload for upload in self.uploads if upload.is_due(now) and (upload.finishing or not lost)]
-        # Before the one it waited for, which may have more to send each time.
-        return [u for u in due if u is self._heir and not self._holder.claimed(u.path)] or due
+        return [upload for upload in self.uploads if upload.is_due(now) and (upload.finishing or not lost)]
 
     def next_time(self, now: float) -> float:
         """When one becomes due that is not so now, infinite if none will by itself."""
         if not self.may_write:
             return float("inf")
-        times = [max(upload.retry_at, self._held_until) for upload in self.uploads if upload.wanted]
+        times = [upload.retry_at for upload in self.uploads if upload.wanted]
         return min((time for time in times if time > now), default=float("inf"))
 
     def expire(self, oldest: float, error: MavftpfsError) -> None:
@@ -191,7 +160,7 @@ class Uploading:
         try:
             if not self._is_complete_already(upload):
                 self.check_may_write()
-                served = not self._lets_stragglers_pass(upload) and await self._serve(upload)
+                served = await self._serve(upload)
         except SessionLost as lost:
             self._on_lost(upload, lost)
         except MavftpfsError as error:
@@ -210,51 +179,15 @@ class Uploading:
         return served
 
     async def _serve(self, upload: QueuedUpload) -> bool:
-        """Open, write and close; return False if it was somebody else's turn before it could write.
-
-        Opening takes up to four round trips, and who came meanwhile would wait for all of them.
-        """
-        if not self.writer.starves(upload) and await self._holder.made_room(upload.path):
+        """Open, write and close; return False if another file was closed for it and it is not yet open."""
+        if not self.writer.starves(upload) and await self._server.made_room(upload.path):
             return False
         session = await self._open(upload)
-        if session is not None:
-            await self._write(upload, session)
-        return session is not None
-
-    async def _write(self, upload: QueuedUpload, session: OpenSession) -> None:
         try:
-            upload.again = upload.again or self.written.lately(upload.path, upload.overwrites)
-            made = upload.create and not upload.feed.proven
-            self.written.begin(upload.path, session.seq, upload.feed.span, upload.overwrites, made=made)
             await self._let_go(upload, await self.writer.run(upload, session))
         finally:
             self.writer.end()
-            self.written.end()
-            self._written, self._written_at = upload, self._clock()
-
-    def on_probed(self, session: OpenSession, size: int) -> None:
-        """`size` bytes were written to a file that only shows what the server does."""
-        self.written.begin(session.path, session.seq, Span(0, size), None, made=True)
-        self._written, self._written_at = None, self._clock()
-
-    def _lets_stragglers_pass(self, upload: QueuedUpload) -> bool:
-        """Whether it is not its turn before what is left of the file before is dead; readers go on, but not
-        the upload of that file, or there would be more of it each time."""
-        until = self._feared_until(self._written_at)
-        if until <= self._clock():
-            self._heir = None
-            return False
-        if self._heir is None:
-            if upload is self._written:
-                return False
-            self._heir = upload
-        self._dead_at = until
         return True
-
-    @property
-    def _held_until(self) -> float:
-        """When what is left is dead that the next upload waits for."""
-        return float("-inf") if self._heir is None else self._dead_at
 
     def _is_complete_already(self, upload: QueuedUpload) -> bool:
         """Whether there is nothing to send; an empty file has to be created once."""
@@ -267,46 +200,94 @@ class Uploading:
 
     # --- opening
 
-    async def _open(self, upload: QueuedUpload) -> OpenSession | None:
-        """None: it gave way."""
+    async def _open(self, upload: QueuedUpload) -> OpenSession:
         feed = upload.feed
-        if not upload.create and not self.writer.resumable:
-            raise LocalProtocolError("how the vehicle opens a file for writing is not known (any more)")
-        if upload.anew and upload.create and (feed.proven or feed.unproven):
+        if not upload.create:
+            return await self._open_in_place(upload)
+        if upload.restarted and (feed.proven or feed.unproven):
             feed.roll_back(everything=True)
-        upload.anew = False
+        upload.restarted = False
         if feed.proven and self.writer.may_try(upload):
-            await self._reopening.find_out(upload)
-        if self.writer.resumable and (feed.proven or not upload.create):
-            return await self._reopening.reopen(upload, max(feed.reached, upload.least))
+            await self._find_out(upload)
+        if feed.proven and self.writer.resumable:
+            session = await self._reopen(upload)
+            if session is not None:
+                return session
         if feed.proven or feed.unproven:
             feed.roll_back(everything=True)
         if upload.free_at is not None and self._clock() - upload.free_at > FREE_FOR:
-            await require_free(self._holder, upload.path)
+            await self._require_free(upload.path)
         if upload.aborted:  # its owner was told that nothing was begun
             raise LocalProtocolError("the upload was given up before its file was made")
-        upload.free_at, upload.begun = None, True  # what is there from now on may be ours
-        before, upload.created_twice = upload.created_twice, True  # for all that is known, if this fails
+        upload.free_at = None
+        upload.resent |= upload.begun
+        upload.begun = True  # what is there from now on may be ours
         try:
-            session = await self._holder.open(upload.path, Opcode.CREATE_FILE)
+            session = await self._server.open(upload.path, Opcode.CREATE_FILE)
         except FtpNak as nak:
-            upload.created_twice = before or nak.retransmitted
+            upload.resent |= nak.retransmitted
             raise
-        finally:
-            upload.created_at = self._clock()
-        upload.opened, upload.created_twice = True, before or session.repeated
+        upload.resent |= session.resent
         return session
+
+    async def _find_out(self, upload: QueuedUpload) -> None:
+        """Find out on an interrupted file of ours what OpenFileWO does (docs/servers.md 8): the size tells,
+        asked afterwards, since the reply to OpenFileWO may say what it was before."""
+        traits, reached = self._queue.write_traits, upload.feed.reached
+        upload.tried = True
+        try:
+            await self._server.open(upload.path, Opcode.OPEN_FILE_WO)
+            size = (await self._server.open(upload.path)).size
+        except FtpNak:
+            return  # it is refused, or somebody removed the file: what is not seen stays unknown
+        if size == 0:
+            traits.wo_truncates = True
+        elif size is not None and size >= reached:
+            traits.wo_truncates = False
+
+    async def _reopen(self, upload: QueuedUpload) -> OpenSession | None:
+        """Open an interrupted file to go on with it; None if it does not have what was proven."""
+        try:
+            session = await self._server.open(upload.path, Opcode.OPEN_FILE_WO)
+        except FtpNak as nak:
+            if errno_for(nak) != errno.ENOENT:
+                raise
+            return None
+        if session.size is None or session.size >= upload.feed.reached:
+            return session
+        await self._server.close()
+        return None
+
+    async def _open_in_place(self, upload: QueuedUpload) -> OpenSession:
+        """Deprecated: change an existing file."""
+        session = await self._server.open(upload.path, Opcode.OPEN_FILE_WO)
+        least = max(upload.feed.reached, upload.least)
+        if session.size is None or session.size >= least:
+            return session
+        upload.feed.roll_back(everything=True)
+        await self._server.close()
+        raise FileChanged(f"{upload.path!r} has {session.size} bytes now, not {least}")
+
+    async def _require_free(self, path: bytes) -> None:
+        """Deprecated: raise AlreadyExists if CreateFile would empty something."""
+        try:
+            await self._server.open(path, Opcode.OPEN_FILE_RO)
+        except FtpNak as nak:
+            if errno_for(nak) != errno.ENOENT:
+                raise
+        else:
+            await self._server.close()
+            raise AlreadyExists(f"{path!r} was made by somebody else in the meantime")
 
     # --- letting go
 
     async def _let_go(self, upload: QueuedUpload, stop: Stop) -> None:
         feed = upload.feed
         if stop is Stop.ABORTED:
-            await self._holder.close_quietly()
+            await self._server.close_quietly()
             return
-        limit = TERMINATE_LIMIT if stop is Stop.ARMED else self._op_deadline
         try:
-            ours = await close_written(self._kit, upload, limit)
+            ours = await self._close(TERMINATE_LIMIT if stop is Stop.ARMED else None)
         except RequestTimeout as error:
             raise SessionLost(str(error)) from error
         last = self.writer.end()
@@ -314,16 +295,36 @@ class Uploading:
         if not ours or isinstance(last, SessionLost):
             raise SessionLost("the vehicle had closed the session before", by_server=True) from last
         feed.check_point()
-        upload.left_at = self._clock()
         if isinstance(last, REFUSALS) and not is_disarmed(last):
             raise last
         if stop is Stop.ARMED:
             upload.fail(Armed("the vehicle was armed"), self._clock())
         elif stop in (Stop.FINISHED, Stop.STARVED):
-            more = feed.has_more()
-            upload.complete(more=more)
+            upload.complete(more=feed.has_more())
             if not upload.finishing and not self.writer.resumable and not self.writer.may_try(upload):
-                upload.hold_restart(self._clock())
+                upload.pause_restart(self._clock())
+
+    async def _close(self, limit: float | None) -> bool:
+        """Terminate; return whether what was ACKed counts as written.
+
+        The answer may be that of a vehicle that restarted before (ArduPilot ACKs what it does not know), and
+        what it had in memory is gone then.
+        """
+        heard_at, reboots = self._driver.last_reply_at, self._vehicle.reboots
+        ours = await self._server.close(limit)
+        if self._vehicle.identity.away_since(heard_at, self._clock()):
+            self._doubt.raise_it("the vehicle was away when a file was closed, and may have restarted")
+        return ours and self._vehicle.reboots == reboots
+
+    async def _close_refused(self, upload: QueuedUpload) -> bool:
+        """Do the same, if its file is open, after a refusal that is reported: another failure is no news."""
+        session = self._server.session  # None where it failed before it got it
+        if session is None or not session.writing or session.path != upload.path:
+            return False
+        try:
+            return await self._close(TERMINATE_LIMIT)
+        except MavftpfsError:
+            return False
 
     def _roll_back(self, upload: QueuedUpload) -> None:
         keep = not upload.create or (self.writer.resumable and upload.feed.proven)
@@ -334,13 +335,12 @@ class Uploading:
 
     def _on_lost(self, upload: QueuedUpload, lost: SessionLost) -> None:
         """Begin again from what is proven, a bounded number of times."""
-        self._holder.abandon()
+        self._server.abandon()
+        if lost.by_server:
+            self._doubt.raise_it(str(lost))
         if upload.aborted:
             return
         self._roll_back(upload)
-        upload.usurped |= lost.by_server
-        if lost.by_server:
-            self._kit.doubt.raise_it(str(lost))
         now = self._clock()
         failures = 1 if upload.feed.got_further() else upload.failures + 1
         if not self.may_write:
@@ -358,9 +358,9 @@ class Uploading:
         if isinstance(error, RequestTimeout):
             self._vehicle.note_timeout()
         if not refused or isinstance(error, RequestTimeout):
-            self._holder.abandon()
+            self._server.abandon()
             self._roll_back(upload)
-        elif await close_refused(self._kit, upload):
+        elif await self._close_refused(upload):
             upload.feed.check_point()
         else:
             self._roll_back(upload)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from mavftpfs.session.policy import USE_MEMORY
-from mavftpfs.session.stream import FileStream
+from mavftpfs.session.reader import FileStream
 from tests.support.worlds import MemorySink
 
 

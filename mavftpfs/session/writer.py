@@ -1,25 +1,33 @@
-"""Drives the write transfer of one upload until there is a reason to let go of the session. Layer: session.
+"""Sends one upload's bytes until there is a reason to let go of the session. Layer: session.
 
 Where OpenFileWO was seen to keep a file's content an upload can be interrupted at any time: Terminate right
 behind the window, and later OpenFileWO and what of that was not ACKed. Where it was seen to empty files that
 would begin the file anew, so the upload keeps the session until its source has nothing more. Where neither
-was seen yet, a file that the upload itself made is interrupted when somebody waits, and reopening it tells.
+was seen yet, the upload is interrupted when somebody waits, and reopening its file tells.
+
+PX4 on NuttX checks each WriteFile against a scratch buffer that every path operation overwrites
+(docs/servers.md 8). Once that was seen, path operations and writes take turns.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
 from enum import Enum
-from math import inf
 
+import trio
+
+from mavftpfs.protocol.chunking import ChunkSize
+from mavftpfs.protocol.engine import Engine
 from mavftpfs.protocol.operations import Simple
 from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.protocol.writing import WriteTransfer
-from mavftpfs.session.kit import Kit, Queue
+from mavftpfs.session.driver import Driver
 from mavftpfs.session.opening import OpenSession
-from mavftpfs.session.policy import LIGHT_USE, is_starving, should_switch
-from mavftpfs.session.turns import Turns
+from mavftpfs.session.policy import LIGHT_USE, Queue, is_starving, should_switch
+from mavftpfs.session.serversession import ServerSession
 from mavftpfs.session.upload import QueuedUpload
+from mavftpfs.session.vehicle import Vehicle
 from mavftpfs.shared.errors import FtpNak, MavftpfsError
 from mavftpfs.shared.model import ROOT, split, wire_path
 
@@ -38,9 +46,6 @@ STALL = 2.0
 
 CHECKPOINT_EVERY = 60.0
 """Seconds after which an upload is terminated and resumed: what a lost session can cost."""
-
-DISTURBED_BEFORE = 1.0
-"""Seconds before we knew of a session in which the answer may have come to what closed it."""
 
 _TURN = 0.5
 _OFTEN = 0.25
@@ -63,6 +68,61 @@ class Stop(Enum):
 _ABRUPT = frozenset((Stop.DOUBT, Stop.ARMED, Stop.ABORTED))
 
 
+class Turns:
+    """Whose turn it is; free for all while nobody writes. on_wanted: asks the writer to make room."""
+
+    def __init__(self, on_wanted: Callable[[], None]) -> None:
+        self._on_wanted = on_wanted
+        self._writing = False
+        self._open = False
+        self._waiting = 0
+        self._inside = 0
+        self._news = trio.Event()
+
+    @property
+    def wanted(self) -> bool:
+        """Whether a path operation waits for its turn."""
+        return self._writing and self._waiting > 0
+
+    def set_writing(self, writing: bool) -> None:
+        """Begin or end to keep path operations out."""
+        self._writing = writing
+        self._tell()
+
+    @asynccontextmanager
+    async def path_operation(self) -> AsyncIterator[None]:
+        """Wait for the turn and keep it for the length of the body."""
+        self._waiting += 1
+        try:
+            while self._writing and not self._open:
+                self._on_wanted()
+                await self._news.wait()
+        finally:
+            self._waiting -= 1
+            self._tell()
+        self._inside += 1
+        try:
+            yield
+        finally:
+            self._inside -= 1
+            self._tell()
+
+    async def give(self, seconds: float) -> None:
+        """Let path operations in for at most so long, and wait until the last of them is out."""
+        self._open = True
+        self._tell()
+        with trio.move_on_after(seconds):
+            while self._waiting or self._inside:
+                await self._news.wait()
+        self._open = False
+        while self._inside:
+            await self._news.wait()
+
+    def _tell(self) -> None:
+        self._news.set()
+        self._news = trio.Event()
+
+
 class Writer:
     """Runs write transfers.
 
@@ -72,25 +132,33 @@ class Writer:
         current: the upload being run. rearms: how often PX4's scratch buffer had to be set right.
     """
 
-    def __init__(self, kit: Kit, queue: Queue, may_write: Callable[[], bool]) -> None:
-        self.turns = Turns(kit.holder.wake)
+    def __init__(
+        self,
+        server: ServerSession,
+        driver: Driver,
+        engine: Engine,
+        vehicle: Vehicle,
+        queue: Queue,
+        clock: Callable[[], float],
+        chunks: ChunkSize,
+        may_write: Callable[[], bool],
+    ) -> None:
+        self.turns = Turns(server.wake)
         self.rearms = 0
         self.current: QueuedUpload | None = None
-        self._holder = kit.holder
-        self._driver = kit.driver
-        self._engine = kit.engine
-        self._vehicle = kit.vehicle
-        self._gate = kit.gate
-        self._clock = kit.clock
+        self._server = server
+        self._driver = driver
+        self._engine = engine
+        self._vehicle = vehicle
+        self._clock = clock
         self._queue = queue
-        self._chunks = kit.write_chunks
+        self._chunks = chunks
         self._may_write = may_write
         self._disarmed_by_paths = False
         self._transfer: WriteTransfer | None = None
         self._last: WriteTransfer | None = None
         self._starved_at: float | None = None
         self._filled = False
-        self._disturbed_at = -inf
 
     # --- news
 
@@ -105,7 +173,7 @@ class Writer:
         """A batch of replies was processed."""
         transfer = self._transfer
         if transfer is not None and (transfer.idle or transfer.done):
-            self._holder.wake()
+            self._server.wake()
 
     def on_reboot(self) -> None:
         """Perhaps other firmware runs now; nothing under way gets an answer."""
@@ -117,15 +185,6 @@ class Writer:
         if self._transfer is not None:
             self._driver.cancel(self._transfer)
 
-    def on_emptied(self) -> None:
-        """The file may have been emptied after the first bytes of it were written."""
-        if self.current is not None and self.current.feed.unproven:
-            self.current.usurped = True
-
-    def on_disturbed(self) -> None:
-        """A request came again that may have closed the session."""
-        self._disturbed_at = self._clock()
-
     @property
     def resumable(self) -> bool:
         """Whether a file that was closed can be written on (WriteTraits.wo_truncates is False)."""
@@ -134,18 +193,11 @@ class Writer:
     def may_try(self, upload: QueuedUpload) -> bool:
         """Whether reopening its file is to tell what OpenFileWO does: at most its own bytes go again."""
         unknown = self._queue.write_traits.wo_truncates is None
-        return unknown and upload.create and not upload.tried and upload.feed.reached > 0
+        return unknown and not upload.tried and upload.feed.reached > 0
 
     def starves(self, upload: QueuedUpload) -> bool:
         """Whether others are not to go before it any more."""
         return is_starving(upload.waited_until(self._clock()), self._engine.rtt)
-
-    def gives_way(self, upload: QueuedUpload) -> bool:
-        """Whether it is somebody else's turn before its file is open. Once it is, a window goes out at least:
-        one small read after another must slow it down, not stop it."""
-        if self.starves(upload):
-            return False
-        return self._is_turn_over(upload, 0.0, self._queue.rival_use(upload))
 
     # --- writing
 
@@ -172,7 +224,7 @@ class Writer:
                 upload.feed,
                 self._chunks,
                 in_flight=self._most_in_flight(upload),
-                on_starved=self._holder.wake,
+                on_starved=self._server.wake,
             )
             stop = await self._drive(upload, session, transfer)
             if transfer.acked_bytes and rearms:
@@ -183,7 +235,7 @@ class Writer:
                 return stop
             assert error is not None
             if not is_disarmed(error) or rearms > 0:
-                self._note_refusal(upload, session, transfer.failed_at, error)
+                self._note_refusal(upload, transfer.failed_at, error)
                 raise error
             rearms += 1
             # From now on path operations take turns with this upload: first those that are under way end.
@@ -201,9 +253,9 @@ class Writer:
     ) -> Stop | None:
         """Run a transfer until there is a reason to let go, or it failed (None)."""
         self._transfer, self._starved_at = transfer, None
-        self._driver.start(transfer, self._holder.wake)
+        self._driver.start(transfer, self._server.wake)
         try:
-            async with self._gate.passing():
+            async with self._server.opener.passing():
                 return await self._watch(upload, session, transfer)
         finally:
             self._transfer, self._last = None, transfer
@@ -227,7 +279,7 @@ class Writer:
     ) -> Stop | None:
         stop: Stop | None = None
         while not transfer.done:
-            self._holder.require(session)
+            self._server.require(session)
             stop = stop or self._reason_to_stop(upload, session, transfer)
             if self._in_doubt(transfer):
                 stop = Stop.DOUBT
@@ -241,14 +293,14 @@ class Writer:
             elif transfer.paused:
                 self._go_on(transfer)
             self._queue.expire_waiters()
-            await self._holder.sleep(self._nap(upload, transfer))
+            await self._server.sleep(self._nap(upload, transfer))
         return None
 
     def _trails(self, upload: QueuedUpload, stop: Stop, transfer: WriteTransfer) -> bool:
         """Whether the Terminate goes out right behind the last requests: a round trip less for who waits.
         Servers carry them out in order; what gets lost is sent when the file is open again. After a refusal,
         and where others' paths cause such, the answers are waited for: that alone sets it right."""
-        if stop is not Stop.YIELD or not self.resumable or self._holder.claimed(upload.path):
+        if stop is not Stop.YIELD or not self.resumable or self._server.claimed(upload.path):
             return False
         if upload.refused_behind or self._disarmed_by_paths:
             return False
@@ -271,7 +323,7 @@ class Writer:
             return Stop.ABORTED
         if not self._may_write():
             return Stop.ARMED
-        if self._holder.claimed(upload.path):
+        if self._server.claimed(upload.path):
             return Stop.YIELD
         waiting_use = self._queue.rival_use(upload)
         if transfer.starved:
@@ -317,14 +369,10 @@ class Writer:
             return False
         return self.resumable or self._vehicle.foreign_client(now)
 
-    def _note_refusal(
-        self, upload: QueuedUpload, session: OpenSession, offset: int | None, error: MavftpfsError
-    ) -> None:
-        """A refusal that means a lost session may mean a full card, too: the same place twice is enough, but
-        for what a request of ours explains that came again."""
+    def _note_refusal(self, upload: QueuedUpload, offset: int | None, error: MavftpfsError) -> None:
+        """A refusal that means a lost session may mean a full card, too: the same place twice is enough."""
         nak = error.__cause__
-        disturbed = self._disturbed_at > session.opened_at - DISTURBED_BEFORE
-        if isinstance(nak, FtpNak) and nak.code == NakCode.FAIL and not disturbed:
+        if isinstance(nak, FtpNak) and nak.code == NakCode.FAIL:
             if offset is not None and offset == upload.refused_at:
                 raise nak
             upload.refused_at = offset

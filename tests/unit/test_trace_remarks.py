@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from mavftpfs.protocol.payload import Opcode, Payload, request
 from mavftpfs.protocol.stats import EngineStats
-from mavftpfs.session.notes import Remarks
+from mavftpfs.session.driver import Remarks
 
 
 def test_a_repeated_request_is_marked_until_it_is_answered() -> None:

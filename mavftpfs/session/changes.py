@@ -1,0 +1,341 @@
+"""Did that change happen? Requests that change the card's names, done once or found out. Layer: session.
+
+A request whose answer may have been lost can be carried out twice, and the second answer is then a refusal
+(docs/servers.md 14.4). Such a refusal, and a silence, are never interpreted: a listing tells what became of
+it. While there is doubt (session.doubt) the network may do the same to a request that we sent once. Then a
+name is not changed twice within the time by which requests were seen to be late, either: the same request,
+carried out late once more, would change what has the name by then.
+"""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import AsyncExitStack, asynccontextmanager, suppress
+from dataclasses import dataclass
+from enum import Enum
+
+import trio
+
+from mavftpfs.protocol.operations import Simple
+from mavftpfs.protocol.payload import NakCode, Opcode
+from mavftpfs.session.doubt import MOST_LATE
+from mavftpfs.session.scheduler import Scheduler
+from mavftpfs.shared.errors import FtpNak, MavftpfsError, OutcomeUnknown, PathTooLong, RequestTimeout
+from mavftpfs.shared.model import ROOT, DirEntry, EntryKind, Listing, split, wire_path
+from mavftpfs.shared.traits import WriteTraits
+
+RENAME_LIMIT = 238
+"""Bytes that both paths of a rename and the NUL between them may have (docs/servers.md 9)."""
+
+VERIFY_LIMIT = 4.0
+"""Seconds to spend on finding out what became of a request that was not answered. Whoever waits was promised
+an answer within `op_deadline`, and this comes after it."""
+
+SWEEPS = 3
+"""How often a directory is listed at most because names of it changed meanwhile."""
+
+TRUNCATE_PATIENCE = 120.0
+"""Seconds a vehicle may need to cut a file (design promise 2)."""
+
+FIRST_TRUNCATE_PATIENCE = 20.0
+"""Seconds, and what the slowest card needs, after which one that was not seen to cut files counts as not
+answering: MAVSDK never does (docs/servers.md 8), and until then nobody can read the file."""
+
+COPY_RATE = 100_000.0
+"""Bytes per second that the slowest card copies or checksums; a repetition waits for so long."""
+
+DOT = b"."
+"""Lists the root on ArduPilot's SITL, with the files that "/" does not show there (docs/servers.md 6)."""
+
+_UNKNOWN_OPCODE = frozenset((NakCode.FAIL, NakCode.UNKNOWN_COMMAND))
+_MISSING = frozenset((NakCode.FAIL, NakCode.FAIL_ERRNO, NakCode.FILE_NOT_FOUND))
+"""What servers say of a name that is not there (any more); the errno may be a stale one (docs/servers.md 12).
+"""
+
+_THERE = frozenset((NakCode.FAIL, NakCode.FAIL_ERRNO, NakCode.FILE_EXISTS))
+_SECOND = {
+    Opcode.REMOVE_FILE: _MISSING,
+    Opcode.REMOVE_DIRECTORY: _MISSING,
+    Opcode.RENAME: _MISSING,
+    Opcode.CREATE_DIRECTORY: _THERE,
+}
+"""What servers may say to a request that was done already, by opcode."""
+
+
+class Outcome(Enum):
+    """What a listing tells about a request."""
+
+    DONE = "done"
+    UNDONE = "undone"
+    CONFLICT = "conflict"
+    UNKNOWN = "unknown"
+
+
+Lister = Callable[[bytes], Awaitable[Listing]]
+Verdict = Callable[[], Awaitable[Outcome]]
+
+
+@dataclass(slots=True)
+class _Executed:
+    """How many requests that change names are under way, and how many were sent."""
+
+    under_way: int = 0
+    sent: int = 0
+
+
+class Changes:
+    """Removes, makes, renames, empties and cuts. list_directory: sweeps a directory.
+
+    All methods raise FtpNak, RequestTimeout, VehicleLost, SessionBusy, PathTooLong, Armed: it did not happen;
+    or OutcomeUnknown: nobody knows.
+    """
+
+    def __init__(self, scheduler: Scheduler, list_directory: Lister, clock: Callable[[], float]) -> None:
+        self._scheduler = scheduler
+        self._list_directory = list_directory
+        self._clock = clock
+        self._executed = _Executed()
+        self._changed_at: dict[bytes, float] = {}
+
+    @property
+    def _traits(self) -> WriteTraits:
+        return self._scheduler.write_traits
+
+    async def remove(self, path: bytes) -> None:
+        """Remove what is known to be a file."""
+        wire = wire_path(path)
+        async with self._changing(path):
+            await self._perform(lambda: Simple(Opcode.REMOVE_FILE, wire), lambda: self._is_absent(path))
+            self._scheduler.gone(path)
+
+    async def remove_directory(self, path: bytes) -> None:
+        """Remove what is known to be an empty directory."""
+        wire = wire_path(path)
+        async with self._changing(path, below=True):
+            await self._perform(lambda: Simple(Opcode.REMOVE_DIRECTORY, wire), lambda: self._is_absent(path))
+
+    async def make_directory(self, path: bytes) -> None:
+        """Make a directory."""
+        wire = wire_path(path)
+        async with self._changing(path):
+            await self._perform(
+                lambda: Simple(Opcode.CREATE_DIRECTORY, wire), lambda: self._is_new_directory(path)
+            )
+
+    async def rename(self, old: bytes, new: bytes, *, completes: bool = False) -> None:
+        """Rename; who reads the old path goes on under the new one. completes: in flight, too."""
+        data = wire_path(old) + b"\0" + wire_path(new)
+        if len(data) > RENAME_LIMIT:
+            raise PathTooLong(f"both paths of a rename have {len(data)} bytes, more than {RENAME_LIMIT}")
+        async with self._changing(old, new, below=True, in_flight=completes):
+            await self._perform(lambda: Simple(Opcode.RENAME, data), lambda: self._is_renamed(old, new))
+            self._scheduler.gone(new)
+            self._scheduler.moved(old, new)
+        self._traits.rename_works = True
+
+    async def create_empty(self, path: bytes) -> None:
+        """Make an empty file, or empty it; done twice it is the same."""
+        wire_path(path)
+        self._scheduler.check_may_write()
+        await self.rest(path)
+        try:
+            await self._scheduler.use_session(path, Opcode.CREATE_FILE)
+        finally:
+            self._note_changed(path)
+
+    async def truncate(self, path: bytes, size: int) -> None:
+        """Cut a file to `size` bytes. A file that has so many already counts as done."""
+        wire = wire_path(path)
+        if self._traits.truncate_works is None and path.startswith(b"/fs/"):
+            self._traits.truncate_works = False  # PX4 on NuttX: its copy-back can destroy the file
+        if self._traits.truncate_works is False:
+            raise FtpNak(Opcode.TRUNCATE_FILE, NakCode.UNKNOWN_COMMAND)
+        work = 2 * size / COPY_RATE
+        patience = TRUNCATE_PATIENCE
+        if self._traits.truncate_works is None:
+            patience = min(patience, FIRST_TRUNCATE_PATIENCE + work)
+
+        def make() -> Simple:
+            return Simple(Opcode.TRUNCATE_FILE, wire, offset=size, patience=patience, server_time=work)
+
+        try:
+            async with self._changing(path, limit=None):
+                await self._perform(make, lambda: self._has_size(path, size))
+        except FtpNak as nak:
+            if nak.code in _UNKNOWN_OPCODE and self._traits.truncate_works is None:
+                self._traits.truncate_works = False
+            raise
+        except OutcomeUnknown:
+            raise
+        except RequestTimeout:  # the listing after it was answered, so the silence was about the request
+            if self._traits.truncate_works is None:
+                self._traits.truncate_works = False
+            raise
+        if self._traits.truncate_works is None:
+            self._traits.truncate_works = True
+
+    async def rest(self, path: bytes) -> None:
+        """Wait while a late copy of the last change of this name may yet be carried out.
+
+        Names that differ by case alone count as one, as on many cards.
+        """
+        until = self._changed_at.get(path.lower(), float("-inf")) + self._scheduler.doubt.lateness
+        await trio.sleep(max(0.0, until - self._clock()))
+
+    # --- one change
+
+    @asynccontextmanager
+    async def _changing(
+        self, *paths: bytes, below: bool = False, in_flight: bool = False, limit: float | None = VERIFY_LIMIT
+    ) -> AsyncIterator[None]:
+        """Check that writing is allowed now, and keep our own session off the paths.
+
+        below: also off all that lies below the first. in_flight: armed or not. limit: seconds beyond the
+        deadline after which the body is given up; None: it bounds itself.
+        """
+        may = self._scheduler.require_link if in_flight else self._scheduler.check_may_write
+        may()
+        most = float("inf") if limit is None else self._scheduler.op_deadline + limit
+        with trio.move_on_after(most) as scope:
+            async with AsyncExitStack() as claims:
+                for path in paths:
+                    await claims.enter_async_context(
+                        self._scheduler.claim(path, below=below and path is paths[0])
+                    )
+                    await self.rest(path)
+                may()  # closing our session may have taken a while
+                try:
+                    yield
+                finally:
+                    for path in paths:
+                        self._note_changed(path)
+        if scope.cancelled_caught:
+            raise OutcomeUnknown("the vehicle did not get round to it in time")
+
+    def _note_changed(self, path: bytes) -> None:
+        now = self._clock()
+        self._changed_at = {name: at for name, at in self._changed_at.items() if now - at <= MOST_LATE}
+        self._changed_at[path.lower()] = now
+
+    async def _perform(self, make: Callable[[], Simple], verify: Verdict) -> None:
+        """Run a request; look what became of it if its answer may not be that to its first execution."""
+        for last in (False, True):
+            try:
+                await self._execute(make)
+            except FtpNak as nak:
+                twice = last or self._may_be_second(nak)
+                # PX4 says 8 to everything after one "file exists", until a listing comes to its end.
+                if not twice and nak.code != NakCode.FILE_EXISTS:
+                    raise
+                outcome = await self._after_refusal(nak, verify)
+                if outcome is Outcome.DONE and twice:
+                    return
+                if outcome is not Outcome.UNDONE or last:
+                    raise
+            except RequestTimeout as silence:
+                outcome = await self._after_silence(verify)
+                if outcome is Outcome.DONE:
+                    return
+                if outcome is Outcome.UNDONE:
+                    raise
+                raise OutcomeUnknown(str(silence)) from silence
+            else:
+                return
+
+    async def _execute(self, make: Callable[[], Simple]) -> None:
+        self._executed.under_way += 1
+        self._executed.sent += 1
+        try:
+            await self._scheduler.server.get_through(lambda: self._scheduler.metadata(make()), changes=True)
+        finally:
+            self._executed.under_way -= 1
+
+    def _may_be_second(self, nak: FtpNak) -> bool:
+        """Whether a refusal may answer the second execution of a request.
+
+        A rename is looked at in any case: its names were looked up just before, and one that is refused for
+        nothing would count as proof that the server renames none.
+        """
+        if nak.retransmitted:
+            return True
+        opcode = Opcode(nak.opcode)
+        looked_at = self._scheduler.doubt.active or opcode == Opcode.RENAME
+        return looked_at and nak.code in _SECOND.get(opcode, ())
+
+    async def _after_refusal(self, nak: FtpNak, verify: Verdict) -> Outcome:
+        try:
+            outcome = await verify()
+        except FtpNak:
+            raise nak from None  # there is not even a parent to list
+        except MavftpfsError as error:
+            raise OutcomeUnknown(f"{nak}; whether it was done is not known") from error
+        if outcome is Outcome.UNKNOWN:
+            raise OutcomeUnknown(f"{nak}; whether it was done is not known") from nak
+        return outcome
+
+    async def _after_silence(self, verify: Verdict) -> Outcome:
+        with trio.move_on_after(VERIFY_LIMIT):
+            try:
+                return await verify()
+            except MavftpfsError:
+                return Outcome.UNKNOWN
+        return Outcome.UNKNOWN
+
+    # --- what listings tell
+
+    async def _find(self, path: bytes) -> tuple[DirEntry | None, bool]:
+        """Return a name's entry by a fresh listing of its parent, and whether the listing is complete."""
+        parent, name = split(path)
+        entries, complete = await self._entries(parent)
+        return next((entry for entry in entries if entry.name == name), None), complete
+
+    async def _entries(self, directory: bytes) -> tuple[tuple[DirEntry, ...], bool]:
+        """Return what a fresh listing shows, and whether it is complete."""
+        entries, complete = await self._steady(directory)
+        if directory == ROOT and not any(entry.kind is EntryKind.FILE for entry in entries):
+            # ArduPilot's SITL hides the files of the root in "/" and shows them in "." (docs/servers.md 6).
+            with suppress(FtpNak):
+                entries += (await self._steady(DOT))[0]
+        return entries, complete
+
+    async def _steady(self, directory: bytes) -> tuple[tuple[DirEntry, ...], bool]:
+        """List; again if changes of ours went on meanwhile. Servers count names: those behind one that is
+        taken away move up, past the place where a sweep goes on. If they never stood still: what any saw."""
+        seen: dict[bytes, DirEntry] = {}
+        listing = None
+        for _ in range(SWEEPS):
+            before = self._executed.sent
+            listing = await self._list_directory(directory)
+            seen |= {entry.name: entry for entry in listing.entries}
+            if self._executed.sent == before and not self._executed.under_way:
+                return listing.entries, listing.complete
+        return tuple(seen.values()), listing is not None and listing.complete
+
+    async def _is_absent(self, path: bytes) -> Outcome:
+        entry, complete = await self._find(path)
+        if entry is not None:
+            return Outcome.UNDONE
+        return Outcome.DONE if complete else Outcome.UNKNOWN
+
+    async def _is_new_directory(self, path: bytes) -> Outcome:
+        """A directory that is there and empty may be the one we made; with entries it is somebody else's."""
+        entry, complete = await self._find(path)
+        if entry is None:
+            return Outcome.UNDONE if complete else Outcome.UNKNOWN
+        if entry.kind is not EntryKind.DIRECTORY:
+            return Outcome.CONFLICT
+        listing = await self._list_directory(path)
+        return Outcome.CONFLICT if listing.entries else Outcome.DONE
+
+    async def _is_renamed(self, old: bytes, new: bytes) -> Outcome:
+        old_entry, complete = await self._find(old)
+        new_entry, new_complete = await self._find(new)
+        if old_entry is not None:
+            return Outcome.CONFLICT if new_entry is not None else Outcome.UNDONE
+        if new_entry is not None and complete:
+            return Outcome.DONE
+        return Outcome.CONFLICT if complete and new_complete else Outcome.UNKNOWN
+
+    async def _has_size(self, path: bytes, size: int) -> Outcome:
+        entry, _ = await self._find(path)
+        return Outcome.DONE if entry is not None and entry.size == size else Outcome.UNDONE

@@ -1,0 +1,98 @@
+"""Whatever a server answers, the session goes through the states of its table and nothing else."""
+
+from __future__ import annotations
+
+import random
+from contextlib import suppress
+from typing import cast
+
+import pytest
+import trio
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from trio.testing import MockClock
+
+from mavftpfs.link.messages import Address
+from mavftpfs.protocol.engine import Engine
+from mavftpfs.protocol.flow import Flow
+from mavftpfs.protocol.operations import OpenFile, Operation, Terminate
+from mavftpfs.protocol.payload import NakCode, Opcode, Payload
+from mavftpfs.session.doubt import Doubt
+from mavftpfs.session.driver import Driver
+from mavftpfs.session.opening import Opener
+from mavftpfs.session.serversession import NEXT, ServerSession, State
+from mavftpfs.session.vehicle import Vehicle
+from mavftpfs.shared.errors import FtpNak, MavftpfsError, RequestTimeout
+
+ANSWERS = st.sampled_from(["ack", "ack", "ack", "silence", "forever", 1, 4, 5, 8, 10])
+ACTS = st.sampled_from(["read", "write", "close", "abandon", "restart", "close unsure", "make room", "claim"])
+
+
+class Answering:
+    """Stands in for the driver: answers as it is told, then acknowledges."""
+
+    def __init__(self, answers: list[str | int]) -> None:
+        self._answers = answers
+
+    async def run(self, operation: Operation) -> None:
+        await trio.lowlevel.checkpoint()
+        answer = self._answers.pop(0) if self._answers else "ack"
+        if answer == "silence":
+            raise RequestTimeout("no answer")
+        if answer == "forever":
+            await trio.sleep_forever()
+        opcode = Opcode.OPEN_FILE_RO
+        if isinstance(operation, OpenFile | Terminate):
+            opcode = Opcode(operation.opcode)
+        if isinstance(answer, int):
+            raise FtpNak(opcode, NakCode(answer), retransmitted=answer % 2 == 1)
+        if isinstance(operation, OpenFile):
+            operation._reply = Payload(1, 0, Opcode.ACK, 0, opcode)
+
+
+@given(st.lists(st.tuples(ACTS, st.lists(ANSWERS, max_size=6)), max_size=12))
+@settings(max_examples=200, deadline=None)
+def test_all_goes_by_the_table(acts: list[tuple[str, list[str | int]]]) -> None:
+    trio.run(_play, acts, clock=MockClock(autojump_threshold=0))
+
+
+async def _play(acts: list[tuple[str, list[str | int]]]) -> None:
+    driver = Answering([])
+    vehicle = Vehicle(0, 0, Address(254, 191))
+    engine = Engine(random.Random(1), Flow())
+    doubt = Doubt(trio.current_time)
+    opener = Opener(cast(Driver, driver), engine, vehicle, doubt, trio.current_time)
+    server = ServerSession(opener, op_deadline=10.0)
+    for number, (act, answers) in enumerate(acts):
+        driver._answers = list(answers)
+        with trio.move_on_after(60), suppress(MavftpfsError):
+            await _do(server, act, b"/f%d" % (number % 3))
+        server.check_invariants()
+
+
+async def _do(server: ServerSession, act: str, path: bytes) -> None:
+    match act:
+        case "read":
+            await server.open(path)
+        case "write":
+            await server.open(path, Opcode.CREATE_FILE)
+        case "close":
+            await server.close()
+        case "close unsure":
+            await server.close_unsure()
+        case "make room":
+            await server.made_room(path)
+        case "abandon":
+            server.abandon()
+        case "restart":
+            server.forget_server()
+        case "claim":
+            await server.honour_claims()
+
+
+def test_a_step_that_is_not_in_the_table_is_a_bug() -> None:
+    assert set(NEXT) == set(State)
+    engine, vehicle = Engine(random.Random(1), Flow()), Vehicle(0, 0, Address(1, 1))
+    opener = Opener(cast(Driver, None), engine, vehicle, Doubt(lambda: 0.0), lambda: 0.0)
+    with pytest.raises(AssertionError):
+        ServerSession(opener)._enter(State.CLOSING)
