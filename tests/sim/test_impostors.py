@@ -244,6 +244,34 @@ async def test_a_forged_reply_from_another_socket_is_not_believed(kind: str) -> 
                 assert await read_file(made, b"/f") == OURS
 
 
+async def test_another_vehicle_that_connects_first_does_not_keep_ours_out() -> None:
+    """Ours went away; another one connects and stays. tcpin has one peer at a time."""
+    port = free_udp_port()
+    ours, theirs = MemoryTree(), MemoryTree()
+    ours.add(b"/f", OURS)
+    theirs.add(b"/f", THEIRS)
+    source = parse_source(f"tcpin:{HOST}:{port}")
+    async with open_link(source) as link, connected(link, ConnectOptions()) as made:
+        identity = made.vehicle.identity
+        with LyingVehicle(ours, f"tcp:{HOST}:{port}"):
+            await made.ready(30.0)
+            assert await read_file(made, b"/f") == OURS
+            await until(lambda: made.vehicle.version is not None)
+        with LyingVehicle(theirs, f"tcp:{HOST}:{port}", seed=2) as other:
+            await until(lambda: identity.stranger)
+            with LyingVehicle(ours, f"tcp:{HOST}:{port}"):
+                await until(lambda: identity.trusted)
+                assert await read_file(made, b"/f") == OURS
+            assert other.server.requests.total() == 0
+
+
+async def until(condition: Callable[[], bool]) -> None:
+    """Wait for what comes soon on a machine that has time."""
+    with trio.fail_after(60.0):
+        while not condition():  # noqa: ASYNC110 (nobody tells)
+            await trio.sleep(0.05)
+
+
 def forging(send: Callable[[bytes], object]) -> Callable[[Payload, Payload], Iterable[Payload]]:
     """Return a hook that sends a forged reply to each read before the true one."""
 
