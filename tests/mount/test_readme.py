@@ -130,16 +130,40 @@ def test_editing(home: Home, field: Field) -> None:
     home.run("mavftpfs umount ~/drone")
 
 
-def test_the_guides_json_keys_are_there(home: Home, field: Field) -> None:
-    """Each key that the guide's tables name for `status --json` is in it."""
+def told_keys(command: str) -> set[str]:
+    """Return the names of keys in the guide's paragraph or table on `COMMAND --json`, without examples."""
+    guide = (PROJECT / "docs/guide.md").read_text().partition("\n## JSON\n")[2]
+    part = guide.partition(f"`{command} --json")[2]
+    part = re.split(r"\n\n`\w+ --json", part)[0]
+    rows = re.findall(r"^\| (`[^|]*`) \|", part, re.MULTILINE)
+    text = "".join(rows) if rows else re.sub(r"\([^)]*\)", "", part.partition(".")[0])
+    return set(re.findall(r"`(\w+)`", text))
+
+
+def inner_keys(group: str) -> set[str]:
+    """Return the keys that the guide names for one group of `status --json`."""
+    guide = (PROJECT / "docs/guide.md").read_text()
+    row = re.search(rf"^\| `{group}` \| (.*) \|$", guide, re.MULTILINE)
+    assert row is not None
+    return set(re.findall(r"`(\w+)`", re.sub(r"\([^)]*\)", "", row[1])))
+
+
+def test_the_guide_names_the_keys_of_json(home: Home, field: Field) -> None:
     home.mountpoint.mkdir()
     home.run(with_vehicle(MOUNTS[0], home, field, "px4"))
     status = json.loads(home.run("mavftpfs status --json ~/drone"))
-    guide = (PROJECT / "docs/guide.md").read_text().partition("\n## JSON\n")[2].partition("`sync --json")[0]
-    rows = dict(re.findall(r"^\| (`[^|]*`) \| (.*) \|$", guide, re.MULTILINE))
-    named = {name for row in rows for name in re.findall(r"`(\w+)`", row)}
-    assert named == set(status)
-    for group in ("vehicle", "link"):
-        inner = re.sub(r"\([^)]*\)", "", rows[f"`{group}`"])
-        assert set(re.findall(r"`(\w+)`", inner)) == set(status[group])
+    assert told_keys("status") == set(status)
+    for group in ("vehicle", "link", "held"):
+        assert inner_keys(group) == set(status[group])
+    synced = json.loads(home.run("mavftpfs sync --json ~/drone ~/logs"))
+    assert told_keys("sync") == set(synced)
+    assert inner_keys("files") == set(synced["files"][0])
+    (entry,) = json.loads(home.run(f"mavftpfs ls --json ~/drone /{LOG}"))
+    assert told_keys("ls") == set(entry)
     home.run("mavftpfs umount ~/drone")
+
+
+def test_the_guide_names_the_keys_of_scan(home: Home, field: Field) -> None:
+    line = with_vehicle(MOUNTS[0], home, field, "px4")
+    (found,) = json.loads(home.run(f"mavftpfs scan --json {line.split()[1]}"))
+    assert told_keys("scan") == set(found)

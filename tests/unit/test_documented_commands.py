@@ -52,6 +52,17 @@ def test_it_can_be_parsed(command: str) -> None:
         parse_source(source)
 
 
+@pytest.mark.parametrize("page", ["docs/guide.md", "mavftpfs/data/mount.mavftpfs.8"])
+def test_the_line_for_fstab(page: str) -> None:
+    text = (PROJECT / page).read_text().replace("\\-", "-")
+    (line,) = re.findall(r"^ *(udpin:\S+ .* 0 0)$", text, re.MULTILINE)
+    source, mountpoint, kind, options, _, _ = line.split()
+    assert parse_source(source).port == 14550
+    assert mountpoint.startswith("/")
+    assert kind == "mavftpfs"
+    assert parse_options([options]).allow_other
+
+
 def test_enough_of_them_are_found() -> None:
     assert len(set(shown())) > 20
 
