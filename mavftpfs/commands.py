@@ -181,7 +181,8 @@ class _Delivery:
             status = control.ask(self._socket, {"command": "status"}, timeout=statuses.PATIENCE)["status"]
         except control.ControlError:
             return  # it ends just now
-        line = delivery_line(status)
+        # One that is still in use holds bytes, too, but does not end.
+        line = delivery_line(status) if status["state"] == "unmounting" else ""
         now = time.monotonic()
         if not line or (not self._in_place and self._said_at is not None and now < self._said_at + SAY_AGAIN):
             return
