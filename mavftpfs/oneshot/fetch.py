@@ -31,10 +31,13 @@ from mavftpfs.shared.errors import (
     NotDeliveredYet,
     RequestTimeout,
     UsageError,
+    VehicleLost,
 )
 from mavftpfs.shared.readable import name_text, readable_size
 
 PART_SUFFIX = ".part"
+MAX_RETURNS = 20
+"""How often a vehicle may vanish and return while one file is fetched."""
 
 _WHY_NOT: dict[type[MavftpfsError], str] = {
     Armed: "no checksums while armed",
@@ -191,12 +194,27 @@ class Fetcher:
     resume: bool = True
 
     async def fetch(self, wanted: Wanted, *, beginning: Path | None = None) -> Fetched:
-        """Fetch a file. beginning: a local file that may hold its first bytes, where there is no .part.
+        """Fetch a file, and go on when the vehicle is heard again after it was lost for a while.
+
+        beginning: a local file that may hold its first bytes, where there is no .part.
 
         Raises:
             DataUnproven: size or checksum disagreed twice. StillGrowing, NotProvenYet: its .part stays.
-            UsageError: the local disk does not take it. Else as Files.open and OpenFile.read.
+            UsageError: the local disk does not take it. VehicleLost: it was not heard again within
+            connect_timeout. Else as Files.open and OpenFile.read.
         """
+        for _ in range(MAX_RETURNS):
+            try:
+                return await self._fetch(wanted, beginning)
+            except (VehicleLost, RequestTimeout) as exc:
+                if not self.session.silent():
+                    raise
+                self.progress.wait()
+                if not await self.session.returned():
+                    raise VehicleLost("the vehicle is silent") from exc
+        raise VehicleLost(f"the vehicle was lost {MAX_RETURNS} times")
+
+    async def _fetch(self, wanted: Wanted, beginning: Path | None) -> Fetched:
         if wanted.local.is_dir():
             raise UsageError(f"{wanted.local} is a directory")
         with local_disk(wanted.local):

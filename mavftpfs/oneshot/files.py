@@ -66,18 +66,25 @@ async def _none() -> Transfers:
     return []
 
 
+async def _no_return() -> bool:
+    return False
+
+
 @dataclass(frozen=True, slots=True)
 class Session:
     """A vehicle's files for the length of one command.
 
     root: where `/` of `files` lies on the vehicle. transfers: asks what is not on the vehicle yet.
-    mountpoint: of the mount whose files these are, None for a connection of our own.
+    mountpoint: of the mount whose files these are, None for a connection of our own. silent: whether the
+    vehicle is not heard; returned: waits for it, and returns whether it is heard again in time.
     """
 
     files: Files
     root: bytes = b"/"
     transfers: Callable[[], Awaitable[Transfers]] = _none
     mountpoint: str | None = None
+    silent: Callable[[], bool] = lambda: False
+    returned: Callable[[], Awaitable[bool]] = _no_return
 
     def on_vehicle(self, path: bytes) -> bytes:
         """Return the vehicle's own name of a path."""

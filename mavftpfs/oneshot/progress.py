@@ -38,7 +38,7 @@ class Progress:
         self.total = self._ended = self._moved = 0
         self.name = ""
         self.size = self.here = 0
-        self.checking = False
+        self.state = ""
 
     def plan(self, files: int, total: int) -> None:
         """Say how much there is to do in all."""
@@ -46,7 +46,7 @@ class Progress:
 
     def begin(self, name: str, size: int, here: int = 0) -> None:
         """Begin a file, or begin it again; `here` bytes of it need not move."""
-        self.name, self.size, self.here, self.checking = name, size, here, False
+        self.name, self.size, self.here, self.state = name, size, here, ""
         self._sample()
 
     def at(self, here: int) -> None:
@@ -58,14 +58,18 @@ class Progress:
 
     def check(self) -> None:
         """All bytes moved; what came is compared."""
-        self.checking = True
+        self.state = "checking"
+
+    def wait(self) -> None:
+        """The vehicle is lost."""
+        self.state = "waiting for the vehicle"
 
     def end(self, planned: int) -> None:
         """The file is through, well or not; `planned`: its bytes in the plan."""
         self._ended += planned
         self.files_done += 1
         self.size = self.here = 0
-        self.name, self.checking = "", False
+        self.name = self.state = ""
 
     @property
     def done(self) -> int:
@@ -108,12 +112,9 @@ def current(progress: Progress, width: int) -> str:
     """Return the line of the file at work, cut to a width: the end of a name tells more than its start."""
     if not progress.name:
         return ""
-    if progress.checking:
-        state = "checking"
-    elif progress.files > 1:
+    state = progress.state
+    if not state and progress.files > 1:
         state = f"{readable_size(progress.here)} of {readable_size(progress.size)}"
-    else:
-        state = ""
     name, room = printable(progress.name), width - len(state) - 2
     if len(name) > room:
         name = "…" + name[-max(room - 1, 1) :]
@@ -129,6 +130,8 @@ class _Screen:
 
     def __rich__(self) -> RenderableType:
         progress, width = self._progress, self._console.width
+        if not progress.files:
+            return Text("looking at what is there")
         line = totals(progress)
         share = progress.done / progress.total if progress.total else 1.0
         bar = ProgressBar(total=1.0, completed=share, width=max(8, min(_BAR, width - len(line) - 8)))

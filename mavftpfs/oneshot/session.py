@@ -14,6 +14,9 @@ from mavftpfs.fuse.options import MountOptions
 from mavftpfs.link.uri import LinkSpec
 from mavftpfs.oneshot.files import Session, Transfers
 from mavftpfs.oneshot.mounted import find_mount, open_mount
+from mavftpfs.session.vehicle import SILENCE_LIMIT
+
+_TICK = 0.2
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +58,18 @@ def _session_of(vehicle: Attached, options: MountOptions) -> Session:
     async def transfers() -> Transfers:
         return cast(Sequence[dict[str, object]], vehicle.tree.status().get("transfers", []))
 
-    return Session(vehicle.tree, options.root, transfers)
+    def silent() -> bool:
+        connection = vehicle.connection
+        return connection.vehicle.silence(connection.clock()) > SILENCE_LIMIT
+
+    async def returned() -> bool:
+        for _ in range(round(options.connect_timeout / _TICK)):
+            if not silent():
+                return True
+            await trio.sleep(_TICK)
+        return not silent()
+
+    return Session(vehicle.tree, options.root, transfers, silent=silent, returned=returned)
 
 
 @asynccontextmanager

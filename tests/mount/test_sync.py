@@ -173,14 +173,29 @@ def test_a_lost_link_leaves_a_part_and_the_next_run_goes_on(field: Field, tmp_pa
     vehicle = field.sim(field.local("card"), "px4", SLOW)
     card, local = vehicle.root / "log", tmp_path / "logs"
     write_log(card / "big.bin", 700_000, 1, 1)
-    with interrupted_sync(vehicle, local, "-o", "op_deadline=3") as child:
+    with interrupted_sync(vehicle, local, "-o", "op_deadline=6,connect_timeout=3") as child:
         vehicle.kill()
         out, err = child.communicate(timeout=COMMAND_TIMEOUT)
     assert child.returncode == 2
     assert out.splitlines()[-1].endswith("1 not here, the next run goes on")
-    assert "big.bin" in err or "0 of 1 logs are here" in err
+    said = "the vehicle is silent; 0 of 1 logs are here, the next run goes on where this one stopped"
+    assert err == f"mavftpfs: {said}\n"
     vehicle.start()
     assert_goes_on(vehicle, card, local)
+
+
+def test_a_link_that_comes_back_is_waited_for(field: Field, tmp_path: Path) -> None:
+    vehicle = field.sim(field.local("card"), "px4", SLOW)
+    card, local = vehicle.root / "log", tmp_path / "logs"
+    write_log(card / "big.bin", 700_000, 1, 1)
+    screen = terminal.mavftpfs("sync", "-o", "op_deadline=6,connect_timeout=80", vehicle.source, local)
+    screen.read_until(lambda _: "kB/s" in screen.raw)
+    vehicle.pause()
+    screen.read_until(lambda _: "waiting for the vehicle" in screen.raw)
+    vehicle.resume()
+    assert screen.finish() == 0
+    assert any("resumed at" in line for line in screen.lines)
+    assert (local / "big.bin").read_bytes() == (card / "big.bin").read_bytes()
 
 
 def test_a_growing_log_is_fetched_as_far_as_it_goes(field: Field, tmp_path: Path) -> None:

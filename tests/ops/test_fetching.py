@@ -154,6 +154,37 @@ async def test_an_interrupted_file_is_gone_on_with_and_proven(tmp_path: Path) ->
     assert names_in(tmp_path) == ["big"]
 
 
+@pytest.mark.parametrize("returns", [True, False])
+async def test_a_vehicle_that_is_lost_is_waited_for(tmp_path: Path, returns: bool) -> None:
+    tree = SpoiltTree({b"/big": BIG})
+    reads, waited = 0, 0
+
+    def lose(name: str, path: bytes) -> None:
+        nonlocal reads
+        reads += name == "read"
+        if name == "read" and reads in (3, 9):
+            raise RequestTimeout("no data came")
+
+    async def returned() -> bool:
+        nonlocal waited
+        waited += 1
+        assert fetcher.progress.state == "waiting for the vehicle"
+        return returns
+
+    tree.on_call = lose
+    session = Session(cast(Files, tree), silent=lambda: True, returned=returned)
+    fetcher = Fetcher(session, Progress())
+    if returns:
+        fetched = await fetcher.fetch(wanted(tree, b"/big", tmp_path / "big"))
+        assert (tmp_path / "big").read_bytes() == BIG
+        assert fetched.resumed > 0
+        assert (waited, fetched.proof) == (2, "size and CRC32")
+        return
+    with pytest.raises(VehicleLost):
+        await fetcher.fetch(wanted(tree, b"/big", tmp_path / "big"))
+    assert names_in(tmp_path) == ["big.part"]
+
+
 async def test_a_part_of_another_file_is_found_out(tmp_path: Path) -> None:
     tree = SpoiltTree({b"/big": BIG})
     (tmp_path / "big.part").write_bytes(b"x" * 1000)
