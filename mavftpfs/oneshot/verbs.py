@@ -2,28 +2,18 @@
 
 from __future__ import annotations
 
-import argparse
 import json
-import logging
 import os
-import signal
 import sys
-from collections.abc import Callable, Coroutine, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
 from datetime import datetime
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
 
-import trio
-
-from mavftpfs import daemon
-from mavftpfs.commands import connection_of, left_by_killed_mounts_line
-from mavftpfs.compose import open_sinks
+from mavftpfs.commands import left_by_killed_mounts_line
 from mavftpfs.exits import ExitCode, exit_code_for
 from mavftpfs.farewell import recovered_directory
-from mavftpfs.fuse.options import parse_options
 from mavftpfs.oneshot import get as getting
 from mavftpfs.oneshot import listing, names, paths, progress
 from mavftpfs.oneshot import put as putting
@@ -32,88 +22,12 @@ from mavftpfs.oneshot import scan as scanning
 from mavftpfs.oneshot import sync as syncing
 from mavftpfs.oneshot.fetch import Fetched, Fetcher
 from mavftpfs.oneshot.files import Session
-from mavftpfs.oneshot.mounted import mountpoint_of
 from mavftpfs.oneshot.plan import Step
-from mavftpfs.oneshot.session import Target
+from mavftpfs.oneshot.running import Args, run, with_session
 from mavftpfs.shared.errors import MavftpfsError, UsageError
 from mavftpfs.shared.readable import name_text, printable, readable, readable_size
 
-ResultT = TypeVar("ResultT")
-Args = argparse.Namespace
-
 STDOUT = "-"
-
-
-# -- running --------------------------------------------------------------------------------------
-
-
-def _target(args: Args, component: int | None) -> Target:
-    mount = mountpoint_of(args.source)
-    if mount is not None:
-        return Target(None, parse_options(args.options), mount=mount)
-    if os.path.isdir(args.source):
-        raise UsageError(f"no vehicle is mounted on {args.source}")
-    options, spec = connection_of(args)
-    if component is not None:
-        options = replace(options, target_component=component)
-    return Target(spec, options)
-
-
-def _run(
-    args: Args,
-    function: Callable[[Target], Coroutine[Any, Any, ResultT]],
-    component: int | None = None,
-) -> ResultT:
-    """Run a verb; Ctrl-C ends it in order, so that the vehicle's session is closed."""
-    target = _target(args, component)
-    daemon.log_to_stderr(logging.DEBUG if args.debug else logging.WARNING)
-    if not args.debug:  # whatever the caches warn of is raised, too, and errors are one line
-        logging.getLogger("mavftpfs.cache").setLevel(logging.ERROR)
-    with open_sinks(target.options, debug=args.debug) as sinks:
-        return trio.run(until_interrupted, partial(function, replace(target, sinks=sinks)))
-
-
-def _with_session(
-    args: Args,
-    function: Callable[[Session], Coroutine[Any, Any, ResultT]],
-    component: int | None = None,
-    *,
-    writing: bool = False,
-) -> ResultT:
-    async def work(target: Target) -> ResultT:
-        async with target.session(writing=writing) as session:
-            return await function(session)
-
-    return _run(args, work, component)
-
-
-async def until_interrupted(function: Callable[[], Coroutine[Any, Any, ResultT]]) -> ResultT:
-    """Return the function's result.
-
-    Raises:
-        KeyboardInterrupt: SIGINT or SIGTERM came first; the function was cancelled and has cleaned up.
-        MavftpfsError, OSError: the function's own.
-    """
-    results: list[ResultT] = []
-    errors: list[Exception] = []
-    with trio.open_signal_receiver(signal.SIGINT, signal.SIGTERM) as signals:
-        async with trio.open_nursery() as nursery:
-
-            async def watch() -> None:
-                async for _ in signals:
-                    nursery.cancel_scope.cancel()
-
-            nursery.start_soon(watch)
-            try:
-                results.append(await function())
-            except Exception as exc:  # raised again outside of the nursery, which would wrap it in a group
-                errors.append(exc)
-            nursery.cancel_scope.cancel()
-    if errors:
-        raise errors[0]
-    if not results:
-        raise KeyboardInterrupt
-    return results[0]
 
 
 def _say(line: str) -> None:
@@ -164,7 +78,7 @@ def sync(args: Args) -> int:
     with _on_interrupt(lambda: f"{_here(outcome)}; the next run goes on where this one stopped"):
         try:
             with progress.shown(bar):
-                _with_session(args, work, component)
+                with_session(args, work, component)
         except MavftpfsError as exc:
             if not outcome.tasks:
                 raise
@@ -254,7 +168,7 @@ def get(args: Args) -> int:
         return f"{got.done} of {got.planned} files are here{begun}"
 
     with _on_interrupt(stopped), progress.shown(bar):
-        _with_session(args, work, component)
+        with_session(args, work, component)
     return ExitCode.INCOMPLETE if got.failed else ExitCode.OK
 
 
@@ -266,7 +180,7 @@ def cat(args: Args) -> int:
     async def work(session: Session) -> None:
         await getting.cat_paths(session, wanted, sys.stdout.buffer, args.verify, _complain, got)
 
-    _with_session(args, work, component)
+    with_session(args, work, component)
     return ExitCode.INCOMPLETE if got.failed else ExitCode.OK
 
 
@@ -292,7 +206,7 @@ def put(args: Args) -> int:
         return f"{line}; {name_text(counts.at_work)} is not, and what was there under that name still is"
 
     with _on_interrupt(stopped), progress.shown(bar):
-        _with_session(args, work, component, writing=True)
+        with_session(args, work, component, writing=True)
     return ExitCode.OK
 
 
@@ -301,7 +215,7 @@ def rm(args: Args) -> int:
     wanted, component = paths.parse_paths(args.paths)
     names.refuse_root(wanted)
     remove = partial(names.remove_paths, paths=wanted, recursive=args.recursive)
-    _with_session(args, remove, component, writing=True)
+    with_session(args, remove, component, writing=True)
     return ExitCode.OK
 
 
@@ -309,21 +223,21 @@ def mkdir(args: Args) -> int:
     """Make directories."""
     wanted, component = paths.parse_paths(args.paths)
     make = partial(names.make_directories, paths=wanted, parents=args.parents)
-    _with_session(args, make, component, writing=True)
+    with_session(args, make, component, writing=True)
     return ExitCode.OK
 
 
 def rmdir(args: Args) -> int:
     """Remove empty directories."""
     wanted, component = paths.parse_paths(args.paths)
-    _with_session(args, partial(names.remove_directories, paths=wanted), component, writing=True)
+    with_session(args, partial(names.remove_directories, paths=wanted), component, writing=True)
     return ExitCode.OK
 
 
 def mv(args: Args) -> int:
     """Rename or move."""
     (*wanted, to), component = paths.parse_paths([*args.paths, args.target])
-    _with_session(args, partial(names.move_paths, paths=wanted, to=to), component, writing=True)
+    with_session(args, partial(names.move_paths, paths=wanted, to=to), component, writing=True)
     return ExitCode.OK
 
 
@@ -349,7 +263,7 @@ def recover(args: Args) -> int:
         await recovering.put_back(session, wanted, bar, tell, force=args.force)
 
     with progress.shown(bar):
-        _with_session(args, work, writing=True)
+        with_session(args, work, writing=True)
     return ExitCode.OK
 
 
@@ -383,7 +297,7 @@ def ls(args: Args) -> int:
     """List directories."""
     wanted, component = paths.parse_paths(args.paths or ["/"])
     work = partial(listing.list_paths, paths=wanted, recursive=args.recursive, by_time=args.by_time)
-    listings = _with_session(args, work, component)
+    listings = with_session(args, work, component)
     if args.json:
         print(json.dumps([entry for _, entries in listings for entry in entries], indent=2))
         return ExitCode.OK
@@ -403,13 +317,13 @@ def crc(args: Args) -> int:
     def tell(path: bytes, number: int) -> None:
         print(f"{number:08x}  {_name(path)}")
 
-    _with_session(args, partial(names.checksum_paths, paths=wanted, tell=tell), component)
+    with_session(args, partial(names.checksum_paths, paths=wanted, tell=tell), component)
     return ExitCode.OK
 
 
 def scan(args: Args) -> int:
     """Show who answers on a link."""
-    found = _run(args, scanning.scan)
+    found = run(args, scanning.scan)
     if args.json:
         print(json.dumps(found, indent=2, default=str))
     else:
