@@ -216,7 +216,7 @@ async def test_what_was_learnt_by_it_costs_the_bytes_once_at_most(
     async with place.world.connection() as connection:
         faults = Faults(place.world)
         source = MemorySource(b"a" * size)
-        upload = await connection.store.open_upload(place.root + b"/new", source, create=True)
+        upload = await connection.store.open_upload(place.root + b"/new", source)
         await upload.finish()
         source.add(b"b" * 100)
         upload.wake()

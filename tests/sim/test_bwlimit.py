@@ -67,7 +67,7 @@ async def read(connection: Connection, here: World) -> None:
 async def write(connection: Connection, here: World) -> None:
     path = ROOTS.get(here.profile, b"") + b"/d/g"
     source = MemorySource(DATA)
-    upload = await connection.store.open_upload(path, source, create=True)
+    upload = await connection.store.open_upload(path, source)
     await upload.finish()
     await upload.abort()
     assert here.tree.data(path) == DATA
@@ -137,7 +137,7 @@ async def test_a_dead_link_is_still_noticed(autojump: MockClock) -> None:
         await trio.sleep(1.0)
         here.link.cut()
         source = MemorySource(DATA)
-        upload = await connection.store.open_upload(b"/d/g", source, create=True)
+        upload = await connection.store.open_upload(b"/d/g", source)
         began = trio.current_time()
         with pytest.raises(Exception, match=r"answer|silent"):
             await upload.finish()

@@ -135,7 +135,7 @@ async def test_truncations_that_nobody_answers_hold_up_no_bytes(autojump: MockCl
         nursery.start_soon(cut, b"/cut too")
         await trio.sleep(10)
         source = MemorySource(content("new", 20_000))
-        upload = await connection.store.open_upload(b"/new", source, create=True)
+        upload = await connection.store.open_upload(b"/new", source)
         with trio.fail_after(8):
             upload.wake()
             await upload.finish()

@@ -61,7 +61,7 @@ class Place:
     async def upload(self, connection: Connection, name: bytes, data: bytes) -> None:
         source = MemorySource(data)
         connection.store.traits.wo_truncates = False
-        upload = await connection.store.open_upload(self.root + b"/" + name, source, create=True)
+        upload = await connection.store.open_upload(self.root + b"/" + name, source)
         upload.wake()
         await upload.finish()
         assert source.all_proven
@@ -217,7 +217,7 @@ async def test_of_two_uploads_none_waits_for_ever(autojump: MockClock) -> None:
     async with place.world.connection(seed=1) as connection, trio.open_nursery() as nursery:
         connection.store.traits.wo_truncates = False
         for number, source in enumerate(sources):
-            upload = await connection.store.open_upload(place.root + b"/%d" % number, source, create=True)
+            upload = await connection.store.open_upload(place.root + b"/%d" % number, source)
             upload.wake()
 
         async def read_now_and_then() -> None:

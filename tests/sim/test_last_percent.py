@@ -101,7 +101,7 @@ async def write(here: World, path: bytes) -> float:
                 marks.see(offset + count)
 
         source = Source(random.Random(1).randbytes(SIZE))
-        upload = await connection.store.open_upload(path, source, create=True)
+        upload = await connection.store.open_upload(path, source)
         await upload.finish()
         took = marks.since()
         await upload.abort()

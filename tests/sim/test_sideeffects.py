@@ -22,7 +22,7 @@ from mavftpfs.sim.profiles import PROFILES, Storage
 from tests.support.faults import Faults
 from tests.support.sources import MemorySource
 from tests.support.takingturns import taking_turns
-from tests.support.uploads import probe
+from tests.support.uploads import know
 from tests.support.worlds import ROOTS, World, begin_to_read, content, path, read_file, world
 
 EVERY_PROFILE = sorted(PROFILES)
@@ -166,7 +166,7 @@ async def test_a_sticky_file_exists_hides_no_other_refusal(profile: str, autojum
         await connection.store.remove(path(profile, "file"))
         await spoil(connection)
         source = MemorySource(b"hello")
-        upload = await connection.store.open_upload(path(profile, "new"), source, create=True)
+        upload = await connection.store.open_upload(path(profile, "new"), source)
         await upload.finish()
         await spoil(connection)
         faults.lose_reply_to(Opcode.TERMINATE_SESSION)
@@ -234,9 +234,9 @@ async def test_an_upload_makes_room_for_a_change_of_its_path(
     open_then: list[list[bytes]] = []
     async with here.connection() as connection:
         if probed:
-            await probe(connection, profile)
+            know(connection, profile)
         source = MemorySource(bytes(300_000))
-        upload = await connection.store.open_upload(path(profile, "file"), source, create=True)
+        upload = await connection.store.open_upload(path(profile, "file"), source)
         await trio.sleep(1)
         faults.at(Opcode.REMOVE_FILE, lambda: open_then.append(here.vehicle.server.open_paths))
         await connection.store.remove(path(profile, "file"))
@@ -323,7 +323,7 @@ async def test_what_may_still_be_open_is_closed_first_too(profile: str, autojump
     open_then: list[list[bytes]] = []
     async with here.connection(ConnectOptions(op_deadline=5.0)) as connection:
         faults.cut_after(1)
-        upload = await connection.store.open_upload(path(profile, "new"), MemorySource(b"x"), create=True)
+        upload = await connection.store.open_upload(path(profile, "new"), MemorySource(b"x"))
         with pytest.raises(RequestTimeout):
             await upload.finish()
         await upload.abort()

@@ -9,7 +9,7 @@ from trio.testing import MockClock
 from mavftpfs.protocol.payload import Opcode
 from mavftpfs.sim.linkmodel import LinkSettings
 from mavftpfs.sim.profiles import PROFILES
-from tests.support.uploads import probe, put
+from tests.support.uploads import know, put
 from tests.support.worlds import content, path, read_file, world
 
 EVERY_PROFILE = sorted(PROFILES)
@@ -47,7 +47,7 @@ async def test_two_uploads_and_a_reader_at_once(profile: str, probed: bool, auto
     got: list[bytes] = []
     async with here.connection() as connection:
         if probed:
-            await probe(connection, profile)
+            know(connection, profile)
         async with trio.open_nursery() as nursery:
 
             async def read() -> None:
@@ -61,20 +61,3 @@ async def test_two_uploads_and_a_reader_at_once(profile: str, probed: bool, auto
         assert here.tree.data(path(profile, f"f{index}")) == content(60_000, index)
     assert here.vehicle.server.open_sessions == 0
     assert [entry.name for entry in here.tree.entries(path(profile, "")) if b"mavftpfs" in entry.name] == []
-
-
-@pytest.mark.parametrize("profile", EVERY_PROFILE)
-async def test_the_probe_learns_what_the_profile_says(profile: str, autojump: MockClock) -> None:
-    here = world(profile, LinkSettings(rate=60_000.0, delay=0.02, loss=0.05))
-    facts = PROFILES[profile]
-    async with here.connection() as connection:
-        await probe(connection, profile)
-        traits = connection.store.traits
-        assert traits.wo_truncates is facts.write_only_truncates
-        assert traits.wo_creates is (facts.write_only_creates or facts.name == "spec")
-        assert traits.rename_works is (facts.storage.value != "littlefs")
-        assert traits.truncate_works is (facts.truncate_file and profile != "px4-nuttx")
-        if traits.rename_works:
-            assert traits.rename_replaces is (facts.storage.value != "fatfs")
-    assert here.tree.entries(path(profile, ""))[2:] == []
-    assert here.vehicle.server.open_sessions == 0

@@ -14,9 +14,9 @@ from mavftpfs.shared.errnos import errno_for
 from mavftpfs.shared.errors import Armed, FtpNak, MavftpfsError, RequestTimeout, SpoolFailed, VehicleLost
 from mavftpfs.sim.linkmodel import LinkSettings
 from mavftpfs.sim.profiles import PROFILES
-from tests.support.faults import Faults, power_goes_at_close
+from tests.support.faults import Faults
 from tests.support.sources import MemorySource
-from tests.support.uploads import probe, start, under_way
+from tests.support.uploads import know, start, under_way
 from tests.support.worlds import MemorySink, World, content, path, read_file, world
 
 EVERY_PROFILE = sorted(PROFILES)
@@ -132,7 +132,7 @@ async def test_a_cut_in_mid_upload_is_bridged(
     here = world(profile, PLAIN)
     async with here.connection() as connection:
         if probed:
-            await probe(connection, profile)
+            know(connection, profile)
         async with under_way(connection, profile, data) as source:
             here.link.cut()
             await trio.sleep(length)
@@ -153,7 +153,7 @@ async def test_a_reboot_in_mid_upload_is_bridged(profile: str, probed: bool, aut
     here = world(profile, PLAIN)
     async with here.connection() as connection:
         if probed:
-            await probe(connection, profile)
+            know(connection, profile)
         await trio.sleep(5)
         async with under_way(connection, profile, data) as source:
             here.vehicle.reboot(trio.current_time(), downtime=4.0)
@@ -192,7 +192,7 @@ async def test_a_session_taken_away_is_got_back(profile: str, probed: bool, auto
     here = world(profile, PLAIN)
     async with here.connection() as connection:
         if probed:
-            await probe(connection, profile)
+            know(connection, profile)
         async with under_way(connection, profile, data) as source:
             session = connection.scheduler.session
             assert session is not None
@@ -228,30 +228,6 @@ async def test_a_full_card_is_told(profile: str, autojump: MockClock) -> None:
     assert here.vehicle.server.open_sessions == 0
 
 
-@pytest.mark.parametrize(("downtime", "beat_after"), [(0.0, 0.0), (3.0, 0.9)])
-@pytest.mark.parametrize("profile", [name for name in EVERY_PROFILE if not name.startswith("mavsdk")])
-async def test_the_power_goes_while_a_file_that_became_too_long_is_closed(
-    profile: str, downtime: float, beat_after: float, autojump: MockClock
-) -> None:
-    """What was changed before the refusal was ACKed, and is gone though the Terminate is ACKed, too."""
-    old, new = content(4 * 239), content(6_000, 1)
-    here = world(profile, PLAIN, f=old)
-    target = path(profile, "f")
-    async with here.connection() as connection:
-        connection.store.traits.wo_truncates = False
-        await trio.sleep(30)
-        here.tree.capacity = len(old)
-        power_goes_at_close(here, target, old, downtime=downtime, beat_after=beat_after)
-        upload = await connection.store.open_upload(target, MemorySource(new), create=False)
-        with pytest.raises(FtpNak):
-            await upload.finish()
-        here.tree.capacity = None
-        connection.store.traits.wo_truncates = False
-        await upload.finish()
-        await upload.abort()
-        assert here.tree.data(target) == new or upload.shared
-
-
 class FailingSource(MemorySource):
     """Bytes on a local disk that does not give back those from `bad` on."""
 
@@ -273,7 +249,7 @@ async def test_a_local_disk_that_fails_ends_one_upload_and_nothing_else(
     here = world(profile, PLAIN, other=b"of another file")
     async with here.connection() as connection:
         if probed:
-            await probe(connection, profile)
+            know(connection, profile)
         source = FailingSource(content(9_000))
         source.bad = bad
         upload = await start(connection, profile, source)
@@ -409,7 +385,7 @@ async def test_a_program_that_writes_now_and_then(profile: str, probed: bool, au
     here = world(profile, PLAIN)
     async with here.connection() as connection:
         if probed:
-            await probe(connection, profile)
+            know(connection, profile)
         source = MemorySource()
         upload = await start(connection, profile, source)
         for step in range(6):
@@ -433,7 +409,7 @@ async def test_what_cannot_be_interrupted_keeps_readers_waiting_until_their_dead
     data = content(200_000)
     here = world(profile, LinkSettings(rate=5_000.0, delay=0.02), old=b"hello")
     async with here.connection() as connection:
-        await probe(connection, profile)
+        know(connection, profile)
         async with under_way(connection, profile, data) as source:
             began = trio.current_time()
             with pytest.raises(RequestTimeout):
@@ -450,7 +426,7 @@ async def test_who_gave_up_waiting_and_asks_again_waits_as_long_again(autojump: 
     """Not told at once that it waited too long: that was the time before."""
     here = world("mavsdk", LinkSettings(rate=5_000.0, delay=0.05), old=b"hello")
     async with here.connection() as connection, trio.open_nursery() as nursery:
-        await probe(connection, "mavsdk")
+        know(connection, "mavsdk")
         upload = await start(connection, "mavsdk", MemorySource(content(400_000)))
         nursery.start_soon(upload.finish)
         await trio.sleep(1.5)
@@ -471,7 +447,7 @@ async def test_what_can_be_interrupted_makes_room_at_once(autojump: MockClock) -
     here = world("px4", LinkSettings(rate=5_000.0, delay=0.05), old=b"hello")
     faults = Faults(here)
     async with here.connection() as connection:
-        await probe(connection, "px4")
+        know(connection, "px4")
         faults.requests.clear()
         async with under_way(connection, "px4", data, seconds=5) as source:
             began = trio.current_time()
@@ -520,7 +496,7 @@ async def test_outside_the_whitelist_stays_refused(autojump: MockClock) -> None:
     here = world("px4-nuttx")
     here.tree.add_directory(b"/etc")
     async with here.connection() as connection:
-        upload = await connection.store.open_upload(b"/etc/new", MemorySource(b"hello"), create=True)
+        upload = await connection.store.open_upload(b"/etc/new", MemorySource(b"hello"))
         with pytest.raises(FtpNak) as refusal:
             await upload.finish()
         assert (refusal.value.opcode, refusal.value.code) == (Opcode.WRITE_FILE, 9)
@@ -578,7 +554,7 @@ async def test_a_long_upload_proves_what_it_has_from_time_to_time(autojump: Mock
     data = content(200_000)
     here = world("px4", LinkSettings(rate=1_000.0, delay=0.05))
     async with here.connection() as connection:
-        await probe(connection, "px4")
+        know(connection, "px4")
         source = MemorySource(data)
         upload = await start(connection, "px4", source)
         await trio.sleep(130)
@@ -594,7 +570,7 @@ async def test_with_another_client_about_silence_is_not_survived(probed: bool, a
     here = world("mavsdk", PLAIN)
     async with here.connection() as connection:
         if probed:
-            await probe(connection, "mavsdk")
+            know(connection, "mavsdk")
         async with under_way(connection, "mavsdk", data) as source:
             listing = request(9, Opcode.LIST_DIRECTORY, data=b"/").encode()
             here.vehicle.foreign_request(listing, Address(255, 190), trio.current_time())
@@ -639,7 +615,7 @@ async def test_finish_again_after_success_sends_only_what_is_new(profile: str, a
     here = world(profile, PLAIN)
     faults = Faults(here)
     async with here.connection() as connection:
-        await probe(connection, profile)
+        know(connection, profile)
         source = MemorySource(content(1000))
         upload = await start(connection, profile, source)
         await upload.finish()
@@ -663,7 +639,7 @@ async def test_each_finish_waits_for_what_it_was_called_for(autojump: MockClock)
     faults = Faults(here)
     proven: list[int] = []
     async with here.connection() as connection:
-        await probe(connection, "px4")
+        know(connection, "px4")
         source = MemorySource(b"first")
         upload = await start(connection, "px4", source)
 
@@ -692,34 +668,10 @@ async def test_nothing_is_created_before_there_is_something(autojump: MockClock)
         assert here.tree.data(b"/d/new") == b""
 
 
-async def test_in_place_goes_on_where_it_was(autojump: MockClock) -> None:
-    """create=False keeps the rest of the file, over interruptions; unknown servers are not tried."""
-    old = content(50_000, 1)
-    new = content(20_000, 2)
-    here = world("px4", PLAIN, old=old)
-    async with here.connection() as connection:
-        source = MemorySource(new)
-        upload = await connection.store.open_upload(b"/d/old", source, create=False)
-        with pytest.raises(MavftpfsError):
-            await upload.finish()
-        assert here.tree.data(b"/d/old") == old
-        await probe(connection, "px4")
-        async with trio.open_nursery() as nursery:
-            nursery.start_soon(upload.finish)
-            await trio.sleep(0.5)
-            session = connection.scheduler.session
-            assert session is not None
-            wire = request(77, Opcode.TERMINATE_SESSION, session=session.id).encode()
-            here.vehicle.server.handle(wire, connection.vehicle.own, trio.current_time())
-        assert source.all_proven
-        assert True not in source.rollbacks
-    assert here.tree.data(b"/d/old") == new + old[20_000:]
-
-
 async def test_a_file_that_shrank_between_two_openings_is_sent_again(autojump: MockClock) -> None:
     here = world("px4", PLAIN)
     async with here.connection() as connection:
-        await probe(connection, "px4")
+        know(connection, "px4")
         source = MemorySource(content(3000))
         upload = await start(connection, "px4", source)
         await upload.finish()
@@ -804,7 +756,7 @@ async def test_a_session_that_is_gone_at_the_end_proves_nothing(probed: bool, au
     faults = Faults(here)
     async with here.connection() as connection:
         if probed:
-            await probe(connection, "px4")
+            know(connection, "px4")
         source = MemorySource(content(3000))
         upload = await start(connection, "px4", source)
         faults.at(Opcode.TERMINATE_SESSION, lambda: steal(here))
@@ -856,7 +808,7 @@ async def test_only_what_was_not_proven_goes_again(autojump: MockClock) -> None:
     here = world("px4", PLAIN)
     faults = Faults(here)
     async with here.connection() as connection:
-        await probe(connection, "px4")
+        know(connection, "px4")
         source = MemorySource(content(20_000))
         upload = await start(connection, "px4", source)
         await upload.finish()

@@ -80,7 +80,7 @@ async def test_never_more_than_a_short_queue_holds(profile: str, autojump_clock:
     here.tree.add_directory(b"/d")
     source = MemorySource(bytes(range(256)) * 400)
     async with here.connection() as connection:
-        upload = await connection.store.open_upload(b"/d/f", source, create=True)
+        upload = await connection.store.open_upload(b"/d/f", source)
         await upload.finish()
         await upload.abort()
     assert here.tree.data(b"/d/f") == source.content

@@ -9,38 +9,28 @@ import trio
 
 from mavftpfs.session.connection import Connection
 from mavftpfs.session.upload import QueuedUpload
+from mavftpfs.sim.profiles import PROFILES
 from tests.support.sources import MemorySource
 from tests.support.worlds import path
 
 
-async def probe(connection: Connection, profile: str) -> None:
-    """Try out what the server does to files that it opens."""
-    first, second = path(profile, ".mavftpfs-aaaadaaa"), path(profile, ".mavftpfs-aaaadaab")
-    await connection.store.probe_open_for_write(first, second)
+def know(connection: Connection, profile: str) -> None:
+    """Have it known what OpenFileWO does, as after the first upload that was interrupted."""
+    connection.store.traits.wo_truncates = PROFILES[profile].write_only_truncates
 
 
 async def start(
     connection: Connection, profile: str, source: MemorySource, name: str = "new"
 ) -> QueuedUpload:
-    return await connection.store.open_upload(path(profile, name), source, create=True)
+    return await connection.store.open_upload(path(profile, name), source)
 
 
 async def put(connection: Connection, target: bytes, data: bytes) -> None:
     """Upload a whole file."""
     source = MemorySource(data)
-    upload = await connection.store.open_upload(target, source, create=True)
+    upload = await connection.store.open_upload(target, source)
     await upload.finish()
     assert source.all_proven
-    await upload.abort()
-
-
-async def append(connection: Connection, target: bytes, data: bytes, at: int) -> None:
-    """Change a file in place."""
-    source = MemorySource(bytes(at) + data)
-    source.dirty.discard(0, at)
-    source.proven.add(0, at)
-    upload = await connection.store.open_upload(target, source, create=False)
-    await upload.finish()
     await upload.abort()
 
 
