@@ -318,7 +318,7 @@ def _install_parser(name: str) -> Parser:
 
 
 def _sim_parser(name: str) -> Parser:
-    from mavftpfs.sim.command import add_arguments
+    from mavftpfs.sim.endpoints import add_arguments
 
     parser = Parser(f"mavftpfs {name}", description="Run a simulated vehicle.")
     add_arguments(parser)
@@ -345,7 +345,7 @@ def _install(args: argparse.Namespace) -> int:
 
 
 def _sim(args: argparse.Namespace) -> int:
-    from mavftpfs.sim.command import run
+    from mavftpfs.sim.endpoints import run
 
     return run(args)
 

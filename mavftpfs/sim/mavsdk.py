@@ -13,11 +13,10 @@ from dataclasses import dataclass
 
 from mavftpfs.link.messages import Address
 from mavftpfs.protocol.payload import MAX_DATA, NakCode, Opcode
-from mavftpfs.sim.filesystem import Entry, Kind, Stat
-from mavftpfs.sim.firmware import Firmware
+from mavftpfs.sim.firmware import ACK, HEADER, NAK, REPLY, Firmware, Request, parse, u32
 from mavftpfs.sim.profiles import Profile
 from mavftpfs.sim.storage import OpenFile, Storage
-from mavftpfs.sim.wire import ACK, HEADER, NAK, REPLY, Request, parse, u32
+from mavftpfs.sim.tree import Entry, Kind, Stat
 
 _READ = int(Opcode.READ_FILE)
 _BURST = int(Opcode.BURST_READ_FILE)

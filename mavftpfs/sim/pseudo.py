@@ -11,7 +11,7 @@ import struct
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import NamedTuple
 
-from mavftpfs.sim.filesystem import Entry, Kind, Stat, fail
+from mavftpfs.sim.tree import Entry, Kind, Stat, fail
 
 PARAM_MAGIC = 0x671B
 MISSION_MAGIC = 0x763D

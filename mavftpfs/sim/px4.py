@@ -1,7 +1,7 @@
 """PX4's FTP server. Layer: sim; pure. Source: mavlink_ftp.cpp, servers.md 1-13 and 15.
 
 One session for everybody on the link; requests run inline in the receiver thread, which also sends bursts
-every 10 ms.
+every 10 ms. Directory and path requests are in px4ops.
 """
 
 from __future__ import annotations
@@ -11,16 +11,26 @@ import errno
 import random
 from collections import deque
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 from mavftpfs.link.messages import Address
 from mavftpfs.protocol.payload import MAX_DATA, NakCode, Opcode
 from mavftpfs.sim import px4ops
-from mavftpfs.sim.firmware import Firmware, Refusal
+from mavftpfs.sim.firmware import (
+    ACK,
+    FULL_FRAME,
+    HEADER,
+    HEADER_SIZE,
+    NAK,
+    REPLY,
+    Firmware,
+    Refusal,
+    Request,
+    frame_size,
+    parse,
+)
 from mavftpfs.sim.profiles import Profile
-from mavftpfs.sim.px4rows import NOT_KEPT, read_row, write_row
-from mavftpfs.sim.px4stream import Stream
 from mavftpfs.sim.storage import OpenFile, StaleErrno, Storage
-from mavftpfs.sim.wire import ACK, FULL_FRAME, HEADER, NAK, REPLY, Request, frame_size, parse
 
 _Fields = tuple[int, int, int, int, int, int, int]
 _BUFFER_LIFE = 2.0
@@ -30,6 +40,99 @@ _WRITE = int(Opcode.WRITE_FILE)
 _BURST = int(Opcode.BURST_READ_FILE)
 _EOF = int(NakCode.EOF)
 _FAIL_ERRNO = int(NakCode.FAIL_ERRNO)
+_COUNT_SIZE = 4
+_NOT_KEPT = int(NakCode.NO_SESSIONS_AVAILABLE)
+"""First byte of short answers that PX4 does not keep for a repeated request, a NAK's or not."""
+
+Replies = list[tuple[Address, bytes]]
+
+
+@dataclass(slots=True)
+class Stream:
+    """A running burst. sent: bytes."""
+
+    target: Address
+    offset: int
+    seq: int
+    sent: int = 0
+
+    def read(
+        self, opened: OpenFile, *, last: bool, alone: bool, profile: Profile, rng: random.Random
+    ) -> bytes:
+        """Return the next packet; `complete` tells whether it ends the burst.
+
+        last, alone: it is a tick's last packet, its only one.
+
+        Raises:
+            OSError: reading failed.
+        """
+        data = opened.read(self.offset, MAX_DATA)
+        self.sent += len(data)
+        over = last and self.sent > profile.burst_bytes
+        # The field is not written on a tick's last packet; only then is it the stack's garbage.
+        garbage = last and alone and not over and rng.random() < profile.garbage_complete
+        packed = self._pack(ACK, int(over or garbage), data)
+        self.offset += len(data)
+        return packed
+
+    def is_over(self, last: bool, profile: Profile) -> bool:
+        """Whether the packet before was the last one."""
+        return last and self.sent > profile.burst_bytes
+
+    def end(self, code: int, number: int) -> bytes:
+        """Return the NAK that ends it; number: errno."""
+        return self._pack(NAK, 0, bytes([code, number & 0xFF] if code == NakCode.FAIL_ERRNO else [code]))
+
+    def _pack(self, opcode: int, complete: int, data: bytes) -> bytes:
+        seq = self.seq & 0xFFFF
+        self.seq += 1
+        return REPLY.pack(seq, 0, opcode, len(data), Opcode.BURST_READ_FILE, complete, self.offset, data)
+
+
+# A transfer is hundreds of thousands of ReadFile or WriteFile requests a second on a fast link. What a row of
+# them needs is looked at once; the first that is not like the others ends it, and goes the usual way.
+
+
+def read_row(
+    wires: Sequence[bytes], opened: OpenFile, size: int, least: int, source: Address, replies: Replies
+) -> int:
+    """Answer ReadFile requests of session 0; return how many.
+
+    size: of the file, as it was opened. least: bytes that each answer has.
+    """
+    unpack, pack, read, append = HEADER.unpack_from, REPLY.pack, opened.read, replies.append
+    for count, wire in enumerate(wires):
+        seq, session, opcode, wanted, _, complete, offset = unpack(wire)
+        if opcode != _READ or session or wanted > MAX_DATA or offset >= size:
+            return count
+        try:
+            data = read(offset, wanted)
+        except OSError:
+            return count
+        if len(data) < least:
+            return count
+        append((source, pack(seq + 1 & 0xFFFF, 0, ACK, len(data), _READ, complete, offset, data)))
+    return len(wires)
+
+
+def write_row(wires: Sequence[bytes], opened: OpenFile, source: Address, replies: Replies) -> int:
+    """Answer WriteFile requests of session 0; return how many. None of them repeats the one before it."""
+    unpack, pack, write, append = HEADER.unpack_from, REPLY.pack, opened.write, replies.append
+    answered = -1
+    for count, wire in enumerate(wires):
+        seq, session, opcode, size, _, complete, offset = unpack(wire)
+        if opcode != _WRITE or session or not 0 < size <= MAX_DATA or seq + 1 == answered:
+            return count
+        try:
+            written = write(offset, wire[HEADER_SIZE : HEADER_SIZE + size])
+        except OSError:
+            return count
+        answered = seq + 1 & 0xFFFF
+        number = written.to_bytes(_COUNT_SIZE, "little")
+        append((source, pack(answered, 0, ACK, _COUNT_SIZE, _WRITE, complete, offset, number)))
+        if written == _NOT_KEPT:
+            answered = -1
+    return len(wires)
 
 
 class Px4(Firmware):
@@ -204,7 +307,7 @@ class Px4(Firmware):
 
     def _keep(self, target: Address, wire: bytes) -> None:
         size = wire[4]
-        if size <= _CACHED_DATA and not (size and wire[12] == NOT_KEPT):
+        if size <= _CACHED_DATA and not (size and wire[12] == _NOT_KEPT):
             self._cached = wire[: 12 + _CACHED_DATA]
             self._cached_seq = wire[0] | wire[1] << 8
             self._cached_target = target

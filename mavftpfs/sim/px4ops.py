@@ -8,11 +8,10 @@ from typing import Protocol
 
 from mavftpfs.protocol.payload import MAX_DATA, NakCode, Opcode
 from mavftpfs.sim import profiles
-from mavftpfs.sim.filesystem import Entry, Kind, fail
-from mavftpfs.sim.firmware import Refusal
+from mavftpfs.sim.firmware import Refusal, Request, c_string, u32
 from mavftpfs.sim.profiles import Profile
 from mavftpfs.sim.storage import OpenFile, StaleErrno, Storage
-from mavftpfs.sim.wire import Request, c_string, u32
+from mavftpfs.sim.tree import Entry, Kind, fail
 
 _WORK_BUFFER = 256
 _RENAME_LIMIT = 255

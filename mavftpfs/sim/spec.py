@@ -12,11 +12,21 @@ from dataclasses import dataclass
 
 from mavftpfs.link.messages import Address
 from mavftpfs.protocol.payload import MAX_DATA, NakCode, Opcode
-from mavftpfs.sim.filesystem import Entry, Kind
-from mavftpfs.sim.firmware import Firmware, Refusal
+from mavftpfs.sim.firmware import (
+    ACK,
+    FULL_FRAME,
+    NAK,
+    Firmware,
+    Refusal,
+    Reply,
+    Request,
+    c_string,
+    parse,
+    u32,
+)
 from mavftpfs.sim.profiles import Profile
 from mavftpfs.sim.storage import OpenFile, Storage
-from mavftpfs.sim.wire import ACK, FULL_FRAME, NAK, Reply, Request, c_string, parse, u32
+from mavftpfs.sim.tree import Entry, Kind
 
 _BURST_PACKETS = 100
 _CODES = {errno.ENOENT: NakCode.FILE_NOT_FOUND, errno.EEXIST: NakCode.FILE_EXISTS}

@@ -14,9 +14,9 @@ from typing import Protocol
 
 from mavftpfs.protocol.crc import crc32
 from mavftpfs.sim import profiles
-from mavftpfs.sim.filesystem import Entry, Kind, Stat, Tree, TreeFile, fail, parent_and_name
 from mavftpfs.sim.profiles import Profile
 from mavftpfs.sim.pseudo import VirtualTrees
+from mavftpfs.sim.tree import Entry, Kind, Stat, Tree, TreeFile, fail, parent_and_name
 
 _FAT_FORBIDDEN = frozenset(b'"*:<>?|\x7f') | frozenset(range(32))
 _SIGNS = rb"!#-)\-0-9@^-`{}~"

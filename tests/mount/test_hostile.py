@@ -13,7 +13,7 @@ import pytest
 
 from mavftpfs.link.messages import Address
 from mavftpfs.protocol.payload import Opcode, Payload
-from mavftpfs.sim.memorytree import MemoryTree
+from mavftpfs.sim.tree import MemoryTree
 from tests.mount.conftest import Field
 from tests.support.hostile import BROKEN, FINE, GOOD, GOOD_NAMES, NAKED
 from tests.support.lying import LyingVehicle, ack, ftp, heartbeat

@@ -27,9 +27,9 @@ from mavftpfs.shared.errors import MavftpfsError, RemoteProtocolError
 from mavftpfs.shared.extents import ExtentSet
 from mavftpfs.shared.model import usable_name
 from mavftpfs.sim.linkmodel import LinkSettings
-from mavftpfs.sim.memorytree import MemoryTree
 from mavftpfs.sim.profiles import PROFILES
-from mavftpfs.sim.server import FtpServer
+from mavftpfs.sim.tree import MemoryTree
+from mavftpfs.sim.vehicle import FtpServer
 from tests.support.replies import sent
 from tests.support.virtual import CLIENT, MemorySink, VirtualLink
 

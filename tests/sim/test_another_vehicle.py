@@ -14,8 +14,8 @@ from mavftpfs.cache.tree import Tree
 from mavftpfs.compose import subscribe
 from mavftpfs.shared.errors import MavftpfsError, VehicleLost
 from mavftpfs.sim.linkmodel import Direction, LinkSettings
-from mavftpfs.sim.memorytree import MemoryTree
 from mavftpfs.sim.profiles import PROFILES
+from mavftpfs.sim.tree import MemoryTree
 from mavftpfs.sim.vehicle import SimVehicle
 from tests.support.fake_store import read_file
 from tests.support.mounting import mounted

@@ -26,8 +26,8 @@ from mavftpfs.session.connection import ConnectOptions, connected
 from mavftpfs.shared.errors import VehicleLost
 from mavftpfs.sim.linkmodel import Duplex, LinkModel, LinkSettings
 from mavftpfs.sim.memory import MemoryLink
-from mavftpfs.sim.memorytree import MemoryTree
 from mavftpfs.sim.profiles import PROFILES
+from mavftpfs.sim.tree import MemoryTree
 from mavftpfs.sim.vehicle import SimVehicle
 from tests.support.uploads import put
 from tests.support.worlds import World, path, read_file, world

@@ -23,7 +23,7 @@ from mavftpfs.link.opening import open_link
 from mavftpfs.link.uri import parse_source
 from mavftpfs.protocol.payload import MAX_DATA, Opcode, Payload, decode_reply, request
 from mavftpfs.shared.errors import LinkClosed, UsageError
-from mavftpfs.sim import command
+from mavftpfs.sim import endpoints
 from mavftpfs.sim.endpoints import Endpoint, client_source, open_endpoint
 from mavftpfs.sim.linkmodel import Direction, Duplex, LinkModel, LinkSettings
 from mavftpfs.sim.memory import MemoryLink
@@ -257,7 +257,7 @@ async def test_a_second_client_of_a_pty_finds_the_vehicle() -> None:
 
 def arguments(*words: str) -> argparse.Namespace:
     parser = argparse.ArgumentParser("sim")
-    command.add_arguments(parser)
+    endpoints.add_arguments(parser)
     return parser.parse_args(words)
 
 
@@ -269,7 +269,7 @@ MODEL_WORDS = """
 
 def test_arguments_reach_the_model() -> None:
     args = arguments("DIR", *MODEL_WORDS.split())
-    assert command.link_settings(args) == LinkSettings(
+    assert endpoints.link_settings(args) == LinkSettings(
         rate=5760, queue=1000, mtu=200, duplex=Duplex.HALF, delay=0.1, jitter=0.2, loss=0.3, burst_loss=0.4,
         duplicate=0.5, corrupt=0.6, reorder=0.7,
     )  # fmt: skip
@@ -288,7 +288,7 @@ def test_nonsense_is_refused(words: str, capsys: pytest.CaptureFixture[str]) -> 
 
 def test_a_missing_directory_is_the_users_error(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=r"cannot serve [^:]*nowhere: No such file"):
-        command.run(arguments(str(tmp_path / "nowhere")))
+        endpoints.run(arguments(str(tmp_path / "nowhere")))
 
 
 @pytest.mark.parametrize(
@@ -300,23 +300,23 @@ def test_a_card_that_nothing_can_be_written_to_is_told(
 ) -> None:
     (tmp_path / storage).mkdir(parents=True, exist_ok=True)
     with pytest.raises(LinkClosed):
-        command.run(arguments(str(tmp_path), "--profile", profile, "--link", "udpin:198.51.100.1:1"))
+        endpoints.run(arguments(str(tmp_path), "--profile", profile, "--link", "udpin:198.51.100.1:1"))
     assert ("/fs/microsd only" in capsys.readouterr().err) == told
 
 
 def test_a_bad_link_is_the_users_error(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="write for example"):
-        command.run(arguments(str(tmp_path), "--link", "smoke:signals"))
+        endpoints.run(arguments(str(tmp_path), "--link", "smoke:signals"))
     with pytest.raises(LinkClosed, match="is not an address"):
-        command.run(arguments(str(tmp_path), "--link", "udpin:198.51.100.1:1"))
+        endpoints.run(arguments(str(tmp_path), "--link", "udpin:198.51.100.1:1"))
 
 
 RUNNER = """
 import argparse, sys
-from mavftpfs.sim import command
+from mavftpfs.sim import endpoints
 parser = argparse.ArgumentParser("sim")
-command.add_arguments(parser)
-sys.exit(command.run(parser.parse_args()))
+endpoints.add_arguments(parser)
+sys.exit(endpoints.run(parser.parse_args()))
 """
 
 

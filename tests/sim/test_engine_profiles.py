@@ -14,9 +14,9 @@ from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.protocol.reading import ReadToEof, ReadTransfer
 from mavftpfs.shared.errors import FtpNak, SessionLost
 from mavftpfs.sim.linkmodel import Direction, LinkSettings
-from mavftpfs.sim.memorytree import MemoryTree
 from mavftpfs.sim.profiles import PROFILES, Family
-from mavftpfs.sim.server import FtpServer
+from mavftpfs.sim.tree import MemoryTree
+from mavftpfs.sim.vehicle import FtpServer
 from tests.support.virtual import MemorySink, VirtualLink
 
 CHUNK = 239

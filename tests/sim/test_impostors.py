@@ -19,8 +19,8 @@ from mavftpfs.session.connection import Connection, ConnectOptions, connected
 from mavftpfs.shared.errors import VehicleLost
 from mavftpfs.sim import vehicle as sim_vehicle
 from mavftpfs.sim.linkmodel import LinkSettings
-from mavftpfs.sim.memorytree import MemoryTree
 from mavftpfs.sim.profiles import PROFILES, Family
+from mavftpfs.sim.tree import MemoryTree
 from mavftpfs.sim.vehicle import SimVehicle
 from tests.support.lying import CrowdedLink, LyingVehicle, ack, ftp, heartbeat
 from tests.support.vehicles import HOST, free_udp_port

@@ -13,9 +13,8 @@ from mavftpfs.cache.options import CacheOptions
 from mavftpfs.cache.tree import Tree
 from mavftpfs.session.connection import Connection
 from mavftpfs.shared.errors import FtpNak
-from mavftpfs.sim.filesystem import Entry, Kind, Stat, TreeFile
 from mavftpfs.sim.linkmodel import LinkSettings
-from mavftpfs.sim.memorytree import DEFAULT_MTIME, MemoryTree
+from mavftpfs.sim.tree import DEFAULT_MTIME, Entry, Kind, MemoryTree, Stat, TreeFile
 from tests.support.worlds import ROOTS, World
 
 GIB = 1 << 30

@@ -14,7 +14,7 @@ from mavftpfs.link.uri import parse_source
 from mavftpfs.protocol.payload import NakCode, Opcode, Payload
 from mavftpfs.session.connection import ConnectOptions, connected
 from mavftpfs.shared.errors import MavftpfsError
-from mavftpfs.sim.memorytree import MemoryTree
+from mavftpfs.sim.tree import MemoryTree
 from tests.support.lying import LyingVehicle, ack, ftp, heartbeat, lie_for, nak
 from tests.support.vehicles import HOST, free_udp_port
 from tests.support.worlds import read_file, world

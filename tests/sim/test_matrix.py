@@ -27,8 +27,8 @@ from mavftpfs.link.messages import Address
 from mavftpfs.protocol.payload import Opcode, request
 from mavftpfs.session.connection import Connection, ConnectOptions
 from mavftpfs.shared.errors import MavftpfsError
-from mavftpfs.sim.filesystem import Kind
 from mavftpfs.sim.profiles import PROFILES, Storage
+from mavftpfs.sim.tree import Kind
 from tests.support.faults import Faults
 from tests.support.mounting import writable_tree
 from tests.support.takingturns import taking_turns

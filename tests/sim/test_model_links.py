@@ -20,10 +20,9 @@ from mavftpfs.cache.tree import Tree
 from mavftpfs.compose import subscribe
 from mavftpfs.session.connection import Connection
 from mavftpfs.shared.errors import FtpNak, RequestTimeout
-from mavftpfs.sim.filesystem import Kind
 from mavftpfs.sim.linkmodel import Duplex, LinkSettings
-from mavftpfs.sim.memorytree import MemoryTree
 from mavftpfs.sim.profiles import PROFILES, Storage
+from mavftpfs.sim.tree import Kind, MemoryTree
 from tests.support.filemodel import START, Model, calls, rewriting_calls
 from tests.support.mounting import writable_tree
 from tests.support.takingturns import taking_turns

@@ -19,9 +19,9 @@ from mavftpfs.cache.tree import OpenFile, Tree
 from mavftpfs.compose import subscribe
 from mavftpfs.session.connection import Connection
 from mavftpfs.shared.errors import LocalProtocolError, MavftpfsError, NotFound
-from mavftpfs.sim.filesystem import Kind
 from mavftpfs.sim.linkmodel import Duplex, LinkSettings
 from mavftpfs.sim.profiles import PROFILES, Storage
+from mavftpfs.sim.tree import Kind
 from tests.support.mounting import writable_tree
 from tests.support.trees import content
 from tests.support.worlds import World

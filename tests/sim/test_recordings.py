@@ -22,8 +22,8 @@ from mavftpfs.link.messages import Address
 from mavftpfs.protocol.payload import Payload, decode_reply
 from mavftpfs.sim.profiles import PROFILES
 from mavftpfs.sim.pseudo import VirtualTrees, pack_parameters, unpack_parameters
-from mavftpfs.sim.server import FtpServer
 from mavftpfs.sim.tree import MemoryTree
+from mavftpfs.sim.vehicle import FtpServer
 
 DATA = Path(__file__).parent.parent / "data"
 CLIENT = Address(255, 190)

@@ -16,9 +16,9 @@ from mavftpfs.session.connection import Connection, ConnectOptions
 from mavftpfs.session.store import Store
 from mavftpfs.shared.errors import Armed, FileChanged, FtpNak, PathTooLong, RequestTimeout
 from mavftpfs.shared.model import join
-from mavftpfs.sim.filesystem import Kind
 from mavftpfs.sim.linkmodel import LinkSettings
 from mavftpfs.sim.profiles import PROFILES, Storage
+from mavftpfs.sim.tree import Kind
 from tests.support.faults import Faults
 from tests.support.sources import MemorySource
 from tests.support.takingturns import taking_turns

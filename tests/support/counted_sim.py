@@ -22,11 +22,10 @@ import trio
 
 from mavftpfs.link.messages import Address
 from mavftpfs.protocol.payload import PAYLOAD_SIZE, Opcode, decode_request
-from mavftpfs.sim.directorytree import DirectoryTree
 from mavftpfs.sim.endpoints import Endpoint, client_source, open_endpoint
 from mavftpfs.sim.profiles import PROFILES
-from mavftpfs.sim.server import FtpServer
-from mavftpfs.sim.vehicle import SimVehicle
+from mavftpfs.sim.tree import DirectoryTree
+from mavftpfs.sim.vehicle import FtpServer, SimVehicle
 
 NAMES = {opcode.value: opcode.name for opcode in Opcode}
 BY_SESSION = ("NONE", "TERMINATE_SESSION", "RESET_SESSIONS", "READ_FILE", "WRITE_FILE", "BURST_READ_FILE")

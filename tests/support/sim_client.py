@@ -10,8 +10,8 @@ from mavftpfs.link.messages import Address
 from mavftpfs.protocol.payload import Opcode, Payload, decode_reply, request
 from mavftpfs.sim.profiles import PROFILES
 from mavftpfs.sim.pseudo import VirtualTrees
-from mavftpfs.sim.server import FtpServer
 from mavftpfs.sim.tree import MemoryTree, Tree
+from mavftpfs.sim.vehicle import FtpServer
 
 CLIENT = Address(255, 190)
 OTHER = Address(254, 191)

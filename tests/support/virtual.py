@@ -1,6 +1,6 @@
 """Runs an engine against a server over a modelled link, on virtual time without trio.
 
-The server is anything with `handle`, `outgoing` and `next_deadline` (mavftpfs.sim.server.FtpServer, or a
+The server is anything with `handle`, `outgoing` and `next_deadline` (mavftpfs.sim.vehicle.FtpServer, or a
 scripted one). Frames are the trimmed payloads behind 15 bytes that stand for MAVLink's overhead.
 """
 

@@ -14,8 +14,8 @@ from mavftpfs.session.connection import Connection, ConnectOptions, connected
 from mavftpfs.shared.extents import ExtentSet
 from mavftpfs.sim.linkmodel import LinkModel, LinkSettings
 from mavftpfs.sim.memory import MemoryLink
-from mavftpfs.sim.memorytree import MemoryTree
 from mavftpfs.sim.profiles import PROFILES
+from mavftpfs.sim.tree import MemoryTree
 from mavftpfs.sim.vehicle import SimVehicle
 
 GOOD_LINK = LinkSettings()

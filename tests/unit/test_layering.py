@@ -67,7 +67,7 @@ PURE_MODULES = {
     "fuse.userattributes",
     "fuse.options",
 }
-IMPURE_MODULES = {"sim.endpoints", "sim.memory", "sim.command"}
+IMPURE_MODULES = {"sim.endpoints", "sim.memory"}
 IMPURE_IMPORTS = {"trio", "time", "socket", "logging", "pyfuse3"}
 
 SOLE_IMPORTERS = {

@@ -15,9 +15,9 @@ from hypothesis import strategies as st
 from mavftpfs.link.messages import Address
 from mavftpfs.protocol.payload import NakCode, Opcode, decode_reply, request
 from mavftpfs.sim.profiles import PROFILES
-from mavftpfs.sim.server import FtpServer
 from mavftpfs.sim.storage import Storage
 from mavftpfs.sim.tree import DirectoryTree, MemoryTree
+from mavftpfs.sim.vehicle import FtpServer
 from tests.support.sim_client import CLIENT, OTHER, Client, ack, nak, small_tree
 
 A = b"/fs/microsd/a.bin"

@@ -25,9 +25,9 @@ from mavftpfs.shared.errors import (
 )
 from mavftpfs.shared.traits import Traits
 from mavftpfs.sim.linkmodel import LinkSettings
-from mavftpfs.sim.memorytree import MemoryTree
 from mavftpfs.sim.profiles import PROFILES
-from mavftpfs.sim.server import FtpServer
+from mavftpfs.sim.tree import MemoryTree
+from mavftpfs.sim.vehicle import FtpServer
 from tests.support.replies import ack, nak, sent
 from tests.support.sources import MemorySource
 from tests.support.virtual import VirtualLink
