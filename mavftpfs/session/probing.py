@@ -10,8 +10,8 @@ from __future__ import annotations
 from mavftpfs.protocol.operations import Simple
 from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.session.changes import RENAME_LIMIT, Changes
-from mavftpfs.session.opening import OpenSession
 from mavftpfs.session.scheduler import Scheduler
+from mavftpfs.session.serversession import OpenSession
 from mavftpfs.shared.errors import FtpNak, RequestTimeout
 from mavftpfs.shared.model import split, wire_path
 from mavftpfs.shared.traits import WriteTraits

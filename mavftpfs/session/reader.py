@@ -269,7 +269,7 @@ class Reading:
             if await self._ensure_open(stream):
                 await self._await_first_want(stream)
             if stream.has_demand or stream.has_ahead:
-                async with self._server.opener.passing():
+                async with self._server.traffic():
                     await self._read(stream)
         except SessionLost as error:
             self._on_session_lost(stream, error)

@@ -21,10 +21,9 @@ from mavftpfs.protocol.payload import Opcode, Payload
 from mavftpfs.protocol.reading import ReadToEof
 from mavftpfs.session.doubt import Doubt
 from mavftpfs.session.driver import Driver
-from mavftpfs.session.opening import Opener, OpenSession
 from mavftpfs.session.policy import LIGHT_USE, ReadMode, is_starving
 from mavftpfs.session.reader import FileStream, Reading
-from mavftpfs.session.serversession import ServerSession, State
+from mavftpfs.session.serversession import OpenSession, ServerSession, State
 from mavftpfs.session.upload import QueuedUpload
 from mavftpfs.session.uploads import Uploading
 from mavftpfs.session.vehicle import Vehicle
@@ -92,8 +91,7 @@ class Scheduler:
         chunk: int | None = None,
     ) -> None:
         self.doubt = Doubt(clock)
-        self.opener = Opener(driver, engine, vehicle, self.doubt, clock)
-        self.server = ServerSession(self.opener, op_deadline)
+        self.server = ServerSession(driver, engine, vehicle, self.doubt, clock, op_deadline)
         self.write_traits = WriteTraits()
         self.op_deadline = op_deadline
         self._driver = driver
@@ -138,10 +136,10 @@ class Scheduler:
         """
         self.require_link()
         if not disturbs:
-            await self.opener.run(operation)
+            await self.server.run(operation)
             return
         async with self._uploading.turns.path_operation():
-            await self.opener.run(operation)
+            await self.server.run(operation)
 
     def open_stream(self, path: bytes, sink: ReadSink, size: int | None) -> FileStream:
         """Register a reader; with size None it asks for an open ACK (await stream.wait_opened())."""
@@ -164,7 +162,7 @@ class Scheduler:
             nonlocal data
             foreign_at = self._vehicle.foreign_at
             operation = ReadToEof(session.id, self.read_chunks.size, limit)
-            await self.opener.run(operation)
+            await self.server.run(operation)
             self.server.require(session)
             if self._vehicle.foreign_at != foreign_at:
                 raise DataUnproven(f"another FTP client was active while {path!r} was read")
@@ -212,7 +210,7 @@ class Scheduler:
         Raises:
             RequestTimeout: what was open there could not be closed.
         """
-        return self.server.claim(path, below=below, limit=self.op_deadline)
+        return self.server.claim(path, below=below)
 
     def moved(self, old: bytes, new: bytes) -> None:
         """A file or directory was renamed: who reads or writes it, or in it, goes on under the new path."""

@@ -1,27 +1,61 @@
-"""The server's one session: its states, and who keeps it off a path. Layer: session.
+"""The server's one session: its states, how it is opened and closed, and what is done when it is taken.
 
-One task opens, uses and closes it. Whoever is about to change a path claims that path: the session is closed
-if it is open there, and stays off it until the claim is given up (our own session on a path is terminated
-before the path is removed, renamed, created or truncated).
+Layer: session. One task, the scheduler's, opens, uses and closes it. Everybody's requests pass here, so that
+nothing is sent while a remedy wants silence.
+
+Servers refuse an open while a session is (still) taken: with NAK 5 (PX4), 4 (ArduPilot, another id) or 1
+(ArduPilot, the same id). ArduPilot refuses all other requests with 4, too (docs/servers.md 1). Asking again
+soon keeps a stale session alive. So there is one list of remedies: close what may be ours, be silent, reset
+if nobody else was heard. After those it is busy.
+
+Whoever is about to change a path claims it: the session is closed if it is open there, and stays off that
+path until the claim is given up.
 """
 
 from __future__ import annotations
 
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
+from functools import partial
 from typing import TypeVar
 
 import trio
 
+from mavftpfs.protocol.engine import Engine
+from mavftpfs.protocol.operations import ListDirectory, OpenFile, Simple, Terminate
 from mavftpfs.protocol.payload import NakCode, Opcode
-from mavftpfs.session.opening import TERMINATE_LIMIT, Opener, OpenSession
+from mavftpfs.protocol.requests import Operation
+from mavftpfs.session.doubt import Doubt
+from mavftpfs.session.driver import Driver
+from mavftpfs.session.vehicle import Vehicle
 from mavftpfs.shared.errors import FtpNak, MavftpfsError, RequestTimeout, SessionBusy, SessionLost
+from mavftpfs.shared.model import wire_path
+
+SILENCE_ARDUPILOT = 3.5
+"""Seconds. ArduPilot lets a session be taken over after 3 s without any reply."""
+
+SILENCE_PX4 = 10.5
+"""Seconds. PX4 closes a session 10 s after the last request of anybody on the link."""
+
+SILENCE_PATIENCE = 5.0
+"""Seconds to wait for requests under way before falling silent: a long listing keeps nobody else out."""
+
+TERMINATE_LIMIT = 5.0
+"""Seconds to wait for a Terminate that is sent for somebody else's sake."""
+
+_LOST_ACKS = 4
+"""How often an open is tried again whose ACKs are lost one after the other."""
+
+_SURELY_OPEN = 8.0
+"""Seconds in which no server closes an idle session (PX4 does after 10)."""
 
 _TAKEN = frozenset((NakCode.INVALID_SESSION, NakCode.NO_SESSIONS_AVAILABLE))
 
 T = TypeVar("T")
+Remedy = Callable[[FtpNak], Awaitable[bool]]
+"""Does something about a refusal; False: it does not apply."""
 
 
 class State(Enum):
@@ -48,6 +82,23 @@ NEXT: dict[State, frozenset[State]] = {
 """All transitions there are."""
 
 
+@dataclass(frozen=True, slots=True)
+class OpenSession:
+    """The server's session, open on a file.
+
+    size: in bytes, as the open ACK said; None where it said nothing. opened_at: when that ACK came. writing:
+    opened by OpenFileWO or CreateFile. seq: of that ACK. resent: its request was sent more than once.
+    """
+
+    path: bytes
+    id: int
+    size: int | None
+    opened_at: float
+    writing: bool = False
+    seq: int = -1
+    resent: bool = False
+
+
 @dataclass(frozen=True, eq=False)
 class _Claim:
     """A path that is about to change. below: with all that lies below it."""
@@ -66,29 +117,46 @@ class ServerSession:
 
     Attributes:
         state: see State. session: what is open in the state OPEN.
+        unsure: files that may be open over there by our doing, by session id.
         switches: how often one file made room for another.
         kept_out: whether the last request that needs no session was refused because of somebody else's.
+        resets, quiet_periods: how often these remedies were used.
     """
 
-    def __init__(self, opener: Opener, op_deadline: float = 30.0) -> None:
-        self.opener = opener
+    def __init__(
+        self,
+        driver: Driver,
+        engine: Engine,
+        vehicle: Vehicle,
+        doubt: Doubt,
+        clock: Callable[[], float],
+        op_deadline: float = 30.0,
+    ) -> None:
         self.state = State.CLOSED
         self.session: OpenSession | None = None
-        self.switches = 0
+        self.unsure: dict[int, bytes] = {}
         self.kept_out = False
+        self.switches = self.resets = self.quiet_periods = 0
+        self._driver = driver
+        self._engine = engine
+        self._vehicle = vehicle
+        self._doubt = doubt
+        self._clock = clock
         self._op_deadline = op_deadline
-        self._path: bytes | None = None  # of what is being opened, while it is
-        self._closing: bytes | None = None
+        self._server_assigns: bool | None = None
+        self._opening: bytes | None = None
         self._claims: list[_Claim] = []
         self._news = trio.Event()
         self._freed = trio.Event()
+        self._under_way = 0
+        self._silent = 0
+        self._traffic_changed = trio.Event()
 
     def check_invariants(self) -> None:
-        """Raise AssertionError if state and books disagree."""
+        """Raise AssertionError if the state and what is remembered disagree."""
         assert (self.session is not None) == (self.state is State.OPEN)
-        assert (self._closing is not None) == (self.state is State.CLOSING)
         if self.state in (State.CLOSED, State.UNSURE):
-            assert bool(self.opener.unsure) == (self.state is State.UNSURE)
+            assert bool(self.unsure) == (self.state is State.UNSURE)
 
     def _enter(self, state: State, session: OpenSession | None = None) -> None:
         assert state in NEXT[self.state], f"{self.state} does not become {state}"
@@ -99,7 +167,7 @@ class ServerSession:
 
     def _settle(self) -> None:
         """Nothing is open, as far as is known."""
-        self._enter(State.UNSURE if self.opener.unsure else State.CLOSED)
+        self._enter(State.UNSURE if self.unsure else State.CLOSED)
 
     # --- waiting
 
@@ -115,16 +183,60 @@ class ServerSession:
             return True
         return False
 
-    # --- opening and closing
+    # --- all traffic
 
-    async def open(self, path: bytes, opcode: Opcode = Opcode.OPEN_FILE_RO) -> OpenSession:
-        """Close what is open and open another file.
+    @asynccontextmanager
+    async def traffic(self) -> AsyncIterator[None]:
+        """Hold this while requests may be on the wire; it waits while nothing is to be said."""
+        while self._silent:
+            await self._traffic_changed.wait()
+        self._under_way += 1
+        try:
+            yield
+        finally:
+            self._under_way -= 1
+            self._tell_traffic()
+
+    async def run(self, operation: Operation) -> None:
+        """Carry out an operation that needs no open file of its own.
 
         Raises:
-            What Opener.open raises, and close of a file that was written to. That a file which was only read
-            could not be closed is no news to whoever opens the next: the opener tries again.
+            What it fails with.
         """
-        self._path = path  # from now on nobody may change that name, also while the other file is closed
+        async with self.traffic():
+            await self._driver.run(operation)
+
+    async def get_through(self, attempt: Callable[[], Awaitable[T]], *, changes: bool = False) -> T:
+        """Do something that another client's session may keep out (ArduPilot), after silences if need be.
+
+        changes: a refusal of what was sent twice may answer the second execution, and is the caller's news.
+
+        Raises:
+            SessionBusy: it did not go away. Else what `attempt` raises.
+        """
+
+        def is_taken(nak: FtpNak) -> bool:
+            return nak.code in _TAKEN and self.session is None and not (changes and nak.retransmitted)
+
+        try:
+            result = await self._insist(attempt, is_taken, self._silences())
+        except SessionBusy:
+            self.kept_out = True
+            raise
+        self.kept_out = False
+        return result
+
+    # --- opening
+
+    async def open(self, path: bytes, opcode: Opcode = Opcode.OPEN_FILE_RO) -> OpenSession:
+        """Close what is open and open another file, by OpenFileRO, OpenFileWO or CreateFile.
+
+        Raises:
+            FtpNak: the server refused. SessionBusy: its session stayed taken. RequestTimeout. What `close`
+                raises of a file that was written to; that a file which was only read could not be closed is
+                no news to whoever opens the next.
+        """
+        self._opening = path  # from now on nobody may change that name, also while the other file is closed
         try:
             if self.session is not None:
                 close = self.close if self.session.writing else self.close_quietly
@@ -132,30 +244,111 @@ class ServerSession:
                 self.switches += 1
             self._enter(State.OPENING)
             try:
-                session = await self.opener.open(path, opcode)
+                session = await self._open_by_remedies(path, opcode)
             except BaseException:
                 self._settle()
                 raise
             self._enter(State.OPEN, session)
         finally:
-            self._path = None
+            self._opening = None
         return session
 
-    async def close(self, limit: float | None = None) -> bool:
-        """Terminate; True if there was nothing to do or it was we who closed it (Opener.close).
+    async def _open_by_remedies(self, path: bytes, opcode: Opcode) -> OpenSession:
+        await self._close_maybe_open()
+        resent = False
 
-        limit: seconds to wait for the answer; None: as for any request, for somebody is told of a failure.
+        async def attempt() -> OpenSession:
+            nonlocal resent
+            try:
+                return await self._ask_to_open(path, opcode)
+            except FtpNak as nak:
+                resent |= nak.retransmitted
+                if not self._may_be_ours(nak):
+                    self.unsure.clear()
+                raise
+
+        remedies = [*[self._close_ours] * _LOST_ACKS, *self._silences(), self._reset]
+        session = await self._insist(attempt, self._refuses_as_taken, remedies)
+        return replace(session, resent=session.resent or resent)
+
+    async def _ask_to_open(self, path: bytes, opcode: Opcode) -> OpenSession:
+        asked = self._engine.home_session
+        operation = OpenFile(opcode, wire_path(path), asked)
+        # A time-out or a cancellation leaves it unsure: the open may have been carried out.
+        self.unsure[0 if self._server_assigns else asked] = path
+        await self.run(operation)
+        self.unsure.clear()
+        self._server_assigns = operation.session != asked
+        self._engine.session = operation.session
+        return OpenSession(
+            path,
+            operation.session,
+            operation.size,
+            self._clock(),
+            writing=opcode != Opcode.OPEN_FILE_RO,
+            seq=operation.reply.seq,
+            resent=operation.retransmitted,
+        )
+
+    def _refuses_as_taken(self, nak: FtpNak) -> bool:
+        """Whether an open was refused because something is open.
+
+        NAK 8 may hide any other code on PX4 (sticky EEXIST), and makes no sense as an answer to an open.
+        ArduPilot's 1 may mean that the session is open under our id, by an open whose ACK was lost; else it
+        is a plain failure.
+        """
+        if nak.code in _TAKEN or nak.code == NakCode.FILE_EXISTS:
+            return True
+        taken = nak.code == NakCode.FAIL and self._may_be_ours(nak) and self._server_assigns is not True
+        if not taken:
+            self.unsure.clear()
+        return taken
+
+    def _may_be_ours(self, nak: FtpNak) -> bool:
+        """Whether an open of ours may have been carried out before this refusal: its ACK was lost, or the
+        network brought an older one once more."""
+        return nak.retransmitted or (self._doubt.active and not self._others_heard())
+
+    # --- closing
+
+    async def close(self, limit: float | None = None) -> bool:
+        """Terminate; return False if the server had closed it before, by itself.
+
+        A session that is not there counts as closed by us if we had to ask twice, within a time in which no
+        server closes an idle one: the first request did it. limit: seconds to wait for the answer; None: as
+        for any request, for somebody is told of a failure.
+
+        Raises:
+            FtpNak: closing failed over there. RequestTimeout: no answer; it is unsure now.
         """
         session = self.session
         if session is None:
             return True
-        self._closing = session.path
+        self._forget(session)
         self._enter(State.CLOSING)
         try:
-            return await self.opener.close(session, self._op_deadline if limit is None else limit)
+            return await self._terminate(session, self._op_deadline if limit is None else limit)
         finally:
-            self._closing = None
             self._settle()
+
+    async def _terminate(self, session: OpenSession, limit: float) -> bool:
+        operation = Terminate(session.id)
+        asked_at = self._clock()
+        try:
+            with trio.fail_after(limit):
+                await self.run(operation)
+        except trio.TooSlowError:
+            self._vehicle.note_timeout()
+            raise RequestTimeout("no answer to TerminateSession") from None
+        except FtpNak as nak:
+            self.unsure.pop(session.id, None)
+            if nak.code != NakCode.FILE_EXISTS:  # PX4's sticky errno for "no such session"
+                raise
+            operation.already_closed = True
+        self.unsure.pop(session.id, None)
+        if not operation.already_closed:
+            return True
+        return operation.retransmitted and self._clock() - asked_at < _SURELY_OPEN
 
     async def close_quietly(self) -> bool:
         """Close after a failure that is already being reported, or for somebody else's sake."""
@@ -168,15 +361,35 @@ class ServerSession:
         """Close what may still be open by our doing; a failure leaves it unsure."""
         if self.state is not State.UNSURE:
             return
-        self._closing = next(iter(self.opener.unsure.values()))
         self._enter(State.CLOSING)
         try:
-            await self.opener.close_unsure()
+            await self._close_maybe_open()
         except MavftpfsError:
             return
         finally:
-            self._closing = None
             self._settle()
+
+    async def _close_maybe_open(self) -> bool:
+        """Close what may be open by our doing, but not what another client may own; return whether something
+        was closed, or was not there.
+
+        Raises:
+            RequestTimeout: no answer; it is as unsure as before.
+        """
+        closed = False
+        for session in list(self.unsure):
+            if session != 0 or not self._others_heard():
+                await self._tolerate(partial(self._terminate_by_id, session))
+                closed = True
+            self.unsure.pop(session, None)
+        return closed
+
+    async def _terminate_by_id(self, session: int) -> None:
+        """Terminate by the id we asked for, and by 0 where the server may have given us that instead."""
+        operation = Terminate(session)
+        await self.run(operation)
+        if operation.already_closed and session and self._server_assigns is None and not self._others_heard():
+            await self.run(Terminate(0))
 
     async def made_room(self, path: bytes) -> bool:
         """Close another file that was only read; return whether there was one and it is closed."""
@@ -193,36 +406,96 @@ class ServerSession:
     def abandon(self) -> None:
         """What is open is lost, or not to be believed: it is closed before the next open."""
         if self.session is not None:
-            self.opener.abandon(self.session)
+            self._forget(self.session)
             self._enter(State.UNSURE)
         self.wake()
 
+    def _forget(self, session: OpenSession) -> None:
+        self.unsure[session.id] = session.path
+        self._engine.session = self._engine.home_session
+
     def forget_server(self) -> None:
-        """The vehicle restarted: nothing is open, unless it was opened before we heard of that."""
+        """The vehicle restarted. What is unsure stays so: the news may come after it was opened anew."""
         self.abandon()
-        self.opener.forget_server()
+        self._server_assigns = None
+        self._engine.session = self._engine.home_session
 
-    # --- requests beside it
+    # --- remedies
 
-    async def get_through(self, attempt: Callable[[], Awaitable[T]], *, changes: bool = False) -> T:
-        """Do something that another client's session may keep out (ArduPilot), after silences if need be.
-
-        changes: a refusal of what was sent twice may answer the second execution, and is the caller's news.
+    async def _insist(
+        self,
+        attempt: Callable[[], Awaitable[T]],
+        is_taken: Callable[[FtpNak], bool],
+        remedies: list[Remedy],
+    ) -> T:
+        """Return what `attempt` returns; each time it is refused as taken comes the next remedy that applies.
 
         Raises:
-            SessionBusy: it did not go away. Else what `attempt` raises.
+            SessionBusy: there is none left. Else what `attempt` raises.
         """
+        while True:
+            try:
+                return await attempt()
+            except FtpNak as nak:
+                if not is_taken(nak):
+                    raise
+                refusal = nak
+            while remedies:
+                if await remedies.pop(0)(refusal):
+                    break
+            else:
+                if refusal.code == NakCode.FAIL:
+                    raise refusal
+                raise SessionBusy("the vehicle's only FTP session is in use by another client") from refusal
 
-        def is_taken(nak: FtpNak) -> bool:
-            return nak.code in _TAKEN and self.session is None and not (changes and nak.retransmitted)
+    def _silences(self) -> list[Remedy]:
+        return [partial(self._be_silent, seconds) for seconds in (SILENCE_ARDUPILOT, SILENCE_PX4)]
 
+    async def _close_ours(self, nak: FtpNak) -> bool:
+        if nak.code == NakCode.FILE_EXISTS:  # a listing that comes to its end clears the sticky errno
+            return await self._tolerate(lambda: self.run(ListDirectory(b"/", False)))
+        return self._may_be_ours(nak) and await self._close_maybe_open()
+
+    async def _be_silent(self, seconds: float, nak: FtpNak) -> bool:
+        if nak.code == NakCode.FAIL:
+            return False
+        self._silent += 1
         try:
-            result = await self.opener.outlast(attempt, is_taken)
-        except SessionBusy:
-            self.kept_out = True
+            with trio.move_on_after(SILENCE_PATIENCE):
+                while self._under_way:
+                    await self._traffic_changed.wait()
+            silent = not self._under_way
+            if silent:
+                self.quiet_periods += 1
+                await trio.sleep(seconds)
+        finally:
+            self._silent -= 1
+            self._tell_traffic()
+        return silent
+
+    async def _reset(self, nak: FtpNak) -> bool:
+        if nak.code == NakCode.FAIL or self._others_heard():
+            return False
+        self.resets += 1
+        reset = Simple(Opcode.RESET_SESSIONS, b"", session=self._engine.home_session, side_effect=True)
+        return await self._tolerate(lambda: self.run(reset))
+
+    async def _tolerate(self, step: Callable[[], Awaitable[None]]) -> bool:
+        """Run a remedy whose refusal changes nothing; a time-out is the caller's news."""
+        try:
+            await step()
+        except RequestTimeout:
             raise
-        self.kept_out = False
-        return result
+        except MavftpfsError:
+            return True
+        return True
+
+    def _others_heard(self) -> bool:
+        return self._vehicle.foreign_client(self._clock())
+
+    def _tell_traffic(self) -> None:
+        self._traffic_changed.set()
+        self._traffic_changed = trio.Event()
 
     # --- claims
 
@@ -231,16 +504,16 @@ class ServerSession:
         return any(claim.covers(path) for claim in self._claims)
 
     @asynccontextmanager
-    async def claim(self, path: bytes, *, below: bool, limit: float) -> AsyncIterator[None]:
-        """Keep the session off a path for the length of the body.
+    async def claim(self, path: bytes, *, below: bool = False) -> AsyncIterator[None]:
+        """Keep the session off a path for the length of the body; below: off all that lies below it, too.
 
         Raises:
-            RequestTimeout: it could not be closed within `limit` seconds.
+            RequestTimeout: it could not be closed in time.
         """
         claim = _Claim(path, below)
         self._claims.append(claim)
         try:
-            with trio.move_on_after(limit) as scope:
+            with trio.move_on_after(self._op_deadline) as scope:
                 while any(claim.covers(busy) for busy in self._busy()):
                     self.wake()
                     await self._freed.wait()
@@ -255,10 +528,9 @@ class ServerSession:
         """Close what is open, or may be open, on claimed paths; errors are the claimer's time-out."""
         if self.session is not None and self.claimed(self.session.path):
             await self.close_quietly()
-        if any(self.claimed(path) for path in self.opener.unsure.values()):
+        if any(self.claimed(path) for path in self.unsure.values()):
             await self.close_unsure()
 
     def _busy(self) -> list[bytes]:
         open_path = None if self.session is None else self.session.path
-        paths = (open_path, self._path, self._closing, *self.opener.unsure.values())
-        return [path for path in paths if path is not None]
+        return [path for path in (open_path, self._opening, *self.unsure.values()) if path is not None]

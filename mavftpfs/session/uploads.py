@@ -15,9 +15,8 @@ from mavftpfs.protocol.engine import Engine
 from mavftpfs.protocol.payload import Opcode
 from mavftpfs.session.doubt import Doubt
 from mavftpfs.session.driver import Driver
-from mavftpfs.session.opening import TERMINATE_LIMIT, OpenSession
 from mavftpfs.session.policy import Queue
-from mavftpfs.session.serversession import ServerSession
+from mavftpfs.session.serversession import TERMINATE_LIMIT, OpenSession, ServerSession
 from mavftpfs.session.upload import Feed, QueuedUpload
 from mavftpfs.session.vehicle import Vehicle
 from mavftpfs.session.writer import Stop, Turns, Writer, is_disarmed

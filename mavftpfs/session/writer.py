@@ -23,9 +23,8 @@ from mavftpfs.protocol.operations import Simple
 from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.protocol.writing import WriteTransfer
 from mavftpfs.session.driver import Driver
-from mavftpfs.session.opening import OpenSession
 from mavftpfs.session.policy import LIGHT_USE, Queue, is_starving, should_switch
-from mavftpfs.session.serversession import ServerSession
+from mavftpfs.session.serversession import OpenSession, ServerSession
 from mavftpfs.session.upload import QueuedUpload
 from mavftpfs.session.vehicle import Vehicle
 from mavftpfs.shared.errors import FtpNak, MavftpfsError
@@ -255,7 +254,7 @@ class Writer:
         self._transfer, self._starved_at = transfer, None
         self._driver.start(transfer, self._server.wake)
         try:
-            async with self._server.opener.passing():
+            async with self._server.traffic():
                 return await self._watch(upload, session, transfer)
         finally:
             self._transfer, self._last = None, transfer

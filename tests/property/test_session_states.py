@@ -19,7 +19,6 @@ from mavftpfs.protocol.operations import OpenFile, Operation, Terminate
 from mavftpfs.protocol.payload import NakCode, Opcode, Payload
 from mavftpfs.session.doubt import Doubt
 from mavftpfs.session.driver import Driver
-from mavftpfs.session.opening import Opener
 from mavftpfs.session.serversession import NEXT, ServerSession, State
 from mavftpfs.session.vehicle import Vehicle
 from mavftpfs.shared.errors import FtpNak, MavftpfsError, RequestTimeout
@@ -61,8 +60,7 @@ async def _play(acts: list[tuple[str, list[str | int]]]) -> None:
     vehicle = Vehicle(0, 0, Address(254, 191))
     engine = Engine(random.Random(1), Flow())
     doubt = Doubt(trio.current_time)
-    opener = Opener(cast(Driver, driver), engine, vehicle, doubt, trio.current_time)
-    server = ServerSession(opener, op_deadline=10.0)
+    server = ServerSession(cast(Driver, driver), engine, vehicle, doubt, trio.current_time, 10.0)
     for number, (act, answers) in enumerate(acts):
         driver._answers = list(answers)
         with trio.move_on_after(60), suppress(MavftpfsError):
@@ -93,6 +91,6 @@ async def _do(server: ServerSession, act: str, path: bytes) -> None:
 def test_a_step_that_is_not_in_the_table_is_a_bug() -> None:
     assert set(NEXT) == set(State)
     engine, vehicle = Engine(random.Random(1), Flow()), Vehicle(0, 0, Address(1, 1))
-    opener = Opener(cast(Driver, None), engine, vehicle, Doubt(lambda: 0.0), lambda: 0.0)
+    server = ServerSession(cast(Driver, None), engine, vehicle, Doubt(lambda: 0.0), lambda: 0.0)
     with pytest.raises(AssertionError):
-        ServerSession(opener)._enter(State.CLOSING)
+        server._enter(State.CLOSING)

@@ -35,7 +35,7 @@ async def test_a_reader_goes_on_beside_a_job_that_has_to_wait(
     monkeypatch.setattr(Scheduler, "_next", counted)
     async with here.connection() as connection, trio.open_nursery() as nursery:
         scheduler = connection.scheduler
-        async with scheduler.server.claim(b"/changing", below=False, limit=5):
+        async with scheduler.server.claim(b"/changing", below=False):
             nursery.start_soon(scheduler.use_session, b"/changing", Opcode.OPEN_FILE_RO)
             await trio.sleep(0.1)
             assert await read_file(connection, b"/big") == content("big", 20_000)

@@ -205,7 +205,7 @@ async def test_times_that_could_not_be_asked_for_are_not_refused(autojump: MockC
     async with here.connection() as connection, trio.open_nursery() as nursery:
 
         async def keep_quiet() -> None:
-            await connection.scheduler.opener._be_silent(3.5, FtpNak(3, NakCode.INVALID_SESSION))
+            await connection.scheduler.server._be_silent(3.5, FtpNak(3, NakCode.INVALID_SESSION))
 
         for _ in range(3):
             nursery.start_soon(keep_quiet)

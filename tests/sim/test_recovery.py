@@ -13,8 +13,8 @@ from trio.testing import MockClock
 from mavftpfs.link.messages import Address
 from mavftpfs.protocol.payload import Opcode, decode_request, request
 from mavftpfs.session.connection import Connection
-from mavftpfs.session.opening import SILENCE_ARDUPILOT
 from mavftpfs.session.reader import REOPENS, STALL
+from mavftpfs.session.serversession import SILENCE_ARDUPILOT
 from mavftpfs.session.store import TIME_PROBE_LIMIT
 from mavftpfs.shared.errors import FileChanged, MavftpfsError, SessionBusy, SessionLost
 from mavftpfs.sim.linkmodel import LinkSettings
@@ -92,8 +92,8 @@ async def test_a_killed_clients_session_is_got_over_by_saying_nothing(autojump: 
         nursery.start_soon(_tolerate_refusals, list_often)
         assert await read_file(connection, path("ardupilot", "f")) == DATA
         nursery.cancel_scope.cancel()
-    assert connection.scheduler.opener.quiet_periods <= 2  # the listings' and the file's, at the same time
-    assert connection.scheduler.opener.resets == 0
+    assert connection.scheduler.server.quiet_periods <= 2  # the listings' and the file's, at the same time
+    assert connection.scheduler.server.resets == 0
     assert sum(silence > SILENCE_ARDUPILOT - 0.1 for silence in log.silences) == 1
     assert log.count(Opcode.OPEN_FILE_RO) == 2
 
@@ -127,7 +127,7 @@ async def test_another_clients_session_is_left_alone(profile: str, autojump: Moc
         await trio.sleep(3.0)
         assert here.vehicle.server.open_paths == [path(profile, "theirs")]
         assert log.count(Opcode.RESET_SESSIONS) == log.count(Opcode.TERMINATE_SESSION) == 0
-        assert connection.scheduler.opener.quiet_periods == 2
+        assert connection.scheduler.server.quiet_periods == 2
         nursery.cancel_scope.cancel()
 
 

@@ -98,7 +98,7 @@ async def test_answers_to_opens_that_are_lost_one_after_the_other(profile: str, 
         await upload.finish()
         assert lost == []
         assert source.all_proven
-        assert connection.scheduler.opener.quiet_periods == 0
+        assert connection.scheduler.server.quiet_periods == 0
         nursery.cancel_scope.cancel()
     assert here.tree.data(path(profile, "new")) == content(3000)
     assert server.open_sessions == 0
@@ -178,7 +178,7 @@ async def test_what_was_opened_before_the_news_of_a_restart_is_closed(
             here.link.kick()
             began = trio.current_time()
         assert connection.vehicle.reboots == 1
-        assert connection.scheduler.opener.quiet_periods == 0
+        assert connection.scheduler.server.quiet_periods == 0
         assert trio.current_time() - began < 9
     assert here.tree.data(path(profile, "new")) == data
     assert here.vehicle.server.open_sessions == 0

@@ -16,7 +16,7 @@ from mavftpfs.protocol.operations import OpenFile, Operation, Simple
 from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.session.doubt import Doubt
 from mavftpfs.session.driver import Driver
-from mavftpfs.session.opening import SILENCE_ARDUPILOT, SILENCE_PATIENCE, SILENCE_PX4, Opener
+from mavftpfs.session.serversession import SILENCE_ARDUPILOT, SILENCE_PATIENCE, SILENCE_PX4, ServerSession
 from mavftpfs.session.vehicle import Vehicle
 from mavftpfs.shared.errors import FtpNak, SessionBusy
 
@@ -37,18 +37,18 @@ class Refusing:
             raise FtpNak(operation.opcode, self.code, retransmitted=self.retransmitted)
 
 
-def opener(code: int) -> tuple[Opener, Refusing, Vehicle]:
+def server(code: int) -> tuple[ServerSession, Refusing, Vehicle]:
     engine = Engine(random.Random(1), Flow())
     vehicle = Vehicle(0, 0, Address(254, 191))
     driver = Refusing(code)
-    made = Opener(cast(Driver, driver), engine, vehicle, Doubt(trio.current_time), trio.current_time)
+    made = ServerSession(cast(Driver, driver), engine, vehicle, Doubt(trio.current_time), trio.current_time)
     return made, driver, vehicle
 
 
 async def test_a_taken_session_is_waited_out_in_silence_then_reset_then_given_up(
     autojump_clock: MockClock,
 ) -> None:
-    made, driver, _ = opener(NakCode.NO_SESSIONS_AVAILABLE)
+    made, driver, _ = server(NakCode.NO_SESSIONS_AVAILABLE)
     with pytest.raises(SessionBusy):
         await made.open(b"/f")
     opcodes = [opcode for _, opcode in driver.log]
@@ -59,7 +59,7 @@ async def test_a_taken_session_is_waited_out_in_silence_then_reset_then_given_up
 
 
 async def test_sessions_are_not_reset_while_another_client_is_heard(autojump_clock: MockClock) -> None:
-    made, driver, vehicle = opener(NakCode.INVALID_SESSION)
+    made, driver, vehicle = server(NakCode.INVALID_SESSION)
     vehicle.foreign_at = trio.current_time() + SILENCE_PX4
     with pytest.raises(SessionBusy):
         await made.open(b"/f")
@@ -68,7 +68,7 @@ async def test_sessions_are_not_reset_while_another_client_is_heard(autojump_clo
 
 
 async def test_a_file_that_fails_plainly_costs_no_silence(autojump_clock: MockClock) -> None:
-    made, driver, _ = opener(NakCode.FAIL)
+    made, driver, _ = server(NakCode.FAIL)
     with pytest.raises(FtpNak):
         await made.open(b"/f")
     assert [opcode for _, opcode in driver.log] == [Opcode.OPEN_FILE_RO]
@@ -76,11 +76,11 @@ async def test_a_file_that_fails_plainly_costs_no_silence(autojump_clock: MockCl
 
 
 async def test_who_stays_for_long_does_not_keep_the_others_out(autojump_clock: MockClock) -> None:
-    made, _, _ = opener(0)
+    made, _, _ = server(0)
     entered: list[float] = []
 
     async def pass_through(stay: float) -> None:
-        async with made.passing():
+        async with made.traffic():
             entered.append(trio.current_time() - start)
             await trio.sleep(stay)
 
@@ -98,7 +98,7 @@ async def test_who_stays_for_long_does_not_keep_the_others_out(autojump_clock: M
 async def test_an_open_that_may_have_worked_the_first_time_is_terminated_before_anything_else(
     autojump_clock: MockClock,
 ) -> None:
-    made, driver, _ = opener(NakCode.FAIL)
+    made, driver, _ = server(NakCode.FAIL)
     driver.retransmitted = True
     with pytest.raises(FtpNak):
         await made.open(b"/f")
