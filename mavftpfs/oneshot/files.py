@@ -1,18 +1,36 @@
-"""What the one-shot verbs need of a vehicle's files. Layer: top.
+"""The vehicle's files as the one-shot verbs use them: of a mount that is up, or of a connection. Layer: top.
 
-`cache.tree.Tree` offers it for a connection of our own, `mounted.MountedFiles` for a mount that is up.
-Paths are normalised (shared.model.normalise).
+Two programs cannot share a serial port, and not well the vehicle's only FTP session, so while a mount of the
+vehicle is up its files are used in place of a second connection. Every call to a mount goes through the
+kernel, in a thread: it may have to wait for its vehicle. For a connection of our own `cache.tree.Tree` offers
+the same. Paths are normalised (shared.model.normalise).
 """
 
 from __future__ import annotations
 
-from collections.abc import Awaitable, Callable, Sequence
+import errno
+import json
+import os
+from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequence
+from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar, cast
 
+import trio
+
+from mavftpfs import control
 from mavftpfs.cache.attributes import Stat
+from mavftpfs.compose import NO_SINKS, Attached, Sinks, attached, no_answer
+from mavftpfs.fuse.operations import XATTR_CRC32, XATTR_STATUS
+from mavftpfs.fuse.options import MountOptions
+from mavftpfs.link.uri import LinkKind, LinkSpec, parse_source
+from mavftpfs.mountpoint import canonical, is_ours, mounts
+from mavftpfs.session.vehicle import SILENCE_LIMIT
+from mavftpfs.shared import errors
+from mavftpfs.shared.errnos import errno_for
 from mavftpfs.shared.errors import NotFound
-from mavftpfs.shared.model import EntryKind
+from mavftpfs.shared.model import ROOT, EntryKind, normalise
+from mavftpfs.shared.readable import name_text
 
 READ_SIZE = 128 * 1024
 
@@ -97,3 +115,332 @@ async def is_directory(files: Files, path: bytes) -> bool:
         return (await files.stat(path)).kind is EntryKind.DIRECTORY
     except NotFound:
         return False
+
+
+STATUS_PATIENCE = 3.0
+"""Seconds for a mount to say what it is of; one that does not is not used."""
+
+ResultT = TypeVar("ResultT")
+
+
+# -- which mount ----------------------------------------------------------------------------------
+
+
+def mountpoint_of(source: str) -> tuple[str, bytes] | None:
+    """Return (mountpoint, subtree) where SOURCE is a mountpoint of ours, else None."""
+    place, _, subtree = source.partition("#")
+    if not place or (":" in place and not place.startswith("/")):
+        return None
+    path = canonical(place)
+    return (path, normalise(os.fsencode(subtree))) if is_ours(path) else None
+
+
+async def find_mount(spec: LinkSpec, options: MountOptions) -> Session | None:
+    """Return the files of the mount that holds this link now, if one is up and may be read by us."""
+    for mountpoint in [path for path in mounts() if is_ours(path)]:
+        with suppress(errors.MavftpfsError, ValueError, KeyError, TypeError):
+            status = await _status(mountpoint)
+            if not _is_wanted(status["vehicle"], options):
+                continue
+            if same_link(parse_source(status["source"]), spec):
+                return session_on(mountpoint, _root_of(status), options.root)
+    return None
+
+
+def _is_wanted(vehicle: Mapping[str, Any], options: MountOptions) -> bool:
+    is_system = options.target_system in (0, vehicle["system"])
+    return is_system and options.target_component in (0, vehicle["component"])
+
+
+async def open_mount(mountpoint: str, subtree: bytes) -> Session:
+    """Return the files below `subtree` of a mount.
+
+    Raises:
+        LinkClosed: it does not answer.
+    """
+    root = _root_of(await _status(mountpoint))
+    return session_on(mountpoint, root, normalise(root + b"/" + subtree))
+
+
+def session_on(mountpoint: str, mounted: bytes, root: bytes) -> Session:
+    """Return the files below `root` of the vehicle, of which `mounted` is on `mountpoint`."""
+
+    async def transfers() -> Transfers:
+        found = (await _status(mountpoint))["transfers"]
+        return [
+            {"path": facts["path"], "size": facts["size"], "bytes_left": facts["size"] - facts["done"]}
+            for facts in found
+            if facts["direction"] == "write"
+        ]
+
+    return Session(MountedFiles(mountpoint, mounted, root), root, transfers, mountpoint)
+
+
+def same_link(one: LinkSpec, other: LinkSpec) -> bool:
+    """Return whether two SOURCEs cannot be open at once, because they are the same link."""
+    if one.kind is not other.kind:
+        return False
+    if one.kind is LinkKind.SERIAL:
+        return os.path.realpath(one.device) == os.path.realpath(other.device)
+    if one.port != other.port:
+        return False
+    listens = one.kind in (LinkKind.UDP_IN, LinkKind.TCP_IN)
+    return one.host == other.host or (listens and bool({one.host, other.host} & {"0.0.0.0", "::"}))
+
+
+async def mount_status(mountpoint: str) -> Mapping[str, Any]:
+    """Return a mount's status.
+
+    Raises:
+        LinkClosed: it does not answer.
+    """
+    return await _status(mountpoint)
+
+
+async def _status(mountpoint: str) -> Mapping[str, Any]:
+    with trio.move_on_after(STATUS_PATIENCE):
+        text = await _in_thread(lambda: os.getxattr(mountpoint, XATTR_STATUS), ROOT)
+        facts: Mapping[str, Any] = json.loads(text)
+        return facts
+    raise errors.LinkClosed(f"the mount on {mountpoint} does not answer")
+
+
+def _root_of(status: Mapping[str, Any]) -> bytes:
+    return os.fsencode(str(status["root"]))
+
+
+# -- its files ------------------------------------------------------------------------------------
+
+_BY_ERRNO: dict[int, type[errors.MavftpfsError]] = {
+    errno_for(kind("")): kind
+    for kind in (
+        *(errors.NotFound, errors.NotADirectory, errors.IsADirectory, errors.AlreadyExists),
+        *(errors.DirectoryNotEmpty, errors.InvalidMove, errors.CrossDevice, errors.ReadOnly, errors.FileBusy),
+        *(errors.NotSupported, errors.FileTooLarge, errors.NoSpace, errors.FileChanged),
+        *(errors.PathTooLong, errors.RequestTimeout),
+    )
+} | {
+    errno.ENOTCONN: errors.LinkClosed,  # the mount's process is gone
+    errno.ECONNABORTED: errors.LinkClosed,
+    errno.ENODEV: errors.LinkClosed,
+    errno.EAGAIN: errors.NotDeliveredYet,  # only the checksum says it, also while armed
+}
+
+
+def _translated(error: OSError, path: bytes) -> errors.MavftpfsError:
+    kind = _BY_ERRNO.get(error.errno or 0, errors.MavftpfsError)
+    hint = " (the vehicle is armed, or mounted with ro)" if kind is errors.ReadOnly else ""
+    return kind(f"{name_text(path)}: {os.strerror(error.errno or errno.EIO)}{hint}")
+
+
+async def _in_thread(function: Callable[[], ResultT], path: bytes) -> ResultT:
+    try:
+        return await trio.to_thread.run_sync(function, abandon_on_cancel=True)
+    except OSError as exc:
+        raise _translated(exc, path) from exc
+
+
+@dataclass(slots=True)
+class MountedFile:
+    """An open file of a mount."""
+
+    path: bytes
+    fd: int
+    size: int
+
+    async def read(self, offset: int, size: int) -> bytes:
+        """See File."""
+        return await _in_thread(lambda: os.pread(self.fd, size, offset), self.path)
+
+    async def write(self, offset: int, data: bytes | memoryview) -> int:
+        """See File."""
+        return await _in_thread(lambda: os.pwrite(self.fd, data, offset), self.path)
+
+    async def fsync(self) -> None:
+        """See File."""
+        await _in_thread(lambda: os.fsync(self.fd), self.path)
+
+    def close(self) -> None:
+        """See File; what was written was brought there by fsync."""
+        fd, self.fd = self.fd, -1
+        if fd >= 0:
+            with suppress(OSError):
+                os.close(fd)
+
+
+class MountedFiles:
+    """Implements Files."""
+
+    def __init__(self, mountpoint: str, mounted: bytes, root: bytes) -> None:
+        """`mounted`: what of the vehicle is on the mountpoint; `root`: what of it is our `/`."""
+        self._mountpoint = os.fsencode(mountpoint)
+        self._mounted = mounted.rstrip(b"/")
+        self._root = root.rstrip(b"/")
+
+    def _place(self, path: bytes) -> bytes:
+        remote = normalise(self._root + b"/" + path)
+        if remote != (self._mounted or ROOT) and not remote.startswith(self._mounted + b"/"):
+            raise errors.NotFound(
+                f"{name_text(remote)} lies outside of {name_text(self._mounted)}, which is mounted on "
+                f"{os.fsdecode(self._mountpoint)}"
+            )
+        return self._mountpoint + remote[len(self._mounted) :].rstrip(b"/")
+
+    async def stat(self, path: bytes) -> Stat:
+        """See Files."""
+        place = self._place(path)
+        return _stat_of(await _in_thread(lambda: os.stat(place), path))
+
+    async def list(self, path: bytes) -> list[tuple[bytes, Stat]]:
+        """See Files."""
+        place = self._place(path)
+
+        def scan() -> list[tuple[bytes, Stat]]:
+            with os.scandir(place) as entries:
+                return [(entry.name, _stat_of(entry.stat())) for entry in entries]
+
+        return await _in_thread(scan, path)
+
+    async def open(self, path: bytes, *, write: bool = False, truncate: bool = False) -> MountedFile:
+        """See Files."""
+        flags = (os.O_RDWR if write else os.O_RDONLY) | (os.O_TRUNC if truncate else 0)
+        return await self._open(path, flags)
+
+    async def create(self, path: bytes, *, exclusive: bool) -> MountedFile:
+        """See Files."""
+        return await self._open(path, os.O_RDWR | os.O_CREAT | (os.O_EXCL if exclusive else 0))
+
+    async def _open(self, path: bytes, flags: int) -> MountedFile:
+        place = self._place(path)
+
+        def opened() -> tuple[int, int]:
+            fd = os.open(place, flags | os.O_CLOEXEC, 0o666)
+            return fd, os.fstat(fd).st_size
+
+        return MountedFile(path, *await _in_thread(opened, path))
+
+    async def crc32(self, path: bytes) -> int:
+        """See Files."""
+        place = self._place(path)
+        return int(await _in_thread(lambda: os.getxattr(place, XATTR_CRC32), path), 16)
+
+    async def mkdir(self, path: bytes) -> None:
+        """See Files."""
+        place = self._place(path)
+        await _in_thread(lambda: os.mkdir(place), path)
+
+    async def rmdir(self, path: bytes) -> None:
+        """See Files."""
+        place = self._place(path)
+        await _in_thread(lambda: os.rmdir(place), path)
+
+    async def unlink(self, path: bytes) -> None:
+        """See Files."""
+        place = self._place(path)
+        await _in_thread(lambda: os.unlink(place), path)
+
+    async def rename(self, old: bytes, new: bytes) -> None:
+        """See Files."""
+        source, target = self._place(old), self._place(new)
+        await _in_thread(lambda: os.rename(source, target), old)
+
+    def expire(self, path: bytes) -> None:
+        """See Files."""
+        self.forget_caches()
+
+    def forget_caches(self) -> None:
+        """Have the mount ask the vehicle again; a mount of somebody else may go on with what it knows."""
+        with suppress(errors.MavftpfsError):
+            socket = control.find_socket(os.fsdecode(self._mountpoint), control.own_directories())
+            control.ask(socket, {"command": "forget"}, timeout=STATUS_PATIENCE)
+
+
+def _stat_of(found: os.stat_result) -> Stat:
+    kind = EntryKind.DIRECTORY if (found.st_mode & 0o170000) == 0o040000 else EntryKind.FILE
+    return Stat(kind, found.st_size, int(found.st_mtime), 0.0)
+
+
+_TICK = 0.2
+
+
+@dataclass(frozen=True, slots=True)
+class Target:
+    """Which vehicle, and how to talk to it. mount: (mountpoint, subtree) if SOURCE was a mountpoint."""
+
+    spec: LinkSpec | None
+    options: MountOptions
+    sinks: Sinks = NO_SINKS
+    mount: tuple[str, bytes] | None = None
+
+    async def mounted(self) -> Session | None:
+        """Return the files of the mount that is to be used, None where there is none."""
+        if self.mount is not None:
+            return await open_mount(*self.mount)
+        assert self.spec is not None
+        return await find_mount(self.spec, self.options)
+
+    @asynccontextmanager
+    async def session(self, *, writing: bool = False) -> AsyncIterator[Session]:
+        """Give the vehicle's files for the length of the body.
+
+        Raises:
+            LinkClosed, VehicleLost, NoFtp: nobody answers within connect_timeout, with the reason.
+        """
+        mounted = await self.mounted()
+        if mounted is not None:
+            yield mounted
+            return
+        assert self.spec is not None
+        deadline = trio.current_time() + self.options.connect_timeout
+        # What the verb asks for first takes the place of the first listing that a mount makes.
+        up = attached(self.spec, self.options, sinks=self.sinks, list_root=False, writing=writing)
+        async with up as vehicle, _answered_by(deadline, vehicle, self.options):
+            yield _session_of(vehicle, self.options)
+
+
+def _session_of(vehicle: Attached, options: MountOptions) -> Session:
+    async def transfers() -> Transfers:
+        return cast(Sequence[dict[str, object]], vehicle.tree.status().get("transfers", []))
+
+    def silent() -> bool:
+        connection = vehicle.connection
+        return connection.vehicle.silence(connection.clock()) > SILENCE_LIMIT
+
+    async def returned() -> bool:
+        for _ in range(round(options.connect_timeout / _TICK)):
+            if not silent():
+                return True
+            await trio.sleep(_TICK)
+        return not silent()
+
+    return Session(vehicle.tree, options.root, transfers, silent=silent, returned=returned)
+
+
+@asynccontextmanager
+async def _answered_by(deadline: float, vehicle: Attached, options: MountOptions) -> AsyncIterator[None]:
+    """End the body when no FTP request was answered by the deadline.
+
+    Raises:
+        NoFtp: as a mount says it.
+    """
+    connection = vehicle.connection
+    over = trio.CancelScope()
+
+    async def watch() -> None:
+        await trio.sleep_until(deadline)
+        if connection.engine.stats.replies == 0:
+            over.cancel()
+
+    failure: Exception | None = None
+    async with trio.open_nursery() as nursery:
+        nursery.start_soon(watch)
+        with over:
+            try:
+                yield
+            except Exception as error:  # raised again outside of the nursery, which would wrap it in a group
+                failure = error
+        nursery.cancel_scope.cancel()
+    if over.cancelled_caught:
+        raise no_answer(connection, options)
+    if failure is not None:
+        raise failure

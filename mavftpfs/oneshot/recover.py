@@ -18,7 +18,7 @@ from typing import Any
 from mavftpfs.exits import NotDelivered
 from mavftpfs.oneshot.files import READ_SIZE, Session
 from mavftpfs.oneshot.progress import Progress
-from mavftpfs.oneshot.put import Piece, Put, Sent, put_paths
+from mavftpfs.oneshot.transfer import Piece, Put, Sent, put_paths
 from mavftpfs.protocol.crc import crc32
 from mavftpfs.shared.errors import (
     Armed,

@@ -13,8 +13,7 @@ from mavftpfs.fuse.options import MountOptions
 from mavftpfs.link.base import Link
 from mavftpfs.link.messages import MAV_TYPE_GCS, Address, AutopilotVersion, Heartbeat
 from mavftpfs.link.opening import open_link
-from mavftpfs.oneshot.mounted import mount_status
-from mavftpfs.oneshot.session import Target
+from mavftpfs.oneshot.files import Target, mount_status
 from mavftpfs.session.connection import Connection, connected
 from mavftpfs.shared.errors import FtpNak, MavftpfsError, VehicleLost
 from mavftpfs.shared.readable import autopilot_name, readable_time

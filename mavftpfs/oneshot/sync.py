@@ -12,13 +12,18 @@ from mavftpfs.oneshot.fetch import (
     Fetched,
     Fetcher,
     LocalDiskFull,
+    Log,
+    Step,
     StillGrowing,
     Wanted,
+    decide,
+    known_time,
     local_disk,
+    newest_first,
     part_of,
+    select,
 )
 from mavftpfs.oneshot.files import Files, Session
-from mavftpfs.oneshot.plan import Log, Step, decide, known_time, newest_first, select
 from mavftpfs.shared.errors import LinkError, MavftpfsError, NotADirectory, NotFound, RequestTimeout
 from mavftpfs.shared.model import EntryKind, join
 from mavftpfs.shared.readable import name_text

@@ -2,30 +2,111 @@
 
 from __future__ import annotations
 
+import argparse
 import json
+import logging
 import os
+import signal
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Coroutine, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from datetime import datetime
 from functools import partial
 from pathlib import Path
+from typing import Any, TypeVar
 
-from mavftpfs.commands import left_by_killed_mounts_line
+import trio
+
+from mavftpfs import daemon
+from mavftpfs.commands import connection_of, left_by_killed_mounts_line
+from mavftpfs.compose import open_sinks
 from mavftpfs.exits import ExitCode, exit_code_for
 from mavftpfs.farewell import recovered_directory
-from mavftpfs.oneshot import get as getting
-from mavftpfs.oneshot import listing, names, paths, progress
-from mavftpfs.oneshot import put as putting
+from mavftpfs.fuse.options import parse_options
+from mavftpfs.oneshot import names, progress, transfer
 from mavftpfs.oneshot import recover as recovering
 from mavftpfs.oneshot import scan as scanning
 from mavftpfs.oneshot import sync as syncing
-from mavftpfs.oneshot.fetch import Fetched, Fetcher
-from mavftpfs.oneshot.files import Session
-from mavftpfs.oneshot.plan import Step
-from mavftpfs.oneshot.running import Args, run, with_session
+from mavftpfs.oneshot.fetch import Fetched, Fetcher, Step
+from mavftpfs.oneshot.files import Session, Target, mountpoint_of
 from mavftpfs.shared.errors import MavftpfsError, UsageError
 from mavftpfs.shared.readable import name_text, printable, readable, readable_size
+
+ResultT = TypeVar("ResultT")
+Args = argparse.Namespace
+
+
+def _target(args: Args, component: int | None) -> Target:
+    mount = mountpoint_of(args.source)
+    if mount is not None:
+        return Target(None, parse_options(args.options), mount=mount)
+    if os.path.isdir(args.source):
+        raise UsageError(f"no vehicle is mounted on {args.source}")
+    options, spec = connection_of(args)
+    if component is not None:
+        options = replace(options, target_component=component)
+    return Target(spec, options)
+
+
+def run(
+    args: Args,
+    function: Callable[[Target], Coroutine[Any, Any, ResultT]],
+    component: int | None = None,
+) -> ResultT:
+    """Run a verb; Ctrl-C ends it in order, so that the vehicle's session is closed."""
+    target = _target(args, component)
+    daemon.log_to_stderr(logging.DEBUG if args.debug else logging.WARNING)
+    if not args.debug:  # whatever the caches warn of is raised, too, and errors are one line
+        logging.getLogger("mavftpfs.cache").setLevel(logging.ERROR)
+    with open_sinks(target.options, debug=args.debug) as sinks:
+        return trio.run(until_interrupted, partial(function, replace(target, sinks=sinks)))
+
+
+def with_session(
+    args: Args,
+    function: Callable[[Session], Coroutine[Any, Any, ResultT]],
+    component: int | None = None,
+    *,
+    writing: bool = False,
+) -> ResultT:
+    """Run a verb on the vehicle's files; `writing` if it changes them."""
+
+    async def work(target: Target) -> ResultT:
+        async with target.session(writing=writing) as session:
+            return await function(session)
+
+    return run(args, work, component)
+
+
+async def until_interrupted(function: Callable[[], Coroutine[Any, Any, ResultT]]) -> ResultT:
+    """Return the function's result.
+
+    Raises:
+        KeyboardInterrupt: SIGINT or SIGTERM came first; the function was cancelled and has cleaned up.
+        MavftpfsError, OSError: the function's own.
+    """
+    results: list[ResultT] = []
+    errors: list[Exception] = []
+    with trio.open_signal_receiver(signal.SIGINT, signal.SIGTERM) as signals:
+        async with trio.open_nursery() as nursery:
+
+            async def watch() -> None:
+                async for _ in signals:
+                    nursery.cancel_scope.cancel()
+
+            nursery.start_soon(watch)
+            try:
+                results.append(await function())
+            except Exception as exc:  # raised again outside of the nursery, which would wrap it in a group
+                errors.append(exc)
+            nursery.cancel_scope.cancel()
+    if errors:
+        raise errors[0]
+    if not results:
+        raise KeyboardInterrupt
+    return results[0]
+
 
 STDOUT = "-"
 
@@ -59,7 +140,7 @@ def sync(args: Args) -> int:
     """Bring the vehicle's logs into a local directory."""
     component, place = None, None
     if args.place is not None:
-        (place,), component = paths.parse_paths([args.place])
+        (place,), component = names.parse_paths([args.place])
     since = None if args.since is None else parse_date(args.since)
     wish = syncing.Wish(Path(args.local), place, args.newest, since, args.dry_run)
     outcome = syncing.Outcome()
@@ -151,15 +232,15 @@ def get(args: Args) -> int:
         if args.recursive:
             raise UsageError("directories cannot be written to stdout; leave out -r or --to -")
         return cat(args)
-    wanted, component = paths.parse_paths(args.paths)
-    got, bar = getting.Got(), progress.Progress()
+    wanted, component = names.parse_paths(args.paths)
+    got, bar = transfer.Got(), progress.Progress()
 
     def tell(fetched: Fetched) -> None:
         print(_fetched_line(fetched), flush=True)
 
     async def work(session: Session) -> None:
         fetcher = Fetcher(session, bar, args.verify, args.resume)
-        await getting.get_paths(
+        await transfer.get_paths(
             fetcher, wanted, Path(args.to), tell, _complain, got, recursive=args.recursive
         )
 
@@ -174,11 +255,11 @@ def get(args: Args) -> int:
 
 def cat(args: Args) -> int:
     """Write files to stdout."""
-    wanted, component = paths.parse_paths(args.paths)
-    got = getting.Got()
+    wanted, component = names.parse_paths(args.paths)
+    got = transfer.Got()
 
     async def work(session: Session) -> None:
-        await getting.cat_paths(session, wanted, sys.stdout.buffer, args.verify, _complain, got)
+        await transfer.cat_paths(session, wanted, sys.stdout.buffer, args.verify, _complain, got)
 
     with_session(args, work, component)
     return ExitCode.INCOMPLETE if got.failed else ExitCode.OK
@@ -189,15 +270,15 @@ def cat(args: Args) -> int:
 
 def put(args: Args) -> int:
     """Put files on the vehicle."""
-    (path,), component = paths.parse_paths([args.path])
-    batches = [(local, putting.collect(local, recursive=args.recursive)) for local in args.locals]
-    counts, bar = putting.Put(), progress.Progress()
+    (path,), component = names.parse_paths([args.path])
+    batches = [(local, transfer.collect(local, recursive=args.recursive)) for local in args.locals]
+    counts, bar = transfer.Put(), progress.Progress()
 
-    def tell(sent: putting.Sent) -> None:
+    def tell(sent: transfer.Sent) -> None:
         print(f"{_name(sent.remote)}: {readable_size(sent.size)}, delivered", flush=True)
 
     async def work(session: Session) -> None:
-        await putting.put_paths(session, batches, path, bar, tell, counts)
+        await transfer.put_paths(session, batches, path, bar, tell, counts)
 
     def stopped() -> str:
         line = f"{counts.done} of {counts.planned} files are on the vehicle"
@@ -212,7 +293,7 @@ def put(args: Args) -> int:
 
 def rm(args: Args) -> int:
     """Remove files."""
-    wanted, component = paths.parse_paths(args.paths)
+    wanted, component = names.parse_paths(args.paths)
     names.refuse_root(wanted)
     remove = partial(names.remove_paths, paths=wanted, recursive=args.recursive)
     with_session(args, remove, component, writing=True)
@@ -221,7 +302,7 @@ def rm(args: Args) -> int:
 
 def mkdir(args: Args) -> int:
     """Make directories."""
-    wanted, component = paths.parse_paths(args.paths)
+    wanted, component = names.parse_paths(args.paths)
     make = partial(names.make_directories, paths=wanted, parents=args.parents)
     with_session(args, make, component, writing=True)
     return ExitCode.OK
@@ -229,14 +310,14 @@ def mkdir(args: Args) -> int:
 
 def rmdir(args: Args) -> int:
     """Remove empty directories."""
-    wanted, component = paths.parse_paths(args.paths)
+    wanted, component = names.parse_paths(args.paths)
     with_session(args, partial(names.remove_directories, paths=wanted), component, writing=True)
     return ExitCode.OK
 
 
 def mv(args: Args) -> int:
     """Rename or move."""
-    (*wanted, to), component = paths.parse_paths([*args.paths, args.target])
+    (*wanted, to), component = names.parse_paths([*args.paths, args.target])
     with_session(args, partial(names.move_paths, paths=wanted, to=to), component, writing=True)
     return ExitCode.OK
 
@@ -295,16 +376,16 @@ def _list_kept(found: Sequence[recovering.Kept], *, as_json: bool) -> None:
 
 def ls(args: Args) -> int:
     """List directories."""
-    wanted, component = paths.parse_paths(args.paths or ["/"])
-    work = partial(listing.list_paths, paths=wanted, recursive=args.recursive, by_time=args.by_time)
+    wanted, component = names.parse_paths(args.paths or ["/"])
+    work = partial(names.list_paths, paths=wanted, recursive=args.recursive, by_time=args.by_time)
     listings = with_session(args, work, component)
     if args.json:
         print(json.dumps([entry for _, entries in listings for entry in entries], indent=2))
         return ExitCode.OK
     terminal = sys.stdout.isatty()
     colours = terminal and not os.environ.get("NO_COLOR") and os.environ.get("TERM") != "dumb"
-    look = listing.Look(args.detailed, args.units, terminal, colours)
-    for line in listing.lines(listings, look):
+    look = names.Look(args.detailed, args.units, terminal, colours)
+    for line in names.lines(listings, look):
         sys.stdout.buffer.write(line.encode("utf-8", "surrogateescape") + b"\n")
     sys.stdout.flush()
     return ExitCode.OK
@@ -312,7 +393,7 @@ def ls(args: Args) -> int:
 
 def crc(args: Args) -> int:
     """Print checksums the vehicle computed, as cksum's relatives do: number, two blanks, name."""
-    wanted, component = paths.parse_paths(args.paths)
+    wanted, component = names.parse_paths(args.paths)
 
     def tell(path: bytes, number: int) -> None:
         print(f"{number:08x}  {_name(path)}")

@@ -12,12 +12,21 @@ import pytest
 import trio
 
 from mavftpfs.oneshot import sync as syncing
-from mavftpfs.oneshot.fetch import Fetched, Fetcher, NotProvenYet, StillGrowing, Wanted, part_of
+from mavftpfs.oneshot.fetch import (
+    PROVEN_BY_DEFAULT,
+    Fetched,
+    Fetcher,
+    NotProvenYet,
+    StillGrowing,
+    Verify,
+    Wanted,
+    known_time,
+    part_of,
+)
 from mavftpfs.oneshot.files import Files, Session
-from mavftpfs.oneshot.get import Got, get_paths, local_name
-from mavftpfs.oneshot.plan import PROVEN_BY_DEFAULT, Verify, known_time
 from mavftpfs.oneshot.progress import Progress
 from mavftpfs.oneshot.sync import Outcome, Wish
+from mavftpfs.oneshot.transfer import Got, get_paths, local_name
 from mavftpfs.shared.errors import (
     Armed,
     DataUnproven,

@@ -12,7 +12,7 @@ from mavftpfs.exits import ExitCode, NotDelivered, exit_code_for
 from mavftpfs.oneshot import names
 from mavftpfs.oneshot.files import Files, Session
 from mavftpfs.oneshot.progress import Progress
-from mavftpfs.oneshot.put import Put, Sent, collect, put_paths
+from mavftpfs.oneshot.transfer import Put, Sent, collect, put_paths
 from mavftpfs.shared.errors import (
     AlreadyExists,
     CrossDevice,

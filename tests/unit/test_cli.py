@@ -20,7 +20,7 @@ import trio
 from mavftpfs import cli, commands, compose, control, daemon, statuses
 from mavftpfs.exits import ExitCode, MountFailed, NoFtp, NotDelivered, exit_code_for
 from mavftpfs.fuse.options import MountOptions
-from mavftpfs.oneshot.running import until_interrupted
+from mavftpfs.oneshot.verbs import until_interrupted
 from mavftpfs.shared import errors
 from mavftpfs.shared.errors import LinkClosed, MavftpfsError, UsageError, VehicleLost
 from mavftpfs.snapshot import snapshot

@@ -60,8 +60,6 @@ PURE_MODULES = {
     "cache.shortnames",
     "cache.snapshots",
     "cache.times",
-    "oneshot.paths",
-    "oneshot.plan",
     "fuse.inodes",
     "fuse.handles",
     "fuse.userattributes",

@@ -1,4 +1,4 @@
-"""oneshot.plan, paths and scan: what to fetch, skip, resume and prove; what words mean."""
+"""oneshot.fetch, names and scan: what to fetch, skip, resume and prove; what words mean."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ import pytest
 
 from mavftpfs.link.messages import Address, AutopilotVersion, Heartbeat
 from mavftpfs.link.uri import parse_source
-from mavftpfs.oneshot import plan
-from mavftpfs.oneshot.mounted import same_link
-from mavftpfs.oneshot.paths import parse_paths
-from mavftpfs.oneshot.plan import Log, Step, Verify
+from mavftpfs.oneshot import fetch
+from mavftpfs.oneshot.fetch import Log, Step, Verify
+from mavftpfs.oneshot.files import same_link
+from mavftpfs.oneshot.names import parse_paths
 from mavftpfs.oneshot.scan import describe_peer, firmware, unique_id
 from mavftpfs.oneshot.verbs import parse_date
 from mavftpfs.shared.errors import UsageError
@@ -34,27 +34,27 @@ MAY, JUNE = 1_714_566_896, 1_717_245_296
     ],
 )
 def test_what_to_do_about_a_file_of_100_bytes(here: int | None, part: int | None, step: Step) -> None:
-    assert plan.decide(100, here, part) is step
+    assert fetch.decide(100, here, part) is step
 
 
 def test_an_empty_file_that_is_here_is_skipped() -> None:
-    assert plan.decide(0, 0, None) is Step.SKIP
-    assert plan.decide(0, None, None) is Step.FETCH
+    assert fetch.decide(0, 0, None) is Step.SKIP
+    assert fetch.decide(0, None, None) is Step.FETCH
 
 
 @pytest.mark.parametrize(
     ("verify", "resumed", "size", "needed"),
     [
-        ("auto", False, plan.PROVEN_BY_DEFAULT, True),
-        ("auto", False, plan.PROVEN_BY_DEFAULT + 1, False),
-        ("auto", True, plan.PROVEN_BY_DEFAULT + 1, True),
-        ("all", False, plan.PROVEN_BY_DEFAULT + 1, True),
+        ("auto", False, fetch.PROVEN_BY_DEFAULT, True),
+        ("auto", False, fetch.PROVEN_BY_DEFAULT + 1, False),
+        ("auto", True, fetch.PROVEN_BY_DEFAULT + 1, True),
+        ("all", False, fetch.PROVEN_BY_DEFAULT + 1, True),
         ("none", False, 1, False),
         ("none", True, 1, True),
     ],
 )
 def test_what_is_proven(verify: Verify, resumed: bool, size: int, needed: bool) -> None:
-    assert plan.proof_needed(verify, resumed=resumed, size=size) is needed
+    assert fetch.proof_needed(verify, resumed=resumed, size=size) is needed
 
 
 def log(below: bytes, mtime: int | None = None) -> Log:
@@ -63,34 +63,34 @@ def log(below: bytes, mtime: int | None = None) -> Log:
 
 def test_the_newest_come_first_by_time_then_by_number() -> None:
     logs = [log(b"s/log9"), log(b"a", MAY), log(b"s/log10"), log(b"b", JUNE), log(b"c", MAY)]
-    assert [one.below for one in plan.newest_first(logs)] == [b"b", b"c", b"a", b"s/log10", b"s/log9"]
+    assert [one.below for one in fetch.newest_first(logs)] == [b"b", b"c", b"a", b"s/log10", b"s/log9"]
 
 
 def test_numbers_are_compared_as_numbers_wherever_they_stand() -> None:
     names = [b"10.BIN", b"9.BIN", b"a1b2", b"a1b10", b"a", b"", b"00000002.BIN"]
     ordered = [b"", b"00000002.BIN", b"9.BIN", b"10.BIN", b"a", b"a1b2", b"a1b10"]
-    assert sorted(names, key=plan.natural) == ordered
+    assert sorted(names, key=fetch.natural) == ordered
 
 
 def test_which_logs_are_wished_for() -> None:
-    logs = plan.newest_first([log(b"a", MAY), log(b"b", JUNE), log(b"c")])
-    assert [one.below for one in plan.select(logs, newest=1, since=None)] == [b"b"]
-    since = plan.select(logs, newest=None, since=MAY + 1)
+    logs = fetch.newest_first([log(b"a", MAY), log(b"b", JUNE), log(b"c")])
+    assert [one.below for one in fetch.select(logs, newest=1, since=None)] == [b"b"]
+    since = fetch.select(logs, newest=None, since=MAY + 1)
     assert [one.below for one in since] == [b"b", b"c"]  # c may be a new one
-    assert plan.select(logs, newest=9, since=None) == logs
+    assert fetch.select(logs, newest=9, since=None) == logs
 
 
 def test_a_clock_that_was_not_set_tells_nothing() -> None:
-    assert plan.known_time(315_532_800) is None
-    assert plan.known_time(MAY) == MAY
+    assert fetch.known_time(315_532_800) is None
+    assert fetch.known_time(MAY) == MAY
 
 
 def test_reads_take_about_a_second() -> None:
-    assert plan.next_read_size(4096, 0.1) == 8192
-    assert plan.next_read_size(plan.LARGEST_READ, 0.1) == plan.LARGEST_READ
-    assert plan.next_read_size(8192, 0.5) == 8192
-    assert plan.next_read_size(8192, 3.0) == 4096
-    assert plan.next_read_size(plan.LEAST_READ, 3.0) == plan.LEAST_READ
+    assert fetch.next_read_size(4096, 0.1) == 8192
+    assert fetch.next_read_size(fetch.LARGEST_READ, 0.1) == fetch.LARGEST_READ
+    assert fetch.next_read_size(8192, 0.5) == 8192
+    assert fetch.next_read_size(8192, 3.0) == 4096
+    assert fetch.next_read_size(fetch.LEAST_READ, 3.0) == fetch.LEAST_READ
 
 
 @pytest.mark.parametrize(
