@@ -13,7 +13,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-from mavftpfs import control, daemon, mountpoint, statuses
+from mavftpfs import control, daemon, mountpoint, report
 from mavftpfs.exits import ExitCode, MountFailed
 from mavftpfs.fuse.options import MountOptions, parse_options, split_words, with_root
 from mavftpfs.link.uri import LinkSpec, parse_source
@@ -67,7 +67,7 @@ def remount(place: str, words: list[str]) -> int:
     if not wanted:
         raise UsageError("remount changes only ro and rw; for other options unmount and mount anew")
     read_only = wanted[-1] == "ro"
-    if not read_only and statuses.status_of(place).get("read_only"):
+    if not read_only and report.status_of(place).get("read_only"):
         raise MountFailed(f"{place} was mounted with ro: unmount it, and mount it without")
     mountpoint.remount(place, read_only=read_only)
     return ExitCode.OK
@@ -144,7 +144,7 @@ def umount(args: argparse.Namespace) -> int:
     """Have a mount's process deliver and unmount; a mount whose process is gone is just taken away."""
     place = canonical(args.mountpoint)
     try:
-        socket = statuses.find_socket(place)
+        socket = report.find_socket(place)
         progress = _Delivery(socket)
         request = {"command": "umount", "lazy": args.lazy}
         try:
@@ -175,10 +175,10 @@ class _Delivery:
 
     def show(self) -> None:
         """Ask the mount, and say what it delivers; called about each second."""
-        from mavftpfs.statustext import delivery_line
+        from mavftpfs.report import delivery_line
 
         try:
-            status = control.ask(self._socket, {"command": "status"}, timeout=statuses.PATIENCE)["status"]
+            status = control.ask(self._socket, {"command": "status"}, timeout=report.PATIENCE)["status"]
         except control.ControlError:
             return  # it ends just now
         # One that is still in use holds bytes, too, but does not end.
@@ -253,22 +253,22 @@ def _wait_for_end(pid: int) -> None:
 
 def status(args: argparse.Namespace) -> int:
     """Show what one mount, or all mounts that this user may ask, are doing."""
-    from mavftpfs import statustext
+    from mavftpfs import report
 
     if args.mountpoint is None:
-        fetch = statuses.all_statuses
+        fetch = report.all_statuses
     else:
         place = canonical(args.mountpoint)
 
-        def fetch() -> list[statuses.Status]:
-            return [statuses.status_of(place)]
+        def fetch() -> list[report.Status]:
+            return [report.status_of(place)]
 
     if args.json:
-        statustext.print_json(fetch, single=args.mountpoint is not None, watch=args.watch)
+        report.print_json(fetch, single=args.mountpoint is not None, watch=args.watch)
         return ExitCode.OK
     if args.watch:
-        statustext.watch_status(fetch, verbose=args.verbose)
+        report.watch_status(fetch, verbose=args.verbose)
     found = fetch()
-    statustext.print_status(found, verbose=args.verbose)
+    report.print_status(found, verbose=args.verbose)
     unanswered = args.mountpoint is not None and found[0].get("problem")
     return ExitCode.MOUNT_FAILED if unanswered else ExitCode.OK

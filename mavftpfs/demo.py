@@ -27,7 +27,7 @@ from rich.console import Console
 from rich.panel import Panel
 from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TransferSpeedColumn
 
-from mavftpfs import control, statuses
+from mavftpfs import control, report
 from mavftpfs.daemon import signals_held
 from mavftpfs.mountpoint import mounts
 
@@ -251,7 +251,7 @@ def fetched_bytes(tour: Tour) -> int:
     Not the copy's size: cp asks for 256 KiB at a time, so the bar would jump.
     """
     try:
-        transfers = statuses.status_of(str(tour.drone))["transfers"]
+        transfers = report.status_of(str(tour.drone))["transfers"]
     except control.ControlError as error:
         raise DemoFailed(f"no status: {error}") from error
     return sum(transfer["done"] for transfer in transfers)

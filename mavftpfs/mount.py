@@ -37,8 +37,8 @@ from mavftpfs.fuse.options import MountOptions, fuse_words
 from mavftpfs.fuse.writing import WritingOperations
 from mavftpfs.link.uri import LinkSpec
 from mavftpfs.mountpoint import is_ours, stderr_of, unmount, unmount_what_is_left
+from mavftpfs.report import Watcher, snapshot
 from mavftpfs.shared.errors import MavftpfsError
-from mavftpfs.snapshot import Watcher, snapshot
 
 log = logging.getLogger("mavftpfs.mount")
 

@@ -17,13 +17,13 @@ from typing import Any
 import pytest
 import trio
 
-from mavftpfs import cli, commands, compose, control, daemon, statuses
+from mavftpfs import cli, commands, compose, control, daemon, report
 from mavftpfs.exits import ExitCode, MountFailed, NoFtp, NotDelivered, exit_code_for
 from mavftpfs.fuse.options import MountOptions
 from mavftpfs.oneshot.verbs import until_interrupted
+from mavftpfs.report import snapshot
 from mavftpfs.shared import errors
 from mavftpfs.shared.errors import LinkClosed, MavftpfsError, UsageError, VehicleLost
-from mavftpfs.snapshot import snapshot
 
 SOURCE = "udpin:127.0.0.1:0"
 
@@ -281,7 +281,7 @@ def sockets(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     directory = tmp_path / "run"
     directory.mkdir()
     monkeypatch.setattr(control, "own_directories", lambda: [directory])
-    monkeypatch.setattr(statuses, "mounts", dict)  # not those of other tests that run just now
+    monkeypatch.setattr(report, "mounts", dict)  # not those of other tests that run just now
     return directory
 
 

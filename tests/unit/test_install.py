@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from mavftpfs import cli, install, manual
+from mavftpfs import cli, install
 from mavftpfs.exits import EXIT_CODES, ExitCode
 from mavftpfs.fuse.options import option_names
 from mavftpfs.shared.errors import UsageError
@@ -96,12 +96,12 @@ def test_man_reads_the_pages_without_a_warning(pieces: dict[str, install.Piece],
 
 
 def test_the_escapes_of_man() -> None:
-    assert manual._escaped(r".x \n -o 100%%") == r"\&.x \en \-o 100%"
+    assert install._escaped(r".x \n -o 100%%") == r"\&.x \en \-o 100%"
 
 
-@pytest.mark.parametrize("shell", manual.SHELLS)
+@pytest.mark.parametrize("shell", install.SHELLS)
 def test_completions_can_be_read_and_know_the_commands(shell: str, tmp_path: Path) -> None:
-    text = manual.completion(cli.whole_parser(), shell)
+    text = install.completion(cli.whole_parser(), shell)
     assert all(name in text for name in COMMANDS)
     if shutil.which(shell) is not None:
         path = tmp_path / "mavftpfs"
@@ -111,7 +111,7 @@ def test_completions_can_be_read_and_know_the_commands(shell: str, tmp_path: Pat
 
 def test_bash_completes_commands_and_options(tmp_path: Path) -> None:
     path = tmp_path / "mavftpfs"
-    path.write_text(manual.completion(cli.whole_parser(), "bash"))
+    path.write_text(install.completion(cli.whole_parser(), "bash"))
     script = (
         'source "$1"; COMP_WORDS=(mavftpfs "${@:2}"); COMP_CWORD=$(($# - 1)); '
         '_shtab_mavftpfs mavftpfs "${!#}" mavftpfs; printf "%s\\n" "${COMPREPLY[@]}"'

@@ -72,7 +72,7 @@ SOLE_IMPORTERS = {
     "pyfuse3": {"fuse.device", "fuse.operations", "fuse.writing", "mount"},
     "pymavlink": {"link.framing"},
     "serial": {"link.serial"},
-    "rich": {"cli", "demo", "report", "oneshot.progress"},
+    "rich": {"cli", "demo", "oneshot.progress"},
 }
 
 MAX_FUNCTION_LINES = 60

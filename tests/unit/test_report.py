@@ -1,4 +1,4 @@
-"""statustext: facts as a person reads them, and as many of them as a terminal has room for."""
+"""report: facts as a person reads them, and as many of them as a terminal has room for."""
 
 from __future__ import annotations
 
@@ -7,9 +7,8 @@ from typing import Any
 
 import pytest
 
+from mavftpfs.report import NOTHING, delivery_line, panel, rows, snapshot, status_lines
 from mavftpfs.shared.readable import printable, readable_size, readable_time
-from mavftpfs.snapshot import snapshot
-from mavftpfs.statustext import NOTHING, delivery_line, panel, rows, status_lines
 
 CONNECTION = {
     "vehicle": [1, 1],
