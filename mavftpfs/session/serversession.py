@@ -1,6 +1,6 @@
-"""The server's one session: its states, how it is opened and closed, and what is done when it is taken.
+"""The server's one session: its states, opening and closing, and remedies when it is taken. Layer: session.
 
-Layer: session. One task, the scheduler's, opens, uses and closes it. Everybody's requests pass here, so that
+One task, the scheduler's, opens, uses and closes it. Everybody's requests pass here, so that
 nothing is sent while a remedy wants silence.
 
 Servers refuse an open while a session is (still) taken: with NAK 5 (PX4), 4 (ArduPilot, another id) or 1
