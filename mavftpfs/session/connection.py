@@ -296,9 +296,9 @@ def _build(
 
     vehicle.on_reboot = on_reboot
 
-    def on_foreign() -> None:
+    def on_foreign(payload: bytes, newcomer: bool) -> None:
         flow.alone = False
-        scheduler.doubt.raise_it("another FTP client is active")
+        scheduler.on_foreign(payload, newcomer=newcomer)
 
     vehicle.on_foreign = on_foreign
     vehicle.on_heartbeat = connection._on_heartbeat

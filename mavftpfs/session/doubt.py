@@ -12,12 +12,38 @@ from __future__ import annotations
 from collections.abc import Callable
 from math import inf
 
+from mavftpfs.protocol.payload import Opcode
+
 LASTS = 600.0
 """Seconds for which a doubt lasts: a second radio or another client stays for a while."""
 
 LEAST_LATE = 1.0
 MOST_LATE = 10.0
 """Seconds by which a copy of a request is taken to be late at least, and at most."""
+
+
+_SESSION, _OPCODE, _REQ_OPCODE = 2, 3, 5  # where they are in a payload
+
+_SESSIONS = frozenset(
+    (
+        Opcode.OPEN_FILE_RO,
+        Opcode.OPEN_FILE_WO,
+        Opcode.CREATE_FILE,
+        Opcode.TERMINATE_SESSION,
+        Opcode.RESET_SESSIONS,
+    )
+)
+_IN_A_SESSION = frozenset((Opcode.READ_FILE, Opcode.BURST_READ_FILE, Opcode.WRITE_FILE))
+
+
+def touches_session(payload: bytes, is_ours: Callable[[int], bool]) -> bool:
+    """Return whether another client's request, or a reply to it, may mean that our session is its own now.
+
+    Listings, checksums and changes of names do not: a ground station that shows directories makes nobody's
+    bytes doubtful. is_ours: whether a session id may be that of our session.
+    """
+    opcode = payload[_REQ_OPCODE] if payload[_OPCODE] in (Opcode.ACK, Opcode.NAK) else payload[_OPCODE]
+    return opcode in _SESSIONS or (opcode in _IN_A_SESSION and is_ours(payload[_SESSION]))
 
 
 class Doubt:
@@ -32,7 +58,7 @@ class Doubt:
         self.reason = ""
         self.on_raised: Callable[[str], None] = lambda reason: None
         self._clock = clock
-        self._at = -inf
+        self._at = self._reads_at = -inf
         self._late = LEAST_LATE
         self._late_at = -inf
 
@@ -41,6 +67,7 @@ class Doubt:
         self.reason = reason
         self._at = self._clock()
         if reads:
+            self._reads_at = self._at
             self.on_raised(reason)
 
     @property
@@ -51,6 +78,10 @@ class Doubt:
     def arose_since(self, at: float) -> bool:
         """Return whether something was noticed after that time."""
         return self._at > at
+
+    def reads_arose_since(self, at: float) -> bool:
+        """Return whether what was read then may be another file's."""
+        return self._reads_at >= at
 
     def note_late(self, seconds: float) -> None:
         """A copy of a request was answered so long after the request was sent first."""

@@ -19,7 +19,7 @@ from mavftpfs.protocol.engine import Engine
 from mavftpfs.protocol.operations import Operation
 from mavftpfs.protocol.payload import Opcode, Payload
 from mavftpfs.protocol.reading import ReadToEof
-from mavftpfs.session.doubt import Doubt
+from mavftpfs.session.doubt import Doubt, touches_session
 from mavftpfs.session.driver import Driver
 from mavftpfs.session.policy import LIGHT_USE, ReadMode, is_starving
 from mavftpfs.session.reader import FileStream, Reading
@@ -150,27 +150,27 @@ class Scheduler:
         return stream
 
     async def read_whole(self, path: bytes, limit: int) -> bytes:
-        """Read a file to EOF whatever its size claims; once more if the session was lost.
+        """Read a file to EOF whatever its size claims; once more if the session was lost or in doubt.
 
         Raises:
-            DataUnproven: another FTP client was heard meanwhile: the bytes may be another file's. Else as
-                use_session.
+            DataUnproven: another FTP client may have used the session each time, so that the bytes may be
+                another file's. Else as use_session.
         """
         data = b""
 
         async def read(session: OpenSession) -> None:
             nonlocal data
-            foreign_at = self._vehicle.foreign_at
+            began = self._clock()
             operation = ReadToEof(session.id, self.read_chunks.size, limit)
             await self.server.run(operation)
             self.server.require(session)
-            if self._vehicle.foreign_at != foreign_at:
+            if self.doubt.reads_arose_since(began):
                 raise DataUnproven(f"another FTP client was active while {path!r} was read")
             data = operation.data
 
         try:
             await self.use_session(path, Opcode.OPEN_FILE_RO, read)
-        except SessionLost:
+        except (SessionLost, DataUnproven):
             await self.use_session(path, Opcode.OPEN_FILE_RO, read)
         return data
 
@@ -242,6 +242,12 @@ class Scheduler:
         """A batch of replies was processed: pass data on, once."""
         self._reading.on_batch(now)
         self._uploading.writer.on_batch()
+
+    def on_foreign(self, payload: bytes, *, newcomer: bool) -> None:
+        """Another FTP client's payload was heard. newcomer: the first for a while, so earlier ones may have
+        been missed."""
+        touches = newcomer or touches_session(payload, self.server.may_be_ours)
+        self.doubt.raise_it("another FTP client is active", reads=touches)
 
     def _on_doubt(self, reason: str) -> None:
         """What was read lately is provisional, also of files closed since."""

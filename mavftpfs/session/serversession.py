@@ -490,6 +490,10 @@ class ServerSession:
             return True
         return True
 
+    def may_be_ours(self, session: int) -> bool:
+        """Return whether an id may be that of our session: always, but where clients choose their ids."""
+        return self._server_assigns is not False or session == self._engine.home_session
+
     def _others_heard(self) -> bool:
         return self._vehicle.foreign_client(self._clock())
 

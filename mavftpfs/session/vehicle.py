@@ -188,14 +188,15 @@ class Vehicle:
     """The target and its neighbourhood.
 
     wanted_system, wanted_component: 0 = the first autopilot heard, resp. that system's autopilot.
-    own: our address; replies to anyone else are another FTP client's.
+    own: our address; replies to anyone else are another FTP client's. on_foreign: called with each payload of
+    another client's, and whether none was heard for a while.
     """
 
     wanted_system: int
     wanted_component: int
     own: Address
     on_reboot: Callable[[], None] = lambda: None
-    on_foreign: Callable[[], None] = lambda: None
+    on_foreign: Callable[[bytes, bool], None] = lambda payload, newcomer: None
     on_heartbeat: Callable[[], None] = lambda: None
     on_armed: Callable[[bool], None] = lambda armed: None
     on_double: Callable[[], None] = lambda: None
@@ -365,8 +366,9 @@ class Vehicle:
         else:
             theirs = frame.target.system in (0, self.address.system)
         if theirs:
+            newcomer = not self.foreign_client(now)
             self.foreign_at = now
-            self.on_foreign()
+            self.on_foreign(frame.payload, newcomer)
 
     def _on_storage(self, message: StorageInformation) -> None:
         if self.storage is None or message.storage_id <= self.storage.storage_id:

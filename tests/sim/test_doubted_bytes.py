@@ -133,7 +133,7 @@ async def test_another_clients_file_took_the_bytes(profile: str, leaves: bool, a
                 stranger(wire(Opcode.RESET_SESSIONS, b""))
                 stranger(wire(Opcode.CREATE_FILE, root + b"/theirs"))
                 connection.vehicle.foreign_at = trio.current_time()
-                connection.vehicle.on_foreign()
+                connection.vehicle.on_foreign(bytes(251), True)
             if count == 200 and leaves:
                 stranger(wire(Opcode.TERMINATE_SESSION, b""))
 

@@ -26,6 +26,8 @@ from mavftpfs.sim.linkmodel import Duplex, LinkSettings
 from tests.support.mounting import mounted
 from tests.support.worlds import ROOTS, MemorySink, World, begin_to_read, content, read_file, world
 
+STRANGER = Address(255, 190)
+
 
 async def test_a_reboot_between_open_and_first_read_is_bridged(autojump: MockClock) -> None:
     here = World("px4", LinkSettings(delay=0.02))
@@ -118,16 +120,59 @@ async def test_a_whole_read_beside_another_client_is_not_believed(profile: str, 
     async with here.connection() as connection, trio.open_nursery() as nursery:
 
         async def interfere() -> None:
-            await trio.sleep(2.0)
             vehicle = connection.vehicle
             assert vehicle.address is not None
-            reply = Payload(9, 0, Opcode.ACK, 0, Opcode.READ_FILE).encode()
-            vehicle.on_message(FtpFrame(vehicle.address, Address(255, 190), reply), trio.current_time())
+            while trio.current_time() < 12.0:
+                await trio.sleep(1.0)
+                session = connection.engine.home_session if profile == "ardupilot" else 0
+                reply = Payload(9, session, Opcode.ACK, 0, Opcode.READ_FILE).encode()
+                vehicle.on_message(FtpFrame(vehicle.address, STRANGER, reply), trio.current_time())
 
         nursery.start_soon(interfere)
         with pytest.raises(DataUnproven):
             await connection.store.read_whole(b"/f", 100_000)
+        await trio.sleep(12.0)
         assert await connection.store.read_whole(b"/f", 100_000) == data
+
+
+BROWSES = request(0, Opcode.LIST_DIRECTORY, data=b"/")
+LOADS = request(0, Opcode.READ_FILE, session=0, size=239)
+
+
+@pytest.mark.parametrize(
+    ("profile", "asks"),
+    [("px4", BROWSES), ("ardupilot", BROWSES), ("mavsdk", BROWSES), ("ardupilot5", LOADS)],
+)
+async def test_files_are_read_beside_a_client_that_leaves_our_session_alone(
+    profile: str, asks: Payload, autojump: MockClock
+) -> None:
+    """A ground station that shows directories all the time, or reads in a session of its own."""
+    here = World(profile, LinkSettings(rate=60_000.0, delay=0.02))
+    here.tree.add(b"/f", content(300_000))
+    here.tree.add(b"/theirs", content(300_000, seed=9))
+    async with mounted(here, b"/") as (connection, tree), trio.open_nursery() as nursery:
+
+        def ask(seq: int, payload: Payload) -> None:
+            wire = payload._replace(seq=seq).encode()
+            here.vehicle.foreign_request(wire, STRANGER, trio.current_time())
+            here.link.kick()
+
+        async def chatter() -> None:
+            if asks is LOADS:
+                ask(20_000, request(0, Opcode.OPEN_FILE_RO, data=b"/theirs"))
+            for seq in range(20_010, 30_000, 2):
+                await trio.sleep(0.1)
+                ask(seq, asks)
+
+        nursery.start_soon(chatter)
+        await trio.sleep(0.3)
+        file = await tree.open(b"/f")
+        assert bytes(await file.read(0, 300_000)) == content(300_000)
+        if profile != "mavsdk":  # it has no files that need this
+            assert await connection.store.read_whole(b"/f", 1 << 20) == content(300_000)
+        assert connection.store.in_doubt()
+        file.close()
+        nursery.cancel_scope.cancel()
 
 
 @pytest.mark.parametrize("profile", ["px4", "ardupilot"])
@@ -288,7 +333,6 @@ async def test_bytes_of_a_session_that_another_client_took_are_asked_for_again(
     root = ROOTS.get(profile, b"")
     here.tree.add(root + b"/ours", content(300_000))
     here.tree.add(root + b"/theirs", content(300_000, seed=9))
-    stranger = Address(255, 190)
     async with mounted(here, root or b"/") as (connection, tree), trio.open_nursery() as nursery:
         file = await tree.open(root + b"/ours")
         first = bytes(await file.read(0, 1000))
@@ -299,11 +343,11 @@ async def test_bytes_of_a_session_that_another_client_took_are_asked_for_again(
                 [(Opcode.RESET_SESSIONS, b""), (Opcode.OPEN_FILE_RO, root + b"/theirs")]
             ):
                 wire = request(30_000 + 10 * seq, opcode, data=path).encode()
-                here.vehicle.foreign_request(wire, stranger, trio.current_time(), audible=False)
+                here.vehicle.foreign_request(wire, STRANGER, trio.current_time(), audible=False)
             here.link.kick()
             await trio.sleep(0.3)
             wire = request(30_100, Opcode.TERMINATE_SESSION, session=0).encode()
-            here.vehicle.foreign_request(wire, stranger, trio.current_time())
+            here.vehicle.foreign_request(wire, STRANGER, trio.current_time())
             here.link.kick()
 
         nursery.start_soon(rival)
