@@ -12,14 +12,14 @@ asks again, by a new reader.
 
 from __future__ import annotations
 
-from collections import OrderedDict, deque
+from collections import OrderedDict
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 
 import trio
 
-from mavftpfs.cache.readahead import Pace, RateMeter
+from mavftpfs.cache.readahead import MAX_WINDOW, RateMeter
 from mavftpfs.shared.errors import RequestTimeout
 from mavftpfs.shared.extents import ExtentSet
 
@@ -27,48 +27,17 @@ BLOCK_SIZE = 128 * 1024
 """Bytes: what malloc still keeps apart well. Blocks of 64 KiB, and the replies put together from them (the
 kernel asks for 256 KiB), left a quarter of the cache's size in unusable holes."""
 
-Gaps = list[tuple[int, int]]
+PIECE = 2 * BLOCK_SIZE
+"""A read is served in pieces of at most so many bytes (what the kernel asks for at once)."""
 
+AHEAD_SECONDS = 3.0
+"""How much of the link's measured rate may lie ahead of a reader."""
 
-class Room:
-    """First come, first served admission of pinned bytes, so that waiting readers cannot fill the memory."""
+SMALL_SECONDS = 2.0
+"""A file that the link carries in this time is small: it is wanted whole."""
 
-    def __init__(self, limit: int) -> None:
-        """`limit`: bytes."""
-        self._limit = limit
-        self._queue: deque[tuple[int, trio.Event]] = deque()
-        self.used = 0
-
-    async def enter(self, count: int) -> None:
-        """Wait for `count` bytes; one that is larger than the limit goes alone."""
-        if not self._queue and self._fits(count):
-            self.used += count
-            return
-        ticket = (count, trio.Event())
-        self._queue.append(ticket)
-        try:
-            await ticket[1].wait()
-        except BaseException:
-            if ticket[1].is_set():
-                self.leave(count)
-            else:
-                self._queue.remove(ticket)
-                self._admit()
-            raise
-
-    def leave(self, count: int) -> None:
-        """Give `count` bytes back."""
-        self.used -= count
-        self._admit()
-
-    def _admit(self) -> None:
-        while self._queue and self._fits(self._queue[0][0]):
-            count, event = self._queue.popleft()
-            self.used += count
-            event.set()
-
-    def _fits(self, count: int) -> bool:
-        return self.used == 0 or self.used + count <= self._limit
+SMALL_FILE = 64 * 1024
+"""Bytes of a file that is small whatever the rate."""
 
 
 class BlockCache:
@@ -80,14 +49,21 @@ class BlockCache:
         self.clock = clock
         self.patience = patience
         self.meter = RateMeter()
-        self.room = Room(budget // 2)
+        self.piece = PIECE if budget >= 8 * PIECE else BLOCK_SIZE
+        self.reads = trio.Semaphore(max(1, budget // 2 // (self.piece + BLOCK_SIZE)))
+        """First come, first served: blocks that are waited for take at most half of the budget."""
         self.bytes_cached = 0
         self.evictions = 0
         self._blocks: OrderedDict[tuple[FileBlocks, int], int] = OrderedDict()
 
-    def pace(self, streams: int) -> Pace:
-        """Return the bounds for readahead while `streams` files are being read."""
-        return Pace(self.budget, streams, self.meter.rate)
+    def readahead_limits(self, streams: int) -> tuple[int, int]:
+        """Return the largest readahead window, and up to which size a file is wanted whole, in bytes, while
+        `streams` files are being read. All windows together fit half of the cache."""
+        limit, rate = min(self.budget // (2 * (streams + 1)), MAX_WINDOW), self.meter.rate
+        if rate is None:
+            return limit, SMALL_FILE
+        limit = min(limit, int(rate * AHEAD_SECONDS))
+        return limit, max(SMALL_FILE, min(limit, int(rate * SMALL_SECONDS)))
 
     def add(self, owner: FileBlocks, index: int, size: int) -> None:
         """Account for a new block, evicting older ones that nobody waits on."""
@@ -132,10 +108,6 @@ class _Waiter:
     error: Exception | None = None
 
 
-def _do_nothing() -> None:
-    """Nobody is to be told."""
-
-
 class FileBlocks:
     """The cached bytes of one version of a file; implements cache.remote.ReadSink.
 
@@ -143,7 +115,7 @@ class FileBlocks:
         given: whether a program got any of the bytes.
         opened_at: when the server opened the file for the session that bytes come from now.
         doubted: what comes from the present reader is ignored; cleared by `begin_reading`.
-        drops: how often bytes were dropped because they were in doubt.
+        drops: how often bytes were dropped because they were in doubt, or another file's.
         on_dropped: called when that happens: the kernel may hold copies.
     """
 
@@ -153,7 +125,7 @@ class FileBlocks:
         self.opened_at = float("-inf")
         self.doubted = False
         self.drops = 0
-        self.on_dropped: Callable[[], None] = _do_nothing
+        self.on_dropped: Callable[[], None] = lambda: None
         self._cache = cache
         self._blocks: dict[int, bytearray] = {}
         self._present = ExtentSet()
@@ -190,7 +162,7 @@ class FileBlocks:
 
     # --- the sink
 
-    def missing(self, start: int, stop: int) -> Gaps:
+    def missing(self, start: int, stop: int) -> list[tuple[int, int]]:
         """Return the parts of [start, stop) not yet held, within the file."""
         return self._present.missing(start, min(stop, self.size))
 
@@ -271,6 +243,7 @@ class FileBlocks:
 
     def start_over(self) -> None:
         """Forget every byte; whoever waits asks again."""
+        self.drops += 1
         self._forget_but(ExtentSet())
 
     def clear(self) -> None:
@@ -295,25 +268,34 @@ class FileBlocks:
     # --- reading
 
     def get(self, start: int, stop: int) -> bytes | memoryview | None:
-        """Return [start, stop) if it is held. 0 <= start < stop <= size."""
-        return self._view(start, stop) if self._present.covers(start, stop) else None
+        """Return [start, stop) if it is held; without a copy if it lies in one block.
 
-    async def fill(self, start: int, stop: int, want: Callable[[Gaps], None]) -> None:
-        """Ask `want` for what is missing of [start, stop), which must be held, and wait for it.
+        0 <= start < stop <= size.
+        """
+        if not self._present.covers(start, stop):
+            return None
+        parts = []
+        while start < stop:
+            index = start // BLOCK_SIZE
+            self._cache.touch(self, index)
+            base = index * BLOCK_SIZE
+            end = min(stop, base + BLOCK_SIZE)
+            parts.append(memoryview(self._blocks[index])[start - base : end - base].toreadonly())
+            start = end
+        return parts[0] if len(parts) == 1 else b"".join(parts)
 
-        `get` may find nothing afterwards: the bytes were dropped. `want` is called before the first await.
+    async def fill(self, start: int, stop: int, want: Callable[[], None]) -> None:
+        """Call `want`, which asks for what is missing of [start, stop), and wait for that. The range must be
+        held (`hold`); `get` may find nothing afterwards, where the bytes were dropped.
 
         Raises:
             RequestTimeout: none of the missing bytes came for `patience` seconds. Else what on_failed got.
         """
-        gaps = self.missing(start, stop)
-        if not gaps:
-            return
-        want(gaps)
         scope = trio.CancelScope(deadline=trio.current_time() + self._cache.patience)
         waiter = _Waiter(start, stop, self._lacking(start, stop), trio.Event(), scope)
         self._waiters.append(waiter)
         try:
+            want()
             with scope:
                 await waiter.done.wait()
         finally:
@@ -324,26 +306,19 @@ class FileBlocks:
             raise RequestTimeout(f"no data came for {self._cache.patience:g} s")
 
     @asynccontextmanager
-    async def held(self, start: int, stop: int) -> AsyncIterator[None]:
-        """Keep the blocks of [start, stop) from being evicted; waits for room.
-
-        Raises:
-            RequestTimeout: other readers kept the room for `patience` seconds.
-        """
+    async def hold(self, start: int, stop: int) -> AsyncIterator[None]:
+        """Keep the blocks of [start, stop) from being evicted; waits for its turn. No more than a piece."""
         indices = range(start // BLOCK_SIZE, -(-stop // BLOCK_SIZE))
-        count = len(indices) * BLOCK_SIZE
-        with trio.move_on_after(self._cache.patience) as scope:
-            await self._cache.room.enter(count)
-        if scope.cancelled_caught:
-            raise RequestTimeout(f"no room for a read within {self._cache.patience:g} s")
-        for index in indices:
-            self._pins[index] = self._pins.get(index, 0) + 1
-        try:
-            yield
-        finally:
+        async with self._cache.reads:
             for index in indices:
-                self._unpin(index)
-            self._cache.room.leave(count)
+                self._pins[index] = self._pins.get(index, 0) + 1
+            try:
+                yield
+            finally:
+                for index in indices:
+                    self._pins[index] -= 1
+                    if not self._pins[index]:
+                        del self._pins[index]
 
     def check_invariants(self) -> None:
         """Raise AssertionError if the books are wrong (for tests)."""
@@ -395,20 +370,3 @@ class FileBlocks:
     def _forget_block(self, index: int) -> None:
         del self._blocks[index]
         self._cache.remove(self, index)
-
-    def _unpin(self, index: int) -> None:
-        self._pins[index] -= 1
-        if not self._pins[index]:
-            del self._pins[index]
-
-    def _view(self, start: int, stop: int) -> bytes | memoryview:
-        """Return the bytes; without a copy if they lie in one block."""
-        parts = []
-        while start < stop:
-            index = start // BLOCK_SIZE
-            self._cache.touch(self, index)
-            base = index * BLOCK_SIZE
-            end = min(stop, base + BLOCK_SIZE)
-            parts.append(memoryview(self._blocks[index])[start - base : end - base].toreadonly())
-            start = end
-        return parts[0] if len(parts) == 1 else b"".join(parts)

@@ -11,7 +11,7 @@ While a file is open the server's session on it is closed and opened again: afte
 of other files. Then size and mtime are compared (`FileHandle.read`): equal, or larger, means the same file,
 because logs grow; else readers that were given bytes get FileChanged, and others go on with the file that is
 there now. The open reply tells the size; the mtime takes a listing that began after the reopening, where
-listings tell any.
+listings tell any. After the vehicle restarted nothing is proven.
 
 The kernel has one page cache for all handles of a path, so a new version bypasses it (direct_io) while
 handles of an older one are open.
@@ -24,16 +24,17 @@ from collections.abc import Callable, Iterable
 from functools import partial
 from itertools import islice
 
+import trio
+
 from mavftpfs.cache.blocks import BlockCache, FileBlocks
 from mavftpfs.cache.dentries import COST_FACTOR, Directory
 from mavftpfs.cache.directories import Directories
 from mavftpfs.cache.kept import KeptCache
 from mavftpfs.cache.openfile import ReadOnlyHandle
-from mavftpfs.cache.options import MIB
-from mavftpfs.cache.readahead import Pace, Readahead
+from mavftpfs.cache.readahead import Readahead
 from mavftpfs.cache.remote import RemoteStore
 from mavftpfs.cache.singleflight import SingleFlight
-from mavftpfs.cache.versions import MAX_TRIES, Fetcher, Version, became_another
+from mavftpfs.cache.versions import NEVER, Fetcher, Version, became_another
 from mavftpfs.shared.errors import (
     DataUnproven,
     FileTooLarge,
@@ -52,8 +53,11 @@ WRAP = 1 << 32
 READING = 3.0
 """Seconds for which a file of which bytes came counts as being read."""
 
-MAX_PIECE = MIB
-"""A read is served in pieces of at most so many bytes (or a quarter of the cache)."""
+MAX_TRIES = 5
+FIRST_PAUSE = 0.25
+"""How often one read tries because its bytes were dropped as doubtful, or the file got another name. Before
+dropped bytes are asked for again it waits so many seconds, twice as long each time: another client of the
+vehicle may be about to leave."""
 
 COMPARE_PAUSE = 2.0
 """Seconds between two listings that only compare one file; 50 times what the last one took where that is
@@ -66,8 +70,8 @@ class Files:
     Attributes:
         is_changing: whether we are changing what the vehicle has of a path, or may have done so in part.
         kept: the cache on the local disk, if there is one.
-        piece: bytes of a read that are served at once.
-        hits, misses: reads that found all they wanted in the cache, and others.
+        hits, misses: reads that found all they wanted in the cache, and others. unproven: reads that ended
+            because their bytes were in doubt again and again.
     """
 
     def __init__(
@@ -88,12 +92,12 @@ class Files:
         self._cache = cache
         self._clock = cache.clock
         self._proof_time = proof_time
-        self._restarted_at = float("-inf")
+        self._restarted_at = NEVER
         self._directories = directories
         self._on_size = on_size
         self._invalidate = invalidate
+        self.piece = cache.piece
         self.fetcher = Fetcher(store, patience=cache.patience, on_changed=self._kill)
-        self.piece = min(MAX_PIECE, cache.budget // 4)
         self._current: OrderedDict[bytes, Version] = OrderedDict()
         self._open_versions: dict[Version, None] = {}
         self._opening: SingleFlight[bytes, tuple[Version, bool]] = SingleFlight()
@@ -101,6 +105,7 @@ class Files:
         self.open_count = 0
         self.hits = 0
         self.misses = 0
+        self.unproven = 0
         directories.on_listed = self._on_listed
 
     # --- opening
@@ -173,14 +178,15 @@ class Files:
         kept = None if self.kept is None else await self.kept.find(path, entry)
         if kept is None or self.kept is None:
             return None
-        version = Version(path, entry.mtime, self._new_blocks(kept.key.size), self._clock(), kept=kept)
+        version = self._new_version(path, entry.mtime, kept.key.size)
+        version.kept = kept
         self._replace(version)
         self.kept.watch(version)
         return version
 
     async def _start_version(self, path: bytes, entry: DirEntry) -> Version:
-        blocks = self._new_blocks()
-        reader = await self._store.open_reader(path, blocks)
+        version = self._new_version(path, None)
+        reader = await self._store.open_reader(path, version.blocks)
         try:
             if entry.size is not None and entry.size >= WRAP and entry.size % WRAP == reader.size:
                 raise FileTooLarge(f"{path!r} has {entry.size} bytes, more than an open reply can tell")
@@ -189,14 +195,13 @@ class Files:
         except BaseException:
             reader.close()
             raise
-        blocks.size = reader.size
+        version.reader, version.blocks.size = reader, reader.size
+        version.proven_at = version.compared_at = self._clock()
+        if entry.size in (None, reader.size):
+            version.mtime = entry.mtime
         old = self._current.get(path)
         if old is not None and old.size > reader.size:
             self._kill(old)
-        mtime = entry.mtime if entry.size in (None, reader.size) else None
-        version = Version(path, mtime, blocks, self._clock(), reader)
-        if mtime is not None or not self._directories.tells_times:
-            version.same_at = blocks.opened_at
         self._replace(version)
         if entry.size != reader.size:
             self._on_size(path, reader.size)
@@ -218,10 +223,11 @@ class Files:
             raise DataUnproven(f"{path!r} has {entry.size} bytes as listed, and {size} as opened")
         return entry
 
-    def _new_blocks(self, size: int = 0) -> FileBlocks:
-        blocks = FileBlocks(self._cache, size)
-        blocks.on_dropped = partial(self._on_dropped, blocks)
-        return blocks
+    def _new_version(self, path: bytes, mtime: int | None, size: int = 0) -> Version:
+        blocks, now = FileBlocks(self._cache, size), self._clock()
+        version = Version(path, mtime, blocks, proven_at=now, compared_at=now)
+        blocks.on_dropped = partial(self._on_dropped, version)
+        return version
 
     def _replace(self, version: Version) -> None:
         old = self._current.pop(version.path, None)
@@ -236,7 +242,7 @@ class Files:
     def status(self) -> dict[str, object]:
         """Return counters."""
         kept = {} if self.kept is None else self.kept.status()
-        return {"hits": self.hits, "misses": self.misses, "reads_unproven": self.fetcher.dropped, **kept}
+        return {"hits": self.hits, "misses": self.misses, "reads_unproven": self.unproven, **kept}
 
     def reads(self) -> list[dict[str, object]]:
         """Return the files that are being fetched: path, size and done in bytes."""
@@ -247,34 +253,48 @@ class Files:
             if v.blocks.waited_for or (v.blocks.received_at > recent and v.blocks.done < v.size)
         ]
 
-    def pace(self) -> Pace:
-        """Return the bounds for readahead now."""
-        return self._cache.pace(len(self._open_versions))
+    def readahead_limits(self) -> tuple[int, int]:
+        """Return the bounds for readahead now (see BlockCache)."""
+        return self._cache.readahead_limits(len(self._open_versions))
 
     # --- is it the same file?
 
     async def compare(self, version: Version, *, now: bool) -> None:
-        """Compare a version with a listing, if its file may have become another one since it was opened.
+        """Compare a version with a listing, if the server opened its file anew and listings tell times.
 
         now: also if one was asked for to compare it just before.
 
         Raises:
             FileChanged: it is another one. Else as RemoteStore.list_directory.
         """
-        waits = not now and self._clock() < version.compare_at
-        if not (waits or version.settled or self.is_changing(version.path)) and self._listings_tell(version):
+        for _ in range(MAX_TRIES):
+            due = now or self._clock() >= version.compare_after
+            if not due or self._is_compared(version) or self.is_changing(version.path):
+                break
+            if not self._listings_tell(version):
+                break
             await self._comparing.run(version, partial(self._compare_once, version))
         version.require_alive()
 
+    def _asked_at(self, version: Version) -> float:
+        """Return since when the path may be another file: the server opened it anew, or restarted."""
+        return max(version.blocks.opened_at, self._restarted_at)
+
+    def _is_compared(self, version: Version) -> bool:
+        return version.compared_at >= self._asked_at(version)
+
+    def _is_restarted(self, version: Version) -> bool:
+        return version.compared_at < self._restarted_at
+
     def _listings_tell(self, version: Version) -> bool:
-        """Return whether a listing tells more than the size that each open reply tells."""
-        restarted = version.restarted_at > version.same_at
-        return restarted or version.mtime is not None or self._directories.tells_times
+        """Return whether a listing tells more than an open reply: that the file did not become smaller."""
+        times = version.mtime is not None or self._directories.tells_times
+        return times or self._is_restarted(version)
 
     async def _compare_once(self, version: Version) -> None:
         path = version.path
         try:
-            directory = await self._directories.recent(split(path)[0], began=version.questioned_at)
+            directory = await self._directories.recent(split(path)[0], began=self._asked_at(version))
         except (NotFound, NotADirectory):
             self._kill(version)
             return
@@ -282,7 +302,7 @@ class Files:
             if present != path or self.is_changing(path):
                 return  # who reads on has it compared under its new name
         took = directory.ended_at - directory.listed_at
-        version.compare_at = self._clock() + max(COMPARE_PAUSE, COST_FACTOR * took)
+        version.compare_after = self._clock() + max(COMPARE_PAUSE, COST_FACTOR * took)
         self._judge(version, directory)
 
     def _judge(self, version: Version, directory: Directory) -> None:
@@ -291,26 +311,21 @@ class Files:
         if entry is None or entry.kind is not EntryKind.FILE:
             if directory.complete or entry is not None:
                 self._kill(version)
-            return
-        another = became_another(version.size, version.mtime, entry)
-        if version.restarted_at > version.same_at:  # nobody went on writing the same log
-            another |= entry.size not in (None, version.size)
-        if not another:
-            self._on_same(version, entry, directory.listed_at)
-        elif version.blocks.given or (entry.size or 0) < version.size:
+        elif not self._is_another(version, entry):
+            if directory.listed_at >= self._asked_at(version):
+                version.compared_at = directory.listed_at
+            if version.mtime is None and entry.size == version.size:
+                version.mtime = entry.mtime
+        elif version.blocks.given or entry.size != version.size:
             self._kill(version)
         else:
-            mtime = entry.mtime if entry.size == version.size else None
-            version.start_over(mtime, directory.listed_at)
-            self._on_dropped(version.blocks)
+            version.start_over(entry.mtime, directory.listed_at)
+            self._on_dropped(version)
 
-    def _on_same(self, version: Version, entry: DirEntry, listed_at: float) -> None:
-        """A listing shows the file as it was opened, or as it grew."""
-        if listed_at < version.questioned_at:
-            return
-        version.same_at = listed_at
-        if version.mtime is None and entry.size == version.size:
-            version.mtime = entry.mtime
+    def _is_another(self, version: Version, entry: DirEntry) -> bool:
+        """A file that is larger after the vehicle restarted is another one: nobody went on writing it."""
+        resized = entry.size not in (None, version.size) and self._is_restarted(version)
+        return resized or became_another(version.size, version.mtime, entry)
 
     def _on_listed(self, path: bytes, directory: Directory) -> None:
         """A directory was listed, for whatever reason."""
@@ -338,20 +353,18 @@ class Files:
             current.shown = False
         self._invalidate(path)
 
-    def _on_dropped(self, blocks: FileBlocks) -> None:
+    def _on_dropped(self, version: Version) -> None:
         """Bytes of a version were dropped: the kernel may hold copies."""
-        for version in dict.fromkeys((*self._current.values(), *self._open_versions)):
-            if version.blocks is blocks:
-                version.shown = False
-                self._invalidate(version.path)
+        version.shown = False
+        if version in self._open_versions or self._current.get(version.path) is version:
+            self._invalidate(version.path)
 
     def rebooted(self) -> None:
         """Nothing is proven any more; open files are compared before more of them is given out."""
         self._restarted_at = self._clock()
-        for version in self._current.values():
-            version.proven_at = float("-inf")
-        for version in self._open_versions:
-            version.restarted_at, version.compare_at = self._restarted_at, float("-inf")
+        for version in dict.fromkeys((*self._current.values(), *self._open_versions)):
+            version.proven_at = version.compare_after = NEVER
+            version.kept = None
 
     # --- we changed the file ourselves
 
@@ -360,7 +373,7 @@ class Files:
         version = self._current.get(path)
         if version is None or version.dead is not None:
             return None
-        return version.blocks if version.settled or not self._listings_tell(version) else None
+        return version.blocks if self._is_compared(version) or not self._listings_tell(version) else None
 
     def was_lost(self, path: bytes) -> bool:
         """Return whether somebody has a version of the path open, and is to read nothing more."""
@@ -389,16 +402,16 @@ class Files:
         self.on_written(path)
         if proven_at <= self._restarted_at:
             return
-        blocks = self._new_blocks(size)
-        blocks.given = True
-        self._replace(Version(path, None, blocks, proven_at, shown=True))
+        version = self._new_version(path, None, size)
+        version.proven_at, version.shown, version.blocks.given = proven_at, True, True
+        self._replace(version)
         for offset, data in pieces:
-            blocks.preload(offset, data)
+            version.blocks.preload(offset, data)
 
     def on_renamed(self, old: bytes, new: bytes) -> None:
         """A file, or a directory with all below it, has another path now; open files follow."""
         self.on_removed(new)
-        for version in self._versions(old):
+        for version in self._at_or_below(old):
             current = self._current.get(version.path) is version
             if current:
                 del self._current[version.path]
@@ -410,10 +423,10 @@ class Files:
 
     def on_removed(self, path: bytes) -> None:
         """A file, or an empty directory, is gone."""
-        for version in self._versions(path):
+        for version in self._at_or_below(path):
             self.on_written(version.path)
 
-    def _versions(self, path: bytes) -> list[Version]:
+    def _at_or_below(self, path: bytes) -> list[Version]:
         """Return what is cached or open of a path, older ones too, and of what lies below it."""
         known = dict.fromkeys((*self._current.values(), *self._open_versions))
         return [v for v in known if v.path == path or v.path.startswith(path + b"/")]
@@ -431,7 +444,7 @@ class Files:
         version.blocks.on_failed(LocalProtocolError(f"{version.path!r} was closed while it was read"))
         if self._current.get(version.path) is not version:
             version.blocks.clear()
-        elif version.dead is not None or version.restarted_at > version.same_at:
+        elif version.dead is not None or self._is_restarted(version):
             self._forget(version)
 
     def forget_closed(self) -> None:
@@ -469,16 +482,23 @@ class FileHandle(ReadOnlyHandle):
         stop = min(offset + size, self.size)
         if offset >= stop:
             return b""
-        version = self._version
+        files, version = self._files, self._version
+        pause = FIRST_PAUSE
         for _ in range(MAX_TRIES):
-            before = version.history
             version.require_alive()
-            data = await self._read_range(offset, stop)
-            await self._files.compare(version, now=sure or stop == self.size)
-            if version.history == before:
+            drops = version.blocks.drops
+            data = await self._read(offset, stop)
+            if data is not None:
+                await files.compare(version, now=sure or stop == self.size)
+            if version.blocks.drops != drops:
+                version.close_reader()
+                await trio.sleep(pause)
+                pause *= 2
+            elif data is not None:
                 version.blocks.given = True
                 return data
-        raise DataUnproven(f"{version.path!r} is doubted again and again while it is read")
+        files.unproven += 1
+        raise DataUnproven(f"bytes of {version.path!r} may be another file's, again and again")
 
     async def require_same(self) -> None:
         """Compare what was read of the file with what is there, if that is in doubt.
@@ -514,17 +534,23 @@ class FileHandle(ReadOnlyHandle):
             self._closed = True
             self._files.release(self._version)
 
-    async def _read_range(self, offset: int, stop: int) -> bytes | memoryview:
+    async def _read(self, offset: int, stop: int) -> bytes | memoryview | None:
+        """Return [offset, stop), None if some of it was dropped meanwhile, or the file got another name."""
         step = self._files.piece
         if stop - offset <= step:
             return await self._read_piece(offset, stop)
-        pieces = [await self._read_piece(at, min(at + step, stop)) for at in range(offset, stop, step)]
+        pieces: list[bytes | memoryview] = []
+        for at in range(offset, stop, step):
+            piece = await self._read_piece(at, min(at + step, stop))
+            if piece is None:
+                return None
+            pieces.append(piece)
         return b"".join(pieces)
 
-    async def _read_piece(self, start: int, stop: int) -> bytes | memoryview:
+    async def _read_piece(self, start: int, stop: int) -> bytes | memoryview | None:
         files, version = self._files, self._version
-        pace = files.pace()
-        plan = self._readahead.on_read(start, stop, limit=pace.limit, small=pace.small)
+        limit, small = files.readahead_limits()
+        plan = self._readahead.on_read(start, stop, limit=limit, small=small)
         if plan.seeked and version.reader is not None:
             version.reader.drop_readahead()
         data = version.blocks.get(start, stop)

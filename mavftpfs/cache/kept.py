@@ -146,14 +146,13 @@ class Version(Protocol):
     mtime: int | None
     blocks: FileBlocks
     handles: int
-    restarted_at: float
     dead: MavftpfsError | None
     kept: Kept | None
 
     @property
     def size(self) -> int: ...
     @property
-    def settled(self) -> bool: ...
+    def compared(self) -> bool: ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -258,7 +257,7 @@ class KeptCache:
                 version.kept = None
                 continue
             ripe = kept.ripe(version.blocks, self._facts.clock())
-            if version.mtime is not None and not version.settled:
+            if version.mtime is not None and not version.compared:
                 continue
             if kept.key.version:
                 left -= await self._write(version, kept, ripe[:left])
@@ -270,7 +269,7 @@ class KeptCache:
     def _may_keep(self, version: Version, kept: Kept) -> bool:
         """Return whether a version is still, for all we know, what its key says."""
         key, listed = kept.key, self._facts.remembered(version.path)
-        if version.dead is not None or version.restarted_at > float("-inf") or version.path != key.path:
+        if version.kept is not kept or version.path != key.path:
             return False
         if self._facts.identity() != key.vehicle or self._facts.growing(key.path):
             return False

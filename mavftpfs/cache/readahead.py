@@ -11,13 +11,6 @@ from dataclasses import dataclass
 
 FIRST_WINDOW = 128 * 1024
 MAX_WINDOW = 8 * 1024 * 1024
-SMALL_FILE = 64 * 1024
-
-AHEAD_SECONDS = 3.0
-"""How much of the link's measured rate may lie ahead of the reader."""
-
-SMALL_SECONDS = 2.0
-"""A file that the link carries in this time is small."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +42,7 @@ class Readahead:
     def on_read(self, start: int, stop: int, *, limit: int, small: int) -> Plan:
         """Note a read of [start, stop) and return what to ask for.
 
-        limit: the largest window now; small: files up to this size are wanted whole (see `Pace`).
+        limit: the largest window now; small: files up to this size are wanted whole, both in bytes.
         """
         if self._next is None:
             return self._first(start, stop, limit, small)
@@ -118,24 +111,3 @@ class RateMeter:
     def rate(self) -> float | None:
         """Bytes per second, None while too little was seen."""
         return self._bytes / self._busy if self._busy >= self.ENOUGH else None
-
-
-@dataclass(frozen=True, slots=True)
-class Pace:
-    """Bounds for readahead, from the cache's size in bytes, the files being read and the link's rate."""
-
-    cache_size: int
-    streams: int
-    rate: float | None
-
-    @property
-    def limit(self) -> int:
-        """The largest window: all windows together fit half of the cache."""
-        room = min(self.cache_size // (2 * (max(self.streams, 1) + 1)), MAX_WINDOW)
-        return room if self.rate is None else min(room, int(self.rate * AHEAD_SECONDS))
-
-    @property
-    def small(self) -> int:
-        """Files up to this size are wanted whole at the first read."""
-        seconds = 0 if self.rate is None else int(self.rate * SMALL_SECONDS)
-        return max(SMALL_FILE, min(seconds, self.limit))

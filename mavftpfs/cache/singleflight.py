@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Awaitable, Callable, Hashable
+from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 
 import trio
@@ -13,13 +14,13 @@ K = TypeVar("K", bound=Hashable)
 T = TypeVar("T")
 
 
+@dataclass(slots=True, eq=False)
 class _Call(Generic[T]):
     """done: it ended; results: one, or none after an error or a cancellation."""
 
-    def __init__(self) -> None:
-        self.done = trio.Event()
-        self.results: list[T] = []
-        self.error: Exception | None = None
+    done: trio.Event = field(default_factory=trio.Event)
+    results: list[T] = field(default_factory=list)
+    error: Exception | None = None
 
 
 class SingleFlight(Generic[K, T]):
@@ -49,7 +50,11 @@ class SingleFlight(Generic[K, T]):
         while True:
             call = self._running.get(key)
             if call is None:
-                call = await self._start(key, work)
+                call = self._running[key] = _Call()
+                if self._nursery is None:
+                    await self._run(key, call, work)
+                else:
+                    self._nursery.start_soon(self._run, key, call, work)
             if not call.done.is_set():
                 await call.done.wait()
             if call.results:
@@ -58,14 +63,6 @@ class SingleFlight(Generic[K, T]):
                 raise call.error.with_traceback(None)
             joined = False  # the caller that ran it was cancelled, or it timed out before we waited long
             await trio.lowlevel.checkpoint()
-
-    async def _start(self, key: K, work: Callable[[], Awaitable[T]]) -> _Call[T]:
-        call = self._running[key] = _Call()
-        if self._nursery is None:
-            await self._run(key, call, work)
-        else:
-            self._nursery.start_soon(self._run, key, call, work)
-        return call
 
     async def _run(self, key: K, call: _Call[T], work: Callable[[], Awaitable[T]]) -> None:
         try:

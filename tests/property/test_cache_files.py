@@ -12,7 +12,7 @@ from trio.testing import MockClock
 
 from mavftpfs.cache.blocks import BLOCK_SIZE, BlockCache, FileBlocks
 from mavftpfs.cache.options import MIN_CACHE_SIZE
-from mavftpfs.cache.readahead import MAX_WINDOW, Pace, Readahead
+from mavftpfs.cache.readahead import MAX_WINDOW, Readahead
 from mavftpfs.cache.tree import OpenFile, Tree
 from mavftpfs.shared.errors import DataUnproven, FileChanged, RequestTimeout, VehicleLost
 from tests.support.fake_store import FakeStore, make_tree
@@ -276,24 +276,23 @@ def test_the_session_above_reads_something() -> None:
 @given(
     st.integers(0, 10**7),
     st.lists(st.tuples(st.integers(0, 10**7), st.integers(1, 300_000)), max_size=30),
-    st.integers(0, 64),
-    st.one_of(st.none(), st.floats(1, 1e9)),
+    st.integers(0, MAX_WINDOW),
+    st.integers(0, MAX_WINDOW),
 )
 def test_readahead_stays_within_the_file_and_its_bounds(
-    size: int, reads: list[tuple[int, int]], streams: int, rate: float | None
+    size: int, reads: list[tuple[int, int]], limit: int, small: int
 ) -> None:
-    pace = Pace(64 * KIB * KIB, streams, rate)
     ahead = Readahead(size)
     for start, length in reads:
         stop = min(start + length, size)
         if start >= stop:
             continue
-        plan = ahead.on_read(start, stop, limit=pace.limit, small=pace.small)
+        plan = ahead.on_read(start, stop, limit=limit, small=small)
         assert 0 <= plan.start <= plan.stop <= size
         assert plan.stop - plan.start <= MAX_WINDOW
         if plan.start < plan.stop:
             assert plan.start >= stop
-            assert plan.stop <= max(stop + pace.limit, pace.small)
+            assert plan.stop <= max(stop + limit, small)
 
 
 @given(st.integers(1, 10**7), st.integers(1, 256 * KIB))

@@ -198,7 +198,7 @@ async def test_the_end_of_a_copy_by_turns_is_compared(profile: str, autojump: Mo
     async with card.opened() as (_, handle):
         await read_head(handle)
         assert await handle.read(200_000, STEP) == OLD[200_000 : 200_000 + STEP]
-        handle._version.compare_at = float("inf")  # type: ignore[attr-defined]
+        handle._version.compare_after = float("inf")  # type: ignore[attr-defined]
         await trio.sleep(IDLE)
         card.replace()
         with pytest.raises(FileChanged):

@@ -10,7 +10,7 @@ import trio
 import trio.testing
 from trio.testing import MockClock
 
-from mavftpfs.cache.blocks import BLOCK_SIZE, BlockCache, FileBlocks, Gaps
+from mavftpfs.cache.blocks import BLOCK_SIZE, BlockCache, FileBlocks
 from mavftpfs.shared.errors import RequestTimeout, VehicleLost
 
 KIB = 1024
@@ -32,14 +32,10 @@ def deliver(blocks: FileBlocks, offset: int, data: bytes, *, batch: bool = True)
     blocks.check_invariants()
 
 
-def nothing(gaps: Gaps) -> None:
-    pass
-
-
 async def read(
-    blocks: FileBlocks, start: int, stop: int, want: Callable[[Gaps], None] = nothing
+    blocks: FileBlocks, start: int, stop: int, want: Callable[[], None] = lambda: None
 ) -> bytes | memoryview | None:
-    async with blocks.held(start, stop):
+    async with blocks.hold(start, stop):
         await blocks.fill(start, stop, want)
         return blocks.get(start, stop)
 
@@ -50,7 +46,7 @@ class Reading:
     def __init__(self, blocks: FileBlocks, start: int, stop: int) -> None:
         self.blocks = blocks
         self.range = (start, stop)
-        self.wanted: list[Gaps] = []
+        self.wanted: list[list[tuple[int, int]]] = []
         self.results: list[bytes | None] = []
         self.errors: list[Exception] = []
         self.took = 0.0
@@ -60,11 +56,14 @@ class Reading:
         began = trio.current_time()
         with self.scope:
             try:
-                data = await read(self.blocks, *self.range, self.wanted.append)
+                data = await read(self.blocks, *self.range, self._want)
                 self.results.append(None if data is None else bytes(data))
             except Exception as error:
                 self.errors.append(error)
         self.took = trio.current_time() - began
+
+    def _want(self) -> None:
+        self.wanted.append(self.blocks.missing(*self.range))
 
 
 async def start_read(nursery: trio.Nursery, blocks: FileBlocks, start: int, stop: int) -> Reading:
@@ -219,12 +218,6 @@ async def test_a_reader_asks_for_what_is_missing_and_gets_it(
     assert reading.results == [data[200:600]]
 
 
-async def test_what_is_present_costs_no_wait(autojump_clock: MockClock) -> None:
-    blocks = FileBlocks(make_cache(), 10)
-    deliver(blocks, 0, content(10))
-    assert bytes(await read(blocks, 0, 10) or b"") == content(10)
-
-
 async def test_readers_wake_once_per_batch(nursery: trio.Nursery, autojump_clock: MockClock) -> None:
     blocks = FileBlocks(make_cache(), 1000)
     reading = await start_read(nursery, blocks, 0, 1000)
@@ -297,83 +290,28 @@ async def test_a_cancelled_read_leaves_nothing_behind(
     reading.scope.cancel()
     await trio.testing.wait_all_tasks_blocked()
     assert not blocks.pinned(0)
-    assert cache.room.used == 0
+    again = await start_read(nursery, blocks, 0, 100)
     deliver(blocks, 0, content(100))
-    assert blocks.complete
+    await trio.testing.wait_all_tasks_blocked()
+    assert again.results == [content(100)]
 
 
-# --- room
+# --- turns
 
 
-async def test_waiting_readers_cannot_pin_more_than_half(
+async def test_reads_that_wait_pin_no_more_than_half_and_take_turns(
     nursery: trio.Nursery, autojump_clock: MockClock
 ) -> None:
     cache = make_cache(8 * BLOCK_SIZE)
     blocks = FileBlocks(cache, 20 * BLOCK_SIZE)
-    readings = [
-        await start_read(nursery, blocks, i * 2 * BLOCK_SIZE, (i * 2 + 2) * BLOCK_SIZE) for i in range(4)
-    ]
+    readings = [await start_read(nursery, blocks, i * BLOCK_SIZE, (i + 1) * BLOCK_SIZE) for i in range(4)]
     assert [len(reading.wanted) for reading in readings] == [1, 1, 0, 0]
-    deliver(blocks, 0, content(2 * BLOCK_SIZE))
+    deliver(blocks, 0, content(BLOCK_SIZE))
     await trio.testing.wait_all_tasks_blocked()
     assert [len(reading.wanted) for reading in readings] == [1, 1, 1, 0]
     readings[1].scope.cancel()
     await trio.testing.wait_all_tasks_blocked()
     assert [len(reading.wanted) for reading in readings] == [1, 1, 1, 1]
-
-
-async def test_a_read_larger_than_the_room_goes_alone(
-    nursery: trio.Nursery, autojump_clock: MockClock
-) -> None:
-    cache = make_cache(4 * BLOCK_SIZE)
-    blocks = FileBlocks(cache, 20 * BLOCK_SIZE)
-    large = await start_read(nursery, blocks, 0, 3 * BLOCK_SIZE)
-    small = await start_read(nursery, blocks, 10 * BLOCK_SIZE, 10 * BLOCK_SIZE + 1)
-    assert (len(large.wanted), len(small.wanted)) == (1, 0)
-
-
-async def test_first_come_first_served(nursery: trio.Nursery, autojump_clock: MockClock) -> None:
-    cache = make_cache(4 * BLOCK_SIZE)
-    blocks = FileBlocks(cache, 20 * BLOCK_SIZE)
-    first = await start_read(nursery, blocks, 0, BLOCK_SIZE)
-    large = await start_read(nursery, blocks, 0, 2 * BLOCK_SIZE)
-    small = await start_read(nursery, blocks, 3 * BLOCK_SIZE, 4 * BLOCK_SIZE)
-    assert (len(large.wanted), len(small.wanted)) == (0, 0)
-    large.scope.cancel()
-    await trio.testing.wait_all_tasks_blocked()
-    assert len(small.wanted) == 1
-    first.scope.cancel()
-    await trio.testing.wait_all_tasks_blocked()
-    assert cache.room.used == BLOCK_SIZE
-
-
-async def test_no_room_for_too_long_is_a_timeout(nursery: trio.Nursery, autojump_clock: MockClock) -> None:
-    cache = make_cache(2 * BLOCK_SIZE)
-    blocks = FileBlocks(cache, 20 * BLOCK_SIZE)
-    first = await start_read(nursery, blocks, 0, 100)
-    second = await start_read(nursery, blocks, BLOCK_SIZE, BLOCK_SIZE + 1)
-    for offset in range(20):
-        deliver(blocks, offset, b"x")
-        await trio.sleep(5)
-    assert [type(error) for error in second.errors] == [RequestTimeout]
-    assert second.wanted == []
-    assert first.errors == []
-
-
-async def test_a_reader_cancelled_just_when_it_was_admitted_gives_the_room_back(
-    nursery: trio.Nursery, autojump_clock: MockClock
-) -> None:
-    cache = make_cache(2 * BLOCK_SIZE)
-    blocks = FileBlocks(cache, 20 * BLOCK_SIZE)
-    first = await start_read(nursery, blocks, 0, 100)
-    second = await start_read(nursery, blocks, BLOCK_SIZE, BLOCK_SIZE + 1)
-    second.scope.cancel()
-    cache.room.leave(BLOCK_SIZE)  # admits the second, which does not yet know that it was cancelled
-    assert cache.room.used == BLOCK_SIZE
-    await trio.testing.wait_all_tasks_blocked()
-    assert cache.room.used == 0
-    await cache.room.enter(BLOCK_SIZE)  # what the first one holds
-    first.scope.cancel()
 
 
 # --- doubtful bytes
@@ -419,4 +357,4 @@ async def test_the_rate_is_measured_from_what_arrives(autojump_clock: MockClock)
         deliver(blocks, step * 100, b"x" * 100)  # known bytes are no traffic worth counting
         await trio.sleep(0.1)
     assert cache.meter.rate == pytest.approx(1000)
-    assert cache.pace(1).limit == pytest.approx(3000, abs=2)
+    assert cache.readahead_limits(1)[0] == pytest.approx(3000, abs=2)

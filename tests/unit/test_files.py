@@ -616,7 +616,7 @@ async def test_two_files_are_not_mixed_over_a_reboot(
 async def test_a_file_of_which_nothing_was_read_is_read_from_what_is_there_after_a_reboot(
     store: FakeStore, tree: Tree, autojump_clock: MockClock
 ) -> None:
-    store.add(LOG, DATA)
+    store.add(LOG, DATA, 5)
     handle = await tree.open(LOG)
     store.chunk_delay, store.chunk = 0.5, 4 * KIB
     got = []
@@ -627,7 +627,7 @@ async def test_a_file_of_which_nothing_was_read_is_read_from_what_is_there_after
     async with trio.open_nursery() as readers:
         readers.start_soon(read)
         await trio.sleep(1.2)
-        store.add(LOG, OTHER + b"more")
+        store.add(LOG, OTHER, 6)
         tree.rebooted()
     assert got == [OTHER[:20_000]]
     assert await handle.read(20_000, 300_000) == OTHER[20_000:]

@@ -6,13 +6,12 @@ from typing import cast
 
 import pytest
 
+from mavftpfs.cache.blocks import SMALL_FILE, BlockCache
 from mavftpfs.cache.context import Context
 from mavftpfs.cache.readahead import (
     FIRST_WINDOW,
     MAX_WINDOW,
     NOTHING,
-    SMALL_FILE,
-    Pace,
     Plan,
     RateMeter,
     Readahead,
@@ -136,13 +135,17 @@ def test_a_slow_link_gets_a_small_window() -> None:
         (1, 1e12, MAX_WINDOW, MAX_WINDOW),
     ],
 )
-def test_pace(streams: int, rate: float | None, limit: int, small: int) -> None:
-    pace = Pace(64 * 1024 * KIB, streams, rate)
-    assert (pace.limit, pace.small) == (limit, small)
+def test_readahead_limits(streams: int, rate: float | None, limit: int, small: int) -> None:
+    cache = BlockCache(64 * 1024 * KIB, clock=lambda: 0.0, patience=1.0)
+    if rate is not None:
+        for step in range(4):
+            cache.meter.on_bytes(int(rate / 8), step / 8)
+    assert cache.readahead_limits(streams) == (limit, small)
 
 
 def test_all_windows_fit_half_of_the_cache() -> None:
-    assert all(n * Pace(1024 * KIB, n, None).limit <= 512 * KIB for n in range(1, 50))
+    cache = BlockCache(1024 * KIB, clock=lambda: 0.0, patience=1.0)
+    assert all(n * cache.readahead_limits(n)[0] <= 512 * KIB for n in range(1, 50))
 
 
 def test_the_rate_counts_only_the_time_between_bytes_that_follow_each_other() -> None:
