@@ -83,8 +83,8 @@ class Link(Protocol):
         """From now on send to this address. Only a link that hears several senders has a choice."""
         ...
 
-    def dismiss(self) -> None:
-        """Let whoever waits for the present peer's place have it, though the peer is not silent."""
+    def keep_peer(self) -> None:
+        """Whoever is served was heard just now: its connection keeps its place for some seconds more."""
         ...
 
     async def aclose(self) -> None:

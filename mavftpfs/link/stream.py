@@ -63,8 +63,7 @@ class StreamLink:
         self._fresh = False
         self._closed = False
         self._peer: NetAddress | None = None
-        self._dismissed = False
-        self._heard_at = trio.current_time()
+        self._vouched_at = trio.current_time()
         self._outbox = Outbox(outbox_limit)
         self._work = trio.Event()
         self._changed = trio.Event()
@@ -78,11 +77,6 @@ class StreamLink:
     def connected(self) -> bool:
         """Whether there is a pipe at the moment."""
         return self._pipe is not None
-
-    @property
-    def silence(self) -> float:
-        """Seconds since anything came in on the present pipe, or since it was opened."""
-        return trio.current_time() - self._heard_at
 
     async def receive(self) -> list[bytes]:
         """Wait for bytes; an empty list says that the stream was reopened.
@@ -132,10 +126,9 @@ class StreamLink:
     def answer(self, address: NetAddress) -> None:
         """Nothing to choose: what we send goes to the peer."""
 
-    def dismiss(self) -> None:
-        """Let the next peer have the place of this one, as soon as there is one."""
-        self._dismissed = True
-        self._notify()
+    def keep_peer(self) -> None:
+        """The present peer is the one to be served, and it is not silent."""
+        self._vouched_at = trio.current_time()
 
     def replace(self, pipe: Pipe, peer: NetAddress | None = None) -> None:
         """Go on with another pipe (a new connection). peer: who opened it, if not we."""
@@ -145,8 +138,7 @@ class StreamLink:
         self._drop()
         self._pipe = pipe
         self._peer = peer
-        self._dismissed = False
-        self._heard_at = trio.current_time()
+        self._vouched_at = trio.current_time()
         self._fresh = self._was_open
         if self._was_open:
             self.stats.reopened += 1
@@ -154,8 +146,8 @@ class StreamLink:
         self._notify()
 
     async def wait_replaceable(self, patience: float) -> None:
-        """Wait until there is no pipe, or it was dismissed, or silent for `patience` seconds."""
-        while self.connected and not self._dismissed and (left := patience - self.silence) > 0:
+        """Wait until there is no pipe, or `keep_peer` was not called for `patience` seconds."""
+        while self.connected and (left := self._vouched_at + patience - trio.current_time()) > 0:
             with trio.move_on_after(left):
                 await self._changed.wait()
 
@@ -208,7 +200,6 @@ class StreamLink:
             if len(data) < _READ_SIZE:
                 break  # saves the read that would say "nothing more"
         if chunks:
-            self._heard_at = trio.current_time()
             self.stats.received_chunks += len(chunks)
             self.stats.received_bytes += sum(map(len, chunks))
         return chunks

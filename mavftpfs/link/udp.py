@@ -118,7 +118,7 @@ class UdpLink:
             self._peer = address
             self._pinned = True
 
-    def dismiss(self) -> None:
+    def keep_peer(self) -> None:
         """Nothing to do: nobody waits, all are heard."""
 
     async def run_writer(self) -> None:

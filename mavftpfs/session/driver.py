@@ -168,6 +168,8 @@ class Driver:
                 self._pass_on(now)
                 self._refill(now)
         self._pass_on(now)
+        if self.vehicle.identity.heard_at == now and not self.vehicle.identity.stranger:
+            self.link.keep_peer()
         self.on_batch(now)
 
     def _handle(self, messages: list[Message | FtpRun], now: float, sender: NetAddress | None) -> None:
@@ -233,7 +235,6 @@ class Driver:
                 self._send_to(sender)
         if vehicle.identity.stranger:
             self._addresses.distrusted = self.peer
-            self.link.dismiss()
         else:
             self._addresses.distrusted = None
 

@@ -70,6 +70,7 @@ class Identity:
     Attributes:
         standing: of who answers now; only a trusted one is asked for files.
         left_at: when it was heard last before it was away, the last time.
+        heard_at: when it was heard last.
         on_doubt: it may have restarted, or be another one: it is to be asked.
         on_settled: called with whether it was a stranger meanwhile: it is trusted again.
     """
@@ -83,7 +84,7 @@ class Identity:
         self._mute = False
         self._moved = False
         self._unanswered = 0
-        self._heard_at: float | None = None
+        self.heard_at: float | None = None
         self._back_at = self.left_at = float("-inf")
 
     @property
@@ -98,21 +99,21 @@ class Identity:
 
     def may_be_asked(self, now: float) -> bool:
         """Whether requests may go out now: not into a silence either, at whose end another one may hear."""
-        if self._known is None or self._heard_at is None:
+        if self._known is None or self.heard_at is None:
             return self.trusted
-        return self.trusted and now - self._heard_at <= ABSENCE
+        return self.trusted and now - self.heard_at <= ABSENCE
 
     def heard(self, now: float) -> None:
         """Something came from the vehicle's address."""
-        before, self._heard_at = self._heard_at, now
+        before, self.heard_at = self.heard_at, now
         if before is not None and now - before > ABSENCE:
             self.left_at, self._back_at = before, now
             self.doubt()
 
     def reopened(self, now: float) -> None:
         """The link was: it may have been away for less than that, or be another one."""
-        if self._heard_at is not None:
-            self.left_at, self._back_at = self._heard_at, now
+        if self.heard_at is not None:
+            self.left_at, self._back_at = self.heard_at, now
         self.doubt()
 
     def moved(self, now: float) -> None:
@@ -122,12 +123,12 @@ class Identity:
 
     def away_since(self, when: float, now: float) -> bool:
         """Return whether it was away after that, so that it may have restarted."""
-        silent = self._heard_at is not None and now - self._heard_at > ABSENCE
+        silent = self.heard_at is not None and now - self.heard_at > ABSENCE
         return silent or self._back_at > when
 
     def heard_since(self, when: float) -> bool:
         """Return whether something came from it after that."""
-        return self._heard_at is not None and self._heard_at > when
+        return self.heard_at is not None and self.heard_at > when
 
     def doubt(self) -> None:
         """It may be another one since now: it restarted, or was silent."""

@@ -60,6 +60,7 @@ class Endpoint:
                 chunks = await self.link.receive()
                 if not chunks:
                     self._reset()
+                self.link.keep_peer()
             if self._scope.cancelled_caught:
                 chunks = []
             now = trio.current_time()

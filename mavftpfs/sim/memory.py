@@ -122,7 +122,7 @@ class MemoryLink:
     def answer(self, address: NetAddress) -> None:
         """Nothing to choose from."""
 
-    def dismiss(self) -> None:
+    def keep_peer(self) -> None:
         """Nobody waits."""
 
     async def aclose(self) -> None:

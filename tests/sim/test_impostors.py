@@ -265,6 +265,35 @@ async def test_another_vehicle_that_connects_first_does_not_keep_ours_out() -> N
             assert other.server.requests.total() == 0
 
 
+async def test_a_peer_that_is_no_vehicle_does_not_keep_ours_out() -> None:
+    """It connects while ours is away, and sends without a pause."""
+    port = free_udp_port()
+    tree = MemoryTree()
+    tree.add(b"/f", OURS)
+    async with (
+        open_link(parse_source(f"tcpin:{HOST}:{port}")) as link,
+        connected(link, ConnectOptions()) as made,
+    ):
+        with LyingVehicle(tree, f"tcp:{HOST}:{port}"):
+            await made.ready(30.0)
+            assert await read_file(made, b"/f") == OURS
+        await until(lambda: made.link.stats.dropped_sends > 0)
+        with socket.create_connection((HOST, port)) as noisy, LyingVehicle(tree, f"tcp:{HOST}:{port}"):
+            async with trio.open_nursery() as nursery:
+                nursery.start_soon(make_noise, noisy)
+                await until(lambda: made.link.stats.reopened == 2)
+                nursery.cancel_scope.cancel()
+            await until(lambda: made.vehicle.identity.trusted)
+            assert await read_file(made, b"/f") == OURS
+
+
+async def make_noise(peer: socket.socket) -> None:
+    """Send heartbeats of somebody else's until cancelled."""
+    while True:
+        peer.send(heartbeat(source=Address(9, 1)))
+        await trio.sleep(0.05)
+
+
 async def until(condition: Callable[[], bool]) -> None:
     """Wait for what comes soon on a machine that has time."""
     with trio.fail_after(60.0):

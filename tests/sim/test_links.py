@@ -505,17 +505,29 @@ async def test_tcpin_serves_one_peer_and_then_the_next() -> None:
             assert second.recv(100) == b"hello second"
 
 
-async def test_tcpin_leaves_a_silent_peer_for_a_new_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mavftpfs.link.tcp.PATIENCE", 0.2)
+async def test_tcpin_leaves_a_peer_that_is_not_the_vehicle_for_a_new_one(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """However much it sends: nobody vouches for it."""
+    monkeypatch.setattr("mavftpfs.link.tcp.PATIENCE", 0.5)
     async with opened(f"tcpin:{HOST}:0") as link:
         address = (HOST, parse_source(link.description).port)
-        with socket.create_connection(address) as dead:
-            dead.sendall(b"x")
-            assert await link.receive() == [b"x"]
-            with socket.create_connection(address) as fresh:
-                fresh.sendall(b"y")
-                assert await link.receive() == []
-                assert await link.receive() == [b"y"]
+        with socket.create_connection(address) as vain, socket.create_connection(address) as fresh:
+            fresh.sendall(b"y")
+            for _ in range(10):
+                vain.sendall(b"x")
+                assert await link.receive() == [b"x"]
+                link.keep_peer()
+                await trio.sleep(0.1)
+            with trio.fail_after(60):
+                while True:
+                    vain.sendall(b"x")
+                    received = await link.receive()
+                    if received != [b"x"]:
+                        break
+                    await trio.sleep(0.1)
+            assert received == []
+            assert await link.receive() == [b"y"]
 
 
 async def test_a_slow_peer_costs_whole_frames_never_parts() -> None:
