@@ -19,7 +19,6 @@ from mavftpfs.protocol.payload import MAX_DATA, NakCode, Opcode
 from mavftpfs.sim import profiles
 from mavftpfs.sim.firmware import (
     ACK,
-    FULL_FRAME,
     NAK,
     Firmware,
     Refusal,
@@ -511,7 +510,7 @@ class ArduPilot(Firmware):
                 if self.profile.exact_eof_offset or len(data) < size:
                     reply.offset += len(data)
                 reply.seq += 1
-                yield self.now + self._interval(size)
+                yield self.now + self.profile.burst_interval
         except Refusal as refusal:
             self._nak(refusal.code)
         except OSError as exc:
@@ -527,10 +526,3 @@ class ArduPilot(Firmware):
         last = index == self.profile.burst_packets - 1
         short = self.profile.short_packet_completes and len(data) < size
         reply.burst_complete = int(last or short)
-
-    def _interval(self, size: int) -> float:
-        """Return the pause after a packet: a third of the bandwidth where there is no flow control."""
-        interval = self.profile.burst_interval
-        if self.profile.bandwidth is None:
-            return interval
-        return max(interval, 3 * (FULL_FRAME - MAX_DATA + size) / self.profile.bandwidth)

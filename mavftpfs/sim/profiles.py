@@ -115,8 +115,6 @@ class Profile:
     """PX4: a burst ends with the first tick that ends beyond this."""
     burst_interval: float = 0.0
     """Time per burst packet at best."""
-    bandwidth: float | None = None
-    """ArduPilot without flow control: a burst takes a third of this at most."""
     short_packet_completes: bool = False
     """burst_complete is set on the short last packet and its NAK; else on the NAK (ArduPilot)."""
     exact_eof_offset: bool = True

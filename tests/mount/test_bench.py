@@ -5,25 +5,17 @@ The real peers are not run in tests: they are others' programs, and have to be d
 
 from __future__ import annotations
 
-import os
 import random
-import signal
-import subprocess
 import sys
-from contextlib import suppress
 from pathlib import Path
 
 import pytest
 from rich.console import Console
 
-from tests.bench import __main__ as entry
 from tests.bench.cases import Direction
 from tests.bench.figures import BARE, US, Outcome, Run, summarise
 from tests.bench.mount import Bench, Cell, run_one
-from tests.bench.peers import PINS, Client, Environment, Job, MountClient, NotToBeHadError, Worker, clients
-from tests.bench.record import Record
-from tests.support.mounts import processes_in, wait_until
-from tests.support.vehicles import PROJECT
+from tests.bench.peers import Client, Environment, Job, MountClient, Worker, clients
 
 SIZE = 60_000
 EVERYBODY = clients(Environment(pins=()))
@@ -80,12 +72,6 @@ def test_a_lossy_link_stands_between_server_and_client(direction: Direction, tmp
     assert run.seconds > SIZE / 625_000, "faster than the link"  # holds however slow the machine is
 
 
-def test_slow_links_are_run_at_once(tmp_path: Path) -> None:
-    bench = Bench([EVERYBODY[BARE]], 3, tmp_path, Console(quiet=True))
-    runs = bench.run([Cell("ardupilot", "57600", way, 2000, 2000, 30.0) for way in ("read", "write")])
-    assert [(run.direction, run.outcome) for run in runs] == [("read", Outcome.OK), ("write", Outcome.OK)]
-
-
 def test_who_only_claims_to_have_moved_it_is_found_out(tmp_path: Path) -> None:
     liar = program("print('some noise\\nready', flush=True); input(); print('done', flush=True); input()")
     assert moved(liar, tmp_path).outcome is Outcome.CORRUPT
@@ -112,62 +98,3 @@ def test_a_mount_that_does_not_come_is_a_failure(tmp_path: Path) -> None:
     dead = MountClient("dead", lambda job, point: [sys.executable, "-c", "raise SystemExit('no FUSE here')"])
     run = moved(dead, tmp_path)
     assert (run.outcome, run.detail) == (Outcome.FAILED, "no FUSE here")
-
-
-def test_a_copy_that_hangs_is_cut_off_and_the_mount_taken_away(tmp_path: Path) -> None:
-    run = run_one(Cell("px4", "57600", "write", SIZE, SIZE, 1.0), EVERYBODY[US], source(tmp_path), 1)
-    assert run.outcome is Outcome.TIMEOUT
-
-
-def test_who_cannot_be_had_is_listed_once(tmp_path: Path) -> None:
-    def missing() -> None:
-        raise NotToBeHadError("needs a thing")
-
-    peer = Worker("peer", lambda job: [], prepare=missing)
-    bench = Bench([peer], 3, tmp_path, Console(quiet=True))
-    (run,) = bench.run([Cell("px4", "unshaped", "read", SIZE, SIZE, 1.0)])
-    assert (run.outcome, run.detail) == (Outcome.UNAVAILABLE, "needs a thing")
-
-
-def test_the_environment_is_of_the_user_and_of_these_versions(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    one, other = Environment(["a==1"]), Environment(["a==2"])
-    assert one.path.is_relative_to(tmp_path / "mavftpfs")
-    assert one.path != other.path
-    assert Environment(["a==1"]).path == one.path
-
-
-def test_a_busy_machine_is_said_and_noted(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr("os.getloadavg", lambda: (50.0, 0.0, 0.0))
-    path = tmp_path / "results.json"
-    argv = ["mount", "--servers", "px4", "--links", "unshaped", "--directions", "read", "--clients", BARE]
-    assert entry.main([*argv, "--size", "20000", "--repetitions", "1", "--json", str(path)]) == 0
-    assert "load 50.0" in capsys.readouterr().err
-    section = Record(path).sections()["mount"]
-    assert section["load"] == 50.0
-    assert [row["outcome"] for row in section["results"]["rows"]] == ["ok"]
-    assert section["results"]["peers"] == list(PINS)
-
-
-def test_an_interrupt_takes_everything_away(tmp_path: Path) -> None:
-    options = ["--servers", "px4", "--links", "57600", "--directions", "read", "--clients", US]
-    command = [sys.executable, "-m", "tests.bench", "mount", *options, "--size", "100000"]
-    environment = {**os.environ, "TMPDIR": str(tmp_path)}
-    bench = subprocess.Popen(command, cwd=PROJECT, env=environment)
-    try:
-        wait_until("mounted", lambda: f"{tmp_path}/" in Path("/proc/self/mounts").read_text(), 180.0)
-        children = Path(f"/proc/{bench.pid}/task/{bench.pid}/children").read_text().split()
-        for pid in (bench.pid, *map(int, children)):
-            with suppress(ProcessLookupError):  # one that has just ended
-                os.kill(pid, signal.SIGINT)
-        assert bench.wait(180.0) == entry.INTERRUPTED
-    finally:
-        bench.kill()
-        bench.wait()
-    assert f"{tmp_path}/" not in Path("/proc/self/mounts").read_text()
-    assert processes_in(tmp_path) == []
-    assert list(tmp_path.iterdir()) == []

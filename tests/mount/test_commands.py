@@ -90,13 +90,6 @@ def test_what_cannot_be_done_is_a_line_and_exit_1(
     assert named in complaint[0]
 
 
-def test_rmdir(field: Field) -> None:
-    card = field.local("card")
-    (card / "empty").mkdir()
-    mavftpfs("rmdir", field.sim(card).source, "/empty")
-    assert list(card.iterdir()) == []
-
-
 def test_files_that_are_made_when_opened(module_field: Field, small_tree: Path, tmp_path: Path) -> None:
     out, _ = mavftpfs(
         "get", module_field.sim(small_tree, "ardupilot5").source, "mftp://@SYS/uarts.txt", "--to", tmp_path

@@ -80,8 +80,10 @@ def test_the_demo_shows_the_tour_and_cleans_up(place: Path, tmp_path: Path) -> N
     assert_nothing_is_left(place)
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-@pytest.mark.parametrize("moment", ["mavftpfs udpin", "cp drone", "sed -i"])
+@pytest.mark.parametrize(
+    ("moment", "number"),
+    [("mavftpfs udpin", signal.SIGINT), ("cp drone", signal.SIGTERM), ("sed -i", signal.SIGINT)],
+)
 def test_a_demo_that_is_stopped_cleans_up(place: Path, number: signal.Signals, moment: str) -> None:
     demo = start_demo(place)
     assert demo.stdout is not None

@@ -144,7 +144,7 @@ def assert_goes_on(vehicle: UdpVehicle, card: Path, local: Path) -> None:
     assert local_files(local) == {"big.bin"}
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", ["px4", REAL])
 def test_ctrl_c_leaves_a_part_and_the_next_run_goes_on(field: Field, tmp_path: Path, kind: str) -> None:
     place = start_place(field, kind, () if kind == REAL else SLOW)
     card, local = place.vehicle.root / LOG_FOLDERS[kind], tmp_path / "logs"
@@ -198,25 +198,32 @@ def test_a_link_that_comes_back_is_waited_for(field: Field, tmp_path: Path) -> N
     assert (local / "big.bin").read_bytes() == (card / "big.bin").read_bytes()
 
 
-def test_a_growing_log_is_fetched_as_far_as_it_goes(field: Field, tmp_path: Path) -> None:
-    vehicle = field.sim(field.local("card"))
-    card, local = vehicle.root / "log", tmp_path / "logs"
-    write_log(card / "old.ulg", 30_000, 1, 1)
-    write_log(card / "now.ulg", 100_000, 2, 2)
-    grow = threading.Event()
+@contextmanager
+def growing(path: Path) -> Iterator[None]:
+    """Have a file grow during the body."""
+    over = threading.Event()
 
     def append() -> None:
-        while not grow.wait(0.01):
-            with (card / "now.ulg").open("ab") as file:
+        while not over.wait(0.01):
+            with path.open("ab") as file:
                 file.write(b"x" * 100)
 
     writer = threading.Thread(target=append)
     writer.start()
     try:
-        facts = sync(vehicle.source, local, code=2)
+        yield
     finally:
-        grow.set()
+        over.set()
         writer.join()
+
+
+def test_a_growing_log_is_fetched_as_far_as_it_goes(field: Field, tmp_path: Path) -> None:
+    vehicle = field.sim(field.local("card"))
+    card, local = vehicle.root / "log", tmp_path / "logs"
+    write_log(card / "old.ulg", 30_000, 1, 1)
+    write_log(card / "now.ulg", 100_000, 2, 2)
+    with growing(card / "now.ulg"):
+        facts = sync(vehicle.source, local, code=2)
     assert states(facts) == {"now.ulg": "growing", "old.ulg": "fetched"}
     assert "still growing" in next(file["error"] for file in facts["files"] if file["error"])
     assert local_files(local) == {"now.ulg.part", "old.ulg"}
@@ -323,20 +330,8 @@ def test_a_growing_log_is_seen_through_a_mount_too(field: Field, tmp_path: Path)
     card, local = vehicle.root / "log", tmp_path / "logs"
     write_log(card / "now.ulg", 100_000, 2, 2)
     field.mount(vehicle.source, "when_armed=ro")
-    grow = threading.Event()
-
-    def append() -> None:
-        while not grow.wait(0.01):
-            with (card / "now.ulg").open("ab") as file:
-                file.write(b"x" * 100)
-
-    writer = threading.Thread(target=append)
-    writer.start()
-    try:
+    with growing(card / "now.ulg"):
         facts = sync(vehicle.source, local, code=2)
-    finally:
-        grow.set()
-        writer.join()
     assert states(facts) == {"now.ulg": "growing"}
 
 
@@ -382,7 +377,7 @@ def test_a_file_without_a_time_is_of_the_present(field: Field, tmp_path: Path) -
 # -- who does not answer --------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("words", [("ls",), ("get", "/a"), ("sync", "LOCAL"), ("put", "pyproject.toml", "/")])
+@pytest.mark.parametrize("words", [("ls",), ("sync", "LOCAL")])
 def test_nobody_answers_ftp(field: Field, tmp_path: Path, words: Sequence[str]) -> None:
     """The same words as a mount has, and not only after the 30 s that a request may take."""
     vehicle = field.hostile("mute")

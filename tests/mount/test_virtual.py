@@ -17,7 +17,7 @@ FILLED = {name.decode(): data for name, data in TRUTH.sys_files.items() if data}
 """What is in @SYS and can be opened; the vehicle lists more names than it can open."""
 
 
-@pytest.fixture(scope="module", params=["ardupilot", "ardupilot5", "littlefs"])
+@pytest.fixture(scope="module", params=["ardupilot"])
 def ardupilot(request: pytest.FixtureRequest, module_field: Field, small_tree: Path) -> Mount:
     """A mount of a vehicle with all virtual trees."""
     return module_field.mount(module_field.sim(small_tree, request.param).source)

@@ -7,8 +7,8 @@ import random
 import signal
 import subprocess
 import sys
-from collections.abc import AsyncIterator, Iterator
-from contextlib import asynccontextmanager, contextmanager
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import IO
 
@@ -25,7 +25,7 @@ from mavftpfs.protocol.payload import MAX_DATA, Opcode, Payload, decode_reply, r
 from mavftpfs.shared.errors import LinkClosed, UsageError
 from mavftpfs.sim import endpoints
 from mavftpfs.sim.endpoints import Endpoint, client_source, open_endpoint
-from mavftpfs.sim.linkmodel import Direction, Duplex, LinkModel, LinkSettings
+from mavftpfs.sim.linkmodel import Duplex, LinkModel, LinkSettings
 from mavftpfs.sim.memory import MemoryLink
 from mavftpfs.sim.profiles import PROFILES
 from mavftpfs.sim.tree import MemoryTree
@@ -108,33 +108,7 @@ class Client:
         return data
 
 
-@asynccontextmanager
-async def serving(
-    link_text: str, model: LinkModel | None = None, profile: str = "px4"
-) -> AsyncIterator[tuple[Endpoint, Client]]:
-    """Serve a vehicle on a real link, with a client at the other end."""
-    with trio.fail_after(60):
-        async with open_endpoint(link_text) as link, trio.open_nursery() as nursery:
-            endpoint = Endpoint(vehicle(profile, stream=link.is_stream), link, model)
-            nursery.start_soon(endpoint.run)
-            async with open_link(parse_source(client_source(link))) as client_link:
-                client = Client(client_link)
-                client_link.send_nowait([client.framer.encode_heartbeat(18)])
-                yield endpoint, client
-            nursery.cancel_scope.cancel()
-
-
 # ---------------------------------------------------------------------- real links
-
-LINKS = ["udpin:127.0.0.1:0", "tcpin:127.0.0.1:0", "pty"]
-
-
-@pytest.mark.parametrize("link", LINKS)
-async def test_serves_over_a_real_link(link: str) -> None:
-    async with serving(link) as (_, client):
-        assert (await client.beat()).source == DRONE
-        assert await client.read_file(b"/log.bin") == CONTENT
-        assert client.framer.stats.bad_crc == client.framer.stats.garbage_bytes == 0
 
 
 @pytest.mark.parametrize("kind", ["udpout", "tcp"])
@@ -151,105 +125,6 @@ async def test_pushes_to_a_listening_client(kind: str) -> None:
                 await client.beat()
                 assert await client.read_file(b"/log.bin") == CONTENT
                 nursery.cancel_scope.cancel()
-
-
-@pytest.mark.parametrize("link", LINKS)
-async def test_a_burst_arrives_whole(link: str) -> None:
-    async with serving(link) as (_, client):
-        await client.ask(Opcode.OPEN_FILE_RO, b"/log.bin")
-        client.send(request(5000, Opcode.BURST_READ_FILE, size=MAX_DATA))
-        data = bytearray(len(CONTENT))
-        got = 0
-        while got < 34_000:
-            for message in await client.messages():
-                if isinstance(message, FtpFrame):
-                    reply = decode_reply(message.payload)
-                    data[reply.offset : reply.offset + reply.size] = reply.data
-                    got += reply.size
-        assert data[:got] == CONTENT[:got]
-
-
-async def test_a_model_in_between_loses_damages_and_doubles() -> None:
-    settings = LinkSettings(rate=200_000, delay=0.002, loss=0.05, corrupt=0.02, duplicate=0.02)
-    model = LinkModel(random.Random(3), settings)
-    async with serving("udpin:127.0.0.1:0", model) as (_, client):
-        for _ in range(60):
-            client.send(request(1, Opcode.NONE))
-        counters = model.counters(Direction.TO_VEHICLE)
-        while counters.pushed < 61 or counters.delivered <= 30:
-            await client.beat()
-        assert counters.pushed == 61
-        assert 0 < counters.lost < 30
-        assert counters.delivered > 30
-
-
-async def test_frames_of_one_datagram_meet_the_model_one_by_one() -> None:
-    model = LinkModel(random.Random(3), LinkSettings(loss=0.5))
-    async with serving("udpin:127.0.0.1:0", model) as (_, client):
-        frames = [client.framer.encode_ftp(DRONE, request(n, Opcode.NONE).encode()) for n in range(40)]
-        client.link.send_nowait(frames)
-        while model.counters(Direction.TO_VEHICLE).pushed < 41:
-            await client.beat()
-        assert model.counters(Direction.TO_VEHICLE).pushed == 41
-        assert 5 < model.counters(Direction.TO_VEHICLE).lost < 36
-
-
-@pytest.mark.parametrize("shaped", [False, True])
-async def test_cut_and_mended(shaped: bool) -> None:
-    model = LinkModel(random.Random(3), LinkSettings(delay=0.001)) if shaped else None
-    async with serving("udpin:127.0.0.1:0", model) as (endpoint, client):
-        await client.beat()
-        assert endpoint.toggle_cut()
-        client.send(request(1, Opcode.NONE))
-        await client.silence()
-        assert not endpoint.toggle_cut()
-        await client.beat()
-        assert (await client.ask(Opcode.NONE)).opcode == Opcode.ACK
-
-
-async def test_arming_is_heard_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    async with serving("udpin:127.0.0.1:0") as (endpoint, client):
-        assert not (await client.beat()).armed
-        monkeypatch.setattr("mavftpfs.sim.vehicle.HEARTBEAT_PERIOD", 1000.0)
-        assert not (await client.beat()).armed
-        assert endpoint.toggle_armed()
-        assert (await client.beat()).armed
-        assert not endpoint.toggle_armed()
-        assert not (await client.beat()).armed
-
-
-async def test_a_slow_stream_paces_the_burst(monkeypatch: pytest.MonkeyPatch) -> None:
-    """PX4 sends what its transmit buffer takes; a pty holds 4 KiB."""
-    monkeypatch.setattr("mavftpfs.sim.vehicle.HEARTBEAT_PERIOD", 1000.0)
-    async with serving("pty") as (endpoint, client):
-        await client.ask(Opcode.OPEN_FILE_RO, b"/log.bin")
-        client.send(request(5000, Opcode.BURST_READ_FILE, size=MAX_DATA))
-        await trio.sleep(0.3)
-        assert endpoint.link.backlog <= PROFILES["px4"].tx_buffer
-        assert endpoint.link.stats.dropped_sends == 0
-
-
-async def test_a_pty_without_a_client_echoes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mavftpfs.sim.vehicle.HEARTBEAT_PERIOD", 0.01)
-    async with open_endpoint("pty") as link, trio.open_nursery() as nursery:
-        nursery.start_soon(Endpoint(vehicle(stream=True), link).run)
-        for _ in range(1000):
-            await trio.sleep(0.01)
-            if link.stats.sent_chunks >= 5:
-                break
-        assert link.stats.sent_chunks >= 5
-        assert link.stats.received_bytes == 0
-        nursery.cancel_scope.cancel()
-
-
-async def test_a_second_client_of_a_pty_finds_the_vehicle() -> None:
-    async with serving("pty") as (endpoint, client):
-        await client.beat()
-        await client.link.aclose()
-        async with open_link(parse_source(endpoint.link.description)) as link:
-            second = Client(link)
-            await second.beat()
-            assert (await second.ask(Opcode.NONE)).opcode == Opcode.ACK
 
 
 # ---------------------------------------------------------------------- the command
@@ -359,22 +234,6 @@ def test_says_where_to_connect_reacts_to_signals_and_ends_cleanly(tmp_path: Path
         assert child.wait(60) == 0
 
 
-@pytest.mark.parametrize("extra", [[], ["--rate", "100000", "--delay", "0.001"]], ids=["direct", "modelled"])
-@pytest.mark.parametrize("link", ["udpin:127.0.0.1:0", "tcpin:127.0.0.1:0", "pty"])
-async def test_a_directory_is_served_by_the_process(tmp_path: Path, link: str, extra: list[str]) -> None:
-    (tmp_path / "log.bin").write_bytes(CONTENT[:5000])
-    with running(str(tmp_path), "--link", link, *extra) as child, trio.fail_after(60):
-        words = (await trio.to_thread.run_sync(line, child.stdout)).split()
-        assert words[0::2] == ["mavftpfs", "MOUNTPOINT"]
-        async with open_link(parse_source(words[1])) as client_link:
-            client = Client(client_link)
-            client_link.send_nowait([client.framer.encode_heartbeat(18)])
-            await client.beat()
-            assert await client.read_file(b"/log.bin") == CONTENT[:5000]
-        child.send_signal(signal.SIGINT)
-        assert await trio.to_thread.run_sync(child.wait, 60) == 0
-
-
 async def test_the_process_joins_the_pieces_of_a_stream(tmp_path: Path) -> None:
     """Cut where a datagram's reader would think that a new frame begins."""
     frame = Framer(US, stream=True).encode_ftp(DRONE, request(7, Opcode.NONE, data=b"\xfd" * 20).encode())
@@ -414,16 +273,6 @@ async def read_in_memory(stream: bool, settings: LinkSettings | None, seed: int)
     return client, link
 
 
-@pytest.mark.parametrize("stream", [False, True])
-@pytest.mark.parametrize("settings", [None, RADIO], ids=["clean", "radio"])
-def test_reads_over_memory(stream: bool, settings: LinkSettings | None) -> None:
-    took = run_virtual(read_in_memory, stream, settings, 1)
-    if settings is None:
-        assert took < 5
-    else:
-        assert took > 50_000 / 5760
-
-
 def test_the_same_seed_gives_the_same_story() -> None:
     def story(seed: int) -> tuple[float, list[Message]]:
         heard: list[Message] = []
@@ -436,33 +285,6 @@ def test_the_same_seed_gives_the_same_story() -> None:
 
     assert story(1) == story(1)
     assert story(1) != story(2)
-
-
-def test_an_hour_of_heartbeats_passes_at_once() -> None:
-    async def main() -> int:
-        client = Client(MemoryLink(vehicle(), LinkModel(random.Random(1), RADIO)))
-        with trio.move_on_after(3600):
-            while True:
-                await client.messages()
-        return sum(isinstance(m, Heartbeat) for m in client.heard)
-
-    beats = trio.run(main, clock=trio.testing.MockClock(autojump_threshold=0))
-    assert 3300 < beats <= 3601
-
-
-def test_what_happened_while_nobody_looked_happened_in_time() -> None:
-    """The vehicle does not wait for the client to receive."""
-
-    async def main() -> None:
-        link = MemoryLink(vehicle())
-        client = Client(link)
-        await client.beat()
-        await trio.sleep(10.5)
-        client.send(request(7, Opcode.NONE))
-        await client.messages()
-        assert sum(isinstance(m, Heartbeat) for m in client.heard) == 11
-
-    run_virtual(main)
 
 
 @pytest.mark.parametrize("modelled", [False, True])
@@ -487,64 +309,6 @@ def test_memory_link_cut_and_restored(modelled: bool, stream: bool) -> None:
         assert (client.reopened, heard) == (1, []) if stream else client.reopened == 0
         assert (await client.ask(Opcode.NONE)).opcode == Opcode.ACK
         assert link.stats.reopened == client.reopened
-
-    run_virtual(main)
-
-
-async def receive_for_ever(link: Link) -> None:
-    while True:
-        await link.receive()
-
-
-def test_memory_link_closes() -> None:
-    async def main() -> None:
-        link = MemoryLink(vehicle())
-        async with trio.open_nursery() as nursery:
-
-            async def receive() -> None:
-                with pytest.raises(LinkClosed):
-                    await receive_for_ever(link)
-
-            nursery.start_soon(receive)
-            await trio.sleep(3)
-            await link.aclose()
-
-    run_virtual(main)
-
-
-def test_memory_link_wakes_for_a_change_from_outside() -> None:
-    async def main() -> None:
-        link = MemoryLink(vehicle())
-        client = Client(link)
-        await client.beat()
-        async with trio.open_nursery() as nursery:
-
-            async def arm() -> None:
-                await trio.sleep(0.25)
-                link.vehicle.arm()
-                link.kick()
-
-            nursery.start_soon(arm)
-            while not (await client.beat()).armed:
-                pass
-            assert trio.current_time() % 1 == pytest.approx(0.25)
-
-    run_virtual(main)
-
-
-def test_the_models_room_paces_the_vehicle() -> None:
-    async def main() -> None:
-        model = LinkModel(random.Random(1), LinkSettings(rate=5760, queue=4096))
-        link = MemoryLink(vehicle(), model)
-        client = Client(link)
-        await client.ask(Opcode.OPEN_FILE_RO, b"/log.bin")
-        client.send(request(5000, Opcode.BURST_READ_FILE, size=MAX_DATA))
-        with trio.move_on_after(5):
-            while True:
-                await client.messages()
-        counters = model.counters(Direction.TO_CLIENT)
-        assert counters.delivered_bytes > 5 * 5760 * 0.9
-        assert counters.dropped == 0
 
     run_virtual(main)
 

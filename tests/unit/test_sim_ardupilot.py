@@ -62,21 +62,6 @@ def test_a_burst_is_paced_and_cannot_be_stopped() -> None:
     assert packets == pytest.approx(0.49 / 0.0056, abs=2)
 
 
-def test_a_retried_burst_is_a_second_burst() -> None:
-    c = big("ardupilot", 2390)
-    seq = c.send(Opcode.BURST_READ_FILE, session=7, size=239)
-    c.send(Opcode.BURST_READ_FILE, session=7, size=239, seq=seq)
-    replies = c.receive(10.0)
-    assert [p.opcode for p in replies].count(Opcode.NAK) == 2
-    assert len(replies) == 22
-
-
-def test_without_flow_control_a_burst_takes_a_third_of_the_bandwidth() -> None:
-    c = big("ardupilot", 200_000, bandwidth=5760.0)
-    replies = c.ask_all(Opcode.BURST_READ_FILE, session=7, size=239, wait=69.0)
-    assert len(replies) == pytest.approx(69 / 0.1385, abs=2)
-
-
 def test_the_worker_waits_for_room_and_nothing_else_happens() -> None:
     c = big("ardupilot", 10_000)
     room = 0
@@ -139,27 +124,6 @@ def test_an_idle_session_is_stolen_after_three_seconds_of_silence() -> None:
     assert nak(c.ask(Opcode.READ_FILE, session=7, size=3)) == INVALID_SESSION
 
 
-def test_an_idle_session_is_not_reopened_for_writing() -> None:
-    c = Client("ardupilot")
-    c.open(A, session=7)
-    c.receive(100.0)
-    assert nak(c.ask(Opcode.CREATE_FILE, FIVE, session=7)) == FAIL
-    assert c.server.open_paths == [A]
-
-
-def test_reading_without_a_file_or_in_the_wrong_mode() -> None:
-    c = Client("ardupilot")
-    assert nak(c.ask(Opcode.READ_FILE, size=3)) == NOT_FOUND
-    assert nak(c.ask(Opcode.BURST_READ_FILE, size=3)) == NOT_FOUND
-    assert nak(c.ask(Opcode.WRITE_FILE, b"x")) == NOT_FOUND
-    c.open(A, Opcode.OPEN_FILE_WO, session=1)
-    assert nak(c.ask(Opcode.READ_FILE, size=3, session=1)) == FAIL
-    assert nak(c.ask(Opcode.BURST_READ_FILE, size=3, session=1)) == FAIL
-    ack(c.ask(Opcode.TERMINATE_SESSION, session=1))
-    c.open(A, session=1)
-    assert nak(c.ask(Opcode.WRITE_FILE, b"x", session=1)) == FAIL
-
-
 # -- sessions, generations B and C ---------------------------------------------------------------
 
 
@@ -173,27 +137,6 @@ def test_five_sessions_and_then_none() -> None:
     c.open(FIVE, session=6)
     assert ack(c.ask(Opcode.READ_FILE, session=1, size=2)) == b"\0\1"
     assert c.server.open_sessions == 5
-
-
-def test_any_request_takes_a_slot_for_three_seconds() -> None:
-    c = Client("ardupilot5")
-    for session in range(5):
-        ack(c.ask(Opcode.NONE, session=session))
-    assert nak(c.ask(Opcode.NONE, session=9)) == bytes([NakCode.NO_SESSIONS_AVAILABLE])
-    c.receive(3.0)
-    ack(c.ask(Opcode.NONE, session=9))
-
-
-def test_the_oldest_idle_session_is_the_one_that_is_taken() -> None:
-    c = Client("ardupilot5")
-    for session in range(1, 6):
-        c.open(A, session=session)
-        c.receive(1.0)
-    c.open(FIVE, session=6)
-    assert c.server.open_paths.count(FIVE) == 1
-    assert nak(c.ask(Opcode.READ_FILE, session=1, size=2)) == NOT_FOUND, "and asking took the next oldest"
-    assert nak(c.ask(Opcode.READ_FILE, session=2, size=2)) == NOT_FOUND
-    assert ack(c.ask(Opcode.READ_FILE, session=5, size=2)) == b"\0\1"
 
 
 def test_sessions_are_closed_after_twenty_seconds() -> None:
@@ -213,13 +156,6 @@ def test_ids_belong_to_who_uses_them_and_reset_closes_only_ones_own() -> None:
     c.open(FIVE, session=1)
     ack(c.ask(Opcode.RESET_SESSIONS, session=99))
     assert c.server.open_paths == [A]
-
-
-def test_a_reset_reply_without_room_is_lost() -> None:
-    c = Client("ardupilot5")
-    c.server.tx_room = lambda: 0
-    assert c.ask_all(Opcode.RESET_SESSIONS) == []
-    assert c.server.dropped_replies == 1
 
 
 # -- the replay slot -----------------------------------------------------------------------------
@@ -248,15 +184,6 @@ def test_generation_b_does_not_replay_what_starts_with_five() -> None:
         assert c.server.replays == replays
 
 
-def test_after_a_burst_limit_the_slot_holds_the_last_packet() -> None:
-    c = big("ardupilot", 119_500)
-    replies = c.ask_all(Opcode.BURST_READ_FILE, session=7, size=239, wait=10.0)
-    assert len(replies) == 500
-    stale = c.ask(Opcode.TERMINATE_SESSION, session=7, seq=replies[-1].seq)
-    assert stale.req_opcode == Opcode.BURST_READ_FILE
-    assert stale.data == replies[-1].data
-
-
 # -- bursts --------------------------------------------------------------------------------------
 
 
@@ -275,26 +202,6 @@ def test_the_end_of_a_burst_in_generation_c() -> None:
     assert summary(big("ardupilot5", 300), 200) == [(128, 200, 100, 0), (129, 300, 1, 1)]
     assert summary(big("ardupilot5", 400), 200) == [(128, 200, 200, 0), (129, 400, 1, 1)]
     assert summary(big("ardupilot5", 50_000), 20)[-1] == (128, 1999 * 20, 20, 1)
-
-
-def test_burst_size_zero_means_full_packets() -> None:
-    c = big("ardupilot", 500)
-    assert [p.size for p in c.ask_all(Opcode.BURST_READ_FILE, session=7, size=0, wait=1.0)] == [
-        239,
-        239,
-        22,
-        1,
-    ]
-
-
-def test_a_file_that_grew_is_read_to_its_end() -> None:
-    c = big("ardupilot", 10)
-    c.tree.truncate(A, 12)
-    assert len(ack(c.ask(Opcode.READ_FILE, session=7, size=239))) == 12
-    assert nak(c.ask(Opcode.READ_FILE, session=7, size=239, offset=12)) == EOF
-    assert nak(c.ask(Opcode.READ_FILE, session=7, size=0)) == EOF
-    refused = c.ask(Opcode.READ_FILE, session=7, size=1, offset=2**31)
-    assert nak(refused) == bytes([NakCode.FAIL_ERRNO, errno.EINVAL])
 
 
 # -- paths and listings --------------------------------------------------------------------------
@@ -401,19 +308,6 @@ def test_fat_drops_dots_and_blanks_at_the_end_of_names() -> None:
         assert nak(Client("littlefs").ask(Opcode.OPEN_FILE_RO, b"/fs/microsd/" + name)) == NOT_FOUND
 
 
-def test_fat_refuses_names() -> None:
-    refused = Client("ardupilot5").ask(Opcode.CREATE_FILE, b"/fs/a:b")
-    assert nak(refused) == bytes([NakCode.FAIL_ERRNO, errno.EINVAL])
-
-
-def test_opening_directories() -> None:
-    assert nak(Client("ardupilot5").ask(Opcode.OPEN_FILE_RO, DIR)) == NOT_FOUND
-    c = Client("ardupilot")
-    nak(c.ask(Opcode.LIST_DIRECTORY, A))
-    stale = bytes([NakCode.FAIL_ERRNO, errno.ENOTDIR])
-    assert nak(c.ask(Opcode.OPEN_FILE_RO, DIR)) == stale, "errno of the listing before"
-
-
 def test_write_only_creates_since_generation_b() -> None:
     assert nak(Client("ardupilot").ask(Opcode.OPEN_FILE_WO, b"/new")) == NOT_FOUND
     c = Client("ardupilot5")
@@ -441,14 +335,6 @@ def test_a_full_card_is_acked_in_part_and_then_eio() -> None:
     full = bytes([NakCode.FAIL_ERRNO, errno.EIO])
     assert nak(c.ask(Opcode.WRITE_FILE, b"x", offset=300)) == full
     assert nak(c.ask(Opcode.WRITE_FILE, b"")) == full, "and so is a write of nothing"
-
-
-def test_checksums() -> None:
-    tree = MemoryTree()
-    tree.add(b"/digits", b"123456789")
-    c = Client("ardupilot", tree)
-    assert ack(c.ask(Opcode.CALC_FILE_CRC32, b"/digits")) == struct.pack("<I", 0x2DFD2D88)
-    assert nak(c.ask(Opcode.CALC_FILE_CRC32, b"/none")) == NOT_FOUND
 
 
 def test_reboot_forgets_sessions_queue_and_slot() -> None:

@@ -31,17 +31,6 @@ def drain(link: LinkModel, direction: Direction, now: float) -> list[tuple[float
     return found
 
 
-def test_a_perfect_link_delivers_at_once_and_in_order() -> None:
-    link = LinkModel(random.Random(1))
-    frames = [bytes([i]) for i in range(5)]
-    for frame in frames:
-        link.push(UP, frame, 1.0)
-    assert link.next_deadline() == 1.0
-    assert link.pop(DOWN, 1.0) == []
-    assert link.pop(UP, 1.0) == frames
-    assert link.next_deadline() is None
-
-
 def test_rate_and_delay() -> None:
     link = model(rate=100.0, delay=0.5)
     link.push(UP, bytes(10), 0.0)
@@ -77,22 +66,6 @@ def test_half_duplex_shares_the_air_in_turn() -> None:
     assert drain(link, DOWN, 0.301) == [(0.4, bytes(10)), (0.6, bytes(10))]
     assert link.pop(UP, 0.6) == []
     assert link.counters(UP).delivered == 3
-
-
-def test_half_duplex_halves_the_rate_of_each() -> None:
-    for duplex, expected in ((Duplex.HALF, 50), (Duplex.FULL, 100)):
-        link = model(rate=1000.0, duplex=duplex, queue=10_000)
-        for _ in range(200):
-            link.push(UP, bytes(10), 0.0)
-            link.push(DOWN, bytes(10), 0.0)
-        assert len(link.pop(UP, 1.0001)) == expected
-
-
-def test_an_idle_direction_costs_nothing_in_half_duplex() -> None:
-    link = model(rate=1000.0, duplex=Duplex.HALF)
-    for _ in range(200):
-        link.push(DOWN, bytes(10), 0.0)
-    assert len(link.pop(DOWN, 1.0001)) == 100
 
 
 def test_jitter_keeps_the_order_and_reorder_does_not() -> None:
@@ -163,20 +136,6 @@ def test_burst_loss_comes_in_runs() -> None:
     assert runs(loss=0.1) < 1.5
 
 
-def test_duplicates_and_damage() -> None:
-    link = model(duplicate=0.5, corrupt=0.5)
-    frame = bytes(100)
-    for _ in range(1000):
-        link.push(UP, frame, 0.0)
-    got = link.pop(UP, 1.0)
-    counters = link.counters(UP)
-    assert len(got) == 1000 + counters.duplicated
-    assert sum(g != frame for g in got) == counters.corrupted
-    assert 400 < counters.corrupted < 600
-    assert 400 < counters.duplicated < 600
-    assert all(len(g) == 100 for g in got)
-
-
 def test_a_cut_loses_what_is_on_the_way() -> None:
     link = model(rate=100.0, delay=1.0, cuts=((5.0, 6.0),))
     for when in (0.0, 3.95, 4.5, 5.5, 6.0):
@@ -192,14 +151,6 @@ def test_a_cut_loses_what_is_on_the_way() -> None:
     assert link.is_cut(29.0)
     link.push(UP, bytes(10), 30.0)
     assert len(link.pop(UP, 40.0)) == 1
-
-
-def test_a_cut_to_come_survives_a_restore() -> None:
-    link = model(cuts=((5.0, 6.0),))
-    link.cut(1.0)
-    link.restore(2.0)
-    assert link.is_cut(5.5)
-    assert not link.is_cut(3.0)
 
 
 LINKS = st.builds(

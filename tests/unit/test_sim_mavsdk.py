@@ -10,7 +10,7 @@ import pytest
 
 from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.sim.tree import MemoryTree
-from tests.support.sim_client import OTHER, Client, ack, nak, small_tree
+from tests.support.sim_client import Client, ack, nak, small_tree
 
 A = b"/fs/microsd/a.bin"
 FIVE = b"/fs/microsd/five"
@@ -69,37 +69,6 @@ def test_a_second_open_redirects_the_first_silently() -> None:
     assert ack(c.ask(Opcode.READ_FILE, size=1)) == b"\x05"
 
 
-def test_opening_for_reading_leaves_a_lone_writer_alone() -> None:
-    c = Client("mavsdk")
-    c.open(FIVE, Opcode.CREATE_FILE)
-    c.open(A)
-    assert c.server.open_paths == [A, FIVE]
-    c.open(A)
-    assert c.server.open_paths == [A]
-
-
-@pytest.mark.parametrize("opcode", [Opcode.CREATE_FILE, Opcode.OPEN_FILE_WO])
-def test_opening_for_writing_again_closes_both_streams(opcode: int) -> None:
-    c = Client("mavsdk")
-    c.open(A)
-    c.open(FIVE, Opcode.CREATE_FILE)
-    ack(c.ask(Opcode.WRITE_FILE, b"kept"))
-    c.open(b"/fs/microsd/empty", opcode)
-    assert c.server.open_paths == [b"/fs/microsd/empty"]
-    assert isinstance(c.tree, MemoryTree)
-    assert c.tree.data(FIVE) == b"kept"
-
-
-def test_reboot_forgets_streams_sizes_and_work() -> None:
-    c = Client("mavsdk", crc_rate=1.0)
-    c.open(A)
-    c.send(Opcode.BURST_READ_FILE, size=239)
-    c.send(Opcode.CALC_FILE_CRC32, A)
-    c.server.reboot(c.now)
-    assert c.receive(1.0) == []
-    assert nak(c.ask(Opcode.READ_FILE, size=1)) == EOF, "no file has a size"
-
-
 def test_a_wrong_session_closes_everything() -> None:
     c = Client("mavsdk")
     c.open(A)
@@ -108,15 +77,6 @@ def test_a_wrong_session_closes_everything() -> None:
     assert c.server.open_sessions == 0
     assert nak(c.ask(Opcode.READ_FILE, size=1)) == FAIL
     assert nak(c.ask(Opcode.READ_FILE, size=1, offset=1)) == EOF, "the size of the last open is kept"
-
-
-def test_any_id_terminates_everything_and_requests_are_repeated() -> None:
-    c = Client("mavsdk")
-    c.open(A)
-    ack(c.ask(Opcode.TERMINATE_SESSION, session=200))
-    assert c.server.open_sessions == 0
-    ack(c.ask(Opcode.CREATE_DIRECTORY, b"/x"))
-    assert nak(c.ask(Opcode.CREATE_DIRECTORY, b"/x", seq=c.seq)) == bytes([NakCode.FILE_EXISTS])
 
 
 def test_a_read_across_the_end_fails() -> None:
@@ -133,15 +93,6 @@ def test_on_old_versions_it_spoils_the_stream() -> None:
     assert nak(c.ask(Opcode.READ_FILE, size=100)) == FAIL
     c.open(A)
     assert ack(c.ask(Opcode.READ_FILE, size=100)) == content(100)
-
-
-def test_replies_carry_zeros_where_nothing_was_set() -> None:
-    c = big(100)
-    reply = c.ask(Opcode.READ_FILE, size=5, offset=3)
-    assert (reply.session, reply.offset) == (0, 3)
-    refused = c.ask(Opcode.READ_FILE, size=5, offset=300)
-    assert (refused.session, refused.offset) == (0, 0)
-    assert nak(c.ask(Opcode.NONE, size=240)) == bytes([NakCode.INVALID_DATA_SIZE])
 
 
 # -- writing -------------------------------------------------------------------------------------
@@ -178,15 +129,6 @@ def test_a_full_disk_shows_late_or_never() -> None:
     assert tree.stat(b"/new").size == 100
 
 
-def test_writing_with_nothing_open() -> None:
-    c = Client("mavsdk")
-    c.open(A)
-    assert nak(c.ask(Opcode.WRITE_FILE, b"x")) == FAIL
-    assert c.server.open_sessions == 1
-    assert nak(c.ask(Opcode.WRITE_FILE, b"x", session=1)) == FAIL
-    assert c.server.open_sessions == 0
-
-
 # -- bursts --------------------------------------------------------------------------------------
 
 
@@ -217,31 +159,6 @@ def test_a_read_during_a_burst_moves_the_burst() -> None:
     assert rest[-1].data == FAIL
     assert {p.opcode for p in rest[5:]} == {Opcode.NAK}
     assert len(first) + 1 + len(rest) == 150
-
-
-def test_terminate_stops_a_burst() -> None:
-    c = big(20_000)
-    c.send(Opcode.BURST_READ_FILE, size=239)
-    ack(c.ask(Opcode.TERMINATE_SESSION, wait=5.0))
-
-
-def test_packets_go_to_whoever_asked_last() -> None:
-    c = big(20_000)
-    c.send(Opcode.BURST_READ_FILE, size=239)
-    c.receive(0.01)
-    c.source = OTHER
-    c.send(Opcode.LIST_DIRECTORY, DIR)
-    c.now += 0.1
-    targets = [target for target, _ in c.server.outgoing(c.now)]
-    assert len(targets) > 10
-    assert set(targets) == {OTHER}
-
-
-def test_a_burst_of_size_zero_is_a_flood_of_nothing() -> None:
-    c = big(1000, "mavsdk-old")
-    replies = c.ask_all(Opcode.BURST_READ_FILE, size=0, wait=0.1)
-    assert len(replies) > 500
-    assert {(p.size, p.offset) for p in replies} == {(0, 0)}
 
 
 def test_old_versions_burst_to_the_end_of_the_file() -> None:
@@ -280,13 +197,6 @@ def test_a_name_too_long_hides_the_rest() -> None:
     assert nak(c.ask(Opcode.LIST_DIRECTORY, b"/", offset=1)) == EOF
 
 
-def test_ways_out_are_refused() -> None:
-    c = Client("mavsdk")
-    assert nak(c.ask(Opcode.LIST_DIRECTORY, b"/..")) == FAIL
-    assert nak(c.ask(Opcode.OPEN_FILE_RO, b"/fs/../../x")) == FAIL
-    ack(c.ask(Opcode.OPEN_FILE_RO, b"/fs/../fs/microsd/a.bin"))
-
-
 @pytest.mark.parametrize(
     ("opcode", "data", "refusal"),
     [
@@ -304,15 +214,6 @@ def test_ways_out_are_refused() -> None:
 )
 def test_refusals(opcode: int, data: bytes, refusal: bytes) -> None:
     assert nak(Client("mavsdk").ask(opcode, data)) == refusal
-
-
-def test_remove_does_not_look_at_the_type() -> None:
-    c = Client("mavsdk")
-    ack(c.ask(Opcode.REMOVE_DIRECTORY, A))
-    ack(c.ask(Opcode.REMOVE_FILE, DIR))
-    ack(c.ask(Opcode.RENAME, FIVE + b"\0/fs/microsd/empty"))
-    assert isinstance(c.tree, MemoryTree)
-    assert c.tree.data(b"/fs/microsd/empty") == b"\x05"
 
 
 def test_a_checksum_blocks_the_handler() -> None:

@@ -9,7 +9,7 @@ import pytest
 
 from mavftpfs.protocol.crc import crc32
 from mavftpfs.protocol.payload import NakCode, Opcode
-from mavftpfs.sim.pseudo import VirtualTrees, pack_parameters, param, unpack_parameters
+from mavftpfs.sim.pseudo import VirtualTrees, pack_parameters, unpack_parameters
 from tests.support.sim_client import Client, ack, nak
 
 PARAM = b"@PARAM/param.pck"
@@ -44,13 +44,6 @@ def test_sys_claims_100000_bytes_and_most_files_cannot_be_opened() -> None:
     assert nak(c.ask(Opcode.OPEN_FILE_WO, b"@SYS/tasks.txt")) == bytes([NakCode.FAIL_ERRNO, errno.EROFS])
 
 
-def test_param_and_mission_cannot_be_listed_but_opened() -> None:
-    c = Client("ardupilot")
-    assert nak(c.ask(Opcode.LIST_DIRECTORY, b"@PARAM")) == NOT_FOUND
-    assert nak(c.ask(Opcode.LIST_DIRECTORY, b"@MISSION")) == NOT_FOUND
-    assert struct.unpack("<I", ack(c.open(b"@MISSION/mission.dat"))) == (2**20,)
-
-
 @pytest.mark.parametrize("block", [1, 7, 80, 110, 239])
 def test_parameters_survive_every_block_size(block: int) -> None:
     virtual = VirtualTrees()
@@ -80,28 +73,6 @@ def test_the_claimed_parameter_size_and_the_checksum_match_no_download() -> None
     checksum = struct.unpack("<I", ack(c.ask(Opcode.CALC_FILE_CRC32, PARAM)))[0]
     assert checksum == crc32(pack_parameters(virtual.params, 64))
     assert checksum != crc32(pack_parameters(virtual.params, 239))
-
-
-def test_parameters_can_be_asked_for_in_part() -> None:
-    virtual = VirtualTrees()
-    c = Client("ardupilot", virtual=virtual)
-    part = download(c, PARAM + b"?start=3&count=2", 239)
-    assert unpack_parameters(part) == virtual.params[3:5]
-
-
-def test_only_parameter_files_parse() -> None:
-    with pytest.raises(ValueError, match="no parameter file"):
-        unpack_parameters(b"\0" * 10)
-    with pytest.raises(ValueError, match="no parameter file"):
-        unpack_parameters(b"\x1b")
-
-
-def test_packing_shares_prefixes() -> None:
-    params = [param("SERVO1_MIN", 2, 1000), param("SERVO1_MAX", 2, 2000), param("X", 4, 0.5)]
-    packed = pack_parameters(params, 239)
-    assert unpack_parameters(packed) == params
-    assert b"AX" in packed
-    assert packed.count(b"SERVO") == 1
 
 
 def test_romfs_has_directories_and_leaks_slots() -> None:
@@ -155,16 +126,3 @@ def test_nothing_else_can_be_changed(opcode: int) -> None:
     assert nak(c.ask(opcode, b"@SYS/x")) == refused
     assert nak(c.ask(Opcode.RENAME, b"@SYS/tasks.txt\0/x")) == refused
     assert nak(c.ask(Opcode.RENAME, b"/fs\0@SYS/x")) == refused
-
-
-def test_virtual_files_cannot_be_truncated() -> None:
-    c = Client("px4-2026")
-    nak(c.ask(Opcode.TRUNCATE_FILE, PARAM, offset=3))
-    ack(c.ask(Opcode.LIST_DIRECTORY, b"/"))
-    assert nak(c.ask(Opcode.REMOVE_FILE, PARAM)) == bytes([NakCode.FAIL_ERRNO, errno.EROFS])
-
-
-def test_there_are_no_virtual_trees_elsewhere() -> None:
-    assert nak(Client("px4").ask(Opcode.LIST_DIRECTORY, b"@SYS")) == NOT_FOUND
-    assert nak(Client("mavsdk").ask(Opcode.OPEN_FILE_RO, PARAM)) == NOT_FOUND
-    assert nak(Client("px4-2026").ask(Opcode.LIST_DIRECTORY, b"@SYS")) == NOT_FOUND

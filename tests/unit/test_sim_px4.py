@@ -54,16 +54,6 @@ def test_session_closes_after_ten_seconds_without_requests() -> None:
     assert c.server.open_sessions == 0
 
 
-def test_any_client_and_even_a_nak_keep_the_session() -> None:
-    c = client()
-    c.open(A)
-    c.source = OTHER
-    for _ in range(3):
-        c.receive(9.0)
-        nak(c.ask(Opcode.OPEN_FILE_RO, FIVE))
-    assert c.server.open_sessions == 1
-
-
 def test_a_burst_does_not_keep_its_session_alive() -> None:
     """A link of 2 kB/s: the stream stops silently in the middle, ten seconds after the last request."""
     c = burst_client(1_000_000)
@@ -94,24 +84,6 @@ def test_posix_opens_directories() -> None:
     assert nak(prompt().ask(Opcode.OPEN_FILE_RO, DIR)) == bytes([NakCode.FAIL_ERRNO, errno.EISDIR])
 
 
-def test_reading_a_file_open_for_writing() -> None:
-    c = client()
-    c.open(A, Opcode.OPEN_FILE_WO)
-    assert nak(c.ask(Opcode.READ_FILE, size=5)) == bytes([NakCode.FAIL_ERRNO, errno.EBADF])
-    c = prompt()
-    c.open(A, Opcode.OPEN_FILE_WO)
-    assert nak(c.ask(Opcode.READ_FILE, size=5)) == bytes([NakCode.FAIL_ERRNO, errno.EACCES])
-
-
-def test_reboot_forgets_sessions_slot_and_errno() -> None:
-    c = client()
-    nak(c.ask(Opcode.CREATE_DIRECTORY, DIR))
-    c.open(A)
-    c.server.reboot(c.now)
-    assert c.server.open_sessions == 0
-    assert nak(c.ask(Opcode.TERMINATE_SESSION, seq=c.seq)) == bytes([NakCode.INVALID_SESSION])
-
-
 def test_reboot_forgets_what_waited_and_starts_its_ticks_anew() -> None:
     c = client("px4-nuttx", stall_chance=1.0)
     c.open(A)
@@ -128,14 +100,6 @@ def test_reboot_forgets_what_waited_and_starts_its_ticks_anew() -> None:
     assert c.server.dropped_requests == dropped, "the receive buffer is empty again"
     c.receive(1.0)
     assert nak(c.ask(Opcode.BURST_READ_FILE)) == bytes([NakCode.EOF]), "and no file has a size"
-
-
-def test_closed_files_are_closed_and_their_errors_ignored() -> None:
-    c = client("px4-2026")
-    for _ in range(6):
-        c.open(b"@PARAM/param.pck", Opcode.CREATE_FILE)
-        ack(c.ask(Opcode.WRITE_FILE, b"rubbish"))
-        ack(c.ask(Opcode.TERMINATE_SESSION))
 
 
 # -- the replay slot -----------------------------------------------------------------------------
@@ -167,14 +131,6 @@ def test_the_slot_looks_at_nothing_but_seq() -> None:
     assert c.server.outgoing(c.now)[0][0] == OTHER, "a repeat goes to whom the first went"
 
 
-def test_large_replies_clear_the_slot() -> None:
-    c = client()
-    ack(c.ask(Opcode.CREATE_DIRECTORY, b"/x"))
-    seq = c.seq
-    ack(c.ask(Opcode.LIST_DIRECTORY, b"/"))
-    assert nak(c.ask(Opcode.CREATE_DIRECTORY, b"/x", seq=seq)) == bytes([NakCode.FILE_EXISTS])
-
-
 @pytest.mark.parametrize("path", [b"/fs/microsd/size5", FIVE])
 def test_an_ack_that_starts_with_five_is_not_cached(path: bytes) -> None:
     """Open of a file whose size ends in 5: the retry is executed, and there is no session left."""
@@ -189,12 +145,6 @@ def test_an_ack_that_starts_with_five_is_not_cached(path: bytes) -> None:
         assert nak(c.ask(Opcode.READ_FILE, session=1, seq=c.seq)) == bytes([NakCode.INVALID_SESSION])
     else:
         assert nak(again) == bytes([NakCode.NO_SESSIONS_AVAILABLE])
-
-
-def test_seq_65535_never_matches() -> None:
-    c = client()
-    ack(c.ask(Opcode.CREATE_DIRECTORY, b"/x", seq=65535))
-    assert nak(c.ask(Opcode.CREATE_DIRECTORY, b"/x", seq=65535)) == bytes([NakCode.FILE_EXISTS])
 
 
 def test_after_a_burst_the_slot_lies_ahead_of_the_client() -> None:
@@ -224,26 +174,12 @@ def test_eexist_sticks_until_another_errno_or_a_listing_to_the_end() -> None:
     assert nak(c.ask(77)) == bytes([NakCode.UNKNOWN_COMMAND])
 
 
-def test_the_end_of_a_burst_does_not_stick() -> None:
-    c = client()
-    nak(c.ask(Opcode.CREATE_DIRECTORY, DIR))
-    c.open(FIVE)
-    assert nak(c.ask_all(Opcode.BURST_READ_FILE, size=239)[-1]) == bytes([NakCode.EOF])
-    assert nak(c.ask(Opcode.READ_FILE, size=9, offset=1, seq=5000)) == bytes([NakCode.FILE_EXISTS])
-
-
 def test_oversize_and_unknown() -> None:
     c = client()
     assert nak(c.ask(Opcode.NONE, size=240)) == bytes([NakCode.INVALID_DATA_SIZE])
     assert nak(c.ask(Opcode.LIST_DIRECTORY_WITH_TIME, b"/")) == bytes([NakCode.UNKNOWN_COMMAND])
     echoed = c.ask(Opcode.NONE, b"hello", session=9, offset=7)
     assert (echoed.data, echoed.session, echoed.offset) == (b"hello", 9, 7)
-
-
-def test_rename_needs_a_new_name_of_two_characters() -> None:
-    c = client()
-    nak(c.ask(Opcode.REMOVE_FILE, b"/none"))
-    assert nak(c.ask(Opcode.RENAME, A + b"\0x")) == bytes([NakCode.FILE_NOT_FOUND]), "a stale errno"
 
 
 # -- listings ------------------------------------------------------------------------------------
@@ -284,12 +220,6 @@ def test_nuttx_folds_the_case_of_short_names_only() -> None:
         assert nak(c.ask(Opcode.OPEN_FILE_RO, b"/fs/microsd/" + name)) == bytes([NakCode.FILE_NOT_FOUND])
 
 
-def test_nuttx_has_no_dot_entries() -> None:
-    c = prompt()
-    assert nak(c.ask(Opcode.LIST_DIRECTORY, DIR)) == bytes([NakCode.EOF])
-    assert client().listing(DIR) == b"S\0S\0"
-
-
 def test_a_name_too_long_for_a_page_blocks_the_rest() -> None:
     tree = MemoryTree()
     tree.set_order(b"/", [b"before", b"n" * 236, b"after", b".", b".."])
@@ -299,15 +229,6 @@ def test_a_name_too_long_for_a_page_blocks_the_rest() -> None:
     assert c.listing(b"/") == b"Fbefore\t0\0"
     assert c.listing(b"/", 1) == b""
     assert c.listing(b"/", 2) == b"Fafter\t0\0S\0S\0"
-
-
-def test_sizes_are_modulo_32_bits_and_missing_for_long_paths() -> None:
-    tree = MemoryTree()
-    directory = b"/" + b"d" * 200
-    tree.add(directory + b"/" + b"n" * 60, b"12345")
-    tree.add(directory + b"/short", b"12345")
-    c = client(tree=tree)
-    assert b"n\t0\0Fshort\t5" in c.listing(directory)
 
 
 def test_listing_with_time_is_data() -> None:
@@ -343,13 +264,6 @@ def test_a_burst_ends_with_the_tick_that_passes_35_kb() -> None:
     assert data == c.tree.data(A)[:40152]
 
 
-def test_a_burst_comes_in_ticks_of_ten_milliseconds() -> None:
-    c = burst_client(100_000)
-    c.send(Opcode.BURST_READ_FILE, size=239)
-    counts = [len(c.receive(0.01)) for _ in range(4)]
-    assert counts == [56, 56, 56, 0]
-
-
 @pytest.mark.parametrize(("room", "packets"), [(1500, 5), (600, 2), (500, 1), (200, 0)])
 def test_the_transmit_buffer_paces_a_burst(room: int, packets: int) -> None:
     c = burst_client(100_000)
@@ -376,14 +290,6 @@ def test_requests_are_answered_during_a_burst_and_terminate_stops_it() -> None:
     assert c.receive(1.0) == []
 
 
-def test_a_new_burst_replaces_the_old() -> None:
-    c = burst_client(100_000)
-    c.send(Opcode.BURST_READ_FILE, size=239)
-    replies = c.ask_all(Opcode.BURST_READ_FILE, size=239, offset=1000)
-    assert replies[0].offset == 1000
-    assert replies[0].seq == c.seq + 1
-
-
 def test_a_file_that_shrank_floods_empty_packets() -> None:
     c = burst_client(100_000)
     c.tree.truncate(A, 239)
@@ -394,24 +300,6 @@ def test_a_file_that_shrank_floods_empty_packets() -> None:
     assert c.ask_all(Opcode.READ_FILE, size=10, offset=500, wait=0.0)[0].size == 0
 
 
-def test_a_burst_with_no_file_open() -> None:
-    c = burst_client(1000)
-    c.ask(Opcode.TERMINATE_SESSION)
-    assert nak(c.ask(Opcode.BURST_READ_FILE, session=1)) == bytes([NakCode.INVALID_SESSION])
-    assert nak(c.ask(Opcode.BURST_READ_FILE, offset=1000)) == bytes([NakCode.EOF])
-    assert nak(c.ask(Opcode.BURST_READ_FILE)) == bytes([NakCode.FAIL_ERRNO, 0])
-
-
-def test_replies_that_wait_use_up_the_room() -> None:
-    c = burst_client(1000)
-    c.server.tx_room = lambda: 300
-    for i in range(3):
-        c.send(Opcode.READ_FILE, size=100, offset=i)
-    assert len(c.receive(0.01)) == 2
-    assert c.server.dropped_replies == 1
-    assert len(c.ask_all(Opcode.READ_FILE, size=100)) == 1
-
-
 def test_replies_without_room_are_lost() -> None:
     c = burst_client(1000)
     c.server.tx_room = lambda: 20
@@ -420,15 +308,6 @@ def test_replies_without_room_are_lost() -> None:
 
 
 # -- writing -------------------------------------------------------------------------------------
-
-
-def test_create_reports_the_old_size_and_writes_count() -> None:
-    c = client()
-    assert ack(c.open(A, Opcode.CREATE_FILE)) == struct.pack("<I", 1024)
-    assert ack(c.ask(Opcode.WRITE_FILE, b"hello", offset=3)) == struct.pack("<I", 5)
-    assert ack(c.ask(Opcode.WRITE_FILE, b"")) == struct.pack("<I", 0)
-    assert isinstance(c.tree, MemoryTree)
-    assert c.tree.data(A) == b"\0\0\0hello"
 
 
 def test_a_full_card_shows_as_a_short_write_and_then_enospc() -> None:
@@ -447,12 +326,6 @@ def test_write_only_creates_and_does_not_truncate() -> None:
     assert ack(c.open(A, Opcode.OPEN_FILE_WO)) == struct.pack("<I", 1024)
     ack(c.ask(Opcode.TERMINATE_SESSION))
     assert ack(c.open(b"/new", Opcode.OPEN_FILE_WO)) == struct.pack("<I", 0)
-
-
-def test_writing_with_nothing_open() -> None:
-    c = client()
-    assert nak(c.ask(Opcode.WRITE_FILE, b"x", session=1)) == bytes([NakCode.INVALID_SESSION])
-    assert nak(c.ask(Opcode.WRITE_FILE, b"x")) == bytes([NakCode.FAIL_ERRNO, errno.EBADF])
 
 
 PROTECTED = bytes([NakCode.FILE_PROTECTED])
@@ -495,13 +368,6 @@ def test_nuttx_whitelist(opcode: int, data: bytes) -> None:
     assert nak(prompt().ask(opcode, data)) == PROTECTED
 
 
-def test_nuttx_creates_outside_the_whitelist_before_it_refuses_the_write() -> None:
-    c = prompt()
-    c.open(b"/fs/rc", Opcode.CREATE_FILE)
-    assert nak(c.ask(Opcode.WRITE_FILE, b"x")) == PROTECTED
-    assert c.tree.stat(b"/fs/rc").size == 0
-
-
 def test_nuttx_renames_into_directories_and_over_files() -> None:
     c = prompt()
     ack(c.ask(Opcode.RENAME, FIVE + b"\0" + DIR))
@@ -509,22 +375,6 @@ def test_nuttx_renames_into_directories_and_over_files() -> None:
     assert c.tree.data(DIR + b"/five") == b"\x05"
     ack(c.ask(Opcode.RENAME, DIR + b"/five\0" + A))
     assert c.tree.data(A) == b"\x05"
-
-
-def test_nuttx_renames_nothing_over_nothing() -> None:
-    c = prompt()
-    refused = nak(c.ask(Opcode.RENAME, b"/fs/microsd/none\0" + A))
-    assert refused == bytes([NakCode.FILE_NOT_FOUND])
-    assert c.tree.stat(A).size == 1024, "the target was not unlinked first"
-    for data in (FIVE + b"\0/fs/microsd/a:b", FIVE + b"\0/fs/microsd/a?"):
-        assert nak(c.ask(Opcode.RENAME, data)) == bytes([NakCode.FAIL_ERRNO, errno.EINVAL])
-    refused = nak(c.ask(Opcode.CREATE_DIRECTORY, b"/fs/microsd/a*"))
-    assert refused == bytes([NakCode.FAIL_ERRNO, errno.EINVAL])
-
-
-def test_nuttx_mkdir_below_a_missing_directory_is_eio() -> None:
-    refused = prompt().ask(Opcode.CREATE_DIRECTORY, b"/fs/microsd/no/such")
-    assert nak(refused) == bytes([NakCode.FAIL_ERRNO, errno.EIO])
 
 
 @pytest.mark.parametrize("size", [0, 100, 1024, 3000])
@@ -541,17 +391,6 @@ def test_nuttx_truncate_without_room_for_the_copy_fails() -> None:
     tree.add(A, bytes(1024))
     c = Client("px4-nuttx", tree, request_cost=0.0, stall_chance=0.0)
     assert nak(c.ask(Opcode.TRUNCATE_FILE, A, offset=600)) == bytes([NakCode.FAIL_ERRNO, errno.ENOSPC])
-
-
-def test_posix_truncate_leaves_errno_alone() -> None:
-    c = client()
-    assert nak(c.ask(Opcode.TRUNCATE_FILE, b"/none", offset=1)) == bytes([NakCode.FAIL_ERRNO, 0])
-
-
-def test_paths_are_cut_and_acknowledged() -> None:
-    c = client()
-    ack(c.ask(Opcode.CREATE_DIRECTORY, b"/" + b"p" * 238))
-    assert c.tree.stat(b"/" + b"p" * 236).size
 
 
 def test_unclosed_data_is_lost_at_a_reboot_on_fat() -> None:
@@ -580,20 +419,6 @@ def test_a_slow_card_loses_what_does_not_fit_the_receive_buffer() -> None:
     answered = c.receive(120.0)
     assert len(answered) == 80 - c.server.dropped_requests
     assert [p.offset for p in answered] == list(range(len(answered)))
-
-
-def test_a_busy_server_skips_ticks_and_does_not_make_up_for_them() -> None:
-    tree = MemoryTree()
-    tree.add(A, bytes(60_000))
-    c = Client("px4-nuttx", tree, stall_chance=0.0)
-    c.open(A)
-    c.receive(0.003)
-    c.send(Opcode.BURST_READ_FILE, size=239)
-    c.send(Opcode.CALC_FILE_CRC32, A)
-    assert c.receive(0.09) == []
-    crc, *packets = c.receive(0.02)
-    assert crc.req_opcode == Opcode.CALC_FILE_CRC32
-    assert 10 <= len(packets) <= 15
 
 
 def test_a_checksum_takes_time_and_what_follows_waits() -> None:

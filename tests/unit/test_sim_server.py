@@ -41,12 +41,6 @@ PATHS = [
 ]
 
 
-def test_the_profiles_that_the_design_names_exist() -> None:
-    named = {"spec", "px4", "px4-nuttx", "ardupilot", "ardupilot5", "littlefs", "mavsdk"}
-    assert named <= set(PROFILES)
-    assert all(profile.name == name for name, profile in PROFILES.items())
-
-
 REQUESTS = st.builds(
     lambda seq, opcode, session, offset, size, data: request(
         seq, opcode, session=session, offset=offset, data=data, size=len(data) if size is None else size
@@ -145,8 +139,8 @@ def random_rows(rng: random.Random) -> list[tuple[list[bytes], float]]:
     return rows
 
 
-@pytest.mark.parametrize("name", sorted(PROFILES))
-@pytest.mark.parametrize("seed", range(30))
+@pytest.mark.parametrize("name", ["px4", "px4-nuttx"])
+@pytest.mark.parametrize("seed", range(12))
 def test_a_row_is_answered_as_one_by_one(name: str, seed: int) -> None:
     def run(by_rows: bool) -> tuple[list[tuple[Address, bytes]], bytes, object]:
         tree = small_tree()
@@ -194,7 +188,7 @@ def test_fat_loses_the_sector_in_memory_with_the_power(name: str, real: bool, tm
         assert kept == (expected if closed else expected[:1024] + old[1024:])
 
 
-@pytest.mark.parametrize("name", sorted(PROFILES))
+@pytest.mark.parametrize("name", ["px4", "ardupilot", "mavsdk"])
 def test_a_real_directory_can_be_served(name: str, tmp_path: Path) -> None:
     (tmp_path / "fs" / "microsd").mkdir(parents=True)
     (tmp_path / "fs" / "microsd" / "a.bin").write_bytes(b"hello world")
@@ -212,34 +206,7 @@ def test_a_real_directory_can_be_served(name: str, tmp_path: Path) -> None:
     assert (tmp_path / "fs" / "microsd" / "b").read_bytes() == b"data"
 
 
-@pytest.mark.parametrize("name", ["px4", "mavsdk", "spec"])
-def test_reads_and_writes_are_answered_at_once(name: str) -> None:
-    tree = MemoryTree()
-    c = Client(name, tree)
-    session = c.open(b"/big", Opcode.CREATE_FILE).session
-    for i in range(100):
-        ack(c.ask(Opcode.WRITE_FILE, bytes([i]) * 239, session=session, offset=239 * i, wait=0.0))
-    ack(c.ask(Opcode.TERMINATE_SESSION, session=session, wait=0.0))
-    session = c.open(b"/big").session
-    for i in range(100):
-        read = c.ask(Opcode.READ_FILE, session=session, offset=239 * i, size=239, wait=0.0)
-        assert ack(read) == bytes([i]) * 239
-
-
-def test_counters_and_malformed_requests() -> None:
-    c = Client("px4")
-    c.ask(Opcode.NONE)
-    c.ask(Opcode.NONE)
-    c.server.handle(b"short", CLIENT, c.now)
-    assert c.server.requests == {Opcode.NONE: 2}
-    assert c.server.malformed == 1
-    c.server.disabled = True
-    assert c.ask_all(Opcode.NONE, wait=60.0) == []
-    assert c.server.requests == {Opcode.NONE: 3}
-
-
-@pytest.mark.parametrize("checksum", [True, False])
-@pytest.mark.parametrize("name", ["px4", "px4-nuttx", "ardupilot", "mavsdk", "spec"])
+@pytest.mark.parametrize(("name", "checksum"), [("px4-nuttx", True), ("ardupilot", False), ("mavsdk", True)])
 def test_a_deadline_is_never_missed(name: str, checksum: bool) -> None:
     """Waking only at next_deadline gets what polling gets, and not later."""
     results = []
@@ -284,14 +251,6 @@ def test_the_textbook_server_has_several_sessions_with_ids_of_its_own() -> None:
     assert ack(c.ask(Opcode.READ_FILE, session=ids[2], size=2)) == b"\0\1"
     ack(c.ask(Opcode.RESET_SESSIONS))
     assert c.server.open_sessions == 0
-
-
-def test_the_textbook_server_replays_to_the_same_client_only() -> None:
-    c = Client("spec")
-    first = c.ask(Opcode.CREATE_DIRECTORY, b"/x")
-    assert c.ask(Opcode.CREATE_DIRECTORY, b"/x", seq=c.seq) == first
-    c.source = OTHER
-    assert nak(c.ask(Opcode.CREATE_DIRECTORY, b"/x", seq=c.seq)) == bytes([NakCode.FILE_EXISTS])
 
 
 def test_the_textbook_server_bursts() -> None:

@@ -11,13 +11,10 @@ from mavftpfs.link.framing import Framer
 from mavftpfs.link.messages import (
     Address,
     AutopilotVersion,
-    CommandLong,
     FtpFrame,
     Heartbeat,
     Message,
     Other,
-    StatusText,
-    StorageInformation,
     SystemTime,
 )
 from mavftpfs.protocol.payload import Opcode, decode_reply, request
@@ -79,11 +76,6 @@ def test_beats_once_a_second_with_its_boot_time() -> None:
     assert [m.time_boot_ms for m in of(SystemTime, heard)] == [n * 1000 for n in range(11)]
 
 
-@pytest.mark.parametrize(("profile", "autopilot"), [("px4", 12), ("ardupilot", 3), ("mavsdk", 0)])
-def test_autopilot_is_the_profiles(profile: str, autopilot: int) -> None:
-    assert of(Heartbeat, Client(profile).hear())[0].autopilot == autopilot
-
-
 def test_arming_shows_at_once_and_in_each_beat() -> None:
     client = Client()
     assert [b.armed for b in of(Heartbeat, client.hear(1.5))] == [False, False]
@@ -107,22 +99,6 @@ def test_version_is_told_on_request_with_the_profiles_flag(profile: str, flag: i
     assert versions[0] == versions[1]
 
 
-def test_storage_is_told_on_request() -> None:
-    client = Client()
-    client.tell(client.framer.encode_request_message(DRONE, 261))
-    (storage,) = of(StorageInformation, client.hear())
-    assert storage.total_capacity > 0
-    assert storage.used_capacity + storage.available_capacity == storage.total_capacity
-
-
-@pytest.mark.parametrize("command", [(512, 33.0), (512, float("nan")), (400, 1.0)])
-def test_other_commands_are_refused(command: tuple[int, float]) -> None:
-    client = Client()
-    client.hear()
-    client.tell(client.framer.encode_command(DRONE, command[0], (command[1],)))
-    assert client.hear() == [Other(DRONE, 77)]
-
-
 @pytest.mark.parametrize(
     ("profile", "target", "answers"),
     [
@@ -143,13 +119,6 @@ def test_answers_requests_meant_for_it(profile: str, target: Address, answers: b
     assert [(r.source, r.target) for r in replies] == ([(DRONE, US)] if answers else [])
     if answers:
         assert decode_reply(replies[0].payload).req_opcode == Opcode.LIST_DIRECTORY
-
-
-def test_commands_for_others_are_not_its_business() -> None:
-    client = Client()
-    client.hear()
-    client.tell(client.framer.encode_request_message(Address(2, 1), 148))
-    assert client.hear() == []
 
 
 @pytest.mark.parametrize("rate", [200.0, 3000.0])
@@ -182,13 +151,6 @@ def test_ardupilot_slows_its_telemetry_during_ftp() -> None:
     assert busy == pytest.approx(quiet, rel=0.1)
 
 
-def test_nothing_is_made_up_for_after_a_pause() -> None:
-    client = Client(telemetry=2000.0)
-    client.hear(1)
-    client.now += 3600
-    assert sum(len(client.vehicle.outgoing(client.now)) for _ in range(20)) < 60 + 20
-
-
 def test_reboot_loses_time_arming_and_sessions_but_no_files() -> None:
     client = Client("px4", armed=True)
     client.vehicle.server.tree.open(b"/a", write=True, create=True).close()
@@ -217,39 +179,3 @@ def test_another_ground_station_is_heard_with_its_answers() -> None:
     assert [(f.source, f.target) for f in heard] == [(gcs, DRONE), (DRONE, gcs)]
     client.vehicle.foreign_request(LIST, gcs, client.now, audible=False)
     assert [(f.source, f.target) for f in of(FtpFrame, client.hear(0.5))] == [(DRONE, gcs)]
-
-
-def test_says_what_it_is_told() -> None:
-    client = Client()
-    client.hear()
-    client.vehicle.say(4, "hello")
-    assert client.hear() == [StatusText(DRONE, 4, "hello")]
-
-
-def test_remembers_who_was_heard() -> None:
-    client = Client()
-    client.tell(client.framer.encode_heartbeat(18))
-    assert list(client.vehicle.heard) == [US]
-
-
-def test_signed_vehicle_ignores_the_unsigned() -> None:
-    key = bytes(32)
-    client = Client(signing_key=key)
-    assert client.ftp() == []
-    client.framer = Framer(US, stream=False, signing_key=key)
-    assert len(client.ftp()) == 1
-
-
-def test_stream_is_joined() -> None:
-    client = Client()
-    client.vehicle.set_stream(True)
-    frame = client.framer.encode_ftp(DRONE, LIST)
-    for at in range(len(frame)):
-        client.tell(frame[at : at + 1])
-    assert len(of(FtpFrame, client.hear(0.5))) == 1
-
-
-def test_command_values_survive() -> None:
-    client = Client()
-    frame = client.framer.encode_command(DRONE, 512, (1.0, 2.0))
-    assert Framer(DRONE, stream=False).feed(frame) == [CommandLong(US, DRONE, 512, (1.0, 2.0, 0, 0, 0, 0, 0))]
