@@ -102,7 +102,7 @@ class BlockCache:
 class _Waiter:
     start: int
     stop: int
-    lacking: int
+    missing: list[tuple[int, int]]
     done: trio.Event
     scope: trio.CancelScope
     error: Exception | None = None
@@ -201,12 +201,12 @@ class FileBlocks:
             self._cache.meter.on_bytes(self._arrived, self._cache.clock())
             self._arrived = 0
         for waiter in self._waiters:
-            lacking = self._lacking(waiter.start, waiter.stop)
-            if lacking == 0:
+            missing = self.missing(waiter.start, waiter.stop)
+            if not missing:
                 waiter.done.set()
-            elif lacking < waiter.lacking:
+            elif missing != waiter.missing:
                 waiter.scope.deadline = trio.current_time() + self._cache.patience
-            waiter.lacking = lacking
+            waiter.missing = missing
 
     def on_queued(self) -> None:
         """The reader waits for its turn while the queue before it moves: those who wait get more time."""
@@ -292,7 +292,7 @@ class FileBlocks:
             RequestTimeout: none of the missing bytes came for `patience` seconds. Else what on_failed got.
         """
         scope = trio.CancelScope(deadline=trio.current_time() + self._cache.patience)
-        waiter = _Waiter(start, stop, self._lacking(start, stop), trio.Event(), scope)
+        waiter = _Waiter(start, stop, self.missing(start, stop), trio.Event(), scope)
         self._waiters.append(waiter)
         try:
             want()
@@ -341,9 +341,6 @@ class FileBlocks:
                 self._forget_block(index)
         self.ask_again()
 
-    def _lacking(self, start: int, stop: int) -> int:
-        return sum(end - begin for begin, end in self._present.missing(start, stop))
-
     def _extent(self, index: int) -> tuple[int, int]:
         start = index * BLOCK_SIZE
         return start, min(start + BLOCK_SIZE, self.size)
@@ -353,19 +350,15 @@ class FileBlocks:
             index = start // BLOCK_SIZE
             block = self._blocks.get(index)
             if block is None:
-                block = self._new_block(index)
+                first, last = self._extent(index)
+                self._cache.add(self, index, last - first)
+                block = self._blocks[index] = bytearray(last - first)
             base = index * BLOCK_SIZE
             end = min(stop, base + BLOCK_SIZE)
             block[start - base : end - base] = data[: end - start]
             self._present.add(start, end)
             data = data[end - start :]
             start = end
-
-    def _new_block(self, index: int) -> bytearray:
-        start, stop = self._extent(index)
-        self._cache.add(self, index, stop - start)
-        block = self._blocks[index] = bytearray(stop - start)
-        return block
 
     def _forget_block(self, index: int) -> None:
         del self._blocks[index]

@@ -69,7 +69,7 @@ class Files:
 
     Attributes:
         is_changing: whether we are changing what the vehicle has of a path, or may have done so in part.
-        kept: the cache on the local disk, if there is one.
+        kept: the cache on the local disk, if there is one. open_versions: those with open handles.
         hits, misses: reads that found all they wanted in the cache, and others. unproven: reads that ended
             because their bytes were in doubt again and again.
     """
@@ -89,17 +89,16 @@ class Files:
         self.kept: KeptCache | None = None
         self.is_changing: Callable[[bytes], bool] = lambda path: False
         self._store = store
-        self._cache = cache
+        self.cache = cache
         self._clock = cache.clock
         self._proof_time = proof_time
         self._restarted_at = NEVER
         self._directories = directories
         self._on_size = on_size
         self._invalidate = invalidate
-        self.piece = cache.piece
         self.fetcher = Fetcher(store, patience=cache.patience, on_changed=self._kill)
         self._current: OrderedDict[bytes, Version] = OrderedDict()
-        self._open_versions: dict[Version, None] = {}
+        self.open_versions: dict[Version, None] = {}
         self._opening: SingleFlight[bytes, tuple[Version, bool]] = SingleFlight()
         self._comparing: SingleFlight[Version, None] = SingleFlight()
         self.open_count = 0
@@ -118,13 +117,13 @@ class Files:
         """
         work = partial(self._open_version, path, entry, listed_at, fresh)
         version, same = await self._opening.run(path, work)
-        others = (v for v in self._open_versions if v.path == path and v is not version)
+        others = (v for v in self.open_versions if v.path == path and v is not version)
         direct_io = any(v.dead is None or v.lost for v in others)
         keep_cache = same and version.shown
         version.shown = not direct_io  # who has an older version open may have the kernel fetch pages of that
         version.handles += 1
         self.open_count += 1
-        self._open_versions[version] = None
+        self.open_versions[version] = None
         return FileHandle(self, version, keep_cache=keep_cache, direct_io=direct_io)
 
     async def learn_size(self, path: bytes) -> int:
@@ -136,7 +135,7 @@ class Files:
         version = self._current.get(path)
         if version is not None and version.handles and version.dead is None:
             return version.size
-        reader = await self._store.open_reader(path, FileBlocks(self._cache))
+        reader = await self._store.open_reader(path, FileBlocks(self.cache))
         reader.close()
         return reader.size
 
@@ -150,7 +149,9 @@ class Files:
             if self.kept is not None:
                 self.kept.watch(version)
             return version, True
-        version = await self._revive(path, entry) if fresh else None
+        version = None
+        if fresh and self.kept is not None:
+            version = await self._revive(path, entry, self.kept)
         if version is None:
             version = await self._start_version(path, entry)
             if fresh and self.kept is not None:
@@ -172,16 +173,16 @@ class Files:
         recent = self._clock() - version.proven_at < self._proof_time
         return recent and (same_size or not newer)
 
-    async def _revive(self, path: bytes, entry: DirEntry) -> Version | None:
+    async def _revive(self, path: bytes, entry: DirEntry, cache: KeptCache) -> Version | None:
         """Return a version of a freshly listed file of which the local disk has blocks, None if it has
         none."""
-        kept = None if self.kept is None else await self.kept.find(path, entry)
-        if kept is None or self.kept is None:
+        kept = await cache.find(path, entry)
+        if kept is None:
             return None
         version = self._new_version(path, entry.mtime, kept.key.size)
         version.kept = kept
         self._replace(version)
-        self.kept.watch(version)
+        cache.watch(version)
         return version
 
     async def _start_version(self, path: bytes, entry: DirEntry) -> Version:
@@ -224,7 +225,7 @@ class Files:
         return entry
 
     def _new_version(self, path: bytes, mtime: int | None, size: int = 0) -> Version:
-        blocks, now = FileBlocks(self._cache, size), self._clock()
+        blocks, now = FileBlocks(self.cache, size), self._clock()
         version = Version(path, mtime, blocks, proven_at=now, compared_at=now)
         blocks.on_dropped = partial(self._on_dropped, version)
         return version
@@ -249,13 +250,9 @@ class Files:
         recent = self._clock() - READING
         return [
             {"path": v.path.decode(errors="replace"), "size": v.size, "done": v.blocks.done}
-            for v in self._open_versions
+            for v in self.open_versions
             if v.blocks.waited_for or (v.blocks.received_at > recent and v.blocks.done < v.size)
         ]
-
-    def readahead_limits(self) -> tuple[int, int]:
-        """Return the bounds for readahead now (see BlockCache)."""
-        return self._cache.readahead_limits(len(self._open_versions))
 
     # --- is it the same file?
 
@@ -268,10 +265,9 @@ class Files:
             FileChanged: it is another one. Else as RemoteStore.list_directory.
         """
         for _ in range(MAX_TRIES):
-            due = now or self._clock() >= version.compare_after
-            if not due or self._is_compared(version) or self.is_changing(version.path):
+            if version.compared_at >= self._asked_at(version) or self.is_changing(version.path):
                 break
-            if not self._listings_tell(version):
+            if not (self._listings_tell(version) and (now or self._clock() >= version.compare_after)):
                 break
             await self._comparing.run(version, partial(self._compare_once, version))
         version.require_alive()
@@ -279,9 +275,6 @@ class Files:
     def _asked_at(self, version: Version) -> float:
         """Return since when the path may be another file: the server opened it anew, or restarted."""
         return max(version.blocks.opened_at, self._restarted_at)
-
-    def _is_compared(self, version: Version) -> bool:
-        return version.compared_at >= self._asked_at(version)
 
     def _is_restarted(self, version: Version) -> bool:
         return version.compared_at < self._restarted_at
@@ -329,7 +322,7 @@ class Files:
 
     def _on_listed(self, path: bytes, directory: Directory) -> None:
         """A directory was listed, for whatever reason."""
-        for version in list(self._open_versions):
+        for version in list(self.open_versions):
             parent, name = split(version.path)
             known = parent == path and name in directory.entries and version.dead is None
             if known and directory.listed_at > version.proven_at and not self.is_changing(version.path):
@@ -339,7 +332,7 @@ class Files:
         """The path is another file now: none of those that were opened there up to this version."""
         lost = not self.is_changing(version.path)
         newest = self._current.get(version.path) is version
-        older = [v for v in self._open_versions if newest and v.path == version.path]
+        older = [v for v in self.open_versions if newest and v.path == version.path]
         for one in dict.fromkeys((version, *older)):
             if one.dead is None:
                 one.lost = lost
@@ -356,13 +349,13 @@ class Files:
     def _on_dropped(self, version: Version) -> None:
         """Bytes of a version were dropped: the kernel may hold copies."""
         version.shown = False
-        if version in self._open_versions or self._current.get(version.path) is version:
+        if version in self.open_versions or self._current.get(version.path) is version:
             self._invalidate(version.path)
 
     def rebooted(self) -> None:
         """Nothing is proven any more; open files are compared before more of them is given out."""
         self._restarted_at = self._clock()
-        for version in dict.fromkeys((*self._current.values(), *self._open_versions)):
+        for version in dict.fromkeys((*self._current.values(), *self.open_versions)):
             version.proven_at = version.compare_after = NEVER
             version.kept = None
 
@@ -373,27 +366,28 @@ class Files:
         version = self._current.get(path)
         if version is None or version.dead is not None:
             return None
-        return version.blocks if self._is_compared(version) or not self._listings_tell(version) else None
+        compared = version.compared_at >= self._asked_at(version)
+        return version.blocks if compared or not self._listings_tell(version) else None
 
     def was_lost(self, path: bytes) -> bool:
         """Return whether somebody has a version of the path open, and is to read nothing more."""
-        return any(v.path == path and v.lost for v in self._open_versions)
+        return any(v.path == path and v.lost for v in self.open_versions)
 
     def end(self, path: bytes, *, doubted: bool = False) -> None:
         """What we are about to write there must not be given to who has another file open."""
         if doubted:
             return
-        for version in [v for v in self._open_versions if v.path == path and v.dead is None]:
+        for version in [v for v in self.open_versions if v.path == path and v.dead is None]:
             self._kill(version)
 
     def was_replaced(self, path: bytes) -> bool:
         """Return whether somebody who is to read on has a version open that is not the vehicle's any more."""
-        return any(v.path == path and v.dead is not None and not v.lost for v in self._open_versions)
+        return any(v.path == path and v.dead is not None and not v.lost for v in self.open_versions)
 
     def on_written(self, path: bytes) -> None:
         """What was cached of the path is no longer the file; who has it open opens it anew."""
         current = self._current.pop(path, None)
-        older = [v for v in self._open_versions if v.path == path and v is not current]
+        older = [v for v in self.open_versions if v.path == path and v is not current]
         for version in older if current is None else [current, *older]:
             version.end(f"{path!r} was written")
 
@@ -428,7 +422,7 @@ class Files:
 
     def _at_or_below(self, path: bytes) -> list[Version]:
         """Return what is cached or open of a path, older ones too, and of what lies below it."""
-        known = dict.fromkeys((*self._current.values(), *self._open_versions))
+        known = dict.fromkeys((*self._current.values(), *self.open_versions))
         return [v for v in known if v.path == path or v.path.startswith(path + b"/")]
 
     # --- closing
@@ -439,7 +433,7 @@ class Files:
         version.handles -= 1
         if version.handles:
             return
-        del self._open_versions[version]
+        del self.open_versions[version]
         version.close_reader()
         version.blocks.on_failed(LocalProtocolError(f"{version.path!r} was closed while it was read"))
         if self._current.get(version.path) is not version:
@@ -536,20 +530,17 @@ class FileHandle(ReadOnlyHandle):
 
     async def _read(self, offset: int, stop: int) -> bytes | memoryview | None:
         """Return [offset, stop), None if some of it was dropped meanwhile, or the file got another name."""
-        step = self._files.piece
-        if stop - offset <= step:
-            return await self._read_piece(offset, stop)
-        pieces: list[bytes | memoryview] = []
-        for at in range(offset, stop, step):
-            piece = await self._read_piece(at, min(at + step, stop))
+        pieces = []
+        for start in range(offset, stop, self._files.cache.piece):
+            piece = await self._read_piece(start, min(start + self._files.cache.piece, stop))
             if piece is None:
                 return None
             pieces.append(piece)
-        return b"".join(pieces)
+        return pieces[0] if len(pieces) == 1 else b"".join(pieces)
 
     async def _read_piece(self, start: int, stop: int) -> bytes | memoryview | None:
         files, version = self._files, self._version
-        limit, small = files.readahead_limits()
+        limit, small = files.cache.readahead_limits(len(files.open_versions))
         plan = self._readahead.on_read(start, stop, limit=limit, small=small)
         if plan.seeked and version.reader is not None:
             version.reader.drop_readahead()

@@ -52,7 +52,8 @@ class LocalFiles:
 
     def __init__(self, patterns: tuple[str, ...], limit: int, now_ns: Callable[[], int]) -> None:
         """`limit`: bytes of all content."""
-        self._patterns = [compile_pattern(translate(p).encode("utf-8", "surrogateescape")) for p in patterns]
+        joined = "|".join(translate(pattern) for pattern in patterns) or r"(?!)"
+        self._pattern = compile_pattern(joined.encode("utf-8", "surrogateescape"))
         self._limit = limit
         self._now_ns = now_ns
         self._entries: dict[bytes, LocalEntry] = {}
@@ -65,7 +66,7 @@ class LocalFiles:
 
     def owns(self, path: bytes) -> bool:
         """Return whether a path is local, whether it exists or not."""
-        return any(pattern.match(part) for part in path.split(b"/") for pattern in self._patterns)
+        return any(map(self._pattern.match, path.split(b"/")))
 
     def find(self, path: bytes) -> LocalEntry:
         """Return what a path is.

@@ -33,7 +33,7 @@ class Readahead:
 
     def __init__(self, size: int) -> None:
         self._size = size
-        self._next: int | None = None  # where a sequential reader would go on
+        self._next = 0  # where a sequential reader would go on
         self._last_start = 0
         self._window = 0
         self._used = 0  # bytes read since the window last doubled
@@ -44,24 +44,20 @@ class Readahead:
 
         limit: the largest window now; small: files up to this size are wanted whole, both in bytes.
         """
-        if self._next is None:
-            return self._first(start, stop, limit, small)
         if stop == self._last_start:  # the kernel has two requests under way; the earlier one came late
             return NOTHING
-        follows = 0 <= start - self._next <= stop - start
+        gap = start - self._next
+        follows = 0 <= gap <= stop - start if self._next else gap == 0
         self._last_start, self._next = start, stop
         if not follows:
             return self._seek()
+        if start == 0:
+            if self._size <= small:
+                self._asked = self._size
+                return Plan(min(stop, self._size), self._size)
+            if stop < FIRST_WINDOW:  # who begins with more at once reads on
+                return NOTHING
         return self._advance(start, stop, limit)
-
-    def _first(self, start: int, stop: int, limit: int, small: int) -> Plan:
-        self._last_start, self._next = start, stop
-        if start != 0:
-            return NOTHING
-        if self._size > small:  # who begins with so much at once reads on
-            return self._advance(start, stop, limit) if stop >= FIRST_WINDOW else NOTHING
-        self._asked = self._size
-        return Plan(min(stop, self._size), self._size)
 
     def _seek(self) -> Plan:
         had_window = self._window > 0
