@@ -8,7 +8,6 @@ from collections.abc import Callable
 import pytest
 import trio
 import trio.testing
-from trio.testing import MockClock
 
 from mavftpfs.cache.blocks import BLOCK_SIZE, BlockCache, FileBlocks
 from mavftpfs.shared.errors import RequestTimeout, VehicleLost
@@ -76,7 +75,7 @@ async def start_read(nursery: trio.Nursery, blocks: FileBlocks, start: int, stop
 # --- presence
 
 
-async def test_bytes_come_back_from_any_split(autojump_clock: MockClock) -> None:
+async def test_bytes_come_back_from_any_split() -> None:
     data = content(3 * BLOCK_SIZE + 100)
     blocks = FileBlocks(make_cache(), len(data))
     for start in range(0, len(data), 239):
@@ -93,7 +92,7 @@ async def test_bytes_come_back_from_any_split(autojump_clock: MockClock) -> None
         assert bytes(view) == data[start:stop]
 
 
-async def test_a_read_within_a_block_is_a_view_that_cannot_be_written(autojump_clock: MockClock) -> None:
+async def test_a_read_within_a_block_is_a_view_that_cannot_be_written() -> None:
     blocks = FileBlocks(make_cache(), 100)
     deliver(blocks, 0, content(100))
     view = blocks.get(10, 20)
@@ -101,14 +100,14 @@ async def test_a_read_within_a_block_is_a_view_that_cannot_be_written(autojump_c
     assert view.readonly
 
 
-async def test_what_is_present_is_never_overwritten(autojump_clock: MockClock) -> None:
+async def test_what_is_present_is_never_overwritten() -> None:
     blocks = FileBlocks(make_cache(), 1000)
     deliver(blocks, 100, b"A" * 100)
     deliver(blocks, 50, b"B" * 200)
     assert bytes(blocks.get(50, 250) or b"") == b"B" * 50 + b"A" * 100 + b"B" * 50
 
 
-async def test_what_lies_beyond_the_opened_size_is_dropped(autojump_clock: MockClock) -> None:
+async def test_what_lies_beyond_the_opened_size_is_dropped() -> None:
     blocks = FileBlocks(make_cache(), 100)
     deliver(blocks, 90, b"x" * 50)
     deliver(blocks, 100, b"x" * 50)
@@ -116,7 +115,7 @@ async def test_what_lies_beyond_the_opened_size_is_dropped(autojump_clock: MockC
     assert blocks.missing(0, 1000) == [(0, 90)]
 
 
-async def test_a_hole_is_not_readable(autojump_clock: MockClock) -> None:
+async def test_a_hole_is_not_readable() -> None:
     blocks = FileBlocks(make_cache(), 1000)
     deliver(blocks, 0, b"x" * 100)
     deliver(blocks, 101, b"x" * 100)
@@ -125,7 +124,7 @@ async def test_a_hole_is_not_readable(autojump_clock: MockClock) -> None:
     assert not blocks.complete
 
 
-async def test_an_empty_file_is_complete_and_empty(autojump_clock: MockClock) -> None:
+async def test_an_empty_file_is_complete_and_empty() -> None:
     blocks = FileBlocks(make_cache(), 0)
     assert blocks.complete
     assert blocks.empty
@@ -134,7 +133,7 @@ async def test_an_empty_file_is_complete_and_empty(autojump_clock: MockClock) ->
 # --- budget
 
 
-async def test_least_recently_read_blocks_go_first(autojump_clock: MockClock) -> None:
+async def test_least_recently_read_blocks_go_first() -> None:
     cache = make_cache(4 * BLOCK_SIZE)
     first, second = FileBlocks(cache, 3 * BLOCK_SIZE), FileBlocks(cache, 2 * BLOCK_SIZE)
     deliver(first, 0, content(3 * BLOCK_SIZE))
@@ -147,9 +146,7 @@ async def test_least_recently_read_blocks_go_first(autojump_clock: MockClock) ->
     cache.check_invariants()
 
 
-async def test_memory_stays_within_the_budget_for_a_file_ten_times_the_cache(
-    autojump_clock: MockClock,
-) -> None:
+async def test_memory_stays_within_the_budget_for_a_file_ten_times_the_cache() -> None:
     cache = make_cache(4 * BLOCK_SIZE)
     blocks = FileBlocks(cache, 40 * BLOCK_SIZE)
     for index in range(40):
@@ -161,7 +158,7 @@ async def test_memory_stays_within_the_budget_for_a_file_ten_times_the_cache(
     assert cache.bytes_cached == 4 * BLOCK_SIZE
 
 
-async def test_small_files_cost_their_size(autojump_clock: MockClock) -> None:
+async def test_small_files_cost_their_size() -> None:
     cache = make_cache()
     blocks = FileBlocks(cache, 100)
     deliver(blocks, 0, b"x")
@@ -171,7 +168,7 @@ async def test_small_files_cost_their_size(autojump_clock: MockClock) -> None:
     assert blocks.empty
 
 
-async def test_blocks_with_waiters_are_not_evicted(nursery: trio.Nursery, autojump_clock: MockClock) -> None:
+async def test_blocks_with_waiters_are_not_evicted(nursery: trio.Nursery) -> None:
     cache = make_cache(4 * BLOCK_SIZE)
     waited = FileBlocks(cache, 2 * BLOCK_SIZE)
     deliver(waited, 0, content(BLOCK_SIZE))
@@ -188,7 +185,7 @@ async def test_blocks_with_waiters_are_not_evicted(nursery: trio.Nursery, autoju
     assert waited.empty
 
 
-async def test_evicted_bytes_are_not_proven_any_more(autojump_clock: MockClock) -> None:
+async def test_evicted_bytes_are_not_proven_any_more() -> None:
     blocks = FileBlocks(make_cache(), 2 * BLOCK_SIZE)
     deliver(blocks, 0, content(2 * BLOCK_SIZE))
     blocks.begin_reading()
@@ -202,9 +199,7 @@ async def test_evicted_bytes_are_not_proven_any_more(autojump_clock: MockClock) 
 # --- waiting
 
 
-async def test_a_reader_asks_for_what_is_missing_and_gets_it(
-    nursery: trio.Nursery, autojump_clock: MockClock
-) -> None:
+async def test_a_reader_asks_for_what_is_missing_and_gets_it(nursery: trio.Nursery) -> None:
     blocks = FileBlocks(make_cache(), 1000)
     data = content(1000)
     deliver(blocks, 300, data[300:400])
@@ -218,7 +213,7 @@ async def test_a_reader_asks_for_what_is_missing_and_gets_it(
     assert reading.results == [data[200:600]]
 
 
-async def test_readers_wake_once_per_batch(nursery: trio.Nursery, autojump_clock: MockClock) -> None:
+async def test_readers_wake_once_per_batch(nursery: trio.Nursery) -> None:
     blocks = FileBlocks(make_cache(), 1000)
     reading = await start_read(nursery, blocks, 0, 1000)
     deliver(blocks, 0, content(1000), batch=False)
@@ -229,9 +224,7 @@ async def test_readers_wake_once_per_batch(nursery: trio.Nursery, autojump_clock
     assert reading.results == [content(1000)]
 
 
-async def test_no_progress_for_patience_is_a_timeout(
-    nursery: trio.Nursery, autojump_clock: MockClock
-) -> None:
+async def test_no_progress_for_patience_is_a_timeout(nursery: trio.Nursery) -> None:
     blocks = FileBlocks(make_cache(), 1000)
     reading = await start_read(nursery, blocks, 0, 1000)
     await trio.sleep(20)
@@ -241,9 +234,7 @@ async def test_no_progress_for_patience_is_a_timeout(
     assert reading.took == pytest.approx(20 + PATIENCE)
 
 
-async def test_only_bytes_of_the_own_range_are_progress(
-    nursery: trio.Nursery, autojump_clock: MockClock
-) -> None:
+async def test_only_bytes_of_the_own_range_are_progress(nursery: trio.Nursery) -> None:
     blocks = FileBlocks(make_cache(), 1000)
     mine = await start_read(nursery, blocks, 0, 100)
     for step in range(60):
@@ -254,7 +245,7 @@ async def test_only_bytes_of_the_own_range_are_progress(
     assert mine.took == pytest.approx(PATIENCE)
 
 
-async def test_slow_but_steady_is_no_timeout(nursery: trio.Nursery, autojump_clock: MockClock) -> None:
+async def test_slow_but_steady_is_no_timeout(nursery: trio.Nursery) -> None:
     blocks = FileBlocks(make_cache(), 10)
     reading = await start_read(nursery, blocks, 0, 10)
     for offset in range(10):
@@ -264,9 +255,7 @@ async def test_slow_but_steady_is_no_timeout(nursery: trio.Nursery, autojump_clo
     assert reading.results == [content(10)]
 
 
-async def test_failure_reaches_those_who_wait_and_no_later_read(
-    nursery: trio.Nursery, autojump_clock: MockClock
-) -> None:
+async def test_failure_reaches_those_who_wait_and_no_later_read(nursery: trio.Nursery) -> None:
     blocks = FileBlocks(make_cache(), 100)
     readings = [await start_read(nursery, blocks, 0, 50), await start_read(nursery, blocks, 0, 100)]
     deliver(blocks, 0, content(50))
@@ -281,9 +270,7 @@ async def test_failure_reaches_those_who_wait_and_no_later_read(
     assert again.results == [content(100)]
 
 
-async def test_a_cancelled_read_leaves_nothing_behind(
-    nursery: trio.Nursery, autojump_clock: MockClock
-) -> None:
+async def test_a_cancelled_read_leaves_nothing_behind(nursery: trio.Nursery) -> None:
     cache = make_cache(4 * BLOCK_SIZE)
     blocks = FileBlocks(cache, 100)
     reading = await start_read(nursery, blocks, 0, 100)
@@ -299,9 +286,7 @@ async def test_a_cancelled_read_leaves_nothing_behind(
 # --- turns
 
 
-async def test_reads_that_wait_pin_no_more_than_half_and_take_turns(
-    nursery: trio.Nursery, autojump_clock: MockClock
-) -> None:
+async def test_reads_that_wait_pin_no_more_than_half_and_take_turns(nursery: trio.Nursery) -> None:
     cache = make_cache(8 * BLOCK_SIZE)
     blocks = FileBlocks(cache, 20 * BLOCK_SIZE)
     readings = [await start_read(nursery, blocks, i * BLOCK_SIZE, (i + 1) * BLOCK_SIZE) for i in range(4)]
@@ -317,7 +302,7 @@ async def test_reads_that_wait_pin_no_more_than_half_and_take_turns(
 # --- doubtful bytes
 
 
-async def test_doubtful_bytes_are_dropped_and_older_ones_are_not(autojump_clock: MockClock) -> None:
+async def test_doubtful_bytes_are_dropped_and_older_ones_are_not() -> None:
     cache, told = make_cache(), []
     blocks = FileBlocks(cache, 3 * BLOCK_SIZE)
     blocks.on_dropped = lambda: told.append(True)
@@ -341,7 +326,7 @@ async def test_doubtful_bytes_are_dropped_and_older_ones_are_not(autojump_clock:
     cache.check_invariants()
 
 
-async def test_a_doubt_wakes_those_who_wait(nursery: trio.Nursery, autojump_clock: MockClock) -> None:
+async def test_a_doubt_wakes_those_who_wait(nursery: trio.Nursery) -> None:
     blocks = FileBlocks(make_cache(), 100)
     reading = await start_read(nursery, blocks, 0, 100)
     blocks.on_suspect("test")
@@ -349,7 +334,7 @@ async def test_a_doubt_wakes_those_who_wait(nursery: trio.Nursery, autojump_cloc
     assert reading.results == [None]
 
 
-async def test_the_rate_is_measured_from_what_arrives(autojump_clock: MockClock) -> None:
+async def test_the_rate_is_measured_from_what_arrives() -> None:
     cache = make_cache()
     blocks = FileBlocks(cache, 10_000)
     for step in range(20):

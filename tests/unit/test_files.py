@@ -8,7 +8,6 @@ from collections.abc import AsyncIterator, Callable
 import pytest
 import trio
 import trio.testing
-from trio.testing import MockClock
 
 from mavftpfs.cache.files import MAX_CLOSED
 from mavftpfs.cache.openfile import OpenFile
@@ -56,12 +55,12 @@ def tree(store: FakeStore) -> Tree:
 # --- reading
 
 
-async def test_reading_gives_the_bytes(store: FakeStore, tree: Tree, autojump_clock: MockClock) -> None:
+async def test_reading_gives_the_bytes(store: FakeStore, tree: Tree) -> None:
     assert await read_file(tree, LOG) == DATA
     assert store.count("open") == 1
 
 
-async def test_reads_are_short_only_at_the_end(tree: Tree, autojump_clock: MockClock) -> None:
+async def test_reads_are_short_only_at_the_end(tree: Tree) -> None:
     handle = await tree.open(LOG)
     assert handle.size == len(DATA)
     assert await handle.read(len(DATA) - 10, 100) == DATA[-10:]
@@ -72,9 +71,7 @@ async def test_reads_are_short_only_at_the_end(tree: Tree, autojump_clock: MockC
     handle.close()
 
 
-async def test_a_read_larger_than_the_cache_is_served_in_pieces(
-    store: FakeStore, autojump_clock: MockClock
-) -> None:
+async def test_a_read_larger_than_the_cache_is_served_in_pieces(store: FakeStore) -> None:
     big = content(5 * MIB)
     store.add(b"/big", big)
     tree = make_tree(store, cache_size=MIB)
@@ -84,9 +81,7 @@ async def test_a_read_larger_than_the_cache_is_served_in_pieces(
     assert int(str(tree.status()["bytes_cached"])) <= MIB
 
 
-async def test_a_second_reader_of_the_file_shares_blocks_and_session(
-    store: FakeStore, tree: Tree, autojump_clock: MockClock
-) -> None:
+async def test_a_second_reader_of_the_file_shares_blocks_and_session(store: FakeStore, tree: Tree) -> None:
     first, second = await tree.open(LOG), await tree.open(LOG)
     async with trio.open_nursery() as readers:
         readers.start_soon(first.read, 0, len(DATA))
@@ -103,9 +98,7 @@ async def test_a_second_reader_of_the_file_shares_blocks_and_session(
     assert tree.status()["open_files"] == 0
 
 
-async def test_two_opens_at_once_are_one_request(
-    store: FakeStore, tree: Tree, autojump_clock: MockClock
-) -> None:
+async def test_two_opens_at_once_are_one_request(store: FakeStore, tree: Tree) -> None:
     store.open_delay = 1
     sizes = []
 
@@ -120,9 +113,7 @@ async def test_two_opens_at_once_are_one_request(
     assert tree.status()["open_files"] == 2
 
 
-async def test_a_cancelled_open_lets_the_other_one_go_on(
-    store: FakeStore, tree: Tree, autojump_clock: MockClock
-) -> None:
+async def test_a_cancelled_open_lets_the_other_one_go_on(store: FakeStore, tree: Tree) -> None:
     store.open_delay = 10
     await tree.stat(LOG)
     sizes = []
@@ -141,9 +132,7 @@ async def test_a_cancelled_open_lets_the_other_one_go_on(
     assert tree.status()["open_files"] == 1
 
 
-async def test_sequential_reads_fetch_ahead_and_release_drops_it(
-    store: FakeStore, tree: Tree, autojump_clock: MockClock
-) -> None:
+async def test_sequential_reads_fetch_ahead_and_release_drops_it(store: FakeStore, tree: Tree) -> None:
     store.add(b"/big", content(8 * MIB))
     handle = await tree.open(b"/big")
     for at in range(0, 512 * KIB, 128 * KIB):
@@ -158,7 +147,7 @@ async def test_sequential_reads_fetch_ahead_and_release_drops_it(
     assert reader.ahead.empty
 
 
-async def test_hits_extend_the_readahead(store: FakeStore, tree: Tree, autojump_clock: MockClock) -> None:
+async def test_hits_extend_the_readahead(store: FakeStore, tree: Tree) -> None:
     store.add(b"/big", content(8 * MIB))
     handle = await tree.open(b"/big")
     await handle.read(0, 128 * KIB)
@@ -173,7 +162,7 @@ async def test_hits_extend_the_readahead(store: FakeStore, tree: Tree, autojump_
 
 
 async def test_an_error_reaches_the_reader_and_the_next_read_tries_again(
-    store: FakeStore, tree: Tree, autojump_clock: MockClock
+    store: FakeStore, tree: Tree
 ) -> None:
     store.fail_chunks = [VehicleLost("gone")]
     handle = await tree.open(LOG)
@@ -182,9 +171,7 @@ async def test_an_error_reaches_the_reader_and_the_next_read_tries_again(
     assert await handle.read(0, 100) == DATA[:100]
 
 
-async def test_a_stalled_read_times_out_and_recovers(
-    store: FakeStore, tree: Tree, autojump_clock: MockClock
-) -> None:
+async def test_a_stalled_read_times_out_and_recovers(store: FakeStore, tree: Tree) -> None:
     handle = await tree.open(LOG)
     store.stalled = True
     began = trio.current_time()
@@ -195,9 +182,7 @@ async def test_a_stalled_read_times_out_and_recovers(
     assert await handle.read(0, 100) == DATA[:100]
 
 
-async def test_a_cancelled_read_leaves_a_consistent_file(
-    store: FakeStore, tree: Tree, autojump_clock: MockClock
-) -> None:
+async def test_a_cancelled_read_leaves_a_consistent_file(store: FakeStore, tree: Tree) -> None:
     store.chunk_delay = 1
     handle = await tree.open(LOG)
     with trio.move_on_after(2.5):
@@ -206,7 +191,7 @@ async def test_a_cancelled_read_leaves_a_consistent_file(
     assert await handle.read(0, len(DATA)) == DATA
 
 
-async def test_a_directory_is_not_opened(tree: Tree, autojump_clock: MockClock) -> None:
+async def test_a_directory_is_not_opened(tree: Tree) -> None:
     with pytest.raises(IsADirectory):
         await tree.open(b"/logs")
     with pytest.raises(IsADirectory):
@@ -215,7 +200,7 @@ async def test_a_directory_is_not_opened(tree: Tree, autojump_clock: MockClock) 
         await tree.open(b"/logs/none")
 
 
-async def test_a_refused_open_leaves_nothing(store: FakeStore, tree: Tree, autojump_clock: MockClock) -> None:
+async def test_a_refused_open_leaves_nothing(store: FakeStore, tree: Tree) -> None:
     store.fail["reader", LOG] = [FtpNak(Opcode.OPEN_FILE_RO, 2, 13)]
     with pytest.raises(FtpNak):
         await tree.open(LOG)
@@ -226,7 +211,7 @@ async def test_a_refused_open_leaves_nothing(store: FakeStore, tree: Tree, autoj
 # --- close-to-open
 
 
-async def test_a_second_cat_asks_nothing(store: FakeStore, tree: Tree, autojump_clock: MockClock) -> None:
+async def test_a_second_cat_asks_nothing(store: FakeStore, tree: Tree) -> None:
     await read_file(tree, LOG)
     before = list(store.calls)
     handle = await tree.open(LOG)
@@ -235,13 +220,11 @@ async def test_a_second_cat_asks_nothing(store: FakeStore, tree: Tree, autojump_
     assert store.calls == before
 
 
-async def test_the_first_open_does_not_keep_the_kernels_pages(tree: Tree, autojump_clock: MockClock) -> None:
+async def test_the_first_open_does_not_keep_the_kernels_pages(tree: Tree) -> None:
     assert not (await tree.open(LOG)).keep_cache
 
 
-async def test_equal_size_and_mtime_prove_the_cache_for_ever(
-    store: FakeStore, tree: Tree, autojump_clock: MockClock
-) -> None:
+async def test_equal_size_and_mtime_prove_the_cache_for_ever(store: FakeStore, tree: Tree) -> None:
     await read_file(tree, LOG)
     await trio.sleep(1000)
     handle = await tree.open(LOG)
@@ -251,9 +234,7 @@ async def test_equal_size_and_mtime_prove_the_cache_for_ever(
     assert store.count("list", b"/logs") == 2
 
 
-async def test_without_mtime_the_proof_lasts_dir_timeout(
-    store: FakeStore, tree: Tree, autojump_clock: MockClock
-) -> None:
+async def test_without_mtime_the_proof_lasts_dir_timeout(store: FakeStore, tree: Tree) -> None:
     store.add(LOG, DATA)
     await read_file(tree, LOG)
     await trio.sleep(19)
@@ -268,9 +249,7 @@ async def test_without_mtime_the_proof_lasts_dir_timeout(
 
 
 @pytest.mark.parametrize("grown", [False, True])
-async def test_a_newer_listing_can_end_a_recent_proof(
-    store: FakeStore, tree: Tree, autojump_clock: MockClock, grown: bool
-) -> None:
+async def test_a_newer_listing_can_end_a_recent_proof(store: FakeStore, tree: Tree, grown: bool) -> None:
     store.add(LOG, DATA)
     await read_file(tree, LOG)
     await trio.sleep(5)
@@ -283,9 +262,7 @@ async def test_a_newer_listing_can_end_a_recent_proof(
     assert store.count("open") == (2 if grown else 1)
 
 
-async def test_a_changed_mtime_starts_a_new_version(
-    store: FakeStore, tree: Tree, autojump_clock: MockClock
-) -> None:
+async def test_a_changed_mtime_starts_a_new_version(store: FakeStore, tree: Tree) -> None:
     old = await tree.open(LOG)
     await old.read(0, 100)
     store.add(LOG, DATA[::-1], 1_700_000_001)
@@ -301,9 +278,7 @@ async def test_a_changed_mtime_starts_a_new_version(
     assert await new.read(5, 5) == DATA[::-1][5:10]
 
 
-async def test_a_waiting_read_of_a_changed_file_ends(
-    store: FakeStore, tree: Tree, autojump_clock: MockClock
-) -> None:
+async def test_a_waiting_read_of_a_changed_file_ends(store: FakeStore, tree: Tree) -> None:
     old = await tree.open(LOG)
     assert await old.read(200_000, 100) == DATA[200_000:200_100]
     store.stalled = True
@@ -323,7 +298,7 @@ async def test_a_waiting_read_of_a_changed_file_ends(
     assert len(errors) == 1
 
 
-async def test_a_smaller_file_is_another_one(store: FakeStore, tree: Tree, autojump_clock: MockClock) -> None:
+async def test_a_smaller_file_is_another_one(store: FakeStore, tree: Tree) -> None:
     store.add(LOG, DATA)
     old = await tree.open(LOG)
     await old.read(0, 100)
@@ -336,7 +311,7 @@ async def test_a_smaller_file_is_another_one(store: FakeStore, tree: Tree, autoj
 
 
 async def test_a_file_that_is_smaller_when_it_is_opened_anew_is_another_one(
-    store: FakeStore, tree: Tree, autojump_clock: MockClock
+    store: FakeStore, tree: Tree
 ) -> None:
     """After a doubt, that is: what was listed tells nothing of what shrank since."""
     handle = await tree.open(LOG)
@@ -349,9 +324,7 @@ async def test_a_file_that_is_smaller_when_it_is_opened_anew_is_another_one(
     handle.close()
 
 
-async def test_a_smaller_ack_is_another_file_even_if_the_listing_is_old(
-    store: FakeStore, autojump_clock: MockClock
-) -> None:
+async def test_a_smaller_ack_is_another_file_even_if_the_listing_is_old(store: FakeStore) -> None:
     tree = make_tree(store, dir_timeout=5)
     store.list_delay = 2  # the listing stays fresh for 100 s, the proof for 5
     store.add(LOG, DATA)
@@ -366,9 +339,7 @@ async def test_a_smaller_ack_is_another_file_even_if_the_listing_is_old(
         await old.read(0, 100)
 
 
-async def test_a_grown_file_is_served_at_its_opened_size(
-    store: FakeStore, tree: Tree, autojump_clock: MockClock
-) -> None:
+async def test_a_grown_file_is_served_at_its_opened_size(store: FakeStore, tree: Tree) -> None:
     store.add(LOG, DATA)
     old = await tree.open(LOG)
     await old.read(0, 100)
@@ -386,9 +357,7 @@ async def test_a_grown_file_is_served_at_its_opened_size(
     assert all(reader.closed for reader in store.readers)
 
 
-async def test_versions_do_not_meet_in_the_kernels_page_cache(
-    store: FakeStore, tree: Tree, autojump_clock: MockClock
-) -> None:
+async def test_versions_do_not_meet_in_the_kernels_page_cache(store: FakeStore, tree: Tree) -> None:
     old = await tree.open(LOG)
     assert not old.direct_io
     store.add(LOG, DATA + b"more", 1_700_000_009)
@@ -405,7 +374,7 @@ async def test_versions_do_not_meet_in_the_kernels_page_cache(
     assert (await tree.open(LOG)).keep_cache
 
 
-async def test_the_ack_beats_the_listing(store: FakeStore, tree: Tree, autojump_clock: MockClock) -> None:
+async def test_the_ack_beats_the_listing(store: FakeStore, tree: Tree) -> None:
     await tree.stat(LOG)
     store.add(LOG, DATA + b"more", 1_700_000_009)
     handle = await tree.open(LOG)
@@ -419,7 +388,7 @@ async def test_the_ack_beats_the_listing(store: FakeStore, tree: Tree, autojump_
 
 
 async def test_a_size_that_does_not_fit_the_ack_is_an_error_not_a_short_file(
-    store: FakeStore, tree: Tree, autojump_clock: MockClock
+    store: FakeStore, tree: Tree
 ) -> None:
     store.files[LOG].claims = (1 << 32) + len(DATA)
     with pytest.raises(FileTooLarge):
@@ -427,9 +396,7 @@ async def test_a_size_that_does_not_fit_the_ack_is_an_error_not_a_short_file(
     assert all(reader.closed for reader in store.readers)
 
 
-async def test_a_stale_mtime_is_not_credited_to_the_size_in_the_ack(
-    store: FakeStore, tree: Tree, autojump_clock: MockClock
-) -> None:
+async def test_a_stale_mtime_is_not_credited_to_the_size_in_the_ack(store: FakeStore, tree: Tree) -> None:
     await tree.stat(LOG)
     store.add(LOG, DATA + b"more", 1_700_000_009)
     old = await tree.open(LOG)
@@ -448,7 +415,7 @@ async def open_partly_cached(store: FakeStore, tree: Tree) -> OpenFile:
 
 
 async def test_a_partly_cached_file_is_opened_again_only_when_bytes_are_wanted(
-    store: FakeStore, tree: Tree, autojump_clock: MockClock
+    store: FakeStore, tree: Tree
 ) -> None:
     handle = await open_partly_cached(store, tree)
     assert store.count("open", b"/big") == 1
@@ -456,9 +423,7 @@ async def test_a_partly_cached_file_is_opened_again_only_when_bytes_are_wanted(
     assert store.count("open", b"/big") == 2
 
 
-async def test_a_file_that_shrank_before_it_was_opened_again(
-    store: FakeStore, tree: Tree, autojump_clock: MockClock
-) -> None:
+async def test_a_file_that_shrank_before_it_was_opened_again(store: FakeStore, tree: Tree) -> None:
     handle = await open_partly_cached(store, tree)
     store.add(b"/big", b"short", 6)
     with pytest.raises(FileChanged):
@@ -470,7 +435,7 @@ async def test_a_file_that_shrank_before_it_was_opened_again(
     assert await read_file(tree, b"/big") == b"short"
 
 
-async def test_closed_files_are_bounded(store: FakeStore, tree: Tree, autojump_clock: MockClock) -> None:
+async def test_closed_files_are_bounded(store: FakeStore, tree: Tree) -> None:
     for i in range(MAX_CLOSED + 3):
         store.add(b"/many/%d" % i, b"x", 5)
     for i in range(MAX_CLOSED + 3):
@@ -482,9 +447,7 @@ async def test_closed_files_are_bounded(store: FakeStore, tree: Tree, autojump_c
 # --- reboot
 
 
-async def test_after_a_reboot_open_files_are_compared_first(
-    store: FakeStore, tree: Tree, autojump_clock: MockClock
-) -> None:
+async def test_after_a_reboot_open_files_are_compared_first(store: FakeStore, tree: Tree) -> None:
     same, other = await tree.open(LOG), None
     store.add(b"/other", DATA, 5)
     tree.forget_caches()
@@ -502,9 +465,7 @@ async def test_after_a_reboot_open_files_are_compared_first(
     assert len(store.calls) == asked
 
 
-async def test_a_file_that_is_gone_after_a_reboot(
-    store: FakeStore, tree: Tree, autojump_clock: MockClock
-) -> None:
+async def test_a_file_that_is_gone_after_a_reboot(store: FakeStore, tree: Tree) -> None:
     handle = await tree.open(LOG)
     await handle.read(0, 1000)
     store.remove(LOG)
@@ -513,9 +474,7 @@ async def test_a_file_that_is_gone_after_a_reboot(
         await handle.read(0, 1000)
 
 
-async def test_a_reboot_with_the_link_still_down_proves_nothing(
-    store: FakeStore, tree: Tree, autojump_clock: MockClock
-) -> None:
+async def test_a_reboot_with_the_link_still_down_proves_nothing(store: FakeStore, tree: Tree) -> None:
     handle = await tree.open(LOG)
     await handle.read(0, 1000)
     await trio.sleep(1)
@@ -529,9 +488,7 @@ async def test_a_reboot_with_the_link_still_down_proves_nothing(
     assert await handle.read(0, 1000) == DATA[:1000]
 
 
-async def test_after_a_reboot_recency_is_no_proof(
-    store: FakeStore, tree: Tree, autojump_clock: MockClock
-) -> None:
+async def test_after_a_reboot_recency_is_no_proof(store: FakeStore, tree: Tree) -> None:
     store.add(LOG, DATA)
     await read_file(tree, LOG)
     tree.rebooted()
@@ -549,9 +506,7 @@ async def read_before_a_reboot(tree: Tree) -> OpenFile:
     return handle
 
 
-async def test_closing_after_a_reboot_forgets_the_file(
-    store: FakeStore, tree: Tree, autojump_clock: MockClock
-) -> None:
+async def test_closing_after_a_reboot_forgets_the_file(store: FakeStore, tree: Tree) -> None:
     handle = await read_before_a_reboot(tree)
     handle.close()
     assert tree.status()["bytes_cached"] == 0
@@ -597,7 +552,6 @@ async def over_a_reboot(store: FakeStore, tree: Tree, change: Callable[[], None]
 async def test_two_files_are_not_mixed_over_a_reboot(
     store: FakeStore,
     tree: Tree,
-    autojump_clock: MockClock,
     mtime: int | None,
     other: bytes,
     later: int | None,
@@ -614,7 +568,7 @@ async def test_two_files_are_not_mixed_over_a_reboot(
 
 
 async def test_a_file_of_which_nothing_was_read_is_read_from_what_is_there_after_a_reboot(
-    store: FakeStore, tree: Tree, autojump_clock: MockClock
+    store: FakeStore, tree: Tree
 ) -> None:
     store.add(LOG, DATA, 5)
     handle = await tree.open(LOG)
@@ -641,7 +595,7 @@ def spoil(path: bytes, offset: int, data: bytes) -> bytes:
     return bytes(byte ^ 0xFF for byte in data)
 
 
-async def test_wrong_bytes_are_fetched_again(store: FakeStore, tree: Tree, autojump_clock: MockClock) -> None:
+async def test_wrong_bytes_are_fetched_again(store: FakeStore, tree: Tree) -> None:
     store.suspect_chunks, store.spoil = 2, spoil
     handle = await tree.open(LOG)
     assert await handle.read(0, 40_000) == DATA[:40_000]
@@ -649,9 +603,7 @@ async def test_wrong_bytes_are_fetched_again(store: FakeStore, tree: Tree, autoj
     assert set(store.invalidated) == {LOG}
 
 
-async def test_bytes_that_stay_suspect_are_an_error(
-    store: FakeStore, tree: Tree, autojump_clock: MockClock
-) -> None:
+async def test_bytes_that_stay_suspect_are_an_error(store: FakeStore, tree: Tree) -> None:
     """In time: a handler waits for 33 s."""
     began = trio.current_time()
     store.suspect_chunks, store.spoil = 10**6, spoil
@@ -664,7 +616,7 @@ async def test_bytes_that_stay_suspect_are_an_error(
     assert await handle.read(0, len(DATA)) == DATA
 
 
-async def test_readers_share_the_bad_news_too(store: FakeStore, autojump_clock: MockClock) -> None:
+async def test_readers_share_the_bad_news_too(store: FakeStore) -> None:
     tree = make_tree(store, cache_size=MIB)
     data = content(2 * MIB)
     store.add(b"/big", data)
@@ -681,9 +633,7 @@ async def test_readers_share_the_bad_news_too(store: FakeStore, autojump_clock: 
     assert results == [True] * 3
 
 
-async def test_bytes_of_an_earlier_reader_are_not_in_doubt(
-    store: FakeStore, tree: Tree, autojump_clock: MockClock
-) -> None:
+async def test_bytes_of_an_earlier_reader_are_not_in_doubt(store: FakeStore, tree: Tree) -> None:
     store.armed = True
     first = await tree.open(LOG)
     await first.read(0, 1000)
@@ -696,9 +646,7 @@ async def test_bytes_of_an_earlier_reader_are_not_in_doubt(
     assert await handle.read(0, 1000) == DATA[:1000]
 
 
-async def test_doubtful_bytes_do_not_survive_the_last_close(
-    store: FakeStore, tree: Tree, autojump_clock: MockClock
-) -> None:
+async def test_doubtful_bytes_do_not_survive_the_last_close(store: FakeStore, tree: Tree) -> None:
     handle = await tree.open(LOG)
     await handle.read(0, 100)
     await trio.sleep(10)
@@ -711,9 +659,7 @@ async def test_doubtful_bytes_do_not_survive_the_last_close(
     assert store.count("crc") == 0
 
 
-async def test_a_suspicion_after_the_last_close_counts(
-    store: FakeStore, tree: Tree, autojump_clock: MockClock
-) -> None:
+async def test_a_suspicion_after_the_last_close_counts(store: FakeStore, tree: Tree) -> None:
     handle = await tree.open(LOG)
     await handle.read(0, 100)
     handle.close()
@@ -729,7 +675,7 @@ async def test_a_suspicion_after_the_last_close_counts(
 
 @pytest.mark.parametrize("delay", [0.0, 0.002])
 async def test_closing_the_last_handle_under_a_read_ends_it(
-    store: FakeStore, tree: Tree, autojump_clock: MockClock, delay: float
+    store: FakeStore, tree: Tree, delay: float
 ) -> None:
     (await tree.open(LOG)).close()
     handle = await tree.open(LOG)

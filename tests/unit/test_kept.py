@@ -8,7 +8,6 @@ from typing import TypeVar
 
 import pytest
 import trio
-from trio.testing import MockClock
 
 from mavftpfs.cache.blocks import BLOCK_SIZE, BlockCache
 from mavftpfs.cache.dentries import Dentries
@@ -107,7 +106,7 @@ async def mounts(nursery: trio.Nursery, tmp_path: Path) -> AsyncIterator[Mounts]
     nursery.cancel_scope.cancel()
 
 
-async def test_a_file_read_yesterday_costs_nothing(mounts: Mounts, autojump_clock: MockClock) -> None:
+async def test_a_file_read_yesterday_costs_nothing(mounts: Mounts) -> None:
     await mounts.read_and_settle()
     tree = mounts.mount()
     assert await read_file(tree, LOG) == DATA
@@ -115,7 +114,7 @@ async def test_a_file_read_yesterday_costs_nothing(mounts: Mounts, autojump_cloc
     assert tree.status()["files_from_disk"] == 1
 
 
-async def test_only_the_rest_is_read(mounts: Mounts, autojump_clock: MockClock) -> None:
+async def test_only_the_rest_is_read(mounts: Mounts) -> None:
     tree, handle = await mounts.open_partly_kept()
     assert await handle.read(0, 100) == DATA[:100]
     assert mounts.asked() == []
@@ -124,7 +123,7 @@ async def test_only_the_rest_is_read(mounts: Mounts, autojump_clock: MockClock) 
     assert mounts.store.count("open") == 1
 
 
-async def test_a_damaged_block_is_read_again(mounts: Mounts, autojump_clock: MockClock) -> None:
+async def test_a_damaged_block_is_read_again(mounts: Mounts) -> None:
     await mounts.read_and_settle()
     for number, path in enumerate(p for p in mounts.path.rglob("*") if p.is_file()):
         data = bytearray(path.read_bytes())
@@ -136,7 +135,7 @@ async def test_a_damaged_block_is_read_again(mounts: Mounts, autojump_clock: Moc
 
 
 @pytest.mark.parametrize("change", ["size", "mtime", "vehicle", "unknown vehicle", "growing", "young"])
-async def test_anything_else_is_read_again(mounts: Mounts, autojump_clock: MockClock, change: str) -> None:
+async def test_anything_else_is_read_again(mounts: Mounts, change: str) -> None:
     await mounts.read_and_settle()
     new = content(len(DATA), seed=8)
     mtime = MTIME
@@ -158,9 +157,7 @@ async def test_anything_else_is_read_again(mounts: Mounts, autojump_clock: MockC
 @pytest.mark.parametrize(
     "why", ["young", "growing", "vehicle unknown", "changed", "suspect", "soon", "other", "rebooted"]
 )
-async def test_what_is_not_beyond_doubt_is_not_kept(
-    mounts: Mounts, autojump_clock: MockClock, why: str
-) -> None:
+async def test_what_is_not_beyond_doubt_is_not_kept(mounts: Mounts, why: str) -> None:
     if why == "young":
         mounts.store.add(LOG, DATA, int(NOW) - 1)
     if why == "growing":
@@ -188,9 +185,7 @@ async def test_what_is_not_beyond_doubt_is_not_kept(
     handle.close()
 
 
-async def test_what_is_kept_is_no_part_of_the_file_that_came_by_a_restart(
-    mounts: Mounts, autojump_clock: MockClock
-) -> None:
+async def test_what_is_kept_is_no_part_of_the_file_that_came_by_a_restart(mounts: Mounts) -> None:
     """It is larger, so it may only have grown, and nothing of it was read since it was opened."""
     tree, handle = await mounts.open_partly_kept()
     new = content(len(DATA) + 1000, seed=8)
@@ -200,7 +195,7 @@ async def test_what_is_kept_is_no_part_of_the_file_that_came_by_a_restart(
     handle.close()
 
 
-async def test_without_an_mtime_a_checksum_decides(mounts: Mounts, autojump_clock: MockClock) -> None:
+async def test_without_an_mtime_a_checksum_decides(mounts: Mounts) -> None:
     mounts.store.add(LOG, DATA, None)
     await mounts.read_and_settle()
     tree = mounts.mount()
@@ -217,9 +212,7 @@ async def test_without_an_mtime_a_checksum_decides(mounts: Mounts, autojump_cloc
 
 
 @pytest.mark.parametrize("why", ["not allowed", "refused", "silent", "incomplete"])
-async def test_without_an_mtime_and_a_checksum_all_is_read(
-    mounts: Mounts, autojump_clock: MockClock, why: str
-) -> None:
+async def test_without_an_mtime_and_a_checksum_all_is_read(mounts: Mounts, why: str) -> None:
     mounts.store.add(LOG, DATA, None)
     await mounts.read_and_settle()
     store = mounts.store
@@ -242,7 +235,7 @@ async def test_without_an_mtime_and_a_checksum_all_is_read(
     assert store.count("open") == 1
 
 
-async def test_a_silent_checksum_is_asked_for_once(mounts: Mounts, autojump_clock: MockClock) -> None:
+async def test_a_silent_checksum_is_asked_for_once(mounts: Mounts) -> None:
     for path in (LOG, b"/logs/b", b"/logs/c"):
         mounts.store.add(path, DATA, None)
         await mounts.read_and_settle(path)
@@ -261,7 +254,7 @@ async def test_a_silent_checksum_is_asked_for_once(mounts: Mounts, autojump_cloc
 
 
 async def test_a_full_disk_ends_the_keeping_not_the_reading(
-    mounts: Mounts, autojump_clock: MockClock, caplog: pytest.LogCaptureFixture
+    mounts: Mounts, caplog: pytest.LogCaptureFixture
 ) -> None:
     tree = mounts.mount()
 
@@ -278,9 +271,7 @@ async def test_a_full_disk_ends_the_keeping_not_the_reading(
     assert tree.status()["disk_failed"] is True
 
 
-async def test_a_handle_of_a_file_that_changed_gets_nothing_from_the_disk(
-    mounts: Mounts, autojump_clock: MockClock
-) -> None:
+async def test_a_handle_of_a_file_that_changed_gets_nothing_from_the_disk(mounts: Mounts) -> None:
     await mounts.read_and_settle()
     tree = mounts.mount(dir_timeout=5)
     old = await tree.open(LOG)
@@ -294,9 +285,7 @@ async def test_a_handle_of_a_file_that_changed_gets_nothing_from_the_disk(
     old.close()
 
 
-async def test_a_file_that_changes_while_the_disk_is_slow(
-    mounts: Mounts, nursery: trio.Nursery, autojump_clock: MockClock
-) -> None:
+async def test_a_file_that_changes_while_the_disk_is_slow(mounts: Mounts, nursery: trio.Nursery) -> None:
     await mounts.read_and_settle()
     tree = mounts.mount(dir_timeout=5)
     old = await tree.open(LOG)
@@ -312,7 +301,7 @@ async def test_a_file_that_changes_while_the_disk_is_slow(
 
 @pytest.mark.parametrize("mtime", [MTIME, None])
 async def test_a_file_that_changes_while_it_is_opened_from_the_disk(
-    mounts: Mounts, nursery: trio.Nursery, autojump_clock: MockClock, mtime: int | None
+    mounts: Mounts, nursery: trio.Nursery, mtime: int | None
 ) -> None:
     mounts.store.add(LOG, DATA, mtime)
     await mounts.read_and_settle()
@@ -332,7 +321,7 @@ async def test_a_file_that_changes_while_it_is_opened_from_the_disk(
     assert await read_file(tree, LOG) == new
 
 
-async def test_two_mounts_at_once_share_the_directory(mounts: Mounts, autojump_clock: MockClock) -> None:
+async def test_two_mounts_at_once_share_the_directory(mounts: Mounts) -> None:
     first, second = mounts.mount(), mounts.mount()
     async with trio.open_nursery() as both:
         for tree in (first, second):

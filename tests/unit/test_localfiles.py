@@ -150,9 +150,7 @@ async def test_a_file_that_is_being_written_is_not_moved_to_another_place(
         await tree.unlink(new)
 
 
-async def test_a_file_that_is_written_while_it_is_moved_stays(
-    autojump_clock: object, store: FakeWriter, tree: Tree
-) -> None:
+async def test_a_file_that_is_written_while_it_is_moved_stays(store: FakeWriter, tree: Tree) -> None:
     """The target has what was there at first; nothing that was written is lost."""
     await write_file(tree, SWAP, b"first")
     store.write_delay = 1.0
@@ -170,7 +168,7 @@ async def test_a_file_that_is_written_while_it_is_moved_stays(
 
 
 async def test_a_file_that_is_written_while_it_is_read_to_be_moved_stays(
-    autojump_clock: object, store: FakeWriter, tree: Tree
+    store: FakeWriter, tree: Tree
 ) -> None:
     store.chunk_delay = 1.0
 
@@ -185,7 +183,7 @@ async def test_a_file_that_is_written_while_it_is_read_to_be_moved_stays(
 
 @pytest.mark.parametrize("later", [0.0, 0.5])
 async def test_nothing_is_moved_over_a_file_that_is_being_written(
-    autojump_clock: object, store: FakeWriter, tree: Tree, later: float
+    store: FakeWriter, tree: Tree, later: float
 ) -> None:
     """What the program writes after that would land in what was moved there."""
     await write_file(tree, SWAP, b"rescued")
@@ -216,9 +214,7 @@ async def move(tree: Tree, old: bytes, new: bytes) -> bytes:
 
 
 @pytest.mark.parametrize("new", [SWAP, b"/other/.x.swp"])
-async def test_what_is_written_at_any_moment_of_a_move_is_not_lost(
-    autojump_clock: object, nursery: trio.Nursery, new: bytes
-) -> None:
+async def test_what_is_written_at_any_moment_of_a_move_is_not_lost(nursery: trio.Nursery, new: bytes) -> None:
     """It stays, or what was written goes along."""
     for moment in range(30):
         store = FakeWriter(KINDS["posix"], nursery)
@@ -246,9 +242,7 @@ async def test_what_is_written_at_any_moment_of_a_move_is_not_lost(
         assert await read_file(tree, place) == (b"++ old" if written else b"-- old"), moment
 
 
-async def test_what_replaces_a_file_while_it_is_moved_is_not_removed(
-    autojump_clock: object, store: FakeWriter, tree: Tree
-) -> None:
+async def test_what_replaces_a_file_while_it_is_moved_is_not_removed(store: FakeWriter, tree: Tree) -> None:
     await write_file(tree, b"/scripts/other", b"other")
     store.chunk_delay = 1.0
     async with trio.open_nursery() as both:
@@ -347,9 +341,7 @@ async def test_they_are_bounded(store: FakeWriter) -> None:
     assert store.files == {}
 
 
-async def test_a_failed_move_costs_nothing_that_was_accepted_before(
-    autojump_clock: object, posix: FakeWriter
-) -> None:
+async def test_a_failed_move_costs_nothing_that_was_accepted_before(posix: FakeWriter) -> None:
     """The target was closed while the vehicle refused it, so its bytes are only here."""
     tree = make_writable(posix)
     await write_file(tree, SWAP, b"new")

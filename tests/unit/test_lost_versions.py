@@ -47,9 +47,7 @@ async def require_lost(reader: OpenFile) -> None:
             await reader.read(9, 9)
 
 
-async def test_it_stays_lost_while_the_new_file_is_written_and_afterwards(
-    store: FakeWriter, autojump_clock: object
-) -> None:
+async def test_it_stays_lost_while_the_new_file_is_written_and_afterwards(store: FakeWriter) -> None:
     tree = make_writable(store, inplace=True)
     lost = await reader_of_another(store, tree)
     later = await tree.open(FILE)
@@ -81,7 +79,7 @@ async def read_and_unlinked(tree: Tree) -> OpenFile:
 
 @pytest.mark.parametrize("meet", [found_by_a_writer, read_and_unlinked])
 async def test_it_is_lost_whatever_happens_to_the_new_file_here(
-    store: FakeWriter, tree: Tree, autojump_clock: object, meet: Callable[[Tree], Awaitable[OpenFile]]
+    store: FakeWriter, tree: Tree, meet: Callable[[Tree], Awaitable[OpenFile]]
 ) -> None:
     lost = await reader_of_another(store, tree)
     later = await meet(tree)
@@ -92,7 +90,7 @@ async def test_it_is_lost_whatever_happens_to_the_new_file_here(
 
 
 async def test_the_kernel_keeps_no_pages_of_the_new_file_while_the_old_one_is_open(
-    store: FakeWriter, tree: Tree, autojump_clock: object
+    store: FakeWriter, tree: Tree
 ) -> None:
     """It would give them to who has the old one open, without asking."""
     lost = await reader_of_another(store, tree)
@@ -106,7 +104,7 @@ async def test_the_kernel_keeps_no_pages_of_the_new_file_while_the_old_one_is_op
     assert not (await tree.open(FILE)).direct_io
 
 
-async def test_all_older_versions_are_lost(store: FakeWriter, tree: Tree, autojump_clock: object) -> None:
+async def test_all_older_versions_are_lost(store: FakeWriter, tree: Tree) -> None:
     """Also the one that was opened before the file grew."""
     first = await opened(tree)
     store.add(FILE, OLD + OLD, 2)
@@ -124,7 +122,7 @@ async def test_all_older_versions_are_lost(store: FakeWriter, tree: Tree, autoju
         await file.release()
 
 
-async def test_what_we_write_ourselves_loses_nobody(store: FakeWriter, autojump_clock: object) -> None:
+async def test_what_we_write_ourselves_loses_nobody(store: FakeWriter) -> None:
     """Also where listings show the new file before its delivery is over."""
     tree = make_writable(store, inplace=True)
     reader, writer = await tree.open(FILE), await tree.open(FILE, write=True)
@@ -165,9 +163,7 @@ async def require_only_the_whole_goes(store: FakeWriter, writer: OpenFile) -> No
 
 
 @pytest.mark.parametrize("cut", [False, True])
-async def test_changes_of_a_lost_file_do_not_go_to_the_new_one(
-    store: FakeWriter, autojump_clock: object, cut: bool
-) -> None:
+async def test_changes_of_a_lost_file_do_not_go_to_the_new_one(store: FakeWriter, cut: bool) -> None:
     """The vehicle restarted with another card."""
     tree = make_writable(store, inplace=True)
     writer = await opened(tree, write=True)
@@ -182,7 +178,7 @@ async def test_changes_of_a_lost_file_do_not_go_to_the_new_one(
 @pytest.mark.parametrize("cut", [False, True])
 @pytest.mark.parametrize("mtime", [1])
 async def test_changes_that_waited_over_a_restart_go_to_the_very_file_only(
-    store: FakeWriter, autojump_clock: object, failed: bool, cut: bool, mtime: int | None
+    store: FakeWriter, failed: bool, cut: bool, mtime: int | None
 ) -> None:
     """Nobody read in between, which would have shown that the card is another one."""
     store.add(FILE, OLD, mtime)
@@ -200,9 +196,7 @@ async def test_changes_that_waited_over_a_restart_go_to_the_very_file_only(
 
 
 @pytest.mark.parametrize("mtime", [1])
-async def test_changes_that_waited_over_a_restart_are_delivered(
-    store: FakeWriter, autojump_clock: object, mtime: int | None
-) -> None:
+async def test_changes_that_waited_over_a_restart_are_delivered(store: FakeWriter, mtime: int | None) -> None:
     store.add(FILE, OLD, mtime)
     tree = make_writable(store, inplace=True)
     writer = await opened(tree, write=True)
@@ -213,9 +207,7 @@ async def test_changes_that_waited_over_a_restart_are_delivered(
 
 
 @pytest.mark.parametrize("look", ["stat", "read", "write", "empty", "make"])
-async def test_a_new_file_is_opened_though_a_writer_has_the_lost_one(
-    store: FakeWriter, autojump_clock: object, look: str
-) -> None:
+async def test_a_new_file_is_opened_though_a_writer_has_the_lost_one(store: FakeWriter, look: str) -> None:
     """That one changed nothing of it, and cannot any more; nobody is told that this came to the vehicle."""
     tree = make_writable(store, inplace=True)
     writer = await opened(tree, write=True)
@@ -243,9 +235,7 @@ async def test_a_new_file_is_opened_though_a_writer_has_the_lost_one(
     assert tree.undelivered() == []
 
 
-async def test_who_has_a_file_open_that_others_removed_does_not_get_the_next_one(
-    store: FakeWriter, autojump_clock: object
-) -> None:
+async def test_who_has_a_file_open_that_others_removed_does_not_get_the_next_one(store: FakeWriter) -> None:
     tree = make_writable(store, inplace=True)
     reader = await opened(tree)
     del store.files[FILE]
@@ -263,7 +253,7 @@ async def test_who_has_a_file_open_that_others_removed_does_not_get_the_next_one
 
 @pytest.mark.parametrize("smaller", [False, True])
 async def test_what_is_held_of_a_lost_file_does_not_get_among_the_pages_of_the_new_one(
-    store: FakeWriter, autojump_clock: object, smaller: bool
+    store: FakeWriter, smaller: bool
 ) -> None:
     """The kernel keeps what it was given by one name, whoever asked."""
     tree = make_writable(store, inplace=True)
@@ -295,9 +285,7 @@ async def test_what_is_held_of_a_lost_file_does_not_get_among_the_pages_of_the_n
     assert not (await tree.open(FILE)).direct_io
 
 
-async def test_a_file_that_grew_after_it_was_written_stays_who_wrote_it_has_open(
-    store: FakeWriter, autojump_clock: object
-) -> None:
+async def test_a_file_that_grew_after_it_was_written_stays_who_wrote_it_has_open(store: FakeWriter) -> None:
     tree = make_writable(store, inplace=True)
     writer = await tree.open(FILE, write=True)
     await writer.write(0, b"mid")
@@ -315,7 +303,7 @@ async def test_a_file_that_grew_after_it_was_written_stays_who_wrote_it_has_open
 @pytest.mark.parametrize("gone", [False, True])
 @pytest.mark.parametrize("later", [0.0, 0.5, 1.5, 2.5])
 async def test_a_name_that_goes_while_a_reader_compares_costs_him_nothing(
-    store: FakeWriter, autojump_clock: object, later: float, gone: bool, restarted: bool, answered: bool
+    store: FakeWriter, later: float, gone: bool, restarted: bool, answered: bool
 ) -> None:
     """The listing that he asked for shows the file by another name than it has by the end of it."""
     tree = make_writable(store, inplace=True)

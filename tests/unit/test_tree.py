@@ -7,7 +7,6 @@ from collections.abc import Awaitable, Callable
 import pytest
 import trio
 import trio.testing
-from trio.testing import MockClock
 
 from mavftpfs.cache.attributes import UNKNOWN_MTIME
 from mavftpfs.cache.directories import SWEEP_TRIES
@@ -52,9 +51,7 @@ def tree(store: FakeStore) -> Tree:
 # --- walking
 
 
-async def test_stat_walks_from_the_root_and_then_costs_nothing(
-    store: FakeStore, tree: Tree, autojump_clock: MockClock
-) -> None:
+async def test_stat_walks_from_the_root_and_then_costs_nothing(store: FakeStore, tree: Tree) -> None:
     assert await tree.stat(b"/fs/microsd/a.txt") == Stat(FILE, 5, 1_700_000_000, 1.0)
     assert store.calls == [("list", b"/"), ("list", b"/fs"), ("list", b"/fs/microsd")]
     assert (await tree.stat(b"/fs/microsd/log")).kind is DIRECTORY
@@ -62,20 +59,16 @@ async def test_stat_walks_from_the_root_and_then_costs_nothing(
     assert len(store.calls) == 3
 
 
-async def test_the_roots_attributes_cost_nothing(
-    store: FakeStore, tree: Tree, autojump_clock: MockClock
-) -> None:
+async def test_the_roots_attributes_cost_nothing(store: FakeStore, tree: Tree) -> None:
     assert await tree.stat(b"/") == Stat(DIRECTORY, 0, UNKNOWN_MTIME, 1.0)
     assert store.calls == []
 
 
-async def test_logs_show_their_date(tree: Tree, autojump_clock: MockClock) -> None:
+async def test_logs_show_their_date(tree: Tree) -> None:
     assert (await tree.stat(b"/fs/microsd/log/2024-05-01/12_34_56.ulg")).mtime == 1714566896
 
 
-async def test_absence_by_a_fresh_listing_costs_nothing(
-    store: FakeStore, tree: Tree, autojump_clock: MockClock
-) -> None:
+async def test_absence_by_a_fresh_listing_costs_nothing(store: FakeStore, tree: Tree) -> None:
     with pytest.raises(NotFound):
         await tree.stat(b"/none")
     with pytest.raises(NotFound):
@@ -89,9 +82,7 @@ async def test_absence_by_a_fresh_listing_costs_nothing(
     assert tree.negative_valid_for(b"/unknown/none") == 0.0
 
 
-async def test_an_incomplete_listing_proves_no_absence(
-    store: FakeStore, tree: Tree, autojump_clock: MockClock
-) -> None:
+async def test_an_incomplete_listing_proves_no_absence(store: FakeStore, tree: Tree) -> None:
     store.incomplete.add(b"/")
     with pytest.raises(NotFound):
         await tree.stat(b"/none")
@@ -105,7 +96,7 @@ async def test_an_incomplete_listing_proves_no_absence(
     assert {name for name, _ in error.value.entries} == {b"fs", b"top"}
 
 
-async def test_a_file_is_never_listed(store: FakeStore, tree: Tree, autojump_clock: MockClock) -> None:
+async def test_a_file_is_never_listed(store: FakeStore, tree: Tree) -> None:
     for path in (b"/top/x", b"/top/x/y", b"/fs/microsd/a.txt/b"):
         with pytest.raises(NotADirectory):
             await tree.stat(path)
@@ -114,9 +105,7 @@ async def test_a_file_is_never_listed(store: FakeStore, tree: Tree, autojump_clo
     assert store.crimes == []
 
 
-async def test_a_directory_that_became_a_file_is_not_listed(
-    store: FakeStore, tree: Tree, autojump_clock: MockClock
-) -> None:
+async def test_a_directory_that_became_a_file_is_not_listed(store: FakeStore, tree: Tree) -> None:
     await tree.list(b"/fs/microsd")
     store.remove(b"/fs/microsd")
     store.files[b"/fs/microsd"] = FakeFile(b"now a file")
@@ -126,9 +115,7 @@ async def test_a_directory_that_became_a_file_is_not_listed(
     assert store.crimes == []
 
 
-async def test_a_refused_directory_is_looked_for_again(
-    store: FakeStore, tree: Tree, autojump_clock: MockClock
-) -> None:
+async def test_a_refused_directory_is_looked_for_again(store: FakeStore, tree: Tree) -> None:
     await tree.stat(b"/fs/microsd")
     store.remove(b"/fs/microsd")
     with pytest.raises(FtpNak):
@@ -138,7 +125,7 @@ async def test_a_refused_directory_is_looked_for_again(
     assert store.count("list", b"/fs") == 2
 
 
-async def test_hostile_paths(store: FakeStore, tree: Tree, autojump_clock: MockClock) -> None:
+async def test_hostile_paths(store: FakeStore, tree: Tree) -> None:
     with pytest.raises(LocalProtocolError):
         await tree.stat(b"/fs/../etc")
     with pytest.raises(PathTooLong):
@@ -147,9 +134,7 @@ async def test_hostile_paths(store: FakeStore, tree: Tree, autojump_clock: MockC
     assert (await tree.stat(b"//fs/./microsd/")).kind is DIRECTORY
 
 
-async def test_a_name_too_long_to_be_asked_for_is_still_shown(
-    store: FakeStore, tree: Tree, autojump_clock: MockClock
-) -> None:
+async def test_a_name_too_long_to_be_asked_for_is_still_shown(store: FakeStore, tree: Tree) -> None:
     name = b"n" * 190
     store.add(b"/fs/microsd/" + name, b"x")
     assert (await tree.stat(b"/fs/microsd/" + name)).size == 1
@@ -157,15 +142,13 @@ async def test_a_name_too_long_to_be_asked_for_is_still_shown(
         await tree.open(b"/fs/microsd/" + name)
 
 
-async def test_list_shows_what_stat_shows(tree: Tree, autojump_clock: MockClock) -> None:
+async def test_list_shows_what_stat_shows(tree: Tree) -> None:
     for name, stat in await tree.list(b"/fs/microsd"):
         assert await tree.stat(b"/fs/microsd/" + name) == stat
     assert {name for name, _ in await tree.list(b"/")} == {b"fs", b"top"}
 
 
-async def test_attributes_are_valid_no_longer_than_the_listing(
-    store: FakeStore, tree: Tree, autojump_clock: MockClock
-) -> None:
+async def test_attributes_are_valid_no_longer_than_the_listing(store: FakeStore, tree: Tree) -> None:
     await tree.stat(b"/top")
     await trio.sleep(19.5)
     assert (await tree.stat(b"/top")).valid_for == pytest.approx(0.5)
@@ -174,9 +157,7 @@ async def test_attributes_are_valid_no_longer_than_the_listing(
 # --- sweeps
 
 
-async def test_requests_for_one_listing_share_a_sweep(
-    store: FakeStore, tree: Tree, autojump_clock: MockClock
-) -> None:
+async def test_requests_for_one_listing_share_a_sweep(store: FakeStore, tree: Tree) -> None:
     store.list_delay = 1
     async with trio.open_nursery() as askers:
         for _ in range(5):
@@ -186,9 +167,7 @@ async def test_requests_for_one_listing_share_a_sweep(
     assert tree.status()["listings_asked"] == 1
 
 
-async def test_an_expensive_listing_is_kept_longer(
-    store: FakeStore, tree: Tree, autojump_clock: MockClock
-) -> None:
+async def test_an_expensive_listing_is_kept_longer(store: FakeStore, tree: Tree) -> None:
     store.list_delay = 2
     await tree.list(b"/")
     await trio.sleep(99)
@@ -199,9 +178,7 @@ async def test_an_expensive_listing_is_kept_longer(
     assert store.count("list") == 2
 
 
-async def test_a_sweep_error_reaches_all_and_is_not_remembered(
-    store: FakeStore, tree: Tree, autojump_clock: MockClock
-) -> None:
+async def test_a_sweep_error_reaches_all_and_is_not_remembered(store: FakeStore, tree: Tree) -> None:
     store.fail["list", b"/"] = [FtpNak(Opcode.LIST_DIRECTORY, NakCode.FAIL)]
     errors = []
 
@@ -219,9 +196,7 @@ async def test_a_sweep_error_reaches_all_and_is_not_remembered(
 
 
 @pytest.mark.parametrize("background", [False, True])
-async def test_a_cancelled_sweep(
-    store: FakeStore, nursery: trio.Nursery, autojump_clock: MockClock, background: bool
-) -> None:
+async def test_a_cancelled_sweep(store: FakeStore, nursery: trio.Nursery, background: bool) -> None:
     """With a nursery it goes on for the next caller; without one the other caller starts anew."""
     tree = make_tree(store, nursery=nursery if background else None)
     store.list_delay = 40
@@ -241,9 +216,7 @@ async def test_a_cancelled_sweep(
     assert store.count("list") == (1 if background else 2)
 
 
-async def test_a_listing_raced_by_a_change_of_ours_is_repeated(
-    store: FakeStore, tree: Tree, autojump_clock: MockClock
-) -> None:
+async def test_a_listing_raced_by_a_change_of_ours_is_repeated(store: FakeStore, tree: Tree) -> None:
     def change(path: bytes) -> None:
         if store.count("list", b"/") == 1:
             store.add(b"/new", b"new")
@@ -255,9 +228,7 @@ async def test_a_listing_raced_by_a_change_of_ours_is_repeated(
     assert tree.negative_valid_for(b"/none") > 0
 
 
-async def test_a_listing_that_is_always_raced_is_given_up_on(
-    store: FakeStore, tree: Tree, autojump_clock: MockClock
-) -> None:
+async def test_a_listing_that_is_always_raced_is_given_up_on(store: FakeStore, tree: Tree) -> None:
     store.during_list = lambda path: tree._dentries.note_removed(b"/never")
     assert b"top" in dict(await tree.list(b"/"))
     assert store.count("list", b"/") == SWEEP_TRIES
@@ -267,9 +238,7 @@ async def test_a_listing_that_is_always_raced_is_given_up_on(
 # --- the vehicle is out of reach
 
 
-async def test_expired_listings_are_served_while_the_vehicle_is_lost(
-    store: FakeStore, tree: Tree, autojump_clock: MockClock
-) -> None:
+async def test_expired_listings_are_served_while_the_vehicle_is_lost(store: FakeStore, tree: Tree) -> None:
     await tree.list(b"/fs/microsd")
     await trio.sleep(100)
     store.lost = True
@@ -291,9 +260,7 @@ async def test_expired_listings_are_served_while_the_vehicle_is_lost(
     assert len(await tree.list(b"/fs/microsd")) == 3
 
 
-async def test_a_time_out_is_no_reason_for_stale_answers(
-    store: FakeStore, tree: Tree, autojump_clock: MockClock
-) -> None:
+async def test_a_time_out_is_no_reason_for_stale_answers(store: FakeStore, tree: Tree) -> None:
     await tree.list(b"/")
     await trio.sleep(100)
     store.fail["list", b"/"] = [RequestTimeout("silence")]
@@ -301,16 +268,14 @@ async def test_a_time_out_is_no_reason_for_stale_answers(
         await tree.list(b"/")
 
 
-async def test_after_a_reboot_listings_are_asked_again(
-    store: FakeStore, tree: Tree, autojump_clock: MockClock
-) -> None:
+async def test_after_a_reboot_listings_are_asked_again(store: FakeStore, tree: Tree) -> None:
     await tree.list(b"/")
     tree.rebooted()
     await tree.list(b"/")
     assert store.count("list") == 2
 
 
-async def test_forgetting_the_caches(store: FakeStore, tree: Tree, autojump_clock: MockClock) -> None:
+async def test_forgetting_the_caches(store: FakeStore, tree: Tree) -> None:
     kept = await tree.open(b"/fs/microsd/a.txt")
     await kept.read(0, 5)
     await read_file(tree, b"/top")
@@ -328,7 +293,7 @@ async def test_forgetting_the_caches(store: FakeStore, tree: Tree, autojump_cloc
 # --- the mount's root
 
 
-async def test_a_subtree_is_mounted(store: FakeStore, autojump_clock: MockClock) -> None:
+async def test_a_subtree_is_mounted(store: FakeStore) -> None:
     tree = make_tree(store, root=b"/fs/microsd")
     assert {name for name, _ in await tree.list(b"/")} == {b"a.txt", b"log"}
     assert await read_file(tree, b"/a.txt") == b"hello"
@@ -341,9 +306,7 @@ async def test_a_subtree_is_mounted(store: FakeStore, autojump_clock: MockClock)
     assert store.count("list", b"/") == 1
 
 
-async def test_the_kernel_hears_of_paths_below_the_mounts_root(
-    store: FakeStore, autojump_clock: MockClock
-) -> None:
+async def test_the_kernel_hears_of_paths_below_the_mounts_root(store: FakeStore) -> None:
     tree = make_tree(store, root=b"/fs/microsd")
     await tree.stat(b"/a.txt")
     store.add(b"/fs/microsd/a.txt", b"hello again", 1_700_000_001)
@@ -351,9 +314,7 @@ async def test_the_kernel_hears_of_paths_below_the_mounts_root(
     assert store.invalidated == [b"/a.txt"]
 
 
-async def test_a_root_that_no_listing_shows_may_be_listed(
-    store: FakeStore, autojump_clock: MockClock
-) -> None:
+async def test_a_root_that_no_listing_shows_may_be_listed(store: FakeStore) -> None:
     store.unlisted.add(b"/fs")
     tree = make_tree(store, root=b"/fs/microsd")
     assert {name for name, _ in await tree.list(b"/")} == {b"a.txt", b"log"}
@@ -364,16 +325,14 @@ async def test_a_root_that_no_listing_shows_may_be_listed(
 
 
 @pytest.mark.parametrize("root", [b"/top", b"/top/deeper", b"/fs/microsd/a.txt"])
-async def test_a_root_that_is_a_file_is_not_listed(
-    store: FakeStore, autojump_clock: MockClock, root: bytes
-) -> None:
+async def test_a_root_that_is_a_file_is_not_listed(store: FakeStore, root: bytes) -> None:
     tree = make_tree(store, root=root)
     with pytest.raises(NotADirectory):
         await tree.list(b"/")
     assert store.crimes == []
 
 
-async def test_the_root_is_proven_again_after_a_reboot(store: FakeStore, autojump_clock: MockClock) -> None:
+async def test_the_root_is_proven_again_after_a_reboot(store: FakeStore) -> None:
     tree = make_tree(store, root=b"/fs")
     await tree.list(b"/")
     store.remove(b"/fs")
@@ -386,7 +345,7 @@ async def test_the_root_is_proven_again_after_a_reboot(store: FakeStore, autojum
 # --- SITL's root
 
 
-async def test_dot_shows_what_root_hides(store: FakeStore, tree: Tree, autojump_clock: MockClock) -> None:
+async def test_dot_shows_what_root_hides(store: FakeStore, tree: Tree) -> None:
     store.add(b"/@SYS/tasks.txt", b"x")
     store.unlisted |= {b"/top"}
     store.dot = {b"top": store.files[b"/top"], b"fs": FakeFile(b"not this one")}
@@ -400,9 +359,7 @@ async def test_dot_shows_what_root_hides(store: FakeStore, tree: Tree, autojump_
     assert store.count("list", b".") == 2
 
 
-async def test_the_first_file_of_a_hidden_root_is_found(
-    store: FakeStore, tree: Tree, autojump_clock: MockClock
-) -> None:
+async def test_the_first_file_of_a_hidden_root_is_found(store: FakeStore, tree: Tree) -> None:
     store.add(b"/@ROMFS/x", b"x")
     store.remove(b"/top")
     store.dot = {}
@@ -416,9 +373,7 @@ async def test_the_first_file_of_a_hidden_root_is_found(
     assert await read_file(tree, b"/late") == b"l"
 
 
-async def test_dot_is_not_asked_twice_if_refused(
-    store: FakeStore, tree: Tree, autojump_clock: MockClock
-) -> None:
+async def test_dot_is_not_asked_twice_if_refused(store: FakeStore, tree: Tree) -> None:
     store.add(b"/@ROMFS/x", b"x")
     store.remove(b"/top")
     store.dot = None
@@ -431,9 +386,7 @@ async def test_dot_is_not_asked_twice_if_refused(
     assert store.count("list", b".") == 2
 
 
-async def test_dot_is_asked_of_no_other_server(
-    store: FakeStore, tree: Tree, autojump_clock: MockClock
-) -> None:
+async def test_dot_is_asked_of_no_other_server(store: FakeStore, tree: Tree) -> None:
     store.remove(b"/top")
     await tree.list(b"/")
     store.add(b"/@SYS/x", b"x")
@@ -446,9 +399,7 @@ async def test_dot_is_asked_of_no_other_server(
 # --- sizes that listings do not tell
 
 
-async def test_an_unknown_size_is_learnt_by_opening(
-    store: FakeStore, tree: Tree, autojump_clock: MockClock
-) -> None:
+async def test_an_unknown_size_is_learnt_by_opening(store: FakeStore, tree: Tree) -> None:
     store.files[b"/top"].has_size = False
     stats = dict(await tree.list(b"/"))
     assert stats[b"top"] == Stat(FILE, 0, UNKNOWN_MTIME, 0.0)
@@ -461,7 +412,7 @@ async def test_an_unknown_size_is_learnt_by_opening(
     assert await read_file(tree, b"/top") == b"t"
 
 
-async def test_an_open_file_knows_its_size(store: FakeStore, tree: Tree, autojump_clock: MockClock) -> None:
+async def test_an_open_file_knows_its_size(store: FakeStore, tree: Tree) -> None:
     store.files[b"/top"].has_size = False
     handle = await tree.open(b"/top")
     assert handle.size == 1
@@ -473,7 +424,7 @@ async def test_an_open_file_knows_its_size(store: FakeStore, tree: Tree, autojum
 
 
 async def test_a_file_of_unknown_size_that_does_not_open_counts_as_empty(
-    store: FakeStore, tree: Tree, autojump_clock: MockClock
+    store: FakeStore, tree: Tree
 ) -> None:
     store.files[b"/top"].has_size = False
     store.fail["reader", b"/top"] = [FtpNak(Opcode.OPEN_FILE_RO, NakCode.FAIL)]
@@ -482,7 +433,7 @@ async def test_a_file_of_unknown_size_that_does_not_open_counts_as_empty(
     assert store.count("reader") == 1
 
 
-async def test_hostile_sizes(store: FakeStore, tree: Tree, autojump_clock: MockClock) -> None:
+async def test_hostile_sizes(store: FakeStore, tree: Tree) -> None:
     store.files[b"/top"].claims = 2**80
     assert (await tree.stat(b"/top")).size == 2**63 - 1
     store.files[b"/top"].claims = -1
@@ -493,9 +444,7 @@ async def test_hostile_sizes(store: FakeStore, tree: Tree, autojump_clock: MockC
 # --- checksums
 
 
-async def test_a_checksum_is_remembered_by_size_and_mtime(
-    store: FakeStore, tree: Tree, autojump_clock: MockClock
-) -> None:
+async def test_a_checksum_is_remembered_by_size_and_mtime(store: FakeStore, tree: Tree) -> None:
     path = b"/fs/microsd/a.txt"
     for _ in range(2):
         assert await tree.crc32(path) == crc32(b"hello")
@@ -509,9 +458,7 @@ async def test_a_checksum_is_remembered_by_size_and_mtime(
     assert await tree.crc32(path) == crc32(b"longer")
 
 
-async def test_without_mtime_a_checksum_lasts_dir_timeout(
-    store: FakeStore, tree: Tree, autojump_clock: MockClock
-) -> None:
+async def test_without_mtime_a_checksum_lasts_dir_timeout(store: FakeStore, tree: Tree) -> None:
     await tree.crc32(b"/top")
     await trio.sleep(19)
     await tree.crc32(b"/top")
@@ -526,16 +473,14 @@ async def test_without_mtime_a_checksum_lasts_dir_timeout(
     assert store.count("crc") == 3
 
 
-async def test_checksums_of_files_of_unknown_size_are_not_remembered(
-    store: FakeStore, tree: Tree, autojump_clock: MockClock
-) -> None:
+async def test_checksums_of_files_of_unknown_size_are_not_remembered(store: FakeStore, tree: Tree) -> None:
     store.files[b"/top"].has_size = False
     await tree.crc32(b"/top")
     await tree.crc32(b"/top")
     assert store.count("crc") == 2
 
 
-async def test_checksums_are_bounded(store: FakeStore, tree: Tree, autojump_clock: MockClock) -> None:
+async def test_checksums_are_bounded(store: FakeStore, tree: Tree) -> None:
     for i in range(MAX_CHECKSUMS + 1):
         store.add(b"/many/%d" % i, b"x", 5)
     for i in range(MAX_CHECKSUMS + 1):
@@ -547,7 +492,7 @@ async def test_checksums_are_bounded(store: FakeStore, tree: Tree, autojump_cloc
     assert store.count("crc") == asked + 1
 
 
-async def test_checksums_are_refused(store: FakeStore, tree: Tree, autojump_clock: MockClock) -> None:
+async def test_checksums_are_refused(store: FakeStore, tree: Tree) -> None:
     store.armed = True
     with pytest.raises(Armed):
         await tree.crc32(b"/top")
@@ -577,7 +522,7 @@ def test_right_options() -> None:
     assert CacheOptions(root=b"/fs/microsd", cache_size=MIN_CACHE_SIZE).root == b"/fs/microsd"
 
 
-async def test_a_bug_in_shared_work_reaches_everyone_and_nothing_stays(autojump_clock: MockClock) -> None:
+async def test_a_bug_in_shared_work_reaches_everyone_and_nothing_stays() -> None:
     flights: SingleFlight[int, int] = SingleFlight()
 
     async def work() -> int:
@@ -599,7 +544,7 @@ async def test_a_bug_in_shared_work_reaches_everyone_and_nothing_stays(autojump_
     assert len(flights) == 0
 
 
-async def test_who_came_later_gets_no_time_out_of_who_was_there(autojump_clock: MockClock) -> None:
+async def test_who_came_later_gets_no_time_out_of_who_was_there() -> None:
     """He waited a moment, and the vehicle may be back."""
     flights: SingleFlight[str, int] = SingleFlight()
     begun: list[float] = []
@@ -618,7 +563,7 @@ async def test_who_came_later_gets_no_time_out_of_who_was_there(autojump_clock: 
     assert begun == [0, 30]
 
 
-async def test_who_came_later_hears_of_a_second_time_out(autojump_clock: MockClock) -> None:
+async def test_who_came_later_hears_of_a_second_time_out() -> None:
     flights: SingleFlight[str, int] = SingleFlight()
 
     async def work() -> int:
@@ -638,7 +583,7 @@ async def times_out(flights: SingleFlight[str, int], work: Callable[[], Awaitabl
         await flights.run("key", work)
 
 
-async def test_keys_do_not_wait_for_each_other(autojump_clock: MockClock) -> None:
+async def test_keys_do_not_wait_for_each_other() -> None:
     flights: SingleFlight[int, int] = SingleFlight()
 
     async def work() -> int:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import pytest
 import trio
 import trio.testing
-from trio.testing import MockClock
 
 from mavftpfs.cache.tree import Tree
 from mavftpfs.cache.virtual import MAX_SIZES, Snapshot, Snapshots
@@ -73,7 +72,7 @@ def refuse(store: FakeStore, path: bytes, code: int = NakCode.FILE_NOT_FOUND, ti
 # --- what appears
 
 
-async def test_unlistable_trees_appear_beside_announced_ones(tree: Tree, autojump_clock: MockClock) -> None:
+async def test_unlistable_trees_appear_beside_announced_ones(tree: Tree) -> None:
     assert await names(tree, b"/") == {b"APM", b"@SYS", b"@ROMFS", b"@PARAM", b"@MISSION"}
     assert await names(tree, b"/@PARAM") == {b"param.pck"}
     assert await names(tree, b"/@MISSION") == {b"mission.dat", b"fence.dat", b"rally.dat"}
@@ -82,9 +81,7 @@ async def test_unlistable_trees_appear_beside_announced_ones(tree: Tree, autojum
     assert dict(await tree.list(b"/"))[b"@MISSION"].kind is EntryKind.DIRECTORY
 
 
-async def test_what_cannot_be_listed_is_not_listed(
-    store: FakeStore, tree: Tree, autojump_clock: MockClock
-) -> None:
+async def test_what_cannot_be_listed_is_not_listed(store: FakeStore, tree: Tree) -> None:
     await tree.list(b"/")
     await tree.list(b"/@PARAM")
     await tree.stat(b"/@MISSION/fence.dat")
@@ -92,9 +89,7 @@ async def test_what_cannot_be_listed_is_not_listed(
     assert {path for call, path in store.calls if call == "list"} == {b"/", b"."}
 
 
-async def test_a_server_without_trees_sees_one_probe_and_only_if_somebody_asks(
-    px4: FakeStore, autojump_clock: MockClock
-) -> None:
+async def test_a_server_without_trees_sees_one_probe_and_only_if_somebody_asks(px4: FakeStore) -> None:
     tree = make_tree(px4)
     assert await names(tree, b"/") == {b"fs"}
     assert px4.calls == [("list", b"/")]
@@ -112,7 +107,7 @@ async def test_a_server_without_trees_sees_one_probe_and_only_if_somebody_asks(
     assert (await tree.stat(PARAM)).size == 12
 
 
-async def test_param_that_opens_makes_the_trees_appear(px4: FakeStore, autojump_clock: MockClock) -> None:
+async def test_param_that_opens_makes_the_trees_appear(px4: FakeStore) -> None:
     px4.add(PARAM, b"p" * 99)
     tree = make_tree(px4)
     assert await names(tree, b"/") == {b"fs"}
@@ -123,7 +118,7 @@ async def test_param_that_opens_makes_the_trees_appear(px4: FakeStore, autojump_
     assert px4.count("whole", PARAM) == 1
 
 
-async def test_a_probe_that_got_no_answer_is_no_answer(px4: FakeStore, autojump_clock: MockClock) -> None:
+async def test_a_probe_that_got_no_answer_is_no_answer(px4: FakeStore) -> None:
     px4.add(PARAM, b"p" * 99)
     px4.fail["whole", PARAM] = [RequestTimeout("silence")]
     tree = make_tree(px4)
@@ -132,7 +127,7 @@ async def test_a_probe_that_got_no_answer_is_no_answer(px4: FakeStore, autojump_
     assert (await tree.stat(PARAM)).size == 99
 
 
-async def test_other_refusals_of_the_probe_count_too(px4: FakeStore, autojump_clock: MockClock) -> None:
+async def test_other_refusals_of_the_probe_count_too(px4: FakeStore) -> None:
     px4.fail["whole", PARAM] = [FtpNak(Opcode.READ_FILE, NakCode.FAIL)]
     tree = make_tree(px4)
     for _ in range(2):
@@ -141,7 +136,7 @@ async def test_other_refusals_of_the_probe_count_too(px4: FakeStore, autojump_cl
     assert px4.count("whole") == 1
 
 
-async def test_the_mount_of_an_at_tree(store: FakeStore, autojump_clock: MockClock) -> None:
+async def test_the_mount_of_an_at_tree(store: FakeStore) -> None:
     assert await names(make_tree(store, root=b"/@SYS"), b"/") == {b"uarts.txt", b"tasks.txt", b"storage.bin"}
     params = make_tree(store, root=b"/@PARAM")
     assert await names(params, b"/") == {b"param.pck"}
@@ -151,7 +146,7 @@ async def test_the_mount_of_an_at_tree(store: FakeStore, autojump_clock: MockClo
 # --- true sizes
 
 
-async def test_stat_open_and_read_agree(store: FakeStore, tree: Tree, autojump_clock: MockClock) -> None:
+async def test_stat_open_and_read_agree(store: FakeStore, tree: Tree) -> None:
     stat = await tree.stat(UARTS)
     assert (stat.size, stat.valid_for) == (10, 1.0)
     store.files[UARTS].data = b"meanwhile it became longer"
@@ -169,9 +164,7 @@ async def test_stat_open_and_read_agree(store: FakeStore, tree: Tree, autojump_c
         await handle.read(0, 1)
 
 
-async def test_a_snapshot_lasts_dir_timeout_and_an_open_gets_some_grace(
-    store: FakeStore, tree: Tree, autojump_clock: MockClock
-) -> None:
+async def test_a_snapshot_lasts_dir_timeout_and_an_open_gets_some_grace(store: FakeStore, tree: Tree) -> None:
     await tree.stat(UARTS)
     await trio.sleep(19.9)
     assert (await tree.stat(UARTS)).valid_for == pytest.approx(0.1)
@@ -188,9 +181,7 @@ async def test_a_snapshot_lasts_dir_timeout_and_an_open_gets_some_grace(
     assert await handle.read(0, 99) == b"SERIAL0 on"
 
 
-async def test_an_expensive_snapshot_is_kept_longer(
-    store: FakeStore, tree: Tree, autojump_clock: MockClock
-) -> None:
+async def test_an_expensive_snapshot_is_kept_longer(store: FakeStore, tree: Tree) -> None:
     store.whole_delay = 5
     await tree.stat(PARAM)
     await trio.sleep(49)
@@ -201,9 +192,7 @@ async def test_an_expensive_snapshot_is_kept_longer(
     assert store.count("whole", PARAM) == 2
 
 
-async def test_the_true_size_is_shown_from_then_on(
-    store: FakeStore, tree: Tree, autojump_clock: MockClock
-) -> None:
+async def test_the_true_size_is_shown_from_then_on(store: FakeStore, tree: Tree) -> None:
     await tree.stat(UARTS)
     await trio.sleep(100)
     listed = dict(await tree.list(b"/@SYS"))[b"uarts.txt"]
@@ -211,9 +200,7 @@ async def test_the_true_size_is_shown_from_then_on(
     assert store.count("whole", UARTS) == 1
 
 
-async def test_readers_at_once_share_the_reading(
-    store: FakeStore, tree: Tree, autojump_clock: MockClock
-) -> None:
+async def test_readers_at_once_share_the_reading(store: FakeStore, tree: Tree) -> None:
     store.whole_delay = 1
     async with trio.open_nursery() as readers:
         for _ in range(4):
@@ -222,9 +209,7 @@ async def test_readers_at_once_share_the_reading(
     assert store.count("whole", UARTS) == 1
 
 
-async def test_romfs_is_an_ordinary_tree_read_whole(
-    store: FakeStore, tree: Tree, autojump_clock: MockClock
-) -> None:
+async def test_romfs_is_an_ordinary_tree_read_whole(store: FakeStore, tree: Tree) -> None:
     path = b"/@ROMFS/defaults.parm"
     assert dict(await tree.list(b"/@ROMFS"))[b"defaults.parm"] == await tree.stat(path)
     assert (await tree.stat(path)).size == 50
@@ -236,15 +221,13 @@ async def test_romfs_is_an_ordinary_tree_read_whole(
     assert store.count("reader") == 0
 
 
-async def test_log_alias_is_read_by_blocks(store: FakeStore, tree: Tree, autojump_clock: MockClock) -> None:
+async def test_log_alias_is_read_by_blocks(store: FakeStore, tree: Tree) -> None:
     store.add(b"/@MAV_LOG/1.BIN", b"log" * 1000)
     assert await read_file(tree, b"/@MAV_LOG/1.BIN") == b"log" * 1000
     assert store.count("whole") == 0
 
 
-async def test_the_log_alias_is_found_though_the_root_does_not_show_it(
-    store: FakeStore, tree: Tree, autojump_clock: MockClock
-) -> None:
+async def test_the_log_alias_is_found_though_the_root_does_not_show_it(store: FakeStore, tree: Tree) -> None:
     store.add(b"/@MAV_LOG/1.BIN", b"log" * 1000)
     store.unlisted.add(b"/@MAV_LOG")
     assert b"@MAV_LOG" not in await names(tree, b"/")
@@ -255,9 +238,7 @@ async def test_the_log_alias_is_found_though_the_root_does_not_show_it(
     assert store.count("list", b"/@MAV_LOG") == 1
 
 
-async def test_the_log_alias_is_not_asked_for_in_vain(
-    store: FakeStore, px4: FakeStore, autojump_clock: MockClock
-) -> None:
+async def test_the_log_alias_is_not_asked_for_in_vain(store: FakeStore, px4: FakeStore) -> None:
     """A server without any `@` tree may not survive being asked to list what it does not have."""
     for place, asked in ((store, 1), (px4, 0)):
         with pytest.raises(NotFound):
@@ -265,9 +246,7 @@ async def test_the_log_alias_is_not_asked_for_in_vain(
         assert place.count("list", b"/@MAV_LOG") == asked
 
 
-async def test_a_large_file_is_not_read_to_answer_stat(
-    store: FakeStore, tree: Tree, autojump_clock: MockClock
-) -> None:
+async def test_a_large_file_is_not_read_to_answer_stat(store: FakeStore, tree: Tree) -> None:
     store.add(b"/@SYS/crash_dump.bin", b"c" * 200_000)
     assert b"crash_dump.bin" in await names(tree, b"/@SYS")
     assert (await tree.stat(b"/@SYS/crash_dump.bin")).size == 200_000
@@ -275,9 +254,7 @@ async def test_a_large_file_is_not_read_to_answer_stat(
     assert len(await read_file(tree, b"/@SYS/crash_dump.bin")) == 200_000
 
 
-async def test_a_file_beyond_the_limit_is_an_error_to_open_but_not_to_stat(
-    store: FakeStore, autojump_clock: MockClock
-) -> None:
+async def test_a_file_beyond_the_limit_is_an_error_to_open_but_not_to_stat(store: FakeStore) -> None:
     tree = make_tree(store, at_file_limit=5)
     stat = await tree.stat(UARTS)
     assert (stat.size, stat.valid_for) == (LIE, 0.0)
@@ -286,9 +263,7 @@ async def test_a_file_beyond_the_limit_is_an_error_to_open_but_not_to_stat(
     assert b"uarts.txt" in await names(tree, b"/@SYS")
 
 
-async def test_checksum_of_what_a_reader_gets(
-    store: FakeStore, tree: Tree, autojump_clock: MockClock
-) -> None:
+async def test_checksum_of_what_a_reader_gets(store: FakeStore, tree: Tree) -> None:
     assert await tree.crc32(PARAM) == crc32(b"p" * 14882)
     assert store.count("crc") == 0
     assert tree.status()["open_files"] == 0
@@ -297,7 +272,7 @@ async def test_checksum_of_what_a_reader_gets(
 # --- queries and odd names
 
 
-async def test_names_with_a_query_are_probed(store: FakeStore, tree: Tree, autojump_clock: MockClock) -> None:
+async def test_names_with_a_query_are_probed(store: FakeStore, tree: Tree) -> None:
     query = PARAM + b"?withdefaults=1"
     store.add(query, b"with defaults")
     assert (await tree.stat(query)).size == 13
@@ -306,9 +281,7 @@ async def test_names_with_a_query_are_probed(store: FakeStore, tree: Tree, autoj
     assert await names(tree, b"/@PARAM") == {b"param.pck"}
 
 
-async def test_absent_names_are_remembered_for_a_while(
-    store: FakeStore, tree: Tree, autojump_clock: MockClock
-) -> None:
+async def test_absent_names_are_remembered_for_a_while(store: FakeStore, tree: Tree) -> None:
     for _ in range(2):
         with pytest.raises(NotFound):
             await tree.stat(b"/@PARAM/none")
@@ -319,9 +292,7 @@ async def test_absent_names_are_remembered_for_a_while(
     assert (await tree.stat(b"/@PARAM/none")).size == 3
 
 
-async def test_names_that_cannot_be_cost_nothing(
-    store: FakeStore, tree: Tree, autojump_clock: MockClock
-) -> None:
+async def test_names_that_cannot_be_cost_nothing(store: FakeStore, tree: Tree) -> None:
     for path in (b"/@PARAM/.hidden", b"/@PARAM/param.pck/x", b"/@MISSION/.Trash-1000"):
         with pytest.raises(NotFound):
             await tree.stat(path)
@@ -342,9 +313,7 @@ async def test_names_that_cannot_be_cost_nothing(
 # --- files that are listed but do not open
 
 
-async def test_what_is_listed_but_not_found_is_hidden(
-    store: FakeStore, tree: Tree, autojump_clock: MockClock
-) -> None:
+async def test_what_is_listed_but_not_found_is_hidden(store: FakeStore, tree: Tree) -> None:
     refuse(store, UARTS)
     assert await names(tree, b"/@SYS") == {b"tasks.txt", b"storage.bin"}
     with pytest.raises(NotFound):
@@ -360,9 +329,7 @@ async def test_what_is_listed_but_not_found_is_hidden(
     assert b"uarts.txt" in await names(tree, b"/@SYS")
 
 
-async def test_listing_reads_each_small_file_once(
-    store: FakeStore, tree: Tree, autojump_clock: MockClock
-) -> None:
+async def test_listing_reads_each_small_file_once(store: FakeStore, tree: Tree) -> None:
     sizes = {name: stat.size for name, stat in await tree.list(b"/@SYS")}
     assert sizes == {b"uarts.txt": 10, b"tasks.txt": 8, b"storage.bin": 16384}
     await tree.list(b"/@SYS")
@@ -371,16 +338,14 @@ async def test_listing_reads_each_small_file_once(
     assert store.count("whole") == 3
 
 
-async def test_not_found_while_reading_is_a_lost_session(
-    store: FakeStore, tree: Tree, autojump_clock: MockClock
-) -> None:
+async def test_not_found_while_reading_is_a_lost_session(store: FakeStore, tree: Tree) -> None:
     store.fail["whole", UARTS] = [FtpNak(Opcode.READ_FILE, NakCode.FILE_NOT_FOUND)]
     with pytest.raises(FtpNak):
         await tree.open(UARTS)
     assert (await tree.stat(UARTS)).size == 10
 
 
-async def test_other_refusals_do_not_hide(store: FakeStore, tree: Tree, autojump_clock: MockClock) -> None:
+async def test_other_refusals_do_not_hide(store: FakeStore, tree: Tree) -> None:
     refuse(store, UARTS, NakCode.FAIL)
     listed = dict(await tree.list(b"/@SYS"))[b"uarts.txt"]
     assert (listed.size, listed.valid_for) == (LIE, 0.0)
@@ -391,9 +356,7 @@ async def test_other_refusals_do_not_hide(store: FakeStore, tree: Tree, autojump
         await tree.open(UARTS)
 
 
-async def test_refused_missions_are_not_shown_for_a_while(
-    store: FakeStore, tree: Tree, autojump_clock: MockClock
-) -> None:
+async def test_refused_missions_are_not_shown_for_a_while(store: FakeStore, tree: Tree) -> None:
     refuse(store, b"/@MISSION/rally.dat", NakCode.FAIL, times=1)
     assert await names(tree, b"/@MISSION") == {b"mission.dat", b"fence.dat"}
     assert await names(tree, b"/@MISSION") == {b"mission.dat", b"fence.dat"}
@@ -401,9 +364,7 @@ async def test_refused_missions_are_not_shown_for_a_while(
     assert b"rally.dat" in await names(tree, b"/@MISSION")
 
 
-async def test_subdirectories_are_shown_and_not_read(
-    store: FakeStore, tree: Tree, autojump_clock: MockClock
-) -> None:
+async def test_subdirectories_are_shown_and_not_read(store: FakeStore, tree: Tree) -> None:
     store.add(b"/@SYS/deep/x.txt", b"x", claims=LIE)
     assert dict(await tree.list(b"/@SYS"))[b"deep"].kind is EntryKind.DIRECTORY
     assert (await tree.stat(b"/@SYS/deep")).kind is EntryKind.DIRECTORY
@@ -415,7 +376,7 @@ async def test_subdirectories_are_shown_and_not_read(
 
 @pytest.mark.parametrize("background", [False, True])
 async def test_on_a_radio_listing_does_not_wait_for_all_files(
-    store: FakeStore, nursery: trio.Nursery, autojump_clock: MockClock, background: bool
+    store: FakeStore, nursery: trio.Nursery, background: bool
 ) -> None:
     tree = make_tree(store, nursery=nursery if background else None)
     store.whole_delay = 2
@@ -435,9 +396,7 @@ async def test_on_a_radio_listing_does_not_wait_for_all_files(
 
 
 @pytest.mark.parametrize("error", [VehicleLost("gone"), RequestTimeout("silence")])
-async def test_a_bad_link_ends_the_probing(
-    store: FakeStore, tree: Tree, autojump_clock: MockClock, error: Exception
-) -> None:
+async def test_a_bad_link_ends_the_probing(store: FakeStore, tree: Tree, error: Exception) -> None:
     await tree.stat(b"/@SYS")
     store.fail["whole", UARTS] = [error]
     listed = dict(await tree.list(b"/@SYS"))
@@ -446,9 +405,7 @@ async def test_a_bad_link_ends_the_probing(
     assert dict(await tree.list(b"/@SYS"))[b"uarts.txt"].size == 10
 
 
-async def test_while_lost_the_last_size_is_shown_and_opens_fail(
-    store: FakeStore, tree: Tree, autojump_clock: MockClock
-) -> None:
+async def test_while_lost_the_last_size_is_shown_and_opens_fail(store: FakeStore, tree: Tree) -> None:
     await tree.stat(UARTS)
     await trio.sleep(100)
     store.lost = True
@@ -462,7 +419,7 @@ async def test_while_lost_the_last_size_is_shown_and_opens_fail(
 
 
 async def test_an_unlistable_file_never_read_has_no_size_to_fall_back_to(
-    store: FakeStore, tree: Tree, autojump_clock: MockClock
+    store: FakeStore, tree: Tree
 ) -> None:
     await tree.list(b"/")
     store.fail["whole", PARAM] = [VehicleLost("gone"), VehicleLost("gone")]
