@@ -1,8 +1,13 @@
-"""A file that is replaced while the vehicle restarts in mid-copy: one version or an error. Virtual time."""
+"""A file that others replace while it is open, or the vehicle restarts under it: one version or an error.
+
+The server's session is closed when nobody wanted bytes for a while, and opened anew. Virtual time.
+"""
 
 from __future__ import annotations
 
 import random
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
 
 import pytest
 import trio
@@ -13,14 +18,22 @@ from mavftpfs.cache.tree import OpenFile, Tree
 from mavftpfs.session.connection import Connection
 from mavftpfs.shared.errors import FileChanged
 from mavftpfs.sim.linkmodel import LinkSettings
-from mavftpfs.sim.profiles import PROFILES
-from tests.support.takingturns import taking_turns
-from tests.support.worlds import ROOTS, World
+from tests.support.worlds import World
 
-OLD = random.Random(1).randbytes(200_000)
-NEW = random.Random(2).randbytes(260_000)
+OLD = random.Random(1).randbytes(120_000)
+NEW = random.Random(2).randbytes(160_000)
 STEP = 16_384
-UNTIMED = {"px4", "px4-nuttx", "ardupilot", "littlefs", "mavsdk-old"}
+THEN = 1_700_000_000
+PATH = b"/big"
+LINK = LinkSettings(rate=200_000.0, delay=0.01)
+SLOW = LinkSettings(rate=12_000.0, delay=0.02)
+IDLE = 4.0
+"""Seconds after which the session is closed."""
+
+TIMED = ["mavsdk", "ardupilot5"]
+"""Listings tell times: sessions for many files, and one for all."""
+
+EVERY = [*TIMED, "px4"]
 
 
 def mounted(connection: Connection) -> Tree:
@@ -30,81 +43,221 @@ def mounted(connection: Connection) -> Tree:
     return tree
 
 
-async def read_through(handle: OpenFile) -> bytes:
-    """Read from the beginning to the end."""
-    return b"".join([bytes(await handle.read(at, STEP)) for at in range(0, handle.size, STEP)])
+class Card:
+    """One vehicle with one file."""
+
+    def __init__(self, profile: str, link: LinkSettings = LINK) -> None:
+        self.world = World(profile, link)
+        self.world.tree.add(PATH, OLD, THEN)
+
+    def replace(self, data: bytes = NEW[: len(OLD)], mtime: int = THEN + 100) -> None:
+        """Move another file over it, as others would."""
+        self.world.tree.add(b"/other", data, mtime)
+        self.world.tree.rename(b"/other", PATH)
+
+    @asynccontextmanager
+    async def opened(self) -> AsyncIterator[tuple[Tree, OpenFile]]:
+        """Mount it and open the file."""
+        async with self.world.connection() as connection:
+            tree = mounted(connection)
+            handle = await tree.open(PATH)
+            yield tree, handle
+            handle.close()
 
 
-async def copy(tree: Tree, path: bytes) -> bytes:
+async def read_on(handle: OpenFile, start: int = 0) -> bytes:
+    """Read from there to the end."""
+    return b"".join([bytes(await handle.read(at, STEP)) for at in range(start, handle.size, STEP)])
+
+
+async def copy(tree: Tree, path: bytes = PATH) -> bytes:
     """Open, read to the end and close, as cp does."""
     handle = await tree.open(path)
     try:
-        return await read_through(handle)
+        return await read_on(handle)
     finally:
         handle.close()
 
 
-@pytest.mark.parametrize("profile", ["px4-2026", "mavsdk"])
+async def read_head(handle: OpenFile) -> None:
+    """Read the first bytes, and wait until the session is closed."""
+    assert await handle.read(0, STEP) == OLD[:STEP]
+    await trio.sleep(IDLE)
+
+
+# --- the vehicle restarts
+
+
+@pytest.mark.parametrize("profile", TIMED)
 async def test_the_end_of_a_copy_waits_for_the_news_of_a_reboot(profile: str, autojump: MockClock) -> None:
     """A vehicle may answer before it tells its boot time, and what is left may come in between."""
-    here = World(profile, LinkSettings(rate=20_000.0, delay=0.02))
-    path = ROOTS.get(profile, b"") + b"/big"
-    here.tree.add(path, OLD, 1_700_000_000)
-    async with here.connection() as connection, trio.open_nursery() as nursery:
-        tree = mounted(connection)
-        await trio.sleep(10)
-        handle = await tree.open(path)
+    card = Card(profile, SLOW)
+    async with card.opened() as (tree, handle), trio.open_nursery() as nursery:
         blocks = handle._version.blocks  # type: ignore[attr-defined]
 
         async def reboot() -> None:
             for _ in range(10_000):
-                if sum(stop - start for start, stop in blocks.missing(0, handle.size)) <= 8_000:
+                if sum(stop - start for start, stop in blocks.missing(0, handle.size)) <= 5_000:
                     break
                 await trio.sleep(0.02)
             now = trio.current_time()
-            here.vehicle.reboot(now, downtime=2.7)
-            here.vehicle._next_beat = now + 4.2
-            here.tree.add(path, NEW[: len(OLD)], 1_700_000_100)
-            here.link.kick()
+            card.world.vehicle.reboot(now, downtime=2.7)
+            card.world.vehicle._next_beat = now + 4.2
+            card.replace()
+            card.world.link.kick()
 
+        await trio.sleep(10)
         nursery.start_soon(reboot)
         with pytest.raises(FileChanged):
-            await read_through(handle)
-        handle.close()
-        assert connection.vehicle.reboots == 1
+            await read_on(handle)
+        assert await copy(tree) == NEW[: len(OLD)]
 
 
 @pytest.mark.parametrize("unasked", [True, False])
-@pytest.mark.parametrize("size", [0, 190_000, 200_000, 260_000])
-@pytest.mark.parametrize("profile", taking_turns(PROFILES))
+@pytest.mark.parametrize("size", [None, 100_000, 120_000, 160_000])
+@pytest.mark.parametrize("profile", EVERY)
 async def test_a_copy_over_a_reboot_is_of_one_version(
-    profile: str, size: int, unasked: bool, autojump: MockClock
+    profile: str, size: int | None, unasked: bool, autojump: MockClock
 ) -> None:
-    """size: of the successor; 0 = the file stays. unasked: the vehicle tells its boot time so. Where listings
-    tell no times, nothing but the size tells a successor."""
-    if size == len(OLD) and profile in UNTIMED:
+    """size: of the successor; None = the file stays. unasked: the vehicle tells its boot time so. Where
+    listings tell no times, nothing but the size tells a successor."""
+    if size == len(OLD) and profile not in TIMED:
         return
-    here = World(profile, LinkSettings(rate=20_000.0, delay=0.02))
-    here.vehicle.tells_time = unasked
-    here.vehicle.reboot(-5.0)
-    path = ROOTS.get(profile, b"") + b"/big"
-    here.tree.add(path, OLD, 1_700_000_000)
-    async with here.connection() as connection, trio.open_nursery() as nursery:
+    card = Card(profile, SLOW)
+    card.world.vehicle.tells_time = unasked
+    card.world.vehicle.reboot(-5.0)
+    async with card.world.connection() as connection, trio.open_nursery() as nursery:
         tree = mounted(connection)
         await trio.sleep(10)  # a boot time has to go back by some seconds to tell of a restart
 
         async def reboot() -> None:
             await trio.sleep(4.5)
-            here.vehicle.reboot(trio.current_time(), downtime=4.0)
+            card.world.vehicle.reboot(trio.current_time(), downtime=4.0)
             if size:
-                here.tree.add(path, NEW[:size], 1_700_000_100)
-            here.link.kick()
+                card.replace(NEW[:size])
+            card.world.link.kick()
 
         nursery.start_soon(reboot)
         if size:
             with pytest.raises(FileChanged):
-                await copy(tree, path)
+                await copy(tree)
         else:
-            assert await copy(tree, path) == OLD
+            assert await copy(tree) == OLD
         assert connection.vehicle.reboots == 1
-        assert await copy(tree, path) == (NEW[:size] or OLD)
+        assert await copy(tree) == (NEW[:size] if size else OLD)
+
+
+# --- the session is opened anew
+
+
+@pytest.mark.parametrize("profile", TIMED)
+@pytest.mark.parametrize("closed", [False, True])
+async def test_nobody_gets_the_head_of_one_file_and_the_rest_of_another(
+    profile: str, closed: bool, autojump: MockClock
+) -> None:
+    """closed: the head was cached by who closed the file before."""
+    card = Card(profile)
+    async with card.opened() as (tree, handle):
+        await read_head(handle)
+        if closed:
+            handle.close()
+        card.replace()
+        with pytest.raises(FileChanged):
+            await (copy(tree) if closed else read_on(handle, STEP))
+        assert await copy(tree) == NEW[: len(OLD)]
+
+
+@pytest.mark.parametrize("profile", TIMED)
+async def test_what_nobody_got_yet_is_read_anew(profile: str, autojump: MockClock) -> None:
+    card = Card(profile)
+    async with card.opened() as (_, handle):
+        blocks = handle._version.blocks  # type: ignore[attr-defined]
+        with trio.move_on_after(0.01):  # a read that is given up
+            await handle.read(0, STEP)
+        await trio.sleep(IDLE)
+        assert not blocks.empty
+        assert blocks.missing(0, len(OLD))
+        card.replace()
+        assert await handle.read(0, len(OLD)) == NEW[: len(OLD)]
+        await trio.sleep(IDLE)
+        assert await read_on(handle) == NEW[: len(OLD)]
+
+
+@pytest.mark.parametrize("grown", [False, True])
+@pytest.mark.parametrize("profile", EVERY)
+async def test_the_same_file_is_read_on(profile: str, grown: bool, autojump: MockClock) -> None:
+    """One that grew, to its opened size. Where listings tell no times none is asked for."""
+    card = Card(profile)
+    async with card.opened() as (tree, handle):
+        sweeps = tree.status()["listings_asked"]
+        parts = []
+        for start in range(0, len(OLD), 40_000):
+            await trio.sleep(IDLE)
+            if grown:
+                card.replace(OLD + b"more", THEN + 1 + start)
+            parts.append(bytes(await handle.read(start, 40_000)))
+        assert b"".join(parts) == OLD
+        assert profile in TIMED or tree.status()["listings_asked"] == sweeps
+
+
+async def test_a_newer_listing_ends_what_it_contradicts(autojump: MockClock) -> None:
+    card = Card("mavsdk")
+    async with card.opened() as (tree, handle):
+        assert await read_on(handle) == OLD
+        card.replace()
+        await trio.sleep(30.0)
+        assert (await tree.stat(PATH)).mtime == THEN + 100
+        with pytest.raises(FileChanged):
+            await handle.read(0, STEP)
+
+
+@pytest.mark.parametrize("profile", TIMED)
+async def test_turns_of_two_readers_cost_few_listings(profile: str, autojump: MockClock) -> None:
+    card = Card(profile)
+    card.world.tree.add(b"/second", OLD * 2, THEN)
+    card.world.tree.add(b"/third", OLD * 2, THEN)
+    async with card.world.connection() as connection:
+        tree = mounted(connection)
+        await tree.stat(PATH)
+        before, began = int(str(tree.status()["listings_asked"])), trio.current_time()
+        got: list[bytes] = []
+
+        async def one(path: bytes) -> None:
+            got.append(await copy(tree, path))
+
+        async with trio.open_nursery() as nursery:
+            nursery.start_soon(one, b"/second")
+            nursery.start_soon(one, b"/third")
+        assert got == [OLD * 2] * 2
+        asked = int(str(tree.status()["listings_asked"])) - before
+        assert asked <= 2 * ((trio.current_time() - began) / 2.0 + 2)
+
+
+async def test_the_end_of_a_copy_by_turns_is_compared(autojump: MockClock) -> None:
+    """Between two comparisons bytes go out unproven, but for the last."""
+    card = Card("ardupilot5")
+    async with card.opened() as (_, handle):
+        await read_head(handle)
+        handle._version.compare_after = float("inf")  # type: ignore[attr-defined]
+        card.replace()
+        with pytest.raises(FileChanged):
+            await read_on(handle, STEP)
+
+
+@pytest.mark.parametrize("profile", TIMED)
+async def test_one_that_was_replaced_after_its_listing_and_again_after_it_was_opened(
+    profile: str, autojump: MockClock
+) -> None:
+    card = Card(profile)
+    async with card.world.connection() as connection:
+        tree = mounted(connection)
+        assert (await tree.stat(PATH)).mtime == THEN
+        card.replace()
+        handle = await tree.open(PATH)
+        assert await handle.read(0, STEP) == NEW[:STEP]
+        await trio.sleep(IDLE)
+        card.replace(NEW[-len(OLD) :], THEN + 200)
+        with pytest.raises(FileChanged):
+            await read_on(handle, STEP)
+        handle.close()
+        assert await copy(tree) == NEW[-len(OLD) :]
