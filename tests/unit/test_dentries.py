@@ -75,19 +75,6 @@ def test_a_fresh_complete_listing_proves_absence() -> None:
     assert dentries.absent_until(b"/e/a", 1) == 1
 
 
-def test_an_incomplete_listing_proves_no_absence() -> None:
-    dentries = make()
-    put(dentries, b"/", file(b"a"), complete=False)
-    assert dentries.absent_until(b"/b", 1) == 1
-    assert dentries.fresh(b"/", 1) is not None
-
-
-def test_the_root_itself_is_never_absent() -> None:
-    dentries = make()
-    put(dentries, b"/")
-    assert dentries.absent_until(b"/", 1) == 1
-
-
 def test_names_that_could_leave_the_tree_do_not_enter_it() -> None:
     dentries = make()
     hostile = [b"", b".", b"..", b"a/b", b"a\0b", b"ok", b"ok"]
@@ -145,14 +132,6 @@ def test_an_expired_listing_is_kept_but_proves_nothing() -> None:
     assert dentries.fresh(b"/", 3) is None
     assert names(dentries, b"/") == {b"a"}
     assert dentries.absent_until(b"/b", 3) == 3
-
-
-def test_expiring_never_makes_a_listing_fresher() -> None:
-    dentries = make()
-    put(dentries, b"/")
-    dentries.expire(b"/", 3)
-    dentries.expire(b"/", 30)
-    assert dentries.fresh(b"/", 10) is None
 
 
 def test_expire_all_covers_sweeps_and_absences() -> None:
@@ -219,23 +198,6 @@ def test_created_and_removed_show_at_once() -> None:
     assert dentries.absent_until(b"/a", 1) == 20
 
 
-def test_changes_in_unknown_directories_are_harmless() -> None:
-    dentries = make()
-    dentries.note_created(b"/d/a", file(b"a"))
-    dentries.note_removed(b"/d/a")
-    dentries.note_resized(b"/d/a", 4)
-    dentries.note_renamed(b"/d/a", b"/e/b")
-    assert len(dentries) == 0
-
-
-def test_removing_a_directory_forgets_what_was_in_it() -> None:
-    dentries = make()
-    put(dentries, b"/", folder(b"d"))
-    put(dentries, b"/d", file(b"a"))
-    dentries.note_removed(b"/d")
-    assert dentries.known(b"/d") is None
-
-
 def test_resized_replaces_size_mtime_and_what_an_open_told() -> None:
     dentries = make()
     directory = put(dentries, b"/", file(b"a", 1, 50))
@@ -245,13 +207,6 @@ def test_resized_replaces_size_mtime_and_what_an_open_told() -> None:
     assert directory.size_of(b"a") == 9
     dentries.note_resized(b"/a", 10, 60)
     assert directory.entries[b"a"] == file(b"a", 10, 60)
-
-
-def test_resizing_what_no_listing_shows_makes_it_doubtful() -> None:
-    dentries = make()
-    put(dentries, b"/", file(b"a"))
-    dentries.note_resized(b"/b", 9)
-    assert dentries.fresh(b"/", 0) is None
 
 
 def test_rename_moves_the_entry_between_listings() -> None:
@@ -264,16 +219,6 @@ def test_rename_moves_the_entry_between_listings() -> None:
     directory = dentries.known(b"/e")
     assert directory is not None
     assert directory.entries == {b"b": file(b"b", 7, 8)}
-
-
-def test_rename_of_a_directory_forgets_both_subtrees() -> None:
-    dentries = make()
-    put(dentries, b"/", folder(b"d"), folder(b"e"))
-    put(dentries, b"/d", file(b"a"))
-    put(dentries, b"/e", file(b"b"))
-    dentries.note_renamed(b"/d", b"/e")
-    assert (dentries.known(b"/d"), dentries.known(b"/e")) == (None, None)
-    assert names(dentries, b"/") == {b"e"}
 
 
 def test_rename_of_something_unknown_makes_the_target_directory_doubtful() -> None:
@@ -290,18 +235,6 @@ def test_rename_of_something_unknown_makes_the_target_directory_doubtful() -> No
 # --- the guard
 
 
-def test_a_change_during_a_listing_beats_it_and_the_result_expires_at_once() -> None:
-    dentries = make()
-    sweep = dentries.begin(b"/", 0)
-    dentries.note_created(b"/new", file(b"new", 5))
-    dentries.note_removed(b"/old")
-    directory = dentries.finish(sweep, Listing((file(b"old"), file(b"kept")), 0), 1)
-    assert set(directory.entries) == {b"new", b"kept"}
-    assert not directory.complete
-    assert dentries.fresh(b"/", 1) is None
-    assert dentries.absent_until(b"/other", 1) == 1
-
-
 def test_a_write_during_a_listing_beats_its_size_but_shifts_nothing() -> None:
     dentries = make()
     put(dentries, b"/", file(b"a", 1))
@@ -313,50 +246,12 @@ def test_a_write_during_a_listing_beats_its_size_but_shifts_nothing() -> None:
     assert dentries.fresh(b"/", 31) is directory
 
 
-def test_what_was_created_during_a_listing_can_be_resized_and_renamed() -> None:
-    dentries = make()
-    sweep = dentries.begin(b"/", 0)
-    dentries.note_created(b"/a", file(b"a", 0))
-    dentries.note_resized(b"/a", 6)
-    dentries.note_renamed(b"/a", b"/b")
-    dentries.note_removed(b"/c")
-    dentries.note_renamed(b"/c", b"/d")
-    directory = dentries.finish(sweep, Listing((file(b"a", 3), file(b"c")), 0), 1)
-    assert directory.entries == {b"b": file(b"b", 6)}
-
-
-def test_a_doubtful_rename_during_a_listing_spoils_it() -> None:
-    dentries = make()
-    sweep = dentries.begin(b"/e", 0)
-    dentries.note_renamed(b"/d/unknown", b"/e/b")
-    assert not dentries.finish(sweep, Listing((), 0), 1).complete
-
-
 def test_what_an_unknown_file_took_the_place_of_is_not_taken_for_it() -> None:
     dentries = make()
     put(dentries, b"/d", file(b"a", 7, 70))
     dentries.note_renamed(b"/unknown", b"/d/a")
     assert dentries.listed_since(b"/d/a", 0.0) == file(b"a", None, None)
     assert dentries.fresh(b"/d", 0.0) is None
-
-
-def test_changes_elsewhere_or_before_do_not_matter() -> None:
-    dentries = make()
-    dentries.note_created(b"/a", file(b"a"))
-    sweep = dentries.begin(b"/", 0)
-    dentries.note_created(b"/d/a", file(b"a"))
-    directory = dentries.finish(sweep, Listing((file(b"b"),), 0), 1)
-    assert (set(directory.entries), directory.complete) == ({b"b"}, True)
-
-
-def test_two_sweeps_of_a_directory_both_learn_of_changes() -> None:
-    dentries = make()
-    first, second = dentries.begin(b"/", 0), dentries.begin(b"/", 0)
-    dentries.note_created(b"/a", file(b"a"))
-    dentries.abandon(first)
-    dentries.note_created(b"/b", file(b"b"))
-    assert set(dentries.finish(second, Listing((), 0), 1).entries) == {b"a", b"b"}
-    assert b"b" not in first.changes
 
 
 # --- mtimes

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import random
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator
 
 import pytest
 import trio
@@ -53,11 +53,6 @@ def tree(store: FakeStore) -> Tree:
 
 
 # --- reading
-
-
-async def test_reading_gives_the_bytes(store: FakeStore, tree: Tree) -> None:
-    assert await read_file(tree, LOG) == DATA
-    assert store.count("open") == 1
 
 
 async def test_reads_are_short_only_at_the_end(tree: Tree) -> None:
@@ -113,25 +108,6 @@ async def test_two_opens_at_once_are_one_request(store: FakeStore, tree: Tree) -
     assert tree.status()["open_files"] == 2
 
 
-async def test_a_cancelled_open_lets_the_other_one_go_on(store: FakeStore, tree: Tree) -> None:
-    store.open_delay = 10
-    await tree.stat(LOG)
-    sizes = []
-
-    async def open_and_note() -> None:
-        sizes.append((await tree.open(LOG)).size)
-
-    async with trio.open_nursery() as openers:
-        with trio.move_on_after(5):
-            async with trio.open_nursery() as inner:
-                inner.start_soon(tree.open, LOG)
-                await trio.testing.wait_all_tasks_blocked()
-                openers.start_soon(open_and_note)
-                await trio.sleep_forever()
-    assert sizes == [len(DATA)]
-    assert tree.status()["open_files"] == 1
-
-
 async def test_sequential_reads_fetch_ahead_and_release_drops_it(store: FakeStore, tree: Tree) -> None:
     store.add(b"/big", content(8 * MIB))
     handle = await tree.open(b"/big")
@@ -180,15 +156,6 @@ async def test_a_stalled_read_times_out_and_recovers(store: FakeStore, tree: Tre
     assert trio.current_time() - began == pytest.approx(30, abs=1)
     store.stalled = False
     assert await handle.read(0, 100) == DATA[:100]
-
-
-async def test_a_cancelled_read_leaves_a_consistent_file(store: FakeStore, tree: Tree) -> None:
-    store.chunk_delay = 1
-    handle = await tree.open(LOG)
-    with trio.move_on_after(2.5):
-        await handle.read(0, 128 * KIB)
-    store.chunk_delay = 0.001
-    assert await handle.read(0, len(DATA)) == DATA
 
 
 async def test_a_directory_is_not_opened(tree: Tree) -> None:
@@ -298,32 +265,6 @@ async def test_a_waiting_read_of_a_changed_file_ends(store: FakeStore, tree: Tre
     assert len(errors) == 1
 
 
-async def test_a_smaller_file_is_another_one(store: FakeStore, tree: Tree) -> None:
-    store.add(LOG, DATA)
-    old = await tree.open(LOG)
-    await old.read(0, 100)
-    store.add(LOG, b"short")
-    await trio.sleep(21)
-    new = await tree.open(LOG)
-    assert await new.read(0, 100) == b"short"
-    with pytest.raises(FileChanged):
-        await old.read(0, 100)
-
-
-async def test_a_file_that_is_smaller_when_it_is_opened_anew_is_another_one(
-    store: FakeStore, tree: Tree
-) -> None:
-    """After a doubt, that is: what was listed tells nothing of what shrank since."""
-    handle = await tree.open(LOG)
-    assert await handle.read(0, 100) == DATA[:100]
-    store.add(LOG, b"short", 1_700_000_000)
-    store.readers[0].sink.on_suspect("another client")
-    for _ in range(2):
-        with pytest.raises(FileChanged):
-            await handle.read(0, 100)
-    handle.close()
-
-
 async def test_a_smaller_ack_is_another_file_even_if_the_listing_is_old(store: FakeStore) -> None:
     tree = make_tree(store, dir_timeout=5)
     store.list_delay = 2  # the listing stays fresh for 100 s, the proof for 5
@@ -396,15 +337,6 @@ async def test_a_size_that_does_not_fit_the_ack_is_an_error_not_a_short_file(
     assert all(reader.closed for reader in store.readers)
 
 
-async def test_a_stale_mtime_is_not_credited_to_the_size_in_the_ack(store: FakeStore, tree: Tree) -> None:
-    await tree.stat(LOG)
-    store.add(LOG, DATA + b"more", 1_700_000_009)
-    old = await tree.open(LOG)
-    await trio.sleep(21)
-    (await tree.open(LOG)).close()
-    assert await old.read(0, 10) == DATA[:10]
-
-
 async def open_partly_cached(store: FakeStore, tree: Tree) -> OpenFile:
     """Open a large file again of which the beginning was read."""
     store.add(b"/big", content(MIB), 5)
@@ -445,24 +377,6 @@ async def test_closed_files_are_bounded(store: FakeStore, tree: Tree) -> None:
 
 
 # --- reboot
-
-
-async def test_after_a_reboot_open_files_are_compared_first(store: FakeStore, tree: Tree) -> None:
-    same, other = await tree.open(LOG), None
-    store.add(b"/other", DATA, 5)
-    tree.forget_caches()
-    other = await tree.open(b"/other")
-    await same.read(0, 1000)
-    await other.read(0, 1000)
-    store.add(b"/other", DATA, 6)
-    tree.rebooted()
-    assert await same.read(0, 1000) == DATA[:1000]
-    with pytest.raises(FileChanged):
-        await other.read(0, 1000)
-    await trio.sleep(25)
-    asked = len(store.calls)
-    await same.read(0, 1000)
-    assert len(store.calls) == asked
 
 
 async def test_a_file_that_is_gone_after_a_reboot(store: FakeStore, tree: Tree) -> None:
@@ -506,88 +420,6 @@ async def read_before_a_reboot(tree: Tree) -> OpenFile:
     return handle
 
 
-async def test_closing_after_a_reboot_forgets_the_file(store: FakeStore, tree: Tree) -> None:
-    handle = await read_before_a_reboot(tree)
-    handle.close()
-    assert tree.status()["bytes_cached"] == 0
-
-
-OTHER = content(300_000, seed=8)
-AT = 100_000
-"""Up to here a program has read when the vehicle restarts."""
-
-
-async def over_a_reboot(store: FakeStore, tree: Tree, change: Callable[[], None]) -> bytes:
-    """Read on over a restart in mid-read, after which `change` was made; return what came after AT."""
-    handle = await tree.open(LOG)
-    assert await handle.read(0, AT) == DATA[:AT]
-    parts = []
-
-    async def read_on() -> None:
-        parts.extend([bytes(await handle.read(at, 10_000)) for at in range(AT, handle.size, 10_000)])
-
-    try:
-        store.chunk_delay, store.chunk = 0.5, 4 * KIB
-        async with trio.open_nursery() as readers:
-            readers.start_soon(read_on)
-            await trio.sleep(0.7)
-            change()
-            await trio.sleep(2)
-            tree.rebooted()
-    finally:
-        handle.close()
-    return b"".join(parts)
-
-
-@pytest.mark.parametrize(
-    ("mtime", "other", "later"),
-    [
-        (5, OTHER, 6),
-        (5, OTHER + content(60_000), 6),
-        (None, OTHER + content(60_000), None),
-        (None, OTHER[:-1], None),
-        (None, DATA + b"more", None),
-    ],
-)
-async def test_two_files_are_not_mixed_over_a_reboot(
-    store: FakeStore,
-    tree: Tree,
-    mtime: int | None,
-    other: bytes,
-    later: int | None,
-) -> None:
-    store.add(LOG, DATA, mtime)
-
-    def replace() -> None:
-        store.add(LOG, other, later)
-
-    with pytest.RaisesGroup(FileChanged):
-        await over_a_reboot(store, tree, replace)
-    assert LOG in store.invalidated
-    assert await read_file(tree, LOG) == other
-
-
-async def test_a_file_of_which_nothing_was_read_is_read_from_what_is_there_after_a_reboot(
-    store: FakeStore, tree: Tree
-) -> None:
-    store.add(LOG, DATA, 5)
-    handle = await tree.open(LOG)
-    store.chunk_delay, store.chunk = 0.5, 4 * KIB
-    got = []
-
-    async def read() -> None:
-        got.append(bytes(await handle.read(0, 20_000)))
-
-    async with trio.open_nursery() as readers:
-        readers.start_soon(read)
-        await trio.sleep(1.2)
-        store.add(LOG, OTHER, 6)
-        tree.rebooted()
-    assert got == [OTHER[:20_000]]
-    assert await handle.read(20_000, 300_000) == OTHER[20_000:]
-    handle.close()
-
-
 # --- doubtful bytes (promise 1)
 
 
@@ -616,23 +448,6 @@ async def test_bytes_that_stay_suspect_are_an_error(store: FakeStore, tree: Tree
     assert await handle.read(0, len(DATA)) == DATA
 
 
-async def test_readers_share_the_bad_news_too(store: FakeStore) -> None:
-    tree = make_tree(store, cache_size=MIB)
-    data = content(2 * MIB)
-    store.add(b"/big", data)
-    store.suspect_chunks, store.spoil = 2, spoil
-    results = []
-
-    async def read(at: int) -> None:
-        handle = await tree.open(b"/big")
-        results.append(await handle.read(at, 50_000) == data[at : at + 50_000])
-
-    async with trio.open_nursery() as readers:
-        for at in range(0, 300_000, 100_000):
-            readers.start_soon(read, at)
-    assert results == [True] * 3
-
-
 async def test_bytes_of_an_earlier_reader_are_not_in_doubt(store: FakeStore, tree: Tree) -> None:
     store.armed = True
     first = await tree.open(LOG)
@@ -657,20 +472,6 @@ async def test_doubtful_bytes_do_not_survive_the_last_close(store: FakeStore, tr
     assert not handle.keep_cache
     assert await handle.read(0, 100) == DATA[:100]
     assert store.count("crc") == 0
-
-
-async def test_a_suspicion_after_the_last_close_counts(store: FakeStore, tree: Tree) -> None:
-    handle = await tree.open(LOG)
-    await handle.read(0, 100)
-    handle.close()
-    for reader in store.readers:
-        reader.sink.on_suspect("another client")
-    handle = await tree.open(LOG)
-    assert not handle.keep_cache
-    assert store.invalidated == [LOG]
-    assert await handle.read(0, 100) == DATA[:100]
-    assert store.count("open") == 2
-    handle.close()
 
 
 @pytest.mark.parametrize("delay", [0.0, 0.002])

@@ -19,7 +19,6 @@ from mavftpfs.shared.errors import (
     Armed,
     FtpNak,
     IsADirectory,
-    ListingIncomplete,
     LocalProtocolError,
     NotADirectory,
     NotFound,
@@ -28,7 +27,7 @@ from mavftpfs.shared.errors import (
     UsageError,
     VehicleLost,
 )
-from mavftpfs.shared.model import DirEntry, EntryKind
+from mavftpfs.shared.model import EntryKind
 from tests.support.fake_store import FakeFile, FakeStore, make_tree, read_file
 
 FILE, DIRECTORY = EntryKind.FILE, EntryKind.DIRECTORY
@@ -64,10 +63,6 @@ async def test_the_roots_attributes_cost_nothing(store: FakeStore, tree: Tree) -
     assert store.calls == []
 
 
-async def test_logs_show_their_date(tree: Tree) -> None:
-    assert (await tree.stat(b"/fs/microsd/log/2024-05-01/12_34_56.ulg")).mtime == 1714566896
-
-
 async def test_absence_by_a_fresh_listing_costs_nothing(store: FakeStore, tree: Tree) -> None:
     with pytest.raises(NotFound):
         await tree.stat(b"/none")
@@ -80,20 +75,6 @@ async def test_absence_by_a_fresh_listing_costs_nothing(store: FakeStore, tree: 
     await trio.sleep(2)
     assert tree.negative_valid_for(b"/none") == 0.0
     assert tree.negative_valid_for(b"/unknown/none") == 0.0
-
-
-async def test_an_incomplete_listing_proves_no_absence(store: FakeStore, tree: Tree) -> None:
-    store.incomplete.add(b"/")
-    with pytest.raises(NotFound):
-        await tree.stat(b"/none")
-    assert tree.negative_valid_for(b"/none") == 0.0
-    with pytest.raises(NotFound):
-        await tree.stat(b"/none")
-    assert store.count("list") == 1
-    assert store.count("open", b"/none") == 2
-    with pytest.raises(ListingIncomplete) as error:
-        await tree.list(b"/")
-    assert {name for name, _ in error.value.entries} == {b"fs", b"top"}
 
 
 async def test_a_file_is_never_listed(store: FakeStore, tree: Tree) -> None:
@@ -142,12 +123,6 @@ async def test_a_name_too_long_to_be_asked_for_is_still_shown(store: FakeStore, 
         await tree.open(b"/fs/microsd/" + name)
 
 
-async def test_list_shows_what_stat_shows(tree: Tree) -> None:
-    for name, stat in await tree.list(b"/fs/microsd"):
-        assert await tree.stat(b"/fs/microsd/" + name) == stat
-    assert {name for name, _ in await tree.list(b"/")} == {b"fs", b"top"}
-
-
 async def test_attributes_are_valid_no_longer_than_the_listing(store: FakeStore, tree: Tree) -> None:
     await tree.stat(b"/top")
     await trio.sleep(19.5)
@@ -165,34 +140,6 @@ async def test_requests_for_one_listing_share_a_sweep(store: FakeStore, tree: Tr
             askers.start_soon(tree.stat, b"/top")
     assert store.count("list") == 1
     assert tree.status()["listings_asked"] == 1
-
-
-async def test_an_expensive_listing_is_kept_longer(store: FakeStore, tree: Tree) -> None:
-    store.list_delay = 2
-    await tree.list(b"/")
-    await trio.sleep(99)
-    await tree.list(b"/")
-    assert store.count("list") == 1
-    await trio.sleep(2)
-    await tree.list(b"/")
-    assert store.count("list") == 2
-
-
-async def test_a_sweep_error_reaches_all_and_is_not_remembered(store: FakeStore, tree: Tree) -> None:
-    store.fail["list", b"/"] = [FtpNak(Opcode.LIST_DIRECTORY, NakCode.FAIL)]
-    errors = []
-
-    async def ask() -> None:
-        try:
-            await tree.list(b"/")
-        except FtpNak as error:
-            errors.append(error)
-
-    async with trio.open_nursery() as askers:
-        askers.start_soon(ask)
-        askers.start_soon(ask)
-    assert len(errors) == 2
-    assert await tree.list(b"/")
 
 
 @pytest.mark.parametrize("background", [False, True])
@@ -214,18 +161,6 @@ async def test_a_cancelled_sweep(store: FakeStore, nursery: trio.Nursery, backgr
     assert len(lists) == 1
     assert trio.current_time() == pytest.approx(40 if background else 70)
     assert store.count("list") == (1 if background else 2)
-
-
-async def test_a_listing_raced_by_a_change_of_ours_is_repeated(store: FakeStore, tree: Tree) -> None:
-    def change(path: bytes) -> None:
-        if store.count("list", b"/") == 1:
-            store.add(b"/new", b"new")
-            tree._dentries.note_created(b"/new", DirEntry(b"new", FILE, 3))
-
-    store.during_list = change
-    assert b"new" in dict(await tree.list(b"/"))
-    assert store.count("list", b"/") == 2
-    assert tree.negative_valid_for(b"/none") > 0
 
 
 async def test_a_listing_that_is_always_raced_is_given_up_on(store: FakeStore, tree: Tree) -> None:
@@ -473,13 +408,6 @@ async def test_without_mtime_a_checksum_lasts_dir_timeout(store: FakeStore, tree
     assert store.count("crc") == 3
 
 
-async def test_checksums_of_files_of_unknown_size_are_not_remembered(store: FakeStore, tree: Tree) -> None:
-    store.files[b"/top"].has_size = False
-    await tree.crc32(b"/top")
-    await tree.crc32(b"/top")
-    assert store.count("crc") == 2
-
-
 async def test_checksums_are_bounded(store: FakeStore, tree: Tree) -> None:
     for i in range(MAX_CHECKSUMS + 1):
         store.add(b"/many/%d" % i, b"x", 5)
@@ -516,10 +444,6 @@ async def test_checksums_are_refused(store: FakeStore, tree: Tree) -> None:
 def test_wrong_options(wrong: dict[str, float]) -> None:
     with pytest.raises(UsageError):
         CacheOptions(**wrong)  # type: ignore[arg-type]
-
-
-def test_right_options() -> None:
-    assert CacheOptions(root=b"/fs/microsd", cache_size=MIN_CACHE_SIZE).root == b"/fs/microsd"
 
 
 async def test_a_bug_in_shared_work_reaches_everyone_and_nothing_stays() -> None:
@@ -563,34 +487,6 @@ async def test_who_came_later_gets_no_time_out_of_who_was_there() -> None:
     assert begun == [0, 30]
 
 
-async def test_who_came_later_hears_of_a_second_time_out() -> None:
-    flights: SingleFlight[str, int] = SingleFlight()
-
-    async def work() -> int:
-        await trio.sleep(30)
-        raise RequestTimeout("silence")
-
-    async with trio.open_nursery() as nursery:
-        nursery.start_soon(times_out, flights, work)
-        for pause in (1, 2):
-            await trio.sleep(pause)
-            nursery.start_soon(times_out, flights, work)
-    assert trio.current_time() == 60
-
-
 async def times_out(flights: SingleFlight[str, int], work: Callable[[], Awaitable[int]]) -> None:
     with pytest.raises(RequestTimeout):
         await flights.run("key", work)
-
-
-async def test_keys_do_not_wait_for_each_other() -> None:
-    flights: SingleFlight[int, int] = SingleFlight()
-
-    async def work() -> int:
-        await trio.sleep(1)
-        return 7
-
-    async with trio.open_nursery() as askers:
-        for key in range(5):
-            askers.start_soon(flights.run, key, work)
-    assert trio.current_time() == 1

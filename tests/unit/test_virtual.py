@@ -127,22 +127,6 @@ async def test_a_probe_that_got_no_answer_is_no_answer(px4: FakeStore) -> None:
     assert (await tree.stat(PARAM)).size == 99
 
 
-async def test_other_refusals_of_the_probe_count_too(px4: FakeStore) -> None:
-    px4.fail["whole", PARAM] = [FtpNak(Opcode.READ_FILE, NakCode.FAIL)]
-    tree = make_tree(px4)
-    for _ in range(2):
-        with pytest.raises(NotFound):
-            await tree.stat(b"/@PARAM")
-    assert px4.count("whole") == 1
-
-
-async def test_the_mount_of_an_at_tree(store: FakeStore) -> None:
-    assert await names(make_tree(store, root=b"/@SYS"), b"/") == {b"uarts.txt", b"tasks.txt", b"storage.bin"}
-    params = make_tree(store, root=b"/@PARAM")
-    assert await names(params, b"/") == {b"param.pck"}
-    assert await read_file(params, b"/param.pck") == b"p" * 14882
-
-
 # --- true sizes
 
 
@@ -190,23 +174,6 @@ async def test_an_expensive_snapshot_is_kept_longer(store: FakeStore, tree: Tree
     await trio.sleep(2)
     await tree.stat(PARAM)
     assert store.count("whole", PARAM) == 2
-
-
-async def test_the_true_size_is_shown_from_then_on(store: FakeStore, tree: Tree) -> None:
-    await tree.stat(UARTS)
-    await trio.sleep(100)
-    listed = dict(await tree.list(b"/@SYS"))[b"uarts.txt"]
-    assert (listed.size, listed.valid_for) == (10, 0.0)
-    assert store.count("whole", UARTS) == 1
-
-
-async def test_readers_at_once_share_the_reading(store: FakeStore, tree: Tree) -> None:
-    store.whole_delay = 1
-    async with trio.open_nursery() as readers:
-        for _ in range(4):
-            readers.start_soon(tree.stat, UARTS)
-            readers.start_soon(tree.open, UARTS)
-    assert store.count("whole", UARTS) == 1
 
 
 async def test_romfs_is_an_ordinary_tree_read_whole(store: FakeStore, tree: Tree) -> None:
@@ -329,15 +296,6 @@ async def test_what_is_listed_but_not_found_is_hidden(store: FakeStore, tree: Tr
     assert b"uarts.txt" in await names(tree, b"/@SYS")
 
 
-async def test_listing_reads_each_small_file_once(store: FakeStore, tree: Tree) -> None:
-    sizes = {name: stat.size for name, stat in await tree.list(b"/@SYS")}
-    assert sizes == {b"uarts.txt": 10, b"tasks.txt": 8, b"storage.bin": 16384}
-    await tree.list(b"/@SYS")
-    await tree.stat(UARTS)
-    await tree.open(UARTS)
-    assert store.count("whole") == 3
-
-
 async def test_not_found_while_reading_is_a_lost_session(store: FakeStore, tree: Tree) -> None:
     store.fail["whole", UARTS] = [FtpNak(Opcode.READ_FILE, NakCode.FILE_NOT_FOUND)]
     with pytest.raises(FtpNak):
@@ -447,13 +405,6 @@ def test_snapshots_stay_within_their_budget() -> None:
     assert snapshots.bytes_cached == 0
     snapshots.clear()
     assert snapshots.size_of(b"big") is None
-
-
-def test_a_snapshot_is_good_until_it_is_not() -> None:
-    snapshots = Snapshots(100)
-    snapshots.put(b"a", Snapshot(b"x", 10))
-    assert snapshots.get(b"a", 9.9) is not None
-    assert snapshots.get(b"a", 10) is None
 
 
 def test_remembered_sizes_are_bounded() -> None:
