@@ -12,7 +12,7 @@ import os
 import re
 import shutil
 import stat
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from enum import Enum
@@ -36,6 +36,9 @@ from mavftpfs.shared.errors import (
     VehicleLost,
 )
 from mavftpfs.shared.readable import name_text, readable_size
+
+Complain = Callable[[str], None]
+"""Hears in a line what went wrong with one of several things."""
 
 Verify = Literal["auto", "all", "none"]
 
@@ -422,3 +425,9 @@ class Fetcher:
             )
         if now < size:
             raise DataUnproven(f"{name_text(wanted.remote)} has shrunk from {size} to {now} bytes")
+
+
+def named(path: bytes, error: MavftpfsError) -> str:
+    """Return an error with the name of what it is about, which some have already."""
+    name, text = name_text(path), str(error)
+    return text if name in text else f"{name}: {text}"

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from mavftpfs.oneshot.fetch import (
+    Complain,
     Fetched,
     Fetcher,
     LocalDiskFull,
@@ -19,6 +20,7 @@ from mavftpfs.oneshot.fetch import (
     decide,
     known_time,
     local_disk,
+    named,
     newest_first,
     part_of,
     select,
@@ -34,8 +36,6 @@ the standard's alias, which shows one of the others again and so comes last."""
 
 MAX_TIMEOUTS = 2
 """Requests of so many files in a row that nobody answered end a run: the others would fare no better."""
-
-Complain = Callable[[str], None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -263,7 +263,7 @@ async def sync(
             timeouts = timeouts + 1 if isinstance(exc, RequestTimeout) else 0
             if isinstance(exc, LinkError | LocalDiskFull) or timeouts == MAX_TIMEOUTS:
                 raise
-            complain(_named(task.log, exc))
+            complain(named(task.log.below, exc))
         else:
             timeouts = 0
             outcome.fetched.append(fetched)
@@ -279,9 +279,3 @@ async def _fetch(fetcher: Fetcher, task: Task) -> Fetched:
     name = name_text(log.below)
     wanted = Wanted(log.path, task.local, name, log.size, log.mtime, task.part, keep_old=True)
     return await fetcher.fetch(wanted, beginning=task.local if task.step is Step.EXTEND else None)
-
-
-def _named(log: Log, error: MavftpfsError) -> str:
-    """Return the error with the log's name, which some have already."""
-    name, text = name_text(log.below), str(error)
-    return text if name in text else f"{name}: {text}"

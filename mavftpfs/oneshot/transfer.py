@@ -20,6 +20,7 @@ from mavftpfs.cache.attributes import Stat
 from mavftpfs.cache.virtual import is_snapshot
 from mavftpfs.exits import NotDelivered
 from mavftpfs.oneshot.fetch import (
+    Complain,
     Fetched,
     Fetcher,
     LocalDiskFull,
@@ -27,6 +28,7 @@ from mavftpfs.oneshot.fetch import (
     Wanted,
     known_time,
     local_disk,
+    named,
     part_of,
     proof_needed,
 )
@@ -52,7 +54,6 @@ from mavftpfs.shared.model import EntryKind, join, split
 from mavftpfs.shared.readable import name_text
 
 Tell = Callable[[Fetched], None]
-Complain = Callable[[MavftpfsError], None]
 
 
 @dataclass(slots=True)
@@ -73,12 +74,12 @@ class _Getter:
     keep_going: bool
     found: list[tuple[bytes, Path, Stat]] = field(default_factory=list)
 
-    def failed(self, error: MavftpfsError) -> None:
+    def failed(self, path: bytes, error: MavftpfsError) -> None:
         """Say it and go on, or end where only one thing was asked for."""
         if not self.keep_going or isinstance(error, LinkError | LocalDiskFull):
             raise error
         self.got.failed += 1
-        self.complain(error)
+        self.complain(named(path, error))
 
     async def plan(self, path: bytes, place: Path) -> None:
         """Collect the files of a path, and make the directories for them."""
@@ -87,7 +88,7 @@ class _Getter:
             if found.kind is EntryKind.DIRECTORY and not self.recursive:
                 raise IsADirectory(f"{name_text(path)} is a directory; get it with -r")
         except MavftpfsError as exc:
-            self.failed(exc)
+            self.failed(path, exc)
             return
         pending = [(path, place, found)]
         while pending:
@@ -100,7 +101,7 @@ class _Getter:
                     local.mkdir(parents=True, exist_ok=True)
                 entries = await self.session.files.list(remote)
             except MavftpfsError as exc:
-                self.failed(exc)
+                self.failed(remote, exc)
                 continue
             self.keep_going = True
             for name, below in reversed(entries):
@@ -144,7 +145,7 @@ async def get_paths(
         try:
             fetched = await fetcher.fetch(wanted)
         except MavftpfsError as exc:
-            getter.failed(exc)
+            getter.failed(wanted.remote, exc)
         else:
             got.done += 1
             tell(fetched)
@@ -177,7 +178,7 @@ async def cat_paths(
             if len(paths) == 1 or isinstance(exc, LinkError):
                 raise
             got.failed += 1
-            complain(exc)
+            complain(named(path, exc))
 
 
 async def _cat(session: Session, path: bytes, out: BinaryIO, verify: Verify) -> None:

@@ -115,10 +115,6 @@ def _say(line: str) -> None:
     print(f"mavftpfs: {readable(line)}", file=sys.stderr, flush=True)
 
 
-def _complain(error: MavftpfsError) -> None:
-    _say(str(error))
-
-
 @contextmanager
 def _on_interrupt(line: Callable[[], str]) -> Iterator[None]:
     """Say in a line what is there and what is not, when Ctrl-C ends the body."""
@@ -240,9 +236,7 @@ def get(args: Args) -> int:
 
     async def work(session: Session) -> None:
         fetcher = Fetcher(session, bar, args.verify, args.resume)
-        await transfer.get_paths(
-            fetcher, wanted, Path(args.to), tell, _complain, got, recursive=args.recursive
-        )
+        await transfer.get_paths(fetcher, wanted, Path(args.to), tell, _say, got, recursive=args.recursive)
 
     def stopped() -> str:
         begun = f"; what came of {printable(bar.name)} is kept, to go on with" if bar.name else ""
@@ -259,7 +253,7 @@ def cat(args: Args) -> int:
     got = transfer.Got()
 
     async def work(session: Session) -> None:
-        await transfer.cat_paths(session, wanted, sys.stdout.buffer, args.verify, _complain, got)
+        await transfer.cat_paths(session, wanted, sys.stdout.buffer, args.verify, _say, got)
 
     with_session(args, work, component)
     return ExitCode.INCOMPLETE if got.failed else ExitCode.OK

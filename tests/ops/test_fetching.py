@@ -359,7 +359,7 @@ async def get_all(tree: FakeTree, *paths: bytes, to: Path, recursive: bool = Tru
         paths,
         to,
         lambda _: None,
-        lambda error: said.append(str(error)),
+        said.append,
         got,
         recursive=recursive,
     )
@@ -403,7 +403,7 @@ async def test_a_directory_goes_on_after_what_fails(tmp_path: Path, call: tuple[
     tree = SpoiltTree({b"/d/a": b"1", inner: b"2", b"/d/c": b"3"})
     tree.on_call = refusing(*call)
     got, said = await get_all(tree, b"/d", to=tmp_path / "d")
-    assert (got.done, got.failed, said) == (2, 1, ["no answer"])
+    assert (got.done, got.failed, said) == (2, 1, ["/d/b: no answer"])
     assert (tmp_path / "d" / "c").read_bytes() == b"3"
 
 
