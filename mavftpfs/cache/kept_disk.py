@@ -24,6 +24,8 @@ from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
 
+from mavftpfs.shared.private import open_private
+
 MAGIC = b"mavftpfs block 2\n"
 DIGEST_SIZE = 16
 NAME = "mavftpfs-blocks"
@@ -127,7 +129,8 @@ class KeptDisk:
         temporary = path.parent / f"{_TEMPORARY}{os.getpid()}-{next(self._numbers)}"
         packed = key.pack(data)
         try:
-            temporary.write_bytes(packed)
+            with open(temporary, "wb", opener=open_private) as file:
+                file.write(packed)
             temporary.replace(path)
         except OSError:
             temporary.unlink(missing_ok=True)
