@@ -76,11 +76,17 @@ class Kept:
 
 
 def kept_below(base: Path) -> list[Kept]:
-    """Return all files in the recovery directories, the oldest directory first."""
+    """Return all files in the recovery directories, the oldest directory first.
+
+    Raises:
+        UsageError: they cannot be read.
+    """
     try:
         directories = sorted(path for path in base.iterdir() if path.is_dir())
     except FileNotFoundError:
         return []
+    except OSError as exc:
+        raise UsageError(f"{base}: {exc.strerror}") from exc
     return [kept for directory in directories for kept in kept_in(directory)]
 
 

@@ -205,14 +205,38 @@ def test_a_mount_whose_socket_is_out_of_reach_is_asked_by_its_root(
     assert mount.run(*STATUS).stdout.count(f"{mount.path}: PX4 1/1, disarmed, link fine: RTT ") == 1
 
 
+def open_way_to(mount: Mount) -> None:
+    """Let other users reach a mountpoint: pytest makes directories that only their owner enters."""
+    for path in mount.path.parents:
+        if path == Path("/tmp"):
+            break
+        path.chmod(0o755)
+
+
+def test_another_user_is_told_in_a_line(
+    field: Field, small_tree: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """He may neither unmount it nor read the state directory, which a careless su left in his environment."""
+    mount = field.mount(field.sim(small_tree).source, "allow_other")
+    open_way_to(mount)
+    state = mount.folder / "state"
+    state.mkdir(mode=0o700)
+    monkeypatch.setenv("XDG_STATE_HOME", str(state))
+    for verb, code, why in (
+        (("umount", mount.path), ExitCode.MOUNT_FAILED, "another user mounted it"),
+        (("recover",), ExitCode.USAGE, "Permission denied"),
+    ):
+        refused = mount.run(*NOBODY, sys.executable, "-m", "mavftpfs", *verb, cwd=Path("/"), code=code)
+        assert len(refused.stderr.splitlines()) == 1
+        assert why in refused.stderr
+    assert mount.run("cat", mount.path / "README.txt").stdout == (small_tree / "README.txt").read_text()
+
+
 def test_a_user_sees_another_users_mount_if_he_may_read_it(field: Field, small_tree: Path) -> None:
     seen = {}
     for options in (("allow_other",), ()):
         mount = field.mount(field.sim(small_tree).source, *options)
-        path = mount.path
-        while path != Path("/tmp"):  # pytest makes directories that only their owner enters
-            path.chmod(0o755) if path != mount.path else None
-            path = path.parent
+        open_way_to(mount)
         shown = mount.run(*NOBODY, *STATUS, cwd=Path("/")).stdout
         seen[options] = str(mount.path) in shown
         refused = mount.run(*NOBODY, *STATUS, mount.path, cwd=Path("/"), code=None)
