@@ -17,6 +17,7 @@ COMMON = (
     "--thread",
     "--group_reporting",
     "--output-format=terse",
+    "--verify_state_save=0",
 )
 JOBS: dict[str, tuple[str, ...]] = {
     "sequential": ("--rw=write", "--bs=1237", "--numjobs=2", "--fsync=97"),
