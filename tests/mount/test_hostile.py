@@ -22,12 +22,12 @@ from tests.support.vehicles import HOST, free_udp_port
 
 QUICK = ("op_deadline=6", "dir_timeout=600")
 REFUSALS = {
-    "open": {3: "ENAMETOOLONG", 4: "EBUSY", 5: "EBUSY", 7: "ENOTSUP", 8: "EBUSY", 9: "EACCES", 10: "ENOENT"},
-    "read": {5: "EBUSY", 7: "ENOTSUP", 9: "EACCES"},
+    "open": {4: "EBUSY", 8: "EBUSY", 9: "EACCES"},
+    "read": {9: "EACCES"},
 }
-"""What a program is told where a code stands for more than EIO. 8 may be PX4's last refusal, of whatever
-(servers.md 12); while reading, 3 is our own mistake, and 4, 8 and 10 mean that the session is gone, again and
-again."""
+"""What a program is told where a code stands for more than EIO; unit/test_errnos.py has them all. 8 may be
+PX4's last refusal, of whatever (servers.md 12); while reading, 4 and 8 mean that the session is gone, again
+and again."""
 
 MAX_RESIDENT = 150 << 20
 """Bytes; far above what a capped listing needs, far below what an endless one would take."""

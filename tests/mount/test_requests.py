@@ -15,7 +15,6 @@ from tests.mount.conftest import Field
 from tests.support.request_cases import CASES, FIRST
 from tests.support.request_costs import MOUNT, PROFILES, expected
 from tests.support.requests import OPTIONS, Case, Cost, Counting, prepare
-from tests.support.takingturns import taking_turns
 
 
 class Counted:
@@ -36,7 +35,13 @@ class Counted:
         return self.costs[case.name]
 
 
-@pytest.fixture(scope="module", params=taking_turns(PROFILES))
+IN_SOAK = ("px4-nuttx", "ardupilot5", "mavsdk")
+
+
+@pytest.fixture(
+    scope="module",
+    params=[pytest.param(name, marks=pytest.mark.soak if name in IN_SOAK else ()) for name in PROFILES],
+)
 def counted(request: pytest.FixtureRequest, module_field: Field) -> Counted:
     """Each server, mounted once."""
     return Counted(module_field, request.param)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import cast
@@ -103,19 +102,6 @@ async def test_a_file_arrives_proven_with_its_time(tmp_path: Path) -> None:
     assert names_in(tmp_path) == ["big"]
 
 
-async def test_a_file_without_a_time_is_of_the_present(tmp_path: Path) -> None:
-    tree = SpoiltTree({b"/a": b"1"}, times={b"/a": 315_532_800})
-    before = time.time() - 1
-    await get(tree, b"/a", tmp_path / "a")
-    assert (tmp_path / "a").stat().st_mtime > before
-
-
-async def test_an_empty_file(tmp_path: Path) -> None:
-    await get(SpoiltTree({b"/none": b""}), b"/none", tmp_path / "none")
-    assert (tmp_path / "none").read_bytes() == b""
-    assert names_in(tmp_path) == ["none"]
-
-
 async def test_wrong_bytes_are_fetched_again_without_the_caches(tmp_path: Path) -> None:
     tree = SpoiltTree({b"/big": BIG})
     tree.bad = 1
@@ -202,25 +188,12 @@ async def test_a_part_of_another_file_is_found_out(tmp_path: Path) -> None:
     assert fetched.resumed == 0
 
 
-async def test_a_part_that_is_longer_than_the_file(tmp_path: Path) -> None:
-    (tmp_path / "a.part").write_bytes(b"12345")
-    await get(SpoiltTree({b"/a": b"123"}), b"/a", tmp_path / "a")
-    assert (tmp_path / "a").read_bytes() == b"123"
-
-
 async def test_a_whole_part_is_only_proven(tmp_path: Path) -> None:
     tree = SpoiltTree({b"/big": BIG})
     (tmp_path / "big.part").write_bytes(BIG)
     await get(tree, b"/big", tmp_path / "big")
     assert (tmp_path / "big").read_bytes() == BIG
     assert tree.reads == 0
-
-
-async def test_no_resume_begins_anew(tmp_path: Path) -> None:
-    tree = SpoiltTree({b"/big": BIG})
-    (tmp_path / "big.part").write_bytes(BIG[:1000])
-    fetched = await fetcher_of(tree, resume=False).fetch(wanted(tree, b"/big", tmp_path / "big"))
-    assert fetched.resumed == 0
 
 
 @pytest.mark.parametrize("error", [Armed("x"), RequestTimeout("x")])
@@ -261,13 +234,6 @@ async def test_a_growing_file_stays_a_part_and_is_said(tmp_path: Path, begun: by
         await get(tree, b"/big", tmp_path / "big")
     assert (tmp_path / "big.part").read_bytes() == BIG
     assert names_in(tmp_path) == ["big.part"]
-
-
-async def test_growth_is_seen_without_a_checksum_too(tmp_path: Path) -> None:
-    tree = SpoiltTree({b"/big": BIG})
-    tree.crc_error, tree.grows = Armed("x"), b"more"
-    with pytest.raises(StillGrowing):
-        await get(tree, b"/big", tmp_path / "big")
 
 
 @pytest.mark.parametrize(
@@ -407,15 +373,6 @@ async def test_a_directory_goes_on_after_what_fails(tmp_path: Path, call: tuple[
     assert (tmp_path / "d" / "c").read_bytes() == b"3"
 
 
-async def test_of_several_paths_the_others_go_on(tmp_path: Path) -> None:
-    tree = SpoiltTree({b"/a": b"1", b"/d/x": b"2"})
-    got, said = await get_all(tree, b"/none", b"/d", b"/a", to=tmp_path, recursive=False)
-    assert (got.done, got.failed) == (1, 2)
-    assert "/none" in said[0]
-    assert "-r" in said[1]
-    assert names_in(tmp_path) == ["a"]
-
-
 async def test_a_single_path_raises_its_error(tmp_path: Path) -> None:
     tree = SpoiltTree({b"/d/x": b"2"})
     for path, error in ((b"/none", NotFound), (b"/d", IsADirectory)):
@@ -509,24 +466,6 @@ async def test_an_empty_log_directory_is_no_error(tmp_path: Path) -> None:
     assert (outcome.place, told, said, outcome.complete) == (b"/APM/LOGS", [], [], True)
 
 
-async def test_a_vehicle_without_logs(tmp_path: Path) -> None:
-    _, _, said = await sync(SpoiltTree({b"/x": b""}), tmp_path)
-    assert "--from" in said[0]
-
-
-async def test_a_dry_run_reads_nothing(tmp_path: Path) -> None:
-    tree = SpoiltTree(dict(LOGS))
-    outcome, _, _ = await sync(tree, tmp_path / "logs", dry_run=True)
-    assert [task.log.below for task in outcome.to_fetch] == [b"d/2.ulg", b"d/1.ulg"]
-    assert tree.reads == 0
-    assert not (tmp_path / "logs").exists()
-
-
-async def test_the_newest_only(tmp_path: Path) -> None:
-    _, told, _ = await sync(SpoiltTree(dict(LOGS)), tmp_path, newest=1)
-    assert told == ["d/2.ulg"]
-
-
 async def test_a_log_that_grew_since_is_gone_on_with(tmp_path: Path) -> None:
     tree = SpoiltTree({b"/log/1": BIG[:2000]})
     await sync(tree, tmp_path)
@@ -572,20 +511,3 @@ async def test_a_name_that_a_directory_has_here(tmp_path: Path) -> None:
     outcome, told, said = await sync(SpoiltTree({b"/log/1": b"x", b"/log/0": b"y"}), tmp_path)
     assert (told, outcome.complete) == (["0"], False)
     assert "is a directory" in said[0]
-
-
-async def test_a_lost_vehicle_leaves_a_part_and_an_honest_outcome(tmp_path: Path) -> None:
-    tree = SpoiltTree({b"/log/2": BIG, b"/log/1": b"x"})
-    reads = 0
-
-    def lose(name: str, path: bytes) -> None:
-        nonlocal reads
-        reads += name == "read"
-        if reads == 3:
-            raise VehicleLost("gone")
-
-    tree.on_call = lose
-    outcome, told, said = await sync(tree, tmp_path)
-    assert (told, outcome.complete) == ([], False)
-    assert "VehicleLost" in said[0]
-    assert names_in(tmp_path) == ["2.part"]

@@ -81,29 +81,11 @@ async def put(tree: Card, *locals_: Path, to: bytes, recursive: bool = False) ->
     return told
 
 
-async def test_a_file_under_a_new_name(local: Path) -> None:
-    tree = Card({b"/x": b"1"})
-    assert await put(tree, local / "a", to=b"/new") == [Sent(b"/new", len(BIG))]
-    assert tree.files == {b"/x": b"1", b"/new": BIG}
-
-
 async def test_a_file_over_another_is_synced_whole(local: Path) -> None:
     tree = Card({b"/x": BIG + b"longer"})
     await put(tree, local / "a", to=b"/x")
     assert tree.files == {b"/x": BIG}
     assert ("fsync", b"/x") in tree.calls
-
-
-async def test_an_empty_file_is_made(local: Path) -> None:
-    tree = Card({b"/x": b"1"})
-    assert await put(tree, local / "e" / "none", to=b"/x") == [Sent(b"/x", 0)]
-    assert tree.files == {b"/x": b""}
-
-
-async def test_several_files_go_into_a_directory(local: Path) -> None:
-    tree = Card({}, {b"/d"})
-    await put(tree, local / "a", local / "e" / "none", to=b"/d")
-    assert tree.files == {b"/d/a": BIG, b"/d/none": b""}
 
 
 @pytest.mark.parametrize(("to", "place"), [(b"/there", b"/there/d"), (b"/new", b"/new")])
@@ -114,13 +96,6 @@ async def test_a_directory_with_all_below(local: Path, to: bytes, place: bytes) 
     assert tree.files == expected
     assert place + b"/e/f" in tree.directories
     assert {sent.remote for sent in told} == expected.keys()
-
-
-async def test_a_directory_that_is_there_is_filled(local: Path) -> None:
-    tree = Card({b"/d/old": b"1"}, {b"/d/e"})
-    await put(tree, local, to=b"/", recursive=True)
-    assert tree.files[b"/d/old"] == b"1"
-    assert tree.files[b"/d/a"] == BIG
 
 
 async def test_a_file_in_the_way_of_a_directory(local: Path) -> None:
@@ -173,29 +148,12 @@ async def mkdir(tree: Card, *paths: bytes, parents: bool = False) -> None:
     await names.make_directories(session_of(tree), paths, parents=parents)
 
 
-async def test_mkdir() -> None:
-    tree = Card({b"/f": b""})
-    await mkdir(tree, b"/a", b"/a/b")
-    assert tree.directories == {b"/a", b"/a/b"}
-    for path, error in ((b"/a", AlreadyExists), (b"/x/y", NotFound), (b"/f/x", NotADirectory)):
-        with pytest.raises(error):
-            await mkdir(tree, path)
-
-
 async def test_mkdir_with_parents() -> None:
     tree = Card({b"/f": b""}, {b"/a"})
     await mkdir(tree, b"/a/b/c", b"/a", b"/", parents=True)
     assert tree.directories == {b"/a", b"/a/b", b"/a/b/c"}
     with pytest.raises(AlreadyExists):
         await mkdir(tree, b"/f", parents=True)
-
-
-async def test_rmdir() -> None:
-    tree = Card({b"/full/f": b""}, {b"/empty"})
-    await names.remove_directories(session_of(tree), [b"/empty"])
-    assert tree.directories == set()
-    with pytest.raises(DirectoryNotEmpty):
-        await names.remove_directories(session_of(tree), [b"/full"])
 
 
 async def rm(tree: Card, *paths: bytes, recursive: bool = False) -> None:

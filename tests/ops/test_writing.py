@@ -15,7 +15,7 @@ from pyfuse3 import EntryAttributes, RequestContext, SetattrFields
 from mavftpfs.fuse.inodes import ROOT_INO
 from mavftpfs.fuse.operations import Operations, Presentation
 from mavftpfs.fuse.writing import WritingOperations
-from mavftpfs.shared.errors import Armed, DirectoryNotEmpty, NoSpace, RequestTimeout
+from mavftpfs.shared.errors import Armed, NoSpace, RequestTimeout
 from tests.ops.faketree import MTIME, FakeFile, FakeTree
 from tests.ops.test_operations import failure, ino_of
 
@@ -298,34 +298,6 @@ async def test_rename_flags() -> None:
     tree.files[b"/b"] = b""
     call = ops.rename(ROOT_INO, b"a.txt", ROOT_INO, b"b", pyfuse3.RENAME_NOREPLACE, CTX)
     assert await failure(call) == errno.EEXIST
-
-
-async def test_what_no_card_has_is_refused() -> None:
-    ops = operations()
-    ino = await ino_of(ops, b"a.txt")
-    assert await failure(ops.symlink(ROOT_INO, b"s", b"t", CTX)) == errno.EPERM
-    assert await failure(ops.link(ino, ROOT_INO, b"l", CTX)) == errno.EPERM
-    assert await failure(ops.mknod(ROOT_INO, b"f", stat.S_IFIFO | 0o644, 0, CTX)) == errno.EPERM
-    assert await failure(ops.setxattr(ino, b"user.x", b"y", CTX)) == errno.ENOTSUP
-    assert await failure(ops.removexattr(ino, b"user.x", CTX)) == errno.ENOTSUP
-
-
-async def test_mknod_and_mkdir_answer_with_the_mode_that_was_asked_for() -> None:
-    ops = operations()
-    entry = await ops.mknod(ROOT_INO, b"f", stat.S_IFREG | 0o640, 0, CTX)
-    assert entry.st_mode == stat.S_IFREG | 0o640
-    entry = await ops.mkdir(ROOT_INO, b"d", 0o710, CTX)
-    assert entry.st_mode == stat.S_IFDIR | 0o710
-
-
-async def test_a_full_directory_stays() -> None:
-    tree = some_tree()
-    ops = operations(tree)
-    ino = await ino_of(ops, b"log")
-    tree.error = DirectoryNotEmpty("/log is not empty")
-    assert await failure(ops.rmdir(ROOT_INO, b"log", CTX)) == errno.ENOTEMPTY
-    tree.error = None
-    assert ops.inodes.known(b"/log") == ino
 
 
 async def _fails(*_: object) -> None:

@@ -130,13 +130,6 @@ def test_help_is_exit_0(words: list[str], capsys: pytest.CaptureFixture[str]) ->
     assert "usage: mavftpfs" in capsys.readouterr().out
 
 
-def test_version(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as caught:
-        cli.main(["-V"])
-    assert caught.value.code == 0
-    assert capsys.readouterr().out.startswith("mavftpfs 0.")
-
-
 def test_what_mount_8_calls_is_parsed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     seen: list[tuple[Any, ...]] = []
 

@@ -48,14 +48,6 @@ def test_the_table_is_read_with_its_escapes_and_the_last_mount_wins(tmp_path: Pa
     assert not is_ours("/mnt/c", table=path)
 
 
-def test_the_real_table_knows_the_root() -> None:
-    assert "/proc" in mounts()
-
-
-def test_a_good_mountpoint(tmp_path: Path) -> None:
-    check_mountpoint(str(tmp_path))
-
-
 @pytest.mark.parametrize(("name", "reason"), [("missing", "mkdir -p"), ("file", "not a directory")])
 def test_a_bad_mountpoint(tmp_path: Path, name: str, reason: str) -> None:
     (tmp_path / "file").touch()
@@ -111,11 +103,6 @@ def test_stderr_is_caught_from_children_and_given_back(capfd: pytest.CaptureFixt
         assert said() == "bad thing"
     os.write(2, b"after\n")
     assert capfd.readouterr().err == "after\n"
-
-
-def test_unmounting_what_is_not_mounted_says_why(tmp_path: Path) -> None:
-    with pytest.raises(MountFailed, match=str(tmp_path)):
-        unmount(str(tmp_path))
 
 
 def test_what_somebody_else_has_unmounted_is_gone(tmp_path: Path) -> None:
