@@ -175,14 +175,12 @@ class _Delivery:
 
     def show(self) -> None:
         """Ask the mount, and say what it delivers; called about each second."""
-        from mavftpfs.report import delivery_line
-
         try:
             status = control.ask(self._socket, {"command": "status"}, timeout=report.PATIENCE)["status"]
         except control.ControlError:
             return  # it ends just now
         # One that is still in use holds bytes, too, but does not end.
-        line = delivery_line(status) if status["state"] == "unmounting" else ""
+        line = report.delivery_line(status) if status["state"] == "unmounting" else ""
         now = time.monotonic()
         if not line or (not self._in_place and self._said_at is not None and now < self._said_at + SAY_AGAIN):
             return
@@ -253,8 +251,6 @@ def _wait_for_end(pid: int) -> None:
 
 def status(args: argparse.Namespace) -> int:
     """Show what one mount, or all mounts that this user may ask, are doing."""
-    from mavftpfs import report
-
     if args.mountpoint is None:
         fetch = report.all_statuses
     else:

@@ -126,7 +126,7 @@ async def attached(
         connection.driver.framer.on_frame = sinks.frame
         await connection.ready(options.connect_timeout)
         keep = await kept_for(options, connection)
-        async with _nursery() as nursery:
+        async with plain_nursery() as nursery:
             with spool_for(connection.vehicle.address) if writing else nullcontext() as spool:
                 notice: Callable[[], str] = str
                 if spool is not None and rescue_for is not None:
@@ -160,7 +160,7 @@ def _start_kept(make: MakeKept, nursery: trio.Nursery, cache: BlockCache, dentri
 
 
 @asynccontextmanager
-async def _nursery() -> AsyncIterator[trio.Nursery]:
+async def plain_nursery() -> AsyncIterator[trio.Nursery]:
     """Give a nursery whose tasks end with the body, and which does not wrap the body's errors in a group."""
     failure: Exception | None = None
     async with trio.open_nursery() as nursery:

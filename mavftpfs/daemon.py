@@ -123,33 +123,37 @@ def _await_report(read_end: int, pid: int, mask: set[int]) -> int:
 
 @contextmanager
 def _ending_raises() -> Iterator[None]:
-    """Have the signals that end us raise _Ended, but for those that our caller has us ignore (nohup)."""
+    """Have the signals that end us raise _Ended."""
 
     def end(number: int, _frame: object) -> NoReturn:
         raise _Ended(number)
 
-    taken = [number for number in _ENDING if signal.getsignal(number) != signal.SIG_IGN]
-    before = {number: signal.signal(number, end) for number in taken}
-    try:
+    with _handled_by(end):
         yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 @contextmanager
 def signals_held() -> Iterator[None]:
     """Let the signals that end us wait for the end of the body: nobody else would know what it starts."""
     came: list[int] = []
+    try:
+        with _handled_by(lambda number, _: came.append(number)):
+            yield
+    finally:
+        for arrived in came:
+            signal.raise_signal(arrived)
+
+
+@contextmanager
+def _handled_by(handler: Callable[[int, object], None]) -> Iterator[None]:
+    """Give the signals that end us to a handler, but for those that our caller has us ignore (nohup)."""
     taken = [number for number in _ENDING if signal.getsignal(number) != signal.SIG_IGN]
-    before = {number: signal.signal(number, lambda number, _: came.append(number)) for number in taken}
+    before = {number: signal.signal(number, handler) for number in taken}
     try:
         yield
     finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-        for arrived in came:
-            signal.raise_signal(arrived)
+        for number, earlier in before.items():
+            signal.signal(number, earlier)
 
 
 def _explain_death(pid: int) -> int:

@@ -20,7 +20,7 @@ import trio
 
 from mavftpfs import control
 from mavftpfs.cache.attributes import Stat
-from mavftpfs.compose import NO_SINKS, Attached, Sinks, attached, no_answer
+from mavftpfs.compose import NO_SINKS, Attached, Sinks, attached, no_answer, plain_nursery
 from mavftpfs.fuse.operations import XATTR_CRC32, XATTR_STATUS
 from mavftpfs.fuse.options import MountOptions
 from mavftpfs.link.uri import LinkKind, LinkSpec, parse_source
@@ -431,16 +431,9 @@ async def _answered_by(deadline: float, vehicle: Attached, options: MountOptions
         if connection.engine.stats.replies == 0:
             over.cancel()
 
-    failure: Exception | None = None
-    async with trio.open_nursery() as nursery:
+    async with plain_nursery() as nursery:
         nursery.start_soon(watch)
         with over:
-            try:
-                yield
-            except Exception as error:  # raised again outside of the nursery, which would wrap it in a group
-                failure = error
-        nursery.cancel_scope.cancel()
+            yield
     if over.cancelled_caught:
         raise no_answer(connection, options)
-    if failure is not None:
-        raise failure

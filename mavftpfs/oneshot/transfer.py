@@ -18,6 +18,7 @@ import trio
 
 from mavftpfs.cache.attributes import Stat
 from mavftpfs.cache.virtual import is_snapshot
+from mavftpfs.compose import plain_nursery
 from mavftpfs.exits import NotDelivered
 from mavftpfs.oneshot.fetch import (
     Complain,
@@ -398,16 +399,9 @@ async def _watched(session: Session, path: bytes, progress: Progress) -> AsyncIt
                 if facts["path"] == name:
                     _show(facts["size"] - facts["bytes_left"], progress)
 
-    failure: Exception | None = None
-    async with trio.open_nursery() as nursery:
+    async with plain_nursery() as nursery:
         nursery.start_soon(watch)
-        try:
-            yield
-        except Exception as error:  # raised again outside of the nursery, which would wrap it in a group
-            failure = error
-        nursery.cancel_scope.cancel()
-    if failure is not None:
-        raise failure
+        yield
 
 
 def _show(acknowledged: int, progress: Progress) -> None:

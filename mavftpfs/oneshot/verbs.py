@@ -20,7 +20,7 @@ import trio
 
 from mavftpfs import daemon
 from mavftpfs.commands import connection_of, left_by_killed_mounts_line
-from mavftpfs.compose import open_sinks
+from mavftpfs.compose import open_sinks, plain_nursery
 from mavftpfs.exits import ExitCode, exit_code_for
 from mavftpfs.farewell import recovered_directory
 from mavftpfs.fuse.options import parse_options
@@ -87,22 +87,15 @@ async def until_interrupted(function: Callable[[], Coroutine[Any, Any, ResultT]]
         MavftpfsError, OSError: the function's own.
     """
     results: list[ResultT] = []
-    errors: list[Exception] = []
     with trio.open_signal_receiver(signal.SIGINT, signal.SIGTERM) as signals:
-        async with trio.open_nursery() as nursery:
+        async with plain_nursery() as nursery:
 
             async def watch() -> None:
                 async for _ in signals:
                     nursery.cancel_scope.cancel()
 
             nursery.start_soon(watch)
-            try:
-                results.append(await function())
-            except Exception as exc:  # raised again outside of the nursery, which would wrap it in a group
-                errors.append(exc)
-            nursery.cancel_scope.cancel()
-    if errors:
-        raise errors[0]
+            results.append(await function())
     if not results:
         raise KeyboardInterrupt
     return results[0]
