@@ -276,6 +276,7 @@ class MountedFiles:
         self._mountpoint = os.fsencode(mountpoint)
         self._mounted = mounted.rstrip(b"/")
         self._root = root.rstrip(b"/")
+        self._expired: set[bytes] = set()
 
     def _place(self, path: bytes) -> bytes:
         remote = normalise(self._root + b"/" + path)
@@ -289,6 +290,9 @@ class MountedFiles:
     async def stat(self, path: bytes) -> Stat:
         """See Files."""
         place = self._place(path)
+        if path in self._expired:  # the kernel believes what it was told a second ago, but for an open
+            self._expired.discard(path)
+            (await self.open(path)).close()
         return _stat_of(await _in_thread(lambda: os.stat(place), path))
 
     async def list(self, path: bytes) -> list[tuple[bytes, Stat]]:
@@ -346,6 +350,7 @@ class MountedFiles:
 
     def expire(self, path: bytes) -> None:
         """See Files."""
+        self._expired.add(path)
         self.forget_caches()
 
     def forget_caches(self) -> None:

@@ -258,8 +258,8 @@ def test_mount_by_its_own_type_and_remount(field: Field, tmp_path: Path) -> None
         f"touch: cannot touch '{mount.path}/new': Read-only file system",
         "written",
     ]
+    wait_until("the daemon ended", lambda: not processes_in(mount.path))  # which has an empty file to deliver
     assert [path.name for path in card.iterdir()] == ["new"]
-    wait_until("the daemon ended", lambda: not processes_in(mount.path))
 
 
 def clears(field: Field, source: str) -> bool:

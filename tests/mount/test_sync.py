@@ -30,6 +30,8 @@ from tests.support.vehicles import HOST, PROJECT, UdpVehicle, free_udp_port
 
 LOG_FOLDERS = {"px4": "log", "ardupilot": "APM/LOGS", REAL: "logs"}
 SLOW = ("--rate", "100000", "--delay", "0.01")
+FAR = ("--delay", "0.2")
+"""So that a growing log has grown between its last read and the next question, on a busy machine too."""
 READS = ("READ_FILE", "BURST_READ_FILE")
 
 
@@ -217,7 +219,7 @@ def growing(path: Path) -> Iterator[None]:
 
 
 def test_a_growing_log_is_fetched_as_far_as_it_goes(field: Field, tmp_path: Path) -> None:
-    vehicle = field.sim(field.local("card"))
+    vehicle = field.sim(field.local("card"), "px4", FAR)
     card, local = vehicle.root / "log", tmp_path / "logs"
     write_log(card / "old.ulg", 30_000, 1, 1)
     write_log(card / "now.ulg", 100_000, 2, 2)
@@ -325,7 +327,7 @@ def test_a_mounted_subtree_and_what_lies_outside_of_it(field: Field, tmp_path: P
 
 
 def test_a_growing_log_is_seen_through_a_mount_too(field: Field, tmp_path: Path) -> None:
-    vehicle = field.sim(field.local("card"), "px4", ("--armed",))
+    vehicle = field.sim(field.local("card"), "px4", ("--armed", *FAR))
     card, local = vehicle.root / "log", tmp_path / "logs"
     write_log(card / "now.ulg", 100_000, 2, 2)
     field.mount(vehicle.source, "when_armed=ro")

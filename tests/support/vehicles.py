@@ -5,7 +5,6 @@ the bad link of `proxy`. Each speaks UDP to a port on 127.0.0.1 where the mount 
 from __future__ import annotations
 
 import itertools
-import json
 import os
 import re
 import signal
@@ -16,7 +15,7 @@ import time
 from collections import deque
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
 from tests.support.logs import assert_clean
 
@@ -223,14 +222,6 @@ class UdpVehicle:
 
     def check_end(self, process: Process) -> None:
         """Judge the vehicle's last words."""
-
-    def link_counts(self) -> dict[str, Any]:
-        """Stop the proxy and return what it did to the datagrams."""
-        assert self.proxy is not None
-        proxy, self.proxy = self.proxy, None
-        assert proxy.stop() == 0
-        counts: dict[str, Any] = json.loads(proxy.output.read_text())
-        return counts
 
 
 class MavsdkVehicle(UdpVehicle):
