@@ -125,15 +125,32 @@ def test_a_vehicle_that_never_answers_ftp_is_exit_2(field: Field) -> None:
     assert not mounted_at(mount.path)
 
 
+@pytest.mark.parametrize(("directory", "shown"), [("same", ["same_for_ever"]), ("refused", [])])
 def test_programs_end_with_an_error_where_a_directory_was_not_listed_to_its_end(
-    liar: Mount, tmp_path: Path
+    liar: Mount, tmp_path: Path, directory: str, shown: list[str]
 ) -> None:
-    """`same` repeats its first page for ever; a backup must not lose what that does not show."""
+    """`same` repeats its first page for ever, and listing `refused` is refused as if it were not there. A
+    backup must not lose what they do not show."""
     backup = tmp_path / "backup"
     backup.mkdir()
     (backup / "kept").write_text("shown by no page")
-    same = liar.path / "same"
-    assert liar.run("ls", same, code=2).stdout.split() == ["same_for_ever"]
-    liar.run("find", same, code=1)
-    liar.run("rsync", "-r", "--delete", f"{same}/", backup, code=23)
+    where = liar.path / directory
+    assert liar.run("ls", where, code=2).stdout.split() == shown
+    liar.run("find", where, code=1)
+    liar.run("rsync", "-a", "--delete", f"{where}/", backup, code=23)
     assert (backup / "kept").exists()
+    get = (
+        sys.executable,
+        "-m",
+        "mavftpfs",
+        "get",
+        "-r",
+        "--to",
+        tmp_path,
+        liar.path,
+        "/names",
+        f"/{directory}",
+    )
+    complaints = liar.run(*get, code=2).stderr.splitlines()
+    assert [f"/{directory}" in line for line in complaints] == [True]
+    assert (tmp_path / "names" / "good.txt").read_bytes() == GOOD

@@ -56,7 +56,7 @@ BROKEN = ("short.bin", "empty_acks.bin", "shifted.bin", "silent.bin", "other_opc
 BROKEN_SIZE = 1000
 
 DIRECTORIES: dict[bytes, tuple[bytes, ...]] = {
-    b"/": (b"Dnames", b"Dnak", b"Dbroken", b"Dendless", b"Dsame", b"Ffine.bin\t5000"),
+    b"/": (b"Dnames", b"Dnak", b"Dbroken", b"Dendless", b"Dsame", b"Drefused", b"Ffine.bin\t5000"),
     b"/names": NAMES,
     b"/nak": tuple(b"F%s%d\t4" % (kind, code) for code in NAKED for kind in (b"open", b"read")),
     b"/broken": tuple(b"F%s\t%d" % (name.encode(), BROKEN_SIZE) for name in BROKEN),
