@@ -43,7 +43,7 @@ def lacking(file: Path, text: str) -> Iterator[str]:
     """Yield the pages that a file cites and that are nowhere."""
     places = (PROJECT, PROJECT / "docs", PROJECT / "mavftpfs", file.parent)
     for name in CITED.findall(text):
-        if not any((place / name).is_file() for place in places) and "://" not in name:
+        if not any((place / name).is_file() for place in places) and not name.startswith("//"):
             yield f"{file.relative_to(PROJECT)}: {name}"
 
 
