@@ -25,10 +25,10 @@ from mavftpfs.protocol.payload import MAX_DATA, decode_request
 from mavftpfs.session.connection import ConnectOptions, connected
 from mavftpfs.shared.errors import VehicleLost
 from mavftpfs.sim.linkmodel import Duplex, LinkModel, LinkSettings
-from mavftpfs.sim.memory import MemoryLink
 from mavftpfs.sim.profiles import PROFILES
 from mavftpfs.sim.tree import MemoryTree
 from mavftpfs.sim.vehicle import SimVehicle
+from tests.support.memory import MemoryLink
 from tests.support.uploads import put
 from tests.support.worlds import World, path, read_file, world
 

@@ -26,10 +26,10 @@ from mavftpfs.shared.errors import LinkClosed, UsageError
 from mavftpfs.sim import endpoints
 from mavftpfs.sim.endpoints import Endpoint, client_source, open_endpoint
 from mavftpfs.sim.linkmodel import Duplex, LinkModel, LinkSettings
-from mavftpfs.sim.memory import MemoryLink
 from mavftpfs.sim.profiles import PROFILES
 from mavftpfs.sim.tree import MemoryTree
 from mavftpfs.sim.vehicle import SimVehicle
+from tests.support.memory import MemoryLink
 from tests.support.vehicles import free_udp_port
 
 US = Address(254, 191)
@@ -316,7 +316,7 @@ def test_memory_link_cut_and_restored(modelled: bool, stream: bool) -> None:
 def test_a_vehicle_that_never_rests_fails_the_test_instead_of_hanging_it(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("mavftpfs.sim.memory._MAX_STEPS", 100)
+    monkeypatch.setattr("tests.support.memory._MAX_STEPS", 100)
 
     async def main() -> None:
         link = MemoryLink(vehicle())

@@ -16,8 +16,8 @@ from mavftpfs.cache.spool import SpoolDirectory
 from mavftpfs.fuse.options import MountOptions
 from mavftpfs.link.uri import parse_source
 from mavftpfs.protocol.payload import Opcode
-from mavftpfs.sim.memory import MemoryLink
 from tests.support.faults import Faults
+from tests.support.memory import MemoryLink
 from tests.support.worlds import World, content, world
 
 

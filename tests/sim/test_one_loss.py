@@ -10,7 +10,7 @@ from trio.testing import MockClock
 
 from mavftpfs.protocol.payload import Opcode
 from mavftpfs.sim.linkmodel import Direction, LinkModel, LinkSettings
-from mavftpfs.sim.memory import MemoryLink
+from tests.support.memory import MemoryLink
 from tests.support.mounting import mounted
 from tests.support.worlds import content, path, world
 

@@ -13,10 +13,10 @@ from mavftpfs.cache.remote import Reader
 from mavftpfs.session.connection import Connection, ConnectOptions, connected
 from mavftpfs.shared.extents import ExtentSet
 from mavftpfs.sim.linkmodel import LinkModel, LinkSettings
-from mavftpfs.sim.memory import MemoryLink
 from mavftpfs.sim.profiles import PROFILES
 from mavftpfs.sim.tree import MemoryTree
 from mavftpfs.sim.vehicle import SimVehicle
+from tests.support.memory import MemoryLink
 
 GOOD_LINK = LinkSettings()
 DEFAULTS = ConnectOptions()

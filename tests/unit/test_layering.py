@@ -65,7 +65,7 @@ PURE_MODULES = {
     "fuse.userattributes",
     "fuse.options",
 }
-IMPURE_MODULES = {"sim.endpoints", "sim.memory"}
+IMPURE_MODULES = {"sim.endpoints"}
 IMPURE_IMPORTS = {"trio", "time", "socket", "logging", "pyfuse3"}
 
 SOLE_IMPORTERS = {

@@ -1,4 +1,4 @@
-"""A link to a simulated vehicle in memory, on whatever clock trio runs. Layer: sim.
+"""A link to a simulated vehicle in memory, on whatever clock trio runs.
 
 With `trio.testing.MockClock(autojump_threshold=0)` hours of radio pass at once. The link owns no task: time
 is caught up, instant by instant and in order, whenever somebody receives or sends, so that what happens at
