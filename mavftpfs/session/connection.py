@@ -25,7 +25,7 @@ from mavftpfs.protocol.budget import FRAME_OVERHEAD, SIGNATURE, Budget
 from mavftpfs.protocol.engine import Engine
 from mavftpfs.protocol.flow import Flow
 from mavftpfs.session.driver import Driver, PayloadTrace
-from mavftpfs.session.policy import ReadMode
+from mavftpfs.session.fairness import ReadMode
 from mavftpfs.session.scheduler import Scheduler
 from mavftpfs.session.store import Store
 from mavftpfs.session.vehicle import Vehicle

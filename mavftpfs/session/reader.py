@@ -17,7 +17,7 @@ from mavftpfs.protocol.engine import Engine
 from mavftpfs.protocol.reading import ReadTransfer
 from mavftpfs.session.doubt import Doubt
 from mavftpfs.session.driver import Driver
-from mavftpfs.session.policy import Queue, ReadMode, Service, should_switch
+from mavftpfs.session.fairness import Queue, ReadMode, Share
 from mavftpfs.session.serversession import ServerSession
 from mavftpfs.shared.errors import FileChanged, MavftpfsError, RemoteProtocolError, SessionLost
 from mavftpfs.shared.extents import ExtentSet
@@ -43,9 +43,7 @@ class FileStream:
         self.path = path
         self._sink = sink
         self.closed = False
-        self.use = Service()
-        self.ticket: int | None = None
-        self.asked_at = 0.0
+        self.share = Share()
         self.wants_open = size is None
         self.last_data_at: float | None = None
         self.clean_failures = 0
@@ -57,15 +55,6 @@ class FileStream:
         self._open_error: MavftpfsError | None = None
         self._orphaned = False
         self._transfer: ReadTransfer | None = None
-
-    def used(self, now: float) -> float:
-        """Return the seconds of service that still count. While it waits they do not fade: who is passed over
-        again and again would pass for somebody who wants little."""
-        return self.use.recent(now if self.ticket is None else min(now, self.asked_at))
-
-    def on_served(self, started: float, now: float) -> None:
-        """It had the session from `started` until now."""
-        self.use = Service(self.used(started) + now - started, now)
 
     # --- the cache's side
 
@@ -325,7 +314,7 @@ class Reading:
                 stream.on_idle()
             stream.detach()
             self._driver.cancel(transfer)
-            stream.on_served(started, self._clock())
+            stream.share.on_turn(started, self._clock())
         if transfer.error is not None:
             raise transfer.error
 
@@ -340,17 +329,11 @@ class Reading:
             return False
         if self._server.claimed(stream.path):
             return False
-        waiting_use = self._queue.rival_use(stream)
-        if waiting_use is None:
+        rival = self._queue.rival_use(stream)
+        if rival is None:
             return True
-        now = self._clock()
-        return not should_switch(
-            current_has_demand=stream.has_demand,
-            current_slice=now - started,
-            current_use=stream.used(now),
-            waiting_use=waiting_use,
-            rtt=self._engine.rtt,
-            current_waited=started - stream.asked_at,
+        return stream.has_demand and not stream.share.gives_way(
+            rival, started, self._clock(), self._engine.rtt
         )
 
     def _stalled(self, transfer: ReadTransfer) -> bool:

@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Awaitable, Callable
 from contextlib import AbstractAsyncContextManager
 from dataclasses import dataclass, field
-from itertools import count
 
 import trio
 
@@ -21,7 +20,7 @@ from mavftpfs.protocol.payload import Opcode, Payload
 from mavftpfs.protocol.reading import ReadToEof
 from mavftpfs.session.doubt import Doubt, touches_session
 from mavftpfs.session.driver import Driver
-from mavftpfs.session.policy import LIGHT_USE, ReadMode, is_starving
+from mavftpfs.session.fairness import ReadMode, Share
 from mavftpfs.session.reader import FileStream, Reading
 from mavftpfs.session.serversession import OpenSession, ServerSession, State
 from mavftpfs.session.upload import QueuedUpload
@@ -44,13 +43,12 @@ _OPENING = frozenset((Opcode.OPEN_FILE_RO, Opcode.OPEN_FILE_WO, Opcode.CREATE_FI
 
 @dataclass(eq=False)
 class _Job:
-    """One open, an action, one Terminate. ticket: its place in the queue."""
+    """One open, an action, one Terminate."""
 
     path: bytes
     opcode: Opcode
     action: Callable[[OpenSession], Awaitable[None]]
-    ticket: int
-    asked_at: float
+    share: Share
     session: OpenSession | None = None
     error: MavftpfsError | None = None
     finished: trio.Event = field(default_factory=trio.Event)
@@ -95,13 +93,13 @@ class Scheduler:
         self.write_traits = WriteTraits()
         self.op_deadline = op_deadline
         self._driver = driver
+        self._engine = engine
         self._vehicle = vehicle
         self.read_mode: ReadMode = read_mode
         self.read_chunks, self.write_chunks = ChunkSize(chunk), ChunkSize(chunk)
         self._clock = clock
         self._used_at = clock()
-        self._tickets = count(1)
-        self._streams: set[FileStream] = set()
+        self._streams: dict[FileStream, None] = {}
         self._closed_streams: list[FileStream] = []
         self._jobs: list[_Job] = []
         parts = (self.server, driver, engine, self, self.doubt, clock)
@@ -144,7 +142,7 @@ class Scheduler:
     def open_stream(self, path: bytes, sink: ReadSink, size: int | None) -> FileStream:
         """Register a reader; with size None it asks for an open ACK (await stream.wait_opened())."""
         stream = FileStream(path, sink, size, self._on_want)
-        self._streams.add(stream)
+        self._streams[stream] = None
         if stream.wants_open:
             self._on_want(stream)
         return stream
@@ -186,7 +184,7 @@ class Scheduler:
             VehicleLost, RequestTimeout, or what opening, the action or closing fail with.
         """
         self.require_link()
-        job = _Job(path, opcode, action, next(self._tickets), self._clock())
+        job = _Job(path, opcode, action, Share(self._clock()))
         self._jobs.append(job)
         self.server.wake()
         try:
@@ -202,7 +200,7 @@ class Scheduler:
 
     def open_upload(self, path: bytes, source: UploadSource, *, create: bool) -> QueuedUpload:
         """Queue an upload."""
-        return self._uploading.add(path, source, create=create, ticket=next(self._tickets))
+        return self._uploading.add(path, source, create=create)
 
     def claim(self, path: bytes, *, below: bool = False) -> AbstractAsyncContextManager[None]:
         """Keep our own session off a path that is about to change, or off all below it.
@@ -303,11 +301,9 @@ class Scheduler:
                 if isinstance(user, _Job):
                     await self._serve_job(user)
                 elif isinstance(user, QueuedUpload):
-                    if await self._uploading.serve(user):
-                        user.ticket = next(self._tickets)
+                    await self._uploading.serve(user)
                 elif await self._reading.serve(user):
-                    user.ticket = None
-                    self._take_ticket(user)
+                    user.share.asked_at = self._clock() if user.has_demand else None
             except MavftpfsError:
                 # Closing the previous file failed; whoever wants something is asked again by _next.
                 self.server.abandon()
@@ -329,13 +325,13 @@ class Scheduler:
     def _on_want(self, stream: FileStream) -> None:
         if stream.closed:
             self._on_closed(stream)
-        elif stream.ticket is None:
-            self._take_ticket(stream)
+        elif stream.has_demand:
+            stream.share.ask(self._clock())
         self.server.wake()
 
     def _on_closed(self, stream: FileStream) -> None:
         if stream in self._streams:
-            self._streams.remove(stream)
+            del self._streams[stream]
             self._closed_streams.append(stream)
             self._forget_closed()
 
@@ -345,35 +341,20 @@ class Scheduler:
     def _is_recent(self, stream: FileStream) -> bool:
         return stream.last_data_at is not None and stream.last_data_at > self._clock() - RECENT
 
-    def _take_ticket(self, stream: FileStream) -> None:
-        if stream.has_demand:
-            stream.ticket = next(self._tickets)
-            stream.asked_at = self._clock()
+    def _waiting(self, now: float) -> list[_User]:
+        """All who want the session and could use it now."""
+        users: list[_User] = [*self._jobs, *(stream for stream in self._streams if stream.has_demand)]
+        users += self._uploading.due(now)
+        return [user for user in users if not self._claimed(user.path)]
 
     def _next(self) -> _User | None:
-        """Demand before readahead, who used little lately before who used much (among those: readers before
-        writers), then who asked first."""
-        now = self._clock()
-        waiting: list[tuple[tuple[bool, bool, int], _User]] = [
-            ((False, False, job.ticket), job) for job in self._jobs if not self._claimed(job.path)
-        ]
-        readahead: FileStream | None = None
-        for stream in self._streams:
-            if self._claimed(stream.path):
-                continue
-            if stream.has_demand:
-                heavy = stream.used(now) >= LIGHT_USE and not is_starving(now - stream.asked_at)
-                waiting.append(((heavy, False, stream.ticket or 0), stream))
-            elif stream.has_ahead and (readahead is None or self._is_open(stream)):
-                readahead = stream
-        for upload in self._uploading.due(now):
-            if not self._claimed(upload.path):
-                starving = self._uploading.writer.starves(upload)
-                heavy = upload.used(now) >= LIGHT_USE and not starving
-                waiting.append(((heavy, not heavy and not starving, upload.ticket), upload))
+        """Whoever is to use the session now; readahead only if nobody waits for anything."""
+        now, rtt = self._clock(), self._engine.rtt
+        waiting = self._waiting(now)
         if waiting:
-            return min(waiting, key=lambda item: item[0])[1]
-        return readahead
+            return min(waiting, key=lambda user: user.share.rank(now, rtt))
+        ahead = [stream for stream in self._streams if stream.has_ahead and not self._claimed(stream.path)]
+        return min(ahead, key=lambda stream: not self._is_open(stream), default=None)
 
     def _claimed(self, path: bytes) -> bool:
         return self.server.claimed(path)
@@ -383,30 +364,25 @@ class Scheduler:
         return session is not None and session.path == stream.path and not session.writing
 
     def rival_use(self, user: object) -> float | None:
-        """Return how much the lightest of those who wait for the session used of it lately."""
-        if any(not self._claimed(job.path) for job in self._jobs):
-            return 0.0
+        """Return how much the lightest of the others who wait used lately; None if nobody waits."""
         now = self._clock()
-        waiting = [stream for stream in self._streams if stream is not user and stream.has_demand]
-        # Nobody makes room for who could not use it yet, or both would be asked for ever.
-        others = [stream.used(now) for stream in waiting if not self._claimed(stream.path)]
-        writing = isinstance(user, QueuedUpload)
-        rivals = [upload for upload in self._uploading.due(now) if upload is not user]
-        others += [up.used(now, beside_upload=writing) for up in rivals if not self._claimed(up.path)]
-        return min(others, default=None)
+        return min((other.share.used(now) for other in self._waiting(now) if other is not user), default=None)
 
     def expire_waiters(self) -> None:
         """Somebody holds the session and cannot be interrupted: do not let others wait for ever."""
-        oldest = self._clock() - self.op_deadline
+        now = self._clock()
         error = RequestTimeout("the vehicle's only session is taken by an upload that cannot be interrupted")
-        for stream in list(self._streams):
-            if stream.has_demand and stream.ticket is not None and stream.asked_at < oldest:
-                stream.fail(error)
-                stream.ticket = None  # who asks again waits anew
-        self._uploading.expire(oldest, error)
-        for job in [job for job in self._jobs if job.asked_at < oldest]:
-            self._jobs.remove(job)
-            job.fail(error)
+        for user in self._waiting(now):
+            asked_at = user.share.asked_at
+            if asked_at is None or asked_at >= now - self.op_deadline:
+                continue
+            if isinstance(user, QueuedUpload):
+                self._uploading.expire(user, error)
+                continue
+            user.share.asked_at = None  # who asks again waits anew
+            user.fail(error)
+            if isinstance(user, _Job):
+                self._jobs.remove(user)
 
     async def _idle(self) -> None:
         now = self._clock()

@@ -8,7 +8,7 @@ from typing import Protocol
 import trio
 
 from mavftpfs.cache.remote import Overwrite, UploadSource
-from mavftpfs.session.policy import Service
+from mavftpfs.session.fairness import Share
 from mavftpfs.shared.errors import LocalProtocolError, MavftpfsError
 
 LONGEST_BACKOFF = 30.0
@@ -140,16 +140,13 @@ class QueuedUpload:
             the background; refusals only when finish is called.
         running: the scheduler's task is at it. clean: everything given so far is ACKed and terminated.
         retry_at: not to be touched before. begun, resent: see cache.remote.Upload.
-        asked_at: when who waits for its end asked, or it had its last turn. filled_in: seconds that it took
-            to send all there was, last time. tried: it was reopened to see what OpenFileWO does.
-        waits_since: when it had something to send and no turn, perhaps with the wait after a failure.
+        filled_in: seconds that it took to send all there was, last time. tried: it was reopened to see what
+            OpenFileWO does.
         restarted: the vehicle did; what was proven does not count. refused_behind: what was sent right before
             the Terminate was refused the last time.
     """
 
-    def __init__(
-        self, host: UploadHost, path: bytes, feed: Feed, *, create: bool, ticket: int, asked_at: float
-    ) -> None:
+    def __init__(self, host: UploadHost, path: bytes, feed: Feed, *, create: bool, now: float) -> None:
         self.path = path
         self.feed = feed
         self.create = create
@@ -159,9 +156,8 @@ class QueuedUpload:
         self.least = 0
         self.free_at: float | None = None
         self.begun = self.resent = False
-        self.ticket = ticket
-        self.asked_at = self.waits_since = self._since = asked_at
-        self.use = Service()
+        self.share = Share(now)
+        self._since = now
         self.error: MavftpfsError | None = None
         self.running = False
         self.clean = False
@@ -206,7 +202,7 @@ class QueuedUpload:
         self._note_waiting()
         self._begin_again()
         if not self.finishing:
-            self.asked_at = self._host.now()
+            self.share.asked_at = self._host.now()
         self._calls += 1
         call = self._calls
         self._pending.add(call)
@@ -239,6 +235,10 @@ class QueuedUpload:
             self.refused_at = None
         self.retry_at = 0.0
 
+    def rest_until(self, at: float) -> None:
+        """It is not to be touched before."""
+        self.retry_at = self.share.asked_at = at
+
     def status(self) -> dict[str, object]:
         """Return facts for people and scripts; JSON-able."""
         return {
@@ -261,16 +261,7 @@ class QueuedUpload:
         """There is something to do; if there was before, it has waited since then."""
         now = self._host.now()
         if not self.is_due(now):
-            self.waits_since = now
-
-    def waited_until(self, now: float) -> float:
-        """Return for how many seconds it could have sent something and had no turn."""
-        return now - max(self.waits_since, self.retry_at)
-
-    def used(self, now: float, *, beside_upload: bool = False) -> float:
-        """Return the seconds of service that still count; they fade although it waits: what it gets between
-        small reads is but a window. Beside an upload they do not, or of several each would get but that."""
-        return self.use.recent(min(now, self.waits_since) if beside_upload else now)
+            self.share.asked_at = now
 
     def is_due(self, now: float) -> bool:
         """Whether there is something to do for it now."""
@@ -298,14 +289,14 @@ class QueuedUpload:
 
     def pause_restart(self, now: float) -> None:
         """The next byte costs the whole file again, so let some gather first."""
-        self.retry_at = now + min(MOST_PAUSE, max(LEAST_PAUSE, PAUSE_FACTOR * self.filled_in))
+        self.rest_until(now + min(MOST_PAUSE, max(LEAST_PAUSE, PAUSE_FACTOR * self.filled_in)))
 
     def fail(self, error: MavftpfsError, now: float, *, refused: bool = False) -> None:
         """Tell whoever waits; refused: asking again by ourselves is of no use."""
         self.error = error
         self.refused = refused
         self.failures += 1
-        self.retry_at = now + min(LONGEST_BACKOFF, 2.0 ** min(self.failures, 5))
+        self.rest_until(now + min(LONGEST_BACKOFF, 2.0 ** min(self.failures, 5)))
         self.tell()
 
     def tell(self) -> None:

@@ -15,7 +15,7 @@ from mavftpfs.protocol.engine import Engine
 from mavftpfs.protocol.payload import Opcode
 from mavftpfs.session.doubt import Doubt
 from mavftpfs.session.driver import Driver
-from mavftpfs.session.policy import Queue
+from mavftpfs.session.fairness import Queue
 from mavftpfs.session.serversession import TERMINATE_LIMIT, OpenSession, ServerSession
 from mavftpfs.session.upload import Feed, QueuedUpload
 from mavftpfs.session.vehicle import Vehicle
@@ -75,10 +75,10 @@ class Uploading:
 
     # --- what others ask for and tell
 
-    def add(self, path: bytes, source: UploadSource, *, create: bool, ticket: int) -> QueuedUpload:
+    def add(self, path: bytes, source: UploadSource, *, create: bool) -> QueuedUpload:
         """Queue an upload."""
         feed = Feed(source, self._chunk)
-        upload = QueuedUpload(self, path, feed, create=create, ticket=ticket, asked_at=self._clock())
+        upload = QueuedUpload(self, path, feed, create=create, now=self._clock())
         self.uploads.append(upload)
         self._server.wake()
         return upload
@@ -119,7 +119,7 @@ class Uploading:
             if not self.may_write and not upload.running and upload.finishing:
                 upload.fail(Armed("the vehicle was armed"), now)
             if self.may_write:
-                upload.retry_at = now
+                upload.rest_until(now)
         self._server.wake()
 
     def on_reboot(self) -> None:
@@ -144,12 +144,10 @@ class Uploading:
         times = [upload.retry_at for upload in self.uploads if upload.wanted]
         return min((time for time in times if time > now), default=float("inf"))
 
-    def expire(self, oldest: float, error: MavftpfsError) -> None:
-        """Tell those who have waited since before `oldest` for an upload that got no turn."""
-        now = self._clock()
-        for upload in self.uploads:
-            if upload.finishing and not upload.running and upload.asked_at < oldest:
-                upload.fail(error, now)
+    def expire(self, upload: QueuedUpload, error: MavftpfsError) -> None:
+        """Tell whoever waits for an upload that it got no turn."""
+        if upload.finishing and not upload.running:
+            upload.fail(error, self._clock())
 
     async def serve(self, upload: QueuedUpload) -> bool:
         """Use the session for an upload. Its errors are told to the upload. False: it sent nothing, for who
@@ -167,11 +165,11 @@ class Uploading:
         finally:
             now = self._clock()
             upload.running = False
+            upload.share.on_turn(started, now)
             if served:
-                upload.asked_at = upload.waits_since = now
+                upload.share.asked_at = max(now, upload.retry_at)
             else:
                 upload.feed.put_back()
-            upload.use.add(now - started, now)
             if not self.may_write and upload.finishing and upload.error is None:
                 upload.fail(Armed("the vehicle was armed"), now)  # while its file was opened or closed
             upload.tell()
@@ -349,7 +347,7 @@ class Uploading:
             upload.fail(cause if isinstance(cause, MavftpfsError) else lost, now)
         else:
             upload.failures = failures
-            upload.retry_at = now + (failures - 1) * 0.5
+            upload.rest_until(now + (failures - 1) * 0.5)
 
     async def _on_error(self, upload: QueuedUpload, error: MavftpfsError) -> None:
         """Close what can be closed, roll back what is not proven, and tell whoever waits."""

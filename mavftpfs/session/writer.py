@@ -23,7 +23,7 @@ from mavftpfs.protocol.operations import Simple
 from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.protocol.writing import WriteTransfer
 from mavftpfs.session.driver import Driver
-from mavftpfs.session.policy import LIGHT_USE, Queue, is_starving, should_switch
+from mavftpfs.session.fairness import LIGHT_USE, Queue
 from mavftpfs.session.serversession import OpenSession, ServerSession
 from mavftpfs.session.upload import QueuedUpload
 from mavftpfs.session.vehicle import Vehicle
@@ -196,7 +196,7 @@ class Writer:
 
     def starves(self, upload: QueuedUpload) -> bool:
         """Whether others are not to go before it any more."""
-        return is_starving(upload.waited_until(self._clock()), self._engine.rtt)
+        return upload.share.waited_long(self._clock(), self._engine.rtt)
 
     # --- writing
 
@@ -324,11 +324,11 @@ class Writer:
             return Stop.ARMED
         if self._server.claimed(upload.path):
             return Stop.YIELD
-        waiting_use = self._queue.rival_use(upload)
+        rival = self._queue.rival_use(upload)
         if transfer.starved:
-            return self._reason_of_starved(upload, now, session.opened_at, pressed=waiting_use is not None)
+            return self._reason_of_starved(upload, now, session.opened_at, pressed=rival is not None)
         self._starved_at = None
-        return Stop.YIELD if self._is_turn_over(upload, now - session.opened_at, waiting_use) else None
+        return Stop.YIELD if self._is_turn_over(upload, session.opened_at, now, rival) else None
 
     def _reason_of_starved(
         self, upload: QueuedUpload, now: float, since: float, *, pressed: bool
@@ -346,16 +346,11 @@ class Writer:
             patience = 0.0
         return Stop.STARVED if now - self._starved_at >= patience else None
 
-    def _is_turn_over(self, upload: QueuedUpload, slice_: float, waiting_use: float | None) -> bool:
-        if waiting_use is None:
-            return self.resumable and slice_ >= CHECKPOINT_EVERY
-        return (self.resumable or self.may_try(upload)) and should_switch(
-            current_has_demand=True,
-            current_slice=slice_,
-            current_use=upload.used(self._clock()),
-            waiting_use=waiting_use,
-            rtt=self._engine.rtt,
-        )
+    def _is_turn_over(self, upload: QueuedUpload, began: float, now: float, rival: float | None) -> bool:
+        if rival is None:
+            return self.resumable and now - began >= CHECKPOINT_EVERY
+        may_stop = self.resumable or self.may_try(upload)
+        return may_stop and upload.share.gives_way(rival, began, now, self._engine.rtt)
 
     def _in_doubt(self, transfer: WriteTransfer) -> bool:
         """Whether it was silent for so long that the session may be somebody else's (servers.md 14.9).

@@ -45,7 +45,7 @@ PURE_MODULES = {
     "link.signing",
     "link.uri",
     "session.doubt",
-    "session.policy",
+    "session.fairness",
     "session.vehicle",
     "cache.attributes",
     "cache.dentries",

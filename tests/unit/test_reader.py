@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import pytest
-
-from mavftpfs.session.policy import USE_MEMORY
 from mavftpfs.session.reader import FileStream
 from tests.support.worlds import MemorySink
 
@@ -36,17 +33,6 @@ def test_only_what_the_cache_lacks_is_wanted() -> None:
     assert not stream.has_demand
     stream.want(0, 300, demand=True)
     assert list(stream._demand) == [(0, 100), (200, 300)]
-
-
-def test_its_service_fades_only_while_it_wants_nothing() -> None:
-    stream, _ = make()
-    stream.on_served(10.0, 14.0)
-    assert stream.used(14.0) == 4.0
-    assert stream.used(14.0 + USE_MEMORY / 2) == pytest.approx(2.0)
-    stream.ticket, stream.asked_at = 1, 14.0
-    assert stream.used(14.0 + USE_MEMORY / 2) == 4.0
-    stream.on_served(30.0, 31.0)
-    assert stream.used(31.0) == 5.0
 
 
 def test_a_suspicion_reaches_what_a_closed_stream_brought() -> None:
