@@ -13,6 +13,7 @@ from mavftpfs.session.doubt import LASTS, LEAST_LATE, MOST_LATE, Doubt
 from mavftpfs.sim.linkmodel import LinkSettings
 from mavftpfs.sim.profiles import PROFILES
 from tests.support.latecomers import Latecomer
+from tests.support.mounting import writable_tree
 from tests.support.takingturns import taking_turns
 from tests.support.uploads import put
 from tests.support.worlds import MemorySink, World, begin_to_read, content, path, read_file, world
@@ -180,19 +181,24 @@ async def test_what_a_late_open_left_open_does_not_lock_us_out(profile: str, aut
 
 
 async def test_who_waits_for_a_turn_is_not_timed_out(autojump: MockClock) -> None:
-    """The queue before each of many readers moves, though for the last it takes longer than a read may."""
+    """200 programs read at once over a round trip of 100 ms: the last one waits longer than a read may."""
     here = World("px4", LinkSettings(delay=0.05))
-    for number in range(100):
+    for number in range(200):
         here.tree.add(b"/f%d" % number, content(2000, number))
+    ended: list[float] = []
     async with here.connection() as connection, trio.open_nursery() as nursery:
-        sinks = [MemorySink(2000) for _ in range(100)]
+        tree = writable_tree(connection, nursery)
+        await tree.list(b"/")
+
+        files = [await tree.open(b"/f%d" % number) for number in range(200)]
 
         async def read(number: int) -> None:
-            reader = await connection.store.open_reader(b"/f%d" % number, sinks[number], expected_size=2000)
-            reader.want(0, 2000, demand=True)
-            assert await sinks[number].wait_for(0, 2000) == content(2000, number)
-            reader.close()
+            assert await files[number].read(0, 2000) == content(2000, number)
+            ended.append(trio.current_time())
 
-        for number in range(100):
-            nursery.start_soon(read, number)
-    assert max(sink.queued for sink in sinks) > 50
+        async with trio.open_nursery() as readers:
+            for number in range(200):
+                readers.start_soon(read, number)
+        nursery.cancel_scope.cancel()
+    assert len(ended) == 200
+    assert ended[-1] - ended[0] > ConnectOptions().op_deadline

@@ -8,7 +8,7 @@ from trio.testing import MockClock
 
 from mavftpfs.link.messages import Address
 from mavftpfs.protocol.operations import Simple
-from mavftpfs.protocol.payload import Opcode, request
+from mavftpfs.protocol.payload import NakCode, Opcode, request
 from mavftpfs.session.connection import ConnectOptions
 from mavftpfs.shared.errnos import errno_for
 from mavftpfs.shared.errors import Armed, FtpNak, MavftpfsError, RequestTimeout, SpoolFailed, VehicleLost
@@ -203,6 +203,32 @@ async def test_a_session_taken_away_is_got_back(profile: str, probed: bool, auto
             here.link.kick()
         assert source.all_proven
     assert here.tree.data(path(profile, "new")) == data
+
+
+async def test_a_write_that_is_refused_for_no_error_goes_on_in_a_new_session(autojump: MockClock) -> None:
+    """PX4 says NAK 2 with errno 0 to a write whose session another ground station reset meanwhile."""
+    data = content(60_000)
+    here = world("px4", PLAIN)
+    server = here.vehicle.server
+    outgoing, refused = server.outgoing, []
+
+    def without_errno(now: float) -> list[tuple[Address, bytes]]:
+        replies = []
+        for source, wire in outgoing(now):
+            if wire[3] == Opcode.NAK and wire[5] == Opcode.WRITE_FILE:
+                wire = wire[:4] + bytes([2]) + wire[5:12] + bytes([NakCode.FAIL_ERRNO, 0]) + wire[14:]
+                refused.append(now)
+            replies.append((source, wire))
+        return replies
+
+    server.outgoing = without_errno  # type: ignore[method-assign]
+    async with here.connection() as connection, under_way(connection, "px4", data) as source:
+        wire = request(77, Opcode.RESET_SESSIONS).encode()
+        server.handle(wire, Address(255, 190), trio.current_time())
+        here.link.kick()
+    assert refused
+    assert source.all_proven
+    assert here.tree.data(path("px4", "new")) == data
 
 
 @pytest.mark.parametrize("profile", EVERY_PROFILE)
