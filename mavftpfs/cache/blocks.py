@@ -291,6 +291,8 @@ class FileBlocks:
         Raises:
             RequestTimeout: none of the missing bytes came for `patience` seconds. Else what on_failed got.
         """
+        if not self.missing(start, stop):
+            return
         scope = trio.CancelScope(deadline=trio.current_time() + self._cache.patience)
         waiter = _Waiter(start, stop, self.missing(start, stop), trio.Event(), scope)
         self._waiters.append(waiter)

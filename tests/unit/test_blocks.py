@@ -213,6 +213,13 @@ async def test_a_reader_asks_for_what_is_missing_and_gets_it(nursery: trio.Nurse
     assert reading.results == [data[200:600]]
 
 
+async def test_what_is_present_costs_no_wait() -> None:
+    blocks = FileBlocks(make_cache(), 10)
+    deliver(blocks, 0, content(10))
+    assert bytes(await read(blocks, 0, 10) or b"") == content(10)
+    assert trio.current_time() == 0
+
+
 async def test_readers_wake_once_per_batch(nursery: trio.Nursery) -> None:
     blocks = FileBlocks(make_cache(), 1000)
     reading = await start_read(nursery, blocks, 0, 1000)
