@@ -9,8 +9,6 @@ import signal
 import socket
 import subprocess
 import sys
-import threading
-from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +19,6 @@ from mavftpfs import cli, commands, compose, control, daemon, report
 from mavftpfs.exits import ExitCode, MountFailed, NoFtp, NotDelivered, exit_code_for
 from mavftpfs.fuse.options import MountOptions
 from mavftpfs.oneshot.verbs import until_interrupted
-from mavftpfs.report import snapshot
 from mavftpfs.shared import errors
 from mavftpfs.shared.errors import LinkClosed, MavftpfsError, UsageError, VehicleLost
 
@@ -240,32 +237,6 @@ def test_errors_of_a_command_are_not_wrapped() -> None:
 # -- status and umount ----------------------------------------------------------------------------
 
 
-class FakeMount(threading.Thread):
-    """A mount's process as the control socket shows it: answers each client with one reply."""
-
-    def __init__(self, path: Path, replies: Mapping[str, Mapping[str, Any]]) -> None:
-        super().__init__(daemon=True)
-        self.replies = replies
-        self.requests: list[dict[str, Any]] = []
-        self.listener = socket.socket(socket.AF_UNIX)
-        self.listener.bind(str(path))
-        self.listener.listen()
-
-    def run(self) -> None:
-        while True:
-            try:
-                client, _ = self.listener.accept()
-            except OSError:
-                return
-            with client, client.makefile("rb") as lines:
-                self.requests.append(json.loads(lines.readline()))
-                reply = self.replies[self.requests[-1]["command"]]
-                client.sendall(json.dumps(reply).encode() + b"\n")
-
-    def stop(self) -> None:
-        self.listener.shutdown(socket.SHUT_RDWR)
-        self.join(20)
-        self.listener.close()
 
 
 @pytest.fixture
@@ -278,37 +249,10 @@ def sockets(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return directory
 
 
-@pytest.fixture
-def fake_mount(sockets: Path, tmp_path: Path) -> Iterator[FakeMount]:
-    """A mount on tmp_path/mnt whose process has ended by the time it says so."""
-    ended = subprocess.Popen(["true"])
-    ended.wait()
-    facts = {"mountpoint": str(tmp_path / "mnt"), "source": SOURCE}
-    facts |= snapshot({"rtt": 0.02, "vehicle": [1, 1], "armed": False}, {}, None, when_armed="ro")
-    replies: dict[str, dict[str, Any]] = {
-        "status": {"ok": True, "status": facts},
-        "umount": {"ok": True, "exit_code": 4, "pid": ended.pid},
-    }
-    mount = FakeMount(sockets / control.socket_name(str(tmp_path / "mnt")), replies)
-    mount.start()
-    yield mount
-    mount.stop()
 
 
-def test_status_json(fake_mount: FakeMount, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["status", str(tmp_path / "mnt"), "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["link"]["rtt"] == 0.02
-    assert cli.main(["status", "--json"]) == 0
-    assert [facts["source"] for facts in json.loads(capsys.readouterr().out)] == [SOURCE]
 
 
-def test_status_for_people(fake_mount: FakeMount, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["status"]) == 0
-    out = capsys.readouterr().out
-    assert out.startswith(f"{tmp_path}/mnt: vehicle 1/1, disarmed, link fine: RTT 20 ms\n")
-    assert SOURCE not in out
-    assert cli.main(["status", "--verbose"]) == 0
-    assert f"  source: {SOURCE}\n" in capsys.readouterr().out
 
 
 def test_status_of_nothing(sockets: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -328,18 +272,8 @@ def test_a_dead_mount_s_socket_is_swept(sockets: Path, capsys: pytest.CaptureFix
     assert not path.exists()
 
 
-def test_umount_gives_the_mount_s_exit_code(fake_mount: FakeMount, tmp_path: Path) -> None:
-    assert cli.main(["umount", "-l", str(tmp_path / "mnt")]) == 4
-    assert fake_mount.requests == [{"command": "umount", "lazy": True}]
 
 
-def test_umount_that_is_refused(
-    fake_mount: FakeMount, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    fake_mount.replies = {"umount": {"ok": False, "error": "it is in use"}}
-    code, line = complaint(capsys, "umount", str(tmp_path / "mnt"))
-    assert code == 3
-    assert "in use" in line
 
 
 def test_umount_of_what_is_not_mounted(
