@@ -1,11 +1,9 @@
 """What a chunk of 239 bytes costs: scripts/bench cost [--size MB] [--memory MB] [--servers NAME ...].
 
-First by part, replayed without waiting (`tests.bench.parts`): the shares hardly vary. Then frames of message
-110 by our codec and by pymavlink's, whose bytes are compared. Then whole: cp from and to a real mount over
-loopback, between two runs of a bare pipelined loop against the same server. Seconds depend on what else the
-machine does, so the figures to go by are each process's CPU time (user + system) per chunk, and the ratio of
-rates to the bare loop. With --memory, the mount's largest resident size while a file
-of so many megabytes is read, and another written, through it. Bytes are compared in every run.
+cp from and to a real mount over loopback, between two runs of a bare pipelined loop against the same server.
+Seconds depend on what else the machine does, so the figures to go by are each process's CPU time (user +
+system) per chunk, and the ratio of rates to the bare loop. With --memory, the mount's largest resident size
+while a file of so many megabytes is read, and another written, through it. Bytes are compared in every run.
 """
 
 from __future__ import annotations
@@ -28,7 +26,6 @@ from rich.table import Table
 
 from mavftpfs.protocol.payload import MAX_DATA
 from tests.bench.bare import Bare
-from tests.bench.parts import codec_costs, read_parts, write_parts
 from tests.support.mounts import Mount
 from tests.support.vehicles import MavsdkVehicle, Process, SimVehicle, UdpVehicle
 
@@ -199,24 +196,6 @@ def memory_writing(size: int) -> Memory:
     return Memory("written", size, peak, ALLOWED)
 
 
-def show_parts(direction: str, parts: dict[str, float]) -> None:
-    """Print what each part costs."""
-    table = Table(f"{direction}: part", "µs a chunk", "share")
-    total = sum(parts.values())
-    for part, cost in parts.items():
-        table.add_row(part, f"{cost:.2f}", f"{cost / total:.0%}")
-    table.add_row("all of these", f"{total:.2f}", "")
-    Console().print(table)
-
-
-def show_codec(costs: dict[str, tuple[float, float]]) -> None:
-    """Print what frames cost beside pymavlink."""
-    table = Table("codec", "µs a frame", "pymavlink's", "ratio")
-    for what, (ours, theirs) in costs.items():
-        table.add_row(what, f"{ours:.2f}", f"{theirs:.2f}", f"{theirs / ours:.0f}")
-    Console().print(table)
-
-
 def show_copies(found: Sequence[Copy]) -> None:
     """Print the copies and their ratios to the bare loop."""
     table = Table("server", "what", "MB/s", "of the bare loop", "client µs/chunk", "server µs/chunk")
@@ -241,11 +220,6 @@ def main() -> int:
     )
     parser.add_argument("--json", type=Path, help="write the results here too")
     arguments = parser.parse_args()
-    parts = {"read": read_parts(), "write": write_parts()}
-    for direction, costs in parts.items():
-        show_parts(direction, costs)
-    codec = codec_costs()
-    show_codec(codec)
     found: list[Copy] = []
     for server in arguments.servers:
         found += copies(server, int(arguments.size * 1e6 * SIZE_SHARE.get(server, LEAST_SHARE)))
@@ -259,12 +233,7 @@ def main() -> int:
             f"{peak.size} bytes {peak.what}: {peak.peak} bytes of memory at most, {peak.allowed} are allowed"
         )
     if arguments.json is not None:
-        results = {
-            "parts": parts,
-            "codec": codec,
-            "copies": [asdict(copy) for copy in found],
-            "memory": [asdict(peak) for peak in peaks],
-        }
+        results = {"copies": [asdict(copy) for copy in found], "memory": [asdict(peak) for peak in peaks]}
         arguments.json.write_text(json.dumps(results, indent=1))
     return 0
 

@@ -158,31 +158,14 @@ def requests_table(results: Sequence[dict[str, Any]]) -> str:
     return markdown(["command", *profiles, f"on {profiles[0]}"], lines)
 
 
-_FRAMES = {
-    "read": ("build a ReadFile", "parse a chunk"),
-    "write": ("build a WriteFile", "parse an ACK"),
-}
-"""The two frames that go and come for each packet of data."""
-
-
-def parts_table(results: dict[str, Any]) -> str:
-    """Return what each part of a packet costs, what frames cost pymavlink, and the memory of large files."""
-    parts = [results["parts"][direction] for direction in _FRAMES]
-    lines = [
-        [name, *(f"{costs[name]:.2f}" if name in costs else "" for costs in parts)]
-        for name in dict.fromkeys(name for costs in parts for name in costs)
-    ]
-    lines.append(["all of these", *(f"{sum(costs.values()):.2f}" for costs in parts)])
-    for what, whose in (("frames alone", 0), ("frames alone, pymavlink", 1)):
-        sums = [sum(results["codec"][frame][whose] for frame in frames) for frames in _FRAMES.values()]
-        lines.append([what, *(f"{cost:.2f}" for cost in sums)])
-    table = markdown(["CPU, µs a packet", *_FRAMES], lines)
+def memory_lines(results: dict[str, Any]) -> str:
+    """Return the memory that large files take."""
     peaks = [
         f"{peak['size'] / 1e6:,.0f} MB {peak['what']} through the mount:"
         f" {peak['peak'] / 1e6:.0f} MB of memory at most ({peak['allowed'] / 1e6:.0f} allowed)."
         for peak in results["memory"]
     ]
-    return "\n\n".join([table, *([" ".join(peaks)] if peaks else [])])
+    return " ".join(peaks)
 
 
 def caption(section: dict[str, Any]) -> str:
@@ -205,7 +188,7 @@ def tables(sections: dict[str, dict[str, Any]]) -> dict[str, str]:
         made = f"`{section['command']}`, {section['date']}; exact."
         found["requests"] = f"{requests_table(section['results'])}\n\n{made}"
     if "cost" in sections:
-        found["parts"] = f"{parts_table(sections['cost']['results'])}\n\n{caption(sections['cost'])}"
+        found["memory"] = f"{memory_lines(sections['cost']['results'])}\n\n{caption(sections['cost'])}"
     if "mount" in sections:
         rows = [row_from_json(fields) for fields in sections["mount"]["results"]["rows"]]
         found["peers"] = f"{peers_table(rows)}\n\n{caption(sections['mount'])}"

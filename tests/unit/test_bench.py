@@ -93,16 +93,6 @@ def test_each_part_is_run_and_noted(tmp_path: Path) -> None:
     assert "tmp" not in path.read_text()
 
 
-def test_the_parts_of_a_chunk_and_the_codec_are_measured(tmp_path: Path) -> None:
-    path = tmp_path / "results.json"
-    assert entry.main(["cost", "--servers", "--json", str(path)]) == 0
-    results = Record(path).sections()["cost"]["results"]
-    assert results["parts"].keys() == {"read", "write"}
-    assert {part for parts in results["parts"].values() for part in parts} > {"find and check frames"}
-    assert len(results["codec"]) == 4, "frames of ours and of pymavlink, which were the same bytes"
-    assert (results["copies"], results["memory"]) == ([], [])
-
-
 def test_datagrams_are_taken_apart_into_frames() -> None:
     framer = Framer(Address(1, 1), stream=False)
     signed = Framer(Address(1, 1), stream=False, signing_key=bytes(32), signing_clock=lambda: 1)

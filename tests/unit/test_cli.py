@@ -237,8 +237,6 @@ def test_errors_of_a_command_are_not_wrapped() -> None:
 # -- status and umount ----------------------------------------------------------------------------
 
 
-
-
 @pytest.fixture
 def sockets(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The only directory in which control sockets are looked for."""
@@ -247,12 +245,6 @@ def sockets(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setattr(control, "own_directories", lambda: [directory])
     monkeypatch.setattr(report, "mounts", dict)  # not those of other tests that run just now
     return directory
-
-
-
-
-
-
 
 
 def test_status_of_nothing(sockets: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -270,10 +262,6 @@ def test_a_dead_mount_s_socket_is_swept(sockets: Path, capsys: pytest.CaptureFix
     assert cli.main(["status", "--json"]) == 0
     assert json.loads(capsys.readouterr().out) == []
     assert not path.exists()
-
-
-
-
 
 
 def test_umount_of_what_is_not_mounted(
