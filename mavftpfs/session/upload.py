@@ -14,11 +14,6 @@ from mavftpfs.shared.errors import LocalProtocolError, MavftpfsError
 LONGEST_BACKOFF = 30.0
 """Most seconds between two attempts after a failure of the link."""
 
-LEAST_PAUSE, MOST_PAUSE = 60.0, 3600.0
-PAUSE_FACTOR = 10.0
-"""Seconds before a file is sent from its beginning again because more of it came, on servers that empty it.
-So many times as long as sending it took: then this takes a small part of the time."""
-
 
 class Feed:
     """Hands a source's chunks on and remembers what was proven of them; chunk: most bytes of one.
@@ -140,8 +135,8 @@ class QueuedUpload:
             the background; refusals only when finish is called.
         running: the scheduler's task is at it. clean: everything given so far is ACKed and terminated.
         retry_at: not to be touched before. begun, resent: see cache.remote.Upload.
-        filled_in: seconds that it took to send all there was, last time. tried: it was reopened to see what
-            OpenFileWO does.
+        tried: it was reopened to see what OpenFileWO does. waits_for_finish: what comes now costs the whole
+            file again, so it waits until somebody waits for the end.
         restarted: the vehicle did; what was proven does not count. refused_behind: what was sent right before
             the Terminate was refused the last time.
     """
@@ -164,8 +159,7 @@ class QueuedUpload:
         self.aborted = False
         self.refused = False
         self.failures = 0
-        self.filled_in = 0.0
-        self.tried = self.restarted = self.refused_behind = False
+        self.tried = self.restarted = self.refused_behind = self.waits_for_finish = False
         self.refused_at: int | None = None
         self.retry_at = 0.0
         self._woken = True
@@ -272,7 +266,7 @@ class QueuedUpload:
         """Whether there is something to do for it, now or later."""
         if self.aborted or self.refused:
             return False
-        return self.finishing or self._woken
+        return self.finishing or (self._woken and not self.waits_for_finish)
 
     def mark(self) -> None:
         """The source has nothing more just now: what `complete` says is true for who called until now."""
@@ -286,10 +280,6 @@ class QueuedUpload:
         self.error = None
         self.failures = 0
         self.tell()
-
-    def pause_restart(self, now: float) -> None:
-        """The next byte costs the whole file again, so let some gather first."""
-        self.rest_until(now + min(MOST_PAUSE, max(LEAST_PAUSE, PAUSE_FACTOR * self.filled_in)))
 
     def fail(self, error: MavftpfsError, now: float, *, refused: bool = False) -> None:
         """Tell whoever waits; refused: asking again by ourselves is of no use."""

@@ -298,8 +298,7 @@ class Uploading:
             upload.fail(Armed("the vehicle was armed"), self._clock())
         elif stop in (Stop.FINISHED, Stop.STARVED):
             upload.complete(more=feed.has_more())
-            if not upload.finishing and not self.writer.resumable and not self.writer.may_try(upload):
-                upload.pause_restart(self._clock())
+            upload.waits_for_finish = not self.writer.resumable and not self.writer.may_try(upload)
 
     async def _close(self, limit: float | None) -> bool:
         """Terminate; return whether what was ACKed counts as written.

@@ -157,7 +157,6 @@ class Writer:
         self._transfer: WriteTransfer | None = None
         self._last: WriteTransfer | None = None
         self._starved_at: float | None = None
-        self._filled = False
 
     # --- news
 
@@ -215,7 +214,7 @@ class Writer:
             self.turns.set_writing(False)
 
     async def _write(self, upload: QueuedUpload, session: OpenSession) -> Stop:
-        rearms, self._filled = 0, False
+        rearms = 0
         self.turns.set_writing(self._disarmed_by_paths)
         while True:
             transfer = WriteTransfer(
@@ -326,23 +325,20 @@ class Writer:
             return Stop.YIELD
         rival = self._queue.rival_use(upload)
         if transfer.starved:
-            return self._reason_of_starved(upload, now, session.opened_at, pressed=rival is not None)
+            return self._reason_of_starved(upload, now - session.opened_at, pressed=rival is not None)
         self._starved_at = None
         return Stop.YIELD if self._is_turn_over(upload, session.opened_at, now, rival) else None
 
-    def _reason_of_starved(
-        self, upload: QueuedUpload, now: float, since: float, *, pressed: bool
-    ) -> Stop | None:
+    def _reason_of_starved(self, upload: QueuedUpload, slice_: float, *, pressed: bool) -> Stop | None:
         if upload.finishing:
             return Stop.FINISHED
+        now = self._clock()
         if self._starved_at is None:
             self._starved_at = now
-            if not self._filled:
-                self._filled, upload.filled_in = True, now - since
         patience = STARVE
         if pressed and (self.resumable or self.may_try(upload)):
             patience = BRIEF_STARVE
-        elif pressed and now - since >= PATIENCE:
+        elif pressed and slice_ >= PATIENCE:
             patience = 0.0
         return Stop.STARVED if now - self._starved_at >= patience else None
 
