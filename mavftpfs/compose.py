@@ -29,7 +29,7 @@ from mavftpfs.farewell import rescue, spool_for
 from mavftpfs.fuse.operations import Space
 from mavftpfs.fuse.options import MountOptions
 from mavftpfs.link.opening import open_link
-from mavftpfs.link.uri import LinkSpec
+from mavftpfs.link.uri import LinkKind, LinkSpec
 from mavftpfs.session.connection import Connection, ConnectOptions, connected
 from mavftpfs.session.driver import PayloadTrace
 from mavftpfs.shared.errnos import errno_for
@@ -48,6 +48,9 @@ from mavftpfs.trace import JsonTrace, Tee, TextTrace, TlogWriter
 
 MIB = 1 << 20
 KEY_SIZE = 32
+BITS_PER_BYTE = 10
+"""On a serial port: eight, and a start and a stop bit."""
+
 
 MakeKept = Callable[[BlockCache, Dentries], KeptCache]
 
@@ -133,7 +136,7 @@ async def attached(
                     notice = partial(rescue, spool, rescue_for)
                 tree = Tree(
                     connection.store,
-                    cache_options(options),
+                    cache_options(options, spec),
                     clock=trio.current_time,
                     invalidate=invalidate,
                     nursery=nursery,
@@ -257,8 +260,8 @@ def connect_options(options: MountOptions) -> ConnectOptions:
     )
 
 
-def cache_options(options: MountOptions) -> CacheOptions:
-    """Return the caches' part of the options."""
+def cache_options(options: MountOptions, spec: LinkSpec) -> CacheOptions:
+    """Return the caches' part of the options, for a link."""
     return CacheOptions(
         root=options.root,
         dir_timeout=options.dir_timeout,
@@ -269,6 +272,7 @@ def cache_options(options: MountOptions) -> CacheOptions:
         dirty_max=options.dirty_max,
         spool_max=options.spool_max,
         rmw_max=options.rmw_max,
+        link_rate=spec.baud / BITS_PER_BYTE if spec.kind is LinkKind.SERIAL else None,
         verify=options.verify,
         verify_max=options.verify_max,
         write_armed=options.when_armed == "ok",

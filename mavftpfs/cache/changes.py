@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Awaitable, Callable
 
 from mavftpfs.cache.context import Context
+from mavftpfs.cache.names import Names
 from mavftpfs.cache.namespace import Namespace
 from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.overlay import Overlay
@@ -18,6 +19,7 @@ class Changes:
     def __init__(
         self,
         context: Context,
+        names: Names,
         overlay: Overlay,
         namespace: Namespace,
         *,
@@ -26,6 +28,7 @@ class Changes:
     ) -> None:
         """`put(path, data, exclusive)` writes and delivers a whole file."""
         self._context = context
+        self._names = names
         self._overlay = overlay
         self._local = overlay.local
         self._namespace = namespace
@@ -48,7 +51,6 @@ class Changes:
             self._local.rmdir(path)
             return
         self._context.require_disarmed()
-        path = self._overlay.spelled(path)
         if self._local.names(path):
             raise DirectoryNotEmpty(f"{path!r} holds local files")
         await self._namespace.rmdir(path)
@@ -60,7 +62,6 @@ class Changes:
             self._local.unlink(path)
             return
         self._context.require_disarmed()
-        path = self._overlay.spelled(path)
         self._overlay.require_free(path)
         await self._namespace.unlink(path)
         self._overlay.times.forget(path)
@@ -81,7 +82,7 @@ class Changes:
         if local_old or local_new:
             await self._rename_across(old, new, to_vehicle=local_old, noreplace=noreplace)
         else:
-            await self._namespace.rename(self._overlay.spelled(old), new, noreplace=noreplace)
+            await self._namespace.rename(old, new, noreplace=noreplace)
 
     async def _rename_across(self, old: bytes, new: bytes, *, to_vehicle: bool, noreplace: bool) -> None:
         """Rename between a local name and one of the vehicle's: a copy, since they are two places.
@@ -91,8 +92,6 @@ class Changes:
         """
         if await self._is_directory(old):
             raise CrossDevice(f"{old!r} and {new!r} are in different places")
-        if not to_vehicle:
-            old = self._overlay.spelled(old)
         source = await self._open_reader(old)
         try:
             if to_vehicle:
@@ -138,17 +137,6 @@ class Changes:
         if writing:
             raise FileBusy(f"{path!r} is being written, so it cannot be moved to another place")
 
-    async def take_back(self, path: bytes, *, if_empty: bool) -> None:
-        """Remove a file that we made for what failed then, or made perhaps: then only an empty one.
-
-        Raises:
-            As WriteStore.
-        """
-        async with self._context.paths.hold(path):
-            others = self._context.nodes.get(path) is not None
-            if not others and not (if_empty and await self._context.writer.stat_size(path)):
-                await self._namespace.remove_perhaps(path)
-
     async def require_parent(self, path: bytes) -> None:
         """Check that the directory of a local path exists, here or on the vehicle.
 
@@ -171,5 +159,5 @@ class Changes:
     async def _is_directory(self, path: bytes) -> bool:
         if self._local.owns(path):
             return self._local.find(path).kind is EntryKind.DIRECTORY
-        entry = await self._namespace.entry(path)
+        entry = await self._names.entry(path)
         return entry is not None and entry.kind is EntryKind.DIRECTORY

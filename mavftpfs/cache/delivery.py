@@ -3,6 +3,9 @@
 `deliver` returns when the vehicle has the file, checked (promise 2), or raises why not; what was not
 delivered stays held, and the next call goes on. While it runs the file is not written (`Node.quiet`), so
 what is verified is what was sent. Uploads begin earlier, in the background, where that is of use.
+
+One way leads to the card: the whole file is sent under a reserved name, verified there, and renamed into
+place (`plan`, `replace`). Only cards that cannot rename get it under its own name.
 """
 
 from __future__ import annotations
@@ -13,26 +16,26 @@ from dataclasses import astuple
 
 import trio
 
-from mavftpfs.cache import base, overwritten
+from mavftpfs.cache import base
+from mavftpfs.cache.cleaner import Cleaner
 from mavftpfs.cache.context import Context
-from mavftpfs.cache.dating import Dater
-from mavftpfs.cache.draft import Draft
+from mavftpfs.cache.draft import Draft, Event, State
+from mavftpfs.cache.names import Names
 from mavftpfs.cache.nodes import Attempt, Node
-from mavftpfs.cache.plan import SENDING, Plan, Rules, choose
-from mavftpfs.cache.probes import Prober
+from mavftpfs.cache.plan import SENDING, Plan, choose
 from mavftpfs.cache.recovery import describe
-from mavftpfs.cache.remote import FREE_FOR
-from mavftpfs.cache.replacing import Present, Replacer
-from mavftpfs.cache.sure import Sure, may_have_made
+from mavftpfs.cache.replace import Replacer
 from mavftpfs.cache.throttle import Throttle
 from mavftpfs.cache.verify import Verifier
 from mavftpfs.shared.errors import (
     AlreadyExists,
     Armed,
-    FileChanged,
+    FtpNak,
     LinkError,
     MavftpfsError,
     NoSpace,
+    OutcomeUnknown,
+    PathTooLong,
     RemoteProtocolError,
     RequestTimeout,
     SessionBusy,
@@ -44,9 +47,14 @@ from mavftpfs.shared.model import DirEntry, EntryKind, split
 log = logging.getLogger("mavftpfs.cache")
 
 MAX_STEPS = 8
-"""Plans tried in one delivery: each but the last one learnt something of the server or fetched the base."""
+"""Steps of one delivery: each but the last learnt something of the server or fetched the base."""
+
+MISMATCHES = 2
+"""After so many copies that are not what was sent the delivery fails."""
 
 FINISHES = 3
+"""How often an upload is asked to end because the source had more."""
+
 PASSING = (RequestTimeout, LinkError, SessionBusy, Armed)
 """Errors after which the upload goes on where it stopped."""
 
@@ -58,14 +66,20 @@ class Deliverer:
         on_undelivered: called when a delivery ended without success.
     """
 
-    def __init__(self, context: Context, sure: Sure, throttle: Throttle) -> None:
+    def __init__(
+        self,
+        context: Context,
+        names: Names,
+        replacer: Replacer,
+        cleaner: Cleaner,
+        throttle: Throttle,
+    ) -> None:
         self._context = context
+        self._names = names
+        self._replacer = replacer
+        self._cleaner = cleaner
         self._throttle = throttle
-        self._rules = Rules(context.options.rmw_max, inplace=context.options.inplace)
-        self.replacer = Replacer(context, sure)
-        self.verifier = Verifier(context, sure)
-        self._prober = Prober(context)
-        self.dater = Dater(context)
+        self.verifier = Verifier(context, names)
         self.delivered = 0
         self.on_undelivered: Callable[[], None] = lambda: None
 
@@ -76,23 +90,57 @@ class Deliverer:
             The reason why not: as WriteStore; VerificationFailed, NotSupported, FileTooLarge, FileChanged.
         """
         while wanted():
-            async with node.lock:
-                if not node.doomed and await self.deliver_locked(node):
+            await node.spared.wait()
+            async with self._context.paths.steady(lambda: node.path, lasting=True), node.lock:
+                if node.removed or not node.undelivered:
+                    await self.abandon(node)
+                    return
+                with node.delivering() as scope:
+                    await self._deliver_or_note(node)
+                if not scope.cancelled_caught:
                     return
 
-    async def deliver_locked(self, node: Node) -> bool:
-        """Do the same for who holds the node's lock; return False if it was called off (Node.doomed)."""
-        with node.delivering() as scope:
-            await self._deliver_or_note(node)
-        return not scope.cancelled_caught
+    async def begin(self, node: Node) -> bool:
+        """Begin to send a draft that may still grow; return False if that has to wait for a close.
+
+        Raises:
+            As deliver.
+        """
+        await node.spared.wait()
+        async with self._context.paths.steady(lambda: node.path, lasting=True), node.lock:
+            if node.removed or not node.undelivered:
+                return True
+            with node.delivering():
+                plan = self._plan(node)
+                if plan is Plan.FIND_OUT:
+                    await self._find_out(node)
+                    plan = self._plan(node)
+                if plan not in SENDING:
+                    return False
+                await self._attempt(node, plan)
+        return True
+
+    async def abandon(self, node: Node) -> None:
+        """Give up the present attempt; what it left under reserved names goes now or at the next listing. The
+        caller has the node's lock, or holds its path alone."""
+        attempt, node.attempt = node.attempt, None
+        if attempt is None:
+            return
+        if node.draft is not None and node.draft.sending is attempt.sending:
+            node.draft.give_up()
+        try:
+            await attempt.upload.abort()
+            if attempt.plan is Plan.REPLACE:
+                await self._replacer.remove(node.path, *attempt.names)
+        finally:
+            self._release(attempt)
+
+    # --- one delivery
 
     async def _deliver_or_note(self, node: Node) -> None:
-        if not node.undelivered:
-            await self.abandon(node)  # what was written since it began was taken back
-            return
         node.quiet = trio.Event()
         try:
-            if node.path not in self._context.torn:  # else its name lacks a file until this is done
+            if node.path not in self._context.own.torn:  # else its name lacks a file until this is done
                 self._context.require_disarmed()
             await self._deliver(node)
             node.error = None
@@ -106,72 +154,11 @@ class Deliverer:
             if node.undelivered:  # also if who waited for it gave up
                 self.on_undelivered()
 
-    async def begin_locked(self, node: Node) -> bool:
-        """Prepare to send a draft that may still grow; return False if that has to wait for a close.
-
-        Raises:
-            As deliver.
-        """
-        with node.delivering():
-            plan = self.plan(node)
-            if plan is Plan.PROBE:
-                await self._prober.probe(node.path)
-                plan = self.plan(node)
-            if plan not in SENDING or plan is Plan.REWRITE:
-                return False
-            await self._attempt(node, plan)
-        return True
-
-    def let_go(self) -> None:
-        """A file lost its name: who waits to write it need not wait."""
-        self._throttle.let_go()
-
-    def plan(self, node: Node) -> Plan:
-        """Return the next step for the node's draft. Raises as plan.choose."""
-        return choose(_draft(node), self._context.writer.traits, self._rules)
-
-    async def abandon(self, node: Node) -> None:
-        """Give up the present attempt; what it left under reserved names goes now or at the next listing."""
-        async with node.firmly():
-            attempt, node.attempt = node.attempt, None
-            if attempt is not None:
-                await self._abandon(node, attempt)
-
-    async def _abandon(self, node: Node, attempt: Attempt) -> None:
-        places = attempt.places
-        try:
-            try:
-                await attempt.upload.abort()
-            finally:  # also if who waits for it gives up
-                self._note_abandoned(node, attempt)
-            if places is not None and not attempt.committing:
-                await self.replacer.clean(node.path, places, new=attempt.upload.begun)
-            elif places is not None and node.path in self._context.torn:
-                self.replacer.leave(node.path, places)
-        finally:
-            if places is not None:
-                self.replacer.release(places)
-
-    def _note_abandoned(self, node: Node, attempt: Attempt) -> None:
-        if node.draft is not None:
-            node.draft.made |= attempt.plan is Plan.NEW and attempt.upload.begun
-            node.draft.begin_again()
-        if attempt.plan is Plan.NEW and not attempt.upload.begun:
-            self._context.dentries.expire(split(node.path)[0], self._context.clock())  # it shows the file
-        elif attempt.path == node.path:
-            self._context.dentries.note_unsized(node.path, made=attempt.plan is Plan.NEW)
-
-    # --- planning
-
     async def _deliver(self, node: Node) -> None:
         mismatches = 0
         for _ in range(MAX_STEPS):
-            draft = _draft(node)
-            if draft.stretched and not draft.fresh and node.attempt is None:
-                draft.has_size(await self.verifier.size(node.path))
-            plan = self.plan(node)
+            plan = self._plan(node)
             if plan is Plan.NOTHING:
-                await self.abandon(node)
                 return
             known = astuple(self._context.writer.traits)
             try:
@@ -179,203 +166,225 @@ class Deliverer:
             except VerificationFailed as error:
                 mismatches += 1
                 await self.abandon(node)
-                if mismatches > 1 or isinstance(error.__cause__, Armed):  # no second copy can be checked
+                if mismatches == MISMATCHES or isinstance(error.__cause__, Armed):  # none can be checked
                     raise
                 log.warning("%s; sending it again", error)
             except MavftpfsError as error:
-                learnt = astuple(self._context.writer.traits) != known
-                restores = draft.ruined and draft.whole and plan is Plan.IN_PLACE
-                if not isinstance(error, PASSING):
+                resumable = isinstance(error, PASSING) and _draft(node).size > 0
+                if not resumable:
                     await self.abandon(node)
-                if isinstance(error, AlreadyExists) and await self._is_ours(node.path, draft):
-                    continue
-                if not (learnt or restores) or isinstance(error, LinkError | Armed):
+                learnt = astuple(self._context.writer.traits) != known
+                if not learnt or isinstance(error, LinkError | Armed):
                     raise
                 log.debug("%r: %s; trying another way", node.path, error)
         raise VerificationFailed(f"no way of writing {node.path!r} led to an end")
 
+    def _plan(self, node: Node) -> Plan:
+        draft = _draft(node)
+        if node.path in self._context.own.torn and draft.state is State.DIRTY:
+            return Plan.MEND  # it was written again before its name had a file
+        return choose(draft, self._context.writer.traits, inplace=self._context.options.inplace)
+
     async def _step(self, node: Node, plan: Plan) -> None:
         if plan in SENDING:
             await self._send(node, plan)
-        elif plan is Plan.PROBE:
-            await self._prober.probe(node.path)
-        elif plan is Plan.FILL:
-            await base.fill(self._context, node)
+        elif plan is Plan.FIND_OUT:
+            await self._find_out(node)
+        elif plan is Plan.FETCH:
+            await base.fetch(self._context, node)
         else:
-            await self.abandon(node)
-            if plan is Plan.TRUNCATE and not _draft(node).changed.empty:
-                await self._cut_first(node, _draft(node))
-            else:
-                await self._act(node, plan)
+            await self._mend(node)
 
-    async def _act(self, node: Node, plan: Plan) -> None:
-        """Do what takes one request."""
-        draft = _draft(node)
-        if plan is Plan.CREATE_EMPTY:
-            async with node.firmly():
-                await self._create_empty(node.path, draft)
-        else:
-            since = self._context.clock()
-            if (size := await self.verifier.size(node.path)) < draft.size:  # it would be filled up with zeros
-                raise FileChanged(f"{node.path!r} has {size} bytes on the vehicle now: nothing to cut")
-            await base.require_same(self._context, node, since)
-            await base.cut(self._context, node, draft.size)
-        await self.verifier.check(node.path, draft)
-        self._on_delivered(node, draft)
+    async def _find_out(self, node: Node) -> None:
+        """See on an empty file of our own whether the card can rename.
 
-    async def _cut_first(self, node: Node, draft: Draft) -> None:
-        """Cut a file of which a part is to be changed, too."""
-        await base.require_stays(self._context, node, self.verifier.size)
-        await base.cut(self._context, node, draft.size)
-        draft.remote_cut(draft.size)
-
-    async def _create_empty(self, path: bytes, draft: Draft) -> None:
+        Raises:
+            As WriteStore.create_empty and rename.
+        """
+        context = self._context
+        context.namer.fresh(node.path)  # raises PathTooLong, before anything is sent
         try:
-            await self._context.writer.create_empty(path, free_at=self._free_at(path, draft))
-        except BaseException as error:  # also if who waits for it gives up
-            if may_have_made(error):
-                draft.maybe_made = True
-                self._context.dentries.expire(split(path)[0], self._context.clock())
-            raise
-        draft.made = True
-        # Whoever takes its name away before it was looked at has to find it there.
-        self._context.dentries.note_created(path, DirEntry(split(path)[1], EntryKind.FILE, 0))
-        self._context.dentries.note_proven(path, self._context.clock())
+            first, second = context.namer.pair(node.path)
+        except PathTooLong:
+            context.writer.traits.rename_works = True  # it shows when the file is to get its name
+            return
+        context.own.live |= {first, second}
+        left = first
+        try:
+            await context.writer.create_empty(first)
+            left = await self._try_to_rename(first, second)
+        finally:
+            context.own.live -= {first, second}
+            context.dentries.expire(split(first)[0], context.clock())
+        await self._replacer.remove(node.path, left)
 
-    async def _is_ours(self, path: bytes, draft: Draft) -> bool:
-        """Return whether a file that appeared is the empty one we may have made; note it if so."""
-        self._context.dentries.expire(split(path)[0], self._context.clock())
-        draft.made = draft.maybe_made and await self.verifier.size(path) == 0
-        return draft.made
+    async def _try_to_rename(self, first: bytes, second: bytes) -> bytes:
+        """Return the name that the file has then. One refusal may be of that moment only."""
+        try:
+            await self._names.rename(first, second)
+        except FtpNak:
+            try:
+                await self._names.rename(first, second)
+            except FtpNak as nak:
+                if not await self._names.cannot_rename(first, second, nak):
+                    raise
+                return first
+        return second
+
+    async def _mend(self, node: Node) -> None:
+        """The renames of this file were interrupted: have them completed or undone, and look what came of it.
+
+        Raises:
+            As Directories.ask and Verifier.check.
+        """
+        draft, own = _draft(node), self._context.own
+        await self._cleaner.mend(node)
+        there = await self._names.ask(node.path) is not None
+        own.torn.pop(node.path, None)
+        if draft.state is not State.TORN:
+            return
+        try:
+            crc32 = await self.verifier.check(node.path, draft, doubted=True) if there else None
+        except VerificationFailed:
+            there = False
+        if there:
+            self._on_delivered(node, crc32)
+        else:
+            draft.on(Event.REFUSED)
 
     # --- sending
 
     async def _send(self, node: Node, plan: Plan) -> None:
         attempt = await self._attempt(node, plan)
-        draft, told, ended_at = _draft(node), 0, float("inf")
-        if not attempt.ended:
-            await self._finish(attempt)
-            if draft.ruined and attempt.plan is Plan.IN_PLACE:
-                raise FileChanged(f"{node.path!r} was emptied on the vehicle while it was changed here")
-            ended_at = self._context.clock()
-            told = await self.verifier.check_sent(attempt.path, draft, attempt.upload)
-        if attempt.places is not None and not attempt.committing:
-            await self._require_old(node, draft, attempt)
-        async with node.firmly():
-            if not attempt.committing:
-                attempt.ended = True
-                await attempt.upload.abort()
-            if attempt.places is not None:
-                await self._commit(node, attempt)
-                await self.verifier.check_replaced(node.path, draft, attempt.upload, told)
+        await self._finish(attempt)
+        draft, writer = _draft(node), self._context.writer
+        doubted = attempt.sending.rewritten or writer.in_doubt() or writer.doubted_since(attempt.begun_at)
+        crc32 = await self.verifier.check(attempt.path, draft, doubted=doubted)
+        if plan is Plan.REPLACE:
+            await self._require_expected(node)
+            await self._commit(node, attempt)
+        else:
             node.attempt = None
-            self._on_delivered(node, draft, ended_at)
+            await attempt.upload.abort()
+        self._on_delivered(node, crc32)
 
     async def _attempt(self, node: Node, plan: Plan) -> Attempt:
         """Return the attempt under way if it still fits, else a new one."""
-        draft = _draft(node)
         attempt = node.attempt
-        if attempt is not None and attempt.fits(plan, draft):
+        if attempt is not None and attempt.plan is plan and not attempt.sending.overtaken:
             return attempt
         await self.abandon(node)
-        least, begun_at = 0, self._context.clock()
-        if not draft.fresh and not draft.ruined:
-            least = await base.require_stays(self._context, node, self.verifier.size)
-        elif draft.ruined and not draft.placed:
-            await self._require_ruin(node, draft)
+        draft, context = _draft(node), self._context
         path, places = node.path, None
-        if plan is Plan.REPLACE:
-            places = self._context.namer.places(node.path)
+        if plan is Plan.OVERWRITE or isinstance(node.error, AlreadyExists):  # which all of it was sent for
+            await self._require_expected(node)
+        if plan is Plan.OVERWRITE:
+            pass
+        elif draft.base is None:
+            path = context.namer.fresh(node.path)
+            context.own.live.add(path)
+        else:
+            places = context.namer.places(node.path)
             path = places.new
-        if plan is Plan.REWRITE:
-            draft.remote_removed()
-        free_at = self._free_at(path, draft) if plan is Plan.NEW else None
-        if places is not None:
-            self.replacer.reserve(places)
+            context.own.live |= places.all
+        begun_at = context.clock()
         try:
             if places is not None:
-                await self.replacer.write_sidecar(places, node.path)
-            await overwritten.fetch_endangered(self._context, node, plan)
-            sending = draft.begin(whole=plan is not Plan.IN_PLACE)
+                await self._replacer.write_sidecar(places, node.path)
+            sending = draft.begin(in_place=plan is Plan.OVERWRITE)
             sending.progress = self._throttle.on_acked
-            writer = self._context.writer
-            if plan is Plan.IN_PLACE:
-                upload = await writer.open_upload(path, sending, create=False, least=least)
-            else:
-                upload = await writer.open_upload(path, sending, create=True, free_at=free_at)
-            if plan is Plan.NEW:
-                self._context.dentries.note_created(path, DirEntry(split(path)[1], EntryKind.FILE, 0))
-            if places is None:
-                self._context.dentries.note_unsized(path)
+            upload = await context.writer.open_upload(path, sending)
         except BaseException:
-            if places is not None:
-                self.replacer.release(places)
+            draft.give_up()
+            context.own.live -= {path} if places is None else places.all
             raise
-        node.attempt = Attempt(plan, path, sending, upload, places, begun_at=begun_at)
+        node.attempt = Attempt(plan, path, sending, upload, begun_at, places)
+        if plan is Plan.OVERWRITE:
+            context.dentries.note_unsized(path, made=draft.base is None)
         return node.attempt
 
-    def _free_at(self, path: bytes, draft: Draft) -> float | None:
-        """Return when a listing last showed the name of a new file to be free, None if it need not be."""
-        return None if draft.on_vehicle else self._context.dentries.free_at(path)
-
-    async def _require_ruin(self, node: Node, draft: Draft) -> None:
-        """Raise FileChanged (or as Verifier.size) if a file lacks nothing: it is a successor, which stays."""
-        with node.looking():
-            size = await self.verifier.size(node.path)
-        if draft.remote_size is not None and size >= draft.remote_size:
-            raise FileChanged(f"{node.path!r} became another file while it was changed here")
-
-    async def _require_old(self, node: Node, draft: Draft, attempt: Attempt) -> None:
-        """Check that what a part was changed of did not become another file while all of it was sent.
+    async def _require_expected(self, node: Node) -> None:
+        """Check that a new file's name is free, or that the file of which a part stays is still the same.
 
         Raises:
-            As base.require_stays.
+            AlreadyExists, FileChanged. Else as Names.is_free and base.require_same.
         """
-        lasted = self._context.clock() - attempt.begun_at
-        if lasted > FREE_FOR and not draft.fresh and not draft.ruined:
-            await base.require_stays(self._context, node, self.verifier.size)
+        draft = _draft(node)
+        if draft.base_limit:
+            await base.require_same(self._context, node, self.verifier)
+        elif draft.base is None and not draft.begun and not await self._names.is_free(node.path):
+            raise AlreadyExists(f"{node.path!r} was made by somebody else in the meantime")
 
     async def _finish(self, attempt: Attempt) -> None:
         attempt.sending.growing = False
         for _ in range(FINISHES):
             attempt.upload.wake()
             await attempt.upload.finish()
-            if not attempt.sending.unacked or attempt.sending.emptied:
+            if not attempt.sending.unacked:
                 return
         raise RemoteProtocolError(f"{attempt.path!r} was said to be finished, and was not")
 
     async def _commit(self, node: Node, attempt: Attempt) -> None:
-        """Rename; if that was begun before, find out first how far it came."""
-        draft, places = _draft(node), attempt.places
-        assert places is not None
-        if attempt.committing:
-            present = await self.replacer.observe(places, node.path)
-            if present.target and not present.new:  # renamed, or tidied up by somebody who took it for litter
-                await self.verifier.check_doubted(node.path, draft)
-        else:
-            present = Present(new=True, old=False, target=True)
-        attempt.committing = True
-        draft.place()
+        """Rename what was sent and verified into place.
+
+        Raises:
+            As Replacer. VerificationFailed: it is not what it was any more.
+        """
+        draft, context = _draft(node), self._context
+        node.attempt = None
         try:
-            await self.replacer.replace(attempt.path, node.path, places, present)
-        except MavftpfsError as error:
-            if not isinstance(error, PASSING):
-                attempt.committing = node.path in self._context.torn  # else all is where it was
-                draft.placed = attempt.committing or isinstance(error, VerificationFailed)
+            await attempt.upload.abort()
+        except BaseException:  # nobody waits any more: all of it is sent again
+            draft.give_up()
+            context.own.leave(attempt.names, node.path)
+            self._release(attempt)
             raise
-        self.replacer.release(places)
+        name = split(attempt.path)[1]
+        context.dentries.note_created(attempt.path, DirEntry(name, EntryKind.FILE, draft.size))
+        draft.commit()
+        try:
+            if attempt.places is None:
+                await self._replacer.place(attempt.path, node.path)
+            else:
+                await self._replacer.replace(attempt.path, node.path, attempt.places)
+            if attempt.upload.resent and await self.verifier.size(node.path) != draft.size:
+                draft.interrupted(ours=True)
+                raise VerificationFailed(f"{node.path!r} was emptied by a request that came twice")
+        except BaseException as error:
+            await self._on_not_placed(node, attempt, error)
+            raise
+        finally:
+            self._release(attempt)
+
+    async def _on_not_placed(self, node: Node, attempt: Attempt, error: BaseException) -> None:
+        draft = _draft(node)
+        if draft.state is not State.COMMITTING:
+            return
+        unknown = isinstance(error, OutcomeUnknown) or not isinstance(error, MavftpfsError)
+        if unknown or node.path in self._context.own.torn:
+            draft.interrupted()
+            return
+        draft.on(Event.REFUSED)
+        await self._replacer.remove(node.path, *attempt.names)
 
     # --- after
 
-    def _on_delivered(self, node: Node, draft: Draft, ended_at: float = float("inf")) -> None:
+    def _release(self, attempt: Attempt) -> None:
+        """What is left under the attempt's names is for the next listing to clean up."""
+        self._context.own.live -= {attempt.path} if attempt.places is None else attempt.places.all
+
+    def _on_delivered(self, node: Node, crc32: int | None) -> None:
         """The vehicle has it: listings, blocks and checksums follow."""
-        context = self._context
-        shown = context.dentries.listed_since(node.path, ended_at)
+        context, draft = self._context, _draft(node)
         context.dentries.note_written(node.path, draft.size)
         context.dentries.note_proven(node.path, context.clock())
-        draft.delivered()
-        base.outdate(context, node)
-        self.dater.on_known(node, shown)
+        if crc32 is None and draft.size <= context.options.verify_max:
+            crc32 = draft.crc32()
+        draft.delivered(crc32)
+        node.generation += 1
+        node.known_at = context.clock()
+        node.close_base()
+        context.files.on_written(node.path)
         context.on_changed(node.path)
         self.delivered += 1
 

@@ -1,23 +1,100 @@
-"""What a file is to be, as far as the vehicle does not provably have it. Layer: cache; pure.
+"""What a file is to be, and how far the vehicle has it. Layer: cache; pure.
 
 A draft lies over a base: the file as it is on the vehicle. Each byte below `size` is *held* (the spool has
 it), else *base* (below `base_limit`: the vehicle has it), else zero: the content between the old end and a
-write beyond it, or of a file that was extended. A hole of the base is never taken for zeros.
+write beyond it, or of a file that was extended.
 
-All handles of a path share its draft. `sending` is the present attempt to deliver it.
+All handles of a path share its draft. Its state, and what may happen next, is in one table: `TRANSITIONS`.
+What is delivered is always the whole draft, as a new file under a reserved name (`delivery`). A write while
+that file is sent joins it; once it is being renamed into place, writers wait for the end of that.
 """
 
 from __future__ import annotations
 
 import zlib
+from dataclasses import dataclass
 from enum import Enum
 from typing import Protocol
 
 from mavftpfs.cache.sending import Sending
-from mavftpfs.shared.errors import DataUnproven
+from mavftpfs.shared.errors import LocalProtocolError
 from mavftpfs.shared.extents import ExtentSet
 
 STEP = 64 * 1024
+"""Bytes read from the spool at once for a checksum."""
+
+
+class State(Enum):
+    """How far the vehicle has a draft.
+
+    CLEAN: it has all of it. DIRTY: it does not, and nothing is under way. SENDING: a new file is written
+    under a reserved name. COMMITTING: that file is verified and being renamed into place. TORN: the renames
+    were interrupted, so the name may lack its file. STALE: the base is another file now.
+    """
+
+    CLEAN = "clean"
+    DIRTY = "dirty"
+    SENDING = "sending"
+    COMMITTING = "committing"
+    TORN = "torn"
+    STALE = "stale"
+
+
+class Event(Enum):
+    """What happens to a draft.
+
+    CHANGED: a program wrote or truncated. EMPTIED: it was truncated to nothing, so that no base matters.
+    BEGUN: an attempt to send it began. GIVEN_UP: the attempt ended without success. COMMITS: what was sent
+    is verified, and the first rename is about to be asked for. PLACED: it has its name. REFUSED: it has not,
+    and all is where it was. INTERRUPTED: nobody knows how far that came. REPLACED: others replaced the base.
+    """
+
+    CHANGED = "changed"
+    EMPTIED = "emptied"
+    BEGUN = "begun"
+    GIVEN_UP = "given up"
+    COMMITS = "commits"
+    PLACED = "placed"
+    REFUSED = "refused"
+    INTERRUPTED = "interrupted"
+    REPLACED = "replaced"
+
+
+TRANSITIONS: dict[State, dict[Event, State]] = {
+    State.CLEAN: {
+        Event.CHANGED: State.DIRTY,
+        Event.EMPTIED: State.DIRTY,
+        Event.REPLACED: State.STALE,
+    },
+    State.DIRTY: {
+        Event.CHANGED: State.DIRTY,
+        Event.EMPTIED: State.DIRTY,
+        Event.BEGUN: State.SENDING,
+        Event.REPLACED: State.STALE,
+    },
+    State.SENDING: {
+        Event.CHANGED: State.SENDING,
+        Event.EMPTIED: State.SENDING,
+        Event.GIVEN_UP: State.DIRTY,
+        Event.COMMITS: State.COMMITTING,
+    },
+    State.COMMITTING: {
+        Event.PLACED: State.CLEAN,
+        Event.REFUSED: State.DIRTY,
+        Event.INTERRUPTED: State.TORN,
+    },
+    State.TORN: {
+        Event.CHANGED: State.DIRTY,
+        Event.EMPTIED: State.DIRTY,
+        Event.PLACED: State.CLEAN,
+        Event.REFUSED: State.DIRTY,
+    },
+    State.STALE: {
+        Event.EMPTIED: State.DIRTY,
+        Event.REPLACED: State.STALE,
+    },
+}
+"""State -> what may happen -> the next state. Anything else is a bug (LocalProtocolError)."""
 
 
 class Content(Protocol):
@@ -48,58 +125,51 @@ class Where(Enum):
     ZERO = "zero"
 
 
+@dataclass(frozen=True, slots=True)
+class Base:
+    """What is known of the vehicle's file below a draft: size in bytes; mtime in seconds UTC and CRC32 where
+    they were told."""
+
+    size: int
+    mtime: int | None = None
+    crc32: int | None = None
+
+
 class Draft:
     """The local content of one file.
 
     Attributes:
         size: bytes, as programs see it.
-        base_limit: below this, bytes that are not held are the vehicle's.
-        remote_size: size of the file on the vehicle, None if there is none.
-        sending: the attempt under way, None before the first and after success.
-        made: an attempt may have made the file, so that what is there is ours; maybe_made: if it is empty.
-        overwrites: what is there was given up for this.
-        placed: what a replacement sent may have the name on the vehicle, so that what was there may be gone.
-        stretched: the vehicle's file may reach to here, also by requests of others that came late; 0 if not.
+        base: the file on the vehicle, None if there is none.
+        base_limit: below this, bytes that are not held are the base's.
+        state: see State.
+        sending: the present attempt's books, only while SENDING.
+        begun: the file may exist under its own name because of us (cards that cannot rename).
     """
 
-    def __init__(self, content: Content, remote_size: int | None) -> None:
+    def __init__(self, content: Content, base: Base | None) -> None:
         self._content = content
-        self.size = remote_size or 0
+        self.size = 0 if base is None else base.size
+        self.base = base
         self.base_limit = self.size
-        self.remote_size = remote_size
+        self.state = State.DIRTY if base is None else State.CLEAN
         self.sending: Sending | None = None
-        self.made = self.maybe_made = self.overwrites = self.placed = False
-        self.stretched = 0
+        self.begun = False
         self._held = ExtentSet()
         self._changed = ExtentSet()
-        self._touched = False
-        self._ruined = False
-        self._lost = ExtentSet()
+        self._lacked = False
 
     # --- what it is
 
     @property
     def clean(self) -> bool:
         """Whether the vehicle has it all."""
-        same = self._changed.empty and self._lost.empty and self.size == self.remote_end
-        return same and not self.placed
+        return self.state is State.CLEAN
 
     @property
-    def remote_end(self) -> int | None:
-        """The size of the file on the vehicle, None if there is none; it may have grown under an attempt."""
-        if self.remote_size is None or self.sending is None or self.sending.whole:
-            return self.remote_size
-        return max(self.remote_size, self.sending.reached)
-
-    @property
-    def on_vehicle(self) -> bool:
-        """Whether what has its name there is this file: it was there before, or we made it."""
-        return self.remote_size is not None or self.made or self.overwrites
-
-    @property
-    def fresh(self) -> bool:
-        """Whether nothing of the file on the vehicle is to stay."""
-        return self.base_limit == 0
+    def undelivered(self) -> bool:
+        """Whether the vehicle lacks something of it that it should have."""
+        return self._lacked if self.state is State.STALE else self.state is not State.CLEAN
 
     @property
     def whole(self) -> bool:
@@ -108,29 +178,18 @@ class Draft:
 
     @property
     def unacked(self) -> int:
-        """Bytes that have still to travel, as far as it is known."""
+        """Bytes that programs wrote and that have still to travel."""
         return self._changed.total if self.sending is None else self.sending.unacked
 
     @property
     def changed(self) -> ExtentSet:
-        """What differs from the vehicle's file, apart from its size (a copy)."""
+        """What programs changed since the vehicle last had it all (a copy)."""
         return self._changed.copy()
 
     @property
     def held(self) -> ExtentSet:
         """What the spool has (a copy)."""
         return self._held.copy()
-
-    @property
-    def touched(self) -> bool:
-        """Whether an unfinished attempt has changed a part of the vehicle's file."""
-        under_way = self.sending is not None and not self.sending.whole and self.sending.reached > 0
-        return self._touched or under_way
-
-    @property
-    def ruined(self) -> bool:
-        """Whether an attempt found the vehicle's file without what was to stay of it: it may have holes."""
-        return self._ruined or (self.sending is not None and self.sending.emptied)
 
     def missing_base(self) -> list[tuple[int, int]]:
         """Return the ranges of which only the vehicle has the bytes."""
@@ -174,7 +233,7 @@ class Draft:
             value = zlib.crc32(self.local_bytes(at, min(at + STEP, self.size)), value)
         return value ^ 0xFFFFFFFF
 
-    # --- changing it
+    # --- what programs do
 
     def write(self, offset: int, data: bytes | memoryview) -> None:
         """Replace bytes; a gap behind the present end becomes zeros.
@@ -185,10 +244,12 @@ class Draft:
         stop = offset + len(data)
         if offset == stop:
             return
+        self._require(Event.CHANGED)
         self._content.put(offset, data)
         self._held.add(offset, stop)
         self._note_changed(min(offset, self.size), stop)
         self.size = max(self.size, stop)
+        self.on(Event.CHANGED)
 
     def truncate(self, size: int) -> None:
         """Cut, or extend with zeros.
@@ -196,116 +257,102 @@ class Draft:
         Raises:
             NoSpace, SpoolFailed: nothing changed.
         """
+        if size == self.size:
+            return
+        event = Event.CHANGED if size else Event.EMPTIED
+        self._require(event)
         if size < self.size:
             self._content.cut(size)
-            for extents in (self._held, self._changed, self._lost):
+            for extents in (self._held, self._changed):
                 extents.discard(size, max(size, extents.end))
             self.base_limit = min(self.base_limit, size)
             if self.sending is not None:
                 self.sending.on_cut(size)
-        elif size > self.size:
+        else:
             self._note_changed(self.size, size)
         self.size = size
+        self.on(event)
 
     def fill(self, offset: int, data: bytes | memoryview) -> None:
-        """Hold bytes of the base, where nothing newer is held, but for what is lost: it stays so.
+        """Hold bytes of the base, where nothing newer is held.
 
         Raises:
-            NoSpace.
+            NoSpace, SpoolFailed.
         """
         stop = min(offset + len(data), self.base_limit, self.size)
         for start, end in self._held.missing(offset, stop):
-            for a, b in self._lost.missing(start, end):
-                self._content.put(a, memoryview(data)[a - offset : b - offset])
-                self._held.add(a, b)
+            self._content.put(start, memoryview(data)[start - offset : end - offset])
+            self._held.add(start, end)
 
-    def doubt(self, start: int, stop: int) -> list[tuple[int, int]]:
-        """The vehicle may have other bytes in [start, stop): return those that are known here, which the next
-        attempt sends if they are not compared before. The others are lost (`require_sound`)."""
-        known = []
-        for where, a, b in self.segments(start, stop):
-            if where is Where.BASE:
-                self._lost.add(a, b)
-            else:
-                self._changed.add(a, b)
-                known.append((a, b))
-        return known
+    # --- what delivery does
 
-    def require_sound(self, start: int = 0, stop: int | None = None) -> None:
-        """Raise DataUnproven if there are bytes in [start, stop) that nobody has for certain."""
-        for a, b in self._lost.intersection(start, self.size if stop is None else stop):
-            raise DataUnproven(
-                f"its bytes {a} to {b - 1} on the vehicle may be another file's, by a request that"
-                " came late: write them, or the whole file, again"
-            )
-
-    # --- delivering it
-
-    def begin(self, *, whole: bool) -> Sending:
-        """Start an attempt: at an empty remote file (`whole`), or at the base with what changed of it."""
-        self.begin_again()
-        extents = [(0, self.size)] if whole else list(self._changed)
-        self.sending = Sending(self.local_bytes, extents, whole=whole)
+    def begin(self, *, in_place: bool) -> Sending:
+        """Start to send a whole draft to an empty file. in_place: to the file's own name, so that from now on
+        nothing counts of what is there."""
+        self.on(Event.BEGUN)
+        if in_place:
+            self.begun, self.base_limit = True, 0
+        self.sending = Sending(self.local_bytes, self.size)
         return self.sending
 
-    def begin_again(self) -> None:
-        """The attempt is given up."""
-        self.remote_size = self.remote_end
-        self._touched = self.touched
-        self._ruined = self.ruined
+    def give_up(self) -> None:
+        """The attempt ended without success."""
+        if self.state is State.SENDING:
+            self.on(Event.GIVEN_UP)
         self.sending = None
 
-    def delivered(self) -> None:
-        """The vehicle has it, checked: from now on that is the base."""
-        self._changed.clear()
-        self._lost.clear()
-        self.remote_size = self.base_limit = self.size
+    def commit(self) -> None:
+        """What was sent is verified and about to be renamed."""
+        self.on(Event.COMMITS)
         self.sending = None
-        self._touched = self._ruined = self.made = self.maybe_made = self.overwrites = False
-        self.placed, self.stretched = False, 0
+
+    def interrupted(self, *, ours: bool = False) -> None:
+        """Nobody knows which file has the name now; all of the draft is known here, so none matters. ours:
+        what has the name is what was sent, or what became of it."""
+        self.on(Event.INTERRUPTED)
+        self.base_limit = 0
+        if ours:
+            self.base = Base(self.size)
+
+    def delivered(self, crc32: int | None = None) -> None:
+        """The vehicle has it, checked: from now on that is the base. crc32: of the content, if known."""
+        if self.state is State.SENDING:  # a card that cannot rename
+            self.commit()
+        self.on(Event.PLACED)
+        self.base, self.base_limit = Base(self.size, crc32=crc32), self.size
+        self.begun = False
+        self._changed.clear()
         self._content.settle()
 
-    def place(self) -> None:
-        """What was sent under another name is about to get that of the vehicle's file."""
-        self.placed = True
-        if not self.fresh:
-            self.stretched = max(self.stretched, self.size)
+    def lose_base(self) -> None:
+        """Others replaced the file on the vehicle. If no byte of it was to stay that changes nothing."""
+        if self.base_limit and self.state is not State.STALE:
+            self._lacked = not self.clean
+            self.give_up()
+            self.on(Event.REPLACED)
 
-    def has_size(self, size: int) -> None:
-        """The vehicle's file was found to have `size` bytes: what was feared to be too long may be."""
-        if self.remote_size is not None and self.remote_size < size <= self.stretched:
-            self.remote_size = size
-        self.stretched = 0
+    def on(self, event: Event) -> None:
+        """Go to the next state.
 
-    def remote_cut(self, size: int) -> None:
-        """The vehicle's file has `size` bytes now, the first of what it had."""
-        self.begin_again()
-        self._touched = True
-        self.remote_size = size
+        Raises:
+            LocalProtocolError: that cannot happen now.
+        """
+        self._require(event)
+        self.state = TRANSITIONS[self.state][event]
 
-    def give_way(self) -> None:
-        """What the present attempt still has to send is not to arrive any more: another one has to follow."""
-        sending = self.sending
-        self.begin_again()
-        if sending is not None:
-            sending.on_cut(0)
-
-    def remote_removed(self) -> None:
-        """The vehicle's file is about to be overwritten: nothing of it counts; the draft must be whole."""
-        self._touched = True
-        self._ruined = False
-        self.base_limit = 0
-        self.remote_size = None
-        self.overwrites = True
-        self._changed = ExtentSet([(0, self.size)])
-        self.sending = None
+    def _require(self, event: Event) -> None:
+        if event not in TRANSITIONS[self.state]:
+            raise LocalProtocolError(f"a file that is {self.state.value} cannot be {event.value}")
 
     def check_invariants(self) -> None:
         """Raise AssertionError if the books are wrong (for tests)."""
         assert self._held.end <= self.size
         assert self._changed.end <= self.size
         assert self.base_limit <= self.size
-        assert self.remote_size is not None or self._changed.covers(0, self.size)
+        assert (self.sending is not None) == (self.state is State.SENDING)
+        assert self.base is not None or self.base_limit == 0
+        if self.state in (State.SENDING, State.COMMITTING, State.TORN):
+            assert self.whole
         if self.sending is not None:
             self.sending.check_invariants()
 
@@ -313,6 +360,5 @@ class Draft:
 
     def _note_changed(self, start: int, stop: int) -> None:
         self._changed.add(start, stop)
-        self._lost.discard(start, stop)
         if self.sending is not None:
             self.sending.on_write(start, stop)

@@ -373,10 +373,8 @@ class Files:
         """Return whether somebody has a version of the path open, and is to read nothing more."""
         return any(v.path == path and v.lost for v in self.open_versions)
 
-    def end(self, path: bytes, *, doubted: bool = False) -> None:
+    def end(self, path: bytes) -> None:
         """What we are about to write there must not be given to who has another file open."""
-        if doubted:
-            return
         for version in [v for v in self.open_versions if v.path == path and v.dead is None]:
             self._kill(version)
 

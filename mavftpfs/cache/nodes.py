@@ -2,55 +2,49 @@
 
 A node is one file of this mount, whatever its name: handles follow it when it is renamed, and keep it when
 it is unlinked. Nodes without handles and without anything to deliver are forgotten.
+
+Locks: see `pathlocks`. A node's lock is taken by who delivers it, or starts to, and only while its path is
+held `shared`; who holds the path alone needs no node's lock, since nobody else can have it.
 """
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator, Iterator
-from contextlib import asynccontextmanager, contextmanager
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 
 import trio
 
-from mavftpfs.cache.asides import Places
-from mavftpfs.cache.draft import Draft
+from mavftpfs.cache.draft import Draft, State
 from mavftpfs.cache.files import FileHandle
 from mavftpfs.cache.plan import Plan
 from mavftpfs.cache.remote import Upload
+from mavftpfs.cache.reserved import Places
 from mavftpfs.cache.sending import Sending
 from mavftpfs.cache.spool import SpoolContent
 from mavftpfs.shared.errors import FileChanged, MavftpfsError
 
 
-@dataclass(slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False)
 class Attempt:
     """One try to deliver a draft.
 
-    path: where its bytes go. places: the reserved names, for a replacement. ended: verified, and the upload
-    is over, or nobody waits for that. committing: the renames may have begun, too. begun_at: when that was
-    known of which a part is to stay.
+    path: where its bytes go. places: the reserved names, where a file is replaced. begun_at: when, by the
+    caches' clock.
     """
 
     plan: Plan
     path: bytes
     sending: Sending
     upload: Upload
+    begun_at: float
     places: Places | None = None
-    ended: bool = False
-    committing: bool = False
-    begun_at: float = float("-inf")
 
-    def fits(self, plan: Plan, draft: Draft) -> bool:
-        """Return whether going on ends with the draft's content on the vehicle, by that plan."""
-        sending = self.sending
-        if self.ended and sending.unacked:
-            return False
-        return (
-            self.plan is plan
-            and draft.sending is sending
-            and not sending.emptied
-            and sending.reached <= draft.size
-        )
+    @property
+    def names(self) -> list[bytes]:
+        """What it left on the card, if it is given up: what was sent, and its sidecar."""
+        sent = [self.path] if self.upload.begun else []
+        return sent if self.places is None or self.places.sidecar is None else [*sent, self.places.sidecar]
 
 
 @dataclass(slots=True, eq=False)
@@ -58,25 +52,19 @@ class Node:
     """One file.
 
     path: its name, or the reserved name it was hidden under. draft: what the vehicle does not have of it;
-    content: the draft's bytes. copied: the draft is only a copy, made because the name was to go. handles:
-    how many are open, writers: those for writing. generation: counts how often its content on the vehicle was
-    changed by us. removed: it has no name any more. hidden: it is still on the vehicle under a reserved name.
-    error: why it could not be delivered. quiet: no delivery is under way, so it may be written. lock: held to
-    deliver it and to change its path. starting: a background upload is about to begin. background: whether
-    it may begin by itself; start_after: not before.
-    base: reads the vehicle's file. known_at: when the vehicle was last known to have it all. doomed: how
-    many changes that take its name away have the lock, or are about to, or empty it: no delivery begins or
-    goes on.
-    looked_at: who has the lock changes nothing on the vehicle just now. parted: its name is another file's.
-    mtime: what a listing since then told, None before there is one. dating: somebody sees to that.
-    may_be_cut: we may have cut it since then. written_at: when a program changed it last. resting: delivers
-    what was sent so far while no program writes; who writes cancels it.
+    content: the draft's bytes. handles: how many are open, writers: those for writing. generation: counts how
+    often its content on the vehicle was changed by us. removed: it has no name any more. hidden: it is still
+    on the vehicle, under a reserved name. error: why it could not be delivered. attempt: the present one to
+    deliver it. base: reads the vehicle's file. starting: an upload in the background is about to begin.
+    background: whether one may begin by itself; start_after: not before. known_at: when the vehicle was last
+    known to have it all. lock: held to deliver it. quiet: no delivery is under way, so it may be written.
+    doomed: how many changes take its name or content away, or are about to: no delivery begins or goes on
+    before it is spared.
     """
 
     path: bytes
     draft: Draft | None = None
     content: SpoolContent | None = None
-    copied: bool = False
     handles: int = 0
     writers: int = 0
     generation: int = 0
@@ -92,23 +80,17 @@ class Node:
     lock: trio.Lock = field(default_factory=trio.Lock)
     quiet: trio.Event = field(default_factory=trio.Event)
     doomed: int = 0
-    looked_at: int = 0
-    parted: bool = False
-    mtime: int | None = None
-    dating: bool = False
-    may_be_cut: bool = False
-    written_at: float = float("-inf")
-    resting: trio.CancelScope | None = None
+    spared: trio.Event = field(default_factory=trio.Event)
     _delivery: trio.CancelScope | None = None
-    _firm: int = 0
 
     def __post_init__(self) -> None:
         self.quiet.set()
+        self.spared.set()
 
     @property
     def undelivered(self) -> bool:
         """Whether the vehicle lacks something of it that it should have."""
-        return self.draft is not None and not self.removed and not self.draft.clean
+        return self.draft is not None and not self.removed and self.draft.undelivered
 
     @property
     def needless(self) -> bool:
@@ -116,83 +98,65 @@ class Node:
         return not self.handles and not self.undelivered
 
     @property
-    def overtaken(self) -> bool:
-        """Whether its attempt may not go on, since the draft took another way."""
-        return (
-            self.attempt is not None
-            and self.draft is not None
-            and self.draft.sending is not self.attempt.sending
-        )
+    def stale(self) -> bool:
+        """Whether its name is another file's."""
+        return self.draft is not None and self.draft.state is State.STALE
+
+    @property
+    def changing(self) -> bool:
+        """Whether what has its name on the vehicle is being changed, or was perhaps."""
+        if self.draft is None:
+            return False
+        in_place = self.attempt is not None and self.attempt.plan is Plan.OVERWRITE
+        return in_place or self.draft.begun or self.draft.state in (State.COMMITTING, State.TORN)
 
     @contextmanager
     def delivering(self) -> Iterator[trio.CancelScope]:
-        """The body brings it to the vehicle, unless it is cancelled because the name goes (`dooming`), or
-        the content (`call_off`)."""
+        """The body brings it to the vehicle, unless it is cancelled because name or content go (`doom`)."""
         with trio.CancelScope() as scope:
             self._delivery = scope
-            self._heed()
+            self.heed()
             try:
                 yield scope
             finally:
                 self._delivery = None
 
-    @asynccontextmanager
-    async def firmly(self) -> AsyncIterator[None]:
-        """The body is short, and nobody would find what it leaves half done: it is called off before it, or
-        not at all."""
-        await trio.lowlevel.checkpoint_if_cancelled()  # else the body would be, at its first wait
-        self._firm += 1
-        try:
-            yield
-        finally:
-            self._firm -= 1
-            self._heed()
-
     @contextmanager
-    def looking(self) -> Iterator[None]:
-        """The body has the lock and changes nothing on the vehicle: what is found there is as others left it,
-        or as it was changed by us before."""
-        self.looked_at += 1
-        try:
-            yield
-        finally:
-            self.looked_at -= 1
-
-    def end_rest(self) -> None:
-        """Its program goes on: what delivers it for nobody is called off, unless it is all but done."""
-        if self.resting is not None and not self._firm:
-            self.resting.cancel()
-
-    @contextmanager
-    def dooming(self) -> Iterator[None]:
-        """The body takes the lock, and then the name away: what is being delivered of it is called off."""
+    def doom(self) -> Iterator[None]:
+        """The body takes the name or the content away: what is being delivered of it is called off, unless it
+        is just being renamed into place."""
         self.doomed += 1
-        self._heed()
+        if self.spared.is_set():
+            self.spared = trio.Event()
+        self.heed()
         try:
             yield
         finally:
             self.doomed -= 1
+            if not self.doomed:
+                self.spared.set()
+
+    def heed(self) -> None:
+        """Call off the delivery under way if it is doomed, and not at a step that nobody would find."""
+        committing = self.draft is not None and self.draft.state is State.COMMITTING
+        if self.doomed and not committing and self._delivery is not None:
+            self._delivery.cancel()
 
     async def call_off(self) -> None:
-        """Have what is being delivered of it called off, since its content is about to go: who waits for the
+        """Have what is being delivered called off, since its content is about to go: who waits for the
         delivery has it begin again then. When this returns nothing is delivered before the next wait."""
-        with self.dooming():
+        with self.doom():
             while not self.quiet.is_set():  # the next one may have begun while we woke up
                 await self.quiet.wait()
-
-    def _heed(self) -> None:
-        if self.doomed and not self._firm and self._delivery is not None:
-            self._delivery.cancel()
 
     def require_reachable(self) -> None:
         """Raise FileChanged if its path may be another file's: it was replaced or removed, not hidden."""
         if self.removed and not self.hidden:
             raise FileChanged(f"what was {self.path!r} is not on the vehicle any more")
 
-    def require_not_parted(self) -> None:
-        """Raise FileChanged if its name is another file's: what is written would not come to the vehicle, and
-        what is read would get among the kernel's pages of that."""
-        if self.parted:
+    def require_current(self) -> None:
+        """Raise FileChanged if its name is another file's."""
+        if self.stale:
             raise FileChanged(f"{self.path!r} is another file by now")
 
     def close_base(self) -> None:
@@ -217,18 +181,19 @@ class Node:
         if self.content is not None:
             self.content.close()
         self.draft = self.content = self.attempt = self.error = None
-        self.background, self.copied = True, False
-        self.known_at, self.mtime, self.may_be_cut = float("-inf"), None, False
+        self.background, self.known_at = True, float("-inf")
 
 
 class Nodes:
-    """All nodes that have a name."""
+    """All nodes that have a name, and those that are hidden."""
 
     def __init__(self) -> None:
         self._by_path: dict[bytes, Node] = {}
+        self.hidden: dict[bytes, Node] = {}
+        self._stale: list[Node] = []
 
     def __iter__(self) -> Iterator[Node]:
-        """Yield every node; changing paths meanwhile is fine."""
+        """Yield every node that has a name; changing paths meanwhile is fine."""
         return iter(list(self._by_path.values()))
 
     def get(self, path: bytes) -> Node | None:
@@ -250,13 +215,34 @@ class Nodes:
         """Forget a node that nobody needs; an attempt has to be called off first."""
         if node.needless and not node.lock.locked() and node.attempt is None:
             node.drop_draft()
-            if self._by_path.get(node.path) is node:
-                del self._by_path[node.path]
+            self.detach(node)
 
     def detach(self, node: Node) -> None:
         """The node's path is not its name any more."""
         if self._by_path.get(node.path) is node:
             del self._by_path[node.path]
+
+    def part(self, node: Node) -> None:
+        """The node's name is another file's: who has it open keeps the node, and others get a new one."""
+        self._stale = [other for other in self._stale if other.handles] + [node]
+        node.lose_name()
+        self.detach(node)
+
+    def has_another(self, path: bytes) -> bool:
+        """Return whether a file is open that had this path, which is another file's now."""
+        return any(node.path == path and node.handles for node in self._stale)
+
+    def hide(self, node: Node, path: bytes) -> None:
+        """An unlinked file's node is called `path`, a reserved name, from now on."""
+        self.detach(node)
+        self.hidden.pop(node.path, None)
+        node.path, node.hidden = path, True
+        self.hidden[path] = node
+
+    def forget_hidden(self, node: Node) -> None:
+        """An unlinked file is gone for good, or is left to the next listing."""
+        node.hidden = False
+        self.hidden.pop(node.path, None)
 
     def rename(self, old: bytes, new: bytes) -> None:
         """Nodes at `old` and below it have another path; `new` must have no nodes."""
@@ -264,3 +250,5 @@ class Nodes:
             del self._by_path[node.path]
             node.path = new + node.path[len(old) :]
             self._by_path[node.path] = node
+        for path in [p for p in self.hidden if p.startswith(old + b"/")]:
+            self.hide(self.hidden[path], new + path[len(old) :])

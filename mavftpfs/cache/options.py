@@ -35,8 +35,9 @@ class CacheOptions:
     op_deadline: a read ends when none of its bytes came for so long.
     dirty_max: written bytes that may wait in memory, and un-ACKed before writers wait; None = about ten
     seconds of the measured rate. spool_max: bytes that may wait on the local disk.
-    rmw_max: the largest file that is sent whole for a change of a part of it, and the most that is fetched of
-    an open file that is to be removed and cannot be hidden.
+    rmw_max: the largest file that is sent whole for a change of a part of it; None = what can be fetched and
+    sent in two minutes. link_rate: bytes per second that the link carries at most, where that is known before
+    anything is measured.
     verify: auto, size, crc (see cache.verify) or none; verify_max: largest file whose CRC32 is
     asked. write_armed: change things in flight too. force: change files that somebody else writes.
     inplace: overwrite files where they cannot be replaced. local: patterns of names that never reach the
@@ -59,7 +60,8 @@ class CacheOptions:
     op_deadline: float = 30.0
     dirty_max: int | None = None
     spool_max: int = 1024 * MIB
-    rmw_max: int = 64 * MIB
+    rmw_max: int | None = None
+    link_rate: float | None = None
     verify: str = "auto"
     verify_max: int = 4 * MIB
     write_armed: bool = False

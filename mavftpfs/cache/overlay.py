@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from mavftpfs.cache.asides import is_reserved
 from mavftpfs.cache.attributes import Stat, shown_mtime
 from mavftpfs.cache.context import Context
 from mavftpfs.cache.draft import Draft
 from mavftpfs.cache.localfiles import LocalFiles
 from mavftpfs.cache.nodes import Node
-from mavftpfs.cache.shortnames import is_short
+from mavftpfs.cache.reserved import is_reserved
 from mavftpfs.cache.times import SECOND, Times, shown
 from mavftpfs.shared.errors import NotADirectory, NotFound, NotSupported
 from mavftpfs.shared.model import EntryKind, join, require_listable, split
@@ -29,18 +28,6 @@ class Overlay:
         self.times = Times()
         self.local = LocalFiles(options.local, options.local_max, self.now_ns)
 
-    def spelled(self, path: bytes) -> bytes:
-        """Return the listed spelling of a path on a card that does not tell case apart."""
-        parent, name = split(path)
-        directory = self._context.dentries.known(parent)
-        traits = self._context.writer.traits
-        folds = traits.folds_case or (traits.folds_short_case and is_short(name))
-        if not folds or directory is None or name in directory.entries:
-            return path
-        alike = [n for n in directory.entries if n.lower() == name.lower()]
-        others = [n for n in alike if traits.folds_case or is_short(n)]
-        return join(parent, others[0]) if others else path
-
     def stat(self, path: bytes) -> Stat | None:
         """Return what is known better here than by any listing, None if the listing decides.
 
@@ -51,7 +38,6 @@ class Overlay:
             raise NotFound(f"{path!r} is a name of our own")
         if self.local.owns(path):
             return self.local.stat(path)
-        self._context.part(path)
         node = self._context.nodes.get(path)
         if node is None or node.draft is None:
             return None
@@ -119,7 +105,6 @@ class Overlay:
 
     def set_times(self, path: bytes, mtime_ns: int) -> None:
         """Show this mtime until the file changes; of a local file keep it."""
-        path = self.spelled(path)
         if self.local.owns(path):
             self.local.set_times(path, mtime_ns)
         else:

@@ -1,9 +1,15 @@
-"""Which names are being changed: changes that concern one another wait for each other. Layer: cache.
+"""Which paths are being changed: the first of the two locks of the writing half. Layer: cache.
+
+The two locks, in the order in which they are taken; there is no third:
+1. The *path lock*, here. Who changes names (mkdir, rmdir, unlink, rename) holds the paths concerned alone.
+   Who opens or delivers a file holds its path `shared`: beside others that share it, and not during a change
+   of its name, or he would hold neither the old file nor the new one.
+2. The *file lock*, `nodes.Node.lock`. Who delivers a file, or begins to in the background, takes it while he
+   holds the path shared. Who holds the path alone needs none.
+A listing may be asked for under either lock, and what it has mended (`cleaner`) takes none.
 
 Two changes concern one another if they name the same path, in any case, or one names a directory above the
-other's. All others go on side by side, so that one that is not answered holds up nobody else. Files are
-opened between changes of their names, not during one: else who opened would hold neither the old file nor
-the new one. Opening holds its path `shared`.
+other's. All others go on side by side, so that one that is not answered holds up nobody else.
 """
 
 from __future__ import annotations
@@ -21,7 +27,8 @@ SLACK = 5.0
 
 
 class PathLocks:
-    """Locks on sets of paths, given in the order in which they were asked for."""
+    """Locks on sets of paths. Who shares one waits only for who holds it alone, not for who waits to: a
+    delivery opens the file it delivers. Others get their turn in the order in which they asked."""
 
     def __init__(self, patience: float) -> None:
         """`patience`: seconds to wait for a lock; with the change that follows SLACK more."""
@@ -30,10 +37,10 @@ class PathLocks:
         self._news = trio.Event()
 
     @asynccontextmanager
-    async def hold(self, *paths: bytes, shared: bool = False) -> AsyncIterator[None]:
+    async def hold(self, *paths: bytes, shared: bool = False, lasting: bool = False) -> AsyncIterator[None]:
         """Hold the paths for the length of the body; one that had to wait may not last its full time.
 
-        shared: beside others that share them.
+        shared: beside others that share them. lasting: the body bounds itself (a delivery may take minutes).
 
         Raises:
             RequestTimeout: others took too long.
@@ -44,52 +51,58 @@ class PathLocks:
             self._held.append(wanted)
             try:
                 waited = await self._wait(wanted)
-                scope.deadline = began + self._patience + SLACK if waited else float("inf")
+                bounded = waited and not lasting
+                scope.deadline = began + self._patience + SLACK if bounded else float("inf")
                 yield
             finally:
-                self._held = [held for held in self._held if held is not wanted]
+                self._held.remove(wanted)
                 self._news.set()
                 self._news = trio.Event()
         if scope.cancelled_caught:
             raise RequestTimeout(f"another change that concerns {paths[0]!r} took too long")
 
     @asynccontextmanager
-    async def steady(self, path: Callable[[], bytes]) -> AsyncIterator[bytes]:
-        """Open a file in the body: its path, which is yielded, and those above it keep their names.
+    async def steady(self, path: Callable[[], bytes], *, lasting: bool = False) -> AsyncIterator[bytes]:
+        """Open or deliver a file in the body: its path, which is yielded, and those above it do not change.
 
-        `path()`: what it is called by now, since it may change until that begins.
+        `path()`: what it is called by now, since it may change until that begins. lasting: see hold.
 
         Raises:
             RequestTimeout: a change took too long.
         """
         while True:
             known = path()
-            async with self.hold(known, shared=True):
+            async with self.hold(known, shared=True, lasting=lasting):
                 if path() == known:
                     yield known
                     return
 
     async def _wait(self, wanted: _Hold) -> bool:
-        """Wait until none that came before is in the way; return whether any was."""
+        """Wait until none is in the way; return whether any was."""
         waited = False
-        while any(held.concerns(wanted) for held in self._before(wanted)):
+        while any(held.blocks(wanted) for held in self._before(wanted)):
             waited = True
             await self._news.wait()
+        wanted.granted = True
         return waited
 
     def _before(self, wanted: _Hold) -> list[_Hold]:
-        places = [place for place, held in enumerate(self._held) if held is wanted]
-        return self._held[: places[0]]
+        """Return who has a lock, or asked for it before."""
+        place = self._held.index(wanted)
+        return [held for at, held in enumerate(self._held) if held.granted or at < place]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(slots=True, eq=False)
 class _Hold:
     paths: tuple[bytes, ...]
     shared: bool
+    granted: bool = False
 
-    def concerns(self, other: _Hold) -> bool:
-        """Return whether one has to wait for the other."""
-        return not (self.shared and other.shared) and any(
+    def blocks(self, other: _Hold) -> bool:
+        """Return whether the other one has to wait for this."""
+        if self is other or (other.shared and (self.shared or not self.granted)):
+            return False
+        return any(
             one == two or one.startswith(two + b"/") or two.startswith(one + b"/")
             for one in self.paths
             for two in other.paths

@@ -68,7 +68,7 @@ def describe(node: Node, draft: Draft, wall: Callable[[], float]) -> dict[str, o
         "whole": draft.whole,
         "held": list(draft.held),
         "changed": list(draft.changed),
-        "size_on_vehicle": draft.remote_size,
+        "size_on_vehicle": None if draft.base is None else draft.base.size,
         "error": None if node.error is None else str(node.error),
         "at": wall(),
     }

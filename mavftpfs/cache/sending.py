@@ -1,4 +1,4 @@
-"""Which bytes of a draft the vehicle has. Layer: cache; pure. Implements cache.remote.UploadSource.
+"""Which bytes of a draft a new file on the vehicle has. Layer: cache; pure. Implements remote.UploadSource.
 
 A byte is dirty, in flight, acked or proven (a Terminate was ACKed after it). It may be written again while
 it is in flight; then it is dirty *and* in flight, and is not handed out before the older copy was accounted
@@ -10,7 +10,7 @@ upload still says of the old attempt changes nothing.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 
 from mavftpfs.shared.extents import ExtentSet
 
@@ -22,39 +22,30 @@ FULL = 239
 
 
 class Sending:
-    """One attempt to send `extents` of a draft whose bytes `read(start, stop)` returns.
+    """One attempt to send a file of `size` bytes, which `read(start, stop)` returns.
 
     Attributes:
         unacked: bytes not ACKed yet.
         reached: one past the highest byte that may have been written to the remote file.
-        whole: the attempt began with an empty remote file, so a rollback of everything means all of it.
         progress: told how many bytes were ACKed.
-        emptied: the remote file was emptied under us though its old bytes were to stay.
-        rewritten: bytes that changed after they may have been sent: an older copy may come late.
+        overtaken: the file was cut below `reached`, so the remote file is too long: it is to be given up.
+        rewritten: bytes changed after they may have been sent, so that an older copy of them may come late.
         growing: more may be written behind the last byte; what fills no request there waits for it.
     """
 
-    def __init__(
-        self, read: Callable[[int, int], bytes], extents: Iterable[tuple[int, int]], *, whole: bool
-    ) -> None:
+    def __init__(self, read: Callable[[int, int], bytes], size: int) -> None:
         self._read = read
-        self.whole = whole
-        self.emptied = self.growing = False
+        self.overtaken = self.rewritten = self.growing = False
         self.progress: Callable[[int], None] | None = None
         self.reached = 0
-        self.rewritten = ExtentSet()
-        self._sent_to = 0  # as `reached`, over rollbacks
-        self._dirty = ExtentSet(extents)
+        self._dirty = ExtentSet([(0, size)] if size else [])
         self._in_flight = ExtentSet()
-        self._void = ExtentSet()  # in flight, but cut off since: nothing may overtake it
         self._acked = ExtentSet()
         self._proven = ExtentSet()
         self._ahead = (0, b"")
         self._clear = 0  # nothing under way lies in the lowest dirty extent, if that begins below
-        self._run = (
-            0,
-            0,
-        )  # ACKed in a row, and not entered yet: ACKs come one by one, a hundred thousand a second
+        # ACKed in a row, and not entered yet: ACKs come one by one, a hundred thousand a second
+        self._run = (0, 0)
 
     @property
     def unacked(self) -> int:
@@ -71,9 +62,7 @@ class Sending:
         """The draft's bytes [start, stop) changed: they go (again)."""
         self._enter_run()
         self._clear = 0
-        sent_to = max(self.reached, self._sent_to)
-        if start < sent_to:
-            self.rewritten.add(start, min(stop, sent_to))
+        self.rewritten |= start < self.reached
         self._dirty.add(start, stop)
         self._acked.discard(start, stop)
         self._proven.discard(start, stop)
@@ -82,12 +71,11 @@ class Sending:
             self._ahead = (0, b"")
 
     def on_cut(self, size: int) -> None:
-        """The draft ends at `size` now; what was sent beyond it shows in `reached`."""
+        """The draft ends at `size` now."""
         self._enter_run()
         self._clear = 0
-        for start, stop in self._in_flight.intersection(size, max(size, self._in_flight.end)):
-            self._void.add(start, stop)
-        for extents in (self._dirty, self._in_flight, self._acked, self._proven, self.rewritten):
+        self.overtaken |= size < self.reached
+        for extents in (self._dirty, self._in_flight, self._acked, self._proven):
             extents.discard(size, max(extents.end, size))
         self._ahead = (0, b"")
 
@@ -96,7 +84,7 @@ class Sending:
     def next_chunk(self, limit: int) -> tuple[int, bytes] | None:
         """See cache.remote.UploadSource."""
         found = self._dirty.first()
-        if found is None or self.emptied:  # what is written behind lost bytes leaves a hole
+        if found is None or self.overtaken:
             return None
         start, stop = found
         if self._run[1] > start:
@@ -137,10 +125,7 @@ class Sending:
         """See cache.remote.UploadSource."""
         self._enter_run()
         self._clear = 0
-        self._void.discard(offset, offset + count)
-        for start, stop in self._in_flight.intersection(offset, offset + count):
-            self._in_flight.discard(start, stop)
-            self._dirty.add(start, stop)
+        self._move_back(self._in_flight.intersection(offset, offset + count))
 
     def on_checkpoint(self) -> None:
         """See cache.remote.UploadSource."""
@@ -151,15 +136,10 @@ class Sending:
         """See cache.remote.UploadSource."""
         self._enter_run()
         self._clear = 0
-        self._void.clear()
         self._move(self._in_flight, self._dirty)
         self._move(self._acked, self._dirty)
         if everything:
             self._move(self._proven, self._dirty)
-            self.emptied |= not self.whole
-            if self.whole:
-                self._sent_to = max(self.reached, self._sent_to)
-                self.reached = 0
 
     def check_invariants(self) -> None:
         """Raise AssertionError if the books are wrong (for tests)."""
@@ -179,7 +159,6 @@ class Sending:
         if offset == end:
             return
         self._run = (0, 0)
-        self._void.discard(offset, end)
         for start, stop in self._in_flight.intersection(offset, end):
             self._in_flight.discard(start, stop)
             for a, b in self._dirty.missing(start, stop):
@@ -190,14 +169,12 @@ class Sending:
         first = self._dirty.first()
         if first is None:
             return None
-        under_way = (self._in_flight, self._void)
-        if not any(extents.overlaps(*first) for extents in under_way):
+        if not self._in_flight.overlaps(*first):
             self._clear = first[1]
             return first[0], min(first[1], first[0] + limit)
         for start, stop in self._dirty:
             for a, b in self._in_flight.missing(start, stop):
-                for c, d in self._void.missing(a, b):
-                    return c, min(d, c + limit)
+                return a, min(b, a + limit)
         return None
 
     def _fetch(self, start: int, stop: int) -> bytes:
@@ -210,3 +187,8 @@ class Sending:
         for start, stop in source:
             target.add(start, stop)
         source.clear()
+
+    def _move_back(self, extents: list[tuple[int, int]]) -> None:
+        for start, stop in extents:
+            self._in_flight.discard(start, stop)
+            self._dirty.add(start, stop)

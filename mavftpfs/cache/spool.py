@@ -25,8 +25,8 @@ from random import Random
 from typing import Any
 
 from mavftpfs.cache import rescuing
-from mavftpfs.cache.asides import new_owner
 from mavftpfs.cache.fulldisk import FullDisk
+from mavftpfs.cache.reserved import new_owner
 from mavftpfs.shared.errors import NoSpace, SpoolFailed
 from mavftpfs.shared.extents import ExtentSet
 from mavftpfs.shared.private import make_private_directory

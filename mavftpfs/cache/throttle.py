@@ -1,7 +1,8 @@
-"""Keeps programs from writing much faster than the link carries. Layer: cache.
+"""Keeps programs from writing more than the link carries. Layer: cache.
 
 close() cannot be killed, so what a close may have to wait for is bounded: about ten seconds of the measured
-rate, shared by the uploads under way, unless dirty_max says otherwise.
+rate, shared by the uploads under way, unless dirty_max says otherwise. A file of which a part is changed is
+sent again whole, so a change is refused (EFBIG) if that would take longer than two minutes.
 """
 
 from __future__ import annotations
@@ -9,14 +10,24 @@ from __future__ import annotations
 import trio
 
 from mavftpfs.cache.context import Context
+from mavftpfs.cache.draft import Draft
 from mavftpfs.cache.nodes import Node
 from mavftpfs.cache.options import KIB, MIB
 from mavftpfs.cache.readahead import RateMeter
+from mavftpfs.shared.errors import FileTooLarge
 
 SECONDS = 10.0
+"""Of the measured rate that may wait, within LEAST and MOST bytes."""
+
 LEAST, MOST = 64 * KIB, 8 * MIB
 UNMEASURED = 256 * KIB
-"""What may wait before the first bytes were ACKed."""
+"""Bytes that may wait before the first were ACKed."""
+
+REWRITE_SECONDS = 120.0
+"""How long it may take to fetch and send a file of which a part was changed."""
+
+LEAST_REWRITE, MOST_REWRITE = 64 * KIB, 64 * MIB
+"""Bytes of such a file that are always allowed, and the most that ever are, unless rmw_max is set."""
 
 FAST, COARSE = 1e6, 16 * KIB
 """Above so many bytes per second it is enough to look at the clock every so many bytes."""
@@ -44,6 +55,30 @@ class Throttle:
             return fixed
         rate = self.meter.rate
         return UNMEASURED if rate is None else min(max(int(rate * SECONDS), LEAST), MOST)
+
+    def require_sendable(self, draft: Draft, size: int) -> None:
+        """Check that a file of `size` bytes, of which the vehicle has a part, can be sent again.
+
+        Raises:
+            FileTooLarge.
+        """
+        limit = self._rewrite_max(draft)
+        if draft.base_limit and size > limit:
+            raise FileTooLarge(
+                f"changing a part of {size} bytes means sending them all; rmw_max allows {limit}"
+            )
+
+    def _rewrite_max(self, draft: Draft) -> int:
+        fixed = self._context.options.rmw_max
+        if fixed is not None:
+            return fixed
+        known = self._context.options.link_rate
+        write = self.meter.rate or self._context.read_rate() or known
+        read = self._context.read_rate() or write
+        if not write or not read:
+            return MOST_REWRITE
+        missing = sum(stop - start for start, stop in draft.missing_base())
+        return min(max(int((REWRITE_SECONDS - missing / read) * write), LEAST_REWRITE), MOST_REWRITE)
 
     def is_full(self, node: Node) -> bool:
         """Return whether the writers of a file have to wait."""

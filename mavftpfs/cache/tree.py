@@ -29,8 +29,7 @@ from mavftpfs.cache.remote import RemoteStore, WriteStore
 from mavftpfs.cache.singleflight import SingleFlight
 from mavftpfs.cache.spool import SpoolDirectory
 from mavftpfs.cache.virtual import VirtualTrees, is_snapshot
-from mavftpfs.cache.writeback import Writeback
-from mavftpfs.cache.writing import make_writeback
+from mavftpfs.cache.writeback import Writeback, make_writeback
 from mavftpfs.shared.errors import FtpNak, IsADirectory, ListingIncomplete, NotDeliveredYet, ReadOnly
 from mavftpfs.shared.model import ROOT, DirEntry, EntryKind, is_virtual, join, normalise, split
 
@@ -110,6 +109,7 @@ class Tree:
                 rng=rng or Random(),
                 nursery=nursery,
                 spool_directory=spool,
+                read_rate=lambda: self._blocks.meter.rate,
                 on_changed=self._checksums.forget_below,
             )
 
@@ -127,7 +127,6 @@ class Tree:
         if is_snapshot(remote):
             return await self._virtual.stat(remote)
         if self._writing is not None:
-            remote = self._writing.overlay.spelled(remote)
             ours = self._writing.overlay.stat(remote)
             if ours is not None:
                 return ours

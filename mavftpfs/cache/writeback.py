@@ -7,26 +7,36 @@ vehicle's. Paths are the vehicle's, normalised; those below `@` never come here 
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from contextlib import closing, suppress
+from functools import partial
 from pathlib import Path
+from random import Random
 
 import trio
 
-from mavftpfs.cache.admission import Admission
 from mavftpfs.cache.background import Background
-from mavftpfs.cache.base import open_base
+from mavftpfs.cache.base import known_base, on_listed, open_base
 from mavftpfs.cache.changes import Changes
-from mavftpfs.cache.cleaning import Cleaner
+from mavftpfs.cache.cleaner import Cleaner
 from mavftpfs.cache.context import Context
 from mavftpfs.cache.delivery import PASSING, Deliverer
-from mavftpfs.cache.draft import Draft
+from mavftpfs.cache.dentries import Dentries, Directory
+from mavftpfs.cache.directories import Directories
+from mavftpfs.cache.draft import Base, Draft, State
+from mavftpfs.cache.files import Files
+from mavftpfs.cache.hiding import Hider
+from mavftpfs.cache.names import Names
 from mavftpfs.cache.namespace import Namespace
 from mavftpfs.cache.nodes import Node
 from mavftpfs.cache.openfile import OpenFile
+from mavftpfs.cache.options import CacheOptions
 from mavftpfs.cache.overlay import Overlay
 from mavftpfs.cache.recovery import recover
-from mavftpfs.cache.spool import Spool, SpoolContent
-from mavftpfs.cache.sure import Sure
+from mavftpfs.cache.remote import RemoteStore, WriteStore
+from mavftpfs.cache.replace import Replacer
+from mavftpfs.cache.reserved import Namer, new_owner
+from mavftpfs.cache.spool import Spool, SpoolContent, SpoolDirectory
 from mavftpfs.cache.throttle import Throttle
 from mavftpfs.cache.writefile import ReadFile, WriteFile
 from mavftpfs.shared.errors import (
@@ -43,16 +53,77 @@ from mavftpfs.shared.model import EntryKind, wire_path
 log = logging.getLogger("mavftpfs.cache")
 
 MAX_FILE = 2**32 - 1
-"""The protocol's offsets have 32 bits; ArduPilot's servers refuse from 2 GiB on (servers.md 8)."""
+"""Bytes: the protocol's offsets have 32 bits; ArduPilot's servers refuse from 2 GiB on (servers.md 8)."""
 
 RETRY_PAUSE = 1.0
+"""Seconds between two rounds of delivering everything."""
+
 REFUSALS = 3
 """After so many rounds in which the vehicle answered and refused all that is left, the end is not put off."""
 
 STEP = 64 * 1024
+"""Bytes of a delivered file that are handed to the block cache at once."""
 
 ADOPTED_PART = 4
 """A delivered file of up to this part of the block cache is kept in it."""
+
+
+def make_writeback(
+    *,
+    store: RemoteStore,
+    writer: WriteStore,
+    directories: Directories,
+    dentries: Dentries,
+    files: Files,
+    options: CacheOptions,
+    clock: Callable[[], float],
+    wall: Callable[[], float],
+    rng: Random,
+    nursery: trio.Nursery | None,
+    spool_directory: SpoolDirectory | None,
+    read_rate: Callable[[], float | None],
+    on_changed: Callable[[bytes], None],
+) -> Writeback:
+    """Return the writing half over the reading half's parts, and have listings mended from now on.
+
+    Without a spool directory what exceeds memory goes to one that does not outlive the process.
+    `read_rate()`: bytes per second, once measured; `on_changed(path)`: the path, and what lies below it, is
+    not what it was.
+    """
+    owner = new_owner(rng) if spool_directory is None else spool_directory.owner
+    dead = frozenset[bytes]() if spool_directory is None else spool_directory.dead_owners
+    context = Context(
+        store=store,
+        writer=writer,
+        directories=directories,
+        dentries=dentries,
+        files=files,
+        options=options,
+        clock=clock,
+        wall=wall,
+        on_changed=on_changed,
+        nursery=nursery,
+        namer=Namer(owner, options.root, rng),
+        read_rate=read_rate,
+    )
+    throttle = Throttle(context)
+    spool = Spool(
+        memory_max=lambda: throttle.limit,
+        spool_max=options.spool_max,
+        directory=None if spool_directory is None else spool_directory.path,
+    )
+    names = Names(context)
+    cleaner = Cleaner(context, names, dead)
+    directories.on_swept = cleaner.on_swept
+    files.is_changing = context.is_changing
+    compare = directories.on_listed
+
+    def listed(path: bytes, directory: Directory) -> None:
+        compare(path, directory)
+        on_listed(context, path, directory)
+
+    directories.on_listed = listed
+    return Writeback(context, names, spool, throttle, cleaner)
 
 
 class Writeback:
@@ -62,34 +133,31 @@ class Writeback:
         overlay: what programs see that no listing shows. changes: mkdir, rmdir, unlink and rename.
     """
 
-    def __init__(self, context: Context, spool: Spool, throttle: Throttle, cleaner: Cleaner) -> None:
+    def __init__(
+        self, context: Context, names: Names, spool: Spool, throttle: Throttle, cleaner: Cleaner
+    ) -> None:
         self._context = context
+        self._names = names
         self._spool = spool
         self._throttle = throttle
         self._cleaner = cleaner
-        sure = Sure(context)
-        self._deliverer = Deliverer(context, sure, throttle)
-        self._admission = Admission(context, self._deliverer, throttle)
-        self._background = Background(context, self._deliverer, throttle, mend=cleaner.mend_torn)
+        replacer = Replacer(context, names)
+        self._deliverer = Deliverer(context, names, replacer, cleaner, throttle)
+        self._background = Background(context, self._deliverer, throttle, replacer, cleaner)
         self.overlay = Overlay(context)
+        hider = Hider(context, names, self._new_content)
         self._namespace = Namespace(
-            context,
-            sure,
-            self._deliverer,
-            purge=cleaner.purge,
-            new_content=self._new_content,
-            on_renamed=self.overlay.on_renamed,
+            context, names, self._deliverer, replacer, hider, on_renamed=self.overlay.on_renamed
         )
         self._local = self.overlay.local
         self.changes = Changes(
-            context, self.overlay, self._namespace, open_reader=self.open_reader, put=self._put
+            context, names, self.overlay, self._namespace, open_reader=self.open_reader, put=self._put
         )
 
     # --- opening
 
     async def open_reader(self, path: bytes) -> OpenFile:
         """Open a file for reading."""
-        path = self.overlay.spelled(path)
         self.overlay.stat(path)  # raises NotFound for names that are hidden
         if self._local.owns(path):
             return self._local.open(path, write=False)
@@ -101,13 +169,11 @@ class Writeback:
 
     async def open(self, path: bytes, *, truncate: bool) -> OpenFile:
         """Open a file for writing."""
-        path = self.overlay.spelled(path)
         if self._local.owns(path):
             return self._local.open(path, write=True, truncate=truncate)
         self._context.require_disarmed()
         async with self._context.paths.hold(path, shared=True):
             file = WriteFile(self, self._context, await self._need_draft(path, truncate=truncate))
-            self._deliverer.dater.watch(file.node)
         if truncate:
             try:
                 await file.truncate(0)
@@ -118,7 +184,6 @@ class Writeback:
 
     async def create(self, path: bytes, *, exclusive: bool) -> OpenFile:
         """Make a file, or open the one that is there."""
-        path = self.overlay.spelled(path)
         if self._local.owns(path):
             await self.changes.require_parent(path)
             return self._local.create(path, exclusive=exclusive)
@@ -126,11 +191,9 @@ class Writeback:
         self.overlay.require_new(path)
         wire_path(path)
         async with self._context.paths.hold(path, shared=True):
-            self._context.part(path)
-            entry = await self._namespace.entry(path)
-            other = None if entry is not None else await self._namespace.other_spelling(path)
-            if entry is None and other is None:
-                await self._namespace.require_kept(path)
+            if await self._names.entry(path) is None:
+                await self._names.require_new(path)
+                self._part_from_removed(path)
                 node = self._context.nodes.need(path)
                 made = node.draft is None
                 if made:
@@ -139,51 +202,55 @@ class Writeback:
                 return WriteFile(self, self._context, node, made=made)
         if exclusive:
             raise AlreadyExists(f"{path!r} exists")
-        return await self.open(other or path, truncate=False)
+        return await self.open(path, truncate=False)
+
+    def _part_from_removed(self, path: bytes) -> None:
+        """Who has a file open that others removed is not to read the one that is about to be made."""
+        node = self._context.nodes.get(path)
+        if node is not None and node.draft is None and node.handles:
+            self._context.nodes.part(node)
+            self._context.files.end(path)
 
     async def _need_draft(self, path: bytes, *, truncate: bool) -> Node:
         """Return the node of a file that exists, with a draft."""
-        context, base, size = self._context, None, None
-        context.part(path)
+        context, handle = self._context, None
         node = context.nodes.get(path)
-        if node is None or node.draft is None:
-            self.overlay.require_free(path)
-            entry = await self._namespace.listed(path)
-            if entry is None:
-                raise NotFound(f"{path!r} does not exist")
-            if entry.kind is not EntryKind.FILE:
-                raise IsADirectory(f"{path!r} is a directory")
-            if truncate:
-                # A size of 0 would mean that there is nothing to do: it has to be true, not remembered.
-                size = entry.size or await context.files.learn_size(path)
-            else:
-                base = await open_base(context, path)  # its ACK tells the size better than a listing
-                size = base.size
-            try:
-                context.require_idle(path)
-                node = context.nodes.need(path)
-                if node.draft is None:
-                    self._new_draft(node, size)
-                    if base is not None:
-                        node.known_at = context.clock()
-                        node.mtime = base.mtime if base.comparable else None
-                    node.base, base = base, node.base
-            finally:
-                if base is not None:
-                    base.close()
+        if node is not None and node.draft is not None:
+            return node
+        self.overlay.require_free(path)
+        entry = await self._names.listed(path)
+        if entry is None:
+            raise NotFound(f"{path!r} does not exist")
+        if entry.kind is not EntryKind.FILE:
+            raise IsADirectory(f"{path!r} is a directory")
+        if truncate:
+            # A size of 0 would mean that there is nothing to do: it has to be true, not remembered.
+            base = Base(entry.size or await context.files.learn_size(path))
+        else:
+            handle = await open_base(context, path)  # its ACK tells the size better than a listing
+            base = known_base(context, path, handle.size)
+        try:
+            context.require_idle(path)
+            node = context.nodes.need(path)
+            if node.draft is None:
+                self._new_draft(node, base)
+                node.base, handle = handle, node.base
+        finally:
+            if handle is not None:
+                handle.close()
         return node
 
-    def _new_draft(self, node: Node, size: int | None) -> None:
-        self._context.files.end(node.path, doubted=size is not None)
+    def _new_draft(self, node: Node, base: Base | None) -> None:
         node.content = self._new_content(node)
-        node.draft = Draft(node.content, size)
+        node.draft = Draft(node.content, base)
+        node.known_at = self._context.clock()
 
     def _new_content(self, node: Node) -> SpoolContent:
         return self._spool.content(node.spool_name)
 
     def holds(self, path: bytes) -> bool:
         """Return whether the vehicle lacks bytes of a file."""
-        node = self._context.nodes.get(self.overlay.spelled(path))
+        node = self._context.nodes.get(path)
         return node is not None and node.undelivered
 
     # --- what handles ask
@@ -192,9 +259,10 @@ class Writeback:
         """Take bytes into a draft; see OpenFile.write."""
         if offset + len(data) > MAX_FILE:
             raise FileTooLarge(f"no vehicle takes files of more than {MAX_FILE} bytes")
-        await self._admission.may_write(node)
-        node.require_not_parted()
+        await self._may_write(node)
+        node.require_current()
         assert node.draft is not None
+        self._throttle.require_sendable(node.draft, max(node.draft.size, offset + len(data)))
         node.draft.write(offset, data)
         self._on_written(node)
         return len(data)
@@ -205,17 +273,59 @@ class Writeback:
             raise FileTooLarge(f"no vehicle takes files of more than {MAX_FILE} bytes")
         assert node.draft is not None
         if size == 0 < node.draft.size:
-            await self._admission.may_empty(node)
+            await self._may_empty(node)
         else:
-            await self._admission.may_write(node)
-        node.require_not_parted()
-        if size != node.draft.size:
-            node.draft.truncate(size)
-            self._background.on_cut(node)
-            self._on_written(node)
+            await self._may_write(node)
+        if node.removed or size:
+            node.require_current()
+        if size == node.draft.size:
+            return
+        if size:
+            self._throttle.require_sendable(node.draft, size)
+        node.draft.truncate(size)
+        self._on_written(node)
+
+    async def _may_write(self, node: Node) -> None:
+        """Wait until a delivery under way is over and not too much is un-ACKed. Who called may change the
+        draft until its next wait.
+
+        Raises:
+            Armed. Else as Deliverer.deliver, when too much is un-ACKed.
+        """
+        idle_since = self._context.clock()
+        while True:
+            self._context.require_disarmed()
+            await node.quiet.wait()
+            if not node.quiet.is_set():
+                continue  # the next delivery began while we woke up
+            if not self._throttle.is_full(node):
+                return
+            if await self._throttle.wait():
+                idle_since = self._context.clock()
+                continue
+            if node.starting and self._context.clock() - idle_since < self._context.options.op_deadline:
+                continue  # an upload is about to begin: to wait for all of it would stop the program
+            # It says what is wrong, if anything is.
+            await self._deliverer.deliver(node, wanted=partial(self._throttle.is_full, node))
+            idle_since = self._context.clock()
+
+    async def _may_empty(self, node: Node) -> None:
+        """Call off what brings bytes to the vehicle that nobody wants any more: no room is needed, either.
+
+        Raises:
+            Armed. FileBusy: it is at a step that is not called off, and that lasts.
+        """
+        with trio.move_on_after(self._context.options.op_deadline):
+            await node.call_off()
+            self._context.require_disarmed()
+            self._throttle.let_go()
+            return
+        raise FileBusy(f"{node.path!r} is just getting its place")
 
     async def deliver(self, node: Node) -> None:
         """Have the vehicle hold the file; see Deliverer.deliver."""
+        if node.stale and not node.undelivered:
+            return  # nothing of it was changed here
         await self._deliverer.deliver(node)
 
     async def close(self, node: Node) -> None:
@@ -238,7 +348,6 @@ class Writeback:
         self._context.nodes.maybe_forget(node)
 
     def _on_written(self, node: Node) -> None:
-        node.copied, node.written_at = False, self._context.clock()
         if not node.removed:
             self.overlay.on_written(node.path)
             self._background.kick(node)
@@ -246,23 +355,20 @@ class Writeback:
     def _settle(self, node: Node) -> None:
         """Nobody has the file open: if the vehicle has it, its content is ordinary cache."""
         draft, context = node.draft, self._context
-        if draft is None or not draft.clean or node.lock.locked():
-            self._background.settle(node)
-            return
-        fits = 0 < draft.size <= context.options.cache_size // ADOPTED_PART
-        recent = context.clock() - node.known_at < context.options.proof_time
-        if fits and recent and draft.whole:
-            starts = range(0, draft.size, STEP)
-            pieces = ((at, draft.local_bytes(at, min(at + STEP, draft.size))) for at in starts)
-            with suppress(SpoolFailed):  # the local disk does not give it back: it is on the vehicle
-                context.files.adopt(node.path, draft.size, pieces, proven_at=node.known_at)
+        if draft is not None and draft.clean and not node.lock.locked():
+            fits = 0 < draft.size <= context.options.cache_size // ADOPTED_PART
+            recent = context.clock() - node.known_at < context.options.proof_time
+            if fits and recent and draft.whole:
+                starts = range(0, draft.size, STEP)
+                pieces = ((at, draft.local_bytes(at, min(at + STEP, draft.size))) for at in starts)
+                with suppress(SpoolFailed):  # the local disk does not give it back: it is on the vehicle
+                    context.files.adopt(node.path, draft.size, pieces, proven_at=node.known_at)
         self._background.settle(node)
 
     # --- names
 
     async def truncate(self, path: bytes, size: int) -> None:
         """See Tree.truncate."""
-        path = self.overlay.spelled(path)
         if self._local.owns(path):
             with closing(self._local.open(path, write=True)) as local:
                 await local.truncate(size)
@@ -280,9 +386,8 @@ class Writeback:
                 await file.release()
         except BaseException:
             file.close()
-            unchanged = node.draft is None or not node.draft.touched
-            if not had and not node.writers and unchanged:
-                await self._forget_draft(node)  # else it is completed later
+            if not had and not node.writers:
+                await self._forget_draft(node)
             raise
 
     async def _put(self, path: bytes, data: bytes, exclusive: bool) -> None:
@@ -306,21 +411,15 @@ class Writeback:
             raise
 
     async def _forget_draft(self, node: Node) -> None:
-        """What was to be written is not wanted any more, since its caller got an error."""
-        async with node.lock:
+        """What was to be written is not wanted any more, since its caller got an error. What may have the
+        name already is completed later."""
+        async with self._context.paths.steady(lambda: node.path, lasting=True), node.lock:
             await self._deliverer.abandon(node)
-            if node.writers:
-                return  # who opened it meanwhile completes it
-            made, maybe, draft = False, False, node.draft
-            if draft is not None and draft.remote_size is None and not draft.overwrites:  # else it was there
-                made, maybe = draft.made, draft.maybe_made
+            draft = node.draft
+            if node.writers or draft is None or draft.begun or draft.state is State.TORN:
+                return
             node.drop_draft()
         self._context.nodes.maybe_forget(node)
-        if made or maybe:
-            try:
-                await self.changes.take_back(node.path, if_empty=not made)
-            except MavftpfsError as error:
-                log.info("a part of %r may have stayed on the vehicle: %s", node.path, error)
 
     # --- the mount's life
 
@@ -358,7 +457,7 @@ class Writeback:
 
     def retry(self) -> None:
         """The vehicle is back, or may be written again: deliver what nobody has open any more."""
-        if self._context.nursery is not None and (self._context.torn or self.undelivered()):
+        if self._context.nursery is not None and (self._context.own.torn or self.undelivered()):
             self._context.nursery.start_soon(self._background.link_back)
 
     def status(self) -> dict[str, object]:

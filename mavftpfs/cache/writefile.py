@@ -53,7 +53,8 @@ class _Reading:
     @property
     def direct_io(self) -> bool:
         """Whether the kernel's pages could come from, or go to, who has another file of the path open."""
-        if self._context.has_another(self._node.path):
+        path = self._node.path
+        if self._context.nodes.has_another(path) or self._context.files.was_lost(path):
             return True
         return self._node.draft is None and self._handle is not None and self._handle.direct_io
 
@@ -81,7 +82,8 @@ class _Reading:
 
     async def _read(self, offset: int, size: int) -> bytes | memoryview:
         node = self._node
-        node.require_not_parted()
+        if node.removed:
+            node.require_current()
         if self._handle is not None:
             self._handle.require_not_lost()
         if node.draft is not None:

@@ -73,7 +73,7 @@ class MountOptions:
     cache_dir: str | None = None
     dirty_max: int | None = None
     spool_max: int = 1 << 30
-    rmw_max: int = 64 << 20
+    rmw_max: int | None = None
     op_deadline: float = 30.0
     connect_timeout: float = 30.0
     read_mode: str = "window"
@@ -220,7 +220,7 @@ VALUES: dict[str, Parser] = {
     "cache_dir": text_value,
     "dirty_max": size(1 << 16, _SIZE_MAX, auto=True),
     "spool_max": size(0, _SIZE_MAX),
-    "rmw_max": size(0, _SIZE_MAX),
+    "rmw_max": size(0, _SIZE_MAX, auto=True),
     "op_deadline": seconds(1, 3600),
     "connect_timeout": seconds(1, 3600),
     "read_mode": choice("window", "burst"),
@@ -412,7 +412,7 @@ HELP: dict[str, str] = {
     "cache_dir=": "keep what was read for the next mount there",
     "dirty_max=": "memory for what is not on the card yet: auto",
     "spool_max=": "local disk for what is not on the card yet: 1G",
-    "rmw_max=": "largest file sent again whole for a changed part: 64M",
+    "rmw_max=": "largest file sent again whole for a changed part: auto",
     "op_deadline=": "seconds without progress until an error: 30",
     "connect_timeout=": "seconds for the first heartbeat and listing: 30",
     "read_mode=": "window or burst",

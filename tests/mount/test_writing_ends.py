@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 
 from mavftpfs import control
-from mavftpfs.cache.asides import is_reserved
+from mavftpfs.cache.reserved import is_reserved
 from tests.mount.conftest import Field
 from tests.support.mounts import Mount, abort_mount, mounted_at, wait_until
 from tests.support.trees import content

@@ -10,7 +10,7 @@ import pytest
 import trio
 from trio.testing import MockClock
 
-from mavftpfs.cache.asides import is_reserved
+from mavftpfs.cache.reserved import is_reserved
 from mavftpfs.cache.tree import Tree
 from mavftpfs.compose import subscribe
 from mavftpfs.link.messages import Address

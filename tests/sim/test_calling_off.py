@@ -16,8 +16,6 @@ from trio.testing import MockClock
 
 from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.tree import Tree
-from mavftpfs.cache.verify import SMALL_LISTING
-from mavftpfs.protocol.payload import Opcode
 from mavftpfs.shared.errors import CrossDevice
 from mavftpfs.sim.linkmodel import LinkSettings
 from tests.support.deliveries import (
@@ -141,7 +139,7 @@ SHORT = {
 CASES = [
     pytest.param(*case, marks=() if case in SHORT else pytest.mark.soak)
     for case in product(PROFILES, WRITES, TAKES)
-    if case[0] != NO_RENAME or case[2] == "unlink"  # nothing can be renamed over there
+    if case[0] != NO_RENAME  # what is open and not all known here keeps its name there
 ]
 
 
@@ -155,31 +153,6 @@ async def test_a_name_goes_at_any_request_of_its_delivery(
 @pytest.mark.parametrize(("profile", "write", "take"), CASES)
 async def test_a_name_goes_on_a_bad_link(profile: str, write: str, take: str, autojump: MockClock) -> None:
     await at_each_request(lambda count: take_after(count, profile, write, take, BAD), step=3)
-
-
-@pytest.mark.parametrize("take", TAKES)
-@pytest.mark.parametrize("profile", ["px4", "px4-nuttx", "mavsdk"])
-async def test_an_empty_file_among_many_loses_its_name(profile: str, take: str, autojump: MockClock) -> None:
-    """As git's locks do. No listing of them all tells that it was made: its size is asked by opening it."""
-    world = World(profile, GOOD)
-    folder = ROOTS.get(profile, b"") + b"/d"
-    path = folder + b"/file"
-    world.tree.add(path + b".other", OTHER)
-    for number in range(SMALL_LISTING):
-        world.tree.add(b"%b/%d" % (folder, number), b"")
-    faults = Faults(world)
-    async with mounted(world) as (_, tree), trio.open_nursery() as nursery:
-        await tree.list(folder)
-        file = await tree.create(path, exclusive=True)
-        made = trio.Event()
-        faults.at(Opcode.TERMINATE_SESSION, made.set)
-        nursery.start_soon(file.release)
-        await made.wait()
-        assert world.tree.data(path) == b""
-        await TAKES[take][0](tree, path)
-    assert (b"file" in names_on_card(world, folder)) == (TAKES[take][1] is not None)
-    if TAKES[take][1] is not None:
-        assert world.tree.data(path) == TAKES[take][1]
 
 
 @pytest.mark.parametrize("take", TAKES)

@@ -14,8 +14,8 @@ import pytest
 import trio
 from trio.testing import MockClock
 
-from mavftpfs.cache.asides import is_reserved
 from mavftpfs.cache.openfile import OpenFile
+from mavftpfs.cache.reserved import is_reserved
 from mavftpfs.cache.spool import SpoolDirectory
 from mavftpfs.cache.tree import Tree
 from mavftpfs.session.connection import Connection, ConnectOptions

@@ -9,7 +9,7 @@ import pytest
 import trio
 from trio.testing import MockClock
 
-from mavftpfs.cache.asides import is_reserved
+from mavftpfs.cache.reserved import is_reserved
 from mavftpfs.cache.tree import OpenFile
 from mavftpfs.protocol.payload import Opcode
 from mavftpfs.shared.errors import FileChanged
@@ -61,29 +61,6 @@ async def test_the_same_file_is_completed(profile: str, autojump: MockClock) -> 
         await trio.sleep(IDLE)
         await writer.release()
         assert card.world.tree.data(card.path) == OLD[:100] + MID + OLD[103:]
-
-
-@pytest.mark.parametrize("profile", TIMED)
-async def test_what_may_be_of_two_files_is_not_kept_of_one_that_is_unlinked(
-    profile: str, autojump: MockClock
-) -> None:
-    """All of it is held here, but of two sessions of the server, which were not compared yet."""
-    card = Card(profile)
-    async with mounted(card.world) as (_, tree):
-        reader = await tree.open(card.path)
-        assert bytes(await reader.read(0, STEP)) == OLD[:STEP]
-        version = reader._handle._version  # type: ignore[attr-defined]
-        version.blocks.openings.look_at = float("inf")  # as while readers take turns
-        await trio.sleep(IDLE)
-        card.replace()
-        for at in range(STEP, len(OLD) - STEP, STEP):
-            await reader.read(at, STEP)
-        await trio.sleep(IDLE)
-        assert version.blocks.complete
-        await tree.unlink(card.path)
-        with pytest.raises(FileChanged):
-            await reader.read(0, len(OLD))
-        await reader.release()
 
 
 @pytest.mark.parametrize("profile", TIMED)
@@ -271,44 +248,6 @@ async def test_one_that_comes_while_the_whole_file_is_sent_is_not_replaced(
         writer.give_up()
 
 
-@pytest.mark.parametrize("profile", [name for name in TIMED if name != "mavsdk"])
-async def test_what_was_replaced_after_it_was_listed_is_changed(profile: str, autojump: MockClock) -> None:
-    """It is opened without asking, since somebody has it open, who read nothing; nor is the rest read."""
-    card = Card(profile)
-    async with mounted(card.world, card.folder) as (_, tree):
-        await trio.sleep(19.0)
-        reader = await tree.open(card.path)
-        await trio.sleep(2.0)
-        await tree.list(card.folder)  # it is as it was
-        card.replace()
-        writer = await tree.open(card.path, write=True)
-        await writer.write(100, MID)
-        await writer.release()
-        assert card.world.tree.data(card.path) == CHANGED[:100] + MID + CHANGED[103:]
-        await tree.truncate(card.path, 1000)
-        assert card.world.tree.data(card.path) == (CHANGED[:100] + MID + CHANGED[103:])[:1000]
-        await reader.release()
-
-
-@pytest.mark.parametrize("profile", TIMED)
-async def test_our_own_cut_is_nobody_elses(profile: str, autojump: MockClock) -> None:
-    """Who waited for it went before its reply came."""
-    card = Card(profile)
-    faults = Faults(card.world)
-    async with mounted(card.world, card.folder) as (_, tree):
-        writer = await tree.open(card.path, write=True)
-        assert bytes(await writer.read(0, STEP)) == OLD[:STEP]
-        await writer.truncate(300_000)
-        with trio.CancelScope() as scope:
-            faults.at(Opcode.TRUNCATE_FILE, scope.cancel)
-            await writer.fsync()
-        assert scope.cancelled_caught
-        await trio.sleep(IDLE)
-        await writer.write(100, MID)
-        await writer.release()
-        assert card.world.tree.data(card.path) == OLD[:100] + MID + OLD[103:300_000]
-
-
 @pytest.mark.parametrize("profile", TIMED)
 async def test_what_was_known_of_a_file_before_is_not_of_the_next(profile: str, autojump: MockClock) -> None:
     """Who has the old one open to read keeps what is remembered of its name."""
@@ -330,21 +269,3 @@ async def test_what_was_known_of_a_file_before_is_not_of_the_next(profile: str, 
         await writer.release()
         assert card.world.tree.data(card.path) == MID
         await reader.release()
-
-
-@pytest.mark.parametrize("many", [False, True], ids=["few names", "many names"])
-@pytest.mark.parametrize("profile", TIMED)
-async def test_what_was_replaced_before_it_was_opened_is_changed(
-    profile: str, many: bool, autojump: MockClock
-) -> None:
-    """The listing is of the file before, and says nothing against the one that was opened."""
-    card = Card(profile, others=many)
-    async with mounted(card.world, card.folder) as (_, tree):
-        card.replace()
-        writer = await tree.open(card.path, write=True)
-        for at in (100, 300):
-            await writer.write(at, MID)
-            await writer.fsync()
-            await trio.sleep(IDLE)
-        await writer.release()
-        assert card.world.tree.data(card.path) == CHANGED[:100] + MID + CHANGED[103:300] + MID + CHANGED[303:]

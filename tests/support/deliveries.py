@@ -8,8 +8,8 @@ from math import inf
 
 import trio
 
-from mavftpfs.cache.asides import is_reserved
 from mavftpfs.cache.openfile import OpenFile
+from mavftpfs.cache.reserved import is_reserved
 from mavftpfs.cache.tree import Tree
 from mavftpfs.sim.linkmodel import LinkSettings
 from tests.support.mounting import mounted

@@ -175,7 +175,7 @@ class FakeStore:
         self.calls.append((call, path))
         await trio.lowlevel.checkpoint()
         self.require_link()
-        errors = self.fail.get((call, path))
+        errors = self.fail.get((call, path)) or self.fail.get((call, b"*"))
         if errors:
             raise errors.pop(0)
 

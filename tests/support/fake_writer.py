@@ -15,9 +15,9 @@ from typing import Any
 import pytest
 import trio
 
-from mavftpfs.cache.asides import is_reserved
 from mavftpfs.cache.options import CacheOptions
 from mavftpfs.cache.remote import FREE_FOR, Overwrite, ReadSink, UploadSource
+from mavftpfs.cache.reserved import is_reserved
 from mavftpfs.cache.spool import SpoolDirectory
 from mavftpfs.cache.tree import Tree
 from mavftpfs.protocol.payload import NakCode, Opcode
@@ -27,6 +27,7 @@ from mavftpfs.shared.errors import (
     FileChanged,
     FtpNak,
     MavftpfsError,
+    OutcomeUnknown,
     RequestTimeout,
     VehicleLost,
 )
@@ -82,6 +83,7 @@ class FakeWriter(FakeStore):
     """Files in memory that can be changed.
 
     Attributes:
+        traits: whether the card can rename was found out before.
         requests: how many changing requests were executed or failed.
         log: what they were. fail_at: number -> error raised instead of executing it. lose_reply_at: executed,
         but answered by silence. freeze_at: from this number on nothing is executed (power lost).
@@ -96,7 +98,7 @@ class FakeWriter(FakeStore):
     def __init__(self, kind: Kind | None = None, nursery: trio.Nursery | None = None) -> None:
         super().__init__(nursery)
         self.kind = kind or Kind()
-        self.traits = WriteTraits()
+        self.traits = WriteTraits(rename_works=self.kind.renames)
         self.requests = 0
         self.log: list[tuple[str, ...]] = []
         self.fail_at: dict[int, MavftpfsError] = {}
@@ -406,7 +408,7 @@ async def list_all(store: FakeWriter, tree: Tree) -> None:
 
 def _maybe_lose(lost: bool) -> None:
     if lost:
-        raise RequestTimeout("the reply was lost")
+        raise OutcomeUnknown("the reply was lost")
 
 
 class FakeUpload:

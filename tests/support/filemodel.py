@@ -17,7 +17,7 @@ from hypothesis.strategies import SearchStrategy
 
 from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.tree import Tree
-from mavftpfs.shared.errors import AlreadyExists, CrossDevice, FileChanged, MavftpfsError, NotFound
+from mavftpfs.shared.errors import AlreadyExists, CrossDevice, FileBusy, FileChanged, MavftpfsError, NotFound
 
 NAMES = [b"/d/a", b"/d/b", b"/d/sub/c"]
 START = {path: path * 300 for path in NAMES[:2]}
@@ -238,6 +238,8 @@ class Model:
             await self.tree.unlink(path)
         except NotFound:
             assert path not in self.names
+        except FileBusy:
+            assert any(handle.file is self.names[path] for handle in self.handles)
         except self.excused:
             self.failures += 1
             await self.adopt_either(dict(self.names), without)

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from difflib import unified_diff
 from pathlib import Path
 
-from mavftpfs.cache.asides import parse
+from mavftpfs.cache.reserved import parse
 from tests.support.mounts import Mount, wait_until
 from tests.support.trees import differing, walk
 from tests.support.vehicles import PROJECT

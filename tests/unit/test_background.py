@@ -7,12 +7,12 @@ import errno
 import pytest
 import trio
 
-from mavftpfs.cache.background import FIRST_PAUSE, LONGEST_PAUSE, ROOM_PAUSES, START_PAUSE
+from mavftpfs.cache.background import FIRST_PAUSE, LONGEST_PAUSE, ROOM_PAUSES
 from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.tree import Tree
 from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.shared.errors import FtpNak, MavftpfsError, RequestTimeout, VehicleLost
-from tests.support.fake_writer import CHUNK, KINDS, FakeWriter, card, make_writable
+from tests.support.fake_writer import KINDS, FakeWriter, card, make_writable
 
 OLD = bytes(range(256)) * 400
 FILE = b"/card/dir/file.txt"
@@ -47,30 +47,6 @@ async def fill(file: OpenFile, start: int, count: int) -> None:
 # --- uploads that could not begin
 
 
-@pytest.mark.parametrize("news", [False, True])
-async def test_an_upload_that_could_not_begin_begins_later(
-    autojump_clock: object, store: FakeWriter, tree: Tree, monkeypatch: pytest.MonkeyPatch, news: bool
-) -> None:
-    refuse_opens(store, monkeypatch)
-    file = await tree.create(NEW, exclusive=True)
-    store.lost = True
-    await file.write(0, bytes(80 * KIB))
-    await trio.sleep(0.1)
-    store.lost = False
-    if news:
-        tree.link_back()
-        await trio.sleep(0.1)
-    else:
-        await file.write(80 * KIB, b"too soon")
-        await trio.sleep(0.1)
-        assert NEW not in store.files
-        await trio.sleep(START_PAUSE)
-        await file.write(80 * KIB, b"in time.")
-        await trio.sleep(0.1)
-    assert len(store.files[NEW].data) >= 80 * KIB - CHUNK
-    await file.release()
-
-
 async def test_a_lost_link_holds_writers_back_before_any_upload_began(
     store: FakeWriter, tree: Tree, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -103,22 +79,6 @@ async def test_what_can_only_go_at_the_close_holds_nobody_back(
     await file.release()
     assert store.files[FILE].data[1000:1008] == b"x" * 8
     nursery.cancel_scope.cancel()
-
-
-async def test_an_error_of_the_link_does_not_end_background_uploads(
-    autojump_clock: object, store: FakeWriter, tree: Tree, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    refuse_opens(store, monkeypatch)
-    file = await tree.create(NEW, exclusive=True)
-    store.lost = True
-    await file.write(0, b"x")
-    with pytest.raises(VehicleLost):
-        await file.fsync()
-    store.lost = False
-    await file.write(0, bytes(80 * KIB))
-    await trio.sleep(0.1)
-    assert len(store.files[NEW].data) == 80 * KIB // CHUNK * CHUNK
-    await file.release()
 
 
 async def test_a_file_that_was_removed_while_its_upload_began_is_forgotten(
@@ -245,10 +205,10 @@ async def test_a_refusal_is_not_repeated_beside_others(
 ) -> None:
     asked: list[object] = []
 
-    def refuse(what: object, path: object, *_: object) -> None:
-        if path == NEW:
+    def refuse(what: object, *paths: object) -> None:
+        if what == "rename" and NEW in paths:
             asked.append(what)
-            raise FtpNak(Opcode.CREATE_FILE, NakCode.FAIL_ERRNO, errno.EACCES)
+            raise FtpNak(Opcode.RENAME, NakCode.FAIL_ERRNO, errno.EACCES)
 
     store.before_request = refuse
     await close_in_vain(tree)

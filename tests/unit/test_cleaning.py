@@ -7,10 +7,10 @@ from collections.abc import AsyncIterator
 import pytest
 import trio
 
-from mavftpfs.cache.asides import Kind, Reserved
-from mavftpfs.cache.cleaning import Cleaner
+from mavftpfs.cache.cleaner import Cleaner
 from mavftpfs.cache.context import Context
 from mavftpfs.cache.dentries import Directory
+from mavftpfs.cache.reserved import Kind, Reserved
 from mavftpfs.cache.tree import Tree
 from mavftpfs.shared.model import DirEntry, EntryKind
 from tests.support.fake_store import read_file
@@ -40,36 +40,18 @@ def reserved(tree: Tree, kind: Kind, target: bytes | None = b"file.txt") -> byte
     return Reserved(parts(tree)[0].namer.owner, kind, b"sss", target).name
 
 
-async def test_a_name_that_is_about_to_be_made_is_not_given_an_old_file(
-    store: FakeWriter, tree: Tree
-) -> None:
-    file = await tree.create(FILE, exclusive=True)
-    await file.write(0, b"ours")
-    store.add(DIRECTORY + b"/" + reserved(tree, Kind.OLD), OLD)
-    tree.forget_caches()
-    await tree.list(DIRECTORY)
-    assert FILE not in store.files
-    assert len(litter(store)) == 1
-    await file.release()
-    assert store.files[FILE].data == b"ours"
-    tree.forget_caches()
-    await tree.list(DIRECTORY)
-    assert store.files[FILE].data == b"ours"
-    assert litter(store) == []
-
-
 async def test_only_a_listing_that_counts_proves_a_torn_name_whole(store: FakeWriter, tree: Tree) -> None:
     """One that began before the name was torn shows it because we said so."""
     context, cleaner = parts(tree)
     place = DIRECTORY + b"/" + reserved(tree, Kind.OLD)
-    context.torn[FILE] = place
+    context.own.torn[FILE] = place
     now = trio.current_time()
     shown = Directory({b"file.txt": DirEntry(b"file.txt", EntryKind.FILE, 3)}, now, now + 20, True)
     await cleaner.on_swept(DIRECTORY, shown)
-    assert context.torn == {FILE: place}
+    assert context.own.torn == {FILE: place}
     store.add(FILE, OLD)
     await tree.list(DIRECTORY)
-    assert context.torn == {}
+    assert context.own.torn == {}
 
 
 async def test_a_file_that_took_the_place_of_another_is_read_anew(store: FakeWriter, tree: Tree) -> None:
@@ -78,12 +60,12 @@ async def test_a_file_that_took_the_place_of_another_is_read_anew(store: FakeWri
     assert await read_file(tree, FILE) == OLD
     context = parts(tree)[0]
     new, old = (DIRECTORY + b"/" + reserved(tree, kind) for kind in (Kind.NEW, Kind.OLD))
-    context.torn[FILE] = old
+    context.own.torn[FILE] = old
     store.files[old] = store.files.pop(FILE)
     store.add(new, OLD[::-1])  # of the same size
     context.dentries.expire(DIRECTORY, trio.current_time())
     assert await read_file(tree, FILE) == OLD[::-1]
-    assert context.torn == {}
+    assert context.own.torn == {}
     assert litter(store) == []
 
 

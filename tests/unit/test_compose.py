@@ -10,6 +10,7 @@ import pytest
 
 from mavftpfs.compose import cache_options, connect_options
 from mavftpfs.fuse.options import MountOptions, fuse_words
+from mavftpfs.link.uri import parse_source
 from mavftpfs.mount import presentation
 
 OTHER: dict[str, Any] = {
@@ -43,7 +44,7 @@ def told(options: MountOptions) -> tuple[Any, ...]:
     """Return what kernel, session and caches are told."""
     return (
         connect_options(options),
-        cache_options(options),
+        cache_options(options, parse_source("udpin:0.0.0.0:14550")),
         fuse_words(options, "SOURCE"),
         presentation(options),
     )

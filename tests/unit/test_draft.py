@@ -5,12 +5,12 @@ from __future__ import annotations
 import pytest
 from hypothesis import settings
 from hypothesis import strategies as st
-from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
+from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
-from mavftpfs.cache.draft import Draft, Where
+from mavftpfs.cache.draft import TRANSITIONS, Base, Draft, Event, State, Where
 from mavftpfs.cache.sending import AHEAD, Sending
 from mavftpfs.protocol.crc import crc32
-from mavftpfs.shared.errors import SpoolFailed
+from mavftpfs.shared.errors import LocalProtocolError, SpoolFailed
 
 
 class Bytes:
@@ -34,7 +34,13 @@ class Bytes:
 
 
 def draft_over(base: bytes | None) -> Draft:
-    return Draft(Bytes(), None if base is None else len(base))
+    return Draft(Bytes(), None if base is None else Base(len(base)))
+
+
+def sending_of(data: bytes) -> tuple[Draft, Sending]:
+    draft = draft_over(None)
+    draft.write(0, data)
+    return draft, draft.begin(in_place=False)
 
 
 def content(draft: Draft, base: bytes) -> bytes:
@@ -51,13 +57,88 @@ def sent(sending: Sending, limit: int = 7) -> list[tuple[int, bytes]]:
     return chunks
 
 
-def test_a_new_file_is_dirty_even_if_empty() -> None:
+# --- states
+
+
+def test_every_state_is_in_the_table_and_can_be_left() -> None:
+    assert TRANSITIONS.keys() == set(State)
+    reached = {state for events in TRANSITIONS.values() for state in events.values()}
+    assert reached == set(State)
+    for state in State:
+        assert any(after is not state for after in TRANSITIONS[state].values())
+
+
+@pytest.mark.parametrize("state", State)
+@pytest.mark.parametrize("event", Event)
+def test_what_the_table_does_not_know_cannot_happen(state: State, event: Event) -> None:
+    draft = draft_over(b"base")
+    draft.state = state
+    if event in TRANSITIONS[state]:
+        draft.on(event)
+        assert draft.state is TRANSITIONS[state][event]
+    else:
+        with pytest.raises(LocalProtocolError):
+            draft.on(event)
+        assert draft.state is state
+
+
+def test_the_life_of_a_new_file() -> None:
     draft = draft_over(None)
-    assert not draft.clean
-    assert draft.fresh
-    assert draft.whole
+    assert not draft.clean, "also if it is empty"
+    assert draft.undelivered
+    sending = draft.begin(in_place=False)
+    draft.write(0, b"abc")
+    assert sent(sending) == [(0, b"abc")]
+    draft.commit()
+    with pytest.raises(LocalProtocolError):
+        draft.write(0, b"x")  # writers wait
     draft.delivered()
     assert draft.clean
+    assert draft.base == Base(3)
+    draft.write(1, b"X")
+    assert draft.state is State.DIRTY
+
+
+def test_an_interrupted_commit_is_torn_and_no_base_counts_any_more() -> None:
+    draft = draft_over(b"old")
+    draft.fill(0, b"old")
+    draft.write(0, b"X")
+    draft.begin(in_place=False)
+    draft.commit()
+    draft.interrupted()
+    assert draft.state is State.TORN
+    draft.lose_base()
+    draft.write(0, b"Y")
+    assert draft.undelivered
+    assert draft.local_bytes(0, 3) == b"Yld"
+
+
+def test_a_base_that_others_replaced() -> None:
+    clean = draft_over(b"old")
+    clean.lose_base()
+    assert (clean.state, clean.undelivered) == (State.STALE, False)
+    cut = draft_over(b"old")
+    cut.truncate(2)
+    cut.lose_base()
+    assert (cut.state, cut.undelivered) == (State.STALE, True)
+    with pytest.raises(LocalProtocolError):
+        cut.write(0, b"x")
+    cut.truncate(0)
+    assert cut.state is State.DIRTY, "nothing of the base is to stay"
+    cut.lose_base()
+    assert cut.state is State.DIRTY
+
+
+def test_an_attempt_that_is_given_up_leaves_it_dirty() -> None:
+    draft, _ = sending_of(b"abc")
+    draft.give_up()
+    draft.give_up()
+    assert draft.state is State.DIRTY
+    assert sent(draft.begin(in_place=True)) == [(0, b"abc")]
+    assert draft.begun
+
+
+# --- content
 
 
 def test_a_cut_that_fails_changes_nothing() -> None:
@@ -70,14 +151,14 @@ def test_a_cut_that_fails_changes_nothing() -> None:
     with pytest.raises(SpoolFailed):
         draft.truncate(2)
     assert content(draft, b"") == b"abcdef"
-    assert sent(draft.begin(whole=True)) == [(0, b"abcdef")]
+    assert sent(draft.begin(in_place=False)) == [(0, b"abcdef")]
 
 
 def test_a_gap_beyond_the_end_is_zeros_and_is_sent() -> None:
     draft = draft_over(None)
     draft.write(5, b"x")
     assert draft.local_bytes(0, 6) == b"\0\0\0\0\0x"
-    assert sent(draft.begin(whole=True)) == [(0, b"\0\0\0\0\0x")]
+    assert sent(draft.begin(in_place=False)) == [(0, b"\0\0\0\0\0x")]
 
 
 def test_a_hole_of_the_base_is_never_zeros() -> None:
@@ -85,7 +166,6 @@ def test_a_hole_of_the_base_is_never_zeros() -> None:
     draft.write(2, b"X")
     assert draft.segments(0, 9) == [(Where.BASE, 0, 2), (Where.HELD, 2, 3), (Where.BASE, 3, 6)]
     assert not draft.whole
-    assert sent(draft.begin(whole=False)) == [(2, b"X")]
 
 
 def test_what_was_cut_off_the_base_does_not_come_back() -> None:
@@ -95,7 +175,7 @@ def test_what_was_cut_off_the_base_does_not_come_back() -> None:
     assert content(draft, b"abcdef") == b"ab\0\0\0"
     draft.truncate(0)
     draft.write(1, b"z")
-    assert draft.fresh
+    assert draft.whole
     assert content(draft, b"abcdef") == b"\0z"
 
 
@@ -109,12 +189,15 @@ def test_filling_never_overwrites_what_is_newer() -> None:
     assert draft.crc32() == crc32(b"abXde")
 
 
+# --- sending
+
+
 def test_a_byte_written_again_in_flight_goes_again_but_not_before_the_first_is_accounted_for() -> None:
-    draft = draft_over(None)
-    draft.write(0, b"first")
-    sending = draft.begin(whole=True)
+    draft, sending = sending_of(b"first")
     assert sending.next_chunk(9) == (0, b"first")
+    assert not sending.rewritten
     draft.write(1, b"XX")
+    assert sending.rewritten
     assert sending.next_chunk(9) is None, "two copies under way could land in the wrong order"
     assert sending.unacked == 5
     sending.on_acked(0, 5)
@@ -125,9 +208,7 @@ def test_a_byte_written_again_in_flight_goes_again_but_not_before_the_first_is_a
 
 
 def test_a_part_that_was_not_written_goes_again() -> None:
-    draft = draft_over(None)
-    draft.write(0, b"abcdef")
-    sending = draft.begin(whole=True)
+    _, sending = sending_of(b"abcdef")
     assert sending.next_chunk(6) == (0, b"abcdef")
     sending.on_acked(0, 4)
     sending.on_unsent(4, 2)
@@ -135,9 +216,7 @@ def test_a_part_that_was_not_written_goes_again() -> None:
 
 
 def test_rollbacks() -> None:
-    draft = draft_over(None)
-    draft.write(0, b"abcdef")
-    sending = draft.begin(whole=True)
+    _, sending = sending_of(b"abcdef")
     sending.next_chunk(2)
     sending.on_acked(0, 2)
     sending.on_checkpoint()
@@ -149,31 +228,30 @@ def test_rollbacks() -> None:
     assert sending.next_chunk(9) == (2, b"cdef")
     sending.on_rollback(True)
     assert sending.next_chunk(9) == (0, b"abcdef")
-    assert not sending.emptied
 
 
-def test_emptying_a_file_that_was_to_be_changed_in_place_is_noticed() -> None:
-    draft = draft_over(b"abcdef")
-    draft.write(0, b"X")
-    sending = draft.begin(whole=False)
-    sending.on_rollback(True)
-    assert sending.emptied
+def test_a_file_that_is_cut_below_what_was_sent_is_not_sent_on() -> None:
+    draft, sending = sending_of(b"abcdef")
+    sending.next_chunk(3)
+    draft.truncate(3)
+    assert not sending.overtaken
+    draft.truncate(2)
+    assert sending.overtaken
+    draft.write(2, b"more")
+    assert sending.next_chunk(9) is None
 
 
 def test_a_late_upload_of_an_earlier_attempt_changes_nothing() -> None:
-    draft = draft_over(None)
-    draft.write(0, b"abc")
-    early = draft.begin(whole=True)
+    draft, early = sending_of(b"abc")
     early.next_chunk(9)
-    late = draft.begin(whole=True)
+    draft.give_up()
+    late = draft.begin(in_place=False)
     early.on_acked(0, 3)
     assert late.unacked == 3
 
 
 def test_an_ack_of_bytes_that_are_not_under_way_is_not_one_of_the_copy_that_goes_next() -> None:
-    draft = draft_over(None)
-    draft.write(0, bytes(40))
-    sending = draft.begin(whole=True)
+    _, sending = sending_of(bytes(40))
     sending.next_chunk(10)
     sending.on_acked(10, 10)
     assert sending.next_chunk(10) == (10, bytes(10))
@@ -181,9 +259,7 @@ def test_an_ack_of_bytes_that_are_not_under_way_is_not_one_of_the_copy_that_goes
 
 
 def test_bytes_fetched_ahead_are_not_stale() -> None:
-    draft = draft_over(None)
-    draft.write(0, bytes(AHEAD * 2))
-    sending = draft.begin(whole=True)
+    draft, sending = sending_of(bytes(AHEAD * 2))
     sending.next_chunk(10)
     draft.write(10, b"new")
     assert sending.next_chunk(5) == (10, b"new\0\0")
@@ -191,29 +267,15 @@ def test_bytes_fetched_ahead_are_not_stale() -> None:
     assert sent(sending, 99) == [(15, b"\0")]
 
 
-def test_growth_in_place_is_remembered_when_the_attempt_is_given_up() -> None:
-    draft = draft_over(b"abc")
-    draft.write(3, b"defg")
-    sending = draft.begin(whole=False)
-    sending.next_chunk(9)
-    draft.truncate(3)
-    assert not draft.clean, "the vehicle's file may be longer now"
-    draft.begin_again()
-    assert draft.remote_size == 7
-    assert not draft.clean
-
-
 class DraftMachine(RuleBasedStateMachine):
-    """A draft, a model of the file, and a model of the vehicle's file under an upload."""
+    """A draft, a model of the file, and a model of the file that an upload makes."""
 
-    @initialize(base=st.none() | st.binary(max_size=40), whole=st.booleans())
-    def start(self, base: bytes | None, whole: bool) -> None:
+    @initialize(base=st.none() | st.binary(max_size=40))
+    def start(self, base: bytes | None) -> None:
         self.base = base or b""
         self.draft = draft_over(base)
         self.model = bytearray(self.base)
-        self.remote = bytearray(self.base)
-        self.sending: Sending | None = None
-        self.whole = whole or base is None
+        self.remote = bytearray()
         self.flight: list[tuple[int, bytes]] = []
 
     @rule(offset=st.integers(0, 60), data=st.binary(max_size=20))
@@ -225,23 +287,22 @@ class DraftMachine(RuleBasedStateMachine):
 
     @rule(size=st.integers(0, 70))
     def truncate(self, size: int) -> None:
-        if self.sending is not None and size < self.sending.reached:
-            self.give_up()  # as delivery does when more was sent than the file is long
         self.draft.truncate(size)
         del self.model[size:]
         self.model.extend(bytes(size - len(self.model)))
+        if self.draft.sending is not None and self.draft.sending.overtaken:
+            self.give_up()
 
+    @precondition(lambda self: self.draft.state is State.DIRTY)
     @rule()
     def begin(self) -> None:
-        self.give_up()
-        if self.whole:
-            self.draft.fill(0, self.base)
-            self.remote.clear()
-        self.sending = self.draft.begin(whole=self.whole)
+        self.draft.fill(0, self.base)
+        self.remote.clear()
+        self.draft.begin(in_place=False)
 
     @rule(limit=st.integers(1, 12))
     def send(self, limit: int) -> None:
-        chunk = self.sending.next_chunk(limit) if self.sending else None
+        chunk = self.draft.sending.next_chunk(limit) if self.draft.sending else None
         if chunk is not None:
             offset, data = chunk
             assert 0 < len(data) <= limit
@@ -251,56 +312,57 @@ class DraftMachine(RuleBasedStateMachine):
     @rule(index=st.integers(0, 5), keep=st.integers(0, 12))
     def answer(self, index: int, keep: int) -> None:
         """One request comes back, perhaps written only in part."""
-        if self.sending is None or not self.flight:
+        sending = self.draft.sending
+        if sending is None or not self.flight:
             return
         offset, data = self.flight.pop(index % len(self.flight))
         count = min(keep, len(data))
         self.remote.extend(bytes(max(0, offset + count - len(self.remote))))
         self.remote[offset : offset + count] = data[:count]
-        self.sending.on_acked(offset, count)
-        self.sending.on_unsent(offset + count, len(data) - count)
+        sending.on_acked(offset, count)
+        sending.on_unsent(offset + count, len(data) - count)
 
     @rule(everything=st.booleans())
     def lose_session(self, everything: bool) -> None:
-        if self.sending is None:
+        if self.draft.sending is None:
             return
-        everything = everything and self.whole
         self.flight.clear()
-        self.sending.on_rollback(everything)
+        self.draft.sending.on_rollback(everything)
         if everything:
             self.remote.clear()
 
     @rule()
     def terminate(self) -> None:
-        if self.sending is not None:
-            self.sending.on_checkpoint()
+        if self.draft.sending is not None:
+            self.draft.sending.on_checkpoint()
 
-    @rule()
-    def finish(self) -> None:
-        """Everything is sent: the vehicle's file is the model."""
-        if self.sending is None:
+    @rule(end=st.sampled_from(["placed", "refused", "torn and placed", "torn and refused"]))
+    def finish(self, end: str) -> None:
+        """Everything is sent: the remote file is the model."""
+        sending = self.draft.sending
+        if sending is None:
             return
         while self.flight:
             self.answer(0, 12)
-        while self.sending.unacked:
+        while sending.unacked:
             self.send(12)
             assert self.flight
             self.answer(0, 12)
-        too_long = len(self.remote) > len(self.model)
-        assert self.whole or too_long == (self.draft.remote_end != len(self.model))
-        assert self.remote[: len(self.model)] == self.model
-        if not too_long:
-            self.base = bytes(self.model)
+        assert self.remote == self.model
+        self.draft.commit()
+        if end.startswith("torn"):
+            self.draft.interrupted()
+        if end.endswith("placed"):
             self.draft.delivered()
-            assert self.draft.clean
-            self.sending = None
+            self.base = bytes(self.model)
+        else:
+            self.draft.on(Event.REFUSED)
+        assert self.draft.clean == end.endswith("placed")
 
+    @rule()
     def give_up(self) -> None:
         self.flight.clear()
-        self.draft.begin_again()
-        self.sending = None
-        if self.whole:
-            self.remote = bytearray(self.base)
+        self.draft.give_up()
 
     @invariant()
     def content_is_the_models(self) -> None:

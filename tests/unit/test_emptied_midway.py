@@ -13,7 +13,7 @@ import trio
 
 from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.tree import Tree
-from mavftpfs.shared.errors import Armed, FileBusy, LinkError, RequestTimeout
+from mavftpfs.shared.errors import Armed, FileBusy, LinkError, OutcomeUnknown, RequestTimeout
 from tests.support.deliveries import in_the_middle
 from tests.support.fake_writer import KINDS, FakeWriter, litter, make_writable
 
@@ -145,7 +145,7 @@ async def test_an_error_is_that_of_what_the_file_is_now(autojump_clock: object, 
 
 
 def refuse(*_: object) -> None:
-    raise RequestTimeout("no answer")
+    raise OutcomeUnknown("no answer")
 
 
 async def test_what_nobody_waits_for_leaves_the_old_file_until_there_is_another(
@@ -268,7 +268,7 @@ async def test_what_was_taken_back_may_have_got_its_place(
         await given(old, new, completes=completes)
         if renames == nth:
             store.lost = True
-            raise RequestTimeout("no answer")
+            raise OutcomeUnknown("no answer")
 
     monkeypatch.setattr(store, "rename", rename)
     with suppress(LinkError, RequestTimeout):

@@ -16,7 +16,6 @@ from mavftpfs.shared.errors import (
     NoSpace,
     NotADirectory,
     NotFound,
-    RequestTimeout,
     VehicleLost,
 )
 from mavftpfs.shared.model import EntryKind
@@ -86,31 +85,6 @@ async def test_a_failed_move_to_the_vehicle_moves_nothing(store: FakeWriter, tre
     assert await read_file(tree, SWAP) == bytes(500)
     assert tree.undelivered() == []
     assert sorted(store.files) == [FILE]
-
-
-@pytest.mark.parametrize("theirs", [None, b"", b"the vehicle's own"])
-async def test_a_move_of_an_empty_file_that_may_have_made_one_leaves_none(
-    store: FakeWriter, tree: Tree, theirs: bytes | None
-) -> None:
-    """The reply to CreateFile was lost; one with content is somebody else's."""
-    await write_file(tree, SWAP, b"")
-    store.lose_reply_at = {1}
-    truly = store.create_empty
-
-    async def create_empty(path: bytes, *, free_at: float | None = None) -> None:
-        try:
-            await truly(path, free_at=free_at)
-        finally:
-            if theirs is not None:
-                store.add(path, theirs)
-
-    store.create_empty = create_empty  # type: ignore[method-assign]
-    with pytest.raises(RequestTimeout):
-        await tree.rename(SWAP, b"/scripts/new")
-    assert await read_file(tree, SWAP) == b""
-    assert {path: file.data for path, file in store.files.items() if path != FILE} == (
-        {b"/scripts/new": theirs} if theirs else {}
-    )
 
 
 @pytest.mark.parametrize("step", ["open_upload", "require_free"])
@@ -258,18 +232,6 @@ async def test_what_replaces_a_file_while_it_is_moved_is_not_removed(store: Fake
         await tree.stat(SWAP)
 
 
-async def test_a_file_is_moved_by_another_spelling_of_its_name(store: FakeWriter, tree: Tree) -> None:
-    store.traits.folds_case = True
-    file = await tree.open(FILE, write=True)
-    await file.write(0, b"++")
-    other = b"/scripts/HOVER.LUA"
-    assert await move(tree, other, SWAP) == other
-    await file.release()
-    assert await move(tree, other, SWAP) == SWAP
-    assert await read_file(tree, SWAP) == b"++ old"
-    assert store.files == {}
-
-
 async def test_trash(store: FakeWriter, tree: Tree) -> None:
     with pytest.raises(NotFound):
         await tree.mkdir(TRASH + b"/files")
@@ -354,17 +316,6 @@ async def test_a_failed_move_costs_nothing_that_was_accepted_before(posix: FakeW
     posix.capacity = None
     assert await tree.drain(60) == []
     assert posix.files[FILE].data == b"accepted"
-
-
-async def test_a_failed_move_over_another_spelling_moves_nothing(store: FakeWriter, tree: Tree) -> None:
-    other = b"/scripts/HOVER.LUA"
-    await write_file(tree, SWAP, b"new")
-    store.capacity = 0
-    with pytest.raises(FtpNak):
-        await tree.rename(SWAP, other)
-    store.capacity = None
-    assert tree.undelivered() == []
-    assert store.files[FILE].data == b"-- old"
 
 
 async def test_unlinked_ones_that_are_open_count_too(store: FakeWriter) -> None:

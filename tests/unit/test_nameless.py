@@ -124,7 +124,8 @@ async def test_a_writer_who_waits_when_the_name_goes_is_let_go(
     await tree.unlink(NEW)
     removed = trio.current_time()
     await trio.sleep(2 * STALL)
-    assert ended == [pytest.approx(removed)]
+    assert len(ended) == 1
+    assert ended[0] < removed + STALL
     await assert_filled(file)
     await file.release()
     assert NEW not in store.files
@@ -138,11 +139,6 @@ async def rename_over_directory(tree: Tree) -> None:
     await tree.rename(b"/card/dir", b"/card/moved", noreplace=False)
 
 
-async def remove_directory(tree: Tree) -> None:
-    await tree.unlink(FILE)
-    await tree.rmdir(b"/card/dir")
-
-
 async def replace_by_other(tree: Tree) -> None:
     await tree.rename(b"/card/other", FILE, noreplace=False)
 
@@ -151,7 +147,6 @@ LOSE: dict[str, LoseName] = {
     "unlink": lambda tree: tree.unlink(FILE),
     "rename over": replace_by_other,
     "directory renamed": rename_over_directory,
-    "directory removed": remove_directory,
 }
 
 

@@ -1,73 +1,59 @@
-"""Which way a draft goes, by what the server was seen to do."""
+"""The next step for a draft, by its state and what the server was seen to do."""
 
 from __future__ import annotations
 
 import pytest
 
-from mavftpfs.cache.draft import Draft
-from mavftpfs.cache.plan import Plan, Rules, choose
-from mavftpfs.shared.errors import FileTooLarge, NotSupported
+from mavftpfs.cache.draft import Base, Draft, State
+from mavftpfs.cache.plan import Plan, choose
+from mavftpfs.shared.errors import FileChanged, NotSupported
 from mavftpfs.shared.traits import WriteTraits
 from tests.unit.test_draft import Bytes
 
-RULES = Rules(rmw_max=1000)
-KEEPS = WriteTraits(wo_truncates=False)
-EMPTIES = WriteTraits(wo_truncates=True)
-NO_RENAME = WriteTraits(wo_truncates=True, rename_works=False)
+RENAMES = WriteTraits(rename_works=True)
+RENAMES_NOT = WriteTraits(rename_works=False)
+UNKNOWN = WriteTraits()
 
 
-def draft(base: int | None, *steps: tuple[int, bytes] | int) -> Draft:
-    """Return a draft over `base` bytes after writes (offset, data) and truncations (size)."""
-    made = Draft(Bytes(), base)
-    for step in steps:
-        if isinstance(step, int):
-            made.truncate(step)
-        else:
-            made.write(*step)
+def draft(base: int | None, write: tuple[int, bytes] | None = None, size: int | None = None) -> Draft:
+    """Return a draft over a base of so many bytes, perhaps cut, perhaps written to."""
+    made = Draft(Bytes(), None if base is None else Base(base))
+    if size is not None:
+        made.truncate(size)
+    if write is not None:
+        made.write(*write)
     return made
 
 
 @pytest.mark.parametrize(
     ("made", "traits", "plan"),
     [
-        (draft(10), WriteTraits(), Plan.NOTHING),
-        (draft(0, 0), WriteTraits(), Plan.NOTHING),
-        (draft(None), WriteTraits(), Plan.CREATE_EMPTY),
-        (draft(10, 0), WriteTraits(), Plan.CREATE_EMPTY),
-        (draft(None, (0, b"x")), WriteTraits(), Plan.NEW),
-        (draft(None, (5, b"x")), NO_RENAME, Plan.NEW),
-        (draft(10, 0, (0, b"x")), WriteTraits(), Plan.REPLACE),
-        (draft(10, 0, (0, b"x")), KEEPS, Plan.REPLACE),
-        (draft(10, (10, b"x")), WriteTraits(), Plan.PROBE),
-        (draft(10, (10, b"x")), KEEPS, Plan.IN_PLACE),
-        (draft(10, 20), KEEPS, Plan.IN_PLACE),
-        (draft(10, (3, b"x")), EMPTIES, Plan.FILL),
-        (draft(10, (0, bytes(10))), EMPTIES, Plan.REPLACE),
-        (draft(10, 5), WriteTraits(), Plan.TRUNCATE),
-        (draft(10, 5), WriteTraits(truncate_works=False), Plan.FILL),
-        (draft(10, 5, (0, b"x")), WriteTraits(), Plan.PROBE),
-        (draft(10, 5, (0, b"x")), KEEPS, Plan.TRUNCATE),
-        (draft(10, 5, (0, b"x")), WriteTraits(wo_truncates=False, truncate_works=False), Plan.FILL),
-        (draft(10, 5, (0, b"x")), EMPTIES, Plan.FILL),
-        (draft(10, 5, (0, b"12345")), KEEPS, Plan.REPLACE),
+        (draft(10), UNKNOWN, Plan.NOTHING),
+        (draft(None), UNKNOWN, Plan.FIND_OUT),
+        (draft(None), RENAMES, Plan.REPLACE),
+        (draft(None, (0, b"x")), RENAMES_NOT, Plan.OVERWRITE),
+        (draft(10, (0, b"x"), 0), RENAMES, Plan.REPLACE),
+        (draft(10, (3, b"x")), UNKNOWN, Plan.FETCH),
+        (draft(10, None, 4), RENAMES, Plan.FETCH),
+        (draft(10, (0, b"0123456789")), RENAMES, Plan.REPLACE),
     ],
 )
 def test_plans(made: Draft, traits: WriteTraits, plan: Plan) -> None:
-    assert choose(made, traits, RULES) is plan
+    assert choose(made, traits, inplace=False) is plan
 
 
 def test_without_rename_nothing_is_replaced_unless_allowed() -> None:
-    made = draft(10, 0, (0, b"x"))
+    changed = draft(10, (0, b"x"), 0)
     with pytest.raises(NotSupported):
-        choose(made, NO_RENAME, RULES)
-    assert choose(made, NO_RENAME, Rules(1000, inplace=True)) is Plan.REWRITE
-    with pytest.raises(NotSupported):  # before the base is fetched for nothing
-        choose(draft(10, (3, b"x")), NO_RENAME, RULES)
+        choose(changed, RENAMES_NOT, inplace=False)
+    assert choose(changed, RENAMES_NOT, inplace=True) is Plan.OVERWRITE
 
 
-def test_a_large_file_is_not_sent_whole_for_a_part_but_is_when_it_is_all_new() -> None:
-    with pytest.raises(FileTooLarge):
-        choose(draft(1001, (3, b"x")), EMPTIES, RULES)
-    assert choose(draft(1000, (3, b"x")), EMPTIES, RULES) is Plan.FILL
-    assert choose(draft(1001, (3, b"x")), KEEPS, RULES) is Plan.IN_PLACE
-    assert choose(draft(9, 0, (0, bytes(2000))), EMPTIES, RULES) is Plan.REPLACE
+def test_what_was_interrupted_is_mended_first_and_what_is_stale_is_an_error() -> None:
+    torn = draft(None)
+    torn.state = State.TORN
+    assert choose(torn, RENAMES, inplace=False) is Plan.MEND
+    stale = draft(10)
+    stale.lose_base()
+    with pytest.raises(FileChanged):
+        choose(stale, RENAMES, inplace=False)

@@ -5,31 +5,26 @@ from __future__ import annotations
 import errno
 import json
 import os
-from contextlib import suppress
 from pathlib import Path
 from random import Random
 
 import pytest
 import trio
 
-from mavftpfs.cache.asides import is_reserved, new_owner
 from mavftpfs.cache.openfile import OpenFile
+from mavftpfs.cache.reserved import is_reserved
 from mavftpfs.cache.spool import SpoolContent, SpoolDirectory
 from mavftpfs.cache.tree import Tree
 from mavftpfs.farewell import keep_the_rest
 from mavftpfs.protocol.crc import crc32
 from mavftpfs.shared.errnos import errno_for
 from mavftpfs.shared.errors import (
-    FileBusy,
-    FileTooLarge,
-    MavftpfsError,
     NotDeliveredYet,
-    RequestTimeout,
     SpoolFailed,
     VehicleLost,
 )
 from mavftpfs.shared.model import split
-from tests.support.fake_writer import CHUNK, KINDS, FakeWriter, card, litter, make_writable
+from tests.support.fake_writer import FakeWriter, card, litter, make_writable
 
 OLD = bytes(range(256)) * 4
 FILE = b"/card/dir/file.txt"
@@ -134,17 +129,13 @@ async def append_and_take_back(store: FakeWriter, tree: Tree) -> OpenFile:
     return file
 
 
-@pytest.mark.parametrize("end", ["flush", "release", "close"])
+@pytest.mark.parametrize("end", ["flush", "release"])
 async def test_an_upload_of_what_was_taken_back_is_called_off(
     autojump_clock: object, mavsdk: FakeWriter, end: str
 ) -> None:
     tree = make_writable(mavsdk)
     file = await append_and_take_back(mavsdk, tree)
-    if end == "close":
-        file.close()
-        await trio.sleep(1)
-    else:
-        await getattr(file, end)()
+    await getattr(file, end)()
     assert litter(mavsdk) == []
     assert all(upload.aborted for upload in mavsdk.uploads if is_reserved(split(upload.path)[1]))
     assert mavsdk.files[FILE].data == b"y" + OLD[1:]
@@ -153,117 +144,13 @@ async def test_an_upload_of_what_was_taken_back_is_called_off(
     await tree.rmdir(split(FILE)[0])
 
 
-async def test_only_unlinked_files_move_up_from_a_directory_that_goes(
-    autojump_clock: object, mavsdk: FakeWriter
-) -> None:
-    """A temporary name that an upload still needs is nobody's to move."""
-    tree = make_writable(mavsdk)
-    used = b"/card/other/.mavftpfs-" + new_owner(Random(1)) + b"taaa"  # as make_writable's
-    mavsdk.add(used, b"")
-    tree._writing._context.live.add(used)  # type: ignore[union-attr]
-    with pytest.raises(FileBusy):
-        await tree.rmdir(b"/card/other")
-    assert used in mavsdk.files
-
-
 # --- what was emptied, or cut
-
-
-async def test_what_is_emptied_is_not_changed_in_place_any_more(
-    autojump_clock: object, store: FakeWriter
-) -> None:
-    """An append was on its way in place; the new content may only replace the file as a whole."""
-    tree = make_writable(store)
-    file = await tree.open(FILE, write=True)
-    await file.write(0, b"y")
-    await file.fsync()
-    store.write_delay = 0.01
-    await file.write(len(OLD), b"a" * 100 * 1024)
-    await trio.sleep(1)
-    reached = len(store.files[FILE].data)
-    assert len(OLD) < reached < len(OLD) + 100 * 1024
-    await file.truncate(0)
-    for at in range(0, 200 * 1024, 20 * 1024):
-        await file.write(at, b"N" * 20 * 1024)
-    await trio.sleep(3)
-    assert store.files[FILE].data.startswith(b"y" + OLD[1:] + b"a")
-    assert len(store.files[FILE].data) <= reached + CHUNK
-    assert litter(store), "it is replaced, beside the program"
-    await file.release()
-    assert store.files[FILE].data == b"N" * 200 * 1024
-    assert litter(store) == []
-
-
-@pytest.mark.parametrize("size", [0, 100])
-async def test_what_is_cut_while_it_is_about_to_be_changed_in_place_is_not(
-    autojump_clock: object, store: FakeWriter, size: int
-) -> None:
-    """The size on the vehicle is being asked for."""
-    store.add(FILE, LARGE)
-    store.traits.wo_truncates = False
-    tree = make_writable(store)
-    file = await tree.open(FILE, write=True)
-    store.list_delay = 1.0
-    await file.write(0, b"n" * 70_000)
-    await trio.sleep(0.5)
-    await file.truncate(size)
-    await file.write(0, b"m" * 70_000)
-    await trio.sleep(20)
-    assert store.files[FILE].data == LARGE
-    await file.release()
-    assert store.files[FILE].data == b"m" * 70_000
-    assert litter(store) == []
 
 
 LARGE = bytes(range(256)) * 400
 
 
 large = card({FILE: LARGE}, kinds=["posix", "fat", "mavsdk"])
-
-
-async def change_and_cut(tree: Tree) -> None:
-    file = await tree.open(FILE, write=True)
-    try:
-        await file.write(10, b"A" * 10)
-        await file.truncate(90_000)
-        await file.release()
-    finally:
-        file.close()
-
-
-async def test_a_large_file_is_changed_and_cut_where_both_can_be_done(
-    autojump_clock: object, large: FakeWriter
-) -> None:
-    tree = make_writable(large, rmw_max=50_000)
-    if large.kind != KINDS["posix"]:
-        with pytest.raises(FileTooLarge):
-            await change_and_cut(tree)
-        assert large.files[FILE].data == LARGE
-        return
-    await change_and_cut(tree)
-    assert large.files[FILE].data == (LARGE[:10] + b"A" * 10 + LARGE[20:])[:90_000]
-    assert sum(entry[0] == "write" and entry[1] == str(FILE) for entry in large.log) == 1
-    assert tree.undelivered() == []
-
-
-async def test_a_change_and_cut_goes_on_after_any_fault(autojump_clock: object, large: FakeWriter) -> None:
-    if large.kind != KINDS["posix"]:
-        return
-    await change_and_cut(make_writable(large))
-    wanted = large.files[FILE].data
-    for number in range(1, large.requests + 1):
-        for lost in (False, True):
-            store = FakeWriter(KINDS["posix"], large.nursery)
-            store.add(FILE, LARGE)
-            tree = make_writable(store)
-            store.lose_reply_at = {number} if lost else set()
-            store.fail_at = {} if lost else {number: RequestTimeout("silence")}
-            with suppress(MavftpfsError):
-                await change_and_cut(tree)
-            assert tree.undelivered() or store.files[FILE].data == wanted
-            await tree.drain(60)
-            assert store.files[FILE].data == wanted
-            assert (tree.undelivered(), store.crimes) == ([], [])
 
 
 # --- what is kept at the end

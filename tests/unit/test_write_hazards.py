@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import errno
-from random import Random
 
 import pytest
 import trio
 
-from mavftpfs.cache.asides import STALE_AFTER, Group, Kind, Reserved, repair
+from mavftpfs.cache.repair import STALE_AFTER
+from mavftpfs.cache.reserved import Kind, Reserved
 from mavftpfs.cache.tree import Tree
 from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.shared.errors import FileChanged, FtpNak
 from tests.support.fake_store import FakeReader
-from tests.support.fake_writer import KINDS, FakeWriter, card, litter, make_writable, write_file
-from tests.unit.test_draft import draft_over
+from tests.support.fake_writer import KINDS, FakeWriter, card, litter, make_writable
 
 OLD = bytes(range(256)) * 4
 FILE = b"/card/dir/file.txt"
@@ -38,50 +37,10 @@ async def test_who_has_a_replaced_file_open_never_reads_its_successor(store: Fak
     assert litter(store) == []
 
 
-def test_bytes_written_after_a_cut_do_not_overtake_those_cut_off_in_flight() -> None:
-    draft = draft_over(None)
-    draft.write(0, b"o" * 400)
-    sending = draft.begin(whole=True)
-    assert [chunk and chunk[0] for chunk in (sending.next_chunk(200), sending.next_chunk(200))] == [0, 200]
-    draft.truncate(250)
-    draft.write(250, b"n" * 150)
-    assert sending.next_chunk(200) is None, "two copies under way could land in the wrong order"
-    sending.on_acked(200, 200)
-    assert sending.next_chunk(200) == (250, b"n" * 150)
-    sending.on_acked(0, 200)
-    sending.on_acked(250, 150)
-    assert sending.unacked == 0
-
-
-def test_bytes_written_after_a_cut_go_out_once_the_older_ones_are_given_up() -> None:
-    for lost in (True, False):
-        draft = draft_over(None)
-        draft.write(0, b"o" * 100)
-        sending = draft.begin(whole=True)
-        sending.next_chunk(100)
-        draft.truncate(0)
-        draft.write(0, b"n" * 100)
-        if lost:
-            sending.on_rollback(everything=True)
-        else:
-            sending.on_unsent(0, 100)
-        assert sending.next_chunk(100) == (0, b"n" * 100)
-
-
-def test_what_was_on_its_way_is_not_replaced_by_the_old_file() -> None:
-    parts = {Kind.MOVED: b"/d/m", Kind.OLD: b"/d/o", Kind.SIDECAR: b"/d/p"}
-    actions = repair(Group(parts, b"sss", b"/d/x/target"), target_exists=False)
-    assert [(a.path, a.to) for a in actions] == [
-        (b"/d/m", b"/d/x/target"),
-        (b"/d/o", None),
-        (b"/d/p", None),
-    ]
-
-
 async def test_a_file_that_could_not_be_made_can_be_removed(store: FakeWriter, tree: Tree) -> None:
     file = await tree.create(b"/card/dir/new", exclusive=True)
     await file.write(0, b"abc")
-    store.fail_at = {1: FULL, 2: FULL}
+    store.fail_at = dict.fromkeys(range(1, 5), FULL)  # the removal of what was sent, too
     with pytest.raises(FtpNak):
         await file.flush()
     with pytest.raises(FtpNak):
@@ -105,17 +64,6 @@ async def test_a_file_renamed_while_it_is_closed_is_forgotten(
     store.add(b"/card/dir/b", b"theirs, longer")
     await trio.sleep(100)
     assert (await tree.stat(b"/card/dir/b")).size == len(b"theirs, longer")
-
-
-async def test_an_unlinked_file_made_anew_is_another_one(store: FakeWriter, tree: Tree) -> None:
-    store.kind = KINDS["littlefs"]  # nothing can be hidden by renaming
-    file = await tree.open(FILE)
-    store.files[FILE].data = OLD[:-1]  # nor is what was opened there to be fetched any more
-    await tree.unlink(FILE)
-    await write_file(tree, FILE, bytes(Random(1).randbytes(len(OLD))))
-    with pytest.raises(FileChanged):
-        await file.read(0, len(OLD))
-    file.close()
 
 
 async def test_a_write_in_the_moment_a_delivery_begins_is_not_forgotten(
@@ -153,7 +101,7 @@ async def test_a_part_is_not_written_into_a_file_that_changed(
 
 async def test_an_error_of_an_empty_file_is_told_at_the_close_too(store: FakeWriter, tree: Tree) -> None:
     file = await tree.create(b"/card/dir/empty", exclusive=True)
-    store.fail_at = {1: FULL, 2: FULL}
+    store.fail_at = dict.fromkeys(range(1, 5), FULL)  # the removal of what was sent, too
     with pytest.raises(FtpNak):
         await file.fsync()
     with pytest.raises(FtpNak):

@@ -11,7 +11,7 @@ import trio
 from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.tree import Tree
 from mavftpfs.protocol.payload import NakCode, Opcode
-from mavftpfs.shared.errors import FileTooLarge, FtpNak, NotFound, NotSupported, RequestTimeout
+from mavftpfs.shared.errors import FtpNak, NotFound, NotSupported, RequestTimeout
 from tests.support.fake_writer import KINDS, FakeUpload, FakeWriter, make_writable, write_file
 
 FILE = b"/d/file"
@@ -193,55 +193,6 @@ async def test_a_file_is_made_before_or_after_another_gets_its_name(
         assert store.crimes == []
 
 
-async def test_a_read_of_what_is_cut_off_meanwhile_ends_at_the_new_end(
-    nursery: trio.Nursery, autojump_clock: object
-) -> None:
-    """It was cut by us, not by somebody else."""
-    old = bytes(range(256)) * 40
-    store = FakeWriter(KINDS["posix"], nursery)
-    store.traits.wo_truncates = False
-    store.add(FILE, old)
-    tree = make_writable(store)
-    writer, reader = await tree.open(FILE, write=True), await tree.open(FILE)
-    store.chunk_delay = 1.0
-
-    async def read() -> None:
-        assert bytes(await reader.read(4000, 2000)) == old[4000:5000]
-
-    async with trio.open_nursery() as both:
-        both.start_soon(read)
-        await trio.sleep(0.5)
-        await writer.truncate(5000)
-        await writer.write(0, b"new")
-        await writer.release()
-    await reader.release()
-    assert store.files[FILE].data == b"new" + old[3:5000]
-
-
-async def test_a_read_goes_on_when_a_truncation_is_refused(
-    nursery: trio.Nursery, autojump_clock: object
-) -> None:
-    """Part of what it reads was held here only for that."""
-    old = bytes(range(256)) * 40
-    store = FakeWriter(KINDS["nuttx"], nursery)
-    store.add(FILE, old)
-    tree = make_writable(store, rmw_max=10)
-    writer, reader = await tree.open(FILE, write=True), await tree.open(FILE)
-    await writer.write(5000, b"new")
-    await writer.release()
-    store.chunk_delay = 1.0
-
-    async def read() -> None:
-        assert bytes(await reader.read(0, len(old))) == old[:5000] + b"new" + old[5003:]
-
-    async with trio.open_nursery() as both:
-        both.start_soon(read)
-        await trio.sleep(0.5)
-        with pytest.raises(FileTooLarge):
-            await tree.truncate(FILE, 6000)
-    await reader.release()
-
-
 class SlowEnd(FakeWriter):
     """Its uploads end slowly, as over a link that is silent."""
 
@@ -416,20 +367,3 @@ class Mute(Afterwards):
         error = RequestTimeout("no answer")
         error.checked = True
         raise error
-
-
-@pytest.mark.parametrize("change", sorted(CHANGES))
-async def test_a_change_that_may_have_happened_is_looked_up_when_it_is_asked_for(
-    nursery: trio.Nursery, autojump_clock: object, change: str
-) -> None:
-    """Not before: who was to change it waited long enough."""
-    store = Mute(KINDS["posix"], nursery)
-    store.add(FILE, b"x")
-    tree = make_writable(store)
-    await tree.list(b"/d")
-    listed = store.count("list")
-    with pytest.raises(RequestTimeout):
-        await CHANGES[change](tree)
-    assert store.count("list") == listed
-    there = names_there(store)
-    assert {b"/d/" + name for name, _ in await tree.list(b"/d")} == there

@@ -8,22 +8,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mavftpfs.cache.asides import (
-    DELETED_AFTER,
+from mavftpfs.cache.repair import DELETED_AFTER, STALE_AFTER, Action, Group, Staleness, leftovers, repair
+from mavftpfs.cache.reserved import (
     RENAME_ROOM,
-    STALE_AFTER,
-    Action,
-    Group,
     Kind,
     Namer,
     Reserved,
-    Staleness,
     fits_rename,
     is_reserved,
-    leftovers,
     new_owner,
     parse,
-    repair,
 )
 from mavftpfs.shared.errors import PathTooLong
 from mavftpfs.shared.model import DirEntry, EntryKind, split, usable_name
@@ -61,7 +55,7 @@ def test_places_fit_every_request_or_are_refused(lengths: list[int], seed: int) 
     except PathTooLong:
         assert len(path) > 200
         return
-    for place in (places.new, places.old, places.moved):
+    for place in (places.new, places.old):
         assert fits_rename(place, path)
         assert len(place) <= 200
         assert path.startswith(split(place)[0])
@@ -89,40 +83,9 @@ def test_nothing_is_put_above_the_storage(storage: bytes) -> None:
             namer.places(path)
     assert split(namer.places(path[:150]).new)[0] == storage
     deep = storage + b"/" + b"d" * (190 - len(storage)) + b"/f"
-    assert split(namer.probes(deep)[0])[0] == storage
+    assert split(namer.pair(deep)[0])[0] == storage
 
 
-def test_names_for_trying_out_are_two_new_ones_near_by() -> None:
-    namer = Namer(b"abcd", b"/r", Random(5))
-    names = [namer.probes(b"/r/d/file") for _ in range(2000)]
-    assert len({name for pair in names for name in pair}) == 4000
-    assert all(split(name)[0] == b"/r/d" for pair in names for name in pair)
-    deep = b"/r/" + b"a" * 100 + b"/" + b"b" * 90 + b"/f"
-    assert {split(name)[0] for name in namer.probes(deep)} == {b"/r/" + b"a" * 100}
-    with pytest.raises(PathTooLong):
-        Namer(b"abcd", b"/" + b"r" * 185, Random(5)).probes(b"/" + b"r" * 185 + b"/f")
-    for name in names[0]:
-        reserved = parse(split(name)[1])
-        assert reserved is not None
-        assert reserved.kind is Kind.DELETED
-
-
-def test_the_short_name_for_trying_out_is_short_for_every_card_and_ours() -> None:
-    """On NuttX that depends on the case, but for capitals it does not."""
-    namer = Namer(b"ab2d", b"/r", Random(5))
-    assert namer.short_probe(b"/r/d/file") == b"/r/d/MVF~AB2D"
-    assert parse(b"MVF~AB2D") == Reserved(b"ab2d", Kind.DELETED, b"")
-    assert Reserved(b"ab2d", Kind.DELETED, b"").name == b"MVF~AB2D"
-    deep = b"/r/" + b"a" * 100 + b"/" + b"b" * 90 + b"/f"
-    assert split(namer.short_probe(deep))[0] == b"/r/" + b"a" * 100
-    assert is_reserved(b"MVF~AB2D")
-    for name in (b"MVF~AB1D", b"MVF~AB2", b"MVF~AB2DX", b"mvf~ab2d", b"MVF~AB2D.", b"XMVF~AB2D"):
-        assert not is_reserved(name)
-
-
-NEW, OLD, MOVED, SIDECAR, DELETED = (
-    b"/d/" + kind.value for kind in (Kind.NEW, Kind.OLD, Kind.MOVED, Kind.SIDECAR, Kind.DELETED)
-)
 TARGET = b"/d/file"
 
 
