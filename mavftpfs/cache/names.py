@@ -29,7 +29,7 @@ from mavftpfs.shared.errors import (
 )
 from mavftpfs.shared.model import DirEntry, EntryKind, folded, join, split
 
-_FILE_PROTECTED = 9
+_FILE_EXISTS, _FILE_PROTECTED = 8, 9
 
 RECENT = 2.0
 """Seconds for which what was seen of a name is taken to be true when the name is about to be changed. So the
@@ -188,13 +188,15 @@ class Names:
     async def cannot_rename(self, old: bytes, new: bytes, nak: FtpNak) -> bool:
         """A first rename was refused: note and return whether the card knows no renames.
 
-        It does not if both names are as they were; the refusal's number proves nothing, but for that of PX4's
-        list of what may be written.
+        It does not if both names are as they were; the refusal's number proves nothing, but for those of a
+        name that exists, perhaps in another spelling, and of PX4's list of what may be written.
 
         Raises:
             As Directories.ask.
         """
-        if nak.code == _FILE_PROTECTED or await self.ask(old) is None or await self.ask(new) is not None:
+        if nak.code in (_FILE_EXISTS, _FILE_PROTECTED):
+            return False
+        if await self.ask(old) is None or await self.ask(new) is not None:
             return False
         self._context.writer.traits.rename_works = False
         return True
