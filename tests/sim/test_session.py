@@ -11,13 +11,14 @@ from mavftpfs.session.connection import ConnectOptions
 from mavftpfs.shared.errors import FtpNak, RequestTimeout, VehicleLost
 from mavftpfs.sim.linkmodel import LinkSettings
 from mavftpfs.sim.profiles import PROFILES
+from tests.support.takingturns import taking_turns
 from tests.support.worlds import MemorySink, begin_to_read, content, path, read_file, world
 
 EVERY_PROFILE = sorted(PROFILES)
 BAD = LinkSettings(rate=60_000.0, delay=0.02, loss=0.1, duplicate=0.02, reorder=0.05)
 
 
-@pytest.mark.parametrize("profile", EVERY_PROFILE)
+@pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
 async def test_list_and_read_over_a_bad_link(profile: str, autojump: MockClock) -> None:
     sizes = (0, 1, 238, 239, 240, 478, 5000, 60_000)
     files = {f"f{size}": content(size, size) for size in sizes}
@@ -32,7 +33,7 @@ async def test_list_and_read_over_a_bad_link(profile: str, autojump: MockClock) 
     assert here.vehicle.server.open_sessions == 0
 
 
-@pytest.mark.parametrize("profile", EVERY_PROFILE)
+@pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
 async def test_a_small_file_costs_open_read_terminate(profile: str, autojump: MockClock) -> None:
     here = world(profile, small=b"hello")
     async with here.connection() as connection:
@@ -46,7 +47,7 @@ async def test_a_small_file_costs_open_read_terminate(profile: str, autojump: Mo
         assert here.vehicle.server.open_sessions == 0
 
 
-@pytest.mark.parametrize("profile", EVERY_PROFILE)
+@pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
 async def test_several_files_at_once_share_the_session(profile: str, autojump: MockClock) -> None:
     files = {f"f{index}": content(20_000, index) for index in range(5)}
     here = world(profile, BAD, **files)
@@ -66,7 +67,7 @@ async def test_several_files_at_once_share_the_session(profile: str, autojump: M
     assert here.vehicle.server.open_sessions == 0
 
 
-@pytest.mark.parametrize("profile", EVERY_PROFILE)
+@pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
 async def test_what_is_asked_for_as_the_last_bytes_come_goes_out_at_once(
     profile: str, autojump: MockClock
 ) -> None:
@@ -84,7 +85,7 @@ async def test_what_is_asked_for_as_the_last_bytes_come_goes_out_at_once(
         reader.close()
 
 
-@pytest.mark.parametrize("profile", EVERY_PROFILE)
+@pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
 async def test_what_is_asked_for_meanwhile_does_not_wait_for_an_answer(
     profile: str, autojump: MockClock
 ) -> None:
@@ -102,7 +103,7 @@ async def test_what_is_asked_for_meanwhile_does_not_wait_for_an_answer(
         reader.close()
 
 
-@pytest.mark.parametrize("profile", EVERY_PROFILE)
+@pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
 async def test_a_small_read_overtakes_a_bulk_copy(profile: str, autojump: MockClock) -> None:
     """Promise 7: Terminate, open and read take a round trip each, and what is on its way comes first."""
     rate, rtt = 20_000.0, 0.1
@@ -144,7 +145,7 @@ async def test_one_small_file_after_another_does_not_stop_a_copy(profile: str, a
         nursery.cancel_scope.cancel()
 
 
-@pytest.mark.parametrize("profile", EVERY_PROFILE)
+@pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
 async def test_a_cut_in_mid_read_is_bridged(profile: str, autojump: MockClock) -> None:
     data = content(100_000)
     here = world(profile, LinkSettings(rate=20_000.0, delay=0.02, cuts=((4.0, 16.0),)), big=data)
@@ -153,7 +154,7 @@ async def test_a_cut_in_mid_read_is_bridged(profile: str, autojump: MockClock) -
     assert here.vehicle.server.open_sessions == 0
 
 
-@pytest.mark.parametrize("profile", EVERY_PROFILE)
+@pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
 async def test_a_reboot_in_mid_read_is_bridged(profile: str, autojump: MockClock) -> None:
     data = content(300_000)
     here = world(profile, LinkSettings(rate=20_000.0, delay=0.02), big=data)
@@ -169,7 +170,7 @@ async def test_a_reboot_in_mid_read_is_bridged(profile: str, autojump: MockClock
         assert connection.vehicle.reboots == 1
 
 
-@pytest.mark.parametrize("profile", EVERY_PROFILE)
+@pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
 async def test_a_reboot_forgets_what_was_seen_of_the_server(profile: str, autojump: MockClock) -> None:
     here = world(profile, small=b"hello")
     async with here.connection() as connection:
@@ -186,7 +187,7 @@ async def test_a_reboot_forgets_what_was_seen_of_the_server(profile: str, autoju
         assert await read_file(connection, path(profile, "small")) == b"hello"
 
 
-@pytest.mark.parametrize("profile", EVERY_PROFILE)
+@pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
 async def test_a_session_left_by_a_killed_client_is_got_over(profile: str, autojump: MockClock) -> None:
     data = content(50_000)
     here = world(profile, LinkSettings(rate=100_000.0, delay=0.02), big=data)
@@ -243,7 +244,7 @@ async def test_no_vehicle_says_what_was_heard(autojump: MockClock) -> None:
             raise AssertionError("connected to nobody")
 
 
-@pytest.mark.parametrize("profile", EVERY_PROFILE)
+@pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
 async def test_refusals_reach_the_caller(profile: str, autojump: MockClock) -> None:
     here = world(profile, small=b"hello")
     async with here.connection() as connection:

@@ -36,8 +36,8 @@ def names(here: World) -> list[bytes]:
     return sorted(name for name in found if name not in (b".", b".."))
 
 
-@pytest.mark.parametrize("profile", EVERY_PROFILE)
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
+@pytest.mark.parametrize("seed", range(2))
 async def test_each_works_over_a_link_that_loses_much(profile: str, seed: int, autojump: MockClock) -> None:
     here = World(profile, BAD, seed=seed)
     here.tree.add(path(profile, "old"), b"content")
@@ -225,7 +225,7 @@ async def test_readers_follow_a_rename(profile: str, autojump: MockClock) -> Non
 
 
 @pytest.mark.parametrize("probed", [False, True], ids=["unknown", "probed"])
-@pytest.mark.parametrize("profile", EVERY_PROFILE)
+@pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
 async def test_an_upload_makes_room_for_a_change_of_its_path(
     profile: str, probed: bool, autojump: MockClock
 ) -> None:

@@ -3,21 +3,21 @@
 from __future__ import annotations
 
 import pytest
-import trio
 from trio.testing import MockClock
 
 from mavftpfs.protocol.payload import Opcode
 from mavftpfs.sim.linkmodel import LinkSettings
 from mavftpfs.sim.profiles import PROFILES
-from tests.support.uploads import know, put
-from tests.support.worlds import content, path, read_file, world
+from tests.support.takingturns import taking_turns
+from tests.support.uploads import put
+from tests.support.worlds import content, path, world
 
 EVERY_PROFILE = sorted(PROFILES)
 BAD = LinkSettings(rate=60_000.0, delay=0.02, loss=0.1, duplicate=0.02, reorder=0.05)
 PLAIN = LinkSettings(rate=60_000.0, delay=0.02)
 
 
-@pytest.mark.parametrize("profile", EVERY_PROFILE)
+@pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
 async def test_what_is_on_the_card_is_what_was_given(profile: str, autojump: MockClock) -> None:
     sizes = (0, 1, 238, 239, 240, 478, 5000, 60_000)
     here = world(profile, BAD, f1=b"something older and longer")
@@ -28,7 +28,7 @@ async def test_what_is_on_the_card_is_what_was_given(profile: str, autojump: Moc
     assert here.vehicle.server.open_sessions == 0
 
 
-@pytest.mark.parametrize("profile", EVERY_PROFILE)
+@pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
 async def test_a_small_file_costs_create_write_terminate(profile: str, autojump: MockClock) -> None:
     here = world(profile)
     async with here.connection() as connection:
@@ -38,26 +38,3 @@ async def test_a_small_file_costs_create_write_terminate(profile: str, autojump:
             Opcode.WRITE_FILE: 1,
             Opcode.TERMINATE_SESSION: 1,
         }
-
-
-@pytest.mark.parametrize("profile", EVERY_PROFILE)
-@pytest.mark.parametrize("probed", [False, True], ids=["unknown", "probed"])
-async def test_two_uploads_and_a_reader_at_once(profile: str, probed: bool, autojump: MockClock) -> None:
-    here = world(profile, LinkSettings(rate=60_000.0, delay=0.02, loss=0.03), old=content(40_000, 9))
-    got: list[bytes] = []
-    async with here.connection() as connection:
-        if probed:
-            know(connection, profile)
-        async with trio.open_nursery() as nursery:
-
-            async def read() -> None:
-                got.append(await read_file(connection, path(profile, "old")))
-
-            nursery.start_soon(read)
-            for index in range(2):
-                nursery.start_soon(put, connection, path(profile, f"f{index}"), content(60_000, index))
-    assert got == [content(40_000, 9)]
-    for index in range(2):
-        assert here.tree.data(path(profile, f"f{index}")) == content(60_000, index)
-    assert here.vehicle.server.open_sessions == 0
-    assert [entry.name for entry in here.tree.entries(path(profile, "")) if b"mavftpfs" in entry.name] == []
