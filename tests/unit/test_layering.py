@@ -11,6 +11,7 @@ import graphlib
 import statistics
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -91,7 +92,7 @@ class Module:
     @property
     def tree(self) -> ast.Module:
         """The syntax tree."""
-        return ast.parse(self.source)
+        return _parsed(self.source)
 
     @property
     def layer(self) -> str:
@@ -108,6 +109,11 @@ class Module:
                 assert node.module is not None
                 yield node.module
                 yield from (f"{node.module}.{alias.name}" for alias in node.names)
+
+
+@cache
+def _parsed(source: str) -> ast.Module:
+    return ast.parse(source)
 
 
 Modules = Mapping[str, Module]
