@@ -26,7 +26,7 @@ from mavftpfs.cache.options import CacheOptions
 from mavftpfs.cache.tree import Tree
 from mavftpfs.exits import NoFtp
 from mavftpfs.farewell import rescue, spool_for
-from mavftpfs.fuse.operations import Space
+from mavftpfs.fuse.handles import Space
 from mavftpfs.fuse.options import MountOptions
 from mavftpfs.link.opening import open_link
 from mavftpfs.link.uri import LinkKind, LinkSpec

@@ -30,9 +30,9 @@ from mavftpfs.control import ControlServer, Reply
 from mavftpfs.exits import ExitCode, MountFailed, exit_code_for
 from mavftpfs.farewell import Holder, say_goodbye
 from mavftpfs.fuse.device import never_blocking
-from mavftpfs.fuse.handles import WritableTree
+from mavftpfs.fuse.handles import Space, WritableTree
 from mavftpfs.fuse.inodes import InodeTable
-from mavftpfs.fuse.operations import Operations, Presentation, Space
+from mavftpfs.fuse.operations import Operations, Presentation
 from mavftpfs.fuse.options import MountOptions, fuse_words
 from mavftpfs.fuse.writing import WritingOperations
 from mavftpfs.link.uri import LinkSpec

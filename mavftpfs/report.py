@@ -29,6 +29,7 @@ import trio
 
 from mavftpfs import control
 from mavftpfs.control import ControlError, NobodyThere
+from mavftpfs.fuse.handles import XATTR_STATUS
 from mavftpfs.mountpoint import OUR_TYPE, Mounted, mounts
 from mavftpfs.shared.readable import autopilot_name, printable, readable_size, readable_time
 
@@ -214,7 +215,6 @@ class Watcher:
 
 Status = Mapping[str, Any]
 
-STATUS_XATTR = "user.mavftpfs.status"
 PATIENCE = 10.0
 """Seconds for a mount to answer: it does so without asking the vehicle."""
 
@@ -305,7 +305,7 @@ def _read_xattr(path: str) -> bytes | int:
 
     def read() -> None:
         try:
-            answer.append(os.getxattr(path, STATUS_XATTR))
+            answer.append(os.getxattr(path, XATTR_STATUS))
         except OSError as exc:
             answer.append(exc.errno or errno.EIO)
 

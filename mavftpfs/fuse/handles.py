@@ -1,4 +1,7 @@
-"""File and directory handles, and what the operations need of the tree. Layer: fuse; pure."""
+"""File and directory handles, and what the operations need of the tree. Layer: fuse; pure.
+
+Without pyfuse3, so that commands that mount nothing work where there is no libfuse3.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +11,17 @@ from dataclasses import dataclass, field
 from typing import Generic, Protocol, TypeVar
 
 from mavftpfs.shared.model import EntryKind
+
+XATTR_CRC32 = b"user.mavftp.crc32"
+XATTR_STATUS = b"user.mavftpfs.status"
+
+
+@dataclass(frozen=True, slots=True)
+class Space:
+    """The card's size and free space in bytes."""
+
+    total: int
+    free: int
 
 
 class Stat(Protocol):

@@ -24,10 +24,13 @@ import trio
 from pyfuse3 import EntryAttributes, FileInfo, FUSEError, RequestContext, StatvfsData
 
 from mavftpfs.fuse.handles import (
+    XATTR_CRC32,
+    XATTR_STATUS,
     DirectoryHandle,
     FileHandle,
     FileTree,
     HandleTable,
+    Space,
     Stat,
     closed_on_failure,
 )
@@ -38,8 +41,6 @@ from mavftpfs.shared.model import MAX_WIRE_PATH, EntryKind, join, split
 
 log = logging.getLogger("mavftpfs.fuse")
 
-XATTR_CRC32 = b"user.mavftp.crc32"
-XATTR_STATUS = b"user.mavftpfs.status"
 
 DEADLINE_MARGIN = 3.0
 """Seconds the tree gets beyond op_deadline to report its own, better error."""
@@ -60,14 +61,6 @@ P = ParamSpec("P")
 T = TypeVar("T")
 S = TypeVar("S", bound="Operations")
 Handler = Callable[Concatenate[S, P], Coroutine[Any, Any, T]]
-
-
-@dataclass(frozen=True, slots=True)
-class Space:
-    """The card's size and free space in bytes."""
-
-    total: int
-    free: int
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,7 +21,7 @@ import trio
 from mavftpfs import control
 from mavftpfs.cache.attributes import Stat
 from mavftpfs.compose import NO_SINKS, Attached, Sinks, attached, no_answer, plain_nursery
-from mavftpfs.fuse.operations import XATTR_CRC32, XATTR_STATUS
+from mavftpfs.fuse.handles import XATTR_CRC32, XATTR_STATUS
 from mavftpfs.fuse.options import MountOptions
 from mavftpfs.link.uri import LinkKind, LinkSpec, parse_source
 from mavftpfs.mountpoint import canonical, is_ours, mounts

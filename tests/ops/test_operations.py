@@ -16,14 +16,12 @@ import trio
 import trio.testing
 from pyfuse3 import FUSEError, RequestContext
 
+from mavftpfs.fuse.handles import XATTR_CRC32, XATTR_STATUS, Space
 from mavftpfs.fuse.inodes import ROOT_INO
 from mavftpfs.fuse.operations import (
     UNKNOWN_SPACE,
-    XATTR_CRC32,
-    XATTR_STATUS,
     Operations,
     Presentation,
-    Space,
 )
 from mavftpfs.shared.errors import Armed, FtpNak, ListingIncomplete, NotFound, PathTooLong, RequestTimeout
 from tests.ops.faketree import MTIME, FakeTree

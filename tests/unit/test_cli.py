@@ -206,6 +206,11 @@ def test_a_reader_that_leaves_is_no_error(tmp_path: Path) -> None:
         assert child.wait(90) == 0
 
 
+def test_commands_that_mount_nothing_need_no_libfuse() -> None:
+    code = "import sys; sys.modules['pyfuse3'] = None; import mavftpfs.oneshot.verbs, mavftpfs.demo"
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=90)
+
+
 # -- one-shot runs --------------------------------------------------------------------------------
 
 
