@@ -209,9 +209,7 @@ def test_many_writers_at_once(twins: Twins, brought: Path) -> None:
     twins.both(script, brought)
 
 
-@pytest.mark.parametrize(
-    "kind", ["px4", "ardupilot5", "littlefs", "mavsdk-server"], scope="module", indirect=True
-)
+@pytest.mark.parametrize("kind", ["littlefs", "mavsdk-server"], scope="module", indirect=True)
 def test_put_mv_and_rm_without_a_mount(kind: str, field: Field, tiny_tree: Path) -> None:
     folder, needed = SERVERS[kind]
     root = field.local("card")
