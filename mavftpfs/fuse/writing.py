@@ -23,9 +23,8 @@ from pyfuse3 import EntryAttributes, FileInfo, FUSEError, RequestContext, Setatt
 
 from mavftpfs.cache.attributes import Stat
 from mavftpfs.fuse.handles import FileHandle, WritableFile, WritableTree, closed_on_failure
-from mavftpfs.fuse.inodes import Inode
+from mavftpfs.fuse.inodes import NANO, Inode, UserAttributeTable
 from mavftpfs.fuse.operations import Operations, Presentation, handler
-from mavftpfs.fuse.userattributes import NANO, UserAttributeTable
 from mavftpfs.shared.errors import MavftpfsError
 from mavftpfs.shared.model import EntryKind, split
 

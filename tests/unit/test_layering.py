@@ -64,7 +64,6 @@ PURE_MODULES = {
     "cache.times",
     "fuse.inodes",
     "fuse.handles",
-    "fuse.userattributes",
     "fuse.options",
 }
 IMPURE_MODULES = {"sim.endpoints"}
