@@ -14,37 +14,24 @@ from mavftpfs.cache.nodes import Node
 from mavftpfs.cache.verify import Verifier
 from mavftpfs.cache.versions import became_another
 from mavftpfs.shared.errnos import errno_for
-from mavftpfs.shared.errors import FileChanged, FtpNak, IsADirectory, LocalProtocolError, NotFound
-from mavftpfs.shared.model import EntryKind, split
+from mavftpfs.shared.errors import FileChanged, FtpNak, LocalProtocolError, NotFound
+from mavftpfs.shared.model import split
 
 STEP = 128 * 1024
 """Bytes fetched at once."""
-
-
-async def open_base(context: Context, path: bytes) -> FileHandle:
-    """Open a file of the vehicle.
-
-    Raises:
-        NotFound, NotADirectory, IsADirectory; else as RemoteStore.open_reader.
-    """
-    found = await context.directories.find(path)
-    if found.entry.kind is not EntryKind.FILE:
-        raise IsADirectory(f"{path!r} is a directory")
-    fresh = context.clock() < found.directory.fresh_until
-    return await context.files.open(path, found.entry, found.directory.listed_at, fresh=fresh)
 
 
 async def open_node(context: Context, node: Node) -> FileHandle:
     """Open what the vehicle has of a node, whatever it is called by now.
 
     Raises:
-        FileChanged: it has no name there. Else as open_base.
+        FileChanged: it has no name there. Else as Files.open.
     """
     while True:
         async with context.paths.steady(lambda: node.path) as path:
             node.require_reachable()
             try:
-                return await open_base(context, path)
+                return await context.files.open(path)
             except (NotFound, FtpNak):
                 if node.path == path:
                     raise  # else it got a reserved name meanwhile
@@ -63,7 +50,7 @@ async def read_base(context: Context, node: Node, start: int, stop: int) -> byte
     """Return bytes of the vehicle's file that a node's draft lies over.
 
     Raises:
-        FileChanged: it is another file by now. Else as open_base and FileHandle.read.
+        FileChanged: it is another file by now. Else as Files.open and FileHandle.read.
     """
     while True:
         node.require_current()

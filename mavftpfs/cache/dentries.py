@@ -196,14 +196,6 @@ class Dentries:
             return float("-inf")
         return known.listed_at
 
-    def listed_since(self, path: bytes, since: float) -> DirEntry | None:
-        """Return what a listing that began then or later shows of a path, None if there is none."""
-        parent, name = split(path)
-        directory = self._directories.get(parent)
-        if directory is None or directory.listed_at < since:
-            return None
-        return directory.entries.get(name)
-
     def note_proven(self, path: bytes, now: float) -> None:
         """The path is what its listing shows, as an answer of just now (`now`) proved."""
         parent, name = split(path)

@@ -182,13 +182,6 @@ class Directories:
             return known
         return await self.ask(path)
 
-    def in_reach(self, path: bytes) -> bool:
-        """Return whether a directory can be listed at once, because it is known to be one; else what lies
-        above it has to be listed before."""
-        if path == self._root:
-            return self._root_proven
-        return path == ROOT or self._dentries.fresh(split(path)[0], self._clock()) is not None
-
     def rebooted(self) -> None:
         """What was learnt of the server's ways may no longer hold."""
         self.tells_times = False

@@ -28,7 +28,7 @@ import trio
 
 from mavftpfs.cache.blocks import BlockCache, FileBlocks
 from mavftpfs.cache.dentries import COST_FACTOR, Directory
-from mavftpfs.cache.directories import Directories
+from mavftpfs.cache.directories import Directories, Found
 from mavftpfs.cache.kept import KeptCache
 from mavftpfs.cache.openfile import ReadOnlyHandle
 from mavftpfs.cache.readahead import Readahead
@@ -38,6 +38,7 @@ from mavftpfs.cache.versions import NEVER, Fetcher, Version, became_another
 from mavftpfs.shared.errors import (
     DataUnproven,
     FileTooLarge,
+    IsADirectory,
     LocalProtocolError,
     NotADirectory,
     NotFound,
@@ -109,14 +110,17 @@ class Files:
 
     # --- opening
 
-    async def open(self, path: bytes, entry: DirEntry, listed_at: float, *, fresh: bool) -> FileHandle:
-        """Open a path that a listing (begun at `listed_at`, perhaps not `fresh` any more) shows as `entry`.
+    async def open(self, path: bytes) -> FileHandle:
+        """Open what the vehicle has there.
 
         Raises:
-            DataUnproven: the size in the reply is smaller than listed. Else as RemoteStore.open_reader.
+            NotFound, NotADirectory, IsADirectory. DataUnproven: the size in the reply is smaller than listed.
+            Else as RemoteStore.open_reader.
         """
-        work = partial(self._open_version, path, entry, listed_at, fresh)
-        version, same = await self._opening.run(path, work)
+        found = await self._directories.find(path)
+        if found.entry.kind is not EntryKind.FILE:
+            raise IsADirectory(f"{path!r} is a directory")
+        version, same = await self._opening.run(path, partial(self._open_version, path, found))
         others = (v for v in self.open_versions if v.path == path and v is not version)
         direct_io = any(v.dead is None or v.lost for v in others)
         keep_cache = same and version.shown
@@ -139,12 +143,11 @@ class Files:
         reader.close()
         return reader.size
 
-    async def _open_version(
-        self, path: bytes, entry: DirEntry, listed_at: float, fresh: bool
-    ) -> tuple[Version, bool]:
+    async def _open_version(self, path: bytes, found: Found) -> tuple[Version, bool]:
         """Return the version to serve, and whether it is the one that was served before."""
+        entry, fresh = found.entry, self._clock() < found.directory.fresh_until
         version = self._current.get(path)
-        if version is not None and self._still_right(version, entry, listed_at, fresh):
+        if version is not None and self._still_right(version, entry, found.directory.listed_at, fresh):
             self._current.move_to_end(path)
             if self.kept is not None:
                 self.kept.watch(version)
@@ -462,9 +465,8 @@ class FileHandle(ReadOnlyHandle):
         self.keep_cache = keep_cache
         self.direct_io = direct_io
 
-    async def read(self, offset: int, size: int, *, sure: bool = False) -> bytes | memoryview:
-        """Return `size` bytes at `offset`, fewer only at the end of the opened size; sure: a comparison with
-        what the vehicle has is not put off.
+    async def read(self, offset: int, size: int) -> bytes | memoryview:
+        """Return `size` bytes at `offset`, fewer only at the end of the opened size.
 
         Raises:
             FileChanged, DataUnproven, RequestTimeout, VehicleLost, FtpNak.
@@ -481,7 +483,7 @@ class FileHandle(ReadOnlyHandle):
             drops = version.blocks.drops
             data = await self._read(offset, stop)
             if data is not None:
-                await files.compare(version, now=sure or stop == self.size)
+                await files.compare(version, now=stop == self.size)
             if version.blocks.drops != drops:
                 version.close_reader()
                 await trio.sleep(pause)
@@ -491,24 +493,6 @@ class FileHandle(ReadOnlyHandle):
                 return data
         files.unproven += 1
         raise DataUnproven(f"bytes of {version.path!r} may be another file's, again and again")
-
-    async def require_same(self) -> None:
-        """Compare what was read of the file with what is there, if that is in doubt.
-
-        Raises:
-            FileChanged: it became another one. Else as Files.compare.
-        """
-        await self._files.compare(self._version, now=True)
-
-    @property
-    def mtime(self) -> int | None:
-        """The file's mtime in seconds UTC, None where no listing told it."""
-        return self._version.mtime
-
-    @property
-    def comparable(self) -> bool:
-        """Whether bytes of it were given out, and a listing can tell whether they are of another file."""
-        return self._version.mtime is not None and self._version.blocks.given
 
     @property
     def lost(self) -> bool:

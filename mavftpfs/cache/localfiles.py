@@ -32,13 +32,12 @@ MAX_ENTRIES = 10_000
 class LocalEntry:
     """A file (data is its content) or a directory (data is None).
 
-    handles: how many are open, writers: those for writing; named: it was not unlinked.
+    handles: how many are open; named: it was not unlinked.
     """
 
     data: bytearray | None
     mtime_ns: int
     handles: int = 0
-    writers: int = 0
     named: bool = True
 
     @property
@@ -118,22 +117,6 @@ class LocalFiles:
             raise AlreadyExists(f"{path!r} exists")
         return self.open(path, write=True)
 
-    def put(self, path: bytes, data: bytes) -> None:
-        """Make a file with a content, replacing one that is there.
-
-        Raises:
-            NoSpace, IsADirectory.
-        """
-        old = self._entries.get(path)
-        if old is not None and old.data is None:
-            raise IsADirectory(f"{path!r} is a directory")
-        freed = 0 if old is None or old.handles else len(old.data or b"")
-        self.require_room(len(data) - freed)
-        if old is not None:
-            self.unlink(path)
-        self._add(path, LocalEntry(bytearray(data), self._now_ns()))
-        self._used += len(data)
-
     def mkdir(self, path: bytes) -> None:
         """Make a directory.
 
@@ -206,7 +189,8 @@ class LocalFiles:
         """
         assert entry.data is not None
         more = size - len(entry.data)
-        self.require_room(more)
+        if more > 0 and self._used + more > self._limit:
+            raise NoSpace(f"local files may take {self._limit} bytes in all")
         if more > 0:
             entry.data.extend(bytes(more))
         else:
@@ -214,24 +198,13 @@ class LocalFiles:
         self._used += more
         entry.mtime_ns = self._now_ns()
 
-    def require_room(self, more: int) -> None:
-        """Raise NoSpace unless `more` bytes fit."""
-        if more > 0 and self._used + more > self._limit:
-            raise NoSpace(f"local files may take {self._limit} bytes in all")
-
     def touch(self, entry: LocalEntry) -> None:
         """A file was written."""
         entry.mtime_ns = self._now_ns()
 
-    def opened(self, entry: LocalEntry, *, writing: bool) -> None:
-        """A handle of the file was made."""
-        entry.handles += 1
-        entry.writers += writing
-
-    def closed(self, entry: LocalEntry, *, writing: bool) -> None:
+    def closed(self, entry: LocalEntry) -> None:
         """A handle of the file was closed."""
         entry.handles -= 1
-        entry.writers -= writing
         self._forget_unused(entry)
 
     def _forget_unused(self, entry: LocalEntry) -> None:
@@ -255,7 +228,7 @@ class LocalHandle:
         self._entry = entry
         self._closed = False
         self.writable = writable
-        files.opened(entry, writing=writable)
+        entry.handles += 1
 
     @property
     def size(self) -> int:
@@ -309,7 +282,7 @@ class LocalHandle:
         """Close; closing twice is harmless."""
         if not self._closed:
             self._closed = True
-            self._files.closed(self._entry, writing=self.writable)
+            self._files.closed(self._entry)
 
     @property
     def _data(self) -> bytearray:

@@ -74,12 +74,11 @@ class Namespace:
             await self._names.remove_directory(path)
             self._context.on_changed(path)
 
-    async def unlink(self, path: bytes, *, first: Callable[[], None] = lambda: None) -> None:
-        """See Tree.unlink; `first()` is called when nobody else can open the file, and may raise."""
+    async def unlink(self, path: bytes) -> None:
+        """See Tree.unlink."""
         node = self._context.nodes.get(path)
         with nullcontext() if node is None else node.doom():
             async with self._context.paths.hold(path):
-                first()
                 node = self._context.nodes.get(path)
                 if node is not None and await self._names.entry(path) is not None:
                     await self._unlink_node(node)

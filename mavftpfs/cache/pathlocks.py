@@ -45,12 +45,15 @@ class PathLocks:
         Raises:
             RequestTimeout: others took too long.
         """
-        wanted = _Hold(tuple(path.lower() for path in paths), shared)
-        began = trio.current_time()
+        wanted = _Hold(tuple(map(bytes.lower, paths)), shared)
+        began, waited = trio.current_time(), False
         with trio.CancelScope(deadline=began + self._patience) as scope:
             self._held.append(wanted)
             try:
-                waited = await self._wait(wanted)
+                while self._is_blocked(wanted):
+                    waited = True
+                    await self._news.wait()
+                wanted.granted = True
                 bounded = waited and not lasting
                 scope.deadline = began + self._patience + SLACK if bounded else float("inf")
                 yield
@@ -77,19 +80,15 @@ class PathLocks:
                     yield known
                     return
 
-    async def _wait(self, wanted: _Hold) -> bool:
-        """Wait until none is in the way; return whether any was."""
-        waited = False
-        while any(held.blocks(wanted) for held in self._before(wanted)):
-            waited = True
-            await self._news.wait()
-        wanted.granted = True
-        return waited
-
-    def _before(self, wanted: _Hold) -> list[_Hold]:
-        """Return who has a lock, or asked for it before."""
-        place = self._held.index(wanted)
-        return [held for at, held in enumerate(self._held) if held.granted or at < place]
+    def _is_blocked(self, wanted: _Hold) -> bool:
+        """Return whether somebody who has a lock, or asked for it before, is in the way."""
+        came_before = True
+        for held in self._held:
+            if held is wanted:
+                came_before = False
+            elif (held.granted or came_before) and held.blocks(wanted):
+                return True
+        return False
 
 
 @dataclass(slots=True, eq=False)
@@ -100,7 +99,7 @@ class _Hold:
 
     def blocks(self, other: _Hold) -> bool:
         """Return whether the other one has to wait for this."""
-        if self is other or (other.shared and (self.shared or not self.granted)):
+        if other.shared and (self.shared or not self.granted):
             return False
         return any(
             one == two or one.startswith(two + b"/") or two.startswith(one + b"/")

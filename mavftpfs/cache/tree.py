@@ -182,11 +182,11 @@ class Tree:
             return await self._writable(remote).open(remote, truncate=truncate)
         if is_snapshot(remote):
             return await self._virtual.open(remote)
-        if self._writing is not None:
-            return await self._writing.open_reader(remote)
-        found = await self._find_file(remote)
-        fresh = self._clock() < found.directory.fresh_until
-        return await self._files.open(remote, found.entry, found.directory.listed_at, fresh=fresh)
+        if remote == self._options.root:
+            raise IsADirectory("the mount's root is a directory")
+        return await (
+            self._files.open(remote) if self._writing is None else self._writing.open_reader(remote)
+        )
 
     async def crc32(self, path: bytes) -> int:
         """Return the vehicle's CRC32 of a file (start value 0, no final xor), remembered by size and mtime.

@@ -16,7 +16,7 @@ from random import Random
 import trio
 
 from mavftpfs.cache.background import Background
-from mavftpfs.cache.base import known_base, on_listed, open_base
+from mavftpfs.cache.base import known_base, on_listed
 from mavftpfs.cache.changes import Changes
 from mavftpfs.cache.cleaner import Cleaner
 from mavftpfs.cache.context import Context
@@ -35,7 +35,7 @@ from mavftpfs.cache.overlay import Overlay
 from mavftpfs.cache.recovery import recover
 from mavftpfs.cache.remote import RemoteStore, WriteStore
 from mavftpfs.cache.replace import Replacer
-from mavftpfs.cache.reserved import Namer, new_owner
+from mavftpfs.cache.reserved import Namer, is_reserved, new_owner
 from mavftpfs.cache.spool import Spool, SpoolContent, SpoolDirectory
 from mavftpfs.cache.throttle import Throttle
 from mavftpfs.cache.writefile import ReadFile, WriteFile
@@ -48,7 +48,7 @@ from mavftpfs.shared.errors import (
     NotFound,
     SpoolFailed,
 )
-from mavftpfs.shared.model import EntryKind, wire_path
+from mavftpfs.shared.model import EntryKind, split, wire_path
 
 log = logging.getLogger("mavftpfs.cache")
 
@@ -150,21 +150,20 @@ class Writeback:
             context, names, self._deliverer, replacer, hider, on_renamed=self.overlay.on_renamed
         )
         self._local = self.overlay.local
-        self.changes = Changes(
-            context, names, self.overlay, self._namespace, open_reader=self.open_reader, put=self._put
-        )
+        self.changes = Changes(context, self.overlay, self._namespace)
 
     # --- opening
 
     async def open_reader(self, path: bytes) -> OpenFile:
         """Open a file for reading."""
-        self.overlay.stat(path)  # raises NotFound for names that are hidden
+        if is_reserved(split(path)[1]):
+            raise NotFound(f"{path!r} is a name of our own")
         if self._local.owns(path):
             return self._local.open(path, write=False)
         async with self._context.paths.hold(path, shared=True):
             node, handle = self._context.nodes.get(path), None
             if node is None or node.draft is None:
-                handle = await open_base(self._context, path)
+                handle = await self._context.files.open(path)
             return ReadFile(self, self._context, self._context.nodes.need(path), handle)
 
     async def open(self, path: bytes, *, truncate: bool) -> OpenFile:
@@ -227,7 +226,7 @@ class Writeback:
             # A size of 0 would mean that there is nothing to do: it has to be true, not remembered.
             base = Base(entry.size or await context.files.learn_size(path))
         else:
-            handle = await open_base(context, path)  # its ACK tells the size better than a listing
+            handle = await context.files.open(path)  # its ACK tells the size better than a listing
             base = known_base(context, path, handle.size)
         try:
             context.require_idle(path)
@@ -388,26 +387,6 @@ class Writeback:
             file.close()
             if not had and not node.writers:
                 await self._forget_draft(node)
-            raise
-
-    async def _put(self, path: bytes, data: bytes, exclusive: bool) -> None:
-        """Write and deliver a whole file; if that fails, nothing of it is kept."""
-        file = await self.create(path, exclusive=exclusive)
-        assert isinstance(file, WriteFile)
-        replacing = False
-        try:
-            if file.size:
-                await file.fsync()  # what was accepted before does not depend on what follows
-            if file.node.writers > 1:
-                raise FileBusy(f"{path!r} is being written, so nothing can be moved over it")
-            replacing = True
-            await file.truncate(0)
-            await file.write(0, data)
-            await file.release()
-        except BaseException:
-            file.close()
-            if replacing and not file.node.handles:
-                await self._forget_draft(file.node)
             raise
 
     async def _forget_draft(self, node: Node) -> None:

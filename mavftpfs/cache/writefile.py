@@ -71,27 +71,30 @@ class _Reading:
         """
         if self._closed:
             raise LocalProtocolError("read of a closed handle")
-        for _ in range(TRIES - 1):
-            state = (self._node.generation, self._node.draft)
-            try:
-                return await self._read(offset, size)
-            except (FileChanged, LocalProtocolError):  # the latter: what lay below was closed as delivered
-                if self._closed or state == (self._node.generation, self._node.draft):
-                    raise
-        return await self._read(offset, size)
-
-    async def _read(self, offset: int, size: int) -> bytes | memoryview:
         node = self._node
-        if node.removed:
-            node.require_current()
+        for tries_left in reversed(range(TRIES)):
+            state = (node.generation, node.draft)
+            try:
+                if node.removed:
+                    node.require_current()
+                if self._handle is not None and state == (self._generation, None):
+                    return await self._handle.read(offset, size)
+                return await self._read_changed(offset, size)
+            except (FileChanged, LocalProtocolError):  # the latter: what lay below was closed as delivered
+                if self._closed or state == (node.generation, node.draft) or not tries_left:
+                    raise
+        raise AssertionError
+
+    async def _read_changed(self, offset: int, size: int) -> bytes | memoryview:
+        """Read a file that was written here since the handle was opened, or that is not open yet."""
+        node = self._node
         if self._handle is not None:
             self._handle.require_not_lost()
         if node.draft is not None:
             return await self._read_draft(node.draft, offset, offset + size)
-        if self._handle is None or self._generation != node.generation:
-            self._close_handle()
-            self._generation = node.generation
-            self._handle = await open_node(self._context, node)
+        self._close_handle()
+        self._generation = node.generation
+        self._handle = await open_node(self._context, node)
         return await self._handle.read(offset, size)
 
     async def _read_draft(self, draft: Draft, start: int, stop: int) -> bytes | memoryview:

@@ -250,7 +250,9 @@ def test_what_an_unknown_file_took_the_place_of_is_not_taken_for_it() -> None:
     dentries = make()
     put(dentries, b"/d", file(b"a", 7, 70))
     dentries.note_renamed(b"/unknown", b"/d/a")
-    assert dentries.listed_since(b"/d/a", 0.0) == file(b"a", None, None)
+    directory = dentries.known(b"/d")
+    assert directory is not None
+    assert directory.entries[b"a"] == file(b"a", None, None)
     assert dentries.fresh(b"/d", 0.0) is None
 
 

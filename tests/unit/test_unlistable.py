@@ -38,13 +38,8 @@ async def rename(tree: Tree, path: bytes) -> None:
     await tree.rename(SEEN, path)
 
 
-async def rename_local(tree: Tree, path: bytes) -> None:
-    await write_file(tree, SWAP, b"local")
-    await tree.rename(SWAP, path)
-
-
 @pytest.mark.parametrize("path", BAD)
-@pytest.mark.parametrize("act", [create, make_directory, rename, rename_local])
+@pytest.mark.parametrize("act", [create, make_directory, rename])
 async def test_such_a_name_is_refused_and_nothing_is_sent(
     store: FakeWriter, tree: Tree, act: Callable[[Tree, bytes], Awaitable[None]], path: bytes
 ) -> None:
