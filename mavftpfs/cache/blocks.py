@@ -284,9 +284,9 @@ class FileBlocks:
             start = end
         return parts[0] if len(parts) == 1 else b"".join(parts)
 
-    async def fill(self, start: int, stop: int, want: Callable[[], None]) -> None:
-        """Call `want`, which asks for what is missing of [start, stop), and wait for that. The range must be
-        held (`hold`); `get` may find nothing afterwards, where the bytes were dropped.
+    async def wait_for(self, start: int, stop: int) -> None:
+        """Wait for what is missing of [start, stop), which was just asked for and is held (`hold`). `get` may
+        find nothing afterwards, where the bytes were dropped.
 
         Raises:
             RequestTimeout: none of the missing bytes came for `patience` seconds. Else what on_failed got.
@@ -297,7 +297,6 @@ class FileBlocks:
         waiter = _Waiter(start, stop, self.missing(start, stop), trio.Event(), scope)
         self._waiters.append(waiter)
         try:
-            want()
             with scope:
                 await waiter.done.wait()
         finally:

@@ -23,7 +23,8 @@ class Context:
     """The vehicle, what is remembered of it, and the files that are open or not delivered.
 
     clock: seconds, monotonic; wall: seconds since 1970. on_changed(path): a path, and what lies below it,
-    was changed by us. read_rate: bytes per second, once measured. armed: nothing may be changed (only
+    was changed by us. read_rate: bytes per second, once measured. paths: see pathlocks. armed: nothing may be
+    changed (only
     Writeback.armed_changed sets it).
     """
 
@@ -39,14 +40,10 @@ class Context:
     nursery: trio.Nursery | None
     namer: Namer
     read_rate: Callable[[], float | None]
+    paths: PathLocks
     nodes: Nodes = field(default_factory=Nodes)
     own: OwnNames = field(default_factory=OwnNames)
     armed: bool = False
-
-    @property
-    def paths(self) -> PathLocks:
-        """See pathlocks: files are opened and delivered between changes of their names."""
-        return self.files.fetcher.paths
 
     @property
     def blocked(self) -> bool:

@@ -481,16 +481,21 @@ class FileHandle(ReadOnlyHandle):
         for _ in range(MAX_TRIES):
             version.require_alive()
             drops = version.blocks.drops
-            data = await self._read(offset, stop)
-            if data is not None:
+            pieces: list[bytes | memoryview] = []
+            for start in range(offset, stop, files.cache.piece):
+                piece = await self._read_piece(start, min(start + files.cache.piece, stop))
+                if piece is None:  # some of it was dropped meanwhile, or the file got another name
+                    break
+                pieces.append(piece)
+            else:
                 await files.compare(version, now=stop == self.size)
+                if version.blocks.drops == drops:
+                    version.blocks.given = True
+                    return pieces[0] if len(pieces) == 1 else b"".join(pieces)
             if version.blocks.drops != drops:
                 version.close_reader()
                 await trio.sleep(pause)
                 pause *= 2
-            elif data is not None:
-                version.blocks.given = True
-                return data
         files.unproven += 1
         raise DataUnproven(f"bytes of {version.path!r} may be another file's, again and again")
 
@@ -509,16 +514,6 @@ class FileHandle(ReadOnlyHandle):
         if not self._closed:
             self._closed = True
             self._files.release(self._version)
-
-    async def _read(self, offset: int, stop: int) -> bytes | memoryview | None:
-        """Return [offset, stop), None if some of it was dropped meanwhile, or the file got another name."""
-        pieces = []
-        for start in range(offset, stop, self._files.cache.piece):
-            piece = await self._read_piece(start, min(start + self._files.cache.piece, stop))
-            if piece is None:
-                return None
-            pieces.append(piece)
-        return pieces[0] if len(pieces) == 1 else b"".join(pieces)
 
     async def _read_piece(self, start: int, stop: int) -> bytes | memoryview | None:
         files, version = self._files, self._version

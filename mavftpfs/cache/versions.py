@@ -121,13 +121,10 @@ class Fetcher:
                     reader = version.reader
                     if reader is None or blocks.doubted:
                         return None
-
-                    def want() -> None:
-                        reader.want(start, stop, demand=True)
-                        if plan.start < plan.stop:
-                            reader.want(plan.start, plan.stop, demand=False)
-
-                    await blocks.fill(start, stop, want)
+                    reader.want(start, stop, demand=True)
+                    if plan.start < plan.stop:
+                        reader.want(plan.start, plan.stop, demand=False)
+                    await blocks.wait_for(start, stop)
                 return blocks.get(start, stop)
         except FileChanged:
             self._on_changed(version)

@@ -105,6 +105,7 @@ def make_writeback(
         nursery=nursery,
         namer=Namer(owner, options.root, rng),
         read_rate=read_rate,
+        paths=files.fetcher.paths,
     )
     throttle = Throttle(context)
     spool = Spool(

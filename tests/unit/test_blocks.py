@@ -35,7 +35,8 @@ async def read(
     blocks: FileBlocks, start: int, stop: int, want: Callable[[], None] = lambda: None
 ) -> bytes | memoryview | None:
     async with blocks.hold(start, stop):
-        await blocks.fill(start, stop, want)
+        want()
+        await blocks.wait_for(start, stop)
         return blocks.get(start, stop)
 
 
