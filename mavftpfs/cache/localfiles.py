@@ -12,8 +12,7 @@ from dataclasses import dataclass
 from fnmatch import translate
 from re import compile as compile_pattern
 
-from mavftpfs.cache.attributes import Stat
-from mavftpfs.cache.times import shown
+from mavftpfs.cache.attributes import Stat, shown
 from mavftpfs.shared.errors import (
     AlreadyExists,
     DirectoryNotEmpty,

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from mavftpfs.cache.attributes import Stat, shown_mtime
+from mavftpfs.cache.attributes import SECOND, Stat, Times, shown, shown_mtime
 from mavftpfs.cache.context import Context
 from mavftpfs.cache.draft import Draft
 from mavftpfs.cache.localfiles import LocalFiles
 from mavftpfs.cache.nodes import Node
 from mavftpfs.cache.reserved import is_reserved
-from mavftpfs.cache.times import SECOND, Times, shown
 from mavftpfs.shared.errors import NotADirectory, NotFound, NotSupported
 from mavftpfs.shared.model import EntryKind, join, require_listable, split
 

@@ -61,7 +61,6 @@ PURE_MODULES = {
     "cache.sending",
     "cache.shortnames",
     "cache.snapshots",
-    "cache.times",
     "fuse.inodes",
     "fuse.handles",
     "fuse.options",
