@@ -299,9 +299,9 @@ class Files:
                 return  # who reads on has it compared under its new name
         took = directory.ended_at - directory.listed_at
         version.compare_after = self._clock() + max(COMPARE_PAUSE, COST_FACTOR * took)
-        self._judge(version, directory)
+        self._compare_listed(version, directory)
 
-    def _judge(self, version: Version, directory: Directory) -> None:
+    def _compare_listed(self, version: Version, directory: Directory) -> None:
         """Take what a listing shows that began after a version was opened."""
         entry = directory.entries.get(split(version.path)[1])
         if entry is None or entry.kind is not EntryKind.FILE:
@@ -329,7 +329,7 @@ class Files:
             parent, name = split(version.path)
             known = parent == path and name in directory.entries and version.dead is None
             if known and directory.listed_at > version.proven_at and not self.is_changing(version.path):
-                self._judge(version, directory)
+                self._compare_listed(version, directory)
 
     def _kill(self, version: Version) -> None:
         """The path is another file now: none of those that were opened there up to this version."""

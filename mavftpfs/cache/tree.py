@@ -66,7 +66,6 @@ class Tree:
         `spool` keeps what is not delivered; `wall`: seconds since 1970; `rng` numbers our temporary names;
         `keep` makes the cache on the local disk.
         """
-        self._store = store
         self._options = options
         self._clock = clock
         self._tell_kernel = invalidate
