@@ -291,10 +291,11 @@ class FileBlocks:
         Raises:
             RequestTimeout: none of the missing bytes came for `patience` seconds. Else what on_failed got.
         """
-        if not self.missing(start, stop):
+        missing = self.missing(start, stop)
+        if not missing:
             return
         scope = trio.CancelScope(deadline=trio.current_time() + self._cache.patience)
-        waiter = _Waiter(start, stop, self.missing(start, stop), trio.Event(), scope)
+        waiter = _Waiter(start, stop, missing, trio.Event(), scope)
         self._waiters.append(waiter)
         try:
             with scope:
