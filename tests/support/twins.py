@@ -76,7 +76,8 @@ class Twins:
     def _only_empty_files_differ(self) -> bool:
         there = {path for path, _ in walk(os.fsencode(self.card))}
         here = {path for path, _ in walk(os.fsencode(self.twin))}
-        changed = {path for path in here if self._differs(path, there)} | set(map(meant, there - here))
+        changed = {path for path in here if self._differs(path, there)}
+        changed |= {path for path in map(meant, there - here) if path is not None}
         return bool(changed) and changed <= here and all(map(self._is_empty_here, changed))
 
     def _is_empty_here(self, path: bytes) -> bool:
@@ -90,8 +91,11 @@ class Twins:
             return True
 
 
-def meant(path: bytes) -> bytes:
-    """Return the path that a name of ours stands for while it is being replaced; any other as it is."""
+def meant(path: bytes) -> bytes | None:
+    """Return the path that a name of ours stands for while it is being replaced, None for one under which a
+    new file is sent; any other path as it is."""
     folder, name = os.path.split(path)
     ours = parse(name)
-    return path if ours is None or ours.target is None else os.path.join(folder, ours.target)
+    if ours is None:
+        return path
+    return None if ours.target is None else os.path.join(folder, ours.target)
