@@ -5,29 +5,10 @@ All paths are normalised mount paths (shared.model). All calls raise only Mavftp
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Protocol
 
 from mavftpfs.shared.model import Listing
 from mavftpfs.shared.traits import WriteTraits
-
-FREE_FOR = 2.0
-"""Seconds for which a listing that lacks a name lets a file be made there without another look. Ten small
-files are copied into a directory by one listing where that takes no longer; else each costs one more request.
-"""
-
-
-@dataclass(frozen=True, slots=True)
-class Overwrite:
-    """Bytes [start, stop) of an uploaded file in the place of which others may have come.
-
-    same: but for what was changed since, they are what the file had there anyway.
-    """
-
-    start: int
-    stop: int
-    same: bool = False
 
 
 class ReadSink(Protocol):
@@ -166,26 +147,6 @@ class Upload(Protocol):
         size is to be compared once more after it was renamed."""
         ...
 
-    @property
-    def repeats(self) -> bool:
-        """Deprecated."""
-        ...
-
-    @property
-    def again(self) -> Sequence[tuple[int, int]]:
-        """Deprecated."""
-        ...
-
-    @property
-    def shared(self) -> bool:
-        """Deprecated: see WriteStore.doubted_since."""
-        ...
-
-    @property
-    def overwrites(self) -> Sequence[Overwrite]:
-        """Deprecated."""
-        ...
-
     def wake(self) -> None:
         """The source has more."""
         ...
@@ -227,27 +188,17 @@ class WriteStore(Protocol):
         """Return whether such a thing was noticed after that time (the caches' clock)."""
         ...
 
-    async def open_upload(
-        self,
-        path: bytes,
-        source: UploadSource,
-        *,
-        create: bool = True,
-        least: int = 0,
-        free_at: float | None = None,
-    ) -> Upload:
+    async def open_upload(self, path: bytes, source: UploadSource) -> Upload:
         """Make a file by CreateFile and write it. Sends nothing before the source has something.
 
         `path` is a temporary of ours, or, on cards that cannot rename, a name that is known to be free. An
         upload that was interrupted goes on by OpenFileWO where that was seen to keep what the file has, else
         the source is told on_rollback(everything=True).
-
-        create, least, free_at: deprecated.
         """
         ...
 
-    async def create_empty(self, path: bytes, *, free_at: float | None = None) -> None:
-        """Make an empty file, or empty it: CreateFile + Terminate. free_at: deprecated."""
+    async def create_empty(self, path: bytes) -> None:
+        """Make an empty file, or empty it: CreateFile + Terminate."""
         ...
 
     async def truncate(self, path: bytes, size: int) -> None:
@@ -277,12 +228,4 @@ class WriteStore(Protocol):
         Raises:
             FtpNak: with a code that errnos maps to ENOENT if there is none.
         """
-        ...
-
-    def endangered(self, path: bytes) -> list[tuple[int, int]]:
-        """Deprecated."""
-        ...
-
-    async def probe_open_for_write(self, first: bytes, second: bytes) -> None:
-        """Deprecated."""
         ...

@@ -198,9 +198,9 @@ class Scheduler:
         assert job.session is not None
         return job.session
 
-    def open_upload(self, path: bytes, source: UploadSource, *, create: bool) -> QueuedUpload:
+    def open_upload(self, path: bytes, source: UploadSource) -> QueuedUpload:
         """Queue an upload."""
-        return self._uploading.add(path, source, create=create)
+        return self._uploading.add(path, source)
 
     def claim(self, path: bytes, *, below: bool = False) -> AbstractAsyncContextManager[None]:
         """Keep our own session off a path that is about to change, or off all below it.

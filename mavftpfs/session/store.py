@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
-import errno
 from collections.abc import Callable
 from functools import partial
 
 import trio
 
-from mavftpfs.cache.remote import FREE_FOR, ReadSink, UploadSource
+from mavftpfs.cache.remote import ReadSink, UploadSource
 from mavftpfs.protocol.operations import ListDirectory, Simple
 from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.session.changes import COPY_RATE, Changes
-from mavftpfs.session.probing import probe_writing
 from mavftpfs.session.reader import FileStream
 from mavftpfs.session.scheduler import Scheduler
 from mavftpfs.session.upload import QueuedUpload
 from mavftpfs.session.vehicle import Vehicle
-from mavftpfs.shared.errnos import errno_for
-from mavftpfs.shared.errors import AlreadyExists, Armed, FtpNak, RemoteProtocolError, RequestTimeout
+from mavftpfs.shared.errors import Armed, FtpNak, RemoteProtocolError, RequestTimeout
 from mavftpfs.shared.model import DirEntry, Listing, wire_path
 from mavftpfs.shared.traits import WriteTraits
 
@@ -59,6 +56,7 @@ class Store:
         self.remove_directory = self._changes.remove_directory
         self.rename = self._changes.rename
         self.truncate = self._changes.truncate
+        self.create_empty = self._changes.create_empty
         """See cache.remote.WriteStore."""
 
     @property
@@ -183,28 +181,12 @@ class Store:
         """See cache.remote.WriteStore."""
         return self._scheduler.doubt.arose_since(at)
 
-    async def open_upload(
-        self,
-        path: bytes,
-        source: UploadSource,
-        *,
-        create: bool = True,
-        least: int = 0,
-        free_at: float | None = None,
-    ) -> QueuedUpload:
+    async def open_upload(self, path: bytes, source: UploadSource) -> QueuedUpload:
         """Queue an upload; nothing is sent before the source has something or finish is called."""
         wire_path(path)
         self._scheduler.check_may_write()
         await self._changes.rest(path)
-        upload = self._scheduler.open_upload(path, source, create=create)
-        upload.least, upload.free_at = least, free_at
-        return upload
-
-    async def create_empty(self, path: bytes, *, free_at: float | None = None) -> None:
-        """See cache.remote.WriteStore."""
-        if free_at is not None and self._clock() - free_at > FREE_FOR:
-            await self._require_free(path)
-        await self._changes.create_empty(path)
+        return self._scheduler.open_upload(path, source)
 
     async def stat_size(self, path: bytes) -> int:
         """See cache.remote.WriteStore."""
@@ -213,22 +195,3 @@ class Store:
         if session.size is None:
             raise RemoteProtocolError("the vehicle's open reply holds no size")
         return session.size
-
-    async def probe_open_for_write(self, first: bytes, second: bytes) -> None:
-        """Deprecated."""
-        self._scheduler.check_may_write()
-        await probe_writing(self._scheduler, self._changes, first, second)
-
-    def endangered(self, path: bytes) -> list[tuple[int, int]]:
-        """Deprecated."""
-        return []
-
-    async def _require_free(self, path: bytes) -> None:
-        """Deprecated."""
-        try:
-            await self.stat_size(path)
-        except FtpNak as nak:
-            if errno_for(nak) != errno.ENOENT:
-                raise
-        else:
-            raise AlreadyExists(f"{path!r} was made by somebody else in the meantime")

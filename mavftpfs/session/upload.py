@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Protocol
 
 import trio
 
-from mavftpfs.cache.remote import Overwrite, UploadSource
+from mavftpfs.cache.remote import UploadSource
 from mavftpfs.session.fairness import Share
 from mavftpfs.shared.errors import LocalProtocolError, MavftpfsError
 
@@ -114,10 +113,6 @@ class UploadHost(Protocol):
         """Return the time."""
         ...
 
-    def doubted_since(self, at: float) -> bool:
-        """Return whether there was a doubt since then."""
-        ...
-
     def on_news(self, upload: QueuedUpload) -> None:
         """Something about the upload changed."""
         ...
@@ -141,18 +136,11 @@ class QueuedUpload:
             the Terminate was refused the last time.
     """
 
-    def __init__(self, host: UploadHost, path: bytes, feed: Feed, *, create: bool, now: float) -> None:
+    def __init__(self, host: UploadHost, path: bytes, feed: Feed, now: float) -> None:
         self.path = path
         self.feed = feed
-        self.create = create
-        self.overwrites: Sequence[Overwrite] = ()
-        self.again: Sequence[tuple[int, int]] = ()
-        self.repeats = False
-        self.least = 0
-        self.free_at: float | None = None
         self.begun = self.resent = False
         self.share = Share(now)
-        self._since = now
         self.error: MavftpfsError | None = None
         self.running = False
         self.clean = False
@@ -171,11 +159,6 @@ class QueuedUpload:
         self._news = trio.Event()
 
     # --- the owner's side
-
-    @property
-    def shared(self) -> bool:
-        """Deprecated."""
-        return self._host.doubted_since(self._since)
 
     def wake(self) -> None:
         """The source has more."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 import errno
 from collections.abc import Callable
 
-from mavftpfs.cache.remote import FREE_FOR, UploadSource
+from mavftpfs.cache.remote import UploadSource
 from mavftpfs.protocol.chunking import ChunkSize
 from mavftpfs.protocol.engine import Engine
 from mavftpfs.protocol.payload import Opcode
@@ -22,9 +22,7 @@ from mavftpfs.session.vehicle import Vehicle
 from mavftpfs.session.writer import Stop, Turns, Writer, is_disarmed
 from mavftpfs.shared.errnos import errno_for
 from mavftpfs.shared.errors import (
-    AlreadyExists,
     Armed,
-    FileChanged,
     FtpNak,
     LocalProtocolError,
     MavftpfsError,
@@ -34,7 +32,7 @@ from mavftpfs.shared.errors import (
     SpoolFailed,
 )
 
-REFUSALS = (FtpNak, ProtocolError, FileChanged, AlreadyExists, SpoolFailed)
+REFUSALS = (FtpNak, ProtocolError, SpoolFailed)
 """Errors that do not pass by themselves."""
 
 REOPENS = 5
@@ -75,10 +73,9 @@ class Uploading:
 
     # --- what others ask for and tell
 
-    def add(self, path: bytes, source: UploadSource, *, create: bool) -> QueuedUpload:
+    def add(self, path: bytes, source: UploadSource) -> QueuedUpload:
         """Queue an upload."""
-        feed = Feed(source, self._chunk)
-        upload = QueuedUpload(self, path, feed, create=create, now=self._clock())
+        upload = QueuedUpload(self, path, Feed(source, self._chunk), self._clock())
         self.uploads.append(upload)
         self._server.wake()
         return upload
@@ -97,10 +94,6 @@ class Uploading:
     def now(self) -> float:
         """See UploadHost."""
         return self._clock()
-
-    def doubted_since(self, at: float) -> bool:
-        """See UploadHost."""
-        return self._doubt.arose_since(at)
 
     def on_news(self, upload: QueuedUpload) -> None:
         """See UploadHost."""
@@ -199,8 +192,6 @@ class Uploading:
 
     async def _open(self, upload: QueuedUpload) -> OpenSession:
         feed = upload.feed
-        if not upload.create:
-            return await self._open_in_place(upload)
         if upload.restarted and (feed.proven or feed.unproven):
             feed.roll_back(everything=True)
         upload.restarted = False
@@ -212,11 +203,8 @@ class Uploading:
                 return session
         if feed.proven or feed.unproven:
             feed.roll_back(everything=True)
-        if upload.free_at is not None and self._clock() - upload.free_at > FREE_FOR:
-            await self._require_free(upload.path)
         if upload.aborted:  # its owner was told that nothing was begun
             raise LocalProtocolError("the upload was given up before its file was made")
-        upload.free_at = None
         upload.resent |= upload.begun
         upload.begun = True  # what is there from now on may be ours
         try:
@@ -254,27 +242,6 @@ class Uploading:
             return session
         await self._server.close()
         return None
-
-    async def _open_in_place(self, upload: QueuedUpload) -> OpenSession:
-        """Deprecated: change an existing file."""
-        session = await self._server.open(upload.path, Opcode.OPEN_FILE_WO)
-        least = max(upload.feed.reached, upload.least)
-        if session.size is None or session.size >= least:
-            return session
-        upload.feed.roll_back(everything=True)
-        await self._server.close()
-        raise FileChanged(f"{upload.path!r} has {session.size} bytes now, not {least}")
-
-    async def _require_free(self, path: bytes) -> None:
-        """Deprecated: raise AlreadyExists if CreateFile would empty something."""
-        try:
-            await self._server.open(path, Opcode.OPEN_FILE_RO)
-        except FtpNak as nak:
-            if errno_for(nak) != errno.ENOENT:
-                raise
-        else:
-            await self._server.close()
-            raise AlreadyExists(f"{path!r} was made by somebody else in the meantime")
 
     # --- letting go
 
@@ -323,7 +290,7 @@ class Uploading:
             return False
 
     def _roll_back(self, upload: QueuedUpload) -> None:
-        keep = not upload.create or (self.writer.resumable and upload.feed.proven)
+        keep = self.writer.resumable and upload.feed.proven
         if upload.feed.proven or upload.feed.unproven:
             upload.feed.roll_back(everything=not keep)
         else:

@@ -10,13 +10,7 @@ from typing import Any
 
 
 class MavftpfsError(Exception):
-    """Base of every error this package raises on purpose; its text is one line for a person.
-
-    Attributes:
-        checked: it was tried already to find out by a listing whether the request was done after all.
-    """
-
-    checked = False
+    """Base of every error this package raises on purpose; its text is one line for a person."""
 
 
 class UsageError(MavftpfsError):

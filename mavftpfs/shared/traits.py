@@ -41,29 +41,14 @@ class WriteTraits:
     """What one server was seen to do when written to; dropped when the vehicle reboots.
 
     Attributes:
-        wo_truncates: OpenFileWO empties the file (servers.md 8). Filled by the session's probe.
-        wo_creates: OpenFileWO makes a missing file. Filled by the session's probe.
+        wo_truncates: OpenFileWO empties the file (servers.md 8). Filled by the session.
         truncate_works: TruncateFile is answered, and safe (False on PX4 on NuttX, whose copy-back can
             destroy the file). Filled by the session.
         rename_works: a rename succeeded (False: LittleFS has none). Filled by the cache.
         rename_replaces: a rename onto an existing file worked (False: FAT refuses it). Filled by the cache.
-        folds_case: two spellings of a name open the same file. Filled by the cache.
-        folds_short_case: those of a short one (8.3) do (NuttX). Filled by the cache.
-        drops_ends: dots and blanks at the end of a name do not count (FatFs). Filled by the cache.
-        drops_short_ends: a dot at the end of a short one does not (NuttX). Filled by the cache.
     """
 
     wo_truncates: bool | None = None
-    wo_creates: bool | None = None
     truncate_works: bool | None = None
     rename_works: bool | None = None
     rename_replaces: bool | None = None
-    folds_case: bool | None = None
-    folds_short_case: bool | None = None
-    drops_ends: bool | None = None
-    drops_short_ends: bool | None = None
-
-    @property
-    def folds(self) -> bool:
-        """Whether names of any kind were seen to be found in another case."""
-        return bool(self.folds_case or self.folds_short_case)

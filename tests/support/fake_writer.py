@@ -16,7 +16,7 @@ import pytest
 import trio
 
 from mavftpfs.cache.options import CacheOptions
-from mavftpfs.cache.remote import FREE_FOR, Overwrite, ReadSink, UploadSource
+from mavftpfs.cache.remote import ReadSink, UploadSource
 from mavftpfs.cache.reserved import is_reserved
 from mavftpfs.cache.spool import SpoolDirectory
 from mavftpfs.cache.tree import Tree
@@ -109,8 +109,6 @@ class FakeWriter(FakeStore):
         self.write_delay = 0.0
         self.linger = 0.0
         self.uploads: list[FakeUpload] = []
-        self.probes = 0
-        self.looks = 0
         self.aliases: dict[bytes, bytes] = {}
         self.before_request: Callable[..., object] | None = None
         self.doubted_at: float | None = None
@@ -142,14 +140,6 @@ class FakeWriter(FakeStore):
         if self.freeze_at is not None and self.requests >= self.freeze_at:
             raise Frozen("the power is gone")
 
-    def require_free(self, path: bytes, free_at: float | None) -> None:
-        """What CreateFile is preceded by, if that is due."""
-        if free_at is None or trio.current_time() - free_at <= FREE_FOR:
-            return
-        self.looks += 1
-        if self.real(path) in self.files:
-            raise AlreadyExists(f"{path!r} is there")
-
     def revive(self) -> None:
         """The power is back."""
         self.freeze_at = None
@@ -177,23 +167,14 @@ class FakeWriter(FakeStore):
 
     # --- WriteStore
 
-    async def open_upload(
-        self,
-        path: bytes,
-        source: UploadSource,
-        *,
-        create: bool = True,
-        least: int = 0,
-        free_at: float | None = None,
-    ) -> FakeUpload:
+    async def open_upload(self, path: bytes, source: UploadSource) -> FakeUpload:
         wire_path(path)
-        upload = FakeUpload(self, path, source, create=create, least=least, free_at=free_at)
+        upload = FakeUpload(self, path, source)
         self.uploads.append(upload)
         return upload
 
-    async def create_empty(self, path: bytes, *, free_at: float | None = None) -> None:
+    async def create_empty(self, path: bytes) -> None:
         wire_path(path)
-        self.require_free(path, free_at)
         lost = await self.request("create", path)
         self._create(path)
         _maybe_lose(lost)
@@ -203,10 +184,6 @@ class FakeWriter(FakeStore):
 
     def doubted_since(self, at: float) -> bool:
         return self.doubted_at is not None and self.doubted_at > at
-
-    def endangered(self, path: bytes) -> list[tuple[int, int]]:
-        """See WriteStore."""
-        return []
 
     async def truncate(self, path: bytes, size: int) -> None:
         lost = await self.request("truncate", path, size)
@@ -266,14 +243,6 @@ class FakeWriter(FakeStore):
         self.require_link()
         self.log.append(("stat", str(path)))
         return len(self._file(path, Opcode.OPEN_FILE_RO).data)
-
-    async def probe_open_for_write(self, first: bytes, second: bytes) -> None:
-        wire_path(first)
-        wire_path(second)
-        await self.request("probe", first)
-        self._require_parent(first, Opcode.CREATE_FILE)
-        self.probes += 1
-        self.traits.wo_truncates = self.kind.wo_truncates
 
     # --- inside
 
@@ -414,27 +383,12 @@ def _maybe_lose(lost: bool) -> None:
 class FakeUpload:
     """Sends chunk by chunk, each one request; in the background too if the store has a nursery."""
 
-    def __init__(
-        self,
-        store: FakeWriter,
-        path: bytes,
-        source: UploadSource,
-        *,
-        create: bool,
-        least: int,
-        free_at: float | None,
-    ) -> None:
+    def __init__(self, store: FakeWriter, path: bytes, source: UploadSource) -> None:
         self.path = path
         self.aborted = False
         self._store = store
         self._source = source
-        self._create = create
-        self._least = least
-        self._free_at = free_at
-        self.begun = False
-        self.repeats = self.shared = self.resent = False
-        self.overwrites: list[Overwrite] = []
-        self.again: list[tuple[int, int]] = []
+        self.begun = self.resent = False
         self._open = False
         self._opened_before = False
         self._sending = trio.Lock()
@@ -500,23 +454,17 @@ class FakeUpload:
 
     def _lose(self) -> None:
         self._open = False
-        self._source.on_rollback(self._create and self._store.kind.wo_truncates)
+        self._source.on_rollback(self._store.kind.wo_truncates)
 
     async def _open_file(self) -> None:
         store = self._store
-        store.require_free(self.path, self._free_at)
         reopened = self._opened_before and not store.kind.wo_truncates
-        self._free_at, self.begun = None, True
-        await store.request("open", self.path, "create" if self._create and not reopened else "write")
-        if self._create and not reopened:
+        self.begun = True
+        await store.request("open", self.path, "write" if reopened else "create")
+        if not reopened:
             store._create(self.path)
             if self._opened_before:
                 self._source.on_rollback(True)
-        elif store.kind.wo_truncates:
-            store.crimes.append(f"OpenFileWO emptied {self.path!r}")
-        elif len(store._file(self.path, Opcode.OPEN_FILE_WO).data) < self._least:
-            self._source.on_rollback(True)
-            raise FileChanged(f"{self.path!r} shrank")
         self._open = self._opened_before = True
 
     async def _write(self, offset: int, data: bytes) -> None:

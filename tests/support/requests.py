@@ -23,12 +23,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from mavftpfs.cache.remote import FREE_FOR
 from tests.support.mounts import Mount
 from tests.support.twins import PRELUDE
 from tests.support.vehicles import SimVehicle
 
 ATTEMPTS = 5
+FREE_FOR = 2.0
 SETTLED = 0.3
 """Seconds without a request, with nothing open and nothing to deliver, after which a command has had its
 effects."""
@@ -71,7 +71,7 @@ SHORT = {
 class Case:
     """One command; `$1` is an empty directory on the local disk.
 
-    aged: what was listed before is no news any more (remote.FREE_FOR) when the script starts. most_looks: how
+    aged: what was listed before is no news any more (FREE_FOR) when the script starts. most_looks: how
     many looks a slow machine may need; the count is that of a fast one. fresh: what was listed before must be
     news still when the script ends; a run in which it was not is made again.
     """

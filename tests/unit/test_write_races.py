@@ -364,6 +364,4 @@ class Mute(Afterwards):
     """Does what it is asked, and is not heard; to look what became of it was in vain, too."""
 
     async def afterwards(self) -> None:
-        error = RequestTimeout("no answer")
-        error.checked = True
-        raise error
+        raise RequestTimeout("no answer")
