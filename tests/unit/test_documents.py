@@ -83,6 +83,20 @@ def test_links_between_pages_lead_somewhere() -> None:
     assert [link for file, text in pages().items() for link in broken(file, text)] == []
 
 
+def unknown_modules(text: str) -> list[str]:
+    """Return the modules and packages that the page about the code names, and that are not there."""
+    named = re.findall(r"`((?:\w+/)+(?:\w+\.py)?|\w+\.py)(?:[:`])", text)
+    package = PROJECT / "mavftpfs"
+    return [name for name in named if not (package / name).exists() and not (PROJECT / name).exists()]
+
+
+def test_the_page_about_the_code_names_what_is_there() -> None:
+    page = (PROJECT / "docs/architecture.md").read_text()
+    assert unknown_modules(page) == []
+    assert len(page.split()) <= 2500
+    assert unknown_modules("see `cache/nothing.py: Class` and `nowhere/`") == ["cache/nothing.py", "nowhere/"]
+
+
 def test_a_missing_page_and_a_broken_link_are_seen() -> None:
     file = PROJECT / "README.md"
     assert list(lacking(file, "as nowhere.md says, and servers.md too")) == ["README.md: nowhere.md"]

@@ -1,4 +1,4 @@
-"""The layer rules of mavftpfs/ARCHITECTURE.md, checked on the syntax tree of every module.
+"""The layer rules of docs/architecture.md, checked on the syntax tree of every module.
 
 The checkers are plain functions over {module name: Module}; the last tests feed them offenders, so that a
 checker that sees nothing is noticed.
@@ -162,7 +162,7 @@ def may_import(module: Module, target: str) -> bool:
 
 
 def is_pure(module: Module) -> bool:
-    """Return whether ARCHITECTURE.md stars the module."""
+    """Return whether the module may use neither trio, time, sockets nor the kernel."""
     return module.name in PURE_MODULES or (module.layer in PURE_LAYERS and module.name not in IMPURE_MODULES)
 
 
