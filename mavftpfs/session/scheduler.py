@@ -136,7 +136,7 @@ class Scheduler:
         if not disturbs:
             await self.server.run(operation)
             return
-        async with self._uploading.turns.path_operation():
+        async with self._uploading.writer.path_gate.passing():
             await self.server.run(operation)
 
     def open_stream(self, path: bytes, sink: ReadSink, size: int | None) -> FileStream:

@@ -15,15 +15,17 @@ LONGEST_BACKOFF = 30.0
 
 
 class Feed:
-    """Hands a source's chunks on and remembers what was proven of them; chunk: most bytes of one.
+    """Hands a source's chunks to the engine and remembers what is proven of them.
 
-    To the engine, which serves everybody, a source that fails (the local disk that has its bytes) has nothing
-    for now; whoever waits for the upload is told why, because `has_more` is asked before it is complete.
+    A source can fail: the local disk has its bytes. The engine, which serves everybody, is then told that
+    there is nothing for now. Whoever waits for the upload hears why: `has_more` is asked before its end.
+
+    chunk: most bytes of one.
 
     Attributes:
-        proven: a Terminate was ACKed, so that the remote file holds at least what was ACKed before it.
-        unproven: bytes ACKed since then. reached: end of the highest ACKed byte of this file; once the
-            session was lost, of the highest proven one.
+        proven: a Terminate was ACKed: the remote file holds all that was ACKed before it.
+        unproven: bytes ACKed since then.
+        reached: end of the highest ACKed byte; after a lost session, of the highest proven one.
     """
 
     def __init__(self, source: UploadSource, chunk: int) -> None:
@@ -126,9 +128,9 @@ class QueuedUpload:
     """Implements cache.remote.Upload; the scheduler's task does the work.
 
     Attributes:
-        error: why the last attempt failed, None while it goes well. Failures of the link are tried again in
-            the background; refusals only when finish is called.
-        running: the scheduler's task is at it. clean: everything given so far is ACKed and terminated.
+        error: why the last attempt failed; None while it goes well. After a failure of the link it is tried
+            again in the background, after a refusal only when `finish` is called.
+        running: it has the session. clean: everything given so far is ACKed, and Terminate, too.
         retry_at: not to be touched before. begun, resent: see cache.remote.Upload.
         tried: it was reopened to see what OpenFileWO does. waits_for_finish: what comes now costs the whole
             file again, so it waits until somebody waits for the end.

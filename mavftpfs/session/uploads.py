@@ -19,7 +19,7 @@ from mavftpfs.session.fairness import Queue
 from mavftpfs.session.serversession import TERMINATE_LIMIT, OpenSession, ServerSession
 from mavftpfs.session.upload import Feed, QueuedUpload
 from mavftpfs.session.vehicle import Vehicle
-from mavftpfs.session.writer import Stop, Turns, Writer, is_disarmed
+from mavftpfs.session.writer import Stop, Writer, is_disarmed
 from mavftpfs.shared.errnos import errno_for
 from mavftpfs.shared.errors import (
     Armed,
@@ -40,7 +40,11 @@ REOPENS = 5
 
 
 class Uploading:
-    """Queues uploads and serves one at a time. when_armed_ok: write in flight, too."""
+    """Queues uploads and serves one at a time. when_armed_ok: write in flight, too.
+
+    Attributes:
+        uploads: those that their owners neither completed nor gave up. writer: sends what they have.
+    """
 
     def __init__(
         self,
@@ -65,11 +69,6 @@ class Uploading:
         self._clock = clock
         self._chunk = chunks.most
         self._when_armed_ok = when_armed_ok
-
-    @property
-    def turns(self) -> Turns:
-        """Where path operations and writes take turns."""
-        return self.writer.turns
 
     # --- what others ask for and tell
 
@@ -143,8 +142,11 @@ class Uploading:
             upload.fail(error, self._clock())
 
     async def serve(self, upload: QueuedUpload) -> bool:
-        """Use the session for an upload. Its errors are told to the upload. False: it sent nothing, for who
-        waited, or may have come while another file was closed for it, goes first."""
+        """Use the session for an upload; its errors are told to the upload.
+
+        Returns:
+            False if only another file was closed for it. Somebody may have come meanwhile who goes first.
+        """
         started = self._clock()
         upload.running = served = True
         try:
@@ -270,8 +272,8 @@ class Uploading:
     async def _close(self, limit: float | None) -> bool:
         """Terminate; return whether what was ACKed counts as written.
 
-        The answer may be that of a vehicle that restarted before (ArduPilot ACKs what it does not know), and
-        what it had in memory is gone then.
+        A vehicle that restarted before may have answered: ArduPilot ACKs the end of a session that it does
+        not know. What it had in memory is lost then.
         """
         heard_at, reboots = self._driver.last_reply_at, self._vehicle.reboots
         ours = await self._server.close(limit)
@@ -280,7 +282,7 @@ class Uploading:
         return ours and self._vehicle.reboots == reboots
 
     async def _close_refused(self, upload: QueuedUpload) -> bool:
-        """Do the same, if its file is open, after a refusal that is reported: another failure is no news."""
+        """Close after a refusal that is reported, if the file is open. Another failure is no news."""
         session = self._server.session  # None where it failed before it got it
         if session is None or not session.writing or session.path != upload.path:
             return False

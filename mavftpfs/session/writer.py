@@ -67,12 +67,15 @@ class Stop(Enum):
 _ABRUPT = frozenset((Stop.DOUBT, Stop.ARMED, Stop.ABORTED))
 
 
-class Turns:
-    """Whose turn it is; free for all while nobody writes. on_wanted: asks the writer to make room."""
+class PathGate:
+    """Keeps path operations out while an upload writes, and lets them in now and then.
+
+    on_wanted: asks the writer to let somebody in.
+    """
 
     def __init__(self, on_wanted: Callable[[], None]) -> None:
         self._on_wanted = on_wanted
-        self._writing = False
+        self._shut = False
         self._open = False
         self._waiting = 0
         self._inside = 0
@@ -80,20 +83,20 @@ class Turns:
 
     @property
     def wanted(self) -> bool:
-        """Whether a path operation waits for its turn."""
-        return self._writing and self._waiting > 0
+        """Whether a path operation waits to be let in."""
+        return self._shut and self._waiting > 0
 
-    def set_writing(self, writing: bool) -> None:
+    def shut(self, shut: bool) -> None:
         """Begin or end to keep path operations out."""
-        self._writing = writing
+        self._shut = shut
         self._tell()
 
     @asynccontextmanager
-    async def path_operation(self) -> AsyncIterator[None]:
-        """Wait for the turn and keep it for the length of the body."""
+    async def passing(self) -> AsyncIterator[None]:
+        """Wait to be let in, and stay inside for the length of the body."""
         self._waiting += 1
         try:
-            while self._writing and not self._open:
+            while self._shut and not self._open:
                 self._on_wanted()
                 await self._news.wait()
         finally:
@@ -106,7 +109,7 @@ class Turns:
             self._inside -= 1
             self._tell()
 
-    async def give(self, seconds: float) -> None:
+    async def let_in(self, seconds: float) -> None:
         """Let path operations in for at most so long, and wait until the last of them is out."""
         self._open = True
         self._tell()
@@ -142,7 +145,7 @@ class Writer:
         chunks: ChunkSize,
         may_write: Callable[[], bool],
     ) -> None:
-        self.turns = Turns(server.wake)
+        self.path_gate = PathGate(server.wake)
         self.rearms = 0
         self.current: QueuedUpload | None = None
         self._server = server
@@ -211,11 +214,11 @@ class Writer:
             return await self._write(upload, session)
         finally:
             self.current = None
-            self.turns.set_writing(False)
+            self.path_gate.shut(False)
 
     async def _write(self, upload: QueuedUpload, session: OpenSession) -> Stop:
         rearms = 0
-        self.turns.set_writing(self._disarmed_by_paths)
+        self.path_gate.shut(self._disarmed_by_paths)
         while True:
             transfer = WriteTransfer(
                 session.id,
@@ -237,8 +240,8 @@ class Writer:
                 raise error
             rearms += 1
             # From now on path operations take turns with this upload: first those that are under way end.
-            self.turns.set_writing(True)
-            await self.turns.give(0.0)
+            self.path_gate.shut(True)
+            await self.path_gate.let_in(0.0)
             await self._rearm(upload.path)
 
     def _most_in_flight(self, upload: QueuedUpload) -> int | None:
@@ -286,7 +289,7 @@ class Writer:
                 if transfer.drained or stop in _ABRUPT or self._trails(upload, stop, transfer):
                     upload.mark()
                     return stop
-            elif self.turns.wanted:
+            elif self.path_gate.wanted:
                 await self._give_turn(upload, transfer)
             elif transfer.paused:
                 self._go_on(transfer)
@@ -374,7 +377,7 @@ class Writer:
         transfer.pause()
         if not transfer.drained:
             return
-        await self.turns.give(max(_TURN, 4.0 * (self._engine.rtt or 0.0)))
+        await self.path_gate.let_in(max(_TURN, 4.0 * (self._engine.rtt or 0.0)))
         await self._rearm(upload.path)
         self._go_on(transfer)
 

@@ -88,7 +88,7 @@ async def test_a_close_and_a_read_beside_a_trickling_writer(profile: str, autoju
         nursery.cancel_scope.cancel()
 
 
-@pytest.mark.parametrize("profile", KEEPING)
+@pytest.mark.parametrize("profile", taking_turns(KEEPING))
 async def test_a_read_and_a_close_beside_a_copy_that_lasts(profile: str, autojump: MockClock) -> None:
     place = Place(profile, SLOW)
     data = random.Random(4).randbytes(600_000)
@@ -105,7 +105,7 @@ async def test_a_read_and_a_close_beside_a_copy_that_lasts(profile: str, autojum
     assert place.data(b"small") == b"b" * 1000
 
 
-@pytest.mark.parametrize("profile", KEEPING)
+@pytest.mark.parametrize("profile", taking_turns(KEEPING))
 async def test_a_copy_that_was_tried_can_be_interrupted_after_a_reboot_too(
     profile: str, autojump: MockClock
 ) -> None:
@@ -130,7 +130,7 @@ async def test_a_copy_that_was_tried_can_be_interrupted_after_a_reboot_too(
     assert place.data(b"small") == b"b" * 1000
 
 
-@pytest.mark.parametrize("profile", TRUNCATING)
+@pytest.mark.parametrize("profile", taking_turns(TRUNCATING))
 async def test_where_it_empties_files_the_second_waits_and_is_told(profile: str, autojump: MockClock) -> None:
     """The bytes stay held, and are brought when the vehicle has time."""
     place = Place(profile, SLOW)
