@@ -168,7 +168,7 @@ class FileBlocks:
 
     def on_opened(self, at: float) -> None:
         """What comes from now on is of the file that was opened at that time."""
-        self.opened_at = at
+        self.opened_at = max(self.opened_at, at)
 
     def on_data(self, offset: int, data: bytes | memoryview) -> None:
         """Keep what is not held yet; what lies beyond the opened size is dropped."""

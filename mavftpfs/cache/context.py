@@ -24,8 +24,7 @@ class Context:
 
     clock: seconds, monotonic; wall: seconds since 1970. on_changed(path): a path, and what lies below it,
     was changed by us. read_rate: bytes per second, once measured. paths: see pathlocks. armed: nothing may be
-    changed (only
-    Writeback.armed_changed sets it).
+    changed (only Writeback.armed_changed sets it).
     """
 
     store: RemoteStore

@@ -268,16 +268,12 @@ class Files:
             FileChanged: it is another one. Else as RemoteStore.list_directory.
         """
         for _ in range(MAX_TRIES):
-            if version.compared_at >= self._asked_at(version) or self.is_changing(version.path):
+            if version.compared or self.is_changing(version.path):
                 break
             if not (self._listings_tell(version) and (now or self._clock() >= version.compare_after)):
                 break
             await self._comparing.run(version, partial(self._compare_once, version))
         version.require_alive()
-
-    def _asked_at(self, version: Version) -> float:
-        """Return since when the path may be another file: the server opened it anew, or restarted."""
-        return max(version.blocks.opened_at, self._restarted_at)
 
     def _is_restarted(self, version: Version) -> bool:
         return version.compared_at < self._restarted_at
@@ -290,7 +286,7 @@ class Files:
     async def _compare_once(self, version: Version) -> None:
         path = version.path
         try:
-            directory = await self._directories.recent(split(path)[0], began=self._asked_at(version))
+            directory = await self._directories.recent(split(path)[0], began=version.blocks.opened_at)
         except (NotFound, NotADirectory):
             self._kill(version)
             return
@@ -308,7 +304,7 @@ class Files:
             if directory.complete or entry is not None:
                 self._kill(version)
         elif not self._is_another(version, entry):
-            if directory.listed_at >= self._asked_at(version):
+            if directory.listed_at >= version.blocks.opened_at:
                 version.compared_at = directory.listed_at
             if version.mtime is None and entry.size == version.size:
                 version.mtime = entry.mtime
@@ -360,6 +356,7 @@ class Files:
         self._restarted_at = self._clock()
         for version in dict.fromkeys((*self._current.values(), *self.open_versions)):
             version.proven_at = version.compare_after = NEVER
+            version.blocks.on_opened(self._restarted_at)
             version.kept = None
 
     # --- we changed the file ourselves
@@ -369,8 +366,7 @@ class Files:
         version = self._current.get(path)
         if version is None or version.dead is not None:
             return None
-        compared = version.compared_at >= self._asked_at(version)
-        return version.blocks if compared or not self._listings_tell(version) else None
+        return version.blocks if version.compared or not self._listings_tell(version) else None
 
     def was_lost(self, path: bytes) -> bool:
         """Return whether somebody has a version of the path open, and is to read nothing more."""
@@ -459,9 +455,9 @@ class FileHandle(ReadOnlyHandle):
     def __init__(self, files: Files, version: Version, *, keep_cache: bool, direct_io: bool) -> None:
         self._files = files
         self._version = version
-        self._readahead = Readahead(version.size)
+        self._readahead = Readahead(version.blocks.size)
         self._closed = False
-        self.size = version.size
+        self.size = version.blocks.size
         self.keep_cache = keep_cache
         self.direct_io = direct_io
 

@@ -50,21 +50,15 @@ class Readahead:
         follows = 0 <= gap <= stop - start if self._next else gap == 0
         self._last_start, self._next = start, stop
         if not follows:
-            return self._seek()
+            had_window = self._window > 0
+            self._window = self._used = self._asked = 0
+            return Plan(seeked=had_window)
         if start == 0:
             if self._size <= small:
                 self._asked = self._size
                 return Plan(min(stop, self._size), self._size)
             if stop < FIRST_WINDOW:  # who begins with more at once reads on
                 return NOTHING
-        return self._advance(start, stop, limit)
-
-    def _seek(self) -> Plan:
-        had_window = self._window > 0
-        self._window = self._used = self._asked = 0
-        return Plan(seeked=had_window)
-
-    def _advance(self, start: int, stop: int, limit: int) -> Plan:
         self._used += stop - start
         if self._window == 0:
             self._window = FIRST_WINDOW

@@ -57,7 +57,8 @@ class Version:
 
     @property
     def compared(self) -> bool:
-        """Whether it was known to be the path's file since the server opened that the last time."""
+        """Whether it was known to be the path's file since the server opened that the last time, or
+        restarted."""
         return self.compared_at >= self.blocks.opened_at
 
     def require_alive(self) -> None:

@@ -36,12 +36,14 @@ class Owner(Protocol):
 class _Reading:
     """Reads of one handle: the draft if there is one, else the vehicle's file."""
 
-    def __init__(self, context: Context, node: Node, handle: FileHandle | None) -> None:
+    def __init__(self, owner: Owner, context: Context, node: Node, handle: FileHandle | None = None) -> None:
+        self._owner = owner
         self._context = context
         self._node = node
         self._handle = handle
         self._generation = node.generation
         self._closed = False
+        node.handles += 1
 
     @property
     def size(self) -> int:
@@ -121,11 +123,6 @@ class _Reading:
 class ReadFile(_Reading, ReadOnlyHandle):
     """One open() for reading (see cache.openfile.OpenFile)."""
 
-    def __init__(self, owner: Owner, context: Context, node: Node, handle: FileHandle | None) -> None:
-        super().__init__(context, node, handle)
-        self._owner = owner
-        node.handles += 1
-
     async def fsync(self) -> None:
         """Deliver what others wrote.
 
@@ -155,11 +152,9 @@ class WriteFile(_Reading):
 
     def __init__(self, owner: Owner, context: Context, node: Node, *, made: bool = False) -> None:
         """`made`: there was no such file before."""
-        super().__init__(context, node, None)
-        self._owner = owner
+        super().__init__(owner, context, node)
         self._made = made
         self.node = node
-        node.handles += 1
         node.writers += 1
 
     async def write(self, offset: int, data: bytes | memoryview) -> int:
