@@ -55,10 +55,11 @@ READING = 3.0
 """Seconds for which a file of which bytes came counts as being read."""
 
 MAX_TRIES = 5
-FIRST_PAUSE = 0.25
-"""How often one read tries because its bytes were dropped as doubtful, or the file got another name. Before
-dropped bytes are asked for again it waits so many seconds, twice as long each time: another client of the
-vehicle may be about to leave."""
+"""How often a version is compared because the vehicle opened it anew meanwhile."""
+
+PAUSES = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
+"""Seconds that a read waits before it tries again because its bytes were dropped as doubtful: together longer
+than what is read stays provisional after another client of the vehicle used our session."""
 
 COMPARE_PAUSE = 2.0
 """Seconds between two listings that only compare one file; 50 times what the last one took where that is
@@ -473,8 +474,7 @@ class FileHandle(ReadOnlyHandle):
         if offset >= stop:
             return b""
         files, version = self._files, self._version
-        pause = FIRST_PAUSE
-        for _ in range(MAX_TRIES):
+        for pause in (*PAUSES, 0.0):
             version.require_alive()
             drops = version.blocks.drops
             pieces: list[bytes | memoryview] = []
@@ -491,7 +491,6 @@ class FileHandle(ReadOnlyHandle):
             if version.blocks.drops != drops:
                 version.close_reader()
                 await trio.sleep(pause)
-                pause *= 2
         files.unproven += 1
         raise DataUnproven(f"bytes of {version.path!r} may be another file's, again and again")
 

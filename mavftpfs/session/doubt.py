@@ -24,16 +24,18 @@ MOST_LATE = 10.0
 
 _SESSION, _OPCODE, _REQ_OPCODE = 2, 3, 5  # where they are in a payload
 
-_SESSIONS = frozenset(
+_OF_SESSIONS = frozenset(
     (
         Opcode.OPEN_FILE_RO,
         Opcode.OPEN_FILE_WO,
         Opcode.CREATE_FILE,
+        Opcode.READ_FILE,
+        Opcode.BURST_READ_FILE,
+        Opcode.WRITE_FILE,
         Opcode.TERMINATE_SESSION,
         Opcode.RESET_SESSIONS,
     )
 )
-_IN_A_SESSION = frozenset((Opcode.READ_FILE, Opcode.BURST_READ_FILE, Opcode.WRITE_FILE))
 
 
 def touches_session(payload: bytes, is_ours: Callable[[int], bool]) -> bool:
@@ -43,7 +45,7 @@ def touches_session(payload: bytes, is_ours: Callable[[int], bool]) -> bool:
     bytes doubtful. is_ours: whether a session id may be that of our session.
     """
     opcode = payload[_REQ_OPCODE] if payload[_OPCODE] in (Opcode.ACK, Opcode.NAK) else payload[_OPCODE]
-    return opcode in _SESSIONS or (opcode in _IN_A_SESSION and is_ours(payload[_SESSION]))
+    return opcode in _OF_SESSIONS and is_ours(payload[_SESSION])
 
 
 class Doubt:

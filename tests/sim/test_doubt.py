@@ -95,6 +95,32 @@ async def test_another_client_raises_it(autojump: MockClock) -> None:
         assert connection.store.in_doubt()
 
 
+async def test_what_another_client_does_decides_whether_bytes_are_in_doubt(autojump: MockClock) -> None:
+    """The first that is heard of him, what may use our session, and for a while after that everything: a
+    request that took the session may have been missed."""
+    data = content(200_000)
+    here = world("px4", LinkSettings(rate=5_000.0, delay=0.02), f=data)
+    async with here.connection() as connection:
+        reader, sink = await begin_to_read(connection, b"/d/f", 5_000)
+
+        async def doubts(opcode: Opcode, pause: float = 0.0) -> bool:
+            await trio.sleep(pause)
+            before = len(sink.suspicions)
+            here.vehicle.foreign_request(
+                request(777, opcode, data=b"/").encode(), Address(255, 190), trio.current_time()
+            )
+            here.link.kick()
+            await trio.sleep(1.0)
+            return len(sink.suspicions) > before
+
+        assert await doubts(Opcode.LIST_DIRECTORY)
+        assert not await doubts(Opcode.LIST_DIRECTORY)
+        assert await doubts(Opcode.READ_FILE)
+        assert await doubts(Opcode.LIST_DIRECTORY, 5.0)
+        assert not await doubts(Opcode.LIST_DIRECTORY, 5.0)
+        reader.close()
+
+
 async def test_a_session_that_vanished_raises_it(autojump: MockClock) -> None:
     data = content(200_000)
     here = world("px4", LinkSettings(rate=50_000.0, delay=0.02), f=data)
