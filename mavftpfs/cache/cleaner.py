@@ -140,21 +140,18 @@ class Cleaner:
         context = self._context
         patience = context.options.op_deadline
         try:
-            text = await read_small(context.store, path, 2 * RENAME_ROOM, patience=patience)
+            text = await read_small(context.store, path, RENAME_ROOM, patience=patience)
         except FtpNak as nak:
             if errno_for(nak) == errno.ENOENT:
                 return group
             raise  # it may say something another time; without it the only copy could count as litter
-        target, _, source = text.partition(b"\0")
-        if not _plausible(target) or not target.startswith(join(directory, b"")):
+        if not _plausible(text) or not text.startswith(join(directory, b"")):
             return group
-        ours = _plausible(source) and source.startswith(join(context.options.root, b""))
-        free = ours and not await self._exists(source)
-        return Group(group.paths, group.serial, target, source if free else None)
+        return Group(group.paths, group.serial, text)
 
 
 def _plausible(path: bytes) -> bool:
-    """Return whether a sidecar may name this path."""
+    """Return whether a sidecar, which anybody may have written, may name this path."""
     try:
         return normalise(path) == path and parse(split(path)[1]) is None
     except LocalProtocolError:

@@ -31,6 +31,7 @@ from mavftpfs.cache.dentries import COST_FACTOR, Directory
 from mavftpfs.cache.directories import Directories, Found
 from mavftpfs.cache.kept import KeptCache
 from mavftpfs.cache.openfile import ReadOnlyHandle
+from mavftpfs.cache.pathlocks import PathLocks
 from mavftpfs.cache.readahead import Readahead
 from mavftpfs.cache.remote import RemoteStore
 from mavftpfs.cache.singleflight import SingleFlight
@@ -98,7 +99,8 @@ class Files:
         self._directories = directories
         self._on_size = on_size
         self._invalidate = invalidate
-        self.fetcher = Fetcher(store, patience=cache.patience, on_changed=self._kill)
+        self.paths = PathLocks(cache.patience)
+        self.fetcher = Fetcher(store, self.paths, self._kill)
         self._current: OrderedDict[bytes, Version] = OrderedDict()
         self.open_versions: dict[Version, None] = {}
         self._opening: SingleFlight[bytes, tuple[Version, bool]] = SingleFlight()
@@ -291,7 +293,7 @@ class Files:
         except (NotFound, NotADirectory):
             self._kill(version)
             return
-        async with self.fetcher.paths.steady(lambda: version.path) as present:
+        async with self.paths.steady(lambda: version.path) as present:
             if present != path or self.is_changing(path):
                 return  # who reads on has it compared under its new name
         took = directory.ended_at - directory.listed_at

@@ -7,9 +7,6 @@ new, old and target have the same number (see `reserved`):
   target missing, old only      rename old to target
   target missing, new only      rename new to `recovered-tSSS-NAME`: older versions left that, where a server
                                 unlinks before it renames (NuttX); nobody can tell whether it is complete
-  target missing, moved         rename it to target, then remove old
-  target there, moved           rename it to where it came from, if a sidecar tells that and nothing is there
-                                by now: the move never happened. Else `recovered-mSSS-NAME`
   sidecar alone, deleted        remove
 Nothing is touched while its owner may be alive: see `Staleness`.
 """
@@ -39,15 +36,11 @@ class Action:
 
 @dataclass(frozen=True, slots=True)
 class Group:
-    """What one replacement left in a directory: the paths by kind, and the target's path if known.
-
-    source: the path that `moved` had, if it is known and free.
-    """
+    """What one replacement left in a directory: the paths by kind, and the target's path if known."""
 
     paths: Mapping[Kind, bytes]
     serial: bytes
     target: bytes | None
-    source: bytes | None = None
 
 
 class Staleness:
@@ -82,12 +75,12 @@ def leftovers(
     """Return what interrupted work left in a listing.
 
     is_dead(path, owner, entry): whether nobody works with that name any more. A group is left alone unless
-    all of it is dead. Directories are ours only as `m`.
+    all of it is dead. Directories are never ours.
     """
     found: dict[tuple[bytes, bytes], dict[Kind, tuple[bytes, DirEntry, bytes | None]]] = {}
     for entry in entries:
         name = parse(entry.name)
-        if name is None or (entry.kind is EntryKind.DIRECTORY and name.kind is not Kind.MOVED):
+        if name is None or entry.kind is EntryKind.DIRECTORY:
             continue
         group = found.setdefault((name.owner, name.serial), {})
         group[name.kind] = (join(directory, entry.name), entry, name.target)
@@ -113,12 +106,7 @@ def repair(group: Group, *, target_exists: bool) -> list[Action]:
     sidecar = paths.pop(Kind.SIDECAR, None)
     litter = (paths.pop(kind, None) for kind in (Kind.DELETED, Kind.FRESH))
     actions = [Action(path) for path in litter if path is not None]
-    new, old, moved = (paths.get(kind) for kind in (Kind.NEW, Kind.OLD, Kind.MOVED))
-    if moved is not None:
-        missing = group.target is not None and not target_exists
-        home = group.target if missing else group.source
-        actions.append(Action(moved, home or _recovered(group, moved)))
-        target_exists = target_exists or missing  # from now on, so `old` must not take its place
+    new, old = paths.get(Kind.NEW), paths.get(Kind.OLD)
     if group.target is None:
         actions += _without_target(group, new, old)
     elif target_exists:

@@ -9,9 +9,6 @@ it, SSS counts, and the kind k is
   p  a *sidecar*: a small file whose content is the path that t and o of the same number belong to. It is
      written first and removed last, and only where NAME does not fit: rename carries both paths in one
      request of 238 bytes, so long paths use the short form, in the nearest directory above that fits;
-  m  made by older versions only: NAME itself, on its way to another spelling. It is never removed; its
-     sidecar holds, behind a NUL, the path it had before.
-Older versions also made `MVF~OOOO`, an empty file to try things out. It counts as a d.
 
 `repair` says what becomes of those that an interruption left.
 """
@@ -35,8 +32,7 @@ MAX_NAME = 255
 """Bytes of a name that every card takes."""
 
 _ALPHABET = b"abcdefghijklmnopqrstuvwxyz234567"  # one spelling on cards that fold case
-_RESERVED = re.compile(rb"\.mavftpfs-([a-z2-7]{4})([ntomdp])([a-z2-7]{3})(?:-(.+))?", re.DOTALL)
-_SHORT_PROBE = re.compile(rb"MVF~([A-Z2-7]{4})")
+_RESERVED = re.compile(rb"\.mavftpfs-([a-z2-7]{4})([ntodp])([a-z2-7]{3})(?:-(.+))?", re.DOTALL)
 _SERIALS = 32**3
 _OWNER_LENGTH, _SERIAL_LENGTH = 4, 3
 
@@ -47,7 +43,6 @@ class Kind(Enum):
     FRESH = b"n"
     NEW = b"t"
     OLD = b"o"
-    MOVED = b"m"
     DELETED = b"d"
     SIDECAR = b"p"
 
@@ -84,14 +79,11 @@ class Places:
 
 def is_reserved(name: bytes) -> bool:
     """Return whether a name is hidden from programs."""
-    return name.startswith(PREFIX) or _SHORT_PROBE.fullmatch(name) is not None
+    return _RESERVED.fullmatch(name) is not None
 
 
 def parse(name: bytes) -> Reserved | None:
     """Return the parts of a reserved name, None for any other name."""
-    probe = _SHORT_PROBE.fullmatch(name)
-    if probe is not None:
-        return Reserved(probe[1].lower(), Kind.DELETED, b"")
     match = _RESERVED.fullmatch(name)
     if match is None:
         return None

@@ -19,13 +19,12 @@ import fcntl
 import logging
 import os
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from random import Random
 from typing import Any
 
 from mavftpfs.cache import rescuing
-from mavftpfs.cache.fulldisk import FullDisk
 from mavftpfs.cache.reserved import new_owner
 from mavftpfs.shared.errors import NoSpace, SpoolFailed
 from mavftpfs.shared.extents import ExtentSet
@@ -127,6 +126,30 @@ class SpoolDirectory:
         kept = [token, *self._tokens(slot)][:TOKENS]
         os.pwrite(self._locks[slot], b"\n".join(kept) + b"\n", 0)
         return token
+
+
+class FullDisk:
+    """Says that it is the disk here that is full, once until there was room: to a program ENOSPC means the
+    card."""
+
+    def __init__(self) -> None:
+        self._said = False
+
+    @contextlib.contextmanager
+    def told(self) -> Iterator[None]:
+        """Log a NoSpace that comes from inside; it goes on."""
+        said = self._said  # an attempt that fails frees what it had taken itself
+        try:
+            yield
+        except NoSpace as error:
+            if not said:
+                log.warning("no room here, not on the vehicle, for what is not delivered yet: %s", error)
+            self._said = True
+            raise
+
+    def freed(self) -> None:
+        """There is room again: the next time is news."""
+        self._said = False
 
 
 class Spool:

@@ -89,17 +89,13 @@ class Version:
 
 
 class Fetcher:
-    """Gets bytes of versions from the vehicle.
+    """Gets bytes of versions from the vehicle."""
 
-    Attributes:
-        paths: whose names are being changed by us: nothing is opened meanwhile.
-    """
-
-    def __init__(self, store: RemoteStore, *, patience: float, on_changed: Callable[[Version], None]) -> None:
-        """`patience`: seconds to wait for who changes names; `on_changed`: the file became another one."""
+    def __init__(self, store: RemoteStore, paths: PathLocks, on_changed: Callable[[Version], None]) -> None:
+        """`paths`: nothing is opened while its name changes; `on_changed`: the file became another one."""
         self._store = store
         self._on_changed = on_changed
-        self.paths = PathLocks(patience)
+        self._paths = paths
         self._opening: SingleFlight[Version, None] = SingleFlight()
 
     async def fetch(self, version: Version, start: int, stop: int, plan: Plan) -> bytes | memoryview | None:
@@ -142,7 +138,7 @@ class Fetcher:
         Raises:
             FileChanged: it is smaller now. Else as RemoteStore.open_reader.
         """
-        async with self.paths.steady(lambda: version.path) as path:
+        async with self._paths.steady(lambda: version.path) as path:
             version.require_alive()
             expected = None if version.blocks.doubted else version.size
             version.close_reader()

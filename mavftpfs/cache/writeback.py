@@ -105,7 +105,7 @@ def make_writeback(
         nursery=nursery,
         namer=Namer(owner, options.root, rng),
         read_rate=read_rate,
-        paths=files.fetcher.paths,
+        paths=files.paths,
     )
     throttle = Throttle(context)
     spool = Spool(

@@ -102,7 +102,7 @@ EDITS = {
     "make": "seq 1 3000 > lines; mkdir -p d/e; echo x > d/x; echo y > d/e/y; cp lines big; cp d/x Upper",
     "append": "echo more >> lines; printf '' >> lines; echo again >> lines; tail -c 20 lines",
     "replace": "seq 5 50 > lines; cat lines",
-    "empty": "touch new; : > d/x; cp /dev/null none; stat -c '%n %s' new d/x none",
+    "empty": "touch new; : > d/x; cp /dev/null none; sync new d/x none; stat -c '%n %s' new d/x none",
     "touch": "touch -d '2020-02-02 02:02:02.5' big d; stat -c '%n %y' big d; touch big",
     "dd": "dd if=big of=odd bs=241 count=37 skip=3 status=none;"
     "dd if=big of=odd bs=239 seek=5 count=2 conv=notrunc status=none;"

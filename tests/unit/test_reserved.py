@@ -114,8 +114,6 @@ def test_repair() -> None:
     assert mended([Kind.NEW, Kind.OLD], target_exists=False) == [(b"t", TARGET), (b"o", None)]
     assert mended([Kind.OLD], target_exists=False) == [(b"o", TARGET)]
     assert mended([Kind.NEW], target_exists=False) == [(b"t", b"/d/recovered-tsss-file")]
-    assert mended([Kind.MOVED], target_exists=False) == [(b"m", TARGET)]
-    assert mended([Kind.MOVED], target_exists=True) == [(b"m", b"/d/recovered-msss-file")]
     assert mended([Kind.DELETED], target_exists=True, target=None) == [(b"d", None)]
 
 
@@ -131,7 +129,6 @@ def test_repair_without_a_target_loses_no_only_copy() -> None:
 
     assert [a.to for a in repair(group(Kind.NEW), target_exists=False)] == [None]
     assert [a.to for a in repair(group(Kind.OLD), target_exists=False)] == [b"/d/recovered-osss"]
-    assert [a.to for a in repair(group(Kind.MOVED), target_exists=False)] == [b"/d/recovered-msss"]
     assert [a.to for a in repair(group(Kind.OLD, Kind.NEW), target_exists=False)] == [
         b"/d/recovered-osss",
         b"/d/recovered-tsss",
@@ -206,9 +203,9 @@ def test_an_unlinked_file_that_is_read_never_changes_and_is_left_alone_for_longe
 
 def test_recovered_names_fit_a_rename() -> None:
     directory = b"/" + b"d" * 40
-    name = Reserved(b"abcd", Kind.MOVED, b"sss", b"n" * 60).name
+    name = Reserved(b"abcd", Kind.NEW, b"sss", b"n" * 60).name
     (action,) = repair(
-        Group({Kind.MOVED: directory + b"/" + name}, b"sss", directory + b"/" + b"n" * 60), target_exists=True
+        Group({Kind.NEW: directory + b"/" + name}, b"sss", directory + b"/" + b"n" * 60), target_exists=False
     )
     assert isinstance(action, Action)
     assert action.to is not None
