@@ -201,10 +201,6 @@ class WriteStore(Protocol):
         """Make an empty file, or empty it: CreateFile + Terminate."""
         ...
 
-    async def truncate(self, path: bytes, size: int) -> None:
-        """TruncateFile; silence and a refusal as unknown set traits.truncate_works to False."""
-        ...
-
     async def remove(self, path: bytes) -> None:
         """Remove what is known to be a file."""
         ...

@@ -22,7 +22,6 @@ from mavftpfs.session.doubt import MOST_LATE
 from mavftpfs.session.scheduler import Scheduler
 from mavftpfs.shared.errors import FtpNak, MavftpfsError, OutcomeUnknown, PathTooLong, RequestTimeout
 from mavftpfs.shared.model import ROOT, DirEntry, EntryKind, Listing, split, wire_path
-from mavftpfs.shared.traits import WriteTraits
 
 RENAME_LIMIT = 238
 """Bytes that both paths of a rename and the NUL between them may have (docs/servers.md 9)."""
@@ -34,20 +33,12 @@ an answer within `op_deadline`, and this comes after it."""
 SWEEPS = 3
 """How often a directory is listed at most because names of it changed meanwhile."""
 
-TRUNCATE_PATIENCE = 120.0
-"""Seconds a vehicle may need to cut a file (design promise 2)."""
-
-FIRST_TRUNCATE_PATIENCE = 20.0
-"""Seconds, and what the slowest card needs, after which one that was not seen to cut files counts as not
-answering: MAVSDK never does (docs/servers.md 8), and until then nobody can read the file."""
-
 COPY_RATE = 100_000.0
-"""Bytes per second that the slowest card copies or checksums; a repetition waits for so long."""
+"""Bytes per second that the slowest card checksums; the question is not repeated before."""
 
 DOT = b"."
 """Lists the root on ArduPilot's SITL, with the files that "/" does not show there (docs/servers.md 6)."""
 
-_UNKNOWN_OPCODE = frozenset((NakCode.FAIL, NakCode.UNKNOWN_COMMAND))
 _MISSING = frozenset((NakCode.FAIL, NakCode.FAIL_ERRNO, NakCode.FILE_NOT_FOUND))
 """What servers say of a name that is not there (any more); the errno may be a stale one (docs/servers.md 12).
 """
@@ -84,7 +75,7 @@ class _Executed:
 
 
 class Changes:
-    """Removes, makes, renames, empties and cuts. list_directory: sweeps a directory.
+    """Removes, makes, renames and empties. list_directory: sweeps a directory.
 
     All methods raise FtpNak, RequestTimeout, VehicleLost, SessionBusy, PathTooLong, Armed: it did not happen;
     or OutcomeUnknown: nobody knows.
@@ -96,10 +87,6 @@ class Changes:
         self._clock = clock
         self._executed = _Executed()
         self._changed_at: dict[bytes, float] = {}
-
-    @property
-    def _traits(self) -> WriteTraits:
-        return self._scheduler.write_traits
 
     async def remove(self, path: bytes) -> None:
         """Remove what is known to be a file."""
@@ -131,7 +118,7 @@ class Changes:
             await self._perform(lambda: Simple(Opcode.RENAME, data), lambda: self._is_renamed(old, new))
             self._scheduler.gone(new)
             self._scheduler.moved(old, new)
-        self._traits.rename_works = True
+        self._scheduler.write_traits.rename_works = True
 
     async def create_empty(self, path: bytes) -> None:
         """Make an empty file, or empty it; done twice it is the same."""
@@ -142,37 +129,6 @@ class Changes:
             await self._scheduler.use_session(path, Opcode.CREATE_FILE)
         finally:
             self._note_changed(path)
-
-    async def truncate(self, path: bytes, size: int) -> None:
-        """Cut a file to `size` bytes. A file that has so many already counts as done."""
-        wire = wire_path(path)
-        if self._traits.truncate_works is None and path.startswith(b"/fs/"):
-            self._traits.truncate_works = False  # PX4 on NuttX: its copy-back can destroy the file
-        if self._traits.truncate_works is False:
-            raise FtpNak(Opcode.TRUNCATE_FILE, NakCode.UNKNOWN_COMMAND)
-        work = 2 * size / COPY_RATE
-        patience = TRUNCATE_PATIENCE
-        if self._traits.truncate_works is None:
-            patience = min(patience, FIRST_TRUNCATE_PATIENCE + work)
-
-        def make() -> Simple:
-            return Simple(Opcode.TRUNCATE_FILE, wire, offset=size, patience=patience, server_time=work)
-
-        try:
-            async with self._changing(path, limit=None):
-                await self._perform(make, lambda: self._has_size(path, size))
-        except FtpNak as nak:
-            if nak.code in _UNKNOWN_OPCODE and self._traits.truncate_works is None:
-                self._traits.truncate_works = False
-            raise
-        except OutcomeUnknown:
-            raise
-        except RequestTimeout:  # the listing after it was answered, so the silence was about the request
-            if self._traits.truncate_works is None:
-                self._traits.truncate_works = False
-            raise
-        if self._traits.truncate_works is None:
-            self._traits.truncate_works = True
 
     async def rest(self, path: bytes) -> None:
         """Wait while a late copy of the last change of this name may yet be carried out.
@@ -186,21 +142,19 @@ class Changes:
 
     @asynccontextmanager
     async def _changing(
-        self, *paths: bytes, below: bool = False, in_flight: bool = False, limit: float | None = VERIFY_LIMIT
+        self, *paths: bytes, below: bool = False, in_flight: bool = False
     ) -> AsyncIterator[None]:
         """Check that writing is allowed now, and keep our own session off the paths.
 
-        below: also off all that lies below the first. in_flight: armed or not. limit: seconds beyond the
-        deadline after which the body is given up; None: it bounds itself.
+        below: also off all that lies below the first. in_flight: armed or not.
         """
         may = self._scheduler.require_link if in_flight else self._scheduler.check_may_write
         may()
-        most = float("inf") if limit is None else self._scheduler.op_deadline + limit
-        with trio.move_on_after(most) as scope:
+        with trio.move_on_after(self._scheduler.op_deadline + VERIFY_LIMIT) as scope:
             async with AsyncExitStack() as claims:
                 for path in paths:
                     await claims.enter_async_context(
-                        self._scheduler.claim(path, below=below and path is paths[0])
+                        self._scheduler.server.claim(path, below=below and path is paths[0])
                     )
                     await self.rest(path)
                 may()  # closing our session may have taken a while
@@ -335,7 +289,3 @@ class Changes:
         if new_entry is not None and complete:
             return Outcome.DONE
         return Outcome.CONFLICT if complete and new_complete else Outcome.UNKNOWN
-
-    async def _has_size(self, path: bytes, size: int) -> Outcome:
-        entry, _ = await self._find(path)
-        return Outcome.DONE if entry is not None and entry.size == size else Outcome.UNDONE

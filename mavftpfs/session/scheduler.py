@@ -7,7 +7,6 @@ wake it. Metadata requests do not need the session: they run beside it and carry
 from __future__ import annotations
 
 from collections.abc import Awaitable, Callable
-from contextlib import AbstractAsyncContextManager
 from dataclasses import dataclass, field
 
 import trio
@@ -115,11 +114,6 @@ class Scheduler:
         return self.server.session
 
     @property
-    def switches(self) -> int:
-        """How often one file made room for another."""
-        return self.server.switches
-
-    @property
     def uploads(self) -> list[QueuedUpload]:
         """The uploads that were neither completed nor aborted by their owners."""
         return list(self._uploading.uploads)
@@ -202,14 +196,6 @@ class Scheduler:
     def open_upload(self, path: bytes, source: UploadSource) -> QueuedUpload:
         """Queue an upload."""
         return self._uploading.add(path, source)
-
-    def claim(self, path: bytes, *, below: bool = False) -> AbstractAsyncContextManager[None]:
-        """Keep our own session off a path that is about to change, or off all below it.
-
-        Raises:
-            RequestTimeout: what was open there could not be closed.
-        """
-        return self.server.claim(path, below=below)
 
     def moved(self, old: bytes, new: bytes) -> None:
         """A file or directory was renamed: who reads or writes it, or in it, goes on under the new path."""
@@ -350,7 +336,7 @@ class Scheduler:
         """All who want the session and could use it now."""
         users: list[_User] = [*self._jobs, *(stream for stream in self._streams if stream.has_demand)]
         users += self._uploading.due(now)
-        return [user for user in users if not self._claimed(user.path)]
+        return [user for user in users if not self.server.claimed(user.path)]
 
     def _next(self) -> _User | None:
         """Whoever is to use the session now; readahead only if nobody waits for anything."""
@@ -358,11 +344,10 @@ class Scheduler:
         waiting = self._waiting(now)
         if waiting:
             return min(waiting, key=lambda user: user.share.rank(now, rtt))
-        ahead = [stream for stream in self._streams if stream.has_ahead and not self._claimed(stream.path)]
+        ahead = [
+            stream for stream in self._streams if stream.has_ahead and not self.server.claimed(stream.path)
+        ]
         return min(ahead, key=lambda stream: not self._is_open(stream), default=None)
-
-    def _claimed(self, path: bytes) -> bool:
-        return self.server.claimed(path)
 
     def _is_open(self, stream: FileStream) -> bool:
         session = self.session

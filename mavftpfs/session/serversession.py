@@ -118,7 +118,6 @@ class ServerSession:
     Attributes:
         state: see State. session: what is open in the state OPEN.
         unsure: files that may be open over there by our doing, by session id.
-        switches: how often one file made room for another.
         kept_out: whether the last request that needs no session was refused because of somebody else's.
         resets, quiet_periods: how often these remedies were used.
     """
@@ -136,7 +135,7 @@ class ServerSession:
         self.session: OpenSession | None = None
         self.unsure: dict[int, bytes] = {}
         self.kept_out = False
-        self.switches = self.resets = self.quiet_periods = 0
+        self.resets = self.quiet_periods = 0
         self._driver = driver
         self._engine = engine
         self._vehicle = vehicle
@@ -241,7 +240,6 @@ class ServerSession:
             if self.session is not None:
                 close = self.close if self.session.writing else self.close_quietly
                 await close()
-                self.switches += 1
             self._enter(State.OPENING)
             try:
                 session = await self._open_by_remedies(path, opcode)
@@ -395,7 +393,6 @@ class ServerSession:
         """Close another file that was only read; return whether there was one and it is closed."""
         if self.session is None or self.session.writing or self.session.path == path:
             return False
-        self.switches += 1
         return await self.close_quietly()
 
     def require(self, session: OpenSession) -> None:

@@ -55,7 +55,6 @@ class Store:
         self.make_directory = self._changes.make_directory
         self.remove_directory = self._changes.remove_directory
         self.rename = self._changes.rename
-        self.truncate = self._changes.truncate
         self.create_empty = self._changes.create_empty
         """See cache.remote.WriteStore."""
 

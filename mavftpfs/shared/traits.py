@@ -42,13 +42,10 @@ class WriteTraits:
 
     Attributes:
         wo_truncates: OpenFileWO empties the file (servers.md 8). Filled by the session.
-        truncate_works: TruncateFile is answered, and safe (False on PX4 on NuttX, whose copy-back can
-            destroy the file). Filled by the session.
         rename_works: a rename succeeded (False: LittleFS has none). Filled by the cache.
         rename_replaces: a rename onto an existing file worked (False: FAT refuses it). Filled by the cache.
     """
 
     wo_truncates: bool | None = None
-    truncate_works: bool | None = None
     rename_works: bool | None = None
     rename_replaces: bool | None = None

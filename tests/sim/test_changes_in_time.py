@@ -15,9 +15,7 @@ from mavftpfs.shared.errors import FileBusy, RequestTimeout
 from mavftpfs.sim.linkmodel import LinkSettings
 from tests.support.faults import Faults
 from tests.support.mounting import mounted
-from tests.support.sources import MemorySource
-from tests.support.trees import content
-from tests.support.worlds import World, read_file
+from tests.support.worlds import World
 
 LIMIT = CacheOptions().op_deadline + SLACK
 PROFILES = ("px4", "ardupilot5", "mavsdk")
@@ -116,28 +114,3 @@ async def test_changes_that_concern_one_another_take_turns(autojump: MockClock) 
                 await tree.mkdir(D + b"/new")
         await tree.mkdir(b"/e/new")
         assert b"new" in {entry.name for entry in world.tree.entries(b"/e")}
-
-
-@pytest.mark.parametrize("profile", ["mavsdk", "mavsdk-old"])
-async def test_truncations_that_nobody_answers_hold_up_no_bytes(autojump: MockClock, profile: str) -> None:
-    """They are waited for. Silence makes the window narrow, and they filled it."""
-    here = World(profile, LinkSettings(delay=0.1))
-    for path in (b"/cut", b"/cut too"):
-        here.tree.add(path, bytes(1000))
-    here.tree.add(b"/file", content("file", 20_000))
-    async with here.connection() as connection, trio.open_nursery() as nursery:
-
-        async def cut(path: bytes) -> None:
-            with pytest.raises(RequestTimeout):
-                await connection.store.truncate(path, 10)
-
-        nursery.start_soon(cut, b"/cut")
-        nursery.start_soon(cut, b"/cut too")
-        await trio.sleep(10)
-        source = MemorySource(content("new", 20_000))
-        upload = await connection.store.open_upload(b"/new", source)
-        with trio.fail_after(8):
-            upload.wake()
-            await upload.finish()
-            assert await read_file(connection, b"/file") == content("file", 20_000)
-        assert here.tree.data(b"/new") == content("new", 20_000)

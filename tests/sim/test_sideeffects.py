@@ -27,7 +27,6 @@ from tests.support.worlds import ROOTS, World, begin_to_read, content, path, rea
 
 EVERY_PROFILE = sorted(PROFILES)
 RENAMING = [name for name in EVERY_PROFILE if PROFILES[name].storage is not Storage.LITTLEFS]
-TRUNCATING = [name for name in EVERY_PROFILE if PROFILES[name].truncate_file and name != "px4-nuttx"]
 BAD = LinkSettings(rate=60_000.0, delay=0.02, loss=0.25)
 
 
@@ -244,43 +243,6 @@ async def test_an_upload_makes_room_for_a_change_of_its_path(
         assert not source.dirty.empty  # it did not wait for the upload's end
         await upload.abort()
     assert here.vehicle.server.open_sessions == 0
-
-
-@pytest.mark.parametrize("profile", TRUNCATING)
-async def test_truncate_cuts_and_extends(profile: str, autojump: MockClock) -> None:
-    here = world(profile, LinkSettings(rate=60_000.0, delay=0.02, loss=0.1), file=b"content")
-    async with here.connection() as connection:
-        await connection.store.truncate(path(profile, "file"), 3)
-        assert here.tree.data(path(profile, "file")) == b"con"
-        await connection.store.truncate(path(profile, "file"), 5)
-        assert here.tree.data(path(profile, "file")) == b"con\0\0"
-        assert connection.store.traits.truncate_works is True
-
-
-@pytest.mark.parametrize("profile", [name for name in EVERY_PROFILE if not PROFILES[name].truncate_file])
-async def test_a_server_without_truncate_is_known_afterwards(profile: str, autojump: MockClock) -> None:
-    here = world(profile, file=b"content")
-    faults = Faults(here)
-    async with here.connection() as connection:
-        began = trio.current_time()
-        with pytest.raises((FtpNak, RequestTimeout)):
-            await connection.store.truncate(path(profile, "file"), 3)
-        assert trio.current_time() - began < 30  # until then nobody can read the file
-        assert connection.store.traits.truncate_works is False
-        count = len(faults.requests)
-        with pytest.raises(FtpNak):
-            await connection.store.truncate(path(profile, "file"), 3)
-        assert len(faults.requests) == count
-
-
-async def test_a_file_is_never_cut_where_that_can_destroy_it(autojump: MockClock) -> None:
-    here = world("px4-nuttx", file=b"content")
-    faults = Faults(here)
-    async with here.connection() as connection:
-        with pytest.raises(FtpNak):
-            await connection.store.truncate(path("px4-nuttx", "file"), 3)
-        assert connection.store.traits.truncate_works is False
-    assert Opcode.TRUNCATE_FILE not in faults.requests
 
 
 async def test_a_tiny_checksum_is_asked_for_again_soon(autojump: MockClock) -> None:

@@ -28,7 +28,6 @@ from mavftpfs.shared.errors import (
     FtpNak,
     MavftpfsError,
     OutcomeUnknown,
-    RequestTimeout,
     VehicleLost,
 )
 from mavftpfs.shared.model import ROOT, join, split, wire_path
@@ -45,8 +44,8 @@ class Kind:
     """How a server behaves.
 
     replaces: rename over a file works (else FileExists, as FAT). moves_into: rename onto a directory moves
-    into it, as NuttX. renames: there is a rename at all. wo_truncates: OpenFileWO empties. truncates:
-    TruncateFile works (None: silence). folds_case: names are found in any case. drops_ends: dots and blanks
+    into it, as NuttX. renames: there is a rename at all. wo_truncates: OpenFileWO empties.
+    folds_case: names are found in any case. drops_ends: dots and blanks
     at the end of a name are dropped. short_names: those of eight characters of one case at most, and three
     behind a dot, are found in the other case, and lose a dot at the end.
     """
@@ -55,7 +54,6 @@ class Kind:
     moves_into: bool = False
     renames: bool = True
     wo_truncates: bool = False
-    truncates: bool | None = True
     folds_case: bool = False
     drops_ends: bool = False
     short_names: bool = False
@@ -63,10 +61,10 @@ class Kind:
 
 KINDS = {
     "posix": Kind(),
-    "nuttx": Kind(moves_into=True, truncates=False, short_names=True),
-    "fat": Kind(replaces=False, folds_case=True, drops_ends=True, truncates=False),
-    "littlefs": Kind(renames=False, truncates=False),
-    "mavsdk": Kind(wo_truncates=True, truncates=None),
+    "nuttx": Kind(moves_into=True, short_names=True),
+    "fat": Kind(replaces=False, folds_case=True, drops_ends=True),
+    "littlefs": Kind(renames=False),
+    "mavsdk": Kind(wo_truncates=True),
 }
 
 
@@ -184,19 +182,6 @@ class FakeWriter(FakeStore):
 
     def doubted_since(self, at: float) -> bool:
         return self.doubted_at is not None and self.doubted_at > at
-
-    async def truncate(self, path: bytes, size: int) -> None:
-        lost = await self.request("truncate", path, size)
-        if self.kind.truncates is None:
-            self.traits.truncate_works = False
-            raise RequestTimeout("silence")
-        if not self.kind.truncates:
-            self.traits.truncate_works = False
-            raise FtpNak(Opcode.TRUNCATE_FILE, NakCode.UNKNOWN_COMMAND)
-        self.traits.truncate_works = True
-        file = self._file(path, Opcode.TRUNCATE_FILE)
-        file.data = file.data[:size].ljust(size, b"\0")
-        _maybe_lose(lost)
 
     async def remove(self, path: bytes) -> None:  # type: ignore[override]  # FakeStore's sets the scene
         lost = await self.request("remove", path)
