@@ -71,21 +71,6 @@ def test_yesterdays_logs_are_not_read_again(field: Field, profile: str) -> None:
     check_cost(field, vehicle, logs, cache, open=1, read=5)
 
 
-@pytest.mark.soak
-def test_changed_logs_and_damaged_blocks_are_read_again(field: Field) -> None:
-    card, cache = field.local("card"), field.local("cache")
-    logs = fill(card)
-    vehicle = field.counted_sim(card, "mavsdk")
-    read_and_keep(field, vehicle, logs, cache)
-    (logs / "00000002.BIN").write_bytes(content("another", 65_536))  # of the same size
-    for block in (path for path in cache.rglob("*") if path.is_file()):
-        if block.stat().st_size < 60_000:
-            block.write_bytes(block.read_bytes()[:-1] + b"?")
-    mark = vehicle.asked()
-    read_all(field.mount(vehicle.source, f"cache_dir={cache}"), logs)
-    assert vehicle.cost_since(mark).counts["open"] == 3
-
-
 def test_without_mtimes_a_checksum_per_file_decides(field: Field) -> None:
     card, cache = field.local("card"), field.local("cache")
     logs = fill(card)
