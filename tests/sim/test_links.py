@@ -7,7 +7,13 @@ import os
 import socket
 import tty
 from collections.abc import AsyncIterator, Callable, Iterator
-from contextlib import AbstractAsyncContextManager, asynccontextmanager, closing, contextmanager
+from contextlib import (
+    AbstractAsyncContextManager,
+    AsyncExitStack,
+    asynccontextmanager,
+    closing,
+    contextmanager,
+)
 from pathlib import Path
 from typing import Any
 
@@ -371,7 +377,8 @@ async def test_closing_wakes_the_receiver(source: str) -> None:
         (f"tcp:{HOST}:1", "nothing listens on port 1"),
         ("tcp:no-such-host.invalid:1", "no-such-host.invalid"),
         ("udpout:no-such-host.invalid:1", "host 'no-such-host.invalid' is unknown"),
-        ("/dev/null", "/dev/null"),
+        ("/dev/null", "/dev/null is no serial port"),
+        ("/proc", "/proc is no serial port"),
     ],
 )
 async def test_what_cannot_be_opened_says_why_in_a_line(source: str, says: str) -> None:
@@ -382,26 +389,16 @@ async def test_what_cannot_be_opened_says_why_in_a_line(source: str, says: str) 
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("kind", ["udpin", "tcpin"])
-async def test_busy_port(kind: str) -> None:
-    async with opened(f"{kind}:{HOST}:0") as link:
+@pytest.mark.parametrize("kind", ["udpin", "tcpin", "serial"])
+async def test_what_somebody_else_uses(kind: str) -> None:
+    async with AsyncExitStack() as stack:
+        if kind == "serial":
+            link: Link = (await stack.enter_async_context(opened_pty()))[0]
+        else:
+            link = await stack.enter_async_context(opened(f"{kind}:{HOST}:0"))
         with pytest.raises(LinkClosed, match="is in use by another program"):
             async with opened(link.description):
                 pytest.fail("it opened")
-
-
-async def test_busy_serial_port() -> None:
-    async with opened_pty() as (link, _):
-        with pytest.raises(LinkClosed, match="is in use by another program"):
-            async with opened(link.description):
-                pytest.fail("it opened")
-
-
-@pytest.mark.parametrize("device", ["/dev/null", "/proc"])
-async def test_what_is_no_serial_port(device: str) -> None:
-    with pytest.raises(LinkClosed, match=f"{device} is no serial port"):
-        async with opened(device):
-            pytest.fail("it opened")
 
 
 @pytest.mark.parametrize("source", [f"udpin:{HOST}:0", f"tcpin:{HOST}:0"])
