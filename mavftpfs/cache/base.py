@@ -158,4 +158,4 @@ def _on_replaced(context: Context, node: Node, draft: Draft) -> None:
     draft.lose_base()
     if draft.state is State.STALE and not draft.undelivered:
         context.nodes.part(node)
-        context.files.distrust(node.path)
+        context.files.forget_pages(node.path)

@@ -341,7 +341,7 @@ class Files:
                 one.end(f"{one.path!r} changed on the vehicle after it was opened")
                 self._invalidate(one.path)
 
-    def distrust(self, path: bytes) -> None:
+    def forget_pages(self, path: bytes) -> None:
         """The kernel may hold bytes of a file that had the path before."""
         current = self._current.get(path)
         if current is not None:

@@ -1,4 +1,8 @@
-"""What programs see that no listing shows: drafts, local names, times set by users. Layer: cache."""
+"""What programs see that no listing shows, and changes of names, here or on the vehicle. Layer: cache.
+
+Drafts, local names and times that users set lie over the vehicle's listings. Between local names and those on
+the vehicle nothing is renamed: they are two places, so programs hear EXDEV and copy.
+"""
 
 from __future__ import annotations
 
@@ -8,9 +12,17 @@ from mavftpfs.cache.attributes import SECOND, Stat, Times, shown, shown_mtime
 from mavftpfs.cache.context import Context
 from mavftpfs.cache.draft import Draft
 from mavftpfs.cache.localfiles import LocalFiles
+from mavftpfs.cache.namespace import Namespace
 from mavftpfs.cache.nodes import Node
 from mavftpfs.cache.reserved import is_reserved
-from mavftpfs.shared.errors import NotADirectory, NotFound, NotSupported
+from mavftpfs.shared.errors import (
+    AlreadyExists,
+    CrossDevice,
+    DirectoryNotEmpty,
+    NotADirectory,
+    NotFound,
+    NotSupported,
+)
 from mavftpfs.shared.model import EntryKind, join, require_listable, split
 
 
@@ -125,3 +137,73 @@ class Overlay:
         entry = None if directory is None else directory.entries.get(name)
         listed = entry.mtime if entry is not None and draft.clean else None
         return shown_mtime(node.path, listed), 0
+
+
+class Changes:
+    """mkdir, rmdir, unlink and rename of paths that may be local or the vehicle's."""
+
+    def __init__(self, context: Context, overlay: Overlay, namespace: Namespace) -> None:
+        self._context = context
+        self._overlay = overlay
+        self._local = overlay.local
+        self._namespace = namespace
+
+    async def mkdir(self, path: bytes) -> None:
+        """See Tree.mkdir."""
+        if self._local.owns(path):
+            await self.require_parent(path)
+            self._local.mkdir(path)
+            return
+        self._context.require_disarmed()
+        self._overlay.require_new(path)
+        await self._namespace.mkdir(path)
+
+    async def rmdir(self, path: bytes) -> None:
+        """See Tree.rmdir."""
+        if self._local.owns(path):
+            self._local.rmdir(path)
+            return
+        self._context.require_disarmed()
+        if self._local.names(path):
+            raise DirectoryNotEmpty(f"{path!r} holds local files")
+        await self._namespace.rmdir(path)
+        self._overlay.times.forget(path)
+
+    async def unlink(self, path: bytes) -> None:
+        """See Tree.unlink."""
+        if self._local.owns(path):
+            self._local.unlink(path)
+            return
+        self._context.require_disarmed()
+        self._overlay.require_free(path)
+        await self._namespace.unlink(path)
+        self._overlay.times.forget(path)
+
+    async def rename(self, old: bytes, new: bytes, *, noreplace: bool) -> None:
+        """See Tree.rename."""
+        local = self._local.owns(old)
+        if local != self._local.owns(new):
+            raise CrossDevice(f"one of {old!r} and {new!r} is not on the vehicle")
+        if local:
+            await self.require_parent(new)
+            if noreplace and split(new)[1] in self._local.names(split(new)[0]):
+                raise AlreadyExists(f"{new!r} exists")
+            self._local.rename(old, new)
+            return
+        self._context.require_disarmed()
+        for path in (old, new):
+            self._overlay.require_free(path)
+        self._overlay.require_new(new)
+        await self._namespace.rename(old, new, noreplace=noreplace)
+
+    async def require_parent(self, path: bytes) -> None:
+        """Check that the directory of a local path exists, here or on the vehicle.
+
+        Raises:
+            NotFound, NotADirectory; else as RemoteStore.list_directory.
+        """
+        parent = split(path)[0]
+        if not self._local.owns(parent):
+            await self._context.directories.get(parent)
+        elif self._local.find(parent).kind is not EntryKind.DIRECTORY:
+            raise NotADirectory(f"{parent!r} is not a directory")

@@ -17,7 +17,6 @@ import trio
 
 from mavftpfs.cache.background import Background
 from mavftpfs.cache.base import known_base, on_listed
-from mavftpfs.cache.changes import Changes
 from mavftpfs.cache.cleaner import Cleaner
 from mavftpfs.cache.context import Context
 from mavftpfs.cache.delivery import PASSING, Deliverer
@@ -31,7 +30,7 @@ from mavftpfs.cache.namespace import Namespace
 from mavftpfs.cache.nodes import Node
 from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.options import CacheOptions
-from mavftpfs.cache.overlay import Overlay
+from mavftpfs.cache.overlay import Changes, Overlay
 from mavftpfs.cache.recovery import recover
 from mavftpfs.cache.remote import RemoteStore, WriteStore
 from mavftpfs.cache.replace import Replacer
