@@ -22,6 +22,7 @@ from mavftpfs.cache.context import Context
 from mavftpfs.cache.names import Names
 from mavftpfs.cache.remote import UploadSource
 from mavftpfs.cache.reserved import Places
+from mavftpfs.protocol.payload import NakCode
 from mavftpfs.shared.errnos import errno_for
 from mavftpfs.shared.errors import (
     AlreadyExists,
@@ -34,7 +35,6 @@ from mavftpfs.shared.model import split
 
 log = logging.getLogger("mavftpfs.cache")
 
-_FILE_EXISTS = 8
 _HONEST = frozenset({errno.EACCES, errno.EROFS, errno.ENOSPC, errno.ENAMETOOLONG})
 """Refusals that mean what they say; others do not tell whether the server replaces files at all."""
 
@@ -60,7 +60,7 @@ class Replacer:
         try:
             await self._names.rename(source, target)
         except FtpNak as nak:
-            if nak.code == _FILE_EXISTS:
+            if nak.code == NakCode.FILE_EXISTS:
                 raise AlreadyExists(f"{target!r} was made by somebody else in the meantime") from nak
             raise
 
@@ -142,7 +142,7 @@ class Replacer:
         except FtpNak as nak:
             if errno_for(nak) in _HONEST:
                 raise
-            if nak.code == _FILE_EXISTS:  # an errno may be a stale one
+            if nak.code == NakCode.FILE_EXISTS:  # an errno may be a stale one
                 traits.rename_replaces = False
             log.debug("the server does not rename %r over %r: %s", source, target, nak)
             return False

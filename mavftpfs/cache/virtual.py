@@ -24,6 +24,7 @@ from mavftpfs.cache.openfile import ReadOnlyHandle
 from mavftpfs.cache.options import CacheOptions
 from mavftpfs.cache.remote import RemoteStore
 from mavftpfs.cache.singleflight import SingleFlight
+from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.shared.errors import (
     DataUnproven,
     FtpNak,
@@ -59,9 +60,6 @@ before gets the bytes of that size."""
 
 MAX_SIZES = 4096
 """Of how many files the true size is remembered."""
-
-_OPEN_FILE_RO = 4
-_FILE_NOT_FOUND = 10
 
 
 def is_snapshot(path: bytes) -> bool:
@@ -382,7 +380,7 @@ class VirtualTrees:
         try:
             data = await self._store.read_whole(path, self._options.at_file_limit)
         except FtpNak as nak:
-            if nak.opcode == _OPEN_FILE_RO:
+            if nak.opcode == Opcode.OPEN_FILE_RO:
                 self._refused(path, nak)
             raise
         now = self._clock()
@@ -402,7 +400,7 @@ class VirtualTrees:
         """
         if tree_of(path) in UNLISTABLE:
             self._dentries.note_absent(path, self._clock() + self._options.proof_time)
-        elif nak.code == _FILE_NOT_FOUND:
+        elif nak.code == NakCode.FILE_NOT_FOUND:
             self._unlisted.add(path)
         else:
             return
