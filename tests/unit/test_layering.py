@@ -32,8 +32,7 @@ LAYERS: dict[str, set[str]] = {
 """Layer -> the layers below it that it may import. The modules at the top are not here: see TOP."""
 
 CONTRACTS = {"cache.remote": {"session"}, "protocol.payload": {"cache"}}
-"""Modules which declare what their layer needs of another, or the numbers that refusals carry, and who may import
-them beside the layers above."""
+"""Modules that other layers may import, too: what the caches need of the session, and the refusals' names."""
 
 SIM_USERS = {"cli", "demo"}
 """Top-level modules (and packages of that name) that may know the simulator."""
