@@ -90,7 +90,8 @@ class ChunkSize:
         return self.size
 
     def on_answered(self, size: int, count: int, sent_at: float, now: float) -> None:
-        """So many requests for `size` bytes each, sent then, were answered."""
+        """Requests for `size` bytes each, sent then, were answered: so many of them at the first attempt.
+        Others prove nothing: a server that is late answers full ones, too, in the end."""
         if size > self._least:
             if size >= self._shortest_lost:
                 self.trying, self._lost = False, 0

@@ -144,7 +144,7 @@ class ReadTransfer(Chunked):
         if reply.opcode == _NAK:
             self._on_nak(request, nak_of(request, reply))
             return
-        self.chunks.on_answered(request.size, 1, request.sent_at, now)
+        self.chunks.on_answered(request.size, int(request.sends == 1), request.sent_at, now)
         data = reply.data
         count = len(data)
         if count != request.size:

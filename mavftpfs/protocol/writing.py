@@ -210,7 +210,7 @@ class WriteTransfer(Chunked):
             self.fail(self._meaning(nak_of(request, reply)))
             return
         del self._unanswered[request]
-        self.chunks.on_answered(request.size, 1, request.sent_at, now)
+        self.chunks.on_answered(request.size, int(request.sends == 1), request.sent_at, now)
         if reply.offset and reply.offset == request.offset:
             self.port.traits.write_ack_offset = True
         count = request.size
