@@ -5,7 +5,7 @@ delivered stays held, and the next call goes on. While it runs the file is not w
 what is verified is what was sent. Uploads begin earlier, in the background, where that is of use.
 
 One way leads to the card: the whole file is sent under a reserved name, verified there, and renamed into
-place (`plan`, `replace`). Only cards that cannot rename get it under its own name.
+place (`draft`, `replace`). Only cards that cannot rename get it under its own name.
 """
 
 from __future__ import annotations
@@ -19,10 +19,9 @@ import trio
 from mavftpfs.cache import base
 from mavftpfs.cache.cleaner import Cleaner
 from mavftpfs.cache.context import Context
-from mavftpfs.cache.draft import Draft, Event, State
+from mavftpfs.cache.draft import SENDING, Draft, Event, Plan, State, choose
 from mavftpfs.cache.names import Names
 from mavftpfs.cache.nodes import Attempt, Node
-from mavftpfs.cache.plan import SENDING, Plan, choose
 from mavftpfs.cache.recovery import describe
 from mavftpfs.cache.replace import Replacer
 from mavftpfs.cache.throttle import Throttle

@@ -4,9 +4,11 @@ A draft lies over a base: the file as it is on the vehicle. Each byte below `siz
 it), else *base* (below `base_limit`: the vehicle has it), else zero: the content between the old end and a
 write beyond it, or of a file that was extended.
 
-All handles of a path share its draft. Its state, and what may happen next, is in one table: `TRANSITIONS`.
-What is delivered is always the whole draft, as a new file under a reserved name (`delivery`). A write while
-that file is sent joins it; once it is being renamed into place, writers wait for the end of that.
+All handles of a path share its draft. Its state, and what may happen next, is in one table: `TRANSITIONS`;
+the next step that brings it to the vehicle is `choose`. Whatever changes a file's content is sent as a whole
+new file under a reserved name beside it, verified there, and renamed into place (`delivery`). Only on cards
+that cannot rename it is sent under its own name. A write while that file is sent joins it; once it is being
+renamed into place, writers wait for the end of that.
 """
 
 from __future__ import annotations
@@ -17,8 +19,9 @@ from enum import Enum
 from typing import Protocol
 
 from mavftpfs.cache.sending import Sending
-from mavftpfs.shared.errors import LocalProtocolError
+from mavftpfs.shared.errors import FileChanged, LocalProtocolError, NotSupported
 from mavftpfs.shared.extents import ExtentSet
+from mavftpfs.shared.traits import WriteTraits
 
 STEP = 64 * 1024
 """Bytes read from the spool at once for a checksum."""
@@ -362,3 +365,49 @@ class Draft:
         self._changed.add(start, stop)
         if self.sending is not None:
             self.sending.on_write(start, stop)
+
+
+# --- the next step
+
+
+class Plan(Enum):
+    """One step.
+
+    NOTHING: the vehicle has it. MEND: have an interrupted replacement completed or undone. FETCH: get what
+    only the vehicle has of the old content. FIND_OUT: see whether the card can rename. REPLACE: send it under
+    a reserved name and rename it. OVERWRITE: send it under its own name.
+    """
+
+    NOTHING = "nothing"
+    MEND = "mend"
+    FETCH = "fetch"
+    FIND_OUT = "find out"
+    REPLACE = "replace"
+    OVERWRITE = "overwrite"
+
+
+SENDING = frozenset({Plan.REPLACE, Plan.OVERWRITE})
+"""Steps that send bytes."""
+
+
+def choose(draft: Draft, traits: WriteTraits, *, inplace: bool) -> Plan:
+    """Return the next step for a draft, by what the server was seen to do. inplace: overwrite files where they
+    cannot be replaced.
+
+    Raises:
+        FileChanged: the base is another file now.
+        NotSupported: the card cannot rename, and `inplace` was not given.
+    """
+    if draft.state is State.CLEAN:
+        return Plan.NOTHING
+    if draft.state is State.STALE:
+        raise FileChanged("others replaced the file on the vehicle while it was changed here")
+    if draft.state is State.TORN:
+        return Plan.MEND
+    if traits.rename_works is False and draft.base is not None and not inplace and not draft.begun:
+        raise NotSupported("this server cannot rename, so a file cannot be replaced safely; see inplace")
+    if not draft.whole:
+        return Plan.FETCH
+    if traits.rename_works is None:
+        return Plan.FIND_OUT
+    return Plan.REPLACE if traits.rename_works else Plan.OVERWRITE

@@ -15,9 +15,8 @@ from dataclasses import dataclass, field
 
 import trio
 
-from mavftpfs.cache.draft import Draft, State
+from mavftpfs.cache.draft import Draft, Plan, State
 from mavftpfs.cache.files import FileHandle
-from mavftpfs.cache.plan import Plan
 from mavftpfs.cache.remote import Upload
 from mavftpfs.cache.reserved import Places
 from mavftpfs.cache.sending import Sending

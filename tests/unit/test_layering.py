@@ -55,7 +55,6 @@ PURE_MODULES = {
     "cache.repair",
     "cache.reserved",
     "cache.draft",
-    "cache.plan",
     "cache.sending",
     "fuse.inodes",
     "fuse.handles",

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from mavftpfs.cache.draft import Base, Draft, State
-from mavftpfs.cache.plan import Plan, choose
+from mavftpfs.cache.draft import Base, Draft, Plan, State, choose
 from mavftpfs.shared.errors import FileChanged, NotSupported
 from mavftpfs.shared.traits import WriteTraits
 from tests.unit.test_draft import Bytes
