@@ -391,8 +391,9 @@ SENDING = frozenset({Plan.REPLACE, Plan.OVERWRITE})
 
 
 def choose(draft: Draft, traits: WriteTraits, *, inplace: bool) -> Plan:
-    """Return the next step for a draft, by what the server was seen to do. inplace: overwrite files where they
-    cannot be replaced.
+    """Return the next step for a draft, by what the server was seen to do.
+
+    inplace: overwrite files where they cannot be replaced.
 
     Raises:
         FileChanged: the base is another file now.
