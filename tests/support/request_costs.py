@@ -60,12 +60,14 @@ ELSEWHERE = {
     "ardupilot5": {
         **FAT,
         MOUNT: "list 4",
-        "first append": "list 6, open 2, create 2, read 2, write 2, close 4, crc 1, rename 4, remove 2; 602 B",
+        "first append": "list 6, open 2, create 2, read 2, write 2, close 4, crc 1, rename 4, remove 2;"
+        " 602 B",
         "echo >>": f"{TIMED}, {REPLACED}; 602 B",
     },
     "mavsdk": {
         MOUNT: "list 2",
-        "first append": "list 2, open 2, create 2, read 2, write 2, close 4, crc 1, rename 2, remove 1; 602 B",
+        "first append": "list 2, open 2, create 2, read 2, write 2, close 4, crc 1, rename 2, remove 1;"
+        " 602 B",
         "echo >>": f"{TIMED}, rename 1; 602 B",
         "rm -r": "list 1, remove 10, rmdir 1",
     },
