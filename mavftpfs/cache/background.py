@@ -22,7 +22,7 @@ from mavftpfs.cache.nodes import Node
 from mavftpfs.cache.replace import Replacer
 from mavftpfs.cache.throttle import Throttle
 from mavftpfs.shared.errnos import errno_for
-from mavftpfs.shared.errors import MavftpfsError
+from mavftpfs.shared.errors import Armed, MavftpfsError
 
 log = logging.getLogger("mavftpfs.cache")
 
@@ -107,7 +107,8 @@ class Background:
             node.background = await self._deliverer.begin(node)
         except MavftpfsError as error:
             node.start_after = self._context.clock() + START_PAUSE
-            log.info("%r is not sent just now: %s", node.path, error)
+            level = logging.DEBUG if isinstance(error, Armed) else logging.INFO  # one line is enough for all
+            log.log(level, "%r is not sent just now: %s", node.path, error)
         finally:
             node.starting = False
             self._throttle.let_go()
