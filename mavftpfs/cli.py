@@ -87,7 +87,8 @@ def _run(words: list[str]) -> int:
     name = words[0] if words else ""
     if name in _COMMANDS:
         make_parser, run = _COMMANDS[name]
-        return run(make_parser(name).parse_args(words[1:]))
+        # also `ls SOURCE -l PATH`: parse_args takes no PATH... after an option that follows SOURCE
+        return run(make_parser(name).parse_intermixed_args(words[1:]))
     parser = _top_parser()
     if not words:
         parser.print_help(sys.stderr)

@@ -533,6 +533,15 @@ def _cut(block: list[Line], room: int) -> list[Line]:
     return [*block[: room - 1], Line(f"  … and {len(block) - room + 1} more lines")]
 
 
+def screen(lines: Sequence[str]) -> str:
+    """Return what draws the lines from the top of a terminal, the first line of each mount in bold.
+
+    All is erased before: behind a line as wide as the terminal an erasure takes its last character.
+    """
+    shown = (line if line.startswith(" ") else f"\x1b[1m{line}\x1b[m" for line in lines)
+    return "\x1b[H\x1b[J" + "\n".join(shown)
+
+
 def watch_status(fetch: Callable[[], Sequence[Status]], *, verbose: bool) -> None:
     """Show the status again each second until interrupted; on a terminal in place, on a screen of its own."""
     if not sys.stdout.isatty():
@@ -546,8 +555,7 @@ def watch_status(fetch: Callable[[], Sequence[Status]], *, verbose: bool) -> Non
             statuses = fetch()
             size = shutil.get_terminal_size()
             lines = panel(statuses, size.columns, size.lines, verbose=verbose)
-            shown = (line if line.startswith(" ") else f"\x1b[1m{line}\x1b[m" for line in lines)
-            sys.stdout.write("\x1b[H" + "\x1b[K\n".join(shown) + "\x1b[J")
+            sys.stdout.write(screen(lines))
             sys.stdout.flush()
             time.sleep(WATCH_PERIOD)
     finally:

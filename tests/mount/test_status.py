@@ -109,13 +109,16 @@ def watched(columns: int, rows: int, *words: str | Path) -> Iterator[int]:
             os.close(terminal)
 
 
+CLEAR = b"\x1b[H\x1b[J"
+
+
 def screens(terminal: int, count: int) -> list[list[str]]:
     """Return the lines of so many whole screens that were drawn, without colours."""
     drawn = b""
-    while drawn.count(b"\x1b[J") < count:
+    while drawn.count(CLEAR) <= count:  # the next one's beginning is the end of one
         drawn += os.read(terminal, 65536)
-    whole = drawn.decode().split("\x1b[J")[:count]
-    texts = [re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", screen.partition("\x1b[H")[2]) for screen in whole]
+    whole = drawn.split(CLEAR)[1 : count + 1]
+    texts = [re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", screen.decode()) for screen in whole]
     return [text.split("\r\n") for text in texts]
 
 

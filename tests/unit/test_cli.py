@@ -87,6 +87,7 @@ def test_the_documented_numbers() -> None:
         (("get", SOURCE, "/a/../b"), ".."),
         (("get", SOURCE, "mftp://comp=1:/a", "mftp://comp=2:/a"), "components"),
         (("ls", SOURCE, "mftp://comp=300:/a"), "300"),
+        (("ls", SOURCE, "-l", "mftp://comp=300:/a"), "'300' is not"),  # an option may stand between
         (("ls", SOURCE, "/", "-o", "uid=x"), "uid"),
         (("status", "a", "b"), "b"),
         (("put", SOURCE), "LOCAL"),

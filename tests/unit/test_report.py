@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import json
+import re
 from typing import Any
 
 import pytest
 
-from mavftpfs.report import NOTHING, delivery_line, panel, rows, snapshot, status_lines
+from mavftpfs.report import NOTHING, delivery_line, panel, rows, screen, snapshot, status_lines
 from mavftpfs.shared.readable import printable, readable_size, readable_time
 
 CONNECTION = {
@@ -121,6 +122,15 @@ def test_a_panel_fits_the_terminal(width: int, height: int, mounts: int) -> None
     assert all(len(line) <= width for line in shown)
     heads = [line for line in shown if "PX4 1/1" in line or "more mounts" in line or width == 20]
     assert len(heads) >= min(mounts, height)
+
+
+def test_nothing_is_erased_behind_a_line_as_wide_as_the_terminal() -> None:
+    lines = panel([{**status(), "mountpoint": f"/mnt/{'x' * 80}"}], 80, 24)
+    assert len(lines[0]) == 80
+    drawn = screen(lines)
+    # The cursor stays on the last character of a full line, and an erasure (J, K) begins at the cursor.
+    first_text = drawn.index(lines[0])
+    assert not re.search(r"\x1b\[[0-2]?[JK]", drawn[first_text:])
 
 
 def test_two_busy_mounts_share_a_terminal() -> None:
