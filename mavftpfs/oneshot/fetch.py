@@ -111,8 +111,12 @@ def next_read_size(size: int, took: float) -> int:
 
 
 def newest_first(logs: Iterable[Log]) -> list[Log]:
-    """Order logs: by time, then by their numbers; those without a time come last."""
-    return sorted(logs, key=lambda log: (log.mtime or 0, natural(log.below)), reverse=True)
+    """Order logs: by time, then by their numbers. Those without a time come last, then what is no log."""
+
+    def age(log: Log) -> tuple[bool, int, object]:
+        return not log.below.endswith(NO_LOG), log.mtime or 0, natural(log.below)
+
+    return sorted(logs, key=age, reverse=True)
 
 
 def select(logs: Sequence[Log], *, newest: int | None, since: float | None) -> list[Log]:
@@ -130,6 +134,8 @@ def natural(name: bytes) -> tuple[tuple[int, int, bytes], ...]:
     return tuple((1, int(part), b"") if part.isdigit() else (0, 0, part) for part in parts)
 
 
+NO_LOG = b"LASTLOG.TXT"
+"""ArduPilot keeps the number of its last log beside the logs. `sync --newest` is not to count it as one."""
 PART_SUFFIX = ".part"
 MAX_RETURNS = 20
 """How often a vehicle may vanish and return while one file is fetched."""

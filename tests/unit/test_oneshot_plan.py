@@ -66,6 +66,13 @@ def test_the_newest_come_first_by_time_then_by_number() -> None:
     assert [one.below for one in fetch.newest_first(logs)] == [b"b", b"c", b"a", b"s/log10", b"s/log9"]
 
 
+def test_the_newest_log_is_not_the_file_that_holds_its_number() -> None:
+    for time in (None, JUNE):  # ArduPilot without and with times
+        logs = [log(b"00000001.BIN", time and MAY), log(b"LASTLOG.TXT", time), log(b"00000002.BIN", time)]
+        ordered = [one.below for one in fetch.newest_first(logs)]
+        assert ordered == [b"00000002.BIN", b"00000001.BIN", b"LASTLOG.TXT"]
+
+
 def test_numbers_are_compared_as_numbers_wherever_they_stand() -> None:
     names = [b"10.BIN", b"9.BIN", b"a1b2", b"a1b10", b"a", b"", b"00000002.BIN"]
     ordered = [b"", b"00000002.BIN", b"9.BIN", b"10.BIN", b"a", b"a1b2", b"a1b10"]
