@@ -319,6 +319,9 @@ def recover(args: Args) -> int:
         _list_kept(recovering.kept_below(base), as_json=args.json)
         return ExitCode.OK
     wanted = recovering.kept_below(base) if args.all else recovering.chosen(args.names, base)
+    if args.all and not wanted:
+        _list_kept(wanted, as_json=False)
+        return ExitCode.OK
     if not wanted:
         raise UsageError("say which files: their names as `mavftpfs recover` lists them, or --all")
     bar = progress.Progress()

@@ -261,6 +261,16 @@ def test_status_of_nothing(sockets: Path, tmp_path: Path, capsys: pytest.Capture
     assert "no vehicle" in capsys.readouterr().out
 
 
+def test_nothing_to_put_back_is_no_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    assert cli.main(["recover", SOURCE, "--all"]) == 0
+    assert capsys.readouterr().out == "everything that was written reached its vehicle\n"
+    _, line = complaint(capsys, "recover", SOURCE)
+    assert "say which files" in line
+
+
 def test_a_dead_mount_s_socket_is_swept(sockets: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = sockets / "dead.sock"
     with socket.socket(socket.AF_UNIX) as dead:
