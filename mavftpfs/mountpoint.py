@@ -25,6 +25,7 @@ from mavftpfs.fuse.options import SUBTYPE
 FUSE_DEVICE = "/dev/fuse"
 OUR_TYPE = f"fuse.{SUBTYPE}"
 MOUNT_TABLE = "/proc/self/mountinfo"
+FSTAB = "/etc/fstab"
 UNMOUNT_PATIENCE = 60.0
 """Seconds for an unmount: it waits for the last flush."""
 BUSY_PATIENCE = 1.0
@@ -110,6 +111,16 @@ def mounts(table: str = MOUNT_TABLE) -> dict[str, Mounted]:
             uid = re.search(r"(?:^|,)user_id=(\d+)", words)
             found[_unescape(columns[4])] = Mounted(kind, _unescape(source), int(uid[1]) if uid else None)
     return found
+
+
+def fstab_options(path: str, *, table: str = FSTAB) -> list[str]:
+    """Return the options that fstab has for a mountpoint, as its lines have them."""
+    try:
+        lines = Path(table).read_text(errors="surrogateescape").splitlines()
+    except OSError:
+        return []
+    found = (line.split() for line in lines)
+    return [words[3] for words in found if len(words) > 3 and _unescape(words[1]).rstrip("/") == path]
 
 
 def unmount(path: str, *, lazy: bool = False) -> None:

@@ -229,6 +229,10 @@ findmnt -n -t fuse.mavftpfs -o TARGET | grep -x "$3"
 mount -t fuse.mavftpfs | grep -c " on $3 type "
 mount -o remount,ro "$3" && touch "$3/new" 2>&1
 mount -o remount,rw "$3" && touch "$3/new" && echo written
+mount -o remount,dir_timeout=3 "$3" 2>&1 && echo taken
+printf '%s %s mavftpfs uid=1,dir_timeout=3 0 0\n' "$2" "$3" >"$1/fstab"
+mount --bind "$1/fstab" /etc/fstab
+mount -o remount,ro "$3" && touch "$3/new" 2>&1
 umount "$3"
 """
 
@@ -257,6 +261,8 @@ def test_mount_by_its_own_type_and_remount(field: Field, tmp_path: Path) -> None
         "1",
         f"touch: cannot touch '{mount.path}/new': Read-only file system",
         "written",
+        "mavftpfs: dir_timeout=3: remount changes only ro and rw; for other options unmount and mount anew",
+        f"touch: cannot touch '{mount.path}/new': Read-only file system",  # though fstab says more than ro
     ]
     wait_until("the daemon ended", lambda: not processes_in(mount.path))  # which has an empty file to deliver
     assert [path.name for path in card.iterdir()] == ["new"]
