@@ -41,6 +41,9 @@ LEAST = 4
 MOST, MOST_SERIAL = 2048, 16
 """The widest: 1 MB/s over 500 ms. At a serial port, whose receive buffers hold fewer, the second."""
 
+SERIAL_QUEUE = 0.1
+"""Seconds of answers, and two more, that may wait at a serial port: who lists a directory waits for them."""
+
 PROBE, SILENT = 2, 3
 """The window while nothing is heard; so many transmissions without any answer are a silence."""
 
@@ -94,8 +97,8 @@ after one that lost more than usual: then a short queue overflows."""
 PACE = 1.2
 """Requests go out at so many times the rate of answers at most, so that it can grow."""
 
-DEPTH, DEPTH_SECONDS = 3, 0.004
-"""Three may go out at once, or what the path takes in 4 ms."""
+DEPTH, DEPTH_SERIAL, DEPTH_SECONDS = 3, 2, 0.004
+"""Three may go out at once, at a serial port two, or what the path takes in 4 ms."""
 
 QUEUE_SHARE, QUEUE_MOST, QUEUE_LEAST = 0.15, 0.05, 0.005
 """A queue stands when the quickest answer of a round took longer than the base round trip: by 15 % of that or
@@ -113,6 +116,10 @@ RESERVE = 0.1
 BRIDGE = 0.4
 """Seconds for which requests go on while a server pauses: else it has nothing to do for a round trip after
 that. No silence that is longer is a pause."""
+
+BRIDGE_FROM = 0.03
+"""Seconds: below that round trip there is no reserve and no bridge. What a server's buffer holds lasts for
+that, and more only overflows it."""
 
 
 class Flow:
@@ -215,7 +222,8 @@ class Flow:
         pace = self._pace()
         if pace == inf:
             return room
-        self._tokens = min(max(DEPTH, pace * DEPTH_SECONDS), self._tokens + (now - self._tokens_at) * pace)
+        depth = DEPTH_SERIAL if self._serial else DEPTH
+        self._tokens = min(max(depth, pace * DEPTH_SECONDS), self._tokens + (now - self._tokens_at) * pace)
         self._tokens_at = now
         self._blocked = self._tokens < room
         return min(room, int(self._tokens))
@@ -244,7 +252,8 @@ class Flow:
         return 0.0 if self._probing else self._bold * RESERVE
 
     def _pauses_expected(self, now: float) -> bool:
-        return not self._serial and self._pacer is None and now < self._paused_at + PAUSES_SECONDS
+        far = self._base >= BRIDGE_FROM and not self._serial and self._pacer is None
+        return far and now < self._paused_at + PAUSES_SECONDS
 
     def next_room_at(self) -> float:
         """Return when there will be room without an answer; inf if that does not depend on time."""
@@ -377,7 +386,8 @@ class Flow:
             self._bold = self._bold * SHYER if shy else min(1.0, self._bold + BOLDER)
         if self._serial:
             back = shy or self._queued(1.5)
-            self.window = max(1, self.window - 1) if back else min(self.cap, self.window + 1)
+            most = int(self._rate * (self._base + SERIAL_QUEUE)) + 2
+            self.window = max(1, self.window - 1) if back else min(self.cap, self.window + 1, most)
             return
         if self._starting:
             self._flat = 0 if grown else self._flat + 1

@@ -9,7 +9,7 @@ import pytest
 import trio
 from trio.testing import MockClock
 
-from mavftpfs.shared.errors import AlreadyExists, LocalProtocolError
+from mavftpfs.shared.errors import AlreadyExists
 from mavftpfs.sim.profiles import PROFILES, Storage
 from tests.support.fake_writer import write_file
 from tests.support.mounting import mounted
@@ -26,9 +26,9 @@ async def test_a_new_name_empties_none_that_the_card_takes_for_it(profile: str, 
     world.tree.add(ONE, OLD)
     world.tree.add(b"/d/plain", NEW)
     async with mounted(world, b"/d") as (_, tree):
-        with pytest.raises(LocalProtocolError):
+        with pytest.raises(AlreadyExists):
             await tree.create(OTHER, exclusive=False)
-        with pytest.raises(LocalProtocolError):
+        with pytest.raises(AlreadyExists):
             await tree.rename(b"/d/plain", OTHER)
         await write_file(tree, THIRD, NEW)
         await write_file(tree, ONE, NEW)

@@ -113,7 +113,10 @@ TRANSFERS: dict[Direction, Callable[[World, bytes], Awaitable[float]]] = {"read"
 
 
 @pytest.mark.parametrize("direction", ["read", "write"])
-@pytest.mark.parametrize("profile", ["px4", "px4-nuttx", "ardupilot", "mavsdk"])
+@pytest.mark.parametrize(
+    "profile",
+    ["px4", *(pytest.param(name, marks=pytest.mark.soak) for name in ("px4-nuttx", "ardupilot", "mavsdk"))],
+)
 def test_the_last_percent_is_not_slow(profile: str, direction: Direction) -> None:
     link = LinkSettings(rate=RATE, delay=RTT / 2, loss=LOSS, queue=int(RATE / 2))
     directory = ROOTS.get(profile, b"") + b"/d"

@@ -146,6 +146,7 @@ async def test_nobody_waits_long_beside_a_copy(
     assert p95(waits) <= copy.allowed(frames)
 
 
+@pytest.mark.soak
 async def test_nor_after_minutes_of_it(autojump: MockClock) -> None:
     """What raises of the rate left in the link's queue passed for the way: 0.85 s where 0.4 are allowed."""
     copy = Copy("ardupilot", NEAR, before=80.0)
@@ -171,7 +172,7 @@ async def test_a_copy_that_goes_on_leaves_room_for_who_comes_next(profile: str, 
     ("kind", "frames", "link"),
     [
         pytest.param("read", 3, NEAR, id="read-near"),
-        pytest.param("ls", 2, NEAR, id="ls-near"),
+        pytest.param("ls", 2, NEAR, id="ls-near", marks=pytest.mark.soak),
         pytest.param("read", 3, FAR, id="read-far", marks=pytest.mark.soak),
     ],
 )

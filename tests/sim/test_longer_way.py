@@ -12,7 +12,7 @@ from trio.testing import MockClock
 from mavftpfs.sim.linkmodel import LinkSettings
 from tests.support.worlds import MemorySink, World
 
-SIZE = 4 << 20
+SIZE = 8 << 20
 
 
 @pytest.mark.parametrize(("rate", "loss"), [(3_000.0, 0.0), (10_000.0, 0.0), (3_000.0, 0.02)])
@@ -27,7 +27,7 @@ async def test_a_small_window_finds_out(rate: float, loss: float, autojump: Mock
         reader.want(0, SIZE, demand=True)
         await trio.sleep(20.0)
         world.model.settings = replace(world.model.settings, rate=60_000.0, delay=0.25)
-        await trio.sleep(30.0)
+        await trio.sleep(90.0)
         before = sink.have.total
         await trio.sleep(10.0)
         share = (sink.have.total - before) / (10.0 * 60_000.0 * 239 / 266 * (1 - loss))

@@ -52,8 +52,8 @@ def test_the_pauses_of_a_card_hardly_cost_a_reader_anything(rtt: float) -> None:
 @pytest.mark.parametrize(
     ("rate", "rtt", "share", "requests"),
     [
-        (1_000_000.0, 0.01, 0.94, 1.9),
-        (1_000_000.0, 0.1, 0.85, 2.2),
+        pytest.param(1_000_000.0, 0.01, 0.94, 1.9, marks=pytest.mark.soak),
+        pytest.param(1_000_000.0, 0.1, 0.85, 2.2, marks=pytest.mark.soak),
         (250_000.0, 0.1, 0.77, 1.6),
     ],
 )
@@ -75,9 +75,9 @@ def test_a_reserve_keeps_to_what_the_links_queue_holds(queue: int) -> None:
 @pytest.mark.parametrize(
     ("rate", "rtt", "jitter", "loss"),
     [
-        (625_000.0, 0.03, 0.005, 0.0),
-        (625_000.0, 0.03, 0.015, 0.03),
-        (1e6, 0.01, 0.01, 0.0),
+        pytest.param(625_000.0, 0.03, 0.005, 0.0, marks=pytest.mark.soak),
+        pytest.param(625_000.0, 0.03, 0.015, 0.03, marks=pytest.mark.soak),
+        pytest.param(1e6, 0.01, 0.01, 0.0, marks=pytest.mark.soak),
         (100_000.0, 0.05, 0.02, 0.0),
     ],
 )
@@ -92,6 +92,7 @@ def test_a_link_that_holds_each_packet_up_is_filled_too(
 
 
 @pytest.mark.parametrize("direction", ["read", "write"])
+@pytest.mark.soak
 @pytest.mark.parametrize(("reorder", "share", "requests"), [(0.1, 0.9, 1.1), (0.5, 0.65, 1.3)])
 def test_so_is_one_that_mixes_packets(
     reorder: float, share: float, requests: float, direction: Direction
@@ -103,7 +104,7 @@ def test_so_is_one_that_mixes_packets(
 
 
 @pytest.mark.parametrize("direction", ["read", "write"])
-@pytest.mark.parametrize("rate", [625_000.0, 1e6])
+@pytest.mark.parametrize("rate", [625_000.0, pytest.param(1e6, marks=pytest.mark.soak)])
 def test_nor_does_that_flood_a_short_queue(rate: float, direction: Direction) -> None:
     """A window three times as wide lost 60 % of what it asked for, and everybody else's packets with it."""
     queue = int(rate * 0.014)

@@ -41,9 +41,8 @@ def test_writing_uses_a_faster_link(profile: str, rtt: float, loss: float) -> No
 @pytest.mark.parametrize(
     ("rtt", "seconds", "share"),
     [
-        (0.3, 20.0, 0.86),
+        (0.3, 60.0, 0.86),
         pytest.param(0.1, 60.0, 0.9, marks=pytest.mark.soak),
-        pytest.param(0.3, 60.0, 0.86, marks=pytest.mark.soak),
     ],
 )
 def test_the_pauses_of_a_card_cost_their_time_once(rtt: float, seconds: float, share: float) -> None:
@@ -65,11 +64,12 @@ def test_a_short_queue_does_not_overflow_and_telemetry_gets_through(
     assert result.share > 0.7
 
 
+@pytest.mark.soak
 def test_what_a_short_queue_loses_is_not_put_down_to_the_pauses_of_a_card() -> None:
     """All was, where the server answers faster than the link brings requests: the more was lost, the more
     went out, in some runs two thirds in vain, until the upload was given up."""
     case = Case("px4-nuttx", 100_000.0, 0.3, 0.0, "write")
-    results = [measure(case, 30.0, queue=SHORT_QUEUE, seed=seed) for seed in range(1, 5)]
+    results = [measure(case, 60.0, queue=SHORT_QUEUE, seed=seed) for seed in range(1, 3)]
     assert mean(result.share for result in results) >= 0.85
     assert mean(result.requests for result in results) <= 1.6
 
