@@ -37,9 +37,9 @@ log = logging.getLogger("mavftpfs.vehicle")
 
 Facts = Mapping[str, Any]
 
-PERIOD = 1.0
-"""Seconds between two looks at the connection."""
-RATE_SPAN = 5
+PERIOD = 0.25
+"""Seconds between two looks at the connection: a heartbeat holds until the next, about a second."""
+RATE_SPAN = 20
 """Looks over which the traffic on the link is averaged."""
 SILENCE = 5.0
 """Seconds without heartbeats after which the vehicle counts as lost for people."""
@@ -63,7 +63,7 @@ def snapshot(connection: Facts, cache: Facts, traffic: float | None, *, when_arm
         ),
         "held": {
             "files": cache.get("files_undelivered", 0),
-            "bytes": cache.get("bytes_held", 0),
+            "bytes": cache.get("bytes_undelivered", 0),
             "bytes_on_disk": cache.get("bytes_held_on_disk", 0),
             "errors": dict(islice(cache.get("errors", {}).items(), MOST)),
         },
@@ -144,7 +144,7 @@ def _transfers(cache: Facts, *, moving: bool, writing: bool) -> list[dict[str, A
 
 
 class Watcher:
-    """Looks at a connection each second: logs each change that a pilot cares for, measures the traffic."""
+    """Looks at a connection: logs each change that a pilot cares for, measures the traffic."""
 
     def __init__(self, status: Callable[[], Facts], *, read_only_when_armed: bool) -> None:
         """`status`: Connection.status."""

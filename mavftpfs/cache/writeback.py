@@ -440,8 +440,9 @@ class Writeback:
             self._context.nursery.start_soon(self._background.link_back)
 
     def status(self) -> dict[str, object]:
-        """Return counters; bytes_... in bytes."""
+        """Return counters; bytes_... in bytes. `undelivered`: of whole files; `held`: what they take here."""
         nodes = list(self._context.nodes)
+        sizes = [node.draft.size for node in nodes if node.undelivered and node.draft is not None]
         errors = {n.path: str(n.error) for n in nodes if n.error is not None}
         return {
             "bytes_held": self._spool.bytes_held,
@@ -450,6 +451,7 @@ class Writeback:
             "dirty_max": self._throttle.limit,
             "write_rate": self._throttle.meter.rate,
             "files_undelivered": len(self.undelivered()),
+            "bytes_undelivered": sum(sizes),
             "transfers": self._throttle.transfers(),
             "errors": {path.decode(errors="replace"): text for path, text in errors.items()},
             "files_delivered": self._deliverer.delivered,

@@ -95,12 +95,13 @@ def test_arming_in_mid_copy_refuses_and_disarming_delivers(field: Field, profile
     assert (card / "APM" / "old.txt").read_text() == "old\n"
     status = json.loads(mount.run(sys.executable, "-m", "mavftpfs", "status", mount.path, "--json").stdout)
     assert status["vehicle"]["armed"] is True
-    assert status["held"]["files"] == 1
+    assert (status["held"]["files"], status["held"]["bytes"]) == (1, taken)
     (transfer,) = status["transfers"]
     assert (transfer["path"], transfer["size"]) == ("/APM/flight.bin", taken)
     assert (transfer["direction"], transfer["state"]) == ("write", "waiting")
     assert 0 <= transfer["done"] < taken
     assert "flight.bin" in mount.run(sys.executable, "-m", "mavftpfs", "status", mount.path).stdout
+    wait_until("the log says so", lambda: "is armed" in mount.alive().text())
     vehicle.send_signal(signal.SIGUSR1)
     expected = BLOCK * (taken // len(BLOCK))
     place = card / "APM" / "flight.bin"

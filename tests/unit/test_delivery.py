@@ -235,6 +235,7 @@ async def test_an_error_is_told_at_every_close_until_the_bytes_are_there(
             await ask()
     assert tree.undelivered() == [b"/card/new"]
     assert tree.status()["errors"] == {"/card/new": "no heartbeat"}
+    assert tree.status()["bytes_undelivered"] == len(NEW)
     reader = await tree.open(b"/card/new")
     await reader.flush()
     await reader.release()

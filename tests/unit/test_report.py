@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import logging
 import re
 from typing import Any
 
 import pytest
+import trio
 
-from mavftpfs.report import NOTHING, delivery_line, panel, rows, screen, snapshot, status_lines
+from mavftpfs.report import NOTHING, Watcher, delivery_line, panel, rows, screen, snapshot, status_lines
 from mavftpfs.shared.readable import printable, readable_size, readable_time
 
 CONNECTION = {
@@ -64,7 +66,7 @@ def test_what_moves_comes_next_and_then_what_is_held_back() -> None:
         "transfers": [WRITE, waiting],
         "write_rate": 300.0,
         "files_undelivered": 3,
-        "bytes_held": 4096,
+        "bytes_undelivered": 4096,
         "errors": {"/b": "the card is full", "/c": "no"},
     }
     assert lines(None, cache)[1:] == [
@@ -104,8 +106,21 @@ def test_a_mount_that_cannot_be_asked_is_a_line() -> None:
     assert [line.fitted() for line in status_lines(dead, verbose=True)] == ["/mnt/a: DEAD: gone"]
 
 
+async def test_what_holds_from_one_heartbeat_to_the_next_is_logged(
+    autojump_clock: object, caplog: pytest.LogCaptureFixture
+) -> None:
+    def facts() -> dict[str, Any]:
+        return {**CONNECTION, "armed": 0.05 < trio.current_time() - began < 0.95}
+
+    caplog.set_level(logging.INFO, "mavftpfs")
+    began = trio.current_time()
+    with trio.move_on_after(3):
+        await Watcher(facts, read_only_when_armed=False).run()
+    assert caplog.messages == ["vehicle 1/1 is armed", "vehicle 1/1 is disarmed"]
+
+
 def test_a_delivery_says_what_it_waits_for() -> None:
-    cache = {"transfers": [WRITE], "write_rate": 300.0, "files_undelivered": 1, "bytes_held": 4096}
+    cache = {"transfers": [WRITE], "write_rate": 300.0, "files_undelivered": 1, "bytes_undelivered": 4096}
     assert delivery_line(status(None, cache)) == "delivering 1 file, 3.1 kB of 4.1 kB, 300 B/s, 3.4 s left"
     lost = delivery_line(status({"lost": True}, {**cache, "transfers": [{**WRITE, "sending": False}]}))
     assert lost == "delivering 1 file, 3.1 kB of 4.1 kB, until the vehicle is back"
@@ -115,7 +130,7 @@ def test_a_delivery_says_what_it_waits_for() -> None:
 @pytest.mark.parametrize(("width", "height"), [(80, 24), (200, 50), (40, 5), (20, 2)])
 @pytest.mark.parametrize("mounts", [1, 2, 7])
 def test_a_panel_fits_the_terminal(width: int, height: int, mounts: int) -> None:
-    cache = {"reads": [READ] * 9, "rate": 5100.0, "files_undelivered": 2, "bytes_held": 4096}
+    cache = {"reads": [READ] * 9, "rate": 5100.0, "files_undelivered": 2, "bytes_undelivered": 4096}
     statuses = [{**status(None, cache), "mountpoint": f"/mnt/{'x' * 30}/{n}"} for n in range(mounts)]
     shown = panel(statuses, width, height)
     assert len(shown) <= height
