@@ -55,6 +55,7 @@ def test_ls(vehicle: SimVehicle, small_tree: Path) -> None:
     }
 
 
+@pytest.mark.holds("promise 1")
 def test_get_is_verified(vehicle: SimVehicle, small_tree: Path, tmp_path: Path) -> None:
     out, _ = mavftpfs("get", vehicle.source, "/sizes/35850.bin", "/README.txt", "--to", tmp_path)
     assert [line.partition(": ")[2] for line in out.splitlines()] == [

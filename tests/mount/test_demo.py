@@ -80,6 +80,7 @@ def test_the_demo_shows_the_tour_and_cleans_up(place: Path, tmp_path: Path) -> N
     assert_nothing_is_left(place)
 
 
+@pytest.mark.holds("fault cancel")
 @pytest.mark.parametrize(
     ("moment", "number"),
     [("mavftpfs udpin", signal.SIGINT), ("cp drone", signal.SIGTERM), ("sed -i", signal.SIGINT)],

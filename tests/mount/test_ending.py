@@ -64,6 +64,7 @@ def end_of(reader: subprocess.Popen[str], mount: Mount) -> tuple[int, str]:
     return reader.returncode, errors.splitlines()[-1] if errors else ""
 
 
+@pytest.mark.holds("fault cancel")
 @pytest.mark.parametrize("how", ["SIGINT", "SIGTERM", "fusermount3", "umount", "command"])
 def test_each_way_to_end_a_mount_is_clean(field: Field, big_tree: Path, how: str) -> None:
     mount = field.mount(field.sim(big_tree).source)
@@ -80,6 +81,7 @@ def test_each_way_to_end_a_mount_is_clean(field: Field, big_tree: Path, how: str
     assert not mounted_at(mount.path)
 
 
+@pytest.mark.holds("fault cancel")
 def test_a_signal_while_a_file_is_read_ends_both(field: Field, big_tree: Path) -> None:
     mount = field.mount(field.sim(big_tree).source)
     reader = start_reading(mount)
@@ -89,6 +91,7 @@ def test_a_signal_while_a_file_is_read_ends_both(field: Field, big_tree: Path) -
     wait_until("the mount is gone", lambda: not mounted_at(mount.path))
 
 
+@pytest.mark.holds("promise 4", "fault silence")
 @pytest.mark.parametrize("kind", ["px4", "mavsdk-server"])
 def test_a_killed_vehicle_is_an_error_in_time_and_comes_back(field: Field, big_tree: Path, kind: str) -> None:
     vehicle: UdpVehicle = field.mavsdk(big_tree) if kind == "mavsdk-server" else field.sim(big_tree, kind)
@@ -118,6 +121,7 @@ def readable(mount: Mount, name: str, content: str) -> bool:
     return mount.run("cat", mount.path / name, code=None, timeout=SILENCE).stdout == content
 
 
+@pytest.mark.holds("promise 5")
 def test_an_open_file_survives_a_vehicle_that_was_gone(field: Field, small_tree: Path) -> None:
     vehicle = field.sim(small_tree)
     mount = field.mount(vehicle.source, "dir_timeout=0", "attr_timeout=0")
@@ -137,6 +141,7 @@ def test_an_open_file_survives_a_vehicle_that_was_gone(field: Field, small_tree:
     assert bytes.fromhex(out) == (small_tree / "sizes/35850.bin").read_bytes()
 
 
+@pytest.mark.holds("fault silence")
 def test_a_link_that_is_silent_for_seconds_costs_nothing_but_time(field: Field, big_tree: Path) -> None:
     content = bytes(range(256)) * 1600
     (big_tree / "middle.bin").write_bytes(content)
@@ -155,6 +160,7 @@ def test_a_link_that_is_silent_for_seconds_costs_nothing_but_time(field: Field, 
     assert (child.returncode, out, errors) == (0, "True\n", "")
 
 
+@pytest.mark.holds("promise 4")
 def test_ctrl_c_of_a_blocked_cat_returns(field: Field, big_tree: Path) -> None:
     vehicle = field.sim(big_tree)
     mount = field.mount(vehicle.source, *QUICK)

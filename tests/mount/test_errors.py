@@ -127,6 +127,7 @@ def test_no_arguments_is_exit_1_with_help() -> None:
     assert "usage" in (done.stdout + done.stderr).lower()
 
 
+@pytest.mark.holds("rule 14.33")
 def test_a_path_too_long_for_the_wire_is_enametoolong(field: Field, tmp_path: Path) -> None:
     root = tmp_path / "root"
     deep = root

@@ -55,6 +55,7 @@ def mounted(request: pytest.FixtureRequest, module_field: Field) -> tuple[Mount,
     return module_field.mount(place.vehicle.source, *place.options), place
 
 
+@pytest.mark.holds("promise 2")
 @pytest.mark.parametrize("job", FEW)
 def test_fio_reads_back_what_it_wrote(mounted: tuple[Mount, Place], job: str) -> None:
     run_fio(*mounted, job, 150_000)

@@ -58,6 +58,7 @@ def names(folder: Path) -> list[str]:
     return sorted(os.listdir(folder))
 
 
+@pytest.mark.holds("fault full card")
 @pytest.mark.parametrize("kind", KINDS)
 def test_what_does_not_fit_costs_nothing_that_was_there(
     root: Path, field: Field, kind: str, tmp_path: Path
@@ -82,6 +83,7 @@ def test_what_does_not_fit_costs_nothing_that_was_there(
     assert mount.read_bytes(shown / "old.bin") == NEW
 
 
+@pytest.mark.holds("fault full card")
 def test_room_that_comes_later_is_used(root: Path, field: Field, tmp_path: Path) -> None:
     mount, shown, card = mounted(field, "px4", root, "log.bin")
     source = tmp_path / "source.bin"

@@ -41,11 +41,13 @@ def liar(module_field: Field) -> Mount:
     return mount
 
 
+@pytest.mark.holds("promise 10")
 def test_only_usable_names_enter_the_tree(liar: Mount) -> None:
     out = liar.python("import os, sys; print(ascii(sorted(os.listdir(sys.argv[1]))))", liar.path / "names")
     assert out.strip() == ascii(sorted(GOOD_NAMES))
 
 
+@pytest.mark.holds("fault odd listing")
 def test_good_files_among_bad_names_are_readable(liar: Mount) -> None:
     for name in sorted(GOOD_NAMES):
         assert liar.read_bytes(liar.path / "names" / name) == GOOD
@@ -55,6 +57,7 @@ def test_a_whole_file_is_right(liar: Mount) -> None:
     assert liar.read_bytes(liar.path / "fine.bin") == FINE
 
 
+@pytest.mark.holds("promise 8")
 @pytest.mark.parametrize("directory", ["endless", "same"])
 def test_endless_listings_end_with_an_error(liar: Mount, directory: str) -> None:
     error = liar.errno_of("os.listdir(sys.argv[1])", liar.path / directory, timeout=120)
@@ -75,6 +78,7 @@ with concurrent.futures.ThreadPoolExecutor(len(sys.argv)) as pool:
 """
 
 
+@pytest.mark.holds("promise 1")
 def test_a_file_that_cannot_be_completed_is_an_error(liar: Mount) -> None:
     paths = [liar.path / "broken" / name for name in BROKEN]
     errors = liar.python(READ_ALL_AT_ONCE, *paths, timeout=120).split()
@@ -83,6 +87,7 @@ def test_a_file_that_cannot_be_completed_is_an_error(liar: Mount) -> None:
     assert liar.read_bytes(liar.path / "fine.bin") == FINE
 
 
+@pytest.mark.holds("fault NAK")
 @pytest.mark.parametrize("step", ["open", "read"])
 @pytest.mark.parametrize("code", NAKED)
 def test_every_refusal_has_an_errno(liar: Mount, step: str, code: int) -> None:
@@ -90,6 +95,7 @@ def test_every_refusal_has_an_errno(liar: Mount, step: str, code: int) -> None:
     assert error == REFUSALS[step].get(code, "EIO")
 
 
+@pytest.mark.holds("promise 1", "promise 10", "fault corrupt")
 def test_noise_and_forged_replies_change_nothing(field: Field) -> None:
     mount = field.mount(field.hostile("noise").source)
     assert mount.read_bytes(mount.path / "fine.bin") == FINE
@@ -97,12 +103,14 @@ def test_noise_and_forged_replies_change_nothing(field: Field) -> None:
         assert mount.read_bytes(mount.path / "names" / name) == GOOD
 
 
+@pytest.mark.holds("promise 1", "rule 14.12")
 def test_bytes_that_another_client_may_have_mixed_up_are_an_error(field: Field) -> None:
     mount = field.mount(field.hostile("rival").source, *QUICK)
     error = mount.errno_of("open(sys.argv[1], 'rb').read()", mount.path / "fine.bin", timeout=120)
     assert error in {"EIO", "ETIMEDOUT"}
 
 
+@pytest.mark.holds("promise 10")
 def test_an_impostor_beside_the_vehicle_changes_nothing(field: Field) -> None:
     """Somebody else sends heartbeats in the vehicle's name, and answers each read before it does."""
     port = free_udp_port()
@@ -139,6 +147,7 @@ def test_a_vehicle_that_never_answers_ftp_is_exit_2(field: Field) -> None:
     assert not mounted_at(mount.path)
 
 
+@pytest.mark.holds("promise 10")
 @pytest.mark.parametrize(("directory", "shown"), [("same", ["same_for_ever"]), ("refused", [])])
 def test_programs_end_with_an_error_where_a_directory_was_not_listed_to_its_end(
     liar: Mount, tmp_path: Path, directory: str, shown: list[str]

@@ -9,9 +9,13 @@ from __future__ import annotations
 import sys
 from contextlib import ExitStack
 
+import pytest
+
 from tests.mount.conftest import Field
 from tests.support.mounts import Mount
 from tests.support.vehicles import PROJECT
+
+pytestmark = pytest.mark.holds("promise 4")
 
 ROUNDS = 60
 ASKER = PROJECT / "tests/support/programs/asker.py"

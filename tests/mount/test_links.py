@@ -65,6 +65,7 @@ def test_a_link_that_listens_for_tcp(field: Field, small_tree: Path) -> None:
     compare(field.mount(f"tcpin:{HOST}:{port}"), small_tree)
 
 
+@pytest.mark.holds("fault overflow")
 @pytest.mark.parametrize("profile", ["px4-nuttx", "ardupilot"])
 def test_a_slow_half_duplex_radio(field: Field, tmp_path: Path, profile: str) -> None:
     card = field.local("card")
@@ -74,6 +75,7 @@ def test_a_slow_half_duplex_radio(field: Field, tmp_path: Path, profile: str) ->
     assert (tmp_path / "copy").read_bytes() == content(profile, 80_000)
 
 
+@pytest.mark.holds("promise 5", "fault reboot")
 @pytest.mark.parametrize(("kind", "what"), [("udpout", "cut"), ("tcpin", "reboot")])
 def test_a_cut_or_a_reboot_in_mid_copy(field: Field, tmp_path: Path, kind: str, what: str) -> None:
     card = field.local("card")
@@ -93,6 +95,7 @@ def test_a_cut_or_a_reboot_in_mid_copy(field: Field, tmp_path: Path, kind: str, 
     assert (tmp_path / "copy").read_bytes() == data
 
 
+@pytest.mark.holds("promise 5")
 def test_tcp_comes_back_after_the_vehicle_did(field: Field, small_tree: Path) -> None:
     vehicle = field.sim(small_tree, link=free_port_link("tcpin"))
     mount = field.mount(vehicle.source, "op_deadline=8")

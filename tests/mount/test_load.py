@@ -32,6 +32,7 @@ COPIES = {
 IN_SOAK = ("px4", "mavsdk")
 
 
+@pytest.mark.holds("promise 7")
 @pytest.mark.parametrize(
     "kind", [pytest.param(kind, marks=pytest.mark.soak if kind in IN_SOAK else ()) for kind in COPIES]
 )
@@ -93,6 +94,7 @@ def two_files(folder: Path, large: int) -> Path:
     return folder
 
 
+@pytest.mark.holds("promise 8")
 def test_memory_is_bounded_while_reading_ten_times_the_cache(field: Field, tmp_path: Path) -> None:
     cache, dirty_max = 2 * MIB, 8 * MIB
     card = two_files(field.local("card"), 16 * cache)
@@ -103,6 +105,7 @@ def test_memory_is_bounded_while_reading_ten_times_the_cache(field: Field, tmp_p
     assert after - before <= cache + SLACK
 
 
+@pytest.mark.holds("promise 8")
 def test_memory_is_bounded_while_writing_ten_times_dirty_max(field: Field) -> None:
     """What the vehicle does not provably have yet waits on the local disk."""
     cache, dirty_max = 2 * MIB, MIB
@@ -132,6 +135,7 @@ with concurrent.futures.ThreadPoolExecutor(len(names)) as pool:
 """
 
 
+@pytest.mark.holds("promise 8")
 def test_120_blocked_opens_do_not_freeze_df(field: Field, tree: Path) -> None:
     vehicle = field.sim(tree)
     mount = field.mount(vehicle.source, "dir_timeout=600")  # stat is to need nothing of the vehicle
@@ -151,6 +155,7 @@ def test_120_blocked_opens_do_not_freeze_df(field: Field, tree: Path) -> None:
     assert read == {name: (tree / "many" / name).read_bytes().hex() for name in names}
 
 
+@pytest.mark.holds("rule 14.7")
 @pytest.mark.parametrize("profile", ["px4", "ardupilot"])
 def test_several_files_are_read_at_once_over_one_session(
     field: Field, tree: Path, tmp_path: Path, profile: str

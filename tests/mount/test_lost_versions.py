@@ -8,6 +8,8 @@ import pytest
 
 from tests.mount.conftest import Field
 
+pytestmark = pytest.mark.holds("fault replaced file")
+
 PROGRAM = """
 import errno, os, sys, time
 path, card = sys.argv[1:]

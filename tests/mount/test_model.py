@@ -39,6 +39,7 @@ def run_lockstep(field: Field, kind: str, link: Sequence[str], seed: int, count:
     assert list(differing(bytes(local), bytes(place.card))) == [], said
 
 
+@pytest.mark.holds("promise 2")
 @pytest.mark.parametrize("kind", MAIN)
 def test_random_calls_do_what_a_local_disk_does(field: Field, kind: str) -> None:
     run_lockstep(field, kind, (*FLAWS, *DELAY, "--loss", "0.001"), seed=1, count=150, limit=120)

@@ -151,6 +151,7 @@ def test_a_subtree_can_be_mounted(field: Field, small_tree: Path) -> None:
     mount.run("diff", "-r", small_tree / "deep/d0", mount.path)
 
 
+@pytest.mark.holds("rule 14.15")
 @pytest.mark.parametrize("profile", ["px4", "ardupilot"])
 def test_bursts_give_the_same_bytes(field: Field, tree: Path, tmp_path: Path, profile: str) -> None:
     trace = tmp_path / "trace"

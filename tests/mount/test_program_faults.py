@@ -42,6 +42,7 @@ def source(tmp_path: Path) -> Path:
     return path
 
 
+@pytest.mark.holds("fault killed program")
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_killed_program_leaves_what_it_wrote(field: Field, kind: str, source: Path) -> None:
     """The kernel closes its files: what write() took arrives, as on a local disk."""
@@ -62,6 +63,7 @@ def test_a_killed_program_leaves_what_it_wrote(field: Field, kind: str, source: 
     assert (place.card / "killed.bin").read_bytes() == DATA
 
 
+@pytest.mark.holds("fault killed program")
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_copy_goes_on_over_a_restart_of_the_vehicle(field: Field, kind: str, source: Path) -> None:
     place = start_place(field, kind, SLOW)

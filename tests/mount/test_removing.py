@@ -15,6 +15,7 @@ SIZE = 200_000
 """Takes over a minute on that link: more than a change of names waits for anything."""
 
 
+@pytest.mark.holds("fault overlap")
 @pytest.mark.parametrize("command", ["rm", "mv"])
 def test_the_name_goes_while_cp_waits_for_the_card(field: Field, command: str) -> None:
     """cp is in its close(), and is told that all is well: nothing is owed for a file without a name."""

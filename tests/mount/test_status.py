@@ -217,6 +217,7 @@ def open_way_to(mount: Mount) -> None:
         path.chmod(0o755)
 
 
+@pytest.mark.holds("promise 10")
 def test_another_user_is_told_in_a_line(
     field: Field, small_tree: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

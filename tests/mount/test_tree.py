@@ -63,6 +63,7 @@ def scene(request: pytest.FixtureRequest, module_field: Field, tree: Path, tree_
     return Scene(expected, module_field.mount(vehicle.source, "ro"), vehicle)
 
 
+@pytest.mark.holds("rule 14.32")
 def test_a_slow_server_gives_the_whole_tree_too(field: Field, tree: Path) -> None:
     mount = field.mount(field.sim(tree, "ardupilot").source)
     mount.run(sys.executable, "-m", "tests.support.trees", "compare", tree, mount.path, timeout=240)
@@ -81,6 +82,7 @@ def local_copy_differs(expected: Path, actual: Path) -> str:
     ).stdout
 
 
+@pytest.mark.holds("promise 1", "rule 14.36")
 def test_walk_finds_the_same_names_sizes_and_bytes(scene: Scene) -> None:
     command = (sys.executable, "-m", "tests.support.trees", "compare", scene.expected, scene.path)
     scene.mount.run(*command, timeout=240)
@@ -172,11 +174,13 @@ WRITES = (
 )
 
 
+@pytest.mark.holds("promise 3")
 @pytest.mark.parametrize("scene", ["px4"], indirect=True)
 def test_a_read_only_mount_refuses_every_change(scene: Scene) -> None:
     assert {scene.mount.errno_of(code, scene.path) for code in WRITES} == {"EROFS"}
 
 
+@pytest.mark.holds("rule 14.30")
 def test_what_is_not_there_is_enoent(scene: Scene) -> None:
     for name in ("nothing", "sizes/nothing", "nothing/below", "README.txtx"):
         assert scene.mount.errno_of("os.stat(sys.argv[1])", scene.path / name) == "ENOENT"

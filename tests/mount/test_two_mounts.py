@@ -59,6 +59,7 @@ def check(child: subprocess.Popen[str], card: Path) -> int:
 OTHERS = ("px4", "px4-nuttx", "ardupilot", "ardupilot5")
 
 
+@pytest.mark.holds("fault two mounts")
 @pytest.mark.parametrize("kind", ["mavsdk", *(pytest.param(kind, marks=pytest.mark.soak) for kind in OTHERS)])
 def test_two_mounts_at_once_confirm_nothing_wrong(field: Field, kind: str) -> None:
     root = field.local("card")

@@ -23,6 +23,7 @@ def ardupilot(request: pytest.FixtureRequest, module_field: Field, small_tree: P
     return module_field.mount(module_field.sim(small_tree, request.param).source)
 
 
+@pytest.mark.holds("fault growing file")
 def test_sys_files_are_whole_although_their_sizes_lie(ardupilot: Mount) -> None:
     for name, data in FILLED.items():
         path = ardupilot.path / "@SYS" / name

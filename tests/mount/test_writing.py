@@ -83,6 +83,7 @@ def brought(kind: str, tiny_tree: Path, tmp_path_factory: pytest.TempPathFactory
     return copy
 
 
+@pytest.mark.holds("promise 2")
 def test_cp_and_tar_bring_a_tree(twins: Twins, brought: Path, tmp_path: Path) -> None:
     archive = tmp_path / "tree.tar"
     subprocess.run(["tar", "-cf", archive, "-C", brought, "sizes", "names", "deep"], check=True, timeout=60)
@@ -137,6 +138,7 @@ def python(name: str, *args: str) -> str:
     return " ".join([sys.executable, str(PROGRAMS / name), *args])
 
 
+@pytest.mark.holds("promise 2")
 @pytest.mark.parametrize("step", EDITS)
 def test_small_edits(twins: Twins, step: str) -> None:
     twins.both(EDITS[step])
@@ -203,6 +205,7 @@ def test_open_flags(twins: Twins) -> None:
     assert len(printed.splitlines()) == 3 * 12 * 3
 
 
+@pytest.mark.holds("promise 2")
 def test_many_writers_at_once(twins: Twins, brought: Path) -> None:
     assert twins.both(python("crowd.py")) == "[]\n"
     script = 'cp -r "$1"/sizes a & first=$!; cp -r "$1"/names b; wait $first; cp -r b c & cksum a/*.bin; wait'

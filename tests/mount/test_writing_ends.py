@@ -74,6 +74,7 @@ def said(writer: subprocess.Popen[str], mount: Mount) -> dict[str, list[str]]:
     return found
 
 
+@pytest.mark.holds("promise 9")
 @pytest.mark.parametrize("profile", ["px4", "ardupilot"])
 def test_arming_in_mid_copy_refuses_and_disarming_delivers(field: Field, profile: str) -> None:
     card = field.local("card")
@@ -125,6 +126,7 @@ CHANGES = (
 )
 
 
+@pytest.mark.holds("promise 9")
 def test_when_armed_ok_writes_in_flight(field: Field) -> None:
     card = field.local("card")
     mount = field.mount(field.sim(card, "px4", ("--armed",)).source, "when_armed=ok")
@@ -165,6 +167,7 @@ def told(process: Process) -> Path:
     return recovered(process.text())
 
 
+@pytest.mark.holds("promise 3")
 def test_unmounting_with_undelivered_data_keeps_it(field: Field, data: Path) -> None:
     card = field.local("card")
     vehicle = field.sim(card)
@@ -216,6 +219,7 @@ def test_what_the_vehicle_refuses_does_not_put_off_the_end(field: Field, data: P
     assert list(card.iterdir()) == []
 
 
+@pytest.mark.holds("promise 3")
 def test_unmounting_waits_for_a_vehicle_that_comes_back(field: Field, data: Path) -> None:
     card = field.local("card")
     vehicle = field.sim(card)
@@ -232,6 +236,7 @@ def test_unmounting_waits_for_a_vehicle_that_comes_back(field: Field, data: Path
     assert sorted(path.name for path in card.iterdir()) == ["confirmed", "lost.bin"]
 
 
+@pytest.mark.holds("promise 3")
 def test_whoever_unmounts_second_waits_for_the_delivery_too(field: Field, data: Path) -> None:
     card = field.local("card")
     vehicle = field.sim(card)
@@ -251,6 +256,7 @@ def test_whoever_unmounts_second_waits_for_the_delivery_too(field: Field, data: 
     assert (card / "lost.bin").read_bytes() == data.read_bytes()
 
 
+@pytest.mark.holds("promise 3")
 def test_unmounting_what_a_killed_daemon_left_says_what_it_held(field: Field, data: Path) -> None:
     vehicle = field.sim(field.local("card"))
     vehicle.left_alone = True
@@ -267,6 +273,7 @@ def test_unmounting_what_a_killed_daemon_left_says_what_it_held(field: Field, da
     assert (place / "lost.bin").read_bytes() == data.read_bytes()
 
 
+@pytest.mark.holds("promise 3")
 def test_a_killed_daemon_loses_only_what_was_not_confirmed(field: Field, data: Path) -> None:
     card = field.local("card")
     (card / "replaced.bin").write_bytes(b"old" * 1000)

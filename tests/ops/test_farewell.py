@@ -66,6 +66,7 @@ async def test_what_cannot_be_delivered_is_kept_and_said(state: Path) -> None:
     assert os.fsdecode(directory).endswith("-udpin_0.0.0.0_14550")
 
 
+@pytest.mark.holds("promise 3")
 async def test_a_second_signal_ends_the_delivery_and_not_the_keeping() -> None:
     tree = Patient(left=[b"/a"], delays={"drain": 1e9})
     said: list[str] = []
@@ -94,6 +95,7 @@ def test_without_a_sane_state_home_it_is_below_home(monkeypatch: pytest.MonkeyPa
         assert farewell.state_directory(value) == Path.home() / ".local" / "state"
 
 
+@pytest.mark.holds("promise 3")
 def test_a_spool_is_private_and_by_vehicle(state: Path) -> None:
     with farewell.spool_for(Address(1, 2)) as one, farewell.spool_for(Address(1, 2)) as two:
         assert one is not None

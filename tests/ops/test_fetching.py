@@ -110,6 +110,7 @@ async def test_wrong_bytes_are_fetched_again_without_the_caches(tmp_path: Path) 
     assert tree.forgotten
 
 
+@pytest.mark.holds("promise 1")
 async def test_wrong_bytes_twice_leave_nothing_and_keep_the_old_file(tmp_path: Path) -> None:
     tree = SpoiltTree({b"/big": BIG})
     tree.bad = 2

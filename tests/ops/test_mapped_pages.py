@@ -17,6 +17,7 @@ OLD = bytes(range(256)) * (SIZE // 256) + b"end" * 100
 PAGES = {"first": (0, PAGE), "middle": (PAGE, 2 * PAGE), "last": (2 * PAGE, SIZE), "all": (0, SIZE)}
 
 
+@pytest.mark.holds("fault overlap")
 @pytest.mark.parametrize("which", PAGES)
 async def test_a_mapped_page_is_not_appended(which: str) -> None:
     start, stop = PAGES[which]

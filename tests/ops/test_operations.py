@@ -239,6 +239,7 @@ async def test_the_kernel_s_cache_is_as_the_tree_says(direct_io: bool, keep_cach
     assert (info.direct_io, info.keep_cache) == (direct_io, keep_cache)
 
 
+@pytest.mark.holds("promise 1")
 @pytest.mark.parametrize("short", [0, 1, 5])
 async def test_a_short_reply_in_mid_file_is_an_error(short: int, caplog: pytest.LogCaptureFixture) -> None:
     tree = some_tree()
@@ -268,6 +269,7 @@ async def test_a_size_the_kernel_does_not_know_is_told_before_open_returns() -> 
 # -- the file system ------------------------------------------------------------------------------
 
 
+@pytest.mark.holds("promise 4")
 async def test_statfs_never_asks_the_tree() -> None:
     tree = some_tree()
     tree.error = AssertionError("asked")
@@ -279,6 +281,7 @@ async def test_statfs_never_asks_the_tree() -> None:
     assert tree.calls == []
 
 
+@pytest.mark.holds("promise 9")
 async def test_checksum_while_armed_is_eagain() -> None:
     tree = some_tree()
     ops = operations(tree)
@@ -292,6 +295,7 @@ async def test_checksum_while_armed_is_eagain() -> None:
     assert await failure(ops.getxattr(ino, XATTR_CRC32, CTX)) == errno.EAGAIN
 
 
+@pytest.mark.holds("promise 4")
 @pytest.mark.parametrize("name", [b"security.capability", b"system.posix_acl_access", b"user.x"])
 async def test_unknown_attributes_never_ask_the_tree(name: bytes) -> None:
     tree = some_tree()
@@ -381,6 +385,7 @@ async def test_not_found_below_a_lookup_is_negative_but_else_enoent() -> None:
     assert await failure(ops.getattr(ino, CTX)) == errno.ENOENT
 
 
+@pytest.mark.holds("promise 4")
 @pytest.mark.parametrize("name", CALLS)
 async def test_every_handler_ends_in_time(name: str, autojump_clock: trio.testing.MockClock) -> None:
     tree = some_tree()
@@ -405,6 +410,7 @@ async def test_a_big_read_on_a_slow_radio_gets_the_time_it_needs(
     assert await failure(ops.read(fh, 0, 131072)) == errno.ETIMEDOUT
 
 
+@pytest.mark.holds("promise 2")
 async def test_a_checksum_gets_its_own_budget(autojump_clock: trio.testing.MockClock) -> None:
     tree = some_tree()
     ops, ino, _ = await prepared(tree)

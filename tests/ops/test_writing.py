@@ -67,6 +67,7 @@ async def test_create_write_flush_and_release_reach_the_tree_in_order() -> None:
     assert tree.opened[0].closed == 1
 
 
+@pytest.mark.holds("promise 3")
 async def test_a_read_handle_is_never_flushed_and_cannot_write() -> None:
     tree = some_tree()
     ops = operations(tree)
@@ -129,6 +130,7 @@ async def test_truncation_comes_in_the_open_flags_and_append_follows_our_size() 
     assert tree.files[b"/a.txt"] == b"onetwo"
 
 
+@pytest.mark.holds("promise 2")
 async def test_what_a_failing_delivery_says_reaches_flush_and_fsync_but_release_only_logs() -> None:
     tree = some_tree()
     ops = operations(tree)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from itertools import pairwise
 from typing import Any
 
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as dialect
@@ -91,6 +92,7 @@ def test_all_ways_in_give_the_same_value(
         assert framer.feed(reference_frame(source, target, payload, old=True)) == [value]
 
 
+@pytest.mark.holds("fault corrupt")
 @given(addresses, payloads, st.integers(0, 265), st.integers(1, 255))
 def test_no_changed_byte_gets_through(target: Address, payload: bytes, at: int, flip: int) -> None:
     frame = bytearray(reference_frame(Address(1, 1), target, payload))
@@ -169,6 +171,7 @@ def test_after_anything_the_stream_recovers(data: bytes, garbage: bytes) -> None
     assert len([m for m in found if m.source == (7, 7)]) >= 15
 
 
+@pytest.mark.holds("promise 10")
 @given(st.lists(st.binary(max_size=400) | streams(), max_size=8), st.booleans(), st.sampled_from([None, KEY]))
 @settings(max_examples=200)
 def test_nothing_raises_and_little_is_kept(pieces: list[bytes], stream: bool, key: bytes | None) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import random
 
+import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
@@ -148,6 +149,7 @@ def busy_engine(seed: int, kind: type[ReadTransfer]) -> tuple[Engine, list[Opera
     return engine, operations, sink
 
 
+@pytest.mark.holds("promise 10")
 @settings(max_examples=200, deadline=None)
 @given(
     st.integers(0, 2**32),
@@ -212,6 +214,7 @@ class Vandal:
         return payload.encode()
 
 
+@pytest.mark.holds("promise 1")
 @settings(max_examples=120, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(
     st.sampled_from(sorted(PROFILES)),

@@ -21,6 +21,8 @@ from tests.support.fake_store import read_file
 from tests.support.mounting import mounted
 from tests.support.worlds import ROOTS, World
 
+pytestmark = pytest.mark.holds("fault another vehicle")
+
 SLOW = LinkSettings(rate=20_000.0, delay=0.02, loss=0.05)
 OURS = random.Random(1).randbytes(60_000)
 THEIRS = random.Random(2).randbytes(60_000)

@@ -88,6 +88,7 @@ async def move(scene: Scene, tree: Tree) -> None:
 JOBS = {"replace": replace, "move": move}
 
 
+@pytest.mark.holds("promise 9")
 @pytest.mark.parametrize("number", [1, 2, 3])
 @pytest.mark.parametrize("job", sorted(JOBS))
 @pytest.mark.parametrize("profile", RENAMING)

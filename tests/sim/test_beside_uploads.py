@@ -26,6 +26,8 @@ from tests.support.sources import MemorySource
 from tests.support.takingturns import taking_turns
 from tests.support.worlds import ROOTS, World, read_file
 
+pytestmark = pytest.mark.holds("promise 7")
+
 EVERY_PROFILE = sorted(PROFILES)
 TRUNCATING = [name for name in EVERY_PROFILE if PROFILES[name].write_only_truncates]
 KEEPING = [name for name in EVERY_PROFILE if not PROFILES[name].write_only_truncates]

@@ -143,6 +143,7 @@ CASES = [
 ]
 
 
+@pytest.mark.holds("fault overlap")
 @pytest.mark.parametrize(("profile", "write", "take"), CASES)
 async def test_a_name_goes_at_any_request_of_its_delivery(
     profile: str, write: str, take: str, autojump: MockClock
@@ -150,11 +151,13 @@ async def test_a_name_goes_at_any_request_of_its_delivery(
     await at_each_request(lambda count: take_after(count, profile, write, take, GOOD), most=PROMPT)
 
 
+@pytest.mark.holds("fault overlap")
 @pytest.mark.parametrize(("profile", "write", "take"), CASES)
 async def test_a_name_goes_on_a_bad_link(profile: str, write: str, take: str, autojump: MockClock) -> None:
     await at_each_request(lambda count: take_after(count, profile, write, take, BAD), step=3)
 
 
+@pytest.mark.holds("promise 4")
 @pytest.mark.parametrize("take", TAKES)
 @pytest.mark.parametrize("profile", PROFILES)
 async def test_a_name_goes_in_a_few_round_trips_whatever_the_size(
@@ -172,6 +175,7 @@ async def test_a_name_goes_in_a_few_round_trips_whatever_the_size(
             assert bytes(await file.read(0, len(LONG) + 1)) == LONG
 
 
+@pytest.mark.holds("fault overlap")
 @pytest.mark.parametrize(
     "profile",
     [

@@ -39,6 +39,7 @@ def made(profile: str, settings: LinkSettings | None = None) -> World:
     return world
 
 
+@pytest.mark.holds("promise 4")
 @pytest.mark.parametrize("profile", PROFILES)
 @pytest.mark.parametrize("change", CHANGES.values(), ids=CHANGES)
 async def test_silence_ends_a_change_in_time(
@@ -73,6 +74,7 @@ async def test_six_changes_are_not_answered_in_the_time_of_one(same: bool, autoj
                 nursery.start_soon(one, number)
 
 
+@pytest.mark.holds("promise 4")
 async def test_nobody_else_waits_for_a_long_delivery(autojump: MockClock) -> None:
     world = made("mavsdk", RADIO)
     world.tree.add(D + b"/long", bytes(1_500_000))

@@ -15,6 +15,8 @@ from mavftpfs.sim.linkmodel import LinkSettings
 from tests.support.uploads import put
 from tests.support.worlds import content, path, read_file, world
 
+pytestmark = pytest.mark.holds("fault long frames")
+
 RADIO = LinkSettings(rate=5760.0, delay=0.05, queue=8192)
 PROFILES = ["px4", "ardupilot", "mavsdk", "px4-nuttx"]
 LIMIT = 150

@@ -17,6 +17,7 @@ from tests.support.worlds import MemorySink, World, read_file
 ROUNDS = 10_000
 
 
+@pytest.mark.holds("fault overlap")
 async def test_a_reader_goes_on_beside_a_job_that_has_to_wait(
     autojump: MockClock, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -42,6 +43,7 @@ async def test_a_reader_goes_on_beside_a_job_that_has_to_wait(
     assert rounds < 100
 
 
+@pytest.mark.holds("fault overlap")
 @pytest.mark.parametrize("profile", ["px4", "mavsdk", "ardupilot"])
 async def test_a_file_is_not_opened_under_a_name_that_it_lost_meanwhile(
     autojump: MockClock, profile: str

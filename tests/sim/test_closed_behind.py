@@ -23,6 +23,8 @@ from tests.support.sources import MemorySource
 from tests.support.takingturns import taking_turns
 from tests.support.worlds import ROOTS, World, read_file
 
+pytestmark = pytest.mark.holds("promise 7")
+
 KEEPING = [name for name in sorted(PROFILES) if not PROFILES[name].write_only_truncates]
 LINK = LinkSettings(rate=100_000.0, delay=0.05, queue=50_000)
 BAD = {

@@ -57,6 +57,7 @@ async def test_the_trace_tells_what_was_repeated_and_what_was_not_believed(autoj
         assert len(doubted) == connection.engine.stats.unknown > 3
 
 
+@pytest.mark.holds("promise 10", "rule 14.37")
 async def test_signing_both_ways(autojump: MockClock) -> None:
     tree = MemoryTree()
     tree.add(b"/f", DATA)
@@ -118,6 +119,7 @@ class Diary(dict[Address, Heartbeat]):
         super().__setitem__(source, heartbeat)
 
 
+@pytest.mark.holds("fault overflow")
 @pytest.mark.parametrize("profile", ["px4", "px4-nuttx", "ardupilot", "mavsdk"])
 @pytest.mark.parametrize("what", ["window", "burst", "write"])
 async def test_heartbeats_go_out_beside_a_copy(what: str, profile: str, autojump: MockClock) -> None:
@@ -173,6 +175,7 @@ async def test_old_firmware_is_asked_for_its_capabilities_in_the_old_way(autojum
         assert vehicle.asked.count(MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES) == 1
 
 
+@pytest.mark.holds("promise 6")
 @pytest.mark.parametrize(
     ("options", "said"),
     [
@@ -192,6 +195,7 @@ async def test_what_we_say_we_are(options: ConnectOptions, said: int | None, aut
         assert await read_file(connection, b"/f") == DATA
 
 
+@pytest.mark.holds("promise 6")
 async def test_a_neighbour_with_our_address_makes_us_move(autojump: MockClock) -> None:
     here = World("ardupilot", LinkSettings(delay=0.01))
     here.tree.add(b"/f", DATA)

@@ -18,6 +18,8 @@ from tests.support.takingturns import taking_turns
 from tests.support.uploads import put
 from tests.support.worlds import MemorySink, World, begin_to_read, content, path, read_file, world
 
+pytestmark = pytest.mark.holds("fault duplicate")
+
 EVERY_PROFILE = sorted(PROFILES)
 CLEAN = LinkSettings(delay=0.02)
 
@@ -95,6 +97,7 @@ async def test_another_client_raises_it(autojump: MockClock) -> None:
         assert connection.store.in_doubt()
 
 
+@pytest.mark.holds("rule 14.12")
 async def test_what_another_client_does_decides_whether_bytes_are_in_doubt(autojump: MockClock) -> None:
     """The first that is heard of him, what may use our session, and for a while after that everything: a
     request that took the session may have been missed."""
@@ -193,6 +196,7 @@ async def test_a_late_open_of_another_file_gives_no_wrong_bytes(
         connection.scheduler.server.check_invariants()
 
 
+@pytest.mark.holds("fault leaving")
 @pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
 async def test_what_a_late_open_left_open_does_not_lock_us_out(profile: str, autojump: MockClock) -> None:
     here = world(profile, CLEAN, one=content(1500, 1), two=content(1500, 2))

@@ -24,6 +24,8 @@ from tests.support.mounting import mounted
 from tests.support.takingturns import taking_turns
 from tests.support.worlds import ROOTS, World
 
+pytestmark = pytest.mark.holds("fault duplicate")
+
 KEEPING = sorted(name for name in PROFILES if not PROFILES[name].write_only_truncates)
 DOUBLING = LinkSettings(delay=0.02, duplicate=0.3)
 CLEAN = LinkSettings(delay=0.02)
@@ -109,6 +111,7 @@ async def test_the_head_of_a_large_new_file_written_at_the_end(
         file.close()
 
 
+@pytest.mark.holds("rule 14.39")
 @pytest.mark.parametrize("leaves", [False, True])
 @pytest.mark.parametrize("profile", ["px4", "px4-2026", "px4-nuttx"])
 async def test_another_clients_file_took_the_bytes(profile: str, leaves: bool, autojump: MockClock) -> None:
@@ -174,6 +177,7 @@ async def test_the_power_went_between_the_last_answer_and_the_close(
         file.close()
 
 
+@pytest.mark.holds("promise 2", "fault killed program")
 @pytest.mark.parametrize(
     "seed", [0, 1, *(pytest.param(seed, marks=pytest.mark.soak) for seed in range(2, 60))]
 )

@@ -123,6 +123,7 @@ CASES = [
 ]
 
 
+@pytest.mark.holds("fault overlap")
 @pytest.mark.parametrize(("profile", "write", "then"), CASES)
 async def test_emptied_at_any_request_of_its_delivery(
     profile: str, write: str, then: str, autojump: MockClock

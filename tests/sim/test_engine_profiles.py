@@ -118,6 +118,7 @@ def test_other_chunk_sizes(name: str, chunk: int) -> None:
         assert rig.read(b"/f", kind, chunk=chunk) == content
 
 
+@pytest.mark.holds("fault lost")
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("name", NAMES)
 def test_a_megabyte_over_a_bad_link(name: str, kind: type[ReadTransfer]) -> None:
@@ -153,6 +154,7 @@ def test_a_card_that_pauses_is_not_asked_twice_over_usb() -> None:
     assert asked <= 1.25 * (-(-len(content) // CHUNK))
 
 
+@pytest.mark.holds("fault overflow")
 @pytest.mark.parametrize("rate", [5_760.0, 57_600.0])
 @pytest.mark.parametrize("name", NAMES)
 def test_a_radio_is_used(name: str, rate: float) -> None:
@@ -228,6 +230,7 @@ def test_reading_to_eof_over_a_bad_link(name: str) -> None:
         assert op.data == content
 
 
+@pytest.mark.holds("fault lost")
 @pytest.mark.parametrize("name", NAMES)
 def test_side_effects_happen_once(name: str) -> None:
     """A mkdir whose reply is lost is replayed where servers do that, else its refusal says "perhaps done"."""

@@ -27,6 +27,8 @@ from tests.support.lying import CrowdedLink, LyingVehicle, ack, ftp, heartbeat
 from tests.support.vehicles import HOST, free_udp_port
 from tests.support.worlds import World, read_file
 
+pytestmark = pytest.mark.holds("promise 10")
+
 HERE = ("10.0.0.1", 14550)
 THERE = ("10.0.0.2", 14550)
 OURS = random.Random(1).randbytes(20_000)

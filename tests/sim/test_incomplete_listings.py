@@ -18,6 +18,8 @@ from tests.support.lying import ack, lie_for, nak
 from tests.support.mounting import mounted
 from tests.support.worlds import World, content, path, world
 
+pytestmark = pytest.mark.holds("promise 10")
+
 LISTS = (Opcode.LIST_DIRECTORY, Opcode.LIST_DIRECTORY_WITH_TIME)
 NAMES = [f"file_{number:02}" for number in range(60)]
 WHOLE = content(60_000)

@@ -98,6 +98,7 @@ async def opened(connection: Connection, path: bytes) -> OpenFile:
     return file
 
 
+@pytest.mark.holds("rule 14.27")
 @pytest.mark.parametrize("profile", ["px4", "px4-nuttx", "mavsdk", "spec"])
 @pytest.mark.parametrize("seed", range(3))
 async def test_any_place_of_a_huge_file_can_be_read(profile: str, seed: int, autojump: MockClock) -> None:
@@ -110,6 +111,7 @@ async def test_any_place_of_a_huge_file_can_be_read(profile: str, seed: int, aut
         await file.release()
 
 
+@pytest.mark.holds("rule 14.27")
 @pytest.mark.parametrize("profile", ["ardupilot", "ardupilot5"])
 async def test_what_ardupilot_cannot_reach_is_an_error(profile: str, autojump: MockClock) -> None:
     """Offsets are signed 32 bits over there (AP_Filesystem::lseek)."""

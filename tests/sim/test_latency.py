@@ -135,6 +135,7 @@ def p95(waits: list[float]) -> float:
     return waits[len(waits) * 95 // 100 - 1]
 
 
+@pytest.mark.holds("promise 7")
 @pytest.mark.parametrize(("profile", "link"), CASES)
 @pytest.mark.parametrize(("kind", "frames"), [("ls", 2), ("read", 3)])
 async def test_nobody_waits_long_beside_a_copy(
@@ -146,6 +147,7 @@ async def test_nobody_waits_long_beside_a_copy(
     assert p95(waits) <= copy.allowed(frames)
 
 
+@pytest.mark.holds("promise 7")
 @pytest.mark.soak
 async def test_nor_after_minutes_of_it(autojump: MockClock) -> None:
     """What raises of the rate left in the link's queue passed for the way: 0.85 s where 0.4 are allowed."""
@@ -155,6 +157,7 @@ async def test_nor_after_minutes_of_it(autojump: MockClock) -> None:
     assert p95(waits) <= copy.allowed(2)
 
 
+@pytest.mark.holds("promise 7")
 @pytest.mark.parametrize("profile", ["px4", "px4-nuttx"])
 async def test_a_copy_that_goes_on_leaves_room_for_who_comes_next(profile: str, autojump: MockClock) -> None:
     """A window for 300 ms is far more than PX4 on NuttX holds: sent at once, it drowned the next request.
@@ -168,6 +171,7 @@ async def test_a_copy_that_goes_on_leaves_room_for_who_comes_next(profile: str, 
     assert p95(waits) <= copy.allowed(3)
 
 
+@pytest.mark.holds("promise 7")
 @pytest.mark.parametrize(
     ("kind", "frames", "link"),
     [
@@ -188,6 +192,7 @@ async def test_nor_beside_a_copy_that_is_interrupted_for_minutes(
     assert p95(waits) <= copy.allowed(frames)
 
 
+@pytest.mark.holds("promise 7")
 @pytest.mark.parametrize("profile", taking_turns(SHORT_QUEUES))
 @pytest.mark.parametrize(("kind", "frames"), [("ls", 2), ("read", 3)])
 async def test_who_comes_next_is_not_dropped_by_a_short_queue(
@@ -202,6 +207,7 @@ async def test_who_comes_next_is_not_dropped_by_a_short_queue(
     assert p95(waits) <= copy.allowed(frames, working=PROFILES[profile].latency)
 
 
+@pytest.mark.holds("promise 7")
 @pytest.mark.parametrize("profile", taking_turns(KEEPING))
 @pytest.mark.parametrize(
     "link", [pytest.param(RADIO, id="radio"), pytest.param(SLOW, id="slow"), pytest.param(FAR, id="far")]
@@ -229,6 +235,7 @@ async def test_most_do_not_on_the_longest_way(profile: str, autojump: MockClock)
     assert waits[SAMPLES // 2] <= copy.allowed(3)
 
 
+@pytest.mark.holds("promise 7")
 @pytest.mark.parametrize("link", [pytest.param(SLOW, id="slow"), pytest.param(FAR, id="far")])
 @pytest.mark.parametrize("profile", taking_turns(KEEPING))
 async def test_an_upload_goes_on_beside_endless_small_reads(

@@ -305,6 +305,7 @@ async def test_sends_before_anybody_was_heard_are_dropped() -> None:
         assert link.backlog == 0
 
 
+@pytest.mark.holds("rule 14.37")
 async def test_udpout_keeps_one_port_and_does_not_mind_a_closed_one() -> None:
     port = free_udp_port()
     async with opened(f"udpout:{HOST}:{port}") as link:
@@ -648,6 +649,7 @@ async def test_a_frame_that_was_begun_is_finished() -> None:
         assert (link.backlog, link.stats.dropped_sends) == (0, 1)
 
 
+@pytest.mark.holds("promise 5")
 async def test_serial_comes_back_when_the_device_does(tmp_path: Path) -> None:
     device = tmp_path / "ttyDRONE"
     master, slave = os.openpty()

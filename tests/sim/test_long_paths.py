@@ -22,6 +22,8 @@ from tests.support.faults import Faults
 from tests.support.mounting import mounted
 from tests.support.worlds import ROOTS, World
 
+pytestmark = pytest.mark.holds("fault odd listing")
+
 RENAMING = sorted(name for name in PROFILES if name != "littlefs")
 OLD = random.Random(1).randbytes(700)
 NEW = random.Random(2).randbytes(900)

@@ -123,6 +123,7 @@ def run(profile: str, link: LinkSettings, sequence: list[tuple[Any, ...]], seed:
     trio.run(deliver_all, profile, link, sequence, seed, clock=MockClock(autojump_threshold=0))
 
 
+@pytest.mark.holds("promise 1", "rule 14.22")
 @pytest.mark.parametrize("link", sorted(LINKS))
 @pytest.mark.parametrize("profile", taking_turns(sorted(PROFILES)))
 @settings(max_examples=4, phases=ONCE)
@@ -133,6 +134,7 @@ def test_the_card_becomes_the_model(
     run(profile, LINKS[link], sequence, seed)
 
 
+@pytest.mark.holds("fault duplicate")
 @pytest.mark.parametrize("profile", sorted(PROFILES))
 @settings(max_examples=2, phases=ONCE)
 @given(sequence=rewriting, seed=st.integers(0, 99))

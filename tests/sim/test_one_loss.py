@@ -14,6 +14,8 @@ from tests.support.memory import MemoryLink
 from tests.support.mounting import mounted
 from tests.support.worlds import content, path, world
 
+pytestmark = pytest.mark.holds("rule 14.38")
+
 WIFI = LinkSettings(rate=625_000.0, delay=0.015, queue=300_000)
 FTP = 110
 OPCODE, REQ_OPCODE = 16, 18

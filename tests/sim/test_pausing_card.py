@@ -12,6 +12,8 @@ from tests.support.mounting import mounted
 from tests.support.trees import content
 from tests.support.worlds import World
 
+pytestmark = pytest.mark.holds("fault duplicate")
+
 FOLDER = b"/fs/microsd/"
 LINKS = {"usb": LinkSettings(rate=1e6, delay=0.001, queue=100_000), "far": LinkSettings(rate=1e5, delay=0.03)}
 FILES = 20

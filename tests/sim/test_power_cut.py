@@ -144,6 +144,7 @@ CASES = [
 ]
 
 
+@pytest.mark.holds("promise 3", "fault power")
 @pytest.mark.parametrize(("profile", "job"), CASES)
 async def test_the_next_mount_finds_one_whole_file(
     profile: str, job: str, tmp_path: Path, autojump: MockClock

@@ -277,6 +277,7 @@ async def test_an_hour_of_radio_loses_no_byte(profile: str, autojump: MockClock)
     assert done["fsync"] > 100, done
 
 
+@pytest.mark.holds("promise 3")
 @pytest.mark.parametrize("profile", ["px4", "px4-nuttx", "ardupilot", "mavsdk"])
 async def test_three_minutes_of_radio_lose_no_byte(profile: str, autojump: MockClock) -> None:
     done = await spend(profile, seed=2, seconds=3 * MINUTE)

@@ -84,6 +84,7 @@ async def test_who_queues_for_the_session_when_the_link_dies_does_not_wait_in_tu
         assert [type(error) for error in errors] == [RequestTimeout, *[VehicleLost] * 4]
 
 
+@pytest.mark.holds("rule 14.31")
 async def test_a_long_listing_with_times_is_not_taken_for_silence(autojump: MockClock) -> None:
     here = World("mavsdk", LinkSettings(rate=5760.0, delay=0.1))
     for index in range(200):
@@ -111,6 +112,7 @@ async def test_bursts_of_exact_multiples_end(autojump: MockClock) -> None:
     assert here.vehicle.server.open_sessions == 0
 
 
+@pytest.mark.holds("rule 14.39")
 @pytest.mark.parametrize("profile", ["px4", "ardupilot"])
 async def test_a_whole_read_beside_another_client_is_not_believed(profile: str, autojump: MockClock) -> None:
     """Servers share session ids, and of an `@` file no checksum can prove the bytes."""
@@ -139,6 +141,7 @@ BROWSES = request(0, Opcode.LIST_DIRECTORY, data=b"/")
 LOADS = request(0, Opcode.READ_FILE, session=0, size=239)
 
 
+@pytest.mark.holds("rule 14.12")
 @pytest.mark.parametrize(
     ("profile", "asks"),
     [("px4", BROWSES), ("ardupilot", BROWSES), ("mavsdk", BROWSES), ("ardupilot5", LOADS)],
@@ -175,6 +178,7 @@ async def test_files_are_read_beside_a_client_that_leaves_our_session_alone(
         nursery.cancel_scope.cancel()
 
 
+@pytest.mark.holds("promise 5")
 @pytest.mark.parametrize("profile", ["px4", "ardupilot"])
 async def test_a_whole_read_survives_a_lost_session(profile: str, autojump: MockClock) -> None:
     here = World(profile, LinkSettings(rate=5000.0, delay=0.02))
@@ -196,6 +200,7 @@ async def test_a_whole_read_survives_a_lost_session(profile: str, autojump: Mock
         assert connection.engine.stats.by_opcode[Opcode.OPEN_FILE_RO] == 2
 
 
+@pytest.mark.holds("rule 14.39")
 @pytest.mark.parametrize("trouble", ["another client is heard", "the session is closed"])
 async def test_what_is_read_meanwhile_is_under_suspicion(trouble: str, autojump: MockClock) -> None:
     here = World("px4", LinkSettings(rate=20_000.0, delay=0.02))
@@ -243,6 +248,7 @@ async def test_what_was_read_shortly_before_is_under_suspicion_though_closed(
         assert not connection.scheduler._closed_streams
 
 
+@pytest.mark.holds("rule 14.31")
 async def test_times_that_could_not_be_asked_for_are_not_refused(autojump: MockClock) -> None:
     """While a stale session is waited out nobody may speak: that is our silence, not the server's."""
     here = World("ardupilot5", LinkSettings(delay=0.02))
@@ -261,6 +267,7 @@ async def test_times_that_could_not_be_asked_for_are_not_refused(autojump: MockC
         assert connection.store.lists_times is True
 
 
+@pytest.mark.holds("rule 14.15")
 @pytest.mark.parametrize("profile", ["px4", "ardupilot"])
 async def test_bursts_through_the_caches(profile: str, autojump: MockClock) -> None:
     """Whole, in the middle, behind what is there, and two files in turns, over a bad link."""
@@ -290,6 +297,7 @@ async def test_bursts_through_the_caches(profile: str, autojump: MockClock) -> N
     assert here.vehicle.server.open_sessions == 0
 
 
+@pytest.mark.holds("rule 14.18")
 @pytest.mark.parametrize("profile", ["mavsdk", "px4", "px4-nuttx"])
 async def test_beside_bursts_that_fill_the_radio_a_listing_is_answered(
     profile: str, autojump: MockClock

@@ -75,6 +75,7 @@ def rival_asks(here: World, opcode: Opcode, data: bytes = b"", *, seq: int, hear
 # --- a session that is taken
 
 
+@pytest.mark.holds("fault stale session", "rule 14.10")
 async def test_a_killed_clients_session_is_got_over_by_saying_nothing(autojump: MockClock) -> None:
     """ArduPilot gives a session away after 3 s in which it answered nobody, with a refusal neither."""
     here = world("ardupilot", LINK, f=DATA, stale=OTHER)
@@ -107,6 +108,7 @@ async def _tolerate_refusals(work: Callable[[], object]) -> None:
             await trio.sleep(0.3)
 
 
+@pytest.mark.holds("promise 6", "rule 14.39")
 @pytest.mark.parametrize("profile", ["px4", "ardupilot"])
 async def test_another_clients_session_is_left_alone(profile: str, autojump: MockClock) -> None:
     """Whoever is heard is alive: no ResetSessions, no Terminate, and its file stays open (promise 6)."""
@@ -134,6 +136,7 @@ async def test_another_clients_session_is_left_alone(profile: str, autojump: Moc
 # --- a session that is lost
 
 
+@pytest.mark.holds("rule 14.9")
 @pytest.mark.parametrize("outage", [3.2, 3.5, 4.0, 6.0, 9.0])
 async def test_after_a_silence_nothing_is_believed_before_the_file_was_opened_again(
     outage: float, autojump: MockClock
@@ -155,6 +158,7 @@ async def test_after_a_silence_nothing_is_believed_before_the_file_was_opened_ag
         assert log.count(Opcode.OPEN_FILE_RO) == 2
 
 
+@pytest.mark.holds("fault idle close")
 async def test_a_session_that_is_lost_each_time_is_an_error_in_the_end(autojump: MockClock) -> None:
     here = world("px4", LINK, f=DATA)
 
@@ -169,6 +173,7 @@ async def test_a_session_that_is_lost_each_time_is_an_error_in_the_end(autojump:
         assert log.count(Opcode.OPEN_FILE_RO) == 1 + REOPENS
 
 
+@pytest.mark.holds("promise 5", "fault idle close")
 @pytest.mark.parametrize(("profile", "outage"), [("px4", 12.0), ("ardupilot5", 23.0)])
 async def test_a_server_that_closed_an_idle_session_during_an_outage(
     profile: str, outage: float, autojump: MockClock
@@ -188,6 +193,7 @@ async def test_a_server_that_closed_an_idle_session_during_an_outage(
         assert log.count(Opcode.OPEN_FILE_RO) == 2
 
 
+@pytest.mark.holds("rule 14.12")
 @pytest.mark.parametrize("profile", EVERY_PROFILE)
 async def test_a_session_is_closed_within_two_seconds_of_its_last_use(
     profile: str, autojump: MockClock
@@ -210,6 +216,7 @@ async def test_a_session_is_closed_within_two_seconds_of_its_last_use(
         assert log.count(Opcode.OPEN_FILE_RO) == 2
 
 
+@pytest.mark.holds("fault growing file")
 @pytest.mark.parametrize("profile", EVERY_PROFILE)
 async def test_a_file_that_shrank_while_it_was_closed_is_another_one(
     profile: str, autojump: MockClock
@@ -233,6 +240,7 @@ async def test_a_file_that_shrank_while_it_was_closed_is_another_one(
 # --- silence as an answer
 
 
+@pytest.mark.holds("rule 14.31")
 async def test_two_silences_prove_that_listings_show_no_times(autojump: MockClock) -> None:
     """One may be loss; MAVSDK's old server never answers an opcode that it does not know."""
     here = world("mavsdk-old", LINK, f=DATA)
@@ -249,6 +257,7 @@ async def test_two_silences_prove_that_listings_show_no_times(autojump: MockCloc
         assert plain[-1] - plain[0] < 2 * TIME_PROBE_LIMIT
 
 
+@pytest.mark.holds("rule 14.31")
 async def test_an_answer_after_one_silence_is_taken(autojump: MockClock) -> None:
     here = world("ardupilot5", LINK, f=DATA)
     async with here.connection() as connection:

@@ -12,6 +12,7 @@ from tests.sim.test_arming_replacement import Scene
 from tests.support.faults import Faults
 
 
+@pytest.mark.holds("promise 3")
 @pytest.mark.parametrize("patience", [5.0, 100.0])
 @pytest.mark.parametrize("profile", list(PROFILES))
 async def test_requests_unanswered_beside_heartbeats(

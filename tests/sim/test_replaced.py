@@ -20,6 +20,8 @@ from mavftpfs.shared.errors import FileChanged
 from mavftpfs.sim.linkmodel import LinkSettings
 from tests.support.worlds import World
 
+pytestmark = pytest.mark.holds("fault replaced file")
+
 OLD = random.Random(1).randbytes(120_000)
 NEW = random.Random(2).randbytes(160_000)
 STEP = 16_384
@@ -113,6 +115,7 @@ async def test_the_end_of_a_copy_waits_for_the_news_of_a_reboot(profile: str, au
         assert await copy(tree) == NEW[: len(OLD)]
 
 
+@pytest.mark.holds("fault reboot", "fault boot time asked")
 @pytest.mark.parametrize("unasked", [True, False])
 @pytest.mark.parametrize("size", [None, 100_000, 120_000, 160_000])
 @pytest.mark.parametrize("profile", EVERY)

@@ -18,6 +18,8 @@ from tests.sim.test_replaced import IDLE, NEW, OLD, PATH, STEP, TIMED, Card
 from tests.support.faults import Faults
 from tests.support.mounting import mounted
 
+pytestmark = pytest.mark.holds("fault replaced file")
+
 MID = b"mid"
 SUCCESSOR = NEW[: len(OLD)]
 

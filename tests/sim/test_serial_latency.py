@@ -13,6 +13,8 @@ from mavftpfs.sim.linkmodel import LinkSettings
 from tests.sim.test_latency import RADIO, Copy, p95
 from tests.support.worlds import World
 
+pytestmark = pytest.mark.holds("promise 7")
+
 FAR_RADIO = LinkSettings(rate=5760.0, delay=0.15, queue=8192)
 
 

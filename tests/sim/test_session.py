@@ -47,6 +47,7 @@ async def test_a_small_file_costs_open_read_terminate(profile: str, autojump: Mo
         assert here.vehicle.server.open_sessions == 0
 
 
+@pytest.mark.holds("rule 14.7")
 @pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
 async def test_several_files_at_once_share_the_session(profile: str, autojump: MockClock) -> None:
     files = {f"f{index}": content(20_000, index) for index in range(5)}
@@ -67,6 +68,7 @@ async def test_several_files_at_once_share_the_session(profile: str, autojump: M
     assert here.vehicle.server.open_sessions == 0
 
 
+@pytest.mark.holds("promise 7")
 @pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
 async def test_what_is_asked_for_as_the_last_bytes_come_goes_out_at_once(
     profile: str, autojump: MockClock
@@ -85,6 +87,7 @@ async def test_what_is_asked_for_as_the_last_bytes_come_goes_out_at_once(
         reader.close()
 
 
+@pytest.mark.holds("promise 7")
 @pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
 async def test_what_is_asked_for_meanwhile_does_not_wait_for_an_answer(
     profile: str, autojump: MockClock
@@ -103,6 +106,7 @@ async def test_what_is_asked_for_meanwhile_does_not_wait_for_an_answer(
         reader.close()
 
 
+@pytest.mark.holds("promise 7")
 @pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
 async def test_a_small_read_overtakes_a_bulk_copy(profile: str, autojump: MockClock) -> None:
     """Promise 7: Terminate, open and read take a round trip each, and what is on its way comes first."""
@@ -145,6 +149,7 @@ async def test_one_small_file_after_another_does_not_stop_a_copy(profile: str, a
         nursery.cancel_scope.cancel()
 
 
+@pytest.mark.holds("promise 5")
 @pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
 async def test_a_cut_in_mid_read_is_bridged(profile: str, autojump: MockClock) -> None:
     data = content(100_000)
@@ -154,6 +159,7 @@ async def test_a_cut_in_mid_read_is_bridged(profile: str, autojump: MockClock) -
     assert here.vehicle.server.open_sessions == 0
 
 
+@pytest.mark.holds("fault reboot")
 @pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
 async def test_a_reboot_in_mid_read_is_bridged(profile: str, autojump: MockClock) -> None:
     data = content(300_000)
@@ -187,6 +193,7 @@ async def test_a_reboot_forgets_what_was_seen_of_the_server(profile: str, autoju
         assert await read_file(connection, path(profile, "small")) == b"hello"
 
 
+@pytest.mark.holds("fault stale session", "rule 14.10")
 @pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
 async def test_a_session_left_by_a_killed_client_is_got_over(profile: str, autojump: MockClock) -> None:
     data = content(50_000)
@@ -217,6 +224,7 @@ async def test_a_close_that_goes_unheard_does_not_fail_the_next_open(autojump: M
             assert await read_file(connection, path("px4", "second")) == b"two"
 
 
+@pytest.mark.holds("promise 4", "rule 14.36")
 async def test_silence_fails_one_request_and_then_all_at_once(autojump: MockClock) -> None:
     here = world("px4", small=b"hello")
     async with here.connection() as connection:

@@ -89,6 +89,7 @@ ACTS: dict[str, tuple[Opcode, Act, list[bytes]]] = {
 }
 
 
+@pytest.mark.holds("fault refused retry")
 @pytest.mark.parametrize("profile", EVERY_PROFILE)
 @pytest.mark.parametrize("act", sorted(ACTS))
 async def test_a_lost_reply_is_found_out(profile: str, act: str, autojump: MockClock) -> None:
@@ -175,6 +176,7 @@ async def test_a_sticky_file_exists_hides_no_other_refusal(profile: str, autojum
         assert here.tree.data(path(profile, "new")) == b"hello world"
 
 
+@pytest.mark.holds("fault refused retry")
 @pytest.mark.parametrize("profile", EVERY_PROFILE)
 async def test_silence_is_unknown_unless_the_listing_tells(profile: str, autojump: MockClock) -> None:
     here = world(profile, file=b"content")
@@ -189,6 +191,7 @@ async def test_silence_is_unknown_unless_the_listing_tells(profile: str, autojum
         await connection.store.make_directory(path(profile, "dir"))
 
 
+@pytest.mark.holds("promise 6")
 @pytest.mark.parametrize("profile", EVERY_PROFILE)
 async def test_our_own_session_is_closed_before_a_path_changes(profile: str, autojump: MockClock) -> None:
     here = world(profile, LinkSettings(rate=20_000.0, delay=0.02), file=bytes(60_000), other=b"x")
@@ -305,6 +308,7 @@ DOUBLED = {
 }
 
 
+@pytest.mark.holds("fault duplicate", "fault refused retry")
 @pytest.mark.parametrize("act", ["remove", "remove_directory", "make_directory", "rename"])
 @pytest.mark.parametrize("profile", EVERY_PROFILE)
 async def test_a_request_doubled_by_the_network_whose_first_answer_is_lost(
@@ -389,6 +393,7 @@ async def test_who_looks_misses_no_name_because_we_take_others_away(
     assert shown >= set(names[taken:])
 
 
+@pytest.mark.holds("promise 9")
 @pytest.mark.parametrize("when_armed", ["ro", "ok"])
 async def test_no_checksum_is_asked_for_in_flight(
     when_armed: Literal["ro", "ok"], autojump: MockClock

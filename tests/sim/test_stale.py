@@ -29,6 +29,7 @@ async def open_elsewhere(connection: Connection) -> None:
     await connection.driver.run(OpenFile(Opcode.CREATE_FILE, b"/d/left", others_session(connection)))
 
 
+@pytest.mark.holds("fault stale session")
 async def test_a_listing_outlasts_the_session_of_a_killed_client(autojump_clock: MockClock) -> None:
     here = ardupilot()
     async with here.connection() as connection:

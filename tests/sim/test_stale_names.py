@@ -46,6 +46,7 @@ class Scene:
         return sorted(name for name in found if name not in (b".", b".."))
 
 
+@pytest.mark.holds("rule 14.34")
 @pytest.mark.parametrize("profile", RENAMING)
 async def test_a_file_made_by_others_is_not_replaced_where_that_is_forbidden(
     profile: str, autojump: MockClock
@@ -59,6 +60,7 @@ async def test_a_file_made_by_others_is_not_replaced_where_that_is_forbidden(
     assert (scene.world.tree.data(scene.a), scene.world.tree.data(scene.b)) == (b"ours", b"THEIRS")
 
 
+@pytest.mark.holds("rule 14.34")
 @pytest.mark.parametrize("profile", RENAMING)
 @pytest.mark.parametrize("was_file", [False, True])
 async def test_nothing_moves_into_what_became_a_directory(
@@ -77,6 +79,7 @@ async def test_nothing_moves_into_what_became_a_directory(
     assert (scene.names(), scene.names(scene.b)) == ([b"a", b"b"], [])
 
 
+@pytest.mark.holds("rule 14.34")
 @pytest.mark.parametrize("profile", EVERY)
 @pytest.mark.parametrize("opened", [False, True])
 async def test_what_became_a_directory_is_not_unlinked(

@@ -17,6 +17,7 @@ BAD = LinkSettings(rate=60_000.0, delay=0.02, loss=0.1, duplicate=0.02, reorder=
 PLAIN = LinkSettings(rate=60_000.0, delay=0.02)
 
 
+@pytest.mark.holds("rule 14.22")
 @pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
 async def test_what_is_on_the_card_is_what_was_given(profile: str, autojump: MockClock) -> None:
     sizes = (0, 1, 238, 239, 240, 478, 5000, 60_000)

@@ -141,6 +141,7 @@ async def test_what_was_opened_before_the_news_of_a_restart_is_closed(
     assert here.vehicle.server.open_sessions == 0
 
 
+@pytest.mark.holds("promise 5")
 @pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
 @pytest.mark.parametrize("probed", [False, True], ids=["unknown", "probed"])
 async def test_a_session_taken_away_is_got_back(profile: str, probed: bool, autojump: MockClock) -> None:
@@ -188,6 +189,7 @@ async def test_a_write_that_is_refused_for_no_error_goes_on_in_a_new_session(aut
     assert here.tree.data(path("px4", "new")) == data
 
 
+@pytest.mark.holds("rule 14.23")
 @pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
 async def test_a_full_card_is_told(profile: str, autojump: MockClock) -> None:
     here = world(profile, PLAIN)
@@ -251,6 +253,7 @@ async def test_a_local_disk_that_fails_ends_one_upload_and_nothing_else(
     assert here.vehicle.server.open_sessions == 0
 
 
+@pytest.mark.holds("promise 9")
 @pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
 async def test_arming_ends_it_and_disarming_lets_it_go_on(profile: str, autojump: MockClock) -> None:
     data = content(60_000)
@@ -418,6 +421,7 @@ async def test_what_can_be_interrupted_makes_room_at_once(autojump: MockClock) -
     assert here.tree.data(b"/d/new") == data
 
 
+@pytest.mark.holds("rule 14.24")
 async def test_path_operations_beside_an_upload_on_nuttx(autojump: MockClock) -> None:
     """Listing outside the card's whitelist makes PX4 refuse the next write (servers.md 8)."""
     data = content(60_000)
@@ -437,6 +441,7 @@ async def test_path_operations_beside_an_upload_on_nuttx(autojump: MockClock) ->
     assert here.tree.data(path("px4-nuttx", "new")) == data
 
 
+@pytest.mark.holds("rule 14.24")
 async def test_a_write_after_silence_on_nuttx(autojump: MockClock) -> None:
     """After 2 s without requests the scratch buffer is gone; the upload survives a short cut."""
     data = content(60_000)

@@ -50,6 +50,7 @@ def test_the_pauses_of_a_card_cost_their_time_once(rtt: float, seconds: float, s
     assert measure(Case("px4-nuttx", 100_000.0, rtt, 0.0, "write"), seconds).share >= share
 
 
+@pytest.mark.holds("fault overflow")
 @pytest.mark.parametrize("loss", [0.0, 0.05])
 @pytest.mark.parametrize(
     ("rate", "rtt", "seconds", "telemetry"), [(5760.0, 0.3, 60.0, 400.0), (100_000.0, 0.1, 10.0, 4000.0)]
@@ -74,6 +75,7 @@ def test_what_a_short_queue_loses_is_not_put_down_to_the_pauses_of_a_card() -> N
     assert mean(result.requests for result in results) <= 1.6
 
 
+@pytest.mark.holds("rule 14.24")
 @pytest.mark.parametrize("profile", ["ardupilot", "ardupilot5", "littlefs"])
 async def test_never_more_than_a_short_queue_holds(profile: str, autojump_clock: MockClock) -> None:
     here = World(profile, LinkSettings(rate=1e6, delay=0.005))

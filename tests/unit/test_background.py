@@ -176,6 +176,7 @@ async def test_a_refusal_is_not_repeated_before_there_is_news(
     assert tree.undelivered() == []
 
 
+@pytest.mark.holds("promise 3")
 async def test_what_did_not_fit_is_tried_again_seldom(
     autojump_clock: object, store: FakeWriter, tree: Tree
 ) -> None:

@@ -116,6 +116,7 @@ async def test_what_lies_beyond_the_opened_size_is_dropped() -> None:
     assert blocks.missing(0, 1000) == [(0, 90)]
 
 
+@pytest.mark.holds("promise 1")
 async def test_a_hole_is_not_readable() -> None:
     blocks = FileBlocks(make_cache(), 1000)
     deliver(blocks, 0, b"x" * 100)
@@ -242,6 +243,7 @@ async def test_no_progress_for_patience_is_a_timeout(nursery: trio.Nursery) -> N
     assert reading.took == pytest.approx(20 + PATIENCE)
 
 
+@pytest.mark.holds("promise 4")
 async def test_only_bytes_of_the_own_range_are_progress(nursery: trio.Nursery) -> None:
     blocks = FileBlocks(make_cache(), 1000)
     mine = await start_read(nursery, blocks, 0, 100)

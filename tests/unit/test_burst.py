@@ -25,6 +25,7 @@ def control(index: int, opcode: int, content: bytes = b"", offset: int = 0) -> P
     return Payload((SEQ + 1 + index) & 0xFFFF, 0, opcode, len(content), 15, 0, offset, content)
 
 
+@pytest.mark.holds("rule 14.15")
 def test_packets_are_placed_by_offset_across_the_wrap_of_seq() -> None:
     burst = make(239 * 1000)
     for index in range(999):
@@ -83,6 +84,7 @@ def test_incoherent_first_packets_are_refused(reply: Payload) -> None:
     assert burst.packet == 0
 
 
+@pytest.mark.holds("promise 1")
 @pytest.mark.parametrize(
     "reply", [data(2)._replace(offset=0), data(2)._replace(offset=479), data(2, step=200)]
 )
@@ -114,6 +116,7 @@ def test_a_grown_file_is_clipped_to_its_size() -> None:
     assert burst.take(data(2), 0.0) == b""
 
 
+@pytest.mark.holds("fault burst end", "rule 14.15")
 def test_eof_ends_it_wherever_it_says_it_is() -> None:
     burst = make()
     burst.take(data(0), 0.0)
@@ -139,6 +142,7 @@ def test_a_refusal_of_the_first_packet_ends_it() -> None:
     assert burst.nak == NakCode.NONE
 
 
+@pytest.mark.holds("rule 14.19")
 def test_endless_refusals() -> None:
     burst = make()
     burst.take(data(0), 0.0)
@@ -150,6 +154,7 @@ def test_endless_refusals() -> None:
     assert burst.endless
 
 
+@pytest.mark.holds("promise 8", "rule 14.19")
 def test_endless_empty_packets() -> None:
     burst = make()
     burst.take(data(0), 0.0)
@@ -162,6 +167,7 @@ def test_endless_empty_packets() -> None:
     assert burst.endless
 
 
+@pytest.mark.holds("rule 14.16")
 def test_quiet_is_long_at_first() -> None:
     assert make().quiet_deadline() == 1.0
     assert Burst(SEQ, 0, 1000, 239, 5.0, 1.0).quiet_deadline() == 8.0

@@ -49,6 +49,7 @@ async def begun(tree: Tree, store: FakeWriter, path: bytes, data: bytes = DATA) 
     return file
 
 
+@pytest.mark.holds("fault overlap")
 @pytest.mark.parametrize("error", [DENIED, SILENCE])
 async def test_a_name_that_stays_gets_its_file(
     autojump_clock: object, store: FakeWriter, error: MavftpfsError
@@ -205,6 +206,7 @@ async def take_when_answered(kind: str, path: bytes, nth: int, nursery: trio.Nur
     return True
 
 
+@pytest.mark.holds("fault overlap")
 @pytest.mark.parametrize("kind", ["posix", "fat", "mavsdk"])
 @pytest.mark.parametrize("path", [NEW, FILE])
 async def test_a_name_goes_in_the_moment_of_any_answer(
@@ -218,6 +220,7 @@ async def test_a_name_goes_in_the_moment_of_any_answer(
     nursery.cancel_scope.cancel()
 
 
+@pytest.mark.holds("fault overlap")
 @pytest.mark.parametrize("path", [NEW, FILE])
 async def test_a_removal_that_was_given_up_loses_nothing(
     autojump_clock: object, store: FakeWriter, path: bytes

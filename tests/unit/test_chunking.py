@@ -17,6 +17,8 @@ from tests.support.replies import ack, chunk, sent
 from tests.support.sources import MemorySource
 from tests.support.virtual import MemorySink
 
+pytestmark = pytest.mark.holds("fault long frames")
+
 CONTENT = random.Random(8).randbytes(MAX_DATA * 40)
 WINDOW = 4
 

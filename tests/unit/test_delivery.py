@@ -92,6 +92,7 @@ async def test_a_refusal_of_that_moment_is_not_taken_for_a_card_that_cannot_rena
     assert store.files[FILE].data == NEW
 
 
+@pytest.mark.holds("rule 14.22")
 async def test_a_file_is_replaced_whole(any_store: FakeWriter) -> None:
     tree = make_writable(any_store)
     if any_store.kind.renames:
@@ -142,6 +143,7 @@ async def test_a_part_is_changed(any_store: FakeWriter) -> None:
     assert litter(any_store) == []
 
 
+@pytest.mark.holds("rule 14.25")
 async def test_truncating(any_store: FakeWriter) -> None:
     tree = make_writable(any_store)
     for size in (700, 300, 1100, 0):
@@ -172,6 +174,7 @@ async def test_a_partial_change_of_a_large_file_is_refused_where_it_would_be_sen
 # --- verification
 
 
+@pytest.mark.holds("promise 2", "rule 14.23")
 async def test_a_mismatch_is_sent_once_more(any_store: FakeWriter) -> None:
     any_store.spoil_uploads = 1
     tree = make_writable(any_store)
@@ -194,6 +197,7 @@ async def test_a_second_mismatch_is_an_error_and_the_old_file_stays(
     assert store.files[FILE].data == NEW
 
 
+@pytest.mark.holds("promise 2")
 async def test_an_unanswered_checksum_counts_as_verified_by_size(store: FakeWriter) -> None:
     store.fail["crc", b"*"] = [RequestTimeout("silence")]
     tree = make_writable(store)
@@ -202,6 +206,7 @@ async def test_an_unanswered_checksum_counts_as_verified_by_size(store: FakeWrit
     assert tree.status()["verified_by_size"] == 1
 
 
+@pytest.mark.holds("promise 2")
 async def test_verify_crc_demands_an_answer(autojump_clock: object, store: FakeWriter) -> None:
     store.fail["crc", b"*"] = [RequestTimeout("silence")] * 2
     tree = make_writable(store, verify="crc")
@@ -223,6 +228,7 @@ async def test_what_is_too_large_or_not_wanted_is_not_summed(
 # --- errors
 
 
+@pytest.mark.holds("promise 3")
 async def test_an_error_is_told_at_every_close_until_the_bytes_are_there(
     autojump_clock: object, store: FakeWriter
 ) -> None:
@@ -265,6 +271,7 @@ async def test_a_full_card_leaves_the_old_file(autojump_clock: object, store: Fa
     assert FILE not in store.files
 
 
+@pytest.mark.holds("promise 3")
 async def test_a_background_failure_that_a_retry_repaired_is_not_told(
     autojump_clock: object, store: FakeWriter
 ) -> None:
@@ -321,6 +328,7 @@ async def test_a_writer_is_told_why_nothing_moves(autojump_clock: object, store:
     file.close()
 
 
+@pytest.mark.holds("promise 9")
 async def test_armed_means_an_error_at_once_and_delivery_after(
     autojump_clock: object, store: FakeWriter
 ) -> None:
@@ -515,6 +523,7 @@ def scene(kind: Kind, nursery: trio.Nursery, path: bytes = FILE) -> FakeWriter:
     return store
 
 
+@pytest.mark.holds("fault power")
 @pytest.mark.parametrize("name", sorted(JOBS))
 @pytest.mark.parametrize("kind", sorted(KINDS))
 async def test_power_lost_after_any_request(

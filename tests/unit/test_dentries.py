@@ -75,6 +75,7 @@ def test_a_fresh_complete_listing_proves_absence() -> None:
     assert dentries.absent_until(b"/e/a", 1) == 1
 
 
+@pytest.mark.holds("promise 10")
 def test_names_that_could_leave_the_tree_do_not_enter_it() -> None:
     dentries = make()
     hostile = [b"", b".", b"..", b"a/b", b"a\0b", b"ok", b"ok"]
@@ -82,6 +83,7 @@ def test_names_that_could_leave_the_tree_do_not_enter_it() -> None:
     assert list(directory.entries) == [b"ok"]
 
 
+@pytest.mark.holds("rule 14.27")
 def test_sizes_and_times_are_clamped() -> None:
     directory = put(make(), b"/", file(b"a", 2**70, 2**70), file(b"b", -5, -5))
     assert directory.entries[b"a"] == file(b"a", MAX_SIZE, None)

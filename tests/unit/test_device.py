@@ -14,6 +14,8 @@ import trio.testing
 
 from mavftpfs.fuse.device import never_blocking
 
+pytestmark = pytest.mark.holds("promise 4")
+
 
 @pytest.fixture
 def pair() -> Iterator[tuple[socket.socket, socket.socket]]:

@@ -62,6 +62,7 @@ def asked(engine: Engine) -> tuple[Simple, Payload]:
 # --- sequence numbers
 
 
+@pytest.mark.holds("fault replay", "rule 14.1")
 def test_starts_at_a_random_seq_and_counts_on_for_life() -> None:
     seqs = set()
     for seed in range(20):
@@ -75,6 +76,7 @@ def test_starts_at_a_random_seq_and_counts_on_for_life() -> None:
         assert sent(engine, 0.0)[0].seq == expected
 
 
+@pytest.mark.holds("fault replay", "rule 14.4")
 def test_65535_is_never_used() -> None:
     engine = make(65533)
     seqs = []
@@ -102,6 +104,7 @@ def test_a_seq_that_is_still_out_is_left_out() -> None:
     assert not first.done
 
 
+@pytest.mark.holds("fault replay", "rule 14.3")
 @pytest.mark.parametrize(
     ("packets", "jump"), [(40, BURST_JUMP), (5_000, 10_004), (25_000, 50_004), (200_000, FURTHEST_JUMP)]
 )
@@ -126,6 +129,7 @@ def test_a_burst_in_small_packets_has_more_of_them() -> None:
     assert sent(engine, 0.0)[0].seq >= 11 + 2 * 4000
 
 
+@pytest.mark.holds("rule 14.3")
 def test_the_rest_of_an_abandoned_burst_does_not_repeat_a_side_effect() -> None:
     """A server that sends the whole file, whatever is asked meanwhile (MAVSDK before 2022)."""
     engine = make(10)
@@ -144,6 +148,7 @@ def test_the_rest_of_an_abandoned_burst_does_not_repeat_a_side_effect() -> None:
 # --- what is believed
 
 
+@pytest.mark.holds("promise 1", "rule 14.2")
 @pytest.mark.parametrize(
     ("change", "counter"),
     [
@@ -166,6 +171,7 @@ def test_a_reply_that_does_not_fit_changes_nothing(change: dict[str, int], count
     assert engine.in_flight == (counter != "stale")  # else the seq will never be answered
 
 
+@pytest.mark.holds("rule 14.2")
 def test_the_session_is_checked_once_it_is_known_to_be_echoed() -> None:
     engine = make(limit=1, traits=Traits(ack_carries_own_session=True))
     _, sink = reading(engine)
@@ -176,6 +182,7 @@ def test_the_session_is_checked_once_it_is_known_to_be_echoed() -> None:
     assert bytes(sink.data[:239]) == b"y" * 239
 
 
+@pytest.mark.holds("rule 14.6")
 def test_a_server_that_answers_session_0_is_believed() -> None:
     engine = make()
     op = OpenFile(Opcode.OPEN_FILE_RO, b"/f", 77)
@@ -188,6 +195,7 @@ def test_a_server_that_answers_session_0_is_believed() -> None:
     assert engine.traits.queue_limit is None
 
 
+@pytest.mark.holds("promise 6")
 def test_an_echoed_id_means_a_short_shared_queue() -> None:
     engine = make()
     op = OpenFile(Opcode.OPEN_FILE_RO, b"/f", 77)
@@ -201,6 +209,7 @@ def test_an_echoed_id_means_a_short_shared_queue() -> None:
     assert engine.traits == Traits()
 
 
+@pytest.mark.holds("fault replay", "rule 14.4")
 @pytest.mark.parametrize(("opcode", "most"), [(Opcode.CREATE_DIRECTORY, 3), (Opcode.LIST_DIRECTORY, 9)])
 def test_a_stale_replay_is_asked_again_under_a_new_seq_and_only_so_often(opcode: int, most: int) -> None:
     """What changes the server might be done once for each new seq."""
@@ -227,6 +236,7 @@ def test_a_stale_replay_is_asked_again_under_a_new_seq_and_only_so_often(opcode:
     assert op.retransmitted
 
 
+@pytest.mark.holds("fault duplicate")
 def test_the_first_reply_counts_its_duplicates_do_not() -> None:
     engine = make()
     op, request = asked(engine)
@@ -242,6 +252,7 @@ def test_the_first_reply_counts_its_duplicates_do_not() -> None:
 # --- sessions of session-agnostic requests
 
 
+@pytest.mark.holds("rule 14.8")
 def test_requests_carry_the_engines_session_and_are_repeated_when_it_changed() -> None:
     engine = make()
     engine.session = 5
@@ -298,6 +309,7 @@ def test_a_late_refusal_under_an_old_session_does_not_repeat_twice() -> None:
 # --- retransmission
 
 
+@pytest.mark.holds("fault lost")
 def test_a_side_effect_goes_out_again_under_the_same_seq_with_growing_waits() -> None:
     engine = make()
     op, request = asked(engine)
@@ -332,6 +344,7 @@ def test_a_late_reply_to_a_side_effect_is_taken_but_not_timed() -> None:
     assert engine.rtt is None
 
 
+@pytest.mark.holds("fault duplicate")
 def test_reads_go_out_again_under_new_seqs_and_old_answers_still_count() -> None:
     engine = make(limit=1)
     transfer, sink = reading(engine, 100)
@@ -393,6 +406,7 @@ def test_a_lost_listing_is_found_by_later_reads_too() -> None:
     assert [request.data for request in again] == [listing.data]
 
 
+@pytest.mark.holds("fault duplicate")
 def test_reordering_is_learnt_and_forgotten() -> None:
     engine = make(limit=4)
     reading(engine)
@@ -543,6 +557,7 @@ def test_one_chunk_that_is_never_answered_fails_the_transfer() -> None:
     assert transfer.wants.covers(cursed or 0, 239)
 
 
+@pytest.mark.holds("rule 14.38")
 def test_checksums_are_not_piled_up() -> None:
     engine = make()
     op = Simple(Opcode.CALC_FILE_CRC32, b"/f", patience=120.0)
@@ -556,6 +571,7 @@ def test_checksums_are_not_piled_up() -> None:
     assert count <= 4
 
 
+@pytest.mark.holds("rule 14.38")
 def test_listings_are_not_piled_up() -> None:
     engine = make()
     for _ in range(20):
@@ -573,6 +589,7 @@ def test_listings_are_not_piled_up() -> None:
 # --- window and priority
 
 
+@pytest.mark.holds("promise 7")
 def test_metadata_goes_first_and_has_a_slot_of_its_own() -> None:
     engine = make(limit=4)
     reading(engine)
@@ -583,6 +600,7 @@ def test_metadata_goes_first_and_has_a_slot_of_its_own() -> None:
     assert engine.in_flight == 5
 
 
+@pytest.mark.holds("promise 7")
 def test_metadata_does_not_wait_for_what_a_wider_window_sent() -> None:
     """All answers were lost in a pause of the server: a Terminate went out 3 s later, when the last of these
     was given up, which each silence put off."""

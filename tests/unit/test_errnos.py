@@ -31,6 +31,7 @@ def test_path_opcodes_are_those_with_a_path() -> None:
     assert {int(opcode) for opcode in REQUESTS} - without == errnos.PATH_OPCODES
 
 
+@pytest.mark.holds("fault NAK")
 @pytest.mark.parametrize("opcode", [*REQUESTS, 17, 255])
 def test_every_opcode_code_and_errno_gives_a_real_errno(opcode: int) -> None:
     for code in range(256):
@@ -100,6 +101,7 @@ def test_naks_of_an_open(code: int, expected: int) -> None:
     assert nak(Opcode.OPEN_FILE_RO, code) == expected
 
 
+@pytest.mark.holds("rule 14.35")
 @pytest.mark.parametrize("opcode", SESSION_REQUESTS)
 def test_a_request_on_an_open_file_cannot_say_that_a_name_exists_or_is_missing(opcode: int) -> None:
     """8 there is PX4's sticky EEXIST, 10 is ArduPilot's lost session."""
@@ -114,6 +116,7 @@ def test_exists_is_told_where_something_is_made(opcode: int) -> None:
     assert nak(opcode, NakCode.FILE_EXISTS) == errno.EEXIST
 
 
+@pytest.mark.holds("rule 14.35")
 @pytest.mark.parametrize("opcode", [Opcode.LIST_DIRECTORY, Opcode.OPEN_FILE_RO, Opcode.REMOVE_FILE])
 def test_exists_is_sticky_where_nothing_is_made(opcode: int) -> None:
     assert nak(opcode, NakCode.FILE_EXISTS) == errno.EIO
@@ -124,6 +127,7 @@ def test_low_errnos_are_the_same_everywhere(number: int) -> None:
     assert nak(Opcode.OPEN_FILE_RO, NakCode.FAIL_ERRNO, number) == number
 
 
+@pytest.mark.holds("rule 14.35")
 @pytest.mark.parametrize(
     ("number", "expected"),
     [

@@ -158,6 +158,7 @@ async def test_a_stalled_read_times_out_and_recovers(store: FakeStore, tree: Tre
     assert await handle.read(0, 100) == DATA[:100]
 
 
+@pytest.mark.holds("promise 6", "rule 14.30")
 async def test_a_directory_is_not_opened(tree: Tree) -> None:
     with pytest.raises(IsADirectory):
         await tree.open(b"/logs")
@@ -280,6 +281,7 @@ async def test_a_smaller_ack_is_another_file_even_if_the_listing_is_old(store: F
         await old.read(0, 100)
 
 
+@pytest.mark.holds("fault growing file", "rule 14.21")
 async def test_a_grown_file_is_served_at_its_opened_size(store: FakeStore, tree: Tree) -> None:
     store.add(LOG, DATA)
     old = await tree.open(LOG)
@@ -298,6 +300,7 @@ async def test_a_grown_file_is_served_at_its_opened_size(store: FakeStore, tree:
     assert all(reader.closed for reader in store.readers)
 
 
+@pytest.mark.holds("fault replaced file")
 async def test_versions_do_not_meet_in_the_kernels_page_cache(store: FakeStore, tree: Tree) -> None:
     old = await tree.open(LOG)
     assert not old.direct_io
@@ -328,6 +331,7 @@ async def test_the_ack_beats_the_listing(store: FakeStore, tree: Tree) -> None:
     assert again.keep_cache
 
 
+@pytest.mark.holds("rule 14.27")
 async def test_a_size_that_does_not_fit_the_ack_is_an_error_not_a_short_file(
     store: FakeStore, tree: Tree
 ) -> None:
@@ -346,6 +350,7 @@ async def open_partly_cached(store: FakeStore, tree: Tree) -> OpenFile:
     return await tree.open(b"/big")
 
 
+@pytest.mark.holds("fault idle close", "rule 14.9")
 async def test_a_partly_cached_file_is_opened_again_only_when_bytes_are_wanted(
     store: FakeStore, tree: Tree
 ) -> None:
@@ -379,6 +384,7 @@ async def test_closed_files_are_bounded(store: FakeStore, tree: Tree) -> None:
 # --- reboot
 
 
+@pytest.mark.holds("promise 5")
 async def test_a_file_that_is_gone_after_a_reboot(store: FakeStore, tree: Tree) -> None:
     handle = await tree.open(LOG)
     await handle.read(0, 1000)

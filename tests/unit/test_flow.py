@@ -92,6 +92,7 @@ def test_loss_with_a_standing_queue_brakes_and_comes_back() -> None:
     assert flow.window >= 0.9 * before
 
 
+@pytest.mark.holds("fault overflow")
 def test_a_queue_ends_the_start() -> None:
     flow = Flow()
     path = Path(flow, rate=200.0, base=0.1)

@@ -25,6 +25,8 @@ from mavftpfs.link.messages import (
 )
 from mavftpfs.shared.errors import LocalProtocolError, UsageError
 
+pytestmark = pytest.mark.holds("promise 10")
+
 US = Address(254, 191)
 DRONE = Address(1, 1)
 KEY = bytes(range(32))

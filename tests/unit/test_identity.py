@@ -7,6 +7,8 @@ import pytest
 from mavftpfs.link.messages import Address, AutopilotVersion
 from mavftpfs.session.vehicle import ABSENCE, PATIENCE, Identity, is_another
 
+pytestmark = pytest.mark.holds("fault another vehicle")
+
 VEHICLE = Address(1, 1)
 
 

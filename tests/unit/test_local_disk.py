@@ -21,6 +21,8 @@ from mavftpfs.shared.errors import MavftpfsError, NoSpace, VehicleLost
 from tests.support.fake_store import read_file
 from tests.support.fake_writer import KINDS, FakeWriter, make_writable, write_file
 
+pytestmark = pytest.mark.holds("promise 3")
+
 BIG = os.urandom(70_000)
 FILE = b"/card/log.bin"
 

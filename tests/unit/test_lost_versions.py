@@ -12,6 +12,8 @@ from mavftpfs.cache.tree import Tree
 from mavftpfs.shared.errors import FileChanged, VehicleLost
 from tests.support.fake_writer import KINDS, FakeWriter, make_writable
 
+pytestmark = pytest.mark.holds("promise 5")
+
 FILE = b"/d/file"
 OLD, NEW = b"old" * 300, b"NEW" * 300
 """As long as one another: only the times differ."""

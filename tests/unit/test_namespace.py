@@ -118,6 +118,7 @@ async def test_renames(store: FakeWriter) -> None:
     await tree.rename(b"/d/b", b"/d/b")
 
 
+@pytest.mark.holds("rule 14.34")
 async def test_renames_that_are_refused(store: FakeWriter) -> None:
     tree = make_writable(store)
     for old, new, error in (

@@ -43,6 +43,7 @@ def test_simple_gives_its_reply() -> None:
     assert not op.retransmitted
 
 
+@pytest.mark.holds("rule 14.4")
 def test_side_effect_decides_how_it_is_repeated() -> None:
     for side_effect in (True, False):
         engine, request = begin(Simple(Opcode.CALC_FILE_CRC32, b"/f", side_effect=side_effect))
@@ -71,6 +72,7 @@ def test_refusals(codes: tuple[int, ...], code: int, errno: int | None) -> None:
     assert (error.opcode, error.code, error.server_errno, error.retransmitted) == (8, code, errno, False)
 
 
+@pytest.mark.holds("fault refused retry")
 def test_a_refusal_after_a_retransmission_says_so() -> None:
     op = Simple(Opcode.REMOVE_FILE, b"/f")
     engine, request = begin(op)
@@ -92,6 +94,7 @@ def test_a_request_too_big_for_the_wire_is_our_fault() -> None:
         request.encode()
 
 
+@pytest.mark.holds("rule 14.33")
 def test_too_long_data_is_refused_before_a_byte_is_sent() -> None:
     with pytest.raises(PathTooLong):
         Simple(Opcode.RENAME, bytes(240))
@@ -108,6 +111,7 @@ def test_an_open_ack_may_say_no_size(data: bytes) -> None:
     assert op.session == 9
 
 
+@pytest.mark.holds("rule 14.6")
 def test_an_open_with_session_0_proves_nothing() -> None:
     op = OpenFile(Opcode.OPEN_FILE_RO, b"/f", 0)
     engine, request = begin(op)
@@ -115,6 +119,7 @@ def test_an_open_with_session_0_proves_nothing() -> None:
     assert engine.traits.ack_carries_own_session is None
 
 
+@pytest.mark.holds("rule 14.11")
 def test_terminate() -> None:
     op = Terminate(4)
     engine, request = begin(op)
@@ -124,6 +129,7 @@ def test_terminate() -> None:
     assert not op.already_closed
 
 
+@pytest.mark.holds("fault refused retry")
 def test_terminating_what_is_closed_is_no_error() -> None:
     op = Terminate(4)
     engine, request = begin(op)
@@ -132,6 +138,7 @@ def test_terminating_what_is_closed_is_no_error() -> None:
     assert op.error is None
 
 
+@pytest.mark.holds("rule 14.11")
 def test_a_failed_close_is_an_error() -> None:
     op = Terminate(4)
     engine, request = begin(op)
@@ -176,6 +183,7 @@ class Lister:
         return [entry.name for entry in self.op.entries]
 
 
+@pytest.mark.holds("rule 14.28")
 def test_pages_are_counted_by_their_non_empty_strings() -> None:
     lister = Lister()
     lister.page(b"S\0S\0Fa\t1\0\0Db\0\0")
@@ -200,6 +208,7 @@ def test_an_empty_directory() -> None:
     assert lister.op.error is None
 
 
+@pytest.mark.holds("rule 14.31")
 def test_opcode_16() -> None:
     lister = Lister(with_time=True)
     lister.page(b"Fa\t1\t1700000000\0Dd\0")
@@ -208,6 +217,7 @@ def test_opcode_16() -> None:
     assert lister.op.entries[0].mtime == 1700000000
 
 
+@pytest.mark.holds("fault odd listing")
 def test_repeats_are_dropped_and_bad_names_counted() -> None:
     lister = Lister()
     lister.page(b"Fa\t1\0Fa\t1\0Fx/y\t1\0D.\0")
@@ -218,6 +228,7 @@ def test_repeats_are_dropped_and_bad_names_counted() -> None:
     assert lister.offsets == [0, 4, 6]
 
 
+@pytest.mark.holds("rule 14.29")
 def test_eight_ends_a_sweep_only_behind_a_page() -> None:
     lister = Lister()
     lister.page(b"Fa\t1\0")
@@ -228,6 +239,7 @@ def test_eight_ends_a_sweep_only_behind_a_page() -> None:
     assert isinstance(lister.op.error, FtpNak)
 
 
+@pytest.mark.holds("fault odd listing")
 def test_an_entry_that_fits_no_page_is_stepped_over() -> None:
     lister = Lister()
     lister.page(b"Fa\t1\0")
@@ -240,6 +252,7 @@ def test_an_entry_that_fits_no_page_is_stepped_over() -> None:
     assert lister.op.done
 
 
+@pytest.mark.holds("rule 14.29")
 def test_empty_pages_behind_others_prove_no_end() -> None:
     """Four neighbours whose entries fit no page look like the end of an old PX4's listing."""
     lister = Lister()
@@ -332,6 +345,7 @@ def test_other_refusals_are_errors() -> None:
     assert isinstance(lister.op.error, FtpNak)
 
 
+@pytest.mark.holds("rule 14.29")
 def test_a_server_that_ignores_the_offset_is_left() -> None:
     lister = Lister()
     while not lister.op.done:
@@ -358,6 +372,7 @@ def test_endless_skip_marks_end(monkeypatch: pytest.MonkeyPatch) -> None:
     assert lister.engine.stats.requests == 50
 
 
+@pytest.mark.holds("promise 8", "rule 14.29")
 def test_a_million_entries_end() -> None:
     lister = Lister()
     count = 0

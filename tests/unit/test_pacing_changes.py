@@ -9,6 +9,8 @@ import pytest
 from mavftpfs.protocol.pacing import Pacer
 from tests.unit.test_pacing import QUEUE, Server
 
+pytestmark = pytest.mark.holds("fault overflow")
+
 QUEUED = 5 / 0.010
 """Requests per second that the server's queue takes at most."""
 

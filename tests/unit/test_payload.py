@@ -23,6 +23,7 @@ def test_layout_is_the_guides() -> None:
     assert wire[15:] == bytes(PAYLOAD_SIZE - 15)
 
 
+@pytest.mark.holds("rule 14.5")
 def test_a_reply_holds_exactly_size_bytes() -> None:
     wire = bytearray(Payload(1, 0, 128, 2, 5, 0, 0, b"ab").encode())
     wire[14:20] = b"stray!"
@@ -45,6 +46,7 @@ def test_wrong_length_is_the_peers_fault(length: int) -> None:
         decode_reply(bytes(length))
 
 
+@pytest.mark.holds("fault corrupt")
 def test_oversize_reply_is_the_peers_fault() -> None:
     wire = bytearray(PAYLOAD_SIZE)
     wire[4] = 240

@@ -24,6 +24,7 @@ def draft(base: int | None, write: tuple[int, bytes] | None = None, size: int | 
     return made
 
 
+@pytest.mark.holds("rule 14.22")
 @pytest.mark.parametrize(
     ("made", "traits", "plan"),
     [

@@ -20,6 +20,8 @@ from tests.support.mounting import mounted
 from tests.support.worlds import world
 from tests.unit.test_daemon import restored_logging
 
+pytestmark = pytest.mark.holds("promise 10")
+
 __all__ = ["restored_logging"]
 
 

@@ -80,6 +80,7 @@ def ranges(requests: list[Payload]) -> list[tuple[int, int]]:
 # --- wants
 
 
+@pytest.mark.holds("rule 14.13")
 def test_the_last_request_is_clamped_to_the_size() -> None:
     reader = Reader(size=500)
     reader.transfer.want(0, 10_000, True)
@@ -149,6 +150,7 @@ def test_readahead_that_is_wanted_twice_is_asked_once() -> None:
     assert ranges(reader.finish()) == [(0, 239), (239, 478)]
 
 
+@pytest.mark.holds("rule 14.14")
 @pytest.mark.parametrize("block", [0, 240])
 def test_chunk_sizes(block: int) -> None:
     with pytest.raises(LocalProtocolError):
@@ -158,6 +160,7 @@ def test_chunk_sizes(block: int) -> None:
 # --- replies to ReadFile
 
 
+@pytest.mark.holds("fault chunk size")
 def test_a_short_reply_is_asked_for_again() -> None:
     reader = Reader(limit=1)
     reader.transfer.want(0, 239, True)
@@ -169,6 +172,7 @@ def test_a_short_reply_is_asked_for_again() -> None:
     assert bytes(reader.sink.data[:239]) == CONTENT[:239]
 
 
+@pytest.mark.holds("fault chunk size", "rule 14.5")
 def test_an_over_long_reply_is_clipped() -> None:
     reader = Reader(limit=1)
     reader.transfer.want(0, 100, True)
@@ -178,6 +182,7 @@ def test_an_over_long_reply_is_clipped() -> None:
     assert reader.transfer.idle
 
 
+@pytest.mark.holds("fault growing file")
 def test_an_empty_ack_means_that_the_file_shrank() -> None:
     reader = Reader()
     reader.transfer.want(0, 1000, True)
@@ -194,6 +199,7 @@ def test_an_early_eof_means_a_shrunken_file_where_sessions_are_echoed() -> None:
     assert isinstance(reader.transfer.error, FileChanged)
 
 
+@pytest.mark.holds("fault idle close", "rule 14.9")
 @pytest.mark.parametrize("codes", [(4,), (10,), (1,), (8,), (2, 9), (6,)])
 def test_a_lost_session_leaves_the_wants(codes: tuple[int, ...]) -> None:
     reader = Reader()
@@ -255,6 +261,7 @@ def test_a_burst_begins_at_the_first_missing_wanted_byte_and_brings_more() -> No
     assert reader.transfer.idle
 
 
+@pytest.mark.holds("fault burst tail", "rule 14.17")
 def test_gaps_are_filled_by_reads_when_the_burst_is_over() -> None:
     reader, request = bursting()
     stream(reader, request, [0, 1, 4, 5, 6, 9])
@@ -273,6 +280,7 @@ def test_gaps_are_filled_by_reads_when_the_burst_is_over() -> None:
     assert reader.sink.repeats == 0
 
 
+@pytest.mark.holds("fault burst tail", "rule 14.16")
 def test_a_burst_that_goes_quiet_is_over_but_not_early() -> None:
     reader, request = bursting()
     stream(reader, request, [0, 1, 2])
@@ -285,6 +293,7 @@ def test_a_burst_that_goes_quiet_is_over_but_not_early() -> None:
     assert again.offset == 717
 
 
+@pytest.mark.holds("fault burst end")
 def test_the_flag_and_a_short_quiet_end_it() -> None:
     reader = Reader(bursts=True)
     reader.engine._timers.of["data"].sample(0.05)
@@ -297,6 +306,7 @@ def test_the_flag_and_a_short_quiet_end_it() -> None:
     assert reader.now < 0.3
 
 
+@pytest.mark.holds("fault burst end")
 def test_a_spurious_flag_does_not_end_it() -> None:
     reader, request = bursting()
     stream(reader, request, list(range(41)), complete=3)
@@ -304,6 +314,7 @@ def test_a_spurious_flag_does_not_end_it() -> None:
     assert reader.engine.stats.by_opcode == {Opcode.BURST_READ_FILE: 1}
 
 
+@pytest.mark.holds("rule 14.17")
 def test_a_burst_waits_for_reads_and_reads_for_the_burst() -> None:
     reader = Reader(bursts=True)
     assert isinstance(reader.transfer, BurstTransfer)
@@ -352,6 +363,7 @@ def test_a_burst_without_session(code: int) -> None:
     assert not reader.transfer.bursting
 
 
+@pytest.mark.holds("rule 14.19")
 @pytest.mark.parametrize("kind", ["empty", "nak"])
 def test_an_endless_stream_must_be_terminated(kind: str) -> None:
     reader, request = bursting()
@@ -365,6 +377,7 @@ def test_an_endless_stream_must_be_terminated(kind: str) -> None:
     assert reader.transfer.wants == ExtentSet([(478, SIZE)])
 
 
+@pytest.mark.holds("fault chunk size")
 def test_px4_sends_239_whatever_was_asked() -> None:
     reader, request = bursting(block=110)
     assert request.size == 110

@@ -32,6 +32,7 @@ def test_steady_round_trips_leave_half_as_slack() -> None:
     assert timer.rto == pytest.approx(0.3)
 
 
+@pytest.mark.holds("rule 14.38")
 def test_variation_widens() -> None:
     timer = RttEstimator(0.03)
     for index in range(100):

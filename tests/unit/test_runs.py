@@ -86,6 +86,7 @@ def take_singly(engine: Engine, wires: list[bytes], now: float) -> int:
     return malformed
 
 
+@pytest.mark.holds("rule 14.2", "rule 14.5")
 @pytest.mark.parametrize("seed", range(8))
 @pytest.mark.parametrize("make", [reader, writer])
 def test_runs_are_believed_as_single_replies_are(make: Make, seed: int) -> None:

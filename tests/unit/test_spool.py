@@ -16,6 +16,8 @@ from mavftpfs.cache import rescuing
 from mavftpfs.cache.spool import PAGE, SLOTS, Spool, SpoolContent, SpoolDirectory
 from mavftpfs.shared.errors import NoSpace, SpoolFailed
 
+pytestmark = pytest.mark.holds("promise 3")
+
 
 def spool_of(tmp_path: Path, memory: int = 4 * PAGE, disk: int = 100 * PAGE) -> Spool:
     return Spool(memory_max=lambda: memory, spool_max=disk, directory=tmp_path)

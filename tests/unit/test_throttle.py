@@ -8,6 +8,8 @@ import trio
 from mavftpfs.cache.throttle import LEAST, MOST, SECONDS, UNMEASURED
 from tests.support.fake_writer import FakeWriter, card, make_writable
 
+pytestmark = pytest.mark.holds("promise 4")
+
 store = card({b"/card/there": b"x"})
 
 

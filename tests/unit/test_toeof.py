@@ -47,6 +47,7 @@ class Reading:
             del self.out[min(self.out)]
 
 
+@pytest.mark.holds("rule 14.13")
 @pytest.mark.parametrize("size", [0, 1, 99, 100, 101, 200, 950, 1000])
 def test_reads_what_is_there(size: int) -> None:
     content = random.Random(size).randbytes(size)
@@ -166,6 +167,7 @@ def test_refusals(codes: tuple[int, ...], error: type[MavftpfsError]) -> None:
     assert isinstance(reading.op.error, error)
 
 
+@pytest.mark.holds("rule 14.14")
 @pytest.mark.parametrize("block", [0, 240])
 def test_block_sizes(block: int) -> None:
     with pytest.raises(LocalProtocolError):

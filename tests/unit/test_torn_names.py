@@ -16,6 +16,8 @@ from mavftpfs.shared.model import split
 from tests.support.fake_store import read_file
 from tests.support.fake_writer import KINDS, FakeWriter, list_all, litter, write_file
 
+pytestmark = pytest.mark.holds("promise 9")
+
 OLD = bytes(range(256)) * 4
 NEW = b"new content " * 100
 FILE = b"/card/dir/file.txt"

@@ -50,6 +50,7 @@ def tree(store: FakeStore) -> Tree:
 # --- walking
 
 
+@pytest.mark.holds("promise 4")
 async def test_stat_walks_from_the_root_and_then_costs_nothing(store: FakeStore, tree: Tree) -> None:
     assert await tree.stat(b"/fs/microsd/a.txt") == Stat(FILE, 5, 1_700_000_000, 1.0)
     assert store.calls == [("list", b"/"), ("list", b"/fs"), ("list", b"/fs/microsd")]
@@ -77,6 +78,7 @@ async def test_absence_by_a_fresh_listing_costs_nothing(store: FakeStore, tree: 
     assert tree.negative_valid_for(b"/unknown/none") == 0.0
 
 
+@pytest.mark.holds("promise 6", "rule 14.30")
 async def test_a_file_is_never_listed(store: FakeStore, tree: Tree) -> None:
     for path in (b"/top/x", b"/top/x/y", b"/fs/microsd/a.txt/b"):
         with pytest.raises(NotADirectory):
@@ -115,6 +117,7 @@ async def test_hostile_paths(store: FakeStore, tree: Tree) -> None:
     assert (await tree.stat(b"//fs/./microsd/")).kind is DIRECTORY
 
 
+@pytest.mark.holds("rule 14.33")
 async def test_a_name_too_long_to_be_asked_for_is_still_shown(store: FakeStore, tree: Tree) -> None:
     name = b"n" * 190
     store.add(b"/fs/microsd/" + name, b"x")
@@ -173,6 +176,7 @@ async def test_a_listing_that_is_always_raced_is_given_up_on(store: FakeStore, t
 # --- the vehicle is out of reach
 
 
+@pytest.mark.holds("promise 4")
 async def test_expired_listings_are_served_while_the_vehicle_is_lost(store: FakeStore, tree: Tree) -> None:
     await tree.list(b"/fs/microsd")
     await trio.sleep(100)

@@ -26,6 +26,8 @@ from mavftpfs.shared.errors import (
 from mavftpfs.shared.model import split
 from tests.support.fake_writer import FakeWriter, card, litter, make_writable
 
+pytestmark = pytest.mark.holds("promise 3")
+
 OLD = bytes(range(256)) * 4
 FILE = b"/card/dir/file.txt"
 NEW = b"/card/dir/new"

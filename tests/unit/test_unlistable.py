@@ -13,6 +13,8 @@ from mavftpfs.shared.errors import MavftpfsError
 from tests.support.fake_store import read_file
 from tests.support.fake_writer import FakeWriter, card, make_writable, write_file
 
+pytestmark = pytest.mark.holds("rule 14.33")
+
 SEEN = b"/d/seen"
 BAD = [b"/d/ta\tb", b"/d/\tx", b"/d/x\t", b"/d/7\t8"]
 SWAP = b"/d/.ta\tb.swp"

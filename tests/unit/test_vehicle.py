@@ -16,6 +16,8 @@ from mavftpfs.link.messages import (
 from mavftpfs.protocol.payload import Opcode, Payload, request
 from mavftpfs.session.vehicle import FOREIGN_MEMORY, SILENCE_LIMIT, Vehicle
 
+pytestmark = pytest.mark.holds("fault boot time asked")
+
 OWN = Address(254, 191)
 PILOT = Address(1, 1)
 GCS = Address(255, 190)
@@ -59,6 +61,7 @@ def tell_boot_times(vehicle: Vehicle, *times: tuple[float, int]) -> None:
         vehicle.on_message(SystemTime(PILOT, 0, boot_ms), now)
 
 
+@pytest.mark.holds("rule 14.37")
 def test_the_first_autopilot_becomes_the_target_and_others_do_not_replace_it() -> None:
     vehicle = listener()
     vehicle.on_message(heartbeat(GCS, autopilot=MAV_AUTOPILOT_INVALID), 0.0)
@@ -87,6 +90,7 @@ def test_a_wanted_component_without_heartbeats_lives_by_its_systems_autopilot() 
     assert vehicle.heartbeat_at == 4.0
 
 
+@pytest.mark.holds("promise 9")
 def test_never_heard_is_armed_and_lost_needs_silence_and_a_time_out() -> None:
     vehicle = listener()
     assert vehicle.armed
@@ -122,6 +126,7 @@ def test_who_may_be_another_vehicle_does_not_disarm_ours() -> None:
     assert vehicle.armed
 
 
+@pytest.mark.holds("promise 9")
 @pytest.mark.parametrize("beats", [True, False])
 def test_nor_does_the_autopilot_beside_a_component_that_may_be_another_ones(beats: bool) -> None:
     """The target is a component; beats: it sends heartbeats of its own."""
@@ -166,6 +171,7 @@ def test_a_component_cannot_disarm_the_autopilot() -> None:
     assert news == [True, False]
 
 
+@pytest.mark.holds("promise 6", "rule 14.39")
 def test_ftp_of_others_is_foreign_and_our_own_replies_are_not() -> None:
     vehicle = listener()
     vehicle.on_message(heartbeat(PILOT), 0.0)

@@ -16,6 +16,8 @@ from mavftpfs.shared.errors import (
 from tests.support.fake_store import read_file
 from tests.support.fake_writer import KINDS, FakeWriter, make_writable, write_file
 
+pytestmark = pytest.mark.holds("promise 2")
+
 OLD = bytes(range(256)) * 400
 FILE = b"/card/dir/file.txt"
 PART = (100, b"changed")

@@ -45,6 +45,7 @@ def test_a_small_file_s_checksum_is_asked_for_again_soon() -> None:
     assert sum(timers.wait(work(0.06, sends=sends)) for sends in (1, 2, 3)) < 1.5
 
 
+@pytest.mark.holds("rule 14.38")
 def test_a_server_not_seen_at_work_gets_the_slowest_one_s_time() -> None:
     timers = learned()
     assert timers.wait(work(10.0, sends=3)) > 10.0

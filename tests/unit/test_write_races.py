@@ -17,6 +17,7 @@ from tests.support.fake_writer import KINDS, FakeUpload, FakeWriter, make_writab
 FILE = b"/d/file"
 
 
+@pytest.mark.holds("fault overlap")
 async def test_a_truncation_while_the_last_writer_is_being_released(
     nursery: trio.Nursery, autojump_clock: object
 ) -> None:
@@ -89,6 +90,7 @@ async def test_a_reader_of_the_old_part_goes_on_when_the_new_part_was_delivered(
             await file.release()
 
 
+@pytest.mark.holds("fault full card")
 async def test_overwriting_in_place_that_failed_goes_on_later(
     nursery: trio.Nursery, autojump_clock: object
 ) -> None:
@@ -134,6 +136,7 @@ async def program(tree: Tree, opening: Callable[[Tree], Awaitable[OpenFile]], la
     await file.release()
 
 
+@pytest.mark.holds("fault overlap")
 @pytest.mark.parametrize("change", ["unlink", "rename over", "rename"])
 @pytest.mark.parametrize("opening", sorted(OPENINGS))
 @pytest.mark.parametrize("kind", sorted(set(KINDS) - {"littlefs"}))
@@ -266,6 +269,7 @@ async def test_a_read_under_way_goes_on_when_the_file_is_renamed(
         assert list(store.files) == [OTHER]
 
 
+@pytest.mark.holds("fault overlap")
 async def test_a_reader_never_gets_bytes_of_what_replaces_its_file(
     nursery: trio.Nursery, autojump_clock: object
 ) -> None:

@@ -174,6 +174,7 @@ async def test_handles_are_closed_once(tree: Tree) -> None:
         await reader.write(0, b"x")
 
 
+@pytest.mark.holds("rule 14.27")
 async def test_no_file_is_larger_than_the_protocol_can_say(tree: Tree) -> None:
     file = await tree.open(FILE, write=True)
     with pytest.raises(FileTooLarge):
@@ -205,6 +206,7 @@ async def test_a_tree_without_a_writer_and_virtual_trees_are_read_only(store: Fa
         await writing.rename(FILE, b"/@SYS/x")
 
 
+@pytest.mark.holds("promise 6")
 async def test_a_growing_file_is_busy(autojump_clock: object, store: FakeWriter) -> None:
     tree = make_writable(store, dir_timeout=1)
     await tree.stat(FILE)
@@ -229,6 +231,7 @@ async def test_a_growing_file_is_busy(autojump_clock: object, store: FakeWriter)
     assert store.files[FILE].data == b""
 
 
+@pytest.mark.holds("promise 6")
 async def test_growth_shows_when_a_file_is_opened_too_and_force_goes_on(store: FakeWriter) -> None:
     tree, forced = make_writable(store), make_writable(store, force=True)
     for each in (tree, forced):

@@ -51,6 +51,7 @@ def count(number: int) -> bytes:
     return number.to_bytes(4, "little")
 
 
+@pytest.mark.holds("rule 14.24")
 def test_chunks_go_out_ascending_and_full() -> None:
     engine = make()
     transfer, source = writing(engine)
@@ -80,6 +81,7 @@ def test_more_goes_out_after_a_wake_only() -> None:
     assert [one.data for one in sent(engine, 0.2)] == [b"more"]
 
 
+@pytest.mark.holds("rule 14.23")
 def test_a_short_write_sends_the_rest() -> None:
     engine = make()
     transfer, source = writing(engine, CONTENT[:239])
@@ -94,6 +96,7 @@ def test_a_short_write_sends_the_rest() -> None:
     assert engine.traits.write_ack_counts is True
 
 
+@pytest.mark.holds("rule 14.23")
 def test_an_ack_without_a_count_is_for_all() -> None:
     engine = make()
     _, source = writing(engine, b"hello")
@@ -218,6 +221,7 @@ def test_what_waits_to_be_repeated_is_not_all_out() -> None:
     assert transfer.all_out
 
 
+@pytest.mark.holds("rule 14.24")
 def test_strict_order_has_one_in_flight() -> None:
     engine = make()
     transfer, _ = writing(engine, in_flight=1)
@@ -229,6 +233,7 @@ def test_strict_order_has_one_in_flight() -> None:
     assert not transfer.starved
 
 
+@pytest.mark.holds("rule 14.24")
 def test_never_more_than_the_server_queues() -> None:
     engine = Engine(random.Random(3), Flow(), traits=Traits(ack_carries_own_session=True, queue_limit=4))
     source = MemorySource(bytes(239 * 200))
@@ -269,6 +274,7 @@ def test_silence_times_out_and_gives_back() -> None:
     assert source.dirty.covers(0, 239)
 
 
+@pytest.mark.holds("rule 14.26")
 @pytest.mark.parametrize("piece", [(0, b""), (0, bytes(1 << 20)), (-1, b"x"), (MAX_OFFSET - 1, b"xy")])
 def test_a_chunk_that_does_not_fit_is_refused_without_a_raise(piece: tuple[int, bytes]) -> None:
     class Broken(MemorySource):
