@@ -81,25 +81,25 @@ def test_jitter_keeps_the_order_and_reorder_does_not() -> None:
 
 
 @pytest.mark.parametrize(
-    ("fields", "low", "high"),
-    [({"loss": 0.1}, 0.08, 0.12), ({"burst_loss": 0.1}, 0.06, 0.14), ({"loss": 1.0}, 1.0, 1.0)],
+    ("fields", "size", "low", "high"),
+    [
+        ({"loss": 0.1}, 1, 0.08, 0.12),
+        ({"burst_loss": 0.1}, 1, 0.06, 0.14),
+        ({"loss": 1.0}, 1, 1.0, 1.0),
+        ({"byte_loss": 1e-3}, 266, 0.21, 0.26),
+        ({"byte_loss": 1e-3}, 30, 0.02, 0.04),
+        ({"piece": 64, "piece_loss": 0.1}, 266, 0.39, 0.43),
+        ({"piece": 64, "piece_loss": 0.1}, 64, 0.09, 0.11),
+    ],
 )
-def test_loss_has_the_share_it_was_given(fields: dict[str, float], low: float, high: float) -> None:
+def test_loss_has_the_share_it_was_given(
+    fields: dict[str, float], size: int, low: float, high: float
+) -> None:
     link = model(**fields)
     for i in range(10_000):
-        link.push(UP, b"x", float(i))
+        link.push(UP, bytes(size), float(i))
     link.pop(UP, 1e6)
     assert low <= link.counters(UP).lost / 10_000 <= high
-
-
-def test_long_frames_are_damaged_more_often() -> None:
-    link = model(byte_loss=1e-3)
-    for i in range(10_000):
-        link.push(UP, bytes(266), float(i))
-        link.push(DOWN, bytes(30), float(i))
-    link.pop(UP, 1e6)
-    assert 0.21 <= link.counters(UP).lost / 10_000 <= 0.26
-    assert 0.02 <= link.counters(DOWN).lost / 10_000 <= 0.04
 
 
 def test_frames_beyond_a_limit_never_arrive() -> None:
@@ -109,16 +109,6 @@ def test_frames_beyond_a_limit_never_arrive() -> None:
         link.push(UP, frame, 0.0)
     assert [len(frame) for frame in link.pop(UP, 1.0)] == [99, 100, 1]
     assert link.counters(UP).lost == 1
-
-
-def test_a_frame_is_lost_with_any_piece_of_it() -> None:
-    link = model(piece=64, piece_loss=0.1)
-    for i in range(10_000):
-        link.push(UP, bytes(266), float(i))
-        link.push(DOWN, bytes(64), float(i))
-    link.pop(UP, 1e6)
-    assert 0.39 <= link.counters(UP).lost / 10_000 <= 0.43
-    assert 0.09 <= link.counters(DOWN).lost / 10_000 <= 0.11
 
 
 def test_burst_loss_comes_in_runs() -> None:

@@ -9,7 +9,7 @@ import pytest
 
 from mavftpfs.protocol.crc import crc32
 from mavftpfs.protocol.payload import NakCode, Opcode
-from mavftpfs.sim.pseudo import VirtualTrees, pack_parameters, unpack_parameters
+from mavftpfs.sim.pseudo import VirtualTrees, pack_parameters
 from tests.support.sim_client import Client, ack, nak
 
 PARAM = b"@PARAM/param.pck"
@@ -42,15 +42,6 @@ def test_sys_claims_100000_bytes_and_most_files_cannot_be_opened() -> None:
     assert nak(c.ask(Opcode.OPEN_FILE_RO, b"@SYS/threads.txt")) == NOT_FOUND
     assert nak(c.ask(Opcode.OPEN_FILE_RO, b"@SYS/none")) == NOT_FOUND
     assert nak(c.ask(Opcode.OPEN_FILE_WO, b"@SYS/tasks.txt")) == bytes([NakCode.FAIL_ERRNO, errno.EROFS])
-
-
-@pytest.mark.parametrize("block", [1, 7, 80, 110, 239])
-def test_parameters_survive_every_block_size(block: int) -> None:
-    virtual = VirtualTrees()
-    c = Client("ardupilot", virtual=virtual)
-    packed = download(c, PARAM, block)
-    assert packed == pack_parameters(virtual.params, block)
-    assert unpack_parameters(packed) == virtual.params
 
 
 def test_a_changed_block_size_is_einval_also_for_the_last_block() -> None:

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import random
-import struct
 from collections.abc import Iterator
-from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -13,12 +11,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mavftpfs.link.messages import Address
-from mavftpfs.protocol.payload import NakCode, Opcode, decode_reply, request
+from mavftpfs.protocol.payload import Opcode, decode_reply, request
 from mavftpfs.sim.profiles import PROFILES
 from mavftpfs.sim.storage import Storage
 from mavftpfs.sim.tree import DirectoryTree, MemoryTree
 from mavftpfs.sim.vehicle import FtpServer
-from tests.support.sim_client import CLIENT, OTHER, Client, ack, nak, small_tree
+from tests.support.sim_client import CLIENT, OTHER, Client, small_tree
 
 A = b"/fs/microsd/a.bin"
 PATHS = [
@@ -188,24 +186,6 @@ def test_fat_loses_the_sector_in_memory_with_the_power(name: str, real: bool, tm
         assert kept == (expected if closed else expected[:1024] + old[1024:])
 
 
-@pytest.mark.parametrize("name", ["px4", "ardupilot", "mavsdk"])
-def test_a_real_directory_can_be_served(name: str, tmp_path: Path) -> None:
-    (tmp_path / "fs" / "microsd").mkdir(parents=True)
-    (tmp_path / "fs" / "microsd" / "a.bin").write_bytes(b"hello world")
-    c = Client(name, tree=None)
-    c.server = FtpServer(DirectoryTree(tmp_path), PROFILES[name], rng=random.Random(1))
-    opened = c.ask(Opcode.OPEN_FILE_RO, A, session=1, wait=1.0)
-    assert ack(opened) == struct.pack("<I", 11)
-    read = c.ask(Opcode.READ_FILE, session=opened.session, size=5, offset=6, wait=1.0)
-    assert ack(read) == b"world"
-    ack(c.ask(Opcode.TERMINATE_SESSION, session=opened.session, wait=1.0))
-    created = c.ask(Opcode.CREATE_FILE, b"/fs/microsd/b", session=1, wait=1.0)
-    ack(created)
-    ack(c.ask(Opcode.WRITE_FILE, b"data", session=created.session, wait=1.0))
-    ack(c.ask(Opcode.TERMINATE_SESSION, session=created.session, wait=1.0))
-    assert (tmp_path / "fs" / "microsd" / "b").read_bytes() == b"data"
-
-
 @pytest.mark.parametrize(("name", "checksum"), [("px4-nuttx", True), ("ardupilot", False), ("mavsdk", True)])
 def test_a_deadline_is_never_missed(name: str, checksum: bool) -> None:
     """Waking only at next_deadline gets what polling gets, and not later."""
@@ -238,53 +218,3 @@ def woken(server: FtpServer, start: float) -> Iterator[tuple[float, bytes]]:
 
 
 # -- the textbook server -------------------------------------------------------------------------
-
-
-def test_the_textbook_server_has_several_sessions_with_ids_of_its_own() -> None:
-    c = Client("spec")
-    ids = [c.open(A, session=50).session for _ in range(4)]
-    assert len(set(ids)) == 4
-    assert 0 not in ids
-    assert nak(c.ask(Opcode.OPEN_FILE_RO, A)) == bytes([NakCode.NO_SESSIONS_AVAILABLE])
-    ack(c.ask(Opcode.TERMINATE_SESSION, session=ids[1]))
-    assert nak(c.ask(Opcode.READ_FILE, session=ids[1], size=1)) == bytes([NakCode.INVALID_SESSION])
-    assert ack(c.ask(Opcode.READ_FILE, session=ids[2], size=2)) == b"\0\1"
-    ack(c.ask(Opcode.RESET_SESSIONS))
-    assert c.server.open_sessions == 0
-
-
-def test_the_textbook_server_bursts() -> None:
-    tree = MemoryTree()
-    tree.add(A, bytes(range(250)) * 100)
-    c = Client("spec", tree)
-    session = c.open(A).session
-    got, offset = b"", 0
-    while True:
-        replies = c.ask_all(Opcode.BURST_READ_FILE, session=session, offset=offset, size=100, wait=1.0)
-        assert [b.seq - a.seq for a, b in pairwise(replies)] == [1] * (len(replies) - 1)
-        assert [p.burst_complete for p in replies] == [0] * (len(replies) - 1) + [1]
-        assert len(replies) == 100 or (replies[-1].opcode == Opcode.NAK and len(replies) == 51)
-        got += b"".join(p.data for p in replies if p.opcode == Opcode.ACK)
-        offset = len(got)
-        if replies[-1].opcode == Opcode.NAK:
-            break
-    assert replies[-1].data == bytes([NakCode.EOF])
-    assert got == tree.data(A)
-
-
-def test_the_textbook_server_does_the_rest() -> None:
-    c = Client("spec")
-    page = c.listing(b"/fs/microsd", opcode=Opcode.LIST_DIRECTORY_WITH_TIME)
-    assert page.startswith(b"Fa.bin\t1024\t1700000000\0")
-    assert c.listing(b"/fs/microsd", 3) == b"Ddir\0"
-    assert nak(c.ask(Opcode.LIST_DIRECTORY, b"/fs/microsd", offset=4)) == bytes([NakCode.EOF])
-    ack(c.ask(Opcode.TRUNCATE_FILE, A, offset=3))
-    ack(c.ask(Opcode.RENAME, A + b"\0/b"))
-    assert isinstance(c.tree, MemoryTree)
-    assert c.tree.data(b"/b") == b"\0\1\2"
-    ack(c.ask(Opcode.REMOVE_FILE, b"/b"))
-    ack(c.ask(Opcode.REMOVE_DIRECTORY, b"/fs/microsd/dir"))
-    assert nak(c.ask(Opcode.REMOVE_DIRECTORY, b"/fs")) == bytes([NakCode.FAIL_ERRNO, 39])
-    assert nak(c.ask(77)) == bytes([NakCode.UNKNOWN_COMMAND])
-    session = c.open(b"/fs/microsd/five").session
-    assert nak(c.ask(Opcode.WRITE_FILE, b"x", session=session)) == bytes([NakCode.FAIL])

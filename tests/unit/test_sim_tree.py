@@ -43,47 +43,9 @@ def failure(action: Callable[[], object]) -> int | None:
     pytest.fail("no OSError")
 
 
-def test_listing_shows_dots_and_kinds(tree: Tree) -> None:
-    found = {entry.name: entry.stat for entry in tree.entries(b"/")}
-    assert set(found) == {b".", b"..", b"dir", b"file"}
-    assert found[b"file"].kind is Kind.FILE
-    assert found[b"file"].size == 10
-    assert found[b"dir"].kind is Kind.DIRECTORY
-
-
 @pytest.mark.parametrize("path", [b"file", b"/file", b"//./file", b"/dir/../file", b"/../../file"])
 def test_paths_are_forgiving_but_stay_below_the_root(tree: Tree, path: bytes) -> None:
     assert get(tree, path) == b"0123456789"
-
-
-def test_reads_and_writes_anywhere(tree: Tree) -> None:
-    opened = tree.open(b"/file", write=True)
-    assert opened.write(12, b"ab") == 2
-    assert opened.write(1, b"XY") == 2
-    assert opened.read(0, 100) == b"0XY3456789\0\0ab"
-    assert opened.read(100, 5) == b""
-    opened.resize(3)
-    opened.close()
-    opened.close()
-    assert tree.stat(b"/file").size == 3
-
-
-def test_open_can_create_and_truncate(tree: Tree) -> None:
-    tree.open(b"/new", write=True, create=True).close()
-    assert get(tree, b"/new") == b""
-    tree.open(b"/file", write=True, create=True).close()
-    assert get(tree, b"/file") == b"0123456789"
-    tree.open(b"/file", write=True, truncate=True).close()
-    assert get(tree, b"/file") == b""
-
-
-def test_rename_moves_and_replaces(tree: Tree) -> None:
-    put(tree, b"/other", b"other")
-    tree.rename(b"/file", b"/other")
-    assert get(tree, b"/other") == b"0123456789"
-    assert failure(lambda: tree.stat(b"/file")) == errno.ENOENT
-    tree.rename(b"/dir", b"/moved")
-    assert get(tree, b"/moved/inner") == b"x"
 
 
 def test_removed_file_stays_readable_while_open(tree: Tree) -> None:

@@ -10,7 +10,6 @@ import pytest
 from mavftpfs.link.framing import Framer
 from mavftpfs.link.messages import (
     Address,
-    AutopilotVersion,
     FtpFrame,
     Heartbeat,
     Message,
@@ -66,37 +65,6 @@ class Client:
 
 def of(kind: type[T], messages: list[Message]) -> list[T]:
     return [m for m in messages if isinstance(m, kind)]
-
-
-def test_beats_once_a_second_with_its_boot_time() -> None:
-    client = Client("px4")
-    heard = client.hear(10.0)
-    beats = of(Heartbeat, heard)
-    assert beats == [Heartbeat(DRONE, 2, 12, 0x41, 3)] * 11
-    assert [m.time_boot_ms for m in of(SystemTime, heard)] == [n * 1000 for n in range(11)]
-
-
-def test_arming_shows_at_once_and_in_each_beat() -> None:
-    client = Client()
-    assert [b.armed for b in of(Heartbeat, client.hear(1.5))] == [False, False]
-    client.vehicle.arm()
-    assert [b.armed for b in of(Heartbeat, client.hear(1.1))] == [True, True]
-    client.vehicle.disarm()
-    assert [b.armed for b in of(Heartbeat, client.hear())] == [False]
-    assert of(Heartbeat, Client(armed=True).hear())[0].armed
-
-
-@pytest.mark.parametrize(
-    ("profile", "flag"), [("px4", 0x20), ("ardupilot5", 0x20), ("spec", 0x20), ("mavsdk", 0)]
-)
-def test_version_is_told_on_request_with_the_profiles_flag(profile: str, flag: int) -> None:
-    client = Client(profile)
-    assert of(AutopilotVersion, client.hear(3)) == []
-    client.tell(client.framer.encode_request_message(DRONE, 148))
-    client.tell(client.framer.encode_request_capabilities(DRONE))
-    versions = of(AutopilotVersion, client.hear())
-    assert [v.capabilities & 0x20 for v in versions] == [flag, flag]
-    assert versions[0] == versions[1]
 
 
 @pytest.mark.parametrize(
