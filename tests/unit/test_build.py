@@ -44,12 +44,6 @@ def test_an_index_shows_links_that_lead_somewhere(hook: Any) -> None:
     )
 
 
-def test_what_lacks_is_named_by_its_package(hook: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert hook.lacking() == [], "scripts/setup installs them"
-    monkeypatch.setenv("PATH", "/nowhere")
-    assert hook.lacking() == ["gcc", "pkg-config", "libfuse3-dev"]
-
-
 def test_a_machine_that_lacks_something_is_refused(hook: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     project = hook.CustomMetadataHook()
     project.root = str(HOOK.parent)

@@ -17,7 +17,7 @@ from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.shared.errors import AlreadyExists, FtpNak, MavftpfsError, NotFound, RequestTimeout
 from mavftpfs.shared.model import Listing, split
 from tests.support.deliveries import in_the_middle
-from tests.support.fake_writer import CHUNK, KINDS, FakeWriter, Kind, litter, make_writable, write_file
+from tests.support.fake_writer import CHUNK, KINDS, FakeWriter, Kind, litter, make_writable
 
 FILE, NEW, OTHER = b"/card/dir/file.txt", b"/card/dir/new", b"/card/dir/other"
 OLD = bytes(range(256)) * 20
@@ -104,40 +104,6 @@ async def test_a_file_that_is_being_renamed_can_be_removed(autojump_clock: objec
     assert set(store.files) == {FILE, OTHER}
     assert bytes(await file.read(0, len(DATA))) == DATA
     await file.release()
-
-
-async def test_an_upload_that_is_about_to_begin_by_itself_is_called_off(
-    autojump_clock: object, store: FakeWriter
-) -> None:
-    """Nobody waits for it: the first it does is to try what the server does to open files."""
-    tree = make_writable(store, dirty_max=64 * 1024)
-    file = await tree.open(FILE, write=True)
-    store.write_delay = 5.0
-    await file.write(100, bytes(64 * 1024))
-    await trio.sleep(0.1)
-    before = trio.current_time()
-    await tree.unlink(FILE)
-    assert trio.current_time() - before < 1.5 * store.write_delay  # the file gets a hidden name, no more
-    store.write_delay = 0.0
-    await trio.sleep(60)
-    assert await file.read(0, 100) == OLD[:100]
-    await file.release()
-    await tree.list(split(FILE)[0])
-    assert set(store.files) == {OTHER}
-
-
-async def test_a_name_that_went_is_free_for_another_file(autojump_clock: object, store: FakeWriter) -> None:
-    tree = make_writable(store)
-    file = await begun(tree, store, FILE)
-    async with in_the_middle(file):
-        await tree.unlink(FILE)
-        store.write_delay = 0.0
-        await write_file(tree, FILE, b"another")
-    await file.write(0, b"!")
-    await file.release()
-    await trio.sleep(60)
-    assert store.files[FILE].data == b"another"
-    assert litter(store) == []
 
 
 # --- at any moment
@@ -258,25 +224,3 @@ async def test_a_delivery_that_was_given_up_at_its_very_end_goes_on(
     await file.release()
     assert tree.undelivered() == []
     assert store.files[path].data == DATA + more
-
-
-async def test_what_waits_to_begin_an_upload_does_not_begin_it(
-    autojump_clock: object, store: FakeWriter
-) -> None:
-    """It comes before the removal at the lock, and is called off like the delivery before it."""
-    tree = make_writable(store)
-    file = await tree.open(FILE, write=True)
-    store.lost = True
-    await file.write(100, LARGE)
-    await trio.sleep(0.1)  # it could not begin
-    store.lost = False
-    store.write_delay = 5.0
-    async with trio.open_nursery() as waiting:
-        waiting.start_soon(file.fsync)
-        await trio.sleep(0.1)
-        tree.link_back()
-        await trio.sleep(0.1)
-        before = trio.current_time()
-        await tree.unlink(FILE)
-        assert trio.current_time() - before < 3.5 * store.write_delay  # its temporary file is removed, too
-    await file.release()

@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 import trio
 
-from mavftpfs import cli, commands, compose, control, daemon, report
+from mavftpfs import cli, commands, compose, control, report
 from mavftpfs.exits import ExitCode, MountFailed, NoFtp, NotDelivered, exit_code_for
 from mavftpfs.fuse.options import MountOptions
 from mavftpfs.oneshot.verbs import until_interrupted
@@ -59,11 +59,6 @@ def complaint(capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, str
 )
 def test_exit_codes(error: MavftpfsError, code: int) -> None:
     assert exit_code_for(error) == code
-
-
-def test_the_documented_numbers() -> None:
-    numbers = [ExitCode.OK, ExitCode.USAGE, ExitCode.NO_VEHICLE, ExitCode.MOUNT_FAILED, ExitCode.UNDELIVERED]
-    assert numbers == [0, 1, 2, 3, 4]
 
 
 # -- words ----------------------------------------------------------------------------------------
@@ -116,35 +111,6 @@ def test_usage_errors_are_one_line_and_exit_1(
 def test_no_words_shows_help(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main([]) == 1
     assert "SOURCE MOUNTPOINT" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    "words", [["--help"], ["mount", "-h"], ["get", "-h"], ["sim", "-h"], ["demo", "-h"], ["status", "-h"]]
-)
-def test_help_is_exit_0(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as caught:
-        cli.main(words)
-    assert caught.value.code == 0
-    assert "usage: mavftpfs" in capsys.readouterr().out
-
-
-def test_what_mount_8_calls_is_parsed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    seen: list[tuple[Any, ...]] = []
-
-    def serve(*args: Any) -> int:
-        seen.append(args)
-        return 0
-
-    monkeypatch.setattr(commands, "_serve", serve)
-    monkeypatch.setattr(daemon, "in_background", lambda work: work(None))
-    words = [f"{SOURCE}#/fs/microsd", str(tmp_path), "-o", "rw,dev,suid,_netdev", "-o", "uid=7"]
-    for command in ([], ["mount"]):
-        assert cli.main([*command, *words]) == 0
-        _, options, spec, mountpoint, _ = seen.pop()
-        assert (options.root, options.uid, options.kernel_words) == (b"/fs/microsd", 7, ("dev", "suid"))
-        assert not options.read_only
-        assert mountpoint == str(tmp_path)
-        assert spec.port == 0
 
 
 def test_baud_and_relative_paths(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

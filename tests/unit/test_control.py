@@ -183,13 +183,6 @@ def test_a_mute_process_is_not_taken_for_a_dead_one(tmp_path: Path) -> None:
 # -- places ---------------------------------------------------------------------------------------
 
 
-def test_all_places_of_a_user_are_searched() -> None:
-    found = control.socket_directories({"XDG_RUNTIME_DIR": "/run/user/7"}, 7, "/home/x")
-    assert found == [Path("/run/user/7/mavftpfs"), Path("/home/x/.cache/mavftpfs")]
-    found = control.socket_directories({}, 7, "/home/x")
-    assert found == [Path("/run/user/7/mavftpfs"), Path("/home/x/.cache/mavftpfs")]
-
-
 def test_a_private_directory_is_made() -> None:
     with TemporaryDirectory() as name:  # a socket's path may not be as long as pytest's directories
         short = Path(name)

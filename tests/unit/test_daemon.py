@@ -69,11 +69,6 @@ def test_an_error_of_ours_is_no_bug(tmp_path: Path) -> None:
     assert (done.returncode, done.stderr) == (1, "mavftpfs: cannot write that log\n")
 
 
-def test_a_child_that_returns_without_a_word_gives_its_code(tmp_path: Path) -> None:
-    done = run("return 4", tmp_path)
-    assert (done.returncode, done.stderr) == (4, "")
-
-
 @pytest.mark.parametrize(
     ("work", "words"),
     [
@@ -174,24 +169,11 @@ def test_a_log_file_is_appended_to(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("restored_logging")
-def test_the_log_shows_names_as_they_are_read(tmp_path: Path) -> None:
-    path = tmp_path / "log"
-    daemon.log_to_file(str(path), logging.INFO)
-    logging.getLogger("mavftpfs").info("%r is not delivered: %s", "/Flüge".encode(), b"it's\x1b")
-    assert path.read_text().endswith("'/Flüge' is not delivered: 'it's?'\n")
-
-
-@pytest.mark.usefixtures("restored_logging")
 def test_a_name_that_is_no_text_is_logged_too(tmp_path: Path) -> None:
     path = tmp_path / "log"
     daemon.log_to_file(str(path), logging.INFO)
     logging.getLogger("mavftpfs").info("%s stays where it is", os.fsdecode(b"/spool/\xff"))
     assert path.read_text().endswith("/spool/\\udcff stays where it is\n")
-
-
-def test_what_the_child_reports_shows_names_as_they_are_read(tmp_path: Path) -> None:
-    done = run("report(1, repr('/Flüge'.encode()) + ' does not exist')\nreturn 1", tmp_path)
-    assert (done.returncode, done.stderr) == (1, "mavftpfs: '/Flüge' does not exist\n")
 
 
 @pytest.mark.parametrize("text", ["cannot open /tmp/b'ü'", "no b'\\x' here", "b'one\ntwo'"])

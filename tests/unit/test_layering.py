@@ -288,15 +288,6 @@ def test_checker_sees_a_wrong_direction(importer: str, target: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("importer", "target"),
-    [("session__store", "cache.remote"), ("cli", "sim.vehicle"), ("mount", "session.store")],
-)
-def test_checker_allows_what_the_page_allows(importer: str, target: str) -> None:
-    modules = package(**{importer: f"import mavftpfs.{target}", target.replace(".", "__"): ""})
-    assert wrong_directions(modules) == []
-
-
-@pytest.mark.parametrize(
     "source", ["import trio", "from time import monotonic", "import random\nx = random.random()"]
 )
 def test_checker_sees_an_impure_module(source: str) -> None:
@@ -304,17 +295,10 @@ def test_checker_sees_an_impure_module(source: str) -> None:
     assert impurities(package(session__driver=source)) == []
 
 
-def test_checker_sees_a_trespasser_and_a_giant() -> None:
+def test_checker_sees_a_trespasser_a_giant_and_a_cycle() -> None:
     assert trespassers(package(cache__files="import pymavlink.mavutil")) == ["cache.files imports pymavlink"]
     body = "    pass\n" * MAX_FUNCTION_LINES
     assert long_parts(package(mount="def f() -> None:\n" + body)) == ["mount.f: 61 lines"]
     assert long_parts(package(mount="\n" * 601)) == ["mount: 601 lines"]
-
-
-def test_checker_sees_a_cycle() -> None:
-    modules = package(
-        cache__a="import mavftpfs.cache.b",
-        cache__b="from mavftpfs.cache import c",
-        cache__c="import mavftpfs.cache.a",
-    )
-    assert set(import_cycle(modules)) == {"cache.a", "cache.b", "cache.c"}
+    modules = package(cache__a="import mavftpfs.cache.b", cache__b="from mavftpfs.cache import a")
+    assert set(import_cycle(modules)) == {"cache.a", "cache.b"}

@@ -50,14 +50,6 @@ def test_a_file_that_begins_again_takes_back_what_it_had() -> None:
     assert progress.done == 0
 
 
-def test_a_file_that_grew_does_not_pass_the_total() -> None:
-    progress = Progress(Clock())
-    progress.plan(1, 1000)
-    progress.begin("/a", 1000)
-    progress.at(1500)
-    assert (progress.done, progress.size) == (1000, 1500)
-
-
 def test_the_end_of_a_long_name_is_shown_and_nothing_a_terminal_obeys() -> None:
     progress = Progress(Clock())
     progress.plan(2, 1000)

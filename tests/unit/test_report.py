@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 import trio
 
-from mavftpfs.report import NOTHING, Watcher, delivery_line, panel, rows, screen, snapshot, status_lines
+from mavftpfs.report import Watcher, delivery_line, panel, rows, screen, snapshot, status_lines
 from mavftpfs.shared.readable import printable, readable_size, readable_time
 
 CONNECTION = {
@@ -101,11 +101,6 @@ def test_nothing_held_back_is_said_where_it_can_be_written() -> None:
     assert lines(read_only=True)[1:] == []
 
 
-def test_a_mount_that_cannot_be_asked_is_a_line() -> None:
-    dead = {"mountpoint": "/mnt/a", "source": "udpin:0", "state": "dead", "problem": "DEAD: gone"}
-    assert [line.fitted() for line in status_lines(dead, verbose=True)] == ["/mnt/a: DEAD: gone"]
-
-
 async def test_what_holds_from_one_heartbeat_to_the_next_is_logged(
     autojump_clock: object, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -146,18 +141,6 @@ def test_nothing_is_erased_behind_a_line_as_wide_as_the_terminal() -> None:
     # The cursor stays on the last character of a full line, and an erasure (J, K) begins at the cursor.
     first_text = drawn.index(lines[0])
     assert not re.search(r"\x1b\[[0-2]?[JK]", drawn[first_text:])
-
-
-def test_two_busy_mounts_share_a_terminal() -> None:
-    cache = {"reads": [READ] * 9, "rate": 5100.0}
-    shown = panel([status(None, cache), status(None, cache)], 80, 24)
-    assert len(shown) == 22  # each whole: the first line, nine files, and that nothing is held back
-    assert sum("10_32_15.ulg: 35 %" in line for line in shown) == 18
-    assert (
-        panel([status(None, {**cache, "reads": [READ] * 40})] * 2, 80, 24)[11::12]
-        == ["  … and 31 more lines"] * 2
-    )
-    assert panel([], 80, 24) == [NOTHING]
 
 
 def test_a_path_that_is_too_long_keeps_its_end() -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import logging
-import re
 import struct
 from pathlib import Path
 
@@ -14,14 +13,15 @@ from pymavlink import mavutil
 from mavftpfs.link.framing import Framer
 from mavftpfs.link.messages import Address
 from mavftpfs.protocol.payload import NakCode, Opcode, Payload, request
+from mavftpfs.protocol.stats import EngineStats
+from mavftpfs.session.driver import Remarks
 from mavftpfs.shared.errors import UsageError
-from mavftpfs.trace import REPLY, REQUEST, JsonTrace, Tee, TextTrace, TlogWriter, describe, text_line
+from mavftpfs.trace import REPLY, REQUEST, JsonTrace, TlogWriter, text_line
 
 READ = request(7, Opcode.READ_FILE, session=3, offset=478, size=100).encode()
 OPEN = request(8, Opcode.OPEN_FILE_RO, data=b"/fs/microsd/a.bin").encode()
 DATA = Payload(8, 3, Opcode.ACK, 4, Opcode.BURST_READ_FILE, 1, 478, b"abcd").encode()
 NAK = Payload(9, 0, Opcode.NAK, 2, Opcode.OPEN_FILE_RO, 0, 0, bytes([NakCode.FAIL_ERRNO, 28])).encode()
-ODD = Payload(9, 0, 77, 239, 99, 0, 0, b"x" * 239).encode()
 
 
 WALL = 1795426200.25
@@ -73,12 +73,6 @@ def test_json_lines(tmp_path: Path) -> None:
     ]
 
 
-def test_json_holds_all_data_unless_told_otherwise() -> None:
-    assert describe(REPLY, ODD)["data"] == (b"x" * 239).hex()
-    assert describe(REPLY, ODD)["opcode"] == "77"
-    assert describe(REPLY, ODD)["req_opcode"] == "99"
-
-
 @pytest.mark.parametrize(
     ("direction", "wire", "line"),
     [
@@ -91,16 +85,6 @@ def test_json_holds_all_data_unless_told_otherwise() -> None:
 )
 def test_text(direction: str, wire: bytes, line: str) -> None:
     assert text_line(direction, wire) == line
-
-
-def test_text_trace_and_tee() -> None:
-    lines: list[str] = []
-    sink = TextTrace(lines.append, wall_clock=lambda: WALL)
-    Tee([sink, sink]).payload(1.0, REQUEST, READ, "dup")
-    assert len(lines) == 2
-    assert re.fullmatch(
-        r"\d\d:\d0:00.250000 -> READ_FILE seq 7 session 3 offset 478 size 100 \(dup\)", lines[0]
-    )
 
 
 def test_tlog_is_readable_by_pymavlink(tmp_path: Path) -> None:
@@ -142,3 +126,28 @@ def test_a_trace_shows_up_while_it_is_written(tmp_path: Path) -> None:
         trace.payload(10.0, REPLY, DATA)
         trace.payload(11.5, REPLY, DATA)
         assert len((tmp_path / "trace").read_text().splitlines()) == 2
+
+
+def test_a_repeated_request_is_marked_until_it_is_answered() -> None:
+    stats = EngineStats()
+    remarks = Remarks(stats)
+    first = request(10, Opcode.READ_FILE, session=1, offset=239, size=239).encode()
+    again = request(14, Opcode.READ_FILE, session=1, offset=239, size=239).encode()
+    other = request(15, Opcode.READ_FILE, session=1, offset=478, size=239).encode()
+    assert remarks.on_request(first) == ""
+    assert remarks.on_request(first) == "retransmit"
+    assert remarks.on_request(again) == "retransmit of 10"
+    assert remarks.on_request(other) == ""
+    remarks.before_reply()
+    assert remarks.after_reply(Payload(15, 1, Opcode.ACK, 1, Opcode.READ_FILE, offset=239)) == ""
+    assert remarks.on_request(first) == ""
+
+
+def test_what_the_engine_did_not_believe_is_named() -> None:
+    stats = EngineStats()
+    remarks = Remarks(stats)
+    reply = Payload(15, 1, Opcode.ACK, 0, Opcode.READ_FILE)
+    for counter, words in (("unknown", "late"), ("stale", "stale"), ("incoherent", "fit")):
+        remarks.before_reply()
+        setattr(stats, counter, getattr(stats, counter) + 1)
+        assert words in remarks.after_reply(reply)
