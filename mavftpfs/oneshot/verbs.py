@@ -41,8 +41,10 @@ def _target(args: Args, component: int | None) -> Target:
     mount = mountpoint_of(args.source)
     if mount is not None:
         return Target(None, parse_options(args.options), mount=mount)
-    if os.path.isdir(args.source):
-        raise UsageError(f"no vehicle is mounted on {args.source}")
+    place = args.source.partition("#")[0]
+    no_device = place.startswith("/") and not place.startswith("/dev/") and not os.path.lexists(place)
+    if no_device or os.path.isdir(place):
+        raise UsageError(f"no vehicle is mounted on {place}")
     options, spec = connection_of(args)
     if component is not None:
         options = replace(options, target_component=component)
