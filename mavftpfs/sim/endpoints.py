@@ -94,9 +94,9 @@ class Endpoint:
     def _set_room(self) -> None:
         model, link, buffer = self.model, self.link, self.vehicle.profile.tx_buffer
         if model is not None:
-            self.vehicle.server.tx_room = lambda: model.room(Direction.TO_CLIENT)
+            self.vehicle.server.firmware.tx_room = lambda: model.room(Direction.TO_CLIENT)
         elif link.is_stream:
-            self.vehicle.server.tx_room = lambda: buffer - link.backlog
+            self.vehicle.server.firmware.tx_room = lambda: buffer - link.backlog
 
     def _next_deadline(self) -> float:
         due = self.vehicle.next_deadline()
@@ -110,7 +110,9 @@ class Endpoint:
     def _exchange(self, chunks: list[bytes], now: float) -> None:
         for chunk in chunks if not self.cut else ():
             self.vehicle.receive(chunk, now)
-            if self.vehicle.server.ready >= _ANSWER_AT:  # the client works on it while the next is served
+            if (
+                self.vehicle.server.firmware.ready >= _ANSWER_AT
+            ):  # the client works on it while the next is served
                 self._answer(now)
         self._answer(now)
 

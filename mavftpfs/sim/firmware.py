@@ -111,7 +111,16 @@ class Refusal(Exception):
 
 
 class Firmware(ABC):
-    """One server's code. Subclasses decide; this class keeps time and the outbox."""
+    """One server's code. Subclasses decide; this class keeps time and the outbox.
+
+    Attributes:
+        tx_room: tells how many bytes the link's transmit buffer still takes (PX4 and ArduPilot pace by it);
+            None = as much as the profile's own buffer.
+        crashed: the process died (MAVSDK) and is silent until `reboot`.
+        dropped_requests: lost to a full queue or receive buffer. dropped_replies: to a full transmit buffer.
+        replays: requests answered from the replay slot.
+        pauses: seconds for which a slow card made each of the last reads and writes wait, 0 included.
+    """
 
     def __init__(self, storage: Storage, profile: Profile, rng: random.Random) -> None:
         self.storage = storage
@@ -166,7 +175,7 @@ class Firmware(ABC):
 
     @property
     def ready(self) -> int:
-        """How many replies are due."""
+        """How many replies wait for the next `outgoing`; those that are due only later do not count."""
         return len(self._ready)
 
     def next_deadline(self) -> float | None:

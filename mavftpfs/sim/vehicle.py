@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import random
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from itertools import groupby
 from operator import itemgetter
 
@@ -53,8 +53,7 @@ class FtpServer:
     """The FTP server of one vehicle component.
 
     tree: what it serves. profile: whose behaviour it has. rng: its stray memory and its bad luck.
-    tx_room: tells how many bytes the link's transmit buffer still takes (PX4 and ArduPilot pace by it);
-    None = as much as the profile's own buffer. requests: counts by opcode, of all that were handed in.
+    firmware: whose code answers, with its counters. requests: counts by opcode, of all that were handed in.
     disabled: True = no request is answered (ArduPilot's BRD_OPTIONS can do that).
     """
 
@@ -74,7 +73,7 @@ class FtpServer:
         self.malformed = 0
         self.disabled = False
         self._storage = Storage(tree, profile, rng, virtual)
-        self._firmware = _FIRMWARES[profile.family](self._storage, profile, rng)
+        self.firmware = _FIRMWARES[profile.family](self._storage, profile, rng)
 
     def handle(self, wire: bytes, source: Address, now: float) -> None:
         """Take the 251-byte payload of a request from `source`; another length is counted and dropped."""
@@ -82,13 +81,13 @@ class FtpServer:
             self.malformed += 1
             return
         self.requests[wire[3]] += 1
-        firmware = self._firmware
+        firmware = self.firmware
         if not self.disabled and not firmware.crashed:
             firmware.handle(wire, source, now)
 
     def handle_run(self, wires: Sequence[bytes], source: Address, now: float) -> None:
         """Take payloads that came together: the same as one by one, in less time."""
-        firmware = self._firmware
+        firmware = self.firmware
         alone = len(wires) == 1  # as over every link in memory, where tests look at each in `handle`
         unfit = firmware.crashed or any(len(wire) != PAYLOAD_SIZE for wire in wires)
         if alone or unfit or self.disabled:
@@ -100,71 +99,32 @@ class FtpServer:
 
     def outgoing(self, now: float) -> list[tuple[Address, bytes]]:
         """Return (target, 251-byte payload) of the replies due by `now`, in order."""
-        return self._firmware.outgoing(now)
+        return self.firmware.outgoing(now)
 
     def next_deadline(self) -> float | None:
         """When to call `outgoing` again if no request comes; in the past if it has something now."""
-        return self._firmware.next_deadline()
+        return self.firmware.next_deadline()
 
     def reboot(self, now: float) -> None:
         """Lose every session, queue and reply, as a vehicle that restarts does.
 
         Files stay, but for what FAT storage learns only when a file is closed.
         """
-        self._firmware.crashed = False
+        self.firmware.crashed = False
         self._storage.lose_power()
         if self._storage.virtual is not None:
             self._storage.virtual.reboot()
-        self._firmware.reboot(now)
-
-    @property
-    def tx_room(self) -> Callable[[], int] | None:
-        """See the class."""
-        return self._firmware.tx_room
-
-    @tx_room.setter
-    def tx_room(self, room: Callable[[], int] | None) -> None:
-        self._firmware.tx_room = room
+        self.firmware.reboot(now)
 
     @property
     def open_paths(self) -> list[bytes]:
         """Paths of the files that clients hold open, as they named them."""
-        return self._firmware.open_paths()
+        return self.firmware.open_paths()
 
     @property
     def open_sessions(self) -> int:
         """How many sessions hold a file."""
-        return len(self._firmware.open_paths())
-
-    @property
-    def crashed(self) -> bool:
-        """Whether the server process died (MAVSDK) and stays silent until `reboot`."""
-        return self._firmware.crashed
-
-    @property
-    def ready(self) -> int:
-        """How many replies wait for the next `outgoing`, not counting those that are due only later."""
-        return self._firmware.ready
-
-    @property
-    def dropped_requests(self) -> int:
-        """Requests lost to a full queue or receive buffer."""
-        return self._firmware.dropped_requests
-
-    @property
-    def dropped_replies(self) -> int:
-        """Replies lost to a full transmit buffer."""
-        return self._firmware.dropped_replies
-
-    @property
-    def pauses(self) -> Sequence[float]:
-        """Seconds for which a slow card made each of the last reads and writes wait, 0 included."""
-        return self._firmware.pauses
-
-    @property
-    def replays(self) -> int:
-        """Requests answered from the replay slot."""
-        return self._firmware.replays
+        return len(self.firmware.open_paths())
 
 
 HEARTBEAT_PERIOD = 1.0

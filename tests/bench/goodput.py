@@ -74,8 +74,8 @@ def measure(
         requests = connection.engine.stats.requests * MAX_DATA / len(data)
         server = world.vehicle.server
         dropped = sum(world.model.counters(direction).dropped for direction in LinkDirection)
-        dropped += server.dropped_replies
-        limit = replace(case, rate=case.rate - telemetry).limit_beside(server.pauses)
+        dropped += server.firmware.dropped_replies
+        limit = replace(case, rate=case.rate - telemetry).limit_beside(server.firmware.pauses)
         return Result(case, limit, len(data) / took / limit, requests, dropped)
 
     return trio.run(run, clock=MockClock(autojump_threshold=0))

@@ -56,7 +56,7 @@ async def swap(world: World, vehicle: SimVehicle, *, gap: float) -> None:
     world.link.cut()
     await trio.sleep(gap)
     world.link.vehicle = vehicle
-    vehicle.server.tx_room = lambda: world.model.room(Direction.TO_CLIENT)
+    vehicle.server.firmware.tx_room = lambda: world.model.room(Direction.TO_CLIENT)
     world.link.restore()
 
 

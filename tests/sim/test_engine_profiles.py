@@ -35,7 +35,7 @@ class Rig:
         self.server = FtpServer(self.tree, self.profile, rng=random.Random(seed))
         self.link = VirtualLink(self.server, settings, seed=seed)
         if settings is not None and settings.rate is not None:
-            self.server.tx_room = lambda: self.link.model.room(Direction.TO_CLIENT)
+            self.server.firmware.tx_room = lambda: self.link.model.room(Direction.TO_CLIENT)
         self.session = 0
 
     @property
@@ -249,7 +249,7 @@ def test_side_effects_happen_once(name: str) -> None:
             assert op.error.code == NakCode.FILE_EXISTS
         assert rig.tree.stat(path)
     never_replays = rig.profile.family is Family.MAVSDK
-    assert (refused > 0, rig.server.replays > 0) == (never_replays, not never_replays)
+    assert (refused > 0, rig.server.firmware.replays > 0) == (never_replays, not never_replays)
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -59,7 +59,7 @@ def share(case: Case, seed: int) -> float:
             began = trio.current_time()
             await (read if case.direction == "read" else write)(tree, world, directory + b"/log.bin", data)
             took = trio.current_time() - began
-        return len(data) / took / case.limit_beside(world.vehicle.server.pauses)
+        return len(data) / took / case.limit_beside(world.vehicle.server.firmware.pauses)
 
     return trio.run(run, clock=MockClock(autojump_threshold=0))
 

@@ -86,7 +86,7 @@ async def test_never_more_than_a_short_queue_holds(profile: str, autojump_clock:
         await upload.finish()
         await upload.abort()
     assert here.tree.data(b"/d/f") == source.content
-    assert here.vehicle.server.dropped_requests == 0
+    assert here.vehicle.server.firmware.dropped_requests == 0
     assert connection.engine.stats.retransmissions == 0
 
 

@@ -57,7 +57,7 @@ class MemoryLink:
         self._closed = False
         self._changed = trio.Event()
         if model is not None:
-            vehicle.server.tx_room = lambda: model.room(Direction.TO_CLIENT)
+            vehicle.server.firmware.tx_room = lambda: model.room(Direction.TO_CLIENT)
 
     @property
     def backlog(self) -> int:

@@ -38,13 +38,13 @@ def test_five_wait_and_the_sixth_is_dropped_silently() -> None:
         c.send(Opcode.READ_FILE, session=7, size=239, offset=239 * i)
     replies = c.receive(1.0)
     assert [p.offset for p in replies] == [239 * i for i in range(5)]
-    assert c.server.dropped_requests == 3
+    assert c.server.firmware.dropped_requests == 3
 
 
 def test_the_worker_waits_for_room_and_nothing_else_happens() -> None:
     c = big("ardupilot", 10_000)
     room = 0
-    c.server.tx_room = lambda: room
+    c.server.firmware.tx_room = lambda: room
     c.send(Opcode.READ_FILE, session=7, size=100)
     c.send(Opcode.NONE, session=7)
     assert c.receive(100.0) == []
@@ -119,7 +119,7 @@ def test_the_last_reply_of_the_server_is_replayed_exactly(profile: str) -> None:
     first = c.ask(Opcode.CREATE_DIRECTORY, b"/x", session=3)
     assert c.ask(Opcode.CREATE_DIRECTORY, b"/x", session=3, seq=c.seq) == first
     assert c.ask(Opcode.REMOVE_FILE, A, session=3, seq=c.seq) == first, "the opcode is not compared"
-    assert c.server.replays == 2
+    assert c.server.firmware.replays == 2
     again = c.ask(Opcode.CREATE_DIRECTORY, b"/x", session=4, seq=c.seq)
     assert nak(again) == bytes([NakCode.FILE_EXISTS])
     c.source = OTHER
@@ -133,7 +133,7 @@ def test_generation_b_does_not_replay_what_starts_with_five() -> None:
         c.open(FIVE, session=1)
         assert ack(c.ask(Opcode.READ_FILE, session=1, size=1)) == b"\x05"
         c.ask(Opcode.READ_FILE, session=1, size=1, seq=c.seq)
-        assert c.server.replays == replays
+        assert c.server.firmware.replays == replays
 
 
 # -- bursts --------------------------------------------------------------------------------------

@@ -44,12 +44,12 @@ def test_listing_a_file_kills_the_server() -> None:
     c.open(A, Opcode.CREATE_FILE)
     ack(c.ask(Opcode.WRITE_FILE, b"abc"))
     assert c.ask_all(Opcode.LIST_DIRECTORY, FIVE, wait=60.0) == []
-    assert c.server.crashed
+    assert c.server.firmware.crashed
     assert c.ask_all(Opcode.LIST_DIRECTORY, DIR, wait=60.0) == []
     assert isinstance(c.tree, MemoryTree)
     assert c.tree.data(A) == b"", "what was in the stream's buffer is gone"
     c.server.reboot(c.now)
-    assert not c.server.crashed
+    assert not c.server.firmware.crashed
     assert nak(c.ask(Opcode.LIST_DIRECTORY, DIR)) == EOF
 
 

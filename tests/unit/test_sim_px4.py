@@ -45,7 +45,7 @@ def test_a_burst_does_not_keep_its_session_alive() -> None:
     """A link of 2 kB/s: the stream stops silently in the middle, ten seconds after the last request."""
     c = burst_client(1_000_000)
     sent_at = c.now
-    c.server.tx_room = lambda: 300 if int(c.now * 100) % 10 == 0 else 0
+    c.server.firmware.tx_room = lambda: 300 if int(c.now * 100) % 10 == 0 else 0
     packets = c.ask_all(Opcode.BURST_READ_FILE, size=239, wait=30.0)
     assert 0 < len(packets) < 147
     assert {p.opcode for p in packets} == {Opcode.ACK}
@@ -68,7 +68,7 @@ def test_reboot_forgets_what_waited_and_starts_its_ticks_anew() -> None:
     c.open(A)
     for _ in range(100):
         c.send(Opcode.READ_FILE, size=100)
-    dropped = c.server.dropped_requests
+    dropped = c.server.firmware.dropped_requests
     assert dropped > 0
     c.now += 0.005
     c.server.reboot(c.now)
@@ -76,7 +76,7 @@ def test_reboot_forgets_what_waited_and_starts_its_ticks_anew() -> None:
     ack(c.ask(Opcode.NONE))
     for _ in range(dropped):
         c.send(Opcode.NONE)
-    assert c.server.dropped_requests == dropped, "the receive buffer is empty again"
+    assert c.server.firmware.dropped_requests == dropped, "the receive buffer is empty again"
     c.receive(1.0)
     assert nak(c.ask(Opcode.BURST_READ_FILE)) == bytes([NakCode.EOF]), "and no file has a size"
 
@@ -166,14 +166,14 @@ def burst_client(size: int, **changes: Any) -> Client:
 @pytest.mark.parametrize(("room", "packets"), [(1500, 5), (600, 2), (500, 1), (200, 0)])
 def test_the_transmit_buffer_paces_a_burst(room: int, packets: int) -> None:
     c = burst_client(100_000)
-    c.server.tx_room = lambda: room
+    c.server.firmware.tx_room = lambda: room
     c.send(Opcode.BURST_READ_FILE, size=239)
     assert [len(c.receive(0.01)) for _ in range(3)] == [packets] * 3
 
 
 def test_a_packet_alone_in_its_tick_may_claim_to_be_the_last() -> None:
     c = burst_client(34_000, garbage_complete=1.0)
-    c.server.tx_room = lambda: 500
+    c.server.firmware.tx_room = lambda: 500
     first, second, third = c.ask_all(Opcode.BURST_READ_FILE, size=239, wait=0.03)
     assert (first.burst_complete, second.burst_complete, third.offset) == (1, 1, 478)
 
@@ -190,9 +190,9 @@ def test_a_file_that_shrank_floods_empty_packets() -> None:
 
 def test_replies_without_room_are_lost() -> None:
     c = burst_client(1000)
-    c.server.tx_room = lambda: 20
+    c.server.firmware.tx_room = lambda: 20
     assert c.ask_all(Opcode.READ_FILE, size=100) == []
-    assert c.server.dropped_replies == 1
+    assert c.server.firmware.dropped_replies == 1
 
 
 # -- writing -------------------------------------------------------------------------------------
@@ -275,9 +275,9 @@ def test_a_slow_card_loses_what_does_not_fit_the_receive_buffer() -> None:
     c.receive(1.0)
     for i in range(80):
         c.send(Opcode.READ_FILE, size=100, offset=i)
-    assert c.server.dropped_requests > 0
+    assert c.server.firmware.dropped_requests > 0
     answered = c.receive(120.0)
-    assert len(answered) == 80 - c.server.dropped_requests
+    assert len(answered) == 80 - c.server.firmware.dropped_requests
     assert [p.offset for p in answered] == list(range(len(answered)))
 
 

@@ -157,7 +157,7 @@ def test_a_row_is_answered_as_one_by_one(name: str, seed: int) -> None:
         return (
             sent,
             bytes(tree.data(A)),
-            (server.requests, server.replays, server.dropped_requests, server.open_paths),
+            (server.requests, server.firmware.replays, server.firmware.dropped_requests, server.open_paths),
         )
 
     assert run(by_rows=True) == run(by_rows=False)
