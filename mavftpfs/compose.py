@@ -43,7 +43,7 @@ from mavftpfs.shared.errors import (
     UsageError,
     VehicleLost,
 )
-from mavftpfs.shared.model import ROOT, DirEntry, split
+from mavftpfs.shared.model import ROOT
 from mavftpfs.trace import JsonTrace, Tee, TextTrace, TlogWriter
 
 MIB = 1 << 20
@@ -342,8 +342,8 @@ async def kept_for(options: MountOptions, connection: Connection) -> MakeKept | 
     def make(cache: BlockCache, dentries: Dentries) -> KeptCache:
         facts = Facts(
             identity=partial(identity, connection),
-            remembered=partial(_remembered, dentries),
-            growing=lambda path: dentries.is_growing(path, trio.current_time()),
+            remembered=dentries.entry,
+            growing=dentries.is_growing,
             crc32=connection.store.crc32,
             crc_limit=partial(crc_limit, options, connection),
             wall=time.time,
@@ -368,9 +368,3 @@ def crc_limit(options: MountOptions, connection: Connection) -> int:
     """Return the size in bytes of the largest file whose checksum may be asked for now."""
     allowed = options.verify in ("auto", "crc") and not connection.vehicle.armed
     return options.verify_max if allowed else 0
-
-
-def _remembered(dentries: Dentries, path: bytes) -> DirEntry | None:
-    parent, name = split(path)
-    directory = dentries.known(parent)
-    return None if directory is None else directory.entries.get(name)

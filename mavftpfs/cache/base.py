@@ -39,11 +39,8 @@ async def open_node(context: Context, node: Node) -> FileHandle:
 
 def known_base(context: Context, path: bytes, size: int) -> Base:
     """Return what is known of a file that was opened and has `size` bytes."""
-    parent, name = split(path)
-    directory = context.dentries.known(parent)
-    entry = None if directory is None else directory.entries.get(name)
-    same = entry is not None and entry.size == size
-    return Base(size, entry.mtime if entry is not None and same else None)
+    entry = context.dentries.entry(path)
+    return Base(size, entry.mtime if entry is not None and entry.size == size else None)
 
 
 async def read_base(context: Context, node: Node, start: int, stop: int) -> bytes | memoryview:

@@ -124,7 +124,6 @@ class Cleaner:
             await self._names.rename(action.path, action.to, completes=torn)
             if action.to == group.target and action.path != group.paths.get(Kind.OLD):
                 context.files.on_written(action.to)
-            context.on_changed(action.to)
             context.own.found(group.paths.values())
         self.mended += 1
 

@@ -22,8 +22,8 @@ from mavftpfs.shared.errors import Armed, FileBusy
 class Context:
     """The vehicle, what is remembered of it, and the files that are open or not delivered.
 
-    clock: seconds, monotonic; wall: seconds since 1970. on_changed(path): a path, and what lies below it,
-    was changed by us. read_rate: bytes per second, once measured. paths: see pathlocks. armed: nothing may be
+    clock: seconds, monotonic; wall: seconds since 1970. read_rate: bytes
+    per second, once measured. paths: see pathlocks. armed: nothing may be
     changed (only Writeback.armed_changed sets it).
     """
 
@@ -35,7 +35,6 @@ class Context:
     options: CacheOptions
     clock: Callable[[], float]
     wall: Callable[[], float]
-    on_changed: Callable[[bytes], None]
     nursery: trio.Nursery | None
     namer: Namer
     read_rate: Callable[[], float | None]
@@ -56,7 +55,7 @@ class Context:
 
     def require_idle(self, path: bytes) -> None:
         """Raise FileBusy if somebody on the vehicle seems to write the file."""
-        if not self.options.force and self.dentries.is_growing(path, self.clock()):
+        if not self.options.force and self.dentries.is_growing(path):
             raise FileBusy(f"{path!r} grows: somebody on the vehicle is writing it")
 
     def is_changing(self, path: bytes) -> bool:
@@ -69,5 +68,3 @@ class Context:
         self.files.on_renamed(old, new)
         self.nodes.rename(old, new)
         self.own.follow_rename(old, new)
-        self.on_changed(old)
-        self.on_changed(new)

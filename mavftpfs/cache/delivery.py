@@ -214,7 +214,7 @@ class Deliverer:
             left = await self._try_to_rename(first, second)
         finally:
             context.own.live -= {first, second}
-            context.dentries.expire(split(first)[0], context.clock())
+            context.dentries.expire(split(first)[0])
         await self._replacer.remove(node.path, left)
 
     async def _try_to_rename(self, first: bytes, second: bytes) -> bytes:
@@ -299,7 +299,7 @@ class Deliverer:
             raise
         node.attempt = Attempt(plan, path, sending, upload, begun_at, places)
         if plan is Plan.OVERWRITE:
-            context.dentries.note_unsized(path, made=draft.base is None)
+            context.dentries.put(path, DirEntry(b"", EntryKind.FILE))
         return node.attempt
 
     async def _require_expected(self, node: Node) -> None:
@@ -338,8 +338,7 @@ class Deliverer:
             context.own.leave(attempt.names, node.path)
             self._release(attempt)
             raise
-        name = split(attempt.path)[1]
-        context.dentries.note_created(attempt.path, DirEntry(name, EntryKind.FILE, draft.size))
+        context.dentries.put(attempt.path, DirEntry(b"", EntryKind.FILE, draft.size))
         draft.commit()
         try:
             if attempt.places is None:
@@ -375,8 +374,7 @@ class Deliverer:
     def _on_delivered(self, node: Node, crc32: int | None) -> None:
         """The vehicle has it: listings, blocks and checksums follow."""
         context, draft = self._context, _draft(node)
-        context.dentries.note_written(node.path, draft.size)
-        context.dentries.note_proven(node.path, context.clock())
+        context.dentries.put(node.path, DirEntry(b"", EntryKind.FILE, draft.size), proven=True)
         if crc32 is None and draft.size <= context.options.verify_max:
             crc32 = draft.crc32()
         draft.delivered(crc32)
@@ -384,7 +382,6 @@ class Deliverer:
         node.known_at = context.clock()
         node.close_base()
         context.files.on_written(node.path)
-        context.on_changed(node.path)
         self.delivered += 1
 
     def _note_failure(self, node: Node, error: MavftpfsError) -> None:

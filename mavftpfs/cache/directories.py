@@ -14,7 +14,7 @@ from functools import partial
 
 import trio
 
-from mavftpfs.cache.dentries import Dentries, Directory
+from mavftpfs.cache.dentries import Dentries, Directory, Sweep
 from mavftpfs.cache.remote import RemoteStore
 from mavftpfs.cache.singleflight import SingleFlight
 from mavftpfs.shared.errnos import errno_for
@@ -25,9 +25,6 @@ log = logging.getLogger("mavftpfs.cache")
 
 DOT = b"."
 """The working directory of a server that runs as a process (ArduPilot SITL)."""
-
-LOG_ALIAS = b"/@MAV_LOG"
-"""The standard's only alias: the directory of logs, which are real files."""
 
 MAX_DEPTH = 256
 """More components than any path that fits a request has."""
@@ -53,25 +50,20 @@ class Directories:
     """Listings of the vehicle's directories. All paths are the vehicle's, normalised.
 
     Attributes:
-        tells_times: whether any listing told an mtime.
+        ask_size: opens a file and returns its size. on_listed: hears of each listing as it is made; on_swept:
+            before it is given out. lost: the vehicle is out of reach.
+        tells_times: whether any listing told an mtime. sweeps, served_stale: counters.
     """
 
+    ask_size: Callable[[bytes], Awaitable[int]]
+
     def __init__(
-        self,
-        store: RemoteStore,
-        dentries: Dentries,
-        root: bytes,
-        *,
-        clock: Callable[[], float],
-        nursery: trio.Nursery | None = None,
-        ask_size: Callable[[bytes], Awaitable[int]],
+        self, store: RemoteStore, dentries: Dentries, root: bytes, *, nursery: trio.Nursery | None = None
     ) -> None:
-        """`ask_size` opens a file and returns its size."""
-        self.ask_size = ask_size
         self._store = store
         self._dentries = dentries
         self._root = root
-        self._clock = clock
+        self._clock = dentries.clock
         self._sweeping: SingleFlight[bytes, Directory] = SingleFlight(nursery)
         self._root_proven = root == ROOT
         self._dot_refused = False
@@ -97,38 +89,16 @@ class Directories:
         directory = await self.get(parent)
         entry = directory.entries.get(name)
         if entry is None and directory.cut_short and name:
-            entry = await self._ask_for(path)
-            self._dentries.note_found(path, entry)
-        if entry is None and path == LOG_ALIAS and _announces_trees(directory):
-            entry = await self._find_log_alias()
-        if entry is None:
-            raise NotFound(f"{path!r} does not exist")
-        return Found(entry, directory)
-
-    async def _find_log_alias(self) -> DirEntry | None:
-        """List `@MAV_LOG`, which newer ArduPilot has without showing it in `/` (servers.md 11)."""
-        if self._dentries.fresh(LOG_ALIAS, self._clock()) is None:
             try:
-                await self._sweeping.run(LOG_ALIAS, partial(self._sweep, LOG_ALIAS))
+                entry = DirEntry(name, EntryKind.FILE, await self.ask_size(path))
             except FtpNak as nak:
                 if errno_for(nak) != errno.ENOENT:
                     raise
-                return None
-        return DirEntry(split(LOG_ALIAS)[1], EntryKind.DIRECTORY)
-
-    async def _ask_for(self, path: bytes) -> DirEntry:
-        """Open a file that an incomplete listing lacks.
-
-        Raises:
-            NotFound: the vehicle says that there is none. Else as RemoteStore.open_reader.
-        """
-        try:
-            size = await self.ask_size(path)
-        except FtpNak as nak:
-            if errno_for(nak) != errno.ENOENT:
-                raise
-            raise NotFound(f"{path!r} does not exist") from nak
-        return DirEntry(split(path)[1], EntryKind.FILE, size)
+            else:
+                self._dentries.learn_found(path, entry)
+        if entry is None:
+            raise NotFound(f"{path!r} does not exist")
+        return Found(entry, directory)
 
     async def get(self, path: bytes) -> Directory:
         """Return a directory's listing: fresh, else swept, else (the vehicle being lost) expired.
@@ -136,24 +106,25 @@ class Directories:
         Raises:
             NotFound, NotADirectory; else as RemoteStore.list_directory.
         """
-        fresh = self._dentries.fresh(path, self._clock())
-        if fresh is not None:
-            return fresh
-        stale = self._dentries.known(path)
-        if self.lost and stale is not None:
-            self.served_stale += 1
-            return stale
+        directory = self._dentries.known(path)
+        if directory is not None and self._clock() < directory.fresh_until:
+            return directory
         try:
-            await self._require_directory(path)
-            directory = await self._sweeping.run(path, partial(self._sweep, path))
+            if self.lost and directory is not None:
+                raise VehicleLost("no heartbeats")
+            if path == self._root:
+                await self._walk_to_root()
+            elif path != ROOT and (await self.find(path)).entry.kind is not EntryKind.DIRECTORY:
+                raise NotADirectory(f"{path!r} is not a directory")
+            swept = await self._sweeping.run(path, partial(self._sweep, path))
         except VehicleLost:
-            if stale is None:
+            if directory is None:
                 raise
             self.served_stale += 1
-            return stale
+            return directory
         if self.on_swept is not None:
-            await self.on_swept(path, directory)
-        return directory
+            await self.on_swept(path, swept)
+        return swept
 
     async def ask(self, path: bytes) -> Directory:
         """Return a directory's listing asked for just now.
@@ -162,7 +133,7 @@ class Directories:
             As get; VehicleLost instead of an old listing.
         """
         asked = self._clock()
-        self._dentries.expire(path, asked)
+        self._dentries.expire(path)
         for _ in range(SWEEP_TRIES):
             directory = await self.get(path)
             if directory.listed_at >= asked:
@@ -177,7 +148,7 @@ class Directories:
         Raises:
             As ask.
         """
-        known = self._dentries.fresh(path, self._clock())
+        known = self._dentries.fresh(path)
         if known is not None and known.listed_at >= (began or 0.0) and known.ended_at >= (ended or 0.0):
             return known
         return await self.ask(path)
@@ -188,55 +159,44 @@ class Directories:
         self._root_proven = self._root == ROOT
         self._dot_refused = False
 
-    async def _require_directory(self, path: bytes) -> None:
-        if path == self._root:
-            await self._require_root()
-        elif path != ROOT and (await self.find(path)).entry.kind is not EntryKind.DIRECTORY:
-            raise NotADirectory(f"{path!r} is not a directory")
-
-    async def _require_root(self) -> None:
-        """Walk to the mount's root once.
+    async def _walk_to_root(self) -> None:
+        """See once that no part of the mount's root is a file.
 
         A part that no listing shows may still be listed, because PX4 hides symlinked directories
-        (MavlinkFTP::_workList sends them as skip entries) and some trees are not announced; a part shown
-        as a file may not.
+        (MavlinkFTP::_workList sends them as skip entries) and some trees are not announced.
         """
-        if self._root_proven:
-            return
         path = ROOT
-        for part in self._root.split(b"/")[1:]:
-            directory = await self._listed(path)
+        for part in () if self._root_proven else self._root.split(b"/")[1:]:
+            directory = self._dentries.fresh(path)
+            if directory is None:
+                directory = await self._sweeping.run(path, partial(self._sweep, path))
             entry = directory.entries.get(part)
             path = join(path, part)
             if entry is not None and entry.kind is not EntryKind.DIRECTORY:
                 raise NotADirectory(f"{path!r} is not a directory")
         self._root_proven = True
 
-    async def _listed(self, path: bytes) -> Directory:
-        """Return the listing of a directory on the way to the root."""
-        fresh = self._dentries.fresh(path, self._clock())
-        return fresh or await self._sweeping.run(path, partial(self._sweep, path))
-
     async def _sweep(self, path: bytes) -> Directory:
-        """List until no change of ours came between."""
-        for _ in range(SWEEP_TRIES - 1):
-            directory, raced = await self._sweep_once(path)
-            if not raced:
+        """List until no change of ours came between, or SWEEP_TRIES times."""
+        tries = 0
+        while True:
+            sweep = self._dentries.begin(path)
+            self.sweeps += 1
+            tries += 1
+            try:
+                listing = await self._list(path)
+            except FtpNak:  # perhaps it is gone, so the parent is asked again
+                self._dentries.forget(path)
+                if path != ROOT:
+                    self._dentries.expire(split(path)[0])
+                raise
+            finally:
+                self._dentries.end(sweep)
+            directory = self._remember(path, sweep, listing)
+            if not sweep.changes or tries == SWEEP_TRIES:
                 return directory
-        return (await self._sweep_once(path))[0]
 
-    async def _sweep_once(self, path: bytes) -> tuple[Directory, bool]:
-        sweep = self._dentries.begin(path, self._clock())
-        self.sweeps += 1
-        try:
-            listing = await self._list(path)
-        except FtpNak:
-            self._dentries.abandon(sweep)
-            self._doubt(path)
-            raise
-        except BaseException:
-            self._dentries.abandon(sweep)
-            raise
+    def _remember(self, path: bytes, sweep: Sweep, listing: Listing) -> Directory:
         known = self._dentries.known(path)
         if not (listing.complete or (known is not None and known.cut_short)):
             log.warning(
@@ -244,17 +204,12 @@ class Directories:
                 path,
                 len(listing.entries),
             )
-        self.tells_times |= any(entry.mtime is not None for entry in listing.entries)
-        directory = self._dentries.finish(sweep, listing, self._clock())
+        for entry in listing.entries:
+            self.tells_times |= entry.mtime is not None
+        directory = self._dentries.remember(sweep, listing)
         if not sweep.void:
             self.on_listed(path, directory)
-        return directory, sweep.reshaped
-
-    def _doubt(self, path: bytes) -> None:
-        """The server refused to list it: perhaps it is gone, so the parent is asked again."""
-        self._dentries.forget(path)
-        if path != ROOT:
-            self._dentries.expire(split(path)[0], self._clock())
+        return directory
 
     async def _list(self, path: bytes) -> Listing:
         listing = await self._store.list_directory(path)
@@ -279,11 +234,6 @@ class Directories:
             listing.complete and dot.complete,
             listing.hidden + dot.hidden,
         )
-
-
-def _announces_trees(root: Directory) -> bool:
-    """Return whether `/` shows other `@` trees: what shows none may not survive being asked for a list."""
-    return any(name.startswith(b"@") for name in root.entries)
 
 
 def _hides_files(listing: Listing) -> bool:

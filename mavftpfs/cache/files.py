@@ -27,7 +27,7 @@ from itertools import islice
 import trio
 
 from mavftpfs.cache.blocks import BlockCache, FileBlocks
-from mavftpfs.cache.dentries import COST_FACTOR, Directory
+from mavftpfs.cache.dentries import COST_FACTOR, Dentries, Directory
 from mavftpfs.cache.directories import Directories, Found
 from mavftpfs.cache.kept import KeptCache
 from mavftpfs.cache.openfile import ReadOnlyHandle
@@ -83,12 +83,11 @@ class Files:
         cache: BlockCache,
         *,
         proof_time: float,
+        dentries: Dentries,
         directories: Directories,
-        on_size: Callable[[bytes, int], None],
         invalidate: Callable[[bytes], None],
     ) -> None:
-        """`proof_time`: seconds that what is known of a file holds; `on_size` hears sizes that open replies
-        told and listings did not."""
+        """`proof_time`: seconds that what is known of a file holds."""
         self.kept: KeptCache | None = None
         self.is_changing: Callable[[bytes], bool] = lambda path: False
         self._store = store
@@ -96,8 +95,8 @@ class Files:
         self._clock = cache.clock
         self._proof_time = proof_time
         self._restarted_at = NEVER
+        self._dentries = dentries
         self._directories = directories
-        self._on_size = on_size
         self._invalidate = invalidate
         self.paths = PathLocks(cache.patience)
         self.fetcher = Fetcher(store, self.paths, self._kill)
@@ -210,8 +209,9 @@ class Files:
         if old is not None and old.size > reader.size:
             self._kill(old)
         self._replace(version)
-        if entry.size != reader.size:
-            self._on_size(path, reader.size)
+        if entry.size != reader.size:  # what the kernel was told is wrong
+            self._dentries.learn_size(path, reader.size)
+            self._invalidate(path)
         return version
 
     async def _require_listed(self, path: bytes, size: int) -> DirEntry:

@@ -82,7 +82,6 @@ class Hider:
             if isinstance(error, FtpNak):
                 raise FileBusy(f"{old!r} is open, and this card cannot keep it: {error}") from error
             raise
-        context.on_changed(old)
         await self.on_hidden(node, hidden)
 
     async def on_hidden(self, node: Node, hidden: bytes) -> None:
@@ -109,7 +108,6 @@ class Hider:
             context.nodes.forget_hidden(node)
             context.own.live.discard(node.path)
         context.files.on_removed(node.path)
-        context.on_changed(node.path)
 
     def displace(self, node: Node) -> None:
         """The file that is open at a path lost its name; who has it open keeps what is held of it."""

@@ -148,7 +148,7 @@ class Names:
         """Remove a file. Raises as WriteStore."""
         async with self._changing(path):
             await self._context.writer.remove(path)
-        self._context.dentries.note_removed(path)
+        self._context.dentries.put(path, None)
 
     async def remove_if_there(self, path: bytes) -> None:
         """Remove a file that may be gone. Raises as WriteStore."""
@@ -157,19 +157,19 @@ class Names:
         except FtpNak as nak:
             if errno_for(nak) != errno.ENOENT:
                 raise
-            self._context.dentries.note_removed(path)
+            self._context.dentries.put(path, None)
 
     async def remove_directory(self, path: bytes) -> None:
         """Remove an empty directory. Raises as WriteStore."""
         async with self._changing(path):
             await self._context.writer.remove_directory(path)
-        self._context.dentries.note_removed(path)
+        self._context.dentries.put(path, None)
 
     async def make_directory(self, path: bytes) -> None:
         """Make a directory. Raises as WriteStore."""
         async with self._changing(path):
             await self._context.writer.make_directory(path)
-        self._context.dentries.note_created(path, DirEntry(split(path)[1], EntryKind.DIRECTORY))
+        self._context.dentries.put(path, DirEntry(b"", EntryKind.DIRECTORY), proven=True)
 
     async def rename(self, old: bytes, new: bytes, *, completes: bool = False) -> None:
         """Rename, on a server that replaces files perhaps over a file; both paths fit a request.
@@ -182,8 +182,7 @@ class Names:
         async with self._changing(old, new):
             await self._context.writer.rename(old, new, completes=completes)
         self._context.writer.traits.rename_works = True
-        self._context.dentries.note_renamed(old, new)
-        self._context.dentries.note_proven(new, self._context.clock())
+        self._context.dentries.rename(old, new)
 
     async def cannot_rename(self, old: bytes, new: bytes, nak: FtpNak) -> bool:
         """A first rename was refused: note and return whether the card knows no renames.
@@ -232,7 +231,7 @@ class Names:
             yield
         except (OutcomeUnknown, trio.Cancelled):
             for path in paths:
-                self._context.dentries.expire(split(path)[0], self._context.clock())
+                self._context.dentries.expire(split(path)[0])
             raise
 
 

@@ -62,7 +62,6 @@ class Namespace:
                 raise AlreadyExists(f"{path!r} exists")
             await self._names.require_new(path)
             await self._names.make_directory(path)
-            self._context.on_changed(path)
 
     async def rmdir(self, path: bytes) -> None:
         """See Tree.rmdir."""
@@ -72,7 +71,6 @@ class Namespace:
                 raise NotADirectory(f"{path!r} is not a directory")
             await self._names.require_empty(path)
             await self._names.remove_directory(path)
-            self._context.on_changed(path)
 
     async def unlink(self, path: bytes) -> None:
         """See Tree.unlink."""
@@ -140,7 +138,6 @@ class Namespace:
         await self._names.purge(path)
         await self._names.remove(path)
         self._context.files.on_removed(path)
-        self._context.on_changed(path)
 
     async def _unlink_node(self, node: Node) -> None:
         path = node.path
@@ -155,7 +152,6 @@ class Namespace:
         if there:
             await self._names.remove_if_there(path)
             self._context.files.on_removed(path)
-            self._context.on_changed(path)
         self._hider.displace(node)
 
     async def _is_file(self, path: bytes, node: Node) -> bool:

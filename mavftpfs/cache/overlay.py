@@ -132,9 +132,7 @@ class Overlay:
         known = self.times.peek(node.path)
         if known is not None:
             return shown(known)
-        parent, name = split(node.path)
-        directory = self._context.dentries.known(parent)
-        entry = None if directory is None else directory.entries.get(name)
+        entry = self._context.dentries.entry(node.path)
         listed = entry.mtime if entry is not None and draft.clean else None
         return shown_mtime(node.path, listed), 0
 

@@ -14,7 +14,6 @@ from __future__ import annotations
 import errno
 import logging
 from collections.abc import Callable
-from dataclasses import replace
 
 import trio
 
@@ -115,16 +114,13 @@ class Replacer:
     def tear(self, path: bytes, place: bytes) -> None:
         """The file of a name may lie at `place` for now: show it on, and have both directories listed."""
         context = self._context
-        for directory, name in (split(path), split(place)):
-            known = context.dentries.known(directory)
-            entry = None if known is None else known.entries.get(name)
-            if entry is not None:
-                context.dentries.note_created(path, replace(entry, name=split(path)[1]))
-                break
+        entry = context.dentries.entry(path) or context.dentries.entry(place)
+        if entry is not None:
+            context.dentries.put(path, entry)
         context.own.torn[path] = place
         self.on_torn()
         for directory in (split(path)[0], split(place)[0]):
-            context.dentries.expire(directory, context.clock())
+            context.dentries.expire(directory)
         log.warning("%r may lie under %r until the vehicle is heard again", path, place)
 
     # --- inside

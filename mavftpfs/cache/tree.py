@@ -8,10 +8,7 @@ modules behind it name them as the vehicle does.
 from __future__ import annotations
 
 import time
-from collections import OrderedDict
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from random import Random
 
@@ -26,12 +23,11 @@ from mavftpfs.cache.kept import KeptCache
 from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.options import CacheOptions
 from mavftpfs.cache.remote import RemoteStore, WriteStore
-from mavftpfs.cache.singleflight import SingleFlight
 from mavftpfs.cache.spool import SpoolDirectory
-from mavftpfs.cache.virtual import VirtualTrees, is_snapshot
+from mavftpfs.cache.virtual import VirtualTrees
 from mavftpfs.cache.writeback import Writeback, make_writeback
 from mavftpfs.shared.errors import FtpNak, IsADirectory, ListingIncomplete, NotDeliveredYet, ReadOnly
-from mavftpfs.shared.model import ROOT, DirEntry, EntryKind, is_virtual, join, normalise, split
+from mavftpfs.shared.model import ROOT, DirEntry, EntryKind, is_snapshot, is_virtual, join, normalise, split
 
 __all__ = ["OpenFile", "Stat", "Tree"]
 
@@ -69,31 +65,31 @@ class Tree:
         self._options = options
         self._clock = clock
         self._tell_kernel = invalidate
-        self._dentries = Dentries(dir_timeout=options.dir_timeout, max_entries=options.max_entries)
-        self._directories = Directories(
-            store, self._dentries, options.root, clock=clock, nursery=nursery, ask_size=self._ask_size
+        self._store = store
+        self._dentries = Dentries(
+            clock=clock, dir_timeout=options.dir_timeout, max_entries=options.max_entries
         )
+        self._directories = Directories(store, self._dentries, options.root, nursery=nursery)
         self._blocks = BlockCache(options.cache_size, clock=clock, patience=options.op_deadline)
         self._files = Files(
             store,
             self._blocks,
             proof_time=options.proof_time,
+            dentries=self._dentries,
             directories=self._directories,
-            on_size=self._on_size,
             invalidate=self._invalidate,
         )
+        self._directories.ask_size = self._files.learn_size
         self._files.kept = None if keep is None else keep(self._blocks, self._dentries)
         self._virtual = VirtualTrees(
             store,
             self._directories,
-            self._dentries,
             options,
             clock=clock,
             invalidate=self._invalidate,
             nursery=nursery,
         )
-        self._learning: SingleFlight[bytes, int] = SingleFlight()
-        self._checksums = _Checksums(store, clock, options.proof_time)
+        self._checksums: dict[bytes, tuple[DirEntry | None, int | None, int]] = {}
         self._writing: Writeback | None = None
         if writer is not None:
             self._writing = make_writeback(
@@ -109,7 +105,6 @@ class Tree:
                 nursery=nursery,
                 spool_directory=spool,
                 read_rate=lambda: self._blocks.meter.rate,
-                on_changed=self._checksums.forget_below,
             )
 
     # --- asking
@@ -131,7 +126,11 @@ class Tree:
                 return ours
         found = await self._directories.find(remote)
         if found.entry.kind is EntryKind.FILE and found.size is None:
-            await self._learning.run(remote, partial(self._learn_size, remote))
+            try:
+                size = await self._files.learn_size(remote)
+            except FtpNak:
+                size = 0  # until it is listed again
+            self._dentries.learn_size(remote, size)
         return self._listed_stat(remote, found)
 
     def negative_valid_for(self, path: bytes) -> float:
@@ -139,10 +138,13 @@ class Tree:
 
         0 where the absence is not proven: the listing was incomplete or is not fresh any more.
         """
-        remote, now = self._remote(path), self._clock()
-        if self._virtual.hides(remote):
-            return self._options.negative_timeout
-        return max(0.0, min(self._options.negative_timeout, self._dentries.absent_until(remote, now) - now))
+        remote = self._remote(path)
+        until = self._virtual.absent_until(remote)
+        parent, name = split(remote)
+        directory = self._dentries.known(parent)
+        if directory is not None and directory.complete and name not in directory.entries:
+            until = max(until, directory.fresh_until)
+        return max(0.0, min(self._options.negative_timeout, until - self._clock()))
 
     async def list(self, path: bytes) -> list[tuple[bytes, Stat]]:
         """Return a directory's entries without `.` and `..`.
@@ -188,7 +190,7 @@ class Tree:
         )
 
     async def crc32(self, path: bytes) -> int:
-        """Return the vehicle's CRC32 of a file (start value 0, no final xor), remembered by size and mtime.
+        """Return the vehicle's CRC32 of a file (start value 0, no final xor), as old as the listing at most.
 
         Of an `@` file it is that of the bytes a reader gets: these are made anew at every open.
 
@@ -200,7 +202,19 @@ class Tree:
             return await self._virtual.crc32(remote)
         if self._writing is not None and self._writing.holds(remote):
             raise NotDeliveredYet(f"{remote!r} is not on the vehicle yet")
-        return await self._checksums.get(remote, await self._find_file(remote))
+        if remote == self._options.root:
+            raise IsADirectory("the mount's root is a directory")
+        found = await self._directories.find(remote)
+        if found.entry.kind is not EntryKind.FILE:
+            raise IsADirectory(f"{remote!r} is a directory")
+        entry, size, value = self._checksums.get(remote, (None, None, 0))
+        if entry is not found.entry or size != found.size:
+            size = found.size
+            value = await self._store.crc32(remote, size=size)
+            self._checksums[remote] = (found.entry, size, value)
+            if len(self._checksums) > MAX_CHECKSUMS:
+                del self._checksums[next(iter(self._checksums))]
+        return value
 
     # --- changing (all raise ReadOnly on a tree without a writer, and below `@` directories)
 
@@ -306,11 +320,10 @@ class Tree:
         self._dentries.forget(ROOT)
         self._files.forget_closed()
         self._virtual.snapshots.clear()
-        self._checksums.clear()
 
     def expire(self, path: bytes) -> None:
         """Have the vehicle list a file's directory again before its size is told the next time."""
-        self._dentries.expire(split(self._remote(path))[0], self._clock())
+        self._dentries.expire(split(self._remote(path))[0])
 
     def status(self) -> dict[str, object]:
         """Return counters; bytes_... in bytes, rate in bytes per second or None."""
@@ -341,11 +354,10 @@ class Tree:
 
     def rebooted(self) -> None:
         """The vehicle restarted: what was known of it must be asked again."""
-        self._dentries.expire_all(self._clock())
+        self._dentries.expire_all()
         self._directories.rebooted()
         self._virtual.rebooted()
         self._files.rebooted()
-        self._checksums.clear()
         if self._writing is not None:
             self._writing.retry()
 
@@ -378,82 +390,3 @@ class Tree:
             if user_set is not None:
                 return Stat(found.entry.kind, size, user_set[0], valid_for, user_set[1])
         return Stat(found.entry.kind, size, shown_mtime(remote, found.entry.mtime), valid_for)
-
-    async def _find_file(self, remote: bytes) -> Found:
-        if remote == self._options.root:
-            raise IsADirectory("the mount's root is a directory")
-        found = await self._directories.find(remote)
-        if found.entry.kind is not EntryKind.FILE:
-            raise IsADirectory(f"{remote!r} is a directory")
-        return found
-
-    async def _learn_size(self, remote: bytes) -> int:
-        """Open a file whose listing tells no size; one that is refused counts as empty until listed again."""
-        try:
-            size = await self._files.learn_size(remote)
-        except FtpNak:
-            size = 0
-        self._dentries.learn_size(remote, size)
-        return size
-
-    async def _ask_size(self, remote: bytes) -> int:
-        return await self._files.learn_size(remote)
-
-    def _on_size(self, remote: bytes, size: int) -> None:
-        """An open told another size than the listing: what the kernel was told is wrong."""
-        self._dentries.learn_size(remote, size, self._clock())
-        self._invalidate(remote)
-
-
-@dataclass(frozen=True, slots=True)
-class _Checksum:
-    size: int
-    mtime: int | None
-    value: int
-    asked_at: float
-
-
-class _Checksums:
-    """The vehicle's CRC32s by path, each good for the size and mtime it was asked at; where there is no
-    mtime, for `lifetime` seconds."""
-
-    def __init__(self, store: RemoteStore, clock: Callable[[], float], lifetime: float) -> None:
-        self._store = store
-        self._clock = clock
-        self._lifetime = lifetime
-        self._known: OrderedDict[bytes, _Checksum] = OrderedDict()
-        self._asking: SingleFlight[bytes, int] = SingleFlight()
-
-    async def get(self, path: bytes, found: Found) -> int:
-        """Return a listed file's checksum.
-
-        Raises:
-            As RemoteStore.crc32.
-        """
-        known = self._known.get(path)
-        if known is not None and self._still_holds(known, found):
-            return known.value
-        return await self._asking.run(path, partial(self._ask, path, found))
-
-    def _still_holds(self, known: _Checksum, found: Found) -> bool:
-        if (known.size, known.mtime) != (found.size, found.entry.mtime):
-            return False
-        return known.mtime is not None or self._clock() - known.asked_at < self._lifetime
-
-    def forget_below(self, path: bytes) -> None:
-        """The path, or what lies below it, changed."""
-        for known in [p for p in self._known if p == path or p.startswith(path + b"/")]:
-            del self._known[known]
-
-    def clear(self) -> None:
-        """Nothing known holds any more."""
-        self._known.clear()
-
-    async def _ask(self, path: bytes, found: Found) -> int:
-        value = await self._store.crc32(path, size=found.size)
-        if found.size is not None:
-            self._known.pop(path, None)
-            self._known[path] = _Checksum(found.size, found.entry.mtime, value, self._clock())
-        if len(self._known) > MAX_CHECKSUMS:
-            self._known.popitem(last=False)
-        return value

@@ -9,6 +9,7 @@ and the open that follows reuses it, so that stat, open and read agree and rsync
 
 from __future__ import annotations
 
+import math
 import zlib
 from collections import OrderedDict
 from collections.abc import Callable, Iterable
@@ -18,7 +19,6 @@ from functools import partial
 import trio
 
 from mavftpfs.cache.attributes import Stat, shown_mtime
-from mavftpfs.cache.dentries import Dentries
 from mavftpfs.cache.directories import Directories, Found
 from mavftpfs.cache.openfile import ReadOnlyHandle
 from mavftpfs.cache.options import CacheOptions
@@ -37,7 +37,7 @@ from mavftpfs.shared.errors import (
     RequestTimeout,
     SessionBusy,
 )
-from mavftpfs.shared.model import ROOT, DirEntry, EntryKind, is_virtual, join, split
+from mavftpfs.shared.model import ROOT, DirEntry, EntryKind, join, split
 
 UNLISTABLE: dict[bytes, tuple[bytes, ...]] = {
     b"@PARAM": (b"param.pck",),
@@ -48,9 +48,6 @@ UNLISTABLE: dict[bytes, tuple[bytes, ...]] = {
 PARAM_FILE = b"/@PARAM/param.pck"
 ANNOUNCERS = frozenset({b"@SYS", b"@ROMFS"})
 TRUE_SIZES = frozenset({b"@ROMFS"})
-ORDINARY = frozenset({b"@MAV_LOG"})
-"""An alias of the log directory: real files, too large to be read whole."""
-
 COST_FACTOR = 10
 """A snapshot that took T seconds to read is good for at least COST_FACTOR * T."""
 
@@ -60,11 +57,6 @@ before gets the bytes of that size."""
 
 MAX_SIZES = 4096
 """Of how many files the true size is remembered."""
-
-
-def is_snapshot(path: bytes) -> bool:
-    """Return whether a file of that path is read whole."""
-    return is_virtual(path) and tree_of(path) not in ORDINARY
 
 
 def tree_of(path: bytes) -> bytes:
@@ -157,7 +149,6 @@ class VirtualTrees:
         self,
         store: RemoteStore,
         directories: Directories,
-        dentries: Dentries,
         options: CacheOptions,
         *,
         clock: Callable[[], float],
@@ -166,13 +157,12 @@ class VirtualTrees:
     ) -> None:
         self._store = store
         self._directories = directories
-        self._dentries = dentries
         self._options = options
         self._clock = clock
         self._invalidate = invalidate
         self._reading: SingleFlight[bytes, Snapshot] = SingleFlight(nursery)
         self._param_opens: bool | None = None
-        self._unlisted: set[bytes] = set()  # listed, but refused as not found: hidden until a reboot
+        self._absent: dict[bytes, float] = {}  # until when a name is known not to open
         self._unread: set[bytes] = set()  # too slow or refused otherwise: listing does not try again
         self.snapshots = Snapshots(options.at_cache_size)
         self.open_count = 0
@@ -185,9 +175,9 @@ class VirtualTrees:
             return tuple(UNLISTABLE)
         return ()
 
-    def hides(self, path: bytes) -> bool:
-        """Return whether a listed path is not shown because it cannot be opened."""
-        return path in self._unlisted
+    def absent_until(self, path: bytes) -> float:
+        """Return until when a path, listed or not, is not shown because it did not open; 0 if it is."""
+        return self._absent.get(path, 0.0)
 
     async def stat(self, path: bytes) -> Stat:
         """Return attributes; of a file with its true size, reading it where the listed one lies.
@@ -266,7 +256,7 @@ class VirtualTrees:
     def rebooted(self) -> None:
         """Forget what this server was seen to do, and all snapshots."""
         self._param_opens = None
-        self._unlisted.clear()
+        self._absent.clear()
         self._unread.clear()
         self.snapshots.clear()
 
@@ -278,7 +268,7 @@ class VirtualTrees:
         if tree in UNLISTABLE:
             return await self._find_unlistable(path, tree)
         found = await self._directories.find(path)
-        if self.hides(path):
+        if not self._shows(path):
             raise NotFound(f"{path!r} is listed, but the vehicle does not open it")
         return found
 
@@ -309,10 +299,7 @@ class VirtualTrees:
         raise NotFound(f"this vehicle has no {tree.decode()}")
 
     def _shows(self, path: bytes) -> bool:
-        now = self._clock()
-        return not self.hides(path) and (
-            tree_of(path) not in UNLISTABLE or self._dentries.absent_until(path, now) <= now
-        )
+        return self._absent.get(path, 0.0) <= self._clock()
 
     # --- reading
 
@@ -399,9 +386,11 @@ class VirtualTrees:
             NotFound: it does.
         """
         if tree_of(path) in UNLISTABLE:
-            self._dentries.note_absent(path, self._clock() + self._options.proof_time)
+            if len(self._absent) >= MAX_SIZES:
+                self._absent.clear()
+            self._absent[path] = self._clock() + self._options.proof_time
         elif nak.code == NakCode.FILE_NOT_FOUND:
-            self._unlisted.add(path)
+            self._absent[path] = math.inf  # until the vehicle restarts
         else:
             return
         raise NotFound(f"the vehicle does not open {path!r}") from nak

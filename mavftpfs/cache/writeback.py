@@ -81,13 +81,11 @@ def make_writeback(
     nursery: trio.Nursery | None,
     spool_directory: SpoolDirectory | None,
     read_rate: Callable[[], float | None],
-    on_changed: Callable[[bytes], None],
 ) -> Writeback:
     """Return the writing half over the reading half's parts, and have listings mended from now on.
 
     Without a spool directory what exceeds memory goes to one that does not outlive the process.
-    `read_rate()`: bytes per second, once measured; `on_changed(path)`: the path, and what lies below it, is
-    not what it was.
+    `read_rate()`: bytes per second, once measured.
     """
     owner = new_owner(rng) if spool_directory is None else spool_directory.owner
     dead = frozenset[bytes]() if spool_directory is None else spool_directory.dead_owners
@@ -100,7 +98,6 @@ def make_writeback(
         options=options,
         clock=clock,
         wall=wall,
-        on_changed=on_changed,
         nursery=nursery,
         namer=Namer(owner, options.root, rng),
         read_rate=read_rate,

@@ -21,7 +21,6 @@ from typing import Literal
 
 import trio
 
-from mavftpfs.cache.virtual import is_snapshot
 from mavftpfs.oneshot.files import READ_SIZE, File, Session
 from mavftpfs.oneshot.progress import Progress
 from mavftpfs.protocol.crc import crc32
@@ -35,6 +34,7 @@ from mavftpfs.shared.errors import (
     UsageError,
     VehicleLost,
 )
+from mavftpfs.shared.model import is_snapshot
 from mavftpfs.shared.readable import name_text, readable_size
 
 Complain = Callable[[str], None]

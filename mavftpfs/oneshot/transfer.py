@@ -17,7 +17,6 @@ from typing import BinaryIO
 import trio
 
 from mavftpfs.cache.attributes import Stat
-from mavftpfs.cache.virtual import is_snapshot
 from mavftpfs.compose import plain_nursery
 from mavftpfs.exits import NotDelivered
 from mavftpfs.oneshot.fetch import (
@@ -51,7 +50,7 @@ from mavftpfs.shared.errors import (
     RequestTimeout,
     UsageError,
 )
-from mavftpfs.shared.model import EntryKind, join, split
+from mavftpfs.shared.model import EntryKind, is_snapshot, join, split
 from mavftpfs.shared.readable import name_text
 
 Tell = Callable[[Fetched], None]

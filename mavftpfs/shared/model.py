@@ -80,6 +80,12 @@ def is_virtual(path: bytes) -> bool:
     return path.startswith(b"/@")
 
 
+def is_snapshot(path: bytes) -> bool:
+    """Return whether it is an `@` file that must be read whole; `@MAV_LOG` names the directory of
+    logs, which are real files."""
+    return is_virtual(path) and path.split(b"/", 2)[1] != b"@MAV_LOG"
+
+
 def wire_path(path: bytes) -> bytes:
     """Return the server's spelling of a normalised path.
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
 from mavftpfs.cache.dentries import Dentries, Sweep
-from mavftpfs.shared.model import DirEntry, EntryKind, Listing, join
+from mavftpfs.shared.model import DirEntry, EntryKind, Listing, join, split
 
 DIRECTORIES = (b"/", b"/d", b"/e")
 NAMES = (b"a", b"b", b"c", b"x")
@@ -37,7 +37,7 @@ class Racing(RuleBasedStateMachine):
     def __init__(self) -> None:
         super().__init__()
         self.now = 0.0
-        self.dentries = Dentries(dir_timeout=20, max_entries=9)
+        self.dentries = Dentries(clock=lambda: self.now, dir_timeout=20, max_entries=9)
         self.truth: dict[bytes, dict[bytes, DirEntry]] = {path: {} for path in DIRECTORIES}
         self.sweeps: list[Paging] = []
         self.unnoted: list[tuple[str, bytes, bytes, int]] = []
@@ -46,8 +46,8 @@ class Racing(RuleBasedStateMachine):
 
     @rule(path=directories)
     def begin(self, path: bytes) -> None:
-        if len(self.sweeps) < 3:
-            self.sweeps.append(Paging(self.dentries.begin(path, self.now)))
+        if path not in [paging.sweep.path for paging in self.sweeps]:
+            self.sweeps.append(Paging(self.dentries.begin(path)))
 
     @precondition(lambda self: self.sweeps)
     @rule(data=st.data())
@@ -59,7 +59,8 @@ class Racing(RuleBasedStateMachine):
         if not entries:
             self.sweeps.remove(paging)
             listing = Listing(tuple(paging.seen.values()), 0.0)
-            directory = self.dentries.finish(paging.sweep, listing, self.now)
+            self.dentries.end(paging.sweep)
+            directory = self.dentries.remember(paging.sweep, listing)
             assert directory.listed_at == paging.sweep.began
 
     @precondition(lambda self: self.sweeps)
@@ -67,7 +68,7 @@ class Racing(RuleBasedStateMachine):
     def abandon(self, data: st.DataObject) -> None:
         paging = data.draw(st.sampled_from(self.sweeps))
         self.sweeps.remove(paging)
-        self.dentries.abandon(paging.sweep)
+        self.dentries.end(paging.sweep)
 
     @rule(seconds=st.sampled_from([1.0, 19.0, 21.0]))
     def wait(self, seconds: float) -> None:
@@ -75,7 +76,7 @@ class Racing(RuleBasedStateMachine):
 
     @rule(path=directories)
     def expire(self, path: bytes) -> None:
-        self.dentries.expire(path, self.now)
+        self.dentries.expire(path)
 
     @rule(path=directories)
     def forget(self, path: bytes) -> None:
@@ -118,13 +119,13 @@ class Racing(RuleBasedStateMachine):
         what, path, new, size = self.unnoted.pop()
         if what == "create":
             name = path.rpartition(b"/")[2]
-            self.dentries.note_created(path, DirEntry(name, EntryKind.FILE, size))
+            self.dentries.put(path, DirEntry(name, EntryKind.FILE, size))
         elif what == "remove":
-            self.dentries.note_removed(path)
+            self.dentries.put(path, None)
         elif what == "resize":
-            self.dentries.note_resized(path, size)
+            self.dentries.put(path, DirEntry(split(path)[1], EntryKind.FILE, size), proven=True)
         else:
-            self.dentries.note_renamed(path, new)
+            self.dentries.rename(path, new)
 
     # --- what must hold
 
@@ -133,18 +134,19 @@ class Racing(RuleBasedStateMachine):
         if self.unnoted:
             return
         for path in DIRECTORIES:
-            directory = self.dentries.fresh(path, self.now)
+            directory = self.dentries.fresh(path)
             if directory is not None:
                 assert directory.complete
                 assert directory.entries == self.truth[path]
 
     @invariant()
-    def absent_is_absent(self) -> None:
+    def proven_is_true(self) -> None:
         if self.unnoted:
             return
         for path in DIRECTORIES:
-            for name in self.truth[path]:
-                assert self.dentries.absent_until(join(path, name), self.now) <= self.now
+            directory = self.dentries.known(path)
+            for name in () if directory is None else directory.proven:
+                assert self.dentries.entry(join(path, name)) == self.truth[path][name]
 
     @invariant()
     def memory_is_bounded(self) -> None:

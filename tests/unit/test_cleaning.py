@@ -46,7 +46,9 @@ async def test_only_a_listing_that_counts_proves_a_torn_name_whole(store: FakeWr
     place = DIRECTORY + b"/" + reserved(tree, Kind.OLD)
     context.own.torn[FILE] = place
     now = trio.current_time()
-    shown = Directory({b"file.txt": DirEntry(b"file.txt", EntryKind.FILE, 3)}, now, now + 20, True)
+    shown = Directory(
+        {b"file.txt": DirEntry(b"file.txt", EntryKind.FILE, 3)}, now, now, now + 20, True, False
+    )
     await cleaner.on_swept(DIRECTORY, shown)
     assert context.own.torn == {FILE: place}
     store.add(FILE, OLD)
@@ -63,7 +65,7 @@ async def test_a_file_that_took_the_place_of_another_is_read_anew(store: FakeWri
     context.own.torn[FILE] = old
     store.files[old] = store.files.pop(FILE)
     store.add(new, OLD[::-1])  # of the same size
-    context.dentries.expire(DIRECTORY, trio.current_time())
+    context.dentries.expire(DIRECTORY)
     assert await read_file(tree, FILE) == OLD[::-1]
     assert context.own.torn == {}
     assert litter(store) == []

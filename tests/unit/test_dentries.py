@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import pytest
 
 from mavftpfs.cache.attributes import MAX_MTIME, MAX_SIZE, UNKNOWN_MTIME, shown_mtime, tidy
-from mavftpfs.cache.dentries import MAX_ABSENT, Dentries, Directory
+from mavftpfs.cache.dentries import Dentries, Directory
 from mavftpfs.shared.model import DirEntry, EntryKind, Listing
 
 
@@ -17,19 +19,30 @@ def folder(name: bytes) -> DirEntry:
     return DirEntry(name, EntryKind.DIRECTORY)
 
 
-def make(max_entries: int = 1000) -> Dentries:
-    return Dentries(dir_timeout=20, max_entries=max_entries)
+class Clock:
+    """Time that passes when a test says so."""
+
+    now = 0.0
+
+    def __call__(self) -> float:
+        return self.now
 
 
-def put(
-    dentries: Dentries,
-    path: bytes,
-    *entries: DirEntry,
-    now: float = 0,
-    took: float = 0,
-    complete: bool = True,
-) -> Directory:
-    return dentries.finish(dentries.begin(path, now), Listing(entries, took, complete), now)
+@pytest.fixture
+def clock() -> Clock:
+    return Clock()
+
+
+def make(
+    clock: Callable[[], float] = lambda: 0.0, *, dir_timeout: float | None = 20, max_entries: int = 1000
+) -> Dentries:
+    return Dentries(clock=clock, dir_timeout=dir_timeout, max_entries=max_entries)
+
+
+def put(dentries: Dentries, path: bytes, *entries: DirEntry, took: float = 0) -> Directory:
+    sweep = dentries.begin(path)
+    dentries.end(sweep)
+    return dentries.remember(sweep, Listing(entries, took))
 
 
 def names(dentries: Dentries, path: bytes) -> set[bytes]:
@@ -37,42 +50,34 @@ def names(dentries: Dentries, path: bytes) -> set[bytes]:
     return set(directory.entries) if directory else {b"(unknown)"}
 
 
-def test_a_listing_is_fresh_for_dir_timeout() -> None:
-    dentries = make()
-    directory = put(dentries, b"/", file(b"a"), now=5)
-    assert dentries.fresh(b"/", 24.9) is directory
-    assert dentries.fresh(b"/", 25) is None
+@pytest.mark.parametrize(("dir_timeout", "took", "life"), [(20, 9, 20), (None, 0.1, 20), (None, 2, 100)])
+def test_a_listing_is_fresh_for_dir_timeout_or_as_long_as_it_was_expensive(
+    clock: Clock, dir_timeout: float | None, took: float, life: float
+) -> None:
+    dentries = make(clock, dir_timeout=dir_timeout)
+    clock.now = 5
+    directory = put(dentries, b"/", file(b"a"), took=took)
+    clock.now += life - 0.1
+    assert dentries.fresh(b"/") is directory
+    clock.now += 0.1
+    assert dentries.fresh(b"/") is None
     assert dentries.known(b"/") is directory
     assert dentries.known(b"/b") is None
 
 
-def test_a_listing_that_was_expensive_is_fresh_for_longer() -> None:
-    dentries = Dentries(dir_timeout=None, max_entries=10)
-    put(dentries, b"/", took=2)
-    assert dentries.fresh(b"/", 99.9) is not None
-    assert dentries.fresh(b"/", 100) is None
-
-
 def test_a_dir_timeout_that_a_user_set_is_the_bound() -> None:
-    dentries = Dentries(dir_timeout=0, max_entries=10)
+    dentries = make(dir_timeout=0)
     put(dentries, b"/", took=2)
-    assert dentries.fresh(b"/", 0) is None
+    assert dentries.fresh(b"/") is None
 
 
-def test_the_listing_is_as_old_as_its_first_page() -> None:
-    dentries = make()
-    sweep = dentries.begin(b"/", 3)
-    directory = dentries.finish(sweep, Listing((), 4.0), 7)
-    assert directory.listed_at == 3
-    assert directory.fresh_until == 7 + 20
-
-
-def test_a_fresh_complete_listing_proves_absence() -> None:
-    dentries = make()
-    put(dentries, b"/d", file(b"a"))
-    assert dentries.absent_until(b"/d/b", 1) == 20
-    assert dentries.absent_until(b"/d/a", 1) == 1
-    assert dentries.absent_until(b"/e/a", 1) == 1
+def test_the_listing_is_as_old_as_its_first_page(clock: Clock) -> None:
+    dentries = make(clock)
+    clock.now = 3
+    sweep = dentries.begin(b"/")
+    clock.now = 7
+    directory = dentries.remember(sweep, Listing((), 4.0))
+    assert (directory.listed_at, directory.fresh_until) == (3, 27)
 
 
 @pytest.mark.holds("promise 10")
@@ -129,24 +134,20 @@ def test_the_newest_listing_stays_however_large() -> None:
 def test_an_expired_listing_is_kept_but_proves_nothing() -> None:
     dentries = make()
     put(dentries, b"/", file(b"a"))
-    dentries.expire(b"/", 3)
-    dentries.expire(b"/unknown", 3)
-    assert dentries.fresh(b"/", 3) is None
+    dentries.expire(b"/")
+    dentries.expire(b"/unknown")
+    assert dentries.fresh(b"/") is None
     assert names(dentries, b"/") == {b"a"}
-    assert dentries.absent_until(b"/b", 3) == 3
 
 
-def test_expire_all_covers_sweeps_and_absences() -> None:
+def test_expire_all_covers_listings_under_way() -> None:
     dentries = make()
     put(dentries, b"/", file(b"a"))
-    dentries.note_absent(b"/x/y", 100)
-    sweep = dentries.begin(b"/b", 1)
-    dentries.expire_all(2)
-    assert dentries.fresh(b"/", 2) is None
-    assert dentries.absent_until(b"/x/y", 2) == 2
-    directory = dentries.finish(sweep, Listing((file(b"c"),), 0), 3)
-    assert set(directory.entries) == {b"c"}
-    assert directory.fresh_until == 3
+    sweep = dentries.begin(b"/b")
+    dentries.expire_all()
+    assert dentries.fresh(b"/") is None
+    directory = dentries.remember(sweep, Listing((file(b"c"),), 0))
+    assert (set(directory.entries), directory.fresh_until) == ({b"c"}, 0)
     assert dentries.known(b"/b") is None
 
 
@@ -154,9 +155,7 @@ def test_forget_takes_all_below_and_nothing_beside() -> None:
     dentries = make()
     for path in (b"/a", b"/a/b", b"/ab", b"/"):
         put(dentries, path, file(b"x"))
-    dentries.note_absent(b"/a/q", 50)
-    dentries.note_absent(b"/ab/q", 50)
-    sweeps = [dentries.begin(path, 1) for path in (b"/a", b"/a/b", b"/ab")]
+    sweeps = [dentries.begin(path) for path in (b"/a", b"/a/b", b"/ab")]
     dentries.forget(b"/a")
     assert [dentries.known(p) is not None for p in (b"/a", b"/a/b", b"/ab", b"/")] == [
         False,
@@ -165,97 +164,55 @@ def test_forget_takes_all_below_and_nothing_beside() -> None:
         True,
     ]
     assert [sweep.void for sweep in sweeps] == [True, True, False]
-    assert (dentries.absent_until(b"/a/q", 1), dentries.absent_until(b"/ab/q", 1)) == (1, 50)
     assert dentries.entry_count == 2
     dentries.forget(b"/")
     assert (len(dentries), dentries.entry_count) == (0, 0)
 
 
-def test_probed_absences_are_bounded() -> None:
-    dentries = make()
-    for i in range(MAX_ABSENT):
-        dentries.note_absent(b"/d/%d" % i, 100)
-    dentries.note_absent(b"/d/0", 200)
-    dentries.note_absent(b"/d/new", 100)
-    assert dentries.absent_until(b"/d/0", 1) == 200
-    assert dentries.absent_until(b"/d/1", 1) == 1
-    assert dentries.absent_until(b"/d/2", 1) == 100
-
-
 # --- our own changes
 
 
-def test_created_and_removed_show_at_once() -> None:
+def test_what_we_changed_shows_at_once() -> None:
     dentries = make()
-    put(dentries, b"/", file(b"a"))
-    dentries.note_absent(b"/b", 50)
-    dentries.note_created(b"/b", file(b"b", 5))
-    assert names(dentries, b"/") == {b"a", b"b"}
-    assert dentries.absent_until(b"/b", 1) == 1
-    assert dentries.entry_count == 2
-    dentries.note_removed(b"/a")
-    dentries.note_removed(b"/never")
-    assert names(dentries, b"/") == {b"b"}
-    assert dentries.entry_count == 1
-    assert dentries.absent_until(b"/a", 1) == 20
-
-
-def test_resized_replaces_size_mtime_and_what_an_open_told() -> None:
-    dentries = make()
-    directory = put(dentries, b"/", file(b"a", 1, 50))
+    put(dentries, b"/", file(b"a", 1, 50))
+    put(dentries, b"/b", file(b"x"))
     dentries.learn_size(b"/a", 2)
-    dentries.note_resized(b"/a", 9)
-    assert directory.entries[b"a"] == file(b"a", 9, None)
+    dentries.put(b"/a", file(b"a", 9))
+    dentries.put(b"/b", folder(b"another name"))
+    directory = dentries.known(b"/")
+    assert directory is not None
+    assert directory.entries == {b"a": file(b"a", 9), b"b": folder(b"b")}
     assert directory.size_of(b"a") == 9
-    dentries.note_resized(b"/a", 10, 60)
-    assert directory.entries[b"a"] == file(b"a", 10, 60)
+    assert dentries.known(b"/b") is None
+    assert dentries.entry(b"/b") == folder(b"b")
+    dentries.put(b"/a", None)
+    dentries.put(b"/never", None)
+    assert names(dentries, b"/") == {b"b"}
+    assert dentries.entry(b"/a") is None
 
 
-def test_rename_moves_the_entry_between_listings() -> None:
+def test_what_the_vehicle_confirmed_is_proven_until_it_is_in_doubt(clock: Clock) -> None:
+    dentries = make(clock)
+    directory = put(dentries, b"/")
+    clock.now = 3
+    dentries.put(b"/a", file(b"a"))
+    assert directory.proven == {}
+    dentries.put(b"/a", file(b"a"), proven=True)
+    assert directory.proven == {b"a": 3}
+    dentries.expire(b"/")
+    assert directory.proven == {}
+
+
+@pytest.mark.holds("fault odd listing")
+def test_a_change_during_a_listing_beats_what_it_saw_and_leaves_it_incomplete() -> None:
     dentries = make()
-    put(dentries, b"/", folder(b"d"), folder(b"e"))
-    put(dentries, b"/d", file(b"a", 7, 8))
-    put(dentries, b"/e", file(b"b", 1))
-    dentries.note_renamed(b"/d/a", b"/e/b")
-    assert names(dentries, b"/d") == set()
-    directory = dentries.known(b"/e")
-    assert directory is not None
-    assert directory.entries == {b"b": file(b"b", 7, 8)}
-
-
-def test_rename_of_something_unknown_makes_the_target_directory_doubtful() -> None:
-    dentries = make()
-    put(dentries, b"/e", file(b"b"))
-    put(dentries, b"/e/b", file(b"c"))
-    dentries.note_absent(b"/e/b", 50)
-    dentries.note_renamed(b"/d/a", b"/e/b")
-    assert dentries.fresh(b"/e", 0) is None
-    assert dentries.known(b"/e/b") is None
-    assert dentries.absent_until(b"/e/b", 1) == 1
-
-
-# --- the guard
-
-
-def test_a_write_during_a_listing_beats_its_size_but_shifts_nothing() -> None:
-    dentries = make()
-    put(dentries, b"/", file(b"a", 1))
-    sweep = dentries.begin(b"/", 30)
-    dentries.note_resized(b"/a", 9)
-    directory = dentries.finish(sweep, Listing((file(b"a", 1, 5),), 0), 31)
-    assert directory.entries == {b"a": file(b"a", 9, None)}
-    assert directory.complete
-    assert dentries.fresh(b"/", 31) is directory
-
-
-def test_what_an_unknown_file_took_the_place_of_is_not_taken_for_it() -> None:
-    dentries = make()
-    put(dentries, b"/d", file(b"a", 7, 70))
-    dentries.note_renamed(b"/unknown", b"/d/a")
-    directory = dentries.known(b"/d")
-    assert directory is not None
-    assert directory.entries[b"a"] == file(b"a", None, None)
-    assert dentries.fresh(b"/d", 0.0) is None
+    sweep = dentries.begin(b"/")
+    dentries.put(b"/a", file(b"a", 9))
+    dentries.put(b"/b", None)
+    assert dentries.entry(b"/a") == file(b"a", 9)
+    directory = dentries.remember(sweep, Listing((file(b"a", 1, 5), file(b"b"), file(b"c")), 0))
+    assert directory.entries == {b"a": file(b"a", 9), b"c": file(b"c")}
+    assert (directory.complete, directory.cut_short, directory.fresh_until) == (False, False, 0)
 
 
 # --- mtimes

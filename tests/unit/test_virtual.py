@@ -188,29 +188,14 @@ async def test_romfs_is_an_ordinary_tree_read_whole(store: FakeStore, tree: Tree
     assert store.count("reader") == 0
 
 
-async def test_log_alias_is_read_by_blocks(store: FakeStore, tree: Tree) -> None:
-    store.add(b"/@MAV_LOG/1.BIN", b"log" * 1000)
-    assert await read_file(tree, b"/@MAV_LOG/1.BIN") == b"log" * 1000
-    assert store.count("whole") == 0
-
-
-async def test_the_log_alias_is_found_though_the_root_does_not_show_it(store: FakeStore, tree: Tree) -> None:
+async def test_the_log_alias_is_read_by_blocks_where_it_is_the_root(store: FakeStore) -> None:
     store.add(b"/@MAV_LOG/1.BIN", b"log" * 1000)
     store.unlisted.add(b"/@MAV_LOG")
-    assert b"@MAV_LOG" not in await names(tree, b"/")
-    assert (await tree.stat(b"/@MAV_LOG")).kind is EntryKind.DIRECTORY
-    assert await names(tree, b"/@MAV_LOG") == {b"1.BIN"}
-    assert await read_file(tree, b"/@MAV_LOG/1.BIN") == b"log" * 1000
-    assert await tree.crc32(b"/@MAV_LOG/1.BIN") == crc32(b"log" * 1000)  # they are real
-    assert store.count("list", b"/@MAV_LOG") == 1
-
-
-async def test_the_log_alias_is_not_asked_for_in_vain(store: FakeStore, px4: FakeStore) -> None:
-    """A server without any `@` tree may not survive being asked to list what it does not have."""
-    for place, asked in ((store, 1), (px4, 0)):
-        with pytest.raises(NotFound):
-            await make_tree(place).stat(b"/@MAV_LOG")
-        assert place.count("list", b"/@MAV_LOG") == asked
+    tree = make_tree(store, root=b"/@MAV_LOG")
+    assert await names(tree, b"/") == {b"1.BIN"}
+    assert await read_file(tree, b"/1.BIN") == b"log" * 1000
+    assert await tree.crc32(b"/1.BIN") == crc32(b"log" * 1000)  # they are real
+    assert store.count("whole") == 0
 
 
 async def test_a_large_file_is_not_read_to_answer_stat(store: FakeStore, tree: Tree) -> None:
