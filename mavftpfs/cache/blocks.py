@@ -13,8 +13,7 @@ asks again, by a new reader.
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import AsyncIterator, Callable
-from contextlib import asynccontextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import trio
@@ -51,10 +50,10 @@ class BlockCache:
         self.meter = RateMeter()
         self.piece = PIECE if budget >= 8 * PIECE else BLOCK_SIZE
         self.reads = trio.Semaphore(max(1, budget // 2 // (self.piece + BLOCK_SIZE)))
-        """First come, first served: blocks that are waited for take at most half of the budget."""
+        """Held by who waits for a piece: what is waited for is not evicted, and takes at most half."""
         self.bytes_cached = 0
         self.evictions = 0
-        self._blocks: OrderedDict[tuple[FileBlocks, int], int] = OrderedDict()
+        self.used: OrderedDict[tuple[FileBlocks, int], int] = OrderedDict()
 
     def readahead_limits(self, streams: int) -> tuple[int, int]:
         """Return the largest readahead window, and up to which size a file is wanted whole, in bytes, while
@@ -67,32 +66,28 @@ class BlockCache:
 
     def add(self, owner: FileBlocks, index: int, size: int) -> None:
         """Account for a new block, evicting older ones that nobody waits on."""
-        for _ in range(len(self._blocks)):
+        for _ in range(len(self.used)):
             if self.bytes_cached + size <= self.budget:
                 break
             self._evict_oldest()
-        self._blocks[owner, index] = size
+        self.used[owner, index] = size
         self.bytes_cached += size
-
-    def touch(self, owner: FileBlocks, index: int) -> None:
-        """Note that a block was read."""
-        self._blocks.move_to_end((owner, index))
 
     def remove(self, owner: FileBlocks, index: int) -> None:
         """A block is gone."""
-        self.bytes_cached -= self._blocks.pop((owner, index))
+        self.bytes_cached -= self.used.pop((owner, index))
 
     def check_invariants(self) -> None:
         """Raise AssertionError if the books are wrong (for tests)."""
-        assert self.bytes_cached == sum(self._blocks.values())
+        assert self.bytes_cached == sum(self.used.values())
         assert self.bytes_cached <= self.budget
-        for owner, index in self._blocks:
+        for owner, index in self.used:
             assert index in owner
 
     def _evict_oldest(self) -> None:
-        owner, index = next(iter(self._blocks))
+        owner, index = next(iter(self.used))
         if owner.pinned(index):
-            self.touch(owner, index)  # in use after all
+            self.used.move_to_end((owner, index))  # in use after all
         else:
             self.evictions += 1
             owner.evict(index)
@@ -130,7 +125,6 @@ class FileBlocks:
         self._blocks: dict[int, bytearray] = {}
         self._present = ExtentSet()
         self._earlier = ExtentSet()  # held before the present reader; INVARIANT: a subset of _present
-        self._pins: dict[int, int] = {}
         self._waiters: list[_Waiter] = []
         self._arrived = 0
         self.received = 0
@@ -256,7 +250,8 @@ class FileBlocks:
 
     def pinned(self, index: int) -> bool:
         """Return whether somebody waits on the block."""
-        return index in self._pins
+        start, stop = self._extent(index)
+        return any(waiter.start < stop and start < waiter.stop for waiter in self._waiters)
 
     def evict(self, index: int) -> None:
         """Forget a block."""
@@ -277,7 +272,7 @@ class FileBlocks:
         parts = []
         while start < stop:
             index = start // BLOCK_SIZE
-            self._cache.touch(self, index)
+            self._cache.used.move_to_end((self, index))
             base = index * BLOCK_SIZE
             end = min(stop, base + BLOCK_SIZE)
             parts.append(memoryview(self._blocks[index])[start - base : end - base].toreadonly())
@@ -285,7 +280,7 @@ class FileBlocks:
         return parts[0] if len(parts) == 1 else b"".join(parts)
 
     async def wait_for(self, start: int, stop: int) -> None:
-        """Wait for what is missing of [start, stop), which was just asked for and is held (`hold`). `get` may
+        """Wait for what is missing of [start, stop), which was just asked for, at most a piece. `get` may
         find nothing afterwards, where the bytes were dropped.
 
         Raises:
@@ -307,21 +302,6 @@ class FileBlocks:
         if not waiter.done.is_set():
             raise RequestTimeout(f"no data came for {self._cache.patience:g} s")
 
-    @asynccontextmanager
-    async def hold(self, start: int, stop: int) -> AsyncIterator[None]:
-        """Keep the blocks of [start, stop) from being evicted; waits for its turn. No more than a piece."""
-        indices = range(start // BLOCK_SIZE, -(-stop // BLOCK_SIZE))
-        async with self._cache.reads:
-            for index in indices:
-                self._pins[index] = self._pins.get(index, 0) + 1
-            try:
-                yield
-            finally:
-                for index in indices:
-                    self._pins[index] -= 1
-                    if not self._pins[index]:
-                        del self._pins[index]
-
     def check_invariants(self) -> None:
         """Raise AssertionError if the books are wrong (for tests)."""
         assert self._present.end <= self.size
@@ -329,7 +309,6 @@ class FileBlocks:
             assert self._present.covers(start, stop)
         for start, stop in self._present:
             assert all(i in self._blocks for i in range(start // BLOCK_SIZE, -(-stop // BLOCK_SIZE)))
-        assert len(self._waiters) <= sum(self._pins.values())
 
     # --- inside
 

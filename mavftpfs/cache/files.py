@@ -19,6 +19,7 @@ handles of an older one are open.
 
 from __future__ import annotations
 
+import errno
 from collections import OrderedDict
 from collections.abc import Callable, Iterable
 from functools import partial
@@ -30,15 +31,18 @@ from mavftpfs.cache.blocks import BlockCache, FileBlocks
 from mavftpfs.cache.dentries import COST_FACTOR, Dentries, Directory
 from mavftpfs.cache.directories import Directories, Found
 from mavftpfs.cache.kept import KeptCache
-from mavftpfs.cache.openfile import ReadOnlyHandle
+from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.pathlocks import PathLocks
 from mavftpfs.cache.readahead import Readahead
 from mavftpfs.cache.remote import RemoteStore
 from mavftpfs.cache.singleflight import SingleFlight
-from mavftpfs.cache.versions import NEVER, Fetcher, Version, became_another
+from mavftpfs.cache.versions import NEVER, Version, became_another
+from mavftpfs.shared.errnos import errno_for
 from mavftpfs.shared.errors import (
     DataUnproven,
+    FileChanged,
     FileTooLarge,
+    FtpNak,
     IsADirectory,
     LocalProtocolError,
     NotADirectory,
@@ -99,10 +103,10 @@ class Files:
         self._directories = directories
         self._invalidate = invalidate
         self.paths = PathLocks(cache.patience)
-        self.fetcher = Fetcher(store, self.paths, self._kill)
         self._current: OrderedDict[bytes, Version] = OrderedDict()
         self.open_versions: dict[Version, None] = {}
         self._opening: SingleFlight[bytes, tuple[Version, bool]] = SingleFlight()
+        self._reopening: SingleFlight[Version, None] = SingleFlight()
         self._comparing: SingleFlight[Version, None] = SingleFlight()
         self.open_count = 0
         self.hits = 0
@@ -123,9 +127,10 @@ class Files:
         if found.entry.kind is not EntryKind.FILE:
             raise IsADirectory(f"{path!r} is a directory")
         version, same = await self._opening.run(path, partial(self._open_version, path, found))
-        others = (v for v in self.open_versions if v.path == path and v is not version)
-        direct_io = any(v.dead is None or v.lost for v in others)
-        keep_cache = same and version.shown
+        keep_cache, direct_io = same and version.shown, False
+        for other in self.open_versions:
+            if other.path == path and other is not version:
+                direct_io |= other.dead is None or other.lost
         version.shown = not direct_io  # who has an older version open may have the kernel fetch pages of that
         version.handles += 1
         self.open_count += 1
@@ -154,13 +159,17 @@ class Files:
             if self.kept is not None:
                 self.kept.watch(version)
             return version, True
-        version = None
-        if fresh and self.kept is not None:
-            version = await self._revive(path, entry, self.kept)
-        if version is None:
+        kept = await self.kept.find(path, entry) if fresh and self.kept is not None else None
+        if kept is not None:
+            version = self._new_version(path, entry.mtime, kept.key.size)
+            version.kept = kept
+            self._replace(version)
+        else:
             version = await self._start_version(path, entry)
             if fresh and self.kept is not None:
                 self.kept.keep(version, entry)
+        if self.kept is not None:
+            self.kept.watch(version)
         return version, False
 
     def _still_right(self, version: Version, entry: DirEntry, listed_at: float, fresh: bool) -> bool:
@@ -169,7 +178,7 @@ class Files:
             return False
         newer = listed_at > version.proven_at
         if newer and became_another(version.size, version.mtime, entry):
-            self._kill(version)
+            self.kill(version)
             return False
         same_size = entry.size in (None, version.size)
         if fresh and entry.size == version.size and entry.mtime is not None and entry.mtime == version.mtime:
@@ -177,18 +186,6 @@ class Files:
             return True
         recent = self._clock() - version.proven_at < self._proof_time
         return recent and (same_size or not newer)
-
-    async def _revive(self, path: bytes, entry: DirEntry, cache: KeptCache) -> Version | None:
-        """Return a version of a freshly listed file of which the local disk has blocks, None if it has
-        none."""
-        kept = await cache.find(path, entry)
-        if kept is None:
-            return None
-        version = self._new_version(path, entry.mtime, kept.key.size)
-        version.kept = kept
-        self._replace(version)
-        cache.watch(version)
-        return version
 
     async def _start_version(self, path: bytes, entry: DirEntry) -> Version:
         version = self._new_version(path, None)
@@ -207,7 +204,7 @@ class Files:
             version.mtime = entry.mtime
         old = self._current.get(path)
         if old is not None and old.size > reader.size:
-            self._kill(old)
+            self.kill(old)
         self._replace(version)
         if entry.size != reader.size:  # what the kernel was told is wrong
             self._dentries.learn_size(path, reader.size)
@@ -230,6 +227,30 @@ class Files:
             raise DataUnproven(f"{path!r} has {entry.size} bytes as listed, and {size} as opened")
         return entry
 
+    async def open_reader(self, version: Version) -> None:
+        """Open a version's file, after a doubt in a new session of the server.
+
+        Raises:
+            FileChanged: it is smaller now. Else as RemoteStore.open_reader.
+        """
+        await self._reopening.run(version, partial(self._open_reader, version))
+
+    async def _open_reader(self, version: Version) -> None:
+        async with self.paths.steady(lambda: version.path) as path:
+            version.require_alive()
+            expected = None if version.blocks.doubted else version.size
+            version.close_reader()
+            version.blocks.begin_reading()
+            reader = await self._store.open_reader(path, version.blocks, expected_size=expected)
+        if version.handles == 0:
+            reader.close()
+            raise LocalProtocolError(f"{version.path!r} was closed while it was read")
+        if reader.size < version.size:
+            reader.close()
+            self.kill(version)
+            version.require_alive()
+        version.reader = reader
+
     def _new_version(self, path: bytes, mtime: int | None, size: int = 0) -> Version:
         blocks, now = FileBlocks(self.cache, size), self._clock()
         version = Version(path, mtime, blocks, proven_at=now, compared_at=now)
@@ -247,18 +268,16 @@ class Files:
                 self._forget(surplus)
 
     def status(self) -> dict[str, object]:
-        """Return counters."""
-        kept = {} if self.kept is None else self.kept.status()
-        return {"hits": self.hits, "misses": self.misses, "reads_unproven": self.unproven, **kept}
-
-    def reads(self) -> list[dict[str, object]]:
-        """Return the files that are being fetched: path, size and done in bytes."""
+        """Return counters; `reads`: the files that are being fetched, with path, size and done in bytes."""
         recent = self._clock() - READING
-        return [
+        reads = [
             {"path": v.path.decode(errors="replace"), "size": v.size, "done": v.blocks.done}
             for v in self.open_versions
             if v.blocks.waited_for or (v.blocks.received_at > recent and v.blocks.done < v.size)
         ]
+        kept = {} if self.kept is None else self.kept.status()
+        counters = {"hits": self.hits, "misses": self.misses, "reads_unproven": self.unproven}
+        return {"reads": reads, **counters, **kept}
 
     # --- is it the same file?
 
@@ -291,7 +310,7 @@ class Files:
         try:
             directory = await self._directories.recent(split(path)[0], began=version.blocks.opened_at)
         except (NotFound, NotADirectory):
-            self._kill(version)
+            self.kill(version)
             return
         async with self.paths.steady(lambda: version.path) as present:
             if present != path or self.is_changing(path):
@@ -305,14 +324,14 @@ class Files:
         entry = directory.entries.get(split(version.path)[1])
         if entry is None or entry.kind is not EntryKind.FILE:
             if directory.complete or entry is not None:
-                self._kill(version)
+                self.kill(version)
         elif not self._is_another(version, entry):
             if directory.listed_at >= version.blocks.opened_at:
                 version.compared_at = directory.listed_at
             if version.mtime is None and entry.size == version.size:
                 version.mtime = entry.mtime
         elif version.blocks.given or entry.size != version.size:
-            self._kill(version)
+            self.kill(version)
         else:
             version.start_over(entry.mtime, directory.listed_at)
             self._on_dropped(version)
@@ -330,7 +349,7 @@ class Files:
             if known and directory.listed_at > version.proven_at and not self.is_changing(version.path):
                 self._compare_listed(version, directory)
 
-    def _kill(self, version: Version) -> None:
+    def kill(self, version: Version) -> None:
         """The path is another file now: none of those that were opened there up to this version."""
         lost = not self.is_changing(version.path)
         newest = self._current.get(version.path) is version
@@ -378,7 +397,7 @@ class Files:
     def end(self, path: bytes) -> None:
         """What we are about to write there must not be given to who has another file open."""
         for version in [v for v in self.open_versions if v.path == path and v.dead is None]:
-            self._kill(version)
+            self.kill(version)
 
     def was_replaced(self, path: bytes) -> bool:
         """Return whether somebody who is to read on has a version open that is not the vehicle's any more."""
@@ -452,8 +471,11 @@ class Files:
         del self._current[version.path]
 
 
-class FileHandle(ReadOnlyHandle):
-    """One open() of a regular file (see openfile.OpenFile)."""
+class FileHandle(OpenFile):
+    """One open() of a regular file."""
+
+    size = 0
+    direct_io = keep_cache = False
 
     def __init__(self, files: Files, version: Version, *, keep_cache: bool, direct_io: bool) -> None:
         self._files = files
@@ -513,16 +535,38 @@ class FileHandle(ReadOnlyHandle):
             self._files.release(self._version)
 
     async def _read_piece(self, start: int, stop: int) -> bytes | memoryview | None:
+        """Return [start, stop), at most a piece. None: it was renamed, or bytes were dropped, meanwhile."""
         files, version = self._files, self._version
+        blocks, kept = version.blocks, version.kept
         limit, small = files.cache.readahead_limits(len(files.open_versions))
-        plan = self._readahead.on_read(start, stop, limit=limit, small=small)
-        if plan.seeked and version.reader is not None:
+        ahead = self._readahead.on_read(start, stop, limit=limit, small=small)
+        if ahead.seeked and version.reader is not None:
             version.reader.drop_readahead()
-        data = version.blocks.get(start, stop)
-        if data is None:
-            files.misses += 1
-            return await files.fetcher.fetch(version, start, stop, plan)
-        files.hits += 1
-        if version.reader is not None and plan.start < plan.stop:
-            version.reader.want(plan.start, plan.stop, demand=False)
-        return data
+        data = blocks.get(start, stop)
+        if data is not None:
+            files.hits += 1
+            if version.reader is not None and ahead.start < ahead.stop:
+                version.reader.want(ahead.start, ahead.stop, demand=False)
+            return data
+        files.misses += 1
+        try:
+            async with files.cache.reads:
+                if kept is not None:
+                    await kept.fill(blocks, start, stop, lambda: version.kept is kept)
+                    version.require_alive()
+                if blocks.missing(start, stop):
+                    if version.reader is None or blocks.doubted:
+                        await files.open_reader(version)
+                    if version.reader is None or blocks.doubted:
+                        return None
+                    version.reader.want(start, stop, demand=True)
+                    if ahead.start < ahead.stop:
+                        version.reader.want(ahead.start, ahead.stop, demand=False)
+                    await blocks.wait_for(start, stop)
+                return blocks.get(start, stop)
+        except (FileChanged, FtpNak) as error:
+            if not isinstance(error, FileChanged) and errno_for(error) != errno.ENOENT:
+                raise
+            files.kill(version)
+            version.require_alive()
+            raise

@@ -232,7 +232,6 @@ class KeptCache:
         it was listed anew, or changed by us, while it was opened."""
         if entry.size == version.size and self._facts.remembered(version.path) is entry:
             version.kept = self._kept(version.path, entry)
-            self.watch(version)
 
     def watch(self, version: Version) -> None:
         """A version is open, perhaps again: more of it may be read."""

@@ -13,6 +13,7 @@ from fnmatch import translate
 from re import compile as compile_pattern
 
 from mavftpfs.cache.attributes import Stat, shown
+from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.shared.errors import (
     AlreadyExists,
     DirectoryNotEmpty,
@@ -216,11 +217,10 @@ class LocalFiles:
         self._entries[path] = entry
 
 
-class LocalHandle:
-    """One open() of a local file (see cache.openfile.OpenFile)."""
+class LocalHandle(OpenFile):
+    """One open() of a local file. There is nowhere to deliver it."""
 
-    direct_io = False
-    keep_cache = False
+    writable = False
 
     def __init__(self, files: LocalFiles, entry: LocalEntry, *, writable: bool) -> None:
         self._files = files
@@ -262,20 +262,6 @@ class LocalHandle:
             NoSpace.
         """
         self._files.resize(self._entry, size)
-
-    async def flush(self) -> None:
-        """Do nothing: there is nowhere to deliver it."""
-
-    async def fsync(self) -> None:
-        """Do nothing: it does not outlive the mount anyway."""
-
-    async def release(self) -> None:
-        """Close."""
-        self.close()
-
-    def give_up(self) -> None:
-        """Close; what it made costs nothing and stays."""
-        self.close()
 
     def close(self) -> None:
         """Close; closing twice is harmless."""

@@ -2,30 +2,31 @@
 
 from __future__ import annotations
 
-from typing import Protocol
-
 from mavftpfs.shared.errors import LocalProtocolError
 
 
-class OpenFile(Protocol):
-    """One open() of a file.
-
-    size: bytes; of a file being written it follows what was written, else it is fixed for the life of the
-    handle. direct_io: the kernel must not cache its pages. keep_cache: pages the kernel holds from the last
-    open are still right. writable: write, truncate and flush do something; fsync may, of any handle.
-    """
+class OpenFile:
+    """One open() of a file. What is not overridden is that of one opened for reading."""
 
     @property
-    def size(self) -> int: ...
+    def size(self) -> int:
+        """Bytes. Of a file being written it follows what was written, else it stays for the handle's life."""
+        raise NotImplementedError
 
     @property
-    def direct_io(self) -> bool: ...
+    def direct_io(self) -> bool:
+        """Whether the kernel must not cache its pages."""
+        return False
 
     @property
-    def keep_cache(self) -> bool: ...
+    def keep_cache(self) -> bool:
+        """Whether pages that the kernel holds from the last open are still right."""
+        return False
 
     @property
-    def writable(self) -> bool: ...
+    def writable(self) -> bool:
+        """Whether write, truncate and flush do something; fsync may, of any handle."""
+        return False
 
     async def read(self, offset: int, size: int) -> bytes | memoryview:
         """Return `size` bytes at `offset`, fewer only at the end of the handle's size.
@@ -33,7 +34,7 @@ class OpenFile(Protocol):
         Raises:
             FileChanged, DataUnproven, RequestTimeout, VehicleLost, FtpNak.
         """
-        ...
+        raise NotImplementedError
 
     async def write(self, offset: int, data: bytes | memoryview) -> int:
         """Take all of `data` and return its length; waits while too much is not on the vehicle yet.
@@ -41,7 +42,7 @@ class OpenFile(Protocol):
         Raises:
             NoSpace, Armed, FileTooLarge, RequestTimeout: nothing was taken.
         """
-        ...
+        raise LocalProtocolError("write to a handle opened for reading")
 
     async def truncate(self, size: int) -> None:
         """Cut or extend the file, locally; delivered like written bytes.
@@ -49,7 +50,7 @@ class OpenFile(Protocol):
         Raises:
             NoSpace, Armed, RequestTimeout.
         """
-        ...
+        raise LocalProtocolError("truncate of a handle opened for reading")
 
     async def flush(self) -> None:
         """One descriptor was closed: deliver what was written, unless that is nothing but an emptied file.
@@ -57,7 +58,6 @@ class OpenFile(Protocol):
         Raises:
             The reason why bytes are still undelivered; as long as they are, at every call.
         """
-        ...
 
     async def fsync(self) -> None:
         """Return when everything written is on the card, checked (promise 2).
@@ -65,7 +65,6 @@ class OpenFile(Protocol):
         Raises:
             As flush.
         """
-        ...
 
     async def release(self) -> None:
         """The last descriptor was closed: deliver, and close whatever came of it. Twice is harmless.
@@ -73,44 +72,12 @@ class OpenFile(Protocol):
         Raises:
             As flush; what could not be delivered is kept.
         """
-        ...
+        self.close()
 
     def give_up(self) -> None:
         """Close; the call that opened it failed, so a file that was made by that is not wanted either."""
-        ...
-
-    def close(self) -> None:
-        """Close without delivering (what was not delivered is kept and delivered later)."""
-        ...
-
-
-class ReadOnlyHandle:
-    """The writing half of a handle that cannot write: there is nothing to deliver."""
-
-    writable = False
-
-    async def write(self, offset: int, data: bytes | memoryview) -> int:
-        """Raise LocalProtocolError: the kernel lets nobody write to a handle opened for reading."""
-        raise LocalProtocolError("write to a handle opened for reading")
-
-    async def truncate(self, size: int) -> None:
-        """Raise LocalProtocolError."""
-        raise LocalProtocolError("truncate of a handle opened for reading")
-
-    async def flush(self) -> None:
-        """Do nothing: what other handles failed to deliver is theirs to hear."""
-
-    async def fsync(self) -> None:
-        """Do nothing: of a file that others may write, this is not all (writefile)."""
-
-    async def release(self) -> None:
-        """Close the handle."""
-        self.close()
-
-    def give_up(self) -> None:
-        """Close the handle: it made nothing."""
         self.close()
 
     def close(self) -> None:
-        """Close the handle; closing twice is harmless."""
+        """Close without delivering; what was not delivered is kept for later. Twice is harmless."""
         raise NotImplementedError

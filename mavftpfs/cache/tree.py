@@ -331,7 +331,6 @@ class Tree:
         return {
             **({} if self._writing is None else self._writing.status()),
             **files.status(),
-            "reads": files.reads(),
             "bytes_cached": blocks.bytes_cached + self._virtual.snapshots.bytes_cached,
             "bytes_evicted_blocks": blocks.evictions,
             "rate": blocks.meter.rate,

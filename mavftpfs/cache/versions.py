@@ -1,4 +1,4 @@
-"""One version of a remote file, and how its bytes come from the vehicle. Layer: cache.
+"""One version of a remote file. Layer: cache.
 
 A version is a file as it was when it was opened: its size, and its time where listings tell it. Handles of
 one version share its blocks and its remote reader. When the file turns out to have become another one the
@@ -8,19 +8,12 @@ that it is `lost`, too: its handles never get what has the path now, whoever wro
 
 from __future__ import annotations
 
-import errno
-from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 
 from mavftpfs.cache.blocks import FileBlocks
 from mavftpfs.cache.kept import Kept
-from mavftpfs.cache.pathlocks import PathLocks
-from mavftpfs.cache.readahead import Plan
-from mavftpfs.cache.remote import Reader, RemoteStore
-from mavftpfs.cache.singleflight import SingleFlight
-from mavftpfs.shared.errnos import errno_for
-from mavftpfs.shared.errors import FileChanged, FtpNak, LocalProtocolError, MavftpfsError
+from mavftpfs.cache.remote import Reader
+from mavftpfs.shared.errors import FileChanged, MavftpfsError
 from mavftpfs.shared.model import DirEntry
 
 NEVER = float("-inf")
@@ -86,72 +79,6 @@ class Version:
         if reader is not None:
             reader.drop_readahead()
             reader.close()
-
-
-class Fetcher:
-    """Gets bytes of versions from the vehicle."""
-
-    def __init__(self, store: RemoteStore, paths: PathLocks, on_changed: Callable[[Version], None]) -> None:
-        """`paths`: nothing is opened while its name changes; `on_changed`: the file became another one."""
-        self._store = store
-        self._on_changed = on_changed
-        self._paths = paths
-        self._opening: SingleFlight[Version, None] = SingleFlight()
-
-    async def fetch(self, version: Version, start: int, stop: int, plan: Plan) -> bytes | memoryview | None:
-        """Return [start, stop) of a version, at most a piece, and ask for what `plan` says beside it.
-
-        None if the bytes were dropped, or the file got another name, before all of them came.
-
-        Raises:
-            FileChanged, RequestTimeout; else as RemoteStore.open_reader.
-        """
-        blocks, kept = version.blocks, version.kept
-        try:
-            async with blocks.hold(start, stop):
-                if kept is not None:
-                    await kept.fill(blocks, start, stop, lambda: version.kept is kept)
-                    version.require_alive()
-                if blocks.missing(start, stop):
-                    if version.reader is None or blocks.doubted:
-                        await self._opening.run(version, partial(self._open, version))
-                    reader = version.reader
-                    if reader is None or blocks.doubted:
-                        return None
-                    reader.want(start, stop, demand=True)
-                    if plan.start < plan.stop:
-                        reader.want(plan.start, plan.stop, demand=False)
-                    await blocks.wait_for(start, stop)
-                return blocks.get(start, stop)
-        except FileChanged:
-            self._on_changed(version)
-            raise
-        except FtpNak as nak:
-            if errno_for(nak) != errno.ENOENT:
-                raise
-            self._on_changed(version)
-            raise FileChanged(f"{version.path!r} was removed from the vehicle") from nak
-
-    async def _open(self, version: Version) -> None:
-        """Open a version's file, after a doubt in a new session of the server.
-
-        Raises:
-            FileChanged: it is smaller now. Else as RemoteStore.open_reader.
-        """
-        async with self._paths.steady(lambda: version.path) as path:
-            version.require_alive()
-            expected = None if version.blocks.doubted else version.size
-            version.close_reader()
-            version.blocks.begin_reading()
-            reader = await self._store.open_reader(path, version.blocks, expected_size=expected)
-        if version.handles == 0:
-            reader.close()
-            raise LocalProtocolError(f"{version.path!r} was closed while it was read")
-        if reader.size < version.size:
-            reader.close()
-            self._on_changed(version)
-            version.require_alive()
-        version.reader = reader
 
 
 def became_another(size: int, mtime: int | None, entry: DirEntry) -> bool:

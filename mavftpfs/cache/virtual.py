@@ -20,7 +20,7 @@ import trio
 
 from mavftpfs.cache.attributes import Stat, shown_mtime
 from mavftpfs.cache.directories import Directories, Found
-from mavftpfs.cache.openfile import ReadOnlyHandle
+from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.options import CacheOptions
 from mavftpfs.cache.remote import RemoteStore
 from mavftpfs.cache.singleflight import SingleFlight
@@ -114,11 +114,11 @@ class Snapshots:
             self.bytes_cached -= len(snapshot.data)
 
 
-class SnapshotHandle(ReadOnlyHandle):
-    """One open() of an `@` file (see openfile.OpenFile)."""
+class SnapshotHandle(OpenFile):
+    """One open() of an `@` file."""
 
+    size = 0
     direct_io = True
-    keep_cache = False
 
     def __init__(self, data: bytes, on_close: Callable[[], None]) -> None:
         self._data = memoryview(data)

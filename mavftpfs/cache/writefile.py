@@ -15,7 +15,7 @@ from mavftpfs.cache.context import Context
 from mavftpfs.cache.draft import Draft, Where
 from mavftpfs.cache.files import FileHandle
 from mavftpfs.cache.nodes import Node
-from mavftpfs.cache.openfile import ReadOnlyHandle
+from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.shared.errors import FileChanged, LocalProtocolError
 
 TRIES = 3
@@ -33,7 +33,7 @@ class Owner(Protocol):
     def forget_made(self, node: Node) -> None: ...
 
 
-class _Reading:
+class _Reading(OpenFile):
     """Reads of one handle: the draft if there is one, else the vehicle's file."""
 
     def __init__(self, owner: Owner, context: Context, node: Node, handle: FileHandle | None = None) -> None:
@@ -120,7 +120,7 @@ class _Reading:
             handle.close()
 
 
-class ReadFile(_Reading, ReadOnlyHandle):
+class ReadFile(_Reading):
     """One open() for reading (see cache.openfile.OpenFile)."""
 
     async def fsync(self) -> None:

@@ -34,7 +34,7 @@ def deliver(blocks: FileBlocks, offset: int, data: bytes, *, batch: bool = True)
 async def read(
     blocks: FileBlocks, start: int, stop: int, want: Callable[[], None] = lambda: None
 ) -> bytes | memoryview | None:
-    async with blocks.hold(start, stop):
+    async with blocks._cache.reads:
         want()
         await blocks.wait_for(start, stop)
         return blocks.get(start, stop)
