@@ -19,7 +19,6 @@ from mavftpfs.cache.cleaner import Cleaner
 from mavftpfs.cache.context import Context
 from mavftpfs.cache.delivery import PASSING, Deliverer
 from mavftpfs.cache.nodes import Node
-from mavftpfs.cache.replace import Replacer
 from mavftpfs.cache.throttle import Throttle
 from mavftpfs.shared.errnos import errno_for
 from mavftpfs.shared.errors import Armed, MavftpfsError
@@ -42,17 +41,14 @@ ROOM_PAUSES = (120.0, 3600.0)
 class Background:
     """Needs the context's nursery; without one nothing is delivered before it is asked for."""
 
-    def __init__(
-        self, context: Context, deliverer: Deliverer, throttle: Throttle, replacer: Replacer, cleaner: Cleaner
-    ) -> None:
+    def __init__(self, context: Context, deliverer: Deliverer, throttle: Throttle, cleaner: Cleaner) -> None:
         self._context = context
         self._deliverer = deliverer
         self._throttle = throttle
         self._cleaner = cleaner
         self._pause = FIRST_PAUSE
         self._redelivering = self._awaits_room = False
-        deliverer.on_undelivered = self.redeliver
-        replacer.on_torn = self.redeliver
+        context.retry_later = self.redeliver
 
     def kick(self, node: Node) -> None:
         """The draft got more: send it, or begin to, if that can be done beside the program."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import zlib
 from dataclasses import replace
 
@@ -11,9 +10,7 @@ from mavftpfs.cache.dentries import Directory
 from mavftpfs.cache.draft import Base, Draft, State
 from mavftpfs.cache.files import FileHandle
 from mavftpfs.cache.nodes import Node
-from mavftpfs.cache.verify import Verifier
 from mavftpfs.cache.versions import became_another
-from mavftpfs.shared.errnos import errno_for
 from mavftpfs.shared.errors import FileChanged, FtpNak, LocalProtocolError, NotFound
 from mavftpfs.shared.model import split
 
@@ -73,8 +70,8 @@ async def read_base(context: Context, node: Node, start: int, stop: int) -> byte
 async def fetch(context: Context, node: Node) -> None:
     """Get what only the vehicle has of a draft; the caller delivers it.
 
-    Where listings tell no times, all of the old file is read, so that its checksum is known: `require_same`
-    compares it before the old file is replaced.
+    Where listings tell no times, all of the old file is read, so that its checksum is known: it is compared
+    before the old file is replaced.
 
     Raises:
         NoSpace; else as read_base.
@@ -94,43 +91,6 @@ async def fetch(context: Context, node: Node) -> None:
         value = zlib.crc32(data, value)
         draft.fill(at, data)
     draft.base = replace(draft.base, crc32=value ^ 0xFFFFFFFF)
-
-
-async def require_same(context: Context, node: Node, verifier: Verifier) -> None:
-    """Check that the file of which a part is to stay is still the one that the draft was made from.
-
-    Raises:
-        FileChanged: it is another, and the draft is stale from now on. Else as Verifier.size and
-        Directories.ask.
-    """
-    draft = node.draft
-    assert draft is not None
-    assert draft.base is not None
-    if not await _is_same(context, node.path, draft.base, verifier):
-        draft.lose_base()
-        raise FileChanged(f"others changed {node.path!r} on the vehicle while it was changed here")
-
-
-async def _is_same(context: Context, path: bytes, base: Base, verifier: Verifier) -> bool:
-    if context.directories.tells_times:
-        entry = (await context.directories.ask(split(path)[0])).entries.get(split(path)[1])
-        if entry is None or entry.size != base.size:
-            return False
-        if None not in (entry.mtime, base.mtime) and entry.mtime != base.mtime:
-            return False
-    elif not await _has_size(path, base.size, verifier):
-        return False
-    # Of what we delivered no listing may have told the time before others replaced it.
-    return base.crc32 is None or await verifier.crc32(path, base.size) in (None, base.crc32)
-
-
-async def _has_size(path: bytes, size: int, verifier: Verifier) -> bool:
-    try:
-        return await verifier.size(path) == size
-    except FtpNak as nak:
-        if errno_for(nak) != errno.ENOENT:
-            raise
-        return False
 
 
 def on_listed(context: Context, path: bytes, directory: Directory) -> None:

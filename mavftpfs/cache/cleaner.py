@@ -33,7 +33,7 @@ class Cleaner:
         """`dead_owners`: mounts that are known to have ended."""
         self._context = context
         self._names = names
-        self._dead_owners = dead_owners | {context.namer.owner}
+        self._dead_owners = dead_owners | {context.own.owner}
         self._staleness = Staleness()
         self._busy: set[bytes] = set()
         self._delivered: set[Node] = set()

@@ -14,7 +14,7 @@ from mavftpfs.cache.nodes import Nodes
 from mavftpfs.cache.options import CacheOptions
 from mavftpfs.cache.pathlocks import PathLocks
 from mavftpfs.cache.remote import RemoteStore, WriteStore
-from mavftpfs.cache.reserved import Namer, OwnNames
+from mavftpfs.cache.reserved import OwnNames
 from mavftpfs.shared.errors import Armed, FileBusy
 
 
@@ -22,9 +22,9 @@ from mavftpfs.shared.errors import Armed, FileBusy
 class Context:
     """The vehicle, what is remembered of it, and the files that are open or not delivered.
 
-    clock: seconds, monotonic; wall: seconds since 1970. read_rate: bytes
-    per second, once measured. paths: see pathlocks. armed: nothing may be
-    changed (only Writeback.armed_changed sets it).
+    clock: seconds, monotonic; wall: seconds since 1970. read_rate: bytes per second, once measured. paths:
+    see pathlocks. armed: nothing may be changed (only Writeback.armed_changed sets it). retry_later():
+    something was not delivered, or a name may lack its file (Background sets it).
     """
 
     store: RemoteStore
@@ -36,12 +36,12 @@ class Context:
     clock: Callable[[], float]
     wall: Callable[[], float]
     nursery: trio.Nursery | None
-    namer: Namer
+    own: OwnNames
     read_rate: Callable[[], float | None]
     paths: PathLocks
     nodes: Nodes = field(default_factory=Nodes)
-    own: OwnNames = field(default_factory=OwnNames)
     armed: bool = False
+    retry_later: Callable[[], None] = lambda: None
 
     @property
     def blocked(self) -> bool:

@@ -24,24 +24,24 @@ from mavftpfs.cache.names import Names
 from mavftpfs.cache.nodes import Attempt, Node
 from mavftpfs.cache.recovery import describe
 from mavftpfs.cache.replace import Replacer
+from mavftpfs.cache.reserved import Kind, Places
 from mavftpfs.cache.throttle import Throttle
 from mavftpfs.cache.verify import Verifier
 from mavftpfs.shared.errors import (
     AlreadyExists,
     Armed,
-    FtpNak,
+    FileChanged,
     LinkError,
     MavftpfsError,
     NoSpace,
     OutcomeUnknown,
-    PathTooLong,
     RemoteProtocolError,
     RequestTimeout,
     SessionBusy,
     SpoolFailed,
     VerificationFailed,
 )
-from mavftpfs.shared.model import DirEntry, EntryKind, split
+from mavftpfs.shared.model import DirEntry, EntryKind
 
 log = logging.getLogger("mavftpfs.cache")
 
@@ -59,11 +59,7 @@ PASSING = (RequestTimeout, LinkError, SessionBusy, Armed)
 
 
 class Deliverer:
-    """Executes plans.
-
-    Attributes:
-        on_undelivered: called when a delivery ended without success.
-    """
+    """Executes plans."""
 
     def __init__(
         self,
@@ -80,22 +76,36 @@ class Deliverer:
         self._throttle = throttle
         self.verifier = Verifier(context, names)
         self.delivered = 0
-        self.on_undelivered: Callable[[], None] = lambda: None
 
-    async def deliver(self, node: Node, *, wanted: Callable[[], bool] = lambda: True) -> None:
+    async def deliver(self, node: Node, *, wanted: Callable[[], bool] | None = None) -> None:
         """Have the vehicle hold the node's file, checked, as long as that is `wanted`.
 
         Raises:
             The reason why not: as WriteStore; VerificationFailed, NotSupported, FileTooLarge, FileChanged.
         """
-        while wanted():
+        while wanted is None or wanted():
             await node.spared.wait()
             async with self._context.paths.steady(lambda: node.path, lasting=True), node.lock:
-                if node.removed or not node.undelivered:
+                draft = node.draft
+                if draft is None or not node.undelivered:
                     await self.abandon(node)
                     return
                 with node.delivering() as scope:
-                    await self._deliver_or_note(node)
+                    node.quiet = trio.Event()
+                    try:
+                        if node.path not in self._context.own.torn:  # else its name lacks a file until then
+                            self._context.require_disarmed()
+                        await self._deliver(node, draft)
+                        node.error = None
+                        node.background = True
+                    except MavftpfsError as error:
+                        self._note_failure(node, draft, error)
+                        raise
+                    finally:
+                        node.quiet.set()
+                        self._throttle.let_go()
+                        if node.undelivered:  # also if who waited for it gave up
+                            self._context.retry_later()
                 if not scope.cancelled_caught:
                     return
 
@@ -107,16 +117,14 @@ class Deliverer:
         """
         await node.spared.wait()
         async with self._context.paths.steady(lambda: node.path, lasting=True), node.lock:
-            if node.removed or not node.undelivered:
+            draft = node.draft
+            if draft is None or not node.undelivered:
                 return True
             with node.delivering():
-                plan = self._plan(node)
-                if plan is Plan.FIND_OUT:
-                    await self._find_out(node)
-                    plan = self._plan(node)
+                plan = self._plan(node, draft)
                 if plan not in SENDING:
                     return False
-                await self._attempt(node, plan)
+                await self._attempt(node, draft, plan)
         return True
 
     async def abandon(self, node: Node) -> None:
@@ -129,39 +137,32 @@ class Deliverer:
             node.draft.give_up()
         try:
             await attempt.upload.abort()
-            if attempt.plan is Plan.REPLACE:
-                await self._replacer.remove(node.path, *attempt.names)
+            if attempt.places is not None:
+                await self._names.discard(node.path, *attempt.names)
         finally:
-            self._release(attempt)
+            self._context.own.live -= attempt.live
 
     # --- one delivery
 
-    async def _deliver_or_note(self, node: Node) -> None:
-        node.quiet = trio.Event()
-        try:
-            if node.path not in self._context.own.torn:  # else its name lacks a file until this is done
-                self._context.require_disarmed()
-            await self._deliver(node)
-            node.error = None
-            node.background = True
-        except MavftpfsError as error:
-            self._note_failure(node, error)
-            raise
-        finally:
-            node.quiet.set()
-            self._throttle.let_go()
-            if node.undelivered:  # also if who waited for it gave up
-                self.on_undelivered()
+    def _plan(self, node: Node, draft: Draft) -> Plan:
+        if node.path in self._context.own.torn and draft.state is State.DIRTY:
+            return Plan.MEND  # it was written again before its name had a file
+        return choose(draft, self._context.writer.traits, inplace=self._context.options.inplace)
 
-    async def _deliver(self, node: Node) -> None:
+    async def _deliver(self, node: Node, draft: Draft) -> None:
         mismatches = 0
         for _ in range(MAX_STEPS):
-            plan = self._plan(node)
-            if plan is Plan.NOTHING:
-                return
+            plan = self._plan(node, draft)
             known = astuple(self._context.writer.traits)
             try:
-                await self._step(node, plan)
+                if plan is Plan.NOTHING:
+                    return
+                elif plan is Plan.MEND:
+                    await self._mend(node, draft)
+                elif plan is Plan.FETCH:
+                    await base.fetch(self._context, node)
+                else:
+                    await self._send(node, draft, plan)
             except VerificationFailed as error:
                 mismatches += 1
                 await self.abandon(node)
@@ -169,8 +170,7 @@ class Deliverer:
                     raise
                 log.warning("%s; sending it again", error)
             except MavftpfsError as error:
-                resumable = isinstance(error, PASSING) and _draft(node).size > 0
-                if not resumable:
+                if not isinstance(error, PASSING) or not draft.size:
                     await self.abandon(node)
                 learnt = astuple(self._context.writer.traits) != known
                 if not learnt or isinstance(error, LinkError | Armed):
@@ -178,68 +178,15 @@ class Deliverer:
                 log.debug("%r: %s; trying another way", node.path, error)
         raise VerificationFailed(f"no way of writing {node.path!r} led to an end")
 
-    def _plan(self, node: Node) -> Plan:
-        draft = _draft(node)
-        if node.path in self._context.own.torn and draft.state is State.DIRTY:
-            return Plan.MEND  # it was written again before its name had a file
-        return choose(draft, self._context.writer.traits, inplace=self._context.options.inplace)
-
-    async def _step(self, node: Node, plan: Plan) -> None:
-        if plan in SENDING:
-            await self._send(node, plan)
-        elif plan is Plan.FIND_OUT:
-            await self._find_out(node)
-        elif plan is Plan.FETCH:
-            await base.fetch(self._context, node)
-        else:
-            await self._mend(node)
-
-    async def _find_out(self, node: Node) -> None:
-        """See on an empty file of our own whether the card can rename.
-
-        Raises:
-            As WriteStore.create_empty and rename.
-        """
-        context = self._context
-        context.namer.fresh(node.path)  # raises PathTooLong, before anything is sent
-        try:
-            first, second = context.namer.pair(node.path)
-        except PathTooLong:
-            context.writer.traits.rename_works = True  # it shows when the file is to get its name
-            return
-        context.own.live |= {first, second}
-        left = first
-        try:
-            await context.writer.create_empty(first)
-            left = await self._try_to_rename(first, second)
-        finally:
-            context.own.live -= {first, second}
-            context.dentries.expire(split(first)[0])
-        await self._replacer.remove(node.path, left)
-
-    async def _try_to_rename(self, first: bytes, second: bytes) -> bytes:
-        """Return the name that the file has then. One refusal may be of that moment only."""
-        try:
-            await self._names.rename(first, second)
-        except FtpNak:
-            try:
-                await self._names.rename(first, second)
-            except FtpNak as nak:
-                if not await self._names.cannot_rename(first, second, nak):
-                    raise
-                return first
-        return second
-
-    async def _mend(self, node: Node) -> None:
+    async def _mend(self, node: Node, draft: Draft) -> None:
         """The renames of this file were interrupted: have them completed or undone, and look what came of it.
 
         Raises:
             As Directories.ask and Verifier.check.
         """
-        draft, own = _draft(node), self._context.own
         await self._cleaner.mend(node)
         there = await self._names.ask(node.path) is not None
-        own.torn.pop(node.path, None)
+        self._context.own.torn.pop(node.path, None)
         if draft.state is not State.TORN:
             return
         try:
@@ -247,133 +194,117 @@ class Deliverer:
         except VerificationFailed:
             there = False
         if there:
-            self._on_delivered(node, crc32)
+            self._on_delivered(node, draft, crc32)
         else:
             draft.on(Event.REFUSED)
 
     # --- sending
 
-    async def _send(self, node: Node, plan: Plan) -> None:
-        attempt = await self._attempt(node, plan)
-        await self._finish(attempt)
-        draft, writer = _draft(node), self._context.writer
-        doubted = attempt.sending.rewritten or writer.in_doubt() or writer.doubted_since(attempt.begun_at)
-        crc32 = await self.verifier.check(attempt.path, draft, doubted=doubted)
-        if plan is Plan.REPLACE:
-            await self._require_expected(node)
-            await self._commit(node, attempt)
-        else:
-            node.attempt = None
-            await attempt.upload.abort()
-        self._on_delivered(node, crc32)
-
-    async def _attempt(self, node: Node, plan: Plan) -> Attempt:
-        """Return the attempt under way if it still fits, else a new one."""
-        attempt = node.attempt
-        if attempt is not None and attempt.plan is plan and not attempt.sending.overtaken:
-            return attempt
-        await self.abandon(node)
-        draft, context = _draft(node), self._context
-        path, places = node.path, None
-        if plan is Plan.OVERWRITE or isinstance(node.error, AlreadyExists):  # which all of it was sent for
-            await self._require_expected(node)
-        if plan is Plan.OVERWRITE:
-            pass
-        elif draft.base is None:
-            path = context.namer.fresh(node.path)
-            context.own.live.add(path)
-        else:
-            places = context.namer.places(node.path)
-            path = places.new
-            context.own.live |= places.all
-        begun_at = context.clock()
-        try:
-            if places is not None:
-                await self._replacer.write_sidecar(places, node.path)
-            sending = draft.begin(in_place=plan is Plan.OVERWRITE)
-            sending.progress = self._throttle.on_acked
-            upload = await context.writer.open_upload(path, sending)
-        except BaseException:
-            draft.give_up()
-            context.own.live -= {path} if places is None else places.all
-            raise
-        node.attempt = Attempt(plan, path, sending, upload, begun_at, places)
-        if plan is Plan.OVERWRITE:
-            context.dentries.put(path, DirEntry(b"", EntryKind.FILE))
-        return node.attempt
-
-    async def _require_expected(self, node: Node) -> None:
-        """Check that a new file's name is free, or that the file of which a part stays is still the same.
-
-        Raises:
-            AlreadyExists, FileChanged. Else as Names.is_free and base.require_same.
-        """
-        draft = _draft(node)
-        if draft.base_limit:
-            await base.require_same(self._context, node, self.verifier)
-        elif draft.base is None and not draft.begun and not await self._names.is_free(node.path):
-            raise AlreadyExists(f"{node.path!r} was made by somebody else in the meantime")
-
-    async def _finish(self, attempt: Attempt) -> None:
+    async def _send(self, node: Node, draft: Draft, plan: Plan) -> None:
+        """Send the whole file, compare it, and rename it into place."""
+        attempt, writer = await self._attempt(node, draft, plan), self._context.writer
         attempt.sending.growing = False
         for _ in range(FINISHES):
             attempt.upload.wake()
             await attempt.upload.finish()
             if not attempt.sending.unacked:
-                return
-        raise RemoteProtocolError(f"{attempt.path!r} was said to be finished, and was not")
+                break
+        else:
+            raise RemoteProtocolError(f"{attempt.path!r} was said to be finished, and was not")
+        doubted = attempt.sending.rewritten or writer.in_doubt() or writer.doubted_since(attempt.begun_at)
+        crc32 = await self.verifier.check(attempt.path, draft, doubted=doubted)
+        if attempt.places is None:
+            node.attempt = None
+            await attempt.upload.abort()
+        else:
+            await self._require_expected(node, draft)
+            await self._commit(node, draft, attempt, attempt.places)
+        self._on_delivered(node, draft, crc32)
 
-    async def _commit(self, node: Node, attempt: Attempt) -> None:
+    async def _attempt(self, node: Node, draft: Draft, plan: Plan) -> Attempt:
+        """Return the attempt under way if it still fits, else a new one."""
+        attempt = node.attempt
+        if attempt is not None and attempt.plan is plan and not attempt.sending.overtaken:
+            return attempt
+        await self.abandon(node)
+        context, places = self._context, None
+        if plan is Plan.OVERWRITE or isinstance(node.error, AlreadyExists):  # which all of it was sent for
+            await self._require_expected(node, draft)
+        if plan is Plan.REPLACE:
+            fresh = draft.base is None
+            places = (
+                Places(context.own.beside(node.path, Kind.FRESH)) if fresh else context.own.places(node.path)
+            )
+            context.own.live |= places.all
+        path = node.path if places is None else places.new
+        begun_at = context.clock()
+        try:
+            if places is not None:
+                await self._replacer.write_sidecar(places, node.path)
+            sending = draft.begin(in_place=places is None)
+            sending.progress = self._throttle.on_acked
+            upload = await context.writer.open_upload(path, sending)
+        except BaseException:
+            draft.give_up()
+            context.own.live -= set() if places is None else places.all
+            raise
+        node.attempt = Attempt(plan, path, sending, upload, begun_at, places)
+        if places is None:
+            context.dentries.put(path, DirEntry(b"", EntryKind.FILE))
+        return node.attempt
+
+    async def _require_expected(self, node: Node, draft: Draft) -> None:
+        """Check that a new file's name is free, or that the file of which a part stays is still the same.
+
+        Raises:
+            AlreadyExists. FileChanged: the draft is stale from now on. Else as Names.is_free and
+            Verifier.is_same.
+        """
+        if draft.base is not None and draft.base_limit:
+            if not await self.verifier.is_same(node.path, draft.base):
+                draft.lose_base()
+                raise FileChanged(f"others changed {node.path!r} on the vehicle while it was changed here")
+        elif draft.base is None and not draft.begun and not await self._names.is_free(node.path):
+            raise AlreadyExists(f"{node.path!r} was made by somebody else in the meantime")
+
+    async def _commit(self, node: Node, draft: Draft, attempt: Attempt, places: Places) -> None:
         """Rename what was sent and verified into place.
 
         Raises:
             As Replacer. VerificationFailed: it is not what it was any more.
         """
-        draft, context = _draft(node), self._context
+        own, path = self._context.own, node.path
         node.attempt = None
         try:
-            await attempt.upload.abort()
-        except BaseException:  # nobody waits any more: all of it is sent again
-            draft.give_up()
-            context.own.leave(attempt.names, node.path)
-            self._release(attempt)
-            raise
-        context.dentries.put(attempt.path, DirEntry(b"", EntryKind.FILE, draft.size))
-        draft.commit()
-        try:
-            if attempt.places is None:
-                await self._replacer.place(attempt.path, node.path)
-            else:
-                await self._replacer.replace(attempt.path, node.path, attempt.places)
-            if attempt.upload.resent and await self.verifier.size(node.path) != draft.size:
+            try:
+                await attempt.upload.abort()
+            except BaseException:  # nobody waits any more: all of it is sent again
+                draft.give_up()
+                own.garbage.update(dict.fromkeys(attempt.names, path))
+                raise
+            self._context.dentries.put(places.new, DirEntry(b"", EntryKind.FILE, draft.size))
+            draft.commit()
+            await self._replacer.put(places, path)
+            if attempt.upload.resent and await self._names.size(path) != draft.size:
                 draft.interrupted(ours=True)
-                raise VerificationFailed(f"{node.path!r} was emptied by a request that came twice")
+                raise VerificationFailed(f"{path!r} was emptied by a request that came twice")
         except BaseException as error:
-            await self._on_not_placed(node, attempt, error)
+            if draft.state is State.COMMITTING:
+                unknown = isinstance(error, OutcomeUnknown) or not isinstance(error, MavftpfsError)
+                if unknown or path in own.torn:
+                    draft.interrupted()
+                else:
+                    draft.on(Event.REFUSED)
+                    await self._names.discard(path, *attempt.names)
             raise
         finally:
-            self._release(attempt)
-
-    async def _on_not_placed(self, node: Node, attempt: Attempt, error: BaseException) -> None:
-        draft = _draft(node)
-        if draft.state is not State.COMMITTING:
-            return
-        unknown = isinstance(error, OutcomeUnknown) or not isinstance(error, MavftpfsError)
-        if unknown or node.path in self._context.own.torn:
-            draft.interrupted()
-            return
-        draft.on(Event.REFUSED)
-        await self._replacer.remove(node.path, *attempt.names)
+            own.live -= attempt.live  # what is left there is for the next listing to clean up
 
     # --- after
 
-    def _release(self, attempt: Attempt) -> None:
-        """What is left under the attempt's names is for the next listing to clean up."""
-        self._context.own.live -= {attempt.path} if attempt.places is None else attempt.places.all
-
-    def _on_delivered(self, node: Node, crc32: int | None) -> None:
+    def _on_delivered(self, node: Node, draft: Draft, crc32: int | None) -> None:
         """The vehicle has it: listings, blocks and checksums follow."""
-        context, draft = self._context, _draft(node)
+        context = self._context
         context.dentries.put(node.path, DirEntry(b"", EntryKind.FILE, draft.size), proven=True)
         if crc32 is None and draft.size <= context.options.verify_max:
             crc32 = draft.crc32()
@@ -384,20 +315,14 @@ class Deliverer:
         context.files.on_written(node.path)
         self.delivered += 1
 
-    def _note_failure(self, node: Node, error: MavftpfsError) -> None:
+    def _note_failure(self, node: Node, draft: Draft, error: MavftpfsError) -> None:
         """Latch the error, and keep the bytes where the end of this process does not lose them."""
         known, node.error = node.error, error
-        draft, content = node.draft, node.content
         level = logging.DEBUG if isinstance(error, Armed) or str(known) == str(error) else logging.WARNING
         log.log(level, "%r is not delivered: %s", node.path, error)  # once: each close tries again
-        if draft is None or content is None:
+        if node.draft is None or node.content is None:
             return
         try:
-            content.persist(describe(node, draft, self._context.wall))
+            node.content.persist(describe(node, draft, self._context.wall))
         except (NoSpace, SpoolFailed, OSError) as trouble:
             log.warning("%r is kept in memory only: %s", node.path, trouble)
-
-
-def _draft(node: Node) -> Draft:
-    assert node.draft is not None
-    return node.draft

@@ -374,14 +374,13 @@ class Plan(Enum):
     """One step.
 
     NOTHING: the vehicle has it. MEND: have an interrupted replacement completed or undone. FETCH: get what
-    only the vehicle has of the old content. FIND_OUT: see whether the card can rename. REPLACE: send it under
-    a reserved name and rename it. OVERWRITE: send it under its own name.
+    only the vehicle has of the old content. REPLACE: send it under a reserved name and rename it. OVERWRITE:
+    send it under its own name, since the card was seen not to rename.
     """
 
     NOTHING = "nothing"
     MEND = "mend"
     FETCH = "fetch"
-    FIND_OUT = "find out"
     REPLACE = "replace"
     OVERWRITE = "overwrite"
 
@@ -409,6 +408,4 @@ def choose(draft: Draft, traits: WriteTraits, *, inplace: bool) -> Plan:
         raise NotSupported("this server cannot rename, so a file cannot be replaced safely; see inplace")
     if not draft.whole:
         return Plan.FETCH
-    if traits.rename_works is None:
-        return Plan.FIND_OUT
-    return Plan.REPLACE if traits.rename_works else Plan.OVERWRITE
+    return Plan.OVERWRITE if traits.rename_works is False else Plan.REPLACE

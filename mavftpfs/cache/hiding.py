@@ -14,8 +14,17 @@ from mavftpfs.cache.context import Context
 from mavftpfs.cache.draft import Base, Draft
 from mavftpfs.cache.names import Names
 from mavftpfs.cache.nodes import Node
+from mavftpfs.cache.reserved import Kind
 from mavftpfs.cache.spool import SpoolContent
-from mavftpfs.shared.errors import FileBusy, FtpNak, MavftpfsError, NoSpace, PathTooLong, SpoolFailed
+from mavftpfs.shared.errors import (
+    FileBusy,
+    FtpNak,
+    MavftpfsError,
+    NoSpace,
+    NotSupported,
+    PathTooLong,
+    SpoolFailed,
+)
 
 log = logging.getLogger("mavftpfs.cache")
 
@@ -71,7 +80,7 @@ class Hider:
         """
         context, old = self._context, node.path
         try:
-            hidden = context.namer.hidden(old)
+            hidden = context.own.beside(old, Kind.DELETED)
         except PathTooLong as error:
             raise FileBusy(f"{old!r} is open, and its path is too long to keep it: {error}") from error
         context.own.live.add(hidden)
@@ -79,7 +88,7 @@ class Hider:
             await self._names.rename(old, hidden)
         except BaseException as error:
             context.own.live.discard(hidden)
-            if isinstance(error, FtpNak):
+            if isinstance(error, FtpNak | NotSupported):
                 raise FileBusy(f"{old!r} is open, and this card cannot keep it: {error}") from error
             raise
         await self.on_hidden(node, hidden)

@@ -10,26 +10,31 @@ Whether a change happened is found out by the session; here the remembered listi
 from __future__ import annotations
 
 import errno
+import logging
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
 import trio
 
 from mavftpfs.cache.context import Context
-from mavftpfs.cache.reserved import is_reserved, parse
+from mavftpfs.cache.reserved import Kind, is_reserved, parse
+from mavftpfs.protocol.payload import Opcode
 from mavftpfs.shared.errnos import errno_for
 from mavftpfs.shared.errors import (
     AlreadyExists,
     DirectoryNotEmpty,
     FileBusy,
     FtpNak,
+    MavftpfsError,
     NotADirectory,
     NotFound,
+    NotSupported,
     OutcomeUnknown,
+    PathTooLong,
 )
 from mavftpfs.shared.model import DirEntry, EntryKind, folded, join, split
 
-_FILE_EXISTS, _FILE_PROTECTED = 8, 9
+log = logging.getLogger("mavftpfs.cache")
 
 RECENT = 2.0
 """Seconds for which what was seen of a name is taken to be true when the name is about to be changed. So the
@@ -89,6 +94,25 @@ class Names:
             return (await self._context.directories.ask(parent)).entries.get(name)
         except (NotFound, NotADirectory):
             return None
+
+    async def size(self, path: bytes) -> int:
+        """Return the size of a file on the vehicle, asked just now.
+
+        Opening it needs the server's one session. That costs another upload all it sent where OpenFileWO
+        empties files: there the directory is listed.
+
+        Raises:
+            As WriteStore.stat_size.
+        """
+        context = self._context
+        if context.writer.traits.wo_truncates:
+            for node in context.nodes:
+                if node.attempt is not None and node.attempt.path != path:
+                    entry = await self.ask(path)
+                    if entry is not None and entry.size is not None:
+                        return entry.size
+                    break
+        return await context.writer.stat_size(path)
 
     async def is_free(self, path: bytes, *, perhaps_directory: bool = False) -> bool:
         """Return whether nothing has a name, asked just now by opening it, so in any spelling.
@@ -171,34 +195,39 @@ class Names:
             await self._context.writer.make_directory(path)
         self._context.dentries.put(path, DirEntry(b"", EntryKind.DIRECTORY), proven=True)
 
+    async def discard(self, target: bytes, *paths: bytes) -> None:
+        """Remove reserved names that are not needed any more; what cannot be removed now goes at a later
+        listing, or before `target` is removed."""
+        for at, path in enumerate(paths):
+            try:
+                await self.remove_if_there(path)
+            except MavftpfsError as error:
+                log.info("%r stays until its directory is listed again: %s", path, error)
+                self._context.own.garbage.update(dict.fromkeys(paths[at:], target))
+                return
+
     async def rename(self, old: bytes, new: bytes, *, completes: bool = False) -> None:
         """Rename, on a server that replaces files perhaps over a file; both paths fit a request.
 
         completes: see WriteStore.rename.
 
         Raises:
-            As WriteStore.
+            NotSupported: the card cannot rename. Else as WriteStore.
         """
-        async with self._changing(old, new):
-            await self._context.writer.rename(old, new, completes=completes)
-        self._context.writer.traits.rename_works = True
+        writer = self._context.writer
+        if writer.traits.rename_works is False:
+            raise NotSupported("this server cannot rename")
+        try:
+            async with self._changing(old, new):
+                await writer.rename(old, new, completes=completes)
+        except FtpNak as nak:
+            if writer.traits.rename_works is None:
+                await self._find_out(old)
+                if writer.traits.rename_works is False:
+                    raise NotSupported("this server cannot rename") from nak
+            raise
+        writer.traits.rename_works = True
         self._context.dentries.rename(old, new)
-
-    async def cannot_rename(self, old: bytes, new: bytes, nak: FtpNak) -> bool:
-        """A first rename was refused: note and return whether the card knows no renames.
-
-        It does not if both names are as they were; the refusal's number proves nothing, but for those of a
-        name that exists, perhaps in another spelling, and of PX4's list of what may be written.
-
-        Raises:
-            As Directories.ask.
-        """
-        if nak.code in (_FILE_EXISTS, _FILE_PROTECTED):
-            return False
-        if await self.ask(old) is None or await self.ask(new) is not None:
-            return False
-        self._context.writer.traits.rename_works = False
-        return True
 
     async def purge(self, path: bytes) -> None:
         """A path is about to lose its name: have nothing of an earlier replacement bring it back.
@@ -208,13 +237,10 @@ class Names:
         """
         own, (parent, name) = self._context.own, split(path)
         directory = self._context.dentries.known(parent)
-        doomed = own.belonging_to(path)
+        doomed = [left for left, target in own.garbage.items() if target == path]
         for entry in [] if directory is None else list(directory.entries):
             reserved, left = parse(entry), join(parent, entry)
-            ours = reserved is not None and (reserved.owner, reserved.target) == (
-                self._context.namer.owner,
-                name,
-            )
+            ours = reserved is not None and (reserved.owner, reserved.target) == (own.owner, name)
             if ours and left not in own.live and left not in doomed:
                 doomed.append(left)
         for left in doomed:
@@ -223,6 +249,37 @@ class Names:
         own.torn.pop(path, None)
 
     # --- inside
+
+    async def _find_out(self, near: bytes) -> None:
+        """A first rename was refused: see on an empty file of ours whether the card can rename at all.
+
+        The refusal's number proves nothing (servers.md 12), and it may be that name which the card does not
+        take.
+
+        Raises:
+            As WriteStore, but FtpNak and OutcomeUnknown.
+        """
+        context = self._context
+        try:
+            first = context.own.beside(near, Kind.FRESH)
+            second = context.own.beside(first, Kind.FRESH)
+        except PathTooLong:
+            return
+        context.own.live |= {first, second}
+        left = first
+        try:
+            await context.writer.create_empty(first)
+            await context.writer.rename(first, second)
+            left, context.writer.traits.rename_works = second, True
+        except OutcomeUnknown:
+            return  # the next listing removes it
+        except FtpNak as nak:
+            if nak.opcode == Opcode.RENAME:
+                context.writer.traits.rename_works = False
+        finally:
+            context.own.live -= {first, second}
+            context.dentries.expire(split(first)[0])
+        await self.discard(left, left)
 
     @asynccontextmanager
     async def _changing(self, *paths: bytes) -> AsyncIterator[None]:

@@ -24,7 +24,6 @@ from mavftpfs.shared.errors import (
     AlreadyExists,
     CrossDevice,
     FileBusy,
-    FtpNak,
     InvalidMove,
     IsADirectory,
     NotADirectory,
@@ -211,10 +210,10 @@ class Namespace:
         await self._names.purge(old)
         try:
             if listed is None:
-                await self._rename_plainly(old, new)
+                await self._names.rename(old, new)
             elif listed.kind is EntryKind.DIRECTORY:
                 await self._names.remove_directory(new)
-                await self._rename_plainly(old, new)
+                await self._names.rename(old, new)
             else:
                 await self._replace(old, new, displaced)
         except NotSupported as error:
@@ -228,25 +227,14 @@ class Namespace:
         """Rename over a file; who has that open keeps it."""
         context = self._context
         keep = displaced is not None and displaced.handles > 0 and not self._hider.keep_local(displaced)
-        places = context.namer.places(new)
+        places = context.own.places(new)
         if keep and places.sidecar is not None:
             raise FileBusy(f"{new!r} is open, and its path is too long to keep it")
         context.own.live |= places.all
         try:
             await self._replacer.replace(old, new, places, keep_old=keep)
-            if keep and displaced is not None:
+            if keep and displaced is not None and places.old is not None:
                 await self._hider.on_hidden(displaced, places.old)
         finally:
             context.own.live -= places.all
             context.own.live |= context.nodes.hidden.keys()
-
-    async def _rename_plainly(self, old: bytes, new: bytes) -> None:
-        traits = self._context.writer.traits
-        try:
-            await self._names.rename(old, new)
-        except FtpNak as nak:
-            if traits.rename_works is False or (
-                traits.rename_works is None and await self._names.cannot_rename(old, new, nak)
-            ):
-                raise NotSupported("this server cannot rename") from nak
-            raise

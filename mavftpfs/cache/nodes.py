@@ -28,8 +28,8 @@ from mavftpfs.shared.errors import FileChanged, MavftpfsError
 class Attempt:
     """One try to deliver a draft.
 
-    path: where its bytes go. places: the reserved names, where a file is replaced. begun_at: when, by the
-    caches' clock.
+    path: where its bytes go. places: the reserved names, but on cards that cannot rename. begun_at: when, by
+    the caches' clock.
     """
 
     plan: Plan
@@ -41,9 +41,14 @@ class Attempt:
 
     @property
     def names(self) -> list[bytes]:
-        """What it left on the card, if it is given up: what was sent, and its sidecar."""
+        """What it leaves on the card if it is given up: what was sent, and its sidecar."""
         sent = [self.path] if self.upload.begun else []
         return sent if self.places is None or self.places.sidecar is None else [*sent, self.places.sidecar]
+
+    @property
+    def live(self) -> set[bytes]:
+        """The reserved names it uses."""
+        return set() if self.places is None else self.places.all
 
 
 @dataclass(slots=True, eq=False)

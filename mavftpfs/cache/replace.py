@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import errno
 import logging
-from collections.abc import Callable
 
 import trio
 
@@ -27,7 +26,6 @@ from mavftpfs.shared.errors import (
     AlreadyExists,
     FtpNak,
     MavftpfsError,
-    NotSupported,
     OutcomeUnknown,
 )
 from mavftpfs.shared.model import split
@@ -39,25 +37,23 @@ _HONEST = frozenset({errno.EACCES, errno.EROFS, errno.ENOSPC, errno.ENAMETOOLONG
 
 
 class Replacer:
-    """Renames files into place.
-
-    Attributes:
-        on_torn: called when a name may lack its file.
-    """
+    """Renames files into place."""
 
     def __init__(self, context: Context, names: Names) -> None:
         self._context = context
         self._names = names
-        self.on_torn: Callable[[], None] = lambda: None
 
-    async def place(self, source: bytes, target: bytes) -> None:
-        """Rename to a name that is free.
+    async def put(self, places: Places, target: bytes) -> None:
+        """Give what was sent its name: in place of the old file, or, if it is new, one that is free.
 
         Raises:
-            AlreadyExists: it is not. Else as WriteStore.rename.
+            AlreadyExists: it is not. Else as replace.
         """
+        if places.old is not None:
+            await self.replace(places.new, target, places)
+            return
         try:
-            await self._names.rename(source, target)
+            await self._names.rename(places.new, target)
         except FtpNak as nak:
             if nak.code == NakCode.FILE_EXISTS:
                 raise AlreadyExists(f"{target!r} was made by somebody else in the meantime") from nak
@@ -70,9 +66,11 @@ class Replacer:
             NotSupported: the server does not rename. Else as WriteStore.rename. The old file has its name
             again then, unless the name is torn.
         """
+        litter = [places.sidecar] if places.sidecar is not None else []
         if not keep_old and self._replaces_at_once(target) and await self._rename_over(source, target):
-            await self._tidy(target, places)
+            await self._names.discard(target, *litter)
             return
+        assert places.old is not None
         if source != places.new:  # else it was written before
             await self.write_sidecar(places, target)
         moved = await self._move_aside(target, places.old)
@@ -87,7 +85,9 @@ class Replacer:
                 await self._undo(places.old, target)
             raise
         self._context.own.found((places.old,))
-        await self._tidy(target, places, old=moved and not keep_old)
+        if moved and not keep_old:
+            litter.insert(0, places.old)
+        await self._names.discard(target, *litter)
 
     async def write_sidecar(self, places: Places, target: bytes) -> None:
         """Write down where short names belong, if the names are short. Raises as Upload.finish."""
@@ -100,17 +100,6 @@ class Replacer:
         finally:
             await upload.abort()
 
-    async def remove(self, target: bytes, *paths: bytes) -> None:
-        """Remove reserved names that are not needed any more; what cannot be removed now goes at a later
-        listing, or before `target` is removed."""
-        for at, path in enumerate(paths):
-            try:
-                await self._names.remove_if_there(path)
-            except MavftpfsError as error:
-                log.info("%r stays until its directory is listed again: %s", path, error)
-                self._context.own.leave(paths[at:], target)
-                return
-
     def tear(self, path: bytes, place: bytes) -> None:
         """The file of a name may lie at `place` for now: show it on, and have both directories listed."""
         context = self._context
@@ -118,7 +107,7 @@ class Replacer:
         if entry is not None:
             context.dentries.put(path, entry)
         context.own.torn[path] = place
-        self.on_torn()
+        context.retry_later()
         for directory in (split(path)[0], split(place)[0]):
             context.dentries.expire(directory)
         log.warning("%r may lie under %r until the vehicle is heard again", path, place)
@@ -147,14 +136,11 @@ class Replacer:
 
     async def _move_aside(self, target: bytes, old: bytes) -> bool:
         """Return whether there was something to move."""
-        traits = self._context.writer.traits
         try:
             await self._names.rename(target, old)
         except FtpNak as nak:
             if errno_for(nak) == errno.ENOENT and await self._names.ask(target) is None:
                 return False
-            if not traits.rename_works and await self._names.cannot_rename(target, old, nak):
-                raise NotSupported("this server cannot rename") from nak
             raise
         except (OutcomeUnknown, trio.Cancelled):
             self.tear(target, old)
@@ -169,10 +155,6 @@ class Replacer:
             if not isinstance(error, MavftpfsError):
                 raise
             log.debug("%r did not get its file back: %s", path, error)
-
-    async def _tidy(self, target: bytes, places: Places, *, old: bool = False) -> None:
-        doomed = [places.old] if old else []
-        await self.remove(target, *doomed, *([] if places.sidecar is None else [places.sidecar]))
 
 
 class _Text(UploadSource):

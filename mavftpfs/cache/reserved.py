@@ -16,7 +16,7 @@ it, SSS counts, and the kind k is
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from enum import Enum
 from random import Random
@@ -65,16 +65,20 @@ class Reserved:
 
 @dataclass(frozen=True, slots=True)
 class Places:
-    """Where one replacement keeps its files; sidecar: only where the names do not tell the target."""
+    """The reserved paths of one delivery.
+
+    new: what is sent. old: the file that is replaced, moved aside; None for a new file. sidecar: only where
+    the names do not tell the target.
+    """
 
     new: bytes
-    old: bytes
+    old: bytes | None = None
     sidecar: bytes | None = None
 
     @property
     def all(self) -> set[bytes]:
         """Every path of it."""
-        return {self.new, self.old} if self.sidecar is None else {self.new, self.old, self.sidecar}
+        return {path for path in (self.new, self.old, self.sidecar) if path is not None}
 
 
 def is_reserved(name: bytes) -> bool:
@@ -101,117 +105,51 @@ def fits_rename(old: bytes, new: bytes) -> bool:
     return len(wire_path(old)) + 1 + len(wire_path(new)) <= RENAME_ROOM
 
 
-class Namer:
-    """Makes reserved names of one mount that do not repeat before it made 32,768 of them."""
+class OwnNames:
+    """The reserved names of this mount. None repeats before it made 32,768 of them.
+
+    Attributes:
+        owner: the mount's token.
+        live: names in use, so no listing's repair touches them.
+        torn: paths that may lack their file on the vehicle though nobody removed them -> where it lies.
+        garbage: reserved paths that could not be removed yet -> the path they belong to. Who removes that
+            path has to remove them first.
+    """
 
     def __init__(self, owner: bytes, root: bytes, rng: Random) -> None:
         """`root`: nothing is put above this directory."""
         self.owner = owner
-        self._root = root
-        self._serial = rng.randrange(_SERIALS)
-
-    def fresh(self, target: bytes) -> bytes:
-        """Return a name for the content of a new file.
-
-        Raises:
-            PathTooLong: no directory at or above the target's is short enough, or the target does not fit.
-        """
-        return self._short(target, Kind.FRESH)
-
-    def hidden(self, path: bytes) -> bytes:
-        """Return a name for a file that is unlinked while it is open. Raises PathTooLong."""
-        return self._short(path, Kind.DELETED)
-
-    def pair(self, path: bytes) -> tuple[bytes, bytes]:
-        """Return two names in one directory, for renaming one to the other. Raises PathTooLong."""
-        first, second = (Reserved(self.owner, Kind.FRESH, self._next_serial()).name for _ in range(2))
-        directory = self._nearest(path, lambda above: _path_fits(join(above, first), join(above, second)))
-        return join(directory, first), join(directory, second)
-
-    def places(self, target: bytes) -> Places:
-        """Return where to keep what replaces `target`. Raises PathTooLong."""
-        wire_path(target)
-        serial = self._next_serial()
-        parent, name = split(target)
-        named = self._places(parent, serial, name)
-        if len(split(named.new)[1]) <= MAX_NAME and _fit(named, target):
-            return named
-        short: list[Places] = []
-
-        def fits(directory: bytes) -> bool:
-            short[:] = [self._places(directory, serial, None)]
-            return _fit(short[0], target)
-
-        self._nearest(target, fits)
-        return short[0]
-
-    # --- inside
-
-    def _short(self, target: bytes, kind: Kind) -> bytes:
-        wire_path(target)
-        name = Reserved(self.owner, kind, self._next_serial()).name
-        directory = self._nearest(target, lambda above: _path_fits(join(above, name), target))
-        return join(directory, name)
-
-    def _next_serial(self) -> bytes:
-        self._serial = (self._serial + 1) % _SERIALS
-        return _spell(self._serial, _SERIAL_LENGTH)
-
-    def _nearest(self, target: bytes, fits: Callable[[bytes], bool]) -> bytes:
-        """Return the first directory that fits, from the target's upwards, on the same storage."""
-        directory = split(target)[0]
-        while not fits(directory):
-            if directory in (ROOT, self._root, storage_of(directory)):
-                raise PathTooLong(f"{target!r} is too long for temporary names beside it")
-            directory = split(directory)[0]
-        return directory
-
-    def _places(self, directory: bytes, serial: bytes, name: bytes | None) -> Places:
-        def place(kind: Kind) -> bytes:
-            target = None if kind is Kind.SIDECAR else name
-            return join(directory, Reserved(self.owner, kind, serial, target).name)
-
-        return Places(place(Kind.NEW), place(Kind.OLD), place(Kind.SIDECAR) if name is None else None)
-
-
-def _fit(places: Places, target: bytes) -> bool:
-    return _path_fits(places.new, target) and _path_fits(places.old, target)
-
-
-def _path_fits(path: bytes, target: bytes) -> bool:
-    """Return whether a path fits a request, and a rename between it and the target does."""
-    return len(path) <= MAX_WIRE_PATH and fits_rename(path, target)
-
-
-def _spell(number: int, length: int) -> bytes:
-    letters = bytearray()
-    for _ in range(length):
-        number, digit = divmod(number, len(_ALPHABET))
-        letters.append(_ALPHABET[digit])
-    return bytes(letters)
-
-
-class OwnNames:
-    """The reserved names that this mount uses, and those it left behind.
-
-    Attributes:
-        live: in use, so no listing's repair touches them.
-        torn: paths that may lack their file on the vehicle though nobody removed them -> where it lies.
-        garbage: reserved paths that could not be removed yet -> the path they belong to.
-    """
-
-    def __init__(self) -> None:
         self.live: set[bytes] = set()
         self.torn: dict[bytes, bytes] = {}
         self.garbage: dict[bytes, bytes] = {}
+        self._root = root
+        self._serial = rng.randrange(_SERIALS)
 
-    def leave(self, paths: Iterable[bytes], target: bytes) -> None:
-        """These could not be removed: who removes the target has to remove them first."""
-        self.garbage.update(dict.fromkeys(paths, target))
+    def beside(self, target: bytes, kind: Kind) -> bytes:
+        """Return a path that does not tell the target's name, in the nearest directory at or above the
+        target's from which it can be renamed to the target.
 
-    def belonging_to(self, target: bytes) -> list[bytes]:
-        """Return what could bring back a name that is removed."""
-        return [path for path, owner in self.garbage.items() if owner == target]
+        Raises:
+            PathTooLong: there is none.
+        """
+        name = Reserved(self.owner, kind, self._next_serial()).name
+        for directory in self._upwards(target):
+            path = join(directory, name)
+            if len(path) <= MAX_WIRE_PATH and fits_rename(path, target):
+                return path
+        raise PathTooLong(f"{target!r} is too long for temporary names beside it")
+
+    def places(self, target: bytes) -> Places:
+        """Return where to keep what replaces `target`. Raises PathTooLong."""
+        serial = self._next_serial()
+        parent, name = split(target)
+        new = join(parent, Reserved(self.owner, Kind.NEW, serial, name).name)
+        if len(split(new)[1]) <= MAX_NAME and len(new) <= MAX_WIRE_PATH and fits_rename(new, target):
+            return Places(new, join(parent, Reserved(self.owner, Kind.OLD, serial, name).name))
+        new = self.beside(target, Kind.NEW)
+        directory, serial = split(new)[0], new[-_SERIAL_LENGTH:]
+        old, sidecar = (Reserved(self.owner, kind, serial).name for kind in (Kind.OLD, Kind.SIDECAR))
+        return Places(new, join(directory, old), join(directory, sidecar))
 
     def found(self, places: Iterable[bytes]) -> None:
         """What lay there has its name again."""
@@ -227,3 +165,23 @@ class OwnNames:
         self.live = {moved(path) for path in self.live}
         self.torn = {moved(path): moved(place) for path, place in self.torn.items()}
         self.garbage = {moved(path): moved(target) for path, target in self.garbage.items()}
+
+    def _next_serial(self) -> bytes:
+        self._serial = (self._serial + 1) % _SERIALS
+        return _spell(self._serial, _SERIAL_LENGTH)
+
+    def _upwards(self, target: bytes) -> Iterator[bytes]:
+        """Yield the target's directory and those above it, on the same storage."""
+        directory = split(target)[0]
+        yield directory
+        while directory not in (ROOT, self._root, storage_of(directory)):
+            directory = split(directory)[0]
+            yield directory
+
+
+def _spell(number: int, length: int) -> bytes:
+    letters = bytearray()
+    for _ in range(length):
+        number, digit = divmod(number, len(_ALPHABET))
+        letters.append(_ALPHABET[digit])
+    return bytes(letters)

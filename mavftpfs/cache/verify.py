@@ -1,20 +1,24 @@
 """Compares a file that was sent with what it should be (promise 2). Layer: cache.
 
-The size always. The CRC32 up to verify_max, and in doubt whatever the size. Leading zeros do not change this
-CRC32 (servers.md 10), so it never stands alone. Silence or a refusal counts as verified by size, is logged
-once and counted; in doubt the file is read back instead, past every cache; verify=crc insists.
+The CRC32 up to verify_max, in doubt whatever the size, always with verify=crc. It runs over the whole file,
+so if it is right the size is right, too. Only zeros before the first other byte do not change it (servers.md
+10): so where it is 0, or was not told, the size is asked for by opening the file. Silence or a refusal counts
+as verified by size, is logged once and counted; in doubt the file is read back instead, past every cache.
 """
 
 from __future__ import annotations
 
+import errno
 import logging
+from contextlib import suppress
 
 import trio
 
 from mavftpfs.cache.context import Context
-from mavftpfs.cache.draft import Draft
+from mavftpfs.cache.draft import Base, Draft
 from mavftpfs.cache.names import Names
 from mavftpfs.cache.remote import Reader, ReadSink, RemoteStore
+from mavftpfs.shared.errnos import errno_for
 from mavftpfs.shared.errors import (
     Armed,
     FileChanged,
@@ -59,76 +63,66 @@ class Verifier:
         doubted: what was sent may be elsewhere, or older: the size alone proves nothing.
 
         Raises:
-            VerificationFailed: it is another file. SessionBusy: another client keeps it from being read
-            back. Else as WriteStore.stat_size.
+            VerificationFailed: it is another file, or its CRC32 was not told though verify=crc. Armed: it is
+            not asked for now. SessionBusy: another client keeps it from being read back. Else as
+            WriteStore.stat_size.
         """
-        verify = self._context.options.verify
-        if verify == "none" and not doubted:
+        options, crc32 = self._context.options, None
+        if options.verify == "none" and not doubted:
             return None
-        size = await self.size(path)
-        if size != draft.size:
-            raise VerificationFailed(f"{path!r} has {size} bytes on the vehicle, {draft.size} were written")
-        if not size:
-            return None
-        if verify == "crc" or doubted or (verify == "auto" and size <= self._context.options.verify_max):
-            crc32 = await self._check_crc32(path, draft, demanded=verify == "crc")
-            if crc32 is not None:
-                return crc32
-        if doubted:
+        by_crc = doubted or options.verify == "crc"
+        by_crc |= options.verify == "auto" and draft.size <= options.verify_max
+        if by_crc and draft.size:
+            try:
+                crc32 = await self._context.store.crc32(path, size=draft.size)
+            except (FtpNak, RequestTimeout, Armed) as error:
+                self._note_unanswered(path, error)
+        if crc32 is not None and crc32 != draft.crc32():
+            raise VerificationFailed(f"the vehicle's checksum of {path!r} is not that of what was written")
+        if not crc32:
+            size = await self._names.size(path)
+            if size != draft.size:
+                raise VerificationFailed(f"{path!r} has {size} bytes there, {draft.size} were written")
+        if crc32 is not None:
+            self.by_crc += 1
+        elif doubted and draft.size:
             await self._read_back(path, draft)
-        else:
+        elif draft.size:
             self.by_size += 1
-        return None
+        return crc32
 
-    async def size(self, path: bytes) -> int:
-        """Return the size of a file on the vehicle, asked just now.
-
-        Opening it needs the server's one session. That costs another upload all it sent where OpenFileWO
-        empties files: there the directory is listed.
+    async def is_same(self, path: bytes, base: Base) -> bool:
+        """Return whether a file on the vehicle is still the one that is known of it.
 
         Raises:
-            As WriteStore.stat_size.
+            As WriteStore.stat_size and Directories.ask.
         """
-        uploading = any(n.attempt is not None and n.attempt.path != path for n in self._context.nodes)
-        if uploading and self._context.writer.traits.wo_truncates:
+        context, options = self._context, self._context.options
+        if context.directories.tells_times:
             entry = await self._names.ask(path)
-            if entry is not None and entry.size is not None:
-                return entry.size
-        return await self._context.writer.stat_size(path)
-
-    async def crc32(self, path: bytes, size: int) -> int | None:
-        """Return the vehicle's CRC32 of a file of `size` bytes, None where it is not answered or too large.
-
-        Raises:
-            As RemoteStore.crc32, but FtpNak, RequestTimeout and Armed.
-        """
-        if size > self._context.options.verify_max or self._context.options.verify in ("size", "none"):
-            return None
+            if entry is None or entry.size != base.size:
+                return False
+            if None not in (entry.mtime, base.mtime) and entry.mtime != base.mtime:
+                return False
+        if base.crc32 is not None and base.size <= options.verify_max and options.verify in ("auto", "crc"):
+            # Of what we delivered no listing may have told the time before others replaced it.
+            with suppress(FtpNak, RequestTimeout, Armed):
+                crc32 = await context.store.crc32(path, size=base.size)
+                if crc32 or crc32 != base.crc32:
+                    return crc32 == base.crc32
+        if context.directories.tells_times:
+            return True
         try:
-            return await self._context.store.crc32(path, size=size)
-        except (FtpNak, RequestTimeout, Armed):
-            return None
+            return await self._names.size(path) == base.size
+        except FtpNak as nak:
+            if errno_for(nak) != errno.ENOENT:
+                raise
+            return False
 
     # --- inside
 
-    async def _check_crc32(self, path: bytes, draft: Draft, *, demanded: bool) -> int | None:
-        """Return the CRC32 if it was compared.
-
-        Raises:
-            VerificationFailed: it differs, or was not answered though verify=crc. Armed: not asked for now.
-        """
-        try:
-            remote = await self._context.store.crc32(path, size=draft.size)
-        except (FtpNak, RequestTimeout, Armed) as error:
-            self._note_unanswered(path, error, demanded=demanded)
-            return None
-        if remote != draft.crc32():
-            raise VerificationFailed(f"the vehicle's checksum of {path!r} is not that of what was written")
-        self.by_crc += 1
-        return remote
-
-    def _note_unanswered(self, path: bytes, error: Exception, *, demanded: bool) -> None:
-        if demanded:
+    def _note_unanswered(self, path: bytes, error: Exception) -> None:
+        if self._context.options.verify == "crc":
             self._context.require_disarmed()  # else it is asked for after the flight
             raise VerificationFailed(f"no checksum of {path!r}: {error}") from error
         if not isinstance(error, Armed):

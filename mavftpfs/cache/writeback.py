@@ -34,7 +34,7 @@ from mavftpfs.cache.overlay import Changes, Overlay
 from mavftpfs.cache.recovery import recover
 from mavftpfs.cache.remote import RemoteStore, WriteStore
 from mavftpfs.cache.replace import Replacer
-from mavftpfs.cache.reserved import Namer, is_reserved, new_owner
+from mavftpfs.cache.reserved import OwnNames, is_reserved, new_owner
 from mavftpfs.cache.spool import Spool, SpoolContent, SpoolDirectory
 from mavftpfs.cache.throttle import Throttle
 from mavftpfs.cache.writefile import ReadFile, WriteFile
@@ -99,7 +99,7 @@ def make_writeback(
         clock=clock,
         wall=wall,
         nursery=nursery,
-        namer=Namer(owner, options.root, rng),
+        own=OwnNames(owner, options.root, rng),
         read_rate=read_rate,
         paths=files.paths,
     )
@@ -140,7 +140,7 @@ class Writeback:
         self._cleaner = cleaner
         replacer = Replacer(context, names)
         self._deliverer = Deliverer(context, names, replacer, cleaner, throttle)
-        self._background = Background(context, self._deliverer, throttle, replacer, cleaner)
+        self._background = Background(context, self._deliverer, throttle, cleaner)
         self.overlay = Overlay(context)
         hider = Hider(context, names, self._new_content)
         self._namespace = Namespace(

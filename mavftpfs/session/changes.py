@@ -282,8 +282,11 @@ class Changes:
         return Outcome.CONFLICT if listing.entries else Outcome.DONE
 
     async def _is_renamed(self, old: bytes, new: bytes) -> Outcome:
-        old_entry, complete = await self._find(old)
-        new_entry, new_complete = await self._find(new)
+        (parent, old_name), (target, new_name) = split(old), split(new)
+        entries, complete = await self._entries(parent)
+        others, new_complete = (entries, complete) if target == parent else await self._entries(target)
+        old_entry = next((entry for entry in entries if entry.name == old_name), None)
+        new_entry = next((entry for entry in others if entry.name == new_name), None)
         if old_entry is not None:
             return Outcome.CONFLICT if new_entry is not None else Outcome.UNDONE
         if new_entry is not None and complete:

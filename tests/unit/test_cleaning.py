@@ -37,7 +37,7 @@ def parts(tree: Tree) -> tuple[Context, Cleaner]:
 
 def reserved(tree: Tree, kind: Kind, target: bytes | None = b"file.txt") -> bytes:
     """A name that this mount left behind."""
-    return Reserved(parts(tree)[0].namer.owner, kind, b"sss", target).name
+    return Reserved(parts(tree)[0].own.owner, kind, b"sss", target).name
 
 
 async def test_only_a_listing_that_counts_proves_a_torn_name_whole(store: FakeWriter, tree: Tree) -> None:

@@ -29,7 +29,7 @@ def draft(base: int | None, write: tuple[int, bytes] | None = None, size: int | 
     ("made", "traits", "plan"),
     [
         (draft(10), UNKNOWN, Plan.NOTHING),
-        (draft(None), UNKNOWN, Plan.FIND_OUT),
+        (draft(None), UNKNOWN, Plan.REPLACE),
         (draft(None), RENAMES, Plan.REPLACE),
         (draft(None, (0, b"x")), RENAMES_NOT, Plan.OVERWRITE),
         (draft(10, (0, b"x"), 0), RENAMES, Plan.REPLACE),

@@ -12,7 +12,7 @@ from mavftpfs.cache.repair import DELETED_AFTER, STALE_AFTER, Action, Group, Sta
 from mavftpfs.cache.reserved import (
     RENAME_ROOM,
     Kind,
-    Namer,
+    OwnNames,
     Reserved,
     fits_rename,
     is_reserved,
@@ -51,10 +51,11 @@ def test_other_names_are_not_ours(name: bytes) -> None:
 def test_places_fit_every_request_or_are_refused(lengths: list[int], seed: int) -> None:
     path = b"".join(b"/" + b"p" * length for length in lengths)
     try:
-        places = Namer(b"abcd", b"/", Random(seed)).places(path)
+        places = OwnNames(b"abcd", b"/", Random(seed)).places(path)
     except PathTooLong:
         assert len(path) > 200
         return
+    assert places.old is not None
     for place in (places.new, places.old):
         assert fits_rename(place, path)
         assert len(place) <= 200
@@ -63,27 +64,27 @@ def test_places_fit_every_request_or_are_refused(lengths: list[int], seed: int) 
 
 
 def test_names_do_not_repeat() -> None:
-    namer = Namer(b"abcd", b"/", Random(5))
+    namer = OwnNames(b"abcd", b"/", Random(5))
     assert len({namer.places(b"/a/b").new for _ in range(5000)}) == 5000
 
 
 def test_nothing_is_put_above_the_root() -> None:
     root = b"/" + b"r" * 60
     with pytest.raises(PathTooLong):
-        Namer(b"abcd", root, Random(5)).places(root + b"/" + b"n" * 138)
+        OwnNames(b"abcd", root, Random(5)).places(root + b"/" + b"n" * 138)
 
 
 @pytest.mark.parametrize("storage", [b"/fs/" + b"s" * 40, b"/fs/microsd"])
 def test_nothing_is_put_above_the_storage(storage: bytes) -> None:
     """On NuttX storages are mounted below /fs, which takes no files."""
-    namer = Namer(b"abcd", b"/", Random(5))
+    namer = OwnNames(b"abcd", b"/", Random(5))
     path = storage + b"/" + b"n" * (199 - len(storage))
     if len(path) + len(storage) + 20 > 238:
         with pytest.raises(PathTooLong):
             namer.places(path)
     assert split(namer.places(path[:150]).new)[0] == storage
-    deep = storage + b"/" + b"d" * (190 - len(storage)) + b"/f"
-    assert split(namer.pair(deep)[0])[0] == storage
+    deep = storage + b"/" + b"d" * (150 - len(storage)) + b"/f"
+    assert split(namer.beside(deep, Kind.FRESH))[0] == storage
 
 
 TARGET = b"/d/file"

@@ -93,6 +93,18 @@ async def test_a_size_that_differs_is_enough(store: FakeWriter) -> None:
     assert store.files[b"/card/new"].data == b"x" * 5000
 
 
+async def test_zeros_that_were_cut_off_are_noticed_though_the_checksum_is_right(store: FakeWriter) -> None:
+    def cut(what: object, *paths: bytes) -> None:
+        if what == "terminate":
+            store.before_request = None
+            store.files[paths[0]].data = bytes(300)
+
+    store.before_request = cut
+    await write_file(make_writable(store), b"/card/new", bytes(5000))
+    assert store.before_request is None
+    assert store.files[b"/card/new"].data == bytes(5000)
+
+
 async def test_a_part_that_arrives_wrong_twice_is_an_error(store: FakeWriter) -> None:
     tree = make_writable(store, verify="crc")
     spoil_each_upload(store)
