@@ -7,7 +7,6 @@ import hashlib
 import os
 import stat
 import sys
-import time
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import ExitStack, asynccontextmanager, contextmanager, nullcontext
 from dataclasses import dataclass
@@ -18,9 +17,8 @@ from typing import Literal, cast
 
 import trio
 
-from mavftpfs.cache.blocks import BlockCache
 from mavftpfs.cache.dentries import Dentries
-from mavftpfs.cache.kept import Facts, KeptCache, vehicle_identity
+from mavftpfs.cache.kept import KeptCache, vehicle_identity
 from mavftpfs.cache.kept_disk import KeptDisk
 from mavftpfs.cache.options import CacheOptions
 from mavftpfs.cache.tree import Tree
@@ -52,7 +50,7 @@ BITS_PER_BYTE = 10
 """On a serial port: eight, and a start and a stop bit."""
 
 
-MakeKept = Callable[[BlockCache, Dentries], KeptCache]
+MakeKept = Callable[[Dentries], KeptCache]
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,8 +154,8 @@ async def attached(
                         spool.discard()
 
 
-def _start_kept(make: MakeKept, nursery: trio.Nursery, cache: BlockCache, dentries: Dentries) -> KeptCache:
-    kept = make(cache, dentries)
+def _start_kept(make: MakeKept, nursery: trio.Nursery, dentries: Dentries) -> KeptCache:
+    kept = make(dentries)
     nursery.start_soon(kept.run)
     return kept
 
@@ -339,19 +337,13 @@ async def kept_for(options: MountOptions, connection: Connection) -> MakeKept | 
         while connection.vehicle.version is None:  # noqa: ASYNC110 (asked for once per mount)
             await trio.sleep(_IDENTITY_POLL)
 
-    def make(cache: BlockCache, dentries: Dentries) -> KeptCache:
-        facts = Facts(
-            identity=partial(identity, connection),
-            remembered=dentries.entry,
-            growing=dentries.is_growing,
-            crc32=connection.store.crc32,
-            crc_limit=partial(crc_limit, options, connection),
-            wall=time.time,
-            clock=cache.clock,
-        )
-        return KeptCache(directory, facts)
-
-    return make
+    return partial(
+        KeptCache,
+        directory,
+        identity=partial(identity, connection),
+        crc32=connection.store.crc32,
+        crc_limit=partial(crc_limit, options, connection),
+    )
 
 
 def identity(connection: Connection) -> bytes | None:

@@ -537,7 +537,7 @@ class FileHandle(OpenFile):
     async def _read_piece(self, start: int, stop: int) -> bytes | memoryview | None:
         """Return [start, stop), at most a piece. None: it was renamed, or bytes were dropped, meanwhile."""
         files, version = self._files, self._version
-        blocks, kept = version.blocks, version.kept
+        blocks = version.blocks
         limit, small = files.cache.readahead_limits(len(files.open_versions))
         ahead = self._readahead.on_read(start, stop, limit=limit, small=small)
         if ahead.seeked and version.reader is not None:
@@ -551,8 +551,8 @@ class FileHandle(OpenFile):
         files.misses += 1
         try:
             async with files.cache.reads:
-                if kept is not None:
-                    await kept.fill(blocks, start, stop, lambda: version.kept is kept)
+                if files.kept is not None:
+                    await files.kept.fill(version, start, stop)
                     version.require_alive()
                 if blocks.missing(start, stop):
                     if version.reader is None or blocks.doubted:

@@ -18,9 +18,8 @@ import os
 import stat
 import struct
 import time
-from collections.abc import Iterable, Iterator
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import count
 from pathlib import Path
 
@@ -46,45 +45,24 @@ class FileKey:
     size: int
     version: str
 
-    def block(self, start: int, stop: int) -> BlockKey:
-        """Return the key of a block, whatever size blocks have in this version of the program."""
-        parts = (self.vehicle, self.path, str((self.size, self.version, start, stop)).encode())
+    def block(self, start: int, stop: int) -> str:
+        """Return the name of a block, whatever size blocks have in this version of the program."""
         digest = hashlib.blake2b(digest_size=DIGEST_SIZE)
-        for part in parts:
+        for part in (self.vehicle, self.path, str((self.size, self.version, start, stop)).encode()):
             digest.update(_LENGTH.pack(len(part)) + part)
-        return BlockKey(digest.hexdigest(), stop - start)
+        return digest.hexdigest()
 
 
-@dataclass(frozen=True, slots=True)
-class BlockKey:
-    """name: the block's file name, which is unique to its content. size: its bytes."""
+@dataclass(slots=True)
+class Kept:
+    """What the disk has, or will have, of one version of a file.
 
-    name: str
-    size: int
+    arrived: when each block that is not there yet was first seen whole. done: blocks that are on the disk.
+    """
 
-    def pack(self, data: bytes) -> bytes:
-        """Return a block as it lies on the disk."""
-        return MAGIC + self._checksum(data) + data
-
-    def unpack(self, stored: bytes) -> bytes | None:
-        """Return the block's bytes, None if what is stored is not exactly what was packed."""
-        start = len(MAGIC) + DIGEST_SIZE
-        data = stored[start:]
-        if len(data) != self.size or stored[:start] != MAGIC + self._checksum(data):
-            return None
-        return data
-
-    def _checksum(self, data: bytes) -> bytes:
-        return hashlib.blake2b(data, digest_size=DIGEST_SIZE, key=self.name.encode()).digest()
-
-
-@dataclass(frozen=True, slots=True)
-class Stored:
-    """A file of the directory. used: seconds since 1970 of its last use."""
-
-    name: str
-    size: int
-    used: float
+    key: FileKey
+    arrived: dict[int, float] = field(default_factory=dict)
+    done: set[int] = field(default_factory=set)
 
 
 class KeptDisk:
@@ -106,73 +84,61 @@ class KeptDisk:
         self._numbers = count()
         self._until_shrink = 0
 
-    def read(self, key: BlockKey) -> bytes | None:
+    def read(self, name: str) -> bytes | None:
         """Return a block; None if it is not there. A damaged block is removed."""
-        path = self._place(key)
+        path = self._path / name[:2] / name
         try:
             stored = path.read_bytes()
         except OSError:
             return None
-        data = key.unpack(stored)
+        data = stored[len(MAGIC) + DIGEST_SIZE :]
+        good = stored == _packed(name, data)
         with suppress(OSError):
-            path.unlink() if data is None else os.utime(path)
-        return data
+            os.utime(path) if good else path.unlink()
+        return data if good else None
 
-    def write(self, key: BlockKey, data: bytes) -> None:
+    def write(self, name: str, data: bytes) -> None:
         """Keep a block.
 
         Raises:
             OSError: there is no room, or the directory is gone.
         """
-        path = self._place(key)
+        path = self._path / name[:2] / name
         path.parent.mkdir(mode=PRIVATE, exist_ok=True)
         temporary = path.parent / f"{_TEMPORARY}{os.getpid()}-{next(self._numbers)}"
-        packed = key.pack(data)
         try:
             with open(temporary, "wb", opener=open_private) as file:
-                file.write(packed)
+                file.write(_packed(name, data))
             temporary.replace(path)
         except OSError:
             temporary.unlink(missing_ok=True)
             raise
-        self._until_shrink -= len(packed)
+        self._until_shrink -= len(data)
         if self._until_shrink <= 0:
             self.shrink()
 
     def shrink(self) -> None:
-        """Remove what was not used for longest until the rest fits, and what crashed writers left."""
+        """If there is too much, remove what was not used for longest; and what crashed writers left."""
         self._until_shrink = self._budget // 16
-        now = time.time()
-        files = list(self._stored())
-        doomed = [file for file in files if _TEMPORARY in file.name and file.used < now - ABANDONED]
-        doomed += surplus((file for file in files if _TEMPORARY not in file.name), self._budget)
-        for file in doomed:
-            with suppress(OSError):  # another mount was faster
-                (self._path / file.name).unlink()
-
-    def _place(self, key: BlockKey) -> Path:
-        return self._path / key.name[:2] / key.name
-
-    def _stored(self) -> Iterator[Stored]:
+        blocks, now = [], time.time()
         for folder in self._path.glob("[0-9a-f][0-9a-f]"):
-            with suppress(OSError), os.scandir(folder) as entries:
-                for entry in entries:
-                    with suppress(OSError):
-                        facts = entry.stat(follow_symlinks=False)
-                        yield Stored(f"{folder.name}/{entry.name}", facts.st_size, facts.st_mtime)
+            for path in folder.iterdir():
+                with suppress(OSError):  # another mount was faster
+                    facts = path.lstat()
+                    if not path.name.startswith(_TEMPORARY):
+                        blocks.append((facts.st_mtime, facts.st_size, path))
+                    elif facts.st_mtime < now - ABANDONED:
+                        path.unlink()
+        total = sum(size for _, size, _ in blocks)
+        goal = total if total <= self._budget else self._budget * 9 // 10
+        for _, size, path in sorted(blocks):
+            if total <= goal:
+                break
+            total -= size
+            path.unlink(missing_ok=True)
 
 
-def surplus(stored: Iterable[Stored], budget: int) -> list[Stored]:
-    """Return the least recently used files that have to go for the rest to fit nine tenths of the budget;
-    none while all of them fit it."""
-    files = sorted(stored, key=lambda file: file.used)
-    total = sum(file.size for file in files)
-    if total <= budget:
-        return []
-    goal, doomed = budget * 9 // 10, []
-    for file in files:
-        if total <= goal:
-            break
-        doomed.append(file)
-        total -= file.size
-    return doomed
+def _packed(name: str, data: bytes) -> bytes:
+    """Return a block as it lies on the disk."""
+    checksum = hashlib.blake2b(data, digest_size=DIGEST_SIZE, key=name.encode())
+    return MAGIC + checksum.digest() + data

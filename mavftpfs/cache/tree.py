@@ -53,7 +53,7 @@ class Tree:
         spool: SpoolDirectory | None = None,
         wall: Callable[[], float] = time.time,
         rng: Random | None = None,
-        keep: Callable[[BlockCache, Dentries], KeptCache] | None = None,
+        keep: Callable[[Dentries], KeptCache] | None = None,
     ) -> None:
         """`invalidate(path)`: the kernel's pages and attributes of a path are wrong; must not block.
 
@@ -80,7 +80,7 @@ class Tree:
             invalidate=self._invalidate,
         )
         self._directories.ask_size = self._files.learn_size
-        self._files.kept = None if keep is None else keep(self._blocks, self._dentries)
+        self._files.kept = None if keep is None else keep(self._dentries)
         self._virtual = VirtualTrees(
             store,
             self._directories,

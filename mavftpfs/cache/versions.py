@@ -11,7 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from mavftpfs.cache.blocks import FileBlocks
-from mavftpfs.cache.kept import Kept
+from mavftpfs.cache.kept_disk import Kept
 from mavftpfs.cache.remote import Reader
 from mavftpfs.shared.errors import FileChanged, MavftpfsError
 from mavftpfs.shared.model import DirEntry

@@ -4,25 +4,22 @@ from __future__ import annotations
 
 from collections.abc import AsyncIterator, Callable
 from pathlib import Path
-from typing import TypeVar
 
 import pytest
 import trio
 
-from mavftpfs.cache.blocks import BLOCK_SIZE, BlockCache
+from mavftpfs.cache.blocks import BLOCK_SIZE
 from mavftpfs.cache.dentries import Dentries
-from mavftpfs.cache.kept import CRC_LIMIT, PERIOD, SETTLED, Facts, KeptCache
-from mavftpfs.cache.kept_disk import BlockKey, KeptDisk
+from mavftpfs.cache.kept import CRC_LIMIT, PERIOD, SETTLED, KeptCache
+from mavftpfs.cache.kept_disk import KeptDisk
 from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.options import CacheOptions
 from mavftpfs.cache.tree import Tree
 from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.shared.errors import FileChanged, FtpNak
-from mavftpfs.shared.model import DirEntry, split
 from tests.support.fake_store import FakeStore, read_file
 from tests.unit.test_files import DATA, LOG, content
 
-T = TypeVar("T")
 NOW = 1_800_000_000.0
 MTIME = 1_700_000_000
 ENOUGH = SETTLED + 2 * PERIOD + 1
@@ -41,29 +38,27 @@ class Mounts:
         self.caches: list[KeptCache] = []
         self.disk_delay = 0.0
 
-    async def run(self, work: Callable[[], T], /) -> T:
+    async def run(self, work: Callable[..., object], *args: object) -> object:
         """Work as a thread would, on virtual time."""
         await trio.sleep(self.disk_delay)
-        return work()
+        return work(*args)
 
     def mount(self, **options: object) -> Tree:
         """Return a tree that knows nothing but what lies in the directory."""
 
-        def keep(cache: BlockCache, dentries: Dentries) -> KeptCache:
-            def remembered(path: bytes) -> DirEntry | None:
-                known = dentries.known(split(path)[0])
-                return None if known is None else known.entries.get(split(path)[1])
-
-            facts = Facts(
-                identity=lambda: self.vehicle,
-                remembered=remembered,
-                growing=self.growing.__contains__,
-                crc32=self.store.crc32,
-                crc_limit=lambda: self.crc_limit,
-                wall=lambda: NOW,
-                clock=trio.current_time,
+        def keep(dentries: Dentries) -> KeptCache:
+            dentries.is_growing = self.growing.__contains__  # type: ignore[assignment,method-assign]
+            self.caches.append(
+                KeptCache(
+                    KeptDisk(self.path, 1 << 24),
+                    dentries,
+                    identity=lambda: self.vehicle,
+                    crc32=self.store.crc32,
+                    crc_limit=lambda: self.crc_limit,
+                    wall=lambda: NOW,
+                    run=self.run,
+                )
             )
-            self.caches.append(KeptCache(KeptDisk(self.path, 1 << 24), facts, run=self.run))
             self.nursery.start_soon(self.caches[-1].run)
             return self.caches[-1]
 
@@ -258,7 +253,7 @@ async def test_a_full_disk_ends_the_keeping_not_the_reading(
 ) -> None:
     tree = mounts.mount()
 
-    def full(key: BlockKey, data: bytes) -> None:
+    def full(name: str, data: bytes) -> None:
         raise OSError(28, "No space left on device")
 
     mounts.caches[0]._disk.write = full  # type: ignore[method-assign]

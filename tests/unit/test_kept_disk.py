@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from mavftpfs.cache.kept import CLOCK_SET, YOUNG, key_of, vehicle_identity
-from mavftpfs.cache.kept_disk import ABANDONED, NAME, BlockKey, FileKey, KeptDisk, Stored, surplus
+from mavftpfs.cache.kept_disk import ABANDONED, NAME, FileKey, KeptDisk
 from mavftpfs.shared.model import DirEntry, EntryKind
 
 NOW = 1_800_000_000.0
@@ -25,7 +25,7 @@ def entry(size: int | None = 5, mtime: int | None = MTIME) -> DirEntry:
     return DirEntry(b"a", EntryKind.FILE, size, mtime)
 
 
-def block(number: int, key: FileKey = KEY) -> BlockKey:
+def block(number: int, key: FileKey = KEY) -> str:
     return key.block(number * len(DATA), (number + 1) * len(DATA))
 
 
@@ -50,8 +50,8 @@ def test_each_part_of_the_key_makes_another_block() -> None:
         FileKey(KEY.vehicle, KEY.path, KEY.size, ""),
         FileKey(KEY.vehicle + b"/", KEY.path[1:], KEY.size, KEY.version),  # parts do not run into each other
     ]
-    names = [block(0, key).name for key in [KEY, *others]] + [block(1).name, block(10).name]
-    names += [KEY.block(0, 5).name, KEY.block(len(DATA), 3 * len(DATA)).name]  # blocks had another size once
+    names = [block(0, key) for key in [KEY, *others]] + [block(1), block(10)]
+    names += [KEY.block(0, 5), KEY.block(len(DATA), 3 * len(DATA))]  # blocks had another size once
     assert len(set(names)) == len(names)
     assert block(0) == block(0, FileKey(VEHICLE, b"/log/a", 100_000, VERSION))
 
@@ -177,15 +177,9 @@ def test_what_a_killed_writer_left_goes_after_a_while(directory: KeptDisk, tmp_p
 
 
 def test_a_failed_write_leaves_nothing_behind(directory: KeptDisk, tmp_path: Path) -> None:
-    place = tmp_path / "deep" / "cache" / NAME / block(0).name[:2] / block(0).name
+    place = tmp_path / "deep" / "cache" / NAME / block(0)[:2] / block(0)
     place.mkdir(parents=True)  # cannot be replaced by a file
     with pytest.raises(IsADirectoryError):
         directory.write(block(0), DATA)
     assert files_of(tmp_path) == []
     assert directory.read(block(0)) is None
-
-
-def test_the_least_recently_used_go_first() -> None:
-    files = [Stored(str(age), 10, -age) for age in range(10)]
-    assert surplus(files, 100) == []
-    assert [file.name for file in surplus(files, 60)] == ["9", "8", "7", "6", "5"]
