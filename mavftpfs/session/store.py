@@ -106,11 +106,14 @@ class Store:
         before so much can have been read."""
         if self._vehicle.armed:
             raise Armed("checksums are not asked for in flight")
-        server_time = CRC_TIME if size is None else size / COPY_RATE
+        server_time, patience = CRC_TIME, CRC_PATIENCE
+        if size is not None:
+            server_time = size / COPY_RATE
+            patience = min(CRC_PATIENCE, self._scheduler.op_deadline + 2 * server_time)
         wire = wire_path(path)
 
         async def ask() -> bytes:
-            operation = Simple(Opcode.CALC_FILE_CRC32, wire, patience=CRC_PATIENCE, server_time=server_time)
+            operation = Simple(Opcode.CALC_FILE_CRC32, wire, patience=patience, server_time=server_time)
             await self._scheduler.metadata(operation, disturbs=False)
             return operation.reply.data
 

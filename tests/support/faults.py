@@ -57,6 +57,11 @@ class Faults:
         """Have the request arrive twice that comes after `count` - 1 more ones."""
         self._repeated.add(len(self.requests) + count)
 
+    def call_off(self) -> None:
+        """Let what was to happen at a count of requests not happen any more."""
+        self._counted.clear()
+        self._repeated.clear()
+
     def _on_request(self, wire: bytes, source: Address, now: float) -> None:
         self._execute(wire, source, now)
         if len(self.requests) in self._repeated:

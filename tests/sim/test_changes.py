@@ -1,114 +1,43 @@
-"""Requests that change names, against every profile: done once, or the caller is told."""
+"""Changes of names: done once, or the caller is told; they end in time, and wait for nobody else's.
+
+What loss, doubling and silence do to each of them at each request is judged in test_matrix.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable
 from typing import Literal
 
 import pytest
 import trio
 from trio.testing import MockClock
 
+from mavftpfs.cache.options import CacheOptions
+from mavftpfs.cache.pathlocks import SLACK
 from mavftpfs.protocol.crc import crc32
 from mavftpfs.protocol.operations import Simple
 from mavftpfs.protocol.payload import Opcode
 from mavftpfs.session.connection import Connection, ConnectOptions
-from mavftpfs.session.store import Store
-from mavftpfs.shared.errors import Armed, FileChanged, FtpNak, PathTooLong, RequestTimeout
+from mavftpfs.shared.errors import Armed, FileBusy, FileChanged, FtpNak, PathTooLong, RequestTimeout
 from mavftpfs.shared.model import join
 from mavftpfs.sim.linkmodel import LinkSettings
 from mavftpfs.sim.profiles import PROFILES, Storage
 from mavftpfs.sim.tree import Kind
 from tests.support.faults import Faults
+from tests.support.mounting import mounted
 from tests.support.sources import MemorySource
 from tests.support.takingturns import taking_turns
 from tests.support.uploads import know
 from tests.support.worlds import ROOTS, World, begin_to_read, content, path, read_file, world
 
 EVERY_PROFILE = sorted(PROFILES)
+
 RENAMING = [name for name in EVERY_PROFILE if PROFILES[name].storage is not Storage.LITTLEFS]
-BAD = LinkSettings(rate=60_000.0, delay=0.02, loss=0.25)
 
 
 def names(here: World) -> list[bytes]:
     found = [entry.name for entry in here.tree.entries(path(here.profile, ""))]
     return sorted(name for name in found if name not in (b".", b".."))
-
-
-@pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
-@pytest.mark.parametrize("seed", range(2))
-async def test_each_works_over_a_link_that_loses_much(profile: str, seed: int, autojump: MockClock) -> None:
-    here = World(profile, BAD, seed=seed)
-    here.tree.add(path(profile, "old"), b"content")
-    renames = profile in RENAMING
-    async with here.connection(ConnectOptions(op_deadline=60.0)) as connection:
-        store = connection.store
-        await store.make_directory(path(profile, "sub"))
-        await store.create_empty(path(profile, "empty"))
-        assert await store.stat_size(path(profile, "old")) == 7
-        if renames:
-            await store.rename(path(profile, "old"), path(profile, "sub/new"))
-            await store.rename(path(profile, "sub"), path(profile, "moved"))
-            assert here.tree.data(path(profile, "moved/new")) == b"content"
-            await store.remove(path(profile, "moved/new"))
-            await store.remove_directory(path(profile, "moved"))
-        else:
-            await store.remove(path(profile, "old"))
-            await store.remove_directory(path(profile, "sub"))
-        assert names(here) == [b"empty"]
-        await store.remove(path(profile, "empty"))
-        assert names(here) == []
-        await trio.sleep(5)
-        assert here.vehicle.server.open_sessions == 0
-
-
-Act = Callable[[Store, str], Awaitable[None]]
-
-ACTS: dict[str, tuple[Opcode, Act, list[bytes]]] = {
-    "mkdir": (
-        Opcode.CREATE_DIRECTORY,
-        lambda store, profile: store.make_directory(path(profile, "new")),
-        [b"dir", b"file", b"new"],
-    ),
-    "remove": (Opcode.REMOVE_FILE, lambda store, profile: store.remove(path(profile, "file")), [b"dir"]),
-    "rmdir": (
-        Opcode.REMOVE_DIRECTORY,
-        lambda store, profile: store.remove_directory(path(profile, "dir")),
-        [b"file"],
-    ),
-    "rename": (
-        Opcode.RENAME,
-        lambda store, profile: store.rename(path(profile, "file"), path(profile, "new")),
-        [b"dir", b"new"],
-    ),
-    "create": (
-        Opcode.CREATE_FILE,
-        lambda store, profile: store.create_empty(path(profile, "new")),
-        [b"dir", b"file", b"new"],
-    ),
-}
-
-
-@pytest.mark.holds("fault refused retry")
-@pytest.mark.parametrize("profile", EVERY_PROFILE)
-@pytest.mark.parametrize("act", sorted(ACTS))
-async def test_a_lost_reply_is_found_out(profile: str, act: str, autojump: MockClock) -> None:
-    """The second execution is refused (where nothing replays): the listing tells that the first worked."""
-    opcode, run, expected = ACTS[act]
-    if act == "rename" and profile not in RENAMING:
-        return
-    here = world(profile, file=b"content")
-    here.tree.add_directory(path(profile, "dir"))
-    faults = Faults(here)
-    async with here.connection() as connection:
-        faults.lose_reply_to(opcode)
-        async with trio.open_nursery() as nursery:  # another request in between ends the replay
-            nursery.start_soon(run, connection.store, profile)
-            await trio.sleep(0.05)
-            await connection.store.list_directory(path(profile, "")[:-1])
-        assert names(here) == expected
-    # The textbook's server gives ids that cannot be guessed when the reply with the id is lost.
-    assert here.vehicle.server.open_sessions == int(profile == "spec" and act == "create")
 
 
 @pytest.mark.parametrize("profile", EVERY_PROFILE)
@@ -248,17 +177,6 @@ async def test_an_upload_makes_room_for_a_change_of_its_path(
     assert here.vehicle.server.open_sessions == 0
 
 
-async def test_a_tiny_checksum_is_asked_for_again_soon(autojump: MockClock) -> None:
-    here = world("px4", file=b"content")
-    faults = Faults(here)
-    async with here.connection() as connection:
-        faults.lose_reply_to(Opcode.CALC_FILE_CRC32)
-        began = trio.current_time()
-        await connection.store.crc32(b"/d/file", size=7)
-        assert trio.current_time() - began < 4
-        assert faults.requests.count(Opcode.CALC_FILE_CRC32) == 2
-
-
 async def test_too_long_a_rename_is_refused_before_a_byte_is_sent(autojump: MockClock) -> None:
     here = world("px4")
     faults = Faults(here)
@@ -297,64 +215,6 @@ async def test_what_may_still_be_open_is_closed_first_too(profile: str, autojump
         faults.at(Opcode.REMOVE_FILE, lambda: open_then.append(here.vehicle.server.open_paths))
         await connection.store.remove(path(profile, "new"))
         assert open_then == [[]]
-
-
-DOUBLING = LinkSettings(delay=0.01, duplicate=1.0)
-DOUBLED = {
-    "remove": Opcode.REMOVE_FILE,
-    "remove_directory": Opcode.REMOVE_DIRECTORY,
-    "make_directory": Opcode.CREATE_DIRECTORY,
-    "rename": Opcode.RENAME,
-}
-
-
-@pytest.mark.holds("fault duplicate", "fault refused retry")
-@pytest.mark.parametrize("act", ["remove", "remove_directory", "make_directory", "rename"])
-@pytest.mark.parametrize("profile", EVERY_PROFILE)
-async def test_a_request_doubled_by_the_network_whose_first_answer_is_lost(
-    profile: str, act: str, autojump: MockClock
-) -> None:
-    """MAVSDK executes both, and all that comes back is the refusal of the second one."""
-    if profile == "littlefs" and act == "rename":
-        return  # it has none
-    here = world(profile, DOUBLING, file=b"content")
-    here.tree.add_directory(path(profile, "empty"))
-    faults = Faults(here)
-    async with here.connection() as connection:
-        store = connection.store
-        await store.stat_size(path(profile, "file"))  # answered twice, which shows what this link does
-        faults.lose_reply_to(DOUBLED[act])
-        if act == "remove":
-            await store.remove(path(profile, "file"))
-        elif act == "make_directory":
-            await store.make_directory(path(profile, "made"))
-        elif act == "rename":
-            await store.rename(path(profile, "file"), path(profile, "renamed"))
-        else:
-            await store.remove_directory(path(profile, "empty"))
-    left = {
-        "remove": [b"empty"],
-        "remove_directory": [b"file"],
-        "make_directory": [b"empty", b"file", b"made"],
-        "rename": [b"empty", b"renamed"],
-    }
-    assert names(here) == left[act]
-
-
-@pytest.mark.parametrize("profile", RENAMING)
-async def test_a_rename_is_the_first_request_that_the_network_doubles(
-    profile: str, autojump: MockClock
-) -> None:
-    """Refused for nothing it would count as proof that the server renames none, and no file is replaced."""
-    here = world(profile, file=b"content")
-    faults = Faults(here)
-    async with here.connection() as connection:
-        await connection.store.stat_size(path(profile, "file"))
-        faults.lose_reply_to(Opcode.RENAME)
-        faults.at(Opcode.RENAME, lambda: setattr(here.model, "settings", LinkSettings(delay=0.01)))
-        here.model.settings = DOUBLING  # until both copies of it are there
-        await connection.store.rename(path(profile, "file"), path(profile, "renamed"))
-    assert names(here) == [b"renamed"]
 
 
 async def test_a_refusal_on_a_link_that_doubles_nothing_costs_no_listing(autojump: MockClock) -> None:
@@ -414,3 +274,81 @@ async def test_no_checksum_is_asked_for_in_flight(
         assert Opcode.CALC_FILE_CRC32 not in faults.requests
         await fly(False)
         assert await connection.store.crc32(b"/d/file") == crc32(b"content")
+
+
+LIMIT = CacheOptions().op_deadline + SLACK
+
+RADIO = LinkSettings(rate=5760.0, delay=0.05)
+
+D = b"/d"
+
+
+def made(profile: str, settings: LinkSettings | None = None) -> World:
+    world = World(profile, settings or LinkSettings())
+    for name in (b"/a", b"/b"):
+        world.tree.add(D + name, b"x" * 30)
+    world.tree.add_directory(D + b"/empty")
+    return world
+
+
+@pytest.mark.parametrize("same", [False, True])
+async def test_six_changes_are_not_answered_in_the_time_of_one(same: bool, autojump: MockClock) -> None:
+    world = made("px4")
+    faults = Faults(world)
+    async with mounted(world, D) as (_, tree):
+        faults.cut_after(0)
+
+        async def one(number: int) -> None:
+            await trio.sleep(3 * number)
+            began = trio.current_time()
+            with pytest.raises(RequestTimeout):
+                await tree.mkdir(D + b"/new%d" % (0 if same else number))
+            assert trio.current_time() - began <= LIMIT
+
+        async with trio.open_nursery() as nursery:
+            for number in range(6):
+                nursery.start_soon(one, number)
+
+
+@pytest.mark.holds("promise 4")
+async def test_nobody_else_waits_for_a_long_delivery(autojump: MockClock) -> None:
+    world = made("mavsdk", RADIO)
+    world.tree.add(D + b"/long", bytes(1_500_000))
+    async with mounted(world, D) as (_, tree):
+        file = await tree.open(D + b"/long", write=True)
+        await file.write(100, b"s" * 1000)
+
+        async def deliver() -> None:
+            await file.flush()
+
+        async def timed(change: Awaitable[None], limit: float) -> None:
+            began = trio.current_time()
+            await change
+            assert trio.current_time() - began <= limit
+
+        async def busy(change: Awaitable[None]) -> None:
+            with pytest.raises(FileBusy):
+                await change
+
+        async with trio.open_nursery() as outer:
+            outer.start_soon(deliver)
+            await trio.sleep(20)
+            async with trio.open_nursery() as nursery:
+                nursery.start_soon(timed, busy(tree.rename(D + b"/long", D + b"/other")), LIMIT)
+                await trio.sleep(1)
+                nursery.start_soon(timed, tree.mkdir(D + b"/new"), 5.0)
+                nursery.start_soon(timed, tree.unlink(D + b"/a"), 5.0)
+            await timed(tree.unlink(D + b"/long"), 5.0)  # for it the delivery is called off
+        await file.release()
+
+
+async def test_changes_that_concern_one_another_take_turns(autojump: MockClock) -> None:
+    world = made("px4", LinkSettings(delay=0.5))
+    async with mounted(world, D) as (_, tree):
+        async with trio.open_nursery() as nursery:
+            nursery.start_soon(tree.rename, D, b"/e")
+            await trio.sleep(0.1)
+            with pytest.raises(Exception, match="does not exist"):
+                await tree.mkdir(D + b"/new")
+        await tree.mkdir(b"/e/new")
+        assert b"new" in {entry.name for entry in world.tree.entries(b"/e")}
