@@ -108,7 +108,6 @@ class Files:
         self._opening: SingleFlight[bytes, tuple[Version, bool]] = SingleFlight()
         self._reopening: SingleFlight[Version, None] = SingleFlight()
         self._comparing: SingleFlight[Version, None] = SingleFlight()
-        self.open_count = 0
         self.hits = 0
         self.misses = 0
         self.unproven = 0
@@ -133,7 +132,6 @@ class Files:
                 direct_io |= other.dead is None or other.lost
         version.shown = not direct_io  # who has an older version open may have the kernel fetch pages of that
         version.handles += 1
-        self.open_count += 1
         self.open_versions[version] = None
         return FileHandle(self, version, keep_cache=keep_cache, direct_io=direct_io)
 
@@ -448,7 +446,6 @@ class Files:
 
     def release(self, version: Version) -> None:
         """A handle of the version was closed."""
-        self.open_count -= 1
         version.handles -= 1
         if version.handles:
             return

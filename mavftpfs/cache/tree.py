@@ -319,7 +319,7 @@ class Tree:
         """Drop everything that is not in use by an open file."""
         self._dentries.forget(ROOT)
         self._files.forget_closed()
-        self._virtual.snapshots.clear()
+        self._virtual.forget()
 
     def expire(self, path: bytes) -> None:
         """Have the vehicle list a file's directory again before its size is told the next time."""
@@ -331,14 +331,13 @@ class Tree:
         return {
             **({} if self._writing is None else self._writing.status()),
             **files.status(),
-            "bytes_cached": blocks.bytes_cached + self._virtual.snapshots.bytes_cached,
+            "bytes_cached": blocks.bytes_cached + self._virtual.bytes_cached,
             "bytes_evicted_blocks": blocks.evictions,
             "rate": blocks.meter.rate,
             "listings_cached": len(self._dentries),
             "entries_cached": self._dentries.entry_count,
             "listings_asked": self._directories.sweeps,
             "listings_served_stale": self._directories.served_stale,
-            "open_files": files.open_count + self._virtual.open_count,
         }
 
     def link_lost(self) -> None:

@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 import zlib
 from collections import OrderedDict
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial
 
@@ -55,8 +55,8 @@ GRACE = 10.0
 """An open may use a snapshot for so many seconds after it ceased to answer stat: who asked for the size just
 before gets the bytes of that size."""
 
-MAX_SIZES = 4096
-"""Of how many files the true size is remembered."""
+MAX_SEEN = 4096
+"""Of how many files it is remembered how reading them went."""
 
 
 def tree_of(path: bytes) -> bytes:
@@ -64,54 +64,18 @@ def tree_of(path: bytes) -> bytes:
     return path[1:].partition(b"/")[0]
 
 
-@dataclass(frozen=True, slots=True)
-class Snapshot:
-    """A whole `@` file. good_until: when it no longer answers stat."""
+@dataclass(slots=True)
+class Seen:
+    """What the last try to read an `@` file showed.
 
-    data: bytes
-    good_until: float
+    size: its true size in bytes, None if it was not read. data: all of it, None if that is not remembered.
+    good_until: when that no longer answers stat. absent_until: when it is shown again, for it did not open.
+    """
 
-
-class Snapshots:
-    """Remembered snapshots within a budget of bytes, and the true sizes of more."""
-
-    def __init__(self, budget: int) -> None:
-        self._budget = budget
-        self._snapshots: OrderedDict[bytes, Snapshot] = OrderedDict()
-        self._sizes: OrderedDict[bytes, int] = OrderedDict()
-        self.bytes_cached = 0
-
-    def get(self, path: bytes, now: float) -> Snapshot | None:
-        """Return a snapshot that is good at `now`."""
-        snapshot = self._snapshots.get(path)
-        return snapshot if snapshot is not None and now < snapshot.good_until else None
-
-    def size_of(self, path: bytes) -> int | None:
-        """Return the size that the last snapshot had, in bytes."""
-        return self._sizes.get(path)
-
-    def put(self, path: bytes, snapshot: Snapshot) -> None:
-        """Remember a snapshot; one that exceeds the budget leaves only its size."""
-        self._drop(path)
-        self._sizes.pop(path, None)
-        self._sizes[path] = len(snapshot.data)
-        if len(self._sizes) > MAX_SIZES:
-            self._drop(self._sizes.popitem(last=False)[0])
-        self._snapshots[path] = snapshot
-        self.bytes_cached += len(snapshot.data)
-        while self.bytes_cached > self._budget:
-            self._drop(next(iter(self._snapshots)))
-
-    def clear(self) -> None:
-        """Forget everything."""
-        self._snapshots.clear()
-        self._sizes.clear()
-        self.bytes_cached = 0
-
-    def _drop(self, path: bytes) -> None:
-        snapshot = self._snapshots.pop(path, None)
-        if snapshot is not None:
-            self.bytes_cached -= len(snapshot.data)
+    size: int | None = None
+    data: bytes | None = None
+    good_until: float = -math.inf
+    absent_until: float = -math.inf
 
 
 class SnapshotHandle(OpenFile):
@@ -120,9 +84,8 @@ class SnapshotHandle(OpenFile):
     size = 0
     direct_io = True
 
-    def __init__(self, data: bytes, on_close: Callable[[], None]) -> None:
-        self._data = memoryview(data)
-        self._on_close: Callable[[], None] | None = on_close
+    def __init__(self, data: bytes) -> None:
+        self._data: memoryview | None = memoryview(data)
         self.size = len(data)
 
     async def read(self, offset: int, size: int) -> bytes | memoryview:
@@ -131,19 +94,21 @@ class SnapshotHandle(OpenFile):
         Raises:
             LocalProtocolError: the handle was closed.
         """
-        if self._on_close is None:
+        if self._data is None:
             raise LocalProtocolError("read of a closed handle")
         return self._data[offset : offset + size]
 
     def close(self) -> None:
         """Release the handle."""
-        if self._on_close is not None:
-            self._on_close()
-            self._on_close = None
+        self._data = None
 
 
 class VirtualTrees:
-    """stat, list and open below `/@...`. Paths are the vehicle's."""
+    """stat, list and open below `/@...`. Paths are the vehicle's.
+
+    Attributes:
+        bytes_cached: of remembered snapshots.
+    """
 
     def __init__(
         self,
@@ -160,12 +125,10 @@ class VirtualTrees:
         self._options = options
         self._clock = clock
         self._invalidate = invalidate
-        self._reading: SingleFlight[bytes, Snapshot] = SingleFlight(nursery)
+        self._reading: SingleFlight[bytes, bytes] = SingleFlight(nursery)
         self._param_opens: bool | None = None
-        self._absent: dict[bytes, float] = {}  # until when a name is known not to open
-        self._unread: set[bytes] = set()  # too slow or refused otherwise: listing does not try again
-        self.snapshots = Snapshots(options.at_cache_size)
-        self.open_count = 0
+        self._seen: OrderedDict[bytes, Seen] = OrderedDict()
+        self.bytes_cached = 0
 
     # --- what the tree asks
 
@@ -176,8 +139,8 @@ class VirtualTrees:
         return ()
 
     def absent_until(self, path: bytes) -> float:
-        """Return until when a path, listed or not, is not shown because it did not open; 0 if it is."""
-        return self._absent.get(path, 0.0)
+        """Return until when a path, listed or not, is not shown because it did not open."""
+        return self._look(path).absent_until
 
     async def stat(self, path: bytes) -> Stat:
         """Return attributes; of a file with its true size, reading it where the listed one lies.
@@ -186,22 +149,30 @@ class VirtualTrees:
             NotFound, NotADirectory; else as RemoteStore.list_directory and read_whole.
         """
         found = await self._find(path)
-        if found is None or found.entry.kind is EntryKind.FILE:
-            return await self._stat_file(path, found)
+        seen = self._look(path)
+        known = seen.data is not None and self._clock() < seen.good_until
+        if not known and self._is_read_to_know(path, found) and not self._directories.lost:
+            try:
+                await self._read(path)
+            except (FtpNak, DataUnproven, LinkError, SessionBusy):
+                if found is None and seen.size is None:
+                    raise
         return self.listed_stat(path, found)
 
     def listed_stat(self, path: bytes, found: Found | None) -> Stat:
-        """Return what is known without traffic; valid_for is 0 where asking again tells more."""
-        now = self._clock()
-        entry = DirEntry(b"", EntryKind.FILE) if found is None else found.entry
-        size, until = self._size(path, found), now
-        snapshot = self.snapshots.get(path, now)
-        if found is not None and (entry.kind is EntryKind.DIRECTORY or tree_of(path) in TRUE_SIZES):
+        """Return what is known without traffic; valid_for is 0 where asking again tells more. found: None for
+        a file that no listing shows."""
+        seen, until = self._look(path), -math.inf
+        kind = EntryKind.FILE if found is None else found.entry.kind
+        if found is not None and (kind is EntryKind.DIRECTORY or tree_of(path) in TRUE_SIZES):
             until = found.directory.fresh_until
-        elif snapshot is not None:
-            until = snapshot.good_until
-        valid_for = max(0.0, min(self._options.attr_timeout, until - now))
-        return Stat(entry.kind, size, shown_mtime(path, entry.mtime), valid_for)
+        elif seen.data is not None:
+            until = seen.good_until
+        size = seen.size
+        if size is None:
+            size = 0 if found is None or kind is EntryKind.DIRECTORY else found.size or 0
+        valid_for = max(0.0, min(self._options.attr_timeout, until - self._clock()))
+        return Stat(kind, size, shown_mtime(path, None if found is None else found.entry.mtime), valid_for)
 
     async def list(self, path: bytes) -> list[tuple[bytes, Stat]]:
         """Return the entries that can be opened, with true sizes as far as they are known in time.
@@ -210,20 +181,26 @@ class VirtualTrees:
             As Tree.list.
         """
         tree = tree_of(path)
-        founds: dict[bytes, Found | None]
+        founds: dict[bytes, Found | None] = {}
         cut_short = False
         if tree in UNLISTABLE:
             if path != b"/" + tree:
                 raise NotADirectory(f"{path!r} is not a directory")
             await self._require_shown(tree)
-            founds = dict.fromkeys(UNLISTABLE[tree])
+            for name in UNLISTABLE[tree]:
+                founds[join(path, name)] = None
         else:
             directory = await self._directories.get(path)
             cut_short = directory.cut_short
-            founds = {name: Found(entry, directory) for name, entry in directory.entries.items()}
-        by_path = {join(path, name): found for name, found in founds.items()}
-        await self._probe(by_path)
-        shown = [(split(p)[1], self.listed_stat(p, f)) for p, f in by_path.items() if self._shows(p)]
+            for name, entry in directory.entries.items():
+                founds[join(path, name)] = Found(entry, directory)
+        await self._read_unread(founds)
+        now = self._clock()
+        shown = [
+            (split(child)[1], self.listed_stat(child, found))
+            for child, found in founds.items()
+            if self._look(child).absent_until <= now
+        ]
         if cut_short:
             raise ListingIncomplete(f"{path!r} was not listed to its end", shown)
         return shown
@@ -237,51 +214,56 @@ class VirtualTrees:
         found = await self._find(path)
         if found is not None and found.entry.kind is not EntryKind.FILE:
             raise IsADirectory(f"{path!r} is a directory")
-        snapshot = self.snapshots.get(path, self._clock() - GRACE) or await self._read(path)
-        self.open_count += 1
-        return SnapshotHandle(snapshot.data, self._on_close)
+        seen = self._look(path)
+        if seen.data is not None and self._clock() < seen.good_until + GRACE:
+            return SnapshotHandle(seen.data)
+        return SnapshotHandle(await self._read(path))
 
     async def crc32(self, path: bytes) -> int:
-        """Return the CRC32 (as FileBlocks.crc32) of what a reader gets; the vehicle sums other bytes.
+        """Return the CRC32 (start value 0, no final xor) of what a reader gets; the vehicle sums other bytes.
 
         Raises:
             As open.
         """
         handle = await self.open(path)
-        try:
-            return zlib.crc32(await handle.read(0, handle.size), 0xFFFFFFFF) ^ 0xFFFFFFFF
-        finally:
-            handle.close()
+        return zlib.crc32(await handle.read(0, handle.size), 0xFFFFFFFF) ^ 0xFFFFFFFF
+
+    def forget(self) -> None:
+        """Forget all snapshots, and what opened or did not."""
+        self._seen.clear()
+        self.bytes_cached = 0
 
     def rebooted(self) -> None:
-        """Forget what this server was seen to do, and all snapshots."""
+        """Forget what this server was seen to do, too."""
         self._param_opens = None
-        self._absent.clear()
-        self._unread.clear()
-        self.snapshots.clear()
+        self.forget()
 
     # --- finding
 
-    async def _find(self, path: bytes) -> Found | None:
-        """Return what the listing says, None for a file in a tree that cannot be listed."""
-        tree = tree_of(path)
-        if tree in UNLISTABLE:
-            return await self._find_unlistable(path, tree)
-        found = await self._directories.find(path)
-        if not self._shows(path):
-            raise NotFound(f"{path!r} is listed, but the vehicle does not open it")
-        return found
+    def _look(self, path: bytes) -> Seen:
+        return self._seen.get(path) or Seen()
 
-    async def _find_unlistable(self, path: bytes, tree: bytes) -> Found | None:
-        await self._require_shown(tree)
-        name = path[len(tree) + 2 :]
-        if not name:
-            root = await self._directories.get(ROOT)
-            return Found(DirEntry(tree, EntryKind.DIRECTORY), root)
-        # No such file starts with a dot, but file managers ask for many that do.
-        if b"/" in name or name.startswith(b".") or not self._shows(path):
-            raise NotFound(f"{path!r} does not exist")
-        return None
+    async def _find(self, path: bytes) -> Found | None:
+        """Return what the listing says, None for a file in a tree that cannot be listed.
+
+        Raises:
+            NotFound: also where it is listed, but was seen not to open. Else as Directories.find.
+        """
+        tree = tree_of(path)
+        found = None
+        if tree not in UNLISTABLE:
+            found = await self._directories.find(path)
+        else:
+            await self._require_shown(tree)
+            name = path[len(tree) + 2 :]
+            if not name:
+                return Found(DirEntry(tree, EntryKind.DIRECTORY), await self._directories.get(ROOT))
+            # No such file starts with a dot, but file managers ask for many that do.
+            if b"/" in name or name.startswith(b"."):
+                raise NotFound(f"{path!r} does not exist")
+        if self._clock() < self._look(path).absent_until:
+            raise NotFound(f"the vehicle does not open {path!r}")
+        return found
 
     async def _require_shown(self, tree: bytes) -> None:
         """Raise NotFound unless this server has such trees; asks it at most once in its life."""
@@ -298,63 +280,33 @@ class VirtualTrees:
                 return
         raise NotFound(f"this vehicle has no {tree.decode()}")
 
-    def _shows(self, path: bytes) -> bool:
-        return self._absent.get(path, 0.0) <= self._clock()
-
     # --- reading
 
-    def _size(self, path: bytes, found: Found | None) -> int:
-        """Return the true size if a snapshot ever told it, else what the listing claims."""
-        true_size = self.snapshots.size_of(path)
-        if true_size is not None:
-            return true_size
-        if found is None or found.entry.kind is EntryKind.DIRECTORY:
-            return 0
-        return found.size or 0
-
-    async def _stat_file(self, path: bytes, found: Found | None) -> Stat:
-        good = self.snapshots.get(path, self._clock()) is not None
-        if not good and self._lies(path, found) and not self._directories.lost:
-            try:
-                await self._read(path)
-            except (FtpNak, DataUnproven, LinkError, SessionBusy):
-                if found is None and self.snapshots.size_of(path) is None:
-                    raise
-        return self.listed_stat(path, found)
-
-    def _lies(self, path: bytes, found: Found | None) -> bool:
-        """Return whether the file is to be read to know its size."""
-        if found is None or found.size is None:
+    def _is_read_to_know(self, path: bytes, found: Found | None) -> bool:
+        """Return whether a path is a file that is to be read to know its size, and whether it opens."""
+        if found is None:
             return True
-        return tree_of(path) not in TRUE_SIZES and found.size <= self._options.at_stat_limit
+        if found.entry.kind is not EntryKind.FILE:
+            return False
+        size = found.size
+        return size is None or (tree_of(path) not in TRUE_SIZES and size <= self._options.at_stat_limit)
 
-    async def _probe(self, by_path: dict[bytes, Found | None]) -> None:
-        """Read what was never read, to know what opens; stop when `probe_time` is over."""
+    async def _read_unread(self, founds: Mapping[bytes, Found | None]) -> None:
+        """Read what no one tried to read yet, until `probe_time` is over or the link is too bad."""
         with trio.move_on_after(self._options.probe_time):
-            for path, found in by_path.items():
-                if self._to_be_probed(path, found) and not await self._probe_one(path):
+            for path, found in founds.items():
+                if path in self._seen or not self._is_read_to_know(path, found):
+                    continue
+                self._seen[path] = Seen()  # what is too slow is not tried by each listing
+                try:
+                    await self._read(path)
+                except (LinkError, RequestTimeout, SessionBusy):
+                    self._seen.pop(path, None)
                     return
+                except (FtpNak, DataUnproven, NotFound):
+                    pass  # it is shown with its listed size, or not at all
 
-    def _to_be_probed(self, path: bytes, found: Found | None) -> bool:
-        if found is not None and found.entry.kind is not EntryKind.FILE:
-            return False
-        known = self.snapshots.size_of(path) is not None or path in self._unread
-        return not known and self._shows(path) and self._lies(path, found)
-
-    async def _probe_one(self, path: bytes) -> bool:
-        """Read a file to see whether it opens; return False if the link is too bad to go on."""
-        self._unread.add(path)
-        try:
-            await self._read(path)
-        except (LinkError, RequestTimeout, SessionBusy):
-            self._unread.discard(path)
-            return False
-        except (FtpNak, DataUnproven, NotFound):
-            return True  # shown with its listed size, or hidden by _read
-        self._unread.discard(path)
-        return True
-
-    async def _read(self, path: bytes) -> Snapshot:
+    async def _read(self, path: bytes) -> bytes:
         """Take a snapshot; concurrent callers share it.
 
         Raises:
@@ -362,38 +314,39 @@ class VirtualTrees:
         """
         return await self._reading.run(path, partial(self._read_once, path))
 
-    async def _read_once(self, path: bytes) -> Snapshot:
+    async def _read_once(self, path: bytes) -> bytes:
         began = self._clock()
         try:
             data = await self._store.read_whole(path, self._options.at_file_limit)
         except FtpNak as nak:
-            if nak.opcode == Opcode.OPEN_FILE_RO:
-                self._refused(path, nak)
-            raise
+            unlistable = tree_of(path) in UNLISTABLE
+            if nak.opcode != Opcode.OPEN_FILE_RO or not (unlistable or nak.code == NakCode.FILE_NOT_FOUND):
+                raise
+            # What is listed and does not open is hidden until the vehicle restarts.
+            absent_until = self._clock() + self._options.proof_time if unlistable else math.inf
+            self._note(path, Seen(self._look(path).size, absent_until=absent_until))
+            raise NotFound(f"the vehicle does not open {path!r}") from nak
         now = self._clock()
         life = max(self._options.proof_time, COST_FACTOR * (now - began))
-        snapshot = Snapshot(data, now + life)
-        shown = self.snapshots.size_of(path)
-        self.snapshots.put(path, snapshot)
-        if shown not in (None, len(data)):
+        known = self._look(path).size
+        self._note(path, Seen(len(data), data, now + life))
+        if known not in (None, len(data)):
             self._invalidate(path)
-        return snapshot
+        return data
 
-    def _refused(self, path: bytes, nak: FtpNak) -> None:
-        """Remember that a file does not open, if the refusal says so.
+    def _note(self, path: bytes, seen: Seen) -> None:
+        """Remember how reading a file went, and the bytes of as many as the budget holds."""
+        self._drop_data(self._look(path))
+        self._seen.pop(path, None)
+        self._seen[path] = seen
+        self.bytes_cached += len(seen.data or b"")
+        if len(self._seen) > MAX_SEEN:
+            self._drop_data(self._seen.popitem(last=False)[1])
+        for older in self._seen.values():
+            if self.bytes_cached <= self._options.at_cache_size:
+                break
+            self._drop_data(older)
 
-        Raises:
-            NotFound: it does.
-        """
-        if tree_of(path) in UNLISTABLE:
-            if len(self._absent) >= MAX_SIZES:
-                self._absent.clear()
-            self._absent[path] = self._clock() + self._options.proof_time
-        elif nak.code == NakCode.FILE_NOT_FOUND:
-            self._absent[path] = math.inf  # until the vehicle restarts
-        else:
-            return
-        raise NotFound(f"the vehicle does not open {path!r}") from nak
-
-    def _on_close(self) -> None:
-        self.open_count -= 1
+    def _drop_data(self, seen: Seen) -> None:
+        self.bytes_cached -= len(seen.data or b"")
+        seen.data = None

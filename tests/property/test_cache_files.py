@@ -242,7 +242,7 @@ class Session:
             assert bytes(await handle.read(0, handle.size)) == self.store.files[path].data
             handle.close()
         assert all(reader.closed for reader in self.store.readers)
-        assert self.tree.status()["open_files"] == 0
+        assert self.tree._files.open_versions == {}
         assert self.store.crimes == []
 
 

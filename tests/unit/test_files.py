@@ -90,7 +90,7 @@ async def test_a_second_reader_of_the_file_shares_blocks_and_session(store: Fake
     assert store.readers[0].drops == 1
     with pytest.raises(LocalProtocolError):
         await second.read(0, 1)
-    assert tree.status()["open_files"] == 0
+    assert tree._files.open_versions == {}
 
 
 async def test_two_opens_at_once_are_one_request(store: FakeStore, tree: Tree) -> None:
@@ -105,7 +105,6 @@ async def test_two_opens_at_once_are_one_request(store: FakeStore, tree: Tree) -
         openers.start_soon(open_and_note)
     assert sizes == [len(DATA)] * 2
     assert store.count("open") == 1
-    assert tree.status()["open_files"] == 2
 
 
 async def test_sequential_reads_fetch_ahead_and_release_drops_it(store: FakeStore, tree: Tree) -> None:
@@ -172,7 +171,7 @@ async def test_a_refused_open_leaves_nothing(store: FakeStore, tree: Tree) -> No
     store.fail["reader", LOG] = [FtpNak(Opcode.OPEN_FILE_RO, 2, 13)]
     with pytest.raises(FtpNak):
         await tree.open(LOG)
-    assert tree.status()["open_files"] == 0
+    assert tree._files.open_versions == {}
     assert await read_file(tree, LOG) == DATA
 
 
