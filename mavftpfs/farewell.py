@@ -12,8 +12,7 @@ from pathlib import Path
 from random import SystemRandom
 from typing import Protocol
 
-from mavftpfs.cache.rescuing import left_in
-from mavftpfs.cache.spool import SpoolDirectory
+from mavftpfs.cache.recovery import SpoolDirectory, left_in
 from mavftpfs.link.messages import Address
 from mavftpfs.shared.errors import MavftpfsError
 

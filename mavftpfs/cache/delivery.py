@@ -323,6 +323,6 @@ class Deliverer:
         if node.draft is None or node.content is None:
             return
         try:
-            node.content.persist(describe(node, draft, self._context.wall))
+            node.content.persist(describe(node.path, draft, error, self._context.wall))
         except (NoSpace, SpoolFailed, OSError) as trouble:
             log.warning("%r is kept in memory only: %s", node.path, trouble)

@@ -1,52 +1,252 @@
-"""Saves what could not be delivered when a mount ends. Layer: cache."""
+"""What of undelivered files outlives a mount, and how it is found again. Layer: cache.
+
+A spooled file `NNNNNN.data` lies in the mount's `SpoolDirectory` beside `NNNNNN.json`, which says what it is:
+`path` on the vehicle, and either `unfinished` (a program was still writing: no close was confirmed or refused
+yet), or what `describe` tells of a file that could not be delivered. `needed` false: the vehicle has it all,
+or nobody wants it any more. A name is written before the first byte, so that whenever the process is killed
+the next mount can say what it found: `SpoolDirectory.rescue` moves it to a recovery directory. A mount that
+ends copies there what it could not deliver (`recover`). Nothing is written to a vehicle by itself: nobody
+knows what happened to the file since.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import errno
+import fcntl
 import json
 import logging
 import os
-from collections.abc import Callable, Iterable
+import shutil
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
+from random import Random
 from typing import BinaryIO
 
 from mavftpfs.cache.draft import Draft
-from mavftpfs.cache.nodes import Node
-from mavftpfs.cache.rescuing import free_name
-from mavftpfs.shared.errors import SpoolFailed
+from mavftpfs.cache.reserved import new_owner
+from mavftpfs.shared.errors import NoSpace, SpoolFailed
 from mavftpfs.shared.private import make_private_directory, open_private
 
 log = logging.getLogger("mavftpfs.cache")
 
+SLOTS = 64
+"""Mounts of one vehicle by one user at the same time."""
+
+TOKENS = 256
+"""Mounts one after the other whose leftovers on the vehicle are known for ours."""
+
 PIECE = 1024 * 1024
 MANIFEST = "manifest.json"
+_LONGEST_NAME = 200
+_FULL = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
 
 
-def recover(nodes: Iterable[Node], directory: Path, wall: Callable[[], float]) -> list[Path]:
+class SpoolDirectory:
+    """A directory on disk that one mount at a time uses; `owner` marks the mount's names on the vehicle.
+
+    Attributes:
+        dead_owners: tokens of mounts that ended here; what they left on the vehicle is nobody's.
+    """
+
+    def __init__(self, base: Path, rng: Random) -> None:
+        """Claim a free slot below `base`.
+
+        Raises:
+            OSError: it cannot be made, or every slot is taken.
+        """
+        make_private_directory(base)
+        self._locks: dict[Path, int] = {}
+        self.dead_owners: frozenset[bytes] = frozenset()
+        free = [slot for slot in (base / f"slot{number}" for number in range(SLOTS)) if self._lock(slot)]
+        if not free:
+            raise OSError(f"all {SLOTS} slots of {base} are in use")
+        self.path = free[0]
+        self.dead_owners = frozenset(token for slot in free for token in self._tokens(slot))
+        self.owner = self._new_token(self.path, rng)
+        self._abandoned = free
+        self._left = frozenset(data_in(self.path))
+
+    def rescue(self, recovery: Path) -> list[Path]:
+        """Move what dead mounts left to `recovery`; return the files, and let go of their slots.
+
+        What cannot be moved stays where a later mount finds it.
+
+        Raises:
+            OSError: there was something, and nothing of it could be moved.
+        """
+        found: list[Path] = []
+        failed: list[OSError] = []
+        for slot in self._abandoned:
+            moved, stuck = rescue(slot, recovery)
+            found += moved
+            failed += stuck
+            if slot != self.path:
+                self._unlock(slot)
+        self._abandoned = []
+        self._left = frozenset(data_in(self.path))
+        if failed and not found:
+            raise failed[0]
+        return found
+
+    def discard(self) -> None:
+        """Remove what this mount put here: the vehicle has it, though a program may not have closed it."""
+        for data in data_in(self.path):
+            if data not in self._left:
+                remove(data)
+
+    def close(self) -> None:
+        """Let go of the directory."""
+        for slot in list(self._locks):
+            self._unlock(slot)
+
+    def _lock(self, slot: Path) -> bool:
+        if self._locks and not slot.exists():
+            return False  # one new slot is enough
+        slot.mkdir(mode=0o700, exist_ok=True)
+        descriptor = os.open(slot / "owner", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            os.close(descriptor)
+            return False
+        self._locks[slot] = descriptor
+        return True
+
+    def _unlock(self, slot: Path) -> None:
+        os.close(self._locks.pop(slot))
+
+    def _tokens(self, slot: Path) -> list[bytes]:
+        """Return the tokens of the slot's mounts, the latest first."""
+        return os.pread(self._locks[slot], 8 * TOKENS, 0).split()
+
+    def _new_token(self, slot: Path, rng: Random) -> bytes:
+        """Each mount has its own: other mounts that began before know the older ones for dead."""
+        token = new_owner(rng)
+        while token in self.dead_owners:
+            token = new_owner(rng)
+        kept = [token, *self._tokens(slot)][:TOKENS]
+        os.pwrite(self._locks[slot], b"\n".join(kept) + b"\n", 0)
+        return token
+
+
+def data_in(slot: Path) -> list[Path]:
+    """Return the spooled files of a directory."""
+    return sorted(slot.glob("*.data"))
+
+
+def write_facts(data: Path, facts: Mapping[str, object], *, durable: bool) -> None:
+    """Write down what a spooled file is, so that being killed leaves the old text or the new one.
+
+    durable: also a loss of power does.
+
+    Raises:
+        OSError.
+    """
+    path = data.with_suffix(".json")
+    draft = path.with_suffix(".new")
+    with open(open_private(draft, os.O_WRONLY | os.O_TRUNC), "wb") as file:
+        file.write(json.dumps(facts, indent=1).encode())
+        file.flush()
+        if durable:
+            os.fsync(file.fileno())
+    draft.replace(path)
+    if durable:
+        _sync_directory(path.parent)
+
+
+def remove(data: Path) -> None:
+    """Remove a spooled file and its description; what cannot be removed is only logged."""
+    for path in (data, data.with_suffix(".json"), data.with_suffix(".new")):
+        try:
+            path.unlink(missing_ok=True)
+        except OSError as exc:
+            log.warning("cannot remove %s: %s", path, exc)
+
+
+def rescue(slot: Path, recovery: Path) -> tuple[list[Path], list[OSError]]:
+    """Move a dead mount's spooled files to `recovery`; return their new paths, and why others stay.
+
+    What the vehicle has anyway is removed, and so is text that describes nothing.
+    """
+    found, failed = [], []
+    for data in data_in(slot):
+        facts = _read_facts(data)
+        try:
+            if _is_needed(data, facts):
+                found.append(_move(data, facts, recovery))
+            else:
+                remove(data)
+        except OSError as exc:
+            log.warning("%s stays where it is: %s", data, exc)
+            failed.append(exc)
+    for stray in (*slot.glob("*.json"), *slot.glob("*.new")):
+        if not stray.with_suffix(".data").exists():
+            with contextlib.suppress(OSError):
+                stray.unlink()
+    return found, failed
+
+
+def left_in(slot: Path) -> list[Path]:
+    """Return the files that the vehicle lacks and that nobody holds any more; none while a mount uses it."""
+    try:
+        descriptor = os.open(slot / "owner", os.O_RDWR | os.O_CLOEXEC)
+    except OSError:
+        return []
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        return [data for data in data_in(slot) if _is_needed(data, _read_facts(data))]
+    except OSError:
+        return []
+    finally:
+        os.close(descriptor)
+
+
+def free_name(directory: Path, name: str) -> Path:
+    """Return a path in `directory` that does not exist, made from at most 200 bytes of `name`."""
+    short = os.fsdecode(os.fsencode(name)[-_LONGEST_NAME:])
+    number = 0
+    while True:
+        path = directory / (short if not number else f"{short}.{number}")
+        if not path.exists():
+            return path
+        number += 1
+
+
+def disk_error(exc: OSError, path: Path | None) -> NoSpace | SpoolFailed:
+    """Return what a local disk's error means to whoever writes: it is full, or it fails."""
+    kind = NoSpace if exc.errno in _FULL else SpoolFailed
+    return kind(f"cannot keep bytes in {path}: {exc}")
+
+
+def recover(
+    files: Iterable[tuple[bytes, Draft, Exception | None]], directory: Path, wall: Callable[[], float]
+) -> dict[bytes, Path]:
     """Copy undelivered files into a directory, with a manifest that says what each is; return the copies.
 
+    files: path, draft, and why it is not delivered.
+
     Of a file that was changed in part only the bytes known here are there; the manifest lists them, the
-    rest of such a file is a hole. A file that is copied is held no longer. One that the local disk does not
-    give back stays where it is, for the next mount, and costs no other: the manifest says why under
-    `not_saved`; what could be read of it may be there, too.
+    rest of such a file is a hole. One that the local disk does not give back stays where it is, for the next
+    mount, and costs no other: the manifest says why under `not_saved`; what could be read of it may be
+    there, too.
 
     Raises:
         OSError, SpoolFailed: nothing could be copied.
     """
-    copied: list[tuple[Node, Path]] = []
+    copied: dict[bytes, Path] = {}
     failed: list[OSError | SpoolFailed] = []
     manifest = []
-    for node in nodes:
-        if node.draft is None:
-            continue
+    for path, draft, reason in files:
         make_private_directory(directory)
-        name = node.path.decode(errors="surrogateescape").strip("/").replace("/", "__")
-        path = free_name(directory, name)
-        facts = {"file": path.name, **describe(node, node.draft, wall)}
+        name = path.decode(errors="surrogateescape").strip("/").replace("/", "__")
+        copy = free_name(directory, name)
+        facts = {"file": copy.name, **describe(path, draft, reason, wall)}
         try:
-            _copy(node.draft, path)
-            copied.append((node, path))
+            _copy(draft, copy)
+            copied[path] = copy
         except (OSError, SpoolFailed) as error:
-            log.error("%r could not be saved: %s", node.path, error)
+            log.error("%r could not be saved: %s", path, error)
             failed.append(error)
             facts["not_saved"] = str(error)
         manifest.append(facts)
@@ -55,23 +255,77 @@ def recover(nodes: Iterable[Node], directory: Path, wall: Callable[[], float]) -
     if copied:
         with _created(free_name(directory, MANIFEST)) as file:
             file.write(json.dumps(manifest, indent=1).encode())
-    for node, _ in copied:
-        node.drop_draft()  # the spool need not offer it again
-    return [path for _, path in copied]
+    return copied
 
 
-def describe(node: Node, draft: Draft, wall: Callable[[], float]) -> dict[str, object]:
+def describe(
+    path: bytes, draft: Draft, error: Exception | None, wall: Callable[[], float]
+) -> dict[str, object]:
     """Return what a spooled file is, for people and JSON; `held` are the extents whose bytes are known."""
     return {
-        "path": node.path.decode(errors="surrogateescape"),
+        "path": path.decode(errors="surrogateescape"),
         "size": draft.size,
         "whole": draft.whole,
         "held": list(draft.held),
         "changed": list(draft.changed),
         "size_on_vehicle": None if draft.base is None else draft.base.size,
-        "error": None if node.error is None else str(node.error),
+        "error": None if error is None else str(error),
         "at": wall(),
     }
+
+
+# --- inside
+
+
+def _sync_directory(path: Path) -> None:
+    directory = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(directory)
+    finally:
+        os.close(directory)
+
+
+def _read_facts(data: Path) -> dict[str, object]:
+    """Return what was written down; nothing if that is not there or not what we write."""
+    try:
+        facts = json.loads(data.with_suffix(".json").read_text())
+    except (OSError, ValueError, RecursionError) as exc:
+        log.warning("%s: what it belongs to was not written down: %s", data, exc)
+        return {}
+    return facts if isinstance(facts, dict) else {}
+
+
+def _is_needed(data: Path, facts: Mapping[str, object]) -> bool:
+    """Return whether the vehicle lacks a spooled file and somebody may want it."""
+    return facts.get("needed") is not False and not (facts.get("unfinished") and not data.stat().st_size)
+
+
+def _move(data: Path, facts: Mapping[str, object], recovery: Path) -> Path:
+    """Move a spooled file and its description; return its new path."""
+    make_private_directory(recovery)
+    target = free_name(recovery, _name_for(data, facts))
+    try:
+        shutil.move(data, target)
+    except OSError:
+        target.unlink(missing_ok=True)  # a part of a copy; the original is still there
+        raise
+    try:
+        shutil.move(data.with_suffix(".json"), target.with_name(target.name + ".json"))
+    except OSError as exc:
+        log.info("%s has no description: %s", target, exc)
+    return target
+
+
+def _name_for(data: Path, facts: Mapping[str, object]) -> str:
+    """Return a name that tells where the bytes belong, as far as that was written down."""
+    path = facts.get("path")
+    if not isinstance(path, str):
+        return data.name
+    try:
+        os.fsencode(path)
+    except UnicodeEncodeError:
+        return data.name
+    return path.replace("\0", "").strip("/").replace("/", "__") or data.name
 
 
 def _created(path: Path) -> BinaryIO:

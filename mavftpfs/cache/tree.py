@@ -22,8 +22,8 @@ from mavftpfs.cache.files import Files
 from mavftpfs.cache.kept import KeptCache
 from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.options import CacheOptions
+from mavftpfs.cache.recovery import SpoolDirectory
 from mavftpfs.cache.remote import RemoteStore, WriteStore
-from mavftpfs.cache.spool import SpoolDirectory
 from mavftpfs.cache.virtual import VirtualTrees
 from mavftpfs.cache.writeback import Writeback, make_writeback
 from mavftpfs.shared.errors import FtpNak, IsADirectory, ListingIncomplete, NotDeliveredYet, ReadOnly

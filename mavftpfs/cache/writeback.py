@@ -31,11 +31,11 @@ from mavftpfs.cache.nodes import Node
 from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.options import CacheOptions
 from mavftpfs.cache.overlay import Changes, Overlay
-from mavftpfs.cache.recovery import recover
+from mavftpfs.cache.recovery import SpoolDirectory, recover
 from mavftpfs.cache.remote import RemoteStore, WriteStore
 from mavftpfs.cache.replace import Replacer
 from mavftpfs.cache.reserved import OwnNames, is_reserved, new_owner
-from mavftpfs.cache.spool import Spool, SpoolContent, SpoolDirectory
+from mavftpfs.cache.spool import Spool, SpoolContent
 from mavftpfs.cache.throttle import Throttle
 from mavftpfs.cache.writefile import ReadFile, WriteFile
 from mavftpfs.shared.errors import (
@@ -242,7 +242,7 @@ class Writeback:
         node.known_at = self._context.clock()
 
     def _new_content(self, node: Node) -> SpoolContent:
-        return self._spool.content(node.spool_name)
+        return SpoolContent(self._spool, node.spool_name)
 
     def holds(self, path: bytes) -> bool:
         """Return whether the vehicle lacks bytes of a file."""
@@ -419,8 +419,12 @@ class Writeback:
 
     def recover_to(self, directory: Path) -> list[Path]:
         """See Tree.recover_to."""
-        lost = [node for node in self._context.nodes if node.undelivered]
-        return recover(lost, directory, self._context.wall)
+        nodes = {node.path: node for node in self._context.nodes if node.undelivered}
+        lost = [(path, node.draft, node.error) for path, node in nodes.items() if node.draft is not None]
+        copies = recover(lost, directory, self._context.wall)
+        for path in copies:
+            nodes[path].drop_draft()  # the spool need not offer it again
+        return list(copies.values())
 
     def armed_changed(self, armed: bool) -> None:
         """See Tree.armed_changed."""
@@ -442,7 +446,7 @@ class Writeback:
         sizes = [node.draft.size for node in nodes if node.undelivered and node.draft is not None]
         errors = {n.path: str(n.error) for n in nodes if n.error is not None}
         return {
-            "bytes_held": self._spool.bytes_held,
+            "bytes_held": self._spool.in_memory + self._spool.on_disk,
             "bytes_held_on_disk": self._spool.on_disk,
             "bytes_local": self._local.used,
             "dirty_max": self._throttle.limit,

@@ -2,7 +2,7 @@
 
 A mount that ends with undelivered files copies them below `recovered`, with a `manifest.json`
 (cache.recovery). What a killed mount held is moved there by the next mount, with a `NAME.json` beside each
-file (cache.rescuing). Nothing is put back by itself: nobody knows what happened to the file since.
+file (cache.recovery). Nothing is put back by itself: nobody knows what happened to the file since.
 """
 
 from __future__ import annotations

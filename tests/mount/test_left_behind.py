@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from mavftpfs.cache.spool import SpoolDirectory
+from mavftpfs.cache.recovery import SpoolDirectory
 from mavftpfs.exits import ExitCode
 from mavftpfs.farewell import spool_base
 from mavftpfs.link.messages import Address

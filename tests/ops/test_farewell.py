@@ -13,7 +13,7 @@ import trio
 import trio.testing
 
 from mavftpfs import farewell
-from mavftpfs.cache.spool import SpoolDirectory
+from mavftpfs.cache.recovery import SpoolDirectory
 from mavftpfs.link.messages import Address
 from tests.ops.faketree import FakeTree
 

@@ -12,7 +12,7 @@ import trio
 from trio.testing import MockClock
 
 from mavftpfs import compose
-from mavftpfs.cache.spool import SpoolDirectory
+from mavftpfs.cache.recovery import SpoolDirectory
 from mavftpfs.fuse.options import MountOptions
 from mavftpfs.link.uri import parse_source
 from mavftpfs.protocol.payload import Opcode

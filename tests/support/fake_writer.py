@@ -16,9 +16,9 @@ import pytest
 import trio
 
 from mavftpfs.cache.options import CacheOptions
+from mavftpfs.cache.recovery import SpoolDirectory
 from mavftpfs.cache.remote import ReadSink, UploadSource
 from mavftpfs.cache.reserved import is_reserved
-from mavftpfs.cache.spool import SpoolDirectory
 from mavftpfs.cache.tree import Tree
 from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.shared.errors import (

@@ -10,7 +10,7 @@ from typing import Any
 import trio
 
 from mavftpfs.cache.options import CacheOptions
-from mavftpfs.cache.spool import SpoolDirectory
+from mavftpfs.cache.recovery import SpoolDirectory
 from mavftpfs.cache.tree import Tree
 from mavftpfs.session.connection import Connection
 from tests.support.worlds import World

@@ -14,7 +14,7 @@ import pytest
 import trio
 
 from mavftpfs.cache.openfile import OpenFile
-from mavftpfs.cache.spool import SpoolDirectory
+from mavftpfs.cache.recovery import SpoolDirectory
 from mavftpfs.cache.tree import Tree
 from mavftpfs.shared.errnos import errno_for
 from mavftpfs.shared.errors import MavftpfsError, NoSpace, VehicleLost

@@ -12,7 +12,8 @@ import pytest
 from trio.testing import MockClock
 
 from mavftpfs.cache.kept_disk import FileKey, KeptDisk
-from mavftpfs.cache.spool import PAGE, Spool, SpoolDirectory
+from mavftpfs.cache.recovery import SpoolDirectory
+from mavftpfs.cache.spool import PAGE, Spool, SpoolContent
 from mavftpfs.daemon import log_to_file
 from mavftpfs.farewell import keep_the_rest
 from mavftpfs.trace import JsonTrace, TlogWriter
@@ -62,7 +63,7 @@ def test_traces_and_logs_are_private_and_follow_no_link(
 def test_what_a_killed_mount_left_is_private(tmp_path: Path) -> None:
     state = tmp_path / "state"
     killed = SpoolDirectory(state / "spool" / "1-1", Random(1))
-    content = Spool(memory_max=lambda: PAGE, spool_max=PAGE, directory=killed.path).content()
+    content = SpoolContent(Spool(memory_max=lambda: PAGE, spool_max=PAGE, directory=killed.path))
     content.put(0, b"precious")
     content.persist({"path": "/card/a", "size": 8})
     assert exposed(state) == []

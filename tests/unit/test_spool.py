@@ -12,8 +12,9 @@ from random import Random
 
 import pytest
 
-from mavftpfs.cache import rescuing
-from mavftpfs.cache.spool import PAGE, SLOTS, Spool, SpoolContent, SpoolDirectory
+from mavftpfs.cache import spool as spooling
+from mavftpfs.cache.recovery import SLOTS, SpoolDirectory
+from mavftpfs.cache.spool import PAGE, Spool, SpoolContent
 from mavftpfs.shared.errors import NoSpace, SpoolFailed
 
 pytestmark = pytest.mark.holds("promise 3")
@@ -25,7 +26,7 @@ def spool_of(tmp_path: Path, memory: int = 4 * PAGE, disk: int = 100 * PAGE) -> 
 
 def test_bytes_stay_in_memory_up_to_the_limit_and_go_to_disk_beyond(tmp_path: Path) -> None:
     spool = spool_of(tmp_path)
-    content = spool.content()
+    content = SpoolContent(spool)
     data = bytes(range(256)) * 1024  # exactly the limit
     content.put(0, data)
     assert (spool.in_memory, spool.on_disk) == (4 * PAGE, 0)
@@ -36,12 +37,12 @@ def test_bytes_stay_in_memory_up_to_the_limit_and_go_to_disk_beyond(tmp_path: Pa
     assert content.get(PAGE - 3, PAGE + 3) == data[PAGE - 3 : PAGE + 3]
     assert content.get(len(data), len(data) + 4) == b"more"
     content.close()
-    assert spool.bytes_held == 0
+    assert (spool.in_memory, spool.on_disk) == (0, 0)
     assert list(tmp_path.iterdir()) == []
 
 
 def test_pages_are_joined(tmp_path: Path) -> None:
-    content = spool_of(tmp_path).content()
+    content = SpoolContent(spool_of(tmp_path))
     content.put(PAGE - 2, b"abcd")
     assert content.get(PAGE - 2, PAGE + 2) == b"abcd"
 
@@ -52,7 +53,7 @@ def test_what_a_dead_mount_left_is_neither_reused_nor_discarded(tmp_path: Path) 
     (slot / "000001.data").write_bytes(b"of a dead mount")
     directory = SpoolDirectory(tmp_path, Random(1))
     spool = spool_of(directory.path, memory=0)
-    content = spool.content()
+    content = SpoolContent(spool)
     content.put(0, b"mine")
     content.persist({"size": 4})
     assert content.get(0, 4) == b"mine"
@@ -64,7 +65,7 @@ def test_what_a_dead_mount_left_is_neither_reused_nor_discarded(tmp_path: Path) 
 
 def test_a_full_spool_takes_nothing_and_loses_nothing(tmp_path: Path) -> None:
     spool = spool_of(tmp_path, memory=0, disk=1000)
-    content = spool.content()
+    content = SpoolContent(spool)
     content.put(0, bytes(900))
     with pytest.raises(NoSpace):
         content.put(900, bytes(200))
@@ -79,7 +80,7 @@ def test_a_disk_that_fills_up_on_the_way_leaves_the_bytes_in_memory(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     spool = spool_of(tmp_path)
-    content = spool.content()
+    content = SpoolContent(spool)
     data = bytes(range(256)) * 1024
     content.put(0, data)
     really, calls = os.pwrite, iter(range(100))
@@ -104,13 +105,13 @@ def test_a_disk_that_fills_up_on_the_way_leaves_the_bytes_in_memory(
 
 def test_no_directory_means_one_that_does_not_stay(tmp_path: Path) -> None:
     spool = Spool(memory_max=lambda: 0, spool_max=1000)
-    content = spool.content()
+    content = SpoolContent(spool)
     content.put(0, b"abc")
     place = spool.new_file().parent
     assert os.stat(place).st_mode & 0o777 == 0o700
     content.close()
     assert not place.exists()
-    content = spool.content()
+    content = SpoolContent(spool)
     content.put(0, b"abc")
     assert content.get(0, 3) == b"abc", "a directory of its own is made anew"
     content.close()
@@ -119,13 +120,13 @@ def test_no_directory_means_one_that_does_not_stay(tmp_path: Path) -> None:
 def test_a_directory_that_cannot_be_used_is_no_space(tmp_path: Path) -> None:
     spool = Spool(memory_max=lambda: 0, spool_max=1000, directory=tmp_path / "none")
     with pytest.raises(NoSpace):
-        spool.content().put(0, b"abc")
+        SpoolContent(spool).put(0, b"abc")
 
 
 def test_what_a_killed_mount_left_is_moved_to_recovery(tmp_path: Path) -> None:
     claimed = SpoolDirectory(tmp_path / "spool", Random(1))
     assert os.stat(claimed.path).st_mode & 0o777 == 0o700
-    content = Spool(memory_max=lambda: PAGE, spool_max=PAGE, directory=claimed.path).content()
+    content = SpoolContent(Spool(memory_max=lambda: PAGE, spool_max=PAGE, directory=claimed.path))
     content.put(0, b"precious")
     facts = {"path": "/card/a/b.txt", "size": 8}
     content.persist(facts)
@@ -204,7 +205,9 @@ def test_there_are_enough_slots_and_not_more(tmp_path: Path) -> None:
 def spilled(tmp_path: Path, name: str | None = "/card/log.bin") -> tuple[SpoolDirectory, SpoolContent]:
     """A file of which so much was written that it went to disk."""
     directory = SpoolDirectory(tmp_path / "spool", Random(1))
-    content = Spool(memory_max=lambda: 0, spool_max=1 << 20, directory=directory.path).content(lambda: name)
+    content = SpoolContent(
+        Spool(memory_max=lambda: 0, spool_max=1 << 20, directory=directory.path), lambda: name
+    )
     content.put(0, b"so far")
     return directory, content
 
@@ -252,7 +255,7 @@ def test_what_could_not_be_written_down_is_tried_again(
         raise OSError(errno.ENOSPC, "full")
 
     with monkeypatch.context() as patch:
-        patch.setattr(rescuing, "write_facts", full)
+        patch.setattr(spooling, "write_facts", full)
         with pytest.raises(NoSpace):
             change(content)
     content.put(6, b", and more")
@@ -325,7 +328,7 @@ def test_one_file_that_cannot_be_moved_keeps_no_other_one_back(
     again = SpoolDirectory(tmp_path / "spool", Random(2))
     assert [path.read_bytes() for path in again.rescue(tmp_path / "r")] == [b"1", b"3"]
     assert sorted(path.name for path in (tmp_path / "r").iterdir()) == ["000001.data", "000003.data"]
-    content = Spool(memory_max=lambda: 0, spool_max=1000, directory=again.path).content()
+    content = SpoolContent(Spool(memory_max=lambda: 0, spool_max=1000, directory=again.path))
     content.put(0, b"new")
     again.discard()
     again.close()
@@ -340,7 +343,7 @@ def test_one_file_that_cannot_be_moved_keeps_no_other_one_back(
 
 
 def test_zeros_behind_a_cut_are_zeros_on_the_disk_too(tmp_path: Path) -> None:
-    content = spool_of(tmp_path).content()
+    content = SpoolContent(spool_of(tmp_path))
     content.put(0, b"x" * (PAGE + 9))
     content.cut(PAGE + 5)
     content.cut(3)
@@ -356,7 +359,7 @@ def failing(*_: object) -> bytes:
 
 def test_a_disk_that_fails_is_an_error_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     spool = spool_of(tmp_path, memory=0)
-    content = spool.content(lambda: "/f")
+    content = SpoolContent(spool, lambda: "/f")
     content.put(0, b"abcdef")
     acts: dict[str, Callable[[], object]] = {
         "pread": lambda: content.get(0, 3),
@@ -379,14 +382,14 @@ def test_a_disk_that_fails_is_an_error_of_its_own(tmp_path: Path, monkeypatch: p
     (data,) = tmp_path.glob("*.data")
     data.unlink()
     data.with_suffix(".json").unlink()
-    assert spool.bytes_held == 0
+    assert (spool.in_memory, spool.on_disk) == (0, 0)
     assert list(tmp_path.iterdir()) == []
 
 
 def test_a_disk_that_is_full_leaves_what_was_kept_before(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    content = spool_of(tmp_path, memory=0).content(lambda: "/f")
+    content = SpoolContent(spool_of(tmp_path, memory=0), lambda: "/f")
     content.put(0, b"abcdef")
     really = os.pwrite
 
@@ -407,7 +410,7 @@ def test_a_name_that_cannot_be_written_down_is_no_space_and_nothing_stays(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     spool = spool_of(tmp_path)
-    content = spool.content(lambda: "/f")
+    content = SpoolContent(spool, lambda: "/f")
     content.put(0, b"in memory")
     with monkeypatch.context() as patch:
         patch.setattr(Path, "replace", failing)

@@ -12,8 +12,9 @@ import pytest
 import trio
 
 from mavftpfs.cache.openfile import OpenFile
+from mavftpfs.cache.recovery import SpoolDirectory
 from mavftpfs.cache.reserved import is_reserved
-from mavftpfs.cache.spool import SpoolContent, SpoolDirectory
+from mavftpfs.cache.spool import SpoolContent
 from mavftpfs.cache.tree import Tree
 from mavftpfs.farewell import keep_the_rest
 from mavftpfs.protocol.crc import crc32
