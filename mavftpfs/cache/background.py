@@ -15,10 +15,10 @@ from functools import partial
 
 import trio
 
-from mavftpfs.cache.cleaner import Cleaner
 from mavftpfs.cache.context import Context
 from mavftpfs.cache.delivery import PASSING, Deliverer
 from mavftpfs.cache.nodes import Node
+from mavftpfs.cache.repair import Cleaner
 from mavftpfs.cache.throttle import Throttle
 from mavftpfs.shared.errnos import errno_for
 from mavftpfs.shared.errors import Armed, MavftpfsError

@@ -15,6 +15,7 @@ from mavftpfs.cache.options import CacheOptions
 from mavftpfs.cache.pathlocks import PathLocks
 from mavftpfs.cache.remote import RemoteStore, WriteStore
 from mavftpfs.cache.reserved import OwnNames
+from mavftpfs.cache.spool import Spool
 from mavftpfs.shared.errors import Armed, FileBusy
 
 
@@ -39,6 +40,7 @@ class Context:
     own: OwnNames
     read_rate: Callable[[], float | None]
     paths: PathLocks
+    spool: Spool
     nodes: Nodes = field(default_factory=Nodes)
     armed: bool = False
     retry_later: Callable[[], None] = lambda: None
@@ -62,9 +64,3 @@ class Context:
         """Return whether we are changing what the vehicle has under a path, or may have done so in part."""
         node = self.nodes.get(path)
         return path in self.own.torn or (node is not None and node.changing)
-
-    def follow_rename(self, old: bytes, new: bytes) -> None:
-        """The vehicle renamed a file, or a directory with all below it."""
-        self.files.on_renamed(old, new)
-        self.nodes.rename(old, new)
-        self.own.follow_rename(old, new)

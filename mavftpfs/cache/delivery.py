@@ -17,12 +17,12 @@ from dataclasses import astuple
 import trio
 
 from mavftpfs.cache import base
-from mavftpfs.cache.cleaner import Cleaner
 from mavftpfs.cache.context import Context
 from mavftpfs.cache.draft import SENDING, Draft, Event, Plan, State, choose
 from mavftpfs.cache.names import Names
 from mavftpfs.cache.nodes import Attempt, Node
 from mavftpfs.cache.recovery import describe
+from mavftpfs.cache.repair import Cleaner
 from mavftpfs.cache.replace import Replacer
 from mavftpfs.cache.reserved import Kind, Places
 from mavftpfs.cache.throttle import Throttle

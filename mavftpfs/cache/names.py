@@ -60,6 +60,13 @@ class Names:
             return DirEntry(split(path)[1], EntryKind.FILE, node.draft.size)
         return await self.listed(path)
 
+    async def need(self, path: bytes) -> DirEntry:
+        """Return what a path is, drafts included. Raises as entry; NotFound if it does not exist."""
+        entry = await self.entry(path)
+        if entry is None:
+            raise NotFound(f"{path!r} does not exist")
+        return entry
+
     async def listed(self, path: bytes) -> DirEntry | None:
         """Return what the vehicle has there, as far as is remembered. Raises as entry."""
         parent, name = split(path)

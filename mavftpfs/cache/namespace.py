@@ -1,61 +1,80 @@
-"""mkdir, rmdir, unlink and rename on the vehicle as rename(2) and its kin have it. Layer: cache.
+"""mkdir, rmdir, unlink and rename, here or on the vehicle, as rename(2) and its kin have it. Layer: cache.
 
 Servers check little: some remove files by rmdir, or move into directories by rename (servers.md 9). So types
 and targets are looked up in listings first. Whoever changes a name holds its path alone (`pathlocks`); what a
 draft has undelivered is delivered before its path changes.
+
+Who has a file open that loses its name reads on. What is known here whole is held here. Else the file is kept
+on the vehicle under a reserved name until its last handle is closed. Where it cannot have one (LittleFS), the
+change of the name is refused (EBUSY).
+
+Between local names and those on the vehicle nothing is renamed: they are two places, so programs hear EXDEV
+and copy.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import logging
 from contextlib import nullcontext
 
 import trio
 
+from mavftpfs.cache.blocks import FileBlocks
 from mavftpfs.cache.context import Context
 from mavftpfs.cache.delivery import Deliverer
-from mavftpfs.cache.draft import State
-from mavftpfs.cache.hiding import Hider
+from mavftpfs.cache.draft import Base, Draft, State
 from mavftpfs.cache.names import Names
 from mavftpfs.cache.nodes import Node
+from mavftpfs.cache.overlay import Overlay
 from mavftpfs.cache.replace import Replacer
-from mavftpfs.cache.reserved import fits_rename
+from mavftpfs.cache.reserved import Kind, fits_rename, require_not_ours
+from mavftpfs.cache.spool import SpoolContent
 from mavftpfs.shared.errors import (
     AlreadyExists,
     CrossDevice,
+    DirectoryNotEmpty,
     FileBusy,
+    FtpNak,
     InvalidMove,
     IsADirectory,
+    MavftpfsError,
+    NoSpace,
     NotADirectory,
     NotFound,
     NotSupported,
+    PathTooLong,
+    SpoolFailed,
 )
-from mavftpfs.shared.model import DirEntry, EntryKind, wire_path
+from mavftpfs.shared.model import DirEntry, EntryKind, require_listable, split, wire_path
+
+log = logging.getLogger("mavftpfs.cache")
+
+PIECE = 64 * 1024
+"""Bytes copied at once."""
 
 
 class Namespace:
-    """Changes of names on the vehicle. Paths are the vehicle's, not local, not below `@`."""
+    """Changes of names. Paths are the vehicle's, not below `@`; those that match `local=` stay here."""
 
     def __init__(
-        self,
-        context: Context,
-        names: Names,
-        deliverer: Deliverer,
-        replacer: Replacer,
-        hider: Hider,
-        *,
-        on_renamed: Callable[[bytes, bytes], None],
+        self, context: Context, names: Names, deliverer: Deliverer, replacer: Replacer, overlay: Overlay
     ) -> None:
-        """`on_renamed(old, new)`: the vehicle's path has another name."""
         self._context = context
         self._names = names
         self._deliverer = deliverer
         self._replacer = replacer
-        self._hider = hider
-        self._on_renamed = on_renamed
+        self._overlay = overlay
+        self._local = overlay.local
 
     async def mkdir(self, path: bytes) -> None:
         """See Tree.mkdir."""
+        if self._local.owns(path):
+            await self.require_local_parent(path)
+            self._local.mkdir(path)
+            return
+        self._context.require_disarmed()
+        require_not_ours(path)
+        require_listable(path)
         async with self._context.paths.hold(path):
             if await self._names.entry(path) is not None:
                 raise AlreadyExists(f"{path!r} exists")
@@ -64,32 +83,52 @@ class Namespace:
 
     async def rmdir(self, path: bytes) -> None:
         """See Tree.rmdir."""
+        if self._local.owns(path):
+            self._local.rmdir(path)
+            return
+        self._context.require_disarmed()
+        if self._local.names(path):
+            raise DirectoryNotEmpty(f"{path!r} holds local files")
         async with self._context.paths.hold(path):
-            entry = await self._need(path)
+            entry = await self._names.need(path)
             if entry.kind is not EntryKind.DIRECTORY:
                 raise NotADirectory(f"{path!r} is not a directory")
             await self._names.require_empty(path)
             await self._names.remove_directory(path)
+        self._overlay.times.forget(path)
 
     async def unlink(self, path: bytes) -> None:
         """See Tree.unlink."""
+        if self._local.owns(path):
+            self._local.unlink(path)
+            return
+        self._context.require_disarmed()
+        require_not_ours(path)
         node = self._context.nodes.get(path)
         with nullcontext() if node is None else node.doom():
             async with self._context.paths.hold(path):
                 node = self._context.nodes.get(path)
                 if node is not None and await self._names.entry(path) is not None:
                     await self._unlink_node(node)
-                    return
-                entry = await self._names.current(path)
-                if entry is None:
-                    raise NotFound(f"{path!r} does not exist")
-                if entry.kind is not EntryKind.FILE:
-                    raise IsADirectory(f"{path!r} is a directory")
-                self._context.require_idle(path)
-                await self._remove(path)
+                else:
+                    await self._unlink_closed(path)
+        self._overlay.times.forget(path)
 
     async def rename(self, old: bytes, new: bytes, *, noreplace: bool) -> None:
         """See Tree.rename."""
+        local = self._local.owns(old)
+        if local != self._local.owns(new):
+            raise CrossDevice(f"one of {old!r} and {new!r} is not on the vehicle")
+        if local:
+            await self.require_local_parent(new)
+            if noreplace and split(new)[1] in self._local.names(split(new)[0]):
+                raise AlreadyExists(f"{new!r} exists")
+            self._local.rename(old, new)
+            return
+        self._context.require_disarmed()
+        require_not_ours(old)
+        require_not_ours(new)
+        require_listable(new)
         if new.startswith(old + b"/"):
             raise InvalidMove(f"{old!r} cannot become a part of itself")
         if old != new:
@@ -98,6 +137,18 @@ class Namespace:
         with nullcontext() if displaced is None else displaced.doom():
             async with self._context.paths.hold(old, new):
                 await self._rename(old, new, noreplace=noreplace)
+
+    async def require_local_parent(self, path: bytes) -> None:
+        """Check that the directory of a local path exists, here or on the vehicle.
+
+        Raises:
+            NotFound, NotADirectory; else as RemoteStore.list_directory.
+        """
+        parent = split(path)[0]
+        if not self._local.owns(parent):
+            await self._context.directories.get(parent)
+        elif self._local.find(parent).kind is not EntryKind.DIRECTORY:
+            raise NotADirectory(f"{parent!r} is not a directory")
 
     async def release(self, node: Node) -> None:
         """Nobody has an unlinked file open any more: remove what was hidden of it.
@@ -110,61 +161,44 @@ class Namespace:
             path = node.path
             async with self._context.paths.hold(path):  # a directory above it may be about to move
                 if node.path == path and node.hidden:
-                    await self._hider.remove(node)
-
-    # --- inside: looking
-
-    async def _need(self, path: bytes) -> DirEntry:
-        entry = await self._names.entry(path)
-        if entry is None:
-            raise NotFound(f"{path!r} does not exist")
-        return entry
-
-    async def _require_replaceable(self, source: DirEntry, new: bytes, target: DirEntry | None) -> None:
-        """Raise what rename(2) says of a target that cannot be replaced; FUSE hands both over unchecked."""
-        if target is None:
-            return
-        if target.kind is EntryKind.DIRECTORY:
-            if source.kind is EntryKind.FILE:
-                raise IsADirectory(f"{new!r} is a directory")
-            await self._names.require_empty(new)
-        elif source.kind is EntryKind.DIRECTORY:
-            raise NotADirectory(f"{new!r} is not a directory")
+                    await self._remove_hidden(node)
 
     # --- inside: unlinking
 
-    async def _remove(self, path: bytes) -> None:
+    async def _unlink_closed(self, path: bytes) -> None:
+        """Remove a file of which nothing is held here."""
+        entry = await self._names.current(path)
+        if entry is None:
+            raise NotFound(f"{path!r} does not exist")
+        if entry.kind is not EntryKind.FILE:
+            raise IsADirectory(f"{path!r} is a directory")
+        self._context.require_idle(path)
         await self._names.purge(path)
         await self._names.remove(path)
         self._context.files.on_removed(path)
 
     async def _unlink_node(self, node: Node) -> None:
-        path = node.path
+        """Remove a file that is open, or not delivered yet."""
+        path, draft = node.path, node.draft
         await self._deliverer.abandon(node)
-        there = await self._is_file(path, node)
-        if there and node.draft is None:
+        entry = await self._names.current(path)
+        if entry is not None and entry.kind is EntryKind.DIRECTORY and draft is None:
+            raise IsADirectory(f"{path!r} is a directory")
+        # What else has its name by now is not to be removed.
+        there = entry is not None and entry.kind is EntryKind.FILE
+        if draft is not None:
+            there &= draft.base is not None or draft.begun or draft.state is State.TORN
+        elif there:
             self._context.require_idle(path)
         await self._names.purge(path)
-        if there and node.handles and not self._hider.keep_local(node):
-            await self._hider.hide(node)
+        if there and node.handles and not self._keep_local(node):
+            await self._hide(node)
             return
         if there:
             await self._names.remove_if_there(path)
             self._context.files.on_removed(path)
-        self._hider.displace(node)
-
-    async def _is_file(self, path: bytes, node: Node) -> bool:
-        """Return whether the vehicle has an open file; what else has its name by now is not to be removed.
-
-        Raises:
-            IsADirectory: it is a directory, and there is no file of ours that could lose its name.
-        """
-        entry, draft = await self._names.current(path), node.draft
-        if entry is not None and entry.kind is EntryKind.DIRECTORY and draft is None:
-            raise IsADirectory(f"{path!r} is a directory")
-        if entry is None or entry.kind is not EntryKind.FILE:
-            return False
-        return draft is None or draft.base is not None or draft.begun or draft.state is State.TORN
+        node.lose_name()
+        self._context.nodes.detach(node)
 
     # --- inside: renaming
 
@@ -182,59 +216,146 @@ class Namespace:
         wire_path(new)
         listed = await self._names.current(new, free=noreplace)
         target = listed or await self._names.entry(new)
-        source = await self._need(old)
+        source = await self._names.need(old)
         if target is None:
             await self._names.require_new(new)
         elif noreplace:
             raise AlreadyExists(f"{new!r} exists")
         if old == new:
             return
-        await self._require_replaceable(source, new, target)
+        if target is not None and target.kind is EntryKind.DIRECTORY:
+            if source.kind is EntryKind.FILE:
+                raise IsADirectory(f"{new!r} is a directory")
+            await self._names.require_empty(new)
+        elif target is not None and source.kind is EntryKind.DIRECTORY:
+            raise NotADirectory(f"{new!r} is not a directory")
         if not fits_rename(old, new):
             raise CrossDevice(f"{old!r} and {new!r} do not fit one request together")
         for path in (old, new):
             if context.nodes.get(path) is None:
                 context.require_idle(path)
-        await self._rename_checked(old, new, source, listed)
-        context.follow_rename(old, new)
-        self._on_renamed(old, new)
-
-    async def _rename_checked(
-        self, old: bytes, new: bytes, source: DirEntry, listed: DirEntry | None
-    ) -> None:
-        displaced = self._context.nodes.get(new)
-        for node in [*self._context.nodes.below(old), *([displaced] if displaced else [])]:
-            await self._deliverer.abandon(node)
-            if node is not displaced and node.draft is not None and node.draft.base is None:
-                raise FileBusy(f"{node.path!r} is being written, and not on the vehicle yet")
-        await self._names.purge(old)
         try:
-            if listed is None:
-                await self._names.rename(old, new)
-            elif listed.kind is EntryKind.DIRECTORY:
-                await self._names.remove_directory(new)
-                await self._names.rename(old, new)
-            else:
-                await self._replace(old, new, displaced)
+            await self._rename_checked(old, new, listed)
         except NotSupported as error:
             raise CrossDevice(str(error)) from error
-        if displaced is not None and not displaced.removed:
-            self._hider.displace(displaced)
         if source.kind is EntryKind.DIRECTORY:
-            self._context.dentries.forget(old)
+            context.dentries.forget(old)
+        context.files.on_renamed(old, new)
+        context.nodes.rename(old, new)
+        context.own.follow_rename(old, new)
+        self._overlay.times.rename(old, new)
+        self._local.move_below(old, new)
+
+    async def _rename_checked(self, old: bytes, new: bytes, listed: DirEntry | None) -> None:
+        """Rename; `listed`: what the vehicle has at `new`, which may be replaced."""
+        displaced = self._context.nodes.get(new)
+        for node in self._context.nodes.below(old):
+            await self._deliverer.abandon(node)
+            if node.draft is not None and node.draft.base is None:
+                raise FileBusy(f"{node.path!r} is being written, and not on the vehicle yet")
+        if displaced is not None:
+            await self._deliverer.abandon(displaced)
+        await self._names.purge(old)
+        if listed is not None and listed.kind is EntryKind.FILE:
+            await self._replace(old, new, displaced)
+        else:
+            if listed is not None:
+                await self._names.remove_directory(new)
+            await self._names.rename(old, new)
+        if displaced is not None and not displaced.removed:
+            displaced.lose_name()
+            self._context.nodes.detach(displaced)
 
     async def _replace(self, old: bytes, new: bytes, displaced: Node | None) -> None:
         """Rename over a file; who has that open keeps it."""
-        context = self._context
-        keep = displaced is not None and displaced.handles > 0 and not self._hider.keep_local(displaced)
-        places = context.own.places(new)
+        context, places = self._context, self._context.own.places(new)
+        keep = displaced is not None and displaced.handles > 0 and not self._keep_local(displaced)
         if keep and places.sidecar is not None:
             raise FileBusy(f"{new!r} is open, and its path is too long to keep it")
         context.own.live |= places.all
         try:
             await self._replacer.replace(old, new, places, keep_old=keep)
             if keep and displaced is not None and places.old is not None:
-                await self._hider.on_hidden(displaced, places.old)
+                await self._on_hidden(displaced, places.old)
         finally:
             context.own.live -= places.all
             context.own.live |= context.nodes.hidden.keys()
+
+    # --- inside: open files that lose their names
+
+    def _keep_local(self, node: Node) -> bool:
+        """Hold what is known of an open file; return whether it can be read on without the vehicle."""
+        draft, blocks = node.draft, self._context.files.cached(node.path)
+        if draft is not None and (draft.whole or blocks is None):
+            return draft.whole
+        if blocks is None or not blocks.complete or self._context.files.was_replaced(node.path):
+            return False  # who opened what was there before must not be given this
+        if draft is not None:
+            return self._fill(draft, blocks)
+        content = SpoolContent(self._context.spool, node.spool_name)
+        draft = Draft(content, Base(blocks.size))
+        if not self._fill(draft, blocks):
+            content.close()
+            return False
+        content.settle()  # whatever becomes of this mount, nobody misses a copy
+        node.draft, node.content = draft, content
+        return True
+
+    def _fill(self, draft: Draft, blocks: FileBlocks) -> bool:
+        """Put what is cached into a draft; return whether all is held then."""
+        try:
+            for at in range(0, draft.base_limit, PIECE):
+                data = blocks.get(at, min(at + PIECE, draft.base_limit))
+                if data is None:
+                    return False
+                draft.fill(at, data)
+        except (NoSpace, SpoolFailed) as error:
+            log.info("what is cached cannot be held here: %s", error)
+            return False
+        return True
+
+    async def _hide(self, node: Node) -> None:
+        """Keep an unlinked file on the vehicle under a reserved name as long as somebody has it open.
+
+        Raises:
+            FileBusy: that cannot be. Else as WriteStore.rename.
+        """
+        own, path = self._context.own, node.path
+        try:
+            hidden = own.beside(path, Kind.DELETED)
+        except PathTooLong as error:
+            raise FileBusy(f"{path!r} is open, and its path is too long to keep it: {error}") from error
+        own.live.add(hidden)
+        try:
+            await self._names.rename(path, hidden)
+        except BaseException as error:
+            own.live.discard(hidden)
+            if isinstance(error, FtpNak | NotSupported):
+                raise FileBusy(f"{path!r} is open, and this card cannot keep it: {error}") from error
+            raise
+        await self._on_hidden(node, hidden)
+
+    async def _on_hidden(self, node: Node, hidden: bytes) -> None:
+        """The file was renamed to a reserved name, under which it is read on."""
+        node.lose_name()
+        self._context.files.on_renamed(node.path, hidden)
+        self._context.nodes.hide(node, hidden)
+        if not node.handles:  # the last one was closed before there was anything to remove
+            try:
+                await self._remove_hidden(node)
+            except MavftpfsError as error:
+                log.info("%r stays until its directory is listed again: %s", hidden, error)
+
+    async def _remove_hidden(self, node: Node) -> None:
+        """Remove what was hidden of a file that nobody has open; the caller holds its path alone.
+
+        Raises:
+            As WriteStore.remove; the next listing of the directory removes it then.
+        """
+        context = self._context
+        try:
+            await self._names.remove_if_there(node.path)
+        finally:
+            context.nodes.forget_hidden(node)
+            context.own.live.discard(node.path)
+        context.files.on_removed(node.path)

@@ -1,8 +1,4 @@
-"""What programs see that no listing shows, and changes of names, here or on the vehicle. Layer: cache.
-
-Drafts, local names and times that users set lie over the vehicle's listings. Between local names and those on
-the vehicle nothing is renamed: they are two places, so programs hear EXDEV and copy.
-"""
+"""What programs see that no listing shows: drafts, local names, and times that users set. Layer: cache."""
 
 from __future__ import annotations
 
@@ -12,18 +8,13 @@ from mavftpfs.cache.attributes import SECOND, Stat, Times, shown, shown_mtime
 from mavftpfs.cache.context import Context
 from mavftpfs.cache.draft import Draft
 from mavftpfs.cache.localfiles import LocalFiles
-from mavftpfs.cache.namespace import Namespace
 from mavftpfs.cache.nodes import Node
 from mavftpfs.cache.reserved import is_reserved
 from mavftpfs.shared.errors import (
-    AlreadyExists,
-    CrossDevice,
-    DirectoryNotEmpty,
     NotADirectory,
     NotFound,
-    NotSupported,
 )
-from mavftpfs.shared.model import EntryKind, join, require_listable, split
+from mavftpfs.shared.model import EntryKind, join, split
 
 
 class Overlay:
@@ -90,25 +81,9 @@ class Overlay:
             raise NotADirectory(f"{path!r} is not a directory")
         return self.overlay(path, {})
 
-    # --- what changes ask
-
     def now_ns(self) -> int:
         """Return the time of day, nanoseconds since 1970."""
         return int(self._context.wall() * SECOND)
-
-    def require_free(self, path: bytes) -> None:
-        """Raise NotSupported for a name of our own."""
-        if is_reserved(split(path)[1]):
-            raise NotSupported(f"names that begin like {path!r} are for replacing files")
-
-    def require_new(self, path: bytes) -> None:
-        """Raise what is wrong with a name that is to be made on the vehicle.
-
-        Raises:
-            NotSupported, LocalProtocolError.
-        """
-        self.require_free(path)
-        require_listable(path)
 
     def on_written(self, path: bytes) -> None:
         """A file's content changed: it is of now, also where no listing tells times."""
@@ -121,11 +96,6 @@ class Overlay:
         else:
             self.times.set(path, mtime_ns)
 
-    def on_renamed(self, old: bytes, new: bytes) -> None:
-        """The vehicle's path has another name, and so has what is local below it."""
-        self.times.rename(old, new)
-        self.local.move_below(old, new)
-
     # --- inside
 
     def _draft_time(self, node: Node, draft: Draft) -> tuple[int, int]:
@@ -135,73 +105,3 @@ class Overlay:
         entry = self._context.dentries.entry(node.path)
         listed = entry.mtime if entry is not None and draft.clean else None
         return shown_mtime(node.path, listed), 0
-
-
-class Changes:
-    """mkdir, rmdir, unlink and rename of paths that may be local or the vehicle's."""
-
-    def __init__(self, context: Context, overlay: Overlay, namespace: Namespace) -> None:
-        self._context = context
-        self._overlay = overlay
-        self._local = overlay.local
-        self._namespace = namespace
-
-    async def mkdir(self, path: bytes) -> None:
-        """See Tree.mkdir."""
-        if self._local.owns(path):
-            await self.require_parent(path)
-            self._local.mkdir(path)
-            return
-        self._context.require_disarmed()
-        self._overlay.require_new(path)
-        await self._namespace.mkdir(path)
-
-    async def rmdir(self, path: bytes) -> None:
-        """See Tree.rmdir."""
-        if self._local.owns(path):
-            self._local.rmdir(path)
-            return
-        self._context.require_disarmed()
-        if self._local.names(path):
-            raise DirectoryNotEmpty(f"{path!r} holds local files")
-        await self._namespace.rmdir(path)
-        self._overlay.times.forget(path)
-
-    async def unlink(self, path: bytes) -> None:
-        """See Tree.unlink."""
-        if self._local.owns(path):
-            self._local.unlink(path)
-            return
-        self._context.require_disarmed()
-        self._overlay.require_free(path)
-        await self._namespace.unlink(path)
-        self._overlay.times.forget(path)
-
-    async def rename(self, old: bytes, new: bytes, *, noreplace: bool) -> None:
-        """See Tree.rename."""
-        local = self._local.owns(old)
-        if local != self._local.owns(new):
-            raise CrossDevice(f"one of {old!r} and {new!r} is not on the vehicle")
-        if local:
-            await self.require_parent(new)
-            if noreplace and split(new)[1] in self._local.names(split(new)[0]):
-                raise AlreadyExists(f"{new!r} exists")
-            self._local.rename(old, new)
-            return
-        self._context.require_disarmed()
-        for path in (old, new):
-            self._overlay.require_free(path)
-        self._overlay.require_new(new)
-        await self._namespace.rename(old, new, noreplace=noreplace)
-
-    async def require_parent(self, path: bytes) -> None:
-        """Check that the directory of a local path exists, here or on the vehicle.
-
-        Raises:
-            NotFound, NotADirectory; else as RemoteStore.list_directory.
-        """
-        parent = split(path)[0]
-        if not self._local.owns(parent):
-            await self._context.directories.get(parent)
-        elif self._local.find(parent).kind is not EntryKind.DIRECTORY:
-            raise NotADirectory(f"{parent!r} is not a directory")

@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from enum import Enum
 from random import Random
 
-from mavftpfs.shared.errors import PathTooLong
+from mavftpfs.shared.errors import NotSupported, PathTooLong
 from mavftpfs.shared.model import MAX_WIRE_PATH, ROOT, join, split, storage_of, wire_path
 
 PREFIX = b".mavftpfs-"
@@ -84,6 +84,12 @@ class Places:
 def is_reserved(name: bytes) -> bool:
     """Return whether a name is hidden from programs."""
     return _RESERVED.fullmatch(name) is not None
+
+
+def require_not_ours(path: bytes) -> None:
+    """Raise NotSupported for a path whose name is reserved."""
+    if is_reserved(split(path)[1]):
+        raise NotSupported(f"names that begin like {path!r} are for replacing files")
 
 
 def parse(name: bytes) -> Reserved | None:

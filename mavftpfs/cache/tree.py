@@ -254,7 +254,7 @@ class Tree:
             AlreadyExists, NotFound, NotADirectory, Armed, PathTooLong.
         """
         remote = self._remote(path)
-        await self._writable(remote).changes.mkdir(remote)
+        await self._writable(remote).names.mkdir(remote)
 
     async def rmdir(self, path: bytes) -> None:
         """Remove an empty directory.
@@ -263,7 +263,7 @@ class Tree:
             NotFound, NotADirectory, DirectoryNotEmpty, Armed.
         """
         remote = self._remote(path)
-        await self._writable(remote).changes.rmdir(remote)
+        await self._writable(remote).names.rmdir(remote)
 
     async def unlink(self, path: bytes) -> None:
         """Remove a file; who has it open goes on reading it.
@@ -272,7 +272,7 @@ class Tree:
             NotFound, IsADirectory, Armed, FileBusy.
         """
         remote = self._remote(path)
-        await self._writable(remote).changes.unlink(remote)
+        await self._writable(remote).names.unlink(remote)
 
     async def rename(self, old: bytes, new: bytes, *, noreplace: bool = False) -> None:
         """Rename a file or directory, over what is there if the rules of rename(2) allow it.
@@ -283,7 +283,7 @@ class Tree:
         """
         source, target = self._remote(old), self._remote(new)
         self._writable(source)
-        await self._writable(target).changes.rename(source, target, noreplace=noreplace)
+        await self._writable(target).names.rename(source, target, noreplace=noreplace)
 
     def undelivered(self) -> Sequence[bytes]:
         """Return the paths of files of which the vehicle does not provably have every byte."""

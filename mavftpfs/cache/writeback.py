@@ -17,24 +17,23 @@ import trio
 
 from mavftpfs.cache.background import Background
 from mavftpfs.cache.base import known_base, on_listed
-from mavftpfs.cache.cleaner import Cleaner
 from mavftpfs.cache.context import Context
 from mavftpfs.cache.delivery import PASSING, Deliverer
 from mavftpfs.cache.dentries import Dentries, Directory
 from mavftpfs.cache.directories import Directories
 from mavftpfs.cache.draft import Base, Draft, State
 from mavftpfs.cache.files import Files
-from mavftpfs.cache.hiding import Hider
 from mavftpfs.cache.names import Names
 from mavftpfs.cache.namespace import Namespace
 from mavftpfs.cache.nodes import Node
 from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.options import CacheOptions
-from mavftpfs.cache.overlay import Changes, Overlay
+from mavftpfs.cache.overlay import Overlay
 from mavftpfs.cache.recovery import SpoolDirectory, recover
 from mavftpfs.cache.remote import RemoteStore, WriteStore
+from mavftpfs.cache.repair import Cleaner
 from mavftpfs.cache.replace import Replacer
-from mavftpfs.cache.reserved import OwnNames, is_reserved, new_owner
+from mavftpfs.cache.reserved import OwnNames, is_reserved, new_owner, require_not_ours
 from mavftpfs.cache.spool import Spool, SpoolContent
 from mavftpfs.cache.throttle import Throttle
 from mavftpfs.cache.writefile import ReadFile, WriteFile
@@ -47,7 +46,7 @@ from mavftpfs.shared.errors import (
     NotFound,
     SpoolFailed,
 )
-from mavftpfs.shared.model import EntryKind, split, wire_path
+from mavftpfs.shared.model import EntryKind, require_listable, split, wire_path
 
 log = logging.getLogger("mavftpfs.cache")
 
@@ -89,6 +88,11 @@ def make_writeback(
     """
     owner = new_owner(rng) if spool_directory is None else spool_directory.owner
     dead = frozenset[bytes]() if spool_directory is None else spool_directory.dead_owners
+    spool = Spool(
+        memory_max=lambda: throttle.limit,
+        spool_max=options.spool_max,
+        directory=None if spool_directory is None else spool_directory.path,
+    )
     context = Context(
         store=store,
         writer=writer,
@@ -102,13 +106,9 @@ def make_writeback(
         own=OwnNames(owner, options.root, rng),
         read_rate=read_rate,
         paths=files.paths,
+        spool=spool,
     )
     throttle = Throttle(context)
-    spool = Spool(
-        memory_max=lambda: throttle.limit,
-        spool_max=options.spool_max,
-        directory=None if spool_directory is None else spool_directory.path,
-    )
     names = Names(context)
     cleaner = Cleaner(context, names, dead)
     directories.on_swept = cleaner.on_swept
@@ -120,34 +120,27 @@ def make_writeback(
         on_listed(context, path, directory)
 
     directories.on_listed = listed
-    return Writeback(context, names, spool, throttle, cleaner)
+    return Writeback(context, names, throttle, cleaner)
 
 
 class Writeback:
     """The writing half of the tree (see cache.tree.Tree for what each call does).
 
     Attributes:
-        overlay: what programs see that no listing shows. changes: mkdir, rmdir, unlink and rename.
+        overlay: what programs see that no listing shows. names: mkdir, rmdir, unlink and rename.
     """
 
-    def __init__(
-        self, context: Context, names: Names, spool: Spool, throttle: Throttle, cleaner: Cleaner
-    ) -> None:
+    def __init__(self, context: Context, names: Names, throttle: Throttle, cleaner: Cleaner) -> None:
         self._context = context
         self._names = names
-        self._spool = spool
         self._throttle = throttle
         self._cleaner = cleaner
         replacer = Replacer(context, names)
         self._deliverer = Deliverer(context, names, replacer, cleaner, throttle)
         self._background = Background(context, self._deliverer, throttle, cleaner)
         self.overlay = Overlay(context)
-        hider = Hider(context, names, self._new_content)
-        self._namespace = Namespace(
-            context, names, self._deliverer, replacer, hider, on_renamed=self.overlay.on_renamed
-        )
+        self.names = Namespace(context, names, self._deliverer, replacer, self.overlay)
         self._local = self.overlay.local
-        self.changes = Changes(context, self.overlay, self._namespace)
 
     # --- opening
 
@@ -181,10 +174,11 @@ class Writeback:
     async def create(self, path: bytes, *, exclusive: bool) -> OpenFile:
         """Make a file, or open the one that is there."""
         if self._local.owns(path):
-            await self.changes.require_parent(path)
+            await self.names.require_local_parent(path)
             return self._local.create(path, exclusive=exclusive)
         self._context.require_disarmed()
-        self.overlay.require_new(path)
+        require_not_ours(path)
+        require_listable(path)
         wire_path(path)
         async with self._context.paths.hold(path, shared=True):
             if await self._names.entry(path) is None:
@@ -213,7 +207,7 @@ class Writeback:
         node = context.nodes.get(path)
         if node is not None and node.draft is not None:
             return node
-        self.overlay.require_free(path)
+        require_not_ours(path)
         entry = await self._names.listed(path)
         if entry is None:
             raise NotFound(f"{path!r} does not exist")
@@ -242,7 +236,7 @@ class Writeback:
         node.known_at = self._context.clock()
 
     def _new_content(self, node: Node) -> SpoolContent:
-        return SpoolContent(self._spool, node.spool_name)
+        return SpoolContent(self._context.spool, node.spool_name)
 
     def holds(self, path: bytes) -> bool:
         """Return whether the vehicle lacks bytes of a file."""
@@ -327,7 +321,7 @@ class Writeback:
     async def close(self, node: Node) -> None:
         """A handle was closed."""
         if node.removed and not node.handles:
-            await self._namespace.release(node)
+            await self.names.release(node)
 
     def drop_handle(self, node: Node, *, writing: bool) -> None:
         """A handle is about to be closed."""
@@ -446,8 +440,8 @@ class Writeback:
         sizes = [node.draft.size for node in nodes if node.undelivered and node.draft is not None]
         errors = {n.path: str(n.error) for n in nodes if n.error is not None}
         return {
-            "bytes_held": self._spool.in_memory + self._spool.on_disk,
-            "bytes_held_on_disk": self._spool.on_disk,
+            "bytes_held": self._context.spool.in_memory + self._context.spool.on_disk,
+            "bytes_held_on_disk": self._context.spool.on_disk,
             "bytes_local": self._local.used,
             "dirty_max": self._throttle.limit,
             "write_rate": self._throttle.meter.rate,

@@ -7,9 +7,9 @@ from collections.abc import AsyncIterator
 import pytest
 import trio
 
-from mavftpfs.cache.cleaner import Cleaner
 from mavftpfs.cache.context import Context
 from mavftpfs.cache.dentries import Directory
+from mavftpfs.cache.repair import Cleaner
 from mavftpfs.cache.reserved import Kind, Reserved
 from mavftpfs.cache.tree import Tree
 from mavftpfs.shared.model import DirEntry, EntryKind
