@@ -24,8 +24,8 @@ import pytest
 import trio
 from trio.testing import MockClock
 
+from mavftpfs.cache.recovery import SpoolDirectory
 from mavftpfs.cache.reserved import is_reserved
-from mavftpfs.cache.spool import SpoolDirectory
 from mavftpfs.cache.tree import Tree
 from mavftpfs.compose import subscribe
 from mavftpfs.link.messages import Address
