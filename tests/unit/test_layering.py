@@ -52,7 +52,6 @@ PURE_MODULES = {
     "cache.dentries",
     "cache.options",
     "cache.readahead",
-    "cache.repair",
     "cache.reserved",
     "cache.draft",
     "cache.sending",
