@@ -56,9 +56,12 @@ class Background:
         if attempt is not None and not attempt.sending.overtaken:
             attempt.sending.growing = node.quiet.is_set()  # nobody writes to one being delivered
             attempt.upload.wake()
-        elif self._context.nursery is not None and self._may_start(node):
-            node.starting = True
-            self._context.nursery.start_soon(self._start, node)
+        elif self._context.nursery is not None and node.background and not node.starting:
+            due = self._context.clock() >= node.start_after and not self._context.blocked
+            much = attempt is not None or (node.draft is not None and node.draft.unacked >= START_AT)
+            if due and much and node.undelivered and _may_pass(node):
+                node.starting = True
+                self._context.nursery.start_soon(self._start, node)
 
     def settle(self, node: Node) -> None:
         """Nobody has the file open: forget it, if the vehicle has it; what still sends it is called off."""
@@ -88,15 +91,6 @@ class Background:
 
     # --- inside
 
-    def _may_start(self, node: Node) -> bool:
-        context, draft = self._context, node.draft
-        if draft is None or not node.background or node.starting or not _may_pass(node):
-            return False
-        if context.clock() < node.start_after or context.blocked:
-            return False
-        overtaken = node.attempt is not None
-        return node.undelivered and (overtaken or draft.unacked >= START_AT)
-
     async def _start(self, node: Node) -> None:
         """Begin an upload while the program still writes."""
         try:
@@ -113,7 +107,7 @@ class Background:
         self._context.nodes.maybe_forget(node)
 
     async def _call_off(self, node: Node) -> None:
-        async with self._context.paths.steady(lambda: node.path, lasting=True), node.lock:
+        async with self._context.paths.steady(node, lasting=True), node.lock:
             if node.needless:
                 await self._deliverer.abandon(node)
         self._context.nodes.maybe_forget(node)

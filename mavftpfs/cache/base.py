@@ -25,7 +25,7 @@ async def open_node(context: Context, node: Node) -> FileHandle:
         FileChanged: it has no name there. Else as Files.open.
     """
     while True:
-        async with context.paths.steady(lambda: node.path) as path:
+        async with context.paths.steady(node) as path:
             node.require_reachable()
             try:
                 return await context.files.open(path)

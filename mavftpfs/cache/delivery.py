@@ -85,7 +85,7 @@ class Deliverer:
         """
         while wanted is None or wanted():
             await node.spared.wait()
-            async with self._context.paths.steady(lambda: node.path, lasting=True), node.lock:
+            async with self._context.paths.steady(node, lasting=True), node.lock:
                 draft = node.draft
                 if draft is None or not node.undelivered:
                     await self.abandon(node)
@@ -116,7 +116,7 @@ class Deliverer:
             As deliver.
         """
         await node.spared.wait()
-        async with self._context.paths.steady(lambda: node.path, lasting=True), node.lock:
+        async with self._context.paths.steady(node, lasting=True), node.lock:
             draft = node.draft
             if draft is None or not node.undelivered:
                 return True

@@ -165,11 +165,6 @@ class Draft:
     # --- what it is
 
     @property
-    def clean(self) -> bool:
-        """Whether the vehicle has it all."""
-        return self.state is State.CLEAN
-
-    @property
     def undelivered(self) -> bool:
         """Whether the vehicle lacks something of it that it should have."""
         return self._lacked if self.state is State.STALE else self.state is not State.CLEAN
@@ -330,7 +325,7 @@ class Draft:
     def lose_base(self) -> None:
         """Others replaced the file on the vehicle. If no byte of it was to stay that changes nothing."""
         if self.base_limit and self.state is not State.STALE:
-            self._lacked = not self.clean
+            self._lacked = self.state is not State.CLEAN
             self.give_up()
             self.on(Event.REPLACED)
 

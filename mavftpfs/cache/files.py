@@ -234,7 +234,7 @@ class Files:
         await self._reopening.run(version, partial(self._open_reader, version))
 
     async def _open_reader(self, version: Version) -> None:
-        async with self.paths.steady(lambda: version.path) as path:
+        async with self.paths.steady(version) as path:
             version.require_alive()
             expected = None if version.blocks.doubted else version.size
             version.close_reader()
@@ -310,7 +310,7 @@ class Files:
         except (NotFound, NotADirectory):
             self.kill(version)
             return
-        async with self.paths.steady(lambda: version.path) as present:
+        async with self.paths.steady(version) as present:
             if present != path or self.is_changing(path):
                 return  # who reads on has it compared under its new name
         took = directory.ended_at - directory.listed_at

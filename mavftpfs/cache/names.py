@@ -17,6 +17,7 @@ from contextlib import asynccontextmanager
 import trio
 
 from mavftpfs.cache.context import Context
+from mavftpfs.cache.draft import State
 from mavftpfs.cache.reserved import Kind, is_reserved, parse
 from mavftpfs.protocol.payload import Opcode
 from mavftpfs.shared.errnos import errno_for
@@ -56,7 +57,7 @@ class Names:
             NotFound, NotADirectory: its directory. Else as RemoteStore.list_directory.
         """
         node = self._context.nodes.get(path)
-        if node is not None and node.draft is not None and not node.stale:
+        if node is not None and node.draft is not None and node.draft.state is not State.STALE:
             return DirEntry(split(path)[1], EntryKind.FILE, node.draft.size)
         return await self.listed(path)
 

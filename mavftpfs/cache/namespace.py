@@ -28,7 +28,6 @@ from mavftpfs.cache.nodes import Node
 from mavftpfs.cache.overlay import Overlay
 from mavftpfs.cache.replace import Replacer
 from mavftpfs.cache.reserved import Kind, fits_rename, require_not_ours
-from mavftpfs.cache.spool import SpoolContent
 from mavftpfs.shared.errors import (
     AlreadyExists,
     CrossDevice,
@@ -292,13 +291,12 @@ class Namespace:
             return False  # who opened what was there before must not be given this
         if draft is not None:
             return self._fill(draft, blocks)
-        content = SpoolContent(self._context.spool, node.spool_name)
-        draft = Draft(content, Base(blocks.size))
+        draft = node.begin_draft(self._context.spool, Base(blocks.size), self._context.clock())
         if not self._fill(draft, blocks):
-            content.close()
+            node.drop_draft()
             return False
-        content.settle()  # whatever becomes of this mount, nobody misses a copy
-        node.draft, node.content = draft, content
+        assert node.content is not None
+        node.content.settle()  # whatever becomes of this mount, nobody misses a copy
         return True
 
     def _fill(self, draft: Draft, blocks: FileBlocks) -> bool:

@@ -15,12 +15,12 @@ from dataclasses import dataclass, field
 
 import trio
 
-from mavftpfs.cache.draft import Draft, Plan, State
+from mavftpfs.cache.draft import Base, Draft, Plan, State
 from mavftpfs.cache.files import FileHandle
 from mavftpfs.cache.remote import Upload
 from mavftpfs.cache.reserved import Places
 from mavftpfs.cache.sending import Sending
-from mavftpfs.cache.spool import SpoolContent
+from mavftpfs.cache.spool import Spool, SpoolContent
 from mavftpfs.shared.errors import FileChanged, MavftpfsError
 
 
@@ -102,11 +102,6 @@ class Node:
         return not self.handles and not self.undelivered
 
     @property
-    def stale(self) -> bool:
-        """Whether its name is another file's."""
-        return self.draft is not None and self.draft.state is State.STALE
-
-    @property
     def changing(self) -> bool:
         """Whether what has its name on the vehicle is being changed, or was perhaps."""
         if self.draft is None:
@@ -119,7 +114,8 @@ class Node:
         """The body brings it to the vehicle, unless it is cancelled because name or content go (`doom`)."""
         with trio.CancelScope() as scope:
             self._delivery = scope
-            self.heed()
+            if self.doomed:
+                scope.cancel()
             try:
                 yield scope
             finally:
@@ -132,19 +128,15 @@ class Node:
         self.doomed += 1
         if self.spared.is_set():
             self.spared = trio.Event()
-        self.heed()
+        committing = self.draft is not None and self.draft.state is State.COMMITTING
+        if self._delivery is not None and not committing:  # nobody would find what it left there
+            self._delivery.cancel()
         try:
             yield
         finally:
             self.doomed -= 1
             if not self.doomed:
                 self.spared.set()
-
-    def heed(self) -> None:
-        """Call off the delivery under way if it is doomed, and not at a step that nobody would find."""
-        committing = self.draft is not None and self.draft.state is State.COMMITTING
-        if self.doomed and not committing and self._delivery is not None:
-            self._delivery.cancel()
 
     async def call_off(self) -> None:
         """Have what is being delivered called off, since its content is about to go: who waits for the
@@ -160,7 +152,7 @@ class Node:
 
     def require_current(self) -> None:
         """Raise FileChanged if its name is another file's."""
-        if self.stale:
+        if self.draft is not None and self.draft.state is State.STALE:
             raise FileChanged(f"{self.path!r} is another file by now")
 
     def close_base(self) -> None:
@@ -178,6 +170,13 @@ class Node:
         self.removed = True
         if self.content is not None:
             self.content.restate()
+
+    def begin_draft(self, spool: Spool, base: Base | None, now: float) -> Draft:
+        """It is going to be changed. base: the vehicle's file, None for a new one."""
+        self.content = SpoolContent(spool, self.spool_name)
+        self.draft = Draft(self.content, base)
+        self.known_at = now
+        return self.draft
 
     def drop_draft(self) -> None:
         """The vehicle has it all, or nobody wants it."""

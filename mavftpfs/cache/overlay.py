@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 from mavftpfs.cache.attributes import SECOND, Stat, Times, shown, shown_mtime
 from mavftpfs.cache.context import Context
-from mavftpfs.cache.draft import Draft
+from mavftpfs.cache.draft import Draft, State
 from mavftpfs.cache.localfiles import LocalFiles
 from mavftpfs.cache.nodes import Node
 from mavftpfs.cache.reserved import is_reserved
@@ -103,5 +103,5 @@ class Overlay:
         if known is not None:
             return shown(known)
         entry = self._context.dentries.entry(node.path)
-        listed = entry.mtime if entry is not None and draft.clean else None
+        listed = entry.mtime if entry is not None and draft.state is State.CLEAN else None
         return shown_mtime(node.path, listed), 0

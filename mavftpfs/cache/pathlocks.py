@@ -14,9 +14,10 @@ other's. All others go on side by side, so that one that is not answered holds u
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
+from typing import Protocol
 
 import trio
 
@@ -24,6 +25,12 @@ from mavftpfs.shared.errors import RequestTimeout
 
 SLACK = 5.0
 """Seconds that a change may take longer than its patience: to look what became of it."""
+
+
+class Named(Protocol):
+    """A file whose name may change."""
+
+    path: bytes
 
 
 class PathLocks:
@@ -65,18 +72,18 @@ class PathLocks:
             raise RequestTimeout(f"another change that concerns {paths[0]!r} took too long")
 
     @asynccontextmanager
-    async def steady(self, path: Callable[[], bytes], *, lasting: bool = False) -> AsyncIterator[bytes]:
+    async def steady(self, file: Named, *, lasting: bool = False) -> AsyncIterator[bytes]:
         """Open or deliver a file in the body: its path, which is yielded, and those above it do not change.
 
-        `path()`: what it is called by now, since it may change until that begins. lasting: see hold.
+        The path may be another one by the time that begins. lasting: see hold.
 
         Raises:
             RequestTimeout: a change took too long.
         """
         while True:
-            known = path()
+            known = file.path
             async with self.hold(known, shared=True, lasting=lasting):
-                if path() == known:
+                if file.path == known:
                     yield known
                     return
 

@@ -51,10 +51,10 @@ class Sending:
     def unacked(self) -> int:
         """Bytes that are dirty or in flight."""
         self._enter_run()
-        again = sum(
-            stop - start for a, b in self._in_flight for start, stop in self._dirty.intersection(a, b)
-        )
-        return self._dirty.total + self._in_flight.total - again
+        total = self._dirty.total
+        for a, b in self._in_flight:
+            total += sum([stop - start for start, stop in self._dirty.missing(a, b)])
+        return total
 
     # --- the program's side
 

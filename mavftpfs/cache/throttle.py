@@ -62,23 +62,21 @@ class Throttle:
         Raises:
             FileTooLarge.
         """
-        limit = self._rewrite_max(draft)
-        if draft.base_limit and size > limit:
+        if not draft.base_limit:
+            return
+        context, limit = self._context, self._context.options.rmw_max
+        if limit is None:
+            limit = MOST_REWRITE
+            write = self.meter.rate or context.read_rate() or context.options.link_rate
+            read = context.read_rate() or write
+            if write and read:
+                missing = sum([stop - start for start, stop in draft.missing_base()])
+                possible = int((REWRITE_SECONDS - missing / read) * write)
+                limit = min(max(possible, LEAST_REWRITE), MOST_REWRITE)
+        if size > limit:
             raise FileTooLarge(
                 f"changing a part of {size} bytes means sending them all; rmw_max allows {limit}"
             )
-
-    def _rewrite_max(self, draft: Draft) -> int:
-        fixed = self._context.options.rmw_max
-        if fixed is not None:
-            return fixed
-        known = self._context.options.link_rate
-        write = self.meter.rate or self._context.read_rate() or known
-        read = self._context.read_rate() or write
-        if not write or not read:
-            return MOST_REWRITE
-        missing = sum(stop - start for start, stop in draft.missing_base())
-        return min(max(int((REWRITE_SECONDS - missing / read) * write), LEAST_REWRITE), MOST_REWRITE)
 
     def is_full(self, node: Node) -> bool:
         """Return whether the writers of a file have to wait."""
@@ -87,7 +85,7 @@ class Throttle:
             return False  # nothing is delivered of a file without a name
         if attempt is None and (not node.background or self._context.nursery is None):
             return False  # nothing of it moves before it is closed: it waits on the local disk
-        streams = sum(1 for other in self._context.nodes if other.attempt is not None)
+        streams = len([other for other in self._context.nodes if other.attempt is not None])
         return draft.unacked > max(self.limit // max(streams, 1), LEAST)
 
     async def wait(self) -> bool:

@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from contextlib import closing, suppress
-from functools import partial
+from contextlib import closing
 from pathlib import Path
 from random import Random
 
@@ -21,7 +20,7 @@ from mavftpfs.cache.context import Context
 from mavftpfs.cache.delivery import PASSING, Deliverer
 from mavftpfs.cache.dentries import Dentries, Directory
 from mavftpfs.cache.directories import Directories
-from mavftpfs.cache.draft import Base, Draft, State
+from mavftpfs.cache.draft import Base, State
 from mavftpfs.cache.files import Files
 from mavftpfs.cache.names import Names
 from mavftpfs.cache.namespace import Namespace
@@ -34,36 +33,24 @@ from mavftpfs.cache.remote import RemoteStore, WriteStore
 from mavftpfs.cache.repair import Cleaner
 from mavftpfs.cache.replace import Replacer
 from mavftpfs.cache.reserved import OwnNames, is_reserved, new_owner, require_not_ours
-from mavftpfs.cache.spool import Spool, SpoolContent
+from mavftpfs.cache.spool import Spool
 from mavftpfs.cache.throttle import Throttle
-from mavftpfs.cache.writefile import ReadFile, WriteFile
+from mavftpfs.cache.writefile import Parts, ReadFile, WriteFile
 from mavftpfs.shared.errors import (
     AlreadyExists,
-    FileBusy,
-    FileTooLarge,
     IsADirectory,
     MavftpfsError,
     NotFound,
-    SpoolFailed,
 )
 from mavftpfs.shared.model import EntryKind, require_listable, split, wire_path
 
 log = logging.getLogger("mavftpfs.cache")
-
-MAX_FILE = 2**32 - 1
-"""Bytes: the protocol's offsets have 32 bits; ArduPilot's servers refuse from 2 GiB on (servers.md 8)."""
 
 RETRY_PAUSE = 1.0
 """Seconds between two rounds of delivering everything."""
 
 REFUSALS = 3
 """After so many rounds in which the vehicle answered and refused all that is left, the end is not put off."""
-
-STEP = 64 * 1024
-"""Bytes of a delivered file that are handed to the block cache at once."""
-
-ADOPTED_PART = 4
-"""A delivered file of up to this part of the block cache is kept in it."""
 
 
 def make_writeback(
@@ -141,6 +128,7 @@ class Writeback:
         self.overlay = Overlay(context)
         self.names = Namespace(context, names, self._deliverer, replacer, self.overlay)
         self._local = self.overlay.local
+        self._parts = Parts(context, self._deliverer, throttle, self._background, self.overlay, self.names)
 
     # --- opening
 
@@ -154,7 +142,7 @@ class Writeback:
             node, handle = self._context.nodes.get(path), None
             if node is None or node.draft is None:
                 handle = await self._context.files.open(path)
-            return ReadFile(self, self._context, self._context.nodes.need(path), handle)
+            return ReadFile(self._parts, self._context.nodes.need(path), handle)
 
     async def open(self, path: bytes, *, truncate: bool) -> OpenFile:
         """Open a file for writing."""
@@ -162,7 +150,7 @@ class Writeback:
             return self._local.open(path, write=True, truncate=truncate)
         self._context.require_disarmed()
         async with self._context.paths.hold(path, shared=True):
-            file = WriteFile(self, self._context, await self._need_draft(path, truncate=truncate))
+            file = WriteFile(self._parts, await self._need_draft(path, truncate=truncate))
         if truncate:
             try:
                 await file.truncate(0)
@@ -183,23 +171,20 @@ class Writeback:
         async with self._context.paths.hold(path, shared=True):
             if await self._names.entry(path) is None:
                 await self._names.require_new(path)
-                self._part_from_removed(path)
-                node = self._context.nodes.need(path)
+                context, node = self._context, self._context.nodes.need(path)
                 made = node.draft is None
+                if made and node.handles:
+                    # Who has a file open that others removed is not to read the one that is about to be made.
+                    context.nodes.part(node)
+                    context.files.end(path)
+                    node = context.nodes.need(path)
                 if made:
-                    self._new_draft(node, None)
+                    node.begin_draft(context.spool, None, context.clock())
                     self.overlay.on_written(path)
-                return WriteFile(self, self._context, node, made=made)
+                return WriteFile(self._parts, node, made=made)
         if exclusive:
             raise AlreadyExists(f"{path!r} exists")
         return await self.open(path, truncate=False)
-
-    def _part_from_removed(self, path: bytes) -> None:
-        """Who has a file open that others removed is not to read the one that is about to be made."""
-        node = self._context.nodes.get(path)
-        if node is not None and node.draft is None and node.handles:
-            self._context.nodes.part(node)
-            self._context.files.end(path)
 
     async def _need_draft(self, path: bytes, *, truncate: bool) -> Node:
         """Return the node of a file that exists, with a draft."""
@@ -223,137 +208,17 @@ class Writeback:
             context.require_idle(path)
             node = context.nodes.need(path)
             if node.draft is None:
-                self._new_draft(node, base)
+                node.begin_draft(context.spool, base, context.clock())
                 node.base, handle = handle, node.base
         finally:
             if handle is not None:
                 handle.close()
         return node
 
-    def _new_draft(self, node: Node, base: Base | None) -> None:
-        node.content = self._new_content(node)
-        node.draft = Draft(node.content, base)
-        node.known_at = self._context.clock()
-
-    def _new_content(self, node: Node) -> SpoolContent:
-        return SpoolContent(self._context.spool, node.spool_name)
-
     def holds(self, path: bytes) -> bool:
         """Return whether the vehicle lacks bytes of a file."""
         node = self._context.nodes.get(path)
         return node is not None and node.undelivered
-
-    # --- what handles ask
-
-    async def write(self, node: Node, offset: int, data: bytes | memoryview) -> int:
-        """Take bytes into a draft; see OpenFile.write."""
-        if offset + len(data) > MAX_FILE:
-            raise FileTooLarge(f"no vehicle takes files of more than {MAX_FILE} bytes")
-        await self._may_write(node)
-        node.require_current()
-        assert node.draft is not None
-        self._throttle.require_sendable(node.draft, max(node.draft.size, offset + len(data)))
-        node.draft.write(offset, data)
-        self._on_written(node)
-        return len(data)
-
-    async def truncate_node(self, node: Node, size: int) -> None:
-        """Cut or extend a draft; see OpenFile.truncate."""
-        if size > MAX_FILE:
-            raise FileTooLarge(f"no vehicle takes files of more than {MAX_FILE} bytes")
-        assert node.draft is not None
-        if size == 0 < node.draft.size:
-            await self._may_empty(node)
-        else:
-            await self._may_write(node)
-        if node.removed or size:
-            node.require_current()
-        if size == node.draft.size:
-            return
-        if size:
-            self._throttle.require_sendable(node.draft, size)
-        node.draft.truncate(size)
-        self._on_written(node)
-
-    async def _may_write(self, node: Node) -> None:
-        """Wait until a delivery under way is over and not too much is un-ACKed. Who called may change the
-        draft until its next wait.
-
-        Raises:
-            Armed. Else as Deliverer.deliver, when too much is un-ACKed.
-        """
-        idle_since = self._context.clock()
-        while True:
-            self._context.require_disarmed()
-            await node.quiet.wait()
-            if not node.quiet.is_set():
-                continue  # the next delivery began while we woke up
-            if not self._throttle.is_full(node):
-                return
-            if await self._throttle.wait():
-                idle_since = self._context.clock()
-                continue
-            if node.starting and self._context.clock() - idle_since < self._context.options.op_deadline:
-                continue  # an upload is about to begin: to wait for all of it would stop the program
-            # It says what is wrong, if anything is.
-            await self._deliverer.deliver(node, wanted=partial(self._throttle.is_full, node))
-            idle_since = self._context.clock()
-
-    async def _may_empty(self, node: Node) -> None:
-        """Call off what brings bytes to the vehicle that nobody wants any more: no room is needed, either.
-
-        Raises:
-            Armed. FileBusy: it is at a step that is not called off, and that lasts.
-        """
-        with trio.move_on_after(self._context.options.op_deadline):
-            await node.call_off()
-            self._context.require_disarmed()
-            self._throttle.let_go()
-            return
-        raise FileBusy(f"{node.path!r} is just getting its place")
-
-    async def deliver(self, node: Node) -> None:
-        """Have the vehicle hold the file; see Deliverer.deliver."""
-        if node.stale and not node.undelivered:
-            return  # nothing of it was changed here
-        await self._deliverer.deliver(node)
-
-    async def close(self, node: Node) -> None:
-        """A handle was closed."""
-        if node.removed and not node.handles:
-            await self.names.release(node)
-
-    def drop_handle(self, node: Node, *, writing: bool) -> None:
-        """A handle is about to be closed."""
-        node.handles -= 1
-        node.writers -= writing
-        if not node.handles and not node.removed:
-            self._settle(node)
-
-    def forget_made(self, node: Node) -> None:
-        """Nobody learnt of a new file, unless it was opened or written meanwhile."""
-        wanted = node.handles or node.removed or node.attempt is not None or node.lock.locked()
-        if not wanted and node.undelivered and node.draft is not None and not node.draft.size:
-            node.drop_draft()
-        self._context.nodes.maybe_forget(node)
-
-    def _on_written(self, node: Node) -> None:
-        if not node.removed:
-            self.overlay.on_written(node.path)
-            self._background.kick(node)
-
-    def _settle(self, node: Node) -> None:
-        """Nobody has the file open: if the vehicle has it, its content is ordinary cache."""
-        draft, context = node.draft, self._context
-        if draft is not None and draft.clean and not node.lock.locked():
-            fits = 0 < draft.size <= context.options.cache_size // ADOPTED_PART
-            recent = context.clock() - node.known_at < context.options.proof_time
-            if fits and recent and draft.whole:
-                starts = range(0, draft.size, STEP)
-                pieces = ((at, draft.local_bytes(at, min(at + STEP, draft.size))) for at in starts)
-                with suppress(SpoolFailed):  # the local disk does not give it back: it is on the vehicle
-                    context.files.adopt(node.path, draft.size, pieces, proven_at=node.known_at)
-        self._background.settle(node)
 
     # --- names
 
@@ -366,7 +231,7 @@ class Writeback:
         self._context.require_disarmed()
         async with self._context.paths.hold(path, shared=True):
             node = await self._need_draft(path, truncate=size == 0)
-            file = WriteFile(self, self._context, node)  # also beside other writers: they may end meanwhile
+            file = WriteFile(self._parts, node)  # also beside other writers: they may end meanwhile
         had = node.undelivered
         try:
             await file.truncate(size)
@@ -383,7 +248,7 @@ class Writeback:
     async def _forget_draft(self, node: Node) -> None:
         """What was to be written is not wanted any more, since its caller got an error. What may have the
         name already is completed later."""
-        async with self._context.paths.steady(lambda: node.path, lasting=True), node.lock:
+        async with self._context.paths.steady(node, lasting=True), node.lock:
             await self._deliverer.abandon(node)
             draft = node.draft
             if node.writers or draft is None or draft.begun or draft.state is State.TORN:

@@ -8,37 +8,56 @@ has the path now is another file.
 
 from __future__ import annotations
 
-from typing import Protocol
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import partial
 
+import trio
+
+from mavftpfs.cache.background import Background
 from mavftpfs.cache.base import open_node, read_base
 from mavftpfs.cache.context import Context
-from mavftpfs.cache.draft import Draft, Where
+from mavftpfs.cache.delivery import Deliverer
+from mavftpfs.cache.draft import Draft, State, Where
 from mavftpfs.cache.files import FileHandle
+from mavftpfs.cache.namespace import Namespace
 from mavftpfs.cache.nodes import Node
 from mavftpfs.cache.openfile import OpenFile
-from mavftpfs.shared.errors import FileChanged, LocalProtocolError
+from mavftpfs.cache.overlay import Overlay
+from mavftpfs.cache.throttle import Throttle
+from mavftpfs.shared.errors import FileBusy, FileChanged, FileTooLarge, LocalProtocolError, SpoolFailed
 
 TRIES = 3
 """How often a read starts anew because the file was delivered meanwhile."""
 
+MAX_FILE = 2**32 - 1
+"""Bytes: the protocol's offsets have 32 bits; ArduPilot's servers refuse from 2 GiB on (servers.md 8)."""
 
-class Owner(Protocol):
-    """What a handle asks of writeback.Writeback."""
+STEP = 64 * 1024
+"""Bytes of a delivered file that are handed to the block cache at once."""
 
-    async def write(self, node: Node, offset: int, data: bytes | memoryview) -> int: ...
-    async def truncate_node(self, node: Node, size: int) -> None: ...
-    async def deliver(self, node: Node) -> None: ...
-    async def close(self, node: Node) -> None: ...
-    def drop_handle(self, node: Node, *, writing: bool) -> None: ...
-    def forget_made(self, node: Node) -> None: ...
+ADOPTED_PART = 4
+"""A delivered file of up to this part of the block cache is kept in it."""
 
 
-class _Reading(OpenFile):
-    """Reads of one handle: the draft if there is one, else the vehicle's file."""
+@dataclass(frozen=True, slots=True)
+class Parts:
+    """What the handles of one mount share."""
 
-    def __init__(self, owner: Owner, context: Context, node: Node, handle: FileHandle | None = None) -> None:
-        self._owner = owner
-        self._context = context
+    context: Context
+    deliverer: Deliverer
+    throttle: Throttle
+    background: Background
+    overlay: Overlay
+    names: Namespace
+
+
+class ReadFile(OpenFile):
+    """One open() for reading: of the draft if there is one, else of the vehicle's file."""
+
+    def __init__(self, parts: Parts, node: Node, handle: FileHandle | None = None) -> None:
+        self._parts = parts
+        self._context = parts.context
         self._node = node
         self._handle = handle
         self._generation = node.generation
@@ -87,6 +106,43 @@ class _Reading(OpenFile):
                     raise
         raise AssertionError
 
+    async def fsync(self) -> None:
+        """Deliver what was written by whomever; see OpenFile.fsync."""
+        await self._parts.deliverer.deliver(self._node)
+
+    async def release(self) -> None:
+        """Close the handle; the last one of an unlinked file has it removed."""
+        if not self._closed:
+            self.close()
+            if self._node.removed and not self._node.handles:
+                await self._parts.names.release(self._node)
+
+    def close(self) -> None:
+        """Close without delivering; closing twice is harmless."""
+        if self._closed:
+            return
+        self._closed = True
+        self._close_handle()
+        node = self._node
+        node.handles -= 1
+        node.writers -= self.writable
+        if not node.handles and not node.removed:
+            if node.draft is not None and node.draft.state is State.CLEAN and not node.lock.locked():
+                self._adopt(node.draft)
+            self._parts.background.settle(node)
+
+    # --- inside
+
+    def _adopt(self, draft: Draft) -> None:
+        """Nobody has the file open, and the vehicle has it: its content is ordinary cache from now on."""
+        context, node = self._context, self._node
+        fits = 0 < draft.size <= context.options.cache_size // ADOPTED_PART
+        if fits and context.clock() - node.known_at < context.options.proof_time and draft.whole:
+            starts = range(0, draft.size, STEP)
+            pieces = ((at, draft.local_bytes(at, min(at + STEP, draft.size))) for at in starts)
+            with suppress(SpoolFailed):  # the local disk does not give it back: it is on the vehicle
+                context.files.adopt(node.path, draft.size, pieces, proven_at=node.known_at)
+
     async def _read_changed(self, offset: int, size: int) -> bytes | memoryview:
         """Read a file that was written here since the handle was opened, or that is not open yet."""
         node = self._node
@@ -120,52 +176,46 @@ class _Reading(OpenFile):
             handle.close()
 
 
-class ReadFile(_Reading):
-    """One open() for reading (see cache.openfile.OpenFile)."""
-
-    async def fsync(self) -> None:
-        """Deliver what others wrote.
-
-        Raises:
-            Why it is not delivered.
-        """
-        await self._owner.deliver(self._node)
-
-    async def release(self) -> None:
-        """Close the handle; the last one of an unlinked file has it removed."""
-        if not self._closed:
-            self.close()
-            await self._owner.close(self._node)
-
-    def close(self) -> None:
-        """Close the handle; closing twice is harmless."""
-        if not self._closed:
-            self._closed = True
-            self._close_handle()
-            self._owner.drop_handle(self._node, writing=False)
-
-
-class WriteFile(_Reading):
-    """One open() for writing (see cache.openfile.OpenFile) of `node`."""
+class WriteFile(ReadFile):
+    """One open() for writing (see cache.openfile.OpenFile)."""
 
     writable = True
 
-    def __init__(self, owner: Owner, context: Context, node: Node, *, made: bool = False) -> None:
+    def __init__(self, parts: Parts, node: Node, *, made: bool = False) -> None:
         """`made`: there was no such file before."""
-        super().__init__(owner, context, node)
+        super().__init__(parts, node)
         self._made = made
-        self.node = node
         node.writers += 1
 
     async def write(self, offset: int, data: bytes | memoryview) -> int:
         """Take all of `data`; see OpenFile.write."""
-        self._require_open()
-        return await self._owner.write(self._node, offset, data)
+        node, stop = self._node, offset + len(data)
+        self._require_possible(stop)
+        await self._may_write(node)
+        node.require_current()
+        assert node.draft is not None
+        self._parts.throttle.require_sendable(node.draft, max(node.draft.size, stop))
+        node.draft.write(offset, data)
+        self._on_written(node)
+        return len(data)
 
     async def truncate(self, size: int) -> None:
         """Cut or extend; see OpenFile.truncate."""
-        self._require_open()
-        await self._owner.truncate_node(self._node, size)
+        node = self._node
+        self._require_possible(size)
+        assert node.draft is not None
+        if size == 0 < node.draft.size:
+            await self._may_empty(node)
+        else:
+            await self._may_write(node)
+        if node.removed or size:
+            node.require_current()
+        if size == node.draft.size:
+            return
+        if size:
+            self._parts.throttle.require_sendable(node.draft, size)
+        node.draft.truncate(size)
+        self._on_written(node)
 
     async def flush(self) -> None:
         """Deliver, unless all that happened is that the file was emptied: more is about to come.
@@ -177,15 +227,7 @@ class WriteFile(_Reading):
         """
         draft = self._node.draft
         if draft is not None and (draft.size > 0 or self._node.error is not None):
-            await self._owner.deliver(self._node)
-
-    async def fsync(self) -> None:
-        """Deliver.
-
-        Raises:
-            Why it is not delivered.
-        """
-        await self._owner.deliver(self._node)
+            await self._parts.deliverer.deliver(self._node)
 
     async def release(self) -> None:
         """Deliver and close; what could not be delivered stays held.
@@ -196,24 +238,66 @@ class WriteFile(_Reading):
         if self._closed:
             return
         try:
-            await self._owner.deliver(self._node)
+            await self._parts.deliverer.deliver(self._node)
         finally:
-            self.close()
-            await self._owner.close(self._node)
+            await super().release()
 
     def give_up(self) -> None:
         """Close, also after release; see OpenFile.give_up."""
         self.close()
-        if self._made:
-            self._owner.forget_made(self._node)
+        node = self._node
+        wanted = node.handles or node.removed or node.attempt is not None or node.lock.locked()
+        if self._made and not wanted and node.undelivered and node.draft is not None and not node.draft.size:
+            node.drop_draft()  # nobody learnt of the new file
+        self._context.nodes.maybe_forget(node)
 
-    def close(self) -> None:
-        """Close without delivering; closing twice is harmless."""
-        if not self._closed:
-            self._closed = True
-            self._close_handle()
-            self._owner.drop_handle(self._node, writing=True)
+    # --- inside
 
-    def _require_open(self) -> None:
+    def _require_possible(self, size: int) -> None:
         if self._closed:
             raise LocalProtocolError("write to a closed handle")
+        if size > MAX_FILE:
+            raise FileTooLarge(f"no vehicle takes files of more than {MAX_FILE} bytes")
+
+    async def _may_write(self, node: Node) -> None:
+        """Wait until a delivery under way is over and not too much is un-ACKed. Who called may change the
+        draft until its next wait.
+
+        Raises:
+            Armed. Else as Deliverer.deliver, when too much is un-ACKed.
+        """
+        context, throttle = self._context, self._parts.throttle
+        idle_since = context.clock()
+        while True:
+            context.require_disarmed()
+            await node.quiet.wait()
+            if not node.quiet.is_set():
+                continue  # the next delivery began while we woke up
+            if not throttle.is_full(node):
+                return
+            if await throttle.wait():
+                idle_since = context.clock()
+                continue
+            if node.starting and context.clock() - idle_since < context.options.op_deadline:
+                continue  # an upload is about to begin: to wait for all of it would stop the program
+            # It says what is wrong, if anything is.
+            await self._parts.deliverer.deliver(node, wanted=partial(throttle.is_full, node))
+            idle_since = context.clock()
+
+    async def _may_empty(self, node: Node) -> None:
+        """Call off what brings bytes to the vehicle that nobody wants any more: no room is needed, either.
+
+        Raises:
+            Armed. FileBusy: it is at a step that is not called off, and that lasts.
+        """
+        with trio.move_on_after(self._context.options.op_deadline):
+            await node.call_off()
+            self._context.require_disarmed()
+            self._parts.throttle.let_go()
+            return
+        raise FileBusy(f"{node.path!r} is just getting its place")
+
+    def _on_written(self, node: Node) -> None:
+        if not node.removed:
+            self._parts.overlay.on_written(node.path)
+            self._parts.background.kick(node)

@@ -84,7 +84,7 @@ def test_what_the_table_does_not_know_cannot_happen(state: State, event: Event) 
 
 def test_the_life_of_a_new_file() -> None:
     draft = draft_over(None)
-    assert not draft.clean, "also if it is empty"
+    assert draft.undelivered, "also if it is empty"
     assert draft.undelivered
     sending = draft.begin(in_place=False)
     draft.write(0, b"abc")
@@ -93,7 +93,7 @@ def test_the_life_of_a_new_file() -> None:
     with pytest.raises(LocalProtocolError):
         draft.write(0, b"x")  # writers wait
     draft.delivered()
-    assert draft.clean
+    assert not draft.undelivered
     assert draft.base == Base(3)
     draft.write(1, b"X")
     assert draft.state is State.DIRTY
@@ -357,7 +357,7 @@ class DraftMachine(RuleBasedStateMachine):
             self.base = bytes(self.model)
         else:
             self.draft.on(Event.REFUSED)
-        assert self.draft.clean == end.endswith("placed")
+        assert (self.draft.state is State.CLEAN) == end.endswith("placed")
 
     @rule()
     def give_up(self) -> None:
