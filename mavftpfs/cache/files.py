@@ -27,7 +27,6 @@ from itertools import islice
 
 import trio
 
-from mavftpfs.cache.blocks import BlockCache, FileBlocks
 from mavftpfs.cache.dentries import COST_FACTOR, Dentries, Directory
 from mavftpfs.cache.directories import Directories, Found
 from mavftpfs.cache.kept import KeptCache
@@ -36,7 +35,7 @@ from mavftpfs.cache.pathlocks import PathLocks
 from mavftpfs.cache.readahead import Readahead
 from mavftpfs.cache.remote import RemoteStore
 from mavftpfs.cache.singleflight import SingleFlight
-from mavftpfs.cache.versions import NEVER, Version, became_another
+from mavftpfs.cache.versions import NEVER, BlockCache, Version, became_another
 from mavftpfs.shared.errnos import errno_for
 from mavftpfs.shared.errors import (
     DataUnproven,
@@ -144,7 +143,7 @@ class Files:
         version = self._current.get(path)
         if version is not None and version.handles and version.dead is None:
             return version.size
-        reader = await self._store.open_reader(path, FileBlocks(self.cache))
+        reader = await self._store.open_reader(path, Version(self.cache, path))
         reader.close()
         return reader.size
 
@@ -187,7 +186,7 @@ class Files:
 
     async def _start_version(self, path: bytes, entry: DirEntry) -> Version:
         version = self._new_version(path, None)
-        reader = await self._store.open_reader(path, version.blocks)
+        reader = await self._store.open_reader(path, version)
         try:
             if entry.size is not None and entry.size >= WRAP and entry.size % WRAP == reader.size:
                 raise FileTooLarge(f"{path!r} has {entry.size} bytes, more than an open reply can tell")
@@ -196,7 +195,7 @@ class Files:
         except BaseException:
             reader.close()
             raise
-        version.reader, version.blocks.size = reader, reader.size
+        version.reader, version.size = reader, reader.size
         version.proven_at = version.compared_at = self._clock()
         if entry.size in (None, reader.size):
             version.mtime = entry.mtime
@@ -236,10 +235,9 @@ class Files:
     async def _open_reader(self, version: Version) -> None:
         async with self.paths.steady(version) as path:
             version.require_alive()
-            expected = None if version.blocks.doubted else version.size
-            version.close_reader()
-            version.blocks.begin_reading()
-            reader = await self._store.open_reader(path, version.blocks, expected_size=expected)
+            expected = None if version.doubted else version.size
+            version.begin_reading()
+            reader = await self._store.open_reader(path, version, expected_size=expected)
         if version.handles == 0:
             reader.close()
             raise LocalProtocolError(f"{version.path!r} was closed while it was read")
@@ -250,15 +248,14 @@ class Files:
         version.reader = reader
 
     def _new_version(self, path: bytes, mtime: int | None, size: int = 0) -> Version:
-        blocks, now = FileBlocks(self.cache, size), self._clock()
-        version = Version(path, mtime, blocks, proven_at=now, compared_at=now)
-        blocks.on_dropped = partial(self._on_dropped, version)
+        version = Version(self.cache, path, size, mtime)
+        version.on_dropped = self._on_dropped
         return version
 
     def _replace(self, version: Version) -> None:
         old = self._current.pop(version.path, None)
         if old is not None and not old.handles:
-            old.blocks.clear()
+            old.clear()
         self._current[version.path] = version
         if len(self._current) > MAX_CLOSED:
             closed = (v for v in self._current.values() if not v.handles and v is not version)
@@ -269,9 +266,9 @@ class Files:
         """Return counters; `reads`: the files that are being fetched, with path, size and done in bytes."""
         recent = self._clock() - READING
         reads = [
-            {"path": v.path.decode(errors="replace"), "size": v.size, "done": v.blocks.done}
+            {"path": v.path.decode(errors="replace"), "size": v.size, "done": v.done}
             for v in self.open_versions
-            if v.blocks.waited_for or (v.blocks.received_at > recent and v.blocks.done < v.size)
+            if v.waited_for or (v.received_at > recent and v.done < v.size)
         ]
         kept = {} if self.kept is None else self.kept.status()
         counters = {"hits": self.hits, "misses": self.misses, "reads_unproven": self.unproven}
@@ -306,7 +303,7 @@ class Files:
     async def _compare_once(self, version: Version) -> None:
         path = version.path
         try:
-            directory = await self._directories.recent(split(path)[0], began=version.blocks.opened_at)
+            directory = await self._directories.recent(split(path)[0], began=version.opened_at)
         except (NotFound, NotADirectory):
             self.kill(version)
             return
@@ -324,15 +321,14 @@ class Files:
             if directory.complete or entry is not None:
                 self.kill(version)
         elif not self._is_another(version, entry):
-            if directory.listed_at >= version.blocks.opened_at:
+            if directory.listed_at >= version.opened_at:
                 version.compared_at = directory.listed_at
             if version.mtime is None and entry.size == version.size:
                 version.mtime = entry.mtime
-        elif version.blocks.given or entry.size != version.size:
+        elif version.given or entry.size != version.size:
             self.kill(version)
         else:
             version.start_over(entry.mtime, directory.listed_at)
-            self._on_dropped(version)
 
     def _is_another(self, version: Version, entry: DirEntry) -> bool:
         """A file that is larger after the vehicle restarted is another one: nobody went on writing it."""
@@ -376,17 +372,17 @@ class Files:
         self._restarted_at = self._clock()
         for version in dict.fromkeys((*self._current.values(), *self.open_versions)):
             version.proven_at = version.compare_after = NEVER
-            version.blocks.on_opened(self._restarted_at)
+            version.on_opened(self._restarted_at)
             version.kept = None
 
     # --- we changed the file ourselves
 
-    def cached(self, path: bytes) -> FileBlocks | None:
+    def cached(self, path: bytes) -> Version | None:
         """Return what is cached of a path's present version, if all that is surely of one file."""
         version = self._current.get(path)
         if version is None or version.dead is not None:
             return None
-        return version.blocks if version.compared or not self._listings_tell(version) else None
+        return version if version.compared or not self._listings_tell(version) else None
 
     def was_lost(self, path: bytes) -> bool:
         """Return whether somebody has a version of the path open, and is to read nothing more."""
@@ -414,10 +410,10 @@ class Files:
         if proven_at <= self._restarted_at:
             return
         version = self._new_version(path, None, size)
-        version.proven_at, version.shown, version.blocks.given = proven_at, True, True
+        version.proven_at, version.shown, version.given = proven_at, True, True
         self._replace(version)
         for offset, data in pieces:
-            version.blocks.preload(offset, data)
+            version.preload(offset, data)
 
     def on_renamed(self, old: bytes, new: bytes) -> None:
         """A file, or a directory with all below it, has another path now; open files follow."""
@@ -428,7 +424,7 @@ class Files:
                 del self._current[version.path]
             version.close_reader()
             version.path = new + version.path[len(old) :]
-            version.blocks.ask_again()
+            version.ask_again()
             if current:
                 self._current[version.path] = version
 
@@ -451,9 +447,9 @@ class Files:
             return
         del self.open_versions[version]
         version.close_reader()
-        version.blocks.on_failed(LocalProtocolError(f"{version.path!r} was closed while it was read"))
+        version.on_failed(LocalProtocolError(f"{version.path!r} was closed while it was read"))
         if self._current.get(version.path) is not version:
-            version.blocks.clear()
+            version.clear()
         elif version.dead is not None or self._is_restarted(version):
             self._forget(version)
 
@@ -464,7 +460,7 @@ class Files:
                 self._forget(version)
 
     def _forget(self, version: Version) -> None:
-        version.blocks.clear()
+        version.clear()
         del self._current[version.path]
 
 
@@ -477,9 +473,9 @@ class FileHandle(OpenFile):
     def __init__(self, files: Files, version: Version, *, keep_cache: bool, direct_io: bool) -> None:
         self._files = files
         self._version = version
-        self._readahead = Readahead(version.blocks.size)
+        self._readahead = Readahead(version.size)
         self._closed = False
-        self.size = version.blocks.size
+        self.size = version.size
         self.keep_cache = keep_cache
         self.direct_io = direct_io
 
@@ -497,7 +493,7 @@ class FileHandle(OpenFile):
         files, version = self._files, self._version
         for pause in (*PAUSES, 0.0):
             version.require_alive()
-            drops = version.blocks.drops
+            drops = version.drops
             pieces: list[bytes | memoryview] = []
             for start in range(offset, stop, files.cache.piece):
                 piece = await self._read_piece(start, min(start + files.cache.piece, stop))
@@ -506,10 +502,10 @@ class FileHandle(OpenFile):
                 pieces.append(piece)
             else:
                 await files.compare(version, now=stop == self.size)
-                if version.blocks.drops == drops:
-                    version.blocks.given = True
+                if version.drops == drops:
+                    version.given = True
                     return pieces[0] if len(pieces) == 1 else b"".join(pieces)
-            if version.blocks.drops != drops:
+            if version.drops != drops:
                 version.close_reader()
                 await trio.sleep(pause)
         files.unproven += 1
@@ -534,12 +530,11 @@ class FileHandle(OpenFile):
     async def _read_piece(self, start: int, stop: int) -> bytes | memoryview | None:
         """Return [start, stop), at most a piece. None: it was renamed, or bytes were dropped, meanwhile."""
         files, version = self._files, self._version
-        blocks = version.blocks
         limit, small = files.cache.readahead_limits(len(files.open_versions))
         ahead = self._readahead.on_read(start, stop, limit=limit, small=small)
         if ahead.seeked and version.reader is not None:
             version.reader.drop_readahead()
-        data = blocks.get(start, stop)
+        data = version.get(start, stop)
         if data is not None:
             files.hits += 1
             if version.reader is not None and ahead.start < ahead.stop:
@@ -551,16 +546,16 @@ class FileHandle(OpenFile):
                 if files.kept is not None:
                     await files.kept.fill(version, start, stop)
                     version.require_alive()
-                if blocks.missing(start, stop):
-                    if version.reader is None or blocks.doubted:
+                if version.missing(start, stop):
+                    if version.reader is None or version.doubted:
                         await files.open_reader(version)
-                    if version.reader is None or blocks.doubted:
+                    if version.reader is None or version.doubted:
                         return None
                     version.reader.want(start, stop, demand=True)
                     if ahead.start < ahead.stop:
                         version.reader.want(ahead.start, ahead.stop, demand=False)
-                    await blocks.wait_for(start, stop)
-                return blocks.get(start, stop)
+                    await version.wait_for(start, stop)
+                return version.get(start, stop)
         except (FileChanged, FtpNak) as error:
             if not isinstance(error, FileChanged) and errno_for(error) != errno.ENOENT:
                 raise

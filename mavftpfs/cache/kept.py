@@ -22,10 +22,9 @@ from typing import Any
 
 import trio
 
-from mavftpfs.cache.blocks import BLOCK_SIZE
 from mavftpfs.cache.dentries import Dentries
 from mavftpfs.cache.kept_disk import FileKey, Kept, KeptDisk
-from mavftpfs.cache.versions import Version
+from mavftpfs.cache.versions import BLOCK_SIZE, Version
 from mavftpfs.shared.errors import (
     Armed,
     FtpNak,
@@ -120,17 +119,17 @@ class KeptCache:
 
     async def fill(self, version: Version, start: int, stop: int) -> None:
         """Add the blocks of [start, stop) that are lacking and on the disk."""
-        kept, blocks = version.kept, version.blocks
+        kept = version.kept
         if kept is None or not kept.key.version:
             return
         for index in range(start // BLOCK_SIZE, -(-stop // BLOCK_SIZE)):
             first, last = _extent(version.size, index)
-            if blocks.missing(max(start, first), min(stop, last)):
+            if version.missing(max(start, first), min(stop, last)):
                 data = await self._run(self._disk.read, kept.key.block(first, last))
                 if version.kept is not kept:
                     return
                 if data is not None:
-                    blocks.preload(first, data)
+                    version.preload(first, data)
                     kept.done.add(index)
 
     def _key(self, path: bytes, entry: DirEntry) -> FileKey | None:
@@ -189,9 +188,9 @@ class KeptCache:
 
     async def _write_ripe(self, version: Version, kept: Kept) -> None:
         """Write blocks that are not on the disk and were held whole for SETTLED seconds."""
-        blocks, now = version.blocks, self._dentries.clock()
+        now = self._dentries.clock()
         extents = [_extent(version.size, index) for index in range(-(-version.size // BLOCK_SIZE))]
-        whole = [i for i, extent in enumerate(extents) if i in blocks and not blocks.missing(*extent)]
+        whole = [i for i, extent in enumerate(extents) if i in version and not version.missing(*extent)]
         kept.arrived = {index: kept.arrived.get(index, now) for index in whole if index not in kept.done}
         ripe = [index for index, at in kept.arrived.items() if now - at >= SETTLED]
         if version.mtime is not None and not version.compared:
@@ -200,10 +199,10 @@ class KeptCache:
             if len(ripe) == len(extents):
                 await self._write_whole(version, kept.key, extents)
             return
-        drops = blocks.drops
+        drops = version.drops
         for index in ripe:
-            data = blocks.get(*extents[index])
-            if data is None or version.kept is not kept or blocks.drops != drops:
+            data = version.get(*extents[index])
+            if data is None or version.kept is not kept or version.drops != drops:
                 return  # it is in doubt, or another file, by now
             if not await self._to_disk(kept.key.block(*extents[index]), bytes(data)):
                 return
@@ -212,7 +211,7 @@ class KeptCache:
     async def _write_whole(self, version: Version, key: FileKey, extents: list[tuple[int, int]]) -> None:
         """Write a file that only its CRC32 tells from others, and that there is one of that path and size."""
         version.kept = None  # this was all
-        parts, value = [bytes(version.blocks.get(*extent) or b"") for extent in extents], 0xFFFFFFFF
+        parts, value = [bytes(version.get(*extent) or b"") for extent in extents], 0xFFFFFFFF
         for part in parts:
             value = zlib.crc32(part, value)
         known = _of_crc32(key, value ^ 0xFFFFFFFF)

@@ -19,7 +19,6 @@ from contextlib import nullcontext
 
 import trio
 
-from mavftpfs.cache.blocks import FileBlocks
 from mavftpfs.cache.context import Context
 from mavftpfs.cache.delivery import Deliverer
 from mavftpfs.cache.draft import Base, Draft, State
@@ -28,6 +27,7 @@ from mavftpfs.cache.nodes import Node
 from mavftpfs.cache.overlay import Overlay
 from mavftpfs.cache.replace import Replacer
 from mavftpfs.cache.reserved import Kind, fits_rename, require_not_ours
+from mavftpfs.cache.versions import Version
 from mavftpfs.shared.errors import (
     AlreadyExists,
     CrossDevice,
@@ -299,7 +299,7 @@ class Namespace:
         node.content.settle()  # whatever becomes of this mount, nobody misses a copy
         return True
 
-    def _fill(self, draft: Draft, blocks: FileBlocks) -> bool:
+    def _fill(self, draft: Draft, blocks: Version) -> bool:
         """Put what is cached into a draft; return whether all is held then."""
         try:
             for at in range(0, draft.base_limit, PIECE):

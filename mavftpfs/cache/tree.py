@@ -15,7 +15,6 @@ from random import Random
 import trio
 
 from mavftpfs.cache.attributes import UNKNOWN_MTIME, Stat, shown_mtime
-from mavftpfs.cache.blocks import BlockCache
 from mavftpfs.cache.dentries import Dentries
 from mavftpfs.cache.directories import Directories, Found
 from mavftpfs.cache.files import Files
@@ -24,6 +23,7 @@ from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.options import CacheOptions
 from mavftpfs.cache.recovery import SpoolDirectory
 from mavftpfs.cache.remote import RemoteStore, WriteStore
+from mavftpfs.cache.versions import BlockCache
 from mavftpfs.cache.virtual import VirtualTrees
 from mavftpfs.cache.writeback import Writeback, make_writeback
 from mavftpfs.shared.errors import FtpNak, IsADirectory, ListingIncomplete, NotDeliveredYet, ReadOnly

@@ -1,77 +1,276 @@
-"""One version of a remote file. Layer: cache.
+"""Versions of remote files: what is known of them, their bytes, and the budget of all. Layer: cache.
 
-A version is a file as it was when it was opened: its size, and its time where listings tell it. Handles of
-one version share its blocks and its remote reader. When the file turns out to have become another one the
-version is `dead`: its handles get FileChanged, and later opens start a new version. If somebody else did
-that it is `lost`, too: its handles never get what has the path now, whoever wrote it.
+A `Version` is a file as it was when it was opened: its size, and its time where listings tell it. Handles of
+one version share its bytes and its remote reader. When the file turns out to have become another one the
+version is `dead`: its handles get FileChanged, and later opens start a new version. If somebody else did that
+it is `lost`, too: its handles never get what has the path now, whoever wrote it.
+
+A version is the sink that its reader fills; those who wait for bytes are woken once per batch. `BlockCache`
+is the byte budget over all: blocks of BLOCK_SIZE bytes, least recently used first out. Code between awaits is
+atomic (trio); nothing here awaits while state is half changed.
+
+Doubtful bytes (promise 1). Servers share session ids between clients, so perfectly matching replies can carry
+another file. When the session layer notices that this may have happened (`on_suspect`), every byte that came
+since the present reader was opened is dropped, and what still comes from it is ignored: who wants such bytes
+asks again, by a new reader.
 """
 
 from __future__ import annotations
 
+from collections import OrderedDict
+from collections.abc import Callable
 from dataclasses import dataclass
 
-from mavftpfs.cache.blocks import FileBlocks
+import trio
+
 from mavftpfs.cache.kept_disk import Kept
+from mavftpfs.cache.readahead import MAX_WINDOW, RateMeter
 from mavftpfs.cache.remote import Reader
-from mavftpfs.shared.errors import FileChanged, MavftpfsError
+from mavftpfs.shared.errors import FileChanged, MavftpfsError, RequestTimeout
+from mavftpfs.shared.extents import ExtentSet
 from mavftpfs.shared.model import DirEntry
 
 NEVER = float("-inf")
 
+BLOCK_SIZE = 128 * 1024
+"""Bytes: what malloc still keeps apart well. Blocks of 64 KiB, and the replies put together from them (the
+kernel asks for 256 KiB), left a quarter of the cache's size in unusable holes."""
+
+PIECE = 2 * BLOCK_SIZE
+"""A read is served in pieces of at most so many bytes (what the kernel asks for at once)."""
+
+AHEAD_SECONDS = 3.0
+"""How much of the link's measured rate may lie ahead of a reader."""
+
+SMALL_SECONDS = 2.0
+"""A file that the link carries in this time is small: it is wanted whole."""
+
+SMALL_FILE = 64 * 1024
+"""Bytes of a file that is small whatever the rate."""
+
+
+class BlockCache:
+    """The budget that all files share."""
+
+    def __init__(self, budget: int, *, clock: Callable[[], float], patience: float) -> None:
+        """Take the budget in bytes, and after how many seconds without progress a read gives up."""
+        self.budget = budget
+        self.clock = clock
+        self.patience = patience
+        self.meter = RateMeter()
+        self.piece = PIECE if budget >= 8 * PIECE else BLOCK_SIZE
+        self.reads = trio.Semaphore(max(1, budget // 2 // (self.piece + BLOCK_SIZE)))
+        """Held by who waits for a piece: what is waited for is not evicted, and takes at most half."""
+        self.bytes_cached = 0
+        self.evictions = 0
+        self.used: OrderedDict[tuple[Version, int], int] = OrderedDict()
+
+    def readahead_limits(self, streams: int) -> tuple[int, int]:
+        """Return the largest readahead window, and up to which size a file is wanted whole, in bytes, while
+        `streams` files are being read. All windows together fit half of the cache."""
+        limit, rate = min(self.budget // (2 * (streams + 1)), MAX_WINDOW), self.meter.rate
+        if rate is None:
+            return limit, SMALL_FILE
+        limit = min(limit, int(rate * AHEAD_SECONDS))
+        return limit, max(SMALL_FILE, min(limit, int(rate * SMALL_SECONDS)))
+
+    def add(self, owner: Version, index: int, size: int) -> None:
+        """Account for a new block, evicting older ones that nobody waits on."""
+        for _ in range(len(self.used)):
+            if self.bytes_cached + size <= self.budget:
+                break
+            self._evict_oldest()
+        self.used[owner, index] = size
+        self.bytes_cached += size
+
+    def remove(self, owner: Version, index: int) -> None:
+        """A block is gone."""
+        self.bytes_cached -= self.used.pop((owner, index))
+
+    def check_invariants(self) -> None:
+        """Raise AssertionError if the books are wrong (for tests)."""
+        assert self.bytes_cached == sum(self.used.values())
+        assert self.bytes_cached <= self.budget
+        for owner, index in self.used:
+            assert index in owner
+
+    def _evict_oldest(self) -> None:
+        owner, index = next(iter(self.used))
+        if owner.pinned(index):
+            self.used.move_to_end((owner, index))  # in use after all
+        else:
+            self.evictions += 1
+            owner.evict(index)
+
 
 @dataclass(slots=True, eq=False)
-class Version:
-    """A file as it was when it was opened. Times are those of the caches' clock.
+class _Waiter:
+    start: int
+    stop: int
+    missing: list[tuple[int, int]]
+    done: trio.Event
+    scope: trio.CancelScope
+    error: Exception | None = None
 
-    mtime: None if not known to belong to this size. proven_at: when it was last known to be what the vehicle
-    holds, so that opening it again needs no request. compared_at: when the path was last known to be this
-    file. compare_after: no listing is asked for before, only to compare. handles: how many are open. shown:
-    whether the kernel may hold pages of it and all of them are good. dead: why it is not the path's file any
-    more; lost: somebody else changed that. kept: its part on the local disk, if it may have one.
+
+class Version:
+    """A file as it was when it was opened; implements cache.remote.ReadSink. Times are those of the caches'
+    clock.
+
+    Attributes:
+        path: what it is called by now. size: in bytes, by the open reply. mtime: None if not known to belong
+            to this size. reader: where its bytes come from, if it is open. handles: how many are open.
+        proven_at: when it was last known to be what the vehicle holds, so that opening it again needs no
+            request. compared_at: when the path was last known to be this file. compare_after: no listing is
+            asked for before, only to compare.
+        shown: whether the kernel may hold pages of it and all of them are good. given: whether a program got
+            any of the bytes. dead: why it is not the path's file any more; lost: somebody else changed that.
+        kept: its part on the local disk, if it may have one.
+        opened_at: when the server opened the file for the session that bytes come from now.
+        doubted: what comes from the present reader is ignored; cleared by `begin_reading`.
+        drops: how often bytes were dropped because they were in doubt, or another file's.
+        on_dropped: called when that happens: the kernel may hold copies.
     """
 
-    path: bytes
-    mtime: int | None
-    blocks: FileBlocks
-    proven_at: float
-    compared_at: float
-    compare_after: float = NEVER
-    reader: Reader | None = None
-    handles: int = 0
-    shown: bool = False
-    dead: MavftpfsError | None = None
-    lost: bool = False
-    kept: Kept | None = None
+    def __init__(self, cache: BlockCache, path: bytes, size: int = 0, mtime: int | None = None) -> None:
+        self.path = path
+        self.size = size
+        self.mtime = mtime
+        self.reader: Reader | None = None
+        self.handles = 0
+        self.proven_at = self.compared_at = cache.clock()
+        self.compare_after = NEVER
+        self.shown = self.given = self.lost = self.doubted = False
+        self.dead: MavftpfsError | None = None
+        self.kept: Kept | None = None
+        self.opened_at = NEVER
+        self.drops = 0
+        self.on_dropped: Callable[[Version], None] = lambda version: None
+        self._cache = cache
+        self._blocks: dict[int, bytearray] = {}
+        self._present = ExtentSet()
+        self._earlier = ExtentSet()  # held before the present reader; INVARIANT: a subset of _present
+        self._waiters: list[_Waiter] = []
+        self._arrived = 0
+        self.received = 0
+        self.received_at = NEVER
+
+    def __contains__(self, index: int) -> bool:
+        """Return whether the block is held."""
+        return index in self._blocks
 
     @property
-    def size(self) -> int:
-        """Size in bytes by the open reply."""
-        return self.blocks.size
+    def empty(self) -> bool:
+        """Whether no byte is held."""
+        return not self._blocks
+
+    @property
+    def waited_for(self) -> bool:
+        """Whether somebody waits for bytes."""
+        return bool(self._waiters)
+
+    @property
+    def done(self) -> int:
+        """How many of the file's bytes came, or are held from before."""
+        return min(self.size, max(self.received, self._present.total))
+
+    @property
+    def complete(self) -> bool:
+        """Whether every byte is held."""
+        return self._present.covers(0, self.size)
+
+    # --- the sink
+
+    def missing(self, start: int, stop: int) -> list[tuple[int, int]]:
+        """Return the parts of [start, stop) not yet held, within the file."""
+        return self._present.missing(start, min(stop, self.size))
+
+    def on_opened(self, at: float) -> None:
+        """What comes from now on is of the file that was opened at that time."""
+        self.opened_at = max(self.opened_at, at)
+
+    def on_data(self, offset: int, data: bytes | memoryview) -> None:
+        """Keep what is not held yet; what lies beyond the opened size is dropped."""
+        if self.doubted:
+            return
+        count = len(data)
+        block = self._blocks.get(offset // BLOCK_SIZE)
+        at = offset % BLOCK_SIZE
+        if block is not None and at + count <= len(block) and self._present.end <= offset:
+            # The usual chunk of a file that is read from front to back.
+            block[at : at + count] = data
+            self._present.add(offset, offset + count)
+            self._arrived += count
+            return
+        stop = min(offset + count, self.size)
+        for start, end in self._present.missing(offset, stop):
+            self._write(start, end, memoryview(data)[start - offset : end - offset])
+            self._arrived += end - start
+
+    def preload(self, offset: int, data: bytes | memoryview) -> None:
+        """Keep bytes that did not come over the link."""
+        for start, end in self._present.missing(offset, min(offset + len(data), self.size)):
+            self._write(start, end, memoryview(data)[start - offset : end - offset])
+
+    def on_batch(self) -> None:
+        """Wake those whose range is complete; give those whose range grew more time."""
+        if self._arrived:
+            self.received += self._arrived
+            self.received_at = self._cache.clock()
+            self._cache.meter.on_bytes(self._arrived, self._cache.clock())
+            self._arrived = 0
+        for waiter in self._waiters:
+            missing = self.missing(waiter.start, waiter.stop)
+            if not missing:
+                waiter.done.set()
+            elif missing != waiter.missing:
+                waiter.scope.deadline = trio.current_time() + self._cache.patience
+            waiter.missing = missing
+
+    def on_queued(self) -> None:
+        """The reader waits for its turn while the queue before it moves: those who wait get more time."""
+        for waiter in self._waiters:
+            waiter.scope.deadline = trio.current_time() + self._cache.patience
+
+    def on_suspect(self, reason: str) -> None:
+        """Drop what came since the reader was opened; whoever waits asks again."""
+        if self.doubted:
+            return
+        self.doubted = True
+        self.drops += 1
+        self._forget_but(self._earlier)
+        self.on_dropped(self)
+
+    def on_failed(self, error: Exception) -> None:
+        """Those who wait get the error; later reads ask again."""
+        for waiter in self._waiters:
+            if not waiter.done.is_set():
+                waiter.error = error
+                waiter.done.set()
+
+    def ask_again(self) -> None:
+        """Those who wait look again, and ask anew for what is missing: their reader is gone."""
+        for waiter in self._waiters:
+            waiter.done.set()
+
+    # --- life of the version
 
     @property
     def compared(self) -> bool:
         """Whether it was known to be the path's file since the server opened that the last time, or
         restarted."""
-        return self.compared_at >= self.blocks.opened_at
+        return self.compared_at >= self.opened_at
 
     def require_alive(self) -> None:
         """Raise FileChanged if the file became another one."""
         if self.dead is not None:
             raise self.dead.with_traceback(None)
 
-    def end(self, why: str) -> None:
-        """It is not the path's file any more; who waits for its bytes hears so."""
-        self.dead, self.kept = FileChanged(why), None
+    def begin_reading(self) -> None:
+        """A reader is about to be opened: what is held now did not come from it."""
         self.close_reader()
-        self.blocks.on_failed(self.dead)
-        self.blocks.clear()
-
-    def start_over(self, mtime: int | None, listed_at: float) -> None:
-        """Nothing of it was given out: it is the file that a listing of that time shows."""
-        self.mtime, self.kept = mtime, None
-        self.compared_at, self.compare_after = listed_at, NEVER
-        self.close_reader()
-        self.blocks.start_over()
+        self.doubted = False
+        self._earlier = self._present.copy()
 
     def close_reader(self) -> None:
         """Drop readahead and the remote reader."""
@@ -79,6 +278,127 @@ class Version:
         if reader is not None:
             reader.drop_readahead()
             reader.close()
+
+    def end(self, why: str) -> None:
+        """It is not the path's file any more; who waits for its bytes hears so."""
+        self.dead, self.kept = FileChanged(why), None
+        self.close_reader()
+        self.on_failed(self.dead)
+        self.clear()
+
+    def start_over(self, mtime: int | None, listed_at: float) -> None:
+        """Nothing of it was given out: it is the file that a listing of that time shows. Every byte goes."""
+        self.mtime, self.kept = mtime, None
+        self.compared_at, self.compare_after = listed_at, NEVER
+        self.close_reader()
+        self.drops += 1
+        self._forget_but(ExtentSet())
+        self.on_dropped(self)
+
+    def clear(self) -> None:
+        """Forget every block that no reader waits on."""
+        for index in list(self._blocks):
+            if not self.pinned(index):
+                self.evict(index)
+
+    # --- for the cache
+
+    def pinned(self, index: int) -> bool:
+        """Return whether somebody waits on the block."""
+        start, stop = self._extent(index)
+        return any(waiter.start < stop and start < waiter.stop for waiter in self._waiters)
+
+    def evict(self, index: int) -> None:
+        """Forget a block."""
+        self._forget_block(index)
+        start, stop = self._extent(index)
+        self._present.discard(start, stop)
+        self._earlier.discard(start, stop)
+
+    # --- reading
+
+    def get(self, start: int, stop: int) -> bytes | memoryview | None:
+        """Return [start, stop) if it is held; without a copy if it lies in one block.
+
+        0 <= start < stop <= size.
+        """
+        if not self._present.covers(start, stop):
+            return None
+        parts = []
+        while start < stop:
+            index = start // BLOCK_SIZE
+            self._cache.used.move_to_end((self, index))
+            base = index * BLOCK_SIZE
+            end = min(stop, base + BLOCK_SIZE)
+            parts.append(memoryview(self._blocks[index])[start - base : end - base].toreadonly())
+            start = end
+        return parts[0] if len(parts) == 1 else b"".join(parts)
+
+    async def wait_for(self, start: int, stop: int) -> None:
+        """Wait for what is missing of [start, stop), which was just asked for, at most a piece. `get` may
+        find nothing afterwards, where the bytes were dropped.
+
+        Raises:
+            RequestTimeout: none of the missing bytes came for `patience` seconds. Else what on_failed got.
+        """
+        missing = self.missing(start, stop)
+        if not missing:
+            return
+        scope = trio.CancelScope(deadline=trio.current_time() + self._cache.patience)
+        waiter = _Waiter(start, stop, missing, trio.Event(), scope)
+        self._waiters.append(waiter)
+        try:
+            with scope:
+                await waiter.done.wait()
+        finally:
+            self._waiters.remove(waiter)
+        if waiter.error is not None:
+            raise waiter.error.with_traceback(None)
+        if not waiter.done.is_set():
+            raise RequestTimeout(f"no data came for {self._cache.patience:g} s")
+
+    def check_invariants(self) -> None:
+        """Raise AssertionError if the books are wrong (for tests)."""
+        assert self._present.end <= self.size
+        for start, stop in self._earlier:
+            assert self._present.covers(start, stop)
+        for start, stop in self._present:
+            assert all(i in self._blocks for i in range(start // BLOCK_SIZE, -(-stop // BLOCK_SIZE)))
+
+    # --- inside
+
+    def _forget_but(self, kept: ExtentSet) -> None:
+        """Forget all bytes that are not in `kept`."""
+        self._present, self._earlier = kept.copy(), kept.copy()
+        for index in list(self._blocks):
+            if self._present.overlaps(*self._extent(index)):
+                self._blocks[index] = bytearray(self._blocks[index])  # a view of the old one may be in use
+            else:
+                self._forget_block(index)
+        self.ask_again()
+
+    def _extent(self, index: int) -> tuple[int, int]:
+        start = index * BLOCK_SIZE
+        return start, min(start + BLOCK_SIZE, self.size)
+
+    def _write(self, start: int, stop: int, data: memoryview) -> None:
+        while start < stop:
+            index = start // BLOCK_SIZE
+            block = self._blocks.get(index)
+            if block is None:
+                first, last = self._extent(index)
+                self._cache.add(self, index, last - first)
+                block = self._blocks[index] = bytearray(last - first)
+            base = index * BLOCK_SIZE
+            end = min(stop, base + BLOCK_SIZE)
+            block[start - base : end - base] = data[: end - start]
+            self._present.add(start, end)
+            data = data[end - start :]
+            start = end
+
+    def _forget_block(self, index: int) -> None:
+        del self._blocks[index]
+        self._cache.remove(self, index)
 
 
 def became_another(size: int, mtime: int | None, entry: DirEntry) -> bool:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from mavftpfs.cache.blocks import BLOCK_SIZE
+from mavftpfs.cache.versions import BLOCK_SIZE
 from tests.mount.conftest import Field
 from tests.support.mounts import Mount, wait_until
 from tests.support.requests import CountedVehicle, Counting

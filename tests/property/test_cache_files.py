@@ -10,10 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from trio.testing import MockClock
 
-from mavftpfs.cache.blocks import BLOCK_SIZE, BlockCache, FileBlocks
 from mavftpfs.cache.options import MIN_CACHE_SIZE
 from mavftpfs.cache.readahead import MAX_WINDOW, Readahead
 from mavftpfs.cache.tree import OpenFile, Tree
+from mavftpfs.cache.versions import BLOCK_SIZE, BlockCache, Version
 from mavftpfs.shared.errors import DataUnproven, FileChanged, RequestTimeout, VehicleLost
 from tests.support.fake_store import FakeStore, make_tree
 
@@ -44,7 +44,7 @@ steps = st.builds(
 def test_blocks_hold_what_came_first_and_only_that(size: int, script: list[Step], seed: int) -> None:
     """After each step, what is readable equals a model of bytes, and of which came before the reader."""
     cache = BlockCache(2 * BLOCK_SIZE, clock=lambda: 0.0, patience=30)
-    blocks = FileBlocks(cache, size)
+    blocks = Version(cache, b"/f", size)
     held: dict[int, int] = {}
     earlier: set[int] = set()
     rng = random.Random(seed)

@@ -95,7 +95,7 @@ async def test_the_end_of_a_copy_waits_for_the_news_of_a_reboot(profile: str, au
     """A vehicle may answer before it tells its boot time, and what is left may come in between."""
     card = Card(profile, SLOW)
     async with card.opened() as (tree, handle), trio.open_nursery() as nursery:
-        blocks = handle._version.blocks  # type: ignore[attr-defined]
+        blocks = handle._version  # type: ignore[attr-defined]
 
         async def reboot() -> None:
             for _ in range(10_000):
@@ -174,7 +174,7 @@ async def test_nobody_gets_the_head_of_one_file_and_the_rest_of_another(
 async def test_what_nobody_got_yet_is_read_anew(profile: str, autojump: MockClock) -> None:
     card = Card(profile)
     async with card.opened() as (_, handle):
-        blocks = handle._version.blocks  # type: ignore[attr-defined]
+        blocks = handle._version  # type: ignore[attr-defined]
         with trio.move_on_after(0.01):  # a read that is given up
             await handle.read(0, STEP)
         await trio.sleep(IDLE)

@@ -8,13 +8,13 @@ from pathlib import Path
 import pytest
 import trio
 
-from mavftpfs.cache.blocks import BLOCK_SIZE
 from mavftpfs.cache.dentries import Dentries
 from mavftpfs.cache.kept import CRC_LIMIT, PERIOD, SETTLED, KeptCache
 from mavftpfs.cache.kept_disk import KeptDisk
 from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.options import CacheOptions
 from mavftpfs.cache.tree import Tree
+from mavftpfs.cache.versions import BLOCK_SIZE
 from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.shared.errors import FileChanged, FtpNak
 from tests.support.fake_store import FakeStore, read_file

@@ -6,7 +6,6 @@ from typing import cast
 
 import pytest
 
-from mavftpfs.cache.blocks import SMALL_FILE, BlockCache
 from mavftpfs.cache.context import Context
 from mavftpfs.cache.readahead import (
     FIRST_WINDOW,
@@ -17,6 +16,7 @@ from mavftpfs.cache.readahead import (
     Readahead,
 )
 from mavftpfs.cache.throttle import Throttle
+from mavftpfs.cache.versions import SMALL_FILE, BlockCache
 
 KIB = 1024
 BIG = 100 * 1024 * KIB

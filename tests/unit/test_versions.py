@@ -9,7 +9,7 @@ import pytest
 import trio
 import trio.testing
 
-from mavftpfs.cache.blocks import BLOCK_SIZE, BlockCache, FileBlocks
+from mavftpfs.cache.versions import BLOCK_SIZE, BlockCache, Version
 from mavftpfs.shared.errors import RequestTimeout, VehicleLost
 
 KIB = 1024
@@ -24,7 +24,7 @@ def content(size: int, seed: int = 7) -> bytes:
     return random.Random(seed).randbytes(size + -size % 4)[:size]  # shorter ones are prefixes of longer ones
 
 
-def deliver(blocks: FileBlocks, offset: int, data: bytes, *, batch: bool = True) -> None:
+def deliver(blocks: Version, offset: int, data: bytes, *, batch: bool = True) -> None:
     blocks.on_data(offset, data)
     if batch:
         blocks.on_batch()
@@ -32,7 +32,7 @@ def deliver(blocks: FileBlocks, offset: int, data: bytes, *, batch: bool = True)
 
 
 async def read(
-    blocks: FileBlocks, start: int, stop: int, want: Callable[[], None] = lambda: None
+    blocks: Version, start: int, stop: int, want: Callable[[], None] = lambda: None
 ) -> bytes | memoryview | None:
     async with blocks._cache.reads:
         want()
@@ -43,7 +43,7 @@ async def read(
 class Reading:
     """A read under way in a nursery."""
 
-    def __init__(self, blocks: FileBlocks, start: int, stop: int) -> None:
+    def __init__(self, blocks: Version, start: int, stop: int) -> None:
         self.blocks = blocks
         self.range = (start, stop)
         self.wanted: list[list[tuple[int, int]]] = []
@@ -66,7 +66,7 @@ class Reading:
         self.wanted.append(self.blocks.missing(*self.range))
 
 
-async def start_read(nursery: trio.Nursery, blocks: FileBlocks, start: int, stop: int) -> Reading:
+async def start_read(nursery: trio.Nursery, blocks: Version, start: int, stop: int) -> Reading:
     reading = Reading(blocks, start, stop)
     nursery.start_soon(reading.run)
     await trio.testing.wait_all_tasks_blocked()
@@ -78,7 +78,7 @@ async def start_read(nursery: trio.Nursery, blocks: FileBlocks, start: int, stop
 
 async def test_bytes_come_back_from_any_split() -> None:
     data = content(3 * BLOCK_SIZE + 100)
-    blocks = FileBlocks(make_cache(), len(data))
+    blocks = Version(make_cache(), b"/f", len(data))
     for start in range(0, len(data), 239):
         deliver(blocks, start, data[start : start + 239])
     assert blocks.complete
@@ -94,7 +94,7 @@ async def test_bytes_come_back_from_any_split() -> None:
 
 
 async def test_a_read_within_a_block_is_a_view_that_cannot_be_written() -> None:
-    blocks = FileBlocks(make_cache(), 100)
+    blocks = Version(make_cache(), b"/f", 100)
     deliver(blocks, 0, content(100))
     view = blocks.get(10, 20)
     assert isinstance(view, memoryview)
@@ -102,14 +102,14 @@ async def test_a_read_within_a_block_is_a_view_that_cannot_be_written() -> None:
 
 
 async def test_what_is_present_is_never_overwritten() -> None:
-    blocks = FileBlocks(make_cache(), 1000)
+    blocks = Version(make_cache(), b"/f", 1000)
     deliver(blocks, 100, b"A" * 100)
     deliver(blocks, 50, b"B" * 200)
     assert bytes(blocks.get(50, 250) or b"") == b"B" * 50 + b"A" * 100 + b"B" * 50
 
 
 async def test_what_lies_beyond_the_opened_size_is_dropped() -> None:
-    blocks = FileBlocks(make_cache(), 100)
+    blocks = Version(make_cache(), b"/f", 100)
     deliver(blocks, 90, b"x" * 50)
     deliver(blocks, 100, b"x" * 50)
     deliver(blocks, 5000, b"x" * 50)
@@ -118,7 +118,7 @@ async def test_what_lies_beyond_the_opened_size_is_dropped() -> None:
 
 @pytest.mark.holds("promise 1")
 async def test_a_hole_is_not_readable() -> None:
-    blocks = FileBlocks(make_cache(), 1000)
+    blocks = Version(make_cache(), b"/f", 1000)
     deliver(blocks, 0, b"x" * 100)
     deliver(blocks, 101, b"x" * 100)
     assert blocks.get(0, 201) is None
@@ -127,7 +127,7 @@ async def test_a_hole_is_not_readable() -> None:
 
 
 async def test_an_empty_file_is_complete_and_empty() -> None:
-    blocks = FileBlocks(make_cache(), 0)
+    blocks = Version(make_cache(), b"/f", 0)
     assert blocks.complete
     assert blocks.empty
 
@@ -137,7 +137,7 @@ async def test_an_empty_file_is_complete_and_empty() -> None:
 
 async def test_least_recently_read_blocks_go_first() -> None:
     cache = make_cache(4 * BLOCK_SIZE)
-    first, second = FileBlocks(cache, 3 * BLOCK_SIZE), FileBlocks(cache, 2 * BLOCK_SIZE)
+    first, second = Version(cache, b"/f", 3 * BLOCK_SIZE), Version(cache, b"/f", 2 * BLOCK_SIZE)
     deliver(first, 0, content(3 * BLOCK_SIZE))
     deliver(second, 0, content(BLOCK_SIZE))
     assert first.get(0, 1) is not None
@@ -150,7 +150,7 @@ async def test_least_recently_read_blocks_go_first() -> None:
 
 async def test_memory_stays_within_the_budget_for_a_file_ten_times_the_cache() -> None:
     cache = make_cache(4 * BLOCK_SIZE)
-    blocks = FileBlocks(cache, 40 * BLOCK_SIZE)
+    blocks = Version(cache, b"/f", 40 * BLOCK_SIZE)
     for index in range(40):
         deliver(blocks, index * BLOCK_SIZE, content(BLOCK_SIZE, index))
         cache.check_invariants()
@@ -162,7 +162,7 @@ async def test_memory_stays_within_the_budget_for_a_file_ten_times_the_cache() -
 
 async def test_small_files_cost_their_size() -> None:
     cache = make_cache()
-    blocks = FileBlocks(cache, 100)
+    blocks = Version(cache, b"/f", 100)
     deliver(blocks, 0, b"x")
     assert cache.bytes_cached == 100
     blocks.clear()
@@ -172,10 +172,10 @@ async def test_small_files_cost_their_size() -> None:
 
 async def test_blocks_with_waiters_are_not_evicted(nursery: trio.Nursery) -> None:
     cache = make_cache(4 * BLOCK_SIZE)
-    waited = FileBlocks(cache, 2 * BLOCK_SIZE)
+    waited = Version(cache, b"/f", 2 * BLOCK_SIZE)
     deliver(waited, 0, content(BLOCK_SIZE))
     reading = await start_read(nursery, waited, 0, 2 * BLOCK_SIZE)
-    other = FileBlocks(cache, 10 * BLOCK_SIZE)
+    other = Version(cache, b"/f", 10 * BLOCK_SIZE)
     for index in range(10):
         deliver(other, index * BLOCK_SIZE, content(BLOCK_SIZE))
     waited.clear()
@@ -188,7 +188,7 @@ async def test_blocks_with_waiters_are_not_evicted(nursery: trio.Nursery) -> Non
 
 
 async def test_evicted_bytes_are_not_proven_any_more() -> None:
-    blocks = FileBlocks(make_cache(), 2 * BLOCK_SIZE)
+    blocks = Version(make_cache(), b"/f", 2 * BLOCK_SIZE)
     deliver(blocks, 0, content(2 * BLOCK_SIZE))
     blocks.begin_reading()
     blocks.evict(0)
@@ -202,7 +202,7 @@ async def test_evicted_bytes_are_not_proven_any_more() -> None:
 
 
 async def test_a_reader_asks_for_what_is_missing_and_gets_it(nursery: trio.Nursery) -> None:
-    blocks = FileBlocks(make_cache(), 1000)
+    blocks = Version(make_cache(), b"/f", 1000)
     data = content(1000)
     deliver(blocks, 300, data[300:400])
     reading = await start_read(nursery, blocks, 200, 600)
@@ -216,14 +216,14 @@ async def test_a_reader_asks_for_what_is_missing_and_gets_it(nursery: trio.Nurse
 
 
 async def test_what_is_present_costs_no_wait() -> None:
-    blocks = FileBlocks(make_cache(), 10)
+    blocks = Version(make_cache(), b"/f", 10)
     deliver(blocks, 0, content(10))
     assert bytes(await read(blocks, 0, 10) or b"") == content(10)
     assert trio.current_time() == 0
 
 
 async def test_readers_wake_once_per_batch(nursery: trio.Nursery) -> None:
-    blocks = FileBlocks(make_cache(), 1000)
+    blocks = Version(make_cache(), b"/f", 1000)
     reading = await start_read(nursery, blocks, 0, 1000)
     deliver(blocks, 0, content(1000), batch=False)
     await trio.testing.wait_all_tasks_blocked()
@@ -234,7 +234,7 @@ async def test_readers_wake_once_per_batch(nursery: trio.Nursery) -> None:
 
 
 async def test_no_progress_for_patience_is_a_timeout(nursery: trio.Nursery) -> None:
-    blocks = FileBlocks(make_cache(), 1000)
+    blocks = Version(make_cache(), b"/f", 1000)
     reading = await start_read(nursery, blocks, 0, 1000)
     await trio.sleep(20)
     deliver(blocks, 0, content(10))
@@ -245,7 +245,7 @@ async def test_no_progress_for_patience_is_a_timeout(nursery: trio.Nursery) -> N
 
 @pytest.mark.holds("promise 4")
 async def test_only_bytes_of_the_own_range_are_progress(nursery: trio.Nursery) -> None:
-    blocks = FileBlocks(make_cache(), 1000)
+    blocks = Version(make_cache(), b"/f", 1000)
     mine = await start_read(nursery, blocks, 0, 100)
     for step in range(60):
         await trio.sleep(1)
@@ -256,7 +256,7 @@ async def test_only_bytes_of_the_own_range_are_progress(nursery: trio.Nursery) -
 
 
 async def test_slow_but_steady_is_no_timeout(nursery: trio.Nursery) -> None:
-    blocks = FileBlocks(make_cache(), 10)
+    blocks = Version(make_cache(), b"/f", 10)
     reading = await start_read(nursery, blocks, 0, 10)
     for offset in range(10):
         await trio.sleep(29)
@@ -266,7 +266,7 @@ async def test_slow_but_steady_is_no_timeout(nursery: trio.Nursery) -> None:
 
 
 async def test_failure_reaches_those_who_wait_and_no_later_read(nursery: trio.Nursery) -> None:
-    blocks = FileBlocks(make_cache(), 100)
+    blocks = Version(make_cache(), b"/f", 100)
     readings = [await start_read(nursery, blocks, 0, 50), await start_read(nursery, blocks, 0, 100)]
     deliver(blocks, 0, content(50))
     blocks.on_failed(VehicleLost("gone"))
@@ -282,7 +282,7 @@ async def test_failure_reaches_those_who_wait_and_no_later_read(nursery: trio.Nu
 
 async def test_a_cancelled_read_leaves_nothing_behind(nursery: trio.Nursery) -> None:
     cache = make_cache(4 * BLOCK_SIZE)
-    blocks = FileBlocks(cache, 100)
+    blocks = Version(cache, b"/f", 100)
     reading = await start_read(nursery, blocks, 0, 100)
     reading.scope.cancel()
     await trio.testing.wait_all_tasks_blocked()
@@ -298,7 +298,7 @@ async def test_a_cancelled_read_leaves_nothing_behind(nursery: trio.Nursery) -> 
 
 async def test_reads_that_wait_pin_no_more_than_half_and_take_turns(nursery: trio.Nursery) -> None:
     cache = make_cache(8 * BLOCK_SIZE)
-    blocks = FileBlocks(cache, 20 * BLOCK_SIZE)
+    blocks = Version(cache, b"/f", 20 * BLOCK_SIZE)
     readings = [await start_read(nursery, blocks, i * BLOCK_SIZE, (i + 1) * BLOCK_SIZE) for i in range(4)]
     assert [len(reading.wanted) for reading in readings] == [1, 1, 0, 0]
     deliver(blocks, 0, content(BLOCK_SIZE))
@@ -313,9 +313,10 @@ async def test_reads_that_wait_pin_no_more_than_half_and_take_turns(nursery: tri
 
 
 async def test_doubtful_bytes_are_dropped_and_older_ones_are_not() -> None:
-    cache, told = make_cache(), []
-    blocks = FileBlocks(cache, 3 * BLOCK_SIZE)
-    blocks.on_dropped = lambda: told.append(True)
+    cache = make_cache()
+    told: list[Version] = []
+    blocks = Version(cache, b"/f", 3 * BLOCK_SIZE)
+    blocks.on_dropped = told.append
     deliver(blocks, 0, content(10))
     blocks.begin_reading()
     deliver(blocks, 10, content(2 * BLOCK_SIZE))
@@ -324,7 +325,7 @@ async def test_doubtful_bytes_are_dropped_and_older_ones_are_not() -> None:
     before = bytes(old)
     for _ in range(2):
         blocks.on_suspect("test")
-    assert (blocks.drops, told) == (1, [True])
+    assert (blocks.drops, told) == (1, [blocks])
     assert blocks.missing(0, 3 * BLOCK_SIZE) == [(10, 3 * BLOCK_SIZE)]
     assert cache.bytes_cached == BLOCK_SIZE
     deliver(blocks, 10, b"\xff" * 20)  # from the reader that is in doubt
@@ -337,7 +338,7 @@ async def test_doubtful_bytes_are_dropped_and_older_ones_are_not() -> None:
 
 
 async def test_a_doubt_wakes_those_who_wait(nursery: trio.Nursery) -> None:
-    blocks = FileBlocks(make_cache(), 100)
+    blocks = Version(make_cache(), b"/f", 100)
     reading = await start_read(nursery, blocks, 0, 100)
     blocks.on_suspect("test")
     await trio.testing.wait_all_tasks_blocked()
@@ -346,7 +347,7 @@ async def test_a_doubt_wakes_those_who_wait(nursery: trio.Nursery) -> None:
 
 async def test_the_rate_is_measured_from_what_arrives() -> None:
     cache = make_cache()
-    blocks = FileBlocks(cache, 10_000)
+    blocks = Version(cache, b"/f", 10_000)
     for step in range(20):
         deliver(blocks, step * 100, b"x" * 100)
         deliver(blocks, step * 100, b"x" * 100)  # known bytes are no traffic worth counting
