@@ -11,7 +11,6 @@ from typing import Any
 
 import pytest
 
-from mavftpfs.protocol.crc import crc32
 from tests.mount.conftest import Field
 from tests.support.logs import suspects
 from tests.support.mounts import COMMAND_TIMEOUT
@@ -68,17 +67,10 @@ def test_get_is_verified(vehicle: SimVehicle, small_tree: Path, tmp_path: Path) 
         assert list(differing(os.fsencode(small_tree / folder), os.fsencode(tmp_path / folder))) == []
 
 
-def test_crc(vehicle: SimVehicle, small_tree: Path) -> None:
-    out, _ = mavftpfs("crc", vehicle.source, "/sizes/478.bin")
-    assert out == f"{crc32((small_tree / 'sizes/478.bin').read_bytes()):08x}  /sizes/478.bin\n"
-
-
 @pytest.mark.parametrize(
     ("words", "named"),
     [
         (("ls", "/none"), "/none"),
-        (("get", "/sizes"), "-r"),
-        (("get", "/README.txt", "--to", "/proc/none/here"), "/proc/none/here"),
         (("rmdir", "/sizes"), "empty"),
     ],
 )
@@ -89,14 +81,6 @@ def test_what_cannot_be_done_is_a_line_and_exit_1(
     assert out == ""
     assert len(complaint) == 1, complaint
     assert named in complaint[0]
-
-
-def test_files_that_are_made_when_opened(module_field: Field, small_tree: Path, tmp_path: Path) -> None:
-    out, _ = mavftpfs(
-        "get", module_field.sim(small_tree, "ardupilot5").source, "mftp://@SYS/uarts.txt", "--to", tmp_path
-    )
-    assert "verified by size (generated" in out
-    assert (tmp_path / "uarts.txt").stat().st_size > 0
 
 
 def test_scan_shows_who_answers(vehicle: SimVehicle) -> None:

@@ -12,7 +12,7 @@ import pytest
 
 from tests.mount.conftest import Field
 from tests.support.logs import suspects
-from tests.support.mounts import COMMAND_TIMEOUT, Mount, abort_mount, mounted_at, processes_in, wait_until
+from tests.support.mounts import COMMAND_TIMEOUT, abort_mount, mounted_at, processes_in, wait_until
 from tests.support.vehicles import HOST, PROJECT, free_udp_port
 
 NOBODY = f"udpin:{HOST}:0"
@@ -36,52 +36,6 @@ def mountpoint(tmp_path: Path) -> Path:
     path = tmp_path / "mnt"
     path.mkdir()
     return path
-
-
-@pytest.mark.parametrize("option", ["frobnicate", "max_read=4096", "cache_sise=1M", "ro=1", "umask=999"])
-def test_a_wrong_option_is_named(mountpoint: Path, option: str) -> None:
-    line = mavftpfs(NOBODY, mountpoint, "-o", f"rw,{option}", code=1)
-    assert option.partition("=")[0] in line
-
-
-@pytest.mark.parametrize("option", ["log_file", "trace", "tlog"])
-def test_a_file_that_cannot_be_written_is_named(mountpoint: Path, option: str) -> None:
-    line = mavftpfs(NOBODY, mountpoint, "-o", f"{option}=/proc/none/file", code=1)
-    assert "/proc/none/file" in line
-
-
-@pytest.mark.parametrize("source", ["warp:somewhere", "udpin:127.0.0.1:notaport", "udpin:127.0.0.1:99999"])
-def test_a_wrong_source_is_named(mountpoint: Path, source: str) -> None:
-    assert source in mavftpfs(source, mountpoint, code=1)
-
-
-def test_a_missing_mountpoint_is_exit_3(tmp_path: Path) -> None:
-    line = mavftpfs(f"udpin:{HOST}:{free_udp_port()}", tmp_path / "nowhere", code=3)
-    assert str(tmp_path / "nowhere") in line
-
-
-def test_a_file_as_mountpoint_is_exit_3(tmp_path: Path) -> None:
-    (tmp_path / "file").touch()
-    assert "not a directory" in mavftpfs(f"udpin:{HOST}:{free_udp_port()}", tmp_path / "file", code=3)
-
-
-def test_a_dead_mountpoint_is_exit_3_and_says_the_cure(field: Field, small_tree: Path) -> None:
-    vehicle = field.sim(small_tree)
-    mount = field.mount(vehicle.source)
-    mount.kill()
-    try:
-        line = mavftpfs(vehicle.source, mount.path, code=3)
-        assert f"mavftpfs umount {mount.path}" in line
-    finally:
-        abort_mount(mount.path)
-    again = Mount(vehicle.source, mount.path, mount.folder)
-    again.start()
-    again.finish()
-
-
-def test_a_second_mount_on_the_same_place_is_refused(field: Field, small_tree: Path) -> None:
-    mount = field.mount(field.sim(small_tree).source)
-    assert str(mount.path) in mavftpfs(f"udpin:{HOST}:{free_udp_port()}", mount.path, code=3)
 
 
 @pytest.mark.parametrize("foreground", [True, False], ids=["foreground", "daemon"])
@@ -118,13 +72,6 @@ def test_no_fuse_device_is_exit_3(mountpoint: Path) -> None:
     assert done.returncode == 3, done.stderr
     assert len(done.stderr.splitlines()) == 1
     assert "/dev/fuse" in done.stderr
-
-
-def test_no_arguments_is_exit_1_with_help() -> None:
-    command = [sys.executable, "-m", "mavftpfs"]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=30, cwd=PROJECT, check=False)
-    assert done.returncode == 1
-    assert "usage" in (done.stdout + done.stderr).lower()
 
 
 @pytest.mark.holds("rule 14.33")

@@ -48,7 +48,7 @@ def run_fio(mount: Mount, place: Place, job: str, size: int, seed: int = 1) -> N
     mount.run("rm", "-r", folder)
 
 
-@pytest.fixture(scope="module", params=["px4", REAL])
+@pytest.fixture(scope="module", params=[REAL])
 def mounted(request: pytest.FixtureRequest, module_field: Field) -> tuple[Mount, Place]:
     """A mount of an empty card."""
     place = start_place(module_field, request.param)

@@ -27,10 +27,9 @@ FULL = ("No space left on device", "Input/output error")
 PLAIN_WORDS = ("px4", "px4-nuttx", "ardupilot")
 """Servers that say what it is; FatFs below ArduPilot and MAVSDK have but one word for all failures."""
 
-IN_SOAK = ("ardupilot", "px4-nuttx", "mavsdk")
+IN_SOAK = ("ardupilot", "ardupilot5", "px4-nuttx", "mavsdk")
 KINDS = [
-    pytest.param(kind, marks=pytest.mark.soak if kind in IN_SOAK else ())
-    for kind in ("px4", "ardupilot5", REAL, *IN_SOAK)
+    pytest.param(kind, marks=pytest.mark.soak if kind in IN_SOAK else ()) for kind in ("px4", REAL, *IN_SOAK)
 ]
 
 

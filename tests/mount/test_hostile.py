@@ -53,10 +53,6 @@ def test_good_files_among_bad_names_are_readable(liar: Mount) -> None:
         assert liar.read_bytes(liar.path / "names" / name) == GOOD
 
 
-def test_a_whole_file_is_right(liar: Mount) -> None:
-    assert liar.read_bytes(liar.path / "fine.bin") == FINE
-
-
 @pytest.mark.holds("promise 8")
 @pytest.mark.parametrize("directory", ["endless", "same"])
 def test_endless_listings_end_with_an_error(liar: Mount, directory: str) -> None:

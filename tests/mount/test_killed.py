@@ -17,7 +17,7 @@ from tests.support.vehicles import PROJECT
 
 pytestmark = pytest.mark.holds("promise 4")
 
-ROUNDS = 60
+ROUNDS = 20
 ASKER = PROJECT / "tests/support/programs/asker.py"
 
 

@@ -29,7 +29,7 @@ COPIES = {
 """Vehicle -> (bytes to copy, options of the link), so that the copy takes several seconds."""
 
 
-IN_SOAK = ("px4", "mavsdk")
+IN_SOAK = ("px4", "px4-nuttx", "ardupilot", "mavsdk")
 
 
 @pytest.mark.holds("promise 7")

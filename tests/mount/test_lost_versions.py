@@ -72,22 +72,20 @@ assert got == b"o" * len(got)
 """
 
 
-@pytest.mark.parametrize("profile", ["mavsdk", "px4-2026"])
-def test_a_slow_reader_gets_nothing_of_a_successor_of_the_same_size(field: Field, profile: str) -> None:
+def test_a_slow_reader_gets_nothing_of_a_successor_of_the_same_size(field: Field) -> None:
     card = field.local("card")
     file = card / "file.bin"
     file.write_bytes(b"o" * 4_000_000)
     os.utime(file, (1_500_000_000,) * 2)
-    mount = field.mount(field.sim(card, profile).source)
+    mount = field.mount(field.sim(card, "mavsdk").source)
     mount.python(SLOW_READER, mount.path / "file.bin", file, timeout=60)
 
 
-@pytest.mark.parametrize("profile", ["ardupilot5"])
-def test_who_has_the_old_file_open_gets_nothing_of_the_new_one(field: Field, profile: str) -> None:
+def test_who_has_the_old_file_open_gets_nothing_of_the_new_one(field: Field) -> None:
     card = field.local("card")
     file = card / "file.bin"
     file.write_bytes(b"old" * 300)
     os.utime(file, (1_500_000_000,) * 2)
-    mount = field.mount(field.sim(card, profile).source, "dir_timeout=0.1")
+    mount = field.mount(field.sim(card, "ardupilot5").source, "dir_timeout=0.1")
     mount.python(PROGRAM, mount.path / "file.bin", file, timeout=60)
     assert file.read_bytes() == b"mid" + b"NEW" * 299

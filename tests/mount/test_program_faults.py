@@ -17,7 +17,7 @@ from tests.support.vehicles import SimVehicle
 
 DATA = content("program", 60_000)
 SLOW = ("--rate", "40000")
-SHORT = ("px4", "mavsdk")
+SHORT = ("px4",)
 KINDS = [
     pytest.param(kind, marks=() if kind in SHORT else pytest.mark.soak)
     for kind in sorted(FOLDERS)

@@ -5,7 +5,6 @@ Each vehicle is mounted once for all tests of this module. Every tool runs as it
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
 from dataclasses import dataclass
@@ -21,7 +20,8 @@ from tests.support.trees import AWKWARD_SIZES, MANY, build_tree
 from tests.support.vehicles import UdpVehicle
 
 BAD_LINK = ("--seed", "7", "--loss", "0.05", "--dup", "0.02", "--reorder", "0.02", "--corrupt", "0.01")
-VEHICLES = taking_turns((*PROFILES, "mavsdk-server", "mavsdk-server-bad-link"))
+VEHICLES = taking_turns((*PROFILES, "mavsdk-server", "mavsdk-server-bad-link"), soak=("mavsdk",))
+"""The library's own server says more about MAVSDK than a simulated one."""
 
 SLOW = ("ardupilot", "littlefs")
 """Servers that send no times either, so that each tool reads again."""
@@ -63,12 +63,6 @@ def scene(request: pytest.FixtureRequest, module_field: Field, tree: Path, tree_
     return Scene(expected, module_field.mount(vehicle.source, "ro"), vehicle)
 
 
-@pytest.mark.holds("rule 14.32")
-def test_a_slow_server_gives_the_whole_tree_too(field: Field, tree: Path) -> None:
-    mount = field.mount(field.sim(tree, "ardupilot").source)
-    mount.run(sys.executable, "-m", "tests.support.trees", "compare", tree, mount.path, timeout=240)
-
-
 def bytes_of(*argv: str | Path) -> bytes:
     """Return what a command prints of a local file."""
     return subprocess.run([str(a) for a in argv], check=True, capture_output=True, timeout=30).stdout
@@ -82,29 +76,16 @@ def local_copy_differs(expected: Path, actual: Path) -> str:
     ).stdout
 
 
-@pytest.mark.holds("promise 1", "rule 14.36")
+@pytest.mark.holds("promise 1", "rule 14.32", "rule 14.36")
 def test_walk_finds_the_same_names_sizes_and_bytes(scene: Scene) -> None:
     command = (sys.executable, "-m", "tests.support.trees", "compare", scene.expected, scene.path)
     scene.mount.run(*command, timeout=240)
-
-
-def test_diff_r_finds_nothing(scene: Scene) -> None:
-    result = scene.mount.run("diff", "-r", "-x", "@*", scene.expected, scene.path, timeout=240)
-    assert result.stdout == ""
 
 
 def test_cp_r_copies_the_tree(scene: Scene, tmp_path: Path) -> None:
     for part in ("sizes", "names", "deep", "many"):
         scene.mount.run("cp", "-r", scene.path / part, tmp_path / part, timeout=240)
         assert local_copy_differs(scene.expected / part, tmp_path / part) == ""
-
-
-def test_cmp_and_cat(scene: Scene) -> None:
-    for path in sorted((scene.expected / "sizes").iterdir()):
-        name = f"sizes/{path.name}"
-        scene.mount.run("cmp", scene.expected / name, scene.path / name, timeout=120)
-    out = scene.mount.run("cat", scene.path / "deep/d0/d1/at2.txt", scene.path / "README.txt").stdout
-    assert out == "level 2\n" + (scene.expected / "README.txt").read_text()
 
 
 def test_dd_reads_odd_offsets(scene: Scene, tmp_path: Path) -> None:
@@ -115,10 +96,13 @@ def test_dd_reads_odd_offsets(scene: Scene, tmp_path: Path) -> None:
         assert copy.read_bytes() == bytes_of("dd", f"if={scene.expected / name}", *numbers)
 
 
-def test_tail_reads_the_end_alone(scene: Scene) -> None:
+def test_tail_and_df(scene: Scene) -> None:
     code = "import sys; f = open(sys.argv[1], 'rb'); f.seek(-300, 2); print(f.read().hex(), f.read(), end='')"
     out = scene.mount.python(code, scene.path / "sizes/131073.bin")
     assert out == (scene.expected / "sizes/131073.bin").read_bytes()[-300:].hex() + " b''"
+    last = scene.mount.run("df", "--output=size,avail,target", "-B1", scene.path).stdout.splitlines()[-1]
+    assert last.split()[-1] == str(scene.path)
+    assert int(last.split()[0]) > 0
 
 
 def test_find_and_ls_and_du_agree_with_the_disk(scene: Scene) -> None:
@@ -136,12 +120,6 @@ def test_find_and_ls_and_du_agree_with_the_disk(scene: Scene) -> None:
     assert kilobytes >= expected // 1024
 
 
-def test_df_answers(scene: Scene) -> None:
-    last = scene.mount.run("df", "--output=size,avail,target", "-B1", scene.path).stdout.splitlines()[-1]
-    assert last.split()[-1] == str(scene.path)
-    assert int(last.split()[0]) > 0
-
-
 def test_rsync_twice_transfers_once(scene: Scene, tmp_path: Path) -> None:
     argv = ("rsync", "-a", "--exclude", "@*", "--itemize-changes", f"{scene.path}/", f"{tmp_path}/copy/")
     first = scene.mount.run(*argv, timeout=240).stdout
@@ -149,14 +127,6 @@ def test_rsync_twice_transfers_once(scene: Scene, tmp_path: Path) -> None:
     assert local_copy_differs(scene.expected, tmp_path / "copy") == ""
     second = scene.mount.run(*argv, timeout=120).stdout
     assert second == ""
-
-
-def test_tar_packs_the_tree(scene: Scene, tmp_path: Path) -> None:
-    archive = tmp_path / "all.tar"
-    scene.mount.run("tar", "-cf", archive, "--exclude", "./@*", "-C", scene.path, ".", timeout=240)
-    (tmp_path / "out").mkdir()
-    subprocess.run(["tar", "-xf", archive, "-C", tmp_path / "out"], check=True, timeout=60)
-    assert local_copy_differs(scene.expected, tmp_path / "out") == ""
 
 
 WRITES = (
@@ -186,12 +156,3 @@ def test_what_is_not_there_is_enoent(scene: Scene) -> None:
         assert scene.mount.errno_of("os.stat(sys.argv[1])", scene.path / name) == "ENOENT"
     assert scene.mount.errno_of("os.listdir(sys.argv[1])", scene.path / "README.txt") == "ENOTDIR"
     assert scene.mount.errno_of("open(sys.argv[1])", scene.path / "sizes") == "EISDIR"
-
-
-def test_attributes_are_sane(scene: Scene) -> None:
-    code = "import os, sys; s = os.stat(sys.argv[1]); print(oct(s.st_mode), s.st_uid, s.st_nlink, s.st_mtime)"
-    mode, uid, links, mtime = scene.mount.python(code, scene.path / "README.txt").split()
-    assert (mode[:4], int(uid), int(links)) == ("0o10", os.getuid(), 1)
-    assert mode[-3:] in ("644", "444")
-    again = scene.mount.python(code, scene.path / "README.txt").split()
-    assert again[3] == mtime, "an mtime that moves makes every rsync copy everything"

@@ -124,47 +124,46 @@ def test_what_was_kept_is_listed_and_put_back_on_demand(field: Field, data: Path
     assert list(state.iterdir()) == []
 
 
-def test_a_file_that_was_changed_since_is_replaced_only_by_force(
-    field: Field, data: Path, state: Path
+def keep(state: Path, **files: dict[str, object]) -> Path:
+    """Leave files as a mount that could not deliver them does; return their directory."""
+    directory = state / "20261123-120000-1-udpin"
+    directory.mkdir(parents=True)
+    for name, facts in files.items():
+        (directory / name).write_bytes(b"kept here")
+        (directory / f"{name}.json").write_text(json.dumps(facts))
+    return directory
+
+
+def test_what_changed_since_is_replaced_only_by_force_and_what_is_there_is_not_sent(
+    field: Field, state: Path
 ) -> None:
-    _, vehicle, card = left_behind(field, data)
-    (card / "lost.bin").write_bytes(b"somebody else's")
-    _, said = run("recover", vehicle.source, "--all", code=ExitCode.USAGE)
-    assert "/lost.bin has 15 bytes on the vehicle, and had nothing when this was kept" in said
-    assert (card / "lost.bin").read_bytes() == b"somebody else's"
-    run("recover", vehicle.source, "--all", "--force")
-    assert (card / "lost.bin").read_bytes() == data.read_bytes()
-    assert list(state.iterdir()) == []
-
-
-def test_what_is_there_already_is_not_sent(field: Field, data: Path, state: Path) -> None:
-    _, vehicle, card = left_behind(field, data)
-    (card / "lost.bin").write_bytes(data.read_bytes())
-    os.utime(card / "lost.bin", (1, 1))
-    assert "was there already" in run("recover", vehicle.source, "--all")[0]
-    assert (card / "lost.bin").stat().st_mtime == 1
+    card = field.local("card")
+    source = field.sim(card).source
+    keep(state, changed={"path": "/changed"}, same={"path": "/same"})
+    (card / "changed").write_bytes(b"somebody else's")
+    (card / "same").write_bytes(b"kept here")
+    os.utime(card / "same", (1, 1))
+    said = "".join(run("recover", source, "--all", code=ExitCode.USAGE))
+    assert "/changed has 15 bytes on the vehicle, and had nothing when this was kept" in said
+    assert "was there already" in said
+    assert ((card / "changed").read_bytes(), (card / "same").stat().st_mtime) == (b"somebody else's", 1)
+    run("recover", source, "--all", "--force")
+    assert (card / "changed").read_bytes() == b"kept here"
     assert list(state.iterdir()) == []
 
 
 def test_a_part_of_a_file_is_not_put_back(field: Field, state: Path) -> None:
     """What a killed mount held of a file that was being written, and of one that was changed in part."""
     card = field.local("card")
-    directory = state / "20261123-120000-1-udpin"
-    directory.mkdir(parents=True)
-    for name, facts in (
-        ("being-written", {"path": "/being-written", "unfinished": True}),
-        ("changed", {"path": "/changed", "whole": False, "size_on_vehicle": 9}),
-        ("unknown", {}),
-    ):
-        (directory / name).write_bytes(b"part")
-        (directory / f"{name}.json").write_text(json.dumps(facts))
-    source = field.sim(card).source
-    for name, reason in (
-        ("being-written", "a program was still writing it"),
-        ("changed", "only the changed parts of it are here"),
-        ("unknown", "where it belongs was not written down"),
-    ):
-        assert reason in run("recover")[0]
-        assert reason in run("recover", source, directory / name, "--force", code=ExitCode.USAGE)[1]
+    directory = keep(
+        state,
+        written={"path": "/written", "unfinished": True},
+        changed={"path": "/changed", "whole": False, "size_on_vehicle": 9},
+        unknown={},
+    )
+    listed = run("recover")[0]
+    for reason in ("a program was still writing it", "only the changed parts of it", "was not written down"):
+        assert reason in listed
+    run("recover", field.sim(card).source, directory / "changed", "--force", code=ExitCode.USAGE)
     assert list(card.iterdir()) == []
     assert len(list(directory.iterdir())) == 6

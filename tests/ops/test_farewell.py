@@ -49,12 +49,6 @@ async def test_a_tree_that_holds_nothing_is_left_without_a_word() -> None:
     assert tree.calls == []
 
 
-async def test_what_is_held_is_delivered_first() -> None:
-    tree = Patient(left=[b"/a"])
-    assert await end_of(tree) == []
-    assert [name for name, _ in tree.calls] == ["drain"]
-
-
 async def test_what_cannot_be_delivered_is_kept_and_said(state: Path) -> None:
     tree = Patient(left=[b"/a", b"/b"])
     tree.can = False
@@ -88,11 +82,6 @@ async def test_a_recovery_directory_that_cannot_be_made_is_said() -> None:
     (line,) = await end_of(Full(left=[b"/a"]))
     assert "1 file(s) did not reach the vehicle" in line
     assert "No space left" in line
-
-
-def test_without_a_sane_state_home_it_is_below_home(monkeypatch: pytest.MonkeyPatch) -> None:
-    for value in ({}, {"XDG_STATE_HOME": "relative"}):
-        assert farewell.state_directory(value) == Path.home() / ".local" / "state"
 
 
 @pytest.mark.holds("promise 3")

@@ -144,27 +144,8 @@ async def test_what_does_not_arrive_is_undelivered(local: Path, call: str) -> No
 # -- names ----------------------------------------------------------------------------------------
 
 
-async def mkdir(tree: Card, *paths: bytes, parents: bool = False) -> None:
-    await names.make_directories(session_of(tree), paths, parents=parents)
-
-
-async def test_mkdir_with_parents() -> None:
-    tree = Card({b"/f": b""}, {b"/a"})
-    await mkdir(tree, b"/a/b/c", b"/a", b"/", parents=True)
-    assert tree.directories == {b"/a", b"/a/b", b"/a/b/c"}
-    with pytest.raises(AlreadyExists):
-        await mkdir(tree, b"/f", parents=True)
-
-
 async def rm(tree: Card, *paths: bytes, recursive: bool = False) -> None:
     await names.remove_paths(session_of(tree), paths, recursive=recursive)
-
-
-async def test_rm_of_files_and_of_all_below() -> None:
-    tree = Card({b"/a": b"", b"/d/x": b"", b"/d/e/y": b"", b"/keep": b""}, {b"/d", b"/d/e", b"/d/e/f"})
-    await rm(tree, b"/a")
-    await rm(tree, b"/d", recursive=True)
-    assert (tree.files, tree.directories) == ({b"/keep": b""}, set())
 
 
 @pytest.mark.parametrize(
@@ -186,15 +167,6 @@ async def test_rm_looks_before_it_removes(
 
 async def mv(tree: Card, *paths: bytes, to: bytes) -> None:
     await names.move_paths(session_of(tree), paths, to)
-
-
-async def test_mv_to_a_name_and_into_a_directory() -> None:
-    tree = Card({b"/a": b"1", b"/b": b"2", b"/c": b"3"}, {b"/d"})
-    await mv(tree, b"/a", to=b"/x")
-    await mv(tree, b"/b", b"/c", to=b"/d")
-    assert tree.files == {b"/x": b"1", b"/d/b": b"2", b"/d/c": b"3"}
-    with pytest.raises(NotADirectory):
-        await mv(tree, b"/x", b"/d", to=b"/nothing")
 
 
 async def test_mv_copies_where_the_server_cannot_rename() -> None:

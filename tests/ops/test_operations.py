@@ -6,7 +6,6 @@ import errno
 import inspect
 import logging
 import os
-import stat
 from collections.abc import Callable, Coroutine
 from typing import Any, cast
 
@@ -24,7 +23,7 @@ from mavftpfs.fuse.operations import (
     Presentation,
 )
 from mavftpfs.shared.errors import Armed, FtpNak, ListingIncomplete, NotFound, PathTooLong, RequestTimeout
-from tests.ops.faketree import MTIME, FakeTree
+from tests.ops.faketree import FakeTree
 
 CTX = cast(RequestContext, None)
 TOKEN = cast(pyfuse3.ReaddirToken, None)
@@ -83,28 +82,6 @@ class Listing:
 # -- attributes and lookup counts -----------------------------------------------------------------
 
 
-async def test_a_file_s_attributes() -> None:
-    ops = operations()
-    entry = await ops.lookup(ROOT_INO, b"a.txt", CTX)
-    assert entry.st_mode == stat.S_IFREG | 0o444
-    assert (entry.st_uid, entry.st_gid, entry.st_nlink) == (1000, 100, 1)
-    assert (entry.st_size, entry.st_blocks) == (6, 1)
-    assert entry.st_mtime_ns == entry.st_ctime_ns == MTIME * 10**9
-    assert entry.entry_timeout == entry.attr_timeout == 1.0
-    again = await ops.getattr(entry.st_ino, CTX)
-    assert (again.st_ino, again.generation, again.st_size) == (entry.st_ino, entry.generation, 6)
-
-
-async def test_lookup_counts_and_forget_takes_back() -> None:
-    ops = operations()
-    ino = await ino_of(ops, b"log", b"1.ulg")
-    assert await ino_of(ops, b"log", b"1.ulg") == ino
-    assert len(ops.inodes) == 3
-    await ops.forget([(ino, 1), (ino, 1)])
-    assert ops.inodes.get(ino) is None
-    assert await failure(ops.getattr(ino, CTX)) == errno.ESTALE
-
-
 async def test_a_missing_name_is_cached_by_the_kernel_and_uses_no_inode() -> None:
     ops = operations()
     entry = await ops.lookup(ROOT_INO, b"nope", CTX)
@@ -137,19 +114,6 @@ async def test_a_parent_renamed_during_lookup_gives_the_name_its_new_path() -> N
 
 
 # -- directories ----------------------------------------------------------------------------------
-
-
-async def test_readdir_gives_attributes_and_counts_what_was_taken(monkeypatch: pytest.MonkeyPatch) -> None:
-    ops, listing = operations(), Listing(monkeypatch)
-    fh = await ops.opendir(ROOT_INO, CTX)
-    await listing.read(ops, fh, 0)
-    assert listing.names == [b"a.txt", b"empty", b"log"]
-    for _, ino, _ in listing.taken:
-        inode = ops.inodes.get(ino)
-        assert inode is not None
-        assert inode.lookups == 1
-    await ops.releasedir(fh)
-    assert await failure(ops.readdir(fh, 0, TOKEN)) == errno.EBADF
 
 
 @pytest.mark.parametrize("room", [1, 2, 3, 7])
@@ -212,31 +176,6 @@ async def test_an_incomplete_listing_is_shown_and_then_an_error(monkeypatch: pyt
 
 
 # -- files ----------------------------------------------------------------------------------------
-
-
-async def test_open_read_release() -> None:
-    tree = some_tree()
-    ops = operations(tree)
-    info = await ops.open(await ino_of(ops, b"log", b"1.ulg"), os.O_RDONLY, CTX)
-    assert bytes(await ops.read(info.fh, 10, 100)) == tree.files[b"/log/1.ulg"][10:110]
-    assert bytes(await ops.read(info.fh, 1000, 100)) == tree.files[b"/log/1.ulg"][1000:]
-    assert bytes(await ops.read(info.fh, 1024, 100)) == b""
-    assert bytes(await ops.read(info.fh, 5000, 100)) == b""
-    await ops.flush(info.fh)
-    await ops.fsync(info.fh, False)
-    await ops.release(info.fh)
-    assert tree.opened[0].closed == 1
-    assert await failure(ops.read(info.fh, 0, 1)) == errno.EBADF
-    assert len(ops.files) == 0
-
-
-@pytest.mark.parametrize(("direct_io", "keep_cache"), [(True, False), (False, True), (False, False)])
-async def test_the_kernel_s_cache_is_as_the_tree_says(direct_io: bool, keep_cache: bool) -> None:
-    tree = some_tree()
-    tree.direct_io, tree.keep_cache = direct_io, keep_cache
-    ops = operations(tree)
-    info = await ops.open(await ino_of(ops, b"a.txt"), os.O_RDONLY, CTX)
-    assert (info.direct_io, info.keep_cache) == (direct_io, keep_cache)
 
 
 @pytest.mark.holds("promise 1")
@@ -375,14 +314,6 @@ async def test_a_bug_is_eio_and_logged_with_its_traceback(
     records = [record for record in caplog.records if record.levelno == logging.ERROR]
     assert len(records) == 1
     assert records[0].exc_info is not None
-
-
-async def test_not_found_below_a_lookup_is_negative_but_else_enoent() -> None:
-    tree = some_tree()
-    ops, ino, _ = await prepared(tree)
-    tree.error = NotFound("x")
-    assert (await ops.lookup(ROOT_INO, b"a.txt", CTX)).st_ino == 0
-    assert await failure(ops.getattr(ino, CTX)) == errno.ENOENT
 
 
 @pytest.mark.holds("promise 4")

@@ -51,22 +51,6 @@ def attributes(**values: int) -> EntryAttributes:
     return entry
 
 
-async def test_create_write_flush_and_release_reach_the_tree_in_order() -> None:
-    tree = some_tree()
-    ops = operations(tree)
-    info, entry = await ops.create(ROOT_INO, b"new", stat.S_IFREG | 0o600, os.O_WRONLY, CTX)
-    assert stat.S_IMODE(entry.st_mode) == 0o600
-    assert await ops.write(info.fh, 0, b"abc") == 3
-    assert (await ops.getattr(entry.st_ino, CTX)).st_nlink == 1
-    await ops.flush(info.fh)
-    assert tree.files[b"/new"] == b"abc"
-    await ops.fsync(info.fh, False)
-    await ops.release(info.fh)
-    names = [name for name, path in tree.calls if path == b"/new" and name != "stat"]
-    assert names == ["create", "open", "write", "flush", "fsync", "release"]
-    assert tree.opened[0].closed == 1
-
-
 @pytest.mark.holds("promise 3")
 async def test_a_read_handle_is_never_flushed_and_cannot_write() -> None:
     tree = some_tree()
@@ -114,20 +98,6 @@ async def test_an_unlinked_file_that_is_only_read_is_released_too() -> None:
     await ops.release(info.fh)
     assert ("release", b"/a.txt") in tree.calls
     assert tree.opened[0].closed == 1
-
-
-async def test_truncation_comes_in_the_open_flags_and_append_follows_our_size() -> None:
-    tree = some_tree()
-    ops = operations(tree)
-    ino = await ino_of(ops, b"a.txt")
-    info = await ops.open(ino, os.O_WRONLY | os.O_TRUNC, CTX)
-    await ops.flush(info.fh)
-    assert tree.files[b"/a.txt"] == b""
-    info = await ops.open(ino, os.O_WRONLY | os.O_APPEND, CTX)
-    await ops.write(info.fh, 0, b"one")
-    await ops.write(info.fh, 3, b"two")
-    await ops.flush(info.fh)
-    assert tree.files[b"/a.txt"] == b"onetwo"
 
 
 @pytest.mark.holds("promise 2")
@@ -281,15 +251,6 @@ async def test_an_open_file_without_a_name_still_has_attributes_and_can_be_cut()
     assert (entry.st_size, entry.st_nlink) == (2, 0)
     await ops.release(info.fh)
     assert await failure(ops.getattr(ino, CTX)) == errno.ESTALE
-
-
-async def test_rename_moves_what_the_kernel_knows_below_a_directory() -> None:
-    ops = operations()
-    ino = await ino_of(ops, b"log", b"1.ulg")
-    await ops.rename(ROOT_INO, b"log", ROOT_INO, b"old", 0, CTX)
-    assert ops.inodes.known(b"/old/1.ulg") == ino
-    assert (await ops.getattr(ino, CTX)).st_size == 100
-    ops.inodes.check_invariants()
 
 
 async def test_rename_flags() -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from typing import Any
 
 import pytest
@@ -10,9 +10,10 @@ import pytest
 ALIKE = frozenset({"spec", "px4-2026", "mavsdk-old", "ardupilot5", "littlefs"})
 
 
-def taking_turns(profiles: Iterable[str]) -> list[Any]:
-    """Return parameters for every profile; some run in the soak only."""
+def taking_turns(profiles: Iterable[str], soak: Collection[str] = ()) -> list[Any]:
+    """Return parameters for every profile; some, and those of `soak`, run in the soak only."""
+    long = ALIKE | set(soak)
     return [
-        pytest.param(profile, marks=pytest.mark.soak if profile in ALIKE else (), id=profile)
+        pytest.param(profile, marks=pytest.mark.soak if profile in long else (), id=profile)
         for profile in profiles
     ]

@@ -98,6 +98,10 @@ def test_exit_codes(error: MavftpfsError, code: int) -> None:
         (("mv", SOURCE, "mftp://comp=1:/a", "mftp://comp=2:/b"), "components"),
         (("crc", SOURCE, "/x", "-o", "signing_key=/proc/none/key"), "/proc/none/key"),
         (("ls", SOURCE, "/", "-o", "trace=/proc/none/t"), "/proc/none/t"),
+        ((SOURCE, "/mnt", "-o", "log_file=/proc/none/l"), "/proc/none/l"),
+        (("ls", "/etc", "/"), "no vehicle is mounted on /etc"),
+        (("sync", SOURCE, "/tmp", "--newest", "0"), "no number"),
+        (("sync", SOURCE, "/tmp", "--since", "soon"), "no date"),
     ],
 )
 def test_usage_errors_are_one_line_and_exit_1(

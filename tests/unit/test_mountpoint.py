@@ -82,6 +82,12 @@ def test_what_stat_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number:
             check_mountpoint(str(tmp_path), table=os.devnull)
 
 
+def test_a_mount_of_ours_is_not_covered_by_another(tmp_path: Path) -> None:
+    path = table(tmp_path, LINE.format(tmp_path, "fuse.mavftpfs"))
+    with pytest.raises(MountFailed, match="already mounted"):
+        check_mountpoint(str(tmp_path), table=path)
+
+
 def test_no_fuse_device(tmp_path: Path) -> None:
     with pytest.raises(MountFailed, match="modprobe fuse"):
         check_fuse(str(tmp_path / "fuse"))
