@@ -39,27 +39,6 @@ async def idle(condition: Callable[[], bool]) -> None:
             await trio.sleep(0.001)
 
 
-async def test_changed_files_are_told_once_each_from_a_thread() -> None:
-    table, kernel = InodeTable(), Kernel()
-    known = table.lookup(b"/a").ino
-    invalidator = Invalidator(table, kernel.notify)
-    invalidator.on_changed(b"/a")
-    invalidator.on_changed(b"/a")
-    invalidator.on_changed(b"/unknown")
-    async with trio.open_nursery() as nursery:
-        nursery.start_soon(invalidator.run)
-        await idle(lambda: bool(kernel.calls) and not invalidator.busy)
-        nursery.cancel_scope.cancel()
-    assert kernel.calls == [(known, False)]
-    assert threading.get_ident() not in kernel.threads
-
-
-async def test_attributes_are_forgotten_when_the_call_is_back() -> None:
-    kernel = Kernel()
-    await Invalidator(InodeTable(), kernel.notify).forget_attributes(7)
-    assert kernel.calls == [(7, True)]
-
-
 @pytest.mark.parametrize(("number", "logged"), [(errno.ENOENT, False), (errno.EPERM, True)])
 async def test_a_refusal_is_logged_unless_the_kernel_had_forgotten(
     number: int, logged: bool, caplog: pytest.LogCaptureFixture

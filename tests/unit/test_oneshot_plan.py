@@ -73,12 +73,6 @@ def test_the_newest_log_is_not_the_file_that_holds_its_number() -> None:
         assert ordered == [b"00000002.BIN", b"00000001.BIN", b"LASTLOG.TXT"]
 
 
-def test_numbers_are_compared_as_numbers_wherever_they_stand() -> None:
-    names = [b"10.BIN", b"9.BIN", b"a1b2", b"a1b10", b"a", b"", b"00000002.BIN"]
-    ordered = [b"", b"00000002.BIN", b"9.BIN", b"10.BIN", b"a", b"a1b2", b"a1b10"]
-    assert sorted(names, key=fetch.natural) == ordered
-
-
 def test_which_logs_are_wished_for() -> None:
     logs = fetch.newest_first([log(b"a", MAY), log(b"b", JUNE), log(b"c")])
     assert [one.below for one in fetch.select(logs, newest=1, since=None)] == [b"b"]
@@ -90,14 +84,6 @@ def test_which_logs_are_wished_for() -> None:
 def test_a_clock_that_was_not_set_tells_nothing() -> None:
     assert fetch.known_time(315_532_800) is None
     assert fetch.known_time(MAY) == MAY
-
-
-def test_reads_take_about_a_second() -> None:
-    assert fetch.next_read_size(4096, 0.1) == 8192
-    assert fetch.next_read_size(fetch.LARGEST_READ, 0.1) == fetch.LARGEST_READ
-    assert fetch.next_read_size(8192, 0.5) == 8192
-    assert fetch.next_read_size(8192, 3.0) == 4096
-    assert fetch.next_read_size(fetch.LEAST_READ, 3.0) == fetch.LEAST_READ
 
 
 @pytest.mark.parametrize(

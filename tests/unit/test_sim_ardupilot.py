@@ -220,18 +220,15 @@ def test_renaming_onto_a_file() -> None:
     assert nak(c.ask(Opcode.RENAME, FIVE + b"\0/new")) == NOT_FOUND, "a stale errno"
 
 
-def test_fat_folds_case() -> None:
+def test_fat_folds_case_and_drops_dots_and_blanks_at_the_end() -> None:
     c = Client("ardupilot5")
     assert ack(c.open(b"/FS/MicroSD/A.BIN")) == struct.pack("<I", 1024)
     ack(c.ask(Opcode.TERMINATE_SESSION))
     assert nak(c.ask(Opcode.CREATE_DIRECTORY, b"/fs/microsd/DIR")) == bytes([NakCode.FILE_EXISTS])
-    assert nak(Client("littlefs").ask(Opcode.OPEN_FILE_RO, b"/FS/microsd/a.bin")) == NOT_FOUND
-
-
-def test_fat_drops_dots_and_blanks_at_the_end_of_names() -> None:
     for name in (b"a.bin.", b"A.bin. . "):
         assert ack(Client("ardupilot5").open(b"/fs/microsd/" + name)) == struct.pack("<I", 1024)
         assert nak(Client("littlefs").ask(Opcode.OPEN_FILE_RO, b"/fs/microsd/" + name)) == NOT_FOUND
+    assert nak(Client("littlefs").ask(Opcode.OPEN_FILE_RO, b"/FS/microsd/a.bin")) == NOT_FOUND
 
 
 def test_write_only_creates_since_generation_b() -> None:

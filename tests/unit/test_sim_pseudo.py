@@ -16,20 +16,6 @@ PARAM = b"@PARAM/param.pck"
 NOT_FOUND = bytes([NakCode.FILE_NOT_FOUND])
 
 
-def download(c: Client, path: bytes, block: int) -> bytes:
-    """Read a file to its EOF NAK in blocks."""
-    c.open(path, session=1)
-    data = b""
-    while True:
-        reply = c.ask(Opcode.READ_FILE, session=1, offset=len(data), size=block)
-        if reply.opcode == Opcode.NAK:
-            assert reply.data == bytes([NakCode.EOF])
-            break
-        data += reply.data
-    ack(c.ask(Opcode.TERMINATE_SESSION, session=1))
-    return data
-
-
 def test_sys_claims_100000_bytes_and_most_files_cannot_be_opened() -> None:
     c = Client("ardupilot")
     page = c.listing(b"@SYS")
@@ -64,18 +50,6 @@ def test_the_claimed_parameter_size_and_the_checksum_match_no_download() -> None
     checksum = struct.unpack("<I", ack(c.ask(Opcode.CALC_FILE_CRC32, PARAM)))[0]
     assert checksum == crc32(pack_parameters(virtual.params, 64))
     assert checksum != crc32(pack_parameters(virtual.params, 239))
-
-
-def test_romfs_has_directories_and_leaks_slots() -> None:
-    c = Client("ardupilot")
-    assert c.listing(b"@ROMFS").endswith(b"Dmodels\0\0")
-    assert c.listing(b"@ROMFS/models") == b"Fquad.json\t14\0\0"
-    assert len(download(c, b"@ROMFS/models/quad.json", 239)) == 14
-    for _ in range(4):
-        assert nak(c.ask(Opcode.LIST_DIRECTORY, b"@ROMFS/none")) == NOT_FOUND
-    assert nak(c.ask(Opcode.LIST_DIRECTORY, b"@ROMFS")) == bytes([NakCode.FAIL_ERRNO, errno.ENFILE])
-    c.server.reboot(c.now)
-    assert c.listing(b"@ROMFS")
 
 
 def test_four_handles_at_a_time() -> None:

@@ -53,16 +53,6 @@ def test_a_burst_does_not_keep_its_session_alive() -> None:
     assert c.now - sent_at > 10
 
 
-def test_size_is_that_of_the_open() -> None:
-    c = client()
-    c.open(FIVE)
-    tree = c.tree
-    assert isinstance(tree, MemoryTree)
-    tree.open(FIVE, write=True).write(1, b"more")
-    assert ack(c.ask(Opcode.READ_FILE, size=239)) == b"\x05more"
-    assert nak(c.ask(Opcode.READ_FILE, size=239, offset=1)) == bytes([NakCode.EOF])
-
-
 def test_reboot_forgets_what_waited_and_starts_its_ticks_anew() -> None:
     c = client("px4-nuttx", stall_chance=1.0)
     c.open(A)
@@ -250,22 +240,6 @@ def test_nuttx_renames_into_directories_and_over_files() -> None:
     assert c.tree.data(A) == b"\x05"
 
 
-@pytest.mark.parametrize("size", [0, 100, 1024, 3000])
-def test_nuttx_truncates_through_a_copy(size: int) -> None:
-    c = prompt()
-    ack(c.ask(Opcode.TRUNCATE_FILE, A, offset=size))
-    assert isinstance(c.tree, MemoryTree)
-    assert c.tree.data(A) == (bytes(range(256)) * 4).ljust(3000, b"\0")[:size]
-    assert all(entry.name != b".trunc.tmp" for entry in c.tree.entries(b"/fs/microsd"))
-
-
-def test_nuttx_truncate_without_room_for_the_copy_fails() -> None:
-    tree = MemoryTree(capacity=1500)
-    tree.add(A, bytes(1024))
-    c = Client("px4-nuttx", tree, request_cost=0.0, stall_chance=0.0)
-    assert nak(c.ask(Opcode.TRUNCATE_FILE, A, offset=600)) == bytes([NakCode.FAIL_ERRNO, errno.ENOSPC])
-
-
 # -- timing --------------------------------------------------------------------------------------
 
 
@@ -290,11 +264,3 @@ def test_a_checksum_takes_time_and_what_follows_waits() -> None:
     assert c.receive(0.2) == []
     crc, none = c.receive(0.2)
     assert (crc.req_opcode, none.req_opcode) == (Opcode.CALC_FILE_CRC32, Opcode.NONE)
-
-
-def test_parameters_of_2026_have_their_exact_size() -> None:
-    c = client("px4-2026")
-    size = struct.unpack("<I", ack(c.open(b"@PARAM/param.pck")))[0]
-    data = b"".join(ack(c.ask(Opcode.READ_FILE, offset=offset, size=239)) for offset in range(0, size, 239))
-    assert len(data) == size
-    assert nak(c.ask(Opcode.READ_FILE, offset=0, size=100)) == bytes([NakCode.FAIL_ERRNO, errno.EINVAL])

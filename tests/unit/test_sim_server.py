@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import random
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -14,9 +13,9 @@ from mavftpfs.link.messages import Address
 from mavftpfs.protocol.payload import Opcode, decode_reply, request
 from mavftpfs.sim.profiles import PROFILES
 from mavftpfs.sim.storage import Storage
-from mavftpfs.sim.tree import DirectoryTree, MemoryTree
+from mavftpfs.sim.tree import DirectoryTree
 from mavftpfs.sim.vehicle import FtpServer
-from tests.support.sim_client import CLIENT, OTHER, Client, small_tree
+from tests.support.sim_client import CLIENT, OTHER, small_tree
 
 A = b"/fs/microsd/a.bin"
 PATHS = [
@@ -184,37 +183,6 @@ def test_fat_loses_the_sector_in_memory_with_the_power(name: str, real: bool, tm
         expected = new + old[100:500] + new + new + old[700:1000] + new + old[1100:]
         kept = storage.open(A).read(0, 4096)
         assert kept == (expected if closed else expected[:1024] + old[1024:])
-
-
-@pytest.mark.parametrize(("name", "checksum"), [("px4-nuttx", True), ("ardupilot", False), ("mavsdk", True)])
-def test_a_deadline_is_never_missed(name: str, checksum: bool) -> None:
-    """Waking only at next_deadline gets what polling gets, and not later."""
-    results = []
-    for polling in (True, False):
-        tree = MemoryTree()
-        tree.add(A, bytes(30_000))
-        c = Client(name, tree, crc_rate=100_000.0)
-        session = c.ask(Opcode.OPEN_FILE_RO, A, session=1).session
-        if checksum:
-            c.send(Opcode.CALC_FILE_CRC32, A, session=session)
-        c.send(Opcode.BURST_READ_FILE, session=session, size=239)
-        results.append(list(polled(c.server, c.now) if polling else woken(c.server, c.now)))
-    by_polling, by_waking = results
-    assert [wire for _, wire in by_polling] == [wire for _, wire in by_waking]
-    assert len(by_waking) >= 100
-    assert all(woke <= seen for (seen, _), (woke, _) in zip(by_polling, by_waking, strict=True))
-
-
-def polled(server: FtpServer, start: float) -> Iterator[tuple[float, bytes]]:
-    for i in range(3000):
-        for _, wire in server.outgoing(start + i / 1000):
-            yield start + i / 1000, wire
-
-
-def woken(server: FtpServer, start: float) -> Iterator[tuple[float, bytes]]:
-    while (due := server.next_deadline()) is not None and due <= start + 3.0:
-        for _, wire in server.outgoing(due):
-            yield due, wire
 
 
 # -- the textbook server -------------------------------------------------------------------------
