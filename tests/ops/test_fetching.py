@@ -12,7 +12,6 @@ import trio
 
 from mavftpfs.oneshot import sync as syncing
 from mavftpfs.oneshot.fetch import (
-    PROVEN_BY_DEFAULT,
     Fetched,
     Fetcher,
     NotProvenYet,
@@ -235,12 +234,6 @@ async def test_without_a_checksum_it_says_what_was_proven(
     assert words in fetched.proof
 
 
-async def test_a_large_file_is_proven_on_demand_only(tmp_path: Path) -> None:
-    tree = SpoiltTree({b"/huge": bytes(PROVEN_BY_DEFAULT + 1)})
-    assert (await get(tree, b"/huge", tmp_path / "a")).proof == "size"
-    assert (await get(tree, b"/huge", tmp_path / "b", "all")).proof == "size and CRC32"
-
-
 @pytest.mark.parametrize(
     ("path", "root", "proven"),
     [(b"/@SYS/uarts.txt", b"/", False), (b"/uarts.txt", b"/@SYS", False), (b"/@MAV_LOG/1.ulg", b"/", True)],
@@ -323,17 +316,6 @@ async def test_what_the_local_disk_refuses_is_told_in_a_line(tmp_path: Path) -> 
     assert (tmp_path / "file").read_bytes() == b"in the way"
 
 
-async def test_a_directory_with_all_below(tmp_path: Path) -> None:
-    files = {b"/d/a": b"1", b"/d/e/b": b"2", b"/d/e/f/\xff": b"3"}
-    got, said = await get_all(SpoiltTree(dict(files), {b"/d/empty"}), b"/d", to=tmp_path / "d")
-    found = {path for path in (tmp_path / "d").rglob("*") if path.is_file()}
-    assert {bytes(path.relative_to(tmp_path)): path.read_bytes() for path in found} == {
-        path[1:]: content for path, content in files.items()
-    }
-    assert (tmp_path / "d" / "empty").is_dir()
-    assert (got.planned, got.done, got.failed, said) == (3, 3, 0, [])
-
-
 def refusing(name: str, path: bytes) -> Callable[[str, bytes], None]:
     """Return what makes one call on one path fail."""
 
@@ -390,17 +372,6 @@ async def sync(
     except MavftpfsError as exc:
         said.append(repr(exc))
     return outcome, told, said
-
-
-async def test_new_logs_come_newest_first_and_once(tmp_path: Path) -> None:
-    tree = SpoiltTree(dict(LOGS))
-    outcome, told, said = await sync(tree, tmp_path / "logs")
-    assert (told, said, outcome.complete) == (["d/2.ulg", "d/1.ulg"], [], True)
-    assert (tmp_path / "logs/d/2.ulg").read_bytes() == b"second"
-    assert names_in(tmp_path / "logs" / "d") == ["1.ulg", "2.ulg"]
-    reads = tree.reads
-    outcome, told, said = await sync(tree, tmp_path / "logs")
-    assert (told, said, outcome.complete, tree.reads) == ([], [], True, reads)
 
 
 @pytest.mark.parametrize(
@@ -467,10 +438,3 @@ async def test_a_directory_that_cannot_be_listed_is_said(tmp_path: Path) -> None
     tree.on_call = lambda name, path: None
     outcome, told, said = await sync(tree, tmp_path)
     assert (len(told), said, outcome.complete) == (2, [], True)
-
-
-async def test_a_name_that_a_directory_has_here(tmp_path: Path) -> None:
-    (tmp_path / "1").mkdir()
-    outcome, told, said = await sync(SpoiltTree({b"/log/1": b"x", b"/log/0": b"y"}), tmp_path)
-    assert (told, outcome.complete) == (["0"], False)
-    assert "is a directory" in said[0]

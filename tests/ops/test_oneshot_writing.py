@@ -81,13 +81,6 @@ async def put(tree: Card, *locals_: Path, to: bytes, recursive: bool = False) ->
     return told
 
 
-async def test_a_file_over_another_is_synced_whole(local: Path) -> None:
-    tree = Card({b"/x": BIG + b"longer"})
-    await put(tree, local / "a", to=b"/x")
-    assert tree.files == {b"/x": BIG}
-    assert ("fsync", b"/x") in tree.calls
-
-
 @pytest.mark.parametrize(("to", "place"), [(b"/there", b"/there/d"), (b"/new", b"/new")])
 async def test_a_directory_with_all_below(local: Path, to: bytes, place: bytes) -> None:
     tree = Card({}, {b"/there"})
