@@ -5,20 +5,14 @@ Deadlines are short here; that each command ends is what `Mount.run` insists on.
 
 from __future__ import annotations
 
-import socket
 import sys
 from pathlib import Path
 
 import pytest
 
-from mavftpfs.link.messages import Address
-from mavftpfs.protocol.payload import Opcode, Payload
-from mavftpfs.sim.tree import MemoryTree
 from tests.mount.conftest import Field
 from tests.support.hostile import BROKEN, FINE, GOOD, GOOD_NAMES, NAKED
-from tests.support.lying import LyingVehicle, ack, ftp, heartbeat
 from tests.support.mounts import Mount, mounted_at
-from tests.support.vehicles import HOST, free_udp_port
 
 QUICK = ("op_deadline=6", "dir_timeout=600")
 REFUSALS = {
@@ -97,37 +91,6 @@ def test_noise_and_forged_replies_change_nothing(field: Field) -> None:
     assert mount.read_bytes(mount.path / "fine.bin") == FINE
     for name in sorted(GOOD_NAMES):
         assert mount.read_bytes(mount.path / "names" / name) == GOOD
-
-
-@pytest.mark.holds("promise 1", "rule 14.12")
-def test_bytes_that_another_client_may_have_mixed_up_are_an_error(field: Field) -> None:
-    mount = field.mount(field.hostile("rival").source, *QUICK)
-    error = mount.errno_of("open(sys.argv[1], 'rb').read()", mount.path / "fine.bin", timeout=120)
-    assert error in {"EIO", "ETIMEDOUT"}
-
-
-@pytest.mark.holds("promise 10")
-def test_an_impostor_beside_the_vehicle_changes_nothing(field: Field) -> None:
-    """Somebody else sends heartbeats in the vehicle's name, and answers each read before it does."""
-    port = free_udp_port()
-    data = bytes(range(256)) * 400
-    tree = MemoryTree()
-    tree.add(b"/f", data)
-    impostor = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-
-    def change(request: Payload, reply: Payload) -> list[Payload]:
-        if request.opcode == Opcode.READ_FILE:
-            forged = ftp(ack(request, b"\xee" * request.size).encode(), Address(254, 191))
-            impostor.sendto(heartbeat() + forged, (HOST, port))
-        return [reply]
-
-    with impostor, LyingVehicle(tree, f"udpout:{HOST}:{port}") as vehicle:
-        mount = field.mount(vehicle.source)
-        address = mount.status()["connection"]["address"]
-        vehicle.server.change = change
-        assert mount.read_bytes(mount.path / "f") == data
-        assert mount.status()["connection"]["address"] == address
-        mount.run(sys.executable, "-m", "mavftpfs", "umount", mount.path)
 
 
 def test_a_vehicle_that_never_answers_ftp_is_exit_2(field: Field) -> None:

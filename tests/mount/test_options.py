@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import json
 import re
-import shutil
 import subprocess
 import sys
-import tempfile
-from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -19,8 +16,6 @@ from mavftpfs.protocol.crc import crc32
 from tests.mount.conftest import Field
 from tests.support.mounts import Mount, abort_mount, mounted_at, processes_in, wait_until
 from tests.support.vehicles import PROJECT
-
-NOBODY_UID = 65534
 
 
 def mount_line(path: Path) -> list[str]:
@@ -123,26 +118,6 @@ def test_every_payload_is_printed_and_recorded_decoded(
     assert {bytes.fromhex(record["data"]) for record in opened} == {b"/sizes/478.bin"}
     answered = {record.get("req_opcode") for record in records if record["dir"] == "reply"}
     assert {"LIST_DIRECTORY", "OPEN_FILE_RO", "READ_FILE", "TERMINATE_SESSION"} <= answered
-
-
-@pytest.fixture
-def open_place() -> Iterator[Path]:
-    """A directory that other users can reach, unlike pytest's own."""
-    path = Path(tempfile.mkdtemp(prefix="mavftpfs-test-", dir="/var/tmp"))
-    path.chmod(0o755)
-    yield path
-    shutil.rmtree(path)
-
-
-def test_allow_other(field: Field, small_tree: Path, open_place: Path) -> None:
-    mount = field.prepare(field.sim(small_tree).source, "allow_other", "umask=022")
-    mount.path = open_place / "mnt"
-    mount.path.mkdir()
-    mount.start()
-    as_nobody = ("setpriv", f"--reuid={NOBODY_UID}", f"--regid={NOBODY_UID}", "--clear-groups")
-    shown = mount.run(*as_nobody, "cat", mount.path / "README.txt").stdout
-    assert shown == (small_tree / "README.txt").read_text()
-    mount.finish()
 
 
 @pytest.mark.holds("rule 14.15")

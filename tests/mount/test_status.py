@@ -2,23 +2,19 @@
 
 from __future__ import annotations
 
-import fcntl
 import json
 import os
 import re
 import signal
-import struct
 import subprocess
 import sys
-import termios
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 
 from mavftpfs.exits import ExitCode
 from tests.mount.conftest import Field
+from tests.support import terminal
 from tests.support.mounts import COMMAND_TIMEOUT, Mount, abort_mount, wait_until
 from tests.support.vehicles import PROJECT, Process, free_udp_port
 
@@ -90,36 +86,7 @@ def test_the_log_tells_of_another_ftp_client(field: Field, small_tree: Path) -> 
         fanout.stop()
 
 
-@contextmanager
-def watched(columns: int, rows: int, *words: str | Path) -> Iterator[int]:
-    """Run `status --watch` on a terminal of that size; gives our end of it."""
-    terminal, theirs = os.openpty()
-    fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", rows, columns, 0, 0))
-    environment = {key: value for key, value in os.environ.items() if key not in ("COLUMNS", "LINES")}
-    argv = [*STATUS, "--watch", *words]
-    # get_terminal_size looks at stdout of the interpreter
-    with subprocess.Popen(argv, stdout=theirs, cwd=PROJECT, env={**environment, "TERM": "xterm"}) as watch:
-        os.close(theirs)
-        try:
-            yield terminal
-            watch.send_signal(signal.SIGINT)
-            assert watch.wait(COMMAND_TIMEOUT) == 130
-        finally:
-            watch.kill()
-            os.close(terminal)
-
-
-CLEAR = b"\x1b[H\x1b[J"
-
-
-def screens(terminal: int, count: int) -> list[list[str]]:
-    """Return the lines of so many whole screens that were drawn, without colours."""
-    drawn = b""
-    while drawn.count(CLEAR) <= count:  # the next one's beginning is the end of one
-        drawn += os.read(terminal, 65536)
-    whole = drawn.split(CLEAR)[1 : count + 1]
-    texts = [re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", screen.decode()) for screen in whole]
-    return [text.split("\r\n") for text in texts]
+CLEAR = "\x1b[H\x1b[J"
 
 
 def test_what_is_read_is_shown_on_a_terminal(field: Field) -> None:
@@ -130,8 +97,11 @@ def test_what_is_read_is_shown_on_a_terminal(field: Field) -> None:
     mount = field.mount(field.sim(card, options=SLOW).source)
     with mount.started("cat", mount.path / name):
         wait_until("it is read", lambda: _reads((*STATUS, "--json", mount.path)) > 0)
-        with watched(80, 24, mount.path) as terminal:
-            shown = screens(terminal, 3)[-1]
+        screen = terminal.mavftpfs("status", "--watch", mount.path)
+        screen.read_until(lambda _: screen.raw.count(CLEAR) > 3)
+        screen.interrupt()
+        assert screen.finish() == 130
+    shown = re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", screen.raw.split(CLEAR)[3]).split("\r\n")
     assert all(len(line) <= 80 for line in shown)
     assert "PX4 1/1, disarmed, link " in shown[0]
     assert re.match(r"  reading .*10_32_15.ulg: \d+ % of 3.0 MB, .* kB/s, .* left$", shown[1]), shown
@@ -219,7 +189,8 @@ def test_another_user_is_told_in_a_line(
         refused = mount.run(*NOBODY, sys.executable, "-m", "mavftpfs", *verb, cwd=Path("/"), code=code)
         assert len(refused.stderr.splitlines()) == 1
         assert why in refused.stderr
-    assert mount.run("cat", mount.path / "README.txt").stdout == (small_tree / "README.txt").read_text()
+    shown = mount.run(*NOBODY, "cat", mount.path / "README.txt", cwd=Path("/")).stdout
+    assert shown == (small_tree / "README.txt").read_text()
     assert str(mount.path) in mount.run(*NOBODY, *STATUS, cwd=Path("/")).stdout
 
 

@@ -188,21 +188,6 @@ def test_unmounting_with_undelivered_data_keeps_it(field: Field, data: Path) -> 
     assert (card / "confirmed").read_text() == "confirmed\n"
 
 
-def test_another_spelling_of_a_name_is_refused(field: Field, data: Path) -> None:
-    """FAT takes it for the file that is there."""
-    card = field.local("card")
-    (card / "fs/microsd").mkdir(parents=True)
-    mount = field.mount(field.sim(card, "px4-nuttx").source)
-    root = mount.path / "fs/microsd"
-    for name in ("first", "other"):
-        mount.run("cp", data, root / name)
-    for command in (["cp", data], ["mkdir"]):
-        result = mount.run(*command, root / "first.", code=None)
-        assert (result.returncode, "File exists" in result.stderr) == (1, True)
-    assert mount.errno_of("os.rename(sys.argv[1], sys.argv[2])", root / "other", root / "first.") == "EEXIST"
-    assert sorted(os.listdir(card / "fs/microsd")) == ["first", "other"]
-
-
 def test_what_the_vehicle_refuses_does_not_put_off_the_end(field: Field, data: Path) -> None:
     card = field.local("card")
     mount = field.mount(field.sim(card, "ardupilot5").source)

@@ -3,8 +3,7 @@
     python -m tests.support.hostile MODE PORT      # speaks from a free port to 127.0.0.1:PORT until SIGTERM
 
 MODE `files` serves the listings and files below; `mute` sends heartbeats and never answers FTP; `noise`
-serves like `files` and surrounds every answer with garbage, forged and foreign replies;
-`rival` lets another client's replies be heard and computes no CRC32.
+serves like `files` and surrounds every answer with garbage, forged and foreign replies.
 """
 
 from __future__ import annotations
@@ -67,9 +66,8 @@ FINE = random.Random("fine").randbytes(5000)
 class Server:
     """Answers requests; one file may be open, its session id is 0."""
 
-    def __init__(self, *, computes_crc: bool = True) -> None:
+    def __init__(self) -> None:
         self.path = b""
-        self.computes_crc = computes_crc
 
     def answer(self, request: Payload) -> Payload | None:
         """Return the answer to a request, or None for silence."""
@@ -80,7 +78,7 @@ class Server:
             return self.open(request, path)
         if request.opcode == Opcode.READ_FILE:
             return self.read(request)
-        if request.opcode == Opcode.CALC_FILE_CRC32 and self.computes_crc:
+        if request.opcode == Opcode.CALC_FILE_CRC32:
             return ack(request, crc32(content(path)).to_bytes(4, "little"))
         if request.opcode in (Opcode.NONE, Opcode.TERMINATE_SESSION, Opcode.RESET_SESSIONS):
             return ack(request, b"")
@@ -185,7 +183,7 @@ def serve(sock: socket.socket, framer: Framer, react: Callable[[FtpFrame], Itera
 def main() -> int:
     """Run as a process until SIGTERM."""
     mode, port = sys.argv[1], int(sys.argv[2])
-    server, rng, framer = Server(computes_crc=mode != "rival"), random.Random(3), Framer(US, stream=False)
+    server, rng, framer = Server(), random.Random(3), Framer(US, stream=False)
 
     def react(frame: FtpFrame) -> Iterator[bytes]:
         answer = None if mode == "mute" else server.answer(decode_request(frame.payload))
@@ -194,8 +192,6 @@ def main() -> int:
         wire = framer.encode_ftp(frame.source, answer.encode())
         if mode == "noise":
             yield from noise(rng, frame, framer, wire)
-        elif mode == "rival":
-            yield framer.encode_ftp(Address(255, 190), answer.encode())
         yield wire
 
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))

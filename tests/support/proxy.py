@@ -4,110 +4,59 @@
 
 The vehicle sends to VEHICLE_PORT (where the proxy listens) and the proxy forwards to CLIENT_PORT (where the
 mount listens); answers go back to whoever spoke last on VEHICLE_PORT. All on 127.0.0.1. What happens to each
-datagram is drawn from the seed. On SIGTERM it prints its counters as JSON and exits 0.
+datagram is drawn from the seed, by the simulator's model of a link. SIGTERM ends it.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import random
 import selectors
 import signal
 import socket
 import sys
-from collections import Counter
-from dataclasses import dataclass, field
+import time
+
+from mavftpfs.sim.linkmodel import Direction, LinkModel, LinkSettings
 
 HOST = "127.0.0.1"
-MAX_HELD = 0.05
-"""Seconds after which a held-back (reordered) datagram is sent in any case."""
-
-
-@dataclass
-class Mischief:
-    """Decides the fate of each datagram."""
-
-    rng: random.Random
-    loss: float
-    dup: float
-    reorder: float
-    corrupt: float
-    counts: Counter[str] = field(default_factory=Counter)
-    held: list[bytes] = field(default_factory=list)
-
-    def pass_on(self, datagram: bytes) -> list[bytes]:
-        """Return what to forward now in place of `datagram`, the held-back ones behind it."""
-        self.counts["datagrams"] += 1
-        if self.happens("loss", self.loss):
-            return self.release()
-        if self.happens("corrupt", self.corrupt):
-            datagram = self.flip_a_bit(datagram)
-        copies = 2 if self.happens("dup", self.dup) else 1
-        if self.happens("reorder", self.reorder):
-            self.held += [datagram] * copies
-            return []
-        return [datagram] * copies + self.release()
-
-    def happens(self, what: str, probability: float) -> bool:
-        """Draw, and count what happened."""
-        hit = self.rng.random() < probability
-        self.counts[what] += hit
-        return hit
-
-    def flip_a_bit(self, datagram: bytes) -> bytes:
-        """Return the datagram with one bit changed."""
-        changed = bytearray(datagram)
-        changed[self.rng.randrange(len(changed))] ^= 1 << self.rng.randrange(8)
-        return bytes(changed)
-
-    def release(self) -> list[bytes]:
-        """Return what was held back."""
-        held, self.held = self.held, []
-        return held
 
 
 class Proxy:
-    """Two sockets and the mischief in each direction."""
+    """Two sockets and the link between them."""
 
-    def __init__(self, vehicle_port: int, client_port: int, down: Mischief, up: Mischief) -> None:
+    def __init__(self, vehicle_port: int, client_port: int, model: LinkModel) -> None:
         self.vehicle = udp_socket(vehicle_port)
         self.client = udp_socket(0)
         self.client_address = (HOST, client_port)
         self.vehicle_address: tuple[str, int] | None = None
-        self.down = down
-        self.up = up
+        self.model = model
 
     def run(self) -> None:
-        """Forward until interrupted."""
+        """Forward for ever."""
         selector = selectors.DefaultSelector()
-        selector.register(self.vehicle, selectors.EVENT_READ, self.from_vehicle)
-        selector.register(self.client, selectors.EVENT_READ, self.from_client)
+        selector.register(self.vehicle, selectors.EVENT_READ, Direction.TO_CLIENT)
+        selector.register(self.client, selectors.EVENT_READ, Direction.TO_VEHICLE)
         while True:
-            ready = selector.select(MAX_HELD)
-            for key, _ in ready:
-                key.data()
-            if not ready:
-                self.to_client(self.down.release())
-                self.to_vehicle(self.up.release())
+            due = self.model.next_deadline()
+            for key, _ in selector.select(None if due is None else max(0.0, due - time.monotonic())):
+                self.take(key.data)
+            self.forward()
 
-    def from_vehicle(self) -> None:
-        """Take one datagram of the vehicle."""
-        datagram, self.vehicle_address = self.vehicle.recvfrom(65536)
-        self.to_client(self.down.pass_on(datagram))
+    def take(self, direction: Direction) -> None:
+        """Take one datagram."""
+        if direction is Direction.TO_CLIENT:
+            datagram, self.vehicle_address = self.vehicle.recvfrom(65536)
+        else:
+            datagram = self.client.recv(65536)
+        self.model.push(direction, datagram, time.monotonic())
 
-    def from_client(self) -> None:
-        """Take one datagram of the mount."""
-        self.to_vehicle(self.up.pass_on(self.client.recv(65536)))
-
-    def to_client(self, datagrams: list[bytes]) -> None:
-        """Send towards the mount; nobody listening yet is a loss."""
-        for datagram in datagrams:
+    def forward(self) -> None:
+        """Send what has arrived; what nobody listens for yet is lost."""
+        now = time.monotonic()
+        for datagram in self.model.pop(Direction.TO_CLIENT, now):
             self.client.sendto(datagram, self.client_address)
-
-    def to_vehicle(self, datagrams: list[bytes]) -> None:
-        """Send towards the vehicle, if it spoke before."""
-        for datagram in datagrams:
+        for datagram in self.model.pop(Direction.TO_VEHICLE, now):
             if self.vehicle_address is not None:
                 self.vehicle.sendto(datagram, self.vehicle_address)
 
@@ -129,18 +78,9 @@ def main() -> int:
     for what in ("loss", "dup", "reorder", "corrupt"):
         parser.add_argument(f"--{what}", type=float, default=0.0)
     args = parser.parse_args()
-    chances = (args.loss, args.dup, args.reorder, args.corrupt)
-    down = Mischief(random.Random(args.seed), *chances)
-    up = Mischief(random.Random(args.seed + 1), *chances)
-
-    def stop(*_: object) -> None:
-        raise SystemExit
-
-    signal.signal(signal.SIGTERM, stop)
-    try:
-        Proxy(args.vehicle_port, args.client_port, down, up).run()
-    except SystemExit:
-        print(json.dumps({"down": down.counts, "up": up.counts}))
+    settings = LinkSettings(loss=args.loss, duplicate=args.dup, reorder=args.reorder, corrupt=args.corrupt)
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
+    Proxy(args.vehicle_port, args.client_port, LinkModel(random.Random(args.seed), settings)).run()
     return 0
 
 
