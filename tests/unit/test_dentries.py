@@ -71,15 +71,6 @@ def test_a_dir_timeout_that_a_user_set_is_the_bound() -> None:
     assert dentries.fresh(b"/") is None
 
 
-def test_the_listing_is_as_old_as_its_first_page(clock: Clock) -> None:
-    dentries = make(clock)
-    clock.now = 3
-    sweep = dentries.begin(b"/")
-    clock.now = 7
-    directory = dentries.remember(sweep, Listing((), 4.0))
-    assert (directory.listed_at, directory.fresh_until) == (3, 27)
-
-
 @pytest.mark.holds("promise 10")
 def test_names_that_could_leave_the_tree_do_not_enter_it() -> None:
     dentries = make()
@@ -119,15 +110,6 @@ def test_least_recently_used_listings_go_first() -> None:
     assert dentries.entry_count == 6
 
 
-def test_the_newest_listing_stays_however_large() -> None:
-    dentries = make(max_entries=5)
-    put(dentries, b"/1", file(b"a"))
-    put(dentries, b"/2", *(file(b"%d" % i) for i in range(50)))
-    assert (len(dentries), dentries.entry_count) == (1, 50)
-    put(dentries, b"/2", file(b"a"))
-    assert (len(dentries), dentries.entry_count) == (1, 1)
-
-
 # --- expiring and forgetting
 
 
@@ -138,17 +120,6 @@ def test_an_expired_listing_is_kept_but_proves_nothing() -> None:
     dentries.expire(b"/unknown")
     assert dentries.fresh(b"/") is None
     assert names(dentries, b"/") == {b"a"}
-
-
-def test_expire_all_covers_listings_under_way() -> None:
-    dentries = make()
-    put(dentries, b"/", file(b"a"))
-    sweep = dentries.begin(b"/b")
-    dentries.expire_all()
-    assert dentries.fresh(b"/") is None
-    directory = dentries.remember(sweep, Listing((file(b"c"),), 0))
-    assert (set(directory.entries), directory.fresh_until) == ({b"c"}, 0)
-    assert dentries.known(b"/b") is None
 
 
 def test_forget_takes_all_below_and_nothing_beside() -> None:
@@ -244,7 +215,3 @@ def test_a_change_during_a_listing_beats_what_it_saw_and_leaves_it_incomplete() 
 )
 def test_log_paths_tell_their_time(path: bytes, expected: int) -> None:
     assert shown_mtime(path, None) == expected
-
-
-def test_a_listed_mtime_beats_the_path() -> None:
-    assert shown_mtime(b"/log/2024-05-01", 7) == 7

@@ -12,16 +12,13 @@ import trio.testing
 from mavftpfs.cache.files import MAX_CLOSED
 from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.tree import Tree
-from mavftpfs.protocol.payload import Opcode
 from mavftpfs.shared.errors import (
     DataUnproven,
     FileChanged,
     FileTooLarge,
-    FtpNak,
     IsADirectory,
     LocalProtocolError,
     NotFound,
-    RequestTimeout,
     VehicleLost,
 )
 from tests.support.fake_store import FakeStore, make_tree, read_file
@@ -93,20 +90,6 @@ async def test_a_second_reader_of_the_file_shares_blocks_and_session(store: Fake
     assert tree._files.open_versions == {}
 
 
-async def test_two_opens_at_once_are_one_request(store: FakeStore, tree: Tree) -> None:
-    store.open_delay = 1
-    sizes = []
-
-    async def open_and_note() -> None:
-        sizes.append((await tree.open(LOG)).size)
-
-    async with trio.open_nursery() as openers:
-        openers.start_soon(open_and_note)
-        openers.start_soon(open_and_note)
-    assert sizes == [len(DATA)] * 2
-    assert store.count("open") == 1
-
-
 async def test_sequential_reads_fetch_ahead_and_release_drops_it(store: FakeStore, tree: Tree) -> None:
     store.add(b"/big", content(8 * MIB))
     handle = await tree.open(b"/big")
@@ -122,41 +105,6 @@ async def test_sequential_reads_fetch_ahead_and_release_drops_it(store: FakeStor
     assert reader.ahead.empty
 
 
-async def test_hits_extend_the_readahead(store: FakeStore, tree: Tree) -> None:
-    store.add(b"/big", content(8 * MIB))
-    handle = await tree.open(b"/big")
-    await handle.read(0, 128 * KIB)
-    await handle.read(128 * KIB, 128 * KIB)
-    await trio.sleep(60)
-    asked = store.readers[0].demand.total
-    await handle.read(256 * KIB, 128 * KIB)
-    assert not store.readers[0].ahead.empty
-    assert asked == 0
-    assert tree.status()["misses"] == 2
-    assert tree.status()["hits"] == 1
-
-
-async def test_an_error_reaches_the_reader_and_the_next_read_tries_again(
-    store: FakeStore, tree: Tree
-) -> None:
-    store.fail_chunks = [VehicleLost("gone")]
-    handle = await tree.open(LOG)
-    with pytest.raises(VehicleLost):
-        await handle.read(0, 100)
-    assert await handle.read(0, 100) == DATA[:100]
-
-
-async def test_a_stalled_read_times_out_and_recovers(store: FakeStore, tree: Tree) -> None:
-    handle = await tree.open(LOG)
-    store.stalled = True
-    began = trio.current_time()
-    with pytest.raises(RequestTimeout):
-        await handle.read(0, 100)
-    assert trio.current_time() - began == pytest.approx(30, abs=1)
-    store.stalled = False
-    assert await handle.read(0, 100) == DATA[:100]
-
-
 @pytest.mark.holds("promise 6", "rule 14.30")
 async def test_a_directory_is_not_opened(tree: Tree) -> None:
     with pytest.raises(IsADirectory):
@@ -165,14 +113,6 @@ async def test_a_directory_is_not_opened(tree: Tree) -> None:
         await tree.open(b"/")
     with pytest.raises(NotFound):
         await tree.open(b"/logs/none")
-
-
-async def test_a_refused_open_leaves_nothing(store: FakeStore, tree: Tree) -> None:
-    store.fail["reader", LOG] = [FtpNak(Opcode.OPEN_FILE_RO, 2, 13)]
-    with pytest.raises(FtpNak):
-        await tree.open(LOG)
-    assert tree._files.open_versions == {}
-    assert await read_file(tree, LOG) == DATA
 
 
 # --- close-to-open
@@ -185,10 +125,6 @@ async def test_a_second_cat_asks_nothing(store: FakeStore, tree: Tree) -> None:
     assert handle.keep_cache
     assert await handle.read(0, len(DATA)) == DATA
     assert store.calls == before
-
-
-async def test_the_first_open_does_not_keep_the_kernels_pages(tree: Tree) -> None:
-    assert not (await tree.open(LOG)).keep_cache
 
 
 async def test_equal_size_and_mtime_prove_the_cache_for_ever(store: FakeStore, tree: Tree) -> None:
@@ -243,26 +179,6 @@ async def test_a_changed_mtime_starts_a_new_version(store: FakeStore, tree: Tree
             await old.read(0, 100)
     old.close()
     assert await new.read(5, 5) == DATA[::-1][5:10]
-
-
-async def test_a_waiting_read_of_a_changed_file_ends(store: FakeStore, tree: Tree) -> None:
-    old = await tree.open(LOG)
-    assert await old.read(200_000, 100) == DATA[200_000:200_100]
-    store.stalled = True
-    errors = []
-
-    async def read() -> None:
-        try:
-            await old.read(0, 100)
-        except FileChanged as error:
-            errors.append(error)
-
-    async with trio.open_nursery() as readers:
-        readers.start_soon(read)
-        await trio.sleep(21)
-        store.add(LOG, DATA[::-1], 1_700_000_001)
-        await tree.open(LOG)
-    assert len(errors) == 1
 
 
 async def test_a_smaller_ack_is_another_file_even_if_the_listing_is_old(store: FakeStore) -> None:
@@ -417,14 +333,6 @@ async def test_after_a_reboot_recency_is_no_proof(store: FakeStore, tree: Tree) 
     handle.close()
 
 
-async def read_before_a_reboot(tree: Tree) -> OpenFile:
-    """Return a handle of a file that was read whole before the vehicle restarted."""
-    handle = await tree.open(LOG)
-    await handle.read(0, len(DATA))
-    tree.rebooted()
-    return handle
-
-
 # --- doubtful bytes (promise 1)
 
 
@@ -451,19 +359,6 @@ async def test_bytes_that_stay_suspect_are_an_error(store: FakeStore, tree: Tree
     assert trio.current_time() < began + 20
     store.suspect_chunks = 0
     assert await handle.read(0, len(DATA)) == DATA
-
-
-async def test_bytes_of_an_earlier_reader_are_not_in_doubt(store: FakeStore, tree: Tree) -> None:
-    store.armed = True
-    first = await tree.open(LOG)
-    await first.read(0, 1000)
-    first.close()
-    handle = await tree.open(LOG)
-    store.suspect_chunks = 10**6
-    with pytest.raises(DataUnproven):
-        await handle.read(200_000, 1000)
-    store.stalled = True
-    assert await handle.read(0, 1000) == DATA[:1000]
 
 
 async def test_doubtful_bytes_do_not_survive_the_last_close(store: FakeStore, tree: Tree) -> None:

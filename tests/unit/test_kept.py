@@ -109,15 +109,6 @@ async def test_a_file_read_yesterday_costs_nothing(mounts: Mounts) -> None:
     assert tree.status()["files_from_disk"] == 1
 
 
-async def test_only_the_rest_is_read(mounts: Mounts) -> None:
-    tree, handle = await mounts.open_partly_kept()
-    assert await handle.read(0, 100) == DATA[:100]
-    assert mounts.asked() == []
-    handle.close()
-    assert await read_file(tree, LOG) == DATA
-    assert mounts.store.count("open") == 1
-
-
 async def test_a_damaged_block_is_read_again(mounts: Mounts) -> None:
     await mounts.read_and_settle()
     for number, path in enumerate(p for p in mounts.path.rglob("*") if p.is_file()):
@@ -230,24 +221,6 @@ async def test_without_an_mtime_and_a_checksum_all_is_read(mounts: Mounts, why: 
     assert store.count("open") == 1
 
 
-async def test_a_silent_checksum_is_asked_for_once(mounts: Mounts) -> None:
-    for path in (LOG, b"/logs/b", b"/logs/c"):
-        mounts.store.add(path, DATA, None)
-        await mounts.read_and_settle(path)
-    asked = []
-
-    async def silent(path: bytes, *, size: int | None = None) -> int:
-        asked.append(path)
-        await trio.sleep_forever()
-        raise AssertionError
-
-    mounts.store.crc32 = silent  # type: ignore[method-assign]
-    tree = mounts.mount()
-    for path in (LOG, b"/logs/b", b"/logs/c"):
-        assert await read_file(tree, path) == DATA
-    assert asked == [LOG]
-
-
 async def test_a_full_disk_ends_the_keeping_not_the_reading(
     mounts: Mounts, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -314,13 +287,3 @@ async def test_a_file_that_changes_while_it_is_opened_from_the_disk(
         mounts.disk_delay = 10.0
     nursery.start_soon(change)
     assert await read_file(tree, LOG) == new
-
-
-async def test_two_mounts_at_once_share_the_directory(mounts: Mounts) -> None:
-    first, second = mounts.mount(), mounts.mount()
-    async with trio.open_nursery() as both:
-        for tree in (first, second):
-            both.start_soon(read_file, tree, LOG)
-    await trio.sleep(ENOUGH)
-    assert await read_file(mounts.mount(), LOG) == DATA
-    assert mounts.asked() == []

@@ -109,14 +109,6 @@ def test_a_changed_byte_is_a_miss_and_the_block_is_gone(
     assert files_of(tmp_path) == []
 
 
-@pytest.mark.parametrize("length", [0, 10, 33, 34, 65_536 + 32])
-def test_a_cut_block_is_a_miss(directory: KeptDisk, tmp_path: Path, length: int) -> None:
-    directory.write(block(0), DATA)
-    (file,) = files_of(tmp_path)
-    file.write_bytes(file.read_bytes()[:length])
-    assert directory.read(block(0)) is None
-
-
 def test_a_block_under_a_wrong_name_is_a_miss(directory: KeptDisk, tmp_path: Path) -> None:
     directory.write(block(0), DATA)
     directory.write(block(1), DATA[::-1])
@@ -174,12 +166,3 @@ def test_what_a_killed_writer_left_goes_after_a_while(directory: KeptDisk, tmp_p
     assert not old.exists()
     assert new.exists()
     assert directory.read(block(0)) == DATA
-
-
-def test_a_failed_write_leaves_nothing_behind(directory: KeptDisk, tmp_path: Path) -> None:
-    place = tmp_path / "deep" / "cache" / NAME / block(0)[:2] / block(0)
-    place.mkdir(parents=True)  # cannot be replaced by a file
-    with pytest.raises(IsADirectoryError):
-        directory.write(block(0), DATA)
-    assert files_of(tmp_path) == []
-    assert directory.read(block(0)) is None

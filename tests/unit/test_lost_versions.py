@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator
 
 import pytest
 import trio
@@ -65,29 +65,6 @@ async def test_it_stays_lost_while_the_new_file_is_written_and_afterwards(store:
     await require_lost(lost)
     await lost.release()
     assert store.files[FILE].data == b"mid" + NEW[3:]
-
-
-async def found_by_a_writer(tree: Tree) -> OpenFile:
-    return await tree.open(FILE, write=True)
-
-
-async def read_and_unlinked(tree: Tree) -> OpenFile:
-    later = await tree.open(FILE)
-    assert bytes(await later.read(0, 900)) == NEW
-    await tree.unlink(FILE)
-    return later
-
-
-@pytest.mark.parametrize("meet", [found_by_a_writer, read_and_unlinked])
-async def test_it_is_lost_whatever_happens_to_the_new_file_here(
-    store: FakeWriter, tree: Tree, meet: Callable[[Tree], Awaitable[OpenFile]]
-) -> None:
-    lost = await reader_of_another(store, tree)
-    later = await meet(tree)
-    await require_lost(lost)
-    assert bytes(await later.read(0, 900)) == NEW
-    for file in (later, lost):
-        await file.release()
 
 
 async def test_the_kernel_keeps_no_pages_of_the_new_file_while_the_old_one_is_open(
@@ -163,21 +140,6 @@ async def require_only_the_whole_goes(store: FakeWriter, writer: OpenFile) -> No
     assert store.files[FILE].data == b"whole"
 
 
-@pytest.mark.parametrize("cut", [False, True])
-async def test_changes_of_a_lost_file_do_not_go_to_the_new_one(store: FakeWriter, cut: bool) -> None:
-    """The vehicle restarted with another card."""
-    tree = make_writable(store, inplace=True)
-    writer = await opened(tree, write=True)
-    store.add(FILE, NEW, 2)
-    tree.rebooted()
-    await require_lost(writer)
-    with pytest.raises(FileChanged):
-        await (writer.truncate(500) if cut else writer.write(0, b"mid"))
-    await trio.sleep(60.0)
-    assert store.files[FILE].data == NEW
-    await writer.release()
-
-
 @pytest.mark.parametrize("failed", [False, True])
 @pytest.mark.parametrize("cut", [False, True])
 async def test_changes_that_waited_over_a_restart_go_to_the_very_file_only(
@@ -195,15 +157,6 @@ async def test_changes_that_waited_over_a_restart_go_to_the_very_file_only(
     store.add(FILE, NEW, 2)
     tree.rebooted()
     await require_only_the_whole_goes(store, writer)
-
-
-async def test_changes_that_waited_over_a_restart_are_delivered(store: FakeWriter) -> None:
-    tree = make_writable(store, inplace=True)
-    writer = await opened(tree, write=True)
-    await writer.write(0, b"mid")
-    tree.rebooted()
-    await writer.release()
-    assert store.files[FILE].data == b"mid" + OLD[3:]
 
 
 @pytest.mark.parametrize("look", ["stat", "read", "write", "empty", "make"])

@@ -68,13 +68,6 @@ def test_the_window_never_passes_the_end() -> None:
     assert ahead.on_read(256 * KIB, 300 * KIB, limit=MAX_WINDOW, small=SMALL_FILE) == NOTHING
 
 
-def test_the_last_bytes_are_asked_even_if_they_are_few() -> None:
-    ahead = Readahead(385 * KIB)
-    read(ahead, 64 * KIB, 64 * KIB)
-    assert read(ahead, 128 * KIB).stop == 384 * KIB
-    assert read(ahead, 256 * KIB, 4 * KIB) == Plan(384 * KIB, 385 * KIB)
-
-
 def test_a_seek_closes_the_window_and_says_so_once() -> None:
     ahead = Readahead(BIG)
     read(ahead, 0)
@@ -85,12 +78,6 @@ def test_a_seek_closes_the_window_and_says_so_once() -> None:
     assert read(ahead, again) == Plan(again + 128 * KIB, again + 128 * KIB + FIRST_WINDOW)
 
 
-def test_random_reads_ask_nothing() -> None:
-    ahead = Readahead(BIG)
-    offsets = [7, 900, 3, 500, 77, 20, 600]
-    assert [read(ahead, offset * 1024 * KIB, 4 * KIB) for offset in offsets] == [NOTHING] * 7
-
-
 def test_the_kernel_may_swap_two_reads() -> None:
     ahead = Readahead(BIG)
     read(ahead, 4 * KIB, 124 * KIB)
@@ -98,13 +85,6 @@ def test_the_kernel_may_swap_two_reads() -> None:
     assert later == Plan(384 * KIB, 512 * KIB)
     assert earlier == NOTHING
     assert read(ahead, 384 * KIB).start == 512 * KIB
-
-
-def test_a_stride_wider_than_a_read_is_random() -> None:
-    ahead = Readahead(BIG)
-    read(ahead, 0, 4 * KIB)
-    assert read(ahead, 9 * KIB, 4 * KIB) == NOTHING
-    assert read(ahead, 4 * KIB + 9 * KIB, 4 * KIB) != NOTHING
 
 
 def test_a_small_file_is_wanted_whole_at_the_first_read_from_its_start() -> None:

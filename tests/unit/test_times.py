@@ -41,12 +41,6 @@ async def test_times_follow_a_rename_and_end_with_another_size(store: FakeWriter
     assert (await tree.stat(FILE)).mtime != 5
 
 
-async def test_writing_ends_a_set_time(tree: Tree) -> None:
-    await tree.set_times(FILE, 5 * 10**9)
-    await tree.truncate(FILE, 10)
-    assert (await tree.stat(FILE)).mtime != 5
-
-
 @pytest.mark.parametrize("listed", [None, 1_500_000_000])
 @pytest.mark.parametrize("data", [b"", b"data"])
 async def test_what_is_made_and_written_shows_the_time_of_day(
@@ -66,15 +60,6 @@ async def test_what_is_made_and_written_shows_the_time_of_day(
         for path in (FILE, b"/card/other"):
             assert (await tree.stat(path)).mtime == 1_700_000_000
         tree.forget_caches()
-
-
-async def test_in_a_directory_just_made_too(store: FakeWriter, tree: Tree) -> None:
-    """Else the next listing changes the time of an open file, and its editor asks who changed it."""
-    store.files[FILE].mtime = 1_500_000_000
-    await tree.stat(FILE)
-    await tree.mkdir(b"/card/new")
-    await write_file(tree, b"/card/new/file", b"data")
-    assert (await tree.stat(b"/card/new/file")).mtime == 1_700_000_000
 
 
 @pytest.mark.parametrize("data", [b"", b"data"])

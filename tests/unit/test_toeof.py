@@ -86,22 +86,6 @@ def test_a_lost_block_is_waited_for_behind_the_end() -> None:
     assert reading.op.data == content
 
 
-def test_nothing_is_asked_behind_a_known_end() -> None:
-    content = random.Random(1).randbytes(300)
-    reading = Reading(any_order=True)
-    for offset in (300, 0, 100, 200):
-        reading.engine.receive(chunk(reading.out[offset], content), 0.0)
-        assert all(request.offset == 0 for request in sent(reading.engine, 0.0))
-    assert reading.op.data == content
-
-
-def test_an_empty_ack_is_an_end() -> None:
-    reading = Reading()
-    reading.answer(0, b"x" * 100)
-    reading.engine.receive(ack(reading.out[100]), 0.0)
-    assert reading.op.data == b"x" * 100
-
-
 def test_an_overlong_block_is_clipped() -> None:
     reading = Reading()
     reading.engine.receive(ack(reading.out[0], b"y" * 150), 0.0)
@@ -117,12 +101,6 @@ def test_the_limit() -> None:
     assert not reading.op.done
     reading.answer(300, bytes(1000))
     assert isinstance(reading.op.error, DataUnproven)
-
-
-def test_exactly_the_limit_is_allowed() -> None:
-    reading = Reading(limit=350)
-    reading.all(bytes(350))
-    assert len(reading.op.data) == 350
 
 
 @pytest.mark.parametrize("late", [False, True])

@@ -76,44 +76,12 @@ async def start_read(nursery: trio.Nursery, blocks: Version, start: int, stop: i
 # --- presence
 
 
-async def test_bytes_come_back_from_any_split() -> None:
-    data = content(3 * BLOCK_SIZE + 100)
-    blocks = Version(make_cache(), b"/f", len(data))
-    for start in range(0, len(data), 239):
-        deliver(blocks, start, data[start : start + 239])
-    assert blocks.complete
-    for start, stop in [
-        (0, 1),
-        (BLOCK_SIZE - 1, BLOCK_SIZE + 1),
-        (5, len(data)),
-        (BLOCK_SIZE, 2 * BLOCK_SIZE),
-    ]:
-        view = blocks.get(start, stop)
-        assert view is not None
-        assert bytes(view) == data[start:stop]
-
-
 async def test_a_read_within_a_block_is_a_view_that_cannot_be_written() -> None:
     blocks = Version(make_cache(), b"/f", 100)
     deliver(blocks, 0, content(100))
     view = blocks.get(10, 20)
     assert isinstance(view, memoryview)
     assert view.readonly
-
-
-async def test_what_is_present_is_never_overwritten() -> None:
-    blocks = Version(make_cache(), b"/f", 1000)
-    deliver(blocks, 100, b"A" * 100)
-    deliver(blocks, 50, b"B" * 200)
-    assert bytes(blocks.get(50, 250) or b"") == b"B" * 50 + b"A" * 100 + b"B" * 50
-
-
-async def test_what_lies_beyond_the_opened_size_is_dropped() -> None:
-    blocks = Version(make_cache(), b"/f", 100)
-    deliver(blocks, 90, b"x" * 50)
-    deliver(blocks, 100, b"x" * 50)
-    deliver(blocks, 5000, b"x" * 50)
-    assert blocks.missing(0, 1000) == [(0, 90)]
 
 
 @pytest.mark.holds("promise 1")
@@ -124,12 +92,6 @@ async def test_a_hole_is_not_readable() -> None:
     assert blocks.get(0, 201) is None
     assert blocks.get(0, 100) is not None
     assert not blocks.complete
-
-
-async def test_an_empty_file_is_complete_and_empty() -> None:
-    blocks = Version(make_cache(), b"/f", 0)
-    assert blocks.complete
-    assert blocks.empty
 
 
 # --- budget
@@ -146,28 +108,6 @@ async def test_least_recently_read_blocks_go_first() -> None:
     assert cache.bytes_cached == 4 * BLOCK_SIZE
     assert cache.evictions == 1
     cache.check_invariants()
-
-
-async def test_memory_stays_within_the_budget_for_a_file_ten_times_the_cache() -> None:
-    cache = make_cache(4 * BLOCK_SIZE)
-    blocks = Version(cache, b"/f", 40 * BLOCK_SIZE)
-    for index in range(40):
-        deliver(blocks, index * BLOCK_SIZE, content(BLOCK_SIZE, index))
-        cache.check_invariants()
-        assert bytes(blocks.get(index * BLOCK_SIZE, (index + 1) * BLOCK_SIZE) or b"") == content(
-            BLOCK_SIZE, index
-        )
-    assert cache.bytes_cached == 4 * BLOCK_SIZE
-
-
-async def test_small_files_cost_their_size() -> None:
-    cache = make_cache()
-    blocks = Version(cache, b"/f", 100)
-    deliver(blocks, 0, b"x")
-    assert cache.bytes_cached == 100
-    blocks.clear()
-    assert cache.bytes_cached == 0
-    assert blocks.empty
 
 
 async def test_blocks_with_waiters_are_not_evicted(nursery: trio.Nursery) -> None:
@@ -187,17 +127,6 @@ async def test_blocks_with_waiters_are_not_evicted(nursery: trio.Nursery) -> Non
     assert waited.empty
 
 
-async def test_evicted_bytes_are_not_proven_any_more() -> None:
-    blocks = Version(make_cache(), b"/f", 2 * BLOCK_SIZE)
-    deliver(blocks, 0, content(2 * BLOCK_SIZE))
-    blocks.begin_reading()
-    blocks.evict(0)
-    deliver(blocks, 0, b"\0" * BLOCK_SIZE)
-    blocks.on_suspect("test")
-    assert blocks.get(0, 1) is None
-    assert blocks.get(BLOCK_SIZE, BLOCK_SIZE + 1) is not None
-
-
 # --- waiting
 
 
@@ -213,13 +142,6 @@ async def test_a_reader_asks_for_what_is_missing_and_gets_it(nursery: trio.Nurse
     deliver(blocks, 400, data[400:600])
     await trio.testing.wait_all_tasks_blocked()
     assert reading.results == [data[200:600]]
-
-
-async def test_what_is_present_costs_no_wait() -> None:
-    blocks = Version(make_cache(), b"/f", 10)
-    deliver(blocks, 0, content(10))
-    assert bytes(await read(blocks, 0, 10) or b"") == content(10)
-    assert trio.current_time() == 0
 
 
 async def test_readers_wake_once_per_batch(nursery: trio.Nursery) -> None:
@@ -253,16 +175,6 @@ async def test_only_bytes_of_the_own_range_are_progress(nursery: trio.Nursery) -
         deliver(blocks, 100, b"x")
     assert [type(error) for error in mine.errors] == [RequestTimeout]
     assert mine.took == pytest.approx(PATIENCE)
-
-
-async def test_slow_but_steady_is_no_timeout(nursery: trio.Nursery) -> None:
-    blocks = Version(make_cache(), b"/f", 10)
-    reading = await start_read(nursery, blocks, 0, 10)
-    for offset in range(10):
-        await trio.sleep(29)
-        deliver(blocks, offset, content(10)[offset : offset + 1])
-    await trio.testing.wait_all_tasks_blocked()
-    assert reading.results == [content(10)]
 
 
 async def test_failure_reaches_those_who_wait_and_no_later_read(nursery: trio.Nursery) -> None:
@@ -343,14 +255,3 @@ async def test_a_doubt_wakes_those_who_wait(nursery: trio.Nursery) -> None:
     blocks.on_suspect("test")
     await trio.testing.wait_all_tasks_blocked()
     assert reading.results == [None]
-
-
-async def test_the_rate_is_measured_from_what_arrives() -> None:
-    cache = make_cache()
-    blocks = Version(cache, b"/f", 10_000)
-    for step in range(20):
-        deliver(blocks, step * 100, b"x" * 100)
-        deliver(blocks, step * 100, b"x" * 100)  # known bytes are no traffic worth counting
-        await trio.sleep(0.1)
-    assert cache.meter.rate == pytest.approx(1000)
-    assert cache.readahead_limits(1)[0] == pytest.approx(3000, abs=2)

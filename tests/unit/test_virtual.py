@@ -80,14 +80,6 @@ async def test_unlistable_trees_appear_beside_announced_ones(tree: Tree) -> None
     assert dict(await tree.list(b"/"))[b"@MISSION"].kind is EntryKind.DIRECTORY
 
 
-async def test_what_cannot_be_listed_is_not_listed(store: FakeStore, tree: Tree) -> None:
-    await tree.list(b"/")
-    await tree.list(b"/@PARAM")
-    await tree.stat(b"/@MISSION/fence.dat")
-    await read_file(tree, PARAM)
-    assert {path for call, path in store.calls if call == "list"} == {b"/", b"."}
-
-
 async def test_a_server_without_trees_sees_one_probe_and_only_if_somebody_asks(px4: FakeStore) -> None:
     tree = make_tree(px4)
     assert await names(tree, b"/") == {b"fs"}
@@ -162,17 +154,6 @@ async def test_a_snapshot_lasts_dir_timeout_and_an_open_gets_some_grace(store: F
     assert await handle.read(0, 99) == b"SERIAL0 on"
 
 
-async def test_an_expensive_snapshot_is_kept_longer(store: FakeStore, tree: Tree) -> None:
-    store.whole_delay = 5
-    await tree.stat(PARAM)
-    await trio.sleep(49)
-    await tree.stat(PARAM)
-    assert store.count("whole", PARAM) == 1
-    await trio.sleep(2)
-    await tree.stat(PARAM)
-    assert store.count("whole", PARAM) == 2
-
-
 async def test_romfs_is_an_ordinary_tree_read_whole(store: FakeStore, tree: Tree) -> None:
     path = b"/@ROMFS/defaults.parm"
     assert dict(await tree.list(b"/@ROMFS"))[b"defaults.parm"] == await tree.stat(path)
@@ -218,15 +199,6 @@ async def test_checksum_of_what_a_reader_gets(store: FakeStore, tree: Tree) -> N
 
 
 # --- queries and odd names
-
-
-async def test_names_with_a_query_are_probed(store: FakeStore, tree: Tree) -> None:
-    query = PARAM + b"?withdefaults=1"
-    store.add(query, b"with defaults")
-    assert (await tree.stat(query)).size == 13
-    assert await read_file(tree, query) == b"with defaults"
-    assert store.count("whole") == 1
-    assert await names(tree, b"/@PARAM") == {b"param.pck"}
 
 
 async def test_absent_names_are_remembered_for_a_while(store: FakeStore, tree: Tree) -> None:
@@ -277,13 +249,6 @@ async def test_what_is_listed_but_not_found_is_hidden(store: FakeStore, tree: Tr
     assert b"uarts.txt" in await names(tree, b"/@SYS")
 
 
-async def test_not_found_while_reading_is_a_lost_session(store: FakeStore, tree: Tree) -> None:
-    store.fail["whole", UARTS] = [FtpNak(Opcode.READ_FILE, NakCode.FILE_NOT_FOUND)]
-    with pytest.raises(FtpNak):
-        await tree.open(UARTS)
-    assert (await tree.stat(UARTS)).size == 10
-
-
 async def test_other_refusals_do_not_hide(store: FakeStore, tree: Tree) -> None:
     refuse(store, UARTS, NakCode.FAIL)
     listed = dict(await tree.list(b"/@SYS"))[b"uarts.txt"]
@@ -293,21 +258,6 @@ async def test_other_refusals_do_not_hide(store: FakeStore, tree: Tree) -> None:
     assert (await tree.stat(UARTS)).size == LIE
     with pytest.raises(FtpNak):
         await tree.open(UARTS)
-
-
-async def test_refused_missions_are_not_shown_for_a_while(store: FakeStore, tree: Tree) -> None:
-    refuse(store, b"/@MISSION/rally.dat", NakCode.FAIL, times=1)
-    assert await names(tree, b"/@MISSION") == {b"mission.dat", b"fence.dat"}
-    assert await names(tree, b"/@MISSION") == {b"mission.dat", b"fence.dat"}
-    await trio.sleep(21)
-    assert b"rally.dat" in await names(tree, b"/@MISSION")
-
-
-async def test_subdirectories_are_shown_and_not_read(store: FakeStore, tree: Tree) -> None:
-    store.add(b"/@SYS/deep/x.txt", b"x", claims=LIE)
-    assert dict(await tree.list(b"/@SYS"))[b"deep"].kind is EntryKind.DIRECTORY
-    assert (await tree.stat(b"/@SYS/deep")).kind is EntryKind.DIRECTORY
-    assert (await tree.stat(b"/@SYS/deep/x.txt")).size == 1
 
 
 # --- slow and lost links
@@ -355,18 +305,6 @@ async def test_while_lost_the_last_size_is_shown_and_opens_fail(store: FakeStore
         await tree.open(UARTS)
     with pytest.raises(VehicleLost):
         await tree.open(PARAM)
-
-
-async def test_an_unlistable_file_never_read_has_no_size_to_fall_back_to(
-    store: FakeStore, tree: Tree
-) -> None:
-    await tree.list(b"/")
-    store.fail["whole", PARAM] = [VehicleLost("gone"), VehicleLost("gone")]
-    with pytest.raises(VehicleLost):
-        await tree.stat(PARAM)
-    listed = dict(await tree.list(b"/@PARAM"))[b"param.pck"]
-    assert (listed.size, listed.valid_for) == (0, 0.0)
-    assert (await tree.stat(PARAM)).size == 14882
 
 
 # --- the memory of snapshots
