@@ -23,7 +23,6 @@ from mavftpfs.cache.names import Names
 from mavftpfs.cache.nodes import Attempt, Node
 from mavftpfs.cache.recovery import describe
 from mavftpfs.cache.repair import Cleaner
-from mavftpfs.cache.replace import Replacer
 from mavftpfs.cache.reserved import Kind, Places
 from mavftpfs.cache.throttle import Throttle
 from mavftpfs.cache.verify import Verifier
@@ -65,13 +64,11 @@ class Deliverer:
         self,
         context: Context,
         names: Names,
-        replacer: Replacer,
         cleaner: Cleaner,
         throttle: Throttle,
     ) -> None:
         self._context = context
         self._names = names
-        self._replacer = replacer
         self._cleaner = cleaner
         self._throttle = throttle
         self.verifier = Verifier(context, names)
@@ -240,7 +237,7 @@ class Deliverer:
         begun_at = context.clock()
         try:
             if places is not None:
-                await self._replacer.write_sidecar(places, node.path)
+                await self._names.write_sidecar(places, node.path)
             sending = draft.begin(in_place=places is None)
             sending.progress = self._throttle.on_acked
             upload = await context.writer.open_upload(path, sending)
@@ -271,7 +268,7 @@ class Deliverer:
         """Rename what was sent and verified into place.
 
         Raises:
-            As Replacer. VerificationFailed: it is not what it was any more.
+            As Names.put. VerificationFailed: it is not what it was any more.
         """
         own, path = self._context.own, node.path
         node.attempt = None
@@ -284,7 +281,7 @@ class Deliverer:
                 raise
             self._context.dentries.put(places.new, DirEntry(b"", EntryKind.FILE, draft.size))
             draft.commit()
-            await self._replacer.put(places, path)
+            await self._names.put(places, path)
             if attempt.upload.resent and await self._names.size(path) != draft.size:
                 draft.interrupted(ours=True)
                 raise VerificationFailed(f"{path!r} was emptied by a request that came twice")

@@ -25,7 +25,6 @@ from mavftpfs.cache.draft import Base, Draft, State
 from mavftpfs.cache.names import Names
 from mavftpfs.cache.nodes import Node
 from mavftpfs.cache.overlay import Overlay
-from mavftpfs.cache.replace import Replacer
 from mavftpfs.cache.reserved import Kind, fits_rename, require_not_ours
 from mavftpfs.cache.versions import Version
 from mavftpfs.shared.errors import (
@@ -55,13 +54,10 @@ PIECE = 64 * 1024
 class Namespace:
     """Changes of names. Paths are the vehicle's, not below `@`; those that match `local=` stay here."""
 
-    def __init__(
-        self, context: Context, names: Names, deliverer: Deliverer, replacer: Replacer, overlay: Overlay
-    ) -> None:
+    def __init__(self, context: Context, names: Names, deliverer: Deliverer, overlay: Overlay) -> None:
         self._context = context
         self._names = names
         self._deliverer = deliverer
-        self._replacer = replacer
         self._overlay = overlay
         self._local = overlay.local
 
@@ -273,7 +269,7 @@ class Namespace:
             raise FileBusy(f"{new!r} is open, and its path is too long to keep it")
         context.own.live |= places.all
         try:
-            await self._replacer.replace(old, new, places, keep_old=keep)
+            await self._names.replace(old, new, places, keep_old=keep)
             if keep and displaced is not None and places.old is not None:
                 await self._on_hidden(displaced, places.old)
         finally:

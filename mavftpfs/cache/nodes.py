@@ -15,11 +15,10 @@ from dataclasses import dataclass, field
 
 import trio
 
-from mavftpfs.cache.draft import Base, Draft, Plan, State
+from mavftpfs.cache.draft import Base, Draft, Plan, Sending, State
 from mavftpfs.cache.files import FileHandle
 from mavftpfs.cache.remote import Upload
 from mavftpfs.cache.reserved import Places
-from mavftpfs.cache.sending import Sending
 from mavftpfs.cache.spool import Spool, SpoolContent
 from mavftpfs.shared.errors import FileChanged, MavftpfsError
 

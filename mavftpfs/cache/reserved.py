@@ -78,7 +78,7 @@ class Places:
     @property
     def all(self) -> set[bytes]:
         """Every path of it."""
-        return {path for path in (self.new, self.old, self.sidecar) if path is not None}
+        return {self.new, self.old or self.new, self.sidecar or self.new}
 
 
 def is_reserved(name: bytes) -> bool:

@@ -31,7 +31,6 @@ from mavftpfs.cache.overlay import Overlay
 from mavftpfs.cache.recovery import SpoolDirectory, recover
 from mavftpfs.cache.remote import RemoteStore, WriteStore
 from mavftpfs.cache.repair import Cleaner
-from mavftpfs.cache.replace import Replacer
 from mavftpfs.cache.reserved import OwnNames, is_reserved, new_owner, require_not_ours
 from mavftpfs.cache.spool import Spool
 from mavftpfs.cache.throttle import Throttle
@@ -122,11 +121,10 @@ class Writeback:
         self._names = names
         self._throttle = throttle
         self._cleaner = cleaner
-        replacer = Replacer(context, names)
-        self._deliverer = Deliverer(context, names, replacer, cleaner, throttle)
+        self._deliverer = Deliverer(context, names, cleaner, throttle)
         self._background = Background(context, self._deliverer, throttle, cleaner)
         self.overlay = Overlay(context)
-        self.names = Namespace(context, names, self._deliverer, replacer, self.overlay)
+        self.names = Namespace(context, names, self._deliverer, self.overlay)
         self._local = self.overlay.local
         self._parts = Parts(context, self._deliverer, throttle, self._background, self.overlay, self.names)
 

@@ -7,8 +7,7 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
-from mavftpfs.cache.draft import TRANSITIONS, Base, Draft, Event, State, Where
-from mavftpfs.cache.sending import AHEAD, Sending
+from mavftpfs.cache.draft import AHEAD, TRANSITIONS, Base, Draft, Event, Sending, State, Where
 from mavftpfs.protocol.crc import crc32
 from mavftpfs.shared.errors import LocalProtocolError, SpoolFailed
 

@@ -54,7 +54,6 @@ PURE_MODULES = {
     "cache.readahead",
     "cache.reserved",
     "cache.draft",
-    "cache.sending",
     "fuse.inodes",
     "fuse.handles",
     "fuse.options",
