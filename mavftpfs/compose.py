@@ -197,7 +197,7 @@ async def _list_root(connection: Connection, tree: Tree, deadline: float, option
 
 def no_answer(connection: Connection, options: MountOptions) -> NoFtp:
     """Return what is said when no FTP request was answered within connect_timeout."""
-    if connection.store.kept_out:
+    if connection.scheduler.server.kept_out:
         return NoFtp(f"another client keeps the only FTP session of {_vehicle(connection)} in use")
     return NoFtp(
         f"{_vehicle(connection)} sends heartbeats but did not answer MAVLink FTP "

@@ -11,8 +11,9 @@ from __future__ import annotations
 
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import AsyncExitStack, asynccontextmanager, suppress
-from dataclasses import dataclass
 from enum import Enum
+from functools import partial
+from math import inf
 
 import trio
 
@@ -20,6 +21,7 @@ from mavftpfs.protocol.operations import Simple
 from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.session.doubt import MOST_LATE
 from mavftpfs.session.scheduler import Scheduler
+from mavftpfs.session.vehicle import Vehicle
 from mavftpfs.shared.errors import FtpNak, MavftpfsError, OutcomeUnknown, PathTooLong, RequestTimeout
 from mavftpfs.shared.model import ROOT, DirEntry, EntryKind, Listing, split, wire_path
 
@@ -66,14 +68,6 @@ Lister = Callable[[bytes], Awaitable[Listing]]
 Verdict = Callable[[], Awaitable[Outcome]]
 
 
-@dataclass(slots=True)
-class _Executed:
-    """How many requests that change names are under way, and how many were sent."""
-
-    under_way: int = 0
-    sent: int = 0
-
-
 class Changes:
     """Removes, makes, renames and empties. list_directory: sweeps a directory.
 
@@ -81,33 +75,35 @@ class Changes:
     or OutcomeUnknown: nobody knows.
     """
 
-    def __init__(self, scheduler: Scheduler, list_directory: Lister, clock: Callable[[], float]) -> None:
+    def __init__(
+        self, scheduler: Scheduler, vehicle: Vehicle, list_directory: Lister, clock: Callable[[], float]
+    ) -> None:
         self._scheduler = scheduler
+        self._vehicle = vehicle
         self._list_directory = list_directory
         self._clock = clock
-        self._executed = _Executed()
+        self._sent = 0
+        self._under_way = 0
         self._changed_at: dict[bytes, float] = {}
 
     async def remove(self, path: bytes) -> None:
         """Remove what is known to be a file."""
-        wire = wire_path(path)
+        request = partial(Simple, Opcode.REMOVE_FILE, wire_path(path))
         async with self._changing(path):
-            await self._perform(lambda: Simple(Opcode.REMOVE_FILE, wire), lambda: self._is_absent(path))
-            self._scheduler.gone(path)
+            await self._perform(request, partial(self._is_absent, path))
+            self._scheduler.on_removed(path)
 
     async def remove_directory(self, path: bytes) -> None:
         """Remove what is known to be an empty directory."""
-        wire = wire_path(path)
+        request = partial(Simple, Opcode.REMOVE_DIRECTORY, wire_path(path))
         async with self._changing(path, below=True):
-            await self._perform(lambda: Simple(Opcode.REMOVE_DIRECTORY, wire), lambda: self._is_absent(path))
+            await self._perform(request, partial(self._is_absent, path))
 
     async def make_directory(self, path: bytes) -> None:
         """Make a directory."""
-        wire = wire_path(path)
+        request = partial(Simple, Opcode.CREATE_DIRECTORY, wire_path(path))
         async with self._changing(path):
-            await self._perform(
-                lambda: Simple(Opcode.CREATE_DIRECTORY, wire), lambda: self._is_new_directory(path)
-            )
+            await self._perform(request, partial(self._is_new_directory, path))
 
     async def rename(self, old: bytes, new: bytes, *, completes: bool = False) -> None:
         """Rename; who reads the old path goes on under the new one. completes: in flight, too."""
@@ -115,27 +111,26 @@ class Changes:
         if len(data) > RENAME_LIMIT:
             raise PathTooLong(f"both paths of a rename have {len(data)} bytes, more than {RENAME_LIMIT}")
         async with self._changing(old, new, below=True, in_flight=completes):
-            await self._perform(lambda: Simple(Opcode.RENAME, data), lambda: self._is_renamed(old, new))
-            self._scheduler.gone(new)
-            self._scheduler.moved(old, new)
-        self._scheduler.write_traits.rename_works = True
+            await self._perform(partial(Simple, Opcode.RENAME, data), partial(self._is_renamed, old, new))
+            self._scheduler.on_renamed(old, new)
+        self._scheduler.traits.rename_works = True
 
     async def create_empty(self, path: bytes) -> None:
         """Make an empty file, or empty it; done twice it is the same."""
         wire_path(path)
-        self._scheduler.check_may_write()
+        self._vehicle.require_writable(self._clock())
         await self.rest(path)
         try:
             await self._scheduler.use_session(path, Opcode.CREATE_FILE)
         finally:
-            self._note_changed(path)
+            self._changed_at[path.lower()] = self._clock()
 
     async def rest(self, path: bytes) -> None:
         """Wait while a late copy of the last change of this name may yet be carried out.
 
         Names that differ by case alone count as one, as on many cards.
         """
-        until = self._changed_at.get(path.lower(), float("-inf")) + self._scheduler.doubt.lateness
+        until = self._changed_at.get(path.lower(), -inf) + self._scheduler.doubt.lateness
         await trio.sleep(max(0.0, until - self._clock()))
 
     # --- one change
@@ -148,34 +143,34 @@ class Changes:
 
         below: also off all that lies below the first. in_flight: armed or not.
         """
-        may = self._scheduler.require_link if in_flight else self._scheduler.check_may_write
-        may()
+        require = self._vehicle.require_there if in_flight else self._vehicle.require_writable
+        require(self._clock())
         with trio.move_on_after(self._scheduler.op_deadline + VERIFY_LIMIT) as scope:
-            async with AsyncExitStack() as claims:
+            async with AsyncExitStack() as stack:
                 for path in paths:
-                    await claims.enter_async_context(
-                        self._scheduler.server.claim(path, below=below and path is paths[0])
-                    )
+                    excluded = self._scheduler.server.excluded(path, below=below and path is paths[0])
+                    await stack.enter_async_context(excluded)
                     await self.rest(path)
-                may()  # closing our session may have taken a while
+                require(self._clock())  # closing our session may have taken a while
                 try:
                     yield
                 finally:
+                    now = self._clock()
+                    for path, at in list(self._changed_at.items()):
+                        if now - at > MOST_LATE:
+                            del self._changed_at[path]
                     for path in paths:
-                        self._note_changed(path)
+                        self._changed_at[path.lower()] = now
         if scope.cancelled_caught:
             raise OutcomeUnknown("the vehicle did not get round to it in time")
 
-    def _note_changed(self, path: bytes) -> None:
-        now = self._clock()
-        self._changed_at = {name: at for name, at in self._changed_at.items() if now - at <= MOST_LATE}
-        self._changed_at[path.lower()] = now
-
     async def _perform(self, make: Callable[[], Simple], verify: Verdict) -> None:
         """Run a request; look what became of it if its answer may not be that to its first execution."""
+        server = self._scheduler.server
         for last in (False, True):
             try:
-                await self._execute(make)
+                await server.retry_while_taken(partial(self._send, make), changes=True)
+                return
             except FtpNak as nak:
                 twice = last or self._may_be_second(nak)
                 # PX4 says 8 to everything after one "file exists", until a listing comes to its end.
@@ -193,16 +188,14 @@ class Changes:
                 if outcome is Outcome.UNDONE:
                     raise
                 raise OutcomeUnknown(str(silence)) from silence
-            else:
-                return
 
-    async def _execute(self, make: Callable[[], Simple]) -> None:
-        self._executed.under_way += 1
-        self._executed.sent += 1
+    async def _send(self, make: Callable[[], Simple]) -> None:
+        self._under_way += 1
+        self._sent += 1
         try:
-            await self._scheduler.server.get_through(lambda: self._scheduler.metadata(make()), changes=True)
+            await self._scheduler.metadata(make())
         finally:
-            self._executed.under_way -= 1
+            self._under_way -= 1
 
     def _may_be_second(self, nak: FtpNak) -> bool:
         """Whether a refusal may answer the second execution of a request.
@@ -213,7 +206,7 @@ class Changes:
         if nak.retransmitted:
             return True
         opcode = Opcode(nak.opcode)
-        looked_at = self._scheduler.doubt.active or opcode == Opcode.RENAME
+        looked_at = self._scheduler.doubt.is_active() or opcode == Opcode.RENAME
         return looked_at and nak.code in _SECOND.get(opcode, ())
 
     async def _after_refusal(self, nak: FtpNak, verify: Verdict) -> Outcome:
@@ -258,10 +251,10 @@ class Changes:
         seen: dict[bytes, DirEntry] = {}
         listing = None
         for _ in range(SWEEPS):
-            before = self._executed.sent
+            before = self._sent
             listing = await self._list_directory(directory)
             seen |= {entry.name: entry for entry in listing.entries}
-            if self._executed.sent == before and not self._executed.under_way:
+            if self._sent == before and not self._under_way:
                 return listing.entries, listing.complete
         return tuple(seen.values()), listing is not None and listing.complete
 

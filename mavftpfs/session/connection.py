@@ -8,6 +8,7 @@ import time
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
 from dataclasses import asdict, dataclass, field
+from math import inf
 from typing import Any, Literal
 
 import trio
@@ -25,10 +26,10 @@ from mavftpfs.protocol.budget import FRAME_OVERHEAD, SIGNATURE, Budget
 from mavftpfs.protocol.engine import Engine
 from mavftpfs.protocol.flow import Flow
 from mavftpfs.session.driver import Driver, PayloadTrace
-from mavftpfs.session.fairness import ReadMode
+from mavftpfs.session.reader import ReadMode
 from mavftpfs.session.scheduler import Scheduler
 from mavftpfs.session.store import Store
-from mavftpfs.session.vehicle import Vehicle
+from mavftpfs.session.vehicle import Standing, Vehicle
 from mavftpfs.shared.errors import MavftpfsError, VehicleLost
 
 log = logging.getLogger("mavftpfs.session")
@@ -113,6 +114,7 @@ class Connection:
         now = self.clock()
         vehicle = self.vehicle
         stats = self.engine.stats
+        session = self.scheduler.server.session
         return {
             "source": self.link.description,
             "address": None if self.driver.peer is None else readable_address(self.driver.peer),
@@ -122,7 +124,7 @@ class Connection:
             "heartbeat_age": None if vehicle.heartbeat_at is None else round(vehicle.silence(now), 1),
             "ftp_flag": vehicle.ftp_flag,
             "lost": vehicle.lost(now),
-            "another_vehicle": vehicle.identity.stranger,
+            "another_vehicle": vehicle.identity.standing is Standing.STRANGER,
             "reboots": vehicle.reboots,
             "other_ftp_client": vehicle.foreign_client(now),
             "rtt": self.engine.rtt,
@@ -133,14 +135,12 @@ class Connection:
                 "chunk": self.scheduler.read_chunks.size,
                 "loss": round(self.engine.flow.loss, 4),
             },
-            "session_open": None
-            if self.scheduler.session is None
-            else self.scheduler.session.path.decode("utf-8", "replace"),
+            "session_open": None if session is None else session.path.decode("utf-8", "replace"),
             "requests": stats.requests,
             "retransmissions": stats.retransmissions,
             "lists_times": self.store.lists_times,
             "write_traits": asdict(self.store.traits),
-            "uploads": [upload.status() for upload in self.scheduler.uploads],
+            "uploads": [upload.status() for upload in self.scheduler.uploads()],
             "link": {
                 "received_bytes": self.link.stats.received_bytes,
                 "sent_bytes": self.link.stats.sent_bytes,
@@ -173,7 +173,7 @@ class Connection:
         self._first_heartbeat.set()
         if self.was_lost:
             self.was_lost = False
-            self.scheduler.on_link_back()
+            self.scheduler.server.wake()
             self._tell("back")
 
     def _tell(self, news: str) -> None:
@@ -268,7 +268,8 @@ def _build(
 ) -> Connection:
     own = Address(options.source_system, options.source_component)
     framer = Framer(own, stream=link.is_stream, signing_key=options.signing_key, signing_clock=signing_now)
-    vehicle = Vehicle(options.target_system, options.target_component, own)
+    write_armed = options.when_armed == "ok"
+    vehicle = Vehicle(options.target_system, options.target_component, own, write_armed)
     signature = 0 if options.signing_key is None else SIGNATURE
     budget = None if options.bwlimit is None else Budget(options.bwlimit, FRAME_OVERHEAD + signature)
     flow = Flow(serial=link.is_serial, limit=options.window, budget=budget)
@@ -276,22 +277,19 @@ def _build(
     driver = Driver(link, framer, engine, vehicle, clock=clock, trace=trace)
     scheduler = Scheduler(
         driver,
-        engine,
         vehicle,
         clock=clock,
         op_deadline=options.op_deadline,
-        when_armed_ok=options.when_armed == "ok",
         read_mode=options.read_mode if budget is None else "window",
         chunk=options.chunk,
     )
-    store = Store(scheduler, vehicle, clock=clock, op_deadline=options.op_deadline)
+    store = Store(scheduler, driver, vehicle, clock=clock, op_deadline=options.op_deadline)
     connection = Connection(store, vehicle, scheduler, engine, driver, link, options, clock)
-    driver.on_batch = scheduler.on_batch
 
     def on_reboot() -> None:
         engine.forget_server()
         scheduler.on_reboot()
-        store.forget_traits()
+        store.forget_server()
         connection._tell("reboot")
 
     vehicle.on_reboot = on_reboot
@@ -306,7 +304,7 @@ def _build(
     vehicle.on_double = lambda: _move_away(connection)
 
     def on_armed(armed: bool) -> None:
-        scheduler.armed_changed(armed)
+        scheduler.on_armed_changed()
         connection._tell("armed" if armed else "disarmed")
 
     vehicle.on_armed = on_armed
@@ -383,10 +381,10 @@ async def _ask_who_it_is(connection: Connection) -> None:
     while True:
         await connection._doubted.wait()
         connection._doubted = trio.Event()
-        asked, asked_at, warned = 0, float("-inf"), False
+        asked, asked_at, warned = 0, -inf, False
         while vehicle.address is not None and _is_unsure(vehicle, asked, now := connection.clock()):
             # It may be gone again: then, and of a stranger, it has time.
-            soon = identity.heard_since(asked_at) and not identity.stranger
+            soon = identity.heard_since(asked_at) and identity.standing is not Standing.STRANGER
             if soon or now - asked_at >= _SELDOM:
                 if vehicle.lacks_boot_time(now):
                     _ask_for(connection, SYSTEM_TIME_ID)
@@ -395,7 +393,7 @@ async def _ask_who_it_is(connection: Connection) -> None:
                     driver.send(driver.framer.encode_request_capabilities(vehicle.address))
                 asked, asked_at = asked + 1, now
             await trio.sleep(_IDENTITY_PERIOD)
-            if identity.stranger and not warned:
+            if identity.standing is Standing.STRANGER and not warned:
                 warned = True
                 log.warning(_ANOTHER, *vehicle.address)
             elif identity.heard_since(asked_at):
@@ -406,4 +404,4 @@ async def _ask_who_it_is(connection: Connection) -> None:
 def _is_unsure(vehicle: Vehicle, asked: int, now: float) -> bool:
     """Return whether there is something to ask; asked: how often that was done."""
     lacks_time = asked < _TIME_TRIES and vehicle.lacks_boot_time(now)
-    return not asked or lacks_time or not vehicle.identity.trusted
+    return not asked or lacks_time or vehicle.identity.standing is not Standing.TRUSTED

@@ -38,14 +38,14 @@ _OF_SESSIONS = frozenset(
 )
 
 
-def touches_session(payload: bytes, is_ours: Callable[[int], bool]) -> bool:
-    """Return whether another client's request, or a reply to it, may mean that our session is its own now.
+def session_used_by(payload: bytes) -> int | None:
+    """Return the id of the session that another client's request, or a reply to it, uses; None: none.
 
-    Listings, checksums and changes of names do not: a ground station that shows directories makes nobody's
-    bytes doubtful. is_ours: whether a session id may be that of our session.
+    If that may be ours it may be its own now. Listings, checksums and changes of names use none: a ground
+    station that shows directories makes nobody's bytes doubtful.
     """
     opcode = payload[_REQ_OPCODE] if payload[_OPCODE] in (Opcode.ACK, Opcode.NAK) else payload[_OPCODE]
-    return opcode in _OF_SESSIONS and is_ours(payload[_SESSION])
+    return payload[_SESSION] if opcode in _OF_SESSIONS else None
 
 
 class Doubt:
@@ -72,9 +72,8 @@ class Doubt:
             self._reads_at = self._at
             self.on_raised(reason)
 
-    @property
-    def active(self) -> bool:
-        """Whether something was noticed in the last ten minutes."""
+    def is_active(self) -> bool:
+        """Return whether something was noticed in the last ten minutes."""
         return self._clock() - self._at <= LASTS
 
     def arose_since(self, at: float) -> bool:
@@ -94,6 +93,6 @@ class Doubt:
     @property
     def lateness(self) -> float:
         """Seconds for which a copy of a request may still come; 0 while there is no doubt."""
-        if not self.active:
+        if not self.is_active():
             return 0.0
         return self._late if self._clock() - self._late_at <= LASTS else LEAST_LATE

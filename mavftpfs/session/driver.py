@@ -10,6 +10,7 @@ from __future__ import annotations
 import logging
 from collections import OrderedDict
 from collections.abc import Callable
+from math import inf
 from typing import Protocol
 
 import trio
@@ -22,7 +23,7 @@ from mavftpfs.protocol.engine import Engine
 from mavftpfs.protocol.operations import Operation
 from mavftpfs.protocol.payload import Payload, decode_reply
 from mavftpfs.protocol.stats import EngineStats
-from mavftpfs.session.vehicle import Vehicle
+from mavftpfs.session.vehicle import Standing, Vehicle
 from mavftpfs.shared.errors import RemoteProtocolError, RequestTimeout
 
 log = logging.getLogger("mavftpfs.session")
@@ -36,6 +37,9 @@ for a retransmission, serial ports do not pause inside a frame."""
 
 REFILL_AT = 32
 """Replies after which room in the window is used at once: the server works meanwhile."""
+
+SILENCE_PATIENCE = 5.0
+"""Seconds to wait for requests under way before falling silent: a long listing keeps nobody else out."""
 
 BACKLOG_LIMIT = 16 * 1024
 """Bytes the link may hold unsent before the engine is asked for more: nothing overtakes what waits there."""
@@ -57,6 +61,7 @@ class Driver:
 
     Attributes:
         peer: the network address that the vehicle is known by; None where the link has only one.
+        on_batch: called after each batch of replies, with the time, by whoever reads or writes a file now.
     """
 
     def __init__(
@@ -67,25 +72,26 @@ class Driver:
         vehicle: Vehicle,
         *,
         clock: Callable[[], float],
-        on_batch: Callable[[float], None] = lambda now: None,
         trace: PayloadTrace | None = None,
     ) -> None:
         self.link = link
         self.framer = framer
         self.engine = engine
         self.vehicle = vehicle
-        self.bad_payloads = 0
         self.peer: NetAddress | None = None
         self.last_reply_at = clock()
         self._heard_at = clock()
-        self.on_batch = on_batch
+        self.on_batch: Callable[[float], None] | None = None
         self._clock = clock
         self._trace = trace
         self._remarks = Remarks(engine.stats)
         self._addresses = AddressBook()
         self._impostor_at: float | None = None
         self._scope: trio.CancelScope | None = None
-        self._waiting: dict[Operation, Callable[[], None]] = {}
+        self._may_send = False
+        self._under_way: dict[Operation, Callable[[], None]] = {}
+        self._silences = 0
+        self._changed = trio.lowlevel.ParkingLot()  # what is under way, or silence, ended
         self._budget = engine.flow.budget
         self._gathered: list[bytes] = []
 
@@ -101,53 +107,79 @@ class Driver:
             now = self._clock()
             if scope.cancelled_caught:
                 self.engine.on_deadline(now)
-                if now >= self._quiet_at:
+                if self.framer.waiting and now >= self._heard_at + QUIET:
                     self._handle(self.framer.give_up(), now, self.link.sender(-1))
                     self._pass_on(now)
-                    self.on_batch(now)
+                    if self.on_batch is not None:
+                        self.on_batch(now)
             else:
                 self._take(chunks, now)
-            self._settle(now)
+            self.kick()
 
-    async def run(self, *operations: Operation) -> None:
-        """Carry operations out, each sent without an answer to the one before; a cancelled caller takes them
-        with it.
+    async def run(self, operation: Operation) -> None:
+        """Carry an operation out; a cancelled caller takes it with it.
 
         Raises:
-            MavftpfsError: the error of the first that failed.
+            MavftpfsError: what the operation failed with.
         """
         finished = trio.Event()
-
-        def on_finished() -> None:
-            if all(operation.done for operation in operations):
-                finished.set()
-
         try:
-            for operation in operations:
-                self.start(operation, on_finished)
+            await self.start(operation, finished.set)
             await finished.wait()
         finally:
-            for operation in operations:
-                self.cancel(operation)
-        for operation in operations:
-            if operation.error is not None:
-                raise operation.error
+            self.cancel(operation)
+        if operation.error is not None:
+            raise operation.error
 
-    def start(self, operation: Operation, on_finished: Callable[[], None]) -> None:
-        """Begin an operation; `on_finished` is called from the pump when it is done or failed."""
-        self._waiting[operation] = on_finished
+    async def start(self, operation: Operation, on_finished: Callable[[], None]) -> None:
+        """Begin an operation, once nobody wants silence any more. `on_finished` is called from the pump when
+        it is done or failed."""
+        while self._silences:
+            await self._changed.park()
+        self._under_way[operation] = on_finished
         self.engine.start(operation, self._clock())
         self.kick()
 
     def cancel(self, operation: Operation) -> None:
         """Forget an operation (harmless when it is finished)."""
-        if self._waiting.pop(operation, None) is not None:
+        if self._under_way.pop(operation, None) is not None:
+            self._changed.unpark_all()
             self.engine.cancel(operation, self._clock())
             self.kick()
 
+    async def be_silent(self, seconds: float) -> bool:
+        """Begin nothing, wait until what is under way has ended, and then say nothing for so long.
+
+        Returns:
+            False: something lasted too long, so there was no silence. It keeps nobody else out any longer.
+        """
+        self._silences += 1
+        try:
+            with trio.move_on_after(SILENCE_PATIENCE):
+                while self._under_way:
+                    await self._changed.park()
+            if self._under_way:
+                return False
+            await trio.sleep(seconds)
+            return True
+        finally:
+            self._silences -= 1
+            self._changed.unpark_all()
+
     def kick(self) -> None:
-        """Send what the engine has to send now; call after anything that may have given it work."""
-        self._settle(self._clock())
+        """Send what can go out now, and tell whose operations ended. Call it after anything that may have
+        given the engine work."""
+        now = self._clock()
+        self._refill(now)
+        for operation in self.engine.take_finished():
+            on_finished = self._under_way.pop(operation, None)
+            if isinstance(operation.error, RequestTimeout):
+                self.vehicle.note_timeout()
+            if on_finished is not None:
+                on_finished()
+                self._changed.unpark_all()
+        if self._scope is not None:
+            self._scope.deadline = self._next_deadline()
 
     def send(self, frame: bytes) -> None:
         """Send one ready frame that is not FTP (a heartbeat, a command)."""
@@ -168,9 +200,11 @@ class Driver:
                 self._pass_on(now)
                 self._refill(now)
         self._pass_on(now)
-        if self.vehicle.identity.heard_at == now and not self.vehicle.identity.stranger:
+        identity = self.vehicle.identity
+        if identity.heard_at == now and identity.standing is not Standing.STRANGER:
             self.link.keep_peer()
-        self.on_batch(now)
+        if self.on_batch is not None:
+            self.on_batch(now)
 
     def _handle(self, messages: list[Message | FtpRun], now: float, sender: NetAddress | None) -> None:
         """Gather replies, and tell the vehicle everything else, in its turn."""
@@ -195,26 +229,21 @@ class Driver:
         if self._budget is not None:
             for wire in wires:
                 self._budget.on_reply(wire, now)
-        if not self.vehicle.believes_reply(now):
+        self.vehicle.identity.heard(now)
+        if self.vehicle.identity.standing is not Standing.TRUSTED:
             return  # what was asked is asked again once it is known who answers
         if self._trace is not None:
             for wire in wires:
                 self._on_traced_reply(wire, now, self._trace)
             return
         malformed = self.engine.receive_run(wires, now)
-        self.bad_payloads += malformed
         if malformed < len(wires):
             self.last_reply_at = now
-
-    @property
-    def _quiet_at(self) -> float:
-        return self._heard_at + QUIET if self.framer.waiting else float("inf")
 
     def _on_traced_reply(self, wire: bytes, now: float, trace: PayloadTrace) -> None:
         try:
             reply = decode_reply(wire)
         except RemoteProtocolError:
-            self.bad_payloads += 1
             trace.payload(now, "reply", wire, "malformed")
             return
         self.last_reply_at = now
@@ -233,10 +262,8 @@ class Driver:
                 self._is_from(vehicle.address, sender, now)
             else:
                 self._send_to(sender)
-        if vehicle.identity.stranger:
-            self._addresses.distrusted = self.peer
-        else:
-            self._addresses.distrusted = None
+        strange = vehicle.identity.standing is Standing.STRANGER
+        self._addresses.distrusted = self.peer if strange else None
 
     def _is_from(self, source: Address, sender: NetAddress, now: float) -> bool:
         """Return whether a message counts that came from a network address; follow the vehicle that moves."""
@@ -259,7 +286,7 @@ class Driver:
         if self._impostor_at is None:
             self._impostor_at = now
         elif self.vehicle.identity.heard_since(self._impostor_at):
-            self._impostor_at = float("inf")
+            self._impostor_at = inf
             log.warning(_IGNORED, readable_address(sender), *source)
 
     def _on_moved(self, sender: NetAddress, now: float) -> None:
@@ -273,27 +300,13 @@ class Driver:
         self.link.answer(address)
 
     def _refill(self, now: float) -> None:
-        target = self.vehicle.address
-        if target is not None and self._may_send(now):
-            self._send(target, self.engine.outgoing(now), now)
-        else:
+        """Send what the engine has to send, if anything may go out now."""
+        target, link = self.vehicle.address, self.link
+        self._may_send = link.backlog < BACKLOG_LIMIT and self.vehicle.identity.may_be_asked(now)
+        if target is None or not self._may_send:
             self.engine.hold(now)
-
-    def _may_send(self, now: float) -> bool:
-        return self.link.backlog < BACKLOG_LIMIT and self.vehicle.identity.may_be_asked(now)
-
-    def _settle(self, now: float) -> None:
-        self._refill(now)
-        for operation in self.engine.take_finished():
-            on_finished = self._waiting.pop(operation, None)
-            if isinstance(operation.error, RequestTimeout):
-                self.vehicle.note_timeout()
-            if on_finished is not None:
-                on_finished()
-        if self._scope is not None:
-            self._scope.deadline = self._next_deadline()
-
-    def _send(self, target: Address, payloads: list[bytes], now: float) -> None:
+            return
+        payloads = self.engine.outgoing(now)
         if not payloads:
             return
         if self._budget is not None:
@@ -302,16 +315,18 @@ class Driver:
         if self._trace is not None:
             for wire in payloads:
                 self._trace.payload(now, "request", wire, self._remarks.on_request(wire))
-        self.link.send_nowait(self.framer.encode_ftp_run(target, payloads))
+        link.send_nowait(self.framer.encode_ftp_run(target, payloads))
 
     def _next_deadline(self) -> float:
         deadline, now = self.engine.next_deadline(), self._clock()
+        if deadline is None:
+            deadline = inf
         if self.link.backlog >= BACKLOG_LIMIT:
             # Nobody tells us that the link drained, and before that nothing can go out.
             deadline = now + 0.01
-        elif deadline is not None and not self._may_send(now):
+        elif not self._may_send:
             deadline = max(deadline, now + 0.05)  # nothing can go out, whatever is due
-        return self._quiet_at if deadline is None else min(deadline, self._quiet_at)
+        return min(deadline, self._heard_at + QUIET) if self.framer.waiting else deadline
 
 
 class Remarks:

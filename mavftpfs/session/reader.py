@@ -7,20 +7,24 @@ not yet fulfilled are kept here and handed to whatever transfer is attached next
 from __future__ import annotations
 
 from collections.abc import Callable
+from math import inf
+from typing import Literal
 
 import trio
 
 from mavftpfs.cache.remote import ReadSink
 from mavftpfs.protocol.burst import BurstTransfer
 from mavftpfs.protocol.chunking import ChunkSize
-from mavftpfs.protocol.engine import Engine
 from mavftpfs.protocol.reading import ReadTransfer
 from mavftpfs.session.doubt import Doubt
 from mavftpfs.session.driver import Driver
-from mavftpfs.session.fairness import Queue, ReadMode, Share
+from mavftpfs.session.queue import Queue, SessionUser
 from mavftpfs.session.serversession import ServerSession
+from mavftpfs.session.vehicle import Vehicle
 from mavftpfs.shared.errors import FileChanged, MavftpfsError, RemoteProtocolError, SessionLost
 from mavftpfs.shared.extents import ExtentSet
+
+ReadMode = Literal["window", "burst"]
 
 STALL = 2.0
 """Seconds without any reply during a read after which the server's session is no longer believed in."""
@@ -31,52 +35,55 @@ FIRST_WANT = 0.05
 REOPENS = 5
 """How often one want may lose its session without a byte of progress before it fails."""
 
+RECENT = 10.0
+"""Seconds for which what was read stays provisional, also of files that were closed since: another client is
+noticed late, because servers answer it on its own link, and a router may pass on only some of that."""
+
 _OFTEN = 0.25
 
 
-class FileStream:
-    """Implements cache.remote.Reader. The scheduler attaches and detaches transfers."""
+class FileStream(SessionUser):
+    """Implements cache.remote.Reader; also the sink of the transfer that reads for it.
 
-    def __init__(
-        self, path: bytes, sink: ReadSink, size: int | None, wake: Callable[[FileStream], None]
-    ) -> None:
-        self.path = path
-        self._sink = sink
-        self.closed = False
-        self.share = Share()
+    Attributes:
+        size: by the first open ACK, in bytes; 0 before that. wants_open: somebody waits for that ACK.
+        last_data_at: when bytes came, None if none did. lost: how often the session was, without progress.
+    """
+
+    def __init__(self, path: bytes, sink: ReadSink, size: int | None, reading: Reading) -> None:
+        super().__init__(path)
+        self.size = size or 0
         self.wants_open = size is None
+        self.closed = False
         self.last_data_at: float | None = None
-        self.clean_failures = 0
-        self._size = size
+        self.lost = 0
+        self._sink = sink
+        self._reading = reading
         self._demand = ExtentSet()
         self._ahead = ExtentSet()
-        self._wake = wake
         self._opened = trio.Event()
         self._open_error: MavftpfsError | None = None
-        self._orphaned = False
+        self._removed = False
         self._transfer: ReadTransfer | None = None
+        if not self.wants_open:
+            self._opened.set()
 
     # --- the cache's side
-
-    @property
-    def size(self) -> int:
-        """Size by the first open ACK, in bytes."""
-        return self._size or 0
 
     def want(self, start: int, stop: int, *, demand: bool) -> None:
         """Ask for bytes of [start, stop), clamped to the size."""
         stop = min(stop, self.size)
         if start >= stop or self.closed:
             return
-        if self._orphaned:
-            self._sink.on_failed(self._gone())
+        if self._removed:
+            self._sink.on_failed(FileChanged(f"{self.path!r} was removed or replaced"))
             return
         wanted = self._demand if demand else self._ahead
         for gap_start, gap_stop in self._sink.missing(start, stop):
             wanted.add(gap_start, gap_stop)
         if self._transfer is not None:
             self._transfer.want(start, stop, demand)
-        self._wake(self)
+        self._reading.on_want(self)
 
     def drop_readahead(self) -> None:
         """Forget what nobody waits for."""
@@ -90,86 +97,77 @@ class FileStream:
         self._demand.clear()
         self._ahead.clear()
         self.wants_open = False
-        self._wake(self)
+        self._reading.on_closed(self)
 
-    # --- the scheduler's side
+    # --- the session's side
 
-    @property
-    def has_demand(self) -> bool:
-        """Whether somebody waits for this file."""
-        if self.closed:
-            return False
-        return self.wants_open or not self._demand.empty
+    def due_at(self) -> float:
+        """See SessionUser."""
+        return 0.0 if self.wants_open or not self._demand.empty else inf
 
-    @property
-    def has_ahead(self) -> bool:
-        """Whether readahead is wanted."""
-        return not self.closed and not self._ahead.empty
+    def prefetches(self) -> bool:
+        """See SessionUser."""
+        return not self._ahead.empty
 
     async def wait_opened(self) -> None:
         """Wait for the first open's outcome; raise its error."""
-        if self._size is None:
-            await self._opened.wait()
+        await self._opened.wait()
         if self._open_error is not None:
             raise self._open_error
 
-    def on_opened(self, size: int) -> None:
-        """Take the size of an open ACK.
+    def on_opened(self, size: int, at: float) -> None:
+        """Bytes come from a session that was opened at that time, on a file of that size.
 
         Raises:
             FileChanged: the file is smaller than what was opened. A larger one only grew: it is served at
                 its opened size.
         """
         self.wants_open = False
-        if self._size is None:
-            self._size = size
+        if not self._opened.is_set():
+            self.size = size
             self._opened.set()
-        elif size < self._size:
-            raise FileChanged(f"{self.path!r} shrank from {self._size} to {size} bytes")
-
-    def on_session(self, opened_at: float) -> None:
-        """Bytes come from a session that was opened at that time."""
+        elif size < self.size:
+            raise FileChanged(f"{self.path!r} shrank from {self.size} to {size} bytes")
         if not self.closed:
-            self._sink.on_opened(opened_at)
+            self._sink.on_opened(at)
 
-    def attach(self, transfer: ReadTransfer) -> None:
-        """Hand what is wanted to a transfer; later wants go to it directly."""
+    def attach(self, transfer: ReadTransfer | None) -> None:
+        """Hand what is wanted to a transfer; later wants go to it directly. None: it ended."""
         self._transfer = transfer
-        for start, stop in self._demand:
-            transfer.want(start, stop, True)
-        for start, stop in self._ahead:
-            transfer.want(start, stop, False)
-
-    # Being the transfer's sink, the stream keeps what is on its way when it is closed from its own sink.
+        if transfer is not None:
+            for start, stop in self._demand:
+                transfer.want(start, stop, True)
+            for start, stop in self._ahead:
+                transfer.want(start, stop, False)
 
     def missing(self, start: int, stop: int) -> list[tuple[int, int]]:
         """Return the parts of [start, stop) that the cache does not hold."""
         return self._sink.missing(start, stop)
 
     def on_data(self, offset: int, data: bytes) -> None:
-        """Pass bytes on."""
+        """Pass bytes on; what is still on its way when it is closed goes nowhere."""
         if not self.closed:
             self._sink.on_data(offset, data)
 
     def on_batch(self) -> None:
         """A batch of data ended. What came is wanted no more, even if the cache soon drops it again."""
-        if not self.closed:
-            self._demand = self._unmet(self._demand)
-            self._ahead = self._unmet(self._ahead)
-            self._sink.on_batch()
+        if self.closed:
+            return
+        for wanted in (self._demand, self._ahead):
+            before = list(wanted)
+            wanted.clear()
+            for start, stop in before:
+                for gap_start, gap_stop in self._sink.missing(start, stop):
+                    wanted.add(gap_start, gap_stop)
+        self._sink.on_batch()
 
     def on_queued(self) -> None:
         """It waits for its turn, and the queue before it moved: the vehicle is not silent."""
-        if not self.closed:
-            self._sink.on_queued()
+        self._sink.on_queued()
 
     def on_suspect(self, reason: str) -> None:
         """What was read lately is provisional, even if it was closed since."""
         self._sink.on_suspect(reason)
-
-    def detach(self) -> None:
-        """Take back what the transfer did not deliver."""
-        self._transfer = None
 
     def on_idle(self) -> None:
         """Everything wanted has come."""
@@ -177,97 +175,109 @@ class FileStream:
         self._ahead.clear()
 
     def fail(self, error: MavftpfsError) -> None:
-        """What is wanted cannot be had now; whoever waits gets the error."""
+        """See SessionUser."""
         self.wants_open = False
         self._demand.clear()
         self._ahead.clear()
-        if self._size is None:
+        if self._opened.is_set():
+            self._sink.on_failed(error)
+        else:
             self._open_error = error
             self._opened.set()
-        else:
-            self._sink.on_failed(error)
 
-    def orphan(self) -> None:
+    def on_removed(self) -> None:
         """The file is gone from its path: nothing more of it can be had, and of its successor nothing may."""
-        self._orphaned = True
-        if self.has_demand:
-            self.fail(self._gone())
-
-    def _gone(self) -> FileChanged:
-        return FileChanged(f"{self.path!r} was removed or replaced")
-
-    def _unmet(self, wanted: ExtentSet) -> ExtentSet:
-        unmet = ExtentSet()
-        for start, stop in wanted:
-            for gap_start, gap_stop in self._sink.missing(start, stop):
-                unmet.add(gap_start, gap_stop)
-        return unmet
+        self._removed = True
+        if self.due_at() < inf:
+            self.fail(FileChanged(f"{self.path!r} was removed or replaced"))
 
 
 class Reading:
-    """Runs read transfers. mode: by which requests. chunks: their size."""
+    """Makes streams, and serves the one whose turn it is. mode: by which requests. chunks: their size."""
 
     def __init__(
         self,
         server: ServerSession,
         driver: Driver,
-        engine: Engine,
         queue: Queue,
+        vehicle: Vehicle,
         doubt: Doubt,
-        clock: Callable[[], float],
         mode: ReadMode,
         chunks: ChunkSize,
+        clock: Callable[[], float],
     ) -> None:
-        self.active: FileStream | None = None
+        self._active: FileStream | None = None
         self._server = server
         self._driver = driver
-        self._engine = engine
+        self._engine = driver.engine
         self._queue = queue
+        self._vehicle = vehicle
         self._doubt = doubt
         self._mode: ReadMode = mode
         self._chunks = chunks
         self._clock = clock
         self._transfer: ReadTransfer | None = None
         self._seen_bytes = 0
+        self._closed: list[FileStream] = []
 
-    def on_batch(self, now: float) -> None:
-        """A batch of replies was processed: pass data on, once."""
-        transfer, stream = self._transfer, self.active
-        if transfer is None or stream is None:
-            return
-        if transfer.received_bytes != self._seen_bytes:
-            self._seen_bytes = transfer.received_bytes
-            stream.last_data_at = now
-            stream.clean_failures = 0
-            stream.on_batch()
-        if transfer.idle or transfer.done:
-            self._server.wake()
+    # --- streams
+
+    def open_stream(self, path: bytes, sink: ReadSink, size: int | None) -> FileStream:
+        """Register a reader; with size None it asks for an open ACK (await stream.wait_opened())."""
+        stream = FileStream(path, sink, size, self)
+        self._queue.add(stream)
+        self.on_want(stream)
+        return stream
+
+    def on_want(self, stream: FileStream) -> None:
+        """It wants something, perhaps of those that somebody waits for."""
+        if stream.asked_at is None and stream.due_at() < inf:
+            stream.asked_at = self._clock()
+        self._server.wake()
+
+    def on_closed(self, stream: FileStream) -> None:
+        """It wants nothing any more; what it read stays provisional for a while."""
+        if stream in self._queue.users:
+            self._closed = [other for other in self._closed if self._is_recent(other)]
+            self._closed.append(stream)
+        self._queue.remove(stream)
+
+    def streams(self) -> list[FileStream]:
+        """Return those that are not closed."""
+        return [user for user in self._queue.users if isinstance(user, FileStream)]
+
+    def on_doubt(self, reason: str) -> None:
+        """What was read lately is provisional, also of files closed since."""
+        self._closed = [stream for stream in self._closed if self._is_recent(stream)]
+        for stream in [*self.streams(), *self._closed]:
+            if stream is self._active or self._is_recent(stream):
+                stream.on_suspect(reason)
+
+    def _is_recent(self, stream: FileStream) -> bool:
+        return stream.last_data_at is not None and stream.last_data_at > self._clock() - RECENT
+
+    # --- one turn
 
     def cut_off(self) -> None:
         """Whatever is under way gets no more answers, or none to be believed."""
         if self._transfer is not None:
             self._driver.cancel(self._transfer)
 
-    async def serve(self, stream: FileStream) -> bool:
-        """Read for a stream. Its errors are told to the stream. False: only another file was closed for it,
-        and who came meanwhile may be next."""
+    async def serve(self, stream: FileStream) -> None:
+        """Read for a stream. Its errors are told to the stream."""
         try:
-            self._queue.require_link()
-            if await self._server.made_room(stream.path):
-                return False
-            if await self._ensure_open(stream):
-                await self._await_first_want(stream)
-            if stream.has_demand or stream.has_ahead:
-                async with self._server.traffic():
-                    await self._read(stream)
+            self._vehicle.require_there(self._clock())
+            await self._open(stream)
+            await self._read(stream)
         except SessionLost as error:
             self._on_session_lost(stream, error)
         except MavftpfsError as error:
             stream.fail(error)
-        return True
+        stream.asked_at = self._clock() if stream.due_at() < inf else None
 
-    async def _ensure_open(self, stream: FileStream) -> bool:
-        """Have the stream's file open; return whether its opener was waiting for that."""
+    async def _open(self, stream: FileStream) -> None:
+        """Have the stream's file open. Give who waited for that a moment to ask for its bytes, before another
+        file takes its turn."""
         session = self._server.session
         awaited = stream.wants_open
         if session is None or session.path != stream.path or session.writing or awaited:
@@ -275,77 +285,85 @@ class Reading:
         try:
             if session.size is None:
                 raise RemoteProtocolError("the vehicle's open reply holds no size")
-            stream.on_opened(session.size)
-            stream.on_session(session.opened_at)
+            stream.on_opened(session.size, session.opened_at)
         except (FileChanged, RemoteProtocolError):
             await self._server.close_quietly()
             raise
-        return awaited
-
-    async def _await_first_want(self, stream: FileStream) -> None:
-        """Give whoever opened a file a moment to ask for its bytes, before another file takes its turn."""
-        with trio.move_on_after(FIRST_WANT):
-            while not (stream.has_demand or stream.has_ahead or stream.closed):
-                await self._server.sleep(FIRST_WANT)
+        if awaited:
+            with trio.move_on_after(FIRST_WANT):
+                while not (stream.due_at() < inf or stream.prefetches() or stream.closed):
+                    await self._server.sleep(FIRST_WANT)
 
     async def _read(self, stream: FileStream) -> None:
         session = self._server.session
-        if session is None:  # the vehicle restarted since it was opened
-            return
+        if session is None or not (stream.due_at() < inf or stream.prefetches()):
+            return  # the vehicle restarted since it was opened, or nothing is wanted
         kind = BurstTransfer if self._mode == "burst" else ReadTransfer
         transfer = kind(session.id, stream.size, stream, self._chunks)
-        started = self._clock()
-        self.active, self._transfer, self._seen_bytes = stream, transfer, 0
+        began = self._clock()
+        self._active, self._transfer, self._seen_bytes = stream, transfer, 0
         stream.attach(transfer)
-        self._give_way(transfer)
-        self._driver.start(transfer, self._server.wake)
+        self._driver.on_batch = self._on_batch
+        self._let_bursts_wait(transfer)
         try:
-            while self._go_on(stream, transfer, started):
-                others = self._queue.rival_use(stream) is not None
-                self._give_way(transfer)
+            await self._driver.start(transfer, self._server.wake)
+            while self._goes_on(stream, transfer, began):
+                self._let_bursts_wait(transfer)
                 # What woke us may be a new want, and with nothing in flight no answer would send for it.
                 self._driver.kick()
-                await self._server.sleep(_OFTEN if others else STALL / 2)
-                if self._stalled(transfer):
-                    raise SessionLost("no answer for a while during a read", by_server=False)
+                await self._server.sleep(_OFTEN)
+                self._check_stall(transfer)
         finally:
-            self.active = self._transfer = None
+            self._active = self._transfer = self._driver.on_batch = None
             if transfer.idle:
                 stream.on_idle()
-            stream.detach()
+            stream.attach(None)
             self._driver.cancel(transfer)
-            stream.share.on_turn(started, self._clock())
+            stream.on_turn(began, self._clock())
         if transfer.error is not None:
             raise transfer.error
 
-    def _give_way(self, transfer: ReadTransfer) -> None:
+    def _on_batch(self, now: float) -> None:
+        """A batch of replies was processed: pass data on, once."""
+        transfer, stream = self._transfer, self._active
+        if transfer is None or stream is None:
+            return
+        if transfer.received_bytes != self._seen_bytes:
+            self._seen_bytes = transfer.received_bytes
+            stream.last_data_at = now
+            stream.lost = 0
+            stream.on_batch()
+        if transfer.idle or transfer.done:
+            self._server.wake()
+
+    def _let_bursts_wait(self, transfer: ReadTransfer) -> None:
         """Let no burst follow another while somebody else waits for an answer: PX4 fills with a burst what
         the link holds, and the answer finds no room there."""
         if isinstance(transfer, BurstTransfer):
             transfer.by_requests = self._engine.in_flight > transfer.in_flight
 
-    def _go_on(self, stream: FileStream, transfer: ReadTransfer, started: float) -> bool:
+    def _goes_on(self, stream: FileStream, transfer: ReadTransfer, began: float) -> bool:
         if transfer.done or transfer.idle or stream.closed or self._server.session is None:
             return False
-        if self._server.claimed(stream.path):
+        if self._server.is_excluded(stream.path):
             return False
         rival = self._queue.rival_use(stream)
         if rival is None:
             return True
-        return stream.has_demand and not stream.share.gives_way(
-            rival, started, self._clock(), self._engine.rtt
-        )
+        return stream.due_at() < inf and not stream.gives_way(rival, began, self._clock(), self._engine.rtt)
 
-    def _stalled(self, transfer: ReadTransfer) -> bool:
+    def _check_stall(self, transfer: ReadTransfer) -> None:
+        """Raise SessionLost after so long without an answer."""
         limit = max(STALL, 4.0 * (self._engine.rtt or 0.0))
         quiet_since = max(self._driver.last_reply_at, transfer.started_at)
-        return not transfer.idle and self._clock() - quiet_since > limit
+        if not transfer.idle and self._clock() - quiet_since > limit:
+            raise SessionLost("no answer for a while during a read", by_server=False)
 
     def _on_session_lost(self, stream: FileStream, error: SessionLost) -> None:
         """Reopen and go on at the same offset (promise 5); what the lost session read is provisional."""
         self._server.abandon()
         if error.by_server:
             self._doubt.raise_it(str(error))
-        stream.clean_failures += 1
-        if stream.clean_failures > REOPENS:
+        stream.lost += 1
+        if stream.lost > REOPENS:
             stream.fail(error)

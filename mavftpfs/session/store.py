@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
+from math import inf
 
 import trio
 
@@ -11,13 +12,13 @@ from mavftpfs.cache.remote import ReadSink, UploadSource
 from mavftpfs.protocol.operations import ListDirectory, Simple
 from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.session.changes import COPY_RATE, Changes
+from mavftpfs.session.driver import Driver
 from mavftpfs.session.reader import FileStream
 from mavftpfs.session.scheduler import Scheduler
-from mavftpfs.session.upload import QueuedUpload
+from mavftpfs.session.upload import Upload
 from mavftpfs.session.vehicle import Vehicle
 from mavftpfs.shared.errors import Armed, FtpNak, RemoteProtocolError, RequestTimeout
 from mavftpfs.shared.model import DirEntry, Listing, wire_path
-from mavftpfs.shared.traits import WriteTraits
 
 TIME_PROBE_LIMIT = 2.5
 """Seconds of silence after which ListDirectory is tried in place of ListDirectoryWithTime."""
@@ -34,50 +35,50 @@ CRC_TIME = 5.0
 
 
 class Store:
-    """Reads, lists, checks and changes remote files."""
+    """Reads, lists, checks and changes remote files.
+
+    Attributes:
+        lists_times: whether this server answers opcode 16; None until it was asked.
+    """
 
     def __init__(
         self,
         scheduler: Scheduler,
+        driver: Driver,
         vehicle: Vehicle,
         *,
         clock: Callable[[], float],
         op_deadline: float = 30.0,
     ) -> None:
+        self.lists_times: bool | None = None
         self._scheduler = scheduler
+        self._server = scheduler.server
+        self._driver = driver
         self._op_deadline = op_deadline
         self._vehicle = vehicle
         self._clock = clock
-        self._lists_times: bool | None = None
         self._time_silences = 0
-        self._changes = Changes(scheduler, self.list_directory, clock)
+        self._changes = Changes(scheduler, vehicle, self.list_directory, clock)
+        # See cache.remote.WriteStore.
+        self.traits = scheduler.traits
+        self.in_doubt = scheduler.doubt.is_active
+        self.doubted_since = scheduler.doubt.arose_since
         self.remove = self._changes.remove
         self.make_directory = self._changes.make_directory
         self.remove_directory = self._changes.remove_directory
         self.rename = self._changes.rename
         self.create_empty = self._changes.create_empty
-        """See cache.remote.WriteStore."""
 
-    @property
-    def lists_times(self) -> bool | None:
-        """Whether this server answers opcode 16; None until it was asked."""
-        return self._lists_times
-
-    @property
-    def kept_out(self) -> bool:
-        """Whether the last listing was refused because of a session that is not ours."""
-        return self._scheduler.server.kept_out
-
-    def forget_traits(self) -> None:
+    def forget_server(self) -> None:
         """The vehicle rebooted, perhaps with other firmware."""
-        self._lists_times = None
+        self.lists_times = None
         self._time_silences = 0
 
     async def list_directory(self, path: bytes) -> Listing:
         """Sweep a directory (see RemoteStore)."""
         wire = wire_path(path)
         started = self._clock()
-        operation = await self._scheduler.server.get_through(partial(self._sweep_as_known, wire))
+        operation = await self._server.retry_while_taken(partial(self._sweep_as_known, wire))
         entries: tuple[DirEntry, ...] = tuple(operation.entries)
         return Listing(entries, self._clock() - started, operation.complete, operation.hidden)
 
@@ -87,8 +88,8 @@ class Store:
         """Open a regular file for reading (see RemoteStore)."""
         wire_path(path)
         if expected_size is None:
-            self._scheduler.require_link()
-        stream = self._scheduler.open_stream(path, sink, expected_size)
+            self._vehicle.require_there(self._clock())
+        stream = self._scheduler.reading.open_stream(path, sink, expected_size)
         try:
             await stream.wait_opened()
         except BaseException:
@@ -114,21 +115,22 @@ class Store:
 
         async def ask() -> bytes:
             operation = Simple(Opcode.CALC_FILE_CRC32, wire, patience=patience, server_time=server_time)
-            await self._scheduler.metadata(operation, disturbs=False)
+            self._vehicle.require_there(self._clock())
+            await self._driver.run(operation)
             return operation.reply.data
 
-        data = await self._scheduler.server.get_through(ask)
+        data = await self._server.retry_while_taken(ask)
         if len(data) < 4:
             raise RemoteProtocolError("the vehicle's checksum reply holds no checksum")
         return int.from_bytes(data[:4], "little")
 
     def _on_times(self, scope: trio.CancelScope) -> None:
         """Opcode 16 was answered: the rest of the listing may take as long as it takes."""
-        self._lists_times = True
-        scope.deadline = float("inf")
+        self.lists_times = True
+        scope.deadline = inf
 
     async def _sweep_as_known(self, wire: bytes) -> ListDirectory:
-        if self._lists_times is False:
+        if self.lists_times is False:
             return await self._sweep(wire)
         return await self._sweep_asking_times(wire)
 
@@ -142,16 +144,16 @@ class Store:
         """Try opcode 16; a refusal or a silence counts only if opcode 3 then answers (design section 4)."""
         began = self._clock()
         refused = False
-        limit = float("inf") if self._lists_times else TIME_PROBE_LIMIT
+        limit = inf if self.lists_times else TIME_PROBE_LIMIT
         asking = ListDirectory(wire, with_time=True)
         try:
             with trio.move_on_after(limit) as scope:
                 asking.on_page = partial(self._on_times, scope)
                 await self._scheduler.metadata(asking)
-                self._lists_times = True
+                self.lists_times = True
                 return asking
         except FtpNak as nak:
-            if self._lists_times or nak.code not in (
+            if self.lists_times or nak.code not in (
                 NakCode.FAIL,
                 NakCode.UNKNOWN_COMMAND,
                 NakCode.FILE_EXISTS,
@@ -159,36 +161,23 @@ class Store:
                 raise
             refused = True
         except RequestTimeout:
-            if self._lists_times:
+            if self.lists_times:
                 raise
         left = max(1.0, self._op_deadline - (self._clock() - began))
         operation = await self._sweep(wire, patience=left)
         self._time_silences += asking.sent  # it may have had to wait for its turn all the time
         if refused or self._time_silences >= TIME_SILENCES:
-            self._lists_times = False
+            self.lists_times = False
         return operation
 
     # --- changing files
 
-    @property
-    def traits(self) -> WriteTraits:
-        """See cache.remote.WriteStore."""
-        return self._scheduler.write_traits
-
-    def in_doubt(self) -> bool:
-        """See cache.remote.WriteStore."""
-        return self._scheduler.doubt.active
-
-    def doubted_since(self, at: float) -> bool:
-        """See cache.remote.WriteStore."""
-        return self._scheduler.doubt.arose_since(at)
-
-    async def open_upload(self, path: bytes, source: UploadSource) -> QueuedUpload:
+    async def open_upload(self, path: bytes, source: UploadSource) -> Upload:
         """Queue an upload; nothing is sent before the source has something or finish is called."""
         wire_path(path)
-        self._scheduler.check_may_write()
+        self._vehicle.require_writable(self._clock())
         await self._changes.rest(path)
-        return self._scheduler.open_upload(path, source)
+        return self._scheduler.uploading.open_upload(path, source)
 
     async def stat_size(self, path: bytes) -> int:
         """See cache.remote.WriteStore."""

@@ -1,17 +1,60 @@
-"""One upload as its owner sees it, and what is known of its progress. Layer: session."""
+"""One upload: what its owner sees, its state, and what is known of its progress. Layer: session."""
 
 from __future__ import annotations
 
-from typing import Protocol
+from collections.abc import Callable
+from enum import Enum
+from math import inf
 
 import trio
 
 from mavftpfs.cache.remote import UploadSource
-from mavftpfs.session.fairness import Share
-from mavftpfs.shared.errors import LocalProtocolError, MavftpfsError
+from mavftpfs.protocol.writing import WriteTransfer
+from mavftpfs.session.queue import Queue, SessionUser
+from mavftpfs.session.serversession import ServerSession
+from mavftpfs.session.vehicle import Vehicle
+from mavftpfs.shared.errors import Armed, LocalProtocolError, MavftpfsError
 
 LONGEST_BACKOFF = 30.0
 """Most seconds between two attempts after a failure of the link."""
+
+REOPENS = 5
+"""How often the session may be lost without getting further in the file before the upload fails."""
+
+
+class UploadState(Enum):
+    """What becomes of an upload next."""
+
+    IDLE = "idle"
+    """The card has all that was given, or nothing was."""
+
+    QUEUED = "queued"
+    """It wants the session, from `retry_at` on."""
+
+    SENDING = "sending"
+    """It has the session."""
+
+    HELD = "held"
+    """Only `finish` goes on with it: it was refused, or to go on means to send the whole file again."""
+
+    ENDING = "ending"
+    """Its owner gave it up, and it still has the session."""
+
+    ENDED = "ended"
+    """Its owner gave it up."""
+
+
+NEXT: dict[UploadState, frozenset[UploadState]] = {
+    UploadState.IDLE: frozenset((UploadState.QUEUED, UploadState.ENDED)),
+    UploadState.QUEUED: frozenset((UploadState.QUEUED, UploadState.SENDING, UploadState.ENDED)),
+    UploadState.SENDING: frozenset(
+        (UploadState.IDLE, UploadState.QUEUED, UploadState.HELD, UploadState.ENDING)
+    ),
+    UploadState.HELD: frozenset((UploadState.QUEUED, UploadState.ENDED)),
+    UploadState.ENDING: frozenset((UploadState.ENDED,)),
+    UploadState.ENDED: frozenset(),
+}
+"""All transitions there are."""
 
 
 class Feed:
@@ -26,18 +69,17 @@ class Feed:
         proven: a Terminate was ACKed: the remote file holds all that was ACKed before it.
         unproven: bytes ACKed since then.
         reached: end of the highest ACKed byte; after a lost session, of the highest proven one.
+        furthest: end of the highest byte that was ever ACKed.
     """
 
     def __init__(self, source: UploadSource, chunk: int) -> None:
         self.proven = False
         self.unproven = 0
         self.reached = 0
+        self.furthest = 0
         self._proven_to = 0
         self._source = source
         self._chunk = chunk
-        self._held: tuple[int, bytes] | None = None
-        self._furthest = 0
-        self._furthest_before = 0
 
     def has_more(self) -> bool:
         """Whether the source has something to send now.
@@ -45,21 +87,18 @@ class Feed:
         Raises:
             MavftpfsError: it fails.
         """
-        if self._held is None:
-            self._held = self._source.next_chunk(self._chunk)
-        return self._held is not None
+        piece = self._source.next_chunk(self._chunk)
+        if piece is None:
+            return False
+        self._source.on_unsent(piece[0], len(piece[1]))  # it was only looked at
+        return True
 
     def next_chunk(self, limit: int) -> tuple[int, bytes] | None:
         """See protocol.writing.ChunkSource."""
-        if self._held is not None and len(self._held[1]) > limit:
-            self.put_back()
-        found, self._held = self._held, None
-        if found is None:
-            try:
-                found = self._source.next_chunk(limit)
-            except MavftpfsError:
-                return None
-        return found
+        try:
+            return self._source.next_chunk(limit)
+        except MavftpfsError:
+            return None
 
     def on_acked(self, offset: int, count: int) -> None:
         """See protocol.writing.ChunkSource."""
@@ -67,19 +106,12 @@ class Feed:
         self.unproven += count
         if stop > self.reached:
             self.reached = stop
-            if stop > self._furthest:
-                self._furthest = stop
+            self.furthest = max(self.furthest, stop)
         self._source.on_acked(offset, count)
 
     def on_unsent(self, offset: int, count: int) -> None:
         """See protocol.writing.ChunkSource."""
         self._source.on_unsent(offset, count)
-
-    def put_back(self) -> None:
-        """Give back what was only looked at."""
-        held, self._held = self._held, None
-        if held is not None:
-            self._source.on_unsent(held[0], len(held[1]))
 
     def check_point(self) -> None:
         """Terminate was ACKed."""
@@ -90,7 +122,8 @@ class Feed:
 
     def roll_back(self, *, everything: bool) -> None:
         """What was ACKed since the last checkpoint, or everything, has to be sent again."""
-        self.put_back()
+        if not self.proven and not self.unproven:
+            return
         if everything:
             self.proven = False
             self._proven_to = 0
@@ -98,183 +131,216 @@ class Feed:
         self.unproven = 0
         self._source.on_rollback(everything)
 
-    def got_further(self) -> bool:
-        """Whether more of the file was reached than when this was asked before."""
-        before, self._furthest_before = self._furthest_before, self._furthest
-        return self._furthest > before
 
-
-class UploadHost(Protocol):
-    """What an upload may ask of the session."""
-
-    def check_may_write(self) -> None:
-        """Raise Armed or VehicleLost."""
-        ...
-
-    def now(self) -> float:
-        """Return the time."""
-        ...
-
-    def on_news(self, upload: QueuedUpload) -> None:
-        """Something about the upload changed."""
-        ...
-
-    def forget(self, upload: QueuedUpload) -> None:
-        """The upload is over."""
-        ...
-
-
-class QueuedUpload:
-    """Implements cache.remote.Upload; the scheduler's task does the work.
+class Upload(SessionUser):
+    """Implements cache.remote.Upload; `uploading` does the work.
 
     Attributes:
-        error: why the last attempt failed; None while it goes well. After a failure of the link it is tried
-            again in the background, after a refusal only when `finish` is called.
-        running: it has the session. clean: everything given so far is ACKed, and Terminate, too.
-        retry_at: not to be touched before. begun, resent: see cache.remote.Upload.
-        tried: it was reopened to see what OpenFileWO does. waits_for_finish: what comes now costs the whole
-            file again, so it waits until somebody waits for the end.
-        restarted: the vehicle did; what was proven does not count. refused_behind: what was sent right before
-            the Terminate was refused the last time.
+        state: see UploadState. error: why the last attempt failed; None while it goes well.
+        transfer: what sends its bytes now. begun, resent: see cache.remote.Upload.
+        retry_at: not to be touched before. reboots: of the vehicle, when its file was opened last.
+        refused_at: where a write was refused the last time as if the session were lost.
     """
 
-    def __init__(self, host: UploadHost, path: bytes, feed: Feed, now: float) -> None:
-        self.path = path
+    def __init__(
+        self,
+        path: bytes,
+        feed: Feed,
+        queue: Queue,
+        server: ServerSession,
+        vehicle: Vehicle,
+        clock: Callable[[], float],
+    ) -> None:
+        super().__init__(path, clock())
         self.feed = feed
+        self.state = UploadState.QUEUED
         self.begun = self.resent = False
-        self.share = Share(now)
         self.error: MavftpfsError | None = None
-        self.running = False
-        self.clean = False
-        self.aborted = False
-        self.refused = False
-        self.failures = 0
-        self.tried = self.restarted = self.refused_behind = self.waits_for_finish = False
-        self.refused_at: int | None = None
+        self.transfer: WriteTransfer | None = None
         self.retry_at = 0.0
-        self._woken = True
-        self._calls = 0
-        self._marked = 0
-        self._completed = 0
-        self._pending: set[int] = set()
-        self._host = host
-        self._news = trio.Event()
+        self.reboots = vehicle.reboots
+        self.refused_at: int | None = None
+        self._queue = queue
+        self._server = server
+        self._vehicle = vehicle
+        self._clock = clock
+        self._failures = 0
+        self._furthest = 0  # in the file, when the session was lost the last time
+        self._endings = 0  # how often all that the source had was out, and the file was to be closed
+        self._completed = 0  # the last of those that was ACKed
+        self._awaited = 0  # the last of those that `finish` waits for
+        self._changed = trio.lowlevel.ParkingLot()
+
+    def _enter(self, state: UploadState) -> None:
+        assert state in NEXT[self.state], f"{self.state} does not become {state}"
+        self.state = state
+        self._changed.unpark_all()
 
     # --- the owner's side
 
     def wake(self) -> None:
         """The source has more."""
-        self._note_waiting()
-        self._woken = True
-        self.clean = False
-        self._host.on_news(self)
+        if self.state is UploadState.IDLE:
+            self._queue_up(self._clock())
+        if self.transfer is not None:
+            self.transfer.wake()
+        self._server.wake()
 
     async def finish(self) -> None:
         """See cache.remote.Upload."""
-        if self.aborted:
+        if self.state in (UploadState.ENDING, UploadState.ENDED):
             raise LocalProtocolError("the upload was aborted")
-        if not self.clean or self.feed.has_more():
-            await self._finish()
-
-    async def _finish(self) -> None:
-        self._host.check_may_write()
-        self._note_waiting()
-        self._begin_again()
+        if self.state in (UploadState.IDLE, UploadState.HELD) and self._is_complete():
+            return
+        now = self._clock()
+        self._vehicle.require_writable(now)
+        if self.error is not None:
+            self.error, self.refused_at, self._failures = None, None, 0
         if not self.finishing:
-            self.share.asked_at = self._host.now()
-        self._calls += 1
-        call = self._calls
-        self._pending.add(call)
-        self._host.on_news(self)
-        try:
-            while call > self._completed:
-                if self.error is not None:
-                    raise self.error
-                await self._news.wait()
-        finally:
-            self._pending.discard(call)
+            self.asked_at = now
+        self.retry_at = 0.0
+        if self.state in (UploadState.IDLE, UploadState.HELD):
+            self._enter(UploadState.QUEUED)
+        awaited = self._awaited = self._endings + 1
+        self.wake()
+        while awaited > self._completed:
+            if self.error is not None:
+                raise self.error
+            await self._changed.park()
 
     async def abort(self) -> None:
         """See cache.remote.Upload."""
-        self.aborted = True
-        self._host.on_news(self)
+        self.error = LocalProtocolError("the upload was aborted")
+        if self.state is UploadState.SENDING:
+            self._enter(UploadState.ENDING)
+        elif self.state not in (UploadState.ENDING, UploadState.ENDED):
+            self._enter(UploadState.ENDED)
+        self._server.wake()
         try:
-            while self.running:
-                await self._news.wait()
+            while self.state is UploadState.ENDING:
+                await self._changed.park()
         finally:
-            self._host.forget(self)
-        self.feed.put_back()
-
-    def _begin_again(self) -> None:
-        self.clean = False
-        if self.error is not None:
-            self.error = None
-            self.refused = False
-            self.failures = 0
-            self.refused_at = None
-        self.retry_at = 0.0
-
-    def rest_until(self, at: float) -> None:
-        """It is not to be touched before."""
-        self.retry_at = self.share.asked_at = at
+            self._queue.remove(self)
 
     def status(self) -> dict[str, object]:
         """Return facts for people and scripts; JSON-able."""
         return {
             "path": self.path.decode("utf-8", "replace"),
-            "running": self.running,
+            "running": self.state is UploadState.SENDING,
             "reached": self.feed.reached,
             "unproven": self.feed.unproven,
-            "clean": self.clean,
             "error": None if self.error is None else str(self.error),
         }
 
-    # --- the session's side
+    def _is_complete(self) -> bool:
+        """Whether the card has all that the source has."""
+        return self.feed.proven and not self.feed.unproven and self.error is None and not self.feed.has_more()
+
+    # --- the queue's side
 
     @property
     def finishing(self) -> bool:
         """Whether somebody waits for the end."""
-        return any(call > self._completed for call in self._pending)
+        return self._awaited > self._completed
 
-    def _note_waiting(self) -> None:
-        """There is something to do; if there was before, it has waited since then."""
-        now = self._host.now()
-        if not self.is_due(now):
-            self.share.asked_at = now
+    def due_at(self) -> float:
+        """See SessionUser. A silent vehicle is only tried while somebody waits."""
+        if self.state is not UploadState.QUEUED or not self._vehicle.may_write:
+            return inf
+        if not self.finishing and self._vehicle.lost(self._clock()):
+            return inf
+        return self.retry_at
 
-    def is_due(self, now: float) -> bool:
-        """Whether there is something to do for it now."""
-        return self.wanted and now >= self.retry_at
+    def expire(self, error: MavftpfsError) -> None:
+        """Tell whoever waits; it keeps its place if nobody does."""
+        if self.finishing:
+            self.fail(error)
 
-    @property
-    def wanted(self) -> bool:
-        """Whether there is something to do for it, now or later."""
-        if self.aborted or self.refused:
-            return False
-        return self.finishing or (self._woken and not self.waits_for_finish)
+    def on_armed_changed(self) -> None:
+        """Whoever waits for an upload is told now; the running one ends itself. On disarming it goes on."""
+        if self.state is UploadState.QUEUED:
+            if self._vehicle.may_write:
+                self._queue_up(self._clock())
+            elif self.finishing:
+                self.fail(Armed("the vehicle was armed"))
 
-    def mark(self) -> None:
-        """The source has nothing more just now: what `complete` says is true for who called until now."""
-        self._marked = self._calls
+    # --- one turn
 
-    def complete(self, *, more: bool) -> None:
-        """Everything given until `mark` is ACKed and terminated; `more`: but there is more by now."""
-        self._completed = self._marked
-        self._woken = more
-        self.clean = not more and self.feed.proven
+    def begin_turn(self, *, resumable: bool) -> bool:
+        """It has the session from now on; return False if it needs it not, for there is nothing to send. An
+        empty file has to be made once. resumable: see `complete`.
+
+        Raises:
+            MavftpfsError: the source fails.
+        """
+        self._enter(UploadState.SENDING)
+        self.mark_ending()
+        feed = self.feed
+        if feed.has_more() or feed.unproven or (self.finishing and not feed.proven):
+            return True
+        self.complete(resumable=resumable)
+        return False
+
+    def mark_ending(self) -> None:
+        """The source has nothing more just now: `complete` is for who called `finish` until now."""
+        self._endings += 1
+
+    def complete(self, *, resumable: bool) -> None:
+        """Everything given until `mark_ending` is ACKed, and the file was closed.
+
+        resumable: it can be written on. Else what comes from now on costs the whole file once more, so it is
+        held until somebody waits for it.
+
+        Raises:
+            MavftpfsError: the source fails.
+        """
+        more = self.feed.has_more()
+        self._completed = self._endings
         self.error = None
-        self.failures = 0
-        self.tell()
+        self._failures = 0
+        if self.state is UploadState.ENDING:
+            return
+        if self.finishing or (more and resumable):
+            self._queue_up(self._clock())
+        elif self.feed.proven and not resumable:
+            self._enter(UploadState.HELD)
+        else:
+            self._enter(UploadState.IDLE)
 
-    def fail(self, error: MavftpfsError, now: float, *, refused: bool = False) -> None:
-        """Tell whoever waits; refused: asking again by ourselves is of no use."""
+    def lose_session(self, error: MavftpfsError) -> None:
+        """Try again from what is proven; after some times without getting further that is a failure."""
+        if self.feed.furthest > self._furthest:
+            self._furthest, self._failures = self.feed.furthest, 0
+        self._failures += 1
+        if self._failures > REOPENS:
+            self.fail(error)
+        elif self.state is UploadState.SENDING:
+            self._queue_up(self._clock() + (self._failures - 1) * 0.5)
+
+    def fail(self, error: MavftpfsError, *, refused: bool = False) -> None:
+        """Tell whoever waits, and try again in the background; refused: that is of no use before `finish`."""
         self.error = error
-        self.refused = refused
-        self.failures += 1
-        self.rest_until(now + min(LONGEST_BACKOFF, 2.0 ** min(self.failures, 5)))
-        self.tell()
+        self._failures += 1
+        self._awaited = self._completed
+        if self.state is UploadState.ENDING:
+            self._changed.unpark_all()
+        elif refused:
+            self._enter(UploadState.HELD)
+        else:
+            self._queue_up(self._clock() + min(LONGEST_BACKOFF, 2.0 ** min(self._failures, 5)))
 
-    def tell(self) -> None:
-        """Let whoever waits look."""
-        self._news.set()
-        self._news = trio.Event()
+    def end_turn(self, began: float) -> None:
+        """It has the session no more."""
+        now = self._clock()
+        self.on_turn(began, now)
+        if self.state is UploadState.ENDING:
+            self._enter(UploadState.ENDED)
+        elif self.state is UploadState.SENDING:
+            self._queue_up(now)
+        self.asked_at = max(now, self.retry_at)
+        if self.state is UploadState.QUEUED and self.finishing and not self._vehicle.may_write:
+            self.fail(Armed("the vehicle was armed"))  # perhaps while its file was opened or closed
+
+    def _queue_up(self, at: float) -> None:
+        self._enter(UploadState.QUEUED)
+        self.retry_at = self.asked_at = at

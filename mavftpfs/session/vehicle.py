@@ -14,6 +14,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import Enum
+from math import inf
 
 from mavftpfs.link.messages import (
     MAV_COMP_ID_AUTOPILOT1,
@@ -23,13 +24,11 @@ from mavftpfs.link.messages import (
     FtpFrame,
     Heartbeat,
     Message,
-    RadioStatus,
-    StatusText,
     StorageInformation,
     SystemTime,
 )
 from mavftpfs.protocol.payload import Opcode
-from mavftpfs.shared.errors import VehicleLost
+from mavftpfs.shared.errors import Armed, VehicleLost
 
 SILENCE_LIMIT = 5.0
 """Seconds without heartbeats after which one timed-out request means that the vehicle is lost."""
@@ -85,23 +84,13 @@ class Identity:
         self._moved = False
         self._unanswered = 0
         self.heard_at: float | None = None
-        self._back_at = self.left_at = float("-inf")
-
-    @property
-    def trusted(self) -> bool:
-        """Whether it is the vehicle that was there at first, as far as can be known."""
-        return self.standing is Standing.TRUSTED
-
-    @property
-    def stranger(self) -> bool:
-        """Whether another vehicle answers."""
-        return self.standing is Standing.STRANGER
+        self._back_at = self.left_at = -inf
 
     def may_be_asked(self, now: float) -> bool:
         """Whether requests may go out now: not into a silence either, at whose end another one may hear."""
-        if self._known is None or self.heard_at is None:
-            return self.trusted
-        return self.trusted and now - self.heard_at <= ABSENCE
+        if self.standing is not Standing.TRUSTED:
+            return False
+        return self._known is None or self.heard_at is None or now - self.heard_at <= ABSENCE
 
     def heard(self, now: float) -> None:
         """Something came from the vehicle's address."""
@@ -134,7 +123,7 @@ class Identity:
         """It may be another one since now: it restarted, or was silent."""
         tells = self._known is not None and not self._mute
         if tells and self.standing is not Standing.DOUBTED:
-            self._strange |= self.stranger
+            self._strange |= self.standing is Standing.STRANGER
             self.standing = Standing.DOUBTED
             self._unanswered = 0
         self.on_doubt()
@@ -162,14 +151,14 @@ class Identity:
             self._settle()
 
     def _is_stranger(self) -> None:
-        was_trusted, self.standing = self.trusted, Standing.STRANGER
+        was_trusted, self.standing = self.standing is Standing.TRUSTED, Standing.STRANGER
         if was_trusted:  # nobody asks, and ours may come back without a silence
             self.on_doubt()
 
     def _settle(self) -> None:
-        if self.trusted:
+        if self.standing is Standing.TRUSTED:
             return
-        strange = self._strange or self.stranger
+        strange = self._strange or self.standing is Standing.STRANGER
         self.standing, self._strange, self._moved = Standing.TRUSTED, False, False
         self.on_settled(strange)
 
@@ -189,6 +178,7 @@ class Vehicle:
     """The target and its neighbourhood.
 
     wanted_system, wanted_component: 0 = the first autopilot heard, resp. that system's autopilot.
+    write_armed: write in flight, too.
     own: our address; replies to anyone else are another FTP client's. on_foreign: called with each payload of
     another client's, and whether none was heard for a while.
     """
@@ -196,6 +186,7 @@ class Vehicle:
     wanted_system: int
     wanted_component: int
     own: Address
+    write_armed: bool = False
     on_reboot: Callable[[], None] = lambda: None
     on_foreign: Callable[[bytes, bool], None] = lambda payload, newcomer: None
     on_heartbeat: Callable[[], None] = lambda: None
@@ -206,16 +197,14 @@ class Vehicle:
     heartbeat_at: float | None = None
     version: AutopilotVersion | None = None
     storage: StorageInformation | None = None
-    radio: RadioStatus | None = None
-    last_text: StatusText | None = None
     foreign_at: float | None = None
     reboots: int = 0
     identity: Identity = field(default_factory=Identity)
     heard: dict[Address, Heartbeat] = field(default_factory=dict)
     _armed: bool | None = None
-    _disarmed_at: float = float("-inf")
+    _disarmed_at: float = -inf
     _boot_ms: int | None = None
-    boot_heard_at: float = float("-inf")
+    boot_heard_at: float = -inf
     _held_back: bool = False
     _timed_out: bool = False
 
@@ -228,46 +217,52 @@ class Vehicle:
         return self._armed is not False
 
     @property
+    def may_write(self) -> bool:
+        """Whether it may be written to now (promise 9)."""
+        return self.write_armed or self._armed is False
+
+    @property
     def ftp_flag(self) -> bool | None:
         """AUTOPILOT_VERSION's FTP capability, None while unknown. It proves nothing (servers.md 5)."""
         return None if self.version is None else bool(self.version.capabilities & MAV_PROTOCOL_CAPABILITY_FTP)
 
     def silence(self, now: float) -> float:
         """Return the seconds since the vehicle's last heartbeat (infinite before the first)."""
-        return float("inf") if self.heartbeat_at is None else now - self.heartbeat_at
+        return inf if self.heartbeat_at is None else now - self.heartbeat_at
 
     def lost(self, now: float) -> bool:
         """Return whether requests that need the link should fail at once."""
-        return self.identity.stranger or (self._timed_out and self.silence(now) > SILENCE_LIMIT)
+        strange = self.identity.standing is Standing.STRANGER
+        return strange or (self._timed_out and self.silence(now) > SILENCE_LIMIT)
 
     def require_there(self, now: float) -> None:
         """Raise VehicleLost while requests that need the link should fail at once."""
-        if self.identity.stranger:
+        if self.identity.standing is Standing.STRANGER:
             raise VehicleLost("another vehicle answers in place of the one that was mounted")
         if self.lost(now):
             raise VehicleLost("the vehicle is silent; waiting for its heartbeat")
+
+    def require_writable(self, now: float) -> None:
+        """Raise Armed while nothing may be written (promise 9), or as `require_there`."""
+        if not self.may_write:
+            raise Armed("the vehicle is armed: nothing is written in flight")
+        self.require_there(now)
 
     def foreign_client(self, now: float) -> bool:
         """Return whether another FTP client of this vehicle was heard lately."""
         return self.foreign_at is not None and now - self.foreign_at < FOREIGN_MEMORY
 
-    def restart_possible(self, now: float) -> bool:
-        """Return whether a restart may have gone unnoticed: it was away since it told its boot time."""
-        return self.tells_boot_time and self.identity.away_since(self.boot_heard_at, now)
-
     @property
     def tells_boot_time(self) -> bool:
         """Whether it told it at all; some do only when they are asked (ArduCopter)."""
-        return self.boot_heard_at > float("-inf")
+        return self.boot_heard_at > -inf
 
     def lacks_boot_time(self, now: float) -> bool:
-        """Return whether its boot time is worth asking for again."""
-        return self.restart_possible(now) or (self.tells_boot_time and self._boot_ms is None)
-
-    def believes_reply(self, now: float) -> bool:
-        """Something of the vehicle's FTP came: return whether it is known to be the vehicle."""
-        self.identity.heard(now)
-        return self.identity.trusted
+        """Return whether its boot time is worth asking for again: it was away since it told it, so a restart
+        may have gone unnoticed, or what it told does not count."""
+        if not self.tells_boot_time:
+            return False
+        return self._boot_ms is None or self.identity.away_since(self.boot_heard_at, now)
 
     def note_timeout(self) -> None:
         """A request to the vehicle went unanswered to its deadline."""
@@ -282,21 +277,17 @@ class Vehicle:
                 self._on_heartbeat(message, now)
             case FtpFrame():
                 self._on_foreign_ftp(message, now)
-            case RadioStatus():
-                self.radio = message
             case _ if self.address is None or message.source.system != self.address.system:
                 return
             case AutopilotVersion() if message.source == self.address:
                 if self.identity.told(message):
                     self.version = message
-            case _ if self.identity.stranger:
+            case _ if self.identity.standing is Standing.STRANGER:
                 return
             case StorageInformation():
                 self._on_storage(message)
             case SystemTime() if message.source == self.address:
                 self._on_boot_time(message.time_boot_ms, now)
-            case StatusText():
-                self.last_text = message
 
     def _on_heartbeat(self, heartbeat: Heartbeat, now: float) -> None:
         if heartbeat.source == self.own:
@@ -307,7 +298,7 @@ class Vehicle:
         if self.address is None and self._is_wanted(heartbeat):
             self.address = self._target_of(heartbeat)
         if heartbeat.is_autopilot and self.address and heartbeat.source.system == self.address.system:
-            self._disarmed_at = float("-inf") if heartbeat.armed else now
+            self._disarmed_at = -inf if heartbeat.armed else now
             # Who may be another one does not say that ours is on the ground.
             if heartbeat.armed or self.identity.may_be_asked(now):
                 self._on_armed(heartbeat.armed)
@@ -316,7 +307,7 @@ class Vehicle:
         self.heartbeat_at = now
         self.heartbeat = heartbeat
         self.identity.heard(now)
-        if self.identity.trusted:
+        if self.identity.standing is Standing.TRUSTED:
             self._on_alive()
 
     def _on_alive(self) -> None:

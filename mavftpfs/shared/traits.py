@@ -38,7 +38,7 @@ class Traits:
 
 @dataclass(slots=True)
 class WriteTraits:
-    """What one server was seen to do when written to; dropped when the vehicle reboots.
+    """What one server was seen to do when written to; forgotten when the vehicle reboots.
 
     Attributes:
         wo_truncates: OpenFileWO empties the file (servers.md 8). Filled by the session.
@@ -49,3 +49,7 @@ class WriteTraits:
     wo_truncates: bool | None = None
     rename_works: bool | None = None
     rename_replaces: bool | None = None
+
+    def forget(self) -> None:
+        """The vehicle rebooted, perhaps with other firmware."""
+        self.wo_truncates = self.rename_works = self.rename_replaces = None

@@ -24,7 +24,7 @@ from mavftpfs.session.vehicle import Vehicle
 from mavftpfs.shared.errors import FtpNak, MavftpfsError, RequestTimeout
 
 ANSWERS = st.sampled_from(["ack", "ack", "ack", "silence", "forever", 1, 4, 5, 8, 10])
-ACTS = st.sampled_from(["read", "write", "close", "abandon", "restart", "close unsure", "make room", "claim"])
+ACTS = st.sampled_from(["read", "write", "close", "abandon", "restart", "close maybe open", "exclude"])
 
 
 class Answering:
@@ -32,6 +32,7 @@ class Answering:
 
     def __init__(self, answers: list[str | int]) -> None:
         self._answers = answers
+        self.engine = Engine(random.Random(1), Flow())
 
     async def run(self, operation: Operation) -> None:
         await trio.lowlevel.checkpoint()
@@ -48,6 +49,10 @@ class Answering:
         if isinstance(operation, OpenFile):
             operation._reply = Payload(1, 0, Opcode.ACK, 0, opcode)
 
+    async def be_silent(self, seconds: float) -> bool:
+        await trio.sleep(seconds)
+        return True
+
 
 @given(st.lists(st.tuples(ACTS, st.lists(ANSWERS, max_size=6)), max_size=12))
 @settings(max_examples=200, deadline=None)
@@ -58,9 +63,8 @@ def test_all_goes_by_the_table(acts: list[tuple[str, list[str | int]]]) -> None:
 async def _play(acts: list[tuple[str, list[str | int]]]) -> None:
     driver = Answering([])
     vehicle = Vehicle(0, 0, Address(254, 191))
-    engine = Engine(random.Random(1), Flow())
     doubt = Doubt(trio.current_time)
-    server = ServerSession(cast(Driver, driver), engine, vehicle, doubt, trio.current_time, 10.0)
+    server = ServerSession(cast(Driver, driver), vehicle, doubt, trio.current_time, 10.0)
     for number, (act, answers) in enumerate(acts):
         driver._answers = list(answers)
         with trio.move_on_after(60), suppress(MavftpfsError):
@@ -76,21 +80,28 @@ async def _do(server: ServerSession, act: str, path: bytes) -> None:
             await server.open(path, Opcode.CREATE_FILE)
         case "close":
             await server.close()
-        case "close unsure":
-            await server.close_unsure()
-        case "make room":
-            await server.made_room(path)
+        case "close maybe open":
+            await server.close_maybe_open()
         case "abandon":
             server.abandon()
         case "restart":
             server.forget_server()
-        case "claim":
-            await server.honour_claims()
+        case "exclude":
+            async with trio.open_nursery() as nursery:
+                nursery.start_soon(_change, server, path)
+                await trio.sleep(1)
+                await server.close_excluded()
+                nursery.cancel_scope.cancel()
+
+
+async def _change(server: ServerSession, path: bytes) -> None:
+    async with server.excluded(path):
+        assert server.session is None or server.session.path != path
 
 
 def test_a_step_that_is_not_in_the_table_is_a_bug() -> None:
     assert set(NEXT) == set(State)
-    engine, vehicle = Engine(random.Random(1), Flow()), Vehicle(0, 0, Address(1, 1))
-    server = ServerSession(cast(Driver, None), engine, vehicle, Doubt(lambda: 0.0), lambda: 0.0)
+    driver, vehicle = cast(Driver, Answering([])), Vehicle(0, 0, Address(1, 1))
+    server = ServerSession(driver, vehicle, Doubt(lambda: 0.0), lambda: 0.0)
     with pytest.raises(AssertionError):
         server._enter(State.CLOSING)

@@ -8,7 +8,7 @@ from trio.testing import MockClock
 
 from mavftpfs.protocol.payload import Opcode
 from mavftpfs.session.connection import Connection
-from mavftpfs.session.scheduler import Scheduler
+from mavftpfs.session.queue import Queue
 from mavftpfs.sim.linkmodel import LinkSettings
 from tests.support.faults import Faults
 from tests.support.trees import content
@@ -25,18 +25,18 @@ async def test_a_reader_goes_on_beside_a_job_that_has_to_wait(
     here.tree.add(b"/big", content("big", 20_000))
     here.tree.add(b"/changing", b"old")
     rounds = 0
-    choose = Scheduler._next
+    choose = Queue.first
 
-    def counted(scheduler: Scheduler) -> object:
+    def counted(queue: Queue) -> object:
         nonlocal rounds
         rounds += 1
         assert rounds < ROUNDS, "it goes round without a moment in between"
-        return choose(scheduler)
+        return choose(queue)
 
-    monkeypatch.setattr(Scheduler, "_next", counted)
+    monkeypatch.setattr(Queue, "first", counted)
     async with here.connection() as connection, trio.open_nursery() as nursery:
         scheduler = connection.scheduler
-        async with scheduler.server.claim(b"/changing", below=False):
+        async with scheduler.server.excluded(b"/changing"):
             nursery.start_soon(scheduler.use_session, b"/changing", Opcode.OPEN_FILE_RO)
             await trio.sleep(0.1)
             assert await read_file(connection, b"/big") == content("big", 20_000)

@@ -27,18 +27,18 @@ CLEAN = LinkSettings(delay=0.02)
 def test_doubt_lasts_for_ten_minutes() -> None:
     now = 0.0
     doubt = Doubt(lambda: now)
-    assert not doubt.active
+    assert not doubt.is_active()
     assert doubt.lateness == 0.0
     now = 5.0
     doubt.raise_it("a reason")
-    assert doubt.active
+    assert doubt.is_active()
     assert doubt.arose_since(4.9)
     assert not doubt.arose_since(5.0)
     assert doubt.lateness == LEAST_LATE
     now += LASTS
-    assert doubt.active
+    assert doubt.is_active()
     now += 0.1
-    assert not doubt.active
+    assert not doubt.is_active()
     assert doubt.lateness == 0.0
 
 
@@ -192,7 +192,7 @@ async def test_a_late_open_of_another_file_gives_no_wrong_bytes(
         await read_or_doubt(connection, path(profile, "two"), two)
         assert copy.late is not None
         await trio.sleep(8)
-        assert connection.scheduler.session is None
+        assert connection.scheduler.server.session is None
         connection.scheduler.server.check_invariants()
 
 

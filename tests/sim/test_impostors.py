@@ -17,6 +17,7 @@ from mavftpfs.link.udp import UdpLink
 from mavftpfs.link.uri import parse_source
 from mavftpfs.protocol.payload import Opcode, Payload
 from mavftpfs.session.connection import Connection, ConnectOptions, connected
+from mavftpfs.session.vehicle import Standing
 from mavftpfs.shared.errors import VehicleLost
 from mavftpfs.sim import vehicle as sim_vehicle
 from mavftpfs.sim.linkmodel import LinkSettings
@@ -175,7 +176,7 @@ async def test_a_companion_has_an_address_of_its_own(
         async with scene.world.connection(ConnectOptions(target_component=191)) as connection:
             await trio.sleep(2.0)
             assert await read_file(connection, b"/f") == OURS
-            assert connection.vehicle.identity.trusted
+            assert connection.vehicle.identity.standing is Standing.TRUSTED
             assert connection.vehicle.armed
             await trio.sleep(10.0)
             assert await read_file(connection, b"/f") == OURS
@@ -270,9 +271,9 @@ async def test_who_is_not_our_vehicle_does_not_keep_it_out(monkeypatch: pytest.M
         with socket.create_connection((HOST, port)) as noisy:
             nursery.start_soon(make_noise, noisy)
             with LyingVehicle(theirs, f"tcp:{HOST}:{port}", seed=2) as other:
-                await until(lambda: identity.stranger)
+                await until(lambda: identity.standing is Standing.STRANGER)
                 with LyingVehicle(ours, f"tcp:{HOST}:{port}"):
-                    await until(lambda: identity.trusted)
+                    await until(lambda: identity.standing is Standing.TRUSTED)
                     assert await read_file(made, b"/f") == OURS
                 assert other.server.requests.total() == 0
             nursery.cancel_scope.cancel()

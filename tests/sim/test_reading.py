@@ -12,11 +12,10 @@ from mavftpfs.cache.options import CacheOptions
 from mavftpfs.cache.tree import Tree
 from mavftpfs.link.framing import Framer
 from mavftpfs.link.messages import Address, FtpFrame
-from mavftpfs.protocol.payload import NakCode, Opcode, Payload, request
+from mavftpfs.protocol.payload import Opcode, Payload, request
 from mavftpfs.session.connection import Connection, ConnectOptions
 from mavftpfs.shared.errors import (
     DataUnproven,
-    FtpNak,
     MavftpfsError,
     RemoteProtocolError,
     RequestTimeout,
@@ -188,7 +187,7 @@ async def test_a_whole_read_survives_a_lost_session(profile: str, autojump: Mock
 
         async def close_it() -> None:
             await trio.sleep(2.0)
-            session = connection.scheduler.session
+            session = connection.scheduler.server.session
             assert session is not None
             wire = request(777, Opcode.TERMINATE_SESSION, session=session.id).encode()
             frame = connection.driver.framer.encode_ftp(Address(1, 1), wire)
@@ -209,7 +208,7 @@ async def test_what_is_read_meanwhile_is_under_suspicion(trouble: str, autojump:
     async with here.connection() as connection:
         _, sink = await begin_to_read(connection, b"/f", 10_000)
         assert sink.suspicions == []
-        session = connection.scheduler.session
+        session = connection.scheduler.server.session
         assert session is not None
         source = Address(255, 190) if trouble == "another client is heard" else connection.vehicle.own
         opcode = Opcode.NONE if source.system == 255 else Opcode.TERMINATE_SESSION
@@ -245,7 +244,7 @@ async def test_what_was_read_shortly_before_is_under_suspicion_though_closed(
         await trio.sleep(11)
         connection.scheduler.doubt.raise_it("once more")
         assert len(sink.suspicions) <= 2  # it was heard twice: question and answer
-        assert not connection.scheduler._closed_streams
+        assert not connection.scheduler.reading._closed
 
 
 @pytest.mark.holds("rule 14.31")
@@ -256,7 +255,7 @@ async def test_times_that_could_not_be_asked_for_are_not_refused(autojump: MockC
     async with here.connection() as connection, trio.open_nursery() as nursery:
 
         async def keep_quiet() -> None:
-            await connection.scheduler.server._be_silent(3.5, FtpNak(3, NakCode.INVALID_SESSION))
+            await connection.driver.be_silent(3.5)
 
         for _ in range(3):
             nursery.start_soon(keep_quiet)

@@ -41,7 +41,7 @@ async def test_a_listing_outlasts_the_session_of_a_killed_client(autojump_clock:
         assert (
             connection.engine.stats.naks == 1 + 2
         )  # opcode 16 is unknown there, and a listing ends with one
-        assert not connection.store.kept_out
+        assert not connection.scheduler.server.kept_out
 
 
 async def test_listings_at_once_do_not_keep_the_dead_session_alive(autojump_clock: MockClock) -> None:
@@ -77,7 +77,7 @@ async def test_a_session_in_use_is_told_in_time_and_is_not_asked_for_often(autoj
             await connection.store.list_directory(b"/d")
         assert 10 < trio.current_time() - began < 20
         assert connection.engine.stats.naks == 3
-        assert connection.store.kept_out
+        assert connection.scheduler.server.kept_out
         nursery.cancel_scope.cancel()
 
 

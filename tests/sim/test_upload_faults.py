@@ -152,7 +152,7 @@ async def test_a_session_taken_away_is_got_back(profile: str, probed: bool, auto
         if probed:
             know(connection, profile)
         async with under_way(connection, profile, data) as source:
-            session = connection.scheduler.session
+            session = connection.scheduler.server.session
             assert session is not None
             wire = request(77, Opcode.TERMINATE_SESSION, session=session.id).encode()
             stranger = here.vehicle.server
@@ -351,7 +351,7 @@ async def test_a_link_that_is_reopened_and_stays_silent_ends_the_wait(
         source = MemorySource(content(2_000))
         upload = await start(connection, profile, source)
         await trio.sleep(0.8)
-        assert connection.scheduler.session is not None
+        assert connection.scheduler.server.session is not None
         assert source.dirty.empty
         assert source.in_flight.empty
         here.link.cut()
@@ -437,7 +437,7 @@ async def test_path_operations_beside_an_upload_on_nuttx(autojump: MockClock) ->
         assert source.rollbacks == []
         refused = faults.refused.count(Opcode.WRITE_FILE)
         assert 1 <= refused < 30  # the first window only: after that, each knows its turn
-        assert connection.scheduler._uploading.writer.rearms >= 5
+        assert connection.scheduler.uploading.rearms >= 5
     assert here.tree.data(path("px4-nuttx", "new")) == data
 
 
@@ -452,7 +452,7 @@ async def test_a_write_after_silence_on_nuttx(autojump: MockClock) -> None:
             await trio.sleep(4)
             here.link.restore()
         assert source.rollbacks == []
-        assert connection.scheduler._uploading.writer.rearms == 1
+        assert connection.scheduler.uploading.rearms == 1
     assert here.tree.data(path("px4-nuttx", "new")) == data
 
 
@@ -464,7 +464,7 @@ async def test_outside_the_whitelist_stays_refused(autojump: MockClock) -> None:
         with pytest.raises(FtpNak) as refusal:
             await upload.finish()
         assert (refusal.value.opcode, refusal.value.code) == (Opcode.WRITE_FILE, 9)
-        assert connection.scheduler._uploading.writer.rearms == 1
+        assert connection.scheduler.uploading.rearms == 1
         await upload.abort()
     assert here.vehicle.server.open_sessions == 0
 
@@ -483,7 +483,7 @@ async def test_abort_leaves_nothing_open_and_asks_for_nothing(profile: str, auto
         left = source.dirty.total
         await trio.sleep(5)
         assert source.dirty.total == left
-        assert connection.scheduler.uploads == []
+        assert connection.scheduler.uploads() == []
 
 
 async def test_an_error_at_close_is_the_callers(autojump: MockClock) -> None:
@@ -495,7 +495,7 @@ async def test_an_error_at_close_is_the_callers(autojump: MockClock) -> None:
         upload = await start(connection, "ardupilot5", source)
 
         def break_close() -> None:
-            slot = next(slot for slot in here.vehicle.server._firmware._slots if slot.file is not None)  # type: ignore[attr-defined]
+            slot = next(slot for slot in here.vehicle.server.firmware._slots if slot.file is not None)  # type: ignore[attr-defined]
             opened = slot.file
 
             def close() -> None:
@@ -558,7 +558,7 @@ async def test_a_server_that_always_loses_the_session_is_given_up(profile: str, 
 
         async def steal() -> None:
             for number in range(400):
-                session = connection.scheduler.session
+                session = connection.scheduler.server.session
                 if session is not None:
                     wire = request(number, Opcode.TERMINATE_SESSION, session=session.id).encode()
                     here.vehicle.server.handle(wire, connection.vehicle.own, trio.current_time())

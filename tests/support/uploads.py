@@ -8,7 +8,7 @@ from contextlib import asynccontextmanager
 import trio
 
 from mavftpfs.session.connection import Connection
-from mavftpfs.session.upload import QueuedUpload
+from mavftpfs.session.upload import Upload
 from mavftpfs.sim.profiles import PROFILES
 from tests.support.sources import MemorySource
 from tests.support.worlds import path
@@ -19,9 +19,7 @@ def know(connection: Connection, profile: str) -> None:
     connection.store.traits.wo_truncates = PROFILES[profile].write_only_truncates
 
 
-async def start(
-    connection: Connection, profile: str, source: MemorySource, name: str = "new"
-) -> QueuedUpload:
+async def start(connection: Connection, profile: str, source: MemorySource, name: str = "new") -> Upload:
     return await connection.store.open_upload(path(profile, name), source)
 
 

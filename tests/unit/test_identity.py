@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from mavftpfs.link.messages import Address, AutopilotVersion
-from mavftpfs.session.vehicle import ABSENCE, PATIENCE, Identity, is_another
+from mavftpfs.session.vehicle import ABSENCE, PATIENCE, Identity, Standing, is_another
 
 pytestmark = pytest.mark.holds("fault another vehicle")
 
@@ -14,6 +14,11 @@ VEHICLE = Address(1, 1)
 
 def version(uid: int = 0, uid2: int = 0) -> AutopilotVersion:
     return AutopilotVersion(VEHICLE, 0, 0, bytes(8), uid, uid2.to_bytes(18))
+
+
+def standing(identity: Identity) -> Standing:
+    """Without what a type checker remembers of it."""
+    return identity.standing
 
 
 class Watched(Identity):
@@ -55,7 +60,7 @@ def test_a_vehicle_that_never_told_is_never_doubted(first: AutopilotVersion | No
     identity.heard(0.0)
     identity.heard(1000.0)
     identity.doubt()
-    assert identity.trusted
+    assert standing(identity) is Standing.TRUSTED
     assert identity.settled == []
 
 
@@ -91,11 +96,11 @@ def test_a_silence_makes_it_doubtful_and_the_same_id_trusted() -> None:
     identity.told(version(1))
     identity.heard(0.0)
     identity.heard(ABSENCE)
-    assert identity.trusted
+    assert standing(identity) is Standing.TRUSTED
     identity.heard(2 * ABSENCE + 0.1)
-    assert (identity.trusted, identity.stranger, identity.doubts) == (False, False, 1)
+    assert (identity.standing, identity.doubts) == (Standing.DOUBTED, 1)
     assert identity.told(version(1))
-    assert identity.trusted
+    assert standing(identity) is Standing.TRUSTED
     assert identity.settled == [False]
 
 
@@ -104,12 +109,12 @@ def test_another_id_is_a_stranger_s_until_ours_is_told() -> None:
     identity.told(version(1))
     identity.doubt()
     assert not identity.told(version(2))
-    assert identity.stranger
+    assert standing(identity) is Standing.STRANGER
     identity.doubt()  # it went: who comes now is not known
-    assert not identity.stranger
-    assert not identity.trusted
+    assert standing(identity) is not Standing.STRANGER
+    assert standing(identity) is not Standing.TRUSTED
     assert identity.told(version(1))
-    assert identity.trusted
+    assert standing(identity) is Standing.TRUSTED
     assert identity.settled == [True]
 
 
@@ -119,9 +124,9 @@ def test_who_is_heard_but_does_not_tell_is_believed_in_the_end() -> None:
     identity.doubt()
     for _ in range(PATIENCE - 1):
         identity.unanswered()
-    assert not identity.trusted
+    assert standing(identity) is not Standing.TRUSTED
     identity.unanswered()
-    assert identity.trusted
+    assert standing(identity) is Standing.TRUSTED
 
 
 def test_silences_between_the_questions_do_not_make_it_doubtful_for_ever() -> None:
@@ -130,7 +135,7 @@ def test_silences_between_the_questions_do_not_make_it_doubtful_for_ever() -> No
     for beat in range(PATIENCE + 1):
         identity.heard(beat * 2 * ABSENCE)
         identity.unanswered()
-    assert identity.trusted
+    assert standing(identity) is Standing.TRUSTED
 
 
 def mute() -> Watched:
@@ -146,17 +151,17 @@ def mute() -> Watched:
 def test_who_never_told_again_is_asked_but_not_kept_waiting() -> None:
     identity = mute()
     identity.doubt()
-    assert identity.trusted
+    assert standing(identity) is Standing.TRUSTED
     assert identity.doubts == 2
     assert not identity.told(version(2))
-    assert identity.stranger
+    assert standing(identity) is Standing.STRANGER
 
 
 def test_who_tells_again_is_doubted_again() -> None:
     identity = mute()
     assert identity.told(version(1))
     identity.doubt()
-    assert not identity.trusted
+    assert standing(identity) is not Standing.TRUSTED
 
 
 def test_another_id_without_a_silence_is_asked_for_again() -> None:
@@ -172,4 +177,4 @@ def test_a_stranger_that_falls_silent_about_itself_stays_one() -> None:
     identity.told(version(2))
     for _ in range(2 * PATIENCE):
         identity.unanswered()
-    assert identity.stranger
+    assert standing(identity) is Standing.STRANGER

@@ -46,7 +46,6 @@ PURE_MODULES = {
     "link.signing",
     "link.uri",
     "session.doubt",
-    "session.fairness",
     "session.vehicle",
     "cache.attributes",
     "cache.dentries",

@@ -14,7 +14,7 @@ from mavftpfs.link.messages import (
     SystemTime,
 )
 from mavftpfs.protocol.payload import Opcode, Payload, request
-from mavftpfs.session.vehicle import FOREIGN_MEMORY, SILENCE_LIMIT, Vehicle
+from mavftpfs.session.vehicle import FOREIGN_MEMORY, SILENCE_LIMIT, Standing, Vehicle
 
 pytestmark = pytest.mark.holds("fault boot time asked")
 
@@ -118,7 +118,7 @@ def test_who_may_be_another_vehicle_does_not_disarm_ours() -> None:
     vehicle.on_message(heartbeat(PILOT), 10.0)
     assert vehicle.armed
     vehicle.on_message(OURS, 20.0)  # it is back, and flies
-    assert vehicle.identity.trusted
+    assert vehicle.identity.standing is Standing.TRUSTED
     assert vehicle.armed
     vehicle.on_message(heartbeat(PILOT), 21.0)
     assert not vehicle.armed
@@ -229,10 +229,10 @@ def test_a_restart_of_who_told_its_boot_time_long_ago_is_seen(restarts: bool, to
     tell_boot_times(vehicle, (0.0, 5_000))
     for second in [*range(21), 35]:
         vehicle.on_message(heartbeat(PILOT), float(second))
-    assert vehicle.restart_possible(35.0)
+    assert vehicle.lacks_boot_time(35.0)
     tell_boot_times(vehicle, (35.0, told))
     assert vehicle.reboots == restarts
-    assert not vehicle.restart_possible(35.0)
+    assert not vehicle.lacks_boot_time(35.0)
 
 
 def test_facts_are_taken_from_the_target_alone() -> None:

@@ -4,31 +4,42 @@ from __future__ import annotations
 
 import pytest
 
-from mavftpfs.session.fairness import LONG_WAIT, MAX_TURN, MIN_TURN, RELIEF, USE_MEMORY, Share
+from mavftpfs.session.queue import LONG_WAIT, MAX_TURN, MIN_TURN, RELIEF, USE_MEMORY, SessionUser
+from mavftpfs.shared.errors import MavftpfsError
 
 
-def heavy(seconds: float = 5.0) -> Share:
-    share = Share()
-    share.on_turn(100.0 - seconds, 100.0)
-    return share
+class User(SessionUser):
+    """Wants the session always."""
+
+    def due_at(self) -> float:
+        return 0.0
+
+    def fail(self, error: MavftpfsError) -> None:
+        raise error
+
+
+def heavy(seconds: float = 5.0) -> User:
+    user = User(b"/f")
+    user.on_turn(100.0 - seconds, 100.0)
+    return user
 
 
 def test_use_fades_but_not_while_it_waits() -> None:
-    share = heavy(2.0)
-    assert share.used(100.0) == 2.0
-    assert share.used(100.0 + USE_MEMORY / 2) == pytest.approx(1.0)
-    assert share.used(100.0 + 2 * USE_MEMORY) == 0.0
-    share.ask(100.0)
-    assert share.used(100.0 + USE_MEMORY / 2) == 2.0
-    share.on_turn(130.0, 131.0)
-    share.asked_at = None
-    assert share.used(131.0) == 3.0
+    user = heavy(2.0)
+    assert user.used(100.0) == 2.0
+    assert user.used(100.0 + USE_MEMORY / 2) == pytest.approx(1.0)
+    assert user.used(100.0 + 2 * USE_MEMORY) == 0.0
+    user.asked_at = 100.0
+    assert user.used(100.0 + USE_MEMORY / 2) == 2.0
+    user.on_turn(130.0, 131.0)
+    user.asked_at = None
+    assert user.used(131.0) == 3.0
 
 
 def test_who_used_little_goes_first_until_another_waited_long() -> None:
-    busy, light = heavy(), Share()
-    busy.ask(100.0)
-    light.ask(101.0)
+    busy, light = heavy(), User(b"/g")
+    busy.asked_at = 100.0
+    light.asked_at = 101.0
     assert light.rank(101.0, 0.02) < busy.rank(101.0, 0.02)
     late = 100.0 + LONG_WAIT
     assert busy.rank(late, 0.02) < light.rank(late, 0.02)
@@ -36,12 +47,12 @@ def test_who_used_little_goes_first_until_another_waited_long() -> None:
 
 
 def test_who_waited_long_keeps_the_session_for_a_while() -> None:
-    share = heavy()
-    share.ask(100.0)
+    user = heavy()
+    user.asked_at = 100.0
     began = 100.0 + LONG_WAIT
-    assert share.gives_way(0.0, began - 0.1, began, 0.02)
-    assert not share.gives_way(0.0, began, began + 0.1, 0.02)
-    assert share.gives_way(0.0, began, began + RELIEF, 0.02)
+    assert user.gives_way(0.0, began - 0.1, began, 0.02)
+    assert not user.gives_way(0.0, began, began + 0.1, 0.02)
+    assert user.gives_way(0.0, began, began + RELIEF, 0.02)
 
 
 @pytest.mark.parametrize(
