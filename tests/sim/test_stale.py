@@ -6,8 +6,9 @@ import pytest
 import trio
 from trio.testing import MockClock
 
-from mavftpfs.protocol.operations import OpenFile, Simple
-from mavftpfs.protocol.payload import Opcode
+from mavftpfs.link.messages import Address
+from mavftpfs.protocol.operations import OpenFile
+from mavftpfs.protocol.payload import Opcode, request
 from mavftpfs.session.connection import Connection, ConnectOptions
 from mavftpfs.shared.errors import FtpNak, SessionBusy
 from tests.support.worlds import World
@@ -64,11 +65,11 @@ async def test_a_session_in_use_is_told_in_time_and_is_not_asked_for_often(autoj
     options = ConnectOptions(op_deadline=20.0)
     async with here.connection(options) as connection, trio.open_nursery() as nursery:
         await open_elsewhere(connection)
-        other = others_session(connection)
+        wire = request(77, Opcode.NONE, session=others_session(connection)).encode()
 
         async def keep_in_use() -> None:
             while True:
-                await connection.driver.run(Simple(Opcode.NONE, session=other))
+                here.vehicle.server.handle(wire, Address(255, 190), trio.current_time())
                 await trio.sleep(1)
 
         nursery.start_soon(keep_in_use)
