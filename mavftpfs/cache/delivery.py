@@ -309,7 +309,7 @@ class Deliverer:
         node.generation += 1
         node.known_at = context.clock()
         node.close_base()
-        context.files.on_written(node.path)
+        context.files.on_changed(node.path)
         self.delivered += 1
 
     def _note_failure(self, node: Node, draft: Draft, error: MavftpfsError) -> None:

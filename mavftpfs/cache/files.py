@@ -111,6 +111,7 @@ class Files:
         self.misses = 0
         self.unproven = 0
         directories.on_listed = self._on_listed
+        cache.on_dropped = self._on_dropped
 
     # --- opening
 
@@ -158,7 +159,7 @@ class Files:
             return version, True
         kept = await self.kept.find(path, entry) if fresh and self.kept is not None else None
         if kept is not None:
-            version = self._new_version(path, entry.mtime, kept.key.size)
+            version = Version(self.cache, path, kept.key.size, entry.mtime)
             version.kept = kept
             self._replace(version)
         else:
@@ -185,7 +186,7 @@ class Files:
         return recent and (same_size or not newer)
 
     async def _start_version(self, path: bytes, entry: DirEntry) -> Version:
-        version = self._new_version(path, None)
+        version = Version(self.cache, path)
         reader = await self._store.open_reader(path, version)
         try:
             if entry.size is not None and entry.size >= WRAP and entry.size % WRAP == reader.size:
@@ -246,11 +247,6 @@ class Files:
             self.kill(version)
             version.require_alive()
         version.reader = reader
-
-    def _new_version(self, path: bytes, mtime: int | None, size: int = 0) -> Version:
-        version = Version(self.cache, path, size, mtime)
-        version.on_dropped = self._on_dropped
-        return version
 
     def _replace(self, version: Version) -> None:
         old = self._current.pop(version.path, None)
@@ -397,19 +393,19 @@ class Files:
         """Return whether somebody who is to read on has a version open that is not the vehicle's any more."""
         return any(v.path == path and v.dead is not None and not v.lost for v in self.open_versions)
 
-    def on_written(self, path: bytes) -> None:
-        """What was cached of the path is no longer the file; who has it open opens it anew."""
-        current = self._current.pop(path, None)
-        older = [v for v in self.open_versions if v.path == path and v is not current]
-        for version in older if current is None else [current, *older]:
-            version.end(f"{path!r} was written")
+    def on_changed(self, path: bytes) -> None:
+        """We wrote or removed what has the path: who has the old file open opens the path anew."""
+        for version in self._at_or_below(path):
+            if self._current.get(version.path) is version:
+                del self._current[version.path]
+            version.end(f"{version.path!r} was changed here")
 
     def adopt(self, path: bytes, size: int, pieces: Iterable[tuple[int, bytes]], *, proven_at: float) -> None:
         """Take over the content of a file we wrote: (offset, bytes) of all of it, then proven."""
-        self.on_written(path)
+        self.on_changed(path)
         if proven_at <= self._restarted_at:
             return
-        version = self._new_version(path, None, size)
+        version = Version(self.cache, path, size)
         version.proven_at, version.shown, version.given = proven_at, True, True
         self._replace(version)
         for offset, data in pieces:
@@ -417,7 +413,7 @@ class Files:
 
     def on_renamed(self, old: bytes, new: bytes) -> None:
         """A file, or a directory with all below it, has another path now; open files follow."""
-        self.on_removed(new)
+        self.on_changed(new)
         for version in self._at_or_below(old):
             current = self._current.get(version.path) is version
             if current:
@@ -427,11 +423,6 @@ class Files:
             version.ask_again()
             if current:
                 self._current[version.path] = version
-
-    def on_removed(self, path: bytes) -> None:
-        """A file, or an empty directory, is gone."""
-        for version in self._at_or_below(path):
-            self.on_written(version.path)
 
     def _at_or_below(self, path: bytes) -> list[Version]:
         """Return what is cached or open of a path, older ones too, and of what lies below it."""

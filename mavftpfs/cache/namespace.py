@@ -170,7 +170,7 @@ class Namespace:
         self._context.require_idle(path)
         await self._names.purge(path)
         await self._names.remove(path)
-        self._context.files.on_removed(path)
+        self._context.files.on_changed(path)
 
     async def _unlink_node(self, node: Node) -> None:
         """Remove a file that is open, or not delivered yet."""
@@ -191,7 +191,7 @@ class Namespace:
             return
         if there:
             await self._names.remove_if_there(path)
-            self._context.files.on_removed(path)
+            self._context.files.on_changed(path)
         node.lose_name()
         self._context.nodes.detach(node)
 
@@ -352,4 +352,4 @@ class Namespace:
         finally:
             context.nodes.forget_hidden(node)
             context.own.live.discard(node.path)
-        context.files.on_removed(node.path)
+        context.files.on_changed(node.path)

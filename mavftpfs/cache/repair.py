@@ -250,7 +250,7 @@ class Cleaner:
             log.warning("%r was left by an interruption: renaming it to %r", action.path, action.to)
             await self._names.rename(action.path, action.to, completes=torn)
             if action.to == group.target and action.path != group.paths.get(Kind.OLD):
-                context.files.on_written(action.to)
+                context.files.on_changed(action.to)
             context.own.found(group.paths.values())
         self.mended += 1
 

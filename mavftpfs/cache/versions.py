@@ -50,7 +50,11 @@ SMALL_FILE = 64 * 1024
 
 
 class BlockCache:
-    """The budget that all files share."""
+    """The budget that all files share.
+
+    Attributes:
+        on_dropped: called when bytes of a version are dropped in doubt: the kernel may hold copies.
+    """
 
     def __init__(self, budget: int, *, clock: Callable[[], float], patience: float) -> None:
         """Take the budget in bytes, and after how many seconds without progress a read gives up."""
@@ -58,6 +62,7 @@ class BlockCache:
         self.clock = clock
         self.patience = patience
         self.meter = RateMeter()
+        self.on_dropped: Callable[[Version], None] = lambda version: None
         self.piece = PIECE if budget >= 8 * PIECE else BLOCK_SIZE
         self.reads = trio.Semaphore(max(1, budget // 2 // (self.piece + BLOCK_SIZE)))
         """Held by who waits for a piece: what is waited for is not evicted, and takes at most half."""
@@ -129,7 +134,6 @@ class Version:
         opened_at: when the server opened the file for the session that bytes come from now.
         doubted: what comes from the present reader is ignored; cleared by `begin_reading`.
         drops: how often bytes were dropped because they were in doubt, or another file's.
-        on_dropped: called when that happens: the kernel may hold copies.
     """
 
     def __init__(self, cache: BlockCache, path: bytes, size: int = 0, mtime: int | None = None) -> None:
@@ -145,7 +149,6 @@ class Version:
         self.kept: Kept | None = None
         self.opened_at = NEVER
         self.drops = 0
-        self.on_dropped: Callable[[Version], None] = lambda version: None
         self._cache = cache
         self._blocks: dict[int, bytearray] = {}
         self._present = ExtentSet()
@@ -239,7 +242,7 @@ class Version:
         self.doubted = True
         self.drops += 1
         self._forget_but(self._earlier)
-        self.on_dropped(self)
+        self._cache.on_dropped(self)
 
     def on_failed(self, error: Exception) -> None:
         """Those who wait get the error; later reads ask again."""
@@ -293,7 +296,7 @@ class Version:
         self.close_reader()
         self.drops += 1
         self._forget_but(ExtentSet())
-        self.on_dropped(self)
+        self._cache.on_dropped(self)
 
     def clear(self) -> None:
         """Forget every block that no reader waits on."""

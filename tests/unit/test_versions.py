@@ -228,7 +228,7 @@ async def test_doubtful_bytes_are_dropped_and_older_ones_are_not() -> None:
     cache = make_cache()
     told: list[Version] = []
     blocks = Version(cache, b"/f", 3 * BLOCK_SIZE)
-    blocks.on_dropped = told.append
+    cache.on_dropped = told.append
     deliver(blocks, 0, content(10))
     blocks.begin_reading()
     deliver(blocks, 10, content(2 * BLOCK_SIZE))
