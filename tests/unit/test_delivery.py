@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 from collections.abc import Awaitable, Callable
+from contextlib import suppress
 from pathlib import Path
 from random import Random
 
@@ -13,7 +14,6 @@ import trio
 
 from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.recovery import SpoolDirectory
-from mavftpfs.cache.reserved import is_reserved
 from mavftpfs.cache.tree import Tree
 from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.shared.errnos import errno_for
@@ -23,14 +23,13 @@ from mavftpfs.shared.errors import (
     FtpNak,
     MavftpfsError,
     NotSupported,
-    PathTooLong,
     RequestTimeout,
     VehicleLost,
     VerificationFailed,
 )
 from mavftpfs.shared.model import split
 from tests.support.fake_store import read_file
-from tests.support.fake_writer import CHUNK, KINDS, FakeWriter, Kind, card, litter, make_writable, write_file
+from tests.support.fake_writer import CHUNK, KINDS, FakeWriter, card, litter, make_writable, write_file
 
 OLD = bytes(range(256)) * 4
 NEW = b"new content " * 100
@@ -112,43 +111,6 @@ async def test_a_file_is_replaced_whole(any_store: FakeWriter) -> None:
             await write_file(tree, FILE, NEW)
         assert any_store.files[FILE].data == OLD
         assert await read_file(tree, FILE) == NEW, "what was accepted is kept and shown"
-    assert litter(any_store) == []
-
-
-async def test_a_second_replacement_knows_the_server(any_store: FakeWriter) -> None:
-    tree = make_writable(any_store)
-    if not any_store.kind.renames:
-        return
-    await write_file(tree, FILE, NEW)
-    any_store.log.clear()
-    await write_file(tree, FILE, OLD)
-    renames = [entry for entry in any_store.log if entry[0] == "rename"]
-    assert len(renames) == (1 if any_store.kind.replaces else 2)
-
-
-async def test_inplace_overwrites_where_nothing_else_goes(nursery: trio.Nursery) -> None:
-    store = FakeWriter(KINDS["littlefs"], nursery)
-    store.add(FILE, OLD)
-    tree = make_writable(store, inplace=True)
-    await write_file(tree, FILE, NEW)
-    assert store.files[FILE].data == NEW
-    assert litter(store) == []
-
-
-async def test_a_part_is_changed(any_store: FakeWriter) -> None:
-    """Where nothing can be replaced the file stays, and what was accepted is kept and shown."""
-    tree = make_writable(any_store)
-    changed = OLD[:100] + b"changed" + OLD[107:] + b"more"
-    file = await tree.open(FILE, write=True)
-    await file.write(100, b"changed")
-    await file.write(len(OLD), b"more")
-    if any_store.kind.renames:
-        await file.release()
-    else:
-        with pytest.raises(NotSupported):
-            await file.release()
-    assert any_store.files[FILE].data == (changed if any_store.kind.renames else OLD)
-    assert await read_file(tree, FILE) == changed
     assert litter(any_store) == []
 
 
@@ -444,174 +406,12 @@ async def test_what_cannot_be_delivered_is_copied_with_a_manifest(
     assert not manifest["card__dir__file.txt"]["whole"]
 
 
-async def test_nothing_to_recover_leaves_no_directory(store: FakeWriter, tmp_path: Path) -> None:
-    assert make_writable(store).recover_to(tmp_path / "rescued") == []
-    assert not (tmp_path / "rescued").exists()
-
-
-# --- paths
-
-
-@pytest.mark.parametrize("length", [100, 118, 119, 200])
-@pytest.mark.parametrize("kind", ["posix", "fat"])
-async def test_long_paths_are_replaced(nursery: trio.Nursery, kind: str, length: int) -> None:
-    store = FakeWriter(KINDS[kind], nursery)
-    path = long_path(length)
-    store.add(path, OLD)
-    tree = make_writable(store)
-    await write_file(tree, path, NEW)
-    assert store.files[path].data == NEW
-    assert litter(store) == []
-    assert store.crimes == []
-
-
 def long_path(length: int) -> bytes:
     parts = b"/card" + b"/a-rather-long-name" * 20
     return parts[: length - 1].rstrip(b"/") + b"x" * (length - len(parts[: length - 1].rstrip(b"/")))
 
 
-async def test_too_long_a_path_is_refused_before_a_byte_is_sent(store: FakeWriter) -> None:
-    tree = make_writable(store)
-    store.add_directory(b"/card" + b"/a-rather-long-name" * 8)
-    requests = store.requests
-    with pytest.raises(PathTooLong):
-        await tree.create(b"/card" + b"/a-rather-long-name" * 8 + b"/" + b"n" * 72, exclusive=True)
-    assert store.requests == requests
-
-
-async def test_nothing_above_is_short_enough(nursery: trio.Nursery) -> None:
-    root = b"/" + b"r" * 60
-    store = FakeWriter(KINDS["posix"], nursery)
-    path = root + b"/" + b"n" * 139
-    store.add(path, OLD)
-    tree = make_writable(store, root=root)
-    with pytest.raises(PathTooLong):
-        await write_file(tree, path[len(root) :], NEW)
-    assert store.files[path].data == OLD
-    assert store.requests == 0
-
-
-# --- interruption anywhere
-
-Job = Callable[[Tree], Awaitable[None]]
-
-JOBS: dict[str, tuple[Job, set[bytes | None]]] = {
-    "replace": (lambda tree: write_file(tree, FILE, NEW), {OLD, NEW}),
-    "part": (
-        lambda tree: change(tree, FILE, 100, NEW),
-        {OLD[:100] + NEW[:n] + OLD[100 + n :] for n in range(0, len(NEW) + 1)},
-    ),
-    "truncate": (lambda tree: tree.truncate(FILE, 500), {OLD, OLD[:500]}),
-    "empty": (lambda tree: tree.truncate(FILE, 0), {OLD, b""}),
-    "rename over": (lambda tree: tree.rename(b"/card/other", FILE), {OLD, NEW}),
-    "unlink": (lambda tree: tree.unlink(FILE), {OLD, None}),
-}
-
-
-async def attempt(job: Job, tree: Tree) -> bool:
-    """Return whether the caller saw success."""
-    try:
-        await job(tree)
-    except MavftpfsError:
-        return False
-    return True
-
-
-async def count_requests(kind: Kind, name: str, path: bytes) -> tuple[int, dict[bytes, bytes], bool]:
-    async with trio.open_nursery() as nursery:
-        store = scene(kind, nursery, path)
-        good = await attempt(JOBS[name][0], make_writable(store))
-        nursery.cancel_scope.cancel()
-    return store.requests, {p: f.data for p, f in store.files.items()}, good
-
-
-def scene(kind: Kind, nursery: trio.Nursery, path: bytes = FILE) -> FakeWriter:
-    store = FakeWriter(kind, nursery)
-    store.add(path, OLD)
-    store.add(b"/card/other", NEW)
-    return store
-
-
-@pytest.mark.holds("fault power")
-@pytest.mark.parametrize("name", sorted(JOBS))
-@pytest.mark.parametrize("kind", sorted(KINDS))
-async def test_power_lost_after_any_request(
-    autojump_clock: object, tmp_path: Path, kind: str, name: str
-) -> None:
-    """What is on the card then is allowed, and the next mount leaves it complete and tidy."""
-    job, allowed = JOBS[name]
-    total, final, good = await count_requests(KINDS[kind], name, FILE)
-    for number in range(total + 1):
-        async with trio.open_nursery() as nursery:
-            async with trio.open_nursery() as cut_off:  # or it would go on when the power is back
-                store = scene(KINDS[kind], cut_off)
-                spool = SpoolDirectory(tmp_path / f"{number}", Random(number))
-                store.freeze_at = number
-                done = await attempt(job, make_writable(store, spool=spool))
-                spool.close()
-                cut_off.cancel_scope.cancel()
-            store.nursery = nursery
-            store.revive()
-            await check_mended(store, tmp_path / f"{number}", allowed)
-            if done:
-                assert {p: f.data for p, f in store.files.items()} == final
-            nursery.cancel_scope.cancel()
-        assert store.crimes == []
-    assert good or not KINDS[kind].renames
-
-
-async def check_mended(store: FakeWriter, directory: Path, allowed: set[bytes | None]) -> None:
-    """Mount anew and list everything: no litter, and each file is one of those it may be."""
-    spool = SpoolDirectory(directory, Random(99))
-    tree = make_writable(store, spool=spool, seed=2)
-    await tree.list(b"/card")
-    await tree.list(b"/card/dir")
-    await tree.list(b"/card")
-    assert litter(store) == []
-    file = store.files.get(FILE)
-    assert (None if file is None else file.data) in allowed
-    contents = [f.data for f in store.files.values()]
-    assert OLD in contents or NEW in contents or file is not None or None in allowed
-    other = store.files.get(b"/card/other")
-    assert other is None or other.data == NEW
-    spool.close()
-
-
-@pytest.mark.parametrize("name", sorted(JOBS))
-@pytest.mark.parametrize("kind", sorted(KINDS))
-@pytest.mark.parametrize("fault", ["lost reply", "silence", "refused"])
-async def test_one_fault_at_any_request(
-    autojump_clock: object, tmp_path: Path, kind: str, name: str, fault: str
-) -> None:
-    """The caller got an error or the truth; draining delivers what is held; no litter stays."""
-    job, allowed = JOBS[name]
-    total, final, good = await count_requests(KINDS[kind], name, FILE)
-    for number in range(1, total + 1):
-        async with trio.open_nursery() as nursery:
-            store = scene(KINDS[kind], nursery)
-            put_fault(store, number, fault)
-            tree = make_writable(store)
-            done = await attempt(job, tree)
-            if done:
-                assert {p: f.data for p, f in store.files.items() if not is_reserved(split(p)[1])} == final
-            remaining = await tree.drain(100 if good else 2)
-            assert remaining == [] or not good
-            tree.forget_caches()
-            await tree.list(b"/card/dir")
-            assert litter(store) == []
-            file = store.files.get(FILE)
-            assert (None if file is None else file.data) in allowed
-            nursery.cancel_scope.cancel()
-        assert store.crimes == []
-
-
-def put_fault(store: FakeWriter, number: int, fault: str) -> None:
-    if fault == "lost reply":
-        store.lose_reply_at.add(number)
-    elif fault == "silence":
-        store.fail_at[number] = RequestTimeout("silence")
-    else:
-        store.fail_at[number] = FtpNak(Opcode.NONE, NakCode.FAIL_ERRNO, errno.EACCES)
+# --- interruption anywhere, of a path that is too long for names that tell where they belong
 
 
 @pytest.mark.parametrize("kind", ["posix", "fat"])
@@ -629,7 +429,10 @@ async def test_power_lost_while_a_long_path_is_replaced(
                 spool = SpoolDirectory(tmp_path / f"{number}", Random(number))
                 store.freeze_at = number
                 tree = make_writable(store, spool=spool)
-                done = await attempt(lambda tree: write_file(tree, path, NEW), tree)
+                done = False
+                with suppress(MavftpfsError):
+                    await write_file(tree, path, NEW)
+                    done = True
                 spool.close()
                 cut_off.cancel_scope.cancel()
             store.nursery = nursery

@@ -84,7 +84,6 @@ def test_what_the_table_does_not_know_cannot_happen(state: State, event: Event) 
 def test_the_life_of_a_new_file() -> None:
     draft = draft_over(None)
     assert draft.undelivered, "also if it is empty"
-    assert draft.undelivered
     sending = draft.begin(in_place=False)
     draft.write(0, b"abc")
     assert sent(sending) == [(0, b"abc")]

@@ -5,7 +5,7 @@ The same at any request of its delivery on every simulated server: tests/sim/tes
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator
 from contextlib import suppress
 
 import pytest
@@ -14,7 +14,6 @@ import trio
 from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.tree import Tree
 from mavftpfs.shared.errors import Armed, FileBusy, LinkError, OutcomeUnknown, RequestTimeout
-from tests.support.deliveries import in_the_middle
 from tests.support.fake_writer import KINDS, FakeWriter, litter, make_writable
 
 FOLDER = b"/card/dir"
@@ -66,64 +65,6 @@ async def by_opening(tree: Tree, path: bytes, file: OpenFile) -> OpenFile:
     return await tree.open(path, write=True, truncate=True)
 
 
-async def by_another_handle(tree: Tree, path: bytes, file: OpenFile) -> OpenFile:
-    other = await tree.open(path, write=True)
-    await other.truncate(0)
-    return other
-
-
-async def by_its_own_handle(tree: Tree, path: bytes, file: OpenFile) -> OpenFile:
-    await file.truncate(0)
-    return await tree.open(path, write=True)
-
-
-async def by_name(tree: Tree, path: bytes, file: OpenFile) -> OpenFile:
-    await tree.truncate(path, 0)
-    return await tree.open(path, write=True)
-
-
-Empty = Callable[[Tree, bytes, OpenFile], Awaitable[OpenFile]]
-WAYS: list[Empty] = [by_opening, by_another_handle, by_its_own_handle, by_name]
-
-
-@pytest.mark.parametrize("empty", WAYS)
-@pytest.mark.parametrize("path", [NEW, FILE])
-@pytest.mark.parametrize("content", [b"", SHORT, DATA + SHORT])
-async def test_emptying_waits_for_no_delivery(
-    autojump_clock: object, store: FakeWriter, path: bytes, empty: Empty, content: bytes
-) -> None:
-    """Who waits for it hears 0 when the card has what the file is by then."""
-    tree = writable(store)
-    file = await begun(tree, store, path)
-    async with in_the_middle(file, waiting=2):
-        before = trio.current_time()
-        other = await empty(tree, path, file)
-        assert trio.current_time() - before < PROMPT
-        await other.write(0, content)
-    assert store.files[path].data in (b"", content)
-    await file.release()
-    await other.release()
-    assert tree.undelivered() == []
-    assert store.files[path].data == content
-    assert await left(tree, store) == {FILE, path}
-    assert store.files[path].data == content
-
-
-async def test_a_change_in_place_is_called_off_too(autojump_clock: object, store: FakeWriter) -> None:
-    tree = writable(store)
-    file = await begun(tree, store, FILE, whole=False)
-    async with in_the_middle(file):
-        before = trio.current_time()
-        other = await by_opening(tree, FILE, file)
-        assert trio.current_time() - before < PROMPT
-        await other.write(0, SHORT)
-    await other.release()
-    assert store.files[FILE].data == SHORT
-    await file.release()
-    assert await left(tree, store) == {FILE}
-    assert store.files[FILE].data == SHORT
-
-
 async def test_an_error_is_that_of_what_the_file_is_now(autojump_clock: object, store: FakeWriter) -> None:
     tree = writable(store)
     file = await begun(tree, store, FILE)
@@ -146,31 +87,6 @@ async def test_an_error_is_that_of_what_the_file_is_now(autojump_clock: object, 
 
 def refuse(*_: object) -> None:
     raise OutcomeUnknown("no answer")
-
-
-async def test_what_nobody_waits_for_leaves_the_old_file_until_there_is_another(
-    autojump_clock: object, store: FakeWriter
-) -> None:
-    """A delivery that is tried again by itself does not bring the emptied file to the card."""
-    tree = writable(store)
-    file = await begun(tree, store, FILE)
-    store.before_request = refuse
-    with pytest.raises(RequestTimeout):
-        await file.release()
-    store.before_request = None
-    if not store.kind.renames:
-        return  # what overwrites it in place emptied it
-    await trio.sleep(3.0)
-    assert litter(store)  # on its way again
-    before = trio.current_time()
-    other = await by_opening(tree, FILE, file)
-    assert trio.current_time() - before < PROMPT
-    await trio.sleep(120)
-    assert store.files[FILE].data == OLD
-    await other.write(0, SHORT)
-    await other.release()
-    assert store.files[FILE].data == SHORT
-    assert await left(tree, store) == {FILE}
 
 
 async def test_emptying_waits_for_no_room(autojump_clock: object, store: FakeWriter) -> None:

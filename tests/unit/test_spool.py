@@ -41,12 +41,6 @@ def test_bytes_stay_in_memory_up_to_the_limit_and_go_to_disk_beyond(tmp_path: Pa
     assert list(tmp_path.iterdir()) == []
 
 
-def test_pages_are_joined(tmp_path: Path) -> None:
-    content = SpoolContent(spool_of(tmp_path))
-    content.put(PAGE - 2, b"abcd")
-    assert content.get(PAGE - 2, PAGE + 2) == b"abcd"
-
-
 def test_what_a_dead_mount_left_is_neither_reused_nor_discarded(tmp_path: Path) -> None:
     slot = tmp_path / "slot0"
     slot.mkdir()
@@ -236,13 +230,6 @@ def test_killed_between_the_name_and_the_first_byte(tmp_path: Path) -> None:
     assert not (tmp_path / "recovered").exists()
 
 
-def test_what_the_vehicle_has_is_not_offered_until_more_is_written(tmp_path: Path) -> None:
-    directory, content = spilled(tmp_path)
-    content.settle()
-    content.put(6, b", and more")
-    assert rescued(directory, tmp_path) == {"card__log.bin": b"so far, and more"}
-
-
 @pytest.mark.parametrize("change", [lambda content: content.put(6, b"more"), lambda content: content.cut(2)])
 def test_what_could_not_be_written_down_is_tried_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, change: Callable[[SpoolContent], None]
@@ -260,18 +247,6 @@ def test_what_could_not_be_written_down_is_tried_again(
             change(content)
     content.put(6, b", and more")
     assert rescued(directory, tmp_path) == {"card__log.bin": b"so far, and more"}
-
-
-def test_what_the_vehicle_has_is_removed_by_the_next_mount(tmp_path: Path) -> None:
-    directory, content = spilled(tmp_path)
-    content.persist({"path": "/card/log.bin", "size": 6})
-    content.settle()
-    assert rescued(directory, tmp_path) == {}
-
-
-def test_what_nobody_wants_any_more_is_not_offered(tmp_path: Path) -> None:
-    directory, _ = spilled(tmp_path, None)
-    assert rescued(directory, tmp_path) == {}
 
 
 def test_more_than_was_written_down_says_so(tmp_path: Path) -> None:

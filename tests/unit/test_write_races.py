@@ -362,10 +362,3 @@ async def test_what_became_of_a_change_that_was_given_up_is_looked_up(
     there = names_there(store)
     assert there == {"unlink": set(), "mkdir": {FILE, b"/d/made"}, "rename": {b"/d/moved"}}[change]
     assert {b"/d/" + name for name, _ in await tree.list(b"/d")} == there
-
-
-class Mute(Afterwards):
-    """Does what it is asked, and is not heard; to look what became of it was in vain, too."""
-
-    async def afterwards(self) -> None:
-        raise RequestTimeout("no answer")
