@@ -227,25 +227,24 @@ class Deliverer:
         context, places = self._context, None
         if plan is Plan.OVERWRITE or isinstance(node.error, AlreadyExists):  # which all of it was sent for
             await self._require_expected(node, draft)
-        if plan is Plan.REPLACE:
-            fresh = draft.base is None
-            places = (
-                Places(context.own.beside(node.path, Kind.FRESH)) if fresh else context.own.places(node.path)
-            )
-            context.own.live |= places.all
-        path = node.path if places is None else places.new
+        if plan is Plan.REPLACE and draft.base is None:
+            places = Places(context.own.beside(node.path, Kind.FRESH))
+        elif plan is Plan.REPLACE:
+            places = context.own.places(node.path)
+        path, live = (node.path, set[bytes]()) if places is None else (places.new, places.all)
+        context.own.live |= live
         begun_at = context.clock()
         try:
-            if places is not None:
-                await self._names.write_sidecar(places, node.path)
+            if places is not None and places.sidecar is not None:
+                await self._names.write_sidecar(places.sidecar, node.path)
             sending = draft.begin(in_place=places is None)
             sending.progress = self._throttle.on_acked
             upload = await context.writer.open_upload(path, sending)
         except BaseException:
             draft.give_up()
-            context.own.live -= set() if places is None else places.all
+            context.own.live -= live
             raise
-        node.attempt = Attempt(plan, path, sending, upload, begun_at, places)
+        node.attempt = Attempt(plan, path, sending, upload, begun_at, places, live)
         if places is None:
             context.dentries.put(path, DirEntry(b"", EntryKind.FILE))
         return node.attempt

@@ -70,7 +70,8 @@ class Names:
         node = self._context.nodes.get(path)
         if node is not None and node.draft is not None and node.draft.state is not State.STALE:
             return DirEntry(split(path)[1], EntryKind.FILE, node.draft.size)
-        return await self.listed(path)
+        parent, name = split(path)
+        return (await self._context.directories.get(parent)).entries.get(name)
 
     async def need(self, path: bytes) -> DirEntry:
         """Return what a path is, drafts included. Raises as entry; NotFound if it does not exist."""
@@ -78,11 +79,6 @@ class Names:
         if entry is None:
             raise NotFound(f"{path!r} does not exist")
         return entry
-
-    async def listed(self, path: bytes) -> DirEntry | None:
-        """Return what the vehicle has there, as far as is remembered. Raises as entry."""
-        parent, name = split(path)
-        return (await self._context.directories.get(parent)).entries.get(name)
 
     async def current(self, path: bytes, *, free: bool = False) -> DirEntry | None:
         """Return what the vehicle has there, as it was shown to be at most RECENT ago.
@@ -297,8 +293,8 @@ class Names:
             await self.discard(target, *litter)
             return
         assert places.old is not None
-        if source != places.new:  # else it was written before
-            await self.write_sidecar(places, target)
+        if places.sidecar is not None and source != places.new:  # else it was written before
+            await self.write_sidecar(places.sidecar, target)
         moved = await self._move_aside(target, places.old)
         try:
             await self.rename(source, target, completes=moved)
@@ -315,11 +311,9 @@ class Names:
             litter.insert(0, places.old)
         await self.discard(target, *litter)
 
-    async def write_sidecar(self, places: Places, target: bytes) -> None:
-        """Write down where short names belong, if the names are short. Raises as Upload.finish."""
-        if places.sidecar is None:
-            return
-        upload = await self._context.writer.open_upload(places.sidecar, _Text(target))
+    async def write_sidecar(self, sidecar: bytes, target: bytes) -> None:
+        """Write down where short names belong. Raises as Upload.finish."""
+        upload = await self._context.writer.open_upload(sidecar, _Text(target))
         try:
             upload.wake()
             await upload.finish()

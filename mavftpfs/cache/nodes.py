@@ -28,7 +28,7 @@ class Attempt:
     """One try to deliver a draft.
 
     path: where its bytes go. places: the reserved names, but on cards that cannot rename. begun_at: when, by
-    the caches' clock.
+    the caches' clock. live: the reserved names it uses.
     """
 
     plan: Plan
@@ -36,18 +36,14 @@ class Attempt:
     sending: Sending
     upload: Upload
     begun_at: float
-    places: Places | None = None
+    places: Places | None
+    live: set[bytes]
 
     @property
     def names(self) -> list[bytes]:
         """What it leaves on the card if it is given up: what was sent, and its sidecar."""
         sent = [self.path] if self.upload.begun else []
         return sent if self.places is None or self.places.sidecar is None else [*sent, self.places.sidecar]
-
-    @property
-    def live(self) -> set[bytes]:
-        """The reserved names it uses."""
-        return set() if self.places is None else self.places.all
 
 
 @dataclass(slots=True, eq=False)

@@ -28,7 +28,7 @@ class Overlay:
         self._context = context
         options = context.options
         self.times = Times()
-        self.local = LocalFiles(options.local, options.local_max, self.now_ns)
+        self.local = LocalFiles(options.local, options.local_max, lambda: int(context.wall() * SECOND))
 
     def stat(self, path: bytes) -> Stat | None:
         """Return what is known better here than by any listing, None if the listing decides.
@@ -81,13 +81,9 @@ class Overlay:
             raise NotADirectory(f"{path!r} is not a directory")
         return self.overlay(path, {})
 
-    def now_ns(self) -> int:
-        """Return the time of day, nanoseconds since 1970."""
-        return int(self._context.wall() * SECOND)
-
     def on_written(self, path: bytes) -> None:
         """A file's content changed: it is of now, also where no listing tells times."""
-        self.times.set(path, self.now_ns())
+        self.times.set(path, int(self._context.wall() * SECOND))
 
     def set_times(self, path: bytes, mtime_ns: int) -> None:
         """Show this mtime until the file changes; of a local file keep it."""

@@ -221,16 +221,19 @@ class SpoolContent:
 
     def _put_in_memory(self, offset: int, data: memoryview) -> bool:
         """Return False, having kept nothing, if that is too much for memory."""
-        pages = range(offset // PAGE, -(-(offset + len(data)) // PAGE))
-        new = [index for index in pages if index not in self._pages]
-        if self._spool.in_memory + len(new) * PAGE > self._spool.memory_max():
+        more = 0
+        for index in range(offset // PAGE, -(-(offset + len(data)) // PAGE)):
+            more += 0 if index in self._pages else PAGE
+        if self._spool.in_memory + more > self._spool.memory_max():
             return False
-        self._spool.in_memory += len(new) * PAGE
-        self._pages.update((index, bytearray(PAGE)) for index in new)
+        self._spool.in_memory += more
         while data:
             index, at = divmod(offset, PAGE)
+            page = self._pages.get(index)
+            if page is None:
+                page = self._pages[index] = bytearray(PAGE)
             count = min(len(data), PAGE - at)
-            self._pages[index][at : at + count] = data[:count]
+            page[at : at + count] = data[:count]
             data, offset = data[count:], offset + count
         return True
 

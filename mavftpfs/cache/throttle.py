@@ -81,12 +81,12 @@ class Throttle:
     def is_full(self, node: Node) -> bool:
         """Return whether the writers of a file have to wait."""
         draft, attempt = node.draft, node.attempt
-        if draft is None or node.removed:
+        if draft is None or node.removed or draft.unacked <= LEAST:
             return False  # nothing is delivered of a file without a name
         if attempt is None and (not node.background or self._context.nursery is None):
             return False  # nothing of it moves before it is closed: it waits on the local disk
-        streams = len([other for other in self._context.nodes if other.attempt is not None])
-        return draft.unacked > max(self.limit // max(streams, 1), LEAST)
+        streams = sum(other.attempt is not None for other in self._context.nodes)
+        return draft.unacked > self.limit // max(streams, 1)
 
     async def wait(self) -> bool:
         """Wait for anything to move; return False if nothing did for STALL seconds."""

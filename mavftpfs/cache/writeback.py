@@ -191,9 +191,7 @@ class Writeback:
         if node is not None and node.draft is not None:
             return node
         require_not_ours(path)
-        entry = await self._names.listed(path)
-        if entry is None:
-            raise NotFound(f"{path!r} does not exist")
+        entry = await self._names.need(path)
         if entry.kind is not EntryKind.FILE:
             raise IsADirectory(f"{path!r} is a directory")
         if truncate:

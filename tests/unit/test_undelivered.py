@@ -147,15 +147,6 @@ async def test_an_upload_of_what_was_taken_back_is_called_off(
     await tree.rmdir(split(FILE)[0])
 
 
-# --- what was emptied, or cut
-
-
-LARGE = bytes(range(256)) * 400
-
-
-large = card({FILE: LARGE}, kinds=["posix", "fat", "mavsdk"])
-
-
 # --- what is kept at the end
 
 
