@@ -1,16 +1,18 @@
-"""Somebody else says that he is the vehicle: it does not count, and the vehicle is not lost by it."""
+"""Somebody else says that he is the vehicle, or takes its place: nothing of one reaches the other."""
 
 from __future__ import annotations
 
 import random
 import socket
-from collections.abc import Callable, Iterable
-from contextlib import suppress
+from collections.abc import AsyncIterator, Callable, Iterable
+from contextlib import asynccontextmanager, suppress
 
 import pytest
 import trio
 from trio.testing import MockClock
 
+from mavftpfs.cache.tree import Tree
+from mavftpfs.compose import subscribe
 from mavftpfs.link.messages import MAV_AUTOPILOT_INVALID, Address
 from mavftpfs.link.opening import open_link
 from mavftpfs.link.udp import UdpLink
@@ -18,25 +20,28 @@ from mavftpfs.link.uri import parse_source
 from mavftpfs.protocol.payload import Opcode, Payload
 from mavftpfs.session.connection import Connection, ConnectOptions, connected
 from mavftpfs.session.vehicle import Standing
-from mavftpfs.shared.errors import VehicleLost
+from mavftpfs.shared.errors import MavftpfsError, VehicleLost
 from mavftpfs.sim import vehicle as sim_vehicle
-from mavftpfs.sim.linkmodel import LinkSettings
+from mavftpfs.sim.linkmodel import Direction, LinkSettings
 from mavftpfs.sim.profiles import PROFILES, Family
 from mavftpfs.sim.tree import MemoryTree
 from mavftpfs.sim.vehicle import SimVehicle
+from tests.support.fake_store import read_file as read_through
 from tests.support.lying import CrowdedLink, LyingVehicle, ack, ftp, heartbeat
+from tests.support.mounting import mounted
 from tests.support.vehicles import HOST, free_udp_port
-from tests.support.worlds import World, read_file
-
-pytestmark = pytest.mark.holds("promise 10")
+from tests.support.worlds import ROOTS, World, read_file
 
 HERE = ("10.0.0.1", 14550)
+
 THERE = ("10.0.0.2", 14550)
+
 OURS = random.Random(1).randbytes(20_000)
+
 THEIRS = random.Random(2).randbytes(20_000)
 
 
-class Scene:
+class Crowd:
     """A vehicle at HERE. other: another one with a file of that name."""
 
     def __init__(self) -> None:
@@ -67,10 +72,11 @@ async def told(connection: Connection) -> None:
     assert connection.vehicle.version is not None
 
 
+@pytest.mark.holds("promise 10")
 async def test_heartbeats_from_elsewhere_do_not_move_the_vehicle(
     autojump: MockClock, caplog: pytest.LogCaptureFixture
 ) -> None:
-    scene = Scene()
+    scene = Crowd()
     async with scene.world.connection() as connection, trio.open_nursery() as nursery:
         await told(connection)
         nursery.start_soon(scene.beat, THERE)
@@ -84,10 +90,11 @@ async def test_heartbeats_from_elsewhere_do_not_move_the_vehicle(
     ]
 
 
+@pytest.mark.holds("promise 10")
 async def test_a_vehicle_whose_address_changes_is_found_again(
     autojump: MockClock, caplog: pytest.LogCaptureFixture
 ) -> None:
-    scene = Scene()
+    scene = Crowd()
     async with scene.world.connection() as connection:
         await told(connection)
         assert await read_file(connection, b"/f") == OURS
@@ -101,12 +108,13 @@ async def test_a_vehicle_whose_address_changes_is_found_again(
     ]
 
 
+@pytest.mark.holds("promise 10")
 @pytest.mark.parametrize("tells", [True, False])
 async def test_another_vehicle_that_takes_the_address_is_not_read(
     tells: bool, autojump: MockClock, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """One that does not tell who it is neither, though ours would be believed in the end."""
-    scene = Scene()
+    scene = Crowd()
     if not tells:
         monkeypatch.setattr(scene.other, "_on_command", lambda command, now: None)
     async with scene.world.connection() as connection, trio.open_nursery() as nursery:
@@ -123,11 +131,12 @@ async def test_another_vehicle_that_takes_the_address_is_not_read(
         nursery.cancel_scope.cancel()
 
 
+@pytest.mark.holds("promise 10")
 async def test_nothing_is_asked_at_a_new_address_before_it_told(
     autojump: MockClock, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Of a vehicle that never told who it is, too."""
-    scene = Scene()
+    scene = Crowd()
     monkeypatch.setattr(scene.ours, "_on_command", lambda command, now: None)
     monkeypatch.setattr(scene.other, "_on_command", lambda command, now: None)
     async with scene.world.connection() as connection:
@@ -139,10 +148,11 @@ async def test_nothing_is_asked_at_a_new_address_before_it_told(
         assert scene.other.server.requests.total() == 0
 
 
+@pytest.mark.holds("promise 10")
 async def test_two_links_to_one_vehicle_do_no_harm(
     autojump: MockClock, caplog: pytest.LogCaptureFixture
 ) -> None:
-    scene = Scene()
+    scene = Crowd()
     scene.link.mirrors = [THERE]
     async with scene.world.connection() as connection:
         for _ in range(5):
@@ -155,12 +165,13 @@ async def test_two_links_to_one_vehicle_do_no_harm(
     assert connection.vehicle.reboots == 0
 
 
+@pytest.mark.holds("promise 10")
 async def test_a_companion_has_an_address_of_its_own(
     autojump: MockClock, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Our target is not the autopilot, whose heartbeats come from elsewhere and say whether it is armed."""
     monkeypatch.setitem(sim_vehicle._AUTOPILOT_TYPE, Family.MAVSDK, MAV_AUTOPILOT_INVALID)
-    scene = Scene()
+    scene = Crowd()
     scene.world.vehicle = SimVehicle(
         scene.world.tree, PROFILES["mavsdk"], rng=random.Random(1), address=Address(1, 191)
     )
@@ -184,10 +195,11 @@ async def test_a_companion_has_an_address_of_its_own(
         nursery.cancel_scope.cancel()
 
 
+@pytest.mark.holds("promise 10")
 async def test_a_target_without_heartbeats_moves_with_its_autopilot(
     autojump: MockClock, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    scene = Scene()
+    scene = Crowd()
     scene.world.vehicle = SimVehicle(
         scene.world.tree, PROFILES["mavsdk"], rng=random.Random(1), address=Address(1, 191)
     )
@@ -214,14 +226,12 @@ async def test_a_target_without_heartbeats_moves_with_its_autopilot(
         nursery.cancel_scope.cancel()
 
 
-# -- on real links ---------------------------------------------------------------------------------
-
-
 def forge(request: Payload) -> bytes:
     """Return the ACK of a read with everything right but the bytes."""
     return ftp(ack(request, b"\xee" * request.size).encode(), Address(254, 191))
 
 
+@pytest.mark.holds("promise 10")
 @pytest.mark.parametrize("kind", ["udpin", "udpout", "tcpin"])
 async def test_a_forged_reply_from_another_socket_is_not_believed(kind: str) -> None:
     """Each read is answered by the forger first. kind: our end of the link."""
@@ -248,6 +258,7 @@ async def test_a_forged_reply_from_another_socket_is_not_believed(kind: str) -> 
                 assert await read_file(made, b"/f") == OURS
 
 
+@pytest.mark.holds("promise 10")
 async def test_who_is_not_our_vehicle_does_not_keep_it_out(monkeypatch: pytest.MonkeyPatch) -> None:
     """tcpin has one peer at a time. Ours goes away; somebody connects who sends without a pause, then another
     vehicle, which stays, and then ours."""
@@ -303,3 +314,174 @@ def forging(send: Callable[[bytes], object]) -> Callable[[Payload, Payload], Ite
         return [reply]
 
     return change
+
+
+# --- another vehicle with the same address
+
+SLOW = LinkSettings(rate=20_000.0, delay=0.02, loss=0.05)
+
+OUR_FILE = random.Random(1).randbytes(60_000)
+
+THEIR_FILE = random.Random(2).randbytes(60_000)
+
+NEW = random.Random(3).randbytes(60_000)
+
+
+class Scene:
+    """A mount of a vehicle that has a file. other: a vehicle of the same kind, with a file of that name."""
+
+    def __init__(self, profile: str, settings: LinkSettings = SLOW) -> None:
+        self.world = World(profile, settings)
+        self.root = ROOTS.get(profile, b"") + b"/d"
+        self.file = self.root + b"/f"
+        self.world.tree.add(self.file, OUR_FILE)
+        self.ours = self.world.vehicle
+        tree = MemoryTree()
+        tree.add(self.file, THEIR_FILE)
+        self.other = SimVehicle(tree, PROFILES[profile], rng=random.Random(99))
+
+    @asynccontextmanager
+    async def mounted(self) -> AsyncIterator[Tree]:
+        """Give a tree that hears the news as a mount does."""
+        async with mounted(self.world) as (connection, tree):
+            subscribe(connection, tree)
+            await trio.sleep(3.0)  # it told who it is
+            yield tree
+
+
+async def swap(world: World, vehicle: SimVehicle, *, gap: float) -> None:
+    """One is switched off, `gap` seconds later the other is there."""
+    world.link.cut()
+    await trio.sleep(gap)
+    world.link.vehicle = vehicle
+    vehicle.server.firmware.tx_room = lambda: world.model.room(Direction.TO_CLIENT)
+    world.link.restore()
+
+
+@pytest.mark.holds("fault another vehicle")
+@pytest.mark.parametrize("gap", [3.0, 40.0])
+@pytest.mark.parametrize("profile", ["px4", "px4-nuttx", "ardupilot"])
+async def test_what_is_held_for_one_is_not_written_to_the_other(
+    profile: str, gap: float, autojump: MockClock
+) -> None:
+    scene = Scene(profile)
+    async with scene.mounted() as tree:
+        await tree.list(scene.root)
+        file = await tree.open(scene.file, write=True, truncate=True)
+        await file.write(0, NEW)
+        async with trio.open_nursery() as nursery:
+
+            async def close() -> None:
+                with pytest.raises(MavftpfsError):
+                    await file.release()
+
+            nursery.start_soon(close)
+            await trio.sleep(1.0)
+            await swap(scene.world, scene.other, gap=gap)
+        await trio.sleep(100.0)
+        assert scene.other.server.requests.total() == 0
+        assert tree.undelivered() == [scene.file]
+        again = await tree.open(scene.file, write=True)
+        with pytest.raises(VehicleLost, match="another vehicle answers"):
+            await again.fsync()
+        again.close()
+        await swap(scene.world, scene.ours, gap=4.0)
+        await trio.sleep(100.0)
+        assert tree.undelivered() == []
+        assert scene.world.tree.data(scene.file) == NEW
+
+
+@pytest.mark.holds("fault another vehicle")
+@pytest.mark.parametrize("profile", ["px4", "px4-2026", "ardupilot"])
+async def test_no_file_is_read_half_from_each(profile: str, autojump: MockClock) -> None:
+    scene = Scene(profile)
+    async with scene.mounted() as tree:
+        file = await tree.open(scene.file)
+        head = bytes(await file.read(0, 10_000))
+        await swap(scene.world, scene.other, gap=4.0)
+        with pytest.raises(MavftpfsError):
+            await file.read(30_000, 30_000)
+        assert scene.other.server.requests.total() == 0
+        await swap(scene.world, scene.ours, gap=4.0)
+        await trio.sleep(5.0)
+        file.close()
+        assert head == OUR_FILE[:10_000]
+        assert await read_through(tree, scene.file) == OUR_FILE
+
+
+@pytest.mark.holds("fault another vehicle")
+async def test_the_same_vehicle_goes_on_after_a_silence(autojump: MockClock) -> None:
+    scene = Scene("px4")
+    async with scene.mounted() as tree:
+        file = await tree.open(scene.file)
+        await swap(scene.world, scene.world.vehicle, gap=4.0)
+        assert bytes(await file.read(0, len(OUR_FILE))) == OUR_FILE
+        file.close()
+
+
+@pytest.mark.holds("fault another vehicle")
+@pytest.mark.parametrize("tells", ["never", "once"])
+async def test_a_vehicle_that_does_not_tell_who_it_is_is_believed(
+    tells: str, autojump: MockClock, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Later, if it told once: it was asked for seconds."""
+    scene = Scene("px4", LinkSettings(delay=0.02))
+    silent = scene.world.vehicle.framer.encode_heartbeat(2, 12)
+    if tells == "never":
+        monkeypatch.setattr(scene.world.vehicle, "_version", lambda: silent)
+    async with scene.mounted() as tree:
+        monkeypatch.setattr(scene.world.vehicle, "_version", lambda: silent)
+        await swap(scene.world, scene.world.vehicle, gap=4.0)
+        start = trio.current_time()
+        assert await read_through(tree, scene.file) == OUR_FILE
+        assert (trio.current_time() - start > 5.0) == (tells == "once")
+
+
+@pytest.mark.holds("fault another vehicle")
+async def test_a_vehicle_that_is_seldom_heard_and_told_once_is_believed(
+    autojump: MockClock, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Between two heartbeats another one could have come, each time."""
+    scene = Scene("px4", LinkSettings(delay=0.02))
+    async with scene.mounted() as tree:
+        monkeypatch.setattr(scene.ours, "_on_command", lambda command, now: None)
+        monkeypatch.setattr("mavftpfs.sim.vehicle.HEARTBEAT_PERIOD", 4.0)
+        await trio.sleep(120.0)
+        start = trio.current_time()
+        for _ in range(10):
+            assert await read_through(tree, scene.file) == OUR_FILE
+            await trio.sleep(5.0)
+        assert trio.current_time() - start < 120.0
+
+
+@pytest.mark.holds("fault another vehicle")
+async def test_ours_is_known_again_though_nobody_was_silent(autojump: MockClock) -> None:
+    """A ground station asked the other one, which is switched on as ours is switched off."""
+    scene = Scene("px4", LinkSettings(delay=0.02))
+    async with scene.mounted() as tree:
+        await swap(scene.world, scene.other, gap=0.5)
+        scene.world.model.push(Direction.TO_CLIENT, scene.other._version(), trio.current_time())
+        await trio.sleep(2.0)
+        with pytest.raises(VehicleLost, match="another vehicle answers"):
+            await tree.open(scene.file)
+        await swap(scene.world, scene.ours, gap=0.5)
+        await trio.sleep(10.0)
+        assert await read_through(tree, scene.file) == OUR_FILE
+
+
+@pytest.mark.holds("fault another vehicle")
+async def test_a_vehicle_that_is_gone_again_is_seldom_asked(
+    autojump: MockClock, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A radio at the edge of its range: it was heard for a moment, and did not answer."""
+    scene = Scene("px4", LinkSettings(delay=0.02))
+    link = scene.world.link
+    async with scene.mounted():
+        monkeypatch.setattr(scene.ours, "_on_command", lambda command, now: None)
+        await swap(scene.world, scene.ours, gap=4.0)
+        await trio.sleep(1.5)
+        link.cut()
+        await trio.sleep(10.0)
+        sent = link.stats.sent_chunks
+        await trio.sleep(100.0)
+        assert link.stats.sent_chunks - sent <= 170, "100 of them are heartbeats"

@@ -1,36 +1,44 @@
-"""The session layer against every profile, on virtual time."""
+"""The server's one session: what it costs, and what is done when it is taken, lost or somebody else's.
+
+Against every profile, on virtual time.
+"""
 
 from __future__ import annotations
+
+import random
+from collections.abc import Callable
+from itertools import pairwise
 
 import pytest
 import trio
 from trio.testing import MockClock
 
-from mavftpfs.protocol.payload import Opcode
-from mavftpfs.session.connection import ConnectOptions
-from mavftpfs.shared.errors import FtpNak, RequestTimeout, VehicleLost
+from mavftpfs.link.messages import Address
+from mavftpfs.protocol.operations import OpenFile
+from mavftpfs.protocol.payload import Opcode, decode_request, request
+from mavftpfs.session.connection import Connection, ConnectOptions
+from mavftpfs.session.queue import Queue
+from mavftpfs.session.reader import REOPENS, STALL
+from mavftpfs.session.serversession import SILENCE_ARDUPILOT
+from mavftpfs.session.store import TIME_PROBE_LIMIT
+from mavftpfs.shared.errors import (
+    FileChanged,
+    FtpNak,
+    MavftpfsError,
+    RequestTimeout,
+    SessionBusy,
+    SessionLost,
+    VehicleLost,
+)
 from mavftpfs.sim.linkmodel import LinkSettings
 from mavftpfs.sim.profiles import PROFILES
+from tests.support.faults import Faults
 from tests.support.takingturns import taking_turns
-from tests.support.worlds import MemorySink, begin_to_read, content, path, read_file, world
+from tests.support.worlds import MemorySink, World, begin_to_read, content, path, read_file, world
 
 EVERY_PROFILE = sorted(PROFILES)
+
 BAD = LinkSettings(rate=60_000.0, delay=0.02, loss=0.1, duplicate=0.02, reorder=0.05)
-
-
-@pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
-async def test_list_and_read_over_a_bad_link(profile: str, autojump: MockClock) -> None:
-    sizes = (0, 1, 238, 239, 240, 478, 5000, 60_000)
-    files = {f"f{size}": content(size, size) for size in sizes}
-    here = world(profile, BAD, **files)
-    async with here.connection() as connection:
-        listing = await connection.store.list_directory(path(profile, "")[:-1])
-        assert {entry.name.decode(): entry.size for entry in listing.entries} == {
-            name: len(data) for name, data in files.items()
-        }
-        for name, data in files.items():
-            assert await read_file(connection, path(profile, name)) == data
-    assert here.vehicle.server.open_sessions == 0
 
 
 @pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
@@ -106,27 +114,6 @@ async def test_what_is_asked_for_meanwhile_does_not_wait_for_an_answer(
         reader.close()
 
 
-@pytest.mark.holds("promise 7")
-@pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
-async def test_a_small_read_overtakes_a_bulk_copy(profile: str, autojump: MockClock) -> None:
-    """Promise 7: Terminate, open and read take a round trip each, and what is on its way comes first."""
-    rate, rtt = 20_000.0, 0.1
-    files = {f"small{number}": content(200, number) for number in range(5)}
-    here = world(profile, LinkSettings(rate=rate, delay=rtt / 2), big=content(400_000), **files)
-    async with here.connection() as connection, trio.open_nursery() as nursery:
-        _, sink = await begin_to_read(connection, path(profile, "big"), 20_000)
-        for name, data in files.items():
-            await trio.sleep(0.4)  # less than a quantum: the copy has only just begun again
-            copied_before, began = sink.have.total, trio.current_time()
-            assert await read_file(connection, path(profile, name)) == data
-            allowed = 3 * rtt + 0.3 + 4 * 300 / rate
-            assert trio.current_time() - began < allowed
-            assert sink.have.total - copied_before < allowed * rate
-        await connection.store.list_directory(path(profile, "")[:-1])
-        assert await sink.wait_for(0, 400_000) == content(400_000)
-        nursery.cancel_scope.cancel()
-
-
 @pytest.mark.parametrize("profile", ["px4", "ardupilot"])
 async def test_one_small_file_after_another_does_not_stop_a_copy(profile: str, autojump: MockClock) -> None:
     small = {f"s{index}": bytes([index]) * 100 for index in range(200)}
@@ -157,23 +144,6 @@ async def test_a_cut_in_mid_read_is_bridged(profile: str, autojump: MockClock) -
     async with here.connection() as connection:
         assert await read_file(connection, path(profile, "big")) == data
     assert here.vehicle.server.open_sessions == 0
-
-
-@pytest.mark.holds("fault reboot")
-@pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
-async def test_a_reboot_in_mid_read_is_bridged(profile: str, autojump: MockClock) -> None:
-    data = content(300_000)
-    here = world(profile, LinkSettings(rate=20_000.0, delay=0.02), big=data)
-    async with here.connection() as connection, trio.open_nursery() as nursery:
-
-        async def reboot() -> None:
-            await trio.sleep(8)
-            here.vehicle.reboot(trio.current_time(), downtime=4.0)
-            here.link.kick()
-
-        nursery.start_soon(reboot)
-        assert await read_file(connection, path(profile, "big")) == data
-        assert connection.vehicle.reboots == 1
 
 
 @pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
@@ -262,3 +232,416 @@ async def test_refusals_reach_the_caller(profile: str, autojump: MockClock) -> N
             await read_file(connection, path(profile, "missing"))
         assert refusal.value.code == 10
         assert await read_file(connection, path(profile, "small")) == b"hello"
+
+
+# --- names that are being changed
+
+ROUNDS = 10_000
+
+
+@pytest.mark.holds("fault overlap")
+async def test_a_reader_goes_on_beside_a_job_that_has_to_wait(
+    autojump: MockClock, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    here = World("px4", LinkSettings(rate=5760.0, delay=0.02))
+    here.tree.add(b"/big", content(20_000))
+    here.tree.add(b"/changing", b"old")
+    rounds = 0
+    choose = Queue.first
+
+    def counted(queue: Queue) -> object:
+        nonlocal rounds
+        rounds += 1
+        assert rounds < ROUNDS, "it goes round without a moment in between"
+        return choose(queue)
+
+    monkeypatch.setattr(Queue, "first", counted)
+    async with here.connection() as connection, trio.open_nursery() as nursery:
+        scheduler = connection.scheduler
+        async with scheduler.server.excluded(b"/changing"):
+            nursery.start_soon(scheduler.use_session, b"/changing", Opcode.OPEN_FILE_RO)
+            await trio.sleep(0.1)
+            assert await read_file(connection, b"/big") == content(20_000)
+    assert rounds < 100
+
+
+@pytest.mark.holds("fault overlap")
+@pytest.mark.parametrize("profile", ["px4", "mavsdk", "ardupilot"])
+async def test_a_file_is_not_opened_under_a_name_that_it_lost_meanwhile(
+    autojump: MockClock, profile: str
+) -> None:
+    """Another file is open and has to be closed first; once more, where the answer to that is lost."""
+    old, new = content(5000, 1), content(5000, 2)
+    for lost in (False, True):
+        for later in range(0, 60, 3):
+            here = World(profile, LinkSettings(delay=0.1))
+            for name, data in ((b"/a", old), (b"/b", new), (b"/other", new)):
+                here.tree.add(name, data)
+            async with here.connection() as connection, trio.open_nursery() as nursery:
+                store, sink = connection.store, MemorySink(5000)
+                assert await read_file(connection, b"/other") == new
+                reader = await store.open_reader(b"/a", sink, expected_size=5000)
+                faults = Faults(here)
+                if lost:
+                    faults.lose_reply_to(Opcode.TERMINATE_SESSION)
+
+                async def change(connection: Connection = connection, later: int = later) -> None:
+                    await trio.sleep(later * 0.02)
+                    await connection.store.rename(b"/a", b"/aside")
+                    await connection.store.rename(b"/b", b"/a")
+
+                nursery.start_soon(change)
+                reader.want(0, 5000, demand=True)
+                assert await sink.wait_for(0, 5000) == old
+                reader.close()
+
+
+# --- a session that is taken
+
+RIVAL = Address(255, 190)
+
+RIVALS_SESSION = 77
+
+LINK = LinkSettings(delay=0.02)
+
+SLOW = LinkSettings(rate=20_000.0, delay=0.02)
+
+DATA = random.Random(1).randbytes(60_000)
+
+OTHER = random.Random(2).randbytes(60_000)
+
+CHECK_PERIOD = STALL / 2
+"""How often a reading looks whether it stalled."""
+
+
+class Log:
+    """When the server was asked what by us, and what it should do after that."""
+
+    def __init__(self, here: World, *, after: Callable[[int], None] = lambda opcode: None) -> None:
+        self.asked: list[tuple[float, int]] = []
+        self._handle = here.vehicle.server.handle
+        self._after = after
+        here.vehicle.server.handle = self._take  # type: ignore[method-assign]
+
+    def _take(self, wire: bytes, source: Address, now: float) -> None:
+        self._handle(wire, source, now)
+        if source.system == 254:
+            opcode = decode_request(wire).opcode
+            self.asked.append((now, opcode))
+            self._after(opcode)
+
+    def count(self, opcode: Opcode) -> int:
+        return sum(asked == opcode for _, asked in self.asked)
+
+    def last(self, opcode: Opcode) -> float:
+        return max(now for now, asked in self.asked if asked == opcode)
+
+    @property
+    def silences(self) -> list[float]:
+        return [later - earlier for (earlier, _), (later, _) in pairwise(self.asked)]
+
+
+def rival_asks(here: World, opcode: Opcode, data: bytes = b"", *, seq: int, heard: bool = True) -> None:
+    """Let another client of the vehicle ask something, so that we hear it on our link or not."""
+    session = 0 if here.profile.startswith("px4") and opcode != Opcode.OPEN_FILE_RO else RIVALS_SESSION
+    wire = request(seq, opcode, session=session, size=100 if not data else len(data), data=data).encode()
+    now = trio.current_time()
+    if heard:
+        here.vehicle.foreign_request(wire, RIVAL, now)
+    else:
+        here.vehicle.server.handle(wire, RIVAL, now)
+    here.link.kick()
+
+
+@pytest.mark.holds("fault stale session", "rule 14.10")
+async def test_a_killed_clients_session_is_got_over_by_saying_nothing(autojump: MockClock) -> None:
+    """ArduPilot gives a session away after 3 s in which it answered nobody, with a refusal neither."""
+    here = world("ardupilot", LINK, f=DATA, stale=OTHER)
+    async with here.connection() as connection, trio.open_nursery() as nursery:
+        rival_asks(here, Opcode.OPEN_FILE_RO, path("ardupilot", "stale"), seq=5, heard=False)
+        await trio.sleep(0.1)
+        assert here.vehicle.server.open_sessions == 1
+        log = Log(here)
+
+        async def list_often() -> None:
+            while True:
+                await connection.store.list_directory(path("ardupilot", "")[:-1])
+                await trio.sleep(0.3)
+
+        nursery.start_soon(_tolerate_refusals, list_often)
+        assert await read_file(connection, path("ardupilot", "f")) == DATA
+        nursery.cancel_scope.cancel()
+    assert connection.scheduler.server.quiet_periods <= 2  # the listings' and the file's, at the same time
+    assert connection.scheduler.server.resets == 0
+    assert sum(silence > SILENCE_ARDUPILOT - 0.1 for silence in log.silences) == 1
+    assert log.count(Opcode.OPEN_FILE_RO) == 2
+
+
+async def _tolerate_refusals(work: Callable[[], object]) -> None:
+    """A listing is refused, too, while another id has the session."""
+    while True:
+        try:
+            await work()  # type: ignore[misc]
+        except MavftpfsError:
+            await trio.sleep(0.3)
+
+
+@pytest.mark.holds("promise 6", "rule 14.39")
+@pytest.mark.parametrize("profile", ["px4", "ardupilot"])
+async def test_another_clients_session_is_left_alone(profile: str, autojump: MockClock) -> None:
+    """Whoever is heard is alive: no ResetSessions, no Terminate, and its file stays open (promise 6)."""
+    here = world(profile, LINK, f=DATA, theirs=OTHER)
+    async with here.connection() as connection, trio.open_nursery() as nursery:
+        log = Log(here)
+        rival_asks(here, Opcode.OPEN_FILE_RO, path(profile, "theirs"), seq=5)
+
+        async def rival_reads() -> None:
+            for seq in range(100, 2000, 2):
+                await trio.sleep(1.0)
+                rival_asks(here, Opcode.READ_FILE, seq=seq)
+
+        nursery.start_soon(rival_reads)
+        await trio.sleep(2.0)
+        with pytest.raises(SessionBusy):
+            await read_file(connection, path(profile, "f"))
+        await trio.sleep(3.0)
+        assert here.vehicle.server.open_paths == [path(profile, "theirs")]
+        assert log.count(Opcode.RESET_SESSIONS) == log.count(Opcode.TERMINATE_SESSION) == 0
+        assert connection.scheduler.server.quiet_periods == 2
+        nursery.cancel_scope.cancel()
+
+
+@pytest.mark.holds("rule 14.9")
+@pytest.mark.parametrize("outage", [3.2, 3.5, 4.0, 6.0, 9.0])
+async def test_after_a_silence_nothing_is_believed_before_the_file_was_opened_again(
+    outage: float, autojump: MockClock
+) -> None:
+    """Meanwhile the session of a PX4, which all share, may have become another client's."""
+    here = world("px4", SLOW, f=DATA, theirs=OTHER)
+    async with here.connection() as connection:
+        log = Log(here)
+        _, sink = await begin_to_read(connection, path("px4", "f"), 10_000)
+        here.link.cut()
+        await trio.sleep(0.2)
+        rival_asks(here, Opcode.TERMINATE_SESSION, seq=5, heard=False)
+        rival_asks(here, Opcode.OPEN_FILE_RO, path("px4", "theirs"), seq=7, heard=False)
+        assert here.vehicle.server.open_paths == [path("px4", "theirs")]
+        assert outage > STALL + CHECK_PERIOD
+        await trio.sleep(outage)
+        here.link.restore()
+        assert await sink.wait_for(0, len(DATA)) == DATA
+        assert log.count(Opcode.OPEN_FILE_RO) == 2
+
+
+@pytest.mark.holds("fault idle close")
+async def test_a_session_that_is_lost_each_time_is_an_error_in_the_end(autojump: MockClock) -> None:
+    here = world("px4", LINK, f=DATA)
+
+    def close_at_once(opcode: int) -> None:
+        if opcode == Opcode.OPEN_FILE_RO:
+            rival_asks(here, Opcode.TERMINATE_SESSION, seq=60_000 + len(log.asked), heard=False)
+
+    async with here.connection() as connection:
+        log = Log(here, after=close_at_once)
+        with trio.fail_after(100), pytest.raises(SessionLost):
+            await read_file(connection, path("px4", "f"))
+        assert log.count(Opcode.OPEN_FILE_RO) == 1 + REOPENS
+
+
+@pytest.mark.holds("promise 5", "fault idle close")
+@pytest.mark.parametrize(("profile", "outage"), [("px4", 12.0), ("ardupilot5", 23.0)])
+async def test_a_server_that_closed_an_idle_session_during_an_outage(
+    profile: str, outage: float, autojump: MockClock
+) -> None:
+    here = world(profile, SLOW, f=DATA)
+    async with here.connection() as connection:
+        log = Log(here)
+        _, sink = await begin_to_read(connection, path(profile, "f"), 10_000)
+        here.link.cut()
+        await trio.sleep(outage)
+        here.link.kick()
+        await trio.sleep(0.01)
+        assert here.vehicle.server.open_sessions == 0
+        here.link.restore()
+        assert await sink.wait_for(0, len(DATA)) == DATA
+        assert sink.suspicions == []
+        assert log.count(Opcode.OPEN_FILE_RO) == 2
+
+
+@pytest.mark.holds("rule 14.12")
+@pytest.mark.parametrize("profile", EVERY_PROFILE)
+async def test_a_session_is_closed_within_two_seconds_of_its_last_use(
+    profile: str, autojump: MockClock
+) -> None:
+    here = world(profile, LINK, f=DATA)
+    async with here.connection() as connection:
+        log = Log(here)
+        sink = MemorySink(len(DATA))
+        reader = await connection.store.open_reader(path(profile, "f"), sink)
+        for offset in (0, 20_000):
+            reader.want(offset, offset + 1000, demand=True)
+            await sink.wait_for(offset, offset + 1000)
+            await trio.sleep(1.0)
+        assert log.count(Opcode.TERMINATE_SESSION) == 0
+        await trio.sleep(5.0)
+        assert log.last(Opcode.TERMINATE_SESSION) - log.last(Opcode.READ_FILE) < 2.0
+        assert here.vehicle.server.open_sessions == 0
+        reader.want(40_000, 41_000, demand=True)
+        assert await sink.wait_for(40_000, 41_000) == DATA[40_000:41_000]
+        assert log.count(Opcode.OPEN_FILE_RO) == 2
+
+
+@pytest.mark.holds("fault growing file")
+@pytest.mark.parametrize("profile", EVERY_PROFILE)
+async def test_a_file_that_shrank_while_it_was_closed_is_another_one(
+    profile: str, autojump: MockClock
+) -> None:
+    here = world(profile, LINK, f=DATA)
+    async with here.connection() as connection:
+        sink = MemorySink(len(DATA))
+        reader = await connection.store.open_reader(path(profile, "f"), sink)
+        reader.want(0, 1000, demand=True)
+        await sink.wait_for(0, 1000)
+        await trio.sleep(5.0)
+        here.tree.add(path(profile, "f"), OTHER[:50_000])
+        reader.want(20_000, 21_000, demand=True)
+        with pytest.raises(FileChanged):
+            await sink.wait_for(20_000, 21_000)
+        assert sink.have.total == 1000
+        await trio.sleep(5.0)
+        assert here.vehicle.server.open_sessions == 0
+
+
+@pytest.mark.holds("rule 14.31")
+async def test_two_silences_prove_that_listings_show_no_times(autojump: MockClock) -> None:
+    """One may be loss; MAVSDK's old server never answers an opcode that it does not know."""
+    here = world("mavsdk-old", LINK, f=DATA)
+    async with here.connection() as connection:
+        log = Log(here)
+        for known in (None, False, False):
+            assert await _listed(connection) == [b"f"]
+            assert connection.store.lists_times is known
+        asked = [opcode for _, opcode in log.asked]
+        assert asked[-1] == Opcode.LIST_DIRECTORY
+        times = [now for now, opcode in log.asked if opcode == Opcode.LIST_DIRECTORY_WITH_TIME]
+        plain = [now for now, opcode in log.asked if opcode == Opcode.LIST_DIRECTORY]
+        assert times[-1] < plain[-3]
+        assert plain[-1] - plain[0] < 2 * TIME_PROBE_LIMIT
+
+
+@pytest.mark.holds("rule 14.31")
+async def test_an_answer_after_one_silence_is_taken(autojump: MockClock) -> None:
+    here = world("ardupilot5", LINK, f=DATA)
+    async with here.connection() as connection:
+        here.link.cut()
+        with trio.CancelScope() as scope:
+            async with trio.open_nursery() as nursery:
+                nursery.start_soon(_listed, connection)
+                await trio.sleep(TIME_PROBE_LIMIT)
+                here.link.restore()
+        assert not scope.cancelled_caught
+        assert connection.store.lists_times is None
+        assert await _listed(connection) == [b"f"]
+        assert connection.store.lists_times is True
+
+
+async def _listed(connection: Connection) -> list[bytes]:
+    return [entry.name for entry in (await connection.store.list_directory(b"/d")).entries]
+
+
+# --- what a killed client left keeps listings and changes out
+
+
+def ardupilot() -> World:
+    here = World("ardupilot")
+    here.tree.mkdir(b"/d")
+    return here
+
+
+def others_session(connection: Connection) -> int:
+    """An id that this connection asks for never."""
+    return connection.engine.home_session % 255 + 1
+
+
+async def open_elsewhere(connection: Connection) -> None:
+    """Leave a session open under an id that is not this connection's, as a killed client does."""
+    await connection.driver.run(OpenFile(Opcode.CREATE_FILE, b"/d/left", others_session(connection)))
+
+
+@pytest.mark.holds("fault stale session")
+async def test_a_listing_outlasts_the_session_of_a_killed_client(autojump_clock: MockClock) -> None:
+    here = ardupilot()
+    async with here.connection() as connection:
+        await open_elsewhere(connection)
+        began = trio.current_time()
+        listing = await connection.store.list_directory(b"/d")
+        assert [entry.name for entry in listing.entries] == [b"left"]
+        assert 3 < trio.current_time() - began < 5
+        assert (
+            connection.engine.stats.naks == 1 + 2
+        )  # opcode 16 is unknown there, and a listing ends with one
+        assert not connection.scheduler.server.kept_out
+
+
+async def test_listings_at_once_do_not_keep_the_dead_session_alive(autojump_clock: MockClock) -> None:
+    here = ardupilot()
+    async with here.connection() as connection, trio.open_nursery() as nursery:
+        await open_elsewhere(connection)
+        began = trio.current_time()
+
+        async def look(after: float) -> None:
+            await trio.sleep(after)
+            await connection.store.list_directory(b"/d")
+            assert trio.current_time() - began < 6
+
+        for number in range(5):
+            nursery.start_soon(look, number / 2)
+
+
+async def test_a_session_in_use_is_told_in_time_and_is_not_asked_for_often(autojump_clock: MockClock) -> None:
+    here = ardupilot()
+    options = ConnectOptions(op_deadline=20.0)
+    async with here.connection(options) as connection, trio.open_nursery() as nursery:
+        await open_elsewhere(connection)
+        wire = request(77, Opcode.NONE, session=others_session(connection)).encode()
+
+        async def keep_in_use() -> None:
+            while True:
+                here.vehicle.server.handle(wire, Address(255, 190), trio.current_time())
+                await trio.sleep(1)
+
+        nursery.start_soon(keep_in_use)
+        began = trio.current_time()
+        with pytest.raises(SessionBusy):
+            await connection.store.list_directory(b"/d")
+        assert 10 < trio.current_time() - began < 20
+        assert connection.engine.stats.naks == 3
+        assert connection.scheduler.server.kept_out
+        nursery.cancel_scope.cancel()
+
+
+async def test_a_change_outlasts_it_too(autojump_clock: MockClock) -> None:
+    here = ardupilot()
+    async with here.connection() as connection:
+        await open_elsewhere(connection)
+        began = trio.current_time()
+        await connection.store.make_directory(b"/d/new")
+        assert 3 < trio.current_time() - began < 5
+        listing = await connection.store.list_directory(b"/d")
+        assert {entry.name for entry in listing.entries} == {b"left", b"new"}
+
+
+@pytest.mark.parametrize("profile", ["ardupilot", "mavsdk", "px4"])
+async def test_a_new_file_s_close_outlasts_bad_luck(profile: str, autojump_clock: MockClock) -> None:
+    here = World(profile)
+    here.tree.add_directory(b"/d")
+    async with here.connection() as connection:
+        await connection.store.list_directory(b"/d")
+        faults = Faults(here)
+        for _ in range(8):
+            faults.lose_reply_to(Opcode.TERMINATE_SESSION)
+        began = trio.current_time()
+        await connection.store.create_empty(b"/d/new")
+        assert trio.current_time() - began > 5
+        assert here.tree.data(b"/d/new") == b""
+    assert here.vehicle.server.open_sessions == 0

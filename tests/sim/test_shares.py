@@ -1,86 +1,172 @@
-"""Reading uses what a link carries: representative cases of the table that scripts/bench prints.
+"""Reading and writing use what a link carries, and leave room for others: a cell for each regime and server.
 
-Virtual time, bytes compared; the whole table takes minutes, these take seconds (a slow link is cheap).
+Virtual time, bytes compared. The targets are those of docs/benchmarks.md; scripts/bench measures all cells.
 """
 
 from __future__ import annotations
 
-import pytest
+import random
+from collections.abc import Awaitable, Callable
+from dataclasses import replace
+from statistics import mean
 
+import pytest
+import trio
+from trio.testing import MockClock
+
+from mavftpfs.cache.tree import Tree
 from mavftpfs.protocol.payload import MAX_DATA
+from mavftpfs.sim.linkmodel import LinkSettings
 from mavftpfs.sim.profiles import PROFILES
-from tests.bench.cases import Case, Direction
+from tests.bench.cases import FRAME, Case, Direction
 from tests.bench.goodput import measure
+from tests.support.mounting import mounted
+from tests.support.sources import MemorySource
 from tests.support.takingturns import taking_turns
+from tests.support.worlds import ROOTS, MemorySink, World
 
 LONG = 60.0
 SHORT = 20.0
 START = 0.06
 """What the start of a short run may cost of its share."""
 
+SHORT_QUEUE = 4096
+BOTH = pytest.mark.parametrize("direction", ["read", "write"])
+
+
+def target(case: Case) -> float:
+    assert case.target is not None
+    return case.target
+
+
+# --- radios
+
 
 @pytest.mark.holds("fault overflow")
-@pytest.mark.parametrize("loss", [0.0, 0.01, 0.05, 0.1])
-@pytest.mark.parametrize("rtt", [0.01, 0.1, 0.3])
+@pytest.mark.parametrize(("rtt", "loss"), [(0.01, 0.0), (0.1, 0.05), (0.3, 0.1)])
 @pytest.mark.parametrize("profile", taking_turns(sorted(PROFILES)))
-def test_a_radio_of_57600_baud(profile: str, rtt: float, loss: float) -> None:
+def test_a_radio_of_57600_baud_is_read(profile: str, rtt: float, loss: float) -> None:
     case = Case(profile, 5760.0, rtt, loss)
-    target = case.target
-    assert target is not None
-    assert measure(case, LONG).share >= target
+    assert measure(case, LONG).share >= target(case)
+
+
+@pytest.mark.parametrize("loss", [0.0, 0.1])
+@pytest.mark.parametrize("profile", taking_turns(sorted(PROFILES)))
+def test_a_radio_of_57600_baud_is_written_and_little_in_vain(profile: str, loss: float) -> None:
+    case = Case(profile, 5760.0, 0.1, loss, "write")
+    result = measure(case, LONG)
+    assert result.share >= target(case)
+    if profile != "px4-nuttx":  # whose card pauses
+        assert result.requests <= 1.05 / (1 - loss) ** 2
+
+
+async def copy(tree: Tree, world: World, case: Case, data: bytes) -> None:
+    """Read, or write, as cp does."""
+    path = ROOTS.get(case.profile, b"") + b"/d/log.bin"
+    if case.direction == "read":
+        file = await tree.open(path)
+        assert b"".join([bytes(await file.read(at, 1 << 17)) for at in range(0, len(data), 1 << 17)]) == data
+        file.close()
+        return
+    file = await tree.create(path, exclusive=True)
+    await file.write(0, data)
+    await file.flush()
+    await file.release()
+    assert world.tree.data(path) == data
+
+
+def serial_share(case: Case, seed: int) -> float:
+    """Return the share of the limit that one run through the caches reaches on a serial port."""
+    link = LinkSettings(rate=case.rate, delay=case.rtt / 2, loss=case.loss, queue=SHORT_QUEUE)
+    world = World(case.profile, link, seed=seed, serial=True)
+    directory = ROOTS.get(case.profile, b"") + b"/d"
+    world.tree.add_directory(directory)
+    data = random.Random(1).randbytes(int(case.limit * LONG))
+    if case.direction == "read":
+        world.tree.add(directory + b"/log.bin", data)
+
+    async def run() -> float:
+        async with mounted(world, directory, verify="size") as (_, tree):
+            began = trio.current_time()
+            await copy(tree, world, case, data)
+            return trio.current_time() - began
+
+    took = trio.run(run, clock=MockClock(autojump_threshold=0))
+    return len(data) / took / case.limit_beside(world.vehicle.server.firmware.pauses)
+
+
+@BOTH
+@pytest.mark.parametrize("profile", ["px4", "px4-nuttx"])
+def test_a_radio_on_a_serial_port_is_used(profile: str, direction: Direction) -> None:
+    """There the window grows from one and looks for what PX4's receive buffer survives. That takes the longer
+    the longer the way is, and luck: so the mean of several runs counts."""
+    case = Case(profile, 5760.0, 0.3, 0.05, direction)
+    assert mean(serial_share(case, seed) for seed in range(1, 4)) >= target(case)
+
+
+# --- faster links
 
 
 @pytest.mark.parametrize(
-    ("rtt", "loss"),
-    [(0.1, 0.05), (0.3, 0.1), pytest.param(0.01, 0.0, marks=pytest.mark.soak)],
-)
-@pytest.mark.parametrize("profile", ["px4", "px4-nuttx", "ardupilot", "mavsdk"])
-def test_a_hundred_kilobytes_per_second(profile: str, rtt: float, loss: float) -> None:
-    case = Case(profile, 100_000.0, rtt, loss)
-    target = case.target
-    assert target is not None
-    assert measure(case, SHORT).share >= target - START
-
-
-@pytest.mark.parametrize(
-    "rtt", [0.1, pytest.param(0.01, marks=pytest.mark.soak), pytest.param(0.3, marks=pytest.mark.soak)]
-)
-def test_the_pauses_of_a_card_hardly_cost_a_reader_anything(rtt: float) -> None:
-    """Without answers in reserve the link is idle in a third of all pauses."""
-    assert measure(Case("px4-nuttx", 100_000.0, rtt, 0.0), LONG).share >= 0.93
-
-
-@pytest.mark.parametrize(
-    ("rate", "rtt", "share", "requests"),
+    ("profile", "direction", "rtt", "loss"),
     [
-        pytest.param(1_000_000.0, 0.01, 0.94, 1.9, marks=pytest.mark.soak),
-        pytest.param(1_000_000.0, 0.1, 0.85, 2.2, marks=pytest.mark.soak),
-        (250_000.0, 0.1, 0.77, 1.6),
+        ("px4", "read", 0.3, 0.1),
+        ("px4-nuttx", "read", 0.1, 0.05),
+        ("ardupilot", "read", 0.3, 0.1),
+        ("mavsdk", "read", 0.1, 0.05),
+        ("ardupilot", "write", 0.01, 0.05),
+        ("mavsdk", "write", 0.1, 0.0),
     ],
 )
-def test_a_card_that_pauses_is_kept_busy(rate: float, rtt: float, share: float, requests: float) -> None:
-    result = measure(Case("px4-nuttx", rate, rtt, 0.0), SHORT)
+def test_a_hundred_kilobytes_per_second(profile: str, direction: Direction, rtt: float, loss: float) -> None:
+    case = Case(profile, 100_000.0, rtt, loss, direction)
+    assert measure(case, SHORT).share >= target(case) - (START if direction == "read" else 0.0)
+
+
+@pytest.mark.parametrize(
+    ("direction", "rate", "rtt", "share", "requests"),
+    [
+        ("read", 100_000.0, 0.1, 0.93, 1.6),
+        ("read", 250_000.0, 0.1, 0.77, 1.6),
+        ("write", 100_000.0, 0.3, 0.86, 1.6),
+        pytest.param("read", 1_000_000.0, 0.01, 0.94, 1.9, marks=pytest.mark.soak),
+        pytest.param("read", 1_000_000.0, 0.1, 0.85, 2.2, marks=pytest.mark.soak),
+    ],
+)
+def test_the_pauses_of_a_card_cost_their_time_once(
+    direction: Direction, rate: float, rtt: float, share: float, requests: float
+) -> None:
+    """Without answers in reserve the link is idle in a third of them, or the server for as long again."""
+    result = measure(Case("px4-nuttx", rate, rtt, 0.0, direction), 30.0 if rate == 100_000.0 else 10.0)
     assert result.share >= share
     assert result.requests <= requests
 
 
-@pytest.mark.parametrize("queue", [10_000, 4096])
-def test_a_reserve_keeps_to_what_the_links_queue_holds(queue: int) -> None:
+def test_a_reserve_keeps_to_what_the_links_queue_holds() -> None:
     """0.25 s would be 25 kB: most of it was lost, and asked for again, twice for each chunk."""
-    result = measure(Case("px4-nuttx", 100_000.0, 0.01, 0.0), SHORT, queue=queue)
+    result = measure(Case("px4-nuttx", 100_000.0, 0.01, 0.0), SHORT, queue=SHORT_QUEUE)
     assert result.share >= 0.8
     assert result.requests <= 1.4
 
 
+@pytest.mark.soak
+def test_what_a_short_queue_loses_is_not_put_down_to_the_pauses_of_a_card() -> None:
+    """All was, where the server answers faster than the link brings requests: the more was lost, the more
+    went out, in some runs two thirds in vain, until the upload was given up."""
+    case = Case("px4-nuttx", 100_000.0, 0.3, 0.0, "write")
+    results = [measure(case, LONG, queue=SHORT_QUEUE, seed=seed) for seed in range(1, 3)]
+    assert mean(result.share for result in results) >= 0.85
+    assert mean(result.requests for result in results) <= 1.6
+
+
 @pytest.mark.holds("fault overflow")
-@pytest.mark.parametrize("direction", ["read", "write"])
+@BOTH
 @pytest.mark.parametrize(
     ("rate", "rtt", "jitter", "loss"),
     [
-        pytest.param(625_000.0, 0.03, 0.005, 0.0, marks=pytest.mark.soak),
+        (100_000.0, 0.05, 0.02, 0.0),
         pytest.param(625_000.0, 0.03, 0.015, 0.03, marks=pytest.mark.soak),
         pytest.param(1e6, 0.01, 0.01, 0.0, marks=pytest.mark.soak),
-        (100_000.0, 0.05, 0.02, 0.0),
     ],
 )
 def test_a_link_that_holds_each_packet_up_is_filled_too(
@@ -93,7 +179,7 @@ def test_a_link_that_holds_each_packet_up_is_filled_too(
     assert result.requests <= 1.1
 
 
-@pytest.mark.parametrize("direction", ["read", "write"])
+@BOTH
 @pytest.mark.soak
 @pytest.mark.parametrize(("reorder", "share", "requests"), [(0.1, 0.9, 1.1), (0.5, 0.65, 1.3)])
 def test_so_is_one_that_mixes_packets(
@@ -105,34 +191,150 @@ def test_so_is_one_that_mixes_packets(
     assert result.requests <= requests
 
 
-@pytest.mark.parametrize("direction", ["read", "write"])
-@pytest.mark.parametrize("rate", [625_000.0, pytest.param(1e6, marks=pytest.mark.soak)])
-def test_nor_does_that_flood_a_short_queue(rate: float, direction: Direction) -> None:
+@BOTH
+def test_nor_does_that_flood_a_short_queue(direction: Direction) -> None:
     """A window three times as wide lost 60 % of what it asked for, and everybody else's packets with it."""
-    queue = int(rate * 0.014)
-    result = measure(Case("px4", rate, 0.03, 0.0, direction), SHORT, jitter=0.01, queue=queue)
+    case = Case("px4", 625_000.0, 0.03, 0.0, direction)
+    result = measure(case, 8.0, jitter=0.01, queue=int(case.rate * 0.014))
     assert result.share >= 0.9
     assert result.requests <= 1.35
 
 
+@pytest.mark.holds("fault overflow")
+@BOTH
 @pytest.mark.parametrize("loss", [0.0, 0.05])
 @pytest.mark.parametrize(
     ("rate", "rtt", "seconds", "telemetry"), [(5760.0, 0.3, LONG, 400.0), (100_000.0, 0.1, 10.0, 4000.0)]
 )
 @pytest.mark.parametrize("profile", ["px4", "ardupilot"])
 def test_telemetry_gets_through_beside_a_copy(
-    profile: str, rate: float, rtt: float, seconds: float, telemetry: float, loss: float
+    profile: str, rate: float, rtt: float, seconds: float, telemetry: float, loss: float, direction: Direction
 ) -> None:
     """It shares a short queue with the answers, which must not fill it for long."""
-    case = Case(profile, rate, rtt, loss)
-    target = case.target
-    assert target is not None
-    result = measure(case, seconds, queue=4096, telemetry=telemetry)
+    case = Case(profile, rate, rtt, loss, direction)
+    result = measure(case, seconds, queue=SHORT_QUEUE, telemetry=telemetry)
     assert result.dropped <= 0.1 * case.limit * seconds / MAX_DATA
-    assert result.share >= target - START
+    assert result.share >= (target(case) - START if direction == "read" else 0.7)
 
 
 def test_a_short_shared_queue_does_not_empty_a_long_way() -> None:
     """ArduPilot, 300 ms away: five at a time would be 3.9 kB/s, its bursts 30; evenly asked it is more."""
     case = Case("ardupilot", 100_000.0, 0.3, 0.0)
     assert measure(case, LONG).share * case.limit > 50_000.0
+
+
+@pytest.mark.holds("rule 14.24")
+@pytest.mark.parametrize("profile", ["ardupilot", "ardupilot5", "littlefs"])
+async def test_never_more_is_written_than_a_short_queue_holds(
+    profile: str, autojump_clock: MockClock
+) -> None:
+    here = World(profile, LinkSettings(rate=1e6, delay=0.005))
+    here.tree.add_directory(b"/d")
+    source = MemorySource(bytes(range(256)) * 400)
+    async with here.connection() as connection:
+        upload = await connection.store.open_upload(b"/d/f", source)
+        await upload.finish()
+        await upload.abort()
+    assert here.tree.data(b"/d/f") == source.content
+    assert here.vehicle.server.firmware.dropped_requests == 0
+    assert connection.engine.stats.retransmissions == 0
+
+
+async def test_a_way_that_becomes_longer_for_good_is_found_out(autojump: MockClock) -> None:
+    """A slow link 50 ms away is full with a few requests; 3.7 kB/s stayed when it became a quick one 500 ms
+    away."""
+    loss, size = 0.02, 8 << 20
+    world = World("px4", LinkSettings(rate=3000.0, delay=0.025, loss=loss))
+    world.tree.add(b"/d/f", random.Random(1).randbytes(size))
+    async with world.connection() as connection:
+        sink = MemorySink(size)
+        reader = await connection.store.open_reader(b"/d/f", sink)
+        reader.want(0, size, demand=True)
+        await trio.sleep(20.0)
+        world.model.settings = replace(world.model.settings, rate=60_000.0, delay=0.25)
+        await trio.sleep(90.0)
+        before = sink.have.total
+        await trio.sleep(10.0)
+        share = (sink.have.total - before) / (10.0 * 60_000.0 * MAX_DATA / FRAME * (1 - loss))
+        reader.close()
+    assert share > 0.85
+
+
+# --- the end of a transfer
+
+RATE, RTT, LOSS, SIZE = 100_000.0, 0.1, 0.1, 700_000
+LAST = 0.99
+IN_VAIN = 1 - (1 - LOSS) ** 2
+"""The share of requests that get no answer."""
+
+TIMER, LONE_TIMER = 1.5, 3.0
+"""Round trips after which what no newer answer tells to be lost is asked for again; the same for Terminate,
+of which it is not known yet how long answers take."""
+
+
+def allowed(case: Case) -> float:
+    """Return how many seconds the last percent may take on average: its share at the rate to be reached, one
+    round trip, and a timer for each time that what is lost most often is lost; one more for chance."""
+    in_flight = min(RATE / FRAME, case.limit / MAX_DATA) * RTT
+    losses: float = sum(1 - (1 - IN_VAIN**times) ** in_flight for times in range(1, 30))
+    close = (1 + IN_VAIN / (1 - IN_VAIN) * LONE_TIMER) * RTT if case.direction == "write" else 0.0
+    return (1 - LAST) * SIZE / (target(case) * case.limit) + RTT + (losses + 1) * TIMER * RTT + close
+
+
+async def last_read(here: World) -> float:
+    """Return how long the end of a read takes."""
+    data, almost = random.Random(1).randbytes(SIZE), 0.0
+    here.tree.add(b"/d/f", data)
+
+    class Sink(MemorySink):
+        def on_data(self, offset: int, data: bytes) -> None:
+            nonlocal almost
+            super().on_data(offset, data)
+            if offset + len(data) >= LAST * SIZE:
+                almost = almost or trio.current_time()
+
+    async with here.connection() as connection:
+        sink = Sink(SIZE)
+        reader = await connection.store.open_reader(b"/d/f", sink)
+        reader.want(0, SIZE, demand=True)
+        assert await sink.wait_for(0, SIZE) == data
+        took = trio.current_time() - almost
+        reader.close()
+    return took
+
+
+async def last_write(here: World) -> float:
+    """Return how long the end of an upload takes."""
+    almost = 0.0
+
+    class Source(MemorySource):
+        def on_acked(self, offset: int, count: int) -> None:
+            nonlocal almost
+            super().on_acked(offset, count)
+            if offset + count >= LAST * SIZE:
+                almost = almost or trio.current_time()
+
+    async with here.connection() as connection:
+        source = Source(random.Random(1).randbytes(SIZE))
+        upload = await connection.store.open_upload(b"/d/f", source)
+        await upload.finish()
+        took = trio.current_time() - almost
+        await upload.abort()
+    assert here.tree.data(b"/d/f") == source.content
+    return took
+
+
+ENDS: dict[Direction, Callable[[World], Awaitable[float]]] = {"read": last_read, "write": last_write}
+
+
+@BOTH
+def test_the_last_percent_is_not_slow(direction: Direction) -> None:
+    """What is lost is asked for again on the way: all of it, only in the end, would be 1.6 s more."""
+
+    def run(seed: int) -> float:
+        link = LinkSettings(rate=RATE, delay=RTT / 2, loss=LOSS, queue=int(RATE / 2))
+        here = World("px4", link, seed=seed)
+        here.tree.add_directory(b"/d")
+        return trio.run(ENDS[direction], here, clock=MockClock(autojump_threshold=0))
+
+    assert mean(map(run, range(1, 4))) <= allowed(Case("px4", RATE, RTT, LOSS, direction))
