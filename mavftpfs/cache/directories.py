@@ -52,7 +52,7 @@ class Directories:
     Attributes:
         ask_size: opens a file and returns its size. on_listed: hears of each listing as it is made; on_swept:
             before it is given out. lost: the vehicle is out of reach.
-        tells_times: whether any listing told an mtime. sweeps, served_stale: counters.
+        tells_times: whether any listing told an mtime. sweeps: how many listings were asked for.
     """
 
     ask_size: Callable[[bytes], Awaitable[int]]
@@ -72,7 +72,6 @@ class Directories:
         self.lost = False
         self.tells_times = False
         self.sweeps = 0
-        self.served_stale = 0
 
     async def find(self, path: bytes) -> Found:
         """Return what is known of a path below the root.
@@ -120,7 +119,6 @@ class Directories:
         except VehicleLost:
             if directory is None:
                 raise
-            self.served_stale += 1
             return directory
         if self.on_swept is not None:
             await self.on_swept(path, swept)

@@ -76,8 +76,6 @@ class Files:
     Attributes:
         is_changing: whether we are changing what the vehicle has of a path, or may have done so in part.
         kept: the cache on the local disk, if there is one. open_versions: those with open handles.
-        hits, misses: reads that found all they wanted in the cache, and others. unproven: reads that ended
-            because their bytes were in doubt again and again.
     """
 
     def __init__(
@@ -107,9 +105,6 @@ class Files:
         self._opening: SingleFlight[bytes, tuple[Version, bool]] = SingleFlight()
         self._reopening: SingleFlight[Version, None] = SingleFlight()
         self._comparing: SingleFlight[Version, None] = SingleFlight()
-        self.hits = 0
-        self.misses = 0
-        self.unproven = 0
         directories.on_listed = self._on_listed
         cache.on_dropped = self._on_dropped
 
@@ -267,8 +262,7 @@ class Files:
             if v.waited_for or (v.received_at > recent and v.done < v.size)
         ]
         kept = {} if self.kept is None else self.kept.status()
-        counters = {"hits": self.hits, "misses": self.misses, "reads_unproven": self.unproven}
-        return {"reads": reads, **counters, **kept}
+        return {"reads": reads, **kept}
 
     # --- is it the same file?
 
@@ -499,7 +493,6 @@ class FileHandle(OpenFile):
             if version.drops != drops:
                 version.close_reader()
                 await trio.sleep(pause)
-        files.unproven += 1
         raise DataUnproven(f"bytes of {version.path!r} may be another file's, again and again")
 
     @property
@@ -527,11 +520,9 @@ class FileHandle(OpenFile):
             version.reader.drop_readahead()
         data = version.get(start, stop)
         if data is not None:
-            files.hits += 1
             if version.reader is not None and ahead.start < ahead.stop:
                 version.reader.want(ahead.start, ahead.stop, demand=False)
             return data
-        files.misses += 1
         try:
             async with files.cache.reads:
                 if files.kept is not None:

@@ -96,12 +96,11 @@ class KeptCache:
         self._watched: dict[Version, Kept] = {}
         self._crc_silent = False
         self._broken = False
-        self.revived = 0
         self.written = 0
 
     def status(self) -> dict[str, object]:
         """Return counters."""
-        return {"files_from_disk": self.revived, "blocks_to_disk": self.written, "disk_failed": self._broken}
+        return {"blocks_to_disk": self.written}
 
     # --- from the disk
 
@@ -114,7 +113,6 @@ class KeptCache:
             return None
         if self._dentries.entry(path) is not entry:
             return None  # listed anew, or changed by us, meanwhile
-        self.revived += 1
         return Kept(key)
 
     async def fill(self, version: Version, start: int, stop: int) -> None:

@@ -332,12 +332,10 @@ class Tree:
             **({} if self._writing is None else self._writing.status()),
             **files.status(),
             "bytes_cached": blocks.bytes_cached + self._virtual.bytes_cached,
-            "bytes_evicted_blocks": blocks.evictions,
             "rate": blocks.meter.rate,
             "listings_cached": len(self._dentries),
             "entries_cached": self._dentries.entry_count,
             "listings_asked": self._directories.sweeps,
-            "listings_served_stale": self._directories.served_stale,
         }
 
     def link_lost(self) -> None:

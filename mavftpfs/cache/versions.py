@@ -67,7 +67,6 @@ class BlockCache:
         self.reads = trio.Semaphore(max(1, budget // 2 // (self.piece + BLOCK_SIZE)))
         """Held by who waits for a piece: what is waited for is not evicted, and takes at most half."""
         self.bytes_cached = 0
-        self.evictions = 0
         self.used: OrderedDict[tuple[Version, int], int] = OrderedDict()
 
     def readahead_limits(self, streams: int) -> tuple[int, int]:
@@ -104,7 +103,6 @@ class BlockCache:
         if owner.pinned(index):
             self.used.move_to_end((owner, index))  # in use after all
         else:
-            self.evictions += 1
             owner.evict(index)
 
 

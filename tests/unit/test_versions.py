@@ -106,7 +106,6 @@ async def test_least_recently_read_blocks_go_first() -> None:
     deliver(second, BLOCK_SIZE, content(BLOCK_SIZE))
     assert first.missing(0, 3 * BLOCK_SIZE) == [(BLOCK_SIZE, 2 * BLOCK_SIZE)]
     assert cache.bytes_cached == 4 * BLOCK_SIZE
-    assert cache.evictions == 1
     cache.check_invariants()
 
 
