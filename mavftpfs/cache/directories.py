@@ -50,7 +50,7 @@ class Directories:
     """Listings of the vehicle's directories. All paths are the vehicle's, normalised.
 
     Attributes:
-        ask_size: opens a file and returns its size. on_listed: hears of each listing as it is made; on_swept:
+        ask_size: opens a file and returns its size. on_listed: who hears of each listing as it is made; on_swept:
             before it is given out. lost: the vehicle is out of reach.
         tells_times: whether any listing told an mtime. sweeps: how many listings were asked for.
     """
@@ -68,7 +68,7 @@ class Directories:
         self._root_proven = root == ROOT
         self._dot_refused = False
         self.on_swept: Callable[[bytes, Directory], Awaitable[None]] | None = None
-        self.on_listed: Callable[[bytes, Directory], None] = lambda path, directory: None
+        self.on_listed: list[Callable[[bytes, Directory], None]] = []
         self.lost = False
         self.tells_times = False
         self.sweeps = 0
@@ -206,7 +206,8 @@ class Directories:
             self.tells_times |= entry.mtime is not None
         directory = self._dentries.remember(sweep, listing)
         if not sweep.void:
-            self.on_listed(path, directory)
+            for hear in self.on_listed:
+                hear(path, directory)
         return directory
 
     async def _list(self, path: bytes) -> Listing:

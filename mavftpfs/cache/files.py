@@ -105,7 +105,7 @@ class Files:
         self._opening: SingleFlight[bytes, tuple[Version, bool]] = SingleFlight()
         self._reopening: SingleFlight[Version, None] = SingleFlight()
         self._comparing: SingleFlight[Version, None] = SingleFlight()
-        directories.on_listed = self._on_listed
+        directories.on_listed.append(self._on_listed)
         cache.on_dropped = self._on_dropped
 
     # --- opening

@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 from contextlib import closing
+from functools import partial
 from pathlib import Path
 from random import Random
 
@@ -18,7 +19,7 @@ from mavftpfs.cache.background import Background
 from mavftpfs.cache.base import known_base, on_listed
 from mavftpfs.cache.context import Context
 from mavftpfs.cache.delivery import PASSING, Deliverer
-from mavftpfs.cache.dentries import Dentries, Directory
+from mavftpfs.cache.dentries import Dentries
 from mavftpfs.cache.directories import Directories
 from mavftpfs.cache.draft import Base, State
 from mavftpfs.cache.files import Files
@@ -99,13 +100,7 @@ def make_writeback(
     cleaner = Cleaner(context, names, dead)
     directories.on_swept = cleaner.on_swept
     files.is_changing = context.is_changing
-    compare = directories.on_listed
-
-    def listed(path: bytes, directory: Directory) -> None:
-        compare(path, directory)
-        on_listed(context, path, directory)
-
-    directories.on_listed = listed
+    directories.on_listed.append(partial(on_listed, context))
     return Writeback(context, names, throttle, cleaner)
 
 
