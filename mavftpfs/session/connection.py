@@ -196,10 +196,9 @@ async def connected(
     async with trio.open_nursery() as nursery:
         tasks = _Tasks(nursery)
         tasks.start(connection.driver.pump)
-        tasks.start(lambda: _send_heartbeats(connection))
+        tasks.start(lambda: _beat(connection))
         tasks.start(lambda: _ask_about_vehicle(connection))
         tasks.start(lambda: _ask_who_it_is(connection))
-        tasks.start(lambda: _watch_link(connection))
         serving = tasks.start(connection.scheduler.serve)
         try:
             yield connection
@@ -325,21 +324,16 @@ def _move_away(connection: Connection) -> None:
     vehicle.own = connection.driver.framer.source = Address(vehicle.own.system, component)
 
 
-async def _send_heartbeats(connection: Connection) -> None:
-    """Heartbeats of an onboard controller: a GCS heartbeat would feed the GCS-loss failsafe (promise 6)."""
-    kind = connection.options.heartbeat
-    if kind == "none":
-        return
+async def _beat(connection: Connection) -> None:
+    """Each second: send a heartbeat, tell the window who else is about, and tell when the vehicle is lost.
+
+    Ours are an onboard controller's: those of a GCS would feed the GCS-loss failsafe (promise 6).
+    """
+    kind, driver = connection.options.heartbeat, connection.driver
     vehicle_type = MAV_TYPE_GCS if kind == "gcs" else MAV_TYPE_ONBOARD_CONTROLLER
     while True:
-        frame = connection.driver.framer.encode_heartbeat(vehicle_type, MAV_AUTOPILOT_INVALID)
-        connection.driver.send(frame)
-        await trio.sleep(HEARTBEAT_PERIOD)
-
-
-async def _watch_link(connection: Connection) -> None:
-    """Tell when the vehicle is lost (not its return), and the window who else is about."""
-    while True:
+        if kind != "none":
+            driver.send(driver.framer.encode_heartbeat(vehicle_type, MAV_AUTOPILOT_INVALID))
         connection.engine.flow.alone = not connection.vehicle.foreign_client(connection.clock())
         await trio.sleep(HEARTBEAT_PERIOD)
         if not connection.was_lost and connection.vehicle.lost(connection.clock()):

@@ -6,6 +6,7 @@ not yet fulfilled are kept here and handed to whatever transfer is attached next
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable
 from math import inf
 from typing import Literal
@@ -131,14 +132,20 @@ class FileStream(SessionUser):
         if not self.closed:
             self._sink.on_opened(at)
 
-    def attach(self, transfer: ReadTransfer | None) -> None:
-        """Hand what is wanted to a transfer; later wants go to it directly. None: it ended."""
+    def attach(self, transfer: ReadTransfer) -> None:
+        """Hand what is wanted to a transfer; later wants go to it directly."""
         self._transfer = transfer
-        if transfer is not None:
-            for start, stop in self._demand:
-                transfer.want(start, stop, True)
-            for start, stop in self._ahead:
-                transfer.want(start, stop, False)
+        for start, stop in self._demand:
+            transfer.want(start, stop, True)
+        for start, stop in self._ahead:
+            transfer.want(start, stop, False)
+
+    def detach(self, *, done: bool) -> None:
+        """The transfer ended; done: everything wanted has come. Else the next one is to bring it."""
+        self._transfer = None
+        if done:
+            self._demand.clear()
+            self._ahead.clear()
 
     def missing(self, start: int, stop: int) -> list[tuple[int, int]]:
         """Return the parts of [start, stop) that the cache does not hold."""
@@ -168,11 +175,6 @@ class FileStream(SessionUser):
     def on_suspect(self, reason: str) -> None:
         """What was read lately is provisional, even if it was closed since."""
         self._sink.on_suspect(reason)
-
-    def on_idle(self) -> None:
-        """Everything wanted has come."""
-        self._demand.clear()
-        self._ahead.clear()
 
     def fail(self, error: MavftpfsError) -> None:
         """See SessionUser."""
@@ -218,7 +220,7 @@ class Reading:
         self._clock = clock
         self._transfer: ReadTransfer | None = None
         self._seen_bytes = 0
-        self._closed: list[FileStream] = []
+        self._closed: deque[FileStream] = deque()
 
     # --- streams
 
@@ -238,20 +240,20 @@ class Reading:
     def on_closed(self, stream: FileStream) -> None:
         """It wants nothing any more; what it read stays provisional for a while."""
         if stream in self._queue.users:
-            self._closed = [other for other in self._closed if self._is_recent(other)]
             self._closed.append(stream)
+            self._forget_closed()
         self._queue.remove(stream)
-
-    def streams(self) -> list[FileStream]:
-        """Return those that are not closed."""
-        return [user for user in self._queue.users if isinstance(user, FileStream)]
 
     def on_doubt(self, reason: str) -> None:
         """What was read lately is provisional, also of files closed since."""
-        self._closed = [stream for stream in self._closed if self._is_recent(stream)]
-        for stream in [*self.streams(), *self._closed]:
-            if stream is self._active or self._is_recent(stream):
+        self._forget_closed()
+        for stream in [*self._queue.users, *self._closed]:
+            if isinstance(stream, FileStream) and (stream is self._active or self._is_recent(stream)):
                 stream.on_suspect(reason)
+
+    def _forget_closed(self) -> None:
+        while self._closed and not self._is_recent(self._closed[0]):
+            self._closed.popleft()
 
     def _is_recent(self, stream: FileStream) -> bool:
         return stream.last_data_at is not None and stream.last_data_at > self._clock() - RECENT
@@ -312,12 +314,13 @@ class Reading:
                 # What woke us may be a new want, and with nothing in flight no answer would send for it.
                 self._driver.kick()
                 await self._server.sleep(_OFTEN)
-                self._check_stall(transfer)
+                heard_at = max(self._driver.last_reply_at, transfer.started_at)
+                limit = max(STALL, 4.0 * (self._engine.rtt or 0.0))
+                if not transfer.idle and self._clock() - heard_at > limit:
+                    raise SessionLost("no answer for a while during a read", by_server=False)
         finally:
             self._active = self._transfer = self._driver.on_batch = None
-            if transfer.idle:
-                stream.on_idle()
-            stream.attach(None)
+            stream.detach(done=transfer.idle)
             self._driver.cancel(transfer)
             stream.on_turn(began, self._clock())
         if transfer.error is not None:
@@ -351,13 +354,6 @@ class Reading:
         if rival is None:
             return True
         return stream.due_at() < inf and not stream.gives_way(rival, began, self._clock(), self._engine.rtt)
-
-    def _check_stall(self, transfer: ReadTransfer) -> None:
-        """Raise SessionLost after so long without an answer."""
-        limit = max(STALL, 4.0 * (self._engine.rtt or 0.0))
-        quiet_since = max(self._driver.last_reply_at, transfer.started_at)
-        if not transfer.idle and self._clock() - quiet_since > limit:
-            raise SessionLost("no answer for a while during a read", by_server=False)
 
     def _on_session_lost(self, stream: FileStream, error: SessionLost) -> None:
         """Reopen and go on at the same offset (promise 5); what the lost session read is provisional."""

@@ -206,7 +206,8 @@ class ServerSession:
 
     async def _open_past_others(self, path: bytes, opcode: Opcode) -> OpenSession:
         """Open, by one remedy after the other while that is refused because a session is taken."""
-        await self._close_what_may_be_ours()
+        if self.maybe_open:
+            await self._close_what_may_be_ours()
         remedies, resent = _Remedies(), False
         while True:
             try:

@@ -78,7 +78,8 @@ class Store:
         """Sweep a directory (see RemoteStore)."""
         wire = wire_path(path)
         started = self._clock()
-        operation = await self._server.retry_while_taken(partial(self._sweep_as_known, wire))
+        sweep = self._sweep if self.lists_times is False else self._sweep_asking_times
+        operation = await self._server.retry_while_taken(partial(sweep, wire))
         entries: tuple[DirEntry, ...] = tuple(operation.entries)
         return Listing(entries, self._clock() - started, operation.complete, operation.hidden)
 
@@ -128,11 +129,6 @@ class Store:
         """Opcode 16 was answered: the rest of the listing may take as long as it takes."""
         self.lists_times = True
         scope.deadline = inf
-
-    async def _sweep_as_known(self, wire: bytes) -> ListDirectory:
-        if self.lists_times is False:
-            return await self._sweep(wire)
-        return await self._sweep_asking_times(wire)
 
     async def _sweep(self, wire: bytes, *, patience: float | None = None) -> ListDirectory:
         operation = ListDirectory(wire)

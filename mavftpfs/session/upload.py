@@ -139,6 +139,8 @@ class Upload(SessionUser):
         state: see UploadState. error: why the last attempt failed; None while it goes well.
         transfer: what sends its bytes now. begun, resent: see cache.remote.Upload.
         retry_at: not to be touched before. reboots: of the vehicle, when its file was opened last.
+        endings: how often all that the source had was out, and the file was to be closed: `complete` is for
+            who called `finish` until then.
         refused_at: where a write was refused the last time as if the session were lost.
     """
 
@@ -166,7 +168,7 @@ class Upload(SessionUser):
         self._clock = clock
         self._failures = 0
         self._furthest = 0  # in the file, when the session was lost the last time
-        self._endings = 0  # how often all that the source had was out, and the file was to be closed
+        self.endings = 0
         self._completed = 0  # the last of those that was ACKed
         self._awaited = 0  # the last of those that `finish` waits for
         self._changed = trio.lowlevel.ParkingLot()
@@ -201,7 +203,7 @@ class Upload(SessionUser):
         self.retry_at = 0.0
         if self.state in (UploadState.IDLE, UploadState.HELD):
             self._enter(UploadState.QUEUED)
-        awaited = self._awaited = self._endings + 1
+        awaited = self._awaited = self.endings + 1
         self.wake()
         while awaited > self._completed:
             if self.error is not None:
@@ -274,19 +276,15 @@ class Upload(SessionUser):
             MavftpfsError: the source fails.
         """
         self._enter(UploadState.SENDING)
-        self.mark_ending()
+        self.endings += 1
         feed = self.feed
         if feed.has_more() or feed.unproven or (self.finishing and not feed.proven):
             return True
         self.complete(resumable=resumable)
         return False
 
-    def mark_ending(self) -> None:
-        """The source has nothing more just now: `complete` is for who called `finish` until now."""
-        self._endings += 1
-
     def complete(self, *, resumable: bool) -> None:
-        """Everything given until `mark_ending` is ACKed, and the file was closed.
+        """Everything given until `endings` was counted is ACKed, and the file was closed.
 
         resumable: it can be written on. Else what comes from now on costs the whole file once more, so it is
         held until somebody waits for it.
@@ -295,7 +293,7 @@ class Upload(SessionUser):
             MavftpfsError: the source fails.
         """
         more = self.feed.has_more()
-        self._completed = self._endings
+        self._completed = self.endings
         self.error = None
         self._failures = 0
         if self.state is UploadState.ENDING:

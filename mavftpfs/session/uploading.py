@@ -330,7 +330,7 @@ class Uploading:
             if stop is not None:
                 transfer.pause()
                 if transfer.drained or stop in _ABRUPT or self._trails(upload, stop, transfer):
-                    upload.mark_ending()
+                    upload.endings += 1
                     return stop
             elif self.path_gate.wanted:
                 await self._let_paths_in(upload, transfer)

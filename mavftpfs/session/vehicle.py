@@ -366,14 +366,12 @@ class Vehicle:
         if self.storage is None or message.storage_id <= self.storage.storage_id:
             self.storage = message
 
-    def _counted_on_ms(self) -> float:
-        """By how much its boot time grew at least from when it told it until it was away: one that is asked
-        only told it long before. (Simulators may run slower than the clock.)"""
-        return max(0.0, self.identity.left_at - self.boot_heard_at) * 1000 / 2
-
     def _on_boot_time(self, boot_ms: int, now: float) -> None:
         before, elapsed_ms = self._boot_ms, (now - self.boot_heard_at) * 1000
-        went_back = before is not None and boot_ms + _REBOOT_SLACK_MS < before + self._counted_on_ms()
+        # It counted on until it was away: one that tells only when it is asked told this long before.
+        # (Simulators may run slower than the clock.)
+        counted_on = max(0.0, self.identity.left_at - self.boot_heard_at) * 1000 / 2
+        went_back = before is not None and boot_ms + _REBOOT_SLACK_MS < before + counted_on
         # Two of them in a row are believed, whatever clock they follow.
         if went_back and boot_ms > 2 * elapsed_ms + _OLDEST_NEWS_MS and not self._held_back:
             self._held_back = True
