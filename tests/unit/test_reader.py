@@ -48,14 +48,7 @@ def test_only_what_the_cache_lacks_is_wanted() -> None:
     assert list(stream._demand) == [(0, 100), (200, 300)]
 
 
-def test_a_suspicion_reaches_what_a_closed_stream_brought() -> None:
-    stream, sink = make()
-    stream.close()
-    stream.on_suspect("late")
-    assert sink.suspicions == ["late"]
-
-
-def test_a_closed_stream_passes_no_data_on() -> None:
+def test_a_closed_stream_passes_doubts_on_and_no_data() -> None:
     stream, sink = make()
     stream.want(0, 100, demand=True)
     stream.close()
@@ -63,3 +56,5 @@ def test_a_closed_stream_passes_no_data_on() -> None:
     stream.want(0, 100, demand=True)
     assert sink.have.empty
     assert stream.due_at() == inf
+    stream.on_suspect("late")
+    assert sink.suspicions == ["late"]

@@ -10,11 +10,12 @@ from mavftpfs.link.messages import (
     AutopilotVersion,
     FtpFrame,
     Heartbeat,
+    Message,
     StorageInformation,
     SystemTime,
 )
 from mavftpfs.protocol.payload import Opcode, Payload, request
-from mavftpfs.session.vehicle import FOREIGN_MEMORY, SILENCE_LIMIT, Standing, Vehicle
+from mavftpfs.session.vehicle import FOREIGN_MEMORY, SILENCE_LIMIT, Vehicle
 
 pytestmark = pytest.mark.holds("fault boot time asked")
 
@@ -32,27 +33,11 @@ def version(source: Address) -> AutopilotVersion:
 
 
 OURS = version(PILOT)
+FLIES, LANDED = heartbeat(PILOT, armed=True), heartbeat(PILOT)
 
 
 def listener(system: int = 0, component: int = 0) -> Vehicle:
     return Vehicle(system, component, OWN)
-
-
-def in_flight() -> Vehicle:
-    """Return one that is armed, and told which it is."""
-    vehicle = listener()
-    vehicle.on_message(heartbeat(PILOT, armed=True), 0.0)
-    vehicle.on_message(OURS, 0.0)
-    return vehicle
-
-
-def counting_reboots() -> tuple[Vehicle, list[int]]:
-    """Return one that was heard, and what gets an item at each reboot."""
-    reboots: list[int] = []
-    vehicle = listener()
-    vehicle.on_reboot = lambda: reboots.append(1)
-    vehicle.on_message(heartbeat(PILOT), 0.0)
-    return vehicle, reboots
 
 
 def tell_boot_times(vehicle: Vehicle, *times: tuple[float, int]) -> None:
@@ -72,19 +57,16 @@ def test_the_first_autopilot_becomes_the_target_and_others_do_not_replace_it() -
     assert vehicle.heartbeat_at == 1.0
 
 
-def test_a_wanted_system_waits_for_its_own_autopilot() -> None:
+def test_a_wanted_system_or_component_waits_for_its_own_autopilot() -> None:
+    """A component without heartbeats lives by that."""
     vehicle = listener(system=9)
     vehicle.on_message(heartbeat(PILOT), 0.0)
     assert vehicle.address is None
     vehicle.on_message(heartbeat(Address(9, 1)), 0.0)
     assert vehicle.address == (9, 1)
-
-
-def test_a_wanted_component_without_heartbeats_lives_by_its_systems_autopilot() -> None:
     vehicle = listener(system=1, component=100)
     vehicle.on_message(heartbeat(PILOT), 3.0)
-    assert vehicle.address == (1, 100)
-    assert vehicle.heartbeat_at == 3.0
+    assert (vehicle.address, vehicle.heartbeat_at) == ((1, 100), 3.0)
     vehicle.on_message(heartbeat(Address(1, 100), autopilot=MAV_AUTOPILOT_INVALID), 4.0)
     vehicle.on_message(heartbeat(PILOT), 9.0)
     assert vehicle.heartbeat_at == 4.0
@@ -104,26 +86,26 @@ def test_never_heard_is_armed_and_lost_needs_silence_and_a_time_out() -> None:
     assert not vehicle.lost(40.0)
 
 
-def test_arming_is_told_once_each_way() -> None:
-    news: list[bool] = []
+@pytest.mark.parametrize(
+    "story",
+    [
+        pytest.param(
+            [(10.0, LANDED, True), (20.0, OURS, True), (21.0, LANDED, False), (31.0, FLIES, True)],
+            id="who may be another one does not disarm ours",
+        ),
+        pytest.param(
+            [(4.0, LANDED, True), (4.1, OURS, False), (8.0, LANDED, False), (8.1, FLIES, True)],
+            id="seldom heard, it is disarmed when it tells who it is",
+        ),
+    ],
+)
+def test_when_a_vehicle_in_flight_counts_as_armed(story: list[tuple[float, Message, bool]]) -> None:
     vehicle = listener()
-    vehicle.on_armed = news.append
-    for armed in (False, False, True, True, False):
-        vehicle.on_message(heartbeat(PILOT, armed=armed), 0.0)
-    assert news == [False, True, False]
-
-
-def test_who_may_be_another_vehicle_does_not_disarm_ours() -> None:
-    vehicle = in_flight()
-    vehicle.on_message(heartbeat(PILOT), 10.0)
-    assert vehicle.armed
-    vehicle.on_message(OURS, 20.0)  # it is back, and flies
-    assert vehicle.identity.standing is Standing.TRUSTED
-    assert vehicle.armed
-    vehicle.on_message(heartbeat(PILOT), 21.0)
-    assert not vehicle.armed
-    vehicle.on_message(heartbeat(PILOT, armed=True), 31.0)
-    assert vehicle.armed
+    vehicle.on_message(FLIES, 0.0)
+    vehicle.on_message(OURS, 0.0)
+    for now, message, armed in story:
+        vehicle.on_message(message, now)
+        assert vehicle.armed is armed, now
 
 
 @pytest.mark.holds("promise 9")
@@ -141,18 +123,6 @@ def test_nor_does_the_autopilot_beside_a_component_that_may_be_another_ones(beat
     assert vehicle.armed
     vehicle.on_message(ours, 10.1)
     assert not vehicle.armed
-
-
-def test_a_vehicle_that_is_seldom_heard_is_disarmed_when_it_tells_who_it_is() -> None:
-    vehicle = in_flight()
-    vehicle.on_message(heartbeat(PILOT), 4.0)
-    assert vehicle.armed
-    vehicle.on_message(OURS, 4.1)
-    assert not vehicle.armed
-    vehicle.on_message(heartbeat(PILOT), 8.0)
-    vehicle.on_message(heartbeat(PILOT, armed=True), 8.1)
-    vehicle.on_message(OURS, 8.2)
-    assert vehicle.armed
 
 
 def test_a_component_cannot_disarm_the_autopilot() -> None:
@@ -188,37 +158,28 @@ def test_ftp_of_others_is_foreign_and_our_own_replies_are_not() -> None:
     assert vehicle.foreign_client(20.0)
 
 
-def test_boot_time_going_back_is_a_reboot_and_reordering_is_not() -> None:
-    vehicle, reboots = counting_reboots()
-    tell_boot_times(vehicle, (0.0, 5000), (0.0, 4500), (0.0, 6000), (0.0, 600_000), (0.0, 1200))
-    assert reboots == [1]
-    vehicle.on_message(SystemTime(Address(8, 1), 0, 10), 0.0)
-    assert reboots == [1]
+HELD_BACK = [(0.0, 60_000), (4.0, 64_000), (4.1, 61_000), (5.0, 65_000), (8.0, 62_000), (9.0, 69_000)]
+OUTAGE = [(10.0, 20_000), (25.0, 21_000), (26.0, 36_000), (626.0, 636_000)]
 
 
-def test_a_message_that_was_held_back_is_no_reboot() -> None:
-    vehicle, reboots = counting_reboots()
-    tell_boot_times(vehicle, (0.0, 60_000), (4.0, 64_000), (4.1, 61_000), (5.0, 65_000), (8.0, 62_000))
-    assert reboots == []
-    assert vehicle.boot_heard_at == 5.0
-    tell_boot_times(vehicle, (9.0, 69_000))
-    assert reboots == []
-    tell_boot_times(vehicle, (12.0, 900))
-    assert reboots == [1]
-
-
-def test_a_clock_that_stays_behind_is_one_of_another_boot() -> None:
-    vehicle, reboots = counting_reboots()
-    tell_boot_times(vehicle, (0.0, 900_000), (1.0, 60_000), (2.0, 61_000), (3.0, 62_000))
-    assert reboots == [1]
-
-
-def test_a_reboot_during_a_long_outage_is_seen_by_the_time_that_is_missing() -> None:
-    vehicle, reboots = counting_reboots()
-    tell_boot_times(vehicle, (10.0, 20_000), (25.0, 21_000), (26.0, 36_000), (626.0, 636_000))
-    assert reboots == []
-    tell_boot_times(vehicle, (1226.0, 700_000))
-    assert reboots == [1]
+@pytest.mark.parametrize(
+    ("told", "reboots"),
+    [
+        pytest.param([(0.0, 5000), (0.0, 4500), (0.0, 6000), (0.0, 600_000)], 0, id="reordered"),
+        pytest.param([(0.0, 5000), (0.0, 600_000), (0.0, 1200)], 1, id="it goes back"),
+        pytest.param(HELD_BACK, 0, id="held back by the network"),
+        pytest.param([*HELD_BACK, (12.0, 900)], 1, id="held back, then it goes back"),
+        pytest.param([(0.0, 900_000), (1.0, 60_000), (2.0, 61_000), (3.0, 62_000)], 1, id="it stays behind"),
+        pytest.param(OUTAGE, 0, id="an outage"),
+        pytest.param([*OUTAGE, (1226.0, 700_000)], 1, id="time is missing after an outage"),
+    ],
+)
+def test_when_boot_times_tell_of_a_reboot(told: list[tuple[float, int]], reboots: int) -> None:
+    vehicle = listener()
+    vehicle.on_message(heartbeat(PILOT), 0.0)
+    tell_boot_times(vehicle, *told)
+    vehicle.on_message(SystemTime(Address(8, 1), 0, 10), 2000.0)
+    assert vehicle.reboots == reboots
 
 
 @pytest.mark.parametrize(("restarts", "told"), [(True, 8_000), (False, 40_000), (False, 24_000)])
