@@ -58,15 +58,9 @@ PASSING = (RequestTimeout, LinkError, SessionBusy, Armed)
 
 
 class Deliverer:
-    """Executes plans."""
+    """Executes the plans of `draft.choose`, one after the other, until the vehicle has the file."""
 
-    def __init__(
-        self,
-        context: Context,
-        names: Names,
-        cleaner: Cleaner,
-        throttle: Throttle,
-    ) -> None:
+    def __init__(self, context: Context, names: Names, cleaner: Cleaner, throttle: Throttle) -> None:
         self._context = context
         self._names = names
         self._cleaner = cleaner
@@ -221,7 +215,7 @@ class Deliverer:
     async def _attempt(self, node: Node, draft: Draft, plan: Plan) -> Attempt:
         """Return the attempt under way if it still fits, else a new one."""
         attempt = node.attempt
-        if attempt is not None and attempt.plan is plan and not attempt.sending.overtaken:
+        if attempt is not None and not attempt.sending.overtaken and attempt.fits(plan):
             return attempt
         await self.abandon(node)
         context, places = self._context, None
@@ -244,7 +238,7 @@ class Deliverer:
             draft.give_up()
             context.own.live -= live
             raise
-        node.attempt = Attempt(plan, path, sending, upload, begun_at, places, live)
+        node.attempt = Attempt(path, places, live, sending, upload, begun_at)
         if places is None:
             context.dentries.put(path, DirEntry(b"", EntryKind.FILE))
         return node.attempt

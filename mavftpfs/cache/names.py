@@ -221,10 +221,8 @@ class Names:
                 self._context.own.garbage.update(dict.fromkeys(paths[at:], target))
                 return
 
-    async def rename(self, old: bytes, new: bytes, *, completes: bool = False) -> None:
-        """Rename, on a server that replaces files perhaps over a file; both paths fit a request.
-
-        completes: see WriteStore.rename.
+    async def rename(self, old: bytes, new: bytes, *, completes: bool = False, over: bool = False) -> None:
+        """Rename; both paths fit a request. completes: see WriteStore.rename. over: a file has the new name.
 
         Raises:
             NotSupported: the card cannot rename. Else as WriteStore.
@@ -236,7 +234,8 @@ class Names:
             async with self._changing(old, new):
                 await writer.rename(old, new, completes=completes)
         except FtpNak as nak:
-            if writer.traits.rename_works is None:
+            expected = over and nak.code == NakCode.FILE_EXISTS  # FAT: the next rename tells more
+            if writer.traits.rename_works is None and not expected:
                 await self._find_out(old)
                 if writer.traits.rename_works is False:
                     raise NotSupported("this server cannot rename") from nak
@@ -384,7 +383,7 @@ class Names:
         """Return whether the server replaced the target."""
         traits = self._context.writer.traits
         try:
-            await self.rename(source, target)
+            await self.rename(source, target, over=True)
         except FtpNak as nak:
             if errno_for(nak) in _HONEST:
                 raise

@@ -27,17 +27,20 @@ from mavftpfs.shared.errors import FileChanged, MavftpfsError
 class Attempt:
     """One try to deliver a draft.
 
-    path: where its bytes go. places: the reserved names, but on cards that cannot rename. begun_at: when, by
-    the caches' clock. live: the reserved names it uses.
+    path: where its bytes go. places: the reserved names, None where it is sent under the file's own name.
+    live: the reserved names it uses. begun_at: when, by the caches' clock.
     """
 
-    plan: Plan
     path: bytes
+    places: Places | None
+    live: set[bytes]
     sending: Sending
     upload: Upload
     begun_at: float
-    places: Places | None
-    live: set[bytes]
+
+    def fits(self, plan: Plan) -> bool:
+        """Return whether that is still the way to send it."""
+        return (self.places is None) == (plan is Plan.OVERWRITE)
 
     @property
     def names(self) -> list[bytes]:
@@ -101,7 +104,7 @@ class Node:
         """Whether what has its name on the vehicle is being changed, or was perhaps."""
         if self.draft is None:
             return False
-        in_place = self.attempt is not None and self.attempt.plan is Plan.OVERWRITE
+        in_place = self.attempt is not None and self.attempt.places is None
         return in_place or self.draft.begun or self.draft.state in (State.COMMITTING, State.TORN)
 
     @contextmanager

@@ -87,10 +87,8 @@ class FakeWriter(FakeStore):
         but answered by silence. freeze_at: from this number on nothing is executed (power lost).
         capacity: bytes of all files; beyond that WriteFile is refused.
         before_request: called with what is asked, before anything is decided.
-        looks: how often a name was looked for before a file was made.
-        aliases: names that are those of others.
         linger: seconds that it takes to give up an upload.
-        spoil_uploads: how many more uploads arrive with a wrong byte. writable_armed: refuse while `armed`.
+        spoil_uploads: how many more uploads arrive with a wrong byte.
     """
 
     def __init__(self, kind: Kind | None = None, nursery: trio.Nursery | None = None) -> None:
@@ -107,9 +105,7 @@ class FakeWriter(FakeStore):
         self.write_delay = 0.0
         self.linger = 0.0
         self.uploads: list[FakeUpload] = []
-        self.aliases: dict[bytes, bytes] = {}
         self.before_request: Callable[..., object] | None = None
-        self.doubted_at: float | None = None
 
     # --- what requests go through
 
@@ -146,7 +142,6 @@ class FakeWriter(FakeStore):
 
     def real(self, path: bytes) -> bytes:
         """Return the stored spelling of a path."""
-        path = self.aliases.get(path, path)
         if self.kind.drops_ends:
             path = path.rstrip(b". ")
         short = self.kind.short_names and _is_short(path)
@@ -178,10 +173,10 @@ class FakeWriter(FakeStore):
         _maybe_lose(lost)
 
     def in_doubt(self) -> bool:
-        return self.doubted_at is not None
+        return False
 
     def doubted_since(self, at: float) -> bool:
-        return self.doubted_at is not None and self.doubted_at > at
+        return False
 
     async def remove(self, path: bytes) -> None:  # type: ignore[override]  # FakeStore's sets the scene
         lost = await self.request("remove", path)

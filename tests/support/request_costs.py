@@ -59,8 +59,8 @@ ELSEWHERE = {
     "ardupilot5": {
         **FAT,
         MOUNT: "list 4",
-        # The first refusal has it find out whether the card can rename at all.
-        "first append": "list 4, open 1, create 2, read 2, write 2, close 3, crc 1, rename 4, remove 2;"
+        # That it does not rename over a file is learnt, and the names are looked at after the refusal.
+        "first append": "list 4, open 1, create 1, read 2, write 2, close 2, crc 1, rename 3, remove 1;"
         " 602 B",
         "echo >>": f"{TIMED}, {REPLACED}; 602 B",
     },
