@@ -201,31 +201,6 @@ async def test_what_did_not_fit_is_tried_again_seldom(
     assert store.requests == count, "it ended"
 
 
-async def test_a_refusal_is_not_repeated_beside_others(
-    autojump_clock: object, store: FakeWriter, tree: Tree
-) -> None:
-    asked: list[object] = []
-
-    def refuse(what: object, *paths: object) -> None:
-        if what == "rename" and NEW in paths:
-            asked.append(what)
-            raise FtpNak(Opcode.RENAME, NakCode.FAIL_ERRNO, errno.EACCES)
-
-    store.before_request = refuse
-    await close_in_vain(tree)
-    count = len(asked)
-    other = await tree.create(b"/card/other", exclusive=True)
-    await other.write(0, b"content")
-    store.lost = True
-    with pytest.raises(VehicleLost):
-        await other.release()
-    await trio.sleep(100)
-    store.lost = False
-    await trio.sleep(100)
-    assert tree.undelivered() == [NEW]
-    assert len(asked) == count
-
-
 async def test_an_open_file_is_left_to_its_program(
     autojump_clock: object, store: FakeWriter, tree: Tree
 ) -> None:

@@ -364,14 +364,6 @@ async def test_what_a_close_did_not_confirm_outlives_the_process(store: FakeWrit
     again.close()
 
 
-async def test_what_was_confirmed_is_not_kept(store: FakeWriter, tmp_path: Path) -> None:
-    spool = SpoolDirectory(tmp_path / "spool", Random(1))
-    tree = make_writable(store, spool=spool, dirty_max=65536)
-    await write_file(tree, b"/card/new", bytes(300_000))
-    assert [path.name for path in spool.path.iterdir()] == ["owner"]
-    spool.close()
-
-
 async def test_what_is_still_open_when_the_mount_ends_is_not_kept(store: FakeWriter, tmp_path: Path) -> None:
     """A kernel that lost its mount closes nothing: the next mount must not offer what was delivered."""
     spool = SpoolDirectory(tmp_path / "spool", Random(1))

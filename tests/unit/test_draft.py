@@ -8,7 +8,6 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
 from mavftpfs.cache.draft import AHEAD, TRANSITIONS, Base, Draft, Event, Sending, State, Where
-from mavftpfs.protocol.crc import crc32
 from mavftpfs.shared.errors import LocalProtocolError, SpoolFailed
 
 
@@ -152,41 +151,6 @@ def test_a_cut_that_fails_changes_nothing() -> None:
     assert sent(draft.begin(in_place=False)) == [(0, b"abcdef")]
 
 
-def test_a_gap_beyond_the_end_is_zeros_and_is_sent() -> None:
-    draft = draft_over(None)
-    draft.write(5, b"x")
-    assert draft.local_bytes(0, 6) == b"\0\0\0\0\0x"
-    assert sent(draft.begin(in_place=False)) == [(0, b"\0\0\0\0\0x")]
-
-
-def test_a_hole_of_the_base_is_never_zeros() -> None:
-    draft = draft_over(b"abcdef")
-    draft.write(2, b"X")
-    assert draft.segments(0, 9) == [(Where.BASE, 0, 2), (Where.HELD, 2, 3), (Where.BASE, 3, 6)]
-    assert not draft.whole
-
-
-def test_what_was_cut_off_the_base_does_not_come_back() -> None:
-    draft = draft_over(b"abcdef")
-    draft.truncate(2)
-    draft.truncate(5)
-    assert content(draft, b"abcdef") == b"ab\0\0\0"
-    draft.truncate(0)
-    draft.write(1, b"z")
-    assert draft.whole
-    assert content(draft, b"abcdef") == b"\0z"
-
-
-def test_filling_never_overwrites_what_is_newer() -> None:
-    draft = draft_over(b"abcdef")
-    draft.write(2, b"X")
-    draft.truncate(5)
-    draft.fill(0, b"abcdef")
-    assert draft.whole
-    assert draft.local_bytes(0, 5) == b"abXde"
-    assert draft.crc32() == crc32(b"abXde")
-
-
 # --- sending
 
 
@@ -203,29 +167,6 @@ def test_a_byte_written_again_in_flight_goes_again_but_not_before_the_first_is_a
     assert sending.next_chunk(9) == (1, b"XX")
     sending.on_acked(1, 2)
     assert sending.unacked == 0
-
-
-def test_a_part_that_was_not_written_goes_again() -> None:
-    _, sending = sending_of(b"abcdef")
-    assert sending.next_chunk(6) == (0, b"abcdef")
-    sending.on_acked(0, 4)
-    sending.on_unsent(4, 2)
-    assert sent(sending) == [(4, b"ef")]
-
-
-def test_rollbacks() -> None:
-    _, sending = sending_of(b"abcdef")
-    sending.next_chunk(2)
-    sending.on_acked(0, 2)
-    sending.on_checkpoint()
-    sending.next_chunk(2)
-    sending.on_acked(2, 2)
-    sending.next_chunk(2)
-    sending.on_rollback(False)
-    assert sending.unacked == 4
-    assert sending.next_chunk(9) == (2, b"cdef")
-    sending.on_rollback(True)
-    assert sending.next_chunk(9) == (0, b"abcdef")
 
 
 def test_a_file_that_is_cut_below_what_was_sent_is_not_sent_on() -> None:

@@ -205,27 +205,9 @@ async def test_killed_after_a_rename(store: FakeWriter, spool: SpoolDirectory, t
     assert await killed(tree, spool, tmp_path) == {"card__name": ("/card/name", b"X" + BIG[1:])}
 
 
-async def test_killed_after_a_rename_of_what_waits(
-    store: FakeWriter, spool: SpoolDirectory, tmp_path: Path
-) -> None:
-    tree, _ = await written(store, spool)
-    await tree.rename(FILE, b"/card/name", noreplace=False)
-    assert await killed(tree, spool, tmp_path) == {}, "a rename delivers first"
-
-
 async def test_killed_after_it_was_unlinked(store: FakeWriter, spool: SpoolDirectory, tmp_path: Path) -> None:
     tree, file = await written(store, spool)
     await tree.unlink(FILE)
-    assert bytes(await file.read(0, len(BIG))) == BIG
-    assert await killed(tree, spool, tmp_path) == {}
-
-
-async def test_killed_after_it_was_replaced(store: FakeWriter, spool: SpoolDirectory, tmp_path: Path) -> None:
-    tree = make_writable(store, spool=spool, dirty_max=65536)
-    await write_file(tree, b"/card/new", b"new")
-    file = await tree.create(FILE, exclusive=True)
-    await file.write(0, BIG)
-    await tree.rename(b"/card/new", FILE, noreplace=False)
     assert bytes(await file.read(0, len(BIG))) == BIG
     assert await killed(tree, spool, tmp_path) == {}
 

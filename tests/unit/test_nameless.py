@@ -77,21 +77,6 @@ async def test_much_more_than_dirty_max_is_written_and_read_back(
     assert tree.status()["bytes_held"] == 0
 
 
-async def test_a_part_of_a_hidden_file_is_written_and_read_back(
-    autojump_clock: object, store: FakeWriter, tree: Tree
-) -> None:
-    file = await tree.open(FILE, write=True, truncate=False)
-    await tree.unlink(FILE)
-    before = trio.current_time()
-    await fill(file, 1)
-    assert trio.current_time() - before < STALL
-    assert await file.read(0, PIECE) == OLD[:PIECE]
-    assert await file.read(PIECE, PIECE) == piece(1)
-    await file.release()
-    assert FILE not in store.files
-    assert len(store.files) == 0
-
-
 async def test_it_holds_no_other_writer_back(autojump_clock: object, store: FakeWriter, tree: Tree) -> None:
     nameless = await tree.create(NEW, exclusive=True)
     await tree.unlink(NEW)

@@ -13,7 +13,7 @@ from mavftpfs.cache.tree import Tree
 from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.shared.errors import FileChanged, FtpNak
 from tests.support.fake_store import FakeReader
-from tests.support.fake_writer import KINDS, FakeWriter, card, litter, make_writable
+from tests.support.fake_writer import KINDS, FakeWriter, card, make_writable
 
 OLD = bytes(range(256)) * 4
 FILE = b"/card/dir/file.txt"
@@ -21,20 +21,6 @@ FULL = FtpNak(Opcode.CREATE_FILE, NakCode.FAIL_ERRNO, 28)
 
 
 store = card({FILE: OLD})
-
-
-async def test_who_has_a_replaced_file_open_never_reads_its_successor(store: FakeWriter, tree: Tree) -> None:
-    store.add(b"/card/dir/other", b"Z" * len(OLD))
-    file = await tree.open(FILE, write=True)
-    await file.write(0, b"ours")
-    await file.flush()
-    await tree.rename(b"/card/dir/other", FILE)
-    assert bytes(await file.read(0, 4)) == b"ours"
-    assert bytes(await file.read(0, len(OLD))) == b"ours" + OLD[4:]
-    assert store.files[FILE].data == b"Z" * len(OLD)
-    await file.release()
-    file.close()
-    assert litter(store) == []
 
 
 async def test_a_file_that_could_not_be_made_can_be_removed(store: FakeWriter, tree: Tree) -> None:

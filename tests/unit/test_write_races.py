@@ -65,31 +65,6 @@ async def test_a_stale_refusal_shows_too_that_there_is_no_rename(
     assert store.files[FILE].data == b"new" * 200
 
 
-async def test_a_reader_of_the_old_part_goes_on_when_the_new_part_was_delivered(
-    nursery: trio.Nursery, autojump_clock: object
-) -> None:
-    old = bytes(range(256)) * 40
-    for kind in KINDS.values():
-        store = FakeWriter(kind, nursery)
-        store.add_directory(b"/d")
-        store.add(FILE, old)
-        tree = make_writable(store, inplace=True)
-        writer = await tree.open(FILE, write=True)
-        reader = await tree.open(FILE)
-        store.chunk_delay = 1.0
-        async with trio.open_nursery() as both:
-
-            async def read() -> None:
-                assert bytes(await reader.read(0, len(old))) == b"new" + old[3:]  # noqa: B023
-
-            await writer.write(0, b"new")
-            both.start_soon(read)
-            await trio.sleep(0.5)
-            await writer.flush()
-        for file in (reader, writer):
-            await file.release()
-
-
 @pytest.mark.holds("fault full card")
 async def test_overwriting_in_place_that_failed_goes_on_later(
     nursery: trio.Nursery, autojump_clock: object

@@ -30,28 +30,6 @@ FILE = b"/card/dir/file.bin"
 store = card({FILE: DATA})
 
 
-async def test_readers_see_what_is_written_at_once(store: FakeWriter, tree: Tree) -> None:
-    early = await tree.open(FILE)
-    assert await early.read(0, 4) == DATA[:4]
-    writer = await tree.open(FILE, write=True)
-    await writer.write(2, b"NEW")
-    late = await tree.open(FILE)
-    assert store.requests == 0
-    for handle in (early, late, writer):
-        assert await handle.read(0, 8) == DATA[:2] + b"NEW" + DATA[5:8]
-        assert handle.size == len(DATA)
-    await writer.write(len(DATA) + 10, b"end")
-    assert await early.read(len(DATA) - 1, 100) == DATA[-1:] + bytes(10) + b"end"
-    assert (await tree.stat(FILE)).size == len(DATA) + 13
-    await writer.release()
-    expected = DATA[:2] + b"NEW" + DATA[5:] + bytes(10) + b"end"
-    assert store.files[FILE].data == expected
-    assert await early.read(0, 10**6) == expected
-    for handle in (early, late):
-        await handle.release()
-    assert await read_file(tree, FILE) == expected
-
-
 async def test_the_shells_redirection_is_one_delivery(store: FakeWriter, tree: Tree) -> None:
     """open(O_TRUNC), dup2, close, write, close: flush comes before the first byte."""
     file = await tree.open(FILE, write=True, truncate=True)
@@ -69,34 +47,11 @@ async def test_the_shells_redirection_is_one_delivery(store: FakeWriter, tree: T
     assert store.files[FILE].data == b"echo\n"
 
 
-async def test_emptying_is_delivered_by_release_and_by_fsync(store: FakeWriter, tree: Tree) -> None:
-    file = await tree.open(FILE, write=True, truncate=True)
-    await file.release()
-    assert store.files[FILE].data == b""
-    await write_file(tree, FILE, b"again")
-    file = await tree.open(FILE, write=True)
-    await file.truncate(0)
-    await file.fsync()
-    assert store.files[FILE].data == b""
-    await file.release()
-
-
 async def test_reading_what_was_just_written_asks_nothing(store: FakeWriter, tree: Tree) -> None:
     await write_file(tree, b"/card/new", DATA)
     before = len(store.calls)
     assert await read_file(tree, b"/card/new") == DATA
     assert len(store.calls) == before
-
-
-async def test_the_second_change_of_an_open_file_starts_from_the_first(store: FakeWriter, tree: Tree) -> None:
-    file = await tree.open(FILE, write=True)
-    expected = bytearray(DATA)
-    for at in (10, 20, 30):
-        await file.write(at, b"!")
-        expected[at] = ord("!")
-        await file.fsync()
-        assert store.files[FILE].data == bytes(expected)
-    await file.release()
 
 
 async def test_creating(store: FakeWriter, tree: Tree) -> None:
@@ -128,18 +83,6 @@ async def test_a_new_file_is_seen_before_it_is_delivered(store: FakeWriter, tree
     await file.release()
     tree.forget_caches()
     assert dict(await tree.list(b"/card"))[b"new"].size == 3
-
-
-async def test_two_writers_share_the_file(store: FakeWriter, tree: Tree) -> None:
-    one = await tree.create(b"/card/new", exclusive=True)
-    two = await tree.open(b"/card/new", write=True)
-    await one.write(0, b"one")
-    await two.write(3, b"two")
-    await one.release()
-    assert store.files[b"/card/new"].data == b"onetwo"
-    await two.write(3, b"TWO")
-    await two.release()
-    assert store.files[b"/card/new"].data == b"oneTWO"
 
 
 async def test_a_write_waits_while_the_file_is_being_delivered(
@@ -247,19 +190,6 @@ async def test_growth_shows_when_a_file_is_opened_too_and_force_goes_on(store: F
 # --- files without a name
 
 
-async def test_an_unlinked_file_that_is_written_is_never_delivered(store: FakeWriter, tree: Tree) -> None:
-    file = await tree.create(b"/card/tmp", exclusive=True)
-    await file.write(0, DATA)
-    await tree.unlink(b"/card/tmp")
-    await file.write(0, b"more")
-    assert await file.read(0, 8) == b"more" + DATA[4:8]
-    await file.flush()
-    await file.release()
-    assert sorted(store.files) == [FILE]
-    assert tree.undelivered() == []
-    assert tree.status()["bytes_held"] == 0
-
-
 async def test_a_cached_file_is_removed_at_once_and_read_on(store: FakeWriter, tree: Tree) -> None:
     file = await tree.open(FILE)
     await file.read(0, len(DATA))
@@ -298,20 +228,6 @@ async def test_a_hidden_file_follows_its_directory(store: FakeWriter, tree: Tree
     assert store.files == {}
 
 
-async def test_an_open_file_is_renamed(store: FakeWriter, tree: Tree) -> None:
-    reader = await tree.open(FILE)
-    writer = await tree.open(FILE, write=True)
-    await writer.write(0, b"first")
-    await tree.rename(FILE, b"/card/moved")
-    assert store.files[b"/card/moved"].data == b"first" + DATA[5:]
-    await writer.write(5, b"second")
-    assert await reader.read(0, 11) == b"firstsecond"
-    await writer.release()
-    await reader.release()
-    assert store.files == {b"/card/moved": store.files[b"/card/moved"]}
-    assert store.files[b"/card/moved"].data == b"firstsecond" + DATA[11:]
-
-
 async def test_open_files_below_a_renamed_directory_follow(store: FakeWriter, tree: Tree) -> None:
     writer = await tree.create(b"/card/dir/new", exclusive=True)
     await writer.write(0, b"abc")
@@ -324,14 +240,3 @@ async def test_open_files_below_a_renamed_directory_follow(store: FakeWriter, tr
     assert (await tree.stat(b"/card/there/new")).size == 6
     with pytest.raises(NotFound):
         await tree.stat(b"/card/dir/new")
-
-
-async def test_who_has_a_replaced_file_open_keeps_what_was_written(store: FakeWriter, tree: Tree) -> None:
-    await write_file(tree, b"/card/tmp", b"newer")
-    old = await tree.create(b"/card/dir/x", exclusive=True)
-    await old.write(0, b"old")
-    await tree.rename(b"/card/tmp", b"/card/dir/x")
-    assert await old.read(0, 9) == b"old"
-    assert await read_file(tree, b"/card/dir/x") == b"newer"
-    await old.release()
-    assert store.files[b"/card/dir/x"].data == b"newer"
