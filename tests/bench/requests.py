@@ -22,7 +22,6 @@ from tests.support.mounts import Mount
 from tests.support.request_cases import CASES, FIRST
 from tests.support.request_costs import MOUNT, PROFILES
 from tests.support.requests import OPTIONS, Case, Cost, CountedVehicle, Counting, prepare
-from tests.support.vehicles import SimVehicle
 
 ROUNDS = 10
 
@@ -33,11 +32,8 @@ def counted(profile: str, cases: tuple[Case, ...], folder: Path) -> dict[str, Co
     for path in (root, here):
         path.mkdir()
     prepare(root, profile, cases)
-    vehicle: SimVehicle = CountedVehicle(root, folder, profile)
-    assert isinstance(vehicle, CountedVehicle)
     with ExitStack() as stack:
-        stack.callback(vehicle.finish)
-        vehicle.start()
+        vehicle = stack.enter_context(CountedVehicle(root, profile))
         mount = Mount(vehicle.source, here, folder, OPTIONS)
         stack.callback(mount.finish)
         counting = Counting(vehicle, mount)

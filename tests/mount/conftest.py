@@ -13,10 +13,12 @@ from typing import TypeVar
 
 import pytest
 
+from mavftpfs.sim.tree import MemoryTree
+from tests.support.lying import LyingVehicle
 from tests.support.mounts import Mount
 from tests.support.requests import CountedVehicle
 from tests.support.trees import SMALL_SIZES, build_tree
-from tests.support.vehicles import HostileVehicle, MavsdkVehicle, SimVehicle, UdpVehicle
+from tests.support.vehicles import HOST, MavsdkVehicle, SimVehicle, UdpVehicle, free_udp_port
 
 V = TypeVar("V", bound=UdpVehicle)
 
@@ -36,15 +38,15 @@ class Field:
 
     def counted_sim(self, root: Path, profile: str) -> CountedVehicle:
         """Start a simulated vehicle that counts what it is asked."""
-        return self._started(CountedVehicle(root, self._subfolder(), profile))
+        return self._stack.enter_context(CountedVehicle(root, profile))
 
     def mavsdk(self, root: Path, bad_link: Sequence[str] = ()) -> MavsdkVehicle:
         """Start the MAVSDK library's server."""
         return self._started(MavsdkVehicle(root, self._subfolder(), bad_link=bad_link))
 
-    def hostile(self, mode: str) -> HostileVehicle:
-        """Start a vehicle that means harm."""
-        return self._started(HostileVehicle(self._subfolder(), mode))
+    def lying(self, tree: MemoryTree) -> LyingVehicle:
+        """Start a vehicle whose answers can be changed."""
+        return self._stack.enter_context(LyingVehicle(tree, f"udpout:{HOST}:{free_udp_port()}"))
 
     def mount(self, source: str, *options: str, argv: Sequence[str] = ()) -> Mount:
         """Mount SOURCE and wait for it."""

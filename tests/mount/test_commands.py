@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 
+from mavftpfs.sim.tree import MemoryTree
 from tests.mount.conftest import Field
 from tests.support.logs import suspects
 from tests.support.mounts import COMMAND_TIMEOUT
@@ -100,10 +101,9 @@ def test_scan_shows_who_answers(vehicle: SimVehicle) -> None:
 
 def test_scan_of_a_vehicle_without_ftp(field: Field) -> None:
     """Whatever its capability flag says."""
-    hostile = field.hostile("mute")
-    assert hostile.process is not None
-    hostile.await_ready(hostile.process)
-    out, _ = mavftpfs("scan", "--json", hostile.source)
+    vehicle = field.lying(MemoryTree())
+    vehicle.server.answer = lambda request: []
+    out, _ = mavftpfs("scan", "--json", vehicle.source)
     (peer,) = json.loads(out)
     assert peer["answers"] is False
     assert peer["ftp"].startswith("no answer")

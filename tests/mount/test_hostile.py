@@ -5,16 +5,50 @@ Deadlines are short here; that each command ends is what `Mount.run` insists on.
 
 from __future__ import annotations
 
+import os
+import random
 import sys
 from pathlib import Path
 
 import pytest
 
+from mavftpfs.protocol.payload import NakCode, Opcode, Payload
+from mavftpfs.sim.tree import MemoryTree
 from tests.mount.conftest import Field
-from tests.support.hostile import BROKEN, FINE, GOOD, GOOD_NAMES, NAKED
+from tests.support.lying import LyingVehicle, ack, nak
 from tests.support.mounts import Mount, mounted_at
 
 QUICK = ("op_deadline=6", "dir_timeout=600")
+
+GOOD = b"good"
+GOOD_NAMES = {"good.txt", "no_size", "caf\udce9"}
+"""What of the directory /names may appear, as os.listdir shows it; all hold GOOD."""
+
+NAMES = (
+    b"F../../etc/passwd\t4",
+    b"F/etc/shadow\t4",
+    b"D..",
+    b"D.",
+    b"F\t4",
+    b"D",
+    b"S",
+    b"Xunknown\t4",
+    b"Fgood.txt\t4",
+    b"Fgood.txt\t4",
+    b"Dgood.txt",
+    b"Fno_size",
+    b"Fcaf\xe9\t4",
+    b"Fsub/dir\t4",
+)
+
+BROKEN = ("short.bin", "empty_acks.bin", "shifted.bin", "silent.bin", "other_opcode.bin")
+"""Files of /broken: 1000 bytes by listing and open, but never fully readable."""
+
+FINE = random.Random("fine").randbytes(5000)
+
+NAKED = (2, 4, 8, 9, 12)
+"""Codes that opening /nak/open<code> and reading /nak/read<code> is refused with, known and unknown."""
+
 REFUSALS = {
     "open": {4: "EBUSY", 8: "EBUSY", 9: "EACCES"},
     "read": {9: "EACCES"},
@@ -27,10 +61,85 @@ MAX_RESIDENT = 150 << 20
 """Bytes; far above what a capped listing needs, far below what an endless one would take."""
 
 
+def card() -> MemoryTree:
+    """What the vehicle has."""
+    tree = MemoryTree()
+    tree.add(b"/fine.bin", FINE)
+    for name in GOOD_NAMES:
+        tree.add(b"/names/" + os.fsencode(name), GOOD)
+    for name in BROKEN:
+        tree.add(b"/broken/" + name.encode(), bytes(1000))
+    for code in NAKED:
+        tree.add(b"/nak/open%d" % code, GOOD)
+        tree.add(b"/nak/read%d" % code, GOOD)
+    for name in ("endless", "same", "refused"):
+        tree.add_directory(f"/{name}".encode())
+    return tree
+
+
+def refusal(request: Payload, code: int) -> Payload:
+    """Return a NAK; FailErrno carries the number of an error of some other operating system."""
+    return (
+        nak(request, code)
+        if code != NakCode.FAIL_ERRNO
+        else nak(request, code)._replace(data=b"\2\xcd", size=2)
+    )
+
+
+def listing(request: Payload) -> list[Payload] | None:
+    """Answer requests for pages of the bad directories."""
+    match request.data.strip(b"/\0"):
+        case b"endless":
+            names = [b"Fendless%09d\t4" % (request.offset + step) for step in range(8)]
+        case b"same":
+            names = [b"Fsame_for_ever\t4"]
+        case b"names":
+            names = list(NAMES[request.offset : request.offset + 5])
+        case b"refused":
+            return [nak(request, NakCode.FILE_NOT_FOUND)]
+        case _:
+            return None
+    return [ack(request, b"\0".join(names) + b"\0") if names else nak(request, NakCode.EOF)]
+
+
+def lie(vehicle: LyingVehicle) -> None:
+    """Have listings and files broken as their names say."""
+
+    def answer(request: Payload) -> list[Payload] | None:
+        opened = b"".join(vehicle.server.open_paths)
+        if request.opcode == Opcode.LIST_DIRECTORY:
+            return listing(request)
+        if request.opcode == Opcode.OPEN_FILE_RO and request.data.startswith(b"/nak/open"):
+            return [refusal(request, int(request.data.rstrip(b"\0")[9:]))]
+        if request.opcode == Opcode.READ_FILE and opened.startswith(b"/nak/read"):
+            return [refusal(request, int(opened[9:]))]
+        if request.opcode == Opcode.READ_FILE and opened.endswith(b"silent.bin"):
+            return []
+        return None
+
+    def change(request: Payload, reply: Payload) -> list[Payload]:
+        if request.opcode != Opcode.READ_FILE:
+            return [reply]
+        match b"".join(vehicle.server.open_paths).rpartition(b"/")[2]:
+            case b"shifted.bin":
+                return [reply._replace(offset=reply.offset + 1)]
+            case b"other_opcode.bin":
+                return [reply._replace(req_opcode=Opcode.LIST_DIRECTORY)]
+            case b"empty_acks.bin" if request.offset >= 239:
+                return [ack(request, b"")]
+            case b"short.bin" if request.offset >= 500:
+                return [nak(request, NakCode.EOF)]
+        return [reply]
+
+    vehicle.server.answer, vehicle.server.change = answer, change
+
+
 @pytest.fixture(scope="module")
 def liar(module_field: Field) -> Mount:
     """A mount of the vehicle with hostile listings and broken files."""
-    mount = module_field.mount(module_field.hostile("files").source, *QUICK)
+    vehicle = module_field.lying(card())
+    lie(vehicle)
+    mount = module_field.mount(vehicle.source, *QUICK)
     mount.allowed_log = ("took longer than its deadline",)
     return mount
 
@@ -85,18 +194,26 @@ def test_every_refusal_has_an_errno(liar: Mount, step: str, code: int) -> None:
     assert error == REFUSALS[step].get(code, "EIO")
 
 
-@pytest.mark.holds("promise 1", "promise 10", "fault corrupt")
-def test_noise_and_forged_replies_change_nothing(field: Field) -> None:
-    mount = field.mount(field.hostile("noise").source)
+@pytest.mark.holds("promise 1", "promise 10")
+def test_forged_replies_beside_each_answer_change_nothing(field: Field) -> None:
+    rng = random.Random(3)
+
+    def forge(request: Payload, reply: Payload) -> list[Payload]:
+        forged = ack(request, b"evil" * 50)
+        replay = [forged._replace(req_opcode=Opcode.RENAME)] * (rng.random() < 0.2)  # which costs a new seq
+        return [forged._replace(seq=(request.seq + 77) & 0xFFFF), *replay, reply]
+
+    vehicle = field.lying(card())
+    vehicle.server.change = forge
+    mount = field.mount(vehicle.source)
     assert mount.read_bytes(mount.path / "fine.bin") == FINE
     for name in sorted(GOOD_NAMES):
         assert mount.read_bytes(mount.path / "names" / name) == GOOD
 
 
 def test_a_vehicle_that_never_answers_ftp_is_exit_2(field: Field) -> None:
-    vehicle = field.hostile("mute")
-    assert vehicle.process is not None
-    vehicle.await_ready(vehicle.process)  # its first heartbeat must come in time
+    vehicle = field.lying(card())
+    vehicle.server.answer = lambda request: []
     mount = field.prepare(vehicle.source)
     result = mount.run(
         sys.executable, "-m", "mavftpfs", vehicle.source, mount.path, "-o", "connect_timeout=8", code=2
@@ -121,18 +238,7 @@ def test_programs_end_with_an_error_where_a_directory_was_not_listed_to_its_end(
     liar.run("find", where, code=1)
     liar.run("rsync", "-a", "--delete", f"{where}/", backup, code=23)
     assert (backup / "kept").exists()
-    get = (
-        sys.executable,
-        "-m",
-        "mavftpfs",
-        "get",
-        "-r",
-        "--to",
-        tmp_path,
-        liar.path,
-        "/names",
-        f"/{directory}",
-    )
-    complaints = liar.run(*get, code=2).stderr.splitlines()
+    get = (sys.executable, "-m", "mavftpfs", "get", "-r", "--to", tmp_path, liar.path)
+    complaints = liar.run(*get, "/names", f"/{directory}", code=2).stderr.splitlines()
     assert [f"/{directory}" in line for line in complaints] == [True]
     assert (tmp_path / "names" / "good.txt").read_bytes() == GOOD

@@ -15,7 +15,6 @@ than FREE_FOR old lacks it. `aged` makes the first look certain; how many follow
 
 from __future__ import annotations
 
-import json
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -23,9 +22,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from mavftpfs.protocol.payload import Opcode, Payload
+from mavftpfs.sim.tree import DirectoryTree
+from tests.support.lying import LyingVehicle
 from tests.support.mounts import Mount
 from tests.support.twins import PRELUDE
-from tests.support.vehicles import SimVehicle
+from tests.support.vehicles import HOST, free_udp_port
 
 ATTEMPTS = 5
 FREE_FOR = 2.0
@@ -38,6 +40,9 @@ LOST = 10.0
 
 SETTLING = 60.0
 KEEP_ALIVE = "NONE"
+BY_SESSION = ("TERMINATE_SESSION", "RESET_SESSIONS", "READ_FILE", "WRITE_FILE", "BURST_READ_FILE")
+"""Opcodes whose data is not a path."""
+
 FOLDERS = {"px4-nuttx": "fs/microsd"}
 ROOM = "cases"
 """The directory of the card in which each case has its own."""
@@ -111,47 +116,41 @@ class Cost:
         return ", ".join(words) + data or "0"
 
 
-class CountedVehicle(SimVehicle):
-    """`tests.support.counted_sim` as a vehicle."""
+class CountedVehicle(LyingVehicle):
+    """A simulated vehicle that keeps each FTP request before it does as it says."""
 
-    @property
-    def journal(self) -> Path:
-        """Where its requests are written down."""
-        return self.folder / "journal"
+    def __init__(self, root: Path, profile: str) -> None:
+        super().__init__(DirectoryTree(root), f"udpout:{HOST}:{free_udp_port()}", profile=profile)
+        self.profile = profile
+        self._requests: list[Payload] = []
+        self.server.answer = self._requests.append  # which answers nothing
 
-    def argv(self) -> list[str]:
-        link = self.link or f"udpout:127.0.0.1:{self.vehicle_port}"
-        python = super().argv()[0]
-        program = [python, "-m", "tests.support.counted_sim"]
-        return [*program, str(self.root), self.profile, link, str(self.journal)]
+    def __exit__(self, *args: Any) -> None:
+        left = self.sessions()
+        super().__exit__(*args)
+        assert left == 0, "a session was left open"
 
     def asked(self) -> int:
         """Return how many requests came so far."""
-        try:
-            return self.journal.read_bytes().count(b"\n")
-        except FileNotFoundError:
-            return 0
+        return len(self._requests)
 
     def sessions(self) -> int:
         """Return how many sessions its server has open."""
-        try:
-            return int(self.journal.with_suffix(".sessions").read_text() or 1)  # empty: it is being written
-        except FileNotFoundError:
-            return 0
+        return self.server.open_sessions
 
     def cost_since(self, mark: int) -> Cost:
         """Return the requests that came after the first `mark`."""
         cost = Cost()
-        for line in self.journal.read_text().splitlines()[mark:]:
-            entry = json.loads(line)
-            name = entry["opcode"]
+        for request in self._requests[mark:]:
+            name = Opcode(request.opcode).name
             if name == KEEP_ALIVE:
                 cost.keep_alives += 1
                 continue
             cost.counts[SHORT[name]] += 1
             if name in ("READ_FILE", "WRITE_FILE"):
-                cost.payload += entry["size"]
-            where = entry.get("path", f"{entry['offset']}+{entry['size']}")
+                cost.payload += request.size
+            path = request.data.rstrip(b"\0").replace(b"\0", b" -> ").decode(errors="replace")
+            where = f"{request.offset}+{request.size}" if name in BY_SESSION else path
             if name == "CREATE_FILE" and cost.requests[-1:] == [f"OPEN_FILE_RO {where}"]:
                 cost.counts.subtract(["open"])
                 cost.counts[LOOK] += 1

@@ -235,18 +235,6 @@ class MavsdkVehicle(UdpVehicle):
         return [sys.executable, "-m", "tests.support.mavsdk_server", str(self.root), url]
 
 
-class HostileVehicle(UdpVehicle):
-    """`tests.support.hostile` in one of its modes; it serves no directory."""
-
-    def __init__(self, folder: Path, mode: str) -> None:
-        super().__init__(folder, folder)
-        self.name = f"hostile-{mode}"
-        self.mode = mode
-
-    def argv(self) -> list[str]:
-        return [sys.executable, "-m", "tests.support.hostile", self.mode, str(self.vehicle_port)]
-
-
 class SimVehicle(UdpVehicle):
     """`mavftpfs sim` with a profile; `options` are its further arguments (link model, seed)."""
 
