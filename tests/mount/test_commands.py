@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -13,27 +11,15 @@ import pytest
 
 from mavftpfs.sim.tree import MemoryTree
 from tests.mount.conftest import Field
-from tests.support.logs import suspects
-from tests.support.mounts import COMMAND_TIMEOUT
+from tests.support.mounts import mavftpfs
 from tests.support.trees import differing
-from tests.support.vehicles import PROJECT, SimVehicle
+from tests.support.vehicles import SimVehicle
 
 
 @pytest.fixture(scope="module")
 def vehicle(module_field: Field, small_tree: Path) -> SimVehicle:
     """A vehicle that nobody mounts; one command after the other speaks with it."""
     return module_field.sim(small_tree)
-
-
-def mavftpfs(command: str, *words: str | Path, code: int = 0) -> tuple[str, list[str]]:
-    """Run a command that must end with `code`; return its output and the lines of its complaint."""
-    argv = [sys.executable, "-m", "mavftpfs", command, *map(str, words)]
-    done = subprocess.run(
-        argv, capture_output=True, text=True, timeout=COMMAND_TIMEOUT, cwd=PROJECT, check=False
-    )
-    assert done.returncode == code, f"{argv}: exit {done.returncode}\n{done.stdout}{done.stderr}"
-    assert suspects(done.stderr) == []
-    return done.stdout, done.stderr.splitlines()
 
 
 def test_ls(vehicle: SimVehicle, small_tree: Path) -> None:
@@ -78,10 +64,10 @@ def test_get_is_verified(vehicle: SimVehicle, small_tree: Path, tmp_path: Path) 
 def test_what_cannot_be_done_is_a_line_and_exit_1(
     vehicle: SimVehicle, words: tuple[str, ...], named: str
 ) -> None:
-    out, complaint = mavftpfs(words[0], vehicle.source, *words[1:], code=1)
+    out, said = mavftpfs(words[0], vehicle.source, *words[1:], code=1)
     assert out == ""
-    assert len(complaint) == 1, complaint
-    assert named in complaint[0]
+    assert len(said.splitlines()) == 1, said
+    assert named in said
 
 
 def test_scan_shows_who_answers(vehicle: SimVehicle) -> None:

@@ -12,22 +12,18 @@ import pytest
 
 from tests.mount.conftest import Field
 from tests.support.logs import suspects
-from tests.support.mounts import COMMAND_TIMEOUT, abort_mount, mounted_at, processes_in, wait_until
+from tests.support.mounts import abort_mount, mavftpfs, mounted_at, processes_in, wait_until
 from tests.support.vehicles import HOST, PROJECT, free_udp_port
 
 NOBODY = f"udpin:{HOST}:0"
 
 
-def mavftpfs(*argv: str | Path, code: int, timeout: float = COMMAND_TIMEOUT) -> str:
-    """Run the command, which must end with `code`, and return its one line of complaint."""
-    command = [sys.executable, "-m", "mavftpfs", *map(str, argv)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=timeout, cwd=PROJECT, check=False)
-    assert done.returncode == code, f"{command}: exit {done.returncode}\n{done.stdout}{done.stderr}"
-    assert done.stdout == ""
-    assert suspects(done.stderr) == []
-    lines = done.stderr.splitlines()
-    assert len(lines) == 1, done.stderr
-    return lines[0]
+def complaint(*words: object, code: int) -> str:
+    """Run a command that must end with `code`, and return its one line of complaint."""
+    out, said = mavftpfs(*words, code=code)
+    assert out == ""
+    assert len(said.splitlines()) == 1, said
+    return said
 
 
 @pytest.fixture
@@ -42,7 +38,7 @@ def mountpoint(tmp_path: Path) -> Path:
 def test_no_vehicle_is_exit_2(mountpoint: Path, foreground: bool) -> None:
     source = f"udpin:{HOST}:{free_udp_port()}"
     extra = ["-f"] if foreground else []
-    line = mavftpfs(source, mountpoint, "-o", "connect_timeout=1", *extra, code=2)
+    line = complaint(source, mountpoint, "-o", "connect_timeout=1", *extra, code=2)
     assert "heartbeat" in line or "vehicle" in line
     assert not mounted_at(mountpoint)
 
@@ -51,17 +47,17 @@ def test_a_busy_port_is_exit_2(mountpoint: Path) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
         sock.bind((HOST, 0))
         port = sock.getsockname()[1]
-        assert str(port) in mavftpfs(f"udpin:{HOST}:{port}", mountpoint, code=2)
+        assert str(port) in complaint(f"udpin:{HOST}:{port}", mountpoint, code=2)
 
 
 def test_a_missing_serial_port_is_exit_2(mountpoint: Path) -> None:
-    line = mavftpfs("/dev/ttyNOTHERE,57600", mountpoint, "-o", "connect_timeout=2", code=2)
+    line = complaint("/dev/ttyNOTHERE,57600", mountpoint, "-o", "connect_timeout=2", code=2)
     assert "/dev/ttyNOTHERE" in line
 
 
 def test_a_missing_remote_root_is_named(field: Field, small_tree: Path, mountpoint: Path) -> None:
     source = field.sim(small_tree).source
-    assert "/no/such" in mavftpfs(f"{source}#/no/such", mountpoint, code=1)
+    assert "/no/such" in complaint(f"{source}#/no/such", mountpoint, code=1)
 
 
 def test_no_fuse_device_is_exit_3(mountpoint: Path) -> None:

@@ -14,8 +14,7 @@ import pytest
 
 from mavftpfs.protocol.crc import crc32
 from tests.mount.conftest import Field
-from tests.support.mounts import Mount, abort_mount, mounted_at, processes_in, wait_until
-from tests.support.vehicles import PROJECT
+from tests.support.mounts import Mount, abort_mount, mavftpfs, mounted_at, processes_in, wait_until
 
 
 def mount_line(path: Path) -> list[str]:
@@ -41,13 +40,13 @@ def test_kernel_shows_source_and_type(plain: Mount) -> None:
 
 def test_status_tells_about_vehicle_and_link(plain: Mount) -> None:
     plain.run("cat", plain.path / "file")
-    status: dict[str, Any] = json.loads(mavftpfs("status", plain.path, "--json"))
+    status: dict[str, Any] = json.loads(mavftpfs("status", plain.path, "--json")[0])
     speed = status["connection"]["speed"]
     assert (speed["read_mode"], speed["chunk"]) == ("window", 239)
     assert speed["loss"] == 0.0 or status["connection"]["retransmissions"], "an answer may have come late"
     assert speed["window"] >= 1
-    assert mavftpfs("status", plain.path).startswith(f"{plain.path}: PX4 1/1, disarmed, link fine: RTT ")
-    shown = mavftpfs("status", "--verbose", plain.path)
+    assert mavftpfs("status", plain.path)[0].startswith(f"{plain.path}: PX4 1/1, disarmed, link fine: RTT ")
+    shown, _ = mavftpfs("status", "--verbose", plain.path)
     assert plain.source in shown
     assert "read mode: window" in shown
 
@@ -131,14 +130,6 @@ def test_bursts_give_the_same_bytes(field: Field, tree: Path, tmp_path: Path) ->
     records = [json.loads(line) for line in trace.read_text().splitlines()]
     streamed = [r for r in records if r["dir"] == "reply" and r.get("req_opcode") == "BURST_READ_FILE"]
     assert len(streamed) > (119500 + 131073) // 239
-
-
-def mavftpfs(*argv: str | Path) -> str:
-    """Run a command that must succeed and return its stdout."""
-    command = [sys.executable, "-m", "mavftpfs", *map(str, argv)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60, cwd=PROJECT, check=False)
-    assert done.returncode == 0, done.stderr
-    return done.stdout
 
 
 # mount(8) runs the program named by the type from a fixed PATH, so one is made to hold it, in a mount

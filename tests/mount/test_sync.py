@@ -23,8 +23,8 @@ from mavftpfs.link.messages import MAV_AUTOPILOT_INVALID, MAV_TYPE_GCS, Address
 from mavftpfs.protocol.crc import crc32
 from tests.mount.conftest import Field
 from tests.support import terminal
-from tests.support.logs import suspects
 from tests.support.mounts import COMMAND_TIMEOUT, wait_until
+from tests.support.mounts import mavftpfs as run
 from tests.support.places import REAL, start_place
 from tests.support.vehicles import HOST, PROJECT, UdpVehicle, free_udp_port
 
@@ -37,16 +37,6 @@ READS = ("READ_FILE", "BURST_READ_FILE")
 
 def argv(*words: object) -> list[str]:
     return [sys.executable, "-m", "mavftpfs", *map(str, words)]
-
-
-def run(*words: object, code: int = 0) -> tuple[str, str]:
-    """Run a command that must end with `code`; return what it said on stdout and stderr."""
-    done = subprocess.run(
-        argv(*words), capture_output=True, text=True, timeout=COMMAND_TIMEOUT, cwd=PROJECT, check=False
-    )
-    assert done.returncode == code, f"{words}: exit {done.returncode}\n{done.stdout}{done.stderr}"
-    assert suspects(done.stderr) == []
-    return done.stdout, done.stderr
 
 
 def sync(*words: object, code: int = 0) -> dict[str, Any]:

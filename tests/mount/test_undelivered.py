@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import signal
-import subprocess
 import sys
 from pathlib import Path
 
@@ -15,6 +14,7 @@ from mavftpfs.exits import ExitCode
 from tests.mount.conftest import Field
 from tests.mount.test_writing_ends import QUICK, write_to_nobody
 from tests.support.mounts import Mount, abort_mount, wait_until
+from tests.support.mounts import mavftpfs as run
 from tests.support.trees import content
 from tests.support.vehicles import SimVehicle
 
@@ -36,14 +36,6 @@ def state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     path.mkdir()
     monkeypatch.setenv("XDG_STATE_HOME", str(path))
     return path / "mavftpfs/recovered"
-
-
-def run(*words: str | Path, code: int = 0) -> tuple[str, str]:
-    """Run mavftpfs; return stdout and stderr."""
-    argv = [*MAVFTPFS, *map(str, words)]
-    done = subprocess.run(argv, capture_output=True, text=True, timeout=120, check=False)
-    assert done.returncode == code, f"{argv}: {done.returncode}\n{done.stdout}{done.stderr}"
-    return done.stdout, done.stderr
 
 
 def test_umount_says_what_it_waits_for_and_ctrl_c_ends_the_waiting_only(

@@ -17,7 +17,7 @@ from pathlib import Path
 import pytest
 
 from tests.mount.conftest import Field
-from tests.support.mounts import wait_until
+from tests.support.mounts import mavftpfs, wait_until
 from tests.support.takingturns import taking_turns
 from tests.support.twins import Twins
 from tests.support.vehicles import UdpVehicle
@@ -207,40 +207,19 @@ def test_many_writers_at_once(twins: Twins, brought: Path) -> None:
     twins.both(script, brought)
 
 
-@pytest.mark.parametrize("kind", ["mavsdk-server"], scope="module", indirect=True)
-def test_put_mv_and_rm_without_a_mount(kind: str, field: Field, tiny_tree: Path) -> None:
-    folder, needed = SERVERS[kind]
-    root = field.local("card")
-    (root / folder).mkdir(parents=True, exist_ok=True)
-    vehicle: UdpVehicle = field.mavsdk(root) if kind == "mavsdk-server" else field.sim(root, kind)
-    base = f"/{folder}" if folder else ""
-    options = ("-o", ",".join(needed)) if needed else ()
-    local = field.local("twin")
-
-    def mavftpfs(command: str, *words: str | Path) -> str:
-        argv = [sys.executable, "-m", "mavftpfs", command, *options]
-        done = subprocess.run(
-            [*argv, *map(str, words)],
-            capture_output=True,
-            text=True,
-            errors="replace",
-            timeout=120,
-            check=False,
-        )
-        assert done.returncode == 0, done.stderr
-        return done.stdout
-
-    source = vehicle.source
-    said = mavftpfs("put", "-r", source, tiny_tree / "sizes", tiny_tree / "README.txt", f"{base}/")
+def test_put_mv_and_rm_without_a_mount(field: Field, tiny_tree: Path) -> None:
+    card, local = field.local("card"), field.local("twin")
+    source = field.mavsdk(card).source
+    said, _ = mavftpfs("put", "-r", source, tiny_tree / "sizes", tiny_tree / "README.txt", "/")
     assert said.count("delivered") == len(list((tiny_tree / "sizes").iterdir())) + 1
-    mavftpfs("mkdir", "-p", source, f"{base}/new/deep")
-    mavftpfs("mv", source, f"{base}/README.txt", f"mftp://{base}/new/deep")
-    mavftpfs("rm", "-r", source, f"{base}/sizes/1.bin", f"{base}/sizes/239.bin")
+    mavftpfs("mkdir", "-p", source, "/new/deep")
+    mavftpfs("mv", source, "/README.txt", "mftp:///new/deep")
+    mavftpfs("rm", "-r", source, "/sizes/1.bin", "/sizes/239.bin")
     shutil.copytree(tiny_tree / "sizes", local / "sizes")
     (local / "new/deep").mkdir(parents=True)
     shutil.copy(tiny_tree / "README.txt", local / "new/deep/README.txt")
     for name in ("1.bin", "239.bin"):
         (local / "sizes" / name).unlink()
-    subprocess.run(["diff", "-r", local, root / folder], check=True, timeout=30)
-    mavftpfs("rm", "-r", source, f"{base}/new", f"{base}/sizes")
-    assert list((root / folder).iterdir()) == []
+    subprocess.run(["diff", "-r", local, card], check=True, timeout=30)
+    mavftpfs("rm", "-r", source, "/new", "/sizes")
+    assert list(card.iterdir()) == []

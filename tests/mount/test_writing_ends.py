@@ -17,7 +17,7 @@ import pytest
 from mavftpfs import control
 from mavftpfs.cache.reserved import is_reserved
 from tests.mount.conftest import Field
-from tests.support.mounts import Mount, abort_mount, mounted_at, wait_until
+from tests.support.mounts import Mount, abort_mount, mavftpfs, mounted_at, wait_until
 from tests.support.trees import content
 from tests.support.vehicles import Process, SimVehicle
 
@@ -92,14 +92,14 @@ def test_arming_in_mid_copy_refuses_and_disarming_delivers(field: Field) -> None
         assert mount.errno_of(code, mount.path / "APM") == "EROFS", code
     assert mount.run("cat", mount.path / "APM/old.txt").stdout == "old\n"
     assert (card / "APM" / "old.txt").read_text() == "old\n"
-    status = json.loads(mount.run(sys.executable, "-m", "mavftpfs", "status", mount.path, "--json").stdout)
+    status = json.loads(mavftpfs("status", mount.path, "--json")[0])
     assert status["vehicle"]["armed"] is True
     assert (status["held"]["files"], status["held"]["bytes"]) == (1, taken)
     (transfer,) = status["transfers"]
     assert (transfer["path"], transfer["size"]) == ("/APM/flight.bin", taken)
     assert (transfer["direction"], transfer["state"]) == ("write", "waiting")
     assert 0 <= transfer["done"] < taken
-    assert "flight.bin" in mount.run(sys.executable, "-m", "mavftpfs", "status", mount.path).stdout
+    assert "flight.bin" in mavftpfs("status", mount.path)[0]
     wait_until("the log says so", lambda: "is armed" in mount.alive().text())
     vehicle.send_signal(signal.SIGUSR1)
     expected = BLOCK * (taken // len(BLOCK))
@@ -248,20 +248,15 @@ def test_what_a_killed_daemon_held_is_named_by_umount_and_by_the_next_mount_in_t
     mount = field.mount(vehicle.source, *QUICK)
     write_to_nobody(mount, vehicle, data)
     mount.kill()
-    argv = [sys.executable, "-m", "mavftpfs", "umount", str(mount.path)]
-    done = subprocess.run(argv, capture_output=True, text=True, timeout=60, check=False)
-    assert done.returncode == 4, done.stderr
-    assert "1 file(s) did not reach the vehicle" in done.stderr
+    _, told = mavftpfs("umount", mount.path, code=4)
+    assert "1 file(s) did not reach the vehicle" in told
     assert not mounted_at(mount.path)
     vehicle.resume()
-    argv = [sys.executable, "-m", "mavftpfs", vehicle.source, str(mount.path)]
     try:
-        done = subprocess.run(argv, capture_output=True, text=True, timeout=60, check=False)
-        assert done.returncode == 0, done.stderr
-        place = recovered(done.stderr)
+        place = recovered(mavftpfs(vehicle.source, mount.path)[1])
         assert state_home in place.parents
         assert (place / "lost.bin").read_bytes() == data.read_bytes()
-        mount.run(sys.executable, "-m", "mavftpfs", "umount", mount.path)
+        mavftpfs("umount", mount.path)
     finally:
         abort_mount(mount.path)
 
@@ -349,21 +344,18 @@ def readable(mount: Mount) -> bool:
 def test_a_put_that_does_not_arrive_is_exit_4(field: Field, data: Path) -> None:
     card = field.local("card")
     vehicle = field.sim(card, "px4", ("--armed",))
-    argv = [sys.executable, "-m", "mavftpfs", "put", vehicle.source, str(data), "/"]
-    done = subprocess.run(argv, capture_output=True, text=True, timeout=60, check=False)
-    assert (done.returncode, done.stdout) == (4, "")
-    assert len(done.stderr.splitlines()) == 1
-    assert "armed" in done.stderr
+    out, told = mavftpfs("put", vehicle.source, data, "/", code=4)
+    assert (out, len(told.splitlines())) == ("", 1)
+    assert "armed" in told
     assert list(card.iterdir()) == []
 
 
-def test_a_put_that_is_refused_leaves_nothing_behind(field: Field, data: Path) -> None:
+def test_a_put_that_is_refused_leaves_nothing_behind(
+    field: Field, data: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The file is here already: no mount has to find another copy of it."""
     vehicle = field.sim(field.local("card"), "px4-nuttx")
     state = field.local("state")
-    argv = [sys.executable, "-m", "mavftpfs", "put", vehicle.source, str(data), "/outside-its-card"]
-    environment = {**os.environ, "XDG_STATE_HOME": str(state)}
-    done = subprocess.run(argv, capture_output=True, text=True, timeout=60, check=False, env=environment)
-    assert done.returncode == 4
-    assert "protected" in done.stderr
+    monkeypatch.setenv("XDG_STATE_HOME", str(state))
+    assert "protected" in mavftpfs("put", vehicle.source, data, "/outside-its-card", code=4)[1]
     assert [path for path in state.rglob("*") if path.is_file() and path.name != "owner"] == []

@@ -19,8 +19,8 @@ from pathlib import Path
 from typing import Any
 
 from mavftpfs.control import ControlError, ask, find_socket, own_directories
-from tests.support.logs import assert_clean
-from tests.support.vehicles import Process
+from tests.support.logs import assert_clean, suspects
+from tests.support.vehicles import PROJECT, Process
 
 COMMAND_TIMEOUT = 120.0
 END_TIMEOUT = 60.0
@@ -44,6 +44,15 @@ def _holds(condition: Callable[[], bool]) -> bool:
         return condition()
     except FileNotFoundError:
         return False
+
+
+def mavftpfs(*words: object, code: int = 0, timeout: float = COMMAND_TIMEOUT) -> tuple[str, str]:
+    """Run a command that must end with `code`; return what it said on stdout and stderr."""
+    argv = [sys.executable, "-m", "mavftpfs", *map(str, words)]
+    done = subprocess.run(argv, capture_output=True, text=True, timeout=timeout, cwd=PROJECT, check=False)
+    assert done.returncode == code, f"{words}: exit {done.returncode}\n{done.stdout}{done.stderr}"
+    assert suspects(done.stderr) == []
+    return done.stdout, done.stderr
 
 
 def mounted_at(path: Path) -> bool:
