@@ -165,9 +165,32 @@ class Connection:
         names = ", ".join(f"{system}/{component}" for system, component in heard)
         return f": heard only {names}; check target_system and target_component"
 
-    def on_doubt(self) -> None:
-        """It is to be asked who answers."""
-        self._doubted.set()
+    # --- what the vehicle tells
+
+    def _on_reboot(self) -> None:
+        self.engine.forget_server()
+        self.scheduler.on_reboot()
+        self.store.forget_server()
+        self._tell("reboot")
+
+    def _on_foreign(self, payload: bytes, newcomer: bool) -> None:
+        self.engine.flow.alone = False
+        self.scheduler.on_foreign(payload, newcomer=newcomer)
+
+    def _on_armed(self, armed: bool) -> None:
+        self.scheduler.on_armed_changed()
+        self._tell("armed" if armed else "disarmed")
+
+    def _move_away(self) -> None:
+        """Somebody else uses our address: replies could not be told apart, so take the next component id."""
+        own = self.vehicle.own
+        if (
+            own.component - self.options.source_component <= 5
+        ):  # more likely our own echo than five neighbours
+            self.vehicle.own = self.driver.framer.source = Address(own.system, own.component % 249 + 1)
+
+    def _on_doubt(self) -> None:
+        self._doubted.set()  # it is to be asked who answers
 
     def _on_heartbeat(self) -> None:
         self._first_heartbeat.set()
@@ -179,6 +202,75 @@ class Connection:
     def _tell(self, news: str) -> None:
         for listener in self.news:
             listener(news)
+
+    # --- what runs as long as the connection
+
+    async def _beat(self) -> None:
+        """Each second: send a heartbeat, tell the window who else is about, tell when the vehicle is lost.
+
+        Ours are an onboard controller's: those of a GCS would feed the GCS-loss failsafe (promise 6).
+        """
+        kind, driver = self.options.heartbeat, self.driver
+        vehicle_type = MAV_TYPE_GCS if kind == "gcs" else MAV_TYPE_ONBOARD_CONTROLLER
+        while True:
+            if kind != "none":
+                driver.send(driver.framer.encode_heartbeat(vehicle_type, MAV_AUTOPILOT_INVALID))
+            self.engine.flow.alone = not self.vehicle.foreign_client(self.clock())
+            await trio.sleep(HEARTBEAT_PERIOD)
+            if not self.was_lost and self.vehicle.lost(self.clock()):
+                self.was_lost = True
+                self._tell("lost")
+
+    async def _ask_about_vehicle(self) -> None:
+        """Ask for AUTOPILOT_VERSION, STORAGE_INFORMATION and SYSTEM_TIME a few times. None is needed."""
+        vehicle, driver = self.vehicle, self.driver
+        await self._first_heartbeat.wait()
+        for attempt in range(_INFO_TRIES):
+            wanted = []
+            if vehicle.version is None:
+                wanted.append(AUTOPILOT_VERSION_ID)
+            if vehicle.storage is None:
+                wanted.append(STORAGE_INFORMATION_ID)
+            if not vehicle.tells_boot_time:
+                wanted.append(SYSTEM_TIME_ID)
+            self._ask_for(*wanted)
+            if not wanted:
+                return
+            if attempt >= _OLD_WAY_FROM and vehicle.version is None and vehicle.address is not None:
+                driver.send(driver.framer.encode_request_capabilities(vehicle.address))
+            await trio.sleep(_INFO_PERIOD)
+
+    def _ask_for(self, *message_ids: int) -> None:
+        driver, address = self.driver, self.vehicle.address
+        for message_id in message_ids:
+            if address is not None:
+                driver.send(driver.framer.encode_request_message(address, message_id))
+
+    async def _ask_who_it_is(self) -> None:
+        """Have the vehicle tell its boot time and its unique id each time it may have restarted or become
+        another one. The boot time first: nothing is asked before the id, and then a restart is known."""
+        vehicle, driver, identity = self.vehicle, self.driver, self.vehicle.identity
+        while True:
+            await self._doubted.wait()
+            self._doubted = trio.Event()
+            asked, asked_at, warned = 0, -inf, False
+            while vehicle.address is not None and _is_unsure(vehicle, asked, now := self.clock()):
+                # It may be gone again: then, and of a stranger, it has time.
+                soon = identity.heard_since(asked_at) and identity.standing is not Standing.STRANGER
+                if soon or now - asked_at >= _SELDOM:
+                    if vehicle.lacks_boot_time(now):
+                        self._ask_for(SYSTEM_TIME_ID)
+                    self._ask_for(AUTOPILOT_VERSION_ID)
+                    if asked >= _OLD_WAY_FROM:
+                        driver.send(driver.framer.encode_request_capabilities(vehicle.address))
+                    asked, asked_at = asked + 1, now
+                await trio.sleep(_IDENTITY_PERIOD)
+                if identity.standing is Standing.STRANGER and not warned:
+                    warned = True
+                    log.warning(_ANOTHER, *vehicle.address)
+                elif identity.heard_since(asked_at):
+                    identity.unanswered()
+                    driver.kick()
 
 
 @asynccontextmanager
@@ -194,12 +286,9 @@ async def connected(
     connection = _build(link, options, rng or random.SystemRandom(), clock, trace)
     failure: Exception | None = None
     async with trio.open_nursery() as nursery:
-        tasks = _Tasks(nursery)
-        tasks.start(connection.driver.pump)
-        tasks.start(lambda: _beat(connection))
-        tasks.start(lambda: _ask_about_vehicle(connection))
-        tasks.start(lambda: _ask_who_it_is(connection))
-        serving = tasks.start(connection.scheduler.serve)
+        serving = _Task(nursery, connection.scheduler.serve)
+        tasks = [serving, _Task(nursery, connection.driver.pump), _Task(nursery, connection._beat)]
+        tasks += [_Task(nursery, connection._ask_about_vehicle), _Task(nursery, connection._ask_who_it_is)]
         try:
             yield connection
         except Exception as error:  # raised again outside, so that it is not wrapped in a group
@@ -209,53 +298,33 @@ async def connected(
             with trio.CancelScope(deadline=trio.current_time() + limit, shield=True):
                 serving.scope.cancel()
                 await serving.ended.wait()
-                await _leave(connection.scheduler)
-            tasks.cancel()
-    failure = tasks.failure or failure
+                await connection.scheduler.close()
+            for task in tasks:
+                task.scope.cancel()
+    for task in tasks:
+        failure = task.failure or failure
     if failure is not None:
         raise failure
 
 
-@dataclass(slots=True)
 class _Task:
-    scope: trio.CancelScope
-    ended: trio.Event
+    """One that whoever cancels us (Ctrl-C) cannot stop: the session must be terminated first."""
 
-
-class _Tasks:
-    """Tasks that whoever cancels us (Ctrl-C) cannot stop: the session must be terminated first."""
-
-    def __init__(self, nursery: trio.Nursery) -> None:
+    def __init__(self, nursery: trio.Nursery, function: Callable[[], Awaitable[None]]) -> None:
+        self.scope = trio.CancelScope(shield=True)
+        self.ended = trio.Event()
         self.failure: MavftpfsError | None = None
-        self._nursery = nursery
-        self._tasks: list[_Task] = []
+        nursery.start_soon(self._run, nursery, function)
 
-    def start(self, function: Callable[[], Awaitable[None]]) -> _Task:
-        task = _Task(trio.CancelScope(shield=True), trio.Event())
-        self._tasks.append(task)
-        self._nursery.start_soon(self._run, task, function)
-        return task
-
-    def cancel(self) -> None:
-        for task in self._tasks:
-            task.scope.cancel()
-
-    async def _run(self, task: _Task, function: Callable[[], Awaitable[None]]) -> None:
+    async def _run(self, nursery: trio.Nursery, function: Callable[[], Awaitable[None]]) -> None:
         try:
-            with task.scope:
+            with self.scope:
                 await function()
         except MavftpfsError as error:
             self.failure = error
-            self._nursery.cancel_scope.cancel()
+            nursery.cancel_scope.cancel()
         finally:
-            task.ended.set()
-
-
-async def _leave(scheduler: Scheduler) -> None:
-    try:
-        await scheduler.close()
-    except MavftpfsError:
-        return  # best effort: a server forgets a session by itself, sooner or later
+            self.ended.set()
 
 
 def _build(
@@ -285,114 +354,18 @@ def _build(
     store = Store(scheduler, driver, vehicle, clock=clock, op_deadline=options.op_deadline)
     connection = Connection(store, vehicle, scheduler, engine, driver, link, options, clock)
 
-    def on_reboot() -> None:
-        engine.forget_server()
-        scheduler.on_reboot()
-        store.forget_server()
-        connection._tell("reboot")
-
-    vehicle.on_reboot = on_reboot
-
-    def on_foreign(payload: bytes, newcomer: bool) -> None:
-        flow.alone = False
-        scheduler.on_foreign(payload, newcomer=newcomer)
-
-    vehicle.on_foreign = on_foreign
+    vehicle.on_reboot = connection._on_reboot
+    vehicle.on_foreign = connection._on_foreign
     vehicle.on_heartbeat = connection._on_heartbeat
-    vehicle.identity.on_doubt = connection.on_doubt
-    vehicle.on_double = lambda: _move_away(connection)
-
-    def on_armed(armed: bool) -> None:
-        scheduler.on_armed_changed()
-        connection._tell("armed" if armed else "disarmed")
-
-    vehicle.on_armed = on_armed
+    vehicle.on_armed = connection._on_armed
+    vehicle.on_double = connection._move_away
+    vehicle.identity.on_doubt = connection._on_doubt
     return connection
 
 
 def signing_now() -> int:
     """Return the present as MAVLink 2 signing counts it: units of 10 µs since 2015-01-01 UTC."""
     return int((time.time() - SIGNING_EPOCH) * 100_000)
-
-
-def _move_away(connection: Connection) -> None:
-    """Somebody else uses our address: replies could not be told apart, so take the next component id."""
-    vehicle = connection.vehicle
-    if vehicle.own.component - connection.options.source_component > 5:
-        return  # more likely our own echo than five neighbours
-    component = vehicle.own.component % 249 + 1
-    vehicle.own = connection.driver.framer.source = Address(vehicle.own.system, component)
-
-
-async def _beat(connection: Connection) -> None:
-    """Each second: send a heartbeat, tell the window who else is about, and tell when the vehicle is lost.
-
-    Ours are an onboard controller's: those of a GCS would feed the GCS-loss failsafe (promise 6).
-    """
-    kind, driver = connection.options.heartbeat, connection.driver
-    vehicle_type = MAV_TYPE_GCS if kind == "gcs" else MAV_TYPE_ONBOARD_CONTROLLER
-    while True:
-        if kind != "none":
-            driver.send(driver.framer.encode_heartbeat(vehicle_type, MAV_AUTOPILOT_INVALID))
-        connection.engine.flow.alone = not connection.vehicle.foreign_client(connection.clock())
-        await trio.sleep(HEARTBEAT_PERIOD)
-        if not connection.was_lost and connection.vehicle.lost(connection.clock()):
-            connection.was_lost = True
-            connection._tell("lost")
-
-
-async def _ask_about_vehicle(connection: Connection) -> None:
-    """Ask for AUTOPILOT_VERSION, STORAGE_INFORMATION and SYSTEM_TIME a few times; none is needed to work."""
-    vehicle, driver = connection.vehicle, connection.driver
-    await connection._first_heartbeat.wait()
-    for attempt in range(_INFO_TRIES):
-        wanted = []
-        if vehicle.version is None:
-            wanted.append(AUTOPILOT_VERSION_ID)
-        if vehicle.storage is None:
-            wanted.append(STORAGE_INFORMATION_ID)
-        if not vehicle.tells_boot_time:
-            wanted.append(SYSTEM_TIME_ID)
-        _ask_for(connection, *wanted)
-        if not wanted:
-            return
-        if attempt >= _OLD_WAY_FROM and vehicle.version is None and vehicle.address is not None:
-            driver.send(driver.framer.encode_request_capabilities(vehicle.address))
-        await trio.sleep(_INFO_PERIOD)
-
-
-def _ask_for(connection: Connection, *message_ids: int) -> None:
-    driver, address = connection.driver, connection.vehicle.address
-    for message_id in message_ids:
-        if address is not None:
-            driver.send(driver.framer.encode_request_message(address, message_id))
-
-
-async def _ask_who_it_is(connection: Connection) -> None:
-    """Have the vehicle tell its boot time and its unique id each time it may have restarted or become another
-    one. The boot time first: nothing is asked before the id, and then a restart is known."""
-    vehicle, driver, identity = connection.vehicle, connection.driver, connection.vehicle.identity
-    while True:
-        await connection._doubted.wait()
-        connection._doubted = trio.Event()
-        asked, asked_at, warned = 0, -inf, False
-        while vehicle.address is not None and _is_unsure(vehicle, asked, now := connection.clock()):
-            # It may be gone again: then, and of a stranger, it has time.
-            soon = identity.heard_since(asked_at) and identity.standing is not Standing.STRANGER
-            if soon or now - asked_at >= _SELDOM:
-                if vehicle.lacks_boot_time(now):
-                    _ask_for(connection, SYSTEM_TIME_ID)
-                _ask_for(connection, AUTOPILOT_VERSION_ID)
-                if asked >= _OLD_WAY_FROM:
-                    driver.send(driver.framer.encode_request_capabilities(vehicle.address))
-                asked, asked_at = asked + 1, now
-            await trio.sleep(_IDENTITY_PERIOD)
-            if identity.standing is Standing.STRANGER and not warned:
-                warned = True
-                log.warning(_ANOTHER, *vehicle.address)
-            elif identity.heard_since(asked_at):
-                identity.unanswered()
-                driver.kick()
 
 
 def _is_unsure(vehicle: Vehicle, asked: int, now: float) -> bool:

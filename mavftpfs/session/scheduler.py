@@ -284,6 +284,7 @@ class Scheduler:
             job.finished.set()
 
     async def close(self) -> None:
-        """Terminate the session, best effort; the caller bounds the wait and cancels `serve` first."""
+        """Terminate the session, best effort: a server forgets it by itself, sooner or later. The caller
+        bounds the wait and cancels `serve` first."""
         await self.server.close_quietly()
         await self.server.close_maybe_open()
