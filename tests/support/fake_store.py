@@ -68,7 +68,6 @@ class FakeStore:
         self.directories: set[bytes] = {ROOT}
         self.unlisted: set[bytes] = set()
         self.dot: dict[bytes, FakeFile] | None = None
-        self.incomplete: set[bytes] = set()
         self.calls: list[tuple[str, bytes]] = []
         self.crimes: list[str] = []
         self.readers: list[FakeReader] = []
@@ -76,7 +75,6 @@ class FakeStore:
         self.list_delay = 0.0
         self.open_delay = 0.0
         self.whole_delay = 0.0
-        self.crc_delay = 0.0
         self.crc_sizes: list[int | None] = []
         self.chunk = 4096
         self.chunk_delay = 0.001
@@ -84,7 +82,6 @@ class FakeStore:
         self.fail_chunks: list[Exception] = []
         self.spoil: Callable[[bytes, int, bytes], bytes] | None = None
         self.suspect_chunks = 0
-        self.stalled = False
         self.lost = False
         self.armed = False
         self.during_list: Callable[[bytes], None] | None = None
@@ -132,7 +129,7 @@ class FakeStore:
         if self.during_list is not None:
             self.during_list(path)
         await trio.sleep(self.list_delay)
-        return Listing(entries, self.list_delay, path not in self.incomplete)
+        return Listing(entries, self.list_delay)
 
     async def open_reader(
         self, path: bytes, sink: ReadSink, *, expected_size: int | None = None
@@ -165,7 +162,6 @@ class FakeStore:
         self.crc_sizes.append(size)
         if self.armed:
             raise Armed("flying")
-        await trio.sleep(self.crc_delay)
         return crc32(self.files[path].data)
 
     # --- inside
@@ -240,9 +236,6 @@ class FakeReader:
     async def _serve(self) -> None:
         try:
             while not self.closed:
-                if self.store.stalled:
-                    await trio.sleep(0.5)
-                    continue
                 start, stop = self._next()
                 if start == stop:
                     break
