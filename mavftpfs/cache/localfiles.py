@@ -23,7 +23,7 @@ from mavftpfs.shared.errors import (
     NotADirectory,
     NotFound,
 )
-from mavftpfs.shared.model import EntryKind, split
+from mavftpfs.shared.model import EntryKind, join, split
 
 MAX_ENTRIES = 10_000
 
@@ -92,6 +92,16 @@ class LocalFiles:
         """Return the local names in a directory, which may be the vehicle's."""
         return [name for parent, name in map(split, self._entries) if parent == directory]
 
+    def list(self, path: bytes) -> list[tuple[bytes, Stat]]:
+        """Return the entries of a local directory.
+
+        Raises:
+            NotFound, NotADirectory.
+        """
+        if self.find(path).data is not None:
+            raise NotADirectory(f"{path!r} is not a directory")
+        return [(name, self.stat(join(path, name))) for name in self.names(path)]
+
     def open(self, path: bytes, *, write: bool, truncate: bool = False) -> LocalHandle:
         """Open a file.
 
@@ -104,6 +114,17 @@ class LocalFiles:
         if truncate:
             self.resize(entry, 0)
         return LocalHandle(self, entry, writable=write)
+
+    def truncate(self, path: bytes, size: int) -> None:
+        """Cut a file or extend it with zeros.
+
+        Raises:
+            NotFound, IsADirectory, NoSpace.
+        """
+        entry = self.find(path)
+        if entry.data is None:
+            raise IsADirectory(f"{path!r} is a directory")
+        self.resize(entry, size)
 
     def create(self, path: bytes, *, exclusive: bool) -> LocalHandle:
         """Make a file, or open the one that is there; the directory it is put in was checked.
@@ -152,13 +173,15 @@ class LocalFiles:
             raise DirectoryNotEmpty(f"{path!r} is not empty")
         del self._entries[path]
 
-    def rename(self, old: bytes, new: bytes) -> None:
+    def rename(self, old: bytes, new: bytes, *, noreplace: bool) -> None:
         """Rename within the local names, over a file or an empty directory of the same kind.
 
         Raises:
-            NotFound, IsADirectory, NotADirectory, DirectoryNotEmpty.
+            NotFound, AlreadyExists (noreplace), IsADirectory, NotADirectory, DirectoryNotEmpty.
         """
         entry, target = self.find(old), self._entries.get(new)
+        if noreplace and target is not None:
+            raise AlreadyExists(f"{new!r} exists")
         if target is entry:
             return
         if target is not None:
@@ -172,14 +195,6 @@ class LocalFiles:
         """The directory `old` is called `new` now, whosever it is."""
         for path in [p for p in self._entries if p == old or p.startswith(old + b"/")]:
             self._entries[new + path[len(old) :]] = self._entries.pop(path)
-
-    def set_times(self, path: bytes, mtime_ns: int) -> None:
-        """Set the mtime.
-
-        Raises:
-            NotFound.
-        """
-        self.find(path).mtime_ns = mtime_ns
 
     def resize(self, entry: LocalEntry, size: int) -> None:
         """Cut a file or extend it with zeros.

@@ -30,7 +30,6 @@ from mavftpfs.cache.versions import Version
 from mavftpfs.shared.errors import (
     AlreadyExists,
     CrossDevice,
-    DirectoryNotEmpty,
     FileBusy,
     FtpNak,
     InvalidMove,
@@ -43,7 +42,7 @@ from mavftpfs.shared.errors import (
     PathTooLong,
     SpoolFailed,
 )
-from mavftpfs.shared.model import DirEntry, EntryKind, require_listable, split, wire_path
+from mavftpfs.shared.model import DirEntry, EntryKind, require_listable, wire_path
 
 log = logging.getLogger("mavftpfs.cache")
 
@@ -52,21 +51,16 @@ PIECE = 64 * 1024
 
 
 class Namespace:
-    """Changes of names. Paths are the vehicle's, not below `@`; those that match `local=` stay here."""
+    """Changes of names. Paths are the vehicle's, not local, not below `@`."""
 
     def __init__(self, context: Context, names: Names, deliverer: Deliverer, overlay: Overlay) -> None:
         self._context = context
         self._names = names
         self._deliverer = deliverer
         self._overlay = overlay
-        self._local = overlay.local
 
     async def mkdir(self, path: bytes) -> None:
         """See Tree.mkdir."""
-        if self._local.owns(path):
-            await self.require_local_parent(path)
-            self._local.mkdir(path)
-            return
         self._context.require_disarmed()
         require_not_ours(path)
         require_listable(path)
@@ -78,12 +72,7 @@ class Namespace:
 
     async def rmdir(self, path: bytes) -> None:
         """See Tree.rmdir."""
-        if self._local.owns(path):
-            self._local.rmdir(path)
-            return
         self._context.require_disarmed()
-        if self._local.names(path):
-            raise DirectoryNotEmpty(f"{path!r} holds local files")
         async with self._context.paths.hold(path):
             entry = await self._names.need(path)
             if entry.kind is not EntryKind.DIRECTORY:
@@ -94,9 +83,6 @@ class Namespace:
 
     async def unlink(self, path: bytes) -> None:
         """See Tree.unlink."""
-        if self._local.owns(path):
-            self._local.unlink(path)
-            return
         self._context.require_disarmed()
         require_not_ours(path)
         node = self._context.nodes.get(path)
@@ -111,15 +97,6 @@ class Namespace:
 
     async def rename(self, old: bytes, new: bytes, *, noreplace: bool) -> None:
         """See Tree.rename."""
-        local = self._local.owns(old)
-        if local != self._local.owns(new):
-            raise CrossDevice(f"one of {old!r} and {new!r} is not on the vehicle")
-        if local:
-            await self.require_local_parent(new)
-            if noreplace and split(new)[1] in self._local.names(split(new)[0]):
-                raise AlreadyExists(f"{new!r} exists")
-            self._local.rename(old, new)
-            return
         self._context.require_disarmed()
         require_not_ours(old)
         require_not_ours(new)
@@ -132,18 +109,6 @@ class Namespace:
         with nullcontext() if displaced is None else displaced.doom():
             async with self._context.paths.hold(old, new):
                 await self._rename(old, new, noreplace=noreplace)
-
-    async def require_local_parent(self, path: bytes) -> None:
-        """Check that the directory of a local path exists, here or on the vehicle.
-
-        Raises:
-            NotFound, NotADirectory; else as RemoteStore.list_directory.
-        """
-        parent = split(path)[0]
-        if not self._local.owns(parent):
-            await self._context.directories.get(parent)
-        elif self._local.find(parent).kind is not EntryKind.DIRECTORY:
-            raise NotADirectory(f"{parent!r} is not a directory")
 
     async def release(self, node: Node) -> None:
         """Nobody has an unlinked file open any more: remove what was hidden of it.
@@ -239,7 +204,6 @@ class Namespace:
         context.nodes.rename(old, new)
         context.own.follow_rename(old, new)
         self._overlay.times.rename(old, new)
-        self._local.move_below(old, new)
 
     async def _rename_checked(self, old: bytes, new: bytes, listed: DirEntry | None) -> None:
         """Rename; `listed`: what the vehicle has at `new`, which may be replaced."""

@@ -7,39 +7,33 @@ from collections.abc import Mapping
 from mavftpfs.cache.attributes import SECOND, Stat, Times, shown, shown_mtime
 from mavftpfs.cache.context import Context
 from mavftpfs.cache.draft import Draft, State
-from mavftpfs.cache.localfiles import LocalFiles
 from mavftpfs.cache.nodes import Node
 from mavftpfs.cache.reserved import is_reserved
 from mavftpfs.shared.errors import (
-    NotADirectory,
     NotFound,
 )
-from mavftpfs.shared.model import EntryKind, join, split
+from mavftpfs.shared.model import EntryKind, split
 
 
 class Overlay:
     """Lies over the vehicle's listings. Paths are the vehicle's.
 
     Attributes:
-        local: names that never reach the vehicle. times: mtimes that it cannot be told.
+        times: mtimes that the vehicle cannot be told.
     """
 
     def __init__(self, context: Context) -> None:
         self._context = context
-        options = context.options
         self.times = Times()
-        self.local = LocalFiles(options.local, options.local_max, lambda: int(context.wall() * SECOND))
 
     def stat(self, path: bytes) -> Stat | None:
         """Return what is known better here than by any listing, None if the listing decides.
 
         Raises:
-            NotFound: a local or reserved name that is not there.
+            NotFound: a reserved name.
         """
         if is_reserved(split(path)[1]):
             raise NotFound(f"{path!r} is a name of our own")
-        if self.local.owns(path):
-            return self.local.stat(path)
         node = self._context.nodes.get(path)
         if node is None or node.draft is None:
             return None
@@ -61,7 +55,6 @@ class Overlay:
         """Return a listing with our own names hidden, and with what the vehicle does not have yet."""
         entries = {name: stat for name, stat in listed.items() if not is_reserved(name)}
         paths = [node.path for node in self._context.nodes if node.draft is not None]
-        paths += [join(directory, name) for name in self.local.names(directory)]
         for path in paths:
             parent, name = split(path)
             stat = self.stat(path) if parent == directory else None
@@ -69,28 +62,9 @@ class Overlay:
                 entries[name] = stat
         return entries
 
-    def list_local(self, path: bytes) -> dict[bytes, Stat] | None:
-        """Return the entries of a local directory, None for one of the vehicle.
-
-        Raises:
-            NotFound, NotADirectory.
-        """
-        if not self.local.owns(path):
-            return None
-        if self.local.find(path).kind is not EntryKind.DIRECTORY:
-            raise NotADirectory(f"{path!r} is not a directory")
-        return self.overlay(path, {})
-
     def on_written(self, path: bytes) -> None:
         """A file's content changed: it is of now, also where no listing tells times."""
         self.times.set(path, int(self._context.wall() * SECOND))
-
-    def set_times(self, path: bytes, mtime_ns: int) -> None:
-        """Show this mtime until the file changes; of a local file keep it."""
-        if self.local.owns(path):
-            self.local.set_times(path, mtime_ns)
-        else:
-            self.times.set(path, mtime_ns)
 
     # --- inside
 

@@ -1,8 +1,9 @@
 """The remote tree as the FUSE layer sees it. Layer: cache.
 
-`Tree` decides who answers: remembered listings (`directories`), blocks of regular files (`files`) or
-snapshots of `@` files (`virtual`), and translates paths: callers name them below the mount's root, the
-modules behind it name them as the vehicle does.
+`Tree` decides who answers: remembered listings (`directories`), blocks of regular files (`files`), what is
+written here (`writeback`), snapshots of `@` files (`virtual`) or names that never reach the vehicle
+(`localfiles`). It translates paths: callers name them below the mount's root, the modules behind it name them
+as the vehicle does.
 """
 
 from __future__ import annotations
@@ -14,11 +15,12 @@ from random import Random
 
 import trio
 
-from mavftpfs.cache.attributes import UNKNOWN_MTIME, Stat, shown_mtime
+from mavftpfs.cache.attributes import SECOND, UNKNOWN_MTIME, Stat, shown_mtime
 from mavftpfs.cache.dentries import Dentries
 from mavftpfs.cache.directories import Directories, Found
 from mavftpfs.cache.files import Files
 from mavftpfs.cache.kept import KeptCache
+from mavftpfs.cache.localfiles import LocalFiles
 from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.options import CacheOptions
 from mavftpfs.cache.recovery import SpoolDirectory
@@ -26,7 +28,16 @@ from mavftpfs.cache.remote import RemoteStore, WriteStore
 from mavftpfs.cache.versions import BlockCache
 from mavftpfs.cache.virtual import VirtualTrees
 from mavftpfs.cache.writeback import Writeback, make_writeback
-from mavftpfs.shared.errors import FtpNak, IsADirectory, ListingIncomplete, NotDeliveredYet, ReadOnly
+from mavftpfs.shared.errors import (
+    CrossDevice,
+    DirectoryNotEmpty,
+    FtpNak,
+    IsADirectory,
+    ListingIncomplete,
+    NotADirectory,
+    NotDeliveredYet,
+    ReadOnly,
+)
 from mavftpfs.shared.model import ROOT, DirEntry, EntryKind, is_snapshot, is_virtual, join, normalise, split
 
 __all__ = ["OpenFile", "Stat", "Tree"]
@@ -89,6 +100,9 @@ class Tree:
             invalidate=self._invalidate,
             nursery=nursery,
         )
+        self._local = LocalFiles(
+            options.local if writer is not None else (), options.local_max, lambda: int(wall() * SECOND)
+        )
         self._checksums: dict[bytes, tuple[DirEntry | None, int | None, int]] = {}
         self._writing: Writeback | None = None
         if writer is not None:
@@ -120,6 +134,8 @@ class Tree:
             return Stat(EntryKind.DIRECTORY, 0, UNKNOWN_MTIME, self._options.attr_timeout)
         if is_snapshot(remote):
             return await self._virtual.stat(remote)
+        if self._local.owns(remote):
+            return self._local.stat(remote)
         if self._writing is not None:
             ours = self._writing.overlay.stat(remote)
             if ours is not None:
@@ -156,9 +172,8 @@ class Tree:
         remote = self._remote(path)
         if is_snapshot(remote):
             return await self._virtual.list(remote)
-        ours = None if self._writing is None else self._writing.overlay.list_local(remote)
-        if ours is not None:
-            return list(ours.items())
+        if self._local.owns(remote):
+            return self._local.list(remote)
         directory = await self._directories.get(remote)
         founds = {name: Found(entry, directory) for name, entry in directory.entries.items()}
         if remote == ROOT:
@@ -167,6 +182,8 @@ class Tree:
         shown = {name: self._listed_stat(join(remote, name), found) for name, found in founds.items()}
         if self._writing is not None:
             shown = self._writing.overlay.overlay(remote, shown)
+        for name in self._local.names(remote):
+            shown[name] = self._local.stat(join(remote, name))
         if directory.cut_short:
             raise ListingIncomplete(f"{remote!r} was not listed to its end", list(shown.items()))
         return list(shown.items())
@@ -179,15 +196,16 @@ class Tree:
             and read_whole.
         """
         remote = self._remote(path)
-        if write or truncate:
-            return await self._writable(remote).open(remote, truncate=truncate)
+        writing = self._writable(remote) if write or truncate else self._writing
         if is_snapshot(remote):
             return await self._virtual.open(remote)
+        if self._local.owns(remote):
+            return self._local.open(remote, write=write or truncate, truncate=truncate)
+        if writing is not None and (write or truncate):
+            return await writing.open(remote, truncate=truncate)
         if remote == self._options.root:
             raise IsADirectory("the mount's root is a directory")
-        return await (
-            self._files.open(remote) if self._writing is None else self._writing.open_reader(remote)
-        )
+        return await (self._files.open(remote) if writing is None else writing.open_reader(remote))
 
     async def crc32(self, path: bytes) -> int:
         """Return the vehicle's CRC32 of a file (start value 0, no final xor), as old as the listing at most.
@@ -226,7 +244,11 @@ class Tree:
                 PathTooLong.
         """
         remote = self._remote(path)
-        return await self._writable(remote).create(remote, exclusive=exclusive)
+        writing = self._writable(remote)
+        if self._local.owns(remote):
+            await self._require_parent(remote)
+            return self._local.create(remote, exclusive=exclusive)
+        return await writing.create(remote, exclusive=exclusive)
 
     async def truncate(self, path: bytes, size: int) -> None:
         """Cut or extend a file; done on the vehicle, unless somebody has it open for writing.
@@ -235,7 +257,11 @@ class Tree:
             NotFound, IsADirectory, Armed, FileBusy, FileTooLarge, NotSupported.
         """
         remote = self._remote(path)
-        await self._writable(remote).truncate(remote, size)
+        writing = self._writable(remote)
+        if self._local.owns(remote):
+            self._local.truncate(remote, size)
+        else:
+            await writing.truncate(remote, size)
 
     async def set_times(self, path: bytes, mtime_ns: int) -> None:
         """Show this mtime (nanoseconds since 1970 UTC) until the file changes; no server can keep it.
@@ -245,7 +271,11 @@ class Tree:
         """
         remote = self._remote(path)
         await self.stat(path)
-        self._writable(remote).overlay.set_times(remote, mtime_ns)
+        writing = self._writable(remote)
+        if self._local.owns(remote):
+            self._local.find(remote).mtime_ns = mtime_ns
+        else:
+            writing.overlay.times.set(remote, mtime_ns)
 
     async def mkdir(self, path: bytes) -> None:
         """Make a directory.
@@ -254,7 +284,12 @@ class Tree:
             AlreadyExists, NotFound, NotADirectory, Armed, PathTooLong.
         """
         remote = self._remote(path)
-        await self._writable(remote).names.mkdir(remote)
+        writing = self._writable(remote)
+        if self._local.owns(remote):
+            await self._require_parent(remote)
+            self._local.mkdir(remote)
+        else:
+            await writing.names.mkdir(remote)
 
     async def rmdir(self, path: bytes) -> None:
         """Remove an empty directory.
@@ -263,7 +298,13 @@ class Tree:
             NotFound, NotADirectory, DirectoryNotEmpty, Armed.
         """
         remote = self._remote(path)
-        await self._writable(remote).names.rmdir(remote)
+        writing = self._writable(remote)
+        if self._local.owns(remote):
+            self._local.rmdir(remote)
+        elif self._local.names(remote):
+            raise DirectoryNotEmpty(f"{remote!r} holds local files")
+        else:
+            await writing.names.rmdir(remote)
 
     async def unlink(self, path: bytes) -> None:
         """Remove a file; who has it open goes on reading it.
@@ -272,7 +313,11 @@ class Tree:
             NotFound, IsADirectory, Armed, FileBusy.
         """
         remote = self._remote(path)
-        await self._writable(remote).names.unlink(remote)
+        writing = self._writable(remote)
+        if self._local.owns(remote):
+            self._local.unlink(remote)
+        else:
+            await writing.names.unlink(remote)
 
     async def rename(self, old: bytes, new: bytes, *, noreplace: bool = False) -> None:
         """Rename a file or directory, over what is there if the rules of rename(2) allow it.
@@ -283,7 +328,15 @@ class Tree:
         """
         source, target = self._remote(old), self._remote(new)
         self._writable(source)
-        await self._writable(target).names.rename(source, target, noreplace=noreplace)
+        writing = self._writable(target)
+        if self._local.owns(source) != self._local.owns(target):
+            raise CrossDevice(f"one of {source!r} and {target!r} is not on the vehicle")
+        if self._local.owns(source):
+            await self._require_parent(target)
+            self._local.rename(source, target, noreplace=noreplace)
+        else:
+            await writing.names.rename(source, target, noreplace=noreplace)
+            self._local.move_below(source, target)
 
     def undelivered(self) -> Sequence[bytes]:
         """Return the paths of files of which the vehicle does not provably have every byte."""
@@ -331,6 +384,7 @@ class Tree:
         return {
             **({} if self._writing is None else self._writing.status()),
             **files.status(),
+            "bytes_local": self._local.used,
             "bytes_cached": blocks.bytes_cached + self._virtual.bytes_cached,
             "rate": blocks.meter.rate,
             "listings_cached": len(self._dentries),
@@ -365,6 +419,12 @@ class Tree:
     def _below(self, remote: bytes) -> bytes:
         """Return the mount's name for a path of the vehicle."""
         return remote if self._options.root == ROOT else remote[len(self._options.root) :] or ROOT
+
+    async def _require_parent(self, remote: bytes) -> None:
+        """Raise NotFound or NotADirectory unless the directory of a local path exists, here or there."""
+        parent = split(remote)[0]
+        if (await self.stat(self._below(parent))).kind is not EntryKind.DIRECTORY:
+            raise NotADirectory(f"{parent!r} is not a directory")
 
     def _writable(self, remote: bytes) -> Writeback:
         if self._writing is None or is_virtual(remote):

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from contextlib import closing
 from functools import partial
 from pathlib import Path
 from random import Random
@@ -120,7 +119,6 @@ class Writeback:
         self._background = Background(context, self._deliverer, throttle, cleaner)
         self.overlay = Overlay(context)
         self.names = Namespace(context, names, self._deliverer, self.overlay)
-        self._local = self.overlay.local
         self._parts = Parts(context, self._deliverer, throttle, self._background, self.overlay, self.names)
 
     # --- opening
@@ -129,8 +127,6 @@ class Writeback:
         """Open a file for reading."""
         if is_reserved(split(path)[1]):
             raise NotFound(f"{path!r} is a name of our own")
-        if self._local.owns(path):
-            return self._local.open(path, write=False)
         async with self._context.paths.hold(path, shared=True):
             node, handle = self._context.nodes.get(path), None
             if node is None or node.draft is None:
@@ -139,8 +135,6 @@ class Writeback:
 
     async def open(self, path: bytes, *, truncate: bool) -> OpenFile:
         """Open a file for writing."""
-        if self._local.owns(path):
-            return self._local.open(path, write=True, truncate=truncate)
         self._context.require_disarmed()
         async with self._context.paths.hold(path, shared=True):
             file = WriteFile(self._parts, await self._need_draft(path, truncate=truncate))
@@ -154,9 +148,6 @@ class Writeback:
 
     async def create(self, path: bytes, *, exclusive: bool) -> OpenFile:
         """Make a file, or open the one that is there."""
-        if self._local.owns(path):
-            await self.names.require_local_parent(path)
-            return self._local.create(path, exclusive=exclusive)
         self._context.require_disarmed()
         require_not_ours(path)
         require_listable(path)
@@ -215,10 +206,6 @@ class Writeback:
 
     async def truncate(self, path: bytes, size: int) -> None:
         """See Tree.truncate."""
-        if self._local.owns(path):
-            with closing(self._local.open(path, write=True)) as local:
-                await local.truncate(size)
-            return
         self._context.require_disarmed()
         async with self._context.paths.hold(path, shared=True):
             node = await self._need_draft(path, truncate=size == 0)
@@ -298,7 +285,6 @@ class Writeback:
         return {
             "bytes_held": self._context.spool.in_memory + self._context.spool.on_disk,
             "bytes_held_on_disk": self._context.spool.on_disk,
-            "bytes_local": self._local.used,
             "dirty_max": self._throttle.limit,
             "write_rate": self._throttle.meter.rate,
             "files_undelivered": len(self.undelivered()),
