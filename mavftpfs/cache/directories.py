@@ -61,9 +61,9 @@ class Directories:
         self, store: RemoteStore, dentries: Dentries, root: bytes, *, nursery: trio.Nursery | None = None
     ) -> None:
         self._store = store
-        self._dentries = dentries
+        self.dentries = dentries
         self._root = root
-        self._clock = dentries.clock
+        self.clock = dentries.clock
         self._sweeping: SingleFlight[bytes, Directory] = SingleFlight(nursery)
         self._root_proven = root == ROOT
         self._dot_refused = False
@@ -94,7 +94,7 @@ class Directories:
                 if errno_for(nak) != errno.ENOENT:
                     raise
             else:
-                self._dentries.learn_found(path, entry)
+                self.dentries.learn_found(path, entry)
         if entry is None:
             raise NotFound(f"{path!r} does not exist")
         return Found(entry, directory)
@@ -105,8 +105,8 @@ class Directories:
         Raises:
             NotFound, NotADirectory; else as RemoteStore.list_directory.
         """
-        directory = self._dentries.known(path)
-        if directory is not None and self._clock() < directory.fresh_until:
+        directory = self.dentries.known(path)
+        if directory is not None and self.clock() < directory.fresh_until:
             return directory
         try:
             if self.lost and directory is not None:
@@ -130,8 +130,8 @@ class Directories:
         Raises:
             As get; VehicleLost instead of an old listing.
         """
-        asked = self._clock()
-        self._dentries.expire(path)
+        asked = self.clock()
+        self.dentries.expire(path)
         for _ in range(SWEEP_TRIES):
             directory = await self.get(path)
             if directory.listed_at >= asked:
@@ -146,7 +146,7 @@ class Directories:
         Raises:
             As ask.
         """
-        known = self._dentries.fresh(path)
+        known = self.dentries.fresh(path)
         if known is not None and known.listed_at >= (began or 0.0) and known.ended_at >= (ended or 0.0):
             return known
         return await self.ask(path)
@@ -165,7 +165,7 @@ class Directories:
         """
         path = ROOT
         for part in () if self._root_proven else self._root.split(b"/")[1:]:
-            directory = self._dentries.fresh(path)
+            directory = self.dentries.fresh(path)
             if directory is None:
                 directory = await self._sweeping.run(path, partial(self._sweep, path))
             entry = directory.entries.get(part)
@@ -178,24 +178,24 @@ class Directories:
         """List until no change of ours came between, or SWEEP_TRIES times."""
         tries = 0
         while True:
-            sweep = self._dentries.begin(path)
+            sweep = self.dentries.begin(path)
             self.sweeps += 1
             tries += 1
             try:
                 listing = await self._list(path)
             except FtpNak:  # perhaps it is gone, so the parent is asked again
-                self._dentries.forget(path)
+                self.dentries.forget(path)
                 if path != ROOT:
-                    self._dentries.expire(split(path)[0])
+                    self.dentries.expire(split(path)[0])
                 raise
             finally:
-                self._dentries.end(sweep)
+                self.dentries.end(sweep)
             directory = self._remember(path, sweep, listing)
             if not sweep.changes or tries == SWEEP_TRIES:
                 return directory
 
     def _remember(self, path: bytes, sweep: Sweep, listing: Listing) -> Directory:
-        known = self._dentries.known(path)
+        known = self.dentries.known(path)
         if not (listing.complete or (known is not None and known.cut_short)):
             log.warning(
                 "%r was not listed to its end: %d names of it are known, and reading it is an error",
@@ -204,7 +204,7 @@ class Directories:
             )
         for entry in listing.entries:
             self.tells_times |= entry.mtime is not None
-        directory = self._dentries.remember(sweep, listing)
+        directory = self.dentries.remember(sweep, listing)
         if not sweep.void:
             for hear in self.on_listed:
                 hear(path, directory)

@@ -27,7 +27,7 @@ from itertools import islice
 
 import trio
 
-from mavftpfs.cache.dentries import COST_FACTOR, Dentries, Directory
+from mavftpfs.cache.dentries import COST_FACTOR, Directory
 from mavftpfs.cache.directories import Directories, Found
 from mavftpfs.cache.kept import KeptCache
 from mavftpfs.cache.openfile import OpenFile
@@ -84,7 +84,6 @@ class Files:
         cache: BlockCache,
         *,
         proof_time: float,
-        dentries: Dentries,
         directories: Directories,
         invalidate: Callable[[bytes], None],
     ) -> None:
@@ -96,7 +95,6 @@ class Files:
         self._clock = cache.clock
         self._proof_time = proof_time
         self._restarted_at = NEVER
-        self._dentries = dentries
         self._directories = directories
         self._invalidate = invalidate
         self.paths = PathLocks(cache.patience)
@@ -200,7 +198,7 @@ class Files:
             self.kill(old)
         self._replace(version)
         if entry.size != reader.size:  # what the kernel was told is wrong
-            self._dentries.learn_size(path, reader.size)
+            self._directories.dentries.learn_size(path, reader.size)
             self._invalidate(path)
         return version
 

@@ -2,7 +2,8 @@
 
 Editors and file managers put such files beside the ones they work on, by names that the `local=` patterns
 know. They live in memory, bounded, and are seen by this mount only. What lies below a directory of such a
-name is local as well.
+name is local as well. Between them and those on the vehicle nothing is renamed: they are two places, so
+programs hear EXDEV and copy.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""mkdir, rmdir, unlink and rename, here or on the vehicle, as rename(2) and its kin have it. Layer: cache.
+"""mkdir, rmdir, unlink and rename on the vehicle, as rename(2) and its kin have it. Layer: cache.
 
 Servers check little: some remove files by rmdir, or move into directories by rename (servers.md 9). So types
 and targets are looked up in listings first. Whoever changes a name holds its path alone (`pathlocks`); what a
@@ -7,9 +7,6 @@ draft has undelivered is delivered before its path changes.
 Who has a file open that loses its name reads on. What is known here whole is held here. Else the file is kept
 on the vehicle under a reserved name until its last handle is closed. Where it cannot have one (LittleFS), the
 change of the name is refused (EBUSY).
-
-Between local names and those on the vehicle nothing is renamed: they are two places, so programs hear EXDEV
-and copy.
 """
 
 from __future__ import annotations

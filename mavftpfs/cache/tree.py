@@ -86,19 +86,13 @@ class Tree:
             store,
             self._blocks,
             proof_time=options.proof_time,
-            dentries=self._dentries,
             directories=self._directories,
             invalidate=self._invalidate,
         )
         self._directories.ask_size = self._files.learn_size
         self._files.kept = None if keep is None else keep(self._dentries)
         self._virtual = VirtualTrees(
-            store,
-            self._directories,
-            options,
-            clock=clock,
-            invalidate=self._invalidate,
-            nursery=nursery,
+            store, self._directories, options, invalidate=self._invalidate, nursery=nursery
         )
         self._local = LocalFiles(
             options.local if writer is not None else (), options.local_max, lambda: int(wall() * SECOND)

@@ -116,14 +116,13 @@ class VirtualTrees:
         directories: Directories,
         options: CacheOptions,
         *,
-        clock: Callable[[], float],
         invalidate: Callable[[bytes], None],
         nursery: trio.Nursery | None = None,
     ) -> None:
         self._store = store
         self._directories = directories
         self._options = options
-        self._clock = clock
+        self._clock = directories.clock
         self._invalidate = invalidate
         self._reading: SingleFlight[bytes, bytes] = SingleFlight(nursery)
         self._param_opens: bool | None = None

@@ -1,6 +1,6 @@
 """Everything that differs from the vehicle's listings and blocks because of us. Layer: cache.
 
-The tree asks here first: what is local, open, or not delivered yet is answered from drafts; the rest is the
+The tree asks here first: what is open, or not delivered yet is answered from drafts; the rest is the
 vehicle's. Paths are the vehicle's, normalised; those below `@` never come here for a change.
 """
 
