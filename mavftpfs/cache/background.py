@@ -54,7 +54,7 @@ class Background:
         """The draft got more: send it, or begin to, if that can be done beside the program."""
         attempt = node.attempt
         if attempt is not None and not attempt.sending.overtaken:
-            attempt.sending.growing = node.quiet.is_set()  # nobody writes to one being delivered
+            attempt.sending.growing = node.idle.is_set()  # nobody writes to one being delivered
             attempt.upload.wake()
         elif self._context.nursery is not None and node.background and not node.starting:
             due = self._context.clock() >= node.start_after and not self._context.blocked
@@ -65,7 +65,7 @@ class Background:
 
     def settle(self, node: Node) -> None:
         """Nobody has the file open: forget it, if the vehicle has it; what still sends it is called off."""
-        if node.needless and node.attempt is not None and self._context.nursery is not None:
+        if node.unneeded and node.attempt is not None and self._context.nursery is not None:
             self._context.nursery.start_soon(self._call_off, node)
         self._context.nodes.maybe_forget(node)
 
@@ -108,7 +108,7 @@ class Background:
 
     async def _call_off(self, node: Node) -> None:
         async with self._context.paths.steady(node, lasting=True), node.lock:
-            if node.needless:
+            if node.unneeded:
                 await self._deliverer.abandon(node)
         self._context.nodes.maybe_forget(node)
 

@@ -114,5 +114,5 @@ def _on_replaced(context: Context, node: Node, draft: Draft) -> None:
         return  # its delivery looks for itself
     draft.lose_base()
     if draft.state is State.STALE and not draft.undelivered:
-        context.nodes.part(node)
+        context.nodes.replaced(node)
         context.files.forget_pages(node.path)

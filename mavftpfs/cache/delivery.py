@@ -1,7 +1,7 @@
 """Brings drafts to the vehicle, and knows that they are there. Layer: cache.
 
 `deliver` returns when the vehicle has the file, checked (promise 2), or raises why not; what was not
-delivered stays held, and the next call goes on. While it runs the file is not written (`Node.quiet`), so
+delivered stays held, and the next call goes on. While it runs the file is not written (`Node.idle`), so
 what is verified is what was sent. Uploads begin earlier, in the background, where that is of use.
 
 One way leads to the card: the whole file is sent under a reserved name, verified there, and renamed into
@@ -75,14 +75,14 @@ class Deliverer:
             The reason why not: as WriteStore; VerificationFailed, NotSupported, FileTooLarge, FileChanged.
         """
         while wanted is None or wanted():
-            await node.spared.wait()
+            await node.unclaimed.wait()
             async with self._context.paths.steady(node, lasting=True), node.lock:
                 draft = node.draft
                 if draft is None or not node.undelivered:
                     await self.abandon(node)
                     return
                 with node.delivering() as scope:
-                    node.quiet = trio.Event()
+                    node.idle = trio.Event()
                     try:
                         if node.path not in self._context.own.torn:  # else its name lacks a file until then
                             self._context.require_disarmed()
@@ -93,7 +93,7 @@ class Deliverer:
                         self._note_failure(node, draft, error)
                         raise
                     finally:
-                        node.quiet.set()
+                        node.idle.set()
                         self._throttle.let_go()
                         if node.undelivered:  # also if who waited for it gave up
                             self._context.retry_later()
@@ -106,7 +106,7 @@ class Deliverer:
         Raises:
             As deliver.
         """
-        await node.spared.wait()
+        await node.unclaimed.wait()
         async with self._context.paths.steady(node, lasting=True), node.lock:
             draft = node.draft
             if draft is None or not node.undelivered:
@@ -219,6 +219,9 @@ class Deliverer:
             return attempt
         await self.abandon(node)
         context, places = self._context, None
+        if context.options.inplace and draft.base is not None and context.writer.traits.rename_works is None:
+            await self._names.find_out(node.path)  # a card may have no room for two files, and never tell
+            plan = self._plan(node, draft)
         if plan is Plan.OVERWRITE or isinstance(node.error, AlreadyExists):  # which all of it was sent for
             await self._require_expected(node, draft)
         if plan is Plan.REPLACE and draft.base is None:

@@ -236,12 +236,43 @@ class Names:
         except FtpNak as nak:
             expected = over and nak.code == NakCode.FILE_EXISTS  # FAT: the next rename tells more
             if writer.traits.rename_works is None and not expected:
-                await self._find_out(old)
+                await self.find_out(old)
                 if writer.traits.rename_works is False:
                     raise NotSupported("this server cannot rename") from nak
             raise
         writer.traits.rename_works = True
         self._context.dentries.rename(old, new)
+
+    async def find_out(self, near: bytes) -> None:
+        """See on an empty file of ours whether the card can rename.
+
+        A refusal of another rename does not tell: its number proves nothing (servers.md 12), and it may be
+        that name which the card does not take.
+
+        Raises:
+            As WriteStore, but FtpNak and OutcomeUnknown.
+        """
+        context = self._context
+        try:
+            first = context.own.beside(near, Kind.FRESH)
+            second = context.own.beside(first, Kind.FRESH)
+        except PathTooLong:
+            return
+        context.own.live |= {first, second}
+        left = first
+        try:
+            await context.writer.create_empty(first)
+            await context.writer.rename(first, second)
+            left, context.writer.traits.rename_works = second, True
+        except OutcomeUnknown:
+            return  # the next listing removes it
+        except FtpNak as nak:
+            if nak.opcode == Opcode.RENAME:
+                context.writer.traits.rename_works = False
+        finally:
+            context.own.live -= {first, second}
+            context.dentries.expire(split(first)[0])
+        await self.discard(left, left)
 
     async def purge(self, path: bytes) -> None:
         """A path is about to lose its name: have nothing of an earlier replacement bring it back.
@@ -299,13 +330,13 @@ class Names:
             await self.rename(source, target, completes=moved)
         except (OutcomeUnknown, trio.Cancelled):
             if moved:
-                self.tear(target, places.old)
+                self.note_torn(target, places.old)
             raise
         except MavftpfsError:
             if moved:
                 await self._undo(places.old, target)
             raise
-        self._context.own.found((places.old,))
+        self._context.own.mended((places.old,))
         if moved and not keep_old:
             litter.insert(0, places.old)
         await self.discard(target, *litter)
@@ -319,7 +350,7 @@ class Names:
         finally:
             await upload.abort()
 
-    def tear(self, path: bytes, place: bytes) -> None:
+    def note_torn(self, path: bytes, place: bytes) -> None:
         """The file of a name may lie at `place` for now: show it on, and have both directories listed."""
         context = self._context
         entry = context.dentries.entry(path) or context.dentries.entry(place)
@@ -332,37 +363,6 @@ class Names:
         log.warning("%r may lie under %r until the vehicle is heard again", path, place)
 
     # --- inside
-
-    async def _find_out(self, near: bytes) -> None:
-        """A first rename was refused: see on an empty file of ours whether the card can rename at all.
-
-        The refusal's number proves nothing (servers.md 12), and it may be that name which the card does not
-        take.
-
-        Raises:
-            As WriteStore, but FtpNak and OutcomeUnknown.
-        """
-        context = self._context
-        try:
-            first = context.own.beside(near, Kind.FRESH)
-            second = context.own.beside(first, Kind.FRESH)
-        except PathTooLong:
-            return
-        context.own.live |= {first, second}
-        left = first
-        try:
-            await context.writer.create_empty(first)
-            await context.writer.rename(first, second)
-            left, context.writer.traits.rename_works = second, True
-        except OutcomeUnknown:
-            return  # the next listing removes it
-        except FtpNak as nak:
-            if nak.opcode == Opcode.RENAME:
-                context.writer.traits.rename_works = False
-        finally:
-            context.own.live -= {first, second}
-            context.dentries.expire(split(first)[0])
-        await self.discard(left, left)
 
     @asynccontextmanager
     async def _changing(self, *paths: bytes) -> AsyncIterator[None]:
@@ -403,7 +403,7 @@ class Names:
                 return False
             raise
         except (OutcomeUnknown, trio.Cancelled):
-            self.tear(target, old)
+            self.note_torn(target, old)
             raise
         return True
 
@@ -411,7 +411,7 @@ class Names:
         try:
             await self.rename(place, path, completes=True)
         except BaseException as error:
-            self.tear(path, place)
+            self.note_torn(path, place)
             if not isinstance(error, MavftpfsError):
                 raise
             log.debug("%r did not get its file back: %s", path, error)

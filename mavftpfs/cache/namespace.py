@@ -83,7 +83,7 @@ class Namespace:
         self._context.require_disarmed()
         require_not_ours(path)
         node = self._context.nodes.get(path)
-        with nullcontext() if node is None else node.doom():
+        with nullcontext() if node is None else node.claim():
             async with self._context.paths.hold(path):
                 node = self._context.nodes.get(path)
                 if node is not None and await self._names.entry(path) is not None:
@@ -103,7 +103,7 @@ class Namespace:
         if old != new:
             await self._deliver_below(old)
         displaced = None if noreplace or old == new else self._context.nodes.get(new)
-        with nullcontext() if displaced is None else displaced.doom():
+        with nullcontext() if displaced is None else displaced.claim():
             async with self._context.paths.hold(old, new):
                 await self._rename(old, new, noreplace=noreplace)
 

@@ -59,9 +59,9 @@ class Node:
     on the vehicle, under a reserved name. error: why it could not be delivered. attempt: the present one to
     deliver it. base: reads the vehicle's file. starting: an upload in the background is about to begin.
     background: whether one may begin by itself; start_after: not before. known_at: when the vehicle was last
-    known to have it all. lock: held to deliver it. quiet: no delivery is under way, so it may be written.
-    doomed: how many changes take its name or content away, or are about to: no delivery begins or goes on
-    before it is spared.
+    known to have it all. lock: held to deliver it. idle: no delivery is under way, so it may be written.
+    claims: how many changes take its name or content away, or are about to: no delivery begins or goes on
+    before it is unclaimed.
     """
 
     path: bytes
@@ -80,14 +80,14 @@ class Node:
     start_after: float = float("-inf")
     known_at: float = float("-inf")
     lock: trio.Lock = field(default_factory=trio.Lock)
-    quiet: trio.Event = field(default_factory=trio.Event)
-    doomed: int = 0
-    spared: trio.Event = field(default_factory=trio.Event)
+    idle: trio.Event = field(default_factory=trio.Event)
+    claims: int = 0
+    unclaimed: trio.Event = field(default_factory=trio.Event)
     _delivery: trio.CancelScope | None = None
 
     def __post_init__(self) -> None:
-        self.quiet.set()
-        self.spared.set()
+        self.idle.set()
+        self.unclaimed.set()
 
     @property
     def undelivered(self) -> bool:
@@ -95,7 +95,7 @@ class Node:
         return self.draft is not None and not self.removed and self.draft.undelivered
 
     @property
-    def needless(self) -> bool:
+    def unneeded(self) -> bool:
         """Whether nobody has it open, and the vehicle has it."""
         return not self.handles and not self.undelivered
 
@@ -109,10 +109,10 @@ class Node:
 
     @contextmanager
     def delivering(self) -> Iterator[trio.CancelScope]:
-        """The body brings it to the vehicle, unless it is cancelled because name or content go (`doom`)."""
+        """The body brings it to the vehicle, unless it is cancelled because name or content go (`claim`)."""
         with trio.CancelScope() as scope:
             self._delivery = scope
-            if self.doomed:
+            if self.claims:
                 scope.cancel()
             try:
                 yield scope
@@ -120,28 +120,28 @@ class Node:
                 self._delivery = None
 
     @contextmanager
-    def doom(self) -> Iterator[None]:
+    def claim(self) -> Iterator[None]:
         """The body takes the name or the content away: what is being delivered of it is called off, unless it
         is just being renamed into place."""
-        self.doomed += 1
-        if self.spared.is_set():
-            self.spared = trio.Event()
+        self.claims += 1
+        if self.unclaimed.is_set():
+            self.unclaimed = trio.Event()
         committing = self.draft is not None and self.draft.state is State.COMMITTING
         if self._delivery is not None and not committing:  # nobody would find what it left there
             self._delivery.cancel()
         try:
             yield
         finally:
-            self.doomed -= 1
-            if not self.doomed:
-                self.spared.set()
+            self.claims -= 1
+            if not self.claims:
+                self.unclaimed.set()
 
     async def call_off(self) -> None:
         """Have what is being delivered called off, since its content is about to go: who waits for the
         delivery has it begin again then. When this returns nothing is delivered before the next wait."""
-        with self.doom():
-            while not self.quiet.is_set():  # the next one may have begun while we woke up
-                await self.quiet.wait()
+        with self.claim():
+            while not self.idle.is_set():  # the next one may have begun while we woke up
+                await self.idle.wait()
 
     def require_reachable(self) -> None:
         """Raise FileChanged if its path may be another file's: it was replaced or removed, not hidden."""
@@ -214,7 +214,7 @@ class Nodes:
 
     def maybe_forget(self, node: Node) -> None:
         """Forget a node that nobody needs; an attempt has to be called off first."""
-        if node.needless and not node.lock.locked() and node.attempt is None:
+        if node.unneeded and not node.lock.locked() and node.attempt is None:
             node.drop_draft()
             self.detach(node)
 
@@ -223,7 +223,7 @@ class Nodes:
         if self._by_path.get(node.path) is node:
             del self._by_path[node.path]
 
-    def part(self, node: Node) -> None:
+    def replaced(self, node: Node) -> None:
         """The node's name is another file's: who has it open keeps the node, and others get a new one."""
         self._stale = [other for other in self._stale if other.handles] + [node]
         node.lose_name()

@@ -251,7 +251,7 @@ class Cleaner:
             await self._names.rename(action.path, action.to, completes=torn)
             if action.to == group.target and action.path != group.paths.get(Kind.OLD):
                 context.files.on_changed(action.to)
-            context.own.found(group.paths.values())
+            context.own.mended(group.paths.values())
         self.mended += 1
 
     async def _exists(self, path: bytes) -> bool:

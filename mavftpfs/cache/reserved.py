@@ -157,7 +157,7 @@ class OwnNames:
         old, sidecar = (Reserved(self.owner, kind, serial).name for kind in (Kind.OLD, Kind.SIDECAR))
         return Places(new, join(directory, old), join(directory, sidecar))
 
-    def found(self, places: Iterable[bytes]) -> None:
+    def mended(self, places: Iterable[bytes]) -> None:
         """What lay there has its name again."""
         where = set(places)
         self.torn = {path: place for path, place in self.torn.items() if place not in where}

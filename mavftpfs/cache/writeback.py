@@ -159,7 +159,7 @@ class Writeback:
                 made = node.draft is None
                 if made and node.handles:
                     # Who has a file open that others removed is not to read the one that is about to be made.
-                    context.nodes.part(node)
+                    context.nodes.replaced(node)
                     context.files.end(path)
                     node = context.nodes.need(path)
                 if made:

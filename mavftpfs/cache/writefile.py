@@ -270,8 +270,8 @@ class WriteFile(ReadFile):
         idle_since = context.clock()
         while True:
             context.require_disarmed()
-            await node.quiet.wait()
-            if not node.quiet.is_set():
+            await node.idle.wait()
+            if not node.idle.is_set():
                 continue  # the next delivery began while we woke up
             if not throttle.is_full(node):
                 return

@@ -142,6 +142,16 @@ async def test_a_partial_change_of_a_large_file_is_refused_where_it_would_be_sen
     assert store.files[FILE].data == OLD
 
 
+async def test_overwriting_in_place_needs_no_room_for_both_files(nursery: trio.Nursery) -> None:
+    """Whether the card can rename is found out on an empty file then, before the card is full."""
+    store = FakeWriter(KINDS["littlefs"], nursery)
+    store.add(FILE, OLD)
+    store.traits.rename_works, store.capacity = None, len(NEW)
+    await write_file(make_writable(store, inplace=True), FILE, NEW)
+    assert store.files == {FILE: store.files[FILE]}
+    assert store.files[FILE].data == NEW
+
+
 # --- verification
 
 
