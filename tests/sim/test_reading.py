@@ -10,7 +10,6 @@ from trio.testing import MockClock
 
 from mavftpfs.cache.options import CacheOptions
 from mavftpfs.cache.tree import Tree
-from mavftpfs.link.framing import Framer
 from mavftpfs.link.messages import Address, FtpFrame
 from mavftpfs.protocol.payload import Opcode, Payload, request
 from mavftpfs.session.connection import Connection, ConnectOptions
@@ -26,17 +25,6 @@ from tests.support.mounting import mounted
 from tests.support.worlds import ROOTS, MemorySink, World, begin_to_read, content, read_file, world
 
 STRANGER = Address(255, 190)
-
-
-async def test_a_reboot_between_open_and_first_read_is_bridged(autojump: MockClock) -> None:
-    here = World("px4", LinkSettings(delay=0.02))
-    here.tree.add(b"/f", b"hello")
-    async with here.connection() as connection:
-        sink = MemorySink(5)
-        reader = await connection.store.open_reader(b"/f", sink)
-        connection.vehicle.on_reboot()
-        reader.want(0, 5, demand=True)
-        assert await sink.wait_for(0, 5) == b"hello"
 
 
 async def test_an_open_reply_without_a_size_is_an_error_at_once(autojump: MockClock) -> None:
@@ -96,19 +84,6 @@ async def test_a_long_listing_with_times_is_not_taken_for_silence(autojump: Mock
         assert all(entry.mtime is not None for entry in listing.entries)
         assert connection.store.lists_times is True
         assert Opcode.LIST_DIRECTORY not in connection.engine.stats.by_opcode
-
-
-async def test_bursts_of_exact_multiples_end(autojump: MockClock) -> None:
-    """500 packets are where ArduPilot stops a burst, and nothing says whether the file ends there, too."""
-    data = random.Random(1).randbytes(2 * 500 * 239)
-    here = World("ardupilot", LinkSettings(delay=0.02, loss=0.02))
-    here.tree.add(b"/f", data)
-    here.tree.add(b"/g", data[: 500 * 239])
-    async with here.connection(ConnectOptions(read_mode="burst")) as connection:
-        assert await read_file(connection, b"/f") == data
-        assert await read_file(connection, b"/g") == data[: 500 * 239]
-        assert connection.engine.stats.by_opcode[Opcode.BURST_READ_FILE] >= 3
-    assert here.vehicle.server.open_sessions == 0
 
 
 @pytest.mark.holds("rule 14.39")
@@ -197,28 +172,6 @@ async def test_a_whole_read_survives_a_lost_session(profile: str, autojump: Mock
         nursery.start_soon(close_it)
         assert await connection.store.read_whole(b"/f", 100_000) == data
         assert connection.engine.stats.by_opcode[Opcode.OPEN_FILE_RO] == 2
-
-
-@pytest.mark.holds("rule 14.39")
-@pytest.mark.parametrize("trouble", ["another client is heard", "the session is closed"])
-async def test_what_is_read_meanwhile_is_under_suspicion(trouble: str, autojump: MockClock) -> None:
-    here = World("px4", LinkSettings(rate=20_000.0, delay=0.02))
-    data = random.Random(2).randbytes(60_000)
-    here.tree.add(b"/f", data)
-    async with here.connection() as connection:
-        _, sink = await begin_to_read(connection, b"/f", 10_000)
-        assert sink.suspicions == []
-        session = connection.scheduler.server.session
-        assert session is not None
-        source = Address(255, 190) if trouble == "another client is heard" else connection.vehicle.own
-        opcode = Opcode.NONE if source.system == 255 else Opcode.TERMINATE_SESSION
-        wire = request(777, opcode, session=session.id).encode()
-        here.vehicle.receive(
-            Framer(source, stream=False).encode_ftp(Address(1, 1), wire), trio.current_time()
-        )
-        here.link.kick()
-        assert await sink.wait_for(0, 60_000) == data
-        assert sink.suspicions != []
 
 
 @pytest.mark.parametrize(("pause", "doubted"), [(2.0, True), (11.0, False)])
@@ -319,7 +272,7 @@ async def test_beside_bursts_that_fill_the_radio_a_listing_is_answered(
         reader.close()
 
 
-@pytest.mark.parametrize("profile", ["px4", "ardupilot", "mavsdk", "px4-nuttx"])
+@pytest.mark.parametrize("profile", ["px4", "ardupilot"])
 async def test_a_file_is_read_over_a_link_that_doubles_requests(profile: str, autojump: MockClock) -> None:
     """Each doubled ReadFile brings an answer that nothing explains: a doubt, but no other file's bytes."""
     here = World(profile, LinkSettings(rate=200_000.0, delay=0.02, duplicate=0.3))

@@ -164,7 +164,7 @@ async def test_a_reboot_forgets_what_was_seen_of_the_server(profile: str, autoju
 
 
 @pytest.mark.holds("fault stale session", "rule 14.10")
-@pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
+@pytest.mark.parametrize("profile", EVERY_PROFILE)
 async def test_a_session_left_by_a_killed_client_is_got_over(profile: str, autojump: MockClock) -> None:
     data = content(50_000)
     here = world(profile, LinkSettings(rate=100_000.0, delay=0.02), big=data)
@@ -412,7 +412,7 @@ async def test_another_clients_session_is_left_alone(profile: str, autojump: Moc
 
 
 @pytest.mark.holds("rule 14.9")
-@pytest.mark.parametrize("outage", [3.2, 3.5, 4.0, 6.0, 9.0])
+@pytest.mark.parametrize("outage", [3.2, 6.0])
 async def test_after_a_silence_nothing_is_believed_before_the_file_was_opened_again(
     outage: float, autojump: MockClock
 ) -> None:
@@ -566,21 +566,6 @@ def others_session(connection: Connection) -> int:
 async def open_elsewhere(connection: Connection) -> None:
     """Leave a session open under an id that is not this connection's, as a killed client does."""
     await connection.driver.run(OpenFile(Opcode.CREATE_FILE, b"/d/left", others_session(connection)))
-
-
-@pytest.mark.holds("fault stale session")
-async def test_a_listing_outlasts_the_session_of_a_killed_client(autojump_clock: MockClock) -> None:
-    here = ardupilot()
-    async with here.connection() as connection:
-        await open_elsewhere(connection)
-        began = trio.current_time()
-        listing = await connection.store.list_directory(b"/d")
-        assert [entry.name for entry in listing.entries] == [b"left"]
-        assert 3 < trio.current_time() - began < 5
-        assert (
-            connection.engine.stats.naks == 1 + 2
-        )  # opcode 16 is unknown there, and a listing ends with one
-        assert not connection.scheduler.server.kept_out
 
 
 async def test_listings_at_once_do_not_keep_the_dead_session_alive(autojump_clock: MockClock) -> None:

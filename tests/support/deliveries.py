@@ -18,7 +18,6 @@ from tests.support.worlds import ROOTS, World
 
 OLD, NEW = content("old", 3000), content("new", 3500)
 GOOD = LinkSettings(rate=50_000.0, delay=0.02)
-BAD = LinkSettings(rate=50_000.0, delay=0.02, loss=0.05, duplicate=0.05, reorder=0.05)
 SLOW = LinkSettings(rate=6000.0, delay=0.05)
 LONG = content("long", 60_000)
 MOMENTS = (0.1, 1.0, 5.0, 9.0)

@@ -1,6 +1,6 @@
 """A delivery that is called off because the file's name was to go, and goes on because it did not.
 
-How names go in mid-delivery on every simulated server: tests/sim/test_calling_off.py.
+How names go in mid-delivery on every simulated server: tests/sim/test_overtaken.py.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """A file that is emptied while what it held is on its way: nobody waits for that, or sends it any more.
 
-The same at any request of its delivery on every simulated server: tests/sim/test_emptied_midway.py.
+The same at any request of its delivery on every simulated server: tests/sim/test_overtaken.py.
 """
 
 from __future__ import annotations
