@@ -263,10 +263,8 @@ class Cleaner:
 
     async def _read_sidecar(self, directory: bytes, path: bytes, group: Group) -> Group:
         """Return the group with what its sidecar tells, as far as that is plausible."""
-        context = self._context
-        patience = context.options.op_deadline
         try:
-            text = await read_small(context.store, path, RENAME_ROOM, patience=patience)
+            text = await read_small(self._context, path, RENAME_ROOM)
         except FtpNak as nak:
             if errno_for(nak) == errno.ENOENT:
                 return group

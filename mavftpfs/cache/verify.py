@@ -12,15 +12,14 @@ import errno
 import logging
 from contextlib import suppress
 
-import trio
-
 from mavftpfs.cache.context import Context
 from mavftpfs.cache.draft import Base, Draft
 from mavftpfs.cache.names import Names
-from mavftpfs.cache.remote import Reader, ReadSink, RemoteStore
+from mavftpfs.cache.versions import BLOCK_SIZE, BlockCache, Version
 from mavftpfs.shared.errnos import errno_for
 from mavftpfs.shared.errors import (
     Armed,
+    DataUnproven,
     FileChanged,
     FtpNak,
     RequestTimeout,
@@ -137,12 +136,17 @@ class Verifier:
             Else as RemoteStore.open_reader.
         """
         for _ in range(READ_TRIES):
-            sink = _Piece(self._context.options.op_deadline)
+            version = await _open(self._context, path)
             try:
-                same = await _compare(self._context.store, path, sink, draft)
+                same = version.size == draft.size
+                for at in range(0, draft.size, PIECE):
+                    stop = min(at + PIECE, draft.size)
+                    same = same and await _take(version, at, stop) == draft.local_bytes(at, stop)
             except FileChanged:
                 same = False
-            if not sink.suspect:
+            finally:
+                version.close_reader()
+            if not version.doubted:
                 break
         else:
             raise SessionBusy(f"another FTP client was active whenever {path!r} was read back")
@@ -151,101 +155,36 @@ class Verifier:
         self.by_reading += 1
 
 
-async def _compare(store: RemoteStore, path: bytes, sink: _Piece, draft: Draft) -> bool:
-    reader = await store.open_reader(path, sink)
-    try:
-        if reader.size != draft.size:
-            return False
-        for at in range(0, draft.size, PIECE):
-            stop = min(at + PIECE, draft.size)
-            if await sink.take(reader, at, stop) != draft.local_bytes(at, stop):
-                return False
-    finally:
-        reader.close()
-    return True
-
-
-async def read_small(store: RemoteStore, path: bytes, limit: int, *, patience: float) -> bytes:
+async def read_small(context: Context, path: bytes, limit: int) -> bytes:
     """Return the first bytes of a file, at most `limit`, past every cache.
 
-    patience: seconds without any byte after which it is given up.
-
     Raises:
-        RequestTimeout. Else as RemoteStore.open_reader.
+        DataUnproven: they may be another file's. Else as RemoteStore.open_reader.
     """
-    sink = _Piece(patience)
-    reader = await store.open_reader(path, sink)
+    version = await _open(context, path)
     try:
-        return await sink.take(reader, 0, min(reader.size, limit))
+        text = await _take(version, 0, min(version.size, limit))
     finally:
-        reader.close()
+        version.close_reader()
+    if text is None:
+        raise DataUnproven(f"another FTP client was active when {path!r} was read")
+    return bytes(text)
 
 
-class _Piece(ReadSink):
-    """Takes one range of a file after the other.
+async def _open(context: Context, path: bytes) -> Version:
+    """Open a file for reading past every cache."""
+    blocks = BlockCache(4 * BLOCK_SIZE, clock=context.clock, patience=context.options.op_deadline)
+    version = Version(blocks, path)
+    version.reader = await context.store.open_reader(path, version)
+    version.size = version.reader.size
+    return version
 
-    Attributes:
-        suspect: the bytes may be another file's.
-    """
 
-    def __init__(self, patience: float) -> None:
-        self.suspect = False
-        self._patience = patience
-        self._start = 0
-        self._data = bytearray()
-        self._gaps: list[tuple[int, int]] = []
-        self._error: Exception | None = None
-        self._news = trio.Event()
-
-    async def take(self, reader: Reader, start: int, stop: int) -> bytes:
-        """Return the bytes [start, stop).
-
-        Raises:
-            RequestTimeout, or why they cannot be had.
-        """
-        self._start, self._data = start, bytearray(stop - start)
-        self._gaps = [(start, stop)] if start < stop else []
-        if self._gaps:
-            reader.want(start, stop, demand=True)
-        while self._gaps and self._error is None:
-            self._news = trio.Event()
-            with trio.move_on_after(self._patience) as scope:
-                await self._news.wait()
-            if scope.cancelled_caught:
-                raise RequestTimeout("nothing of what was written could be read back")
-        if self._error is not None:
-            raise self._error
-        return bytes(self._data)
-
-    def missing(self, start: int, stop: int) -> list[tuple[int, int]]:
-        """See ReadSink: only the present range is wanted."""
-        cut = [(max(start, a), min(stop, b)) for a, b in self._gaps]
-        return [(a, b) for a, b in cut if a < b]
-
-    def on_opened(self, at: float) -> None:
-        """See ReadSink: another file would not compare."""
-
-    def on_data(self, offset: int, data: bytes) -> None:
-        """See ReadSink."""
-        end = offset + len(data)
-        for a, b in self.missing(offset, end):
-            self._data[a - self._start : b - self._start] = data[a - offset : b - offset]
-        left = [piece for a, b in self._gaps for piece in ((a, min(b, offset)), (max(a, end), b))]
-        self._gaps = [(a, b) for a, b in left if a < b]
-
-    def on_batch(self) -> None:
-        """See ReadSink."""
-        self._news.set()
-
-    def on_queued(self) -> None:
-        """See ReadSink."""
-        self._news.set()
-
-    def on_suspect(self, reason: str) -> None:
-        """See ReadSink."""
-        self.suspect = True
-
-    def on_failed(self, error: Exception) -> None:
-        """See ReadSink."""
-        self._error = error
-        self._news.set()
+async def _take(version: Version, start: int, stop: int) -> bytes | memoryview | None:
+    """Return the bytes [start, stop), None if they may be another file's."""
+    if start == stop:
+        return b""
+    assert version.reader is not None
+    version.reader.want(start, stop, demand=True)
+    await version.wait_for(start, stop)
+    return version.get(start, stop)
