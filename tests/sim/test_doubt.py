@@ -14,6 +14,7 @@ import pytest
 import trio
 from trio.testing import MockClock
 
+from mavftpfs.cache.reserved import is_reserved
 from mavftpfs.cache.tree import Tree
 from mavftpfs.link.messages import Address
 from mavftpfs.protocol.payload import Opcode, request
@@ -439,6 +440,27 @@ async def test_fsync_is_true_though_the_vehicle_restarts_at_any_request(
                     await trio.sleep(10)
             assert bytes(world.tree.data(path)) == bytes(model)
         file.close()
+
+
+@pytest.mark.holds("promise 2")
+async def test_where_no_checksum_is_told_the_file_is_read_back(autojump: MockClock) -> None:
+    """A byte that is wrong on the card is noticed, and all of it is sent again."""
+    world, data = World("px4", CLEAN), bytes(range(1, 240)) * 300
+    world.tree.add(b"/d/f", b"x")
+    faults = Faults(world)
+    faults.ignore(Opcode.CALC_FILE_CRC32)
+
+    def spoil() -> None:
+        (name,) = (entry.name for entry in world.tree.entries(b"/d") if is_reserved(entry.name))
+        world.tree.add(b"/d/" + name, data[:70_000] + b"?" + data[70_001:])
+
+    async with mounted(world, b"/d") as (connection, tree):
+        connection.scheduler.doubt.raise_it("an answer that came twice")
+        faults.at(Opcode.OPEN_FILE_RO, spoil)  # to see its size
+        await make(tree, b"/d/new", data)
+        assert world.tree.data(b"/d/new") == data
+        assert faults.requests.count(Opcode.CREATE_FILE) == 2
+        assert tree.status()["verified_by_reading"] == 1
 
 
 async def test_what_is_beyond_doubt_costs_nothing(autojump: MockClock) -> None:
