@@ -15,25 +15,24 @@ from typing import IO
 import pytest
 import trio
 import trio.testing
+from trio.testing import MockClock
 
-from mavftpfs.link.base import Link
 from mavftpfs.link.framing import Framer
 from mavftpfs.link.messages import Address, FtpFrame, Heartbeat, Message
 from mavftpfs.link.opening import open_link
 from mavftpfs.link.uri import parse_source
-from mavftpfs.protocol.payload import MAX_DATA, Opcode, Payload, decode_reply, request
+from mavftpfs.protocol.payload import Opcode, request
+from mavftpfs.session.connection import ConnectOptions, connected
 from mavftpfs.shared.errors import LinkClosed, UsageError
 from mavftpfs.sim import endpoints
 from mavftpfs.sim.endpoints import Endpoint, client_source, open_endpoint
-from mavftpfs.sim.linkmodel import Duplex, LinkModel, LinkSettings
+from mavftpfs.sim.linkmodel import Duplex, LinkSettings
 from mavftpfs.sim.profiles import PROFILES
 from mavftpfs.sim.tree import MemoryTree
 from mavftpfs.sim.vehicle import SimVehicle
-from tests.support.memory import MemoryLink
 from tests.support.vehicles import free_udp_port
+from tests.support.worlds import World, read_file
 
-US = Address(254, 191)
-DRONE = Address(1, 1)
 CONTENT = random.Random("content").randbytes(50_000)
 
 
@@ -41,71 +40,6 @@ def vehicle(profile: str = "px4", *, stream: bool = False, telemetry: float = 0.
     tree = MemoryTree()
     tree.add(b"/log.bin", CONTENT)
     return SimVehicle(tree, PROFILES[profile], rng=random.Random(1), stream=stream, telemetry=telemetry)
-
-
-class Client:
-    """A plain client: one request at a time, or a window of reads."""
-
-    def __init__(self, link: Link) -> None:
-        self.link = link
-        self.framer = Framer(US, stream=link.is_stream)
-        self.seq = 100
-        self.heard: list[Message] = []
-        self.reopened = 0
-
-    async def messages(self) -> list[Message]:
-        """Return what the next batch brings."""
-        chunks = await self.link.receive()
-        if not chunks:
-            self.reopened += 1
-            self.framer.reset()
-        found = [message for chunk in chunks for message in self.framer.feed(chunk)]
-        self.heard += found
-        return found
-
-    async def beat(self) -> Heartbeat:
-        """Wait for a heartbeat."""
-        while True:
-            for message in await self.messages():
-                if isinstance(message, Heartbeat):
-                    return message
-
-    async def silence(self) -> None:
-        """Wait until longer than between two heartbeats nothing comes."""
-        heard = True
-        while heard:
-            with trio.move_on_after(1.5) as scope:
-                await self.messages()
-            heard = not scope.cancelled_caught
-
-    def send(self, wanted: Payload) -> None:
-        self.link.send_nowait([self.framer.encode_ftp(DRONE, wanted.encode())])
-
-    async def ask(self, opcode: Opcode, data: bytes = b"", **fields: int) -> Payload:
-        """Ask until an answer comes, every second with the same seq."""
-        self.seq = (self.seq + 7) & 0xFFFF
-        while True:
-            self.send(request(self.seq, opcode, data=data, **fields))
-            with trio.move_on_after(1):
-                while True:
-                    for message in await self.messages():
-                        if isinstance(message, FtpFrame):
-                            reply = decode_reply(message.payload)
-                            if reply.seq == (self.seq + 1) & 0xFFFF and reply.req_opcode == opcode:
-                                return reply
-
-    async def read_file(self, path: bytes) -> bytes:
-        """Open and read a file, one chunk after the other."""
-        opened = await self.ask(Opcode.OPEN_FILE_RO, path)
-        assert opened.opcode == Opcode.ACK
-        size, data = int.from_bytes(opened.data, "little"), b""
-        while len(data) < size:
-            count = min(MAX_DATA, size - len(data))
-            reply = await self.ask(Opcode.READ_FILE, offset=len(data), size=count)
-            assert reply.offset == len(data)
-            data += reply.data
-        await self.ask(Opcode.TERMINATE_SESSION)
-        return data
 
 
 # ---------------------------------------------------------------------- real links
@@ -119,12 +53,26 @@ async def test_pushes_to_a_listening_client(kind: str) -> None:
             port = parse_source(client_link.description).port
             async with open_endpoint(f"{kind}:127.0.0.1:{port}") as link, trio.open_nursery() as nursery:
                 assert client_source(link) == client_link.description
-                endpoint = Endpoint(vehicle(stream=link.is_stream), link)
-                nursery.start_soon(endpoint.run)
-                client = Client(client_link)
-                await client.beat()
-                assert await client.read_file(b"/log.bin") == CONTENT
+                nursery.start_soon(Endpoint(vehicle(stream=link.is_stream), link).run)
+                async with connected(client_link, ConnectOptions()) as connection:
+                    await connection.ready(20.0)
+                    assert await read_file(connection, b"/log.bin") == CONTENT
                 nursery.cancel_scope.cancel()
+
+
+def test_the_same_seed_gives_the_same_story() -> None:
+    async def story(seed: int) -> object:
+        settings = LinkSettings(
+            rate=5760, queue=4096, duplex=Duplex.HALF, delay=0.05, loss=0.02, corrupt=0.01
+        )
+        here = World("px4", settings, seed=seed, telemetry=300.0)
+        here.tree.add(b"/log.bin", CONTENT)
+        async with here.connection() as connection:
+            assert await read_file(connection, b"/log.bin") == CONTENT
+            return trio.current_time(), connection.engine.stats
+
+    stories = [trio.run(story, seed, clock=MockClock(autojump_threshold=0)) for seed in (1, 1, 2)]
+    assert stories[0] == stories[1] != stories[2]
 
 
 # ---------------------------------------------------------------------- the command
@@ -236,92 +184,20 @@ def test_says_where_to_connect_reacts_to_signals_and_ends_cleanly(tmp_path: Path
 
 async def test_the_process_joins_the_pieces_of_a_stream(tmp_path: Path) -> None:
     """Cut where a datagram's reader would think that a new frame begins."""
-    frame = Framer(US, stream=True).encode_ftp(DRONE, request(7, Opcode.NONE, data=b"\xfd" * 20).encode())
+    framer = Framer(Address(254, 191), stream=True)
+    frame = framer.encode_ftp(Address(1, 1), request(7, Opcode.NONE, data=b"\xfd" * 20).encode())
     middle = frame.index(b"\xfd", 1)
     with running(str(tmp_path), "--link", "tcpin:127.0.0.1:0") as child, trio.fail_after(60):
         words = (await trio.to_thread.run_sync(line, child.stdout)).split()
-        async with open_link(parse_source(words[1])) as client_link:
-            client = Client(client_link)
-            await client.beat()
-            client_link.send_nowait([frame[:middle]])
+        async with open_link(parse_source(words[1])) as link:
+            heard: list[Message] = []
+
+            async def hear(kind: type[Message]) -> None:
+                while not any(isinstance(message, kind) for message in heard):
+                    heard.extend(message for chunk in await link.receive() for message in framer.feed(chunk))
+
+            await hear(Heartbeat)
+            link.send_nowait([frame[:middle]])
             await trio.sleep(0.1)
-            client_link.send_nowait([frame[middle:]])
-            while not any(isinstance(message, FtpFrame) for message in client.heard):
-                await client.messages()
-
-
-# ---------------------------------------------------------------------- in memory
-
-
-def run_virtual(main: object, *args: object) -> float:
-    """Run on a mock clock; return the virtual seconds it took."""
-    clock = trio.testing.MockClock(autojump_threshold=0)
-    start = clock.current_time()
-    trio.run(main, *args, clock=clock)  # type: ignore[arg-type]
-    return clock.current_time() - start
-
-
-RADIO = LinkSettings(rate=5760, queue=4096, duplex=Duplex.HALF, delay=0.05, loss=0.02, corrupt=0.01)
-
-
-async def read_in_memory(stream: bool, settings: LinkSettings | None, seed: int) -> tuple[Client, MemoryLink]:
-    model = None if settings is None else LinkModel(random.Random(seed), settings)
-    link = MemoryLink(vehicle(stream=stream, telemetry=300), model, stream=stream, rng=random.Random(seed))
-    client = Client(link)
-    await client.beat()
-    assert await client.read_file(b"/log.bin") == CONTENT
-    return client, link
-
-
-def test_the_same_seed_gives_the_same_story() -> None:
-    def story(seed: int) -> tuple[float, list[Message]]:
-        heard: list[Message] = []
-
-        async def main() -> None:
-            client, _ = await read_in_memory(True, RADIO, seed)
-            heard.extend(client.heard)
-
-        return run_virtual(main), heard
-
-    assert story(1) == story(1)
-    assert story(1) != story(2)
-
-
-@pytest.mark.parametrize("modelled", [False, True])
-@pytest.mark.parametrize("stream", [False, True])
-def test_memory_link_cut_and_restored(modelled: bool, stream: bool) -> None:
-    async def main() -> None:
-        model = LinkModel(random.Random(1), LinkSettings(delay=0.5)) if modelled else None
-        link = MemoryLink(vehicle(stream=stream), model, stream=stream)
-        client = Client(link)
-        await client.beat()
-        client.send(request(7, Opcode.NONE))
-        await trio.sleep(0.1)
-        link.cut()  # the modelled request is still under way
-        client.send(request(8, Opcode.NONE))
-        with trio.move_on_after(30):
-            while True:
-                await client.messages()
-        await trio.sleep(1)
-        assert link.vehicle.server.requests.total() == (0 if modelled else 1)
-        link.restore()
-        heard = await client.messages()
-        assert (client.reopened, heard) == (1, []) if stream else client.reopened == 0
-        assert (await client.ask(Opcode.NONE)).opcode == Opcode.ACK
-        assert link.stats.reopened == client.reopened
-
-    run_virtual(main)
-
-
-def test_a_vehicle_that_never_rests_fails_the_test_instead_of_hanging_it(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr("tests.support.memory._MAX_STEPS", 100)
-
-    async def main() -> None:
-        link = MemoryLink(vehicle())
-        monkeypatch.setattr(type(link.vehicle), "next_deadline", lambda self: 0.0)
-        with pytest.raises(AssertionError, match="one instant"):
-            await link.receive()
-
-    run_virtual(main)
+            link.send_nowait([frame[middle:]])
+            await hear(FtpFrame)

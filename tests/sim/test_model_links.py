@@ -8,7 +8,8 @@ example alone, trio's order of tasks included (which hypothesis seeds), so what 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from random import Random
+from typing import Any, cast
 
 import pytest
 import trio
@@ -19,7 +20,7 @@ from trio.testing import MockClock
 from mavftpfs.cache.tree import Tree
 from mavftpfs.compose import subscribe
 from mavftpfs.session.connection import Connection
-from mavftpfs.shared.errors import FtpNak, RequestTimeout
+from mavftpfs.shared.errors import FtpNak, MavftpfsError, RequestTimeout
 from mavftpfs.sim.linkmodel import Duplex, LinkSettings
 from mavftpfs.sim.profiles import PROFILES, Storage
 from mavftpfs.sim.tree import Kind, MemoryTree
@@ -56,6 +57,7 @@ ONCE = (Phase.generate,)
 """Nothing is made smaller: a hundred calls less one are another history, and minutes pass."""
 
 sequences = st.lists(calls(largest=20_000, chunk=6000), min_size=CALLS, max_size=CALLS)
+short = st.lists(calls(largest=20_000, chunk=3000), min_size=CALLS // 5, max_size=CALLS // 5)
 rewriting = st.lists(rewriting_calls(largest=20_000, chunk=3000), min_size=CALLS, max_size=CALLS)
 
 
@@ -151,3 +153,88 @@ def test_hundred_thousands_of_calls(
     profile: str, link: str, sequence: list[tuple[Any, ...]], seed: int
 ) -> None:
     run(profile, LINKS[link], sequence, seed)
+
+
+# --- programs side by side, and the day's trouble
+
+TROUBLED = LinkSettings(rate=5760.0, queue=2048, duplex=Duplex.HALF, delay=0.02, burst_loss=0.05)
+
+
+class Below:
+    """A tree, seen from one of its directories: each program works in its own."""
+
+    def __init__(self, tree: Tree, root: bytes) -> None:
+        self.tree = tree
+        self.root = root
+
+    def __getattr__(self, name: str) -> Any:
+        """Return a method of the tree that takes our paths."""
+
+        def call(*args: Any, **options: Any) -> Any:
+            given = [self.root + arg if isinstance(arg, bytes) else arg for arg in args]
+            return getattr(self.tree, name)(*given, **options)
+
+        return call
+
+
+async def trouble(here: World, rng: Random) -> None:
+    """Cut the link, restart the vehicle, fly."""
+    for number in range(10_000):
+        await trio.sleep(rng.uniform(30, 120))
+        if number % 7 == 3:
+            here.vehicle.reboot(trio.current_time(), downtime=rng.choice((0.0, 8.0)))
+        elif number % 3 == 1:
+            here.vehicle.arm()
+            await trio.sleep(rng.uniform(5, 40))
+            here.vehicle.disarm()
+        else:
+            here.link.cut()
+            await trio.sleep(rng.choice((0.5, 4.0, 15.0, 45.0)))
+            here.link.restore()
+        here.link.kick()
+
+
+async def work(model: Model, sequence: list[tuple[Any, ...]], rng: Random) -> None:
+    """Make the calls of one program, which pauses between them."""
+    for call in sequence:
+        await model.do(*call)
+        await trio.sleep(rng.uniform(0.5, 8.0))
+
+
+async def lose_nothing(profile: str, programs: list[list[tuple[Any, ...]]], seed: int) -> None:
+    """Have them work side by side in trouble; when it is over the card is what each of them wrote."""
+    here = World(profile, TROUBLED, seed=seed, telemetry=1200.0)
+    root = ROOTS.get(profile, b"")
+    async with here.connection(seed=seed) as connection, trio.open_nursery() as nursery:
+        tree = mount(connection, nursery, profile, seed)
+        models = []
+        for number, _ in enumerate(programs):
+            below = b"/%d" % number
+            for path, data in START.items():
+                here.tree.add(root + below + path, data)
+            here.tree.add_directory(root + below + b"/d/sub")
+            card = SimCard(here.tree, root + below)
+            models.append(Model(cast(Tree, Below(tree, below)), card, MavftpfsError))
+        async with trio.open_nursery() as troubles:
+            troubles.start_soon(trouble, here, Random(seed))
+            async with trio.open_nursery() as working:
+                for number, (model, sequence) in enumerate(zip(models, programs, strict=True)):
+                    working.start_soon(work, model, sequence, Random(number))
+            troubles.cancel_scope.cancel()
+        here.link.restore()
+        here.vehicle.disarm()
+        here.link.kick()
+        await trio.sleep(20.0)
+        for model in models:
+            await model.end()
+        nursery.cancel_scope.cancel()
+
+
+@pytest.mark.holds("promise 3")
+@pytest.mark.parametrize("profile", taking_turns(sorted(PROFILES)))
+@settings(max_examples=1, phases=ONCE)
+@given(programs=st.lists(short, min_size=3, max_size=3), seed=st.integers(0, 99))
+def test_a_day_of_trouble_loses_no_byte(
+    profile: str, programs: list[list[tuple[Any, ...]]], seed: int
+) -> None:
+    trio.run(lose_nothing, profile, programs, seed, clock=MockClock(autojump_threshold=0))
