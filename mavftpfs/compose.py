@@ -9,7 +9,7 @@ import stat
 import sys
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import ExitStack, asynccontextmanager, contextmanager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from random import SystemRandom
@@ -134,11 +134,10 @@ async def attached(
                     notice = partial(rescue, spool, rescue_for)
                 tree = Tree(
                     connection.store,
-                    cache_options(options, spec),
+                    replace(cache_options(options, spec), read_only=not writing),
                     clock=trio.current_time,
                     invalidate=invalidate,
                     nursery=nursery,
-                    writer=connection.store if writing else None,
                     spool=spool,
                     rng=SystemRandom(),
                     keep=None if keep is None else partial(_start_kept, keep, nursery),

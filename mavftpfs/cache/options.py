@@ -24,7 +24,7 @@ find out whether the disk cuts names short."""
 class CacheOptions:
     """Times in seconds, sizes in bytes.
 
-    root: the vehicle's directory that is the mount's `/`.
+    root: the vehicle's directory that is the mount's `/`. read_only: nothing there is changed or hidden.
     dir_timeout: how long a listing (and the proof that a cached file is the vehicle's) holds; None: 20 s,
     and a listing that is expensive longer.
     attr_timeout, negative_timeout: how long the kernel may keep attributes, and an absence.
@@ -48,6 +48,7 @@ class CacheOptions:
     """
 
     root: bytes = ROOT
+    read_only: bool = False
     dir_timeout: float | None = None
     attr_timeout: float = 1.0
     negative_timeout: float = 2.0

@@ -2,16 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 from mavftpfs.cache.attributes import SECOND, Stat, Times, shown, shown_mtime
 from mavftpfs.cache.context import Context
 from mavftpfs.cache.draft import Draft, State
 from mavftpfs.cache.nodes import Node
-from mavftpfs.cache.reserved import is_reserved
-from mavftpfs.shared.errors import (
-    NotFound,
-)
 from mavftpfs.shared.model import EntryKind, split
 
 
@@ -27,13 +21,7 @@ class Overlay:
         self.times = Times()
 
     def stat(self, path: bytes) -> Stat | None:
-        """Return what is known better here than by any listing, None if the listing decides.
-
-        Raises:
-            NotFound: a reserved name.
-        """
-        if is_reserved(split(path)[1]):
-            raise NotFound(f"{path!r} is a name of our own")
+        """Return what is known better here than by any listing, None if the listing decides."""
         node = self._context.nodes.get(path)
         if node is None or node.draft is None:
             return None
@@ -47,20 +35,17 @@ class Overlay:
         """
         node = self._context.nodes.get(path)
         if node is not None and node.draft is not None:
-            return None  # `overlay` shows it
+            return None  # `stat` shows it
         known = self.times.get(path, size, mtime)
         return None if known is None else shown(known)
 
-    def overlay(self, directory: bytes, listed: Mapping[bytes, Stat]) -> dict[bytes, Stat]:
-        """Return a listing with our own names hidden, and with what the vehicle does not have yet."""
-        entries = {name: stat for name, stat in listed.items() if not is_reserved(name)}
-        paths = [node.path for node in self._context.nodes if node.draft is not None]
-        for path in paths:
-            parent, name = split(path)
-            stat = self.stat(path) if parent == directory else None
+    def lay_over(self, directory: bytes, entries: dict[bytes, Stat]) -> None:
+        """Add to a listing what the vehicle does not have yet."""
+        for node in self._context.nodes:
+            parent, name = split(node.path)
+            stat = self.stat(node.path) if parent == directory else None
             if stat is not None:
                 entries[name] = stat
-        return entries
 
     def on_written(self, path: bytes) -> None:
         """A file's content changed: it is of now, also where no listing tells times."""

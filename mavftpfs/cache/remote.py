@@ -225,3 +225,7 @@ class WriteStore(Protocol):
             FtpNak: with a code that errnos maps to ENOENT if there is none.
         """
         ...
+
+
+class VehicleStore(RemoteStore, WriteStore, Protocol):
+    """The vehicle's files, to read and to change."""

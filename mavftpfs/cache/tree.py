@@ -24,10 +24,11 @@ from mavftpfs.cache.localfiles import LocalFiles
 from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.options import CacheOptions
 from mavftpfs.cache.recovery import SpoolDirectory
-from mavftpfs.cache.remote import RemoteStore, WriteStore
+from mavftpfs.cache.remote import VehicleStore
+from mavftpfs.cache.reserved import is_reserved
 from mavftpfs.cache.versions import BlockCache
 from mavftpfs.cache.virtual import VirtualTrees
-from mavftpfs.cache.writeback import Writeback, make_writeback
+from mavftpfs.cache.writeback import make_writeback
 from mavftpfs.shared.errors import (
     CrossDevice,
     DirectoryNotEmpty,
@@ -36,6 +37,7 @@ from mavftpfs.shared.errors import (
     ListingIncomplete,
     NotADirectory,
     NotDeliveredYet,
+    NotFound,
     ReadOnly,
 )
 from mavftpfs.shared.model import ROOT, DirEntry, EntryKind, is_snapshot, is_virtual, join, normalise, split
@@ -54,13 +56,12 @@ class Tree:
 
     def __init__(
         self,
-        store: RemoteStore,
+        store: VehicleStore,
         options: CacheOptions,
         *,
         clock: Callable[[], float],
         invalidate: Callable[[bytes], None],
         nursery: trio.Nursery | None = None,
-        writer: WriteStore | None = None,
         spool: SpoolDirectory | None = None,
         wall: Callable[[], float] = time.time,
         rng: Random | None = None,
@@ -69,7 +70,7 @@ class Tree:
         """`invalidate(path)`: the kernel's pages and attributes of a path are wrong; must not block.
 
         With a nursery, listings and snapshots under way survive the cancellation of who asked for them, and
-        written bytes go to the vehicle while the program still writes. Without a writer all is read-only.
+        written bytes go to the vehicle while the program still writes.
         `spool` keeps what is not delivered; `wall`: seconds since 1970; `rng` numbers our temporary names;
         `keep` makes the cache on the local disk.
         """
@@ -95,25 +96,22 @@ class Tree:
             store, self._directories, options, invalidate=self._invalidate, nursery=nursery
         )
         self._local = LocalFiles(
-            options.local if writer is not None else (), options.local_max, lambda: int(wall() * SECOND)
+            () if options.read_only else options.local, options.local_max, lambda: int(wall() * SECOND)
         )
         self._checksums: dict[bytes, tuple[DirEntry | None, int | None, int]] = {}
-        self._writing: Writeback | None = None
-        if writer is not None:
-            self._writing = make_writeback(
-                store=store,
-                writer=writer,
-                directories=self._directories,
-                dentries=self._dentries,
-                files=self._files,
-                options=options,
-                clock=clock,
-                wall=wall,
-                rng=rng or Random(),
-                nursery=nursery,
-                spool_directory=spool,
-                read_rate=lambda: self._blocks.meter.rate,
-            )
+        self._writing = make_writeback(
+            store=store,
+            directories=self._directories,
+            dentries=self._dentries,
+            files=self._files,
+            options=options,
+            clock=clock,
+            wall=wall,
+            rng=rng or Random(),
+            nursery=nursery,
+            spool_directory=spool,
+            read_rate=lambda: self._blocks.meter.rate,
+        )
 
     # --- asking
 
@@ -130,10 +128,10 @@ class Tree:
             return await self._virtual.stat(remote)
         if self._local.owns(remote):
             return self._local.stat(remote)
-        if self._writing is not None:
-            ours = self._writing.overlay.stat(remote)
-            if ours is not None:
-                return ours
+        self._require_not_hidden(remote)
+        ours = self._writing.overlay.stat(remote)
+        if ours is not None:
+            return ours
         found = await self._directories.find(remote)
         if found.entry.kind is EntryKind.FILE and found.size is None:
             try:
@@ -174,8 +172,9 @@ class Tree:
             for name in self._virtual.shown_in_root(directory.entries):
                 founds[name] = Found(DirEntry(name, EntryKind.DIRECTORY), directory)
         shown = {name: self._listed_stat(join(remote, name), found) for name, found in founds.items()}
-        if self._writing is not None:
-            shown = self._writing.overlay.overlay(remote, shown)
+        if not self._options.read_only:
+            shown = {name: stat for name, stat in shown.items() if not is_reserved(name)}
+        self._writing.overlay.lay_over(remote, shown)
         for name in self._local.names(remote):
             shown[name] = self._local.stat(join(remote, name))
         if directory.cut_short:
@@ -190,16 +189,18 @@ class Tree:
             and read_whole.
         """
         remote = self._remote(path)
-        writing = self._writable(remote) if write or truncate else self._writing
+        if write or truncate:
+            self._require_writable(remote)
         if is_snapshot(remote):
             return await self._virtual.open(remote)
         if self._local.owns(remote):
             return self._local.open(remote, write=write or truncate, truncate=truncate)
-        if writing is not None and (write or truncate):
-            return await writing.open(remote, truncate=truncate)
+        if write or truncate:
+            return await self._writing.open(remote, truncate=truncate)
         if remote == self._options.root:
             raise IsADirectory("the mount's root is a directory")
-        return await (self._files.open(remote) if writing is None else writing.open_reader(remote))
+        self._require_not_hidden(remote)
+        return await self._writing.open_reader(remote)
 
     async def crc32(self, path: bytes) -> int:
         """Return the vehicle's CRC32 of a file (start value 0, no final xor), as old as the listing at most.
@@ -212,7 +213,7 @@ class Tree:
         remote = self._remote(path)
         if is_snapshot(remote):
             return await self._virtual.crc32(remote)
-        if self._writing is not None and self._writing.holds(remote):
+        if self._writing.holds(remote):
             raise NotDeliveredYet(f"{remote!r} is not on the vehicle yet")
         if remote == self._options.root:
             raise IsADirectory("the mount's root is a directory")
@@ -228,7 +229,7 @@ class Tree:
                 del self._checksums[next(iter(self._checksums))]
         return value
 
-    # --- changing (all raise ReadOnly on a tree without a writer, and below `@` directories)
+    # --- changing (all raise ReadOnly with `read_only`, and below `@` directories)
 
     async def create(self, path: bytes, *, exclusive: bool) -> OpenFile:
         """Make a file, or open (not empty) the one that is there, for writing.
@@ -238,11 +239,11 @@ class Tree:
                 PathTooLong.
         """
         remote = self._remote(path)
-        writing = self._writable(remote)
+        self._require_writable(remote)
         if self._local.owns(remote):
             await self._require_parent(remote)
             return self._local.create(remote, exclusive=exclusive)
-        return await writing.create(remote, exclusive=exclusive)
+        return await self._writing.create(remote, exclusive=exclusive)
 
     async def truncate(self, path: bytes, size: int) -> None:
         """Cut or extend a file; done on the vehicle, unless somebody has it open for writing.
@@ -251,11 +252,11 @@ class Tree:
             NotFound, IsADirectory, Armed, FileBusy, FileTooLarge, NotSupported.
         """
         remote = self._remote(path)
-        writing = self._writable(remote)
+        self._require_writable(remote)
         if self._local.owns(remote):
             self._local.truncate(remote, size)
         else:
-            await writing.truncate(remote, size)
+            await self._writing.truncate(remote, size)
 
     async def set_times(self, path: bytes, mtime_ns: int) -> None:
         """Show this mtime (nanoseconds since 1970 UTC) until the file changes; no server can keep it.
@@ -265,11 +266,11 @@ class Tree:
         """
         remote = self._remote(path)
         await self.stat(path)
-        writing = self._writable(remote)
+        self._require_writable(remote)
         if self._local.owns(remote):
             self._local.find(remote).mtime_ns = mtime_ns
         else:
-            writing.overlay.times.set(remote, mtime_ns)
+            self._writing.overlay.times.set(remote, mtime_ns)
 
     async def mkdir(self, path: bytes) -> None:
         """Make a directory.
@@ -278,12 +279,12 @@ class Tree:
             AlreadyExists, NotFound, NotADirectory, Armed, PathTooLong.
         """
         remote = self._remote(path)
-        writing = self._writable(remote)
+        self._require_writable(remote)
         if self._local.owns(remote):
             await self._require_parent(remote)
             self._local.mkdir(remote)
         else:
-            await writing.names.mkdir(remote)
+            await self._writing.names.mkdir(remote)
 
     async def rmdir(self, path: bytes) -> None:
         """Remove an empty directory.
@@ -292,13 +293,13 @@ class Tree:
             NotFound, NotADirectory, DirectoryNotEmpty, Armed.
         """
         remote = self._remote(path)
-        writing = self._writable(remote)
+        self._require_writable(remote)
         if self._local.owns(remote):
             self._local.rmdir(remote)
         elif self._local.names(remote):
             raise DirectoryNotEmpty(f"{remote!r} holds local files")
         else:
-            await writing.names.rmdir(remote)
+            await self._writing.names.rmdir(remote)
 
     async def unlink(self, path: bytes) -> None:
         """Remove a file; who has it open goes on reading it.
@@ -307,11 +308,11 @@ class Tree:
             NotFound, IsADirectory, Armed, FileBusy.
         """
         remote = self._remote(path)
-        writing = self._writable(remote)
+        self._require_writable(remote)
         if self._local.owns(remote):
             self._local.unlink(remote)
         else:
-            await writing.names.unlink(remote)
+            await self._writing.names.unlink(remote)
 
     async def rename(self, old: bytes, new: bytes, *, noreplace: bool = False) -> None:
         """Rename a file or directory, over what is there if the rules of rename(2) allow it.
@@ -321,27 +322,24 @@ class Tree:
             CrossDevice, PathTooLong, Armed, FileBusy.
         """
         source, target = self._remote(old), self._remote(new)
-        self._writable(source)
-        writing = self._writable(target)
+        self._require_writable(source)
+        self._require_writable(target)
         if self._local.owns(source) != self._local.owns(target):
             raise CrossDevice(f"one of {source!r} and {target!r} is not on the vehicle")
         if self._local.owns(source):
             await self._require_parent(target)
             self._local.rename(source, target, noreplace=noreplace)
         else:
-            await writing.names.rename(source, target, noreplace=noreplace)
+            await self._writing.names.rename(source, target, noreplace=noreplace)
             self._local.move_below(source, target)
 
     def undelivered(self) -> Sequence[bytes]:
         """Return the paths of files of which the vehicle does not provably have every byte."""
-        if self._writing is None:
-            return []
         return [self._below(remote) for remote in self._writing.undelivered()]
 
     async def drain(self, timeout: float) -> Sequence[bytes]:
         """Deliver everything, trying again for at most `timeout` seconds; return what remains."""
-        if self._writing is not None:
-            await self._writing.drain(timeout)
+        await self._writing.drain(timeout)
         return self.undelivered()
 
     def recover_to(self, directory: Path) -> Sequence[Path]:
@@ -353,12 +351,11 @@ class Tree:
         Raises:
             OSError, SpoolFailed: nothing could be copied.
         """
-        return [] if self._writing is None else self._writing.recover_to(directory)
+        return self._writing.recover_to(directory)
 
     def armed_changed(self, armed: bool) -> None:
         """The vehicle was armed or disarmed: nothing is changed in flight unless when_armed=ok."""
-        if self._writing is not None:
-            self._writing.armed_changed(armed)
+        self._writing.armed_changed(armed)
 
     # --- news and housekeeping
 
@@ -376,7 +373,7 @@ class Tree:
         """Return counters; bytes_... in bytes, rate in bytes per second or None."""
         files, blocks = self._files, self._blocks
         return {
-            **({} if self._writing is None else self._writing.status()),
+            **self._writing.status(),
             **files.status(),
             "bytes_local": self._local.used,
             "bytes_cached": blocks.bytes_cached + self._virtual.bytes_cached,
@@ -393,8 +390,7 @@ class Tree:
     def link_back(self) -> None:
         """Heartbeats are back."""
         self._directories.lost = False
-        if self._writing is not None:
-            self._writing.retry()
+        self._writing.retry()
 
     def rebooted(self) -> None:
         """The vehicle restarted: what was known of it must be asked again."""
@@ -402,8 +398,7 @@ class Tree:
         self._directories.rebooted()
         self._virtual.rebooted()
         self._files.rebooted()
-        if self._writing is not None:
-            self._writing.retry()
+        self._writing.retry()
 
     # --- inside
 
@@ -420,10 +415,13 @@ class Tree:
         if (await self.stat(self._below(parent))).kind is not EntryKind.DIRECTORY:
             raise NotADirectory(f"{parent!r} is not a directory")
 
-    def _writable(self, remote: bytes) -> Writeback:
-        if self._writing is None or is_virtual(remote):
+    def _require_writable(self, remote: bytes) -> None:
+        if self._options.read_only or is_virtual(remote):
             raise ReadOnly(f"{remote!r} is only read")
-        return self._writing
+
+    def _require_not_hidden(self, remote: bytes) -> None:
+        if is_reserved(split(remote)[1]) and not self._options.read_only:
+            raise NotFound(f"{remote!r} is a name of our own")
 
     def _invalidate(self, remote: bytes) -> None:
         self._tell_kernel(self._below(remote))
@@ -435,8 +433,7 @@ class Tree:
         unknown = found.entry.kind is EntryKind.FILE and found.size is None
         valid_for = 0.0 if unknown else max(0.0, min(self._options.attr_timeout, left))
         size = 0 if found.entry.kind is EntryKind.DIRECTORY else found.size or 0
-        if self._writing is not None:
-            user_set = self._writing.overlay.shown_time(remote, size, found.entry.mtime)
-            if user_set is not None:
-                return Stat(found.entry.kind, size, user_set[0], valid_for, user_set[1])
+        user_set = self._writing.overlay.shown_time(remote, size, found.entry.mtime)
+        if user_set is not None:
+            return Stat(found.entry.kind, size, user_set[0], valid_for, user_set[1])
         return Stat(found.entry.kind, size, shown_mtime(remote, found.entry.mtime), valid_for)

@@ -29,9 +29,9 @@ from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.options import CacheOptions
 from mavftpfs.cache.overlay import Overlay
 from mavftpfs.cache.recovery import SpoolDirectory, recover
-from mavftpfs.cache.remote import RemoteStore, WriteStore
+from mavftpfs.cache.remote import VehicleStore
 from mavftpfs.cache.repair import Cleaner
-from mavftpfs.cache.reserved import OwnNames, is_reserved, new_owner, require_not_ours
+from mavftpfs.cache.reserved import OwnNames, new_owner, require_not_ours
 from mavftpfs.cache.spool import Spool
 from mavftpfs.cache.throttle import Throttle
 from mavftpfs.cache.writefile import Parts, ReadFile, WriteFile
@@ -39,9 +39,8 @@ from mavftpfs.shared.errors import (
     AlreadyExists,
     IsADirectory,
     MavftpfsError,
-    NotFound,
 )
-from mavftpfs.shared.model import EntryKind, require_listable, split, wire_path
+from mavftpfs.shared.model import EntryKind, require_listable, wire_path
 
 log = logging.getLogger("mavftpfs.cache")
 
@@ -54,8 +53,7 @@ REFUSALS = 3
 
 def make_writeback(
     *,
-    store: RemoteStore,
-    writer: WriteStore,
+    store: VehicleStore,
     directories: Directories,
     dentries: Dentries,
     files: Files,
@@ -81,7 +79,7 @@ def make_writeback(
     )
     context = Context(
         store=store,
-        writer=writer,
+        writer=store,
         directories=directories,
         dentries=dentries,
         files=files,
@@ -97,7 +95,8 @@ def make_writeback(
     throttle = Throttle(context)
     names = Names(context)
     cleaner = Cleaner(context, names, dead)
-    directories.on_swept = cleaner.on_swept
+    if not options.read_only:
+        directories.on_swept = cleaner.on_swept
     files.is_changing = context.is_changing
     directories.on_listed.append(partial(on_listed, context))
     return Writeback(context, names, throttle, cleaner)
@@ -125,8 +124,6 @@ class Writeback:
 
     async def open_reader(self, path: bytes) -> OpenFile:
         """Open a file for reading."""
-        if is_reserved(split(path)[1]):
-            raise NotFound(f"{path!r} is a name of our own")
         async with self._context.paths.hold(path, shared=True):
             node, handle = self._context.nodes.get(path), None
             if node is None or node.draft is None:

@@ -8,12 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, cast
 
 import trio
 
 from mavftpfs.cache.options import CacheOptions
-from mavftpfs.cache.remote import ReadSink
+from mavftpfs.cache.remote import ReadSink, VehicleStore
 from mavftpfs.cache.tree import Tree
 from mavftpfs.protocol.crc import crc32
 from mavftpfs.protocol.payload import NakCode, Opcode
@@ -25,8 +25,8 @@ from mavftpfs.shared.model import ROOT, DirEntry, EntryKind, Listing, join, spli
 def make_tree(store: FakeStore, *, nursery: trio.Nursery | None = None, **options: Any) -> Tree:
     """Return the cache facade over a store; what it tells the kernel to drop goes to `store.invalidated`."""
     return Tree(
-        store,
-        CacheOptions(**options),
+        cast(VehicleStore, store),
+        CacheOptions(read_only=True, **options),
         clock=trio.current_time,
         invalidate=store.invalidated.append,
         nursery=nursery,

@@ -321,7 +321,6 @@ def make_writable(
         clock=trio.current_time,
         invalidate=store.invalidated.append,
         nursery=store.nursery,
-        writer=store,
         spool=spool,
         wall=lambda: 1_700_000_000.0,
         rng=Random(seed),

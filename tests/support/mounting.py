@@ -31,7 +31,6 @@ def writable_tree(
         clock=trio.current_time,
         invalidate=lambda path: None,
         nursery=nursery,
-        writer=connection.store,
         spool=spool,
         rng=random.Random(seed),
     )

@@ -91,7 +91,7 @@ async def test_a_file_that_was_removed_while_its_upload_began_is_forgotten(
         nursery.start_soon(file.release)
         nursery.start_soon(tree.unlink, FILE)
     await trio.sleep(1)
-    assert list(tree._writing._context.nodes) == []  # type: ignore[union-attr]
+    assert list(tree._writing._context.nodes) == []
     assert tree.status()["bytes_held"] == 0
 
 
@@ -115,7 +115,7 @@ async def test_what_a_close_did_not_deliver_is_delivered_without_news(
     await trio.sleep(2 * FIRST_PAUSE)
     assert tree.undelivered() == []
     assert store.files[NEW].data == b"content"
-    assert list(tree._writing._context.nodes) == []  # type: ignore[union-attr]
+    assert list(tree._writing._context.nodes) == []
 
 
 async def test_a_close_that_was_given_up_is_made_good(

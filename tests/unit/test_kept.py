@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import AsyncIterator, Callable
 from pathlib import Path
+from typing import cast
 
 import pytest
 import trio
@@ -13,6 +14,7 @@ from mavftpfs.cache.kept import CRC_LIMIT, PERIOD, SETTLED, KeptCache
 from mavftpfs.cache.kept_disk import KeptDisk
 from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.options import CacheOptions
+from mavftpfs.cache.remote import VehicleStore
 from mavftpfs.cache.tree import Tree
 from mavftpfs.cache.versions import BLOCK_SIZE
 from mavftpfs.protocol.payload import NakCode, Opcode
@@ -64,8 +66,8 @@ class Mounts:
 
         self.store.calls.clear()
         return Tree(
-            self.store,
-            CacheOptions(**options),  # type: ignore[arg-type]
+            cast(VehicleStore, self.store),
+            CacheOptions(read_only=True, **options),  # type: ignore[arg-type]
             clock=trio.current_time,
             invalidate=self.store.invalidated.append,
             keep=keep,
