@@ -3,7 +3,6 @@ in the foreground and as a daemon."""
 
 from __future__ import annotations
 
-import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -41,18 +40,6 @@ def test_no_vehicle_is_exit_2(mountpoint: Path, foreground: bool) -> None:
     line = complaint(source, mountpoint, "-o", "connect_timeout=1", *extra, code=2)
     assert "heartbeat" in line or "vehicle" in line
     assert not mounted_at(mountpoint)
-
-
-def test_a_busy_port_is_exit_2(mountpoint: Path) -> None:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
-        sock.bind((HOST, 0))
-        port = sock.getsockname()[1]
-        assert str(port) in complaint(f"udpin:{HOST}:{port}", mountpoint, code=2)
-
-
-def test_a_missing_serial_port_is_exit_2(mountpoint: Path) -> None:
-    line = complaint("/dev/ttyNOTHERE,57600", mountpoint, "-o", "connect_timeout=2", code=2)
-    assert "/dev/ttyNOTHERE" in line
 
 
 def test_a_missing_remote_root_is_named(field: Field, small_tree: Path, mountpoint: Path) -> None:

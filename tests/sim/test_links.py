@@ -1,4 +1,4 @@
-"""Links over real sockets and ptys. The other end is pymavlink's mavutil or a bare descriptor."""
+"""Links over real sockets and ptys; the other end is a bare descriptor."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from contextlib import (
     AbstractAsyncContextManager,
     AsyncExitStack,
     asynccontextmanager,
-    closing,
     contextmanager,
 )
 from pathlib import Path
@@ -20,11 +19,10 @@ from typing import Any
 import pytest
 import trio
 import trio.testing
-from pymavlink import mavutil
 
 from mavftpfs.link.base import MAX_DATAGRAM, Link, pack
 from mavftpfs.link.framing import Framer
-from mavftpfs.link.messages import Address, FtpFrame, Heartbeat, Message
+from mavftpfs.link.messages import Address, Heartbeat
 from mavftpfs.link.opening import open_link
 from mavftpfs.link.stream import StreamLink
 from mavftpfs.link.tcp import open_tcp
@@ -62,110 +60,12 @@ def udp_socket(host: str = HOST, port: int = 0) -> Iterator[socket.socket]:
         yield sock
 
 
-@asynccontextmanager
-async def pymavlink(device: str, **options: Any) -> AsyncIterator[Any]:
-    """Open pymavlink's own connection, as system 1, component 1."""
-    options = {"source_system": 1, "source_component": 1, "dialect": "ardupilotmega", **options}
-    with closing(
-        await trio.to_thread.run_sync(lambda: mavutil.mavlink_connection(device, **options))
-    ) as connection:
-        yield connection
-
-
-async def hear(connection: Any, kind: str) -> Any:
-    """Return the next message of a kind that pymavlink receives."""
-    message = await trio.to_thread.run_sync(
-        lambda: connection.recv_match(type=kind, blocking=True, timeout=60)
-    )
-    assert message is not None
-    return message
-
-
-async def read(link: Link, framer: Framer, wanted: Callable[[Message], bool]) -> Message:
-    """Receive until a message is the wanted one."""
-    with trio.fail_after(60):
-        while True:
-            for chunk in await link.receive():
-                for message in framer.feed(chunk):
-                    if wanted(message):
-                        return message
-
-
-def is_ftp(message: Message) -> bool:
-    return isinstance(message, FtpFrame)
-
-
 async def read_bytes(link: Link, size: int) -> bytes:
     data = b""
     with trio.fail_after(60):
         while len(data) < size:
             data += b"".join(await link.receive())
     return data
-
-
-async def converse(link: Link, other: Any) -> None:
-    """Exchange heartbeats and FTP messages with pymavlink, both ways."""
-    framer = Framer(US, stream=link.is_stream)
-    other.mav.heartbeat_send(2, 12, 0, 0, 4)
-    assert await read(link, framer, lambda m: isinstance(m, Heartbeat)) == Heartbeat(DRONE, 2, 12, 0, 4)
-    frames = [framer.encode_heartbeat(18)]
-    frames += [framer.encode_ftp(DRONE, bytes([n]) * 251) for n in range(1, 21)]
-    link.send_nowait(frames)
-    assert (await hear(other, "HEARTBEAT")).type == 18
-    for n in range(1, 21):
-        message = await hear(other, "FILE_TRANSFER_PROTOCOL")
-        assert bytes(message.payload) == bytes([n]) * 251
-    other.mav.file_transfer_protocol_send(0, *US, list(PAYLOAD))
-    assert await read(link, framer, is_ftp) == FtpFrame(DRONE, US, PAYLOAD)
-    assert framer.stats.bad_crc == framer.stats.garbage_bytes == 0
-
-
-# ---------------------------------------------------------------------- with pymavlink
-
-
-async def test_udpin_and_pymavlink() -> None:
-    async with udpin() as (link, port), pymavlink(f"udpout:{HOST}:{port}") as other:
-        await converse(link, other)
-
-
-async def test_udpout_and_pymavlink() -> None:
-    async with pymavlink(f"udpin:{HOST}:0") as other:
-        port = other.port.getsockname()[1]
-        async with opened(f"udpout:{HOST}:{port}") as link:
-            link.send_nowait([Framer(US, stream=False).encode_heartbeat(18)])
-            assert (await hear(other, "HEARTBEAT")).get_srcSystem() == 254
-            await converse(link, other)
-
-
-async def test_tcpin_and_pymavlink() -> None:
-    async with opened(f"tcpin:{HOST}:0") as link:
-        port = parse_source(link.description).port
-        async with pymavlink(f"tcp:{HOST}:{port}") as other:
-            await converse(link, other)
-
-
-async def test_serial_and_pymavlink() -> None:
-    async with opened_pty() as (link, master):
-        # pymavlink gets the other end of the cable through a pty of its own.
-        other_master, other_slave = os.openpty()
-        tty.setraw(other_slave)
-        async with pymavlink(os.ttyname(other_slave), baud=57600) as other, trio.open_nursery() as nursery:
-            nursery.start_soon(cable, master, other_master)
-            nursery.start_soon(cable, other_master, master)
-            await converse(link, other)
-            nursery.cancel_scope.cancel()
-        os.close(other_master)
-        os.close(other_slave)
-
-
-async def cable(source: int, sink: int) -> None:
-    """Carry bytes from one pty master to another."""
-    while True:
-        await trio.lowlevel.wait_readable(source)
-        data = os.read(source, 4096)
-        while data:
-            await trio.lowlevel.wait_writable(sink)
-            data = data[os.write(sink, data) :]
 
 
 # ---------------------------------------------------------------------- UDP
@@ -402,13 +302,6 @@ async def test_what_somebody_else_uses(kind: str) -> None:
                 pytest.fail("it opened")
 
 
-@pytest.mark.parametrize("source", [f"udpin:{HOST}:0", f"tcpin:{HOST}:0"])
-async def test_an_error_of_the_body_comes_out_as_itself(source: str) -> None:
-    with pytest.raises(KeyError):
-        async with opened(source):
-            raise KeyError("body")
-
-
 # ---------------------------------------------------------------------- TCP
 
 
@@ -572,21 +465,6 @@ async def opened_pty(baud: int = 115200) -> AsyncIterator[tuple[StreamLink, int]
     finally:
         os.close(master)
         os.close(slave)
-
-
-async def test_serial_carries_every_byte_both_ways() -> None:
-    data = bytes(range(256)) * 4
-    async with opened_pty() as (link, master):
-        assert link.is_serial
-        assert link.is_stream
-        os.write(master, data)
-        assert await read_bytes(link, len(data)) == data
-        link.send_nowait([data])
-        got = b""
-        while len(got) < len(data):
-            await trio.lowlevel.wait_readable(master)
-            got += os.read(master, 4096)
-        assert got == data
 
 
 @asynccontextmanager
