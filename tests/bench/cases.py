@@ -37,17 +37,11 @@ WAITING = 0.25
 MOST_WAITING = 0.45
 """Seconds of answers, with the round trip, that may wait in a link for the pauses of a card."""
 
-MEANS = {
-    "read": {0.0: 0.97, 0.01: 0.97, 0.05: 0.96, 0.1: 0.95},
-    "write": {0.0: 0.96, 0.01: 0.94, 0.05: 0.87, 0.1: 0.80},
-}
-"""Share of the limit to reach in the mean over all conditions, each capped at 1, by direction and loss."""
-
 TARGETS = {
     "read": {0.0: 0.88, 0.01: 0.88, 0.05: 0.82, 0.1: 0.77},
     "write": {0.0: 0.86, 0.01: 0.84, 0.05: 0.75, 0.1: 0.66},
 }
-"""The same to reach in each."""
+"""Share of the limit to reach, by direction and loss."""
 
 
 @dataclass(frozen=True, slots=True)

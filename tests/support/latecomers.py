@@ -42,12 +42,6 @@ class Latecomer:
         server.handle = self._on_request  # type: ignore[method-assign]
         server.outgoing = self._on_replies  # type: ignore[method-assign]
 
-    def rearm(self, after: Opcode, nth: int = 1) -> None:
-        """Keep the request there is, and send it after these, counted from now on."""
-        assert self._kept is not None
-        assert self.late is None
-        self._after, self._left, self._first = after, nth, True
-
     def _on_request(self, wire: bytes, source: Address, now: float) -> None:
         self._handle(wire, source, now)
         if self.late is not None:
