@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Awaitable, Callable
+from random import Random
 
 import pytest
 import trio
@@ -11,6 +12,7 @@ import trio.testing
 from mavftpfs.cache.attributes import UNKNOWN_MTIME
 from mavftpfs.cache.directories import SWEEP_TRIES
 from mavftpfs.cache.options import MIN_CACHE_SIZE, CacheOptions
+from mavftpfs.cache.reserved import Kind, Reserved, new_owner
 from mavftpfs.cache.singleflight import SingleFlight
 from mavftpfs.cache.tree import Stat, Tree
 from mavftpfs.protocol.crc import crc32
@@ -23,6 +25,7 @@ from mavftpfs.shared.errors import (
     NotADirectory,
     NotFound,
     PathTooLong,
+    ReadOnly,
     RequestTimeout,
     UsageError,
     VehicleLost,
@@ -156,6 +159,18 @@ async def test_a_listing_that_is_always_raced_is_given_up_on(store: FakeStore, t
     assert b"top" in dict(await tree.list(b"/"))
     assert store.count("list", b"/") == SWEEP_TRIES
     assert tree.negative_valid_for(b"/none") == 0.0
+
+
+async def test_a_tree_that_is_only_read_shows_what_others_left(store: FakeStore, tree: Tree) -> None:
+    """Names like those of our own, too: there may be nothing else left of a file."""
+    left = Reserved(new_owner(Random(1)), Kind.NEW, b"sss", b"a.txt").name
+    for name in (left, b".a.txt.swp"):
+        store.add(b"/fs/microsd/" + name, b"left")
+        assert await read_file(tree, b"/fs/microsd/" + name) == b"left"
+        tree.forget_caches()
+    assert {left, b".a.txt.swp"} < set(dict(await tree.list(b"/fs/microsd")))
+    with pytest.raises(ReadOnly):
+        await tree.unlink(b"/fs/microsd/" + left)
 
 
 # --- the vehicle is out of reach

@@ -137,7 +137,7 @@ async def test_a_full_spool_refuses_and_keeps_what_it_took(store: FakeWriter) ->
     assert store.files[b"/card/dir/new"].data == bytes(60_000)
 
 
-async def test_a_tree_without_a_writer_and_virtual_trees_are_read_only(store: FakeWriter) -> None:
+async def test_read_only_and_virtual_trees_refuse_changes(store: FakeWriter) -> None:
     reading = make_tree(store)
     for ask in (reading.mkdir(b"/x"), reading.open(FILE, write=True), reading.unlink(FILE)):
         with pytest.raises(ReadOnly):
