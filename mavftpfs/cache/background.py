@@ -31,8 +31,8 @@ START_AT = 64 * 1024
 START_PAUSE = 5.0
 """Seconds after which one that could not begin is tried again."""
 
-FIRST_PAUSE, LONGEST_PAUSE = 2.0, 30.0
-"""Seconds between two attempts to deliver what nobody has open."""
+PAUSES = (2.0, 30.0)
+"""Seconds between two attempts to deliver what nobody has open: at first, and at most."""
 
 ROOM_PAUSES = (120.0, 3600.0)
 """The same for what the card had no room for: most of a file may travel before that shows again."""
@@ -46,8 +46,7 @@ class Background:
         self._deliverer = deliverer
         self._throttle = throttle
         self._cleaner = cleaner
-        self._pause = FIRST_PAUSE
-        self._redelivering = self._awaits_room = False
+        self._retried: set[Callable[[Node], bool]] = set()
         context.retry_later = self.redeliver
 
     def kick(self, node: Node) -> None:
@@ -71,7 +70,6 @@ class Background:
 
     async def link_back(self) -> None:
         """What failed, or was refused, may work now."""
-        self._pause = FIRST_PAUSE
         await self._cleaner.mend_torn()
         for node in self._context.nodes:
             node.start_after = float("-inf")
@@ -81,13 +79,10 @@ class Background:
     def redeliver(self) -> None:
         """Something was not delivered, or left a name without a file: try again by and by."""
         nursery = self._context.nursery
-        if nursery is not None and not self._redelivering:
-            self._redelivering = True
-            self._pause = FIRST_PAUSE
-            nursery.start_soon(self._redeliver)
-        if nursery is not None and not self._awaits_room and self._any(_lacked_room):
-            self._awaits_room = True
-            nursery.start_soon(self._await_room)
+        for which, pauses in ((_may_pass, PAUSES), (_lacked_room, ROOM_PAUSES)):
+            if nursery is not None and which not in self._retried:
+                self._retried.add(which)
+                nursery.start_soon(self._retry, which, *pauses)
 
     # --- inside
 
@@ -112,28 +107,17 @@ class Background:
                 await self._deliverer.abandon(node)
         self._context.nodes.maybe_forget(node)
 
-    async def _redeliver(self) -> None:
+    async def _retry(self, which: Callable[[Node], bool], pause: float, longest: float) -> None:
+        """Try again, ever more seldom, as long as there are such files."""
+        nodes, own = self._context.nodes, self._context.own
         try:
-            while self._context.own.torn or self._any(_may_pass):
-                pause, self._pause = self._pause, min(2 * self._pause, LONGEST_PAUSE)
-                await trio.sleep(pause)
-                await self._cleaner.mend_torn()
-                await self._deliver_closed(_may_pass)
-        finally:
-            self._redelivering = False
-
-    async def _await_room(self) -> None:
-        pause, longest = ROOM_PAUSES
-        try:
-            while self._any(_lacked_room):
+            while (which is _may_pass and own.torn) or any(n.undelivered and which(n) for n in nodes):
                 await trio.sleep(pause)
                 pause = min(2 * pause, longest)
-                await self._deliver_closed(_lacked_room)
+                await self._cleaner.mend_torn()
+                await self._deliver_closed(which)
         finally:
-            self._awaits_room = False
-
-    def _any(self, which: Callable[[Node], bool]) -> bool:
-        return any(node.undelivered and which(node) for node in self._context.nodes)
+            self._retried.discard(which)
 
     def _is_left_to_us(self, node: Node) -> bool:
         return node.undelivered and (not node.writers or node.path in self._context.own.torn)

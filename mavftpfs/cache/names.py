@@ -24,8 +24,7 @@ from contextlib import asynccontextmanager
 import trio
 
 from mavftpfs.cache.context import Context
-from mavftpfs.cache.draft import State
-from mavftpfs.cache.remote import UploadSource
+from mavftpfs.cache.draft import Sending, State
 from mavftpfs.cache.reserved import Kind, Places, is_reserved, parse
 from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.shared.errnos import errno_for
@@ -343,7 +342,8 @@ class Names:
 
     async def write_sidecar(self, sidecar: bytes, target: bytes) -> None:
         """Write down where short names belong. Raises as Upload.finish."""
-        upload = await self._context.writer.open_upload(sidecar, _Text(target))
+        text = Sending(lambda start, stop: target[start:stop], len(target))
+        upload = await self._context.writer.open_upload(sidecar, text)
         try:
             upload.wake()
             await upload.finish()
@@ -415,34 +415,6 @@ class Names:
             if not isinstance(error, MavftpfsError):
                 raise
             log.debug("%r did not get its file back: %s", path, error)
-
-
-class _Text(UploadSource):
-    """A path to upload."""
-
-    def __init__(self, data: bytes) -> None:
-        self._data = data
-        self._at = 0
-
-    def next_chunk(self, limit: int) -> tuple[int, bytes] | None:
-        """See UploadSource."""
-        chunk = (self._at, self._data[self._at : self._at + limit])
-        self._at += len(chunk[1])
-        return chunk if chunk[1] else None
-
-    def on_acked(self, offset: int, count: int) -> None:
-        """See UploadSource."""
-
-    def on_unsent(self, offset: int, count: int) -> None:
-        """See UploadSource: all behind it again, it is at most one path."""
-        self._at = min(self._at, offset)
-
-    def on_checkpoint(self) -> None:
-        """See UploadSource."""
-
-    def on_rollback(self, everything: bool) -> None:
-        """See UploadSource."""
-        self._at = 0
 
 
 def _plain(name: bytes) -> bytes:

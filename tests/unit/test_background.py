@@ -7,7 +7,7 @@ import errno
 import pytest
 import trio
 
-from mavftpfs.cache.background import FIRST_PAUSE, LONGEST_PAUSE, ROOM_PAUSES
+from mavftpfs.cache.background import PAUSES, ROOM_PAUSES
 from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.tree import Tree
 from mavftpfs.protocol.payload import NakCode, Opcode
@@ -112,7 +112,7 @@ async def test_what_a_close_did_not_deliver_is_delivered_without_news(
     store.fail_at[1] = RequestTimeout("silence")
     await close_in_vain(tree)
     assert tree.undelivered() == [NEW]
-    await trio.sleep(2 * FIRST_PAUSE)
+    await trio.sleep(2 * PAUSES[0])
     assert tree.undelivered() == []
     assert store.files[NEW].data == b"content"
     assert list(tree._writing._context.nodes) == []
@@ -145,9 +145,9 @@ async def test_attempts_grow_seldom_and_go_on(autojump_clock: object, store: Fak
     await trio.sleep(1000)
     times = sorted(set(asked))
     assert 30 < len(times) < 60
-    assert times[-1] - times[-2] == pytest.approx(LONGEST_PAUSE, abs=2)
+    assert times[-1] - times[-2] == pytest.approx(PAUSES[1], abs=2)
     store.lost = False
-    await trio.sleep(2 * LONGEST_PAUSE)
+    await trio.sleep(2 * PAUSES[1])
     assert tree.undelivered() == []
     count = len(asked)
     await trio.sleep(1000)
@@ -157,7 +157,7 @@ async def test_attempts_grow_seldom_and_go_on(autojump_clock: object, store: Fak
     tree.forget_caches()
     store.fail_at[store.requests + 1] = RequestTimeout("silence")
     await close_in_vain(tree)
-    await trio.sleep(2 * FIRST_PAUSE)
+    await trio.sleep(2 * PAUSES[0])
     assert tree.undelivered() == [], "the next one begins anew"
 
 
@@ -215,5 +215,5 @@ async def test_an_open_file_is_left_to_its_program(
     with pytest.raises(VehicleLost):
         await file.release()
     store.lost = False
-    await trio.sleep(2 * LONGEST_PAUSE)
+    await trio.sleep(2 * PAUSES[1])
     assert tree.undelivered() == []

@@ -7,7 +7,7 @@ from collections.abc import AsyncIterator
 import pytest
 import trio
 
-from mavftpfs.cache.background import FIRST_PAUSE
+from mavftpfs.cache.background import PAUSES
 from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.tree import Tree
 from mavftpfs.protocol.payload import NakCode, Opcode
@@ -252,7 +252,7 @@ async def test_a_torn_name_that_nobody_asks_for_is_mended_without_news(
     with pytest.raises(OutcomeUnknown):
         await tree.rename(OTHER, FILE)
     assert FILE not in store.files
-    await trio.sleep(2 * FIRST_PAUSE)
+    await trio.sleep(2 * PAUSES[0])
     assert store.files[FILE].data == OLD
     listings = store.count("list")
     await trio.sleep(1000)
