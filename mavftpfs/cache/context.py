@@ -13,7 +13,7 @@ from mavftpfs.cache.files import Files
 from mavftpfs.cache.nodes import Nodes
 from mavftpfs.cache.options import CacheOptions
 from mavftpfs.cache.pathlocks import PathLocks
-from mavftpfs.cache.remote import RemoteStore, WriteStore
+from mavftpfs.cache.remote import VehicleStore
 from mavftpfs.cache.reserved import OwnNames
 from mavftpfs.cache.spool import Spool
 from mavftpfs.shared.errors import Armed, FileBusy
@@ -28,8 +28,7 @@ class Context:
     something was not delivered, or a name may lack its file (Background sets it).
     """
 
-    store: RemoteStore
-    writer: WriteStore
+    store: VehicleStore
     directories: Directories
     dentries: Dentries
     files: Files

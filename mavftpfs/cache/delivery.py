@@ -72,7 +72,7 @@ class Deliverer:
         """Have the vehicle hold the node's file, checked, as long as that is `wanted`.
 
         Raises:
-            The reason why not: as WriteStore; VerificationFailed, NotSupported, FileTooLarge, FileChanged.
+            The reason why not: as VehicleStore; VerificationFailed, NotSupported, FileTooLarge, FileChanged.
         """
         while wanted is None or wanted():
             await node.unclaimed.wait()
@@ -138,13 +138,13 @@ class Deliverer:
     def _plan(self, node: Node, draft: Draft) -> Plan:
         if node.path in self._context.own.torn and draft.state is State.DIRTY:
             return Plan.MEND  # it was written again before its name had a file
-        return choose(draft, self._context.writer.traits, inplace=self._context.options.inplace)
+        return choose(draft, self._context.store.traits, inplace=self._context.options.inplace)
 
     async def _deliver(self, node: Node, draft: Draft) -> None:
         mismatches = 0
         for _ in range(MAX_STEPS):
             plan = self._plan(node, draft)
-            known = astuple(self._context.writer.traits)
+            known = astuple(self._context.store.traits)
             try:
                 if plan is Plan.NOTHING:
                     return
@@ -163,7 +163,7 @@ class Deliverer:
             except MavftpfsError as error:
                 if not isinstance(error, PASSING) or not draft.size:
                     await self.abandon(node)
-                learnt = astuple(self._context.writer.traits) != known
+                learnt = astuple(self._context.store.traits) != known
                 if not learnt or isinstance(error, LinkError | Armed):
                     raise
                 log.debug("%r: %s; trying another way", node.path, error)
@@ -193,7 +193,7 @@ class Deliverer:
 
     async def _send(self, node: Node, draft: Draft, plan: Plan) -> None:
         """Send the whole file, compare it, and rename it into place."""
-        attempt, writer = await self._attempt(node, draft, plan), self._context.writer
+        attempt, writer = await self._attempt(node, draft, plan), self._context.store
         attempt.sending.growing = False
         for _ in range(FINISHES):
             attempt.upload.wake()
@@ -219,7 +219,7 @@ class Deliverer:
             return attempt
         await self.abandon(node)
         context, places = self._context, None
-        if context.options.inplace and draft.base is not None and context.writer.traits.rename_works is None:
+        if context.options.inplace and draft.base is not None and context.store.traits.rename_works is None:
             await self._names.find_out(node.path)  # a card may have no room for two files, and never tell
             plan = self._plan(node, draft)
         if plan is Plan.OVERWRITE or isinstance(node.error, AlreadyExists):  # which all of it was sent for
@@ -236,7 +236,7 @@ class Deliverer:
                 await self._names.write_sidecar(places.sidecar, node.path)
             sending = draft.begin(in_place=places is None)
             sending.progress = self._throttle.on_acked
-            upload = await context.writer.open_upload(path, sending)
+            upload = await context.store.open_upload(path, sending)
         except BaseException:
             draft.give_up()
             context.own.live -= live

@@ -116,17 +116,17 @@ class Names:
         empties files: there the directory is listed.
 
         Raises:
-            As WriteStore.stat_size.
+            As VehicleStore.stat_size.
         """
         context = self._context
-        if context.writer.traits.wo_truncates:
+        if context.store.traits.wo_truncates:
             for node in context.nodes:
                 if node.attempt is not None and node.attempt.path != path:
                     entry = await self.ask(path)
                     if entry is not None and entry.size is not None:
                         return entry.size
                     break
-        return await context.writer.stat_size(path)
+        return await context.store.stat_size(path)
 
     async def is_free(self, path: bytes, *, perhaps_directory: bool = False) -> bool:
         """Return whether nothing has a name, asked just now by opening it, so in any spelling.
@@ -134,10 +134,10 @@ class Names:
         perhaps_directory: it may be another spelling of a directory, which does not open either.
 
         Raises:
-            As WriteStore.stat_size.
+            As VehicleStore.stat_size.
         """
         try:
-            await self._context.writer.stat_size(path)
+            await self._context.store.stat_size(path)
         except FtpNak as nak:
             if errno_for(nak) == errno.ENOENT:
                 return True
@@ -183,13 +183,13 @@ class Names:
     # --- changing
 
     async def remove(self, path: bytes) -> None:
-        """Remove a file. Raises as WriteStore."""
+        """Remove a file. Raises as VehicleStore."""
         async with self._changing(path):
-            await self._context.writer.remove(path)
+            await self._context.store.remove(path)
         self._context.dentries.put(path, None)
 
     async def remove_if_there(self, path: bytes) -> None:
-        """Remove a file that may be gone. Raises as WriteStore."""
+        """Remove a file that may be gone. Raises as VehicleStore."""
         try:
             await self.remove(path)
         except FtpNak as nak:
@@ -198,15 +198,15 @@ class Names:
             self._context.dentries.put(path, None)
 
     async def remove_directory(self, path: bytes) -> None:
-        """Remove an empty directory. Raises as WriteStore."""
+        """Remove an empty directory. Raises as VehicleStore."""
         async with self._changing(path):
-            await self._context.writer.remove_directory(path)
+            await self._context.store.remove_directory(path)
         self._context.dentries.put(path, None)
 
     async def make_directory(self, path: bytes) -> None:
-        """Make a directory. Raises as WriteStore."""
+        """Make a directory. Raises as VehicleStore."""
         async with self._changing(path):
-            await self._context.writer.make_directory(path)
+            await self._context.store.make_directory(path)
         self._context.dentries.put(path, DirEntry(b"", EntryKind.DIRECTORY), proven=True)
 
     async def discard(self, target: bytes, *paths: bytes) -> None:
@@ -221,12 +221,12 @@ class Names:
                 return
 
     async def rename(self, old: bytes, new: bytes, *, completes: bool = False, over: bool = False) -> None:
-        """Rename; both paths fit a request. completes: see WriteStore.rename. over: a file has the new name.
+        """Rename; both paths fit a request. completes: see VehicleStore. over: a file has the new name.
 
         Raises:
-            NotSupported: the card cannot rename. Else as WriteStore.
+            NotSupported: the card cannot rename. Else as VehicleStore.
         """
-        writer = self._context.writer
+        writer = self._context.store
         if writer.traits.rename_works is False:
             raise NotSupported("this server cannot rename")
         try:
@@ -249,7 +249,7 @@ class Names:
         that name which the card does not take.
 
         Raises:
-            As WriteStore, but FtpNak and OutcomeUnknown.
+            As VehicleStore, but FtpNak and OutcomeUnknown.
         """
         context = self._context
         try:
@@ -260,14 +260,14 @@ class Names:
         context.own.live |= {first, second}
         left = first
         try:
-            await context.writer.create_empty(first)
-            await context.writer.rename(first, second)
-            left, context.writer.traits.rename_works = second, True
+            await context.store.create_empty(first)
+            await context.store.rename(first, second)
+            left, context.store.traits.rename_works = second, True
         except OutcomeUnknown:
             return  # the next listing removes it
         except FtpNak as nak:
             if nak.opcode == Opcode.RENAME:
-                context.writer.traits.rename_works = False
+                context.store.traits.rename_works = False
         finally:
             context.own.live -= {first, second}
             context.dentries.expire(split(first)[0])
@@ -277,7 +277,7 @@ class Names:
         """A path is about to lose its name: have nothing of an earlier replacement bring it back.
 
         Raises:
-            As WriteStore: then the name has to stay.
+            As VehicleStore: then the name has to stay.
         """
         own, (parent, name) = self._context.own, split(path)
         directory = self._context.dentries.known(parent)
@@ -314,7 +314,7 @@ class Names:
         """Rename over a file that exists; with keep_old that lies at `places.old` afterwards.
 
         Raises:
-            NotSupported: the server does not rename. Else as WriteStore.rename. The old file has its name
+            NotSupported: the server does not rename. Else as VehicleStore.rename. The old file has its name
             again then, unless the name is torn.
         """
         litter = [places.sidecar] if places.sidecar is not None else []
@@ -343,7 +343,7 @@ class Names:
     async def write_sidecar(self, sidecar: bytes, target: bytes) -> None:
         """Write down where short names belong. Raises as Upload.finish."""
         text = Sending(lambda start, stop: target[start:stop], len(target))
-        upload = await self._context.writer.open_upload(sidecar, text)
+        upload = await self._context.store.open_upload(sidecar, text)
         try:
             upload.wake()
             await upload.finish()
@@ -377,11 +377,11 @@ class Names:
     def _replaces_at_once(self, target: bytes) -> bool:
         """Return whether the target has the old file or the new one at any time. NuttX, where storages are
         mounted at /fs/NAME, removes the old one first (servers.md 9)."""
-        return self._context.writer.traits.rename_replaces is not False and not target.startswith(b"/fs/")
+        return self._context.store.traits.rename_replaces is not False and not target.startswith(b"/fs/")
 
     async def _rename_over(self, source: bytes, target: bytes) -> bool:
         """Return whether the server replaced the target."""
-        traits = self._context.writer.traits
+        traits = self._context.store.traits
         try:
             await self.rename(source, target, over=True)
         except FtpNak as nak:

@@ -111,7 +111,7 @@ class Namespace:
         """Nobody has an unlinked file open any more: remove what was hidden of it.
 
         Raises:
-            As WriteStore.remove; the next listing of the directory removes it then.
+            As VehicleStore.remove; the next listing of the directory removes it then.
         """
         node.drop_draft()
         while node.hidden and not node.handles:
@@ -273,7 +273,7 @@ class Namespace:
         """Keep an unlinked file on the vehicle under a reserved name as long as somebody has it open.
 
         Raises:
-            FileBusy: that cannot be. Else as WriteStore.rename.
+            FileBusy: that cannot be. Else as VehicleStore.rename.
         """
         own, path = self._context.own, node.path
         try:
@@ -305,7 +305,7 @@ class Namespace:
         """Remove what was hidden of a file that nobody has open; the caller holds its path alone.
 
         Raises:
-            As WriteStore.remove; the next listing of the directory removes it then.
+            As VehicleStore.remove; the next listing of the directory removes it then.
         """
         context = self._context
         try:

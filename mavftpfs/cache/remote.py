@@ -166,10 +166,10 @@ class Upload(Protocol):
         ...
 
 
-class WriteStore(Protocol):
-    """How the caches change the vehicle's files.
+class VehicleStore(RemoteStore, Protocol):
+    """The vehicle's files, and how the caches change them.
 
-    Nothing here checks types or targets: who calls did. All methods raise FtpNak, RequestTimeout,
+    Nothing below checks types or targets: who calls did. These raise FtpNak, RequestTimeout,
     VehicleLost, SessionBusy, PathTooLong and, while armed, Armed; then the change did not happen. Only
     OutcomeUnknown says that nobody knows: a request was not answered, and no listing could tell.
     """
@@ -225,7 +225,3 @@ class WriteStore(Protocol):
             FtpNak: with a code that errnos maps to ENOENT if there is none.
         """
         ...
-
-
-class VehicleStore(RemoteStore, WriteStore, Protocol):
-    """The vehicle's files, to read and to change."""

@@ -64,7 +64,7 @@ class Verifier:
         Raises:
             VerificationFailed: it is another file, or its CRC32 was not told though verify=crc. Armed: it is
             not asked for now. SessionBusy: another client keeps it from being read back. Else as
-            WriteStore.stat_size.
+            VehicleStore.stat_size.
         """
         options, crc32 = self._context.options, None
         if options.verify == "none" and not doubted:
@@ -94,7 +94,7 @@ class Verifier:
         """Return whether a file on the vehicle is still the one that is known of it.
 
         Raises:
-            As WriteStore.stat_size and Directories.ask.
+            As VehicleStore.stat_size and Directories.ask.
         """
         context, options = self._context, self._context.options
         if context.directories.tells_times:

@@ -79,7 +79,6 @@ def make_writeback(
     )
     context = Context(
         store=store,
-        writer=store,
         directories=directories,
         dentries=dentries,
         files=files,

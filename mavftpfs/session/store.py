@@ -59,7 +59,7 @@ class Store:
         self._clock = clock
         self._time_silences = 0
         self._changes = Changes(scheduler, vehicle, self.list_directory, clock)
-        # See cache.remote.WriteStore.
+        # See cache.remote.VehicleStore.
         self.traits = scheduler.traits
         self.in_doubt = scheduler.doubt.is_active
         self.doubted_since = scheduler.doubt.arose_since
@@ -176,7 +176,7 @@ class Store:
         return self._scheduler.uploading.open_upload(path, source)
 
     async def stat_size(self, path: bytes) -> int:
-        """See cache.remote.WriteStore."""
+        """See cache.remote.VehicleStore."""
         wire_path(path)
         session = await self._scheduler.use_session(path, Opcode.OPEN_FILE_RO)
         if session.size is None:

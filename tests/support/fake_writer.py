@@ -1,4 +1,4 @@
-"""A vehicle that can be written, in memory: FakeStore with cache.remote.WriteStore, of any kind of server.
+"""A vehicle that can be written, in memory: FakeStore with cache.remote.VehicleStore, of any kind of server.
 
 `Kind` says how it behaves. Failures are put on requests by number: every request of the writing side, and
 every chunk of an upload, counts as one.
@@ -158,7 +158,7 @@ class FakeWriter(FakeStore):
         """Bytes of all files."""
         return sum(len(file.data) for file in self.files.values())
 
-    # --- WriteStore
+    # --- VehicleStore
 
     async def open_upload(self, path: bytes, source: UploadSource) -> FakeUpload:
         wire_path(path)
