@@ -55,7 +55,7 @@ class Background:
         if attempt is not None and not attempt.sending.overtaken:
             attempt.sending.growing = node.idle.is_set()  # nobody writes to one being delivered
             attempt.upload.wake()
-        elif self._context.nursery is not None and node.background and not node.starting:
+        elif self._context.nursery is not None and not node.starting:
             due = self._context.clock() >= node.start_after and not self._context.blocked
             much = attempt is not None or (node.draft is not None and node.draft.unacked >= START_AT)
             if due and much and node.undelivered and _may_pass(node):
@@ -89,7 +89,8 @@ class Background:
     async def _start(self, node: Node) -> None:
         """Begin an upload while the program still writes."""
         try:
-            node.background = await self._deliverer.begin(node)
+            if not await self._deliverer.begin(node):
+                node.start_after = float("inf")
         except MavftpfsError as error:
             node.start_after = self._context.clock() + START_PAUSE
             level = logging.DEBUG if isinstance(error, Armed) else logging.INFO  # one line is enough for all

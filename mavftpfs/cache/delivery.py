@@ -88,7 +88,7 @@ class Deliverer:
                             self._context.require_disarmed()
                         await self._deliver(node, draft)
                         node.error = None
-                        node.background = True
+                        node.start_after = float("-inf")
                     except MavftpfsError as error:
                         self._note_failure(node, draft, error)
                         raise

@@ -58,10 +58,10 @@ class Node:
     often its content on the vehicle was changed by us. removed: it has no name any more. hidden: it is still
     on the vehicle, under a reserved name. error: why it could not be delivered. attempt: the present one to
     deliver it. base: reads the vehicle's file. starting: an upload in the background is about to begin.
-    background: whether one may begin by itself; start_after: not before. known_at: when the vehicle was last
-    known to have it all. lock: held to deliver it. idle: no delivery is under way, so it may be written.
-    claims: how many changes take its name or content away, or are about to: no delivery begins or goes on
-    before it is unclaimed.
+    start_after: none begins by itself before (infinite: only a close sends it). known_at: when the vehicle
+    was last known to have it all. lock: held to deliver it. idle: no delivery is under way, so it may be
+    written. claims: how many changes take its name or content away, or are about to: no delivery begins or
+    goes on before it is unclaimed.
     """
 
     path: bytes
@@ -76,7 +76,6 @@ class Node:
     attempt: Attempt | None = None
     base: FileHandle | None = None
     starting: bool = False
-    background: bool = True
     start_after: float = float("-inf")
     known_at: float = float("-inf")
     lock: trio.Lock = field(default_factory=trio.Lock)
@@ -182,7 +181,7 @@ class Node:
         if self.content is not None:
             self.content.close()
         self.draft = self.content = self.attempt = self.error = None
-        self.background, self.known_at = True, float("-inf")
+        self.start_after = self.known_at = float("-inf")
 
 
 class Nodes:
