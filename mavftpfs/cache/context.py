@@ -23,9 +23,9 @@ from mavftpfs.shared.errors import Armed, FileBusy
 class Context:
     """The vehicle, what is remembered of it, and the files that are open or not delivered.
 
-    clock: seconds, monotonic; wall: seconds since 1970. read_rate: bytes per second, once measured. paths:
-    see pathlocks. armed: nothing may be changed (only Writeback.armed_changed sets it). retry_later():
-    something was not delivered, or a name may lack its file (Background sets it).
+    clock: seconds, monotonic; wall: seconds since 1970. paths: see pathlocks. armed: nothing may be
+    changed (only Writeback.armed_changed sets it). retry_later(): something was not delivered, or a name may
+    lack its file (Background sets it).
     """
 
     store: VehicleStore
@@ -37,7 +37,6 @@ class Context:
     wall: Callable[[], float]
     nursery: trio.Nursery | None
     own: OwnNames
-    read_rate: Callable[[], float | None]
     paths: PathLocks
     spool: Spool
     nodes: Nodes = field(default_factory=Nodes)

@@ -67,8 +67,9 @@ class Throttle:
         context, limit = self._context, self._context.options.rmw_max
         if limit is None:
             limit = MOST_REWRITE
-            write = self.meter.rate or context.read_rate() or context.options.link_rate
-            read = context.read_rate() or write
+            read = context.files.cache.meter.rate
+            write = self.meter.rate or read or context.options.link_rate
+            read = read or write
             if write and read:
                 missing = sum([stop - start for start, stop in draft.missing_base()])
                 possible = int((REWRITE_SECONDS - missing / read) * write)

@@ -102,15 +102,12 @@ class Tree:
         self._writing = make_writeback(
             store=store,
             directories=self._directories,
-            dentries=self._dentries,
             files=self._files,
             options=options,
-            clock=clock,
             wall=wall,
             rng=rng or Random(),
             nursery=nursery,
             spool_directory=spool,
-            read_rate=lambda: self._blocks.meter.rate,
         )
 
     # --- asking

@@ -18,7 +18,6 @@ from mavftpfs.cache.background import Background
 from mavftpfs.cache.base import known_base, on_listed
 from mavftpfs.cache.context import Context
 from mavftpfs.cache.delivery import PASSING, Deliverer
-from mavftpfs.cache.dentries import Dentries
 from mavftpfs.cache.directories import Directories
 from mavftpfs.cache.draft import Base, State
 from mavftpfs.cache.files import Files
@@ -55,20 +54,16 @@ def make_writeback(
     *,
     store: VehicleStore,
     directories: Directories,
-    dentries: Dentries,
     files: Files,
     options: CacheOptions,
-    clock: Callable[[], float],
     wall: Callable[[], float],
     rng: Random,
     nursery: trio.Nursery | None,
     spool_directory: SpoolDirectory | None,
-    read_rate: Callable[[], float | None],
 ) -> Writeback:
     """Return the writing half over the reading half's parts, and have listings mended from now on.
 
     Without a spool directory what exceeds memory goes to one that does not outlive the process.
-    `read_rate()`: bytes per second, once measured.
     """
     owner = new_owner(rng) if spool_directory is None else spool_directory.owner
     dead = frozenset[bytes]() if spool_directory is None else spool_directory.dead_owners
@@ -80,14 +75,13 @@ def make_writeback(
     context = Context(
         store=store,
         directories=directories,
-        dentries=dentries,
+        dentries=directories.dentries,
         files=files,
         options=options,
-        clock=clock,
+        clock=directories.clock,
         wall=wall,
         nursery=nursery,
         own=OwnNames(owner, options.root, rng),
-        read_rate=read_rate,
         paths=files.paths,
         spool=spool,
     )
