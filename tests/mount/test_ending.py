@@ -120,45 +120,6 @@ def readable(mount: Mount, name: str, content: str) -> bool:
     return mount.run("cat", mount.path / name, code=None, timeout=SILENCE).stdout == content
 
 
-@pytest.mark.holds("promise 5")
-def test_an_open_file_survives_a_vehicle_that_was_gone(field: Field, small_tree: Path) -> None:
-    vehicle = field.sim(small_tree)
-    mount = field.mount(vehicle.source, "dir_timeout=0", "attr_timeout=0")
-    code = (
-        "import sys\n"
-        "with open(sys.argv[1], 'rb', buffering=0) as file:\n"
-        "    print('open', flush=True); sys.stdin.readline()\n"
-        "    print(file.read().hex())\n"
-    )
-    argv = [sys.executable, "-c", code, str(mount.path / "sizes/35850.bin")]
-    reader = subprocess.Popen(argv, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
-    assert reader.stdout is not None
-    assert reader.stdout.readline() == "open\n"
-    vehicle.kill()
-    vehicle.start()
-    out, _ = reader.communicate("\n", timeout=SILENCE)
-    assert bytes.fromhex(out) == (small_tree / "sizes/35850.bin").read_bytes()
-
-
-@pytest.mark.holds("fault silence")
-def test_a_link_that_is_silent_for_seconds_costs_nothing_but_time(field: Field, big_tree: Path) -> None:
-    content = bytes(range(256)) * 1600
-    (big_tree / "middle.bin").write_bytes(content)
-    vehicle = field.sim(big_tree, "ardupilot", ("--rate", "250000"))
-    mount = field.mount(vehicle.source)
-    code = "import sys; f = open(sys.argv[1], 'rb', 0); f.read(1); print('begun', flush=True)\n"
-    code += "print(f.read() == open(sys.argv[2], 'rb').read()[1:])"
-    argv = (sys.executable, "-c", code, mount.path / "middle.bin", big_tree / "middle.bin")
-    with mount.started(*argv) as child:
-        assert child.stdout is not None
-        assert child.stdout.readline() == "begun\n"
-        vehicle.pause()
-        time.sleep(2.5)
-        vehicle.resume()
-        out, errors = child.communicate(timeout=SILENCE)
-    assert (child.returncode, out, errors) == (0, "True\n", "")
-
-
 @pytest.mark.holds("promise 4")
 def test_ctrl_c_of_a_blocked_cat_returns(field: Field, big_tree: Path) -> None:
     vehicle = field.sim(big_tree)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import signal
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -12,7 +11,7 @@ import pytest
 from tests.mount.conftest import Field
 from tests.support.mounts import Mount, wait_until
 from tests.support.trees import content
-from tests.support.vehicles import HOST, SimVehicle, free_udp_port
+from tests.support.vehicles import HOST, free_udp_port
 
 FLAWS = ("--loss", "0.1", "--dup", "0.05", "--reorder", "0.05", "--corrupt", "0.02")
 BAD = (*FLAWS, "--delay", "0.01", "--seed", "5")
@@ -27,12 +26,6 @@ def free_port_link(kind: str) -> str:
 def size_of(path: Path) -> int:
     """Return a local file's size, 0 if it is not there yet."""
     return path.stat().st_size if path.exists() else 0
-
-
-def says(vehicle: SimVehicle, words: str) -> bool:
-    """Return whether a vehicle said so: of two equal signals at once it would get one."""
-    assert vehicle.process is not None
-    return words in vehicle.process.text()
 
 
 def compare(mount: Mount, expected: Path, part: str = "") -> None:
@@ -63,20 +56,15 @@ def test_a_slow_half_duplex_radio(field: Field, tmp_path: Path) -> None:
 
 
 @pytest.mark.holds("promise 5", "fault reboot")
-@pytest.mark.parametrize(("kind", "what"), [("udpout", "cut"), ("tcpin", "reboot")])
-def test_a_cut_or_a_reboot_in_mid_copy(field: Field, tmp_path: Path, kind: str, what: str) -> None:
+def test_a_reboot_in_mid_copy(field: Field, tmp_path: Path) -> None:
     card = field.local("card")
-    data = content("cut", 600_000)
+    data = content("reboot", 400_000)
     (card / "log.bin").write_bytes(data)
-    vehicle = field.sim(card, "px4", ("--rate", "150000"), link=free_port_link(kind))
+    vehicle = field.sim(card, "px4", ("--rate", "150000"), link=free_port_link("tcpin"))
     mount = field.mount(vehicle.source)
     with mount.started("cp", mount.path / "log.bin", tmp_path / "copy") as copy:
         wait_until("it is under way", lambda: size_of(tmp_path / "copy") > 0)
-        vehicle.send_signal(signal.SIGUSR2 if what == "cut" else signal.SIGHUP)
-        wait_until("it is done", lambda: says(vehicle, "link cut" if what == "cut" else "rebooted"))
-        if what == "cut":
-            time.sleep(3.0)
-            vehicle.send_signal(signal.SIGUSR2)
+        vehicle.send_signal(signal.SIGHUP)
         _, errors = copy.communicate(timeout=120)
     assert (copy.returncode, errors) == (0, "")
     assert (tmp_path / "copy").read_bytes() == data

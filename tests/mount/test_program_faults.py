@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -13,7 +12,6 @@ from tests.mount.conftest import Field
 from tests.support.mounts import wait_until
 from tests.support.places import FOLDERS, start_place
 from tests.support.trees import content
-from tests.support.vehicles import SimVehicle
 
 DATA = content("program", 60_000)
 SLOW = ("--rate", "40000")
@@ -61,26 +59,3 @@ def test_a_killed_program_leaves_what_it_wrote(field: Field, kind: str, source: 
     wait_until("it arrives", lambda: (place.card / "killed.bin").read_bytes() == written)
     mount.run("cp", source, target)
     assert (place.card / "killed.bin").read_bytes() == DATA
-
-
-@pytest.mark.holds("fault killed program")
-@pytest.mark.parametrize("kind", KINDS)
-def test_a_copy_goes_on_over_a_restart_of_the_vehicle(field: Field, kind: str, source: Path) -> None:
-    place = start_place(field, kind, SLOW)
-    assert isinstance(place.vehicle, SimVehicle)
-    mount = field.mount(place.vehicle.source, *place.options)
-    mount.run("cp", source, mount.path / place.folder / "old.bin")
-    source.write_bytes(DATA[::-1])
-    with mount.started("cp", source, mount.path / place.folder / "old.bin") as child:
-        wait_until("it is under way", lambda: len(list(place.card.iterdir())) > 1 or is_new(place.card))
-        place.vehicle.send_signal(signal.SIGHUP)
-        _, errors = child.communicate(timeout=90)
-    assert (child.returncode, errors) == (0, "")
-    assert (place.card / "old.bin").read_bytes() == DATA[::-1]
-    mount.run("ls", "-A", mount.path / place.folder)
-    wait_until("no litter", lambda: [path.name for path in place.card.iterdir()] == ["old.bin"])
-
-
-def is_new(card: Path) -> bool:
-    """Return whether the file is being overwritten where it lies."""
-    return (card / "old.bin").read_bytes()[:1000] != DATA[:1000]
