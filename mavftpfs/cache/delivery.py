@@ -5,7 +5,7 @@ delivered stays held, and the next call goes on. While it runs the file is not w
 what is verified is what was sent. Uploads begin earlier, in the background, where that is of use.
 
 One way leads to the card: the whole file is sent under a reserved name, verified there, and renamed into
-place (`draft`, `replace`). Only cards that cannot rename get it under its own name.
+place (`draft`, `names`). Only cards that cannot rename get it under its own name.
 """
 
 from __future__ import annotations

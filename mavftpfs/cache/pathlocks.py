@@ -6,7 +6,7 @@ The two locks, in the order in which they are taken; there is no third:
    of its name, or he would hold neither the old file nor the new one.
 2. The *file lock*, `nodes.Node.lock`. Who delivers a file, or begins to in the background, takes it while he
    holds the path shared. Who holds the path alone needs none.
-A listing may be asked for under either lock, and what it has mended (`cleaner`) takes none.
+A listing may be asked for under either lock, and what it has mended (`repair`) takes none.
 
 Two changes concern one another if they name the same path, in any case, or one names a directory above the
 other's. All others go on side by side, so that one that is not answered holds up nobody else.
