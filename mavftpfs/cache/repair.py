@@ -7,8 +7,8 @@ new, old and target have the same number (see `reserved`):
   target there                  remove new, then old, then the sidecar
   target missing, old and new   rename new to target (it was verified before old was moved), remove old
   target missing, old only      rename old to target
-  target missing, new only      rename new to `recovered-tSSS-NAME`: somebody else removed the target, and nobody
-                                can tell whether new is complete
+  target missing, new only      rename new to `recovered-tSSS-NAME`: somebody else removed the target, and
+                                nobody can tell whether new is complete
   sidecar alone, deleted        remove
 Nothing is touched while its owner may be alive: see `Staleness`.
 """
