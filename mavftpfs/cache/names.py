@@ -40,7 +40,7 @@ from mavftpfs.shared.errors import (
     OutcomeUnknown,
     PathTooLong,
 )
-from mavftpfs.shared.model import DirEntry, EntryKind, folded, join, split
+from mavftpfs.shared.model import DirEntry, EntryKind, join, split
 
 log = logging.getLogger("mavftpfs.cache")
 
@@ -50,6 +50,9 @@ _HONEST = frozenset({errno.EACCES, errno.EROFS, errno.ENOSPC, errno.ENAMETOOLONG
 RECENT = 2.0
 """Seconds for which what was seen of a name is taken to be true when the name is about to be changed. So the
 removal of many files does not list their directory before each."""
+
+_ONE_LETTER = bytes(range(128)) + b"\x80" * 128
+"""Takes all bytes beyond ASCII for one."""
 
 
 class Names:
@@ -418,4 +421,6 @@ class Names:
 
 
 def _plain(name: bytes) -> bytes:
-    return folded(name.rstrip(b". "))
+    """Return what a name has in common with those that a card may take for the same: letters in any case, and
+    beyond ASCII whatever a code page makes of them (by page 850 FatFs folds the UTF-8 of ä and å)."""
+    return name.rstrip(b". ").lower().translate(_ONE_LETTER)

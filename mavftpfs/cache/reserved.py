@@ -22,7 +22,7 @@ from enum import Enum
 from random import Random
 
 from mavftpfs.shared.errors import NotSupported, PathTooLong
-from mavftpfs.shared.model import MAX_WIRE_PATH, ROOT, join, split, storage_of, wire_path
+from mavftpfs.shared.model import MAX_WIRE_PATH, ROOT, join, split, wire_path
 
 PREFIX = b".mavftpfs-"
 RENAME_ROOM = 238
@@ -180,7 +180,7 @@ class OwnNames:
         """Yield the target's directory and those above it, on the same storage."""
         directory = split(target)[0]
         yield directory
-        while directory not in (ROOT, self._root, storage_of(directory)):
+        while directory not in (ROOT, self._root, _storage_of(directory)):
             directory = split(directory)[0]
             yield directory
 
@@ -191,3 +191,15 @@ def _spell(number: int, length: int) -> bytes:
         number, digit = divmod(number, len(_ALPHABET))
         letters.append(_ALPHABET[digit])
     return bytes(letters)
+
+
+def _storage_of(directory: bytes) -> bytes:
+    """Return the top directory of the storage that a directory lies on, or what is surely not above it.
+
+    NuttX mounts each storage at /fs/NAME, and what is above is no storage at all (servers.md 6 and 13);
+    elsewhere nothing tells where one ends.
+    """
+    parts = directory.split(b"/")
+    if parts[1] != b"fs":
+        return ROOT
+    return b"/".join(parts[:3])

@@ -98,18 +98,6 @@ def wire_path(path: bytes) -> bytes:
     return wire
 
 
-def storage_of(directory: bytes) -> bytes:
-    """Return the top directory of the storage that a directory lies on, or what is surely not above it.
-
-    NuttX mounts each storage at /fs/NAME, and what is above is no storage at all (servers.md 6 and 13);
-    elsewhere nothing tells where one ends.
-    """
-    parts = directory.split(b"/")
-    if parts[1] != b"fs":
-        return ROOT
-    return b"/".join(parts[:3])
-
-
 def require_listable(path: bytes) -> None:
     """Check that a listing could show a new name: what no listing shows can be neither found nor removed.
 
@@ -119,15 +107,6 @@ def require_listable(path: bytes) -> None:
     name = split(path)[1]
     if b"\t" in name:
         raise LocalProtocolError(f"{name!r} holds a tab, so no listing could show it")
-
-
-_ONE_LETTER = bytes(range(128)) + b"\x80" * 128
-
-
-def folded(name: bytes) -> bytes:
-    """Return what names, or paths, have in common that a card may take for one: letters in any case, and
-    beyond ASCII whatever a code page makes of them (by page 850 FatFs folds the UTF-8 of ä and å)."""
-    return name.lower().translate(_ONE_LETTER)
 
 
 def usable_name(name: bytes) -> bool:
