@@ -74,7 +74,19 @@ class Background:
         for node in self._context.nodes:
             node.start_after = float("-inf")
             self.kick(node)
-        await self._deliver_closed(lambda node: True)
+        await self.deliver_each(self._is_left_to_us)
+
+    async def deliver_each(self, wanted: Callable[[Node], bool]) -> None:
+        """Try once to deliver each file that is wanted, as long as it is; errors are kept with the file."""
+        for node in self._context.nodes:
+            if not node.undelivered or not wanted(node):
+                continue
+            try:
+                await self._deliverer.deliver(node, wanted=partial(wanted, node))
+            except MavftpfsError as error:
+                log.debug("%r is still not delivered: %s", node.path, error)
+            else:
+                self._context.nodes.maybe_forget(node)
 
     def redeliver(self) -> None:
         """Something was not delivered, or left a name without a file: try again by and by."""
@@ -116,24 +128,13 @@ class Background:
                 await trio.sleep(pause)
                 pause = min(2 * pause, longest)
                 await self._cleaner.mend_torn()
-                await self._deliver_closed(which)
+                await self.deliver_each(lambda node: which(node) and self._is_left_to_us(node))
         finally:
             self._retried.discard(which)
 
     def _is_left_to_us(self, node: Node) -> bool:
-        return node.undelivered and (not node.writers or node.path in self._context.own.torn)
-
-    async def _deliver_closed(self, which: Callable[[Node], bool]) -> None:
-        """Try once what nobody writes any more, and what left a name without a file."""
-        for node in self._context.nodes:
-            if not self._is_left_to_us(node) or not which(node):
-                continue
-            try:
-                await self._deliverer.deliver(node, wanted=partial(self._is_left_to_us, node))
-            except MavftpfsError as error:
-                log.debug("%r is still not delivered: %s", node.path, error)
-            else:
-                self._context.nodes.maybe_forget(node)
+        """Nobody writes it any more, or its name may lack a file."""
+        return not node.writers or node.path in self._context.own.torn
 
 
 def _may_pass(node: Node) -> bool:

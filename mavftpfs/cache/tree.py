@@ -28,7 +28,7 @@ from mavftpfs.cache.remote import VehicleStore
 from mavftpfs.cache.reserved import is_reserved
 from mavftpfs.cache.versions import BlockCache
 from mavftpfs.cache.virtual import VirtualTrees
-from mavftpfs.cache.writeback import make_writeback
+from mavftpfs.cache.writeback import Writeback
 from mavftpfs.shared.errors import (
     CrossDevice,
     DirectoryNotEmpty,
@@ -99,7 +99,7 @@ class Tree:
             () if options.read_only else options.local, options.local_max, lambda: int(wall() * SECOND)
         )
         self._checksums: dict[bytes, tuple[DirEntry | None, int | None, int]] = {}
-        self._writing = make_writeback(
+        self._writing = Writeback(
             store=store,
             directories=self._directories,
             files=self._files,

@@ -37,7 +37,6 @@ from mavftpfs.cache.writefile import Parts, ReadFile, WriteFile
 from mavftpfs.shared.errors import (
     AlreadyExists,
     IsADirectory,
-    MavftpfsError,
 )
 from mavftpfs.shared.model import EntryKind, require_listable, wire_path
 
@@ -50,51 +49,6 @@ REFUSALS = 3
 """After so many rounds in which the vehicle answered and refused all that is left, the end is not put off."""
 
 
-def make_writeback(
-    *,
-    store: VehicleStore,
-    directories: Directories,
-    files: Files,
-    options: CacheOptions,
-    wall: Callable[[], float],
-    rng: Random,
-    nursery: trio.Nursery | None,
-    spool_directory: SpoolDirectory | None,
-) -> Writeback:
-    """Return the writing half over the reading half's parts, and have listings mended from now on.
-
-    Without a spool directory what exceeds memory goes to one that does not outlive the process.
-    """
-    owner = new_owner(rng) if spool_directory is None else spool_directory.owner
-    dead = frozenset[bytes]() if spool_directory is None else spool_directory.dead_owners
-    spool = Spool(
-        memory_max=lambda: throttle.limit,
-        spool_max=options.spool_max,
-        directory=None if spool_directory is None else spool_directory.path,
-    )
-    context = Context(
-        store=store,
-        directories=directories,
-        dentries=directories.dentries,
-        files=files,
-        options=options,
-        clock=directories.clock,
-        wall=wall,
-        nursery=nursery,
-        own=OwnNames(owner, options.root, rng),
-        paths=files.paths,
-        spool=spool,
-    )
-    throttle = Throttle(context)
-    names = Names(context)
-    cleaner = Cleaner(context, names, dead)
-    if not options.read_only:
-        directories.on_swept = cleaner.on_swept
-    files.is_changing = context.is_changing
-    directories.on_listed.append(partial(on_listed, context))
-    return Writeback(context, names, throttle, cleaner)
-
-
 class Writeback:
     """The writing half of the tree (see cache.tree.Tree for what each call does).
 
@@ -102,16 +56,53 @@ class Writeback:
         overlay: what programs see that no listing shows. names: mkdir, rmdir, unlink and rename.
     """
 
-    def __init__(self, context: Context, names: Names, throttle: Throttle, cleaner: Cleaner) -> None:
-        self._context = context
-        self._names = names
-        self._throttle = throttle
-        self._cleaner = cleaner
-        self._deliverer = Deliverer(context, names, cleaner, throttle)
-        self._background = Background(context, self._deliverer, throttle, cleaner)
+    def __init__(
+        self,
+        *,
+        store: VehicleStore,
+        directories: Directories,
+        files: Files,
+        options: CacheOptions,
+        wall: Callable[[], float],
+        rng: Random,
+        nursery: trio.Nursery | None,
+        spool_directory: SpoolDirectory | None,
+    ) -> None:
+        """Stand on the reading half's parts, and have listings mended from now on.
+
+        Without a spool directory what exceeds memory goes to one that does not outlive the process.
+        """
+        owner = new_owner(rng) if spool_directory is None else spool_directory.owner
+        dead = frozenset[bytes]() if spool_directory is None else spool_directory.dead_owners
+        self._context = context = Context(
+            store=store,
+            directories=directories,
+            dentries=directories.dentries,
+            files=files,
+            options=options,
+            clock=directories.clock,
+            wall=wall,
+            nursery=nursery,
+            own=OwnNames(owner, options.root, rng),
+            paths=files.paths,
+            spool=Spool(
+                memory_max=lambda: throttle.limit,
+                spool_max=options.spool_max,
+                directory=None if spool_directory is None else spool_directory.path,
+            ),
+        )
+        self._throttle = throttle = Throttle(context)
+        self._names = names = Names(context)
+        self._cleaner = cleaner = Cleaner(context, names, dead)
+        self._deliverer = deliverer = Deliverer(context, names, cleaner, throttle)
+        self._background = Background(context, deliverer, throttle, cleaner)
         self.overlay = Overlay(context)
-        self.names = Namespace(context, names, self._deliverer, self.overlay)
-        self._parts = Parts(context, self._deliverer, throttle, self._background, self.overlay, self.names)
+        self.names = Namespace(context, names, deliverer, self.overlay)
+        self._parts = Parts(context, deliverer, throttle, self._background, self.overlay, self.names)
+        if not options.read_only:
+            directories.on_swept = cleaner.on_swept
+        files.is_changing = context.is_changing
+        directories.on_listed.append(partial(on_listed, context))
 
     # --- opening
 
@@ -232,17 +223,14 @@ class Writeback:
 
     async def drain(self, timeout: float) -> None:
         """See Tree.drain."""
-        refused = 0
+        nodes, refused = self._context.nodes, 0
         with trio.move_on_after(timeout):
-            await self._deliver_all()
+            await self._background.deliver_each(lambda node: True)
             while self.undelivered() and refused < REFUSALS:
                 await trio.sleep(RETRY_PAUSE)
-                await self._deliver_all()
-                refused = refused + 1 if self._only_refused() else 0
-
-    def _only_refused(self) -> bool:
-        """Whether the vehicle answers, and takes nothing of what is left."""
-        return not any(isinstance(n.error, PASSING) for n in self._context.nodes if n.undelivered)
+                await self._background.deliver_each(lambda node: True)
+                passing = any(isinstance(n.error, PASSING) for n in nodes if n.undelivered)
+                refused = 0 if passing else refused + 1
 
     def recover_to(self, directory: Path) -> list[Path]:
         """See Tree.recover_to."""
@@ -286,15 +274,3 @@ class Writeback:
             "leftovers_mended": self._cleaner.mended,
             "armed": self._context.armed,
         }
-
-    async def _deliver_all(self) -> None:
-        """Try to deliver everything once."""
-        for node in self._context.nodes:
-            if not node.undelivered:
-                continue
-            try:
-                await self._deliverer.deliver(node)
-            except MavftpfsError as error:
-                log.debug("%r is still not delivered: %s", node.path, error)
-            else:
-                self._context.nodes.maybe_forget(node)
