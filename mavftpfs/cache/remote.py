@@ -176,7 +176,7 @@ class VehicleStore(RemoteStore, Protocol):
 
     @property
     def traits(self) -> WriteTraits:
-        """What the server was seen to do; a new object after a reboot."""
+        """What the server was seen to do; forgotten when it restarts."""
         ...
 
     def in_doubt(self) -> bool:

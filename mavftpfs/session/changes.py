@@ -10,7 +10,7 @@ carried out late once more, would change what has the name by then.
 from __future__ import annotations
 
 from collections.abc import AsyncIterator, Awaitable, Callable
-from contextlib import AsyncExitStack, asynccontextmanager, suppress
+from contextlib import asynccontextmanager, suppress
 from enum import Enum
 from functools import partial
 from math import inf
@@ -123,7 +123,7 @@ class Changes:
         try:
             await self._scheduler.use_session(path, Opcode.CREATE_FILE)
         finally:
-            self._changed_at[path.lower()] = self._clock()
+            self._note_changed(path)
 
     async def rest(self, path: bytes) -> None:
         """Wait while a late copy of the last change of this name may yet be carried out.
@@ -146,23 +146,24 @@ class Changes:
         require = self._vehicle.require_there if in_flight else self._vehicle.require_writable
         require(self._clock())
         with trio.move_on_after(self._scheduler.op_deadline + VERIFY_LIMIT) as scope:
-            async with AsyncExitStack() as stack:
+            async with self._scheduler.server.excluded(*paths, below=below):
                 for path in paths:
-                    excluded = self._scheduler.server.excluded(path, below=below and path is paths[0])
-                    await stack.enter_async_context(excluded)
                     await self.rest(path)
                 require(self._clock())  # closing our session may have taken a while
                 try:
                     yield
                 finally:
-                    now = self._clock()
-                    for path, at in list(self._changed_at.items()):
-                        if now - at > MOST_LATE:
-                            del self._changed_at[path]
                     for path in paths:
-                        self._changed_at[path.lower()] = now
+                        self._note_changed(path)
         if scope.cancelled_caught:
             raise OutcomeUnknown("the vehicle did not get round to it in time")
+
+    def _note_changed(self, path: bytes) -> None:
+        now = self._clock()
+        while self._changed_at and now - next(iter(self._changed_at.values())) > MOST_LATE:
+            del self._changed_at[next(iter(self._changed_at))]
+        self._changed_at.pop(path.lower(), None)
+        self._changed_at[path.lower()] = now  # the oldest are in front
 
     async def _perform(self, make: Callable[[], Simple], verify: Verdict) -> None:
         """Run a request; look what became of it if its answer may not be that to its first execution."""

@@ -345,13 +345,12 @@ def _build(
     driver = Driver(link, framer, engine, vehicle, clock=clock, trace=trace)
     scheduler = Scheduler(
         driver,
-        vehicle,
         clock=clock,
         op_deadline=options.op_deadline,
         read_mode=options.read_mode if budget is None else "window",
         chunk=options.chunk,
     )
-    store = Store(scheduler, driver, vehicle, clock=clock, op_deadline=options.op_deadline)
+    store = Store(scheduler, driver, clock=clock, op_deadline=options.op_deadline)
     connection = Connection(store, vehicle, scheduler, engine, driver, link, options, clock)
 
     vehicle.on_reboot = connection._on_reboot

@@ -57,7 +57,6 @@ class Doubt:
     """
 
     def __init__(self, clock: Callable[[], float]) -> None:
-        self.reason = ""
         self.on_raised: Callable[[str], None] = lambda reason: None
         self._clock = clock
         self._at = self._reads_at = -inf
@@ -66,7 +65,6 @@ class Doubt:
 
     def raise_it(self, reason: str, *, reads: bool = True) -> None:
         """Something was noticed now; reads: what was read lately may be another file's, too."""
-        self.reason = reason
         self._at = self._clock()
         if reads:
             self._reads_at = self._at

@@ -21,7 +21,6 @@ from mavftpfs.session.doubt import Doubt
 from mavftpfs.session.driver import Driver
 from mavftpfs.session.queue import Queue, SessionUser
 from mavftpfs.session.serversession import ServerSession
-from mavftpfs.session.vehicle import Vehicle
 from mavftpfs.shared.errors import FileChanged, MavftpfsError, RemoteProtocolError, SessionLost
 from mavftpfs.shared.extents import ExtentSet
 
@@ -44,9 +43,10 @@ _OFTEN = 0.25
 
 
 class FileStream(SessionUser):
-    """Implements cache.remote.Reader; also the sink of the transfer that reads for it.
+    """Implements cache.remote.Reader.
 
     Attributes:
+        sink: where its bytes go; nothing does once it is closed, but that they are in doubt.
         size: by the first open ACK, in bytes; 0 before that. wants_open: somebody waits for that ACK.
         last_data_at: when bytes came, None if none did. lost: how often the session was, without progress.
     """
@@ -58,7 +58,7 @@ class FileStream(SessionUser):
         self.closed = False
         self.last_data_at: float | None = None
         self.lost = 0
-        self._sink = sink
+        self.sink = sink
         self._reading = reading
         self._demand = ExtentSet()
         self._ahead = ExtentSet()
@@ -77,10 +77,10 @@ class FileStream(SessionUser):
         if start >= stop or self.closed:
             return
         if self._removed:
-            self._sink.on_failed(FileChanged(f"{self.path!r} was removed or replaced"))
+            self.sink.on_failed(FileChanged(f"{self.path!r} was removed or replaced"))
             return
         wanted = self._demand if demand else self._ahead
-        for gap_start, gap_stop in self._sink.missing(start, stop):
+        for gap_start, gap_stop in self.sink.missing(start, stop):
             wanted.add(gap_start, gap_stop)
         if self._transfer is not None:
             self._transfer.want(start, stop, demand)
@@ -130,7 +130,7 @@ class FileStream(SessionUser):
         elif size < self.size:
             raise FileChanged(f"{self.path!r} shrank from {self.size} to {size} bytes")
         if not self.closed:
-            self._sink.on_opened(at)
+            self.sink.on_opened(at)
 
     def attach(self, transfer: ReadTransfer) -> None:
         """Hand what is wanted to a transfer; later wants go to it directly."""
@@ -147,15 +147,6 @@ class FileStream(SessionUser):
             self._demand.clear()
             self._ahead.clear()
 
-    def missing(self, start: int, stop: int) -> list[tuple[int, int]]:
-        """Return the parts of [start, stop) that the cache does not hold."""
-        return self._sink.missing(start, stop)
-
-    def on_data(self, offset: int, data: bytes) -> None:
-        """Pass bytes on; what is still on its way when it is closed goes nowhere."""
-        if not self.closed:
-            self._sink.on_data(offset, data)
-
     def on_batch(self) -> None:
         """A batch of data ended. What came is wanted no more, even if the cache soon drops it again."""
         if self.closed:
@@ -164,17 +155,9 @@ class FileStream(SessionUser):
             before = list(wanted)
             wanted.clear()
             for start, stop in before:
-                for gap_start, gap_stop in self._sink.missing(start, stop):
+                for gap_start, gap_stop in self.sink.missing(start, stop):
                     wanted.add(gap_start, gap_stop)
-        self._sink.on_batch()
-
-    def on_queued(self) -> None:
-        """It waits for its turn, and the queue before it moved: the vehicle is not silent."""
-        self._sink.on_queued()
-
-    def on_suspect(self, reason: str) -> None:
-        """What was read lately is provisional, even if it was closed since."""
-        self._sink.on_suspect(reason)
+        self.sink.on_batch()
 
     def fail(self, error: MavftpfsError) -> None:
         """See SessionUser."""
@@ -182,7 +165,7 @@ class FileStream(SessionUser):
         self._demand.clear()
         self._ahead.clear()
         if self._opened.is_set():
-            self._sink.on_failed(error)
+            self.sink.on_failed(error)
         else:
             self._open_error = error
             self._opened.set()
@@ -202,7 +185,6 @@ class Reading:
         server: ServerSession,
         driver: Driver,
         queue: Queue,
-        vehicle: Vehicle,
         doubt: Doubt,
         mode: ReadMode,
         chunks: ChunkSize,
@@ -213,7 +195,7 @@ class Reading:
         self._driver = driver
         self._engine = driver.engine
         self._queue = queue
-        self._vehicle = vehicle
+        self._vehicle = driver.vehicle
         self._doubt = doubt
         self._mode: ReadMode = mode
         self._chunks = chunks
@@ -238,7 +220,9 @@ class Reading:
         self._server.wake()
 
     def on_closed(self, stream: FileStream) -> None:
-        """It wants nothing any more; what it read stays provisional for a while."""
+        """It wants nothing any more, nor what is on its way. What it read stays provisional for a while."""
+        if stream is self._active:
+            self.cut_off()
         if stream in self._queue.users:
             self._closed.append(stream)
             self._forget_closed()
@@ -249,7 +233,7 @@ class Reading:
         self._forget_closed()
         for stream in [*self._queue.users, *self._closed]:
             if isinstance(stream, FileStream) and (stream is self._active or self._is_recent(stream)):
-                stream.on_suspect(reason)
+                stream.sink.on_suspect(reason)
 
     def _forget_closed(self) -> None:
         while self._closed and not self._is_recent(self._closed[0]):
@@ -301,7 +285,7 @@ class Reading:
         if session is None or not (stream.due_at() < inf or stream.prefetches()):
             return  # the vehicle restarted since it was opened, or nothing is wanted
         kind = BurstTransfer if self._mode == "burst" else ReadTransfer
-        transfer = kind(session.id, stream.size, stream, self._chunks)
+        transfer = kind(session.id, stream.size, stream.sink, self._chunks)
         began = self._clock()
         self._active, self._transfer, self._seen_bytes = stream, transfer, 0
         stream.attach(transfer)

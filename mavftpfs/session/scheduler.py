@@ -23,7 +23,6 @@ from mavftpfs.session.reader import RECENT, FileStream, Reading, ReadMode
 from mavftpfs.session.serversession import OpenSession, ServerSession, State
 from mavftpfs.session.upload import Upload
 from mavftpfs.session.uploading import Uploading
-from mavftpfs.session.vehicle import Vehicle
 from mavftpfs.shared.errors import DataUnproven, MavftpfsError, SessionLost
 from mavftpfs.shared.traits import WriteTraits
 
@@ -72,7 +71,6 @@ class Scheduler:
     def __init__(
         self,
         driver: Driver,
-        vehicle: Vehicle,
         *,
         clock: Callable[[], float],
         op_deadline: float = 30.0,
@@ -84,13 +82,13 @@ class Scheduler:
         self.read_chunks, self.write_chunks = ChunkSize(chunk), ChunkSize(chunk)
         self.op_deadline = op_deadline
         self.doubt = Doubt(clock)
-        self.server = ServerSession(driver, vehicle, self.doubt, clock, op_deadline)
+        self.server = ServerSession(driver, self.doubt, clock, op_deadline)
         self.queue = Queue(self.server, driver.engine, clock, op_deadline)
-        parts = (self.server, driver, self.queue, vehicle, self.doubt)
+        parts = (self.server, driver, self.queue, self.doubt)
         self.reading = Reading(*parts, read_mode, self.read_chunks, clock)
         self.uploading = Uploading(*parts, self.traits, self.write_chunks, clock)
         self._driver = driver
-        self._vehicle = vehicle
+        self._vehicle = driver.vehicle
         self._clock = clock
         self._used_at = clock()
         self._touched_at = -inf
@@ -173,7 +171,7 @@ class Scheduler:
 
     def on_removed(self, path: bytes) -> None:
         """The file of this name was removed or replaced: what its readers still want cannot be had."""
-        for user in self.queue.users:
+        for user in list(self.queue.users):  # who is told may close it
             if user.path == path and isinstance(user, FileStream):
                 user.on_removed()
 
@@ -251,9 +249,9 @@ class Scheduler:
 
     def _tell_queue(self, served: SessionUser | None) -> None:
         """Somebody had a turn in which the vehicle answered: who waits for the next ones is not timed out."""
-        for user in self.queue.users:
+        for user in list(self.queue.users):
             if user is not served and isinstance(user, FileStream) and user.due_at() < inf:
-                user.on_queued()
+                user.sink.on_queued()
 
     async def _idle(self) -> None:
         now = self._clock()

@@ -26,7 +26,6 @@ from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.protocol.requests import Operation
 from mavftpfs.session.doubt import Doubt
 from mavftpfs.session.driver import Driver
-from mavftpfs.session.vehicle import Vehicle
 from mavftpfs.shared.errors import FtpNak, MavftpfsError, RequestTimeout, SessionBusy, SessionLost
 from mavftpfs.shared.model import wire_path
 
@@ -93,13 +92,13 @@ class OpenSession:
 
 @dataclass(eq=False)
 class _Excluded:
-    """A path that is about to change. below: with all that lies below it."""
+    """Paths that are about to change. below: with all that lies below the first."""
 
-    path: bytes
+    paths: tuple[bytes, ...]
     below: bool
 
     def covers(self, path: bytes) -> bool:
-        return path == self.path or (self.below and path.startswith(self.path.rstrip(b"/") + b"/"))
+        return path in self.paths or (self.below and path.startswith(self.paths[0].rstrip(b"/") + b"/"))
 
 
 @dataclass
@@ -126,7 +125,6 @@ class ServerSession:
     def __init__(
         self,
         driver: Driver,
-        vehicle: Vehicle,
         doubt: Doubt,
         clock: Callable[[], float],
         op_deadline: float = 30.0,
@@ -138,7 +136,7 @@ class ServerSession:
         self.resets = self.quiet_periods = 0
         self._driver = driver
         self._engine = driver.engine
-        self._vehicle = vehicle
+        self._vehicle = driver.vehicle
         self._doubt = doubt
         self._clock = clock
         self._op_deadline = op_deadline
@@ -444,13 +442,13 @@ class ServerSession:
         return any(excluded.covers(path) for excluded in self._excluded)
 
     @asynccontextmanager
-    async def excluded(self, path: bytes, *, below: bool = False) -> AsyncIterator[None]:
-        """Keep the session off a path for the length of the body; below: off all that lies below it, too.
+    async def excluded(self, *paths: bytes, below: bool = False) -> AsyncIterator[None]:
+        """Keep the session off paths for the length of the body; below: off all below the first, too.
 
         Raises:
             RequestTimeout: it could not be closed in time.
         """
-        excluded = _Excluded(path, below)
+        excluded = _Excluded(paths, below)
         self._excluded.append(excluded)
         try:
             with trio.move_on_after(self._op_deadline) as scope:
@@ -458,7 +456,7 @@ class ServerSession:
                     self.wake()
                     await self._changed.park()
             if scope.cancelled_caught:
-                raise RequestTimeout("our own session on this path could not be closed")
+                raise RequestTimeout("our own session on these paths could not be closed")
             yield
         finally:
             self._excluded.remove(excluded)

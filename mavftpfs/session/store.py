@@ -16,7 +16,6 @@ from mavftpfs.session.driver import Driver
 from mavftpfs.session.reader import FileStream
 from mavftpfs.session.scheduler import Scheduler
 from mavftpfs.session.upload import Upload
-from mavftpfs.session.vehicle import Vehicle
 from mavftpfs.shared.errors import Armed, FtpNak, RemoteProtocolError, RequestTimeout
 from mavftpfs.shared.model import DirEntry, Listing, wire_path
 
@@ -45,7 +44,6 @@ class Store:
         self,
         scheduler: Scheduler,
         driver: Driver,
-        vehicle: Vehicle,
         *,
         clock: Callable[[], float],
         op_deadline: float = 30.0,
@@ -55,10 +53,10 @@ class Store:
         self._server = scheduler.server
         self._driver = driver
         self._op_deadline = op_deadline
-        self._vehicle = vehicle
+        self._vehicle = driver.vehicle
         self._clock = clock
         self._time_silences = 0
-        self._changes = Changes(scheduler, vehicle, self.list_directory, clock)
+        self._changes = Changes(scheduler, driver.vehicle, self.list_directory, clock)
         # See cache.remote.VehicleStore.
         self.traits = scheduler.traits
         self.in_doubt = scheduler.doubt.is_active

@@ -269,8 +269,8 @@ class Upload(SessionUser):
     # --- one turn
 
     def begin_turn(self, *, resumable: bool) -> bool:
-        """It has the session from now on; return False if it needs it not, for there is nothing to send. An
-        empty file has to be made once. resumable: see `complete`.
+        """It has the session from now on. Return False if there is nothing to send, so that it is complete;
+        but an empty file has to be made once. resumable: see `complete`.
 
         Raises:
             MavftpfsError: the source fails.

@@ -29,7 +29,6 @@ from mavftpfs.session.driver import Driver
 from mavftpfs.session.queue import LIGHT_USE, Queue
 from mavftpfs.session.serversession import TERMINATE_LIMIT, OpenSession, ServerSession
 from mavftpfs.session.upload import Feed, Upload, UploadState
-from mavftpfs.session.vehicle import Vehicle
 from mavftpfs.shared.errnos import errno_for
 from mavftpfs.shared.errors import (
     Armed,
@@ -150,7 +149,6 @@ class Uploading:
         server: ServerSession,
         driver: Driver,
         queue: Queue,
-        vehicle: Vehicle,
         doubt: Doubt,
         traits: WriteTraits,
         chunks: ChunkSize,
@@ -163,7 +161,7 @@ class Uploading:
         self._driver = driver
         self._engine = driver.engine
         self._queue = queue
-        self._vehicle = vehicle
+        self._vehicle = driver.vehicle
         self._doubt = doubt
         self._chunks = chunks
         self._clock = clock

@@ -33,6 +33,7 @@ class Answering:
     def __init__(self, answers: list[str | int]) -> None:
         self._answers = answers
         self.engine = Engine(random.Random(1), Flow())
+        self.vehicle = Vehicle(0, 0, Address(254, 191))
 
     async def run(self, operation: Operation) -> None:
         await trio.lowlevel.checkpoint()
@@ -62,9 +63,8 @@ def test_all_goes_by_the_table(acts: list[tuple[str, list[str | int]]]) -> None:
 
 async def _play(acts: list[tuple[str, list[str | int]]]) -> None:
     driver = Answering([])
-    vehicle = Vehicle(0, 0, Address(254, 191))
     doubt = Doubt(trio.current_time)
-    server = ServerSession(cast(Driver, driver), vehicle, doubt, trio.current_time, 10.0)
+    server = ServerSession(cast(Driver, driver), doubt, trio.current_time, 10.0)
     for number, (act, answers) in enumerate(acts):
         driver._answers = list(answers)
         with trio.move_on_after(60), suppress(MavftpfsError):
@@ -101,7 +101,6 @@ async def _change(server: ServerSession, path: bytes) -> None:
 
 def test_a_step_that_is_not_in_the_table_is_a_bug() -> None:
     assert set(NEXT) == set(State)
-    driver, vehicle = cast(Driver, Answering([])), Vehicle(0, 0, Address(1, 1))
-    server = ServerSession(driver, vehicle, Doubt(lambda: 0.0), lambda: 0.0)
+    server = ServerSession(cast(Driver, Answering([])), Doubt(lambda: 0.0), lambda: 0.0)
     with pytest.raises(AssertionError):
         server._enter(State.CLOSING)

@@ -29,6 +29,7 @@ class Refusing:
         self.retransmitted = False
         self.log: list[tuple[float, Opcode]] = []
         self.engine = Engine(random.Random(1), Flow())
+        self.vehicle = Vehicle(0, 0, Address(254, 191))
 
     async def run(self, operation: Operation) -> None:
         await trio.lowlevel.checkpoint()
@@ -43,9 +44,9 @@ class Refusing:
 
 
 def server(code: int) -> tuple[ServerSession, Refusing, Vehicle]:
-    vehicle, driver = Vehicle(0, 0, Address(254, 191)), Refusing(code)
-    made = ServerSession(cast(Driver, driver), vehicle, Doubt(trio.current_time), trio.current_time)
-    return made, driver, vehicle
+    driver = Refusing(code)
+    made = ServerSession(cast(Driver, driver), Doubt(trio.current_time), trio.current_time)
+    return made, driver, driver.vehicle
 
 
 async def test_a_taken_session_is_waited_out_in_silence_then_reset_then_given_up(
