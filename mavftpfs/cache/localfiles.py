@@ -19,7 +19,6 @@ from mavftpfs.shared.errors import (
     AlreadyExists,
     DirectoryNotEmpty,
     IsADirectory,
-    LocalProtocolError,
     NoSpace,
     NotADirectory,
     NotFound,
@@ -48,7 +47,11 @@ class LocalEntry:
 
 
 class LocalFiles:
-    """All local names of a mount, by path."""
+    """All local names of a mount, by path.
+
+    Attributes:
+        used: bytes of content, also of files that are open and have no name any more.
+    """
 
     def __init__(self, patterns: tuple[str, ...], limit: int, now_ns: Callable[[], int]) -> None:
         """`limit`: bytes of all content."""
@@ -57,12 +60,7 @@ class LocalFiles:
         self._limit = limit
         self._now_ns = now_ns
         self._entries: dict[bytes, LocalEntry] = {}
-        self._used = 0
-
-    @property
-    def used(self) -> int:
-        """Bytes of content."""
-        return self._used
+        self.used = 0
 
     def owns(self, path: bytes) -> bool:
         """Return whether a path is local, whether it exists or not."""
@@ -160,7 +158,7 @@ class LocalFiles:
             raise IsADirectory(f"{path!r} is a directory")
         del self._entries[path]
         entry.named = False
-        self._forget_unused(entry)
+        self.forget_unused(entry)
 
     def rmdir(self, path: bytes) -> None:
         """Remove an empty directory.
@@ -205,27 +203,31 @@ class LocalFiles:
         """
         assert entry.data is not None
         more = size - len(entry.data)
-        if more > 0 and self._used + more > self._limit:
+        if more > 0 and self.used + more > self._limit:
             raise NoSpace(f"local files may take {self._limit} bytes in all")
         if more > 0:
             entry.data.extend(bytes(more))
         else:
             del entry.data[size:]
-        self._used += more
+        self.used += more
         entry.mtime_ns = self._now_ns()
 
-    def touch(self, entry: LocalEntry) -> None:
-        """A file was written."""
+    def write(self, entry: LocalEntry, offset: int, data: bytes | memoryview) -> None:
+        """Write into a file.
+
+        Raises:
+            NoSpace.
+        """
+        assert entry.data is not None
+        if offset + len(data) > len(entry.data):
+            self.resize(entry, offset + len(data))
+        entry.data[offset : offset + len(data)] = data
         entry.mtime_ns = self._now_ns()
 
-    def closed(self, entry: LocalEntry) -> None:
-        """A handle of the file was closed."""
-        entry.handles -= 1
-        self._forget_unused(entry)
-
-    def _forget_unused(self, entry: LocalEntry) -> None:
+    def forget_unused(self, entry: LocalEntry) -> None:
+        """A file has fewer names or handles; without any its bytes are not counted any more."""
         if not entry.named and not entry.handles:
-            self._used -= len(entry.data or b"")
+            self.used -= len(entry.data or b"")
 
     def _add(self, path: bytes, entry: LocalEntry) -> None:
         if len(self._entries) >= MAX_ENTRIES:
@@ -241,6 +243,8 @@ class LocalHandle(OpenFile):
     def __init__(self, files: LocalFiles, entry: LocalEntry, *, writable: bool) -> None:
         self._files = files
         self._entry = entry
+        assert entry.data is not None
+        self._data = entry.data
         self._closed = False
         self.writable = writable
         entry.handles += 1
@@ -249,11 +253,6 @@ class LocalHandle(OpenFile):
     def size(self) -> int:
         """Bytes."""
         return len(self._data)
-
-    @property
-    def mtime_ns(self) -> int:
-        """Nanoseconds since 1970."""
-        return self._entry.mtime_ns
 
     async def read(self, offset: int, size: int) -> bytes:
         """Return bytes, fewer only at the end."""
@@ -265,10 +264,7 @@ class LocalHandle(OpenFile):
         Raises:
             NoSpace.
         """
-        if offset + len(data) > self.size:
-            self._files.resize(self._entry, offset + len(data))
-        self._data[offset : offset + len(data)] = data
-        self._files.touch(self._entry)
+        self._files.write(self._entry, offset, data)
         return len(data)
 
     async def truncate(self, size: int) -> None:
@@ -283,10 +279,5 @@ class LocalHandle(OpenFile):
         """Close; closing twice is harmless."""
         if not self._closed:
             self._closed = True
-            self._files.closed(self._entry)
-
-    @property
-    def _data(self) -> bytearray:
-        if self._entry.data is None:
-            raise LocalProtocolError("a directory has no content")
-        return self._entry.data
+            self._entry.handles -= 1
+            self._files.forget_unused(self._entry)

@@ -161,11 +161,6 @@ class Version:
         return index in self._blocks
 
     @property
-    def empty(self) -> bool:
-        """Whether no byte is held."""
-        return not self._blocks
-
-    @property
     def waited_for(self) -> bool:
         """Whether somebody waits for bytes."""
         return bool(self._waiters)
