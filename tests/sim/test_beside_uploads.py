@@ -25,7 +25,8 @@ from tests.support.faults import Faults
 from tests.support.mounting import mounted
 from tests.support.sources import MemorySource
 from tests.support.takingturns import taking_turns
-from tests.support.worlds import ROOTS, World, read_file
+from tests.support.uploads import know, start, under_way
+from tests.support.worlds import ROOTS, MemorySink, World, content, path, read_file, world
 
 EVERY_PROFILE = sorted(PROFILES)
 
@@ -472,3 +473,109 @@ async def test_three_uploads_alternate_by_more_than_a_window(autojump: MockClock
 async def test_a_short_queue_is_filled_beside_another_upload(autojump: MockClock) -> None:
     """The place for the Terminate was kept free through whole turns: a fifth less was written."""
     assert await seconds_for(2, replace(LINK, delay=0.15, loss=0.01)) < 46
+
+
+# --- requests about other paths, on PX4's NuttX and elsewhere
+
+PLAIN = LinkSettings(rate=20_000.0, delay=0.02)
+
+
+async def test_who_gave_up_waiting_and_asks_again_waits_as_long_again(autojump: MockClock) -> None:
+    """Not told at once that it waited too long: that was the time before."""
+    here = world("mavsdk", LinkSettings(rate=5_000.0, delay=0.05), old=b"hello")
+    async with here.connection() as connection, trio.open_nursery() as nursery:
+        know(connection, "mavsdk")
+        upload = await start(connection, "mavsdk", MemorySource(content(400_000)))
+        nursery.start_soon(upload.finish)
+        await trio.sleep(1.5)
+        sink = MemorySink(5)
+        reader = await connection.store.open_reader(path("mavsdk", "old"), sink, expected_size=5)
+        for _ in range(2):
+            began = trio.current_time()
+            reader.want(0, 5, demand=True)
+            with pytest.raises(RequestTimeout):
+                await sink.wait_for(0, 5)
+            assert trio.current_time() - began == pytest.approx(30.0, abs=2.0)
+        reader.close()
+        nursery.cancel_scope.cancel()
+
+
+@pytest.mark.holds("rule 14.24")
+async def test_path_operations_beside_an_upload_on_nuttx(autojump: MockClock) -> None:
+    """Listing outside the card's whitelist makes PX4 refuse the next write (servers.md 8)."""
+    data = content(60_000)
+    here = world("px4-nuttx", PLAIN)
+    here.tree.add(b"/etc/init.d/rcS", b"#")
+    faults = Faults(here)
+    async with here.connection() as connection:
+        async with under_way(connection, "px4-nuttx", data, seconds=0.5) as source:
+            for _ in range(8):
+                await connection.store.list_directory(b"/etc/init.d")
+                await trio.sleep(0.3)
+        assert source.all_proven
+        assert source.rollbacks == []
+        refused = faults.refused.count(Opcode.WRITE_FILE)
+        assert 1 <= refused < 30  # the first window only: after that, each knows its turn
+        assert connection.scheduler.uploading.rearms >= 5
+    assert here.tree.data(path("px4-nuttx", "new")) == data
+
+
+async def test_outside_the_whitelist_stays_refused(autojump: MockClock) -> None:
+    here = world("px4-nuttx")
+    here.tree.add_directory(b"/etc")
+    async with here.connection() as connection:
+        upload = await connection.store.open_upload(b"/etc/new", MemorySource(b"hello"))
+        with pytest.raises(FtpNak) as refusal:
+            await upload.finish()
+        assert (refusal.value.opcode, refusal.value.code) == (Opcode.WRITE_FILE, 9)
+        assert connection.scheduler.uploading.rearms == 1
+        await upload.abort()
+    assert here.vehicle.server.open_sessions == 0
+
+
+async def test_who_gives_up_waiting_for_its_turn_does_not_stop_the_writer(autojump: MockClock) -> None:
+    data = content(200_000)
+    here = world("px4-nuttx", LinkSettings(rate=20_000.0, delay=0.3))
+    here.tree.add(b"/etc/rc", b"#")
+    faults = Faults(here)
+    async with here.connection() as connection:
+        async with under_way(connection, "px4-nuttx", data, seconds=1) as source:
+            await connection.store.list_directory(b"/etc")
+            await trio.sleep(5)
+            asked = faults.requests.count(Opcode.LIST_DIRECTORY)
+            with trio.move_on_after(0.05) as impatience:
+                await connection.store.list_directory(b"/etc")
+            await trio.sleep(1)
+            assert impatience.cancelled_caught
+            assert faults.requests.count(Opcode.LIST_DIRECTORY) == asked  # it waited for its turn
+        assert source.all_proven
+        assert source.rollbacks == []
+    assert here.tree.data(path("px4-nuttx", "new")) == data
+
+
+async def test_a_crowd_of_listings_beside_an_upload_on_nuttx(autojump: MockClock) -> None:
+    """Whatever slips in between arming and writing, the upload is not refused for it."""
+    data = content(40_000)
+    here = World("px4-nuttx", LinkSettings(rate=60_000.0, delay=0.03, loss=0.02))
+    here.tree.add_directory(path("px4-nuttx", "")[:-1])
+    here.tree.add(b"/etc/init.d/rcS", b"#")
+    listed = 0
+    async with here.connection() as connection:
+        source = MemorySource(data)
+        upload = await start(connection, "px4-nuttx", source)
+        async with trio.open_nursery() as nursery:
+
+            async def crowd(directory: bytes) -> None:
+                nonlocal listed
+                while True:
+                    await connection.store.list_directory(directory)
+                    listed += 1
+
+            for directory in (b"/etc", b"/etc/init.d", b"/", b"/fs"):
+                nursery.start_soon(crowd, directory)
+            await upload.finish()
+            nursery.cancel_scope.cancel()
+        assert source.all_proven
+        assert source.rollbacks == []
+        assert listed > 10
+    assert here.tree.data(path("px4-nuttx", "new")) == data

@@ -10,14 +10,14 @@ from mavftpfs.link.messages import Address
 from mavftpfs.protocol.payload import NakCode, Opcode, request
 from mavftpfs.session.connection import ConnectOptions
 from mavftpfs.shared.errnos import errno_for
-from mavftpfs.shared.errors import Armed, FtpNak, MavftpfsError, RequestTimeout, SpoolFailed
+from mavftpfs.shared.errors import Armed, FtpNak, MavftpfsError, SpoolFailed
 from mavftpfs.sim.linkmodel import LinkSettings
 from mavftpfs.sim.profiles import PROFILES
 from tests.support.faults import Faults
 from tests.support.sources import MemorySource
 from tests.support.takingturns import taking_turns
 from tests.support.uploads import know, put, start, under_way
-from tests.support.worlds import MemorySink, World, content, path, read_file, world
+from tests.support.worlds import World, content, path, read_file, world
 
 EVERY_PROFILE = sorted(PROFILES)
 
@@ -51,42 +51,6 @@ async def test_a_small_file_costs_create_write_terminate(profile: str, autojump:
 
 
 PLAIN = LinkSettings(rate=20_000.0, delay=0.02)
-
-
-# The textbook's server gives ids that cannot be guessed, and never forgets.
-@pytest.mark.parametrize("profile", taking_turns(name for name in EVERY_PROFILE if name != "spec"))
-async def test_answers_to_opens_that_are_lost_one_after_the_other(profile: str, autojump: MockClock) -> None:
-    """Servers replay nothing once they have answered another request, and refuse what is open: by us."""
-    here = world(profile, PLAIN)
-    server, lost = here.vehicle.server, [Opcode.CREATE_FILE] * 3
-    outgoing = server.outgoing
-
-    def lossy(now: float) -> list[tuple[Address, bytes]]:
-        replies = outgoing(now)
-        for reply in replies:
-            if reply[1][3] == Opcode.ACK and reply[1][5] in lost:
-                lost.pop()
-                replies.remove(reply)
-                break
-        return replies
-
-    server.outgoing = lossy  # type: ignore[method-assign]
-    async with here.connection() as connection, trio.open_nursery() as nursery:
-
-        async def list_all_the_time() -> None:
-            while True:
-                await connection.store.list_directory(path(profile, "")[:-1])
-
-        nursery.start_soon(list_all_the_time)
-        source = MemorySource(content(3000))
-        upload = await start(connection, profile, source)
-        await upload.finish()
-        assert lost == []
-        assert source.all_proven
-        assert connection.scheduler.server.quiet_periods == 0
-        nursery.cancel_scope.cancel()
-    assert here.tree.data(path(profile, "new")) == content(3000)
-    assert server.open_sessions == 0
 
 
 @pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
@@ -354,74 +318,6 @@ async def test_a_link_that_is_reopened_and_stays_silent_ends_the_wait(
             await upload.finish()
 
 
-async def test_who_gave_up_waiting_and_asks_again_waits_as_long_again(autojump: MockClock) -> None:
-    """Not told at once that it waited too long: that was the time before."""
-    here = world("mavsdk", LinkSettings(rate=5_000.0, delay=0.05), old=b"hello")
-    async with here.connection() as connection, trio.open_nursery() as nursery:
-        know(connection, "mavsdk")
-        upload = await start(connection, "mavsdk", MemorySource(content(400_000)))
-        nursery.start_soon(upload.finish)
-        await trio.sleep(1.5)
-        sink = MemorySink(5)
-        reader = await connection.store.open_reader(path("mavsdk", "old"), sink, expected_size=5)
-        for _ in range(2):
-            began = trio.current_time()
-            reader.want(0, 5, demand=True)
-            with pytest.raises(RequestTimeout):
-                await sink.wait_for(0, 5)
-            assert trio.current_time() - began == pytest.approx(30.0, abs=2.0)
-        reader.close()
-        nursery.cancel_scope.cancel()
-
-
-@pytest.mark.holds("rule 14.24")
-async def test_path_operations_beside_an_upload_on_nuttx(autojump: MockClock) -> None:
-    """Listing outside the card's whitelist makes PX4 refuse the next write (servers.md 8)."""
-    data = content(60_000)
-    here = world("px4-nuttx", PLAIN)
-    here.tree.add(b"/etc/init.d/rcS", b"#")
-    faults = Faults(here)
-    async with here.connection() as connection:
-        async with under_way(connection, "px4-nuttx", data, seconds=0.5) as source:
-            for _ in range(8):
-                await connection.store.list_directory(b"/etc/init.d")
-                await trio.sleep(0.3)
-        assert source.all_proven
-        assert source.rollbacks == []
-        refused = faults.refused.count(Opcode.WRITE_FILE)
-        assert 1 <= refused < 30  # the first window only: after that, each knows its turn
-        assert connection.scheduler.uploading.rearms >= 5
-    assert here.tree.data(path("px4-nuttx", "new")) == data
-
-
-@pytest.mark.holds("rule 14.24")
-async def test_a_write_after_silence_on_nuttx(autojump: MockClock) -> None:
-    """After 2 s without requests the scratch buffer is gone; the upload survives a short cut."""
-    data = content(60_000)
-    here = world("px4-nuttx", PLAIN)
-    async with here.connection() as connection:
-        async with under_way(connection, "px4-nuttx", data) as source:
-            here.link.cut()
-            await trio.sleep(4)
-            here.link.restore()
-        assert source.rollbacks == []
-        assert connection.scheduler.uploading.rearms == 1
-    assert here.tree.data(path("px4-nuttx", "new")) == data
-
-
-async def test_outside_the_whitelist_stays_refused(autojump: MockClock) -> None:
-    here = world("px4-nuttx")
-    here.tree.add_directory(b"/etc")
-    async with here.connection() as connection:
-        upload = await connection.store.open_upload(b"/etc/new", MemorySource(b"hello"))
-        with pytest.raises(FtpNak) as refusal:
-            await upload.finish()
-        assert (refusal.value.opcode, refusal.value.code) == (Opcode.WRITE_FILE, 9)
-        assert connection.scheduler.uploading.rearms == 1
-        await upload.abort()
-    assert here.vehicle.server.open_sessions == 0
-
-
 @pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
 async def test_abort_leaves_nothing_open_and_asks_for_nothing(profile: str, autojump: MockClock) -> None:
     here = world(profile, PLAIN)
@@ -612,54 +508,6 @@ async def test_an_aborted_upload_gives_back_what_was_only_looked_at(autojump: Mo
     assert here.vehicle.server.open_sessions == 0
 
 
-async def test_who_gives_up_waiting_for_its_turn_does_not_stop_the_writer(autojump: MockClock) -> None:
-    data = content(200_000)
-    here = world("px4-nuttx", LinkSettings(rate=20_000.0, delay=0.3))
-    here.tree.add(b"/etc/rc", b"#")
-    faults = Faults(here)
-    async with here.connection() as connection:
-        async with under_way(connection, "px4-nuttx", data, seconds=1) as source:
-            await connection.store.list_directory(b"/etc")
-            await trio.sleep(5)
-            asked = faults.requests.count(Opcode.LIST_DIRECTORY)
-            with trio.move_on_after(0.05) as impatience:
-                await connection.store.list_directory(b"/etc")
-            await trio.sleep(1)
-            assert impatience.cancelled_caught
-            assert faults.requests.count(Opcode.LIST_DIRECTORY) == asked  # it waited for its turn
-        assert source.all_proven
-        assert source.rollbacks == []
-    assert here.tree.data(path("px4-nuttx", "new")) == data
-
-
-async def test_a_crowd_of_listings_beside_an_upload_on_nuttx(autojump: MockClock) -> None:
-    """Whatever slips in between arming and writing, the upload is not refused for it."""
-    data = content(40_000)
-    here = World("px4-nuttx", LinkSettings(rate=60_000.0, delay=0.03, loss=0.02))
-    here.tree.add_directory(path("px4-nuttx", "")[:-1])
-    here.tree.add(b"/etc/init.d/rcS", b"#")
-    listed = 0
-    async with here.connection() as connection:
-        source = MemorySource(data)
-        upload = await start(connection, "px4-nuttx", source)
-        async with trio.open_nursery() as nursery:
-
-            async def crowd(directory: bytes) -> None:
-                nonlocal listed
-                while True:
-                    await connection.store.list_directory(directory)
-                    listed += 1
-
-            for directory in (b"/etc", b"/etc/init.d", b"/", b"/fs"):
-                nursery.start_soon(crowd, directory)
-            await upload.finish()
-            nursery.cancel_scope.cancel()
-        assert source.all_proven
-        assert source.rollbacks == []
-        assert listed > 10
-    assert here.tree.data(path("px4-nuttx", "new")) == data
-
-
 def steal(here: World) -> None:
     """Terminate the session of a PX4 as if by another client; nobody hears it."""
     wire = request(77, Opcode.TERMINATE_SESSION, session=0).encode()
@@ -749,16 +597,3 @@ async def test_who_stops_waiting_does_not_stop_the_upload(profile: str, autojump
         assert source.all_proven
         assert here.vehicle.server.open_sessions == 0
     assert here.tree.data(path(profile, "new")) == data
-
-
-async def test_the_status_names_uploads(autojump: MockClock) -> None:
-    here = world("px4", PLAIN)
-    async with here.connection() as connection:
-        upload = await start(connection, "px4", MemorySource(content(60_000)))
-        await trio.sleep(1)
-        [shown] = connection.status()["uploads"]
-        assert shown["path"] == "/d/new"
-        assert shown["running"] is True
-        assert 0 < shown["unproven"] == shown["reached"]
-        await upload.abort()
-        assert connection.status()["uploads"] == []
