@@ -18,7 +18,7 @@ from mavftpfs.protocol.crc import crc32
 from mavftpfs.protocol.operations import Simple
 from mavftpfs.protocol.payload import Opcode
 from mavftpfs.session.connection import Connection, ConnectOptions
-from mavftpfs.shared.errors import Armed, FileBusy, FileChanged, FtpNak, PathTooLong, RequestTimeout
+from mavftpfs.shared.errors import Armed, FileBusy, FileChanged, FtpNak, RequestTimeout
 from mavftpfs.shared.model import join
 from mavftpfs.sim.linkmodel import LinkSettings
 from mavftpfs.sim.profiles import PROFILES, Storage
@@ -175,15 +175,6 @@ async def test_an_upload_makes_room_for_a_change_of_its_path(
         assert not source.dirty.empty  # it did not wait for the upload's end
         await upload.abort()
     assert here.vehicle.server.open_sessions == 0
-
-
-async def test_too_long_a_rename_is_refused_before_a_byte_is_sent(autojump: MockClock) -> None:
-    here = world("px4")
-    faults = Faults(here)
-    async with here.connection() as connection:
-        with pytest.raises(PathTooLong):
-            await connection.store.rename(b"/d/" + b"a" * 116, b"/d/" + b"b" * 117)
-    assert faults.requests == []
 
 
 async def test_a_sticky_file_exists_does_not_hide_the_whitelist(autojump: MockClock) -> None:

@@ -19,8 +19,6 @@ from mavftpfs.link.messages import (
     CommandLong,
     Heartbeat,
 )
-from mavftpfs.link.opening import open_link
-from mavftpfs.link.uri import parse_source
 from mavftpfs.protocol.payload import MAX_DATA, decode_request
 from mavftpfs.session.connection import ConnectOptions, connected
 from mavftpfs.shared.errors import VehicleLost
@@ -207,37 +205,3 @@ async def test_a_neighbour_with_our_address_makes_us_move(autojump: MockClock) -
         assert connection.vehicle.own != own
         assert connection.vehicle.own.system == own.system
         assert await read_file(connection, b"/f") == DATA
-
-
-async def test_a_second_talker_on_the_port_does_not_get_our_requests() -> None:
-    """QGroundControl or a script on the same port: we go on answering the vehicle's address."""
-    tree = MemoryTree()
-    tree.add(b"/f", DATA)
-    vehicle = SimVehicle(tree, PROFILES["px4"], rng=random.Random(1))
-    talker = Framer(Address(255, 190), stream=False)
-    with trio.fail_after(60):
-        async with open_link(parse_source("udpin:127.0.0.1:0")) as link, trio.open_nursery() as nursery:
-            port = parse_source(link.description).port
-            assert port is not None
-            nursery.start_soon(_serve, vehicle, port)
-            async with connected(link, ConnectOptions()) as connection:
-                await connection.ready(20)
-                chatter = trio.socket.socket(type=trio.socket.SOCK_DGRAM)
-                with chatter:
-                    for _ in range(20):
-                        await chatter.sendto(talker.encode_heartbeat(6, 8), ("127.0.0.1", port))
-                    await trio.sleep(0.05)
-                    assert await read_file(connection, b"/f") == DATA
-            nursery.cancel_scope.cancel()
-
-
-async def _serve(vehicle: SimVehicle, port: int) -> None:
-    sock = trio.socket.socket(type=trio.socket.SOCK_DGRAM)
-    with sock:
-        await sock.connect(("127.0.0.1", port))
-        while True:
-            now = trio.current_time()
-            for frame in vehicle.outgoing(now):
-                await sock.send(frame)
-            with trio.move_on_at(min(vehicle.next_deadline(), now + 0.2)):
-                vehicle.receive(await sock.recv(4096), trio.current_time())

@@ -99,17 +99,6 @@ async def test_an_answer_that_comes_twice_raises_it(autojump: MockClock) -> None
         assert 3 < connection.scheduler.doubt.lateness < 4
 
 
-async def test_another_client_raises_it(autojump: MockClock) -> None:
-    here = world("px4", CLEAN)
-    async with here.connection() as connection:
-        here.vehicle.foreign_request(
-            request(777, Opcode.NONE).encode(), Address(255, 190), trio.current_time()
-        )
-        here.link.kick()
-        await trio.sleep(0.5)
-        assert connection.store.in_doubt()
-
-
 @pytest.mark.holds("rule 14.12")
 async def test_what_another_client_does_decides_whether_bytes_are_in_doubt(autojump: MockClock) -> None:
     """The first that is heard of him, what may use our session, and for a while after that everything: a
@@ -249,7 +238,6 @@ async def test_who_waits_for_a_turn_is_not_timed_out(autojump: MockClock) -> Non
 
 # --- bytes that were ACKed and are not on the card
 
-KEEPING = sorted(name for name in PROFILES if not PROFILES[name].write_only_truncates)
 
 DOUBLING = LinkSettings(delay=0.02, duplicate=0.3)
 

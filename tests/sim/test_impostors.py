@@ -410,16 +410,6 @@ async def test_no_file_is_read_half_from_each(profile: str, autojump: MockClock)
 
 
 @pytest.mark.holds("fault another vehicle")
-async def test_the_same_vehicle_goes_on_after_a_silence(autojump: MockClock) -> None:
-    scene = Scene("px4")
-    async with scene.mounted() as tree:
-        file = await tree.open(scene.file)
-        await swap(scene.world, scene.world.vehicle, gap=4.0)
-        assert bytes(await file.read(0, len(OUR_FILE))) == OUR_FILE
-        file.close()
-
-
-@pytest.mark.holds("fault another vehicle")
 @pytest.mark.parametrize("tells", ["never", "once"])
 async def test_a_vehicle_that_does_not_tell_who_it_is_is_believed(
     tells: str, autojump: MockClock, monkeypatch: pytest.MonkeyPatch

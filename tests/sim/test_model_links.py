@@ -180,7 +180,7 @@ class Below:
 async def trouble(here: World, rng: Random) -> None:
     """Cut the link, restart the vehicle, fly."""
     for number in range(10_000):
-        await trio.sleep(rng.uniform(30, 120))
+        await trio.sleep(rng.uniform(5, 20))
         if number % 7 == 3:
             here.vehicle.reboot(trio.current_time(), downtime=rng.choice((0.0, 8.0)))
         elif number % 3 == 1:
@@ -189,7 +189,7 @@ async def trouble(here: World, rng: Random) -> None:
             here.vehicle.disarm()
         else:
             here.link.cut()
-            await trio.sleep(rng.choice((0.5, 4.0, 15.0, 45.0)))
+            await trio.sleep(rng.choice((0.5, 15.0, 50.0)))
             here.link.restore()
         here.link.kick()
 

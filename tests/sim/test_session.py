@@ -23,7 +23,6 @@ from mavftpfs.session.serversession import SILENCE_ARDUPILOT
 from mavftpfs.session.store import TIME_PROBE_LIMIT
 from mavftpfs.shared.errors import (
     FileChanged,
-    FtpNak,
     MavftpfsError,
     RequestTimeout,
     SessionBusy,
@@ -220,18 +219,6 @@ async def test_no_vehicle_says_what_was_heard(autojump: MockClock) -> None:
     with pytest.raises(VehicleLost, match="heard only 1/1"):
         async with here.connection(ConnectOptions(target_system=9)):
             raise AssertionError("connected to nobody")
-
-
-@pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
-async def test_refusals_reach_the_caller(profile: str, autojump: MockClock) -> None:
-    here = world(profile, small=b"hello")
-    async with here.connection() as connection:
-        with pytest.raises(FtpNak):
-            await connection.store.list_directory(path(profile, "missing"))
-        with pytest.raises(FtpNak) as refusal:
-            await read_file(connection, path(profile, "missing"))
-        assert refusal.value.code == 10
-        assert await read_file(connection, path(profile, "small")) == b"hello"
 
 
 # --- names that are being changed
@@ -566,21 +553,6 @@ def others_session(connection: Connection) -> int:
 async def open_elsewhere(connection: Connection) -> None:
     """Leave a session open under an id that is not this connection's, as a killed client does."""
     await connection.driver.run(OpenFile(Opcode.CREATE_FILE, b"/d/left", others_session(connection)))
-
-
-async def test_listings_at_once_do_not_keep_the_dead_session_alive(autojump_clock: MockClock) -> None:
-    here = ardupilot()
-    async with here.connection() as connection, trio.open_nursery() as nursery:
-        await open_elsewhere(connection)
-        began = trio.current_time()
-
-        async def look(after: float) -> None:
-            await trio.sleep(after)
-            await connection.store.list_directory(b"/d")
-            assert trio.current_time() - began < 6
-
-        for number in range(5):
-            nursery.start_soon(look, number / 2)
 
 
 async def test_a_session_in_use_is_told_in_time_and_is_not_asked_for_often(autojump_clock: MockClock) -> None:
