@@ -56,9 +56,15 @@ CALLS = 100
 ONCE = (Phase.generate,)
 """Nothing is made smaller: a hundred calls less one are another history, and minutes pass."""
 
-sequences = st.lists(calls(largest=20_000, chunk=6000), min_size=CALLS, max_size=CALLS)
-short = st.lists(calls(largest=20_000, chunk=3000), min_size=CALLS // 5, max_size=CALLS // 5)
-rewriting = st.lists(rewriting_calls(largest=20_000, chunk=3000), min_size=CALLS, max_size=CALLS)
+
+def varied(sequence: list[tuple[Any, ...]]) -> bool:
+    """Return whether there is something to it: hypothesis begins with a hundred times the same call."""
+    return len({call[0] for call in sequence}) > 5
+
+
+sequences = st.lists(calls(largest=20_000, chunk=6000), min_size=CALLS, max_size=CALLS).filter(varied)
+short = st.lists(calls(largest=20_000, chunk=3000), min_size=CALLS // 4, max_size=CALLS // 4).filter(varied)
+rewriting = st.lists(rewriting_calls(20_000, 3000), min_size=CALLS, max_size=CALLS).filter(varied)
 
 
 class SimCard:
@@ -128,7 +134,7 @@ def run(profile: str, link: LinkSettings, sequence: list[tuple[Any, ...]], seed:
 @pytest.mark.holds("promise 1", "rule 14.22")
 @pytest.mark.parametrize("link", sorted(LINKS))
 @pytest.mark.parametrize("profile", taking_turns(sorted(PROFILES)))
-@settings(max_examples=2, phases=ONCE)
+@settings(max_examples=1, phases=ONCE)
 @given(sequence=sequences, seed=st.integers(0, 99))
 def test_the_card_becomes_the_model(
     profile: str, link: str, sequence: list[tuple[Any, ...]], seed: int
@@ -138,7 +144,7 @@ def test_the_card_becomes_the_model(
 
 @pytest.mark.holds("fault duplicate")
 @pytest.mark.parametrize("profile", taking_turns(sorted(PROFILES)))
-@settings(max_examples=2, phases=ONCE)
+@settings(max_examples=1, phases=ONCE)
 @given(sequence=rewriting, seed=st.integers(0, 99))
 def test_bytes_held_back_for_round_trips(profile: str, sequence: list[tuple[Any, ...]], seed: int) -> None:
     run(profile, STRAYING, sequence, seed)
@@ -225,6 +231,9 @@ async def lose_nothing(profile: str, programs: list[list[tuple[Any, ...]]], seed
         here.vehicle.disarm()
         here.link.kick()
         await trio.sleep(20.0)
+        for model in models:
+            while model.handles:
+                await model.on_close(0)
         for model in models:
             await model.end()
         nursery.cancel_scope.cancel()
