@@ -75,6 +75,8 @@ class Deliverer:
             The reason why not: as VehicleStore; VerificationFailed, NotSupported, FileTooLarge, FileChanged.
         """
         while wanted is None or wanted():
+            if not node.undelivered and node.attempt is None:
+                return
             await node.unclaimed.wait()
             async with self._context.paths.steady(node, lasting=True), node.lock:
                 draft = node.draft
