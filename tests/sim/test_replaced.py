@@ -345,25 +345,6 @@ async def test_a_change_of_the_old_file_does_not_go_into_its_successor(
         assert card.world.tree.data(PATH) == b"whole"
 
 
-@pytest.mark.parametrize("profile", TIMED)
-async def test_the_same_file_is_completed_and_read_on(profile: str, autojump: MockClock) -> None:
-    card = Card(profile)
-    expected = bytearray(OLD)
-    async with mounted(card.world) as (_, tree):
-        writer = await tree.open(PATH, write=True)
-        assert bytes(await writer.read(0, STEP)) == OLD[:STEP]
-        for at in (100, 300):
-            await writer.write(at, MID)
-            await trio.sleep(IDLE)
-            await writer.fsync()
-            expected[at : at + 3] = MID
-            await trio.sleep(IDLE)
-            assert bytes(await writer.read(0, len(OLD))) == expected
-            await trio.sleep(30.0)
-        await writer.release()
-        assert card.world.tree.data(PATH) == expected
-
-
 @pytest.mark.parametrize("successor", [SUCCESSOR, OLD + b"more"], ids=["as long", "grown"])
 async def test_one_that_comes_while_the_whole_file_is_sent_is_not_replaced(
     successor: bytes, autojump: MockClock
