@@ -1,7 +1,6 @@
 """All measurements: scripts/bench [PART] [--quick] [--json FILE] [--date DATE] [options of the part].
 
 goodput   share of a link's limit, reading and writing, on virtual time (the same figures on every machine)
-requests  requests per command
 cost      CPU time and memory of the hot path
 mount     a real mount beside the clients that people use now, over real sockets
 plots     draw what docs/benchmarks.md shows from the file of --json
@@ -25,7 +24,7 @@ from tempfile import TemporaryDirectory
 from tests.bench import tables
 from tests.bench.record import Record
 
-MEASURED = ("goodput", "requests", "cost", "mount")
+MEASURED = ("goodput", "cost", "mount")
 TIMED = ("cost", "mount")
 """Parts that use the machine's clock."""
 
@@ -35,7 +34,6 @@ PARTS = (*MEASURED, "plots", "all")
 
 QUICK: dict[str, tuple[str, ...]] = {
     "goodput": ("--seconds", "10", "--profiles", "px4", "ardupilot", "mavsdk", "--rates", "100000"),
-    "requests": ("--profile", "px4"),
     "cost": ("--size", "8", "--servers", "px4"),
     "mount": ("--quick",),
 }

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections import Counter
-from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -19,9 +17,6 @@ from tests.bench.cases import Case
 from tests.bench.figures import BARE, LINKS, US, Outcome, Row, Run, as_json, limit, summarise
 from tests.bench.record import Record
 from tests.bench.shaper import frames_of
-from tests.support.request_cases import CASES
-from tests.support.request_costs import MOUNT, PROFILES, expected
-from tests.support.requests import Cost
 
 PROJECT = Path(__file__).parents[2]
 TIMEOUTS = {"wifi-5%": 20.0, "unshaped": 10.0}
@@ -130,7 +125,9 @@ def sections() -> dict[str, dict[str, Any]]:
 
 
 def test_tables_go_between_their_marks() -> None:
-    marks = [f"<!-- bench: {name} -->old<!-- bench: end -->\n" for name in ("goodput", "peers", "cost")]
+    marks = [
+        f"<!-- bench: {name} -->old<!-- bench: end -->\n" for name in ("requests", "goodput", "peers", "cost")
+    ]
     text = "a\n" + "b\n".join(marks) + "c"
     filled = tables.filled_in(text, sections())
     assert filled == tables.filled_in(filled, sections())
@@ -142,15 +139,6 @@ def test_tables_go_between_their_marks() -> None:
     assert "`scripts/bench mount`, 2026-01-02, 2 CPUs.\n" in filled
     with pytest.raises(ValueError, match="goodput"):
         tables.filled_in("no marks", sections())
-
-
-def test_the_requests_recorded_are_those_that_tests_hold() -> None:
-    found = Record(plots.RESULTS).sections()["requests"]["results"]
-    wanted = set(product(PROFILES, [MOUNT, *(case.name for case in CASES)]))
-    assert {(run["profile"], run["command"]) for run in found} == wanted
-    for run in found:
-        cost = Cost(Counter(run["requests"]), payload=run["payload"])
-        assert cost.text() in expected(run["profile"], run["command"]), f"{run}: scripts/bench requests"
 
 
 def test_the_page_shows_what_was_recorded() -> None:
