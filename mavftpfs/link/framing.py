@@ -342,10 +342,6 @@ class Framer:
         """Return a SYSTEM_TIME frame."""
         return self._pack(dialect.MAVLink_system_time_message(unix_usec, time_boot_ms))
 
-    def encode_radio_status(self, rssi: int, remrssi: int, txbuf: int, rxerrors: int = 0) -> bytes:
-        """Return a RADIO_STATUS frame; txbuf: free share of the transmit buffer in percent."""
-        return self._pack(dialect.MAVLink_radio_status_message(rssi, remrssi, txbuf, 20, 20, rxerrors, 0))
-
     def encode_statustext(self, severity: int, text: str) -> bytes:
         """Return a STATUSTEXT frame; text is cut to 50 bytes."""
         return self._pack(dialect.MAVLink_statustext_message(severity, text.encode()[:50]))

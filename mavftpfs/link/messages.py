@@ -97,26 +97,6 @@ class SystemTime:
 
 
 @dataclass(frozen=True, slots=True)
-class RadioStatus:
-    """RADIO_STATUS of a telemetry radio; txbuf is the free share of its transmit buffer in percent."""
-
-    source: Address
-    rssi: int
-    remrssi: int
-    txbuf: int
-    rxerrors: int
-
-
-@dataclass(frozen=True, slots=True)
-class StatusText:
-    """STATUSTEXT; text without padding."""
-
-    source: Address
-    severity: int
-    text: str
-
-
-@dataclass(frozen=True, slots=True)
 class CommandLong:
     """COMMAND_LONG as the simulated vehicle hears it."""
 
@@ -135,15 +115,7 @@ class Other:
 
 
 Message: TypeAlias = (
-    FtpFrame
-    | Heartbeat
-    | AutopilotVersion
-    | StorageInformation
-    | SystemTime
-    | RadioStatus
-    | StatusText
-    | CommandLong
-    | Other
+    FtpFrame | Heartbeat | AutopilotVersion | StorageInformation | SystemTime | CommandLong | Other
 )
 
 
@@ -175,10 +147,6 @@ def _command_long(source: Address, m: Any) -> CommandLong:
     return CommandLong(source, Address(m.target_system, m.target_component), m.command, params)
 
 
-def _radio_status(source: Address, m: Any) -> RadioStatus:
-    return RadioStatus(source, m.rssi, m.remrssi, m.txbuf, m.rxerrors)
-
-
 def _ftp(source: Address, m: Any) -> FtpFrame:
     return FtpFrame(source, Address(m.target_system, m.target_component), bytes(m.payload))
 
@@ -192,10 +160,6 @@ def _autopilot_version(source: Address, m: Any) -> AutopilotVersion:
         m.uid,
         bytes(m.uid2),
     )
-
-
-def _status_text(source: Address, m: Any) -> StatusText:
-    return StatusText(source, m.severity, m.text)
 
 
 def _storage_information(source: Address, m: Any) -> StorageInformation:
@@ -214,11 +178,8 @@ DECODERS: dict[int, Callable[[Address, Any], Message]] = {
     0: _heartbeat,
     2: _system_time,
     76: _command_long,
-    109: _radio_status,
     110: _ftp,
     148: _autopilot_version,
-    166: _radio_status,  # RADIO, what old SiK firmware sends; same fields
-    253: _status_text,
     261: _storage_information,
 }
 """By message id; all other messages are `Other`."""
