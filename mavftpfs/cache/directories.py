@@ -50,8 +50,8 @@ class Directories:
     """Listings of the vehicle's directories. All paths are the vehicle's, normalised.
 
     Attributes:
-        ask_size: opens a file and returns its size. on_listed: who hears of each listing as it is made;
-            on_swept: who does before it is given out. lost: the vehicle is out of reach.
+        ask_size: opens a file and returns its size. on_listed: called with each listing as it is made;
+            on_swept: before it is given out. lost: the vehicle is out of reach.
         tells_times: whether any listing told an mtime. sweeps: how many listings were asked for.
     """
 

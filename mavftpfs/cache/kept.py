@@ -1,6 +1,6 @@
 """Which blocks of files are kept on the local disk for the next mount, and when they are used. Layer: cache.
 
-Off unless `cache_dir=` names a directory. What tells versions of a file apart (design D10):
+Off unless `cache_dir=` names a directory. What tells versions of a file apart:
 - its size and mtime, where a listing tells an mtime of a clock that was set: blocks are then used without a
   request;
 - else its size and CRC32: the vehicle is asked for it when blocks of that path and size are kept, only while

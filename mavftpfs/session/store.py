@@ -135,7 +135,7 @@ class Store:
         return operation
 
     async def _sweep_asking_times(self, wire: bytes) -> ListDirectory:
-        """Try opcode 16; a refusal or a silence counts only if opcode 3 then answers (design section 4)."""
+        """Try opcode 16; a refusal or a silence counts only if opcode 3 then answers."""
         began = self._clock()
         refused = False
         limit = inf if self.lists_times else TIME_PROBE_LIMIT
