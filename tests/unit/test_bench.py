@@ -126,18 +126,19 @@ def sections() -> dict[str, dict[str, Any]]:
 
 def test_tables_go_between_their_marks() -> None:
     marks = [
-        f"<!-- bench: {name} -->old<!-- bench: end -->\n" for name in ("requests", "goodput", "peers", "cost")
+        f"<!-- bench: {name} -->stale<!-- bench: end -->\n"
+        for name in ("requests", "goodput", "peers", "cost")
     ]
     text = "a\n" + "b\n".join(marks) + "c"
     filled = tables.filled_in(text, sections())
     assert filled == tables.filled_in(filled, sections())
-    assert "old" not in filled
+    assert "stale" not in filled
     assert filled.startswith("a\n")
     assert filled.endswith("\nc")
     assert "| PX4, Wi-Fi, 5 % loss, read | **500** | 500 (1.00) | failed | 500 (1.00) |" in filled
     assert "| mavftpfs | 0.500 / – | 120 / – | – / – |" in filled
     assert "`scripts/bench mount`, 2026-01-02, 2 CPUs.\n" in filled
-    with pytest.raises(ValueError, match="goodput"):
+    with pytest.raises(ValueError, match="requests"):
         tables.filled_in("no marks", sections())
 
 
