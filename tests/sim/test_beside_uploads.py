@@ -117,32 +117,6 @@ async def test_a_read_and_a_close_beside_a_copy_that_lasts(profile: str, autojum
 
 
 @pytest.mark.holds("promise 7")
-@pytest.mark.parametrize("profile", taking_turns(KEEPING))
-async def test_a_copy_that_was_tried_can_be_interrupted_after_a_reboot_too(
-    profile: str, autojump: MockClock
-) -> None:
-    """What OpenFileWO does is not known any more then: the same file tells once more."""
-    place = Place(profile, SLOW)
-    data = random.Random(4).randbytes(400_000)
-    async with place.mounted() as (connection, tree), trio.open_nursery() as nursery:
-        nursery.start_soon(place.copy, tree, b"big", data)
-        await trio.sleep(10)
-        assert await read_file(connection, place.root + b"/other") == b"q" * 3000  # the trial
-        await trio.sleep(2)
-        assert connection.store.traits.wo_truncates is False
-        place.world.vehicle.reboot(trio.current_time(), downtime=4.0)
-        place.world.link.kick()
-        await trio.sleep(15)
-        assert connection.store.traits.wo_truncates is None
-        with trio.fail_after(10):
-            assert await read_file(connection, place.root + b"/other") == b"q" * 3000
-        with trio.fail_after(10):
-            await place.copy(tree, b"small", b"b" * 1000)
-    assert place.data(b"big") == data
-    assert place.data(b"small") == b"b" * 1000
-
-
-@pytest.mark.holds("promise 7")
 @pytest.mark.parametrize("profile", taking_turns(TRUNCATING))
 async def test_where_it_empties_files_the_second_waits_and_is_told(profile: str, autojump: MockClock) -> None:
     """The bytes stay held, and are brought when the vehicle has time."""
@@ -384,23 +358,6 @@ async def test_arming_while_it_is_closed_is_told(profile: str, autojump: MockClo
         nursery.start_soon(_read_always, place, connection)
         with trio.fail_after(60), pytest.raises(Armed):
             await place.upload(connection, b"new", random.Random(1).randbytes(SIZE))
-        nursery.cancel_scope.cancel()
-
-
-@pytest.mark.holds("promise 7")
-async def test_listings_beside_a_reader_do_not_halve_what_is_written(autojump: MockClock) -> None:
-    """PX4 on NuttX refuses writes once it was asked for another path, which only an answer tells."""
-    place = Uploading("px4-nuttx", LINK)
-    async with place.world.connection() as connection, trio.open_nursery() as nursery:
-
-        async def list_always() -> None:
-            while True:
-                await connection.store.list_directory(b"/")
-
-        nursery.start_soon(_read_always, place, connection)
-        nursery.start_soon(list_always)
-        with trio.fail_after(100):
-            await place.upload(connection, b"new", random.Random(1).randbytes(20_000))
         nursery.cancel_scope.cancel()
 
 

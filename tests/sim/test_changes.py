@@ -177,18 +177,6 @@ async def test_an_upload_makes_room_for_a_change_of_its_path(
     assert here.vehicle.server.open_sessions == 0
 
 
-async def test_a_sticky_file_exists_does_not_hide_the_whitelist(autojump: MockClock) -> None:
-    here = world("px4-nuttx")
-    here.tree.add(b"/etc/rc", b"#")
-    here.tree.add_directory(path("px4-nuttx", "dir"))
-    async with here.connection() as connection:
-        with pytest.raises(FtpNak):
-            await connection.scheduler.metadata(Simple(Opcode.CREATE_DIRECTORY, path("px4-nuttx", "dir")))
-        with pytest.raises(FtpNak) as refusal:
-            await connection.store.remove(b"/etc/rc")
-        assert refusal.value.code == 9
-
-
 @pytest.mark.parametrize("profile", [name for name in EVERY_PROFILE if name != "spec"])
 async def test_what_may_still_be_open_is_closed_first_too(profile: str, autojump: MockClock) -> None:
     """A CreateFile whose ACK never came may have opened the file that is then removed."""

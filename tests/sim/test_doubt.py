@@ -451,24 +451,6 @@ async def test_where_no_checksum_is_told_the_file_is_read_back(autojump: MockClo
         assert tree.status()["verified_by_reading"] == 1
 
 
-async def test_what_is_beyond_doubt_costs_nothing(autojump: MockClock) -> None:
-    """On a link that loses and doubles nothing what was written twice is believed like all else."""
-    world = World("px4", CLEAN)
-    world.tree.add(b"/d/f", b"x" * 300_000)
-    faults = Faults(world)
-    async with mounted(world, b"/d") as (_, tree):
-        file = await tree.open(b"/d/f", write=True)
-        await file.write(0, b"A" * 100)
-        await file.fsync()
-        faults.requests.clear()
-        await file.write(0, b"B" * 70_000)
-        await trio.sleep(0.1)
-        await file.write(0, b"C" * 100)
-        await file.flush()
-        assert faults.requests.count(Opcode.READ_FILE) == 0
-        file.close()
-
-
 # --- and what raises none
 
 FOLDER = b"/fs/microsd/"

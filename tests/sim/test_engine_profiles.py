@@ -8,8 +8,8 @@ import pytest
 
 from mavftpfs.protocol.burst import BurstTransfer
 from mavftpfs.protocol.chunking import ChunkSize
-from mavftpfs.protocol.operations import ListDirectory, OpenFile, Simple, Terminate
-from mavftpfs.protocol.payload import NakCode, Opcode
+from mavftpfs.protocol.operations import ListDirectory, OpenFile, Terminate
+from mavftpfs.protocol.payload import Opcode
 from mavftpfs.protocol.reading import ReadToEof, ReadTransfer
 from mavftpfs.shared.errors import FtpNak, SessionLost
 from mavftpfs.sim.linkmodel import Direction, LinkSettings
@@ -171,46 +171,6 @@ def test_reading_to_eof_over_a_bad_link(name: str) -> None:
     else:
         assert op.error is None
         assert op.data == content
-
-
-@pytest.mark.holds("fault lost")
-@pytest.mark.parametrize("name", NAMES)
-def test_side_effects_happen_once(name: str) -> None:
-    """A mkdir whose reply is lost is replayed where servers do that, else its refusal says "perhaps done"."""
-    rig = Rig(name, LinkSettings(delay=0.02, loss=0.3), seed=3)
-    root = b"/fs/microsd/" if rig.profile.writable_root else b"/"
-    rig.tree.add_directory(root)
-    refused = 0
-    for index in range(20):
-        path = root + b"dir%d" % index
-        op = Simple(Opcode.CREATE_DIRECTORY, path)
-        rig.link.run(op)
-        if op.error is not None:
-            refused += 1
-            assert isinstance(op.error, FtpNak)
-            assert op.error.retransmitted
-            assert op.error.code == NakCode.FILE_EXISTS
-        assert rig.tree.stat(path)
-    never_replays = rig.profile.family is Family.MAVSDK
-    assert (refused > 0, rig.server.firmware.replays > 0) == (never_replays, not never_replays)
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_small_reads_here_and_there(name: str) -> None:
-    rig = Rig(name, BAD, seed=11)
-    content = random.Random(7).randbytes(100_000)
-    rig.tree.add(b"/big", content)
-    transfer, sink = rig.start(b"/big")
-    size = transfer.size
-    rng = random.Random(1)
-    for _ in range(10):
-        start = rng.randrange(size)
-        stop = min(size, start + rng.randrange(1, 3000))
-        transfer.want(start, stop, True)
-        rig.link.run_until(lambda: transfer.idle or transfer.done)
-        assert transfer.error is None
-        assert bytes(sink.data[start:stop]) == content[start:stop]
-        assert sink.held.covers(start, stop)
 
 
 def spend(link: VirtualLink, seconds: float) -> None:

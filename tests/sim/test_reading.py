@@ -272,18 +272,6 @@ async def test_beside_bursts_that_fill_the_radio_a_listing_is_answered(
         reader.close()
 
 
-@pytest.mark.parametrize("profile", ["px4", "ardupilot"])
-async def test_a_file_is_read_over_a_link_that_doubles_requests(profile: str, autojump: MockClock) -> None:
-    """Each doubled ReadFile brings an answer that nothing explains: a doubt, but no other file's bytes."""
-    here = World(profile, LinkSettings(rate=200_000.0, delay=0.02, duplicate=0.3))
-    target = ROOTS.get(profile, b"") + b"/f"
-    here.tree.add(target, content(300_000))
-    async with mounted(here) as (_, tree):
-        file = await tree.open(target)
-        assert bytes(await file.read(0, 300_000)) == content(300_000)
-        file.close()
-
-
 @pytest.mark.parametrize("profile", ["px4", "mavsdk", "ardupilot"])
 async def test_bytes_of_a_session_that_another_client_took_are_asked_for_again(
     profile: str, autojump: MockClock
