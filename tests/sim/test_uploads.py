@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Awaitable, Callable
+from functools import partial
+
 import pytest
 import trio
 from trio.testing import MockClock
 
 from mavftpfs.link.messages import Address
 from mavftpfs.protocol.payload import NakCode, Opcode, request
-from mavftpfs.session.connection import ConnectOptions
+from mavftpfs.session.connection import Connection, ConnectOptions
 from mavftpfs.shared.errnos import errno_for
 from mavftpfs.shared.errors import Armed, FtpNak, MavftpfsError, SpoolFailed
 from mavftpfs.sim.linkmodel import LinkSettings
@@ -53,45 +56,58 @@ async def test_a_small_file_costs_create_write_terminate(profile: str, autojump:
 PLAIN = LinkSettings(rate=20_000.0, delay=0.02)
 
 
-@pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
+async def cut(here: World, connection: Connection, length: float) -> None:
+    here.link.cut()
+    await trio.sleep(length)
+    here.link.restore()
+
+
+async def reboot(here: World, connection: Connection) -> None:
+    here.vehicle.reboot(trio.current_time(), downtime=4.0)
+    here.link.kick()
+
+
+async def take_session(here: World, connection: Connection) -> None:
+    """Another ground station terminates whatever it finds, as MAVSDK and QGroundControl do."""
+    session = connection.scheduler.server.session
+    assert session is not None
+    wire = request(77, Opcode.TERMINATE_SESSION, session=session.id).encode()
+    for source in (Address(255, 190), connection.vehicle.own):
+        here.vehicle.server.handle(wire, source, trio.current_time())
+    here.link.kick()
+
+
+INTERRUPTIONS: dict[str, Callable[[World, Connection], Awaitable[None]]] = {
+    "cut": partial(cut, length=3.0),
+    "long cut": partial(cut, length=14.0),  # PX4 closes an idle session after 10 s
+    "reboot": reboot,
+    "taken": take_session,
+}
+
+
+@pytest.mark.holds("promise 5")
+@pytest.mark.parametrize("interruption", INTERRUPTIONS)
 @pytest.mark.parametrize("probed", [False, True], ids=["unknown", "probed"])
-@pytest.mark.parametrize("length", [3.0, 14.0])
-async def test_a_cut_in_mid_upload_is_bridged(
-    profile: str, probed: bool, length: float, autojump: MockClock
+@pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
+async def test_what_interrupts_it_is_bridged(
+    profile: str, probed: bool, interruption: str, autojump: MockClock
 ) -> None:
     data = content(60_000)
     here = world(profile, PLAIN)
     async with here.connection() as connection:
         if probed:
             know(connection, profile)
-        async with under_way(connection, profile, data) as source:
-            here.link.cut()
-            await trio.sleep(length)
-            here.link.restore()
-        assert source.all_proven
-        resumable = probed and not PROFILES[profile].write_only_truncates
-        if length < 10:  # PX4 closes an idle session after 10 s
-            assert True not in source.rollbacks
-            assert source.checkpoints == 1 + resumable  # what is in doubt is terminated, not believed
-    assert here.tree.data(path(profile, "new")) == data
-    assert here.vehicle.server.open_sessions == 0
-
-
-@pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
-@pytest.mark.parametrize("probed", [False, True], ids=["unknown", "probed"])
-async def test_a_reboot_in_mid_upload_is_bridged(profile: str, probed: bool, autojump: MockClock) -> None:
-    data = content(80_000)
-    here = world(profile, PLAIN)
-    async with here.connection() as connection:
-        if probed:
-            know(connection, profile)
         await trio.sleep(5)
         async with under_way(connection, profile, data) as source:
-            here.vehicle.reboot(trio.current_time(), downtime=4.0)
-            here.link.kick()
+            await INTERRUPTIONS[interruption](here, connection)
         assert source.all_proven
-        assert True in source.rollbacks
-        assert connection.store.traits.wo_truncates is None
+        if interruption == "cut":
+            assert True not in source.rollbacks
+            resumable = probed and not PROFILES[profile].write_only_truncates
+            assert source.checkpoints == 1 + resumable  # what is in doubt is terminated, not believed
+        if interruption == "reboot":
+            assert True in source.rollbacks
+            assert connection.store.traits.wo_truncates is None
     assert here.tree.data(path(profile, "new")) == data
 
 
@@ -113,28 +129,6 @@ async def test_what_was_opened_before_the_news_of_a_restart_is_closed(
         assert trio.current_time() - began < 9
     assert here.tree.data(path(profile, "new")) == data
     assert here.vehicle.server.open_sessions == 0
-
-
-@pytest.mark.holds("promise 5")
-@pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
-@pytest.mark.parametrize("probed", [False, True], ids=["unknown", "probed"])
-async def test_a_session_taken_away_is_got_back(profile: str, probed: bool, autojump: MockClock) -> None:
-    """Another ground station terminates whatever it finds, as MAVSDK and QGroundControl do."""
-    data = content(60_000)
-    here = world(profile, PLAIN)
-    async with here.connection() as connection:
-        if probed:
-            know(connection, profile)
-        async with under_way(connection, profile, data) as source:
-            session = connection.scheduler.server.session
-            assert session is not None
-            wire = request(77, Opcode.TERMINATE_SESSION, session=session.id).encode()
-            stranger = here.vehicle.server
-            for source_address in (Address(255, 190), connection.vehicle.own):
-                stranger.handle(wire, source_address, trio.current_time())
-            here.link.kick()
-        assert source.all_proven
-    assert here.tree.data(path(profile, "new")) == data
 
 
 async def test_a_write_that_is_refused_for_no_error_goes_on_in_a_new_session(autojump: MockClock) -> None:
