@@ -245,13 +245,10 @@ class Scheduler:
                 self.server.abandon()
             self._used_at = self._clock()
             if self._driver.last_reply_at >= began:
-                self._tell_queue(user)
-
-    def _tell_queue(self, served: SessionUser | None) -> None:
-        """Somebody had a turn in which the vehicle answered: who waits for the next ones is not timed out."""
-        for user in list(self.queue.users):
-            if user is not served and isinstance(user, FileStream) and user.due_at() < inf:
-                user.sink.on_queued()
+                # The vehicle answered in this turn: who waits for a later one is not timed out.
+                for other in list(self.queue.users):
+                    if other is not user and isinstance(other, FileStream) and other.due_at() < inf:
+                        other.sink.on_queued()
 
     async def _idle(self) -> None:
         now = self._clock()
