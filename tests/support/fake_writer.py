@@ -6,7 +6,6 @@ every chunk of an upload, counts as one.
 
 from __future__ import annotations
 
-import re
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from dataclasses import dataclass
 from random import Random
@@ -35,8 +34,6 @@ from mavftpfs.shared.traits import WriteTraits
 from tests.support.fake_store import FakeFile, FakeReader, FakeStore
 
 CHUNK = 239
-_SHORT = re.compile(rb"([0-9_~-]|[A-Z]){1,8}(\.([0-9A-Z]{,3}|[0-9a-z]{,3}))?")
-_SHORT_SMALL = re.compile(rb"([0-9_~-]|[a-z]){1,8}(\.([0-9A-Z]{,3}|[0-9a-z]{,3}))?")
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,10 +41,8 @@ class Kind:
     """How a server behaves.
 
     replaces: rename over a file works (else FileExists, as FAT). moves_into: rename onto a directory moves
-    into it, as NuttX. renames: there is a rename at all. wo_truncates: OpenFileWO empties.
-    folds_case: names are found in any case. drops_ends: dots and blanks
-    at the end of a name are dropped. short_names: those of eight characters of one case at most, and three
-    behind a dot, are found in the other case, and lose a dot at the end.
+    into it, as NuttX. renames: there is a rename at all. wo_truncates: OpenFileWO empties. folds_case: names
+    are found in any case. drops_ends: dots and blanks at the end of a name are dropped.
     """
 
     replaces: bool = True
@@ -56,21 +51,15 @@ class Kind:
     wo_truncates: bool = False
     folds_case: bool = False
     drops_ends: bool = False
-    short_names: bool = False
 
 
 KINDS = {
     "posix": Kind(),
-    "nuttx": Kind(moves_into=True, short_names=True),
+    "nuttx": Kind(moves_into=True),
     "fat": Kind(replaces=False, folds_case=True, drops_ends=True),
     "littlefs": Kind(renames=False),
     "mavsdk": Kind(wo_truncates=True),
 }
-
-
-def _is_short(path: bytes) -> bool:
-    name = split(path)[1]
-    return any(kind.fullmatch(name) is not None for kind in (_SHORT, _SHORT_SMALL))
 
 
 class Frozen(VehicleLost):
@@ -144,12 +133,10 @@ class FakeWriter(FakeStore):
         """Return the stored spelling of a path."""
         if self.kind.drops_ends:
             path = path.rstrip(b". ")
-        short = self.kind.short_names and _is_short(path)
-        path = path.removesuffix(b".") if short else path
-        if path in self.files or path in self.directories or not (self.kind.folds_case or short):
+        if path in self.files or path in self.directories or not self.kind.folds_case:
             return path
         for known in [*self.files, *self.directories]:
-            if known.lower() == path.lower() and (self.kind.folds_case or _is_short(known)):
+            if known.lower() == path.lower():
                 return known
         return path
 

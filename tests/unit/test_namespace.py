@@ -171,7 +171,7 @@ async def test_another_spelling_of_a_name_is_refused(fat: FakeWriter, name: byte
 
 async def test_only_the_case_of_a_name_changes(store: FakeWriter) -> None:
     tree = make_writable(store)
-    if store.kind.renames and not store.kind.folds_case and not store.kind.short_names:
+    if store.kind.renames and not store.kind.folds_case:
         await tree.rename(b"/d/a", b"/d/A")
         await tree.rename(b"/d/full", b"/d/FULL")
         tree.forget_caches()
