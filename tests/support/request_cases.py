@@ -110,7 +110,6 @@ WRITING = (
         "cat ten/* > /dev/null; ls -l",
         ten,
         aged=True,
-        most_looks=10,
     ),
 )
 """What changes the card."""

@@ -9,8 +9,8 @@ Keep-alive requests (opcode 0) depend on time and are counted apart. A run in wh
 request, because the machine was too busy to answer in time, is made again; if that goes on, the repetitions
 that the client reports have to explain every request too many.
 
-Before a new file is made its name is looked for by an open that is refused ("look"), unless a listing less
-than FREE_FOR old lacks it. `aged` makes the first look certain; how many follow of it depends on time.
+Before a new file gets its name that is opened, to see that it is free, unless a listing less than FREE_FOR
+old lacks it. `aged` makes that certain.
 """
 
 from __future__ import annotations
@@ -49,11 +49,9 @@ ROOM = "cases"
 
 OPTIONS = ("dir_timeout=3600",)
 
-LOOK = "look"
 SHORT = {
     "LIST_DIRECTORY": "list",
     "LIST_DIRECTORY_WITH_TIME": "list",
-    LOOK: LOOK,
     "OPEN_FILE_RO": "open",
     "OPEN_FILE_WO": "open-wo",
     "CREATE_FILE": "create",
@@ -76,9 +74,8 @@ SHORT = {
 class Case:
     """One command; `$1` is an empty directory on the local disk.
 
-    aged: what was listed before is no news any more (FREE_FOR) when the script starts. most_looks: how
-    many looks a slow machine may need; the count is that of a fast one. fresh: what was listed before must be
-    news still when the script ends; a run in which it was not is made again.
+    aged: what was listed before is no news any more (FREE_FOR) when the script starts. fresh: it must be news
+    still when the script ends; a run in which it was not is made again.
     """
 
     name: str
@@ -87,7 +84,6 @@ class Case:
     prepare: Callable[[Path], None] = lambda folder: None
     timeout: float = 120.0
     aged: bool = False
-    most_looks: int = 1
     fresh: bool = False
 
 
@@ -151,9 +147,6 @@ class CountedVehicle(LyingVehicle):
                 cost.payload += request.size
             path = request.data.rstrip(b"\0").replace(b"\0", b" -> ").decode(errors="replace")
             where = f"{request.offset}+{request.size}" if name in BY_SESSION else path
-            if name == "CREATE_FILE" and cost.requests[-1:] == [f"OPEN_FILE_RO {where}"]:
-                cost.counts.subtract(["open"])
-                cost.counts[LOOK] += 1
             cost.requests.append(f"{name} {where}")
         return cost
 
@@ -183,8 +176,6 @@ class Counting:
             cost = self._run_once(case, attempt)
             if not cost.repeats and not cost.late:
                 break
-        if 1 < cost.counts[LOOK] <= case.most_looks:
-            cost.counts[LOOK] = 1
         return cost
 
     def _run_once(self, case: Case, attempt: int) -> Cost:
