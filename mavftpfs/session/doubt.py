@@ -52,8 +52,7 @@ class Doubt:
     """Whether, and since when, what was ACKed is not believed without a look.
 
     Attributes:
-        reason: of the latest doubt, for people.
-        on_raised: called with the reason each time that what was read is in doubt.
+        on_raised: called each time that what was read is in doubt, with the reason, for people.
     """
 
     def __init__(self, clock: Callable[[], float]) -> None:

@@ -13,10 +13,11 @@ and stays off that path until the change was made.
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 from contextlib import asynccontextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from enum import Enum
+from functools import partial
 from typing import TypeVar
 
 import trio
@@ -106,7 +107,7 @@ class _Remedies:
     """What is left to be tried against refusals because the session is taken; silences in seconds."""
 
     closings: int = _LOST_ACKS
-    silences: tuple[float, ...] = (SILENCE_ARDUPILOT, SILENCE_PX4)
+    silences: Iterator[float] = field(default_factory=partial(iter, (SILENCE_ARDUPILOT, SILENCE_PX4)))
     resets: int = 1
 
 
@@ -393,9 +394,7 @@ class ServerSession:
             return
         if nak.code == NakCode.FAIL:
             raise nak
-        while left.silences:
-            seconds, *rest = left.silences
-            left.silences = tuple(rest)
+        for seconds in left.silences:
             if await self._driver.be_silent(seconds):
                 self.quiet_periods += 1
                 return
