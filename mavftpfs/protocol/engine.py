@@ -47,8 +47,8 @@ class Engine:
     Attributes:
         session: the id that session-agnostic requests carry (the open one, else home_session).
         home_session: the id to ask for when opening, 1..255.
-        on_stray: told of each answer that nobody waits for and that no repetition of ours explains, with the
-            seconds since its request went out (0 where that is not known).
+        on_unexplained: told of each answer that nobody waits for and that no repetition of ours explains,
+            with the seconds since its request went out (0 where that is not known).
     """
 
     def __init__(
@@ -65,7 +65,7 @@ class Engine:
         self.flow = flow
         self.traits = Traits() if traits is None else traits
         self.stats = EngineStats()
-        self.on_stray: Callable[[Payload, float], None] = lambda reply, late: None
+        self.on_unexplained: Callable[[Payload, float], None] = lambda reply, late: None
         self._ledger = Ledger(rng.randrange(LAST_SEQ + 1))
         self._op_deadline = op_deadline
         self._note = note
@@ -220,8 +220,8 @@ class Engine:
         self.stats.unknown += 1
         duplicates = self._ledger.duplicates
         if not duplicates.explains(reply.seq) and reply.req_opcode != _BURST:
-            self.stats.strays += 1
-            self.on_stray(reply, duplicates.late_by(reply.seq, now))
+            self.stats.unexplained += 1
+            self.on_unexplained(reply, duplicates.late_by(reply.seq, now))
 
     def _on_stale(self, request: Request) -> None:
         """A replay of some earlier reply under this seq: this seq will never be answered (servers.md 2)."""

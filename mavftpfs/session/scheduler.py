@@ -92,7 +92,7 @@ class Scheduler:
         self._clock = clock
         self._used_at = clock()
         self._touched_at = -inf
-        driver.engine.on_stray = self._on_stray
+        driver.engine.on_unexplained = self._on_unexplained
         self.doubt.on_raised = self.reading.on_doubt
 
     def uploads(self) -> list[Upload]:
@@ -187,7 +187,7 @@ class Scheduler:
         reads = newcomer or now - self._touched_at <= RECENT
         self.doubt.raise_it("another FTP client is active", reads=reads)
 
-    def _on_stray(self, reply: Payload, late: float) -> None:
+    def _on_unexplained(self, reply: Payload, late: float) -> None:
         """An answer came that no request of ours explains. An older open that was carried out once more may
         have put its file in the place of ours (MAVSDK); all else is no other file's."""
         session = self.server.session

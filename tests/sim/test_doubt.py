@@ -81,7 +81,7 @@ async def test_our_own_repetitions_raise_none(profile: str, autojump: MockClock)
         await read_file(connection, path(profile, "f"))
         await put(connection, path(profile, "new"), content(20_000))
         assert connection.engine.stats.retransmissions
-        assert connection.engine.stats.strays == 0
+        assert connection.engine.stats.unexplained == 0
 
 
 async def test_an_answer_that_comes_twice_raises_it(autojump: MockClock) -> None:
@@ -481,12 +481,12 @@ async def test_small_files_do_not_wait_for_each_other(autojump: MockClock) -> No
         await make(tree, FOLDER + b"large", content(400_000, 2))
         stats = connection.engine.stats
         assert stats.unknown + stats.spurious > 0
-        assert stats.strays == 0
+        assert stats.unexplained == 0
         begun = trio.current_time()
         for number in range(FILES):
             await make(tree, FOLDER + b"%d" % number, content(500, number))
         took = trio.current_time() - begun
-        assert stats.strays == 0
+        assert stats.unexplained == 0
     for number in range(FILES):
         assert here.tree.data(FOLDER + b"%d" % number) == content(500, number)
     # Five round trips for each, and the card's own pauses; each waited for 0.25 to 1 s more.

@@ -63,7 +63,7 @@ def test_a_card_that_pauses_is_no_bad_path() -> None:
         engine.receive(chunk(request, CONTENT), 3.0)
     assert engine.stats.spurious
     assert engine.stats.unknown
-    assert engine.stats.strays == 0
+    assert engine.stats.unexplained == 0
 
 
 def test_nor_is_one_of_which_nobody_wants_the_answer_any_more() -> None:
@@ -76,7 +76,7 @@ def test_nor_is_one_of_which_nobody_wants_the_answer_any_more() -> None:
     for request in asked:
         engine.receive(chunk(request, CONTENT), 3.0)
     assert engine.stats.unknown
-    assert engine.stats.strays == 0
+    assert engine.stats.unexplained == 0
 
 
 def test_nor_what_comes_of_a_burst_that_was_given_up() -> None:
@@ -86,7 +86,7 @@ def test_nor_what_comes_of_a_burst_that_was_given_up() -> None:
     engine.cancel(transfer, 0.0)
     engine.receive(packet(burst, 0, bytes(239)), 0.1)
     assert engine.stats.unknown
-    assert engine.stats.strays == 0
+    assert engine.stats.unexplained == 0
 
 
 def test_two_answers_to_two_requests() -> None:
@@ -94,9 +94,9 @@ def test_two_answers_to_two_requests() -> None:
     request = asked_twice(engine)
     engine.receive(ack(request), 1.1)
     engine.receive(ack(request), 1.2)
-    assert engine.stats.strays == 0
+    assert engine.stats.unexplained == 0
     engine.receive(ack(request), 1.3)
-    assert engine.stats.strays == 1
+    assert engine.stats.unexplained == 1
 
 
 def test_two_answers_to_one_request() -> None:
@@ -104,13 +104,13 @@ def test_two_answers_to_one_request() -> None:
     request = ask(engine, Opcode.CREATE_DIRECTORY, 0.0)
     engine.receive(ack(request), 0.1)
     engine.receive(ack(request), 0.1)
-    assert engine.stats.strays == 1
+    assert engine.stats.unexplained == 1
 
 
 def test_how_late_a_copy_was_is_told() -> None:
     engine = make()
     heard: list[tuple[int, float]] = []
-    engine.on_stray = lambda reply, late: heard.append((reply.req_opcode, late))
+    engine.on_unexplained = lambda reply, late: heard.append((reply.req_opcode, late))
     request = ask(engine, Opcode.CREATE_DIRECTORY, 1.0)
     engine.receive(ack(request), 1.1)
     engine.receive(ack(request), 4.0)
@@ -130,9 +130,9 @@ def test_two_answers_to_one_of_two_requests() -> None:
     engine = make()
     _, second = read_twice(engine)
     engine.receive(chunk(second, CONTENT), 1.1)
-    assert engine.stats.strays == 0
+    assert engine.stats.unexplained == 0
     engine.receive(chunk(second, CONTENT), 1.1)
-    assert engine.stats.strays == 1
+    assert engine.stats.unexplained == 1
 
 
 def test_two_answers_to_one_of_three_requests() -> None:
@@ -142,9 +142,9 @@ def test_two_answers_to_one_of_three_requests() -> None:
     assert 0 in [request.offset for request in again(engine, 9.0)]
     for request in (first, second):
         engine.receive(chunk(request, CONTENT), 9.1)
-    assert engine.stats.strays == 0
+    assert engine.stats.unexplained == 0
     engine.receive(chunk(second, CONTENT), 9.1)
-    assert engine.stats.strays == 1
+    assert engine.stats.unexplained == 1
 
 
 def test_work_may_take_its_time() -> None:
@@ -155,7 +155,7 @@ def test_work_may_take_its_time() -> None:
     engine.receive(ack(ask(engine, Opcode.CREATE_DIRECTORY, 20.2)), 20.3)
     engine.receive(ack(request, bytes(4)), 35.0)
     assert engine.stats.unknown
-    assert engine.stats.strays == 0
+    assert engine.stats.unexplained == 0
 
 
 def test_little_is_remembered() -> None:
