@@ -48,26 +48,6 @@ def test_the_window_doubles_as_it_is_used_up() -> None:
     assert sizes[:4] == [FIRST_WINDOW, 2 * FIRST_WINDOW, 2 * FIRST_WINDOW, 4 * FIRST_WINDOW]
 
 
-def test_what_was_asked_is_not_asked_again_and_small_steps_wait() -> None:
-    ahead = Readahead(BIG)
-    covered = 0
-    plans = 0
-    for start in range(0, 4 * 1024 * KIB, 4 * KIB):
-        plan = read(ahead, start, 4 * KIB)
-        if plan != NOTHING:
-            assert plan.start == max(covered, start + 4 * KIB)
-            covered = plan.stop
-            plans += 1
-    assert plans < 25
-
-
-def test_the_window_never_passes_the_end() -> None:
-    ahead = Readahead(300 * KIB)
-    read(ahead, 0)
-    assert read(ahead, 128 * KIB) == Plan(256 * KIB, 300 * KIB)
-    assert ahead.on_read(256 * KIB, 300 * KIB, limit=MAX_WINDOW, small=SMALL_FILE) == NOTHING
-
-
 def test_a_seek_closes_the_window_and_says_so_once() -> None:
     ahead = Readahead(BIG)
     read(ahead, 0)
