@@ -9,6 +9,8 @@ from mavftpfs.protocol.payload import Opcode
 from tests.support.worlds import World
 
 _OPCODE, _REQ_OPCODE = 3, 5
+LOST = 400
+"""Bytes that a card forgets: less than a sector."""
 
 
 class Faults:
@@ -95,10 +97,8 @@ class Faults:
         return self._cut_after is not None and len(self.requests) >= self._cut_after
 
 
-def power_goes_at_close(
-    world: World, path: bytes, left: bytes, *, downtime: float, beat_after: float
-) -> None:
-    """Have the vehicle restart where the next TerminateSession comes, with `left` in the file it was for."""
+def power_goes_at_close(world: World, *, downtime: float, beat_after: float) -> None:
+    """Have the vehicle restart where the next TerminateSession comes; it forgets the end of the file."""
     server = world.vehicle.server
     handle = server.handle
 
@@ -107,7 +107,9 @@ def power_goes_at_close(
             handle(wire, source, now)
             return
         server.handle = handle  # type: ignore[method-assign]
+        [path] = server.open_paths
+        data = bytes(world.tree.data(path))
         world.vehicle.reboot(now, downtime, beat_after=beat_after)
-        world.tree.add(path, left)
+        world.tree.add(path, data[:-LOST] + bytes(LOST))
 
     server.handle = power_cut  # type: ignore[method-assign]
