@@ -2,21 +2,22 @@
 
 Theory. A window of W answered requests per round trip is a rate. Beyond what the path carries, more of them
 only wait in a queue, ours and everybody else's. So the window aims at what the path holds: its rate (the best
-recent rate of answers) times its base round trip (the least one seen lately), and a few hundredths of a
-second more, to find out when the path improves. Requests go out evenly, at hardly more than that rate, so
-that a short queue holds them.
+recent rate of answers) times its base round trip (the least one seen lately), and a little more. Every few
+rounds it asks for a quarter more, to find out when the path improves. Requests go out evenly, at hardly more
+than that rate, so that a short queue holds them.
 
-Loss alone shrinks nothing, because it changes neither rate nor round trip: radios lose frames. Loss while a
-queue stands (even the quickest answer of a round took long) is congestion, and narrows the window. When
-nothing at all is heard for a retransmission timeout, two requests probe until something is. At first the
-window grows by one with every answer, which doubles it each round, until the rate stops growing, a queue
+Loss alone shrinks nothing, because it changes neither rate nor round trip: radios lose frames. It is made up
+for by as many more requests, but not in every round: what is lost because we send too much ceases then. Loss
+while a queue stands (even the quickest answer of a round took long) is congestion, and narrows the window.
+When nothing at all is heard for a retransmission timeout, two requests probe until something is. At first
+the window grows by one with every answer, which doubles it each round, until the rate stops growing, a queue
 stands, or much is lost.
 
 A serial port has a receive buffer of unknown size in front of a slow server, and what overflows it is lost
 silently. There the window grows from one, by one a round, and goes back by one when more is lost than usual.
 
 A card that pauses for a tenth of a second (PX4 on NuttX) leaves a slow link idle for as long. After such
-pauses some answers are kept in the link's queue.
+pauses some answers are kept in the link's queue, and requests go on, at a third of the pace, while it pauses.
 
 A *round* is the time until a request that was sent after the round's start is answered. Beside this rule
 stand `pacing`, for servers that queue five requests, and `budget`, for the user's `bwlimit=`."""
@@ -33,7 +34,8 @@ from mavftpfs.protocol.pacing import Pacer
 # The table of constants: all that decide the window. Requests, unless a unit is given.
 
 FIRST = 8
-"""The window at first: as much as two packets of an ordinary TCP connection."""
+"""The window at first: as much as two packets of an ordinary TCP connection. A server pauses when no answer
+comes for as long as so many take."""
 
 LEAST = 4
 """The narrowest window: fewer are no load, and with fewer it takes long to notice a loss."""
@@ -41,85 +43,79 @@ LEAST = 4
 MOST, MOST_SERIAL = 2048, 16
 """The widest: 1 MB/s over 500 ms. At a serial port, whose receive buffers hold fewer, the second."""
 
-SERIAL_QUEUE = 0.1
-"""Seconds of answers, and two more, that may wait at a serial port: who lists a directory waits for them."""
-
 PROBE, SILENT = 2, 3
 """The window while nothing is heard; so many transmissions without any answer are a silence."""
 
+SLACK = 2
+"""The window is wider than the path by so many: so the slowest part is busy between two answers."""
+
+DEPTH, DEPTH_SERIAL = 3, 2
+"""So many may go out at once, at a serial port the second, or what the path takes in TICK."""
+
 ROUNDS = 10
-"""The best rate of so many rounds is the path's: enough for a bad round, few enough for a changed link."""
+"""The best rate of so many rounds is the path's: enough for a bad round, few enough for a changed link. Each
+has at least as many answers: the best of shorter ones would be the luckiest."""
 
-ROUND_ANSWERS, ROUND_SECONDS = 10, 0.01
-"""A round has at least so many answers and takes so long: the best of shorter ones would be the luckiest."""
+FLAT_ROUNDS = 3
+"""So many rounds in which the rate has not grown end the start: a wider window takes two to show."""
 
-GROWTH, FLAT_ROUNDS = 1.25, 3
-"""A rate has grown when it is so many times the best before (as in BBR). So many rounds in which it has not
-end the start: what a wider window brings shows two rounds later."""
+CYCLE, STEP = 5, 0.25
+"""One round in so many, and any after the rate has grown, asks for a quarter more than the path carries. The
+round after that one in so many makes up for no losses: those of a queue that we overflow cease. The start
+goes on while the rate grows by a quarter."""
 
-START, OVERFLOW = 4.0, 0.33
+START = 4.0
 """At the start the window grows by one with each answer, to at most four times what fills the path as far as
-it is known; a round that loses a third ends that."""
+it is known."""
 
-BASE_SECONDS, BASE_SHARE = 30.0, 0.75
-"""So many seconds after the base round trip was last seen, it is looked for by two rounds of three quarters
-of what fills the path: the way may have become longer."""
+TICK = 0.005
+"""Seconds: less than a queue, and the shortest round. Timers and batches on both ends are no more precise."""
+
+LITTLE = 0.05
+"""Seconds that an answer may take longer before it is said to have waited in a queue. A usual round trip
+counts for the window up to that more than the least one, or twice that: where answers come in bunches (Wi-Fi,
+a modem that gathers), the least would leave it too narrow."""
 
 BASE_LEAST = 0.0005
 """Seconds: no round trip counts for less. Both ends of a fast path work in batches, and what is on its way
 in such a time keeps them busy; more only waits, and costs them time."""
 
-SPREAD_SECONDS = 0.05
-"""A usual round trip counts for the window, up to twice the least one or 50 ms more: where answers come in
-bunches (Wi-Fi, a modem that gathers), the least would leave it too narrow."""
+KNOWN = 30.0
+"""Seconds for which it is believed that a server pauses, and that the base round trip is the way's. Then two
+rounds of a STEP less than fills the path look for it."""
+
+QUEUE_SHARE = 0.15
+"""A queue stands when the quickest answer of a round took longer than the base round trip: by 15 % of that or
+LITTLE, whichever is less, by TICK, and by twice what the answers of the round differ. Jitter is no queue."""
+
+QUEUE = 0.1
+"""Seconds of answers that wait in a link's queue: at most at a serial port, because who lists a directory
+waits for them; by intent where a server pauses, because the link sends them meanwhile."""
+
+SMOOTHING = 0.2
+"""What one round counts for in an average, at most."""
 
 LOSS_MEMORY = 100
-"""Requests over which the share of losses is averaged."""
+"""Requests over which the share of losses is averaged, at least."""
 
-LOSS_RISE, MOST_LOSS = 0.1, 0.25
+LOSS_RISE, MOST_LOSS = 0.1, 0.34
 """The share that a wider window and a higher pace make up for rises so many times as slowly as it falls
-(losses of a link stay, those of a queue of ours go), and is at most that of 20 % each way."""
+(losses of a link stay, those of a queue of ours go), and is at most that of 19 % each way. A round of the
+start that loses more ends it."""
 
 UNUSUAL = 3.0
 """A round lost more than usual when that many standard deviations would have to be chance."""
 
-SLACK, SLACK_SECONDS = 2, 0.02
-"""The window is wider than the path by one, and by two more or 20 ms, whichever is less: so the slowest part
-is busy between two answers."""
+BOLDER = 0.06
+"""Of what the window has beyond the path, and of the reserve for pauses, a share is used. Each round adds so
+much, one that lost more than usual takes a STEP of it: then a short queue overflows."""
 
-CURIOSITY, CURIOSITY_SECONDS = 0.25, 0.05
-"""And by a quarter of the path or 50 ms, whichever is less, to see whether it carries more."""
+PAUSE, LONGEST_PAUSE = 0.02, 0.4
+"""Seconds without an answer that are a pause, and beyond which they are a silence."""
 
-BOLDER, SHYER = 0.03, 0.8
-"""The share of this, and of the reserve below, that is used: what each round adds, and what is left of it
-after one that lost more than usual: then a short queue overflows."""
-
-PACE = 1.2
-"""Requests go out at so many times the rate of answers at most, so that it can grow."""
-
-DEPTH, DEPTH_SERIAL, DEPTH_SECONDS = 3, 2, 0.004
-"""Three may go out at once, at a serial port two, or what the path takes in 4 ms."""
-
-QUEUE_SHARE, QUEUE_MOST, QUEUE_LEAST = 0.15, 0.05, 0.005
-"""A queue stands when the quickest answer of a round took longer than the base round trip: by 15 % of that or
-50 ms, whichever is less, by 5 ms, and by twice what the answers of the round differ. Jitter is no queue."""
-
-PAUSE_SECONDS, PAUSE_ANSWERS = 0.02, 8
-"""A server pauses when no answer comes for 20 ms and for as long as eight take."""
-
-PAUSES_SECONDS = 20.0
-"""Seconds after a pause for which others are expected."""
-
-RESERVE = 0.1
-"""Seconds of answers to keep in the link's queue for pauses: it sends them meanwhile."""
-
-BRIDGE = 0.4
-"""Seconds for which requests go on while a server pauses: else it has nothing to do for a round trip after
-that. No silence that is longer is a pause."""
-
-BRIDGE_FROM = 0.03
-"""Seconds: below that round trip there is no reserve and no bridge. What a server's buffer holds lasts for
-that, and more only overflows it."""
+BRIDGE = 0.35
+"""While a server pauses, requests go on at this share of its rate: else it has nothing to do for a round trip
+after that. Most of them overflow its buffer."""
 
 
 class Flow:
@@ -156,13 +152,13 @@ class Flow:
         self._base, self._base_seen = inf, 0.0
         self._probing = 0  # rounds of the search for the base round trip that are left
         self._spread = 0.0
-        self._usual_loss = 0.0
+        self._usual_loss, self._per_answer = 0.0, 1.0  # so many requests are to bring one answer
         self._bold = 1.0
         # The pauses of a server.
         self._answered_at, self._wake = inf, inf
         self._paused_at, self._pause = -inf, 0.0
         # The round.
-        self._round_end, self._round_start = -1, 0.0
+        self._round, self._round_end, self._round_start = 0, -1, 0.0
         self._answered = self._lost = 0
         self._least, self._total_rtt, self._rtts = inf, 0.0, 0
         self._starved = False
@@ -177,7 +173,7 @@ class Flow:
         if limit is None or self.cap == self._limit:
             self._pacer = None
         elif self._pacer is None or self._pacer.queue != self.cap:
-            self._pacer = Pacer(self.cap, self._limit)
+            self._pacer, self._pause = Pacer(self.cap, self._limit), 0.0
 
     # --- who may send
 
@@ -197,7 +193,7 @@ class Flow:
             self._hurried = True
         elif self._hurried:  # an answer that somebody waits for should not queue behind our slack
             room -= min(SLACK + 1, self.window // 2)
-        else:
+        elif self._pause:
             room += int(self._beyond(now, paced) * self._rate)
         if self._pacer is not None:
             room = self._room_beside_pacer(self._pacer, room, in_flight, now, paced, urgent)
@@ -223,7 +219,7 @@ class Flow:
         if pace == inf:
             return room
         depth = DEPTH_SERIAL if self._serial else DEPTH
-        self._tokens = min(max(depth, pace * DEPTH_SECONDS), self._tokens + (now - self._tokens_at) * pace)
+        self._tokens = min(max(depth, pace * TICK), self._tokens + (now - self._tokens_at) * pace)
         self._tokens_at = now
         self._blocked = self._tokens < room
         return min(room, int(self._tokens))
@@ -232,28 +228,24 @@ class Flow:
         """Return how many requests may go out in a second."""
         if self._starting or self._rate == 0.0 or self._base < BASE_LEAST:
             return inf
-        return PACE * self._rate / (1.0 - min(self._usual_loss, MOST_LOSS))
+        return self._rate * (1.0 if self._round % CYCLE == 1 else (1.0 + STEP) * self._per_answer)
 
     def _beyond(self, now: float, paced: bool) -> float:
         """Return seconds of requests for which there is room beyond the window because a server pauses."""
-        if not self._pauses_expected(now):
+        if now >= self._paused_at + KNOWN:
             return 0.0
         silence = now - self._answered_at
-        if silence > PAUSE_SECONDS:
-            bridge = min(BRIDGE, silence)
+        if silence > PAUSE:
+            bridge = min(LONGEST_PAUSE, silence)
         else:  # those of a pause that just ended are not answered before a round trip later
             bridge = self._pause if now < self._paused_at + self._base else 0.0
-        if silence < BRIDGE:
-            self._wake = now + PAUSE_ANSWERS / self._rate
-        return max(bridge, self._reserve() if paced else 0.0)
+        if silence < LONGEST_PAUSE:
+            self._wake = now + FIRST / self._rate
+        return max(BRIDGE * bridge, self._reserve() if paced else 0.0)
 
     def _reserve(self) -> float:
         """Return for how many seconds answers should wait in the link's queue."""
-        return 0.0 if self._probing else self._bold * RESERVE
-
-    def _pauses_expected(self, now: float) -> bool:
-        far = self._base >= BRIDGE_FROM and not self._serial and self._pacer is None
-        return far and now < self._paused_at + PAUSES_SECONDS
+        return 0.0 if self._probing else self._bold * QUEUE
 
     def next_room_at(self) -> float:
         """Return when there will be room without an answer; inf if that does not depend on time."""
@@ -266,11 +258,6 @@ class Flow:
         return min(self._wake, self._tokens_at + (1.0 - self._tokens) / self._pace() + 1e-6)
 
     @property
-    def held(self) -> bool:
-        """Whether somebody was only held back by the user's budget, so that waiting is no silence."""
-        return self.budget is not None and self.budget.held
-
-    @property
     def most_beside(self) -> int:
         """How many may be in flight if somebody waits: none more where a server holds but a few of them."""
         return 0 if self._serial or self._pacer is not None else self.cap
@@ -278,7 +265,7 @@ class Flow:
     @property
     def patience(self) -> float:
         """Seconds of silence that prove no loss: newer answers will, where more than a few are in flight."""
-        return 0.0 if self._serial or self._pacer or self._starved else self._pause
+        return 0.0 if self._starved else self._pause
 
     # --- what happens
 
@@ -297,13 +284,9 @@ class Flow:
         if self._pacer is not None:
             self._pacer.on_starved()
 
-    def on_reply(self, now: float, rtt: float | None, order: int, next_order: int) -> None:
-        """A request was answered; see `on_replies`. rtt: None if nobody knows which transmission it was."""
-        self.on_replies(now, rtt, (order,), next_order)
-
     def on_replies(self, now: float, rtt: float | None, orders: Sequence[int], next_order: int) -> None:
-        """Requests that went out together were answered together. orders: of their transmissions; next_order:
-        what the next one will get."""
+        """Requests that went out together were answered together. rtt: None if nobody knows which of their
+        transmissions were; orders: of those; next_order: what the next one will get."""
         self._answered += len(orders)
         self._note_pause(now, rtt)
         if rtt is not None:
@@ -320,10 +303,8 @@ class Flow:
         if self._pacer is not None:
             for order in orders:
                 self._pacer.on_reply(now, rtt, order, next_order)
-        over = max(orders) >= self._round_end and (
-            self._round_end < 0 or now >= self._round_start + ROUND_SECONDS
-        )
-        enough = self._answered >= ROUND_ANSWERS or self._starting or self._starved or self._serial
+        over = max(orders) >= self._round_end and (self._round_end < 0 or now >= self._round_start + TICK)
+        enough = self._answered >= ROUNDS or self._starting or self._starved or self._serial
         # At the start a queue grows fast: a few answers that waited in one are enough.
         if (over and enough) or (self._starting and self._rtts >= FIRST and self._queued()):
             self._end_round(now, next_order)
@@ -332,12 +313,12 @@ class Flow:
         gap, self._answered_at = now - self._answered_at, now
         # What ends a pause waited for its end; after a run of losses nothing waited.
         waited = rtt is not None and rtt > self._base + gap / 2 and self._rate > 0.0
-        if waited and not self._starting and gap > PAUSE_SECONDS + PAUSE_ANSWERS / self._rate:
-            self._paused_at, self._pause = now, max(min(gap, BRIDGE), self._pause)
-        elif self._pause and not self._pauses_expected(now):
+        if waited and gap > PAUSE + FIRST / self._rate and not self._serial and self._pacer is None:
+            self._paused_at, self._pause = now, max(min(gap, LONGEST_PAUSE), self._pause)
+        elif now >= self._paused_at + KNOWN:
             self._pause = 0.0
 
-    def on_loss(self, order: int, sends: int = 1) -> None:
+    def on_loss(self, order: int) -> None:
         """The transmission numbered `order` is taken to be lost."""
         self._lost += 1
         if self._pacer is not None:
@@ -360,6 +341,7 @@ class Flow:
     # --- rounds
 
     def _end_round(self, now: float, next_order: int) -> None:
+        self._round += 1
         if self._round_end >= 0 and now > self._round_start:
             self._learn(now, now - self._round_start)
         self._round_end, self._round_start = next_order, now
@@ -369,8 +351,9 @@ class Flow:
 
     def _learn(self, now: float, took: float) -> None:
         total = self._answered + self._lost
-        # What arrives while a server pauses overflows its buffer: that says nothing of the link.
-        excused = self._paused_at >= self._round_start
+        # What arrives while a server pauses overflows its buffer, and its answers wait: that says nothing of
+        # the link. It shows for a round trip after that.
+        excused = self._pause > 0.0 and self._paused_at + self._base >= self._round_start
         waits = self._reserve() if self._pause else 0.0
         congested = self._lost > 0 and not excused and self._queued(1.0, waits)
         usual = self._usual_loss * total
@@ -379,38 +362,35 @@ class Flow:
         self._learn_round_trip(now)
         if congested and not self._starved and self._queued(2.0, waits):
             self._rates.clear()  # only what came now is the path's
-        grown = self._learn_rate(self._answered / took)
+        rate, before = self._answered / took, self._rate
+        if rate > before or not self._starved:
+            self._rates.append(rate)
+        self._rate = max(self._rates, default=0.0)
         if self._starved:
             return
         if not excused:
-            self._bold = self._bold * SHYER if shy else min(1.0, self._bold + BOLDER)
+            self._bold = self._bold * (1.0 - STEP) if shy else min(1.0, self._bold + BOLDER)
         if self._serial:
-            back = shy or self._queued(1.5)
-            most = int(self._rate * (self._base + SERIAL_QUEUE)) + 2
+            back = shy or self._queued()
+            most = int(self._rate * (self._base + QUEUE)) + 2
             self.window = max(1, self.window - 1) if back else min(self.cap, self.window + 1, most)
             return
         if self._starting:
-            self._flat = 0 if grown else self._flat + 1
-            overflown = self._lost >= max(2 * FIRST, OVERFLOW * total)
-            self._starting = self._flat < FLAT_ROUNDS and not overflown and not self._queued()
+            self._flat = 0 if rate > (1.0 + STEP) * before else self._flat + 1
+            overflown = self._lost >= max(2 * FIRST, MOST_LOSS * total) or self._queued()
+            self._starting = self._flat < FLAT_ROUNDS and (excused or not overflown)
         if not self._starting:
-            self.window = min(self.cap, self._target())
+            self.window = min(self.cap, self._target(more=self._round % CYCLE == 0 or rate > before))
 
     def _learn_loss(self, total: int, *, learn: bool) -> None:
-        loss, memory = self._lost / total, min(0.2, total / LOSS_MEMORY)
+        loss, memory = self._lost / total, min(SMOOTHING, total / LOSS_MEMORY)
         self.loss += (loss - self.loss) * memory
         if loss < self._usual_loss:
             self._usual_loss += (loss - self._usual_loss) * memory
         elif learn:
             self._usual_loss += (loss - self._usual_loss) * memory * (1.0 if self._starting else LOSS_RISE)
-
-    def _learn_rate(self, rate: float) -> bool:
-        """Take the rate of a round; return whether the best one has grown."""
-        before = self._rate
-        if rate > before or not self._starved:
-            self._rates.append(rate)
-        self._rate = max(self._rates, default=0.0)
-        return rate > GROWTH * before
+        plain = self._round % CYCLE == 1
+        self._per_answer = 1.0 if plain else 1.0 / (1.0 - min(self._usual_loss, MOST_LOSS))
 
     def _learn_round_trip(self, now: float) -> None:
         least = self._least
@@ -418,19 +398,19 @@ class Flow:
             return
         if self._probing:
             self._probing -= 1
-        elif now >= self._base_seen + BASE_SECONDS and not (self._starting or self._serial or self._pacer):
+        elif now >= self._base_seen + KNOWN and not (self._starting or self._serial or self._pacer):
             self._probing = 3
         if self._probing == 1:
             self._base, self._base_seen = least, now
         spread = self._total_rtt / self._rtts - self._base
-        self._spread += (min(spread, SPREAD_SECONDS) - self._spread) * 0.2
+        self._spread += (min(spread, LITTLE) - self._spread) * SMOOTHING
 
     def _queued(self, times: float = 1.0, reserve: float = 0.0) -> bool:
         """Whether even the quickest answer of the round waited in a queue, so many times as long as a little;
         reserve: seconds that it waited for another reason."""
         if self._least == inf:
             return False
-        little = min(QUEUE_SHARE * self._base, QUEUE_MOST) + QUEUE_LEAST
+        little = min(QUEUE_SHARE * self._base, LITTLE) + TICK
         jitter = self._total_rtt / self._rtts - self._least
         return self._least > self._base + times * little + 2.0 * jitter + reserve
 
@@ -438,14 +418,13 @@ class Flow:
         """Return how many requests fill the path, as far as is known."""
         if self._base == inf:
             return LEAST
-        return self._rate * max(self._base, BASE_LEAST) / (1.0 - min(self._usual_loss, MOST_LOSS))
+        return self._rate * max(self._base, BASE_LEAST) * self._per_answer
 
-    def _target(self) -> int:
-        """Return the window that fills the path, and a little more."""
+    def _target(self, *, more: bool) -> int:
+        """Return the window that fills the path, and a little more. more: or a STEP."""
         held = self._held()
         if self._probing > 1:
-            return max(1, int(BASE_SHARE * held))
+            return max(1, int((1.0 - STEP) * held))
         spread = min(self._rate * self._spread, held)
-        curiosity = min(CURIOSITY * (held + spread), self._rate * CURIOSITY_SECONDS)
-        slack = 1 + min(SLACK, self._rate * SLACK_SECONDS)
-        return max(LEAST, round(held + slack + self._bold * (spread + curiosity)))
+        step = STEP * (held + spread) if more else 0.0
+        return max(LEAST, round(held + SLACK + self._bold * (spread + step)))

@@ -154,7 +154,7 @@ class Pacer:
     # --- news
 
     def on_reply(self, now: float, rtt: float | None, order: int, next_order: int) -> None:
-        """A request was answered; see Flow.on_reply."""
+        """A request was answered; see Flow.on_replies."""
         if rtt is not None and rtt < self._least_rtt:
             self._least_rtt = rtt
         if order < self._from:

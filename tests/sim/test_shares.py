@@ -126,11 +126,11 @@ def test_a_hundred_kilobytes_per_second(profile: str, direction: Direction, rtt:
 @pytest.mark.parametrize(
     ("direction", "rate", "rtt", "share", "requests"),
     [
-        ("read", 100_000.0, 0.1, 0.93, 1.6),
-        ("read", 250_000.0, 0.1, 0.77, 1.6),
-        ("write", 100_000.0, 0.3, 0.86, 1.6),
-        pytest.param("read", 1_000_000.0, 0.01, 0.94, 1.9, marks=pytest.mark.soak),
-        pytest.param("read", 1_000_000.0, 0.1, 0.85, 2.2, marks=pytest.mark.soak),
+        ("read", 100_000.0, 0.1, 0.92, 1.1),
+        ("read", 250_000.0, 0.1, 0.77, 1.3),
+        ("write", 100_000.0, 0.3, 0.85, 1.2),
+        pytest.param("read", 1_000_000.0, 0.01, 0.94, 1.5, marks=pytest.mark.soak),
+        pytest.param("read", 1_000_000.0, 0.1, 0.83, 1.7, marks=pytest.mark.soak),
     ],
 )
 def test_the_pauses_of_a_card_cost_their_time_once(
@@ -196,8 +196,8 @@ def test_nor_does_that_flood_a_short_queue(direction: Direction) -> None:
     """A window three times as wide lost 60 % of what it asked for, and everybody else's packets with it."""
     case = Case("px4", 625_000.0, 0.03, 0.0, direction)
     result = measure(case, 8.0, jitter=0.01, queue=int(case.rate * 0.014))
-    assert result.share >= 0.9
-    assert result.requests <= 1.35
+    assert result.share >= 0.87
+    assert result.requests <= 1.2
 
 
 @pytest.mark.holds("fault overflow")

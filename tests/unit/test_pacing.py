@@ -163,7 +163,7 @@ def test_a_flow_uses_it_where_the_server_queues_little_and_for_whom_it_suits() -
     for order in range(200):
         now = order * 0.01
         flow.on_sent(1, now)
-        flow.on_reply(now, 0.3, order, order + QUEUE)
+        flow.on_replies(now, 0.3, (order,), order + QUEUE)
     assert flow.room(QUEUE, 3.0, paced=True) == 0, "beside other clients the queue is all there is"
     flow.alone = True
     shared = QUEUE + 1  # the place that is kept for others
