@@ -23,7 +23,7 @@ import trio
 
 from mavftpfs.oneshot.files import READ_SIZE, File, Session
 from mavftpfs.oneshot.progress import Progress
-from mavftpfs.protocol.crc import crc32
+from mavftpfs.protocol.payload import crc32
 from mavftpfs.shared.errors import (
     Armed,
     DataUnproven,

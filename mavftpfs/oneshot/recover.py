@@ -19,7 +19,7 @@ from mavftpfs.exits import NotDelivered
 from mavftpfs.oneshot.files import READ_SIZE, Session
 from mavftpfs.oneshot.progress import Progress
 from mavftpfs.oneshot.transfer import Piece, Put, Sent, put_paths
-from mavftpfs.protocol.crc import crc32
+from mavftpfs.protocol.payload import crc32
 from mavftpfs.shared.errors import (
     Armed,
     FtpNak,

@@ -35,7 +35,7 @@ from mavftpfs.oneshot.fetch import (
 from mavftpfs.oneshot.files import READ_SIZE, File, Session, is_directory
 from mavftpfs.oneshot.names import emptied, make_directory
 from mavftpfs.oneshot.progress import Progress
-from mavftpfs.protocol.crc import crc32
+from mavftpfs.protocol.payload import crc32
 from mavftpfs.shared.errors import (
     Armed,
     CrossDevice,

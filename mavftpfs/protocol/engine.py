@@ -12,7 +12,9 @@ Nothing that comes in can raise: `receive` takes any payload at any time.
 from __future__ import annotations
 
 import random
+from collections import defaultdict
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from math import inf
 from operator import attrgetter
 
@@ -20,7 +22,6 @@ from mavftpfs.protocol.flow import Flow
 from mavftpfs.protocol.ledger import LAST_SEQ, Ledger
 from mavftpfs.protocol.payload import NakCode, Opcode, Payload, reply_of, split_run
 from mavftpfs.protocol.requests import Operation, Priority, Request, Run, encode_run
-from mavftpfs.protocol.stats import EngineStats
 from mavftpfs.protocol.timers import Timers
 from mavftpfs.shared.errors import RemoteProtocolError, RequestTimeout
 from mavftpfs.shared.traits import Traits
@@ -32,6 +33,30 @@ _INVALID_SESSION = bytes((NakCode.INVALID_SESSION,))
 _FEW = 4
 _BURST = int(Opcode.BURST_READ_FILE)
 _ACK, _NAK = int(Opcode.ACK), int(Opcode.NAK)
+
+
+@dataclass(slots=True)
+class EngineStats:
+    """Plain counters since the engine was made.
+
+    requests: transmissions, by_opcode too. retransmissions: those of them that repeat a request, spurious:
+    and those that turned out to be needless. replies: believed ones, burst packets included; naks: those
+    of them. unknown: replies that fit nothing outstanding (late, duplicate, not ours). stale: right seq,
+    wrong req_opcode. incoherent: right seq, but session, offset or opcode cannot be. unexplained: unknown
+    ones that no repetition of ours explains. timeouts: operations failed with RequestTimeout.
+    """
+
+    requests: int = 0
+    retransmissions: int = 0
+    spurious: int = 0
+    replies: int = 0
+    naks: int = 0
+    unknown: int = 0
+    stale: int = 0
+    incoherent: int = 0
+    unexplained: int = 0
+    timeouts: int = 0
+    by_opcode: defaultdict[int, int] = field(default_factory=lambda: defaultdict(int))
 
 
 class Engine:
@@ -75,7 +100,7 @@ class Engine:
         self._due, self._heard_at = inf, -inf
         self._burst_op: Operation | None = None  # whose the burst packets may be
         self._burst_heard_at = -inf  # believed or not: an abandoned burst of ArduPilot goes on
-        self._apply_queue_limit()
+        flow.set_queue_limit(self.traits.queue_limit)
 
     # --- facts
 
@@ -87,7 +112,7 @@ class Engine:
     @property
     def in_flight(self) -> int:
         """Requests on their way, those of cancelled operations included."""
-        return self._ledger.in_flight
+        return len(self._ledger.flying)
 
     def timeout(self, family: str) -> float:
         """Return the present retransmission timeout of a family of opcodes, in seconds."""
@@ -103,15 +128,12 @@ class Engine:
     def learn_session_echo(self, echoed: bool) -> None:
         """An Open ACK carried the id asked for, or another (servers.md 14.6)."""
         self.traits.learn_session_echo(echoed)
-        self._apply_queue_limit()
+        self.flow.set_queue_limit(self.traits.queue_limit)
 
     def forget_server(self) -> None:
         """The server restarted, perhaps as another one: nothing that was learned of it holds."""
         self.traits = Traits()
         self.session = self.home_session
-        self._apply_queue_limit()
-
-    def _apply_queue_limit(self) -> None:
         self.flow.set_queue_limit(self.traits.queue_limit)
 
     # --- operations
@@ -119,6 +141,8 @@ class Engine:
     def start(self, op: Operation, now: float) -> None:
         """Take an operation on; its first request goes out with the next `outgoing`."""
         op.attach(self, now)
+        if op.patience == inf:
+            op.patience = self._op_deadline
         self._ops.append(op)
 
     def cancel(self, op: Operation, now: float) -> None:
@@ -206,7 +230,7 @@ class Engine:
             flow.on_spurious()
         if request.single and request.sent_at > self._burst_heard_at:
             rtt = self._timers.sample(request, now)
-        flow.on_reply(now, rtt, request.order, self._ledger.order)
+        flow.on_replies(now, rtt, (request.order,), self._ledger.order)
         for lost in self._ledger.lose_outrun():
             self.flow.on_loss(lost.order)
         op = request.op
@@ -269,9 +293,12 @@ class Engine:
         self.flow.begin()
         if len(self._ops) > 1:
             self._ops.sort(key=attrgetter("priority"))
-        if all(self._serve(op, now, wires) for op in self._ops):
+        starved = True
+        for op in self._ops:
+            starved = starved and self._serve(op, now, wires)
+        if starved:
             self.flow.on_starved()
-        if self.flow.held:
+        if self.flow.budget is not None and self.flow.budget.held:
             for op in self._ops:
                 op.progress_at = max(op.progress_at, now)
         self._retire()
@@ -289,7 +316,7 @@ class Engine:
         ledger = self._ledger
         # Metadata may use one slot more than bulk work: a full window must not make it wait.
         urgent = op.priority is Priority.METADATA
-        in_flight = ledger.in_flight - urgent
+        in_flight = len(ledger.flying) - urgent
         room = self.flow.room(in_flight, now, paced=op.paced, urgent=urgent)
         if room <= 0 and in_flight <= _FEW and (unheard := ledger.unheard()):
             room = self.flow.room(in_flight - unheard, now, paced=op.paced)
@@ -344,20 +371,17 @@ class Engine:
 
     def next_deadline(self) -> float | None:
         """Return when `on_deadline` wants to be called, or None if nothing is pending."""
-        deadline = min(self._due if self._ledger.in_flight else inf, self.flow.next_room_at())
+        deadline = min(self._due if self._ledger.flying else inf, self.flow.next_room_at())
         for op in self._ops:
-            deadline = min(deadline, op.timer, op.progress_at + self._patience(op))
+            deadline = min(deadline, op.timer, op.progress_at + op.patience)
         return None if deadline == inf else deadline
-
-    def _patience(self, op: Operation) -> float:
-        return self._op_deadline if op.patience is None else op.patience
 
     def on_deadline(self, now: float) -> None:
         """Act on what is overdue; harmless when called early or late."""
         for op in self._ops:
             if op.timer <= now:
                 op.on_timer(now)
-            if op.progress_at + self._patience(op) <= now:
+            if op.progress_at + op.patience <= now:
                 self._time_out(op)
         if now >= self._due:
             self._check_timers(now)
@@ -366,7 +390,7 @@ class Engine:
     def _check_timers(self, now: float) -> None:
         self._due = inf
         silent: list[str] = []
-        for request in self._ledger.flying():
+        for request in list(self._ledger.flying.values()):
             if request.timer <= now:
                 request.timer = self._reconsidered(request)
             if request.timer <= now:
@@ -385,18 +409,18 @@ class Engine:
         # ArduPilot answers nothing else during a burst: silence proves nothing then (servers.md 4).
         since = max(request.sent_at, self._burst_heard_at)
         due = since + self._timers.wait(request)
-        patience = self.flow.patience if request.manner.ordered and self._ledger.in_flight > _FEW else 0.0
+        patience = self.flow.patience if request.manner.ordered and len(self._ledger.flying) > _FEW else 0.0
         return max(due, min(due, self._heard_at) + patience)  # a stream of other answers is no pause
 
     def _expire(self, request: Request, now: float) -> None:
         """A timer ran out: ask again, or give up the operation when this one request took too long."""
         op = request.op
-        if now - request.first_sent >= self._patience(op) and op is not self._ledger.ghost:
+        if now - request.first_sent >= op.patience and op is not self._ledger.ghost:
             self._time_out(op)
-        self.flow.on_loss(request.order, request.sends)
+        self.flow.on_loss(request.order)
         self._ledger.lose(request)
 
     def _time_out(self, op: Operation) -> None:
         if not op.done:
             self.stats.timeouts += 1
-            op.fail(RequestTimeout(f"no answer within {self._patience(op):g} s"))
+            op.fail(RequestTimeout(f"no answer within {op.patience:g} s"))

@@ -12,7 +12,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from itertools import islice
 
-from mavftpfs.protocol.duplicates import DuplicateDetector
 from mavftpfs.protocol.payload import MAX_DATA, Fields, Opcode, Payload
 from mavftpfs.protocol.requests import Operation, Request, Run, Transmission
 from mavftpfs.shared.errors import LocalProtocolError
@@ -32,6 +31,63 @@ _MAX_REORDER = 64
 _MOST_QUICK_SENDS = 20
 
 
+_MOST_REMEMBERED = 1024
+"""Requests whose late answers are remembered; a window holds fewer."""
+
+
+class DuplicateDetector:
+    """Knows which answers are still to come, and when requests that change names went out.
+
+    Whoever asks twice may be answered twice. Any further answer means that the network delivered a request,
+    or its answer, more than once, so that a request may be carried out once more at any time.
+
+    Answers are known by their seq, which is the request's plus one.
+    """
+
+    __slots__ = ("_expected", "_sent")
+
+    def __init__(self) -> None:
+        self._expected: dict[int, int] = {}
+        self._sent: dict[int, float] = {}
+
+    def on_sent(self, request: Request, now: float) -> None:
+        """A request went out; the first time counts for one that keeps its seq."""
+        if request.manner.same_seq:
+            if request.sends == 1:
+                self._sent.pop(request.seq + 1, None)
+            self._sent.setdefault(request.seq + 1, now)
+            _shorten(self._sent)
+
+    def on_settled(self, request: Request, answered: int | None) -> None:
+        """Nobody waits for a request any more. answered: the seq of the answer that came, if one did."""
+        seqs = {request.seq + 1, *(request.aliases or ())}
+        for seq in seqs:
+            # With several seqs nobody knows how often each was sent.
+            left = request.sends - (len(seqs) - 1) - (seq == answered)
+            if left > 0:
+                self._expected.pop(seq, None)
+                self._expected[seq] = left
+        _shorten(self._expected)
+
+    def explains(self, seq: int) -> bool:
+        """Return whether an answer that nobody waits for was still to come; it is not expected again."""
+        left = self._expected.get(seq, 0)
+        if left > 1:
+            self._expected[seq] = left - 1
+        else:
+            self._expected.pop(seq, None)
+        return left > 0
+
+    def late_by(self, seq: int, now: float) -> float:
+        """Return the seconds since the request with this answer went out first; 0 if that is not known."""
+        return now - self._sent.get(seq, now)
+
+
+def _shorten(remembered: dict[int, int] | dict[int, float]) -> None:
+    while len(remembered) > _MOST_REMEMBERED:
+        del remembered[next(iter(remembered))]
+
+
 class Ghost(Operation):
     """Owns the requests of cancelled operations until they are answered or given up."""
 
@@ -49,19 +105,20 @@ class Ledger:
     Attributes:
         again: lost requests which go out again as soon as there is room.
         newest_answered: order of the last transmission that was answered. first: no older one may be lost.
+        flying: the requests on their way by the order of their transmission, oldest first, ghosts included.
         order: number of the next transmission.
         reorder: how many transmissions later an answer must be to prove a loss; grows when that was wrong.
         duplicates: knows which answers that nobody waits for are due to repetitions of ours.
     """
 
     __slots__ = (
-        "_flying",
         "_seq",
         "_table",
         "again",
         "duplicates",
         "find",
         "first",
+        "flying",
         "ghost",
         "newest_answered",
         "order",
@@ -72,7 +129,7 @@ class Ledger:
         self._seq = next_seq
         self.duplicates = DuplicateDetector()
         self._table: dict[int, Request] = {}
-        self._flying: dict[int, Request] = {}
+        self.flying: dict[int, Request] = {}
         self.find = self._table.get
         """Returns the unanswered request to which a reply with a seq belongs, or None."""
         self.first = 0
@@ -82,22 +139,13 @@ class Ledger:
         self.order = 0
         self.reorder = _MIN_REORDER
 
-    @property
-    def in_flight(self) -> int:
-        """Requests on their way, ghosts included."""
-        return len(self._flying)
-
-    def flying(self) -> list[Request]:
-        """Return the requests on their way, oldest transmission first."""
-        return list(self._flying.values())
-
     def unheard(self) -> int:
         """Return how many that carry no bytes were repeated in vain: perhaps nobody will ever answer them.
 
         A TruncateFile is waited for two minutes, and MAVSDK answers none (servers.md 8): it would keep a
         window that losses made narrow from everybody else.
         """
-        return sum(request.sends > 1 and not request.manner.ordered for request in self._flying.values())
+        return sum(request.sends > 1 and not request.manner.ordered for request in self.flying.values())
 
     # --- going out
 
@@ -118,7 +166,7 @@ class Ledger:
 
     def launch(self, requests: Sequence[Request], now: float, timer: float) -> None:
         """Number requests that go out for the first time, and note that they are on their way."""
-        table, flying = self._table, self._flying
+        table, flying = self._table, self.flying
         order = self.order
         for request in requests:
             seq = self._seq
@@ -162,7 +210,7 @@ class Ledger:
     def enter(self, request: Request) -> None:
         """Note that a numbered request is on its way."""
         self._table[request.seq + 1] = request
-        self._flying[request.order] = request
+        self.flying[request.order] = request
         request.flying = True
 
     # --- coming in
@@ -173,7 +221,7 @@ class Ledger:
         Usual is the ACK, as `Engine.receive` would believe it, to the only transmission of a request with the
         opcode `bulk` of its operation, sent later than `after`. The run ends where operation or time change.
         """
-        table, flying = self._table, self._flying
+        table, flying = self._table, self.flying
         request = table.get(replies[at][0])
         run: Run = []
         if request is None or request.sent_at <= after:
@@ -201,7 +249,8 @@ class Ledger:
 
         Its order, sent_at, single and outrun are those of the answered transmission from then on.
         """
-        self.duplicates.on_answered(request, seq)
+        if request.sends > 1:
+            self.duplicates.on_settled(request, seq)
         self._remove(request)
         current = seq == request.seq + 1
         if not current and request.aliases is not None:
@@ -217,7 +266,8 @@ class Ledger:
 
     def forget(self, request: Request) -> None:
         """Give up a request that was not answered."""
-        self.duplicates.on_given_up(request)
+        if request.sends:
+            self.duplicates.on_settled(request, None)
         self._remove(request)
 
     def _remove(self, request: Request) -> None:
@@ -228,43 +278,33 @@ class Ledger:
             for key in request.aliases:
                 table.pop(key, None)
         if request.flying:
-            self._land(request)
+            request.flying = False
+            del self.flying[request.order]
         else:
             self.again = [other for other in self.again if other is not request]
 
     def lose_outrun(self) -> list[Request]:
         """Lose the requests that later answers prove to be lost, and return them."""
         lost = []
-        while (request := self._next_outrun()) is not None:
-            self.lose(request)
-            lost.append(request)
-        return lost
-
-    def _next_outrun(self) -> Request | None:
-        """Look at what is older than what was answered, at each transmission once."""
-        proven, order, flying = self.newest_answered - self.reorder, self.first, self._flying
-        found = None
-        while order <= proven and found is None:
-            request = flying.get(order)
+        proven = self.newest_answered - self.reorder
+        for order in range(self.first, proven + 1):  # looks at each transmission once
+            request = self.flying.get(order)
             # One that was lost so often may never be answered: only its timer repeats it from now on.
             if request is not None and request.manner.ordered and request.sends <= _MOST_QUICK_SENDS:
                 request.outrun = True
-                found = request
-            order += 1
-        self.first = order
-        return found
+                self.lose(request)
+                lost.append(request)
+        self.first = max(self.first, proven + 1)
+        return lost
 
     def lose(self, request: Request) -> None:
         """This transmission will not be answered: ask again, unless nobody would want to know."""
-        self._land(request)
+        request.flying = False
+        del self.flying[request.order]
         if request.op is self.ghost or request.manner.once:
             self.forget(request)
         else:
             self.again.append(request)
-
-    def _land(self, request: Request) -> None:
-        request.flying = False
-        del self._flying[request.order]
 
     # --- by operation
 
@@ -285,6 +325,6 @@ class Ledger:
         """Forget what `op` had lost, and make ghosts of what it has on its way."""
         for request in [request for request in self.again if request.op is op]:
             self.forget(request)
-        for request in self._flying.values():
+        for request in self.flying.values():
             if request.op is op:
                 request.op = self.ghost

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from math import inf
 
 from mavftpfs.protocol.listing import parse_page
 from mavftpfs.protocol.payload import MAX_DATA, NakCode, Opcode, Payload
@@ -25,7 +26,7 @@ class Simple(Operation):
         session: the id to send; None sends the engine's, and asks again with the new one if it changed.
         size: header field; None means len(data).
         side_effect: repeat under the same seq first, because a second execution would be another act.
-        patience: seconds until RequestTimeout, None for the engine's deadline.
+        patience: seconds until RequestTimeout, inf for the engine's deadline.
         server_time: seconds that the slowest server works at it; a repetition waits for so long, or for as
             long as this server may need by what was seen of it.
 
@@ -46,7 +47,7 @@ class Simple(Operation):
         session: int | None = None,
         size: int | None = None,
         side_effect: bool | None = None,
-        patience: float | None = None,
+        patience: float = inf,
         server_time: float | None = None,
     ) -> None:
         super().__init__()

@@ -1,4 +1,4 @@
-"""The 251-byte body of FILE_TRANSFER_PROTOCOL (message 110). Layer: protocol; pure.
+"""The 251-byte body of FILE_TRANSFER_PROTOCOL (message 110), and the CRC of files. Layer: protocol; pure.
 
 Layout (MAVLink FTP guide, "Payload Format"): seq u16 LE, session, opcode, size, req_opcode,
 burst_complete, padding, offset u32 LE, then up to 239 bytes of data. Own enums, because pymavlink's
@@ -8,6 +8,7 @@ dialects lack opcode 16.
 from __future__ import annotations
 
 import struct
+import zlib
 from collections.abc import Sequence
 from enum import IntEnum
 from typing import NamedTuple, TypeAlias
@@ -165,3 +166,12 @@ def _oversize(size: int) -> RemoteProtocolError:
 
 def _wrong_length(wire: bytes) -> RemoteProtocolError:
     return RemoteProtocolError(f"payload of {len(wire)} bytes, {PAYLOAD_SIZE} expected")
+
+
+def crc32(data: bytes | bytearray | memoryview, previous: int = 0) -> int:
+    """Return the CRC32 of `data` as CalcFileCRC32 defines it, continued from `previous` (0 at the start).
+
+    Reflected polynomial 0xEDB88320, start value 0, no final xor, on every server (servers.md 10), so
+    leading zero bytes do not change it: always compare sizes too.
+    """
+    return zlib.crc32(data, previous ^ 0xFFFFFFFF) ^ 0xFFFFFFFF

@@ -219,7 +219,7 @@ class Operation:
     """A state machine which the engine asks for requests and tells of replies.
 
     The engine sets `progress_at` (inf while nothing is wanted of the server) and fails the operation
-    with RequestTimeout when there was no progress for `patience` seconds (None: the engine's deadline).
+    with RequestTimeout when there was no progress for `patience` seconds (inf: the engine's deadline).
     `timer` is when `on_timer` wants to be called. An operation ends by `finish` or `fail`, once.
     """
 
@@ -233,7 +233,7 @@ class Operation:
     def __init__(self) -> None:
         self.done = False
         self.error: MavftpfsError | None = None
-        self.patience: float | None = None
+        self.patience = inf
         self.started_at = 0.0
         self.progress_at = inf
         self.timer = inf

@@ -1,4 +1,8 @@
-"""How long to wait for which reply: one estimator for each family of opcodes. Layer: protocol; pure."""
+"""How long to wait for which reply. Layer: protocol; pure.
+
+One estimator for each family of opcodes, because a listing of a big directory or a checksum takes seconds
+where a read takes milliseconds.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +10,13 @@ from math import inf
 
 from mavftpfs.protocol.payload import Opcode
 from mavftpfs.protocol.requests import FLOORS, Manner, Request
-from mavftpfs.protocol.rtt import INITIAL_RTO, RttEstimator
+
+INITIAL_RTO = 1.0
+"""Seconds to wait while no round trip is known, if nothing better is."""
+
+LONGEST_BACK_OFF = 3.0
+_FREE_SILENCES = 2
+_MAX_DOUBLINGS = 7
 
 _LONGEST_WAIT = 5.0
 
@@ -34,6 +44,61 @@ _USUAL_SENDS = 2
 _FORGETTING = 0.125
 
 
+class RttEstimator:
+    """Smoothed round-trip time, its variation, and the retransmission timeout of one family; all in seconds.
+
+    RFC 6298 with Karn's rule (the caller gives only samples that belong to one transmission) and two changes.
+    The floor is small, because a tail loss on a fast link would otherwise cost 1 s. And there is always half
+    a round trip of slack above the mean.
+
+    Args:
+        floor: least timeout. first: the timeout before the first sample, if the floor is not more.
+    """
+
+    __slots__ = ("_silences", "floor", "rto", "samples", "smoothed", "unfloored", "variation")
+
+    def __init__(self, floor: float, first: float = INITIAL_RTO) -> None:
+        self.floor = floor
+        self._silences = 0
+        self.unfloored = first
+        self.rto = max(first, floor)
+        """How long to wait for a reply before it is asked again.
+
+        Backed off to at most LONGEST_BACK_OFF: a link that comes back should not wait longer for us.
+        """
+        self.samples = 0
+        self.smoothed = 0.0
+        self.variation = 0.0
+
+    def sample(self, rtt: float) -> None:
+        """Take one round trip that provably belongs to one transmission; ends a back-off."""
+        if self.samples:
+            error = rtt - self.smoothed
+            self.smoothed = smoothed = self.smoothed + error * 0.125
+            self.variation += ((error if error > 0 else -error) - self.variation) * 0.25
+        else:
+            self.smoothed = smoothed = rtt
+            self.variation = rtt / 2
+        self.samples += 1
+        self._silences = 0
+        slack = 4 * self.variation
+        half = smoothed / 2
+        self.unfloored = rto = smoothed + (slack if slack > half else half)
+        self.rto = rto if rto > self.floor else self.floor
+
+    def on_silence(self) -> None:
+        """Nothing was heard for a whole timeout; from the third in a row on, each doubles it.
+
+        Not from the first: at 20 % loss each way a lone request goes unanswered every third time.
+        """
+        self._silences += 1
+        rto = max(self.unfloored, self.floor)
+        doublings = self._silences - _FREE_SILENCES
+        if doublings > 0 and rto < LONGEST_BACK_OFF:
+            rto = min(rto * (1 << min(doublings, _MAX_DOUBLINGS)), LONGEST_BACK_OFF)
+        self.rto = rto
+
+
 class Timers:
     """Round trips by family (see `requests.Manner`).
 
@@ -55,15 +120,17 @@ class Timers:
     @property
     def rtt(self) -> float | None:
         """Smoothed round trip in seconds: of reads, else of any request; None before the first."""
-        known = [timer for timer in self.of.values() if timer.known]
-        return known[0].smoothed if known else None
+        for timer in self.of.values():
+            if timer.samples:
+                return timer.smoothed
+        return None
 
     def timeout(self, family: str) -> float:
         """Return the present retransmission timeout of a family of opcodes, in seconds."""
         timer = self.of[family]
-        if timer.known:
+        if timer.samples:
             return timer.rto
-        known = (other.unfloored for other in self.of.values() if other.known)
+        known = (other.unfloored for other in self.of.values() if other.samples)
         return max(min(known, default=INITIAL_RTO), FLOORS[family])
 
     def sample(self, request: Request, now: float) -> float:
@@ -81,16 +148,13 @@ class Timers:
             timer = self.of[request.manner.family]
             timer.sample(now - sent_at)
             if timer.samples == 1:
-                self._lend(timer.unfloored)
+                # A lost Open after a few listings should not cost a second: that is what nothing known would
+                # mean. The first sample allows for three round trips, which is generous for who has none yet.
+                for other in self.of.values():
+                    if not other.samples and timer.unfloored < other.unfloored:
+                        other.unfloored = timer.unfloored
+                        other.rto = max(timer.unfloored, other.floor)
         return now - sent_at
-
-    def _lend(self, timeout: float) -> None:
-        """A lost Open after a few listings should not cost a second: that is what nothing known would mean.
-
-        The first sample allows for three round trips, which is generous for whoever has none yet.
-        """
-        for timer in self.of.values():
-            timer.borrow(timeout)
 
     def wait(self, request: Request) -> float:
         """Return how long to wait for the reply to this transmission of a request, in seconds."""
@@ -102,7 +166,7 @@ class Timers:
             # The way and the work take their times one after the other.
             wait = rto = rto + self._work_of(request)
         # Under the same seq no repetition tells the round trip: where that is not known, it may be longer.
-        free = manner.free_sends if timer.known or not manner.same_seq else 1
+        free = manner.free_sends if timer.samples or not manner.same_seq else 1
         doublings = request.sends - free
         if doublings > 0:
             wait = min(rto * (1 << min(doublings, 6)), max(rto, _LONGEST_WAIT))

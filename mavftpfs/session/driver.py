@@ -19,10 +19,9 @@ from mavftpfs.link.addresses import AddressBook, NetAddress, readable_address
 from mavftpfs.link.base import Link
 from mavftpfs.link.framing import Framer
 from mavftpfs.link.messages import Address, FtpRun, Message, singly
-from mavftpfs.protocol.engine import Engine
+from mavftpfs.protocol.engine import Engine, EngineStats
 from mavftpfs.protocol.operations import Operation
 from mavftpfs.protocol.payload import Payload, decode_reply
-from mavftpfs.protocol.stats import EngineStats
 from mavftpfs.session.vehicle import Standing, Vehicle
 from mavftpfs.shared.errors import RemoteProtocolError, RequestTimeout
 

@@ -128,7 +128,7 @@ class Store:
         self.lists_times = True
         scope.deadline = inf
 
-    async def _sweep(self, wire: bytes, *, patience: float | None = None) -> ListDirectory:
+    async def _sweep(self, wire: bytes, *, patience: float = inf) -> ListDirectory:
         operation = ListDirectory(wire)
         operation.patience = patience
         await self._scheduler.metadata(operation)

@@ -12,7 +12,7 @@ import re
 import weakref
 from typing import Protocol
 
-from mavftpfs.protocol.crc import crc32
+from mavftpfs.protocol.payload import crc32
 from mavftpfs.sim import profiles
 from mavftpfs.sim.profiles import Profile
 from mavftpfs.sim.pseudo import VirtualTrees

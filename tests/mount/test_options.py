@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from mavftpfs.protocol.crc import crc32
+from mavftpfs.protocol.payload import crc32
 from tests.mount.conftest import Field
 from tests.support.mounts import Mount, abort_mount, mavftpfs, mounted_at, processes_in, wait_until
 

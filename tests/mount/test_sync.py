@@ -18,7 +18,7 @@ from typing import Any
 
 from mavftpfs.link.framing import Framer
 from mavftpfs.link.messages import MAV_AUTOPILOT_INVALID, MAV_TYPE_GCS, Address
-from mavftpfs.protocol.crc import crc32
+from mavftpfs.protocol.payload import crc32
 from tests.mount.conftest import Field
 from tests.support import terminal
 from tests.support.mounts import COMMAND_TIMEOUT, wait_until

@@ -10,7 +10,7 @@ from pathlib import Path
 import trio
 
 from mavftpfs.cache.tree import Stat
-from mavftpfs.protocol.crc import crc32
+from mavftpfs.protocol.payload import crc32
 from mavftpfs.shared.errors import AlreadyExists, IsADirectory, NotADirectory, NotFound
 from mavftpfs.shared.model import ROOT, EntryKind, split
 

@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 
 from mavftpfs.link.messages import Address
 from mavftpfs.protocol.burst import BurstTransfer
-from mavftpfs.protocol.crc import crc32
 from mavftpfs.protocol.engine import Engine
 from mavftpfs.protocol.flow import Flow
 from mavftpfs.protocol.listing import parse_page
@@ -20,6 +19,7 @@ from mavftpfs.protocol.payload import (
     PAYLOAD_SIZE,
     Opcode,
     Payload,
+    crc32,
     decode_reply,
     decode_request,
 )

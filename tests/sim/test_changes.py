@@ -14,9 +14,8 @@ from trio.testing import MockClock
 
 from mavftpfs.cache.options import CacheOptions
 from mavftpfs.cache.pathlocks import SLACK
-from mavftpfs.protocol.crc import crc32
 from mavftpfs.protocol.operations import Simple
-from mavftpfs.protocol.payload import Opcode
+from mavftpfs.protocol.payload import Opcode, crc32
 from mavftpfs.session.connection import Connection, ConnectOptions
 from mavftpfs.shared.errors import Armed, FileBusy, FileChanged, FtpNak, RequestTimeout
 from mavftpfs.shared.model import join

@@ -15,8 +15,7 @@ import trio
 from mavftpfs.cache.options import CacheOptions
 from mavftpfs.cache.remote import ReadSink, VehicleStore
 from mavftpfs.cache.tree import Tree
-from mavftpfs.protocol.crc import crc32
-from mavftpfs.protocol.payload import NakCode, Opcode
+from mavftpfs.protocol.payload import NakCode, Opcode, crc32
 from mavftpfs.shared.errors import Armed, DataUnproven, FileChanged, FtpNak, VehicleLost
 from mavftpfs.shared.extents import ExtentSet
 from mavftpfs.shared.model import ROOT, DirEntry, EntryKind, Listing, join, split, wire_path

@@ -6,13 +6,12 @@ import pytest
 
 from mavftpfs.protocol.ledger import Ghost
 from mavftpfs.protocol.requests import READ_MANNER, Request, manner_of
-from mavftpfs.protocol.rtt import INITIAL_RTO, LONGEST_BACK_OFF, RttEstimator
-from mavftpfs.protocol.timers import Timers
+from mavftpfs.protocol.timers import INITIAL_RTO, LONGEST_BACK_OFF, RttEstimator, Timers
 
 
 def test_before_the_first_sample() -> None:
     timer = RttEstimator(0.03)
-    assert not timer.known
+    assert timer.samples == 0
     assert timer.rto == INITIAL_RTO
     assert RttEstimator(10.0).rto == 10.0
 
@@ -20,7 +19,7 @@ def test_before_the_first_sample() -> None:
 def test_first_sample_allows_three_times() -> None:
     timer = RttEstimator(0.03)
     timer.sample(0.1)
-    assert timer.known
+    assert timer.samples
     assert timer.rto == pytest.approx(0.3)
 
 

@@ -7,8 +7,7 @@ import struct
 
 import pytest
 
-from mavftpfs.protocol.crc import crc32
-from mavftpfs.protocol.payload import NakCode, Opcode
+from mavftpfs.protocol.payload import NakCode, Opcode, crc32
 from mavftpfs.sim.pseudo import VirtualTrees, pack_parameters
 from tests.support.sim_client import Client, ack, nak
 

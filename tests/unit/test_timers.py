@@ -7,8 +7,7 @@ import pytest
 from mavftpfs.protocol.operations import Simple
 from mavftpfs.protocol.payload import Opcode
 from mavftpfs.protocol.requests import Request, manner_of
-from mavftpfs.protocol.rtt import INITIAL_RTO
-from mavftpfs.protocol.timers import Timers
+from mavftpfs.protocol.timers import INITIAL_RTO, Timers
 
 
 def answered(timers: Timers, opcode: Opcode, rtt: float) -> None:

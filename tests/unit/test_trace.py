@@ -12,8 +12,8 @@ from pymavlink import mavutil
 
 from mavftpfs.link.framing import Framer
 from mavftpfs.link.messages import Address
+from mavftpfs.protocol.engine import EngineStats
 from mavftpfs.protocol.payload import NakCode, Opcode, Payload, request
-from mavftpfs.protocol.stats import EngineStats
 from mavftpfs.session.driver import Remarks
 from mavftpfs.shared.errors import UsageError
 from mavftpfs.trace import REPLY, REQUEST, JsonTrace, TlogWriter, text_line

@@ -15,8 +15,7 @@ from mavftpfs.cache.options import MIN_CACHE_SIZE, CacheOptions
 from mavftpfs.cache.reserved import Kind, Reserved, new_owner
 from mavftpfs.cache.singleflight import SingleFlight
 from mavftpfs.cache.tree import Stat, Tree
-from mavftpfs.protocol.crc import crc32
-from mavftpfs.protocol.payload import NakCode, Opcode
+from mavftpfs.protocol.payload import NakCode, Opcode, crc32
 from mavftpfs.shared.errors import (
     Armed,
     FtpNak,

@@ -17,7 +17,7 @@ from mavftpfs.cache.reserved import is_reserved
 from mavftpfs.cache.spool import SpoolContent
 from mavftpfs.cache.tree import Tree
 from mavftpfs.farewell import keep_the_rest
-from mavftpfs.protocol.crc import crc32
+from mavftpfs.protocol.payload import crc32
 from mavftpfs.shared.errnos import errno_for
 from mavftpfs.shared.errors import (
     NotDeliveredYet,

@@ -8,7 +8,7 @@ import pytest
 import trio
 
 from mavftpfs.cache.tree import Tree
-from mavftpfs.protocol.crc import crc32
+from mavftpfs.protocol.payload import crc32
 from mavftpfs.shared.errors import (
     Armed,
     VerificationFailed,

@@ -7,8 +7,7 @@ import trio
 import trio.testing
 
 from mavftpfs.cache.tree import Tree
-from mavftpfs.protocol.crc import crc32
-from mavftpfs.protocol.payload import NakCode, Opcode
+from mavftpfs.protocol.payload import NakCode, Opcode, crc32
 from mavftpfs.shared.errors import (
     DataUnproven,
     FtpNak,
