@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-import struct
-
 from mavftpfs.link.messages import Address
 from mavftpfs.protocol.payload import Opcode
 from tests.support.worlds import World
 
-_SEQ, _OPCODE = slice(0, 2), 3
+_OPCODE = 3
 
 
 class Latecomer:
     """Has a request of a kind executed once more, right after the server got the nth of another kind.
 
-    Which request of a kind: the first, or the last that came before. Its answer travels like any other, or is
-    lost (`mute`).
+    Which request of a kind: the first, or the last that came before. Its answer travels like any other.
 
     Attributes:
         late: seconds after the first execution; None while it was not repeated.
@@ -29,18 +26,15 @@ class Latecomer:
         after: Opcode,
         nth: int = 1,
         first: bool = False,
-        mute: bool = False,
     ) -> None:
         self.late: float | None = None
         self._world = world
         self._what, self._after, self._left = what, after, nth
         self._first = first
-        self._mute = mute
         self._kept: tuple[bytes, float] | None = None
         server = world.vehicle.server
-        self._handle, self._outgoing = server.handle, server.outgoing
+        self._handle = server.handle
         server.handle = self._on_request  # type: ignore[method-assign]
-        server.outgoing = self._on_replies  # type: ignore[method-assign]
 
     def _on_request(self, wire: bytes, source: Address, now: float) -> None:
         self._handle(wire, source, now)
@@ -54,11 +48,3 @@ class Latecomer:
                 self._world.link.kick()
         if wire[_OPCODE] == self._what and not (self._first and self._kept is not None):
             self._kept = (wire, now)
-
-    def _on_replies(self, now: float) -> list[tuple[Address, bytes]]:
-        replies = self._outgoing(now)
-        if not self._mute or self.late is None or self._kept is None:
-            return replies
-        (asked,) = struct.unpack("<H", self._kept[0][_SEQ])
-        answer = struct.pack("<H", (asked + 1) % 65536)
-        return [reply for reply in replies if reply[1][_SEQ] != answer]

@@ -86,8 +86,6 @@ class MemorySink:
         self.data = bytearray(size)
         self.have = ExtentSet()
         self.suspicions: list[str] = []
-        self.queued = 0
-        self.openings: list[float] = []
         self.errors: list[Exception] = []
         self._news = trio.Event()
 
@@ -95,7 +93,7 @@ class MemorySink:
         return self.have.missing(start, stop)
 
     def on_opened(self, at: float) -> None:
-        self.openings.append(at)
+        """Nobody asks."""
 
     def on_data(self, offset: int, data: bytes) -> None:
         assert offset + len(data) <= len(self.data)
@@ -106,7 +104,7 @@ class MemorySink:
         self._tell()
 
     def on_queued(self) -> None:
-        self.queued += 1
+        """Nobody asks."""
 
     def on_suspect(self, reason: str) -> None:
         self.suspicions.append(reason)
