@@ -253,12 +253,11 @@ class Draft:
         stop = offset + len(data)
         if offset == stop:
             return
-        self._require(Event.CHANGED)
+        after = self._after(Event.CHANGED)
         self._content.put(offset, data)
         self._held.add(offset, stop)
         self._note_changed(min(offset, self.size), stop)
-        self.size = max(self.size, stop)
-        self.on(Event.CHANGED)
+        self.size, self.state = max(self.size, stop), after
 
     def truncate(self, size: int) -> None:
         """Cut, or extend with zeros.
@@ -268,8 +267,7 @@ class Draft:
         """
         if size == self.size:
             return
-        event = Event.CHANGED if size else Event.EMPTIED
-        self._require(event)
+        after = self._after(Event.CHANGED if size else Event.EMPTIED)
         if size < self.size:
             self._content.cut(size)
             for extents in (self._held, self._changed):
@@ -279,8 +277,7 @@ class Draft:
                 self.sending.on_cut(size)
         else:
             self._note_changed(self.size, size)
-        self.size = size
-        self.on(event)
+        self.size, self.state = size, after
 
     def fill(self, offset: int, data: bytes | memoryview) -> None:
         """Hold bytes of the base, where nothing newer is held.
@@ -346,12 +343,13 @@ class Draft:
         Raises:
             LocalProtocolError: that cannot happen now.
         """
-        self._require(event)
-        self.state = TRANSITIONS[self.state][event]
+        self.state = self._after(event)
 
-    def _require(self, event: Event) -> None:
-        if event not in TRANSITIONS[self.state]:
+    def _after(self, event: Event) -> State:
+        after = TRANSITIONS[self.state].get(event)
+        if after is None:
             raise LocalProtocolError(f"a file that is {self.state.value} cannot be {event.value}")
+        return after
 
     def check_invariants(self) -> None:
         """Raise AssertionError if the books are wrong (for tests)."""

@@ -169,7 +169,7 @@ class Cleaner:
     async def on_swept(self, path: bytes, directory: Directory) -> None:
         """A directory was listed. Raises nothing of ours: the listing is right without us."""
         reserved = [entry for name, entry in directory.entries.items() if is_reserved(name)]
-        missing = self._missing(path, directory)
+        missing = self._missing(path, directory) if self._context.own.torn else []
         if path in self._busy or not (reserved or missing):
             return
         self._busy.add(path)
