@@ -15,7 +15,6 @@ from mavftpfs.oneshot.fetch import (
     Fetched,
     Fetcher,
     NotProvenYet,
-    StillGrowing,
     Verify,
     Wanted,
     known_time,
@@ -115,32 +114,6 @@ async def test_wrong_bytes_twice_leave_nothing_and_keep_the_old_file(tmp_path: P
 # -- going on -------------------------------------------------------------------------------------
 
 
-async def test_an_interrupted_file_is_gone_on_with_and_proven(tmp_path: Path) -> None:
-    tree = SpoiltTree({b"/big": BIG})
-    reads = 0
-
-    def interrupt(name: str, path: bytes) -> None:
-        nonlocal reads
-        reads += name == "read"
-        if reads == 4:
-            raise KeyboardInterrupt
-
-    tree.on_call = interrupt
-    with pytest.raises(KeyboardInterrupt):
-        await get(tree, b"/big", tmp_path / "big")
-    assert names_in(tmp_path) == ["big.part"]
-    came = (tmp_path / "big.part").read_bytes()
-    assert came
-    assert BIG.startswith(came)
-    tree.on_call = lambda name, path: None
-    tree.calls.clear()
-    fetched = await get(tree, b"/big", tmp_path / "big", "none")
-    assert (fetched.resumed, fetched.proof) == (len(came), "size and CRC32")
-    assert ("crc32", b"/big") in tree.calls
-    assert (tmp_path / "big").read_bytes() == BIG
-    assert names_in(tmp_path) == ["big"]
-
-
 @pytest.mark.parametrize("returns", [True, False])
 async def test_a_vehicle_that_is_lost_is_waited_for(tmp_path: Path, returns: bool) -> None:
     tree = SpoiltTree({b"/big": BIG})
@@ -200,24 +173,6 @@ async def test_where_no_checksum_can_be_had_all_is_fetched_anew(tmp_path: Path) 
     (tmp_path / "big.part").write_bytes(b"x" * 1000)
     fetched = await get(tree, b"/big", tmp_path / "big")
     assert (fetched.resumed, (tmp_path / "big").read_bytes()) == (0, BIG)
-
-
-@pytest.mark.parametrize("begun", [b"", BIG[:1000]])
-async def test_a_growing_file_stays_a_part_and_is_said(tmp_path: Path, begun: bytes) -> None:
-    tree = SpoiltTree({b"/big": BIG})
-    if begun:
-        (tmp_path / "big.part").write_bytes(begun)
-    tree.grows = b"more"
-
-    async def grown(path: bytes) -> int:
-        tree.files[path] += b"more"
-        return 0
-
-    tree.crc32 = grown  # type: ignore[method-assign]
-    with pytest.raises(StillGrowing, match=r"/big is still growing: its first 502.0 kB"):
-        await get(tree, b"/big", tmp_path / "big")
-    assert (tmp_path / "big.part").read_bytes() == BIG
-    assert names_in(tmp_path) == ["big.part"]
 
 
 @pytest.mark.parametrize(

@@ -116,19 +116,6 @@ async def test_a_parent_renamed_during_lookup_gives_the_name_its_new_path() -> N
 # -- directories ----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("room", [1, 2, 3, 7])
-async def test_readdir_in_portions_has_every_name_once(monkeypatch: pytest.MonkeyPatch, room: int) -> None:
-    tree = FakeTree({b"/f%02d" % index: b"" for index in range(20)})
-    ops, listing = operations(tree), Listing(monkeypatch, room)
-    fh = await ops.opendir(ROOT_INO, CTX)
-    offset = 0
-    while offset >= 0:
-        offset = await listing.read(ops, fh, offset)
-        ops.inodes.check_invariants()
-    assert listing.names == sorted(path[1:] for path in tree.files)
-    assert len(ops.inodes) == 21
-
-
 async def test_readdir_offsets_are_stable_while_the_directory_changes(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

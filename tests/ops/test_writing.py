@@ -207,14 +207,6 @@ async def test_a_directory_shows_when_its_entries_were_changed(change: Callable[
     assert await _times(ops, log) == (NOW + 9 * NANO - 5, NOW + 9 * NANO - 5)
 
 
-async def test_a_rename_changes_both_directories_and_a_new_one_is_of_now() -> None:
-    ops = operations(now_ns=lambda: NOW)
-    await ops.rename(ROOT_INO, b"a.txt", await ino_of(ops, b"empty"), b"in", 0, CTX)
-    assert await _times(ops, ROOT_INO) == await _times(ops, await ino_of(ops, b"empty")) == (NOW, NOW)
-    entry = await ops.mkdir(await ino_of(ops, b"log"), b"sub", 0o755, CTX)
-    assert (entry.st_mtime_ns, entry.st_ctime_ns) == (NOW, NOW)
-
-
 async def test_what_was_just_made_was_used_just_now() -> None:
     """Mail readers remove by its atime what a program left behind long ago."""
     tree = some_tree()

@@ -48,14 +48,6 @@ def test_what_is_written_is_removed_again(tmp_path: Path, capsys: pytest.Capture
     assert run_install("--root", str(tmp_path), "--remove") == 0, "nothing is there any more"
 
 
-def test_print_writes_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run_install("--root", str(tmp_path), "--print") == 0
-    assert list(tmp_path.iterdir()) == []
-    said = capsys.readouterr().out
-    assert "\nExecStart=" in said
-    assert "\n.SH NAME\n" in said
-
-
 def test_a_user_needs_no_root(tmp_path: Path) -> None:
     parser = cli.whole_parser()
     found = list(install.for_user(parser, Path("/home/me/.local/bin/mavftpfs"), {"HOME": "/home/me"}))
@@ -91,10 +83,6 @@ def test_man_reads_the_pages_without_a_warning(pieces: dict[str, install.Piece],
         said = checked("man", "--warnings", "--encoding=UTF-8", "--local-file", page)
         assert "warning" not in said
         assert "drone" in said
-
-
-def test_the_escapes_of_man() -> None:
-    assert install._escaped(r".x \n -o 100%%") == r"\&.x \en \-o 100%"
 
 
 @pytest.mark.parametrize("shell", install.SHELLS)

@@ -12,24 +12,6 @@ class Clock:
         return self.now
 
 
-def test_one_total_of_many_files() -> None:
-    clock = Clock()
-    progress = Progress(clock)
-    progress.plan(3, 3_000_000)
-    assert totals(progress) == "0/3 files, 0 B of 3.0 MB"
-    progress.begin("/a", 1_000_000)
-    for _ in range(10):
-        clock.now += 1
-        progress.at(progress.here + 100_000)
-    assert totals(progress) == "0/3 files, 1.0 MB of 3.0 MB, 100.0 kB/s, 20 s left"
-    assert current(progress, 80) == "/a  1.0 MB of 1.0 MB"
-    progress.check()
-    assert current(progress, 80) == "/a  checking"
-    progress.end(1_000_000)
-    assert (progress.done, current(progress, 80)) == (1_000_000, "")
-    assert totals(progress).startswith("1/3 files, 1.0 MB of 3.0 MB")
-
-
 def test_what_was_here_counts_as_done_but_not_as_speed() -> None:
     clock = Clock()
     progress = Progress(clock)

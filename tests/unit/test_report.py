@@ -143,11 +143,6 @@ def test_nothing_is_erased_behind_a_line_as_wide_as_the_terminal() -> None:
     assert not re.search(r"\x1b\[[0-2]?[JK]", drawn[first_text:])
 
 
-def test_a_path_that_is_too_long_keeps_its_end() -> None:
-    line = status_lines(status(None, {"reads": [READ], "rate": 5100.0}))[1].fitted(67)
-    assert line == "  reading …/10_32_15.ulg: 35 % of 3.4 MB, 5.1 kB/s, 7 min 13 s left"
-
-
 def test_everything_else_is_for_who_asks_for_it() -> None:
     facts = {
         "connection": {"rtt": 0.1, "uploads": [], "write_traits": {"renames": True}},
