@@ -18,56 +18,27 @@ import pytest
 
 from tests.mount.conftest import Field
 from tests.support.mounts import mavftpfs, wait_until
+from tests.support.places import FOLDERS, NO_RENAME, start_place
 from tests.support.takingturns import taking_turns
 from tests.support.twins import Twins
-from tests.support.vehicles import UdpVehicle
-
-SERVERS: dict[str, tuple[str, tuple[str, ...]]] = {
-    "px4": ("", ()),
-    "px4-nuttx": ("fs/microsd", ()),
-    "ardupilot": ("APM", ()),
-    "ardupilot5": ("APM", ()),
-    "littlefs": ("APM", ("inplace",)),
-    "mavsdk": ("", ()),
-    "mavsdk-server": ("", ()),
-    "spec": ("", ()),
-    "px4-2026": ("", ()),
-    "mavsdk-old": ("", ()),
-}
-"""Where each may be written, and the options it needs for that."""
 
 FAT = ("px4-nuttx", "ardupilot5")
 NOT_ON_FAT = re.compile(rb'[?"*:<>|\\]')
 
-NO_RENAME = ("littlefs",)
-"""Servers that cannot rename: programs that replace a file by rename, and do not copy it then, fail there."""
 
-
-def make_twins(field: Field, kind: str, *options: str) -> tuple[Twins, UdpVehicle]:
-    """Start a vehicle with an empty card and mount it."""
-    folder, needed = SERVERS[kind]
-    root = field.local("card")
-    card = root / folder
-    card.mkdir(parents=True, exist_ok=True)
-    vehicle: UdpVehicle = field.mavsdk(root) if kind == "mavsdk-server" else field.sim(root, kind)
-    mount = field.mount(vehicle.source, *needed, *options)
-    return Twins(mount, mount.path / folder, card, field.local("twin")), vehicle
-
-
-@pytest.fixture(
-    scope="module",
-    params=taking_turns(SERVERS, soak=("mavsdk",)),  # the library's own server is here, too
-)
+@pytest.fixture(scope="module", params=taking_turns(FOLDERS, soak=("mavsdk",)))
 def kind(request: pytest.FixtureRequest) -> str:
-    """The server's name."""
+    """The server's name; the library's own is here in place of the simulated MAVSDK."""
     name: str = request.param
     return name
 
 
 @pytest.fixture(scope="module")
 def twins(kind: str, module_field: Field) -> Twins:
-    """The server, mounted."""
-    return make_twins(module_field, kind)[0]
+    """The server with an empty card, mounted."""
+    place = start_place(module_field, kind)
+    mount = module_field.mount(place.vehicle.source, *place.options)
+    return Twins(mount, mount.path / place.folder, place.card, module_field.local("twin"))
 
 
 @pytest.fixture(scope="module")

@@ -5,9 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import TYPE_CHECKING
 
-from tests.support.vehicles import MavsdkVehicle, SimVehicle, UdpVehicle
+from tests.support.vehicles import UdpVehicle
+
+if TYPE_CHECKING:
+    from tests.mount.conftest import Field
 
 REAL = "mavsdk-server"
 """The MAVSDK library's server; all others are simulated."""
@@ -33,16 +36,6 @@ NO_RENAME = ("littlefs",)
 """Servers that cannot rename: programs that replace a file by rename cannot work there."""
 
 
-class Starter(Protocol):
-    """What starts vehicles: tests.mount.conftest.Field."""
-
-    def local(self, name: str) -> Path: ...
-
-    def sim(self, root: Path, profile: str, options: Sequence[str]) -> SimVehicle: ...
-
-    def mavsdk(self, root: Path, bad_link: Sequence[str]) -> MavsdkVehicle: ...
-
-
 @dataclass
 class Place:
     """A vehicle with an empty card. folder: what of it may be written; card: that on the local disk."""
@@ -58,7 +51,7 @@ class Place:
         return OPTIONS.get(self.kind, ())
 
 
-def start_place(field: Starter, kind: str, link: Sequence[str] = ()) -> Place:
+def start_place(field: Field, kind: str, link: Sequence[str] = ()) -> Place:
     """Start a vehicle of that kind. link: arguments of its link model."""
     root = field.local("card")
     card = root / FOLDERS[kind]

@@ -15,7 +15,6 @@ import time
 from collections import deque
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Protocol
 
 from tests.support.logs import assert_clean
 
@@ -126,29 +125,6 @@ class Process:
     def text(self) -> str:
         """Everything it wrote to stderr and stdout."""
         return self.log.read_text(errors="replace") + self.output.read_text(errors="replace")
-
-
-class Vehicle(Protocol):
-    """Something that serves the directory `root` to a mount of `source`."""
-
-    root: Path
-
-    @property
-    def source(self) -> str:
-        """SOURCE for mavftpfs."""
-        ...
-
-    def start(self) -> None:
-        """Start, or start again after kill."""
-        ...
-
-    def kill(self) -> None:
-        """kill -9: the vehicle is gone without a word."""
-        ...
-
-    def finish(self) -> None:
-        """End it and fail if it logged anything suspicious or kept a session open."""
-        ...
 
 
 class UdpVehicle:
