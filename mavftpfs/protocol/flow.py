@@ -117,6 +117,10 @@ BRIDGE = 0.35
 """While a server pauses, requests go on at this share of its rate: else it has nothing to do for a round trip
 after that. Most of them overflow its buffer."""
 
+BRIDGE_FROM = 0.03
+"""Seconds: below that round trip there is no reserve and no bridge. What a server's buffer holds lasts for
+that."""
+
 
 class Flow:
     """The in-flight window.
@@ -232,7 +236,7 @@ class Flow:
 
     def _beyond(self, now: float, paced: bool) -> float:
         """Return seconds of requests for which there is room beyond the window because a server pauses."""
-        if now >= self._paused_at + KNOWN:
+        if now >= self._paused_at + KNOWN or self._base < BRIDGE_FROM:
             return 0.0
         silence = now - self._answered_at
         if silence > PAUSE:
