@@ -10,8 +10,8 @@ from mavftpfs.protocol.burst import BurstTransfer
 from mavftpfs.protocol.chunking import ChunkSize
 from mavftpfs.protocol.engine import Engine
 from mavftpfs.protocol.flow import Flow
-from mavftpfs.protocol.ledger import BURST_JUMP, FURTHEST_JUMP, Ghost
-from mavftpfs.protocol.operations import ListDirectory, OpenFile, Operation, Simple
+from mavftpfs.protocol.ledger import BURST_JUMP, FURTHEST_JUMP
+from mavftpfs.protocol.operations import ListDirectory, OpenFile, Simple
 from mavftpfs.protocol.payload import NakCode, Opcode, Payload
 from mavftpfs.protocol.reading import ReadTransfer
 from mavftpfs.shared.errors import FtpNak, LocalProtocolError, RequestTimeout
@@ -680,11 +680,6 @@ def test_a_request_behind_others_finds_nothing_of_its_own_to_repeat() -> None:
     assert engine.in_flight == 1
 
 
-def test_a_ghost_asks_for_nothing() -> None:
-    with pytest.raises(LocalProtocolError):
-        Ghost().next_request(0.0)
-
-
 def test_an_operation_runs_once() -> None:
     engine = make()
     op = mkdir()
@@ -808,32 +803,3 @@ def test_answers_to_others_do_not_put_a_timer_off_for_ever() -> None:
 
 
 # --- facts
-
-
-def test_facts() -> None:
-    engine = make()
-    assert engine.rtt is None
-    assert engine.flow.loss == 0.0
-    assert engine.timeout("data") == 1.0
-    engine.start(mkdir(), 0.0)
-    engine.receive(ack(sent(engine, 0.0)[0]), 0.1)
-    assert engine.rtt == pytest.approx(0.1)
-    assert engine.timeout("data") == pytest.approx(0.3)
-    assert engine.timeout("path") == pytest.approx(0.3)
-    engine.note("nobody listens")
-
-
-def test_an_operation_must_be_started_to_see_the_engine() -> None:
-    op = Operation()
-    with pytest.raises(LocalProtocolError):
-        _ = op.port
-    with pytest.raises(NotImplementedError):
-        op.next_request(0.0)
-    with pytest.raises(NotImplementedError):
-        op.on_reply(None, None, 0.0)  # type: ignore[arg-type]
-    op.timer = 5.0
-    op.on_timer(5.0)
-    assert op.timer > 1e9
-    assert not op.on_burst(Payload(0, 0, 128, 0), 0.0)
-    assert not op.bursting
-    assert op.on_burst_sent(None, 0.0) == 0  # type: ignore[arg-type]

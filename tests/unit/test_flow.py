@@ -8,7 +8,7 @@ from itertools import pairwise
 import pytest
 
 from mavftpfs.protocol.engine import Engine
-from mavftpfs.protocol.flow import KNOWN, MOST, MOST_SERIAL, QUEUE, Flow
+from mavftpfs.protocol.flow import KNOWN, MOST_SERIAL, QUEUE, Flow
 from mavftpfs.protocol.operations import Simple
 from mavftpfs.protocol.payload import Opcode
 
@@ -41,14 +41,6 @@ class Path:
     def rounds(self, count: int, *, lost: int = 0) -> None:
         for _ in range(count):
             self.round(lost=lost)
-
-
-def test_begins_small() -> None:
-    assert Flow().window == 8
-    assert Flow(serial=True).window == 1
-    assert Flow(limit=2).window == 2
-    assert Flow().cap == MOST
-    assert Flow(serial=True).cap == MOST_SERIAL
 
 
 def test_grows_to_what_the_path_holds_and_not_far_beyond() -> None:
@@ -102,21 +94,6 @@ def test_a_queue_ends_the_start() -> None:
         widest = max(widest, flow.window)
     assert widest <= 64
     assert 20 <= flow.window <= 40
-
-
-def test_limits() -> None:
-    flow = Flow(limit=8)
-    path = Path(flow, rate=1000.0, base=0.1)
-    path.rounds(10)
-    assert flow.window == 8
-    flow.set_queue_limit(4)
-    assert (flow.window, flow.cap) == (4, 4)
-    path.rounds(10)
-    assert flow.window == 4
-    flow.set_queue_limit(None)
-    assert flow.cap == 8
-    flow.set_queue_limit(0)
-    assert flow.window == 1
 
 
 def test_a_start_that_overflows_a_buffer_ends() -> None:
@@ -192,14 +169,6 @@ def test_rounds_without_a_round_trip_change_little(limit: int | None) -> None:
         path.now += 1.0 / 1000.0
         flow.on_replies(path.now, None, (order,), order + flow.window)
     assert least <= flow.window <= most
-
-
-def test_rounds_in_no_time_or_without_round_trips_are_survived() -> None:
-    flow = Flow()
-    for order in range(10):
-        flow.on_replies(1.0, None, (order,), order + 1)
-    assert flow.window <= 18
-    assert flow.loss == 0.0
 
 
 def test_a_short_queue_of_ones_own_takes_one_more() -> None:
@@ -343,3 +312,45 @@ def test_on_a_fast_path_the_window_is_no_wider_than_keeps_the_server_busy(best: 
             rates.append(path.rate)
     assert max(windows) <= 160
     assert sum(rates) / len(rates) >= 0.5 * computer.rate(best)
+
+
+def test_an_answer_that_is_waited_for_queues_behind_less() -> None:
+    flow = Flow()
+    path = Path(flow, rate=1000.0, base=0.1)
+    path.rounds(20)
+    flow.begin()
+    flow.room(0, 100.0, paced=True, urgent=True)
+    full = flow.window
+    assert flow.room(full - 1, 100.0, paced=True) <= 0
+    assert flow.room(full - 1, 100.0, paced=True, urgent=True) == 1
+    flow.begin()
+    assert flow.room(full - 1, 100.0, paced=True) == 1
+
+
+@pytest.mark.parametrize("window", [1, 2, 4])
+def test_bulk_goes_on_beside_it_even_in_a_small_window(window: int) -> None:
+    flow = Flow(limit=window)
+    flow.room(0, 100.0, paced=True, urgent=True)
+    assert flow.room(0, 100.0, paced=True) >= 1
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_random_losses_at_the_start_are_not_taken_for_an_overflow(seed: int) -> None:
+    """One request or answer in five is lost, as at 10 % each way; a false ceiling would last for minutes."""
+    flow = Flow()
+    path = Path(flow, rate=400.0, base=0.3)
+    rng = random.Random(seed)
+    for _ in range(16):
+        path.round(lost=sum(rng.random() < 0.19 for _ in range(flow.window)))
+    assert flow.window > 60
+
+
+def test_reads_too_use_one_more_of_a_short_queue_of_ones_own() -> None:
+    """Five at a look instead of four: 116 KiB/s instead of 93 from an ArduPilot close by."""
+    flow = Flow()
+    flow.set_queue_limit(4)
+    assert flow.room(4, 0.0, paced=True) == 0
+    flow.alone = True
+    assert flow.room(4, 0.0, paced=True) == 1
+    flow.room(4, 0.0, paced=True, urgent=True)
+    assert flow.room(4, 0.0, paced=True) == 0, "left to who waits for a small answer"

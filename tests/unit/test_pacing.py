@@ -10,6 +10,8 @@ import pytest
 from mavftpfs.protocol.flow import Flow
 from mavftpfs.protocol.pacing import Pacer
 
+pytestmark = pytest.mark.holds("fault overflow")
+
 QUEUE = 4
 
 
@@ -176,3 +178,92 @@ def test_a_flow_uses_it_where_the_server_queues_little_and_for_whom_it_suits() -
     assert flow.room(shared, 3.0, paced=True) > 0
     flow.on_silence()
     assert flow.room(shared, 3.0, paced=True) <= 0
+
+
+QUEUED = 5 / 0.010
+"""Requests per second that the server's queue takes at most."""
+
+
+def lost(server: Server, seconds: float) -> float:
+    """Return which share of what is sent for so long finds the queue full or is lost on its way."""
+    before = server.order
+    return 1.0 - server.run(seconds) * seconds / (server.order - before)
+
+
+def fall_silent(server: Server, seconds: float) -> None:
+    """Have nothing come through for a while."""
+    server.loss, usual = 1.0, server.loss
+    for _ in range(int(seconds)):
+        server.run(1.0)
+        server.pacer.on_silence()
+    server.loss = usual
+
+
+@pytest.mark.parametrize("base", [0.03, 0.1, 0.3])
+def test_no_queue_of_ours_grows_before_a_slow_link(base: float) -> None:
+    """Each raise left one, which was then taken for the way: 0.2 s more after a minute and a half."""
+    server = Server(base=base, slowest=376.0)
+    server.run(300.0)
+    filled = 376.0 * (base + 0.012)
+    assert server.in_flight <= 1.4 * filled + QUEUE
+    assert server.run(60.0) > 0.95 * 376.0
+
+
+@pytest.mark.parametrize("base", [0.1, 0.3])
+def test_a_link_that_begins_to_lose_much_is_used_on(base: float) -> None:
+    """A third is no overflow if as much is lost of fewer: 33 a second were left of 400."""
+    server = Server(base=base)
+    server.run(30.0)
+    server.loss = 0.3
+    server.run(20.0)
+    assert server.run(20.0) > 0.4 * QUEUED
+
+
+@pytest.mark.parametrize("base", [0.1, 0.3])
+def test_a_silence_teaches_nothing_about_what_is_usually_lost(base: float) -> None:
+    """All that was lost in it was taken for usual, and from then on a sixth that found the queue full."""
+    server = Server(base=base)
+    server.run(30.0)
+    fall_silent(server, 8.0)
+    server.run(20.0)
+    assert lost(server, 60.0) < 0.05
+
+
+@pytest.mark.parametrize("base", [0.1, 0.3])
+@pytest.mark.parametrize("seed", range(3))
+def test_an_overflow_does_not_become_usual_where_much_is_lost(base: float, seed: int) -> None:
+    """As many were answered at any rate beyond what the queue takes, so chance led further and further."""
+    server = Server(base=base, loss=0.3)
+    server.rng = random.Random(seed)
+    server.run(120.0)
+    assert lost(server, 60.0) < 0.45
+
+
+@pytest.mark.parametrize("base", [0.1, 0.3])
+def test_no_queue_stays_flooded_once_a_bad_link_is_a_good_one(base: float) -> None:
+    server = Server(base=base, loss=0.4)
+    server.run(60.0)
+    server.loss = 0.0
+    server.run(120.0)
+    assert lost(server, 60.0) < 0.1
+
+
+@pytest.mark.parametrize(("before", "base"), [(0.03, 0.2), (0.1, 0.3)])
+def test_a_way_that_becomes_longer_is_filled(before: float, base: float) -> None:
+    server = Server(base=before, slowest=376.0)
+    server.run(30.0)
+    server.base = base
+    server.run(10.0)
+    assert server.run(20.0) > 0.9 * 376.0
+
+
+def test_no_queue_stands_before_a_link_that_becomes_slower() -> None:
+    server = Server(base=0.1, slowest=376.0)
+    server.run(30.0)
+    server.slowest = 75.0
+    server.run(20.0)
+    assert server.in_flight <= 1.4 * 75.0 * 0.112 + QUEUE
+    assert server.run(20.0) > 0.95 * 75.0
+    server.slowest = 376.0
+    server.run(40.0)
+    assert server.run(20.0) > 0.9 * 376.0

@@ -7,11 +7,9 @@ import pytest
 from mavftpfs.protocol.payload import (
     MAX_DATA,
     PAYLOAD_SIZE,
-    Opcode,
     Payload,
     decode_reply,
     decode_request,
-    request,
 )
 from mavftpfs.shared.errors import LocalProtocolError, RemoteProtocolError
 
@@ -33,11 +31,6 @@ def test_a_reply_holds_exactly_size_bytes() -> None:
 def test_a_request_holds_the_whole_field() -> None:
     wire = Payload(1, 0, 3, 1, 0, 0, 0, b"/").encode()
     assert decode_request(wire).data == b"/" + bytes(MAX_DATA - 1)
-
-
-def test_request_helper() -> None:
-    assert request(7, Opcode.LIST_DIRECTORY, data=b"/a").size == 2
-    assert request(7, Opcode.READ_FILE, session=2, offset=9, size=100) == Payload(7, 2, 5, 100, 0, 0, 9)
 
 
 @pytest.mark.parametrize("length", [0, 250, 252])

@@ -13,7 +13,7 @@ from mavftpfs.protocol.flow import Flow
 from mavftpfs.protocol.payload import NakCode, Opcode, Payload
 from mavftpfs.protocol.reading import ReadTransfer
 from mavftpfs.protocol.requests import Priority
-from mavftpfs.shared.errors import FileChanged, FtpNak, LocalProtocolError, MavftpfsError, SessionLost
+from mavftpfs.shared.errors import FileChanged, FtpNak, LocalProtocolError, SessionLost
 from mavftpfs.shared.extents import ExtentSet
 from mavftpfs.shared.traits import Traits
 from tests.support.replies import ack, burst_nak, chunk, nak, packet, sent
@@ -390,17 +390,3 @@ def test_packets_after_the_transfer_ended_are_dropped() -> None:
     reader.engine.receive(burst_nak(request, 0, NakCode.EOF), 0.1)
     assert not reader.transfer.on_burst(packet(request, 0, CONTENT[:239]), 0.2)
     assert reader.sink.held.empty
-
-
-def test_a_timer_without_a_burst_is_harmless() -> None:
-    reader = Reader()
-    reader.transfer.on_timer(5.0)
-    assert reader.transfer.timer > 1e9
-
-
-def test_failing_twice_keeps_the_first_error() -> None:
-    reader = Reader()
-    first: MavftpfsError = SessionLost("first")
-    reader.transfer.fail(first)
-    reader.transfer.fail(FileChanged("second"))
-    assert reader.transfer.error is first
