@@ -262,7 +262,7 @@ def copy_log(tour: Tour) -> None:
             progress.update(bar, completed=LOG_SIZE)
     if child.returncode != 0:
         raise DemoFailed(f"cp ended with {child.returncode}")
-    sums = tour.command("sha256sum", f"card/{LOG}", "flight.ulg")
+    sums = tour.command("md5sum", f"card/{LOG}", "flight.ulg")
     tour.verdict(len({line.split()[0] for line in sums.splitlines()}) == 1)
 
 
