@@ -50,6 +50,9 @@ MAX_STEPS = 8
 MISMATCHES = 2
 """After so many copies that are not what was sent the delivery fails."""
 
+LATE_WRITES = 1.0
+"""Seconds before it is sent again: over two radios a copy of a write may come so late, into the new file."""
+
 FINISHES = 3
 """How often an upload is asked to end because the source had more."""
 
@@ -162,6 +165,7 @@ class Deliverer:
                 if mismatches == MISMATCHES or isinstance(error.__cause__, Armed):  # none can be checked
                     raise
                 log.warning("%s; sending it again", error)
+                await trio.sleep(LATE_WRITES)
             except MavftpfsError as error:
                 if not isinstance(error, PASSING) or not draft.size:
                     await self.abandon(node)
