@@ -65,7 +65,8 @@ class BlockCache:
         self.on_dropped: Callable[[Version], None] = lambda version: None
         self.piece = PIECE if budget >= 8 * PIECE else BLOCK_SIZE
         self.reads = trio.Semaphore(max(1, budget // 2 // (self.piece + BLOCK_SIZE)))
-        """Held by who waits for a piece: what is waited for is not evicted, and takes at most half."""
+        """Held by who waits for a piece: what is waited for is not evicted, and takes at most half. A lock:
+        see `pathlocks`. Who holds a path alone must not wait for it."""
         self.bytes_cached = 0
         self.used: OrderedDict[tuple[Version, int], int] = OrderedDict()
 

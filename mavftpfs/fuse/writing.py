@@ -142,7 +142,10 @@ class WritingOperations(Operations):
 
     @handler
     async def flush(self, fh: int) -> None:
-        """A descriptor was closed: 0 means that everything written is on the card, checked."""
+        """A descriptor was closed: 0 means that everything written is on the card, checked.
+
+        But a file that was only emptied, or made, is delivered by fsync or release.
+        """
         file = _writable(self._file(fh))
         if file is not None:
             await file.flush()

@@ -62,7 +62,7 @@ class State(Enum):
     """
 
 
-NEXT: dict[State, frozenset[State]] = {
+SESSION_NEXT: dict[State, frozenset[State]] = {
     # Opening closes first what may be open; a refusal of the open itself proves that nothing is open.
     State.CLOSED: frozenset((State.OPENING,)),
     State.OPENING: frozenset((State.OPEN, State.CLOSED, State.MAYBE_OPEN)),
@@ -154,7 +154,7 @@ class ServerSession:
             assert bool(self.maybe_open) == (self.state is State.MAYBE_OPEN)
 
     def _enter(self, state: State, session: OpenSession | None = None) -> None:
-        assert state in NEXT[self.state], f"{self.state} does not become {state}"
+        assert state in SESSION_NEXT[self.state], f"{self.state} does not become {state}"
         self.state, self.session = state, session
         self.check_invariants()
         self._changed.unpark_all()

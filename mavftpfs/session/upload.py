@@ -44,7 +44,7 @@ class UploadState(Enum):
     """Its owner gave it up."""
 
 
-NEXT: dict[UploadState, frozenset[UploadState]] = {
+UPLOAD_NEXT: dict[UploadState, frozenset[UploadState]] = {
     UploadState.IDLE: frozenset((UploadState.QUEUED, UploadState.ENDED)),
     UploadState.QUEUED: frozenset((UploadState.QUEUED, UploadState.SENDING, UploadState.ENDED)),
     UploadState.SENDING: frozenset(
@@ -174,7 +174,7 @@ class Upload(SessionUser):
         self._changed = trio.lowlevel.ParkingLot()
 
     def _enter(self, state: UploadState) -> None:
-        assert state in NEXT[self.state], f"{self.state} does not become {state}"
+        assert state in UPLOAD_NEXT[self.state], f"{self.state} does not become {state}"
         self.state = state
         self._changed.unpark_all()
 

@@ -1,7 +1,7 @@
 """What a server was seen to do, as far as behaviour depends on it. Layer: shared; pure.
 
-None means "not seen yet". Nothing here is derived from a name or a version: the engine fills a field
-when an answer proves it, the session layer may fill one that it learned in an earlier session.
+None means "not seen yet". Nothing here is derived from a name or a version: a field is filled when an answer
+proves it, and forgotten when the vehicle restarts.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The trees that a simulated server serves: one in memory, and a real directory. Layer: sim; pure.
+"""The trees that a simulated server serves: one in memory, and a real directory. Layer: sim.
 
 Paths are bytes, separated by `/`; a leading slash is optional and `..` never leads above the root.
 Every failure is an OSError with a Linux errno number.

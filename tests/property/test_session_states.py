@@ -19,7 +19,7 @@ from mavftpfs.protocol.operations import OpenFile, Operation, Terminate
 from mavftpfs.protocol.payload import NakCode, Opcode, Payload
 from mavftpfs.session.doubt import Doubt
 from mavftpfs.session.driver import Driver
-from mavftpfs.session.serversession import NEXT, ServerSession, State
+from mavftpfs.session.serversession import SESSION_NEXT, ServerSession, State
 from mavftpfs.session.vehicle import Vehicle
 from mavftpfs.shared.errors import FtpNak, MavftpfsError, RequestTimeout
 
@@ -100,7 +100,7 @@ async def _change(server: ServerSession, path: bytes) -> None:
 
 
 def test_a_step_that_is_not_in_the_table_is_a_bug() -> None:
-    assert set(NEXT) == set(State)
+    assert set(SESSION_NEXT) == set(State)
     server = ServerSession(cast(Driver, Answering([])), Doubt(lambda: 0.0), lambda: 0.0)
     with pytest.raises(AssertionError):
         server._enter(State.CLOSING)

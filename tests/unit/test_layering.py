@@ -57,8 +57,8 @@ PURE_MODULES = {
     "fuse.handles",
     "fuse.options",
 }
-IMPURE_MODULES = {"sim.endpoints"}
-IMPURE_IMPORTS = {"trio", "time", "socket", "logging", "pyfuse3"}
+IMPURE_MODULES = {"sim.endpoints", "sim.tree", "shared.private"}
+IMPURE_IMPORTS = {"trio", "time", "socket", "logging", "pyfuse3", "os", "pathlib"}
 
 SOLE_IMPORTERS = {
     "pyfuse3": {"fuse.device", "fuse.operations", "fuse.writing", "mount"},
@@ -154,7 +154,7 @@ def may_import(module: Module, target: str) -> bool:
 
 
 def is_pure(module: Module) -> bool:
-    """Return whether the module may use neither trio, time, sockets nor the kernel."""
+    """Return whether the module may use neither trio, time, files, sockets nor the kernel."""
     return module.name in PURE_MODULES or (module.layer in PURE_LAYERS and module.name not in IMPURE_MODULES)
 
 
@@ -285,7 +285,14 @@ def test_checker_sees_a_wrong_direction(importer: str, target: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "source", ["import trio", "from time import monotonic", "import random\nx = random.random()"]
+    "source",
+    [
+        "import trio",
+        "import os",
+        "from pathlib import Path",
+        "from time import monotonic",
+        "import random\nx = random.random()",
+    ],
 )
 def test_checker_sees_an_impure_module(source: str) -> None:
     assert len(impurities(package(protocol__engine=source))) == 1
