@@ -298,7 +298,7 @@ class Reading:
                 # What woke us may be a new want, and with nothing in flight no answer would send for it.
                 self._driver.kick()
                 await self._server.sleep(_OFTEN)
-                heard_at = max(self._driver.last_reply_at, transfer.started_at)
+                heard_at = max(self._driver.last_reply_at, transfer.progress_at)  # `bwlimit=` is no silence
                 limit = max(STALL, 4.0 * (self._engine.rtt or 0.0))
                 if not transfer.idle and self._clock() - heard_at > limit:
                     raise SessionLost("no answer for a while during a read", by_server=False)
