@@ -29,7 +29,6 @@ from mavftpfs.session.driver import PayloadTrace
 from mavftpfs.shared.errors import UsageError
 from mavftpfs.shared.private import open_private
 
-REQUEST = "request"
 REPLY = "reply"
 
 _FLUSH_PERIOD = 1.0

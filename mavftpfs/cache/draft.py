@@ -105,7 +105,6 @@ TRANSITIONS: dict[State, dict[Event, State]] = {
     },
     State.STALE: {
         Event.EMPTIED: State.DIRTY,
-        Event.REPLACED: State.STALE,
     },
 }
 """State -> what may happen -> the next state. Anything else is a bug (LocalProtocolError)."""

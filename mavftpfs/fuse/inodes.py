@@ -20,7 +20,6 @@ from __future__ import annotations
 
 import hashlib
 from collections import OrderedDict
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 from mavftpfs.shared.model import ROOT
@@ -120,10 +119,6 @@ class InodeTable:
             inode = self._by_path.pop(path)
             inode.path = new + path[len(old) :]
             self._by_path[inode.path] = inode
-
-    def paths_below(self, path: bytes) -> Sequence[bytes]:
-        """Return the known paths at and below `path`, parents first."""
-        return sorted(self._subtree(path))
 
     def check_invariants(self) -> None:
         """Assert what the module's docstring promises (for tests)."""

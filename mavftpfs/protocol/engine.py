@@ -40,8 +40,8 @@ class EngineStats:
     """Plain counters since the engine was made.
 
     requests: transmissions, by_opcode too. retransmissions: those of them that repeat a request, spurious:
-    and those that turned out to be needless. replies: believed ones, burst packets included; naks: those
-    of them. unknown: replies that fit nothing outstanding (late, duplicate, not ours). stale: right seq,
+    and those that turned out to be needless. replies: believed ones, burst packets included.
+    unknown: replies that fit nothing outstanding (late, duplicate, not ours). stale: right seq,
     wrong req_opcode. incoherent: right seq, but session, offset or opcode cannot be. unexplained: unknown
     ones that no repetition of ours explains. timeouts: operations failed with RequestTimeout.
     """
@@ -50,7 +50,6 @@ class EngineStats:
     retransmissions: int = 0
     spurious: int = 0
     replies: int = 0
-    naks: int = 0
     unknown: int = 0
     stale: int = 0
     incoherent: int = 0
@@ -66,8 +65,6 @@ class Engine:
         rng: for the first seq and the session id to ask for.
         flow: the in-flight window.
         op_deadline: seconds without progress after which an operation fails with RequestTimeout.
-        traits: what is already known of the server.
-        note: called with one line for each thing a trace should show.
 
     Attributes:
         session: the id that session-agnostic requests carry (the open one, else home_session).
@@ -82,25 +79,21 @@ class Engine:
         flow: Flow,
         *,
         op_deadline: float = OP_DEADLINE,
-        traits: Traits | None = None,
-        note: Callable[[str], None] | None = None,
     ) -> None:
         self.home_session = rng.randrange(1, 256)
         self.session = self.home_session
         self.flow = flow
-        self.traits = Traits() if traits is None else traits
+        self.traits = Traits()
         self.stats = EngineStats()
         self.on_unexplained: Callable[[Payload, float], None] = lambda reply, late: None
         self._ledger = Ledger(rng.randrange(LAST_SEQ + 1))
         self._op_deadline = op_deadline
-        self._note = note
         self._ops: list[Operation] = []
         self._finished: list[Operation] = []
         self._timers = Timers()
         self._due, self._heard_at = inf, -inf
         self._burst_op: Operation | None = None  # whose the burst packets may be
         self._burst_heard_at = -inf  # believed or not: an abandoned burst of ArduPilot goes on
-        flow.set_queue_limit(self.traits.queue_limit)
 
     # --- facts
 
@@ -117,11 +110,6 @@ class Engine:
     def timeout(self, family: str) -> float:
         """Return the present retransmission timeout of a family of opcodes, in seconds."""
         return self._timers.timeout(family)
-
-    def note(self, text: str) -> None:
-        """Tell the trace something."""
-        if self._note is not None:
-            self._note(text)
 
     # --- traits
 
@@ -187,9 +175,7 @@ class Engine:
             self._believe(request, reply, now)
         elif not request.fits(reply, self.traits):
             self.stats.incoherent += 1
-        elif reply.opcode == _NAK and self._asks_again(request, reply):
-            self.note("refused under an old session id: asking again")
-        else:
+        elif reply.opcode != _NAK or not self._asks_again(request, reply):
             self._believe(request, reply, now)
 
     def receive_run(self, wires: Sequence[bytes], now: float) -> int:
@@ -222,7 +208,6 @@ class Engine:
 
     def _believe(self, request: Request, reply: Payload, now: float) -> None:
         self.stats.replies += 1
-        self.stats.naks += reply.opcode == _NAK
         self._heard_at = now
         rtt, flow = None, self.flow
         if not self._ledger.settle(request, reply.seq, now):
@@ -254,7 +239,6 @@ class Engine:
         # It may not be a replay but the rest of an abandoned burst: each new seq may be one more execution.
         limit = _MAX_SIDE_EFFECT_REPLAYS if request.manner.same_seq else _MAX_REPLAYS
         if request.replays <= limit and request.flying:
-            self.note(f"stale replay for seq {request.seq}: asking again under a new one")
             request.fresh_seq = True
             self._ledger.lose(request)
 
@@ -278,7 +262,6 @@ class Engine:
         if op is None or not op.on_burst(reply, now):
             return False
         self.stats.replies += 1
-        self.stats.naks += reply.opcode == _NAK
         self._heard_at = now
         op.progress_at = now
         if op.done:

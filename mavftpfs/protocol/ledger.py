@@ -142,8 +142,7 @@ class Ledger:
     def unheard(self) -> int:
         """Return how many that carry no bytes were repeated in vain: perhaps nobody will ever answer them.
 
-        A TruncateFile is waited for two minutes, and MAVSDK answers none (servers.md 8): it would keep a
-        window that losses made narrow from everybody else.
+        A checksum is waited for two minutes: it would keep a window that losses made narrow from everybody.
         """
         return sum(request.sends > 1 and not request.manner.ordered for request in self.flying.values())
 

@@ -113,15 +113,6 @@ class OpenFile(Simple):
         super().__init__(opcode, path, session=session)
         self.session = session
         self.size: int | None = None
-        self._asked = self._request
-
-    @property
-    def answers(self) -> list[int]:
-        """The seqs that its answers may have: one for each seq under which it went out."""
-        asked = self._asked
-        if asked is None or not asked.sends:
-            return []
-        return [*(asked.aliases or ()), asked.seq + 1]
 
     def on_ack(self, request: Request, reply: Payload) -> None:
         """Take session and size; learn whether the server echoes ids."""
@@ -157,11 +148,6 @@ class ListDirectory(Operation):
 
     Only for paths known to be directories: listing a file kills a MAVSDK server.
 
-    Args:
-        foreseen: how many strings the directory probably holds, 0 if nobody knows. What follows them is asked
-            for beside the first page, and its answer used only if the first page ends just there: the request
-            is the one that would have gone out then, a round trip later.
-
     Attributes:
         entries: what was listed, each name once, `.` and `..` left out.
         complete: False when a cap or empty pages ended the sweep: absence of a name then proves nothing.
@@ -170,7 +156,7 @@ class ListDirectory(Operation):
         on_page: called for each page.
     """
 
-    def __init__(self, path: bytes, with_time: bool = False, *, foreseen: int = 0) -> None:
+    def __init__(self, path: bytes, with_time: bool = False) -> None:
         super().__init__()
         if len(path) > MAX_DATA:
             raise PathTooLong(f"path of {len(path)} bytes does not fit the {MAX_DATA} of a request")
@@ -183,9 +169,6 @@ class ListDirectory(Operation):
         self._opcode = Opcode.LIST_DIRECTORY_WITH_TIME if with_time else Opcode.LIST_DIRECTORY
         self._names: set[bytes] = set()
         self.strings = 0
-        self._foreseen = foreseen
-        self._early: Request | None = None
-        self._early_reply: Payload | None = None
         self._asked = False
         self._pages = 0
         self._first_page = b""
@@ -194,32 +177,15 @@ class ListDirectory(Operation):
         self._empty_pages = 0
 
     def next_request(self, now: float) -> Request | None:
-        """Return the request for the next page, and once the one for what probably follows it."""
-        if not self._asked:
-            self._asked = True
-            if self._early is None or self._early.offset != self.strings:
-                return self._request(self.strings)
-        if self._foreseen > self.strings == 0:
-            self._early, self._foreseen = self._request(self._foreseen), 0
-            return self._early
-        return None
-
-    def _request(self, offset: int) -> Request:
-        manner = manner_of(self._opcode)
-        return Request(self, self._opcode, manner, 0, offset, len(self._path), self._path, follows=True)
+        """Return the request for the next page."""
+        if self._asked:
+            return None
+        self._asked = True
+        manner, path = manner_of(self._opcode), self._path
+        return Request(self, self._opcode, manner, 0, self.strings, len(path), path, follows=True)
 
     def on_reply(self, request: Request, reply: Payload, now: float) -> None:
         """Take a page, or find that there are no more."""
-        if request.offset != self.strings:  # what is behind the first page came before it, or is not there
-            self._early_reply = reply
-            return
-        self._on_page(request, reply)
-        early, known = self._early, self._early_reply
-        if early is not None and known is not None and early.offset == self.strings and not self.done:
-            self._early_reply = None
-            self._on_page(early, known)
-
-    def _on_page(self, request: Request, reply: Payload) -> None:
         if reply.opcode == Opcode.NAK:
             self._on_nak(nak_of(request, reply))
             return

@@ -57,7 +57,6 @@ _MANNERS = {
     Opcode.WRITE_FILE: WRITE_MANNER,
     Opcode.LIST_DIRECTORY: _LIST,
     Opcode.LIST_DIRECTORY_WITH_TIME: _LIST,
-    Opcode.TRUNCATE_FILE: _SLOW,
     Opcode.CALC_FILE_CRC32: _SLOW,
 }
 
@@ -208,10 +207,6 @@ class Port(Protocol):
 
     def learn_session_echo(self, echoed: bool) -> None:
         """An Open ACK carried the session id asked for, or another."""
-        ...
-
-    def note(self, text: str) -> None:
-        """Tell the trace something; cheap when nobody listens."""
         ...
 
 

@@ -11,10 +11,10 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
-from urllib.parse import quote_from_bytes, unquote_to_bytes
+from urllib.parse import unquote_to_bytes
 
 from mavftpfs.shared.errors import LocalProtocolError, UsageError
-from mavftpfs.shared.model import is_virtual, normalise
+from mavftpfs.shared.model import normalise
 
 SCHEME = "mftp://"
 _EXAMPLE = "mftp://comp=1:/fs/microsd/log"
@@ -23,7 +23,6 @@ _NEW_COMPONENT = re.compile(r"comp=([^:/]*):")
 # Some senders put the slash before the bracket.
 _OLD_COMPONENT = re.compile(r"/?\[;comp=([^\]]*)\]")
 _BAD_ESCAPE = re.compile(r"%(?![0-9A-Fa-f]{2})")
-_PLAIN = "/@?=&:;,+!$'()*~"
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,13 +61,6 @@ def parse_url(text: str) -> MftpUrl:
     except LocalProtocolError as exc:
         raise UsageError(f"{text!r}: {exc}") from exc
     return MftpUrl(component, path)
-
-
-def format_url(url: MftpUrl) -> str:
-    """Return a URL which `parse_url` takes for the same."""
-    path = url.path[1:] if is_virtual(url.path) else url.path
-    prefix = "" if url.component is None else f"comp={url.component}:"
-    return SCHEME + prefix + quote_from_bytes(path, safe=_PLAIN)
 
 
 def _component(text: str, url: str) -> int:

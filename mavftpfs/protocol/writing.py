@@ -137,11 +137,6 @@ class WriteTransfer(Chunked):
             self.finish()
 
     @property
-    def paused(self) -> bool:
-        """Whether nothing new is sent."""
-        return self._paused
-
-    @property
     def drained(self) -> bool:
         """Whether nothing is on its way."""
         return not self._unanswered

@@ -113,7 +113,6 @@ class Changes:
         async with self._changing(old, new, below=True, in_flight=completes):
             await self._perform(partial(Simple, Opcode.RENAME, data), partial(self._is_renamed, old, new))
             self._scheduler.on_renamed(old, new)
-        self._scheduler.traits.rename_works = True
 
     async def create_empty(self, path: bytes) -> None:
         """Make an empty file, or empty it; done twice it is the same."""

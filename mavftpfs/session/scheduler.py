@@ -209,8 +209,6 @@ class Scheduler:
         self.doubt.raise_it("the vehicle restarted")
         self.traits.forget()
         self._end_session()
-        self.server.forget_server()
-        self.uploading.forget_server()
 
     def on_armed_changed(self) -> None:
         """On arming uploads are terminated and held; on disarming they go on (promise 9)."""

@@ -141,7 +141,6 @@ class ServerSession:
         self._doubt = doubt
         self._clock = clock
         self._op_deadline = op_deadline
-        self._server_assigns: bool | None = None
         self._opening: bytes | None = None
         self._excluded: list[_Excluded] = []
         self._news = trio.Event()
@@ -162,6 +161,11 @@ class ServerSession:
     def _settle(self) -> None:
         """Nothing is open, as far as is known."""
         self._enter(State.MAYBE_OPEN if self.maybe_open else State.CLOSED)
+
+    @property
+    def _echoes(self) -> bool | None:
+        """Whether the session has the id that we ask for, or one that the server assigns; None: not seen."""
+        return self._engine.traits.ack_carries_own_session
 
     # --- waiting
 
@@ -227,10 +231,9 @@ class ServerSession:
         asked = self._engine.home_session
         operation = OpenFile(opcode, wire_path(path), asked)
         # A time-out or a cancellation leaves it so: the open may have been carried out.
-        self.maybe_open[0 if self._server_assigns else asked] = path
+        self.maybe_open[0 if self._echoes is False else asked] = path
         await self._driver.run(operation)
         self.maybe_open.clear()
-        self._server_assigns = operation.session != asked
         self._engine.session = operation.session
         return OpenSession(
             path,
@@ -251,7 +254,7 @@ class ServerSession:
         """
         if nak.code in _TAKEN or nak.code == NakCode.FILE_EXISTS:
             return True
-        return nak.code == NakCode.FAIL and ours and self._server_assigns is not True
+        return nak.code == NakCode.FAIL and ours and self._echoes is not False
 
     def _may_be_ours(self, nak: FtpNak) -> bool:
         """Whether an open of ours may have been carried out before this refusal: its ACK was lost, or the
@@ -329,7 +332,7 @@ class ServerSession:
         for session in list(self.maybe_open):
             if session != 0 or not self._others_heard():
                 already_closed = await self._try(Terminate(session))
-                if already_closed and session and self._server_assigns is None and not self._others_heard():
+                if already_closed and session and self._echoes is None and not self._others_heard():
                     await self._try(Terminate(0))  # the server may have given us that id instead
                 closed = True
             self.maybe_open.pop(session, None)
@@ -341,7 +344,8 @@ class ServerSession:
             raise SessionLost("the vehicle restarted, or opened another file", by_server=True)
 
     def abandon(self) -> None:
-        """What is open is lost, or not to be believed: it is closed before the next open."""
+        """What is open is lost, or not to be believed: it is closed before the next open. After a restart,
+        too: that news may come after it was opened anew."""
         if self.session is not None:
             self._let_go(self.session, State.MAYBE_OPEN)
         self.wake()
@@ -350,12 +354,6 @@ class ServerSession:
         self.maybe_open[session.id] = session.path
         self._engine.session = self._engine.home_session
         self._enter(state)
-
-    def forget_server(self) -> None:
-        """The vehicle restarted. What may be open stays so: the news may come after it was opened anew."""
-        self.abandon()
-        self._server_assigns = None
-        self._engine.session = self._engine.home_session
 
     # --- when it is taken
 
@@ -427,7 +425,7 @@ class ServerSession:
 
     def may_be_ours(self, session: int) -> bool:
         """Return whether an id may be that of our session: always, but where clients choose their ids."""
-        return self._server_assigns is not False or session == self._engine.home_session
+        return not self._echoes or session == self._engine.home_session
 
     def _others_heard(self) -> bool:
         return self._vehicle.foreign_client(self._clock())

@@ -165,7 +165,6 @@ class Uploading:
         self._doubt = doubt
         self._chunks = chunks
         self._clock = clock
-        self._paths_disarm = False
         self._transfer: WriteTransfer | None = None
 
     def open_upload(self, path: bytes, source: UploadSource) -> Upload:
@@ -174,11 +173,6 @@ class Uploading:
         upload = Upload(path, feed, self._queue, self._server, self._vehicle, self._clock)
         self._queue.add(upload)
         return upload
-
-    def forget_server(self) -> None:
-        """Perhaps other firmware runs now; nothing under way gets an answer."""
-        self._paths_disarm = False
-        self.cut_off()
 
     def cut_off(self) -> None:
         """The session is another file's, or nobody's."""
@@ -270,7 +264,7 @@ class Uploading:
             SessionLost, FtpNak, RequestTimeout, RemoteProtocolError: what the transfer failed with.
         """
         rearmed = False
-        self.path_gate.shut(self._paths_disarm)
+        self.path_gate.shut(self._engine.traits.paths_disarm)
         try:
             while True:
                 # Beside who is to wait for a window only, a short queue keeps a place for the Terminate.
@@ -281,7 +275,7 @@ class Uploading:
                 )
                 stop = await self._run(upload, session, transfer)
                 if transfer.acked_bytes and rearmed:
-                    self._paths_disarm, rearmed = True, False
+                    self._engine.traits.paths_disarm, rearmed = True, False
                 error = transfer.error
                 if error is None:
                     assert stop is not None
@@ -371,9 +365,9 @@ class Uploading:
         """Whether the Terminate goes out right behind the last requests: a round trip less for who waits.
         Servers carry them out in order; what gets lost is sent when the file is open again. Where others'
         paths cause refusals, the answers are waited for: that alone sets it right."""
-        if stop is not Stop.YIELD or self.traits.wo_truncates is not False or self._paths_disarm:
+        if stop is not Stop.YIELD or self.traits.wo_truncates is not False:
             return False
-        if self._server.is_excluded(upload.path):
+        if self._engine.traits.paths_disarm or self._server.is_excluded(upload.path):
             return False
         if transfer.all_out:
             transfer.repeat_nothing()
@@ -450,7 +444,7 @@ class Uploading:
             raise SessionLost(str(error)) from error
         last = self._end_transfer()
         if last is not None and transfer is not None:
-            self._paths_disarm |= is_disarmed(last)
+            self._engine.traits.paths_disarm |= is_disarmed(last)
             self._note_refusal(upload, transfer, last)
         if not ours or isinstance(last, SessionLost):
             raise SessionLost("the vehicle had closed the session before", by_server=True) from last

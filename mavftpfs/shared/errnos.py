@@ -15,11 +15,11 @@ import errno
 from mavftpfs.shared import errors
 
 _LIST, _LIST_WITH_TIME, _OPEN_RO, _CREATE, _OPEN_WO = 3, 16, 4, 6, 11
-_REMOVE, _MKDIR, _RMDIR, _TRUNCATE, _RENAME, _CRC = 8, 9, 10, 12, 13, 14
-_TERMINATE, _READ, _WRITE, _BURST = 1, 5, 7, 15
+_REMOVE, _MKDIR, _RMDIR, _RENAME, _CRC = 8, 9, 10, 13, 14
+_READ, _WRITE, _BURST = 5, 7, 15
 
 PATH_OPCODES = frozenset(
-    {_LIST, _LIST_WITH_TIME, _OPEN_RO, _CREATE, _OPEN_WO, _REMOVE, _MKDIR, _RMDIR, _TRUNCATE, _RENAME, _CRC}
+    {_LIST, _LIST_WITH_TIME, _OPEN_RO, _CREATE, _OPEN_WO, _REMOVE, _MKDIR, _RMDIR, _RENAME, _CRC}
 )
 """Requests that carry a path: only for these can a NAK say something about a name."""
 
@@ -39,8 +39,7 @@ _BY_REQUEST: dict[tuple[int, int], int] = {
     **{(opcode, _NOT_FOUND): errno.ENOENT for opcode in PATH_OPCODES},
     # Elsewhere FileExists is PX4's sticky EEXIST and says nothing (servers.md 12).
     **{(opcode, _EXISTS): errno.EEXIST for opcode in (_CREATE, _MKDIR, _RENAME, _OPEN_WO)},
-    # ArduPilot without these opcodes answers plain Fail (servers.md 6 and 8).
-    (_TRUNCATE, _FAIL): errno.EOPNOTSUPP,
+    # ArduPilot without this opcode answers plain Fail (servers.md 6).
     (_LIST_WITH_TIME, _FAIL): errno.EOPNOTSUPP,
     # Not the caller's fault: our own request was wrong.
     (_READ, _DATA_SIZE): errno.EIO,

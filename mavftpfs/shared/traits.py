@@ -22,12 +22,14 @@ class Traits:
         queue_limit: the most requests that may be in flight; None where no limit is known.
         write_ack_counts: WriteFile ACKs say how many bytes were written.
         write_ack_offset: they say where (MAVSDK's say 0), and are believed only if that is the place.
+        paths_disarm: a path operation made it refuse the next write (PX4 on NuttX, servers.md 8).
     """
 
     ack_carries_own_session: bool | None = None
     queue_limit: int | None = None
     write_ack_counts: bool | None = None
     write_ack_offset: bool | None = None
+    paths_disarm: bool = False
 
     def learn_session_echo(self, echoed: bool) -> None:
         """Note whether an Open ACK carried the id asked for; an echoing server has the shared queue."""

@@ -50,8 +50,6 @@ class Profile:
     """Opcode 16 lists directories as a bare D<name> (PX4 of early 2026)."""
     unknown_code: int = 7
     """NAK code for an unknown opcode (ArduPilot before mid-2026: 1)."""
-    truncate_file: bool = True
-    """TruncateFile works."""
     virtual_trees: bool = False
     """@SYS, @ROMFS, @PARAM and @MISSION exist (ArduPilot)."""
     exact_virtual_sizes: bool = False
@@ -134,7 +132,6 @@ _ARDUPILOT = Profile(
     name="ardupilot",
     family=Family.ARDUPILOT,
     unknown_code=1,
-    truncate_file=False,
     virtual_trees=True,
     double_nul=True,
     root_hides_files=True,
@@ -153,7 +150,6 @@ _ARDUPILOT5 = Profile(
     case_fold=True,
     newlib_errnos=True,
     list_with_time=True,
-    truncate_file=False,
     virtual_trees=True,
     drop_long_names=True,
     sessions=5,
@@ -167,7 +163,6 @@ _MAVSDK = Profile(
     name="mavsdk",
     family=Family.MAVSDK,
     list_with_time=True,
-    truncate_file=False,
     path_limit=239,
     write_only_truncates=True,
     write_only_creates=False,

@@ -85,7 +85,8 @@ async def _do(server: ServerSession, act: str, path: bytes) -> None:
         case "abandon":
             server.abandon()
         case "restart":
-            server.forget_server()
+            server.abandon()
+            server._engine.forget_server()
         case "exclude":
             async with trio.open_nursery() as nursery:
                 nursery.start_soon(_change, server, path)

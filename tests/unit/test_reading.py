@@ -35,7 +35,8 @@ class Reader:
         traits: Traits | None = None,
         limit: int = 4,
     ) -> None:
-        self.engine = Engine(random.Random(1), Flow(limit=limit), traits=traits)
+        self.engine = Engine(random.Random(1), Flow(limit=limit))
+        self.engine.traits = traits or Traits()
         self.sink = MemorySink(size)
         kind = BurstTransfer if bursts else ReadTransfer
         self.transfer = kind(0, size, self.sink, ChunkSize(block))

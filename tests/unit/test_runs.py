@@ -92,7 +92,9 @@ def take_singly(engine: Engine, wires: list[bytes], now: float) -> int:
 def test_runs_are_believed_as_single_replies_are(make: Make, seed: int) -> None:
     rng = random.Random(seed)
     traits = [Traits(ack_carries_own_session=seed % 2 == 1) for _ in range(2)]
-    engines = [Engine(random.Random(1), Steady(), traits=known) for known in traits]
+    engines = [Engine(random.Random(1), Steady()) for _ in range(2)]
+    for engine, known in zip(engines, traits, strict=True):
+        engine.traits = known
     (first, answer, state), (second, _, twin_state) = make(), make()
     for engine, op in zip(engines, (first, second), strict=True):
         engine.start(op, 0.0)

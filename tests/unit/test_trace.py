@@ -16,7 +16,7 @@ from mavftpfs.protocol.engine import EngineStats
 from mavftpfs.protocol.payload import NakCode, Opcode, Payload, request
 from mavftpfs.session.driver import Remarks
 from mavftpfs.shared.errors import UsageError
-from mavftpfs.trace import REPLY, REQUEST, JsonTrace, TlogWriter, text_line
+from mavftpfs.trace import REPLY, JsonTrace, TlogWriter, text_line
 
 READ = request(7, Opcode.READ_FILE, session=3, offset=478, size=100).encode()
 OPEN = request(8, Opcode.OPEN_FILE_RO, data=b"/fs/microsd/a.bin").encode()
@@ -30,9 +30,9 @@ WALL = 1795426200.25
 
 def test_json_lines(tmp_path: Path) -> None:
     with JsonTrace(tmp_path / "trace", data_limit=3, wall_clock=lambda: WALL) as trace:
-        trace.payload(1.5, REQUEST, READ, "retransmit")
+        trace.payload(1.5, "request", READ, "retransmit")
         trace.payload(2.25, REPLY, DATA)
-        trace.payload(3.0, REQUEST, OPEN)
+        trace.payload(3.0, "request", OPEN)
         trace.payload(4.0, REPLY, b"short")
     lines = [json.loads(line) for line in (tmp_path / "trace").read_text().splitlines()]
     assert {line.pop("time") for line in lines} == {"2026-11-23T09:30:00.250000+00:00"}
@@ -76,8 +76,8 @@ def test_json_lines(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("direction", "wire", "line"),
     [
-        (REQUEST, READ, "-> READ_FILE seq 7 session 3 offset 478 size 100"),
-        (REQUEST, OPEN, "-> OPEN_FILE_RO seq 8 session 0 offset 0 size 17 b'/fs/microsd/a.bi'..."),
+        ("request", READ, "-> READ_FILE seq 7 session 3 offset 478 size 100"),
+        ("request", OPEN, "-> OPEN_FILE_RO seq 8 session 0 offset 0 size 17 b'/fs/microsd/a.bi'..."),
         (REPLY, DATA, "<- BURST_READ_FILE ACK seq 8 session 3 offset 478 size 4 complete b'abcd'"),
         (REPLY, NAK, "<- OPEN_FILE_RO NAK FAIL_ERRNO seq 9 session 0 offset 0 size 2 b'\\x1c'"),
         (REPLY, b"", "reply of 0 bytes, malformed"),

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
-from mavftpfs.protocol.url import MftpUrl, format_url, is_url, parse_url
+from mavftpfs.protocol.url import MftpUrl, is_url, parse_url
 from mavftpfs.shared.errors import UsageError
 
 
@@ -64,16 +62,3 @@ def test_errors(text: str, says: str) -> None:
 def test_is_url() -> None:
     assert is_url("mftp://a")
     assert not is_url("/mftp://a")
-
-
-names = st.binary(min_size=1, max_size=20).filter(
-    lambda n: n not in (b".", b"..") and b"/" not in n and b"\0" not in n
-)
-
-
-@given(st.none() | st.integers(1, 255), st.lists(names, max_size=4))
-def test_round_trip(component: int | None, parts: list[bytes]) -> None:
-    url = MftpUrl(component, b"/" + b"/".join(parts))
-    text = format_url(url)
-    assert text.isascii()
-    assert parse_url(text) == url
