@@ -31,6 +31,7 @@ from mavftpfs import control
 from mavftpfs.control import ControlError, NobodyThere
 from mavftpfs.fuse.handles import XATTR_STATUS
 from mavftpfs.mountpoint import OUR_TYPE, Mounted, mounts
+from mavftpfs.session.vehicle import SILENCE_LIMIT
 from mavftpfs.shared.readable import autopilot_name, printable, readable_size, readable_time
 
 log = logging.getLogger("mavftpfs.vehicle")
@@ -41,8 +42,6 @@ PERIOD = 0.25
 """Seconds between two looks at the connection: a heartbeat holds until the next, about a second."""
 RATE_SPAN = 20
 """Looks over which the traffic on the link is averaged."""
-SILENCE = 5.0
-"""Seconds without heartbeats after which the vehicle counts as lost for people."""
 MOST = 100
 """Entries of each list: an extended attribute holds 64 KiB. `held` counts them all."""
 _TOLD = {"transfers", "errors", "reads"}
@@ -110,7 +109,7 @@ def link_state(connection: Facts) -> str:
     if connection.get("another_vehicle"):
         return "replaced"
     age = connection.get("heartbeat_age")
-    if connection.get("lost") or (age is not None and age > SILENCE):
+    if connection.get("lost") or (age is not None and age > SILENCE_LIMIT):
         return "lost"
     loss = connection.get("speed", {}).get("loss") or 0.0
     return "lossy" if loss >= LOSSY else "fine"

@@ -19,12 +19,9 @@ from mavftpfs.cache.remote import RemoteStore
 from mavftpfs.cache.singleflight import SingleFlight
 from mavftpfs.shared.errnos import errno_for
 from mavftpfs.shared.errors import FtpNak, NotADirectory, NotFound, PathTooLong, VehicleLost
-from mavftpfs.shared.model import ROOT, DirEntry, EntryKind, Listing, join, split
+from mavftpfs.shared.model import DOT, ROOT, DirEntry, EntryKind, Listing, hides_files, join, split
 
 log = logging.getLogger("mavftpfs.cache")
-
-DOT = b"."
-"""The working directory of a server that runs as a process (ArduPilot SITL)."""
 
 MAX_DEPTH = 256
 """More components than any path that fits a request has."""
@@ -212,7 +209,7 @@ class Directories:
 
     async def _list(self, path: bytes) -> Listing:
         listing = await self._store.list_directory(path)
-        if path == ROOT and not self._dot_refused and _hides_files(listing):
+        if not self._dot_refused and hides_files(path, listing.entries):
             return await self._with_dot(listing)
         return listing
 
@@ -233,10 +230,3 @@ class Directories:
             listing.complete and dot.complete,
             listing.hidden + dot.hidden,
         )
-
-
-def _hides_files(listing: Listing) -> bool:
-    """Return whether this looks like ArduPilot's `/` with its files left out."""
-    names = {entry.name for entry in listing.entries}
-    plain = any(entry.kind is EntryKind.FILE for entry in listing.entries)
-    return not plain and not names.isdisjoint((b"@SYS", b"@ROMFS"))

@@ -219,7 +219,7 @@ class Files:
         return entry
 
     async def open_reader(self, version: Version) -> None:
-        """Open a version's file, after a doubt in a new session of the server.
+        """Give a version a reader. In doubt the file is opened anew at once, else when bytes are wanted.
 
         Raises:
             FileChanged: it is smaller now. Else as RemoteStore.open_reader.

@@ -110,10 +110,8 @@ class Throttle:
             self.let_go()
 
     def let_go(self) -> None:
-        """Have those who wait look again."""
-        self._has_moved = (
-            True  # whoever waits next undoes it: an event for each ACK would cost more than the ACK
-        )
+        """Have those who wait look again. Who waits from now on waits for the next news."""
+        self._has_moved = True  # `wait` makes the new event: one for each ACK would cost more than the ACK
         self._moved.set()
 
     def transfers(self) -> list[dict[str, object]]:

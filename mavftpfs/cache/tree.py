@@ -281,7 +281,7 @@ class Tree:
             await self._require_parent(remote)
             self._local.mkdir(remote)
         else:
-            await self._writing.names.mkdir(remote)
+            await self._writing.namespace.mkdir(remote)
 
     async def rmdir(self, path: bytes) -> None:
         """Remove an empty directory.
@@ -296,7 +296,7 @@ class Tree:
         elif self._local.names(remote):
             raise DirectoryNotEmpty(f"{remote!r} holds local files")
         else:
-            await self._writing.names.rmdir(remote)
+            await self._writing.namespace.rmdir(remote)
 
     async def unlink(self, path: bytes) -> None:
         """Remove a file; who has it open goes on reading it.
@@ -309,7 +309,7 @@ class Tree:
         if self._local.owns(remote):
             self._local.unlink(remote)
         else:
-            await self._writing.names.unlink(remote)
+            await self._writing.namespace.unlink(remote)
 
     async def rename(self, old: bytes, new: bytes, *, noreplace: bool = False) -> None:
         """Rename a file or directory, over what is there if the rules of rename(2) allow it.
@@ -327,7 +327,7 @@ class Tree:
             await self._require_parent(target)
             self._local.rename(source, target, noreplace=noreplace)
         else:
-            await self._writing.names.rename(source, target, noreplace=noreplace)
+            await self._writing.namespace.rename(source, target, noreplace=noreplace)
             self._local.move_below(source, target)
 
     def undelivered(self) -> Sequence[bytes]:

@@ -254,7 +254,7 @@ class Version:
 
     @property
     def compared(self) -> bool:
-        """Whether it was known to be the path's file since the server opened that the last time, or
+        """Whether something showed that it is the path's file after the server opened that last, or
         restarted."""
         return self.compared_at >= self.opened_at
 

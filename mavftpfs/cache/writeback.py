@@ -53,7 +53,7 @@ class Writeback:
     """The writing half of the tree (see cache.tree.Tree for what each call does).
 
     Attributes:
-        overlay: what programs see that no listing shows. names: mkdir, rmdir, unlink and rename.
+        overlay: what programs see that no listing shows. namespace: mkdir, rmdir, unlink and rename.
     """
 
     def __init__(
@@ -97,8 +97,8 @@ class Writeback:
         self._deliverer = deliverer = Deliverer(context, names, cleaner, throttle)
         self._background = Background(context, deliverer, throttle, cleaner)
         self.overlay = Overlay(context)
-        self.names = Namespace(context, names, deliverer, self.overlay)
-        self._parts = Parts(context, deliverer, throttle, self._background, self.overlay, self.names)
+        self.namespace = Namespace(context, names, deliverer, self.overlay)
+        self._parts = Parts(context, deliverer, throttle, self._background, self.overlay, self.namespace)
         if not options.read_only:
             directories.on_swept = cleaner.on_swept
         files.is_changing = context.is_changing

@@ -49,7 +49,7 @@ class Parts:
     throttle: Throttle
     background: Background
     overlay: Overlay
-    names: Namespace
+    namespace: Namespace
 
 
 class ReadFile(OpenFile):
@@ -115,7 +115,7 @@ class ReadFile(OpenFile):
         if not self._closed:
             self.close()
             if self._node.removed and not self._node.handles:
-                await self._parts.names.release(self._node)
+                await self._parts.namespace.release(self._node)
 
     def close(self) -> None:
         """Close without delivering; closing twice is harmless."""

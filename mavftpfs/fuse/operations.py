@@ -46,7 +46,7 @@ DEADLINE_MARGIN = 3.0
 """Seconds the tree gets beyond op_deadline to report its own, better error."""
 
 CRC_BUDGET = 120.0
-"""Seconds for a checksum: the drone reads the whole file for it (design promise 2)."""
+"""Seconds for a checksum: the drone reads the whole file for it (promise 2)."""
 
 SLOWEST_RATE = 256
 """Bytes/s of the slowest link worth waiting for. The tree ends a read without progress by itself; this

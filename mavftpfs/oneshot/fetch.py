@@ -51,8 +51,8 @@ LEAST_READ, LARGEST_READ = 2048, 128 * 1024
 QUICK, SLOW = 0.25, 1.0
 """Seconds after which reads become larger, or smaller."""
 
-CLOCK_SET = 946_684_800
-"""2000-01-01 UTC: an earlier time is that of a clock that nobody set."""
+EARLIEST = 946_684_800
+"""2000-01-01 UTC: an earlier time tells people nothing. (That a clock was set takes more: see cache.kept.)"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,7 +76,7 @@ class Step(Enum):
 
 def known_time(mtime: int) -> int | None:
     """Return a listed time, None where it tells nothing."""
-    return mtime if mtime >= CLOCK_SET else None
+    return mtime if mtime >= EARLIEST else None
 
 
 def decide(size: int, here: int | None, part: int | None) -> Step:

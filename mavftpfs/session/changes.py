@@ -23,7 +23,7 @@ from mavftpfs.session.doubt import MOST_LATE
 from mavftpfs.session.scheduler import Scheduler
 from mavftpfs.session.vehicle import Vehicle
 from mavftpfs.shared.errors import FtpNak, MavftpfsError, OutcomeUnknown, PathTooLong, RequestTimeout
-from mavftpfs.shared.model import ROOT, DirEntry, EntryKind, Listing, split, wire_path
+from mavftpfs.shared.model import DOT, DirEntry, EntryKind, Listing, hides_files, split, wire_path
 
 RENAME_LIMIT = 238
 """Bytes that both paths of a rename and the NUL between them may have (docs/servers.md 9)."""
@@ -37,9 +37,6 @@ SWEEPS = 3
 
 COPY_RATE = 100_000.0
 """Bytes per second that the slowest card checksums; the question is not repeated before."""
-
-DOT = b"."
-"""Lists the root on ArduPilot's SITL, with the files that "/" does not show there (docs/servers.md 6)."""
 
 _MISSING = frozenset((NakCode.FAIL, NakCode.FAIL_ERRNO, NakCode.FILE_NOT_FOUND))
 """What servers say of a name that is not there (any more); the errno may be a stale one (docs/servers.md 12).
@@ -72,7 +69,8 @@ class Changes:
     """Removes, makes, renames and empties. list_directory: sweeps a directory.
 
     All methods raise FtpNak, RequestTimeout, VehicleLost, SessionBusy, PathTooLong, Armed: it did not happen;
-    or OutcomeUnknown: nobody knows.
+    or OutcomeUnknown: nobody knows. Only create_empty looks at no listing: after its RequestTimeout the file
+    may be there, and empty.
     """
 
     def __init__(
@@ -239,8 +237,7 @@ class Changes:
     async def _entries(self, directory: bytes) -> tuple[tuple[DirEntry, ...], bool]:
         """Return what a fresh listing shows, and whether it is complete."""
         entries, complete = await self._steady(directory)
-        if directory == ROOT and not any(entry.kind is EntryKind.FILE for entry in entries):
-            # ArduPilot's SITL hides the files of the root in "/" and shows them in "." (docs/servers.md 6).
+        if hides_files(directory, entries):
             with suppress(FtpNak):
                 entries += (await self._steady(DOT))[0]
         return entries, complete

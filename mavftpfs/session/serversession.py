@@ -300,6 +300,7 @@ class ServerSession:
         self.maybe_open.pop(session.id, None)
         if not operation.already_closed:
             return True
+        # Our own first request closed it, if no server closes an idle session so soon.
         return operation.retransmitted and self._clock() - asked_at < _SURELY_OPEN
 
     async def close_quietly(self) -> bool:

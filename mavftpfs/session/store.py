@@ -27,7 +27,7 @@ TIME_SILENCES = 2
 look the same once."""
 
 CRC_PATIENCE = 120.0
-"""Seconds a vehicle may need for a checksum (design promise 2)."""
+"""Seconds a vehicle may need for a checksum (promise 2)."""
 
 CRC_TIME = 5.0
 """Seconds before a checksum is asked for again where the file's size is not known."""

@@ -139,8 +139,8 @@ class Upload(SessionUser):
         state: see UploadState. error: why the last attempt failed; None while it goes well.
         transfer: what sends its bytes now. begun, resent: see cache.remote.Upload.
         retry_at: not to be touched before. reboots: of the vehicle, when its file was opened last.
-        endings: how often all that the source had was out, and the file was to be closed: `complete` is for
-            who called `finish` until then.
+        endings: counted when a turn begins, and when all that the source had is out and the file is to be
+            closed. What was given before is in that file: `complete` tells who called `finish` until then.
         refused_at: where a write was refused the last time as if the session were lost.
     """
 

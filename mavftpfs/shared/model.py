@@ -6,6 +6,7 @@ Paths are bytes, absolute in the *mount's* spelling: `/a/b`, `/@SYS/uarts.txt`; 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
 
@@ -46,6 +47,19 @@ class Listing:
     took: float
     complete: bool = True
     hidden: int = 0
+
+
+DOT = b"."
+"""The working directory of a server that runs as a process (ArduPilot SITL)."""
+
+
+def hides_files(path: bytes, entries: Sequence[DirEntry]) -> bool:
+    """Return whether a listing looks like the `/` of ArduPilot's SITL, which has its files in `DOT` only
+    (servers.md 14.32)."""
+    if path != ROOT:
+        return False
+    names, kinds = {entry.name for entry in entries}, {entry.kind for entry in entries}
+    return EntryKind.FILE not in kinds and not names.isdisjoint((b"@SYS", b"@ROMFS"))
 
 
 def join(parent: bytes, name: bytes) -> bytes:
