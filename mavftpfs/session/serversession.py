@@ -120,7 +120,6 @@ class ServerSession:
         state: see State. session: what is open in the state OPEN.
         maybe_open: files that may be open over there by our doing, by session id.
         kept_out: whether the last request that needs no session was refused because of somebody else's.
-        resets, quiet_periods: how often these remedies were used.
     """
 
     def __init__(
@@ -134,7 +133,6 @@ class ServerSession:
         self.session: OpenSession | None = None
         self.maybe_open: dict[int, bytes] = {}
         self.kept_out = False
-        self.resets = self.quiet_periods = 0
         self._driver = driver
         self._engine = driver.engine
         self._vehicle = driver.vehicle
@@ -395,12 +393,10 @@ class ServerSession:
             raise nak
         for seconds in left.silences:
             if await self._driver.be_silent(seconds):
-                self.quiet_periods += 1
                 return
         if not left.resets or self._others_heard():
             raise SessionBusy("the vehicle's only FTP session is in use by another client") from nak
         left.resets -= 1
-        self.resets += 1
         session = self._engine.home_session
         await self._try(Simple(Opcode.RESET_SESSIONS, b"", session=session, side_effect=True))
 

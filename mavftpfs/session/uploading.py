@@ -141,7 +141,6 @@ class Uploading:
 
     Attributes:
         traits: what the server was seen to do. path_gate: what asks the server for a path passes it.
-        rearms: how often PX4's scratch buffer had to be set right.
     """
 
     def __init__(
@@ -156,7 +155,6 @@ class Uploading:
     ) -> None:
         self.traits = traits
         self.path_gate = PathGate(server.wake)
-        self.rearms = 0
         self._server = server
         self._driver = driver
         self._engine = driver.engine
@@ -423,7 +421,6 @@ class Uploading:
 
         One request from beyond the end suffices; whatever it answers, the next write tells.
         """
-        self.rearms += 1
         wire = wire_path(storage_root(path)).rstrip(b"/") + b"/"
         try:
             await self._driver.run(Simple(Opcode.LIST_DIRECTORY, wire, offset=_BEYOND_ANY_LISTING))

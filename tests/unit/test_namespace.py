@@ -8,6 +8,7 @@ from contextlib import suppress
 import pytest
 import trio
 
+from mavftpfs.cache.options import MIN_CACHE_SIZE
 from mavftpfs.cache.repair import STALE_AFTER
 from mavftpfs.cache.reserved import Kind, Reserved
 from mavftpfs.shared.errors import (
@@ -97,6 +98,24 @@ async def test_a_directory_filled_behind_our_back_is_not_removed(store: FakeWrit
     store.add(b"/d/empty/new", b"")
     with pytest.raises(DirectoryNotEmpty):
         await tree.rmdir(b"/d/empty")
+
+
+async def test_who_changes_names_needs_no_room_for_reading(fat: FakeWriter) -> None:
+    """Readers that wait have all of that, and each wants its path shared, to open its file."""
+    tree = make_writable(fat, cache_size=MIN_CACHE_SIZE)
+    opened = await tree.open(b"/d/full/x")
+    fat.chunk_delay = 25.0
+    async with trio.open_nursery() as readers:
+        for name in (b"/d/a", b"/d/b", b"/d/full/x"):
+            readers.start_soon(read_file, tree, name)
+        await trio.sleep(1)
+        assert tree._blocks.reads.statistics().tasks_waiting
+        with trio.fail_after(10):
+            await tree.rename(b"/d/full/x", b"/d/full/y")
+            await tree.unlink(b"/d/full/y")
+            await tree.mkdir(b"/d/new")
+        readers.cancel_scope.cancel()
+    opened.close()
 
 
 async def test_renames(store: FakeWriter) -> None:
