@@ -9,9 +9,9 @@ At open it is decided whether what is cached of the path is still the vehicle's 
 
 While a file is open the server's session on it is closed and opened again: after losses, restarts, and turns
 of other files. Then size and mtime are compared (`FileHandle.read`): equal, or larger, means the same file,
-because logs grow; else readers that were given bytes get FileChanged, and others go on with the file that is
-there now. The open reply tells the size; the mtime takes a listing that began after the reopening, where
-listings tell any. After the vehicle restarted nothing is proven.
+because logs grow. Else readers get FileChanged; only where the size is equal and none of them was given bytes
+they go on with the file that is there now. The open reply tells the size; the mtime takes a listing that
+began after the reopening, where listings tell any. After the vehicle restarted nothing is proven.
 
 The kernel has one page cache for all handles of a path, so a new version bypasses it (direct_io) while
 handles of an older one are open.

@@ -230,7 +230,7 @@ class Version:
             waiter.scope.deadline = trio.current_time() + self._cache.patience
 
     def on_suspect(self, reason: str) -> None:
-        """Drop what came since the reader was opened; whoever waits asks again."""
+        """Drop what came since the reader was opened, given out or not; whoever waits asks again."""
         if self.doubted:
             return
         self.doubted = True

@@ -1,4 +1,4 @@
-"""Doubt: one flag with a time. Layer: session; pure.
+"""Doubt: when something was noticed, and when something that concerns reads. Layer: session; pure.
 
 Servers share session ids between clients, requests name a session and no file, and some links deliver a
 request twice, the second time late. Whatever shows that this happened raises the same doubt: an answer that
