@@ -56,6 +56,10 @@ LATE_WRITES = 1.0
 FINISHES = 3
 """How often an upload is asked to end because the source had more."""
 
+SENT_TWICE = 4096
+"""Bytes of the largest file that is sent before it is known whether the card can rename. It goes in a round
+trip or two, so sending it again on the few cards that cannot costs less than four requests in each mount."""
+
 PASSING = (RequestTimeout, LinkError, SessionBusy, Armed)
 """Errors after which the upload goes on where it stopped."""
 
@@ -141,9 +145,8 @@ class Deliverer:
     # --- one delivery
 
     def _plan(self, node: Node, draft: Draft) -> Plan:
-        if node.path in self._context.own.torn and draft.state is State.DIRTY:
-            return Plan.MEND  # it was written again before its name had a file
-        return choose(draft, self._context.store.traits, inplace=self._context.options.inplace)
+        torn = node.path in self._context.own.torn
+        return choose(draft, self._context.store.traits, torn=torn, inplace=self._context.options.inplace)
 
     async def _deliver(self, node: Node, draft: Draft) -> None:
         mismatches = 0
@@ -225,8 +228,10 @@ class Deliverer:
             return attempt
         await self.abandon(node)
         context, places = self._context, None
-        if context.options.inplace and draft.base is not None and context.store.traits.rename_works is None:
-            await self._names.find_out(node.path)  # a card may have no room for two files, and never tell
+        # A card may have no room beside the file that `inplace` replaces, and never tell.
+        ask_first = draft.size > SENT_TWICE or (context.options.inplace and draft.base is not None)
+        if ask_first and context.store.traits.rename_works is None:
+            await self._names.find_out(node.path)
             plan = self._plan(node, draft)
         if plan is Plan.OVERWRITE or isinstance(node.error, AlreadyExists):  # which all of it was sent for
             await self._require_expected(node, draft)

@@ -43,7 +43,8 @@ class State(Enum):
 
     CLEAN: it has all of it. DIRTY: it does not, and nothing is under way. SENDING: a new file is written
     under a reserved name. COMMITTING: that file is verified and being renamed into place. TORN: the renames
-    were interrupted, so the name may lack its file. STALE: the base is another file now.
+    were interrupted, so nobody knows whether it was delivered (`OwnNames.torn`: which names may lack their
+    file). STALE: the base is another file now.
     """
 
     CLEAN = "clean"
@@ -568,10 +569,10 @@ SENDING = frozenset({Plan.REPLACE, Plan.OVERWRITE})
 """Steps that send bytes."""
 
 
-def choose(draft: Draft, traits: WriteTraits, *, inplace: bool) -> Plan:
+def choose(draft: Draft, traits: WriteTraits, *, torn: bool, inplace: bool) -> Plan:
     """Return the next step for a draft, by what the server was seen to do.
 
-    inplace: overwrite files where they cannot be replaced.
+    torn: its name may lack its file on the card. inplace: overwrite files where they cannot be replaced.
 
     Raises:
         FileChanged: the base is another file now.
@@ -581,7 +582,7 @@ def choose(draft: Draft, traits: WriteTraits, *, inplace: bool) -> Plan:
         return Plan.NOTHING
     if draft.state is State.STALE:
         raise FileChanged("others replaced the file on the vehicle while it was changed here")
-    if draft.state is State.TORN:
+    if draft.state is State.TORN or (torn and draft.state is State.DIRTY):  # written again meanwhile
         return Plan.MEND
     if traits.rename_works is False and draft.base is not None and not inplace and not draft.begun:
         raise NotSupported("this server cannot rename, so a file cannot be replaced safely; see inplace")

@@ -117,7 +117,8 @@ class OwnNames:
     Attributes:
         owner: the mount's token.
         live: names in use, so no listing's repair touches them.
-        torn: paths that may lack their file on the vehicle though nobody removed them -> where it lies.
+        torn: paths that may lack their file on the vehicle though nobody removed them -> where it lies. What
+            became of a draft is another question: its state says that.
         garbage: reserved paths that could not be removed yet -> the path they belong to. Who removes that
             path has to remove them first.
     """

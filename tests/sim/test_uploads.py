@@ -9,14 +9,17 @@ import pytest
 import trio
 from trio.testing import MockClock
 
+from mavftpfs.cache.delivery import SENT_TWICE
 from mavftpfs.link.messages import Address
-from mavftpfs.protocol.payload import NakCode, Opcode, request
+from mavftpfs.protocol.payload import MAX_DATA, NakCode, Opcode, request
 from mavftpfs.session.connection import Connection, ConnectOptions
 from mavftpfs.shared.errnos import errno_for
 from mavftpfs.shared.errors import Armed, FtpNak, MavftpfsError, SpoolFailed
 from mavftpfs.sim.linkmodel import LinkSettings
 from mavftpfs.sim.profiles import PROFILES
+from tests.support.fake_writer import write_file
 from tests.support.faults import Faults
+from tests.support.mounting import mounted
 from tests.support.sources import MemorySource
 from tests.support.takingturns import taking_turns
 from tests.support.uploads import know, put, start, under_way
@@ -51,6 +54,19 @@ async def test_a_small_file_costs_create_write_terminate(profile: str, autojump:
             Opcode.WRITE_FILE: 1,
             Opcode.TERMINATE_SESSION: 1,
         }
+
+
+@pytest.mark.parametrize("size", [SENT_TWICE + 1, 200_000])
+async def test_the_first_large_file_is_sent_once_where_the_card_cannot_rename(
+    size: int, autojump: MockClock
+) -> None:
+    here = world("littlefs")
+    target, data = path("littlefs", "new"), content(size)
+    async with mounted(here, target[:-4]) as (connection, tree):
+        await write_file(tree, target, data)
+        assert connection.engine.stats.by_opcode[Opcode.WRITE_FILE] == -(-size // MAX_DATA)
+        assert here.tree.data(target) == data
+    assert {entry.name for entry in here.tree.entries(target[:-4])} == {b".", b"..", b"new"}
 
 
 PLAIN = LinkSettings(rate=20_000.0, delay=0.02)

@@ -39,21 +39,24 @@ def draft(base: int | None, write: tuple[int, bytes] | None = None, size: int | 
     ],
 )
 def test_plans(made: Draft, traits: WriteTraits, plan: Plan) -> None:
-    assert choose(made, traits, inplace=False) is plan
+    assert choose(made, traits, torn=False, inplace=False) is plan
 
 
 def test_without_rename_nothing_is_replaced_unless_allowed() -> None:
     changed = draft(10, (0, b"x"), 0)
     with pytest.raises(NotSupported):
-        choose(changed, RENAMES_NOT, inplace=False)
-    assert choose(changed, RENAMES_NOT, inplace=True) is Plan.OVERWRITE
+        choose(changed, RENAMES_NOT, torn=False, inplace=False)
+    assert choose(changed, RENAMES_NOT, torn=False, inplace=True) is Plan.OVERWRITE
 
 
 def test_what_was_interrupted_is_mended_first_and_what_is_stale_is_an_error() -> None:
     torn = draft(None)
     torn.state = State.TORN
-    assert choose(torn, RENAMES, inplace=False) is Plan.MEND
+    assert choose(torn, RENAMES, torn=False, inplace=False) is Plan.MEND
+    torn.write(0, b"x")
+    assert choose(torn, RENAMES, torn=True, inplace=False) is Plan.MEND
+    assert choose(torn, RENAMES, torn=False, inplace=False) is Plan.REPLACE
     stale = draft(10)
     stale.lose_base()
     with pytest.raises(FileChanged):
-        choose(stale, RENAMES, inplace=False)
+        choose(stale, RENAMES, torn=False, inplace=False)
