@@ -25,13 +25,7 @@ import trio
 from mavftpfs.cache.dentries import Dentries
 from mavftpfs.cache.kept_disk import FileKey, Kept, KeptDisk
 from mavftpfs.cache.versions import BLOCK_SIZE, Version
-from mavftpfs.shared.errors import (
-    Armed,
-    FtpNak,
-    RemoteProtocolError,
-    RequestTimeout,
-    VehicleLost,
-)
+from mavftpfs.shared.errors import MavftpfsError
 from mavftpfs.shared.model import DirEntry, is_virtual
 
 log = logging.getLogger("mavftpfs.cache")
@@ -144,7 +138,7 @@ class KeptCache:
         with trio.move_on_after(CRC_LIMIT) as scope:
             try:
                 return _of_crc32(key, await self._crc32(key.path))
-            except (Armed, FtpNak, RemoteProtocolError, RequestTimeout, VehicleLost):
+            except MavftpfsError:  # without one all is read
                 return None
         self._crc_silent = scope.cancelled_caught
         return None

@@ -100,7 +100,8 @@ class RemoteStore(Protocol):
         long the vehicle may need, before which the question is not repeated.
 
         Raises:
-            Armed: not asked in flight. FtpNak, RequestTimeout, VehicleLost.
+            Armed: not asked in flight. FtpNak, RequestTimeout, VehicleLost. SessionBusy: another client's
+            session kept the question out, so it may be asked again later.
         """
         ...
 

@@ -27,10 +27,14 @@ from mavftpfs.protocol.payload import crc32
 from mavftpfs.shared.errors import (
     Armed,
     DataUnproven,
+    FileBusy,
+    FtpNak,
     LinkError,
     MavftpfsError,
     NotDeliveredYet,
+    NotSupported,
     RequestTimeout,
+    SessionBusy,
     UsageError,
     VehicleLost,
 )
@@ -140,12 +144,17 @@ PART_SUFFIX = ".part"
 MAX_RETURNS = 20
 """How often a vehicle may vanish and return while one file is fetched."""
 
-_WHY_NOT: dict[type[MavftpfsError], str] = {
+_NOT_NOW: dict[type[MavftpfsError], str] = {
     Armed: "no checksums while armed",
     NotDeliveredYet: "the vehicle is armed, or has not got all of it yet",
     RequestTimeout: "the vehicle did not answer",
+    SessionBusy: "another program has the vehicle's session",
+    FileBusy: "another program has the vehicle's session",  # so a mount says it
 }
 """Why there is no checksum now, though there may be one later."""
+
+NO_CHECKSUM = (*_NOT_NOW, FtpNak, NotSupported)
+"""Errors that say that there is no checksum, and nothing else about the file."""
 
 
 class LocalDiskFull(UsageError):
@@ -395,8 +404,8 @@ class Fetcher:
             theirs = await self.session.files.crc32(wanted.remote)
         except LinkError:
             raise
-        except (Armed, NotDeliveredYet, RequestTimeout) as exc:
-            why = next(words for kind, words in _WHY_NOT.items() if isinstance(exc, kind))
+        except tuple(_NOT_NOW) as exc:
+            why = next(words for kind, words in _NOT_NOW.items() if isinstance(exc, kind))
             await self._require_size(wanted, size)
             if resumed:
                 raise NotProvenYet(

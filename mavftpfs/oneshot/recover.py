@@ -16,17 +16,13 @@ from pathlib import Path
 from typing import Any
 
 from mavftpfs.exits import NotDelivered
+from mavftpfs.oneshot.fetch import NO_CHECKSUM
 from mavftpfs.oneshot.files import READ_SIZE, Session
 from mavftpfs.oneshot.progress import Progress
 from mavftpfs.oneshot.transfer import Piece, Put, Sent, put_paths
 from mavftpfs.protocol.payload import crc32
 from mavftpfs.shared.errors import (
-    Armed,
-    FtpNak,
-    NotDeliveredYet,
     NotFound,
-    NotSupported,
-    RequestTimeout,
     UsageError,
 )
 from mavftpfs.shared.model import EntryKind, normalise
@@ -232,7 +228,7 @@ async def _prove(session: Session, path: bytes, kept: Kept) -> None:
 async def _crc32(session: Session, path: bytes) -> int | None:
     try:
         return await session.files.crc32(path)
-    except (Armed, FtpNak, NotDeliveredYet, NotSupported, RequestTimeout):
+    except NO_CHECKSUM:
         return None
 
 

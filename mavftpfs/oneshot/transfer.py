@@ -20,6 +20,7 @@ from mavftpfs.cache.attributes import Stat
 from mavftpfs.compose import plain_nursery
 from mavftpfs.exits import NotDelivered
 from mavftpfs.oneshot.fetch import (
+    NO_CHECKSUM,
     Complain,
     Fetched,
     Fetcher,
@@ -37,17 +38,12 @@ from mavftpfs.oneshot.names import emptied, make_directory
 from mavftpfs.oneshot.progress import Progress
 from mavftpfs.protocol.payload import crc32
 from mavftpfs.shared.errors import (
-    Armed,
     CrossDevice,
     DataUnproven,
-    FtpNak,
     IsADirectory,
     LinkError,
     MavftpfsError,
     NotADirectory,
-    NotDeliveredYet,
-    NotSupported,
-    RequestTimeout,
     UsageError,
 )
 from mavftpfs.shared.model import EntryKind, is_snapshot, join, split
@@ -201,7 +197,7 @@ async def _cat(session: Session, path: bytes, out: BinaryIO, verify: Verify) -> 
         return
     try:
         theirs = await session.files.crc32(path)
-    except (Armed, NotDeliveredYet, RequestTimeout, FtpNak, NotSupported):
+    except NO_CHECKSUM:
         return
     if theirs != crc:
         raise DataUnproven(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from io import BytesIO
 from pathlib import Path
 from typing import cast
 
@@ -23,13 +24,15 @@ from mavftpfs.oneshot.fetch import (
 from mavftpfs.oneshot.files import Files, Session
 from mavftpfs.oneshot.progress import Progress
 from mavftpfs.oneshot.sync import Outcome, Wish
-from mavftpfs.oneshot.transfer import Got, get_paths
+from mavftpfs.oneshot.transfer import Got, cat_paths, get_paths
 from mavftpfs.shared.errors import (
     Armed,
     DataUnproven,
+    FileBusy,
     FtpNak,
     MavftpfsError,
     RequestTimeout,
+    SessionBusy,
     UsageError,
     VehicleLost,
 )
@@ -153,7 +156,7 @@ async def test_a_part_of_another_file_is_found_out(tmp_path: Path) -> None:
     assert fetched.resumed == 0
 
 
-@pytest.mark.parametrize("error", [Armed("x"), RequestTimeout("x")])
+@pytest.mark.parametrize("error", [Armed("x"), RequestTimeout("x"), SessionBusy("x"), FileBusy("x")])
 async def test_what_was_resumed_waits_for_its_proof(tmp_path: Path, error: Exception) -> None:
     tree = SpoiltTree({b"/big": BIG})
     tree.crc_error = error
@@ -187,6 +190,15 @@ async def test_without_a_checksum_it_says_what_was_proven(
     fetched = await get(tree, b"/big", tmp_path / "big")
     assert fetched.proof.startswith("size (")
     assert words in fetched.proof
+
+
+@pytest.mark.parametrize("error", [FtpNak(14, 7), SessionBusy("x"), FileBusy("x")])
+async def test_without_a_checksum_what_is_written_out_counts(error: Exception) -> None:
+    tree = SpoiltTree({b"/big": BIG})
+    tree.crc_error = error
+    out, got = BytesIO(), Got()
+    await cat_paths(Session(cast(Files, tree), b"/"), [b"/big"], out, "all", pytest.fail, got)
+    assert (out.getvalue(), got.done) == (BIG, 1)
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,7 @@ from mavftpfs.cache.remote import VehicleStore
 from mavftpfs.cache.tree import Tree
 from mavftpfs.cache.versions import BLOCK_SIZE
 from mavftpfs.protocol.payload import NakCode, Opcode
-from mavftpfs.shared.errors import FileChanged, FtpNak
+from mavftpfs.shared.errors import FileChanged, FtpNak, SessionBusy
 from tests.support.fake_store import FakeStore, read_file
 from tests.unit.test_files import DATA, LOG, content
 
@@ -198,7 +198,7 @@ async def test_without_an_mtime_a_checksum_decides(mounts: Mounts) -> None:
     assert mounts.store.count("open") == 1
 
 
-@pytest.mark.parametrize("why", ["not allowed", "refused", "silent", "incomplete"])
+@pytest.mark.parametrize("why", ["not allowed", "refused", "taken", "silent", "incomplete"])
 async def test_without_an_mtime_and_a_checksum_all_is_read(mounts: Mounts, why: str) -> None:
     mounts.store.add(LOG, DATA, None)
     await mounts.read_and_settle()
@@ -211,9 +211,11 @@ async def test_without_an_mtime_and_a_checksum_all_is_read(mounts: Mounts, why: 
     async def refuse(path: bytes, *, size: int | None = None) -> int:
         if why == "silent":
             await trio.sleep(10 * CRC_LIMIT)
+        if why == "taken":
+            raise SessionBusy("by another ground station")
         raise FtpNak(Opcode.CALC_FILE_CRC32, NakCode.FAIL)
 
-    if why in ("refused", "silent"):
+    if why in ("refused", "taken", "silent"):
         store.crc32 = refuse  # type: ignore[method-assign]
     tree = mounts.mount()
     began = trio.current_time()
