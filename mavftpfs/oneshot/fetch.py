@@ -153,7 +153,7 @@ _NOT_NOW: dict[type[MavftpfsError], str] = {
 }
 """Why there is no checksum now, though there may be one later."""
 
-NO_CHECKSUM = (*_NOT_NOW, FtpNak, NotSupported)
+NO_CHECKSUM: tuple[type[MavftpfsError], ...] = (*_NOT_NOW, FtpNak, NotSupported)
 """Errors that say that there is no checksum, and nothing else about the file."""
 
 
