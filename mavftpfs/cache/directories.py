@@ -11,6 +11,7 @@ import logging
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from functools import partial
+from math import inf
 
 import trio
 
@@ -25,6 +26,9 @@ log = logging.getLogger("mavftpfs.cache")
 
 MAX_DEPTH = 256
 """More components than any path that fits a request has."""
+
+LOOK = 1.0
+"""Seconds after which who waits for a listing, and knows an older one, looks whether the vehicle is heard."""
 
 SWEEP_TRIES = 3
 """How often a listing is repeated because names came or went meanwhile through us."""
@@ -97,7 +101,7 @@ class Directories:
         return Found(entry, directory)
 
     async def get(self, path: bytes) -> Directory:
-        """Return a directory's listing: fresh, else swept, else (the vehicle being lost) expired.
+        """Return a directory's listing: fresh, else swept, else (the vehicle being silent) expired.
 
         Raises:
             NotFound, NotADirectory; else as RemoteStore.list_directory.
@@ -112,7 +116,7 @@ class Directories:
                 await self._walk_to_root()
             elif path != ROOT and (await self.find(path)).entry.kind is not EntryKind.DIRECTORY:
                 raise NotADirectory(f"{path!r} is not a directory")
-            swept = await self._sweeping.run(path, partial(self._sweep, path))
+            swept = await self._swept(path, LOOK if directory is not None else inf)
         except VehicleLost:
             if directory is None:
                 raise
@@ -120,6 +124,18 @@ class Directories:
         if self.on_swept is not None:
             await self.on_swept(path, swept)
         return swept
+
+    async def _swept(self, path: bytes, patience: float) -> Directory:
+        """Return a new listing. The vehicle is looked at each `patience` seconds.
+
+        Raises:
+            VehicleLost: it was silent by then. The listing goes on, for whoever asks next.
+        """
+        while True:
+            with trio.move_on_after(patience):
+                return await self._sweeping.run(path, partial(self._sweep, path))
+            if self._store.is_silent():
+                raise VehicleLost("no heartbeats")
 
     async def ask(self, path: bytes) -> Directory:
         """Return a directory's listing asked for just now.

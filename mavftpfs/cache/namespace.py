@@ -156,6 +156,8 @@ class Namespace:
             self._context.files.on_changed(path)
         node.lose_name()
         self._context.nodes.detach(node)
+        if not node.handles:
+            node.drop_draft()
 
     # --- inside: renaming
 
@@ -221,6 +223,8 @@ class Namespace:
         if displaced is not None and not displaced.removed:
             displaced.lose_name()
             self._context.nodes.detach(displaced)
+            if not displaced.handles:
+                displaced.drop_draft()
 
     async def _replace(self, old: bytes, new: bytes, displaced: Node | None) -> None:
         """Rename over a file; who has that open keeps it."""

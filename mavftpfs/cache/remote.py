@@ -70,6 +70,10 @@ class Reader(Protocol):
 class RemoteStore(Protocol):
     """The vehicle's files."""
 
+    def is_silent(self) -> bool:
+        """Return whether no heartbeat was heard for some seconds."""
+        ...
+
     async def list_directory(self, path: bytes) -> Listing:
         """Sweep a directory that is known to be one.
 

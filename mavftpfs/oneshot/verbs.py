@@ -360,7 +360,7 @@ def _list_kept(found: Sequence[recovering.Kept], *, as_json: bool) -> None:
     if left:
         print(left)
     elif not found:
-        print("everything that was written reached its vehicle")
+        print("nothing was kept")
 
 
 # -- looking --------------------------------------------------------------------------------------

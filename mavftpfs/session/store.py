@@ -16,6 +16,7 @@ from mavftpfs.session.driver import Driver
 from mavftpfs.session.reader import FileStream
 from mavftpfs.session.scheduler import Scheduler
 from mavftpfs.session.upload import Upload
+from mavftpfs.session.vehicle import SILENCE_LIMIT
 from mavftpfs.shared.errors import Armed, FtpNak, RemoteProtocolError, RequestTimeout
 from mavftpfs.shared.model import DirEntry, Listing, wire_path
 
@@ -71,6 +72,10 @@ class Store:
         """The vehicle rebooted, perhaps with other firmware."""
         self.lists_times = None
         self._time_silences = 0
+
+    def is_silent(self) -> bool:
+        """Return whether the vehicle is silent (see RemoteStore)."""
+        return self._vehicle.silence(self._clock()) > SILENCE_LIMIT
 
     async def list_directory(self, path: bytes) -> Listing:
         """Sweep a directory (see RemoteStore)."""

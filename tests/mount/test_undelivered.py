@@ -99,7 +99,7 @@ def left_behind(field: Field, data: Path) -> tuple[Mount, SimVehicle, Path]:
 
 
 def test_what_was_kept_is_listed_and_put_back_on_demand(field: Field, data: Path, state: Path) -> None:
-    assert run("recover")[0] == "everything that was written reached its vehicle\n"
+    assert run("recover")[0] == "nothing was kept\n"
     _, vehicle, card = left_behind(field, data)
     (directory,) = state.iterdir()
     heading, line = run("recover")[0].splitlines()

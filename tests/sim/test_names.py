@@ -419,3 +419,19 @@ async def test_230_bytes_are_refused_before_anything_is_changed(profile: str, au
         assert tree.undelivered() == []
     assert not CHANGING & {opcode for opcode, _ in requests}
     assert here.tree.data(path) == OLD
+
+
+@pytest.mark.holds("promise 4")
+@pytest.mark.parametrize("profile", taking_turns(EVERY))
+async def test_a_known_directory_does_not_wait_for_a_silent_vehicle(
+    profile: str, autojump: MockClock
+) -> None:
+    """Nor until a request has timed out."""
+    scene = Scene(profile)
+    async with scene.mounted() as tree:
+        known = dict(await tree.list(scene.root))
+        await trio.sleep(60.0)
+        scene.world.link.cut()
+        began = trio.current_time()
+        assert dict(await tree.list(scene.root)).keys() == known.keys()
+        assert trio.current_time() - began < 10.0

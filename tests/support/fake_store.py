@@ -113,6 +113,10 @@ class FakeStore:
 
     # --- RemoteStore
 
+    def is_silent(self) -> bool:
+        """See RemoteStore."""
+        return self.lost
+
     async def list_directory(self, path: bytes) -> Listing:
         await self._begin("list", path, Opcode.LIST_DIRECTORY)
         if path in self.files:

@@ -236,7 +236,7 @@ def test_nothing_to_put_back_is_no_error(
 ) -> None:
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
     assert cli.main(["recover", SOURCE, "--all"]) == 0
-    assert capsys.readouterr().out == "everything that was written reached its vehicle\n"
+    assert capsys.readouterr().out == "nothing was kept\n"
     _, line = complaint(capsys, "recover", SOURCE)
     assert "say which files" in line
 

@@ -212,6 +212,18 @@ async def test_killed_after_it_was_unlinked(store: FakeWriter, spool: SpoolDirec
     assert await killed(tree, spool, tmp_path) == {}
 
 
+async def test_removing_what_was_not_delivered_frees_its_place(store: FakeWriter, tmp_path: Path) -> None:
+    tree = make_writable(store, dirty_max=65536, spool_max=2 * len(BIG))
+    for _ in range(5):
+        file = await begin(tree, store)
+        with pytest.raises(MavftpfsError):
+            await file.flush()
+        file.close()
+        store.lost = False
+        await tree.unlink(FILE)
+        assert tree.status()["bytes_held_on_disk"] == 0
+
+
 async def test_killed_after_fsync_and_more(store: FakeWriter, spool: SpoolDirectory, tmp_path: Path) -> None:
     tree, file = await written(store, spool)
     await file.fsync()
