@@ -116,7 +116,7 @@ class Directories:
                 await self._walk_to_root()
             elif path != ROOT and (await self.find(path)).entry.kind is not EntryKind.DIRECTORY:
                 raise NotADirectory(f"{path!r} is not a directory")
-            swept = await self._swept(path, LOOK if directory is not None else inf)
+            swept = await self._swept(path, older=directory is not None)
         except VehicleLost:
             if directory is None:
                 raise
@@ -125,12 +125,13 @@ class Directories:
             await self.on_swept(path, swept)
         return swept
 
-    async def _swept(self, path: bytes, patience: float) -> Directory:
-        """Return a new listing. The vehicle is looked at each `patience` seconds.
+    async def _swept(self, path: bytes, *, older: bool) -> Directory:
+        """Return a new listing. older: one is known that will do while the vehicle is silent.
 
         Raises:
-            VehicleLost: it was silent by then. The listing goes on, for whoever asks next.
+            VehicleLost: it is silent. The listing goes on, for whoever asks next.
         """
+        patience = LOOK if older and self._sweeping.outlives_callers else inf
         while True:
             with trio.move_on_after(patience):
                 return await self._sweeping.run(path, partial(self._sweep, path))
