@@ -128,7 +128,7 @@ def test_a_hundred_kilobytes_per_second(profile: str, direction: Direction, rtt:
     [
         ("read", 100_000.0, 0.1, 0.92, 1.1),
         ("read", 250_000.0, 0.1, 0.77, 1.3),
-        ("write", 100_000.0, 0.3, 0.85, 1.2),
+        ("write", 100_000.0, 0.3, 0.84, 1.2),  # 1.2 of its 30 s go to whether the card can rename
         pytest.param("read", 1_000_000.0, 0.01, 0.94, 1.5, marks=pytest.mark.soak),
         pytest.param("read", 1_000_000.0, 0.1, 0.83, 1.7, marks=pytest.mark.soak),
     ],
