@@ -154,10 +154,7 @@ class Namespace:
         if there:
             await self._names.remove_if_there(path)
             self._context.files.on_changed(path)
-        node.lose_name()
-        self._context.nodes.detach(node)
-        if not node.handles:
-            node.drop_draft()
+        self._context.nodes.unnamed(node)
 
     # --- inside: renaming
 
@@ -221,10 +218,7 @@ class Namespace:
                 await self._names.remove_directory(new)
             await self._names.rename(old, new)
         if displaced is not None and not displaced.removed:
-            displaced.lose_name()
-            self._context.nodes.detach(displaced)
-            if not displaced.handles:
-                displaced.drop_draft()
+            self._context.nodes.unnamed(displaced)
 
     async def _replace(self, old: bytes, new: bytes, displaced: Node | None) -> None:
         """Rename over a file; who has that open keeps it."""

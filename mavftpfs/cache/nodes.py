@@ -222,6 +222,13 @@ class Nodes:
         if self._by_path.get(node.path) is node:
             del self._by_path[node.path]
 
+    def unnamed(self, node: Node) -> None:
+        """The node's file was removed, or another one was renamed over it; what only its name needed goes."""
+        node.lose_name()
+        self.detach(node)
+        if not node.handles:
+            node.drop_draft()
+
     def replaced(self, node: Node) -> None:
         """The node's name is another file's: who has it open keeps the node, and others get a new one."""
         self._stale = [other for other in self._stale if other.handles] + [node]

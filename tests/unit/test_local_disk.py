@@ -212,7 +212,8 @@ async def test_killed_after_it_was_unlinked(store: FakeWriter, spool: SpoolDirec
     assert await killed(tree, spool, tmp_path) == {}
 
 
-async def test_removing_what_was_not_delivered_frees_its_place(store: FakeWriter, tmp_path: Path) -> None:
+@pytest.mark.parametrize("how", ["unlink", "rename over it"])
+async def test_removing_what_was_not_delivered_frees_its_place(store: FakeWriter, how: str) -> None:
     tree = make_writable(store, dirty_max=65536, spool_max=2 * len(BIG))
     for _ in range(5):
         file = await begin(tree, store)
@@ -220,7 +221,12 @@ async def test_removing_what_was_not_delivered_frees_its_place(store: FakeWriter
             await file.flush()
         file.close()
         store.lost = False
-        await tree.unlink(FILE)
+        if how == "unlink":
+            await tree.unlink(FILE)
+        else:
+            await write_file(tree, b"/card/other", b"small")
+            await tree.rename(b"/card/other", FILE, noreplace=False)
+            await tree.unlink(FILE)
         assert tree.status()["bytes_held_on_disk"] == 0
 
 
