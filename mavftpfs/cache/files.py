@@ -352,8 +352,11 @@ class Files:
     def _on_dropped(self, version: Version) -> None:
         """Bytes of a version were dropped: the kernel may hold copies."""
         version.shown = False
-        if version in self.open_versions or self._current.get(version.path) is version:
+        current = self._current.get(version.path) is version
+        if current or version in self.open_versions:
             self._invalidate(version.path)
+        if current and not version.handles:
+            self._forget(version)  # to open it anew costs less than to compare it with a listing
 
     def rebooted(self) -> None:
         """Nothing is proven any more; open files are compared before more of them is given out."""

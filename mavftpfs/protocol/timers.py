@@ -15,10 +15,9 @@ INITIAL_RTO = 1.0
 """Seconds to wait while no round trip is known, if nothing better is."""
 
 LONGEST_BACK_OFF = 3.0
+"""Seconds between two tries that doubling reaches at most: a link that comes back should not wait longer."""
 _FREE_SILENCES = 2
 _MAX_DOUBLINGS = 7
-
-_LONGEST_WAIT = 5.0
 
 _FIRST_WAITS = {"list": 0.5}
 """Seconds to wait while no round trip is known, where that is not INITIAL_RTO.
@@ -62,10 +61,7 @@ class RttEstimator:
         self._silences = 0
         self.unfloored = first
         self.rto = max(first, floor)
-        """How long to wait for a reply before it is asked again.
-
-        Backed off to at most LONGEST_BACK_OFF: a link that comes back should not wait longer for us.
-        """
+        """How long to wait for a reply before it is asked again, backed off after silences."""
         self.samples = 0
         self.smoothed = 0.0
         self.variation = 0.0
@@ -160,16 +156,16 @@ class Timers:
         """Return how long to wait for the reply to this transmission of a request, in seconds."""
         manner = request.manner
         timer = self.of[manner.family]
-        wait = rto = timer.rto
+        base, rto = max(timer.unfloored, timer.floor), timer.rto
         patient = request.sends >= manner.patient_after
         if patient and manner.family == _WORK:
             # The way and the work take their times one after the other.
-            wait = rto = rto + self._work_of(request)
+            work = self._work_of(request)
+            base, rto = base + work, rto + work
         # Under the same seq no repetition tells the round trip: where that is not known, it may be longer.
         free = manner.free_sends if timer.samples or not manner.same_seq else 1
-        doublings = request.sends - free
-        if doublings > 0:
-            wait = min(rto * (1 << min(doublings, 6)), max(rto, _LONGEST_WAIT))
+        doublings = min(max(0, request.sends - free), _MAX_DOUBLINGS)
+        wait = max(rto, min(base * (1 << doublings), LONGEST_BACK_OFF))
         return max(wait, manner.patience) if patient and manner.family != _WORK else wait
 
     def _learn_pace(self, request: Request, elapsed: float) -> None:

@@ -373,6 +373,22 @@ async def test_doubtful_bytes_do_not_survive_the_last_close(store: FakeStore, tr
     assert store.count("crc") == 0
 
 
+async def test_a_closed_file_whose_bytes_were_dropped_is_read_again_without_a_listing(
+    store: FakeStore, tree: Tree
+) -> None:
+    """A tree is read twice over a link that doubles: with a listing for each file that took minutes."""
+    handle = await tree.open(LOG)
+    await handle.read(0, len(DATA))
+    sink = store.readers[0].sink
+    handle.close()
+    sink.on_suspect("late news")
+    assert store.invalidated == [LOG]
+    listings = store.count("list")
+    assert await read_file(tree, LOG) == DATA
+    assert store.count("list") == listings
+    assert store.count("reader") == 2
+
+
 @pytest.mark.parametrize("delay", [0.0, 0.002])
 async def test_closing_the_last_handle_under_a_read_ends_it(
     store: FakeStore, tree: Tree, delay: float
