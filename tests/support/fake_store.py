@@ -235,6 +235,7 @@ class FakeReader:
         elif size < self.size:
             raise FileChanged("shrank")
         self.opened = True
+        self.sink.on_opened(trio.current_time())
 
     async def _serve(self) -> None:
         try:
