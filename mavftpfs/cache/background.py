@@ -56,6 +56,8 @@ class Background:
             attempt.sending.growing = node.idle.is_set()  # nobody writes to one being delivered
             attempt.upload.wake()
         elif self._context.nursery is not None and not node.starting:
+            if attempt is not None and node.draft is not None and node.draft.size:
+                node.start_after = float("inf")  # who changes what was sent does so again
             due = self._context.clock() >= node.start_after and not self._context.blocked
             much = attempt is not None or (node.draft is not None and node.draft.unacked >= START_AT)
             if due and much and node.undelivered and _may_pass(node):

@@ -211,7 +211,7 @@ class Deliverer:
                 break
         else:
             raise RemoteProtocolError(f"{attempt.path!r} was said to be finished, and was not")
-        doubted = attempt.sending.rewritten or writer.in_doubt() or writer.doubted_since(attempt.begun_at)
+        doubted = writer.in_doubt() or writer.doubted_since(attempt.begun_at)
         crc32 = await self.verifier.check(attempt.path, draft, doubted=doubted)
         if attempt.places is None:
             node.attempt = None

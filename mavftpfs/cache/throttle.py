@@ -84,7 +84,7 @@ class Throttle:
         draft, attempt = node.draft, node.attempt
         if draft is None or node.removed or draft.unacked <= LEAST:
             return False  # nothing is delivered of a file without a name
-        if attempt is None and (node.start_after == float("inf") or self._context.nursery is None):
+        if node.start_after == float("inf") or (attempt is None and self._context.nursery is None):
             return False  # nothing of it moves before it is closed: it waits on the local disk
         streams = sum(other.attempt is not None for other in self._context.nodes)
         return draft.unacked > self.limit // max(streams, 1)
