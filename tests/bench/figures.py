@@ -158,8 +158,8 @@ def ratio(value: float | None, reference: float | None) -> float | None:
     return None if value is None or not reference else value / reference
 
 
-def as_json(thing: Run | Row | LinkShape) -> dict[str, Any]:
-    """Return a run, row or shape as JSON has it: few digits, so that a rerun differs where it matters."""
+def as_json(thing: Run | Row) -> dict[str, Any]:
+    """Return a run or row as JSON has it: few digits, so that a rerun differs where it matters."""
     return {
         key: float(f"{value:.4g}") if isinstance(value, float) else value
         for key, value in asdict(thing).items()

@@ -1,4 +1,4 @@
-"""The share of a link that reading and writing reach, on virtual time: python -m tests.bench.goodput --help.
+"""The share of a link that reading and writing reach, on virtual time: scripts/bench goodput --help.
 
 Deterministic: a simulated vehicle with its real queue and timing, a modelled link, no clock but the model's.
 Writing is timed from open to close through the caches, with verify=size; reading from open to the last byte
@@ -8,10 +8,8 @@ through the session. Bytes are compared in every run.
 from __future__ import annotations
 
 import argparse
-import json
 import random
 import signal
-import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, replace
 from functools import partial
@@ -29,6 +27,7 @@ from mavftpfs.protocol.payload import MAX_DATA
 from mavftpfs.session.connection import Connection
 from mavftpfs.sim.linkmodel import Direction as LinkDirection
 from mavftpfs.sim.linkmodel import LinkSettings
+from tests.bench import record
 from tests.bench.cases import Case, Direction, Result
 from tests.support.mounting import writable_tree
 from tests.support.worlds import ROOTS, MemorySink, World
@@ -158,12 +157,7 @@ def show(results: list[Result]) -> None:
     console.print(table)
 
 
-def as_json(results: list[Result]) -> list[dict[str, object]]:
-    """Return everything that is known of each run."""
-    return [asdict(result) | {"target": result.case.target} for result in results]
-
-
-def main() -> int:
+def main(argv: Sequence[str]) -> int:
     """Measure and print."""
     parser = argparse.ArgumentParser(prog="scripts/bench goodput", description="share of the link's limit")
     profiles = ["px4", "px4-nuttx", "ardupilot", "ardupilot5", "littlefs", "mavsdk"]
@@ -173,17 +167,11 @@ def main() -> int:
     parser.add_argument("--rtts", nargs="+", type=float, default=[0.01, 0.1, 0.3])
     parser.add_argument("--losses", nargs="+", type=float, default=[0.0, 0.01, 0.05, 0.1])
     parser.add_argument("--seconds", type=float, default=60.0, help="link time of each run")
-    parser.add_argument("--json", type=Path, help="write the results here too")
-    arguments = parser.parse_args()
+    parser.add_argument("--json", type=Path, help="put the results into this file")
+    arguments = parser.parse_args(argv)
     results = everything(list(cases(arguments)), arguments.seconds)
     show(results)
     if arguments.json is not None:
-        arguments.json.write_text(json.dumps(as_json(results), indent=1))
+        found = [asdict(result) | {"target": result.case.target} for result in results]
+        record.put(arguments.json, "goodput", argv, 0.0, found)
     return 0
-
-
-if __name__ == "__main__":
-    try:
-        sys.exit(main())
-    except KeyboardInterrupt:
-        sys.exit(130)

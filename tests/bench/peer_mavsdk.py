@@ -1,6 +1,6 @@
 """The MAVSDK library's FTP client moving one file; run by the Python of the peers' own environment.
 
-    peer_mavsdk.py PORT read|write REMOTE LOCAL [--plain]
+    peer_mavsdk.py PORT read|write REMOTE LOCAL
 
 REMOTE and LOCAL must have the same last part: the library names the copy after the original. Nothing of the
 project is imported.
@@ -26,7 +26,6 @@ def main() -> int:
     parser.add_argument("direction", choices=["read", "write"])
     parser.add_argument("remote")
     parser.add_argument("local")
-    parser.add_argument("--plain", action="store_true", help="read by ReadFile one by one, not by bursts")
     args = parser.parse_args()
     configuration = Configuration.create_with_component_type(ComponentType.GROUND_STATION)
     with Mavsdk(configuration) as mavsdk:
@@ -54,7 +53,7 @@ def move(ftp: Ftp, args: argparse.Namespace) -> str:
             ended.set()
 
     if args.direction == "read":
-        ftp.download_async(args.remote, os.path.dirname(args.local), not args.plain, on_progress)
+        ftp.download_async(args.remote, os.path.dirname(args.local), True, on_progress)
     else:
         ftp.upload_async(args.local, posixpath.dirname(args.remote), on_progress)
     ended.wait()

@@ -11,13 +11,14 @@ from __future__ import annotations
 import ctypes.util
 import hashlib
 import os
+import platform
 import select
 import shutil
 import subprocess
 import sys
 import time
 import venv
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -66,26 +67,29 @@ class Measured:
     detail: str = ""
 
 
+@dataclass(frozen=True, slots=True)
 class Client:
-    """One way to move a file; `name` is what tables call it."""
+    """One way to move a file; `name` is what tables call it.
+
+    argv: the command line for a job, and the mount point. mounts: it is a mount. prepare: makes sure that it
+    can run, or raises NotToBeHadError.
+    """
 
     name: str
+    argv: Callable[[Job, Path], list[str]]
+    mounts: bool = False
     directions: tuple[Direction, ...] = ("read", "write")
-
-    def takes_part(self, direction: Direction, *, shaped: bool) -> bool:
-        """Whether there is something to compare, on a shaped link or the loopback."""
-        return direction in self.directions
-
-    def prepare(self) -> None:
-        """Make sure that it can run.
-
-        Raises:
-            NotToBeHadError: it cannot.
-        """
+    prepare: Callable[[], object] = lambda: None
 
     def run(self, job: Job) -> Measured:
         """Do the job; everything that was started has ended on return."""
-        raise NotImplementedError
+        point = job.folder / "mnt"
+        point.mkdir()
+        return (
+            _by_mount(self.argv(job, point), point, job)
+            if self.mounts
+            else _by_worker(self.argv(job, point), job)
+        )
 
 
 def cpu_of(pid: int) -> float:
@@ -123,100 +127,66 @@ class Lines:
             self._buffer += piece
 
 
-class Worker(Client):
-    """A client that is a process of its own, spoken to by lines."""
-
-    def __init__(
-        self, name: str, argv: Callable[[Job], list[str]], *, prepare: Callable[[], object] = lambda: None
-    ) -> None:
-        self.name = name
-        self._argv = argv
-        self._prepare = prepare
-
-    def prepare(self) -> None:
-        self._prepare()
-
-    def run(self, job: Job) -> Measured:
-        log = job.folder / "worker.log"
-        with log.open("wb") as errors:
-            child = subprocess.Popen(
-                self._argv(job), stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=errors, cwd=PROJECT
-            )
-        try:
-            measured = self._converse(child, job)
-        finally:
-            child.kill()
-            child.communicate()
-        if measured.outcome is Outcome.FAILED and not measured.detail:
-            return Measured(Outcome.FAILED, detail=_last_line(log))
-        return measured
-
-    @staticmethod
-    def _converse(child: subprocess.Popen[bytes], job: Job) -> Measured:
-        assert child.stdout is not None
-        assert child.stdin is not None
-        lines = Lines(child.stdout.fileno())
-        first = lines.await_one(("ready", "failed"), CONNECT_TIMEOUT)
-        if first != "ready":
-            return Measured(Outcome.FAILED, detail=first or "")
-        cpu = cpu_of(child.pid)
-        began = time.monotonic()
-        child.stdin.write(b"go\n")
-        child.stdin.flush()
-        answer = lines.await_one(("done", "failed"), job.timeout)
-        seconds = time.monotonic() - began
-        if answer is None:
-            return Measured(Outcome.TIMEOUT if seconds >= job.timeout else Outcome.FAILED)
-        if answer != "done":
-            return Measured(Outcome.FAILED, detail=answer.removeprefix("failed "))
-        return Measured(Outcome.OK, seconds, cpu_of(child.pid) - cpu, _peak(child.pid))
+def _by_worker(argv: list[str], job: Job) -> Measured:
+    log = job.folder / "worker.log"
+    with log.open("wb") as errors:
+        child = subprocess.Popen(
+            argv, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=errors, cwd=PROJECT
+        )
+    try:
+        measured = _converse(child, job)
+    finally:
+        child.kill()
+        child.communicate()
+    if measured.outcome is Outcome.FAILED and not measured.detail:
+        return Measured(Outcome.FAILED, detail=_last_line(log))
+    return measured
 
 
-class MountClient(Client):
-    """A mount, and `cp`."""
+def _converse(child: subprocess.Popen[bytes], job: Job) -> Measured:
+    assert child.stdout is not None
+    assert child.stdin is not None
+    lines = Lines(child.stdout.fileno())
+    first = lines.await_one(("ready", "failed"), CONNECT_TIMEOUT)
+    if first != "ready":
+        return Measured(Outcome.FAILED, detail=first or "")
+    cpu = cpu_of(child.pid)
+    began = time.monotonic()
+    child.stdin.write(b"go\n")
+    child.stdin.flush()
+    answer = lines.await_one(("done", "failed"), job.timeout)
+    seconds = time.monotonic() - began
+    if answer is None:
+        return Measured(Outcome.TIMEOUT if seconds >= job.timeout else Outcome.FAILED)
+    if answer != "done":
+        return Measured(Outcome.FAILED, detail=answer.removeprefix("failed "))
+    return Measured(Outcome.OK, seconds, cpu_of(child.pid) - cpu, _peak(child.pid))
 
-    def __init__(
-        self,
-        name: str,
-        argv: Callable[[Job, Path], list[str]],
-        *,
-        directions: tuple[Direction, ...] = ("read", "write"),
-        prepare: Callable[[], object] = lambda: None,
-    ) -> None:
-        self.name = name
-        self.directions = directions
-        self._argv = argv
-        self._prepare = prepare
 
-    def prepare(self) -> None:
-        self._prepare()
-
-    def run(self, job: Job) -> Measured:
-        point = job.folder / "mnt"
-        point.mkdir()
-        daemon = Process("daemon", self._argv(job, point), job.folder)
-        try:
-            if not _await_mount(daemon, point):
-                return Measured(Outcome.FAILED, detail=_last_line(daemon.log) or "not mounted in time")
-            return self._copy(daemon.popen.pid, point, job)
-        finally:
-            _end(daemon, point)
-
-    @staticmethod
-    def _copy(pid: int, point: Path, job: Job) -> Measured:
+def _by_mount(argv: list[str], point: Path, job: Job) -> Measured:
+    daemon = Process("daemon", argv, job.folder)
+    try:
+        if not _await_mount(daemon, point):
+            return Measured(Outcome.FAILED, detail=_last_line(daemon.log) or "not mounted in time")
         there = point / job.remote.lstrip("/")
         source, target = (there, job.local) if job.direction == "read" else (job.local, there)
-        cpu = cpu_of(pid)
-        code, seconds, spent, said = copy(source, target, job, point)
-        if code is None:
-            return Measured(Outcome.TIMEOUT)
-        if code != 0:
-            return Measured(Outcome.FAILED, detail=said)
-        return Measured(Outcome.OK, seconds, cpu_of(pid) - cpu + spent, _peak(pid))
+        cpu = cpu_of(daemon.popen.pid)
+        copied = _copy(source, target, job, point)
+        if copied.cpu is None:
+            return copied
+        spent = copied.cpu + cpu_of(daemon.popen.pid) - cpu
+        return Measured(Outcome.OK, copied.seconds, spent, _peak(daemon.popen.pid))
+    finally:
+        if mounted_at(point) and daemon.running:
+            subprocess.run(["fusermount3", "-u", point], capture_output=True, timeout=20, check=False)
+            with suppress(subprocess.TimeoutExpired):
+                daemon.popen.wait(END_TIMEOUT)
+        daemon.kill()
+        abort_mount(point)
 
 
-def copy(source: Path, target: Path, job: Job, point: Path) -> tuple[int | None, float, float, str]:
-    """Return exit code (None: cut off), seconds, CPU seconds and complaint of `cp`."""
+def _copy(source: Path, target: Path, job: Job, point: Path) -> Measured:
+    """Run `cp`; cpu is its own."""
     log = job.folder / "cp.log"
     with log.open("wb") as errors:
         began = time.monotonic()
@@ -232,7 +202,11 @@ def copy(source: Path, target: Path, job: Job, point: Path) -> tuple[int | None,
         abort_mount(point)  # else it waits in the kernel
     _, status, used = os.wait4(child.pid, 0)
     child.returncode = os.waitstatus_to_exitcode(status)
-    return (child.returncode if in_time else None), seconds, used.ru_utime + used.ru_stime, _last_line(log)
+    if not in_time:
+        return Measured(Outcome.TIMEOUT)
+    if child.returncode:
+        return Measured(Outcome.FAILED, detail=_last_line(log))
+    return Measured(Outcome.OK, seconds, used.ru_utime + used.ru_stime)
 
 
 def _await_mount(daemon: Process, point: Path) -> bool:
@@ -242,15 +216,6 @@ def _await_mount(daemon: Process, point: Path) -> bool:
             return True
         time.sleep(0.02)
     return False
-
-
-def _end(daemon: Process, point: Path) -> None:
-    if mounted_at(point) and daemon.running:
-        subprocess.run(["fusermount3", "-u", point], capture_output=True, timeout=END_TIMEOUT, check=False)
-        with suppress(subprocess.TimeoutExpired):
-            daemon.popen.wait(END_TIMEOUT)
-    daemon.kill()
-    abort_mount(point)
 
 
 def _peak(pid: int) -> int:
@@ -267,69 +232,64 @@ def _last_line(log: Path) -> str:
 # -- the peers' environment -------------------------------------------------------------------------
 
 
-class Environment:
-    """A virtual environment with the peers, made when first needed and kept."""
-
-    def __init__(self, pins: Sequence[str] = PINS) -> None:
-        self._pins = tuple(pins)
-        version = f"{sys.version_info.major}.{sys.version_info.minor}"
-        key = hashlib.sha256("\n".join((version, *self._pins)).encode()).hexdigest()[:12]
-        cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-        self.path = cache / "mavftpfs" / f"bench-peers-{key}"
-        self._stamp = self.path / "complete"
-
-    @property
-    def python(self) -> str:
-        """Its interpreter."""
-        return str(self.path / "bin" / "python")
-
-    def prepare(self) -> None:
-        """Make it if it is not there.
-
-        Raises:
-            NotToBeHadError: the packages cannot be installed.
-        """
-        if self._stamp.exists():
-            return
-        print(
-            f"installing the peers ({', '.join(self._pins)}) in an environment of their own", file=sys.stderr
-        )
-        shutil.rmtree(self.path, ignore_errors=True)
-        venv.create(self.path, with_pip=True)
-        command = [self.python, "-m", "pip", "install", "--quiet", "--disable-pip-version-check", *self._pins]
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
-        if done.returncode != 0:
-            reason = done.stderr.strip().splitlines()[-1:] or ["pip failed"]
-            raise NotToBeHadError(f"not installed: {reason[0][:200]}")
-        self._stamp.touch()
-
-    def prepare_fusepy(self) -> None:
-        """As `prepare`; fusepy needs FUSE 2 besides.
-
-        Raises:
-            NotToBeHadError: something is missing.
-        """
-        if ctypes.util.find_library("fuse") is None:
-            raise NotToBeHadError("needs libfuse.so.2 (Debian: libfuse2)")
-        self.prepare()
-
-    def script(self, module: str) -> str:
-        """Return the path of a file of pymavlink in it."""
-        (found,) = self.path.glob(f"lib/python*/site-packages/pymavlink/{module}.py")
-        return str(found)
+def _environment() -> Path:
+    """Return where the virtual environment with the peers is, or will be."""
+    key = hashlib.sha256("\n".join((platform.python_version(), *PINS)).encode()).hexdigest()[:12]
+    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    return cache / "mavftpfs" / f"bench-peers-{key}"
 
 
-def clients(environment: Environment) -> dict[str, Client]:
+def install() -> None:
+    """Make that environment if it is not there.
+
+    Raises:
+        NotToBeHadError: the packages cannot be installed.
+    """
+    place = _environment()
+    if (place / "complete").exists():
+        return
+    print(f"installing the peers ({', '.join(PINS)}) in an environment of their own", file=sys.stderr)
+    shutil.rmtree(place, ignore_errors=True)
+    venv.create(place, with_pip=True)
+    command = [
+        str(place / "bin/python"),
+        "-m",
+        "pip",
+        "install",
+        "--quiet",
+        "--disable-pip-version-check",
+        *PINS,
+    ]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode != 0:
+        reason = done.stderr.strip().splitlines()[-1:] or ["pip failed"]
+        raise NotToBeHadError(f"not installed: {reason[0][:200]}")
+    (place / "complete").touch()
+
+
+def install_with_fuse() -> None:
+    """As `install`; pymavlink's mount needs FUSE 2 besides.
+
+    Raises:
+        NotToBeHadError: something is missing.
+    """
+    if ctypes.util.find_library("fuse") is None:
+        raise NotToBeHadError("needs libfuse.so.2 (Debian: libfuse2)")
+    install()
+
+
+def clients() -> dict[str, Client]:
     """Return everybody who can take part, by name."""
-    python = environment.python
+    place = _environment()
+    python = str(place / "bin/python")
 
-    def peer(script: str, *more: str) -> Callable[[Job], list[str]]:
-        return lambda job: [python, str(HERE / f"{script}.py"), *_task(job), *more]
+    def peer(script: str, job: Job, *more: str) -> list[str]:
+        return [python, str(HERE / f"{script}.py"), *_task(job), *more]
 
-    def tuned(job: Job) -> list[str]:
-        return [*peer("peer_pymavlink")(job), "--chunk", "239", "--window", str(job.window)]
+    def tuned(job: Job, point: Path) -> list[str]:
+        return peer("peer_pymavlink", job, "--chunk", "239", "--window", str(job.window))
 
-    def bare(job: Job) -> list[str]:
+    def bare(job: Job, point: Path) -> list[str]:
         limits = ["--window", str(job.window), "--timeout", str(job.patience)]
         return [sys.executable, "-m", "tests.bench.bare", *_task(job), *limits]
 
@@ -338,26 +298,18 @@ def clients(environment: Environment) -> dict[str, Client]:
         return [sys.executable, "-m", "mavftpfs", source, str(point), "-f", "-o", "verify=size"]
 
     def fusepy(job: Job, point: Path) -> list[str]:
-        source = f"udpin:{HOST}:{job.port}"
-        return [python, environment.script("mavftpfs"), "-m", source, "--mountpoint", str(point)]
+        (script,) = place.glob("lib/python*/site-packages/pymavlink/mavftpfs.py")
+        return [python, str(script), "-m", f"udpin:{HOST}:{job.port}", "--mountpoint", str(point)]
 
-    everybody: list[Client] = [
-        Worker(BARE, bare),
-        MountClient(US, ours),
-        Worker("pymavlink mavftp", peer("peer_pymavlink"), prepare=environment.prepare),
-        Worker("pymavlink mavftp, tuned", tuned, prepare=environment.prepare),
-        MountClient("pymavlink mavftpfs", fusepy, directions=("read",), prepare=environment.prepare_fusepy),
-        Worker("MAVSDK", peer("peer_mavsdk"), prepare=environment.prepare),
-        PlainReads("MAVSDK, no burst", peer("peer_mavsdk", "--plain"), prepare=environment.prepare),
+    everybody = [
+        Client(BARE, bare),
+        Client(US, ours, mounts=True),
+        Client("pymavlink mavftp", lambda job, point: peer("peer_pymavlink", job), prepare=install),
+        Client("pymavlink mavftp, tuned", tuned, prepare=install),
+        Client("pymavlink mavftpfs", fusepy, True, ("read",), install_with_fuse),
+        Client("MAVSDK", lambda job, point: peer("peer_mavsdk", job), prepare=install),
     ]
     return {client.name: client for client in everybody}
-
-
-class PlainReads(Worker):
-    """One ReadFile at a time: for reading alone, and hopeless where a round trip takes time."""
-
-    def takes_part(self, direction: Direction, *, shaped: bool) -> bool:
-        return direction == "read" and not shaped
 
 
 def _task(job: Job) -> list[str]:

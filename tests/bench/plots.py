@@ -17,9 +17,8 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 
-from tests.bench import tables
+from tests.bench import record, tables
 from tests.bench.figures import BARE, US, Outcome, Row, row_from_json
-from tests.bench.record import Record
 
 RESULTS = Path(__file__).parent / "results" / "results.json"
 
@@ -58,34 +57,16 @@ def draw(path: Path, size: tuple[float, float], paint: Callable[[Figure], None])
 # -- goodput ----------------------------------------------------------------------------------------
 
 
-def middle(results: Results, key: str) -> float:
-    """Return the middle one of the values that a condition took."""
-    values = sorted({run["case"][key] for run in results})
-    return float(values[len(values) // 2])
-
-
-def share_against(results: Results, x: str, fixed: dict[str, float]) -> dict[str, list[tuple[float, float]]]:
-    """Return for each profile the points (x, share of the limit) under the fixed conditions, by x."""
-    lines: dict[str, list[tuple[float, float]]] = {}
-    for run in results:
-        case = run["case"]
-        if all(case[key] == value for key, value in fixed.items()):
-            lines.setdefault(case["profile"], []).append((case[x], run["share"]))
-    return {profile: sorted(points) for profile, points in lines.items()}
-
-
-def plot_goodput(results: Results, x: str, path: Path) -> None:
-    """Draw share of the limit against `x` (loss or rtt), reading and writing beside each other."""
-    rate = middle(results, "rate")
-    other = {"rtt": middle(results, "rtt")} if x == "loss" else {"loss": lossy(results)}
-    said = f"RTT {other['rtt'] * 1000:g} ms" if x == "loss" else f"{other['loss'] * 100:g} % loss"
+def plot_goodput(results: Results, path: Path) -> None:
+    """Draw share of the limit against loss, reading and writing, at the middle rate and round trip."""
+    rates, rtts = ({run["case"][key] for run in results} for key in ("rate", "rtt"))
+    rate, rtt = (sorted(values)[len(values) // 2] for values in (rates, rtts))
+    chosen = [run for run in results if (run["case"]["rate"], run["case"]["rtt"]) == (rate, rtt)]
 
     def paint(figure: Figure) -> None:
         for axes, direction in zip(figure.subplots(1, 2, sharey=True), ("read", "write"), strict=True):
-            chosen = [run for run in results if run["case"]["direction"] == direction]
-            paint_lines(axes, share_against(chosen, x, {"rate": rate, **other}), x)
-            paint_targets(axes, chosen, x, other)
-            axes.set_title(f"{direction}, {rate / 1000:g} kB/s, {said}", fontsize=10)
+            paint_lines(axes, [run for run in chosen if run["case"]["direction"] == direction])
+            axes.set_title(f"{direction}, {rate / 1000:g} kB/s, RTT {rtt * 1000:g} ms", fontsize=10)
         figure.axes[0].set_ylim(0, max(1.05, figure.axes[0].get_ylim()[1]))
         figure.axes[0].set_ylabel("share of the limit")
         handles, labels = figure.axes[0].get_legend_handles_labels()
@@ -94,36 +75,21 @@ def plot_goodput(results: Results, x: str, path: Path) -> None:
     draw(path, (8.6, 3.6), paint)
 
 
-def lossy(results: Results) -> float:
-    """Return the smallest loss that is one, else none."""
-    return float(min((run["case"]["loss"] for run in results if run["case"]["loss"] > 0), default=0.0))
-
-
-def paint_lines(axes: Axes, lines: dict[str, list[tuple[float, float]]], x: str) -> None:
-    """Draw one line for each profile."""
-    scale, label = (100, "loss each way, %") if x == "loss" else (1000, "round trip, ms")
+def paint_lines(axes: Axes, results: Results) -> None:
+    """Draw one line for each profile, and what is to be reached."""
+    lines: dict[str, dict[float, float]] = {}
+    for run in results:
+        loss = run["case"]["loss"] * 100
+        lines.setdefault(run["case"]["profile"], {})[loss] = run["share"]
+    targets = {run["case"]["loss"] * 100: run["target"] for run in results if run["target"] is not None}
     for (profile, points), colour, marker in zip(lines.items(), COLOURS, MARKERS, strict=False):
-        xs, ys = [at * scale for at, _ in points], [share for _, share in points]
+        xs = sorted(points)
+        ys = [points[x] for x in xs]
         axes.plot(xs, ys, color=colour, marker=marker, markersize=5, label=profile)
-    if x == "rtt":
-        axes.set_xscale("log")
-        ticks = sorted({at * scale for points in lines.values() for at, _ in points})
-        axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
-        axes.minorticks_off()
-    axes.set_xlabel(label)
-
-
-def paint_targets(axes: Axes, results: Results, x: str, other: dict[str, float]) -> None:
-    """Draw what is to be reached."""
-    found = {
-        run["case"][x]: run["target"]
-        for run in results
-        if run["target"] is not None and all(run["case"][key] == value for key, value in other.items())
-    }
-    scale = 100 if x == "loss" else 1000
-    xs = sorted(found)
-    ys = [found[at] for at in xs]
-    axes.plot([at * scale for at in xs], ys, color="#808890", linestyle="dashed", linewidth=1, label="target")
+    xs = sorted(targets)
+    ys = [targets[x] for x in xs]
+    axes.plot(xs, ys, color="#808890", linestyle="dashed", linewidth=1, label="target")
+    axes.set_xlabel("loss each way, %")
 
 
 # -- the peers --------------------------------------------------------------------------------------
@@ -198,9 +164,8 @@ def plot_all(sections: dict[str, dict[str, Any]], folder: Path) -> list[Path]:
     written: list[Path] = []
     if "goodput" in sections:
         results: Results = sections["goodput"]["results"]
-        for x in ("loss", "rtt"):
-            written.append(folder / f"goodput-{x}.svg")
-            plot_goodput(results, x, written[-1])
+        written.append(folder / "goodput-loss.svg")
+        plot_goodput(results, written[-1])
     if "mount" in sections:
         written.append(folder / "peers.svg")
         plot_peers([row_from_json(row) for row in sections["mount"]["results"]["rows"]], written[-1])
@@ -217,7 +182,7 @@ def main(argv: Sequence[str]) -> int:
         "--page", type=Path, metavar="FILE", help="put the tables between the marks in this file"
     )
     args = parser.parse_args(argv)
-    sections = Record(args.json).sections()
+    sections = record.sections(args.json)
     if not sections:
         print(f"nothing is recorded in {args.json}", file=sys.stderr)
         return 1

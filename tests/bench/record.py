@@ -1,7 +1,5 @@
 """The JSON file that the bench writes: one section for each part, so that parts can be measured anew alone.
 
-    {"schema": 1, "sections": {"mount": {"command": ..., "date": ..., "versions": ..., "results": ...}, ...}}
-
 Nothing in it names the machine, or a path on it.
 """
 
@@ -10,53 +8,35 @@ from __future__ import annotations
 import json
 import os
 import platform
+from collections.abc import Sequence
+from datetime import date
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-SCHEMA = 1
 PACKAGES = ("mavftpfs", "mavsdk", "pyfuse3", "pymavlink", "trio")
 
 
-class Record:
-    """One such file; a section that is put there replaces its predecessor and leaves the others alone."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-
-    def sections(self) -> dict[str, dict[str, Any]]:
-        """Return all sections; none if there is no file yet.
-
-        Raises:
-            ValueError: the file is of another schema, or no JSON.
-        """
-        if not self.path.exists():
-            return {}
-        content = json.loads(self.path.read_text())
-        if not isinstance(content, dict) or content.get("schema") != SCHEMA:
-            raise ValueError(f"{self.path} was not written by this bench")
-        sections: dict[str, dict[str, Any]] = content["sections"]
-        return sections
-
-    def put(self, name: str, command: str, results: Any, date: str, load: float) -> None:
-        """Write a section: what the command found, with versions and the date as the user gave it.
-
-        load: the machine's load when it began; beyond a part of `cpus` seconds are worth little.
-        """
-        sections = self.sections()
-        sections[name] = {
-            "command": command,
-            "cpus": os.cpu_count(),
-            "date": date,
-            "load": round(load, 1),
-            "results": results,
-            "versions": versions(),
-        }
-        content = {"schema": SCHEMA, "sections": sections}
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        self.path.write_text(json.dumps(content, indent=1, sort_keys=True) + "\n")
+def sections(path: Path) -> dict[str, dict[str, Any]]:
+    """Return all sections by part; none if there is no file yet."""
+    found: dict[str, dict[str, Any]] = json.loads(path.read_text())["sections"] if path.exists() else {}
+    return found
 
 
-def versions() -> dict[str, str]:
-    """Return what was measured with."""
-    return {"python": platform.python_version(), **{name: version(name) for name in PACKAGES}}
+def put(path: Path, part: str, argv: Sequence[str], load: float, results: Any) -> None:
+    """Replace a part's section.
+
+    argv: what it was run with. load: the machine's, before it began: seconds of a busy one are worth little.
+    """
+    words = [word for before, word in zip(["", *argv], argv, strict=False) if "--json" not in (before, word)]
+    versions = {"python": platform.python_version(), **{name: version(name) for name in PACKAGES}}
+    section = {
+        "command": " ".join(["scripts/bench", part, *words]),
+        "cpus": os.cpu_count(),
+        "date": date.today().isoformat(),
+        "load": round(load, 1),
+        "results": results,
+        "versions": versions,
+    }
+    content = {"schema": 1, "sections": {**sections(path), part: section}}
+    path.write_text(json.dumps(content, indent=1, sort_keys=True) + "\n")

@@ -157,16 +157,6 @@ def requests_table() -> str:
     return markdown(["command", *PROFILES, f"on {PROFILES[0]}"], lines)
 
 
-def memory_lines(results: dict[str, Any]) -> str:
-    """Return the memory that large files take."""
-    peaks = [
-        f"{peak['size'] / 1e6:,.0f} MB {peak['what']} through the mount:"
-        f" {peak['peak'] / 1e6:.0f} MB of memory at most ({peak['allowed'] / 1e6:.0f} allowed)."
-        for peak in results["memory"]
-    ]
-    return " ".join(peaks)
-
-
 def caption(section: dict[str, Any]) -> str:
     """Return what made a section, and on what; a machine that was busy with other things is called that."""
     made = f"{section['date']}, {section['cpus']} CPUs".removeprefix(", ")
@@ -182,8 +172,6 @@ def tables(sections: dict[str, dict[str, Any]]) -> dict[str, str]:
         section = sections["goodput"]
         made = f"`{section['command']}`, {section['date']}; on virtual time, so the same on any machine."
         found["goodput"] = f"{goodput_table(section['results'])}\n\n{made}"
-    if "cost" in sections:
-        found["memory"] = f"{memory_lines(sections['cost']['results'])}\n\n{caption(sections['cost'])}"
     if "mount" in sections:
         rows = [row_from_json(fields) for fields in sections["mount"]["results"]["rows"]]
         found["peers"] = f"{peers_table(rows)}\n\n{caption(sections['mount'])}"

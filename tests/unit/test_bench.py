@@ -12,11 +12,9 @@ from mavftpfs.link.framing import Framer
 from mavftpfs.link.messages import Address
 from mavftpfs.protocol.payload import Opcode, request
 from tests.bench import __main__ as entry
-from tests.bench import bare, plots, tables
+from tests.bench import bare, plots, record, tables
 from tests.bench.cases import Case
 from tests.bench.figures import BARE, LINKS, US, Outcome, Row, Run, as_json, limit, summarise
-from tests.bench.record import Record
-from tests.bench.shaper import frames_of
 
 PROJECT = Path(__file__).parents[2]
 TIMEOUTS = {"wifi-5%": 20.0, "unshaped": 10.0}
@@ -67,28 +65,19 @@ def test_a_row_has_the_median_and_its_shares() -> None:
     assert ours.per_chunk == pytest.approx(0.5 * 239 / 1e6)
 
 
-def test_each_part_is_run_and_noted(tmp_path: Path) -> None:
+def test_a_part_is_run_and_noted_beside_the_others(tmp_path: Path) -> None:
     path = tmp_path / "results.json"
-    few = ["--profiles", "px4", "--rtts", "0.1", "--losses", "0", "--direction", "read", "--seconds", "2"]
-    assert entry.main(["goodput", "--quick", "--json", str(path), "--date", "2026-01-02", *few]) == 0
-    section = Record(path).sections()["goodput"]
-    (result,) = section["results"]
+    record.put(path, "mount", ["--json", str(path), "--quick"], 0.5, {"rows": []})
+    few = ["--profiles", "px4", "--rates", "100000", "--rtts", "0.1", "--losses", "0"]
+    few += ["--direction", "read", "--seconds", "2"]
+    assert entry.main(["goodput", *few, "--json", str(path)]) == 0
+    sections = record.sections(path)
+    assert sections["mount"]["command"] == "scripts/bench mount --quick"
+    (result,) = sections["goodput"]["results"]
     assert result["case"]["rate"] == 100_000
     assert 0.3 < result["share"] < 1.1
-    assert section["command"] == "scripts/bench goodput --quick " + " ".join(few)
+    assert sections["goodput"]["command"] == "scripts/bench goodput " + " ".join(few)
     assert "tmp" not in path.read_text()
-
-
-def test_datagrams_are_taken_apart_into_frames() -> None:
-    framer = Framer(Address(1, 1), stream=False)
-    signed = Framer(Address(1, 1), stream=False, signing_key=bytes(32), signing_clock=lambda: 1)
-    frames = [framer.encode_heartbeat(2, 12), signed.encode_heartbeat(2, 12)]
-    frames += [framer.encode_ftp(Address(255, 190), request(7, Opcode.READ_FILE, data=b"\x05").encode())]
-    old = bytes.fromhex("fe09000101000000000002030403") + bytes(3)
-    assert list(frames_of(b"".join([*frames, old]))) == [*frames, old]
-    assert list(frames_of(b"no MAVLink")) == [b"no MAVLink"]
-    assert list(frames_of(frames[0] + b"\xfd\x09")) == [frames[0], b"\xfd\x09"]
-    assert list(frames_of(b"")) == []
 
 
 @pytest.mark.parametrize("data", [b"", b"\x00", b"/log\x00", bytes(range(239))])
@@ -144,10 +133,10 @@ def test_tables_go_between_their_marks() -> None:
 
 def test_the_page_shows_what_was_recorded() -> None:
     page = (PROJECT / "docs/benchmarks.md").read_text()
-    recorded = Record(plots.RESULTS).sections()
+    recorded = record.sections(plots.RESULTS)
     assert tables.filled_in(page, recorded) == page, "scripts/bench plots --page docs/benchmarks.md"
     pictures = re.findall(r"\]\(\.\./(tests/bench/\S+\.svg)\)", page)
-    assert len(pictures) == 3
+    assert len(pictures) == 2
     assert [name for name in pictures if not (PROJECT / name).is_file()] == []
     for section in recorded.values():
         assert f"`{' '.join(section['command'].split()[:2])}`" in page, "the command that made it"
