@@ -40,7 +40,7 @@ from mavftpfs.shared.errors import (
     SpoolFailed,
     VerificationFailed,
 )
-from mavftpfs.shared.model import DirEntry, EntryKind
+from mavftpfs.shared.model import DirEntry, EntryKind, split
 
 log = logging.getLogger("mavftpfs.cache")
 
@@ -137,8 +137,8 @@ class Deliverer:
             node.draft.give_up()
         try:
             await attempt.upload.abort()
-            if attempt.places is not None:
-                await self._names.discard(node.path, *attempt.names)
+            if attempt.places is not None and attempt.upload.begun:
+                await self._names.discard(attempt.path)
         finally:
             self._context.own.live -= attempt.live
 
@@ -243,8 +243,6 @@ class Deliverer:
         context.own.live |= live
         begun_at = context.clock()
         try:
-            if places is not None and places.sidecar is not None:
-                await self._names.write_sidecar(places.sidecar, node.path)
             sending = draft.begin(in_place=places is None)
             sending.progress = self._throttle.on_acked
             upload = await context.store.open_upload(path, sending)
@@ -284,7 +282,7 @@ class Deliverer:
                 await attempt.upload.abort()
             except BaseException:  # nobody waits any more: all of it is sent again
                 draft.give_up()
-                own.garbage.update(dict.fromkeys(attempt.names, path))
+                self._context.dentries.expire(split(path)[0])
                 raise
             self._context.dentries.put(places.new, DirEntry(b"", EntryKind.FILE, draft.size))
             draft.commit()
@@ -299,7 +297,7 @@ class Deliverer:
                     draft.interrupted()
                 else:
                     draft.on(Event.REFUSED)
-                    await self._names.discard(path, *attempt.names)
+                    await self._names.discard(attempt.path)
             raise
         finally:
             own.live -= attempt.live  # what is left there is for the next listing to clean up

@@ -24,7 +24,7 @@ from contextlib import asynccontextmanager
 import trio
 
 from mavftpfs.cache.context import Context
-from mavftpfs.cache.draft import Sending, State
+from mavftpfs.cache.draft import State
 from mavftpfs.cache.reserved import Kind, Places, is_reserved, parse
 from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.shared.errnos import errno_for
@@ -212,16 +212,14 @@ class Names:
             await self._context.store.make_directory(path)
         self._context.dentries.put(path, DirEntry(b"", EntryKind.DIRECTORY), proven=True)
 
-    async def discard(self, target: bytes, *paths: bytes) -> None:
-        """Remove reserved names that are not needed any more; what cannot be removed now goes at a later
-        listing, or before `target` is removed."""
-        for at, path in enumerate(paths):
-            try:
-                await self.remove_if_there(path)
-            except MavftpfsError as error:
-                log.info("%r stays until its directory is listed again: %s", path, error)
-                self._context.own.garbage.update(dict.fromkeys(paths[at:], target))
-                return
+    async def discard(self, path: bytes) -> None:
+        """Remove a reserved name that is not needed any more; if that cannot be now, a later listing has it
+        removed, and so has who removes the name that it belongs to (`purge`)."""
+        try:
+            await self.remove_if_there(path)
+        except MavftpfsError as error:
+            log.info("%r stays until its directory is listed again: %s", path, error)
+            self._context.dentries.expire(split(path)[0])
 
     async def rename(self, old: bytes, new: bytes, *, completes: bool = False, over: bool = False) -> None:
         """Rename; both paths fit a request. completes: see VehicleStore. over: a file has the new name.
@@ -274,7 +272,7 @@ class Names:
         finally:
             context.own.live -= {first, second}
             context.dentries.expire(split(first)[0])
-        await self.discard(left, left)
+        await self.discard(left)
 
     async def purge(self, path: bytes) -> None:
         """A path is about to lose its name: have nothing of an earlier replacement bring it back.
@@ -284,15 +282,13 @@ class Names:
         """
         own, (parent, name) = self._context.own, split(path)
         directory = self._context.dentries.known(parent)
-        doomed = [left for left, target in own.garbage.items() if target == path]
+        needed = own.live.union(place for torn, place in own.torn.items() if torn != path)
         for entry in [] if directory is None else list(directory.entries):
             reserved, left = parse(entry), join(parent, entry)
-            ours = reserved is not None and (reserved.owner, reserved.target) == (own.owner, name)
-            if ours and left not in own.live and left not in doomed:
-                doomed.append(left)
-        for left in doomed:
-            await self.remove_if_there(left)
-            own.garbage.pop(left, None)
+            if reserved is None or reserved.owner != own.owner or left in needed:
+                continue
+            if reserved.target in (name, None):
+                await self.remove_if_there(left)
         own.torn.pop(path, None)
 
     # --- giving a verified file its name
@@ -320,13 +316,9 @@ class Names:
             NotSupported: the server does not rename. Else as VehicleStore.rename. The old file has its name
             again then, unless the name is torn.
         """
-        litter = [places.sidecar] if places.sidecar is not None else []
         if not keep_old and self._replaces_at_once(target) and await self._rename_over(source, target):
-            await self.discard(target, *litter)
             return
         assert places.old is not None
-        if places.sidecar is not None and source != places.new:  # else it was written before
-            await self.write_sidecar(places.sidecar, target)
         moved = await self._move_aside(target, places.old)
         try:
             await self.rename(source, target, completes=moved)
@@ -340,29 +332,17 @@ class Names:
             raise
         self._context.own.mended((places.old,))
         if moved and not keep_old:
-            litter.insert(0, places.old)
-        await self.discard(target, *litter)
-
-    async def write_sidecar(self, sidecar: bytes, target: bytes) -> None:
-        """Write down where short names belong. Raises as Upload.finish."""
-        text = Sending(lambda start, stop: target[start:stop], len(target))
-        upload = await self._context.store.open_upload(sidecar, text)
-        try:
-            upload.wake()
-            await upload.finish()
-        finally:
-            await upload.abort()
+            await self.discard(places.old)
 
     def note_torn(self, path: bytes, place: bytes) -> None:
-        """The file of a name may lie at `place` for now: show it on, and have both directories listed."""
+        """The file of a name may lie at `place` beside it for now: show it on, and have that listed."""
         context = self._context
         entry = context.dentries.entry(path) or context.dentries.entry(place)
         if entry is not None:
             context.dentries.put(path, entry)
         context.own.torn[path] = place
         context.retry_later()
-        for directory in (split(path)[0], split(place)[0]):
-            context.dentries.expire(directory)
+        context.dentries.expire(split(path)[0])
         log.warning("%r may lie under %r until the vehicle is heard again", path, place)
 
     # --- inside

@@ -224,8 +224,6 @@ class Namespace:
         """Rename over a file; who has that open keeps it."""
         context, places = self._context, self._context.own.places(new)
         keep = displaced is not None and displaced.handles > 0 and not self._keep_local(displaced)
-        if keep and places.sidecar is not None:
-            raise FileBusy(f"{new!r} is open, and its path is too long to keep it")
         context.own.live |= places.all
         try:
             await self._names.replace(old, new, places, keep_old=keep)

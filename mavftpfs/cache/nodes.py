@@ -42,12 +42,6 @@ class Attempt:
         """Return whether that is still the way to send it."""
         return (self.places is None) == (plan is Plan.OVERWRITE)
 
-    @property
-    def names(self) -> list[bytes]:
-        """What it leaves on the card if it is given up: what was sent, and its sidecar."""
-        sent = [self.path] if self.upload.begun else []
-        return sent if self.places is None or self.places.sidecar is None else [*sent, self.places.sidecar]
-
 
 @dataclass(slots=True, eq=False)
 class Node:

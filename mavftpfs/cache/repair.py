@@ -4,31 +4,30 @@
 
 new, old and target have the same number (see `reserved`):
   fresh (a new file's content)  remove
-  target there                  remove new, then old, then the sidecar
+  deleted                       remove
+  target there                  remove new, then old
   target missing, old and new   rename new to target (it was verified before old was moved), remove old
   target missing, old only      rename old to target
   target missing, new only      rename new to `recovered-tSSS-NAME`: somebody else removed the target, and
                                 nobody can tell whether new is complete
-  sidecar alone, deleted        remove
+  target not known, old         rename both to `recovered-...`: it may be the only copy
+  target not known, new only    remove: old is moved aside before new is needed
 Nothing is touched while its owner may be alive: see `Staleness`.
 """
 
 from __future__ import annotations
 
-import errno
 import logging
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from mavftpfs.cache.context import Context
 from mavftpfs.cache.dentries import Directory
 from mavftpfs.cache.names import Names
 from mavftpfs.cache.nodes import Node
 from mavftpfs.cache.reserved import MAX_NAME, RENAME_ROOM, Kind, is_reserved, parse
-from mavftpfs.cache.verify import read_small
-from mavftpfs.shared.errnos import errno_for
-from mavftpfs.shared.errors import FtpNak, LocalProtocolError, MavftpfsError, NotADirectory, NotFound
-from mavftpfs.shared.model import MAX_WIRE_PATH, DirEntry, EntryKind, join, normalise, split
+from mavftpfs.shared.errors import MavftpfsError, NotADirectory, NotFound
+from mavftpfs.shared.model import MAX_WIRE_PATH, DirEntry, EntryKind, join, split
 
 log = logging.getLogger("mavftpfs.cache")
 
@@ -115,32 +114,18 @@ def leftovers(
 def repair(group: Group, *, target_exists: bool) -> list[Action]:
     """Return the steps that undo or complete an interrupted replacement; any may be the last one done.
 
-    `target_exists` is asked for groups with a target. Without one (the sidecar is missing or unreadable) what
-    is the only copy of something is renamed to where a person finds it.
+    `target_exists` is asked for groups with a target.
     """
-    paths = dict(group.paths)
-    sidecar = paths.pop(Kind.SIDECAR, None)
-    litter = (paths.pop(kind, None) for kind in (Kind.DELETED, Kind.FRESH))
-    actions = [Action(path) for path in litter if path is not None]
-    new, old = paths.get(Kind.NEW), paths.get(Kind.OLD)
-    if group.target is None:
-        actions += _without_target(group, new, old)
-    elif target_exists:
-        actions += [Action(path) for path in (new, old) if path is not None]
-    elif old is not None:
-        actions.append(Action(old if new is None else new, group.target))
-        actions += [] if new is None else [Action(old)]
-    elif new is not None:
-        actions.append(Action(new, _recovered(group, new)))
-    return actions if sidecar is None else [*actions, Action(sidecar)]
-
-
-def _without_target(group: Group, new: bytes | None, old: bytes | None) -> list[Action]:
-    """The short form is used only after its sidecar was written: a `t` alone is litter, an `o` never."""
-    if old is not None:
-        rest = [] if new is None else [Action(new, _recovered(group, new))]
-        return [Action(old, _recovered(group, old)), *rest]
-    return [] if new is None else [Action(new)]
+    order = (Kind.DELETED, Kind.FRESH, Kind.NEW, Kind.OLD)
+    paths = [group.paths[kind] for kind in order if kind in group.paths]
+    new, old = group.paths.get(Kind.NEW), group.paths.get(Kind.OLD)
+    if target_exists or (old is None and (new is None or group.target is None)):
+        return [Action(path) for path in paths]
+    if group.target is None or old is None:
+        return [Action(path, _recovered(group, path)) for path in (old, new) if path is not None]
+    if new is None:
+        return [Action(old, group.target)]
+    return [Action(new, group.target), Action(old)]
 
 
 def _recovered(group: Group, path: bytes) -> bytes:
@@ -169,17 +154,14 @@ class Cleaner:
     async def on_swept(self, path: bytes, directory: Directory) -> None:
         """A directory was listed. Raises nothing of ours: the listing is right without us."""
         reserved = [entry for name, entry in directory.entries.items() if is_reserved(name)]
-        missing = self._missing(path, directory) if self._context.own.torn else []
-        if path in self._busy or not (reserved or missing):
+        self._note_whole(path, directory)
+        if path in self._busy or not reserved:
             return
         self._busy.add(path)
         try:
             for group in leftovers(path, reserved, self._is_dead)[:MAX_GROUPS]:
                 if not self._context.blocked or self._is_torn(group):
-                    await self._mend(path, group)
-            torn = self._context.own.torn
-            for place in {split(torn[name])[0] for name in missing if name in torn} - {path}:
-                await self._context.directories.ask(place)
+                    await self._mend(group)
         except MavftpfsError as error:
             log.info("%r is cleaned up at a later listing: %s", path, error)
         finally:
@@ -193,11 +175,9 @@ class Cleaner:
 
     async def mend(self, node: Node) -> None:
         """Do so for one file, whose lock the caller has."""
-        place = self._context.own.torn.get(node.path, node.path)
         self._delivered.add(node)
         try:
-            for directory in {split(place)[0], split(node.path)[0]}:
-                await self._list(directory)
+            await self._list(split(node.path)[0])
         finally:
             self._delivered.discard(node)
 
@@ -209,15 +189,12 @@ class Cleaner:
         except MavftpfsError as error:
             log.info("%r is mended at a later listing: %s", directory, error)
 
-    def _missing(self, path: bytes, directory: Directory) -> list[bytes]:
-        """Return the torn names that a listing just made does not show; those it shows are whole again."""
-        missing, torn = [], self._context.own.torn
-        for name in [name for name in torn if split(name)[0] == path]:
-            if split(name)[1] not in directory.entries:
-                missing.append(name)
-            elif directory is self._context.dentries.known(path):
-                del torn[name]
-        return missing
+    def _note_whole(self, path: bytes, directory: Directory) -> None:
+        """The torn names that a listing just made shows are whole again."""
+        torn = self._context.own.torn
+        for torn_path in [torn_path for torn_path in torn if split(torn_path)[0] == path]:
+            if split(torn_path)[1] in directory.entries and directory is self._context.dentries.known(path):
+                del torn[torn_path]
 
     def _is_torn(self, group: Group) -> bool:
         return not set(self._context.own.torn.values()).isdisjoint(group.paths.values())
@@ -229,10 +206,11 @@ class Cleaner:
             return True
         return self._staleness.is_stale(path, entry.size, self._context.clock())
 
-    async def _mend(self, directory: bytes, group: Group) -> None:
-        sidecar = group.paths.get(Kind.SIDECAR)
-        if group.target is None and sidecar is not None:
-            group = await self._read_sidecar(directory, sidecar, group)
+    async def _mend(self, group: Group) -> None:
+        if group.target is None:
+            for path, place in self._context.own.torn.items():
+                if place in group.paths.values():
+                    group = replace(group, target=path)
         exists = group.target is not None and await self._exists(group.target)
         node = None if group.target is None else self._context.nodes.get(group.target)
         if exists or node is None or not node.lock.locked() or node in self._delivered:
@@ -245,7 +223,6 @@ class Cleaner:
             self._staleness.forget(action.path)
             if action.to is None:
                 await self._names.remove(action.path)
-                context.own.garbage.pop(action.path, None)
                 continue
             log.warning("%r was left by an interruption: renaming it to %r", action.path, action.to)
             await self._names.rename(action.path, action.to, completes=torn)
@@ -260,23 +237,3 @@ class Cleaner:
         except (NotFound, NotADirectory):
             return False
         return True
-
-    async def _read_sidecar(self, directory: bytes, path: bytes, group: Group) -> Group:
-        """Return the group with what its sidecar tells, as far as that is plausible."""
-        try:
-            text = await read_small(self._context, path, RENAME_ROOM)
-        except FtpNak as nak:
-            if errno_for(nak) == errno.ENOENT:
-                return group
-            raise  # it may say something another time; without it the only copy could count as litter
-        if not _plausible(text) or not text.startswith(join(directory, b"")):
-            return group
-        return Group(group.paths, group.serial, text)
-
-
-def _plausible(path: bytes) -> bool:
-    """Return whether a sidecar, which anybody may have written, may name this path."""
-    try:
-        return normalise(path) == path and parse(split(path)[1]) is None
-    except LocalProtocolError:
-        return False

@@ -5,10 +5,9 @@ it, SSS counts, and the kind k is
   n  the content of a file that is new, perhaps incomplete;
   t  the new content of NAME, which exists, perhaps incomplete;
   o  the old NAME, moved aside only after the new content was verified;
-  d  a file that was unlinked while somebody has it open;
-  p  a *sidecar*: a small file whose content is the path that t and o of the same number belong to. It is
-     written first and removed last, and only where NAME does not fit: rename carries both paths in one
-     request of 238 bytes, so long paths use the short form, in the nearest directory above that fits;
+  d  a file that was unlinked while somebody has it open.
+They lie beside the file they belong to. n and d have the short form; t and o have it where NAME does not fit:
+a rename carries both paths in one request of 238 bytes.
 
 `repair` says what becomes of those that an interruption left.
 """
@@ -16,13 +15,13 @@ it, SSS counts, and the kind k is
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import Enum
 from random import Random
 
 from mavftpfs.shared.errors import NotSupported, PathTooLong
-from mavftpfs.shared.model import MAX_WIRE_PATH, ROOT, join, split, wire_path
+from mavftpfs.shared.model import MAX_WIRE_PATH, join, split, wire_path
 
 PREFIX = b".mavftpfs-"
 RENAME_ROOM = 238
@@ -32,7 +31,7 @@ MAX_NAME = 255
 """Bytes of a name that every card takes."""
 
 _ALPHABET = b"abcdefghijklmnopqrstuvwxyz234567"  # one spelling on cards that fold case
-_RESERVED = re.compile(rb"\.mavftpfs-([a-z2-7]{4})([ntodp])([a-z2-7]{3})(?:-(.+))?", re.DOTALL)
+_RESERVED = re.compile(rb"\.mavftpfs-([a-z2-7]{4})([ntod])([a-z2-7]{3})(?:-(.+))?", re.DOTALL)
 _SERIALS = 32**3
 _OWNER_LENGTH, _SERIAL_LENGTH = 4, 3
 
@@ -44,7 +43,6 @@ class Kind(Enum):
     NEW = b"t"
     OLD = b"o"
     DELETED = b"d"
-    SIDECAR = b"p"
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,18 +65,16 @@ class Reserved:
 class Places:
     """The reserved paths of one delivery.
 
-    new: what is sent. old: the file that is replaced, moved aside; None for a new file. sidecar: only where
-    the names do not tell the target.
+    new: what is sent. old: the file that is replaced, moved aside; None for a new file.
     """
 
     new: bytes
     old: bytes | None = None
-    sidecar: bytes | None = None
 
     @property
     def all(self) -> set[bytes]:
         """Every path of it."""
-        return {self.new, self.old or self.new, self.sidecar or self.new}
+        return {self.new, self.old or self.new}
 
 
 def is_reserved(name: bytes) -> bool:
@@ -90,6 +86,14 @@ def require_not_ours(path: bytes) -> None:
     """Raise NotSupported for a path whose name is reserved."""
     if is_reserved(split(path)[1]):
         raise NotSupported(f"names that begin like {path!r} are for replacing files")
+
+
+def require_writable(path: bytes) -> None:
+    """Raise NotSupported for a reserved name, PathTooLong where none fits beside the path."""
+    require_not_ours(path)
+    shortest = Reserved(b"o" * _OWNER_LENGTH, Kind.NEW, b"s" * _SERIAL_LENGTH).name
+    if not fits_rename(join(split(path)[0], shortest), path):
+        raise PathTooLong(f"{path!r} is too long for a temporary name beside it")
 
 
 def parse(name: bytes) -> Reserved | None:
@@ -119,44 +123,29 @@ class OwnNames:
         live: names in use, so no listing's repair touches them.
         torn: paths that may lack their file on the vehicle though nobody removed them -> where it lies. What
             became of a draft is another question: its state says that.
-        garbage: reserved paths that could not be removed yet -> the path they belong to. Who removes that
-            path has to remove them first.
     """
 
-    def __init__(self, owner: bytes, root: bytes, rng: Random) -> None:
-        """`root`: nothing is put above this directory."""
+    def __init__(self, owner: bytes, rng: Random) -> None:
         self.owner = owner
         self.live: set[bytes] = set()
         self.torn: dict[bytes, bytes] = {}
-        self.garbage: dict[bytes, bytes] = {}
-        self._root = root
         self._serial = rng.randrange(_SERIALS)
 
     def beside(self, target: bytes, kind: Kind) -> bytes:
-        """Return a path that does not tell the target's name, in the nearest directory at or above the
-        target's from which it can be renamed to the target.
-
-        Raises:
-            PathTooLong: there is none.
-        """
-        name = Reserved(self.owner, kind, self._next_serial()).name
-        for directory in self._upwards(target):
-            path = join(directory, name)
-            if len(path) <= MAX_WIRE_PATH and fits_rename(path, target):
-                return path
-        raise PathTooLong(f"{target!r} is too long for temporary names beside it")
+        """Return a path in the target's directory that does not tell its name. Raises PathTooLong."""
+        path = self._path(target, kind, self._next_serial(), tells=False)
+        if path is None:
+            raise PathTooLong(f"{target!r} is too long for a temporary name beside it")
+        return path
 
     def places(self, target: bytes) -> Places:
         """Return where to keep what replaces `target`. Raises PathTooLong."""
         serial = self._next_serial()
-        parent, name = split(target)
-        new = join(parent, Reserved(self.owner, Kind.NEW, serial, name).name)
-        if len(split(new)[1]) <= MAX_NAME and len(new) <= MAX_WIRE_PATH and fits_rename(new, target):
-            return Places(new, join(parent, Reserved(self.owner, Kind.OLD, serial, name).name))
-        new = self.beside(target, Kind.NEW)
-        directory, serial = split(new)[0], new[-_SERIAL_LENGTH:]
-        old, sidecar = (Reserved(self.owner, kind, serial).name for kind in (Kind.OLD, Kind.SIDECAR))
-        return Places(new, join(directory, old), join(directory, sidecar))
+        for tells in (True, False):
+            new, old = (self._path(target, kind, serial, tells=tells) for kind in (Kind.NEW, Kind.OLD))
+            if new is not None:
+                return Places(new, old)
+        raise PathTooLong(f"{target!r} is too long for temporary names beside it")
 
     def mended(self, places: Iterable[bytes]) -> None:
         """What lay there has its name again."""
@@ -171,19 +160,18 @@ class OwnNames:
 
         self.live = {moved(path) for path in self.live}
         self.torn = {moved(path): moved(place) for path, place in self.torn.items()}
-        self.garbage = {moved(path): moved(target) for path, target in self.garbage.items()}
 
     def _next_serial(self) -> bytes:
         self._serial = (self._serial + 1) % _SERIALS
         return _spell(self._serial, _SERIAL_LENGTH)
 
-    def _upwards(self, target: bytes) -> Iterator[bytes]:
-        """Yield the target's directory and those above it, on the same storage."""
-        directory = split(target)[0]
-        yield directory
-        while directory not in (ROOT, self._root, _storage_of(directory)):
-            directory = split(directory)[0]
-            yield directory
+    def _path(self, target: bytes, kind: Kind, serial: bytes, *, tells: bool) -> bytes | None:
+        """Return a path beside the target, None if it does not fit a rename to it."""
+        parent, name = split(target)
+        ours = Reserved(self.owner, kind, serial, name if tells else None).name
+        path = join(parent, ours)
+        fits = len(ours) <= MAX_NAME and len(path) <= MAX_WIRE_PATH and fits_rename(path, target)
+        return path if fits else None
 
 
 def _spell(number: int, length: int) -> bytes:
@@ -192,15 +180,3 @@ def _spell(number: int, length: int) -> bytes:
         number, digit = divmod(number, len(_ALPHABET))
         letters.append(_ALPHABET[digit])
     return bytes(letters)
-
-
-def _storage_of(directory: bytes) -> bytes:
-    """Return the top directory of the storage that a directory lies on, or what is surely not above it.
-
-    NuttX mounts each storage at /fs/NAME, and what is above is no storage at all (servers.md 6 and 13);
-    elsewhere nothing tells where one ends.
-    """
-    parts = directory.split(b"/")
-    if parts[1] != b"fs":
-        return ROOT
-    return b"/".join(parts[:3])

@@ -19,7 +19,6 @@ from mavftpfs.cache.versions import BLOCK_SIZE, BlockCache, Version
 from mavftpfs.shared.errnos import errno_for
 from mavftpfs.shared.errors import (
     Armed,
-    DataUnproven,
     FileChanged,
     FtpNak,
     RequestTimeout,
@@ -153,22 +152,6 @@ class Verifier:
         if not same:
             raise VerificationFailed(f"{path!r} does not hold on the vehicle what was written")
         self.by_reading += 1
-
-
-async def read_small(context: Context, path: bytes, limit: int) -> bytes:
-    """Return the first bytes of a file, at most `limit`, past every cache.
-
-    Raises:
-        DataUnproven: they may be another file's. Else as RemoteStore.open_reader.
-    """
-    version = await _open(context, path)
-    try:
-        text = await _take(version, 0, min(version.size, limit))
-    finally:
-        version.close_reader()
-    if text is None:
-        raise DataUnproven(f"another FTP client was active when {path!r} was read")
-    return bytes(text)
 
 
 async def _open(context: Context, path: bytes) -> Version:

@@ -30,7 +30,7 @@ from mavftpfs.cache.overlay import Overlay
 from mavftpfs.cache.recovery import SpoolDirectory, recover
 from mavftpfs.cache.remote import VehicleStore
 from mavftpfs.cache.repair import Cleaner
-from mavftpfs.cache.reserved import OwnNames, new_owner, require_not_ours
+from mavftpfs.cache.reserved import OwnNames, new_owner, require_writable
 from mavftpfs.cache.spool import Spool
 from mavftpfs.cache.throttle import Throttle
 from mavftpfs.cache.writefile import Parts, ReadFile, WriteFile
@@ -38,7 +38,7 @@ from mavftpfs.shared.errors import (
     AlreadyExists,
     IsADirectory,
 )
-from mavftpfs.shared.model import EntryKind, require_listable, wire_path
+from mavftpfs.shared.model import EntryKind, require_listable
 
 log = logging.getLogger("mavftpfs.cache")
 
@@ -83,7 +83,7 @@ class Writeback:
             clock=directories.clock,
             wall=wall,
             nursery=nursery,
-            own=OwnNames(owner, options.root, rng),
+            own=OwnNames(owner, rng),
             paths=files.paths,
             spool=Spool(
                 memory_max=lambda: throttle.limit,
@@ -130,9 +130,8 @@ class Writeback:
     async def create(self, path: bytes, *, exclusive: bool) -> OpenFile:
         """Make a file, or open the one that is there."""
         self._context.require_disarmed()
-        require_not_ours(path)
+        require_writable(path)
         require_listable(path)
-        wire_path(path)
         async with self._context.paths.hold(path, shared=True):
             if await self._names.entry(path) is None:
                 await self._names.require_new(path)
@@ -157,7 +156,7 @@ class Writeback:
         node = context.nodes.get(path)
         if node is not None and node.draft is not None:
             return node
-        require_not_ours(path)
+        require_writable(path)
         entry = await self._names.need(path)
         if entry.kind is not EntryKind.FILE:
             raise IsADirectory(f"{path!r} is a directory")

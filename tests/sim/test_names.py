@@ -332,11 +332,13 @@ async def append(tree: Tree, path: bytes, data: bytes) -> None:
 
 
 @pytest.mark.holds("fault odd listing")
-@pytest.mark.parametrize("length", [118, 119, 200])
+@pytest.mark.parametrize(("length", "name"), [(118, 40), (119, 40), (200, 198)])
 @pytest.mark.parametrize("profile", taking_turns(RENAMING))
-async def test_everything_works_up_to_200_bytes(profile: str, length: int, autojump: MockClock) -> None:
+async def test_everything_works_up_to_200_bytes(
+    profile: str, length: int, name: int, autojump: MockClock
+) -> None:
     here = World(profile)
-    path, other = long_path(profile, length), long_path(profile, length, b"y")
+    path, other = long_path(profile, length, name=name), long_path(profile, length, b"y", name=name)
     here.tree.add_directory(split(path)[0])
     before = set(everything(here))
     async with mounted(here) as (_, tree):
@@ -370,13 +372,12 @@ async def test_everything_works_up_to_200_bytes(profile: str, length: int, autoj
 
 
 @pytest.mark.holds("fault odd listing")
-@pytest.mark.parametrize("name", [16, 90])
-@pytest.mark.parametrize("length", [118, 119, 200])
+@pytest.mark.parametrize(("length", "name"), [(118, 40), (119, 90), (200, 198)])
 @pytest.mark.parametrize("profile", taking_turns(PROFILES))
 async def test_the_first_change_may_be_an_append(
     profile: str, length: int, name: int, autojump: MockClock
 ) -> None:
-    """What is tried out beforehand needs names of its own, in or above a directory with a long path."""
+    """What is tried out beforehand needs names of its own."""
     here = World(profile)
     path = long_path(profile, length, name=name)
     here.tree.add(path, OLD)
@@ -384,6 +385,22 @@ async def test_the_first_change_may_be_an_append(
     async with mounted(here, inplace=True) as (_, tree):
         await append(tree, path, NEW)
     assert here.tree.data(path) == OLD + NEW
+    assert set(everything(here)) == before
+
+
+@pytest.mark.parametrize("profile", taking_turns(RENAMING))
+async def test_a_path_too_long_for_names_beside_it_is_not_written(profile: str, autojump: MockClock) -> None:
+    here = World(profile)
+    path, new = long_path(profile, 150), long_path(profile, 150, b"y")
+    here.tree.add(path, OLD)
+    before = set(everything(here))
+    async with mounted(here) as (_, tree):
+        with pytest.raises(PathTooLong):
+            await append(tree, path, b"more")
+        with pytest.raises(PathTooLong):
+            await write_file(tree, new, NEW)
+        assert await read_file(tree, path) == OLD
+    assert here.tree.data(path) == OLD
     assert set(everything(here)) == before
 
 

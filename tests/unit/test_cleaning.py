@@ -14,7 +14,7 @@ from mavftpfs.cache.reserved import Kind, Reserved
 from mavftpfs.cache.tree import Tree
 from mavftpfs.shared.model import DirEntry, EntryKind
 from tests.support.fake_store import read_file
-from tests.support.fake_writer import KINDS, FakeWriter, litter, make_writable
+from tests.support.fake_writer import KINDS, FakeWriter, litter
 
 OLD = bytes(range(256)) * 4
 DIRECTORY = b"/card/dir"
@@ -69,28 +69,3 @@ async def test_a_file_that_took_the_place_of_another_is_read_anew(store: FakeWri
     assert await read_file(tree, FILE) == OLD[::-1]
     assert context.own.torn == {}
     assert litter(store) == []
-
-
-@pytest.mark.parametrize(
-    ("text", "goes_to"),
-    [
-        (b"/card/dir/gone", b"/card/dir/gone"),
-        (b"/card/../gone", b"/card/recovered-osss"),
-        (b"/elsewhere/gone", b"/card/recovered-osss"),
-        (b"/card/dir/gone\0more", b"/card/recovered-osss"),
-        (b"garbage", b"/card/recovered-osss"),
-    ],
-)
-async def test_what_a_sidecar_may_say(nursery: trio.Nursery, text: bytes, goes_to: bytes) -> None:
-    """It lies on the card, where anybody may have written it."""
-    store = FakeWriter(KINDS["fat"], nursery)
-    for path in (b"/card/dir/x", b"/elsewhere/x"):
-        store.add(path, b"stays")
-    tree = make_writable(store, root=b"/card")
-    store.add(b"/card/" + reserved(tree, Kind.OLD, None), b"old")
-    store.add(b"/card/" + reserved(tree, Kind.SIDECAR, None), text)
-    await tree.list(b"/")
-    assert {path for path, file in store.files.items() if file.data == b"old"} == {goes_to}
-    assert sum(file.data == b"stays" for file in store.files.values()) == 2
-    assert litter(store) == []
-    nursery.cancel_scope.cancel()

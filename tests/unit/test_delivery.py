@@ -5,7 +5,6 @@ from __future__ import annotations
 import errno
 import json
 from collections.abc import Awaitable, Callable
-from contextlib import suppress
 from pathlib import Path
 from random import Random
 
@@ -21,13 +20,11 @@ from mavftpfs.shared.errors import (
     Armed,
     FileTooLarge,
     FtpNak,
-    MavftpfsError,
     NotSupported,
     RequestTimeout,
     VehicleLost,
     VerificationFailed,
 )
-from mavftpfs.shared.model import split
 from tests.support.fake_store import read_file
 from tests.support.fake_writer import CHUNK, KINDS, FakeWriter, card, litter, make_writable, write_file
 
@@ -406,49 +403,3 @@ async def test_what_cannot_be_delivered_is_copied_with_a_manifest(
     assert manifest["card__dir__new"]["whole"]
     assert manifest["card__dir__file.txt"]["changed"] == [[500, 504]]
     assert not manifest["card__dir__file.txt"]["whole"]
-
-
-def long_path(length: int) -> bytes:
-    parts = b"/card" + b"/a-rather-long-name" * 20
-    return parts[: length - 1].rstrip(b"/") + b"x" * (length - len(parts[: length - 1].rstrip(b"/")))
-
-
-# --- interruption anywhere, of a path that is too long for names that tell where they belong
-
-
-@pytest.mark.parametrize("kind", ["posix", "fat"])
-async def test_power_lost_while_a_long_path_is_replaced(
-    autojump_clock: object, tmp_path: Path, kind: str
-) -> None:
-    """The short names do not say where they belong; a sidecar does."""
-    path = long_path(180)
-    number = 0
-    while True:
-        async with trio.open_nursery() as nursery:
-            async with trio.open_nursery() as cut_off:
-                store = FakeWriter(KINDS[kind], cut_off)
-                store.add(path, OLD)
-                spool = SpoolDirectory(tmp_path / f"{number}", Random(number))
-                store.freeze_at = number
-                tree = make_writable(store, spool=spool)
-                done = False
-                with suppress(MavftpfsError):
-                    await write_file(tree, path, NEW)
-                    done = True
-                spool.close()
-                cut_off.cancel_scope.cancel()
-            store.nursery = nursery
-            store.revive()
-            again = SpoolDirectory(tmp_path / f"{number}", Random(99))
-            tree = make_writable(store, spool=again, seed=2)
-            directory = split(path)[0]
-            while directory != b"/":
-                await tree.list(directory)
-                directory = split(directory)[0]
-            again.close()
-            assert litter(store) == []
-            assert store.files[path].data in (OLD, NEW)
-            nursery.cancel_scope.cancel()
-        if done:
-            return
-        number += 1

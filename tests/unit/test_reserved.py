@@ -47,44 +47,28 @@ def test_other_names_are_not_ours(name: bytes) -> None:
     assert parse(name) is None
 
 
-@given(st.lists(st.integers(1, 60), min_size=1, max_size=8), st.integers())
+@given(st.lists(st.integers(1, 150), min_size=1, max_size=8), st.integers())
 def test_places_fit_every_request_or_are_refused(lengths: list[int], seed: int) -> None:
     path = b"".join(b"/" + b"p" * length for length in lengths)
+    parent, name = split(path)
     try:
-        places = OwnNames(b"abcd", b"/", Random(seed)).places(path)
+        places = OwnNames(b"abcd", Random(seed)).places(path)
     except PathTooLong:
-        assert len(path) > 200
+        assert len(parent) + len(path) > 218
         return
     assert places.old is not None
     for place in (places.new, places.old):
         assert fits_rename(place, path)
         assert len(place) <= 200
-        assert path.startswith(split(place)[0])
-    assert (places.sidecar is None) == (split(places.new)[1].endswith(b"-" + split(path)[1]))
+        assert split(place)[0] == parent
+    told = parse(split(places.new)[1])
+    assert told is not None
+    assert told.target == (name if len(parent) + len(path) + len(name) <= 217 else None)
 
 
 def test_names_do_not_repeat() -> None:
-    namer = OwnNames(b"abcd", b"/", Random(5))
+    namer = OwnNames(b"abcd", Random(5))
     assert len({namer.places(b"/a/b").new for _ in range(5000)}) == 5000
-
-
-def test_nothing_is_put_above_the_root() -> None:
-    root = b"/" + b"r" * 60
-    with pytest.raises(PathTooLong):
-        OwnNames(b"abcd", root, Random(5)).places(root + b"/" + b"n" * 138)
-
-
-@pytest.mark.parametrize("storage", [b"/fs/" + b"s" * 40, b"/fs/microsd"])
-def test_nothing_is_put_above_the_storage(storage: bytes) -> None:
-    """On NuttX storages are mounted below /fs, which takes no files."""
-    namer = OwnNames(b"abcd", b"/", Random(5))
-    path = storage + b"/" + b"n" * (199 - len(storage))
-    if len(path) + len(storage) + 20 > 238:
-        with pytest.raises(PathTooLong):
-            namer.places(path)
-    assert split(namer.places(path[:150]).new)[0] == storage
-    deep = storage + b"/" + b"d" * (150 - len(storage)) + b"/f"
-    assert split(namer.beside(deep, Kind.FRESH))[0] == storage
 
 
 TARGET = b"/d/file"
@@ -100,10 +84,8 @@ def mended(
     kinds: list[Kind], *, target_exists: bool, target: bytes | None = b"file"
 ) -> list[tuple[bytes, bytes | None]]:
     """Return the kinds and what becomes of them: None = removed."""
-    entries = [named(kind, None if kind is Kind.SIDECAR else target) for kind in kinds]
+    entries = [named(kind, target) for kind in kinds]
     (group,) = leftovers(b"/d", entries, lambda *_: True)
-    if Kind.SIDECAR in kinds:
-        group = Group(group.paths, group.serial, TARGET)
     kind_of = {path: kind.value for kind, path in group.paths.items()}
     return [(kind_of[action.path], action.to) for action in repair(group, target_exists=target_exists)]
 
@@ -116,12 +98,6 @@ def test_repair() -> None:
     assert mended([Kind.OLD], target_exists=False) == [(b"o", TARGET)]
     assert mended([Kind.NEW], target_exists=False) == [(b"t", b"/d/recovered-tsss-file")]
     assert mended([Kind.DELETED], target_exists=True, target=None) == [(b"d", None)]
-
-
-def test_repair_with_a_sidecar_removes_it_last() -> None:
-    kinds = [Kind.NEW, Kind.OLD, Kind.SIDECAR]
-    assert mended(kinds, target_exists=False, target=None) == [(b"t", TARGET), (b"o", None), (b"p", None)]
-    assert mended([Kind.SIDECAR], target_exists=True, target=None) == [(b"p", None)]
 
 
 def test_repair_without_a_target_loses_no_only_copy() -> None:

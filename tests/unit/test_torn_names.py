@@ -261,8 +261,8 @@ async def test_a_torn_name_that_nobody_asks_for_is_mended_without_news(
 
 @pytest.mark.parametrize("long", [False, True])
 async def test_removing_a_torn_file_removes_it(store: FakeWriter, tree: Tree, long: bool) -> None:
-    """long: what is left of it lies in a directory above, under names that do not tell."""
-    path = b"/card/" + b"d" * 116 + b"/f" if long else FILE
+    """long: what is left of it lies under names that do not tell where they belong."""
+    path = b"/card/" + b"f" * 150 if long else FILE
     store.add(path, OLD)
     Trap(store, tree, 2, "lost")
     with pytest.raises(VehicleLost):

@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-import errno
-
 import pytest
 import trio
 
-from mavftpfs.cache.repair import STALE_AFTER
-from mavftpfs.cache.reserved import Kind, Reserved
 from mavftpfs.cache.tree import Tree
 from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.shared.errors import FileChanged, FtpNak
-from tests.support.fake_store import FakeReader
-from tests.support.fake_writer import KINDS, FakeWriter, card, make_writable
+from tests.support.fake_writer import KINDS, FakeWriter, card
 
 OLD = bytes(range(256)) * 4
 FILE = b"/card/dir/file.txt"
@@ -105,26 +100,3 @@ async def test_emptying_does_not_trust_a_remembered_size_of_nothing(store: FakeW
     await file.fsync()
     file.close()
     assert store.files[b"/card/dir/log"].data == b""
-
-
-async def test_an_only_copy_stays_while_its_sidecar_cannot_be_opened(
-    autojump_clock: object, store: FakeWriter, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    tree = make_writable(store, dir_timeout=1)
-    copy, sidecar = (b"/card/" + Reserved(b"zzzz", kind, b"abc").name for kind in (Kind.NEW, Kind.SIDECAR))
-    store.add(copy, b"the only copy")
-    store.add(sidecar, b"/card/dir/gone")
-    await tree.list(b"/card")
-    await trio.sleep(STALE_AFTER)
-
-    async def refuse(*_: object, **__: object) -> FakeReader:
-        raise FtpNak(Opcode.OPEN_FILE_RO, NakCode.FAIL_ERRNO, errno.ENFILE)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(store, "open_reader", refuse)
-        await tree.list(b"/card")
-    assert store.files[copy].data == b"the only copy"
-    await trio.sleep(10)
-    await tree.list(b"/card")
-    assert store.files[b"/card/recovered-tabc-gone"].data == b"the only copy"
-    assert sidecar not in store.files
