@@ -68,7 +68,7 @@ async def read_base(context: Context, node: Node, start: int, stop: int) -> byte
 
 
 async def fetch(context: Context, node: Node) -> None:
-    """Get what only the vehicle has of a draft; the caller delivers it.
+    """Get what only the vehicle has of a draft, if anything; the caller delivers it.
 
     Where listings tell no times, all of the old file is read, so that its checksum is known: it is compared
     before the old file is replaced.
@@ -78,7 +78,8 @@ async def fetch(context: Context, node: Node) -> None:
     """
     draft = node.draft
     assert draft is not None
-    assert draft.base is not None
+    if draft.base is None or draft.whole:
+        return
     uncut = draft.base_limit == draft.base.size
     if context.directories.tells_times or not uncut or draft.base.size > context.options.verify_max:
         for start, stop in draft.missing_base():
@@ -110,7 +111,7 @@ def on_listed(context: Context, path: bytes, directory: Directory) -> None:
 
 
 def _on_replaced(context: Context, node: Node, draft: Draft) -> None:
-    if node.lock.locked():
+    if node.delivery is not None:
         return  # its delivery looks for itself
     draft.lose_base()
     if draft.state is State.STALE and not draft.undelivered:

@@ -1,8 +1,8 @@
 """Brings drafts to the vehicle, and knows that they are there. Layer: cache.
 
 `deliver` returns when the vehicle has the file, checked (promise 2), or raises why not; what was not
-delivered stays held, and the next call goes on. While it runs the file is not written (`Node.idle`), so
-what is verified is what was sent. Uploads begin earlier, in the background, where that is of use.
+delivered stays held, and the next call goes on. While it runs the file is not written (`Node.lock`), so
+what is verified is what was sent. Uploads begin earlier (`push`), where that is of use.
 
 One way leads to the card: the whole file is sent under a reserved name, verified there, and renamed into
 place (`draft`, `names`). Only cards that cannot rename get it under its own name.
@@ -18,7 +18,7 @@ import trio
 
 from mavftpfs.cache import base
 from mavftpfs.cache.context import Context
-from mavftpfs.cache.draft import SENDING, Draft, Event, Plan, State, choose
+from mavftpfs.cache.draft import Draft, Event, State
 from mavftpfs.cache.names import Names
 from mavftpfs.cache.nodes import Attempt, Node
 from mavftpfs.cache.recovery import describe
@@ -33,6 +33,7 @@ from mavftpfs.shared.errors import (
     LinkError,
     MavftpfsError,
     NoSpace,
+    NotSupported,
     OutcomeUnknown,
     RemoteProtocolError,
     RequestTimeout,
@@ -60,12 +61,23 @@ SENT_TWICE = 4096
 """Bytes of the largest file that is sent before it is known whether the card can rename. It goes in a round
 trip or two, so sending it again on the few cards that cannot costs less than four requests in each mount."""
 
+START_AT = 64 * 1024
+"""A background upload begins when so many bytes wait; fewer wait for the close."""
+
+START_PAUSE = 5.0
+"""Seconds after which one that could not begin is tried again."""
+
 PASSING = (RequestTimeout, LinkError, SessionBusy, Armed)
 """Errors after which the upload goes on where it stopped."""
 
 
+def may_pass(node: Node) -> bool:
+    """Return whether what kept a file from being delivered, if anything did, may be over by itself."""
+    return node.error is None or isinstance(node.error, PASSING)
+
+
 class Deliverer:
-    """Executes the plans of `draft.choose`, one after the other, until the vehicle has the file."""
+    """Brings files to the vehicle."""
 
     def __init__(self, context: Context, names: Names, cleaner: Cleaner, throttle: Throttle) -> None:
         self._context = context
@@ -81,51 +93,68 @@ class Deliverer:
         Raises:
             The reason why not: as VehicleStore; VerificationFailed, NotSupported, FileTooLarge, FileChanged.
         """
-        while wanted is None or wanted():
-            if not node.undelivered and node.attempt is None:
-                return
-            await node.unclaimed.wait()
-            async with self._context.paths.steady(node, lasting=True), node.lock:
-                draft = node.draft
-                if draft is None or not node.undelivered:
-                    await self.abandon(node)
-                    return
-                with node.delivering() as scope:
-                    node.idle = trio.Event()
-                    try:
-                        if node.path not in self._context.own.torn:  # else its name lacks a file until then
-                            self._context.require_disarmed()
-                        await self._deliver(node, draft)
-                        node.error = None
-                        node.start_after = float("-inf")
-                    except MavftpfsError as error:
-                        self._note_failure(node, draft, error)
-                        raise
-                    finally:
-                        node.idle.set()
-                        self._throttle.let_go()
-                        if node.undelivered:  # also if who waited for it gave up
-                            self._context.retry_later()
-                if not scope.cancelled_caught:
-                    return
+        done = False
+        while not done and (node.undelivered or node.attempt is not None) and (wanted is None or wanted()):
+            async with node.lock:
+                if not node.claims:  # else the name or the content goes first
+                    done = await self._deliver(node)
 
-    async def begin(self, node: Node) -> bool:
-        """Begin to send a draft that may still grow; return False if that has to wait for a close.
-
-        Raises:
-            As deliver.
-        """
-        await node.unclaimed.wait()
-        async with self._context.paths.steady(node, lasting=True), node.lock:
+    async def _deliver(self, node: Node) -> bool:
+        """Deliver; the caller has the node's lock. Return False if that was called off. Raises as deliver."""
+        context = self._context
+        async with context.paths.steady(node, lasting=True):
             draft = node.draft
             if draft is None or not node.undelivered:
+                await self.abandon(node)
                 return True
-            with node.delivering():
-                plan = self._plan(node, draft)
-                if plan not in SENDING:
-                    return False
-                await self._attempt(node, draft, plan)
-        return True
+            with trio.CancelScope() as node.delivery:
+                try:
+                    if node.path not in context.own.torn:  # else its name lacks a file until then
+                        context.require_disarmed()
+                    await self._try(node, draft)
+                    node.error, node.start_after = None, float("-inf")
+                    return True
+                except MavftpfsError as error:
+                    self._note_failure(node, draft, error)
+                    raise
+                finally:
+                    node.delivery = None
+                    self._throttle.let_go()
+                    if node.undelivered:  # also if who waited for it gave up
+                        context.retry_later()
+        return False
+
+    async def push(self, node: Node) -> None:
+        """The draft got more: send it, or begin to, if that can be done beside the program. The caller has
+        the node's lock."""
+        context, attempt, draft = self._context, node.attempt, node.draft
+        if draft is None or not node.undelivered:
+            return
+        if attempt is not None and attempt.sending is draft.sending:
+            if not attempt.sending.overtaken:
+                attempt.sending.growing = True
+                attempt.upload.wake()
+                return
+            node.start_after = float("inf")  # who changes what was sent does so again
+        due = context.clock() >= node.start_after and not context.blocked and not node.claims
+        if not due or draft.unacked < START_AT or not may_pass(node):
+            return
+        if draft.state is State.TORN or node.path in context.own.torn or not draft.whole:
+            node.start_after = float("inf")
+            return
+        try:
+            async with context.paths.steady(node, lasting=True):
+                with trio.CancelScope() as node.delivery:
+                    attempt = await self._attempt(node, draft)
+                    attempt.sending.growing = True
+                    attempt.upload.wake()
+        except MavftpfsError as error:
+            node.start_after = context.clock() + START_PAUSE
+            level = logging.DEBUG if isinstance(error, Armed) else logging.INFO  # one line is enough for all
+            log.log(level, "%r is not sent just now: %s", node.path, error)
+        finally:
+            node.delivery = None
+            self._throttle.let_go()
 
     async def abandon(self, node: Node) -> None:
         """Give up the present attempt; what it left under reserved names goes now or at the next listing. The
@@ -140,28 +169,35 @@ class Deliverer:
             if attempt.places is not None and attempt.upload.begun:
                 await self._names.discard(attempt.path)
         finally:
-            self._context.own.live -= attempt.live
+            if attempt.places is not None:
+                self._context.own.live -= attempt.places.all
 
     # --- one delivery
 
-    def _plan(self, node: Node, draft: Draft) -> Plan:
-        torn = node.path in self._context.own.torn
-        return choose(draft, self._context.store.traits, torn=torn, inplace=self._context.options.inplace)
+    def _is_in_place(self, draft: Draft) -> bool:
+        """Return whether it is sent under its own name, since the card was seen not to rename.
 
-    async def _deliver(self, node: Node, draft: Draft) -> None:
+        Raises:
+            FileChanged: the base is another file now. NotSupported: it cannot be replaced safely.
+        """
+        if draft.state is State.STALE:
+            raise FileChanged("others replaced the file on the vehicle while it was changed here")
+        in_place = self._context.store.traits.rename_works is False
+        if in_place and draft.base is not None and not (self._context.options.inplace or draft.begun):
+            raise NotSupported("this server cannot rename, so a file cannot be replaced safely; see inplace")
+        return in_place
+
+    async def _try(self, node: Node, draft: Draft) -> None:
+        """Deliver, trying again as long as something was learnt of the server."""
         mismatches = 0
         for _ in range(MAX_STEPS):
-            plan = self._plan(node, draft)
             known = astuple(self._context.store.traits)
             try:
-                if plan is Plan.NOTHING:
-                    return
-                elif plan is Plan.MEND:
+                if draft.state is State.TORN or node.path in self._context.own.torn:
                     await self._mend(node, draft)
-                elif plan is Plan.FETCH:
-                    await base.fetch(self._context, node)
-                else:
-                    await self._send(node, draft, plan)
+                if draft.state is not State.CLEAN:
+                    await self._send(node, draft)
+                return
             except VerificationFailed as error:
                 mismatches += 1
                 await self.abandon(node)
@@ -200,9 +236,11 @@ class Deliverer:
 
     # --- sending
 
-    async def _send(self, node: Node, draft: Draft, plan: Plan) -> None:
+    async def _send(self, node: Node, draft: Draft) -> None:
         """Send the whole file, compare it, and rename it into place."""
-        attempt, writer = await self._attempt(node, draft, plan), self._context.store
+        self._is_in_place(draft)  # before anything is fetched for it
+        await base.fetch(self._context, node)
+        attempt, store = await self._attempt(node, draft), self._context.store
         attempt.sending.growing = False
         for _ in range(FINISHES):
             attempt.upload.wake()
@@ -211,7 +249,7 @@ class Deliverer:
                 break
         else:
             raise RemoteProtocolError(f"{attempt.path!r} was said to be finished, and was not")
-        doubted = writer.in_doubt() or writer.doubted_since(attempt.begun_at)
+        doubted = store.in_doubt() or store.doubted_since(attempt.begun_at)
         crc32 = await self.verifier.check(attempt.path, draft, doubted=doubted)
         if attempt.places is None:
             node.attempt = None
@@ -221,23 +259,24 @@ class Deliverer:
             await self._commit(node, draft, attempt, attempt.places)
         self._on_delivered(node, draft, crc32)
 
-    async def _attempt(self, node: Node, draft: Draft, plan: Plan) -> Attempt:
+    async def _attempt(self, node: Node, draft: Draft) -> Attempt:
         """Return the attempt under way if it still fits, else a new one."""
-        attempt = node.attempt
-        if attempt is not None and not attempt.sending.overtaken and attempt.fits(plan):
-            return attempt
+        attempt, in_place = node.attempt, self._is_in_place(draft)
+        if attempt is not None and attempt.sending is draft.sending and in_place == (attempt.places is None):
+            if not attempt.sending.overtaken:
+                return attempt
         await self.abandon(node)
         context, places = self._context, None
         # A card may have no room beside the file that `inplace` replaces, and never tell.
         ask_first = draft.size > SENT_TWICE or (context.options.inplace and draft.base is not None)
         if ask_first and context.store.traits.rename_works is None:
             await self._names.find_out(node.path)
-            plan = self._plan(node, draft)
-        if plan is Plan.OVERWRITE or isinstance(node.error, AlreadyExists):  # which all of it was sent for
+            in_place = self._is_in_place(draft)
+        if in_place or isinstance(node.error, AlreadyExists):  # which all of it was sent for
             await self._require_expected(node, draft)
-        if plan is Plan.REPLACE and draft.base is None:
+        if not in_place and draft.base is None:
             places = Places(context.own.beside(node.path, Kind.FRESH))
-        elif plan is Plan.REPLACE:
+        elif not in_place:
             places = context.own.places(node.path)
         path, live = (node.path, set[bytes]()) if places is None else (places.new, places.all)
         context.own.live |= live
@@ -250,7 +289,7 @@ class Deliverer:
             draft.give_up()
             context.own.live -= live
             raise
-        node.attempt = Attempt(path, places, live, sending, upload, begun_at)
+        node.attempt = Attempt(path, places, sending, upload, begun_at)
         if places is None:
             context.dentries.put(path, DirEntry(b"", EntryKind.FILE))
         return node.attempt
@@ -300,7 +339,7 @@ class Deliverer:
                     await self._names.discard(attempt.path)
             raise
         finally:
-            own.live -= attempt.live  # what is left there is for the next listing to clean up
+            own.live -= places.all  # what is left there is for the next listing to clean up
 
     # --- after
 
@@ -322,9 +361,9 @@ class Deliverer:
         known, node.error = node.error, error
         level = logging.DEBUG if isinstance(error, Armed) or str(known) == str(error) else logging.WARNING
         log.log(level, "%r is not delivered: %s", node.path, error)  # once: each close tries again
-        if node.draft is None or node.content is None:
+        if node.draft is not draft:
             return
         try:
-            node.content.persist(describe(node.path, draft, error, self._context.wall))
+            draft.content.persist(describe(node.path, draft, error, self._context.wall))
         except (NoSpace, SpoolFailed, OSError) as trouble:
             log.warning("%r is kept in memory only: %s", node.path, trouble)

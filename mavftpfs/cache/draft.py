@@ -5,10 +5,9 @@ it), else *base* (below `base_limit`: the vehicle has it), else zero: the conten
 write beyond it, or of a file that was extended.
 
 All handles of a path share its draft. Its state, and what may happen next, is in one table: `TRANSITIONS`;
-the next step that brings it to the vehicle is `choose`. Whatever changes a file's content is sent as a whole
-new file under a reserved name beside it, verified there, and renamed into place (`delivery`). Only on cards
-that cannot rename it is sent under its own name. A write while that file is sent joins it; once it is being
-renamed into place, writers wait for the end of that.
+`delivery` takes the steps. Whatever changes a file's content is sent as a whole new file under a reserved name
+beside it, verified there, and renamed into place. Only on cards that cannot rename it is sent under its own
+name. What is appended while that file is sent joins it; during a close writers wait.
 
 `Sending` has the books of one attempt. A new attempt gets new books, so whatever a late upload still says of
 the old one changes nothing.
@@ -20,11 +19,10 @@ import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
-from typing import Protocol
+from typing import Any, Protocol
 
-from mavftpfs.shared.errors import FileChanged, LocalProtocolError, NotSupported
+from mavftpfs.shared.errors import LocalProtocolError
 from mavftpfs.shared.extents import ExtentSet
-from mavftpfs.shared.traits import WriteTraits
 
 AHEAD = 64 * 1024
 """Bytes fetched from the spool at once, since chunks are small."""
@@ -87,7 +85,7 @@ TRANSITIONS: dict[State, dict[Event, State]] = {
     },
     State.SENDING: {
         Event.CHANGED: State.SENDING,
-        Event.EMPTIED: State.SENDING,
+        Event.EMPTIED: State.DIRTY,
         Event.GIVEN_UP: State.DIRTY,
         Event.COMMITS: State.COMMITTING,
     },
@@ -110,23 +108,15 @@ TRANSITIONS: dict[State, dict[Event, State]] = {
 
 
 class Content(Protocol):
-    """Keeps bytes by offset (cache.spool.SpoolContent)."""
+    """Keeps bytes by offset; see cache.spool.SpoolContent."""
 
-    def put(self, offset: int, data: bytes | memoryview) -> None:
-        """Keep them. Raises NoSpace or SpoolFailed, having kept none."""
-        ...
-
-    def get(self, start: int, stop: int) -> bytes:
-        """Return bytes that were put. Raises SpoolFailed."""
-        ...
-
-    def cut(self, size: int) -> None:
-        """Forget what lies at and beyond `size`. Raises NoSpace or SpoolFailed, having forgotten nothing."""
-        ...
-
-    def settle(self) -> None:
-        """The vehicle has all of it."""
-        ...
+    def put(self, offset: int, data: bytes | memoryview) -> None: ...
+    def get(self, start: int, stop: int) -> bytes: ...
+    def cut(self, size: int) -> None: ...
+    def settle(self) -> None: ...
+    def restate(self) -> None: ...
+    def persist(self, facts: dict[str, Any]) -> None: ...
+    def close(self) -> None: ...
 
 
 class Where(Enum):
@@ -151,6 +141,7 @@ class Draft:
     """The local content of one file.
 
     Attributes:
+        content: keeps what is held.
         size: bytes, as programs see it.
         base: the file on the vehicle, None if there is none.
         base_limit: below this, bytes that are not held are the base's.
@@ -160,7 +151,7 @@ class Draft:
     """
 
     def __init__(self, content: Content, base: Base | None) -> None:
-        self._content = content
+        self.content = content
         self.size = 0 if base is None else base.size
         self.base = base
         self.base_limit = self.size
@@ -227,7 +218,7 @@ class Draft:
         parts = []
         for where, a, b in self.segments(start, stop):
             assert where is not Where.BASE
-            parts.append(self._content.get(a, b) if where is Where.HELD else bytes(b - a))
+            parts.append(self.content.get(a, b) if where is Where.HELD else bytes(b - a))
         return parts[0] if len(parts) == 1 else b"".join(parts)
 
     def crc32(self) -> int:
@@ -253,7 +244,7 @@ class Draft:
         if offset == stop:
             return
         after = self._after(Event.CHANGED)
-        self._content.put(offset, data)
+        self.content.put(offset, data)
         self._held.add(offset, stop)
         self._note_changed(min(offset, self.size), stop)
         self.size, self.state = max(self.size, stop), after
@@ -268,11 +259,13 @@ class Draft:
             return
         after = self._after(Event.CHANGED if size else Event.EMPTIED)
         if size < self.size:
-            self._content.cut(size)
+            self.content.cut(size)
             for extents in (self._held, self._changed):
                 extents.discard(size, max(size, extents.end))
             self.base_limit = min(self.base_limit, size)
-            if self.sending is not None:
+            if size == 0:
+                self.sending = None
+            elif self.sending is not None:
                 self.sending.on_changed(size, size)
         else:
             self._note_changed(self.size, size)
@@ -286,7 +279,7 @@ class Draft:
         """
         stop = min(offset + len(data), self.base_limit, self.size)
         for start, end in self._held.missing(offset, stop):
-            self._content.put(start, memoryview(data)[start - offset : end - offset])
+            self.content.put(start, memoryview(data)[start - offset : end - offset])
             self._held.add(start, end)
 
     # --- what delivery does
@@ -327,7 +320,7 @@ class Draft:
         self.base, self.base_limit = Base(self.size, crc32=crc32), self.size
         self.begun = False
         self._changed.clear()
-        self._content.settle()
+        self.content.settle()
 
     def lose_base(self) -> None:
         """Others replaced the file on the vehicle. If no byte of it was to stay that changes nothing."""
@@ -448,47 +441,3 @@ class Sending:
             self._proven.clear()
         self._acked = self._proven.copy()
         self._todo = ExtentSet(self._acked.missing(0, self._size))
-
-
-# --- the next step
-
-
-class Plan(Enum):
-    """One step.
-
-    NOTHING: the vehicle has it. MEND: have an interrupted replacement completed or undone. FETCH: get what
-    only the vehicle has of the old content. REPLACE: send it under a reserved name and rename it. OVERWRITE:
-    send it under its own name, since the card was seen not to rename.
-    """
-
-    NOTHING = "nothing"
-    MEND = "mend"
-    FETCH = "fetch"
-    REPLACE = "replace"
-    OVERWRITE = "overwrite"
-
-
-SENDING = frozenset({Plan.REPLACE, Plan.OVERWRITE})
-"""Steps that send bytes."""
-
-
-def choose(draft: Draft, traits: WriteTraits, *, torn: bool, inplace: bool) -> Plan:
-    """Return the next step for a draft, by what the server was seen to do.
-
-    torn: its name may lack its file on the card. inplace: overwrite files where they cannot be replaced.
-
-    Raises:
-        FileChanged: the base is another file now.
-        NotSupported: the card cannot rename, and `inplace` was not given.
-    """
-    if draft.state is State.CLEAN:
-        return Plan.NOTHING
-    if draft.state is State.STALE:
-        raise FileChanged("others replaced the file on the vehicle while it was changed here")
-    if draft.state is State.TORN or (torn and draft.state is State.DIRTY):  # written again meanwhile
-        return Plan.MEND
-    if traits.rename_works is False and draft.base is not None and not inplace and not draft.begun:
-        raise NotSupported("this server cannot rename, so a file cannot be replaced safely; see inplace")
-    if not draft.whole:
-        return Plan.FETCH
-    return Plan.OVERWRITE if traits.rename_works is False else Plan.REPLACE

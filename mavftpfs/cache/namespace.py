@@ -12,7 +12,8 @@ change of the name is refused (EBUSY).
 from __future__ import annotations
 
 import logging
-from contextlib import nullcontext
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager, nullcontext
 
 import trio
 
@@ -82,14 +83,12 @@ class Namespace:
         """See Tree.unlink."""
         self._context.require_disarmed()
         require_not_ours(path)
-        node = self._context.nodes.get(path)
-        with nullcontext() if node is None else node.claim():
-            async with self._context.paths.hold(path):
-                node = self._context.nodes.get(path)
-                if node is not None and await self._names.entry(path) is not None:
-                    await self._unlink_node(node)
-                else:
-                    await self._unlink_closed(path)
+        async with self._claim(path), self._context.paths.hold(path):
+            node = self._context.nodes.get(path)
+            if node is not None and await self._names.entry(path) is not None:
+                await self._unlink_node(node)
+            else:
+                await self._unlink_closed(path)
         self._overlay.times.forget(path)
 
     async def rename(self, old: bytes, new: bytes, *, noreplace: bool) -> None:
@@ -102,10 +101,9 @@ class Namespace:
             raise InvalidMove(f"{old!r} cannot become a part of itself")
         if old != new:
             await self._deliver_below(old)
-        displaced = None if noreplace or old == new else self._context.nodes.get(new)
-        with nullcontext() if displaced is None else displaced.claim():
-            async with self._context.paths.hold(old, new):
-                await self._rename(old, new, noreplace=noreplace)
+        claimed = nullcontext() if noreplace or old == new else self._claim(new)
+        async with claimed, self._context.paths.hold(old, new):
+            await self._rename(old, new, noreplace=noreplace)
 
     async def release(self, node: Node) -> None:
         """Nobody has an unlinked file open any more: remove what was hidden of it.
@@ -119,6 +117,18 @@ class Namespace:
             async with self._context.paths.hold(path):  # a directory above it may be about to move
                 if node.path == path and node.hidden:
                     await self._remove_hidden(node)
+
+    @asynccontextmanager
+    async def _claim(self, path: bytes) -> AsyncIterator[None]:
+        """The body takes the name of what is open at a path, or not delivered yet."""
+        nodes = self._context.nodes
+        node = nodes.get(path)
+        try:
+            async with nullcontext() if node is None else node.claim():
+                yield
+        finally:
+            if node is not None:
+                nodes.maybe_forget(node)
 
     # --- inside: unlinking
 
@@ -248,8 +258,7 @@ class Namespace:
         if not self._fill(draft, blocks):
             node.drop_draft()
             return False
-        assert node.content is not None
-        node.content.settle()  # whatever becomes of this mount, nobody misses a copy
+        draft.content.settle()  # whatever becomes of this mount, nobody misses a copy
         return True
 
     def _fill(self, draft: Draft, blocks: Version) -> bool:

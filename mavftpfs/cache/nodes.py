@@ -3,19 +3,18 @@
 A node is one file of this mount, whatever its name: handles follow it when it is renamed, and keep it when
 it is unlinked. Nodes without handles and without anything to deliver are forgotten.
 
-Locks: see `pathlocks`. A node's lock is taken by who delivers it, or starts to, and only while its path is
-held `shared`; who holds the path alone needs no node's lock, since nobody else can have it.
+Locks: see `pathlocks`. A node's lock is taken before its path is held.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import AsyncIterator, Iterator
+from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
 
 import trio
 
-from mavftpfs.cache.draft import Base, Draft, Plan, Sending, State
+from mavftpfs.cache.draft import Base, Draft, Sending, State
 from mavftpfs.cache.files import FileHandle
 from mavftpfs.cache.remote import Upload
 from mavftpfs.cache.reserved import Places
@@ -28,39 +27,33 @@ class Attempt:
     """One try to deliver a draft.
 
     path: where its bytes go. places: the reserved names, None where it is sent under the file's own name.
-    live: the reserved names it uses. begun_at: when, by the caches' clock.
+    begun_at: when, by the caches' clock.
     """
 
     path: bytes
     places: Places | None
-    live: set[bytes]
     sending: Sending
     upload: Upload
     begun_at: float
 
-    def fits(self, plan: Plan) -> bool:
-        """Return whether that is still the way to send it."""
-        return (self.places is None) == (plan is Plan.OVERWRITE)
 
 
 @dataclass(slots=True, eq=False)
 class Node:
     """One file.
 
-    path: its name, or the reserved name it was hidden under. draft: what the vehicle does not have of it;
-    content: the draft's bytes. handles: how many are open, writers: those for writing. generation: counts how
-    often its content on the vehicle was changed by us. removed: it has no name any more. hidden: it is still
-    on the vehicle, under a reserved name. error: why it could not be delivered. attempt: the present one to
-    deliver it. base: reads the vehicle's file. starting: an upload in the background is about to begin.
-    start_after: none begins by itself before (infinite: only a close sends it). known_at: when the vehicle
-    was last known to have it all. lock: held to deliver it. idle: no delivery is under way, so it may be
-    written. claims: how many changes take its name or content away, or are about to: no delivery begins or
-    goes on before it is unclaimed.
+    path: its name, or the reserved name it was hidden under. draft: what the vehicle does not have of it.
+    handles: how many are open, writers: those for writing. generation: counts how often its content on the
+    vehicle was changed by us. removed: it has no name any more. hidden: it is still on the vehicle, under a
+    reserved name. error: why it could not be delivered. attempt: the present one to deliver it. base: reads
+    the vehicle's file. start_after: no upload begins by itself before (infinite: only a close sends it).
+    known_at: when the vehicle was last known to have it all. lock: held by who writes or delivers it, or
+    takes its name. delivery: what ends the delivery under way. claims: how many wait for the lock to take
+    name or content away; they go before deliveries.
     """
 
     path: bytes
     draft: Draft | None = None
-    content: SpoolContent | None = None
     handles: int = 0
     writers: int = 0
     generation: int = 0
@@ -69,18 +62,11 @@ class Node:
     error: MavftpfsError | None = None
     attempt: Attempt | None = None
     base: FileHandle | None = None
-    starting: bool = False
     start_after: float = float("-inf")
     known_at: float = float("-inf")
     lock: trio.Lock = field(default_factory=trio.Lock)
-    idle: trio.Event = field(default_factory=trio.Event)
+    delivery: trio.CancelScope | None = None
     claims: int = 0
-    unclaimed: trio.Event = field(default_factory=trio.Event)
-    _delivery: trio.CancelScope | None = None
-
-    def __post_init__(self) -> None:
-        self.idle.set()
-        self.unclaimed.set()
 
     @property
     def undelivered(self) -> bool:
@@ -100,41 +86,22 @@ class Node:
         in_place = self.attempt is not None and self.attempt.places is None
         return in_place or self.draft.begun or self.draft.state in (State.COMMITTING, State.TORN)
 
-    @contextmanager
-    def delivering(self) -> Iterator[trio.CancelScope]:
-        """The body brings it to the vehicle, unless it is cancelled because name or content go (`claim`)."""
-        with trio.CancelScope() as scope:
-            self._delivery = scope
-            if self.claims:
-                scope.cancel()
-            try:
-                yield scope
-            finally:
-                self._delivery = None
-
-    @contextmanager
-    def claim(self) -> Iterator[None]:
-        """The body takes the name or the content away: what is being delivered of it is called off, unless it
-        is just being renamed into place."""
+    @asynccontextmanager
+    async def claim(self) -> AsyncIterator[None]:
+        """The body takes the name or the content away, and has the lock: what is being delivered is called
+        off, unless it is just being renamed into place. Who waits for that delivery has it begin again."""
         self.claims += 1
-        if self.unclaimed.is_set():
-            self.unclaimed = trio.Event()
-        committing = self.draft is not None and self.draft.state is State.COMMITTING
-        if self._delivery is not None and not committing:  # nobody would find what it left there
-            self._delivery.cancel()
+        try:
+            committing = self.draft is not None and self.draft.state is State.COMMITTING
+            if self.delivery is not None and not committing:  # nobody would find what it left there
+                self.delivery.cancel()
+            await self.lock.acquire()
+        finally:
+            self.claims -= 1
         try:
             yield
         finally:
-            self.claims -= 1
-            if not self.claims:
-                self.unclaimed.set()
-
-    async def call_off(self) -> None:
-        """Have what is being delivered called off, since its content is about to go: who waits for the
-        delivery has it begin again then. When this returns nothing is delivered before the next wait."""
-        with self.claim():
-            while not self.idle.is_set():  # the next one may have begun while we woke up
-                await self.idle.wait()
+            self.lock.release()
 
     def require_reachable(self) -> None:
         """Raise FileChanged if its path may be another file's: it was replaced or removed, not hidden."""
@@ -159,22 +126,21 @@ class Node:
     def lose_name(self) -> None:
         """It has no name any more; only who has it open needs its bytes."""
         self.removed = True
-        if self.content is not None:
-            self.content.restate()
+        if self.draft is not None:
+            self.draft.content.restate()
 
     def begin_draft(self, spool: Spool, base: Base | None, now: float) -> Draft:
         """It is going to be changed. base: the vehicle's file, None for a new one."""
-        self.content = SpoolContent(spool, self.spool_name)
-        self.draft = Draft(self.content, base)
+        self.draft = Draft(SpoolContent(spool, self.spool_name), base)
         self.known_at = now
         return self.draft
 
     def drop_draft(self) -> None:
         """The vehicle has it all, or nobody wants it."""
         self.close_base()
-        if self.content is not None:
-            self.content.close()
-        self.draft = self.content = self.attempt = self.error = None
+        if self.draft is not None:
+            self.draft.content.close()
+        self.draft = self.attempt = self.error = None
         self.start_after = self.known_at = float("-inf")
 
 

@@ -1,15 +1,15 @@
-"""Which paths are being changed: the first of three locks. Layer: cache.
+"""Which paths are being changed: the second of three locks. Layer: cache.
 
 In the order in which they are taken:
-1. The *path lock*, here. Who changes names (mkdir, rmdir, unlink, rename) holds the paths concerned alone.
+1. The *file lock*, `nodes.Node.lock`. Who writes or delivers a file has it, and who takes its name or content
+   away (`Node.claim`).
+2. The *path lock*, here. Who changes names (mkdir, rmdir, unlink, rename) holds the paths concerned alone.
    Who opens or delivers a file holds its path `shared`: beside others that share it, and not during a change
    of its name, or he would hold neither the old file nor the new one.
-2. The *file lock*, `nodes.Node.lock`. Who delivers a file, or begins to in the background, takes it while he
-   holds the path shared. Who holds the path alone needs none.
 3. `versions.BlockCache.reads`, which bounds the memory of who waits for a file's bytes. A delivery takes it
    below both, to fetch what its draft lies over. A reader that has it takes its path `shared`, to open the
    file: that waits only for who holds the path alone, and he never reads through the cache.
-A listing may be asked for under either lock, and what it has mended (`repair`) takes none.
+A listing may be asked for under any lock, and what it has mended (`repair`) takes none.
 
 Two changes concern one another if they name the same path, in any case, or one names a directory above the
 other's. All others go on side by side, so that one that is not answered holds up nobody else.

@@ -213,7 +213,7 @@ class Cleaner:
                     group = replace(group, target=path)
         exists = group.target is not None and await self._exists(group.target)
         node = None if group.target is None else self._context.nodes.get(group.target)
-        if exists or node is None or not node.lock.locked() or node in self._delivered:
+        if exists or node is None or node.delivery is None or node in self._delivered:
             await self._execute(group, target_exists=exists)
         # else it is being written here: a later listing shows what came of it
 

@@ -95,10 +95,10 @@ class Writeback:
         self._names = names = Names(context)
         self._cleaner = cleaner = Cleaner(context, names, dead)
         self._deliverer = deliverer = Deliverer(context, names, cleaner, throttle)
-        self._background = Background(context, deliverer, throttle, cleaner)
+        self._background = Background(context, deliverer, cleaner)
         self.overlay = Overlay(context)
         self.namespace = Namespace(context, names, deliverer, self.overlay)
-        self._parts = Parts(context, deliverer, throttle, self._background, self.overlay, self.namespace)
+        self._parts = Parts(context, deliverer, throttle, self.overlay, self.namespace)
         if not options.read_only:
             directories.on_swept = cleaner.on_swept
         files.is_changing = context.is_changing
@@ -206,7 +206,7 @@ class Writeback:
     async def _forget_draft(self, node: Node) -> None:
         """What was to be written is not wanted any more, since its caller got an error. What may have the
         name already is completed later."""
-        async with self._context.paths.steady(node, lasting=True), node.lock:
+        async with node.lock, self._context.paths.steady(node, lasting=True):
             await self._deliverer.abandon(node)
             draft = node.draft
             if node.writers or draft is None or draft.begun or draft.state is State.TORN:

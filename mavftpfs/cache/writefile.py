@@ -14,7 +14,6 @@ from functools import partial
 
 import trio
 
-from mavftpfs.cache.background import Background
 from mavftpfs.cache.base import open_node, read_base
 from mavftpfs.cache.context import Context
 from mavftpfs.cache.delivery import Deliverer
@@ -47,7 +46,6 @@ class Parts:
     context: Context
     deliverer: Deliverer
     throttle: Throttle
-    background: Background
     overlay: Overlay
     namespace: Namespace
 
@@ -129,7 +127,7 @@ class ReadFile(OpenFile):
         if not node.handles and not node.removed:
             if node.draft is not None and node.draft.state is State.CLEAN and not node.lock.locked():
                 self._adopt(node.draft)
-            self._parts.background.settle(node)
+            self._context.nodes.maybe_forget(node)
 
     # --- inside
 
@@ -190,32 +188,33 @@ class WriteFile(ReadFile):
     async def write(self, offset: int, data: bytes | memoryview) -> int:
         """Take all of `data`; see OpenFile.write."""
         node, stop = self._node, offset + len(data)
-        self._require_possible(stop)
-        await self._may_write(node)
-        node.require_current()
-        assert node.draft is not None
-        self._parts.throttle.require_sendable(node.draft, max(node.draft.size, stop))
-        node.draft.write(offset, data)
-        self._on_written(node)
+        await self._have_room(stop)
+        async with node.lock:
+            self._context.require_disarmed()
+            node.require_current()
+            assert node.draft is not None
+            self._parts.throttle.require_sendable(node.draft, max(node.draft.size, stop))
+            node.draft.write(offset, data)
+            await self._on_written(node)
         return len(data)
 
     async def truncate(self, size: int) -> None:
         """Cut or extend; see OpenFile.truncate."""
         node = self._node
-        self._require_possible(size)
         assert node.draft is not None
-        if size == 0 < node.draft.size:
-            await self._may_empty(node)
-        else:
-            await self._may_write(node)
-        if node.removed or size:
-            node.require_current()
-        if size == node.draft.size:
+        if size or not node.draft.size:
+            await self._have_room(size)
+            async with node.lock:
+                await self._truncate(node, size)
             return
-        if size:
-            self._parts.throttle.require_sendable(node.draft, size)
-        node.draft.truncate(size)
-        self._on_written(node)
+        if self._closed:
+            raise LocalProtocolError("truncate of a closed handle")
+        # What is under way to the vehicle is not wanted any more: no room is needed, either.
+        with trio.move_on_after(self._context.options.op_deadline):
+            async with node.claim():
+                await self._truncate(node, 0)
+                return
+        raise FileBusy(f"{node.path!r} is just getting its place")
 
     async def flush(self) -> None:
         """Deliver, unless all that happened is that the file was emptied: more is about to come.
@@ -253,51 +252,35 @@ class WriteFile(ReadFile):
 
     # --- inside
 
-    def _require_possible(self, size: int) -> None:
+    async def _have_room(self, size: int) -> None:
+        """Wait until not too much is un-ACKed. size: of the file, in bytes, if nobody else writes to it.
+
+        Raises:
+            FileTooLarge, Armed. Else as Deliverer.deliver, when nothing moves.
+        """
         if self._closed:
             raise LocalProtocolError("write to a closed handle")
         if size > MAX_FILE:
             raise FileTooLarge(f"no vehicle takes files of more than {MAX_FILE} bytes")
-
-    async def _may_write(self, node: Node) -> None:
-        """Wait until a delivery under way is over and not too much is un-ACKed. Who called may change the
-        draft until its next wait.
-
-        Raises:
-            Armed. Else as Deliverer.deliver, when too much is un-ACKed.
-        """
-        context, throttle = self._context, self._parts.throttle
-        idle_since = context.clock()
-        while True:
-            context.require_disarmed()
-            await node.idle.wait()
-            if not node.idle.is_set():
-                continue  # the next delivery began while we woke up
-            if not throttle.is_full(node):
-                return
-            if await throttle.wait():
-                idle_since = context.clock()
-                continue
-            if node.starting and context.clock() - idle_since < context.options.op_deadline:
-                continue  # an upload is about to begin: to wait for all of it would stop the program
-            # It says what is wrong, if anything is.
-            await self._parts.deliverer.deliver(node, wanted=partial(throttle.is_full, node))
-            idle_since = context.clock()
-
-    async def _may_empty(self, node: Node) -> None:
-        """Call off what brings bytes to the vehicle that nobody wants any more: no room is needed, either.
-
-        Raises:
-            Armed. FileBusy: it is at a step that is not called off, and that lasts.
-        """
-        with trio.move_on_after(self._context.options.op_deadline):
-            await node.call_off()
+        throttle = self._parts.throttle
+        while throttle.is_full(self._node):
             self._context.require_disarmed()
-            self._parts.throttle.let_go()
-            return
-        raise FileBusy(f"{node.path!r} is just getting its place")
+            if not await throttle.wait():  # a delivery says what is wrong, if anything is
+                await self._parts.deliverer.deliver(self._node, wanted=partial(throttle.is_full, self._node))
 
-    def _on_written(self, node: Node) -> None:
+    async def _truncate(self, node: Node, size: int) -> None:
+        self._context.require_disarmed()
+        if node.removed or size:
+            node.require_current()
+        assert node.draft is not None
+        if size == node.draft.size:
+            return
+        if size:
+            self._parts.throttle.require_sendable(node.draft, size)
+        node.draft.truncate(size)
+        await self._on_written(node)
+
+    async def _on_written(self, node: Node) -> None:
         if not node.removed:
             self._parts.overlay.on_written(node.path)
-            self._parts.background.kick(node)
+            await self._parts.deliverer.push(node)
