@@ -262,9 +262,8 @@ class Deliverer:
     async def _attempt(self, node: Node, draft: Draft) -> Attempt:
         """Return the attempt under way if it still fits, else a new one."""
         attempt, in_place = node.attempt, self._is_in_place(draft)
-        if attempt is not None and attempt.sending is draft.sending and in_place == (attempt.places is None):
-            if not attempt.sending.overtaken:
-                return attempt
+        if attempt is not None and attempt.fits(draft, in_place=in_place):
+            return attempt
         await self.abandon(node)
         context, places = self._context, None
         # A card may have no room beside the file that `inplace` replaces, and never tell.

@@ -5,9 +5,9 @@ it), else *base* (below `base_limit`: the vehicle has it), else zero: the conten
 write beyond it, or of a file that was extended.
 
 All handles of a path share its draft. Its state, and what may happen next, is in one table: `TRANSITIONS`;
-`delivery` takes the steps. Whatever changes a file's content is sent as a whole new file under a reserved name
-beside it, verified there, and renamed into place. Only on cards that cannot rename it is sent under its own
-name. What is appended while that file is sent joins it; during a close writers wait.
+`delivery` takes the steps. Whatever changes a file's content is sent as a whole new file under a reserved
+name beside it, verified there, and renamed into place. Only on cards that cannot rename it is sent under its
+own name. What is appended while that file is sent joins it; during a close writers wait.
 
 `Sending` has the books of one attempt. A new attempt gets new books, so whatever a late upload still says of
 the old one changes nothing.

@@ -36,6 +36,11 @@ class Attempt:
     upload: Upload
     begun_at: float
 
+    def fits(self, draft: Draft, *, in_place: bool) -> bool:
+        """Return whether what it sent is still right, and where it goes is."""
+        if self.sending is not draft.sending or self.sending.overtaken:
+            return False
+        return in_place == (self.places is None)
 
 
 @dataclass(slots=True, eq=False)
