@@ -10,31 +10,15 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
 from mavftpfs.cache.draft import AHEAD, TRANSITIONS, Base, Draft, Event, Sending, State, Where
+from mavftpfs.cache.spool import Spool, SpoolContent
 from mavftpfs.shared.errors import LocalProtocolError, SpoolFailed
 
 
-class Bytes:
-    """A Content in a bytearray; bytes that were never put, or were cut, are poison."""
-
-    def __init__(self) -> None:
-        self.data = bytearray()
-
-    def put(self, offset: int, data: bytes | memoryview) -> None:
-        self.data.extend(b"\xee" * (offset + len(data) - len(self.data)))
-        self.data[offset : offset + len(data)] = data
-
-    def get(self, start: int, stop: int) -> bytes:
-        return bytes(self.data[start:stop])
-
-    def cut(self, size: int) -> None:
-        self.data[size:] = b"\xee" * max(0, len(self.data) - size)
-
-    def settle(self) -> None:
-        pass
+SPOOL = Spool(memory_max=lambda: 1 << 40, spool_max=0)
 
 
 def draft_over(base: bytes | None) -> Draft:
-    return Draft(Bytes(), None if base is None else Base(len(base)))
+    return Draft(SpoolContent(SPOOL), None if base is None else Base(len(base)))
 
 
 def sending_of(data: bytes) -> tuple[Draft, Sending]:
@@ -141,11 +125,11 @@ def test_an_attempt_that_is_given_up_leaves_it_dirty() -> None:
 
 
 def test_a_cut_that_fails_changes_nothing() -> None:
-    class Failing(Bytes):
+    class Failing(SpoolContent):
         def cut(self, size: int) -> None:
             raise SpoolFailed("bad sector")
 
-    draft = Draft(Failing(), None)
+    draft = Draft(Failing(SPOOL), None)
     draft.write(0, b"abcdef")
     with pytest.raises(SpoolFailed):
         draft.truncate(2)
