@@ -13,7 +13,6 @@ from mavftpfs.cache.draft import AHEAD, TRANSITIONS, Base, Draft, Event, Sending
 from mavftpfs.cache.spool import Spool, SpoolContent
 from mavftpfs.shared.errors import LocalProtocolError, SpoolFailed
 
-
 SPOOL = Spool(memory_max=lambda: 1 << 40, spool_max=0)
 
 
