@@ -20,7 +20,7 @@ from math import inf
 from mavftpfs.protocol.chunking import ChunkSize
 from mavftpfs.protocol.payload import MAX_DATA, NakCode, Opcode, Payload
 from mavftpfs.protocol.reading import SESSION_CODES, DataSink, ReadTransfer
-from mavftpfs.protocol.requests import Request, manner_of
+from mavftpfs.protocol.requests import MANNERS, Request
 from mavftpfs.shared.errors import MavftpfsError, SessionLost
 from mavftpfs.shared.extents import ExtentSet
 
@@ -204,7 +204,7 @@ class BurstTransfer(ReadTransfer):
         if self._unanswered or first is None:
             return []
         opcode = Opcode.BURST_READ_FILE
-        return [Request(self, opcode, manner_of(opcode), self.session, first[0], self.chunks.size)]
+        return [Request(self, opcode, MANNERS[opcode], self.session, first[0], self.chunks.size)]
 
     def on_burst_sent(self, request: Request, now: float) -> int:
         """Begin to follow the burst; return how many packets it may bring (MAVSDK: all the rest)."""

@@ -9,7 +9,6 @@ from __future__ import annotations
 from math import inf
 
 from mavftpfs.protocol.payload import MAX_DATA
-from mavftpfs.protocol.requests import Operation, Request
 from mavftpfs.shared.errors import LocalProtocolError
 
 SHORT = 64
@@ -41,7 +40,7 @@ class ChunkSize:
         fixed: the size that the user asked for, in bytes; None to choose it.
 
     Attributes:
-        most: bytes of the longest chunk.
+        most: bytes of the longest chunk. size: of a chunk as far as that is settled.
 
     Raises:
         LocalProtocolError: a fixed size that is not within 1..239.
@@ -57,17 +56,18 @@ class ChunkSize:
         "_since",
         "_turn",
         "most",
+        "size",
         "trying",
     )
 
     def __init__(self, fixed: int | None = None) -> None:
         if fixed is not None and not 1 <= fixed <= MAX_DATA:
             raise LocalProtocolError(f"a chunk of {fixed} bytes is not within 1..{MAX_DATA}")
-        self.most = MAX_DATA if fixed is None else fixed
+        self.most = self.size = MAX_DATA if fixed is None else fixed
         self._least = SHORT if fixed is None else fixed
         self.trying = False
         """Whether full and short chunks take turns, so that each request needs a size of its own."""
-        self._short_until: float | None = None
+        self._short_until = inf
         self._lost = 0  # full chunks in a row; while trying: beside the short ones
         self._since = -inf  # what was sent before proves nothing: a later one passed, or the link was away
         self._first_lost_at = 0.0
@@ -75,18 +75,13 @@ class ChunkSize:
         self._answered = 0  # short chunks, while trying
         self._turn = False
 
-    @property
-    def size(self) -> int:
-        """Bytes of a chunk as far as that is settled."""
-        return self.most if self._short_until is None else self._least
-
     def next_size(self, now: float) -> int:
         """Return the bytes of the next chunk."""
         if self.trying:
             self._turn = not self._turn
             return self._least if self._turn else self.most
-        if self._short_until is not None and now >= self._short_until:
-            self._short_until, self._lost = None, 0
+        if now >= self._short_until:
+            self._short_until, self._lost, self.size = inf, 0, self.most
         return self.size
 
     def on_answered(self, size: int, count: int, sent_at: float, now: float) -> None:
@@ -121,34 +116,6 @@ class ChunkSize:
             return
         if self.trying:
             if self._answered >= PROOF and self._lost >= PROOF:
-                self.trying, self._short_until = False, now + SHORT_SECONDS
+                self.trying, self._short_until, self.size = False, now + SHORT_SECONDS, self._least
         elif self._lost >= SUSPICIOUS_LOSSES or (self._lost >= LONE_LOSSES and seconds >= LONE_SECONDS):
             self.trying, self._answered = True, 0
-
-
-class Chunked(Operation):
-    """Moves a file in chunks.
-
-    Args:
-        chunks: chooses their size; None for a choice of its own.
-    """
-
-    def __init__(self, chunks: ChunkSize | None = None) -> None:
-        super().__init__()
-        self.chunks = ChunkSize() if chunks is None else chunks
-
-    def next_row(self, most: int, now: float) -> tuple[int, int]:
-        """Return the size of the next chunks, and how many of that size may go out, at most `most`."""
-        size = self.chunks.next_size(now)
-        return size, 1 if self.chunks.trying else most
-
-    def takes_back(self, request: Request, now: float) -> bool:
-        """See Operation: the bytes of one that was too long go out in other chunks."""
-        again = request.opcode == self.bulk and self.chunks.on_lost(request.size, request.sent_at, now)
-        if again:
-            self.take_back(request)
-        return again
-
-    def take_back(self, request: Request) -> None:
-        """Have the bytes of a request asked for anew."""
-        raise NotImplementedError

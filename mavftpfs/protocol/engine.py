@@ -21,9 +21,9 @@ from operator import attrgetter
 from mavftpfs.protocol.flow import Flow
 from mavftpfs.protocol.ledger import LAST_SEQ, Ledger
 from mavftpfs.protocol.payload import NakCode, Opcode, Payload, reply_of, split_run
-from mavftpfs.protocol.requests import Operation, Priority, Request, Run, encode_run
+from mavftpfs.protocol.requests import Operation, Priority, Request, encode
 from mavftpfs.protocol.timers import Timers
-from mavftpfs.shared.errors import RemoteProtocolError, RequestTimeout
+from mavftpfs.shared.errors import LocalProtocolError, RemoteProtocolError, RequestTimeout
 from mavftpfs.shared.traits import Traits
 
 OP_DEADLINE = 30.0
@@ -100,7 +100,10 @@ class Engine:
     @property
     def rtt(self) -> float | None:
         """Smoothed round trip in seconds: of reads, else of any request; None before the first."""
-        return self._timers.rtt
+        for timer in self._timers.of.values():
+            if timer.samples:
+                return timer.smoothed
+        return None
 
     @property
     def in_flight(self) -> int:
@@ -127,8 +130,15 @@ class Engine:
     # --- operations
 
     def start(self, op: Operation, now: float) -> None:
-        """Take an operation on; its first request goes out with the next `outgoing`."""
-        op.attach(self, now)
+        """Take an operation on; its first request goes out with the next `outgoing`.
+
+        Raises:
+            LocalProtocolError: it was taken on before.
+        """
+        if op.started:
+            raise LocalProtocolError("an operation runs once")
+        op.started, op.port = True, self
+        op.waits(now)
         if op.patience == inf:
             op.patience = self._op_deadline
         self._ops.append(op)
@@ -136,24 +146,20 @@ class Engine:
     def cancel(self, op: Operation, now: float) -> None:
         """Forget an operation; its late replies are discarded. Harmless when it is finished."""
         if op in self._ops:
-            self._ops.remove(op)
-            self._release(op)
+            self._drop(op)
 
     def take_finished(self) -> list[Operation]:
         """Return the operations that ended since the last call."""
         finished, self._finished = self._finished, []
         return finished
 
-    def _release(self, op: Operation) -> None:
+    def _drop(self, op: Operation) -> None:
+        """It ended, or is to be forgotten."""
+        self._ops.remove(op)
         self._ledger.release(op)
         if op is self._burst_op:
             self._burst_op = None
-
-    def _retire(self) -> None:
-        """Move ended operations to the finished ones."""
-        for op in [op for op in self._ops if op.done]:
-            self._ops.remove(op)
-            self._release(op)
+        if op.done:
             self._finished.append(op)
 
     # --- what comes in
@@ -183,46 +189,41 @@ class Engine:
         replies = split_run(wires)
         at, malformed = 0, 0
         while at < len(replies):
-            run = self._ledger.settle_run(replies, at, self._burst_heard_at, now)
-            try:
-                if run:
-                    self._believe_run(run, now)
-                else:
+            run = self._ledger.settle_run(replies, at, self._burst_heard_at)
+            if run:
+                op = run[0][0].op
+                self._on_answers(run[-1][0], len(run), now)
+                op.on_run(run, now)
+                if op.done:
+                    self._drop(op)
+            else:
+                try:
                     self.receive(reply_of(replies[at]), now)
-            except RemoteProtocolError:
-                malformed += 1
+                except RemoteProtocolError:
+                    malformed += 1
             at += len(run) or 1
         return malformed
 
-    def _believe_run(self, run: Run, now: float) -> None:
-        op = run[0][0].op
-        self.stats.replies += len(run)
-        self._heard_at = op.progress_at = now
-        rtt = self._timers.sample(run[0][0], now)
-        self.flow.on_replies(now, rtt, [request.order for request, _ in run], self._ledger.order)
-        for lost in self._ledger.lose_outrun():
-            self.flow.on_loss(lost.order)
-        op.on_run(run, now)
-        if op.done:
-            self._retire()
-
     def _believe(self, request: Request, reply: Payload, now: float) -> None:
-        self.stats.replies += 1
-        self._heard_at = now
-        rtt, flow = None, self.flow
-        if not self._ledger.settle(request, reply.seq, now):
+        if not self._ledger.settle(request, reply.seq):
             self.stats.spurious += 1
-            flow.on_spurious()
-        if request.single and request.sent_at > self._burst_heard_at:
-            rtt = self._timers.sample(request, now)
-        flow.on_replies(now, rtt, (request.order,), self._ledger.order)
-        for lost in self._ledger.lose_outrun():
-            self.flow.on_loss(lost.order)
+            self.flow.on_spurious()
+        self._on_answers(request, 1, now)
         op = request.op
-        op.progress_at = now
         op.on_reply(request, reply, now)
         if op.done:
-            self._retire()
+            self._drop(op)
+
+    def _on_answers(self, newest: Request, count: int, now: float) -> None:
+        """Requests of one operation that went out together were answered; newest: the last of them."""
+        ledger, flow = self._ledger, self.flow
+        self.stats.replies += count
+        self._heard_at = newest.op.progress_at = now
+        timed = newest.single and newest.sent_at > self._burst_heard_at
+        rtt = self._timers.sample(newest, now) if timed else None
+        flow.on_replies(now, rtt, count, newest.order, ledger.order)
+        for lost in ledger.lose_outrun():
+            flow.on_loss(lost.order)
 
     def _on_unknown(self, reply: Payload, now: float) -> None:
         """An answer fits nothing outstanding. What comes of a burst that was given up is no news."""
@@ -265,7 +266,7 @@ class Engine:
         self._heard_at = now
         op.progress_at = now
         if op.done:
-            self._retire()
+            self._drop(op)
         return True
 
     # --- what goes out
@@ -277,14 +278,15 @@ class Engine:
         if len(self._ops) > 1:
             self._ops.sort(key=attrgetter("priority"))
         starved = True
-        for op in self._ops:
+        for op in self._ops.copy():
             starved = starved and self._serve(op, now, wires)
+            if op.done:
+                self._drop(op)
         if starved:
             self.flow.on_starved()
         if self.flow.budget is not None and self.flow.budget.held:
             for op in self._ops:
                 op.progress_at = max(op.progress_at, now)
-        self._retire()
         return wires
 
     def hold(self, now: float) -> None:
@@ -294,18 +296,18 @@ class Engine:
 
     def _serve(self, op: Operation, now: float, wires: list[bytes]) -> bool:
         """Send what `op` has; return False when the window is full."""
-        if not op.waits(now):
+        if op.done or not op.waits(now):
             return True
         ledger = self._ledger
         # Metadata may use one slot more than bulk work: a full window must not make it wait.
-        urgent = op.priority is Priority.METADATA
+        urgent = op.rank is Priority.METADATA
         in_flight = len(ledger.flying) - urgent
         room = self.flow.room(in_flight, now, paced=op.paced, urgent=urgent)
         if room <= 0 and in_flight <= _FEW and (unheard := ledger.unheard()):
             room = self.flow.room(in_flight - unheard, now, paced=op.paced)
         if room <= 0 and urgent and in_flight < self.flow.most_beside:
             # Nor must a window that was full when it shrank, of what may be answered late or never.
-            others = sum(other.sent and other.priority is Priority.METADATA for other in self._ops)
+            others = sum(other.sent and other.rank is Priority.METADATA for other in self._ops)
             room = self.flow.room(others, now, paced=op.paced, urgent=True)
         left = room
         while left > 0:
@@ -321,34 +323,26 @@ class Engine:
         return left > 0
 
     def _transmit(self, requests: Sequence[Request], now: float) -> list[bytes]:
-        """Number requests of one opcode and return them encoded."""
-        first = requests[0]
-        opcode = first.opcode
-        self.stats.by_opcode[opcode] += len(requests)
+        """Number requests of one opcode, or one that is repeated, and return them encoded."""
+        first, ledger = requests[0], self._ledger
+        self.stats.by_opcode[first.opcode] += len(requests)
         if first.follows:
             first.session = self.session
-        if first.sends or opcode == _BURST:
-            self._transmit_again(first, now)
+        first.op.sent = True
+        if first.sends:
+            self.stats.retransmissions += 1
+            ledger.relaunch(first, now)
+            first.timer = now + self._timers.wait(first)
         else:
-            timer = now + self._timers.of[first.manner.family].rto
-            first.op.sent = True
-            self._ledger.launch(requests, now, timer)
-            self._due = min(self._due, timer)
-        return encode_run(requests)
-
-    def _transmit_again(self, request: Request, now: float) -> None:
-        """Number a repeated request, or a burst, which is never repeated."""
-        self._ledger.number(request, now)
-        request.op.sent = True
-        self.stats.retransmissions += request.sends > 1
-        if request.opcode == _BURST:
-            self._burst_op = request.op
-            # Whatever the burst's packets use as seq must not be a seq of ours (servers.md 2, collision).
-            self._ledger.jump(request.op.on_burst_sent(request, now))
+            ledger.launch(requests, now, now + self._timers.of[first.manner.family].rto)
+        if first.opcode == _BURST:
+            self._burst_op = first.op
+            ledger.leave(first)  # its packets tell what became of it, and it is never repeated
+            # Whatever they use as seq must not be a seq of ours (servers.md 2, collision).
+            ledger.jump(first.op.on_burst_sent(first, now))
         else:
-            self._ledger.enter(request)
-            request.timer = now + self._timers.wait(request)
-            self._due = min(self._due, request.timer)
+            self._due = min(self._due, first.timer)
+        return encode(requests)
 
     # --- timers
 
@@ -361,49 +355,44 @@ class Engine:
 
     def on_deadline(self, now: float) -> None:
         """Act on what is overdue; harmless when called early or late."""
-        for op in self._ops:
+        late: set[Operation] = set()
+        if now >= self._due:
+            late = self._check_timers(now)
+        for op in self._ops.copy():
             if op.timer <= now:
                 op.on_timer(now)
-            if op.progress_at + op.patience <= now:
-                self._time_out(op)
-        if now >= self._due:
-            self._check_timers(now)
-        self._retire()
+            if (op in late or op.progress_at + op.patience <= now) and not op.done:
+                self.stats.timeouts += 1
+                op.fail(RequestTimeout(f"no answer within {op.patience:g} s"))
+            if op.done:
+                self._drop(op)
 
-    def _check_timers(self, now: float) -> None:
+    def _check_timers(self, now: float) -> set[Operation]:
+        """Ask again for what is overdue; return the operations of which one request took too long."""
         self._due = inf
         silent: list[str] = []
-        for request in list(self._ledger.flying.values()):
+        late: set[Operation] = set()
+        ledger, flow = self._ledger, self.flow
+        for request in list(ledger.flying.values()):
             if request.timer <= now:
-                request.timer = self._reconsidered(request)
-            if request.timer <= now:
-                if self._heard_at < request.sent_at:
-                    silent += [request.manner.family] * request.sends
-                self._expire(request, now)
-            else:
+                # Round trips may have grown meanwhile. And ArduPilot answers nothing else during a burst:
+                # silence proves nothing then (servers.md 4).
+                due = max(request.sent_at, self._burst_heard_at) + self._timers.wait(request)
+                paused = request.manner.ordered and not flow.starved and len(ledger.flying) > _FEW
+                patience = flow.pause if paused else 0.0
+                # A stream of other answers is no pause.
+                request.timer = max(due, min(due, self._heard_at) + patience)
+            if request.timer > now:
                 self._due = min(self._due, request.timer)
+                continue
+            if self._heard_at < request.sent_at:
+                silent += [request.manner.family] * request.sends
+            if now - request.first_sent >= request.op.patience:
+                late.add(request.op)
+            flow.on_loss(request.order)
+            ledger.lose(request)
         for family in set(silent):
             self._timers.of[family].on_silence()
         if silent:
-            self.flow.on_silence(len(silent))
-
-    def _reconsidered(self, request: Request) -> float:
-        """Return when this transmission is overdue by what is known now: round trips may have grown."""
-        # ArduPilot answers nothing else during a burst: silence proves nothing then (servers.md 4).
-        since = max(request.sent_at, self._burst_heard_at)
-        due = since + self._timers.wait(request)
-        patience = self.flow.patience if request.manner.ordered and len(self._ledger.flying) > _FEW else 0.0
-        return max(due, min(due, self._heard_at) + patience)  # a stream of other answers is no pause
-
-    def _expire(self, request: Request, now: float) -> None:
-        """A timer ran out: ask again, or give up the operation when this one request took too long."""
-        op = request.op
-        if now - request.first_sent >= op.patience and op is not self._ledger.ghost:
-            self._time_out(op)
-        self.flow.on_loss(request.order)
-        self._ledger.lose(request)
-
-    def _time_out(self, op: Operation) -> None:
-        if not op.done:
-            self.stats.timeouts += 1
-            op.fail(RequestTimeout(f"no answer within {op.patience:g} s"))
+            flow.on_silence(len(silent))
+        return late

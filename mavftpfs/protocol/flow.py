@@ -25,7 +25,6 @@ stand `pacing`, for servers that queue five requests, and `budget`, for the user
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
 from math import inf, sqrt
 
 from mavftpfs.protocol.budget import Budget
@@ -134,6 +133,8 @@ class Flow:
         window: requests that may be in flight. cap: the widest window now.
         loss: the share of requests that are lost, 0..1.
         alone: no other FTP client was heard lately.
+        pause: seconds without an answer that prove no loss, because the server pauses; not while `starved`:
+            there was room and nothing to send.
     """
 
     def __init__(
@@ -160,13 +161,14 @@ class Flow:
         self._bold = 1.0
         # The pauses of a server.
         self._answered_at, self._wake = inf, inf
-        self._paused_at, self._pause = -inf, 0.0
+        self._paused_at, self.pause = -inf, 0.0
         # The round.
         self._round, self._round_end, self._round_start = 0, -1, 0.0
         self._answered = self._lost = 0
         self._least, self._total_rtt, self._rtts = inf, 0.0, 0
-        self._starved = False
+        self.starved = False
         # The pace.
+        self._pace = inf  # requests that may go out in a second
         self._tokens, self._tokens_at = float(DEPTH), 0.0
         self._blocked = False
 
@@ -177,7 +179,7 @@ class Flow:
         if limit is None or self.cap == self._limit:
             self._pacer = None
         elif self._pacer is None or self._pacer.queue != self.cap:
-            self._pacer, self._pause = Pacer(self.cap, self._limit), 0.0
+            self._pacer, self.pause = Pacer(self.cap, self._limit), 0.0
 
     # --- who may send
 
@@ -197,16 +199,21 @@ class Flow:
             self._hurried = True
         elif self._hurried:  # an answer that somebody waits for should not queue behind our slack
             room -= min(SLACK + 1, self.window // 2)
-        elif self._pause:
+        elif self.pause:
             room += int(self._beyond(now, paced) * self._rate)
         if self._pacer is not None:
             room = self._room_beside_pacer(self._pacer, room, in_flight, now, paced, urgent)
-        elif room > 0 and not urgent:
-            room = self._room_by_pace(room, now)
+        elif room > 0 and not urgent and self._pace < inf:
+            depth = DEPTH_SERIAL if self._serial else DEPTH
+            earned = (now - self._tokens_at) * self._pace
+            self._tokens = min(max(depth, self._pace * TICK), self._tokens + earned)
+            self._tokens_at = now
+            self._blocked = self._tokens < room
+            room = min(room, int(self._tokens))
         if self.budget is None or room <= 0:
             return room
         allowed = self.budget.room(now, urgent=urgent)
-        self._starved |= allowed < room
+        self.starved |= allowed < room
         return min(allowed, room)
 
     def _room_beside_pacer(
@@ -218,22 +225,6 @@ class Flow:
         beyond = pacer.room_for_urgent if urgent else pacer.room
         return beyond(in_flight, now) if paced and room <= 0 and self.alone else room
 
-    def _room_by_pace(self, room: int, now: float) -> int:
-        pace = self._pace()
-        if pace == inf:
-            return room
-        depth = DEPTH_SERIAL if self._serial else DEPTH
-        self._tokens = min(max(depth, pace * TICK), self._tokens + (now - self._tokens_at) * pace)
-        self._tokens_at = now
-        self._blocked = self._tokens < room
-        return min(room, int(self._tokens))
-
-    def _pace(self) -> float:
-        """Return how many requests may go out in a second."""
-        if self._starting or self._rate == 0.0 or self._base < BASE_LEAST:
-            return inf
-        return self._rate * (1.0 if self._round % CYCLE == 1 else (1.0 + STEP) * self._per_answer)
-
     def _beyond(self, now: float, paced: bool) -> float:
         """Return seconds of requests for which there is room beyond the window because a server pauses."""
         if now >= self._paused_at + KNOWN or self._base < BRIDGE_FROM:
@@ -242,7 +233,7 @@ class Flow:
         if silence > PAUSE:
             bridge = min(LONGEST_PAUSE, silence)
         else:  # those of a pause that just ended are not answered before a round trip later
-            bridge = self._pause if now < self._paused_at + self._base else 0.0
+            bridge = self.pause if now < self._paused_at + self._base else 0.0
         if silence < LONGEST_PAUSE:
             self._wake = now + FIRST / self._rate
         return max(BRIDGE * bridge, self._reserve() if paced else 0.0)
@@ -259,17 +250,12 @@ class Flow:
             return self._pacer.next_at()
         if not self._blocked or self._tokens >= 1.0:
             return self._wake
-        return min(self._wake, self._tokens_at + (1.0 - self._tokens) / self._pace() + 1e-6)
+        return min(self._wake, self._tokens_at + (1.0 - self._tokens) / self._pace + 1e-6)
 
     @property
     def most_beside(self) -> int:
         """How many may be in flight if somebody waits: none more where a server holds but a few of them."""
         return 0 if self._serial or self._pacer is not None else self.cap
-
-    @property
-    def patience(self) -> float:
-        """Seconds of silence that prove no loss: newer answers will, where more than a few are in flight."""
-        return 0.0 if self._starved else self._pause
 
     # --- what happens
 
@@ -283,44 +269,41 @@ class Flow:
 
     def on_starved(self) -> None:
         """There was room in the window and nothing to send: this round's rate says little."""
-        self._starved = True
+        self.starved = True
         self._answered_at = inf
         if self._pacer is not None:
             self._pacer.on_starved()
 
-    def on_replies(self, now: float, rtt: float | None, orders: Sequence[int], next_order: int) -> None:
-        """Requests that went out together were answered together. rtt: None if nobody knows which of their
-        transmissions were; orders: of those; next_order: what the next one will get."""
-        self._answered += len(orders)
-        self._note_pause(now, rtt)
-        if rtt is not None:
-            self._least = min(self._least, rtt)
-            if rtt <= self._base:
-                self._base, self._base_seen = rtt, now
-            self._total_rtt += rtt * len(orders)
-            self._rtts += len(orders)
-        if self._before_silence:
-            self.window, self._before_silence = min(self.cap, self._before_silence), 0
-        elif self._starting and not self._starved:
-            most = max(2 * FIRST, START * self._held())
-            self.window = max(self.window, min(self.cap, self.window + len(orders), int(most)))
-        if self._pacer is not None:
-            for order in orders:
-                self._pacer.on_reply(now, rtt, order, next_order)
-        over = max(orders) >= self._round_end and (self._round_end < 0 or now >= self._round_start + TICK)
-        enough = self._answered >= ROUNDS or self._starting or self._starved or self._serial
-        # At the start a queue grows fast: a few answers that waited in one are enough.
-        if (over and enough) or (self._starting and self._rtts >= FIRST and self._queued()):
-            self._end_round(now, next_order)
-
-    def _note_pause(self, now: float, rtt: float | None) -> None:
+    def on_replies(self, now: float, rtt: float | None, count: int, newest: int, next_order: int) -> None:
+        """So many requests that went out together were answered together. rtt: None if nobody knows which of
+        their transmissions were; newest: the order of the last of those; next_order: what the next one will
+        get."""
+        self._answered += count
         gap, self._answered_at = now - self._answered_at, now
         # What ends a pause waited for its end; after a run of losses nothing waited.
         waited = rtt is not None and rtt > self._base + gap / 2 and self._rate > 0.0
         if waited and gap > PAUSE + FIRST / self._rate and not self._serial and self._pacer is None:
-            self._paused_at, self._pause = now, max(min(gap, LONGEST_PAUSE), self._pause)
+            self._paused_at, self.pause = now, max(min(gap, LONGEST_PAUSE), self.pause)
         elif now >= self._paused_at + KNOWN:
-            self._pause = 0.0
+            self.pause = 0.0
+        if rtt is not None:
+            self._least = min(self._least, rtt)
+            if rtt <= self._base:
+                self._base, self._base_seen = rtt, now
+            self._total_rtt += rtt * count
+            self._rtts += count
+        if self._before_silence:
+            self.window, self._before_silence = min(self.cap, self._before_silence), 0
+        elif self._starting and not self.starved:
+            most = max(2 * FIRST, START * self._held())
+            self.window = max(self.window, min(self.cap, self.window + count, int(most)))
+        if self._pacer is not None:
+            self._pacer.on_replies(now, rtt, count, newest, next_order)
+        over = newest >= self._round_end and (self._round_end < 0 or now >= self._round_start + TICK)
+        enough = self._answered >= ROUNDS or self._starting or self.starved or self._serial
+        # At the start a queue grows fast: a few answers that waited in one are enough.
+        if (over and enough) or (self._starting and self._rtts >= FIRST and self._queued()):
+            self._end_round(now, next_order)
 
     def on_loss(self, order: int) -> None:
         """The transmission numbered `order` is taken to be lost."""
@@ -348,29 +331,33 @@ class Flow:
         self._round += 1
         if self._round_end >= 0 and now > self._round_start:
             self._learn(now, now - self._round_start)
+        if not self._starting and self._rate > 0.0 and self._base >= BASE_LEAST:
+            self._pace = self._rate * (1.0 if self._round % CYCLE == 1 else (1.0 + STEP) * self._per_answer)
+        else:
+            self._pace = inf
         self._round_end, self._round_start = next_order, now
         self._answered = self._lost = 0
         self._least, self._total_rtt, self._rtts = inf, 0.0, 0
-        self._starved = False
+        self.starved = False
 
     def _learn(self, now: float, took: float) -> None:
         total = self._answered + self._lost
         # What arrives while a server pauses overflows its buffer, and its answers wait: that says nothing of
         # the link. It shows for a round trip after that.
-        excused = self._pause > 0.0 and self._paused_at + self._base >= self._round_start
-        waits = self._reserve() if self._pause else 0.0
+        excused = self.pause > 0.0 and self._paused_at + self._base >= self._round_start
+        waits = self._reserve() if self.pause else 0.0
         congested = self._lost > 0 and not excused and self._queued(1.0, waits)
         usual = self._usual_loss * total
         shy = congested or (not excused and self._lost > usual + UNUSUAL * sqrt(usual + 1.0))
         self._learn_loss(total, learn=not (excused or self._queued() or (self._serial and shy)))
         self._learn_round_trip(now)
-        if congested and not self._starved and self._queued(2.0, waits):
+        if congested and not self.starved and self._queued(2.0, waits):
             self._rates.clear()  # only what came now is the path's
         rate, before = self._answered / took, self._rate
-        if rate > before or not self._starved:
+        if rate > before or not self.starved:
             self._rates.append(rate)
         self._rate = max(self._rates, default=0.0)
-        if self._starved:
+        if self.starved:
             return
         if not excused:
             self._bold = self._bold * (1.0 - STEP) if shy else min(1.0, self._bold + BOLDER)

@@ -14,7 +14,6 @@ from itertools import islice
 
 from mavftpfs.protocol.payload import MAX_DATA, Fields, Opcode, Payload
 from mavftpfs.protocol.requests import Operation, Request, Run, Transmission
-from mavftpfs.shared.errors import LocalProtocolError
 
 LAST_SEQ = 65534
 """65535 is never used: it defeats the servers' duplicate test (servers.md 2)."""
@@ -50,13 +49,11 @@ class DuplicateDetector:
         self._expected: dict[int, int] = {}
         self._sent: dict[int, float] = {}
 
-    def on_sent(self, request: Request, now: float) -> None:
-        """A request went out; the first time counts for one that keeps its seq."""
-        if request.manner.same_seq:
-            if request.sends == 1:
-                self._sent.pop(request.seq + 1, None)
-            self._sent.setdefault(request.seq + 1, now)
-            _shorten(self._sent)
+    def on_sent(self, request: Request) -> None:
+        """A request that changes names goes out under a new seq."""
+        self._sent.pop(request.seq + 1, None)
+        self._sent[request.seq + 1] = request.sent_at
+        _shorten(self._sent)
 
     def on_settled(self, request: Request, answered: int | None) -> None:
         """Nobody waits for a request any more. answered: the seq of the answer that came, if one did."""
@@ -89,11 +86,7 @@ def _shorten(remembered: dict[int, int] | dict[int, float]) -> None:
 
 
 class Ghost(Operation):
-    """Owns the requests of cancelled operations until they are answered or given up."""
-
-    def next_request(self, now: float) -> Request | None:
-        """Never asked: a ghost is in no engine's list."""
-        raise LocalProtocolError("a ghost asks for nothing")
+    """Owns the requests of cancelled operations until they are answered or given up. No engine asks it."""
 
     def on_reply(self, request: Request, reply: Payload, now: float) -> None:
         """Nobody wants to know."""
@@ -182,39 +175,38 @@ class Ledger:
             table[seq + 1] = flying[order] = request
             order += 1
         self.order = order
-        self.duplicates.on_sent(requests[0], now)
+        if requests[0].manner.same_seq:
+            self.duplicates.on_sent(requests[0])
 
-    def number(self, request: Request, now: float) -> None:
-        """Give a request that goes out (again) its seq and order number."""
-        if request.sends == 0:
-            request.first_sent = now
-            request.seq = self.take_seq()
-        elif request.manner.same_seq and not request.fresh_seq:
-            request.single = False
-        else:
+    def relaunch(self, request: Request, now: float) -> None:
+        """Number a request that goes out again, and note that it is on its way."""
+        same_seq = request.manner.same_seq and not request.fresh_seq
+        if not same_seq:
             if request.aliases is None:
                 request.aliases = {}
             past = Transmission(request.order, request.sent_at, request.single, request.outrun)
             request.aliases[request.seq + 1] = past
             request.seq = self.take_seq()
-            request.single = True
             request.fresh_seq = False
+        request.single = not same_seq
         request.order = self.order
         request.outrun = False
         request.sent_at = now
         request.sends += 1
         self.order += 1
-        self.duplicates.on_sent(request, now)
-
-    def enter(self, request: Request) -> None:
-        """Note that a numbered request is on its way."""
-        self._table[request.seq + 1] = request
-        self.flying[request.order] = request
+        if request.manner.same_seq and not same_seq:
+            self.duplicates.on_sent(request)
+        self._table[request.seq + 1] = self.flying[request.order] = request
         request.flying = True
+
+    def leave(self, request: Request) -> None:
+        """It is on its way, but no answer to it is waited for."""
+        request.flying = False
+        del self._table[request.seq + 1], self.flying[request.order]
 
     # --- coming in
 
-    def settle_run(self, replies: list[Fields], at: int, after: float, now: float) -> Run:
+    def settle_run(self, replies: list[Fields], at: int, after: float) -> Run:
         """Take out requests as long as replies, from index `at` on, are usual ones; return what they answer.
 
         Usual is the ACK, as `Engine.receive` would believe it, to the only transmission of a request with the
@@ -243,7 +235,7 @@ class Ledger:
         self.newest_answered = newest
         return run
 
-    def settle(self, request: Request, seq: int, now: float) -> bool:
+    def settle(self, request: Request, seq: int) -> bool:
         """Take out a request answered under `seq`; return False if that was an alias.
 
         Its order, sent_at, single and outrun are those of the answered transmission from then on.
@@ -322,8 +314,9 @@ class Ledger:
 
     def release(self, op: Operation) -> None:
         """Forget what `op` had lost, and make ghosts of what it has on its way."""
-        for request in [request for request in self.again if request.op is op]:
-            self.forget(request)
+        for request in self.again.copy():
+            if request.op is op:
+                self.forget(request)
         for request in self.flying.values():
             if request.op is op:
                 request.op = self.ghost

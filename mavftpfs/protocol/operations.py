@@ -7,8 +7,8 @@ from math import inf
 
 from mavftpfs.protocol.listing import parse_page
 from mavftpfs.protocol.payload import MAX_DATA, NakCode, Opcode, Payload
-from mavftpfs.protocol.requests import Operation, Priority, Request, manner_of, nak_of
-from mavftpfs.shared.errors import FtpNak, LocalProtocolError, PathTooLong
+from mavftpfs.protocol.requests import MANNERS, Operation, Priority, Request, nak_of
+from mavftpfs.shared.errors import FtpNak, PathTooLong
 from mavftpfs.shared.model import DirEntry
 
 __all__ = ["ListDirectory", "OpenFile", "Operation", "Priority", "Simple", "Terminate"]
@@ -56,49 +56,29 @@ class Simple(Operation):
         self.patience = patience
         self.opcode = opcode
         self.retransmitted = False
-        manner = manner_of(opcode)
+        manner = MANNERS[opcode]
         if side_effect is not None:
             manner = manner._replace(same_seq=side_effect)
         if server_time is not None:
             manner = manner._replace(family="work", free_sends=2, patient_after=1, patience=server_time)
         count = len(data) if size is None else size
-        self._request: Request | None = Request(
-            self, opcode, manner, session or 0, offset, count, data, follows=session is None
-        )
-        self._reply: Payload | None = None
+        request = Request(self, opcode, manner, session or 0, offset, count, data, follows=session is None)
+        self._requests = [request]
+        self.reply: Payload
 
-    @property
-    def reply(self) -> Payload:
-        """The ACK.
-
-        Raises:
-            LocalProtocolError: there is none (yet).
-        """
-        if self._reply is None:
-            raise LocalProtocolError("no reply yet")
-        return self._reply
-
-    def next_request(self, now: float) -> Request | None:
+    def next_requests(self, most: int, now: float) -> list[Request]:
         """Return the one request, once."""
-        request, self._request = self._request, None
-        return request
+        requests, self._requests = self._requests, []
+        return requests
 
     def on_reply(self, request: Request, reply: Payload, now: float) -> None:
         """End with the ACK or the NAK."""
         self.retransmitted = request.sends > 1
         if reply.opcode == Opcode.NAK:
-            self.on_nak(nak_of(request, reply))
+            self.fail(nak_of(request, reply))
         else:
-            self._reply = reply
-            self.on_ack(request, reply)
+            self.reply = reply
             self.finish()
-
-    def on_ack(self, request: Request, reply: Payload) -> None:
-        """Take what the ACK says."""
-
-    def on_nak(self, nak: FtpNak) -> None:
-        """End with the refusal."""
-        self.fail(nak)
 
 
 class OpenFile(Simple):
@@ -114,8 +94,11 @@ class OpenFile(Simple):
         self.session = session
         self.size: int | None = None
 
-    def on_ack(self, request: Request, reply: Payload) -> None:
+    def on_reply(self, request: Request, reply: Payload, now: float) -> None:
         """Take session and size; learn whether the server echoes ids."""
+        super().on_reply(request, reply, now)
+        if self.error is not None:
+            return
         self.session = reply.session
         if len(reply.data) >= 4:
             self.size = int.from_bytes(reply.data[:4], "little")
@@ -134,13 +117,11 @@ class Terminate(Simple):
         super().__init__(Opcode.TERMINATE_SESSION, session=session)
         self.already_closed = False
 
-    def on_nak(self, nak: FtpNak) -> None:
+    def on_reply(self, request: Request, reply: Payload, now: float) -> None:
         """A session that is not there is closed."""
-        if nak.code == NakCode.INVALID_SESSION:
-            self.already_closed = True
-            self.finish()
-        else:
-            self.fail(nak)
+        super().on_reply(request, reply, now)
+        if isinstance(self.error, FtpNak) and self.error.code == NakCode.INVALID_SESSION:
+            self.error, self.already_closed = None, True
 
 
 class ListDirectory(Operation):
@@ -176,13 +157,13 @@ class ListDirectory(Operation):
         self._stale_pages = 0
         self._empty_pages = 0
 
-    def next_request(self, now: float) -> Request | None:
+    def next_requests(self, most: int, now: float) -> list[Request]:
         """Return the request for the next page."""
         if self._asked:
-            return None
+            return []
         self._asked = True
-        manner, path = manner_of(self._opcode), self._path
-        return Request(self, self._opcode, manner, 0, self.strings, len(path), path, follows=True)
+        manner, path = MANNERS[self._opcode], self._path
+        return [Request(self, self._opcode, manner, 0, self.strings, len(path), path, follows=True)]
 
     def on_reply(self, request: Request, reply: Payload, now: float) -> None:
         """Take a page, or find that there are no more."""

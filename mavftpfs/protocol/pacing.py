@@ -153,18 +153,18 @@ class Pacer:
 
     # --- news
 
-    def on_reply(self, now: float, rtt: float | None, order: int, next_order: int) -> None:
-        """A request was answered; see Flow.on_replies."""
+    def on_replies(self, now: float, rtt: float | None, count: int, newest: int, next_order: int) -> None:
+        """See Flow.on_replies."""
         if rtt is not None and rtt < self._least_rtt:
             self._least_rtt = rtt
-        if order < self._from:
+        if newest < self._from:
             return
         if self._starved:
             self._begin(next_order)
         elif self._since is None:
-            self._since = now  # the first answer begins the measurement and is none of it
+            self._since = now  # the first answers begin the measurement and are none of it
         else:
-            self._answered += 1
+            self._answered += count
             if self._answered >= self._enough() and now > self._since:
                 self._end_trial(now, self._since, next_order)
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import Protocol
 
-from mavftpfs.protocol.chunking import Chunked, ChunkSize
+from mavftpfs.protocol.chunking import ChunkSize
 from mavftpfs.protocol.payload import MAX_DATA, NakCode, Opcode, Payload
 from mavftpfs.protocol.requests import READ_MANNER, Operation, Priority, Request, Run, nak_of
 from mavftpfs.shared.errors import (
@@ -46,7 +46,7 @@ class DataSink(Protocol):
         ...
 
 
-class ReadTransfer(Chunked):
+class ReadTransfer(Operation):
     """Reads wanted ranges of an open regular file for as long as its owner likes.
 
     Args:
@@ -60,10 +60,12 @@ class ReadTransfer(Chunked):
     size), FtpNak, or RequestTimeout. `wants` stays valid after a failure.
     """
 
+    rank = Priority.DEMAND
     bulk = _READ
 
     def __init__(self, session: int, size: int, sink: DataSink, chunks: ChunkSize | None = None) -> None:
-        super().__init__(chunks)
+        super().__init__()
+        self.chunks = ChunkSize() if chunks is None else chunks
         self.session = session
         self.size = size
         self.received_bytes = 0
@@ -77,18 +79,16 @@ class ReadTransfer(Chunked):
 
     def want(self, start: int, stop: int, demand: bool) -> None:
         """Ask for what the sink lacks of [start, stop), clamped to the size, if it is not on its way."""
-        asked = ExtentSet((request.offset, request.offset + request.size) for request in self._unanswered)
-        for gap_start, gap_stop in self._sink.missing(start, min(stop, self.size)):
-            for piece_start, piece_stop in asked.missing(gap_start, gap_stop):
-                self._want_piece(piece_start, piece_stop, demand)
-
-    def _want_piece(self, start: int, stop: int, demand: bool) -> None:
-        if demand:
-            self._demand.add(start, stop)
-            self._ahead.discard(start, stop)
-        else:
-            for ahead_start, ahead_stop in self._demand.missing(start, stop):
-                self._ahead.add(ahead_start, ahead_stop)
+        lacking = ExtentSet(self._sink.missing(start, min(stop, self.size)))
+        for request in self._unanswered:
+            lacking.discard(request.offset, request.offset + request.size)
+        for piece_start, piece_stop in lacking:
+            if demand:
+                self._demand.add(piece_start, piece_stop)
+                self._ahead.discard(piece_start, piece_stop)
+            else:
+                for ahead_start, ahead_stop in self._demand.missing(piece_start, piece_stop):
+                    self._ahead.add(ahead_start, ahead_stop)
 
     def drop_readahead(self) -> None:
         """Forget wants that nobody waits for; what is on its way still arrives."""
@@ -123,17 +123,17 @@ class ReadTransfer(Chunked):
 
     def next_requests(self, most: int, now: float) -> list[Request]:
         """Return ReadFile requests for a row of chunks; what somebody waits for goes first."""
-        chunk, most = self.next_row(most, now)
-        row = self._demand.take_first(most * chunk) or self._ahead.take_first(most * chunk)
+        chunk = self.chunks.next_size(now)
+        limit = chunk if self.chunks.trying else most * chunk
+        row = self._demand.take_first(limit) or self._ahead.take_first(limit)
         return [] if row is None else self._requests_for(*row, chunk)
 
     def _requests_for(self, start: int, stop: int, chunk: int) -> list[Request]:
-        session = self.session
-        requests = [
-            Request(self, _READ, READ_MANNER, session, offset, chunk) for offset in range(start, stop, chunk)
-        ]
-        requests[-1].size = stop - requests[-1].offset
-        self._unanswered.update(dict.fromkeys(requests))
+        session, requests = self.session, []
+        for offset in range(start, stop, chunk):
+            request = Request(self, _READ, READ_MANNER, session, offset, min(chunk, stop - offset))
+            requests.append(request)
+            self._unanswered[request] = None
         return requests
 
     # --- replies to ReadFile
@@ -209,10 +209,13 @@ class ReadTransfer(Chunked):
             return SessionLost(str(nak), by_server=True)
         return nak
 
-    def take_back(self, request: Request) -> None:
-        """See Chunked."""
+    def takes_back(self, request: Request, now: float) -> bool:
+        """See Operation: the bytes of one that was too long are asked for by others."""
+        if request.opcode != _READ or not self.chunks.on_lost(request.size, request.sent_at, now):
+            return False
         del self._unanswered[request]
         self._demand.add(request.offset, request.offset + request.size)
+        return True
 
     def fail(self, error: MavftpfsError) -> None:
         """End; what was on its way is wanted again."""
@@ -249,13 +252,13 @@ class ReadToEof(Operation):
         self._end: int | None = None  # lowest index known to hold nothing
         self._last: int | None = None  # index of a short block
 
-    def next_request(self, now: float) -> Request | None:
+    def next_requests(self, most: int, now: float) -> list[Request]:
         """Return the request for the next block; at most a few ahead of what is known to exist."""
         if self._next > self._whole + _BLOCKS_AHEAD or not self._plausible(self._next):
-            return None
+            return []
         offset = self._next * self._chunk
         self._next += 1
-        return Request(self, _READ, READ_MANNER, self._session, offset, self._chunk)
+        return [Request(self, _READ, READ_MANNER, self._session, offset, self._chunk)]
 
     def on_reply(self, request: Request, reply: Payload, now: float) -> None:
         """Keep a block, or learn where the end is."""

@@ -14,11 +14,10 @@ from struct import Struct
 from typing import NamedTuple, Protocol, TypeAlias
 
 from mavftpfs.protocol.payload import MAX_DATA, NakCode, Opcode, Payload
-from mavftpfs.shared.errors import FtpNak, LocalProtocolError, MavftpfsError
+from mavftpfs.shared.errors import FtpNak, MavftpfsError
 from mavftpfs.shared.traits import Traits
 
 _pack = Struct(f"<HBBBBBxI{MAX_DATA}s").pack  # fills up with zeros
-_pack_empty = Struct(f"<HBBBBBxI{MAX_DATA}x").pack
 
 
 class Manner(NamedTuple):
@@ -52,18 +51,14 @@ _LIST = Manner("list", same_seq=False, ordered=True, patient_after=4, patience=2
 _PATH = Manner("path", same_seq=True, free_sends=4)
 _SLOW = Manner("slow", same_seq=True, patient_after=2, patience=40.0)
 
-_MANNERS = {
+MANNERS: dict[int, Manner] = dict.fromkeys(range(256), _PATH) | {
     Opcode.READ_FILE: READ_MANNER,
     Opcode.WRITE_FILE: WRITE_MANNER,
     Opcode.LIST_DIRECTORY: _LIST,
     Opcode.LIST_DIRECTORY_WITH_TIME: _LIST,
     Opcode.CALC_FILE_CRC32: _SLOW,
 }
-
-
-def manner_of(opcode: int) -> Manner:
-    """Return how requests with `opcode` are repeated; unknown ones are taken to have side effects."""
-    return _MANNERS.get(opcode, _PATH)  # type: ignore[call-overload,no-any-return]
+"""How requests with each opcode are repeated; those not named here are taken to have side effects."""
 
 
 class Transmission(NamedTuple):
@@ -149,29 +144,13 @@ class Request:
             return reply.offset == self.offset or not echoed
         return reply.opcode == Opcode.NAK
 
-    def encode(self) -> bytes:
-        """Return the 251 wire bytes under the present seq.
 
-        Raises:
-            LocalProtocolError: a field does not fit; a bug of the caller.
-        """
-        data = self.data
-        if not data:
-            return _pack_empty(self.seq, self.session, self.opcode, self.size, 0, 0, self.offset)
-        if len(data) > MAX_DATA:
-            raise LocalProtocolError(f"{len(data)} bytes of data do not fit {MAX_DATA}")
-        return _pack(self.seq, self.session, self.opcode, self.size, 0, 0, self.offset, data)
-
-
-def encode_run(requests: Sequence[Request]) -> list[bytes]:
-    """Return what `encode` returns for each.
-
-    Raises:
-        LocalProtocolError: as `encode`.
-    """
-    if len(requests) == 1 or requests[0].data:
-        return [request.encode() for request in requests]
-    return [_pack_empty(r.seq, r.session, r.opcode, r.size, 0, 0, r.offset) for r in requests]
+def encode(requests: Sequence[Request]) -> list[bytes]:
+    """Return the 251 wire bytes of each under its present seq; its data must fit."""
+    wires = []
+    for r in requests:
+        wires.append(_pack(r.seq, r.session, r.opcode, r.size, 0, 0, r.offset, r.data))
+    return wires
 
 
 Run: TypeAlias = list[tuple[Request, bytes]]
@@ -219,6 +198,8 @@ class Operation:
     """
 
     rank = Priority.METADATA
+    """Who goes first; `priority` says it more exactly."""
+
     bulk = -1
     """The opcode whose ACKs may come as an `on_run`; -1: none."""
 
@@ -229,26 +210,16 @@ class Operation:
         self.done = False
         self.error: MavftpfsError | None = None
         self.patience = inf
-        self.started_at = 0.0
         self.progress_at = inf
         self.timer = inf
         self.sent = False
-        self._port: Port | None = None
-
-    @property
-    def port(self) -> Port:
-        """The engine.
-
-        Raises:
-            LocalProtocolError: the operation was not started.
-        """
-        if self._port is None:
-            raise LocalProtocolError("the operation was not started")
-        return self._port
+        self.started = False
+        self.port: Port
+        """The engine, once this was started."""
 
     @property
     def priority(self) -> Priority:
-        """Who goes first."""
+        """Who goes first now."""
         return self.rank
 
     @property
@@ -261,19 +232,6 @@ class Operation:
         """Whether a burst of this operation is running."""
         return False
 
-    def attach(self, port: Port, now: float) -> None:
-        """Called by the engine when it takes the operation on.
-
-        Raises:
-            LocalProtocolError: it was taken on before.
-        """
-        if self._port is not None:
-            raise LocalProtocolError("an operation runs once")
-        self._port = port
-        self.started_at = now
-        if not self.idle:
-            self.progress_at = now
-
     def waits(self, now: float) -> bool:
         """Return whether something is wanted of the server: since now, if nothing was before."""
         if self.idle:
@@ -283,15 +241,10 @@ class Operation:
             self.progress_at = now
         return True
 
-    def next_request(self, now: float) -> Request | None:
-        """Return the next new request, or None if there is none for now."""
-        raise NotImplementedError
-
     def next_requests(self, most: int, now: float) -> list[Request]:
         """Return some of the next new requests, at most `most` (at least one) and all of one opcode; none if
         there is none for now."""
-        request = self.next_request(now)
-        return [] if request is None else [request]
+        raise NotImplementedError
 
     def on_reply(self, request: Request, reply: Payload, now: float) -> None:
         """Take the believed ACK or NAK to `request`."""

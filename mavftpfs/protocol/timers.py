@@ -96,11 +96,7 @@ class RttEstimator:
 
 
 class Timers:
-    """Round trips by family (see `requests.Manner`).
-
-    Attributes:
-        of: the estimators.
-    """
+    """Round trips by family (see `requests.Manner`). of: the estimators, that of reads first."""
 
     __slots__ = ("_at", "_manner", "_pace", "_sent_at", "of")
 
@@ -112,14 +108,6 @@ class Timers:
         self._at = self._sent_at = -inf
         self._manner: Manner | None = None
         self._pace: dict[int, float] = {}
-
-    @property
-    def rtt(self) -> float | None:
-        """Smoothed round trip in seconds: of reads, else of any request; None before the first."""
-        for timer in self.of.values():
-            if timer.samples:
-                return timer.smoothed
-        return None
 
     def timeout(self, family: str) -> float:
         """Return the present retransmission timeout of a family of opcodes, in seconds."""

@@ -10,11 +10,12 @@ from collections import deque
 from collections.abc import Callable
 from typing import Protocol
 
-from mavftpfs.protocol.chunking import Chunked, ChunkSize
+from mavftpfs.protocol.chunking import ChunkSize
 from mavftpfs.protocol.payload import NakCode, Opcode, Payload
 from mavftpfs.protocol.requests import (
     LAST_WRITE_MANNER,
     WRITE_MANNER,
+    Operation,
     Priority,
     Request,
     Run,
@@ -27,6 +28,7 @@ from mavftpfs.shared.errors import (
     RemoteProtocolError,
     SessionLost,
 )
+from mavftpfs.shared.extents import ExtentSet
 
 __all__ = ["ChunkSource", "WriteTransfer"]
 
@@ -64,7 +66,7 @@ class ChunkSource(Protocol):
         ...
 
 
-class WriteTransfer(Chunked):
+class WriteTransfer(Operation):
     """Writes what a source has for as long as its owner likes.
 
     Args:
@@ -95,7 +97,8 @@ class WriteTransfer(Chunked):
         in_flight: int | None = None,
         on_starved: Callable[[], None] = lambda: None,
     ) -> None:
-        super().__init__(chunks)
+        super().__init__()
+        self.chunks = ChunkSize() if chunks is None else chunks
         self.session = session
         self.acked_bytes = 0
         self.failed_at: int | None = None
@@ -165,7 +168,8 @@ class WriteTransfer(Chunked):
         if self._paused or most <= 0:
             return []
         session = self.session
-        chunk, most = self.next_row(min(most, _ROW), now)
+        chunk = self.chunks.next_size(now)
+        most = 1 if self.chunks.trying else min(most, _ROW)
         piece = self._rest.popleft() if self._rest else self._next_piece(most * chunk)
         if piece is None:
             return []
@@ -173,12 +177,12 @@ class WriteTransfer(Chunked):
         if len(data) > most * chunk:  # it went out in longer ones before
             self._rest.appendleft((offset + most * chunk, data[most * chunk :]))
             data = data[: most * chunk]
-        requests = [
-            Request(self, _WRITE, WRITE_MANNER, session, offset + at, chunk, data[at : at + chunk])
-            for at in range(0, len(data), chunk)
-        ]
-        requests[-1].size = len(requests[-1].data)
-        self._unanswered.update(dict.fromkeys(requests))
+        requests = []
+        for at in range(0, len(data), chunk):
+            part = data[at : at + chunk]
+            request = Request(self, _WRITE, WRITE_MANNER, session, offset + at, len(part), part)
+            requests.append(request)
+            self._unanswered[request] = None
         return requests
 
     def _next_piece(self, limit: int) -> tuple[int, bytes] | None:
@@ -278,14 +282,17 @@ class WriteTransfer(Chunked):
             return lost
         return nak
 
-    def take_back(self, request: Request) -> None:
-        """See Chunked."""
+    def takes_back(self, request: Request, now: float) -> bool:
+        """See Operation: the bytes of one that was too long go out in others."""
+        if not self.chunks.on_lost(request.size, request.sent_at, now):
+            return False
         del self._unanswered[request]
         offset, data = request.offset, request.data
         if self._rest and self._rest[-1][0] + len(self._rest[-1][1]) == offset:
             offset, before = self._rest.pop()
             data = before + data
         self._rest.append((offset, data))
+        return True
 
     def fail(self, error: MavftpfsError) -> None:
         """End; what was not ACKed goes back to the source."""
@@ -294,9 +301,12 @@ class WriteTransfer(Chunked):
         super().fail(error)
 
     def _give_back(self) -> None:
-        pieces = [(request.offset, request.size) for request in self._unanswered]
-        pieces += [(offset, len(data)) for offset, data in self._rest]
+        pieces = ExtentSet()
+        for request in self._unanswered:
+            pieces.add(request.offset, request.offset + request.size)
+        for offset, data in self._rest:
+            pieces.add(offset, offset + len(data))
         self._unanswered.clear()
         self._rest.clear()
-        for offset, count in sorted(pieces):
-            self._source.on_unsent(offset, count)
+        for start, stop in pieces:
+            self._source.on_unsent(start, stop - start)

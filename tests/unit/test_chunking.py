@@ -165,7 +165,7 @@ def test_a_late_answer_to_a_long_request_changes_nothing(writes: bool) -> None:
 
 def test_a_write_ack_that_counts_a_full_chunk_is_no_answer_to_a_short_one() -> None:
     writes = Transfers(writes=True, passing=0)
-    writes.chunks.most = 100
+    writes.chunks.most = writes.chunks.size = 100
     (first, *_) = sent(writes.engine, 0.0)
     writes.engine.receive(ack(first, MAX_DATA.to_bytes(4, "little")), 0.1)
     assert writes.source.acked.empty

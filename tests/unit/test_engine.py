@@ -773,11 +773,11 @@ def test_silence_proves_nothing_while_the_server_pauses_but_a_lone_requests_does
     for request in first:
         engine.receive(chunk(request, bytes(SIZE)), 0.05)
     engine.flow.window = 1 + others
-    engine.flow._pause = 0.3
+    engine.flow.pause = 0.3
     waiting = sent(engine, 0.05)
     assert len(waiting) == 1 + others
     engine.receive(chunk(waiting[0], bytes(SIZE)), 0.1)
-    engine.flow._pause = 0.3
+    engine.flow.pause = 0.3
     sent(engine, 0.1)
     engine.on_deadline(0.35)
     assert (engine.stats.retransmissions == 0 and not engine._ledger.again) is patient
@@ -793,7 +793,7 @@ def test_answers_to_others_do_not_put_a_timer_off_for_ever() -> None:
         engine.receive(chunk(request, bytes(SIZE)), 0.05)
     engine.flow.window = 9
     assert len(sent(engine, 0.05)) == 9
-    engine.flow._pause = 0.3
+    engine.flow.pause = 0.3
     for step in range(1, 30):
         engine._heard_at = 0.05 + step / 50
         engine.on_deadline(engine._heard_at)

@@ -69,7 +69,7 @@ class Server:
             self.pacer.on_loss(order)
         else:
             self.answered += 1
-            self.pacer.on_reply(self.now, rtt, order, self.order)
+            self.pacer.on_replies(self.now, rtt, 1, order, self.order)
 
 
 def test_nothing_beyond_the_queue_goes_out_before_a_rate_is_known() -> None:
@@ -147,7 +147,7 @@ def test_who_is_waited_for_does_not_come_to_a_full_queue() -> None:
     assert pacer.room_for_urgent(QUEUE, 0.0) == 0, "no rate is known"
     for order in range(200):
         pacer.on_sent(1, order * 0.01)
-        pacer.on_reply(order * 0.01, 0.3, order, order + QUEUE)
+        pacer.on_replies(order * 0.01, 0.3, 1, order, order + QUEUE)
     pacer.on_sent(QUEUE + 1, 3.0)
     assert pacer.room_for_urgent(QUEUE, 3.001) == 0
     due = pacer.next_at()
@@ -165,7 +165,7 @@ def test_a_flow_uses_it_where_the_server_queues_little_and_for_whom_it_suits() -
     for order in range(200):
         now = order * 0.01
         flow.on_sent(1, now)
-        flow.on_replies(now, 0.3, (order,), order + QUEUE)
+        flow.on_replies(now, 0.3, 1, order, order + QUEUE)
     assert flow.room(QUEUE, 3.0, paced=True) == 0, "beside other clients the queue is all there is"
     flow.alone = True
     shared = QUEUE + 1  # the place that is kept for others

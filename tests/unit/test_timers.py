@@ -7,7 +7,7 @@ import pytest
 from mavftpfs.protocol.ledger import Ghost
 from mavftpfs.protocol.operations import Simple
 from mavftpfs.protocol.payload import Opcode
-from mavftpfs.protocol.requests import READ_MANNER, Request, manner_of
+from mavftpfs.protocol.requests import MANNERS, READ_MANNER, Request
 from mavftpfs.protocol.timers import INITIAL_RTO, LONGEST_BACK_OFF, RttEstimator, Timers
 
 
@@ -16,7 +16,7 @@ def answered(timers: Timers, opcode: Opcode, rtt: float) -> None:
 
 
 def sent(opcode: Opcode) -> Request:
-    request = Request(Simple(opcode), opcode, manner_of(opcode), 0, 0, 0)
+    request = Request(Simple(opcode), opcode, MANNERS[opcode], 0, 0, 0)
     request.sent_at = 100.0
     request.sends = 1
     return request
@@ -114,7 +114,7 @@ def test_what_went_and_came_together_is_one_sample() -> None:
     assert timers.of["data"].samples == 1
     assert timers.sample(requests[0], 1.3) == pytest.approx(0.3)
     assert timers.of["data"].samples == 2
-    listing = Request(Ghost(), 3, manner_of(3), 0, 0, 1)
+    listing = Request(Ghost(), 3, MANNERS[3], 0, 0, 1)
     listing.sent_at = 1.0
     timers.sample(listing, 1.3)
     assert timers.of["list"].samples == 1

@@ -6,22 +6,21 @@ import pytest
 
 from mavftpfs.protocol.operations import Simple
 from mavftpfs.protocol.payload import Opcode
-from mavftpfs.protocol.requests import Request, manner_of
+from mavftpfs.protocol.requests import MANNERS, Request
 from mavftpfs.protocol.timers import Timers
 
 CRC = Opcode.CALC_FILE_CRC32
 
 
 def work(server_time: float, *, sends: int = 1, opcode: Opcode = CRC) -> Request:
-    request = Simple(opcode, b"/f", server_time=server_time).next_request(0.0)
-    assert request is not None
+    (request,) = Simple(opcode, b"/f", server_time=server_time).next_requests(1, 0.0)
     request.sent_at, request.sends = 100.0, sends
     return request
 
 
 def path(sends: int) -> Request:
     request = Request(
-        Simple(Opcode.OPEN_FILE_RO), Opcode.OPEN_FILE_RO, manner_of(Opcode.OPEN_FILE_RO), 0, 0, 0
+        Simple(Opcode.OPEN_FILE_RO), Opcode.OPEN_FILE_RO, MANNERS[Opcode.OPEN_FILE_RO], 0, 0, 0
     )
     request.sent_at, request.sends = 100.0, sends
     return request
