@@ -30,13 +30,13 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from mavftpfs.link.fastframe import FTP_MESSAGE_ID, FTP_PAYLOAD_SIZE, FtpFrameCodec, frame_crc
 from mavftpfs.link.messages import (
-    DECODERS,
     MAV_AUTOPILOT_INVALID,
+    READABLE,
     Address,
     FtpFrame,
     FtpRun,
     Message,
-    Other,
+    read_message,
     singly,
 )
 from mavftpfs.link.signing import SIGNATURE_BLOCK, SignatureCheck
@@ -59,16 +59,12 @@ _CRC_EXTRA: dict[int, int] = {number: kind.crc_extra for number, kind in dialect
 
 @dataclass(slots=True)
 class FramerStats:
-    """Plain sums. frames: all accepted; other: those of them that are `Other`; unreadable: whole and
-    valid, but their fields made no sense; bad_signature also counts unsigned frames refused, and
-    bad_time those of them that the right key signed, but too long ago."""
+    """Plain sums. bad_signature also counts unsigned frames refused, and bad_time those of them that the
+    right key signed, but too long ago. garbage_bytes: in no frame."""
 
-    frames: int = 0
-    other: int = 0
     bad_crc: int = 0
     bad_signature: int = 0
     bad_time: int = 0
-    unreadable: int = 0
     garbage_bytes: int = 0
 
 
@@ -77,10 +73,14 @@ class Framer:
 
     Args:
         source: who we are in the frames we send.
-        stream: False if `feed` gets datagrams.
+        stream: whether `feed` gets pieces of a stream, and no datagrams.
         signing_key: 32 bytes; then all is sent signed, and unsigned or wrongly signed frames are refused.
         signing_clock: now, in units of 10 µs since 2015-01-01; must not go back from one run to the next,
             or the vehicle refuses us.
+
+    Attributes:
+        waiting: a stream ended in what may be the beginning of a frame.
+        on_frame: called with the bytes of each frame accepted or built (for a .tlog), where it is not None.
 
     Raises:
         UsageError: the key has another length.
@@ -96,9 +96,8 @@ class Framer:
     ) -> None:
         self.stats = FramerStats()
         self.on_frame: Callable[[bytes], None] | None = None
-        """Called with the bytes of each frame accepted or built (for a .tlog); None costs nothing."""
         self.stream = stream
-        """Whether `feed` gets pieces of a stream; not to be changed once it was fed."""
+        self.waiting = False
         self._tail = b""
         self._codec = FtpFrameCodec(source, _CRC_EXTRA[FTP_MESSAGE_ID])
         self._decoder = dialect.MAVLink(None)
@@ -128,22 +127,31 @@ class Framer:
     def feed_runs(self, data: bytes) -> list[Message | FtpRun]:
         """As `feed`, but each FtpFrame comes in an FtpRun, with those behind it where there are any."""
         if self._tail:
-            data = self._join(data)
+            if not self.stream and data[:1] in (b"\xfd", b"\xfe"):
+                self.reset()
+            data = self._tail + data
         out: list[Message | FtpRun] = []
-        position = self._scan(data, out)
+        position = after = 0
+        while True:
+            if self._check is None:
+                position = self._codec.decode_runs(data, after, out)
+                if self.on_frame is not None:
+                    self._report_run(data, after, position)
+            if position >= len(data):
+                break
+            after = self._step(data, position, out)
+            if after == position:
+                break
+            position = after
         self._tail = data[position:]
-        self.stats.frames += _frames(out)
+        self.waiting = self.stream and position < len(data)
         return out
 
     def reset(self) -> None:
         """Forget a half-received frame: the stream was reopened."""
         self.stats.garbage_bytes += len(self._tail)
         self._tail = b""
-
-    @property
-    def waiting(self) -> bool:
-        """Whether a stream ended in what may be the beginning of a frame."""
-        return self.stream and bool(self._tail)
+        self.waiting = False
 
     def give_up(self) -> list[Message | FtpRun]:
         """The stream fell silent in mid-frame: there was none; return what is found behind its beginning."""
@@ -151,33 +159,11 @@ class Framer:
         self.stream = False  # as at the end of a datagram: nothing more decides
         try:
             while self._tail:
-                position = self._scan(self._tail, out)
-                skipped = self._skip(position, min(position + 1, len(self._tail)))
-                self._tail = self._tail[skipped:]
+                out += self.feed_runs(b"")
+                self._tail = self._tail[self._skip(0, min(1, len(self._tail))) :]
         finally:
             self.stream = True
-        self.stats.frames += _frames(out)
         return out
-
-    def _join(self, data: bytes) -> bytes:
-        if not self.stream and data[:1] in (b"\xfd", b"\xfe"):
-            self.reset()
-        return self._tail + data
-
-    def _scan(self, data: bytes, out: list[Message | FtpRun]) -> int:
-        """Append the messages of `data` to `out`; return where an unfinished frame begins."""
-        position = 0
-        while True:
-            if self._check is None:
-                start, position = position, self._codec.decode_runs(data, position, out)
-                if self.on_frame is not None:
-                    self._report_run(data, start, position)
-            if position >= len(data):
-                return position
-            after = self._step(data, position, out)
-            if after == position:
-                return position
-            position = after
 
     def _report_run(self, data: bytes, start: int, stop: int) -> None:
         while start < stop and self.on_frame is not None:
@@ -235,17 +221,12 @@ class Framer:
         if not self._authentic(frame, message_id, signed, source):
             self.stats.bad_signature += 1
             return
-        decode = DECODERS.get(message_id)
-        if decode is None:
-            self.stats.other += 1
-            out.append(Other(source, message_id))
-        else:
-            try:
-                message = decode(source, self._decoder.decode(bytearray(frame)))
-            except (dialect.MAVError, AttributeError, TypeError, ValueError):
-                self.stats.unreadable += 1
-                return
-            out.append(FtpRun(*message[:2], [message.payload]) if isinstance(message, FtpFrame) else message)
+        try:
+            fields = self._decoder.decode(bytearray(frame)) if message_id in READABLE else None
+            message = read_message(source, message_id, fields)
+        except (dialect.MAVError, AttributeError, TypeError, ValueError):
+            return  # whole and valid, but its fields make no sense
+        out.append(FtpRun(*message[:2], [message.payload]) if isinstance(message, FtpFrame) else message)
         if self.on_frame is not None:
             self.on_frame(frame)
 
@@ -271,7 +252,8 @@ class Framer:
         if wrong := set(map(len, payloads)) - {FTP_PAYLOAD_SIZE}:
             raise LocalProtocolError(f"FTP payload of {wrong.pop()} bytes, {FTP_PAYLOAD_SIZE} needed")
         if self._check is not None:
-            return [self._pack(self._ftp_message(target, payload)) for payload in payloads]
+            name = "file_transfer_protocol"
+            return [self.encode(name, 0, *target, list(payload)) for payload in payloads]
         sender = self._sender
         frames = self._codec.encode(sender.seq, target, payloads)
         sender.seq = (sender.seq + len(frames)) & 0xFF
@@ -280,9 +262,16 @@ class Framer:
                 self.on_frame(frame)
         return frames
 
-    @staticmethod
-    def _ftp_message(target: Address, payload: bytes) -> Any:
-        return dialect.MAVLink_file_transfer_protocol_message(0, target[0], target[1], list(payload))
+    def encode(self, name: str, *fields: Any) -> bytes:
+        """Return the frame of any message: encode("system_time", 0, 7). fields: in pymavlink's order."""
+        sender = self._sender
+        if self._check is not None:
+            sender.signing.timestamp = max(sender.signing.timestamp, self._check.now)
+        frame: bytes = getattr(dialect, f"MAVLink_{name}_message")(*fields).pack(sender)
+        sender.seq = (sender.seq + 1) & 0xFF
+        if self.on_frame is not None:
+            self.on_frame(frame)
+        return frame
 
     def encode_heartbeat(
         self,
@@ -292,95 +281,15 @@ class Framer:
         system_status: int = 4,
     ) -> bytes:
         """Return a HEARTBEAT frame (system_status 4: active)."""
-        return self._pack(
-            dialect.MAVLink_heartbeat_message(vehicle_type, autopilot, base_mode, 0, system_status, 3)
-        )
-
-    def encode_command(self, target: Address, command: int, params: Sequence[float] = ()) -> bytes:
-        """Return a COMMAND_LONG frame; missing params are 0."""
-        values = [*params, *([0.0] * (7 - len(params)))]
-        return self._pack(
-            dialect.MAVLink_command_long_message(target.system, target.component, command, 0, *values)
-        )
+        return self.encode("heartbeat", vehicle_type, autopilot, base_mode, 0, system_status, 3)
 
     def encode_request_message(self, target: Address, message_id: int) -> bytes:
         """Return MAV_CMD_REQUEST_MESSAGE for `message_id`."""
-        return self.encode_command(target, MAV_CMD_REQUEST_MESSAGE, (float(message_id),))
+        return self._encode_command(target, MAV_CMD_REQUEST_MESSAGE, message_id)
 
     def encode_request_capabilities(self, target: Address) -> bytes:
         """Return the older way to ask for AUTOPILOT_VERSION (ArduPilot before 4.1, PX4 before 1.13)."""
-        return self.encode_command(target, MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES, (1.0,))
+        return self._encode_command(target, MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES, 1)
 
-    # ------------------------------------------------------------------ the vehicle's side (simulator)
-
-    def encode_command_ack(self, command: int, result: int, target: Address) -> bytes:
-        """Return a COMMAND_ACK frame (result: MAV_RESULT)."""
-        return self._pack(dialect.MAVLink_command_ack_message(command, result, 0, 0, *target))
-
-    def encode_autopilot_version(
-        self, capabilities: int, flight_sw_version: int, git_hash: bytes, uid: int, uid2: bytes = bytes(18)
-    ) -> bytes:
-        """Return an AUTOPILOT_VERSION frame; git_hash: 8 bytes, uid2: 18 bytes."""
-        zeros = [0] * 8
-        return self._pack(
-            dialect.MAVLink_autopilot_version_message(
-                capabilities, flight_sw_version, 0, 0, 0, list(git_hash), zeros, zeros, 0, 0, uid, list(uid2)
-            )
-        )
-
-    def encode_storage_information(
-        self, time_boot_ms: int, total: float, used: float, *, storage_id: int = 1, status: int = 2
-    ) -> bytes:
-        """Return a STORAGE_INFORMATION frame; sizes in MiB, status 2: ready."""
-        return self._pack(
-            dialect.MAVLink_storage_information_message(
-                time_boot_ms, storage_id, 1, status, total, used, total - used, 0.0, 0.0
-            )
-        )
-
-    def encode_system_time(self, unix_usec: int, time_boot_ms: int) -> bytes:
-        """Return a SYSTEM_TIME frame."""
-        return self._pack(dialect.MAVLink_system_time_message(unix_usec, time_boot_ms))
-
-    def encode_statustext(self, severity: int, text: str) -> bytes:
-        """Return a STATUSTEXT frame; text is cut to 50 bytes."""
-        return self._pack(dialect.MAVLink_statustext_message(severity, text.encode()[:50]))
-
-    def encode_telemetry(self, step: int, time_boot_ms: int) -> bytes:
-        """Return the next message of an autopilot's usual mix; `step` counts up."""
-        ms, us = time_boot_ms & 0xFFFFFFFF, time_boot_ms * 1000
-        match step % 5:
-            case 0:
-                message = dialect.MAVLink_attitude_message(ms, 0.1, 0.2, 0.3, 0.01, 0.02, 0.03)
-            case 1:
-                message = dialect.MAVLink_global_position_int_message(
-                    ms, 473977418, 85455938, 488000, 50000, 120, -30, 4, 9000
-                )
-            case 2:
-                message = dialect.MAVLink_vfr_hud_message(12.5, 12.0, 90, 55, 488.1, 0.4)
-            case 3:
-                message = dialect.MAVLink_sys_status_message(
-                    0x3FFFFF, 0x3FFFFF, 0x3FFFFF, 350, 15800, 1200, 80, 0, 0, 1, 1, 1, 1
-                )
-            case _:
-                message = dialect.MAVLink_highres_imu_message(
-                    us, 0.1, 0.2, -9.8, 0.01, 0.02, 0.03, 0.2, 0.01, 0.4, 958.0, 1.0, 488.0, 31.5, 0x1FFF
-                )
-        return self._pack(message)
-
-    def _pack(self, message: Any) -> bytes:
-        sender = self._sender
-        if self._check is not None:
-            sender.signing.timestamp = max(sender.signing.timestamp, self._check.now)
-        frame: bytes = message.pack(sender)
-        sender.seq = (sender.seq + 1) & 0xFF
-        if self.on_frame is not None:
-            self.on_frame(frame)
-        return frame
-
-
-def _frames(messages: list[Message | FtpRun]) -> int:
-    frames = 0
-    for message in messages:
-        frames += len(message.payloads) if type(message) is FtpRun else 1
-    return frames
+    def _encode_command(self, target: Address, command: int, value: int) -> bytes:
+        return self.encode("command_long", *target, command, 0, value, 0, 0, 0, 0, 0, 0)

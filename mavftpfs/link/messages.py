@@ -1,12 +1,11 @@
 """What the framing understands of MAVLink, as plain values. Layer: link; pure, no pymavlink.
 
-Every other message is `Other`: counted and traced, never an error. `DECODERS` makes the values of pymavlink's
-message objects, which `framing` hands in.
+Every other message is `Other`: traced, never an error.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, NamedTuple, TypeAlias
 
@@ -131,55 +130,27 @@ def singly(messages: Iterable[Message | FtpRun]) -> list[Message]:
     return single
 
 
-# -- from pymavlink's message objects --------------------------------------------------------------
+READABLE = frozenset((0, 2, 76, 110, 148, 261))
+"""The ids of messages that `read_message` looks into."""
 
 
-def _heartbeat(source: Address, m: Any) -> Heartbeat:
-    return Heartbeat(source, m.type, m.autopilot, m.base_mode, m.system_status)
-
-
-def _system_time(source: Address, m: Any) -> SystemTime:
-    return SystemTime(source, m.time_unix_usec, m.time_boot_ms)
-
-
-def _command_long(source: Address, m: Any) -> CommandLong:
-    params = (m.param1, m.param2, m.param3, m.param4, m.param5, m.param6, m.param7)
-    return CommandLong(source, Address(m.target_system, m.target_component), m.command, params)
-
-
-def _ftp(source: Address, m: Any) -> FtpFrame:
-    return FtpFrame(source, Address(m.target_system, m.target_component), bytes(m.payload))
-
-
-def _autopilot_version(source: Address, m: Any) -> AutopilotVersion:
-    return AutopilotVersion(
-        source,
-        m.capabilities,
-        m.flight_sw_version,
-        bytes(m.flight_custom_version),
-        m.uid,
-        bytes(m.uid2),
-    )
-
-
-def _storage_information(source: Address, m: Any) -> StorageInformation:
-    return StorageInformation(
-        source,
-        m.storage_id,
-        m.storage_count,
-        m.status,
-        m.total_capacity,
-        m.used_capacity,
-        m.available_capacity,
-    )
-
-
-DECODERS: dict[int, Callable[[Address, Any], Message]] = {
-    0: _heartbeat,
-    2: _system_time,
-    76: _command_long,
-    110: _ftp,
-    148: _autopilot_version,
-    261: _storage_information,
-}
-"""By message id; all other messages are `Other`."""
+def read_message(source: Address, message_id: int, m: Any) -> Message:
+    """Return what pymavlink's message object says. One that lacks a field raises AttributeError or such."""
+    match message_id:
+        case 0:
+            return Heartbeat(source, m.type, m.autopilot, m.base_mode, m.system_status)
+        case 2:
+            return SystemTime(source, m.time_unix_usec, m.time_boot_ms)
+        case 76:
+            params = (m.param1, m.param2, m.param3, m.param4, m.param5, m.param6, m.param7)
+            return CommandLong(source, Address(m.target_system, m.target_component), m.command, params)
+        case 110:
+            return FtpFrame(source, Address(m.target_system, m.target_component), bytes(m.payload))
+        case 148:
+            git_hash, uid2 = bytes(m.flight_custom_version), bytes(m.uid2)
+            return AutopilotVersion(source, m.capabilities, m.flight_sw_version, git_hash, m.uid, uid2)
+        case 261:
+            size = (m.total_capacity, m.used_capacity, m.available_capacity)
+            return StorageInformation(source, m.storage_id, m.storage_count, m.status, *size)
+        case _:
+            return Other(source, message_id)

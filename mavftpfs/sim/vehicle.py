@@ -11,6 +11,7 @@ from collections import Counter
 from collections.abc import Sequence
 from itertools import groupby
 from operator import itemgetter
+from typing import Any
 
 from mavftpfs.link.framing import (
     AUTOPILOT_VERSION_ID,
@@ -241,7 +242,7 @@ class SimVehicle:
 
     def say(self, severity: int, text: str) -> None:
         """Send a STATUSTEXT."""
-        self._ready.append(self.framer.encode_statustext(severity, text))
+        self._ready.append(self.framer.encode("statustext", severity, text.encode()[:50]))
 
     def outgoing(self, now: float) -> list[bytes]:
         """Return the frames to send now, in order."""
@@ -304,7 +305,7 @@ class SimVehicle:
         for _ in range(_MOST_TELEMETRY_PER_CALL):
             if self._next_telemetry > now:
                 return
-            frame = self.framer.encode_telemetry(self._telemetry_step, self._boot_ms(now))
+            frame = self.framer.encode(*telemetry(self._telemetry_step, self._boot_ms(now)))
             self._telemetry_step += 1
             frames.append(frame)
             self._next_telemetry = max(self._next_telemetry, self._booted_at or 0.0) + len(frame) / rate
@@ -322,17 +323,31 @@ class SimVehicle:
         elif asks and wanted == SYSTEM_TIME_ID:
             frame = self._system_time(now)
         elif asks and wanted == STORAGE_INFORMATION_ID:
-            frame = self.framer.encode_storage_information(self._boot_ms(now), CAPACITY_MIB, CAPACITY_MIB / 4)
+            size = (CAPACITY_MIB, CAPACITY_MIB / 4, CAPACITY_MIB * 3 / 4)
+            frame = self.framer.encode("storage_information", self._boot_ms(now), 1, 1, 2, *size, 0, 0)
         result = _UNSUPPORTED if frame is None else _ACCEPTED
-        self._ready.append(self.framer.encode_command_ack(command.command, result, command.source))
+        self._ready.append(self.framer.encode("command_ack", command.command, result, 0, 0, *command.source))
         if frame is not None:
             self._ready.append(frame)
 
     def _system_time(self, now: float) -> bytes:
         boot_ms = self._boot_ms(now)
-        return self.framer.encode_system_time(_UNIX_AT_START * 1_000_000 + boot_ms * 1000, boot_ms)
+        return self.framer.encode("system_time", _UNIX_AT_START * 1_000_000 + boot_ms * 1000, boot_ms)
 
     def _version(self) -> bytes:
         # MAVSDK's server never says that it speaks FTP (servers.md 5).
         ftp = 0 if self.profile.family is Family.MAVSDK else MAV_PROTOCOL_CAPABILITY_FTP
-        return self.framer.encode_autopilot_version(ftp | _MAVLINK2, 0x01100000, b"simulate", self._uid)
+        versions = (ftp | _MAVLINK2, 0x01100000, 0, 0, 0, b"simulate", bytes(8), bytes(8), 0, 0)
+        return self.framer.encode("autopilot_version", *versions, self._uid, list(bytes(18)))
+
+
+def telemetry(step: int, boot_ms: int) -> tuple[Any, ...]:
+    """Return the next message of an autopilot's usual mix, for Framer.encode; `step` counts up."""
+    mix: tuple[tuple[Any, ...], ...] = (
+        ("attitude", boot_ms, 0.1, 0.2, 0.3, 0.01, 0.02, 0.03),
+        ("global_position_int", boot_ms, 473977418, 85455938, 488000, 50000, 120, -30, 4, 9000),
+        ("vfr_hud", 12.5, 12.0, 90, 55, 488.1, 0.4),
+        ("sys_status", *[0x3FFFFF] * 3, 350, 15800, 1200, 80, 0, 0, 1, 1, 1, 1),
+        ("highres_imu", boot_ms * 1000, *[0.1] * 9, 958.0, 1.0, 488.0, 31.5, 0x1FFF),
+    )
+    return mix[step % len(mix)]

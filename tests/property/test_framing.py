@@ -13,6 +13,7 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 from mavftpfs.link.fastframe import FtpFrameCodec
 from mavftpfs.link.framing import Framer
 from mavftpfs.link.messages import Address, FtpFrame, FtpRun, Message, Other, singly
+from mavftpfs.sim.vehicle import telemetry
 
 EXTRA = dialect.MAVLink_file_transfer_protocol_message.crc_extra
 KEY = bytes(32)
@@ -109,7 +110,7 @@ def some_frame(draw: st.DrawFn) -> bytes:
     if kind == "beat":
         return framer.encode_heartbeat(2, 12)
     if kind == "other":
-        return framer.encode_telemetry(draw(st.integers(0, 4)), 5)
+        return framer.encode(*telemetry(draw(st.integers(0, 4)), 5))
     payload = draw(payloads)
     frame = reference_frame(
         Address(1, 1), Address(2, 2), payload, old=kind == "v1", key=KEY if kind == "signed" else None

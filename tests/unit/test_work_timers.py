@@ -19,9 +19,7 @@ def work(server_time: float, *, sends: int = 1, opcode: Opcode = CRC) -> Request
 
 
 def path(sends: int) -> Request:
-    request = Request(
-        Simple(Opcode.OPEN_FILE_RO), Opcode.OPEN_FILE_RO, MANNERS[Opcode.OPEN_FILE_RO], 0, 0, 0
-    )
+    request = Request(Simple(Opcode.OPEN_FILE_RO), Opcode.OPEN_FILE_RO, MANNERS[Opcode.OPEN_FILE_RO], 0, 0, 0)
     request.sent_at, request.sends = 100.0, sends
     return request
 
