@@ -17,7 +17,7 @@ from typing import Literal, cast
 
 import trio
 
-from mavftpfs.cache.dentries import Dentries
+from mavftpfs.cache.directories import Directories
 from mavftpfs.cache.kept import KeptCache, vehicle_identity
 from mavftpfs.cache.kept_disk import KeptDisk
 from mavftpfs.cache.options import CacheOptions
@@ -50,7 +50,7 @@ BITS_PER_BYTE = 10
 """On a serial port: eight, and a start and a stop bit."""
 
 
-MakeKept = Callable[[Dentries], KeptCache]
+MakeKept = Callable[[Directories], KeptCache]
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,8 +153,8 @@ async def attached(
                         spool.discard()
 
 
-def _start_kept(make: MakeKept, nursery: trio.Nursery, dentries: Dentries) -> KeptCache:
-    kept = make(dentries)
+def _start_kept(make: MakeKept, nursery: trio.Nursery, directories: Directories) -> KeptCache:
+    kept = make(directories)
     nursery.start_soon(kept.run)
     return kept
 

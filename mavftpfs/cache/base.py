@@ -6,7 +6,7 @@ import zlib
 from dataclasses import replace
 
 from mavftpfs.cache.context import Context
-from mavftpfs.cache.dentries import Directory
+from mavftpfs.cache.directories import Directory
 from mavftpfs.cache.draft import Base, Draft, State
 from mavftpfs.cache.files import FileHandle
 from mavftpfs.cache.nodes import Node
@@ -36,7 +36,7 @@ async def open_node(context: Context, node: Node) -> FileHandle:
 
 def known_base(context: Context, path: bytes, size: int) -> Base:
     """Return what is known of a file that was opened and has `size` bytes."""
-    entry = context.dentries.entry(path)
+    entry = context.directories.entry(path)
     return Base(size, entry.mtime if entry is not None and entry.size == size else None)
 
 

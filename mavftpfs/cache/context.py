@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 
 import trio
 
-from mavftpfs.cache.dentries import Dentries
 from mavftpfs.cache.directories import Directories
+from mavftpfs.cache.draft import State
 from mavftpfs.cache.files import Files
 from mavftpfs.cache.nodes import Nodes
 from mavftpfs.cache.options import CacheOptions
@@ -16,7 +16,8 @@ from mavftpfs.cache.pathlocks import PathLocks
 from mavftpfs.cache.remote import VehicleStore
 from mavftpfs.cache.reserved import OwnNames
 from mavftpfs.cache.spool import Spool
-from mavftpfs.shared.errors import Armed, FileBusy
+from mavftpfs.shared.errors import Armed, FileBusy, NotFound
+from mavftpfs.shared.model import DirEntry, EntryKind, split
 
 
 @dataclass(slots=True)
@@ -30,7 +31,6 @@ class Context:
 
     store: VehicleStore
     directories: Directories
-    dentries: Dentries
     files: Files
     options: CacheOptions
     clock: Callable[[], float]
@@ -55,8 +55,26 @@ class Context:
 
     def require_idle(self, path: bytes) -> None:
         """Raise FileBusy if somebody on the vehicle seems to write the file."""
-        if not self.options.force and self.dentries.is_growing(path):
+        if not self.options.force and self.directories.is_growing(path):
             raise FileBusy(f"{path!r} grows: somebody on the vehicle is writing it")
+
+    async def entry(self, path: bytes) -> DirEntry | None:
+        """Return what a path is, drafts included; None if it does not exist though its directory does.
+
+        Raises:
+            NotFound, NotADirectory: its directory. Else as RemoteStore.list_directory.
+        """
+        node, (parent, name) = self.nodes.get(path), split(path)
+        if node is not None and node.draft is not None and node.draft.state is not State.STALE:
+            return DirEntry(name, EntryKind.FILE, node.draft.size)
+        return (await self.directories.get(parent)).entries.get(name)
+
+    async def need(self, path: bytes) -> DirEntry:
+        """Return what a path is, drafts included. Raises as entry; NotFound if it does not exist."""
+        entry = await self.entry(path)
+        if entry is None:
+            raise NotFound(f"{path!r} does not exist")
+        return entry
 
     def is_changing(self, path: bytes) -> bool:
         """Return whether we are changing what the vehicle has under a path, or may have done so in part."""

@@ -221,7 +221,7 @@ class Deliverer:
             As Directories.ask and Verifier.check.
         """
         await self._cleaner.mend(node)
-        there = await self._names.ask(node.path) is not None
+        there = await self._context.directories.current(node.path) is not None
         self._context.own.torn.pop(node.path, None)
         if draft.state is not State.TORN:
             return
@@ -290,7 +290,7 @@ class Deliverer:
             raise
         node.attempt = Attempt(path, places, sending, upload, begun_at)
         if places is None:
-            context.dentries.put(path, DirEntry(b"", EntryKind.FILE))
+            context.directories.put(path, DirEntry(b"", EntryKind.FILE))
         return node.attempt
 
     async def _require_expected(self, node: Node, draft: Draft) -> None:
@@ -320,9 +320,9 @@ class Deliverer:
                 await attempt.upload.abort()
             except BaseException:  # nobody waits any more: all of it is sent again
                 draft.give_up()
-                self._context.dentries.expire(split(path)[0])
+                self._context.directories.expire(split(path)[0])
                 raise
-            self._context.dentries.put(places.new, DirEntry(b"", EntryKind.FILE, draft.size))
+            self._context.directories.put(places.new, DirEntry(b"", EntryKind.FILE, draft.size))
             draft.commit()
             await self._names.put(places, path)
             if attempt.upload.resent and await self._names.size(path) != draft.size:
@@ -345,7 +345,7 @@ class Deliverer:
     def _on_delivered(self, node: Node, draft: Draft, crc32: int | None) -> None:
         """The vehicle has it: listings, blocks and checksums follow."""
         context = self._context
-        context.dentries.put(node.path, DirEntry(b"", EntryKind.FILE, draft.size), proven=True)
+        context.directories.put(node.path, DirEntry(b"", EntryKind.FILE, draft.size), proven=True)
         if crc32 is None and draft.size <= context.options.verify_max:
             crc32 = draft.crc32()
         draft.delivered(crc32)

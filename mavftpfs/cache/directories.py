@@ -1,4 +1,13 @@
-"""Asks the vehicle for listings and answers from remembered ones. Layer: cache.
+"""What the vehicle has under which name: remembered listings, and asking for new ones. Layer: cache.
+
+There is no stat on the wire (servers.md 14.30): everything known of a path comes from its parent's
+listing. A listing is fresh for a while; a name that a fresh and complete one lacks does not exist.
+Expired listings are kept to be served while the vehicle is out of reach.
+
+A listing takes many requests, and a change made by us meanwhile may show in it or not. So each sweep under
+way is a `Sweep` in which every change of ours is written down, and what was written down beats what the sweep
+saw. The entries behind a changed name shifted between the sweep's pages (servers.md 6, "Concurrent change"):
+so the result is incomplete and expires at once.
 
 Only a path that its parent's listing shows as a directory is listed: listing a file ends a MAVSDK server
 (servers.md 6), so a path is walked from the root. A walk costs nothing where listings are fresh.
@@ -8,21 +17,39 @@ from __future__ import annotations
 
 import errno
 import logging
+from collections import OrderedDict
 from collections.abc import Awaitable, Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import partial
 from math import inf
 
 import trio
 
-from mavftpfs.cache.dentries import Dentries, Directory, Sweep
+from mavftpfs.cache.attributes import tidy
+from mavftpfs.cache.options import DIR_TIMEOUT, CacheOptions
 from mavftpfs.cache.remote import RemoteStore
 from mavftpfs.cache.singleflight import SingleFlight
 from mavftpfs.shared.errnos import errno_for
 from mavftpfs.shared.errors import FtpNak, NotADirectory, NotFound, PathTooLong, VehicleLost
-from mavftpfs.shared.model import DOT, ROOT, DirEntry, EntryKind, Listing, hides_files, join, split
+from mavftpfs.shared.model import (
+    DOT,
+    ROOT,
+    DirEntry,
+    EntryKind,
+    Listing,
+    hides_files,
+    join,
+    split,
+    usable_name,
+)
 
 log = logging.getLogger("mavftpfs.cache")
+
+COST_FACTOR = 50
+"""A listing that took T seconds is fresh for at least COST_FACTOR * T: it costs at most 2 % of the link."""
+
+STILL_GROWING = 30.0
+"""A file that was seen to grow is taken to be open on the vehicle for so many seconds."""
 
 MAX_DEPTH = 256
 """More components than any path that fits a request has."""
@@ -32,6 +59,33 @@ LOOK = 1.0
 
 SWEEP_TRIES = 3
 """How often a listing is repeated because names came or went meanwhile through us."""
+
+
+@dataclass(slots=True)
+class Directory:
+    """A remembered listing.
+
+    entries: by name, as listed. listed_at: when the sweep began, ended_at: when it was done; fresh_until:
+    after that it proves nothing. complete: whether a name that is not in it is absent. cut_short: the vehicle
+    did not list it to its end.
+    sizes: what opening told about an entry since, which beats the listing. growing: when a file was last seen
+    to be larger than before, though we did not write it. proven: when the vehicle last confirmed that we gave
+    a name to what is listed there.
+    """
+
+    entries: dict[bytes, DirEntry]
+    listed_at: float
+    ended_at: float
+    fresh_until: float
+    complete: bool
+    cut_short: bool
+    sizes: dict[bytes, int] = field(default_factory=dict)
+    growing: dict[bytes, float] = field(default_factory=dict)
+    proven: dict[bytes, float] = field(default_factory=dict)
+
+    def size_of(self, name: bytes) -> int | None:
+        """Return the best known size of a listed name in bytes, None if nothing told it."""
+        return self.sizes.get(name, self.entries[name].size)
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,8 +101,22 @@ class Found:
         return self.directory.size_of(self.entry.name)
 
 
+@dataclass(slots=True, eq=False)
+class Sweep:
+    """A listing under way.
+
+    changes: what we changed in that directory since it began. void: it is in doubt, or not wanted any more.
+    """
+
+    path: bytes
+    began: float
+    changes: dict[bytes, DirEntry | None] = field(default_factory=dict)
+    void: bool = False
+
+
 class Directories:
-    """Listings of the vehicle's directories. All paths are the vehicle's, normalised.
+    """Listings of the vehicle's directories. All paths are the vehicle's, normalised. The least recently used
+    ones are dropped when they have more than `max_entries` names.
 
     Attributes:
         ask_size: opens a file and returns its size. on_listed: called with each listing as it is made;
@@ -59,20 +127,128 @@ class Directories:
     ask_size: Callable[[bytes], Awaitable[int]]
 
     def __init__(
-        self, store: RemoteStore, dentries: Dentries, root: bytes, *, nursery: trio.Nursery | None = None
+        self,
+        store: RemoteStore,
+        options: CacheOptions,
+        *,
+        clock: Callable[[], float],
+        nursery: trio.Nursery | None = None,
     ) -> None:
+        """`clock`: seconds, monotonic. With a nursery a listing outlives who asked for it."""
         self._store = store
-        self.dentries = dentries
-        self._root = root
-        self.clock = dentries.clock
+        self._options = options
+        self.clock = clock
+        self._known: OrderedDict[bytes, Directory] = OrderedDict()
+        self._sweeps: dict[bytes, Sweep] = {}
         self._sweeping: SingleFlight[bytes, Directory] = SingleFlight(nursery)
-        self._root_proven = root == ROOT
-        self._dot_refused = False
         self.on_swept: Callable[[bytes, Directory], Awaitable[None]] | None = None
         self.on_listed: list[Callable[[bytes, Directory], None]] = []
         self.lost = False
-        self.tells_times = False
         self.sweeps = 0
+        self.rebooted()
+
+    def __len__(self) -> int:
+        return len(self._known)
+
+    @property
+    def entry_count(self) -> int:
+        """Names remembered over all listings."""
+        return sum([len(directory.entries) for directory in self._known.values()])
+
+    # --- what is remembered
+
+    def known(self, path: bytes) -> Directory | None:
+        """Return the directory's listing, expired or not."""
+        directory = self._known.get(path)
+        if directory is not None:
+            self._known.move_to_end(path)
+        return directory
+
+    def fresh(self, path: bytes) -> Directory | None:
+        """Return the directory's listing if it still proves something."""
+        directory = self.known(path)
+        return directory if directory is not None and self.clock() < directory.fresh_until else None
+
+    def entry(self, path: bytes) -> DirEntry | None:
+        """Return what a path was last known to be."""
+        parent, name = split(path)
+        directory = self._known.get(parent)
+        return None if directory is None else directory.entries.get(name)
+
+    def is_growing(self, path: bytes) -> bool:
+        """Return whether somebody on the vehicle seems to write the file."""
+        parent, name = split(path)
+        directory = self._known.get(parent)
+        return directory is not None and self.clock() - directory.growing.get(name, -inf) < STILL_GROWING
+
+    def learn_size(self, path: bytes, size: int) -> None:
+        """An open told the size: it beats the listing until the next one. If it is larger, the file grows."""
+        parent, name = split(path)
+        directory = self._known.get(parent)
+        if directory is None or name not in directory.entries:
+            return
+        before = directory.size_of(name)
+        directory.sizes[name] = size
+        if before is not None and size > before:
+            directory.growing[name] = self.clock()
+
+    def put(self, path: bytes, entry: DirEntry | None, *, proven: bool = False) -> None:
+        """We made, wrote, renamed or removed (None) what has this name; what lies below is to be listed anew.
+
+        proven: the vehicle said just now that the name is this.
+        """
+        self.forget(path)
+        parent, name = split(path)
+        if entry is not None and entry.name != name:
+            entry = replace(entry, name=name)
+        sweep, directory = self._sweeps.get(parent), self._known.get(parent)
+        if sweep is not None:
+            sweep.changes[name] = entry
+        if directory is None:
+            return
+        for facts in (directory.entries, directory.sizes, directory.growing, directory.proven):
+            facts.pop(name, None)
+        if entry is not None:
+            directory.entries[name] = entry
+            if proven:
+                directory.proven[name] = self.clock()
+
+    def rename(self, old: bytes, new: bytes) -> None:
+        """We renamed something, perhaps over something else, and the vehicle just said so."""
+        entry = self.entry(old)
+        self.put(old, None)
+        self.put(new, entry, proven=True)
+        if entry is None:
+            self.expire(split(new)[0])
+
+    def expire(self, path: bytes) -> None:
+        """The listing of `path` is in doubt: it proves nothing any more, but may be served stale."""
+        sweep, directory = self._sweeps.get(path), self._known.get(path)
+        if sweep is not None:
+            sweep.void = True
+        if directory is not None:
+            directory.fresh_until = min(directory.fresh_until, self.clock())
+            directory.proven.clear()
+
+    def forget(self, path: bytes) -> None:
+        """Drop the listings of `path` and of all below it."""
+        below = path.rstrip(b"/") + b"/"
+        for known in list(self._known):
+            if known == path or known.startswith(below):
+                del self._known[known]
+        for known, sweep in self._sweeps.items():
+            if known == path or known.startswith(below):
+                sweep.void = True
+
+    def rebooted(self) -> None:
+        """Everything is in doubt, and what was learnt of the server's ways may no longer hold."""
+        for path in self._known.keys() | self._sweeps.keys():
+            self.expire(path)
+        self.tells_times = False
+        self._root_proven = self._options.root == ROOT
+        self._dot_refused = False
+
+    # --- asking
 
     async def find(self, path: bytes) -> Found:
         """Return what is known of a path below the root.
@@ -95,10 +271,49 @@ class Directories:
                 if errno_for(nak) != errno.ENOENT:
                     raise
             else:
-                self.dentries.learn_found(path, entry)
+                directory.entries.setdefault(name, entry)
         if entry is None:
             raise NotFound(f"{path!r} does not exist")
         return Found(entry, directory)
+
+    async def current(self, path: bytes, *, within: float = 0.0) -> DirEntry | None:
+        """Return what the vehicle has there, not drafts, as it was shown to be at most `within` seconds ago.
+
+        That something is there counts from the end of a listing, or from our change; that nothing is, from
+        the beginning of a listing.
+
+        Raises:
+            As ask, but None where its directory is gone.
+        """
+        parent, name = split(path)
+        known, since = self.known(parent), self.clock() - within
+        if known is not None and within:
+            seen = known.proven.get(name, -inf)
+            if self.clock() < known.fresh_until:
+                seen = max(seen, known.ended_at if name in known.entries else known.listed_at)
+            if seen >= since:
+                return known.entries.get(name)
+        try:
+            return (await self.ask(parent)).entries.get(name)
+        except (NotFound, NotADirectory):
+            return None
+
+    async def ask(self, path: bytes, *, began: float | None = None) -> Directory:
+        """Return a directory's listing that is asked for just now, or began at that time or later.
+
+        Raises:
+            As get; VehicleLost instead of an old listing.
+        """
+        known = None if began is None else self.fresh(path)
+        if known is not None and began is not None and known.listed_at >= began:
+            return known
+        asked = self.clock()
+        self.expire(path)
+        for _ in range(SWEEP_TRIES):
+            directory = await self.get(path)
+            if directory.listed_at >= asked:
+                return directory
+        raise VehicleLost("the vehicle does not answer")
 
     async def get(self, path: bytes) -> Directory:
         """Return a directory's listing: fresh, else swept, else (the vehicle being silent) expired.
@@ -106,13 +321,13 @@ class Directories:
         Raises:
             NotFound, NotADirectory; else as RemoteStore.list_directory.
         """
-        directory = self.dentries.known(path)
+        directory = self.known(path)
         if directory is not None and self.clock() < directory.fresh_until:
             return directory
         try:
             if self.lost and directory is not None:
                 raise VehicleLost("no heartbeats")
-            if path == self._root:
+            if path == self._options.root:
                 await self._walk_to_root()
             elif path != ROOT and (await self.find(path)).entry.kind is not EntryKind.DIRECTORY:
                 raise NotADirectory(f"{path!r} is not a directory")
@@ -124,6 +339,8 @@ class Directories:
         if self.on_swept is not None:
             await self.on_swept(path, swept)
         return swept
+
+    # --- listing
 
     async def _swept(self, path: bytes, *, older: bool) -> Directory:
         """Return a new listing. older: one is known that will do while the vehicle is silent.
@@ -138,39 +355,6 @@ class Directories:
             if self._store.is_silent():
                 raise VehicleLost("no heartbeats")
 
-    async def ask(self, path: bytes) -> Directory:
-        """Return a directory's listing asked for just now.
-
-        Raises:
-            As get; VehicleLost instead of an old listing.
-        """
-        asked = self.clock()
-        self.dentries.expire(path)
-        for _ in range(SWEEP_TRIES):
-            directory = await self.get(path)
-            if directory.listed_at >= asked:
-                return directory
-        raise VehicleLost("the vehicle does not answer")
-
-    async def recent(
-        self, path: bytes, *, began: float | None = None, ended: float | None = None
-    ) -> Directory:
-        """Return a listing that began, or ended, at the given time or later; asks for one if there is none.
-
-        Raises:
-            As ask.
-        """
-        known = self.dentries.fresh(path)
-        if known is not None and known.listed_at >= (began or 0.0) and known.ended_at >= (ended or 0.0):
-            return known
-        return await self.ask(path)
-
-    def rebooted(self) -> None:
-        """What was learnt of the server's ways may no longer hold."""
-        self.tells_times = False
-        self._root_proven = self._root == ROOT
-        self._dot_refused = False
-
     async def _walk_to_root(self) -> None:
         """See once that no part of the mount's root is a file.
 
@@ -178,8 +362,8 @@ class Directories:
         (MavlinkFTP::_workList sends them as skip entries) and some trees are not announced.
         """
         path = ROOT
-        for part in () if self._root_proven else self._root.split(b"/")[1:]:
-            directory = self.dentries.fresh(path)
+        for part in () if self._root_proven else self._options.root.split(b"/")[1:]:
+            directory = self.fresh(path)
             if directory is None:
                 directory = await self._sweeping.run(path, partial(self._sweep, path))
             entry = directory.entries.get(part)
@@ -192,43 +376,26 @@ class Directories:
         """List until no change of ours came between, or SWEEP_TRIES times."""
         tries = 0
         while True:
-            sweep = self.dentries.begin(path)
+            sweep = self.begin(path)
             self.sweeps += 1
             tries += 1
             try:
-                listing = await self._list(path)
+                listing = await self._store.list_directory(path)
+                if not self._dot_refused and hides_files(path, listing.entries):
+                    listing = await self._with_dot(listing)
             except FtpNak:  # perhaps it is gone, so the parent is asked again
-                self.dentries.forget(path)
+                self.forget(path)
                 if path != ROOT:
-                    self.dentries.expire(split(path)[0])
+                    self.expire(split(path)[0])
                 raise
             finally:
-                self.dentries.end(sweep)
-            directory = self._remember(path, sweep, listing)
+                del self._sweeps[path]
+            directory = self.remember(sweep, listing)
+            if not sweep.void:
+                for hear in self.on_listed:
+                    hear(path, directory)
             if not sweep.changes or tries == SWEEP_TRIES:
                 return directory
-
-    def _remember(self, path: bytes, sweep: Sweep, listing: Listing) -> Directory:
-        known = self.dentries.known(path)
-        if not (listing.complete or (known is not None and known.cut_short)):
-            log.warning(
-                "%r was not listed to its end: %d names of it are known, and reading it is an error",
-                path,
-                len(listing.entries),
-            )
-        for entry in listing.entries:
-            self.tells_times |= entry.mtime is not None
-        directory = self.dentries.remember(sweep, listing)
-        if not sweep.void:
-            for hear in self.on_listed:
-                hear(path, directory)
-        return directory
-
-    async def _list(self, path: bytes) -> Listing:
-        listing = await self._store.list_directory(path)
-        if not self._dot_refused and hides_files(path, listing.entries):
-            return await self._with_dot(listing)
-        return listing
 
     async def _with_dot(self, listing: Listing) -> Listing:
         """Add what only `.` shows: ArduPilot on SITL omits every plain file of `/` (servers.md 14.32)."""
@@ -247,3 +414,54 @@ class Directories:
             listing.complete and dot.complete,
             listing.hidden + dot.hidden,
         )
+
+    def begin(self, path: bytes) -> Sweep:
+        """Note that a listing of `path` starts. One at a time of each directory."""
+        sweep = self._sweeps[path] = Sweep(path, self.clock())
+        return sweep
+
+    def remember(self, sweep: Sweep, listing: Listing) -> Directory:
+        """Remember a listing and return it, our own changes applied."""
+        now, old = self.clock(), self._known.get(sweep.path)
+        if not (listing.complete or (old is not None and old.cut_short)):
+            count = len(listing.entries)
+            log.warning(
+                "%r was not listed to its end: %d names of it are known, and reading it is an error",
+                sweep.path,
+                count,
+            )
+        entries = {}
+        for entry in listing.entries:
+            self.tells_times |= entry.mtime is not None
+            if usable_name(entry.name):
+                entries[entry.name] = tidy(entry)
+        for name, changed in sweep.changes.items():
+            entries.pop(name, None)
+            if changed is not None:
+                entries[name] = changed
+        life = self._options.dir_timeout
+        if life is None:
+            life = max(DIR_TIMEOUT, COST_FACTOR * listing.took)
+        if sweep.changes or sweep.void:
+            life = 0.0
+        complete = listing.complete and not sweep.changes
+        new = Directory(entries, sweep.began, now, now + life, complete, not listing.complete)
+        if old is not None:
+            _see_growth(old, new, sweep)
+        if not sweep.void:
+            self._known[sweep.path] = new
+            self._known.move_to_end(sweep.path)
+            weight = len(self._known) + self.entry_count
+            while weight > self._options.max_entries and len(self._known) > 1:
+                weight -= 1 + len(self._known.popitem(last=False)[1].entries)
+        return new
+
+
+def _see_growth(old: Directory, new: Directory, sweep: Sweep) -> None:
+    """Note which files grew since the last listing without us, or did a short while ago."""
+    for name in new.entries.keys() & old.entries.keys() - sweep.changes.keys():
+        before, after = old.size_of(name), new.size_of(name)
+        if before is not None and after is not None and after > before:
+            new.growing[name] = new.ended_at
+        elif name in old.growing:
+            new.growing[name] = old.growing[name]

@@ -27,8 +27,7 @@ from itertools import islice
 
 import trio
 
-from mavftpfs.cache.dentries import COST_FACTOR, Directory
-from mavftpfs.cache.directories import Directories, Found
+from mavftpfs.cache.directories import COST_FACTOR, Directories, Directory, Found
 from mavftpfs.cache.kept import KeptCache
 from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.pathlocks import PathLocks
@@ -198,7 +197,7 @@ class Files:
             self.kill(old)
         self._replace(version)
         if entry.size != reader.size:  # what the kernel was told is wrong
-            self._directories.dentries.learn_size(path, reader.size)
+            self._directories.learn_size(path, reader.size)
             self._invalidate(path)
         return version
 
@@ -211,7 +210,7 @@ class Files:
             DataUnproven: it shows another size. NotFound; else as RemoteStore.list_directory.
         """
         parent, name = split(path)
-        entry = (await self._directories.recent(parent, began=self._clock())).entries.get(name)
+        entry = (await self._directories.ask(parent)).entries.get(name)
         if entry is None:
             raise NotFound(f"{path!r} does not exist any more")
         if entry.size != size:
@@ -291,7 +290,7 @@ class Files:
     async def _compare_once(self, version: Version) -> None:
         path = version.path
         try:
-            directory = await self._directories.recent(split(path)[0], began=version.opened_at)
+            directory = await self._directories.ask(split(path)[0], began=version.opened_at)
         except (NotFound, NotADirectory):
             self.kill(version)
             return

@@ -22,7 +22,7 @@ from typing import Any
 
 import trio
 
-from mavftpfs.cache.dentries import Dentries
+from mavftpfs.cache.directories import Directories
 from mavftpfs.cache.kept_disk import FileKey, Kept, KeptDisk
 from mavftpfs.cache.versions import BLOCK_SIZE, Version
 from mavftpfs.shared.errors import MavftpfsError
@@ -70,7 +70,7 @@ class KeptCache:
     def __init__(
         self,
         disk: KeptDisk,
-        dentries: Dentries,
+        directories: Directories,
         *,
         identity: Callable[[], bytes | None],
         crc32: Callable[[bytes], Awaitable[int]],
@@ -81,7 +81,7 @@ class KeptCache:
         """`identity`: which vehicle it is, None if unknown. `crc32` asks it for one; `crc_limit`: the largest
         file for which it may be asked now. `wall`: seconds since 1970. `run` calls a thread."""
         self._disk = disk
-        self._dentries = dentries
+        self._directories = directories
         self._identity = identity
         self._crc32 = crc32
         self._crc_limit = crc_limit
@@ -105,7 +105,7 @@ class KeptCache:
             key = await self._with_crc32(key)
         if key is None or await self._run(self._disk.read, key.block(*_extent(key.size, 0))) is None:
             return None
-        if self._dentries.entry(path) is not entry:
+        if self._directories.entry(path) is not entry:
             return None  # listed anew, or changed by us, meanwhile
         return Kept(key)
 
@@ -126,7 +126,7 @@ class KeptCache:
 
     def _key(self, path: bytes, entry: DirEntry) -> FileKey | None:
         """Return the key of a freshly listed file, None if nothing of it may be kept or used now."""
-        if self._dentries.is_growing(path):
+        if self._directories.is_growing(path):
             return None
         key = key_of(self._identity(), path, entry, self._wall())
         return None if key is None or (not key.version and key.size > self._crc_limit()) else key
@@ -148,7 +148,7 @@ class KeptCache:
     def keep(self, version: Version, entry: DirEntry) -> None:
         """A version was opened that a fresh listing shows as `entry`: what is read of it may be kept, unless
         it was listed anew, or changed by us, while it was opened."""
-        if entry.size == version.size and self._dentries.entry(version.path) is entry:
+        if entry.size == version.size and self._directories.entry(version.path) is entry:
             key = self._key(version.path, entry)
             version.kept = None if key is None else Kept(key)
 
@@ -173,14 +173,16 @@ class KeptCache:
 
     def _may_keep(self, version: Version, key: FileKey) -> bool:
         """Return whether a version is still, for all we know, what its key says."""
-        if version.path != key.path or self._identity() != key.vehicle or self._dentries.is_growing(key.path):
+        if version.path != key.path or self._identity() != key.vehicle:
             return False
-        listed = self._dentries.entry(key.path)
+        if self._directories.is_growing(key.path):
+            return False
+        listed = self._directories.entry(key.path)
         return listed is None or (listed.size, listed.mtime) == (key.size, version.mtime)
 
     async def _write_ripe(self, version: Version, kept: Kept) -> None:
         """Write blocks that are not on the disk and were held whole for SETTLED seconds."""
-        now = self._dentries.clock()
+        now = self._directories.clock()
         extents = [_extent(version.size, index) for index in range(-(-version.size // BLOCK_SIZE))]
         whole = [i for i, extent in enumerate(extents) if i in version and not version.missing(*extent)]
         kept.arrived = {index: kept.arrived.get(index, now) for index in whole if index not in kept.done}

@@ -24,7 +24,6 @@ from contextlib import asynccontextmanager
 import trio
 
 from mavftpfs.cache.context import Context
-from mavftpfs.cache.draft import State
 from mavftpfs.cache.reserved import Kind, Places, is_reserved, parse
 from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.shared.errnos import errno_for
@@ -34,8 +33,6 @@ from mavftpfs.shared.errors import (
     FileBusy,
     FtpNak,
     MavftpfsError,
-    NotADirectory,
-    NotFound,
     NotSupported,
     OutcomeUnknown,
     PathTooLong,
@@ -46,10 +43,6 @@ log = logging.getLogger("mavftpfs.cache")
 
 _HONEST = frozenset({errno.EACCES, errno.EROFS, errno.ENOSPC, errno.ENAMETOOLONG})
 """Refusals that mean what they say; others do not tell whether the server replaces files at all."""
-
-RECENT = 2.0
-"""Seconds for which what was seen of a name is taken to be true when the name is about to be changed. So the
-removal of many files does not list their directory before each."""
 
 _ONE_LETTER = bytes(range(128)) + b"\x80" * 128
 """Takes all bytes beyond ASCII for one."""
@@ -62,55 +55,6 @@ class Names:
         self._context = context
 
     # --- asking
-
-    async def entry(self, path: bytes) -> DirEntry | None:
-        """Return what a path is, drafts included; None if it does not exist though its directory does.
-
-        Raises:
-            NotFound, NotADirectory: its directory. Else as RemoteStore.list_directory.
-        """
-        node = self._context.nodes.get(path)
-        if node is not None and node.draft is not None and node.draft.state is not State.STALE:
-            return DirEntry(split(path)[1], EntryKind.FILE, node.draft.size)
-        parent, name = split(path)
-        return (await self._context.directories.get(parent)).entries.get(name)
-
-    async def need(self, path: bytes) -> DirEntry:
-        """Return what a path is, drafts included. Raises as entry; NotFound if it does not exist."""
-        entry = await self.entry(path)
-        if entry is None:
-            raise NotFound(f"{path!r} does not exist")
-        return entry
-
-    async def current(self, path: bytes, *, free: bool = False) -> DirEntry | None:
-        """Return what the vehicle has there, as it was shown to be at most RECENT ago.
-
-        free: that it is nothing counts for no longer than that either. Else the time that the listing took is
-        not counted.
-
-        Raises:
-            As entry; VehicleLost instead of an old answer.
-        """
-        parent, name = split(path)
-        context = self._context
-        since = context.clock() - RECENT
-        known = context.dentries.known(parent)
-        if known is not None and known.proven.get(name, float("-inf")) >= since:
-            return known.entries[name]
-        asked = context.directories.recent(parent, began=since if free else None, ended=since)
-        return (await asked).entries.get(name)
-
-    async def ask(self, path: bytes) -> DirEntry | None:
-        """Return what a listing asked for just now says of a path.
-
-        Raises:
-            As Directories.ask, but None where its directory is gone.
-        """
-        parent, name = split(path)
-        try:
-            return (await self._context.directories.ask(parent)).entries.get(name)
-        except (NotFound, NotADirectory):
-            return None
 
     async def size(self, path: bytes) -> int:
         """Return the size of a file on the vehicle, asked just now.
@@ -125,7 +69,7 @@ class Names:
         if context.store.traits.wo_truncates:
             for node in context.nodes:
                 if node.attempt is not None and node.attempt.path != path:
-                    entry = await self.ask(path)
+                    entry = await self._context.directories.current(path)
                     if entry is not None and entry.size is not None:
                         return entry.size
                     break
@@ -144,7 +88,8 @@ class Names:
         except FtpNak as nak:
             if errno_for(nak) == errno.ENOENT:
                 return True
-            return not perhaps_directory and await self.ask(path) is None  # else of an older refusal
+            # Other numbers may be those of an older refusal.
+            return not perhaps_directory and await self._context.directories.current(path) is None
         return False
 
     async def require_new(self, path: bytes) -> None:
@@ -189,7 +134,7 @@ class Names:
         """Remove a file. Raises as VehicleStore."""
         async with self._changing(path):
             await self._context.store.remove(path)
-        self._context.dentries.put(path, None)
+        self._context.directories.put(path, None)
 
     async def remove_if_there(self, path: bytes) -> None:
         """Remove a file that may be gone. Raises as VehicleStore."""
@@ -198,19 +143,19 @@ class Names:
         except FtpNak as nak:
             if errno_for(nak) != errno.ENOENT:
                 raise
-            self._context.dentries.put(path, None)
+            self._context.directories.put(path, None)
 
     async def remove_directory(self, path: bytes) -> None:
         """Remove an empty directory. Raises as VehicleStore."""
         async with self._changing(path):
             await self._context.store.remove_directory(path)
-        self._context.dentries.put(path, None)
+        self._context.directories.put(path, None)
 
     async def make_directory(self, path: bytes) -> None:
         """Make a directory. Raises as VehicleStore."""
         async with self._changing(path):
             await self._context.store.make_directory(path)
-        self._context.dentries.put(path, DirEntry(b"", EntryKind.DIRECTORY), proven=True)
+        self._context.directories.put(path, DirEntry(b"", EntryKind.DIRECTORY), proven=True)
 
     async def discard(self, path: bytes) -> None:
         """Remove a reserved name that is not needed any more; if that cannot be now, a later listing has it
@@ -219,7 +164,7 @@ class Names:
             await self.remove_if_there(path)
         except MavftpfsError as error:
             log.info("%r stays until its directory is listed again: %s", path, error)
-            self._context.dentries.expire(split(path)[0])
+            self._context.directories.expire(split(path)[0])
 
     async def rename(self, old: bytes, new: bytes, *, completes: bool = False, over: bool = False) -> None:
         """Rename; both paths fit a request. completes: see VehicleStore. over: a file has the new name.
@@ -241,7 +186,7 @@ class Names:
                     raise NotSupported("this server cannot rename") from nak
             raise
         writer.traits.rename_works = True
-        self._context.dentries.rename(old, new)
+        self._context.directories.rename(old, new)
 
     async def find_out(self, near: bytes) -> None:
         """See on an empty file of ours whether the card can rename.
@@ -271,7 +216,7 @@ class Names:
                 context.store.traits.rename_works = False
         finally:
             context.own.live -= {first, second}
-            context.dentries.expire(split(first)[0])
+            context.directories.expire(split(first)[0])
         await self.discard(left)
 
     async def purge(self, path: bytes) -> None:
@@ -281,7 +226,7 @@ class Names:
             As VehicleStore: then the name has to stay.
         """
         own, (parent, name) = self._context.own, split(path)
-        directory = self._context.dentries.known(parent)
+        directory = self._context.directories.known(parent)
         needed = own.live.union(place for torn, place in own.torn.items() if torn != path)
         for entry in [] if directory is None else list(directory.entries):
             reserved, left = parse(entry), join(parent, entry)
@@ -337,12 +282,12 @@ class Names:
     def note_torn(self, path: bytes, place: bytes) -> None:
         """The file of a name may lie at `place` beside it for now: show it on, and have that listed."""
         context = self._context
-        entry = context.dentries.entry(path) or context.dentries.entry(place)
+        entry = context.directories.entry(path) or context.directories.entry(place)
         if entry is not None:
-            context.dentries.put(path, entry)
+            context.directories.put(path, entry)
         context.own.torn[path] = place
         context.retry_later()
-        context.dentries.expire(split(path)[0])
+        context.directories.expire(split(path)[0])
         log.warning("%r may lie under %r until the vehicle is heard again", path, place)
 
     # --- inside
@@ -354,7 +299,7 @@ class Names:
             yield
         except (OutcomeUnknown, trio.Cancelled):
             for path in paths:
-                self._context.dentries.expire(split(path)[0])
+                self._context.directories.expire(split(path)[0])
             raise
 
     def _replaces_at_once(self, target: bytes) -> bool:
@@ -382,7 +327,7 @@ class Names:
         try:
             await self.rename(target, old)
         except FtpNak as nak:
-            if errno_for(nak) == errno.ENOENT and await self.ask(target) is None:
+            if errno_for(nak) == errno.ENOENT and await self._context.directories.current(target) is None:
                 return False
             raise
         except (OutcomeUnknown, trio.Cancelled):

@@ -44,6 +44,10 @@ from mavftpfs.shared.model import DirEntry, EntryKind, require_listable, wire_pa
 
 log = logging.getLogger("mavftpfs.cache")
 
+RECENT = 2.0
+"""Seconds for which what was seen of a name is taken to be true when the name is about to be changed. So the
+removal of many files does not list their directory before each."""
+
 PIECE = 64 * 1024
 """Bytes copied at once."""
 
@@ -63,7 +67,7 @@ class Namespace:
         require_not_ours(path)
         require_listable(path)
         async with self._context.paths.hold(path):
-            if await self._names.entry(path) is not None:
+            if await self._context.entry(path) is not None:
                 raise AlreadyExists(f"{path!r} exists")
             await self._names.require_new(path)
             await self._names.make_directory(path)
@@ -72,7 +76,7 @@ class Namespace:
         """See Tree.rmdir."""
         self._context.require_disarmed()
         async with self._context.paths.hold(path):
-            entry = await self._names.need(path)
+            entry = await self._context.need(path)
             if entry.kind is not EntryKind.DIRECTORY:
                 raise NotADirectory(f"{path!r} is not a directory")
             await self._names.require_empty(path)
@@ -85,7 +89,7 @@ class Namespace:
         require_not_ours(path)
         async with self._claim(path), self._context.paths.hold(path):
             node = self._context.nodes.get(path)
-            if node is not None and await self._names.entry(path) is not None:
+            if node is not None and await self._context.entry(path) is not None:
                 await self._unlink_node(node)
             else:
                 await self._unlink_closed(path)
@@ -134,7 +138,7 @@ class Namespace:
 
     async def _unlink_closed(self, path: bytes) -> None:
         """Remove a file of which nothing is held here."""
-        entry = await self._names.current(path)
+        entry = await self._context.directories.current(path, within=RECENT)
         if entry is None:
             raise NotFound(f"{path!r} does not exist")
         if entry.kind is not EntryKind.FILE:
@@ -148,7 +152,7 @@ class Namespace:
         """Remove a file that is open, or not delivered yet."""
         path, draft = node.path, node.draft
         await self._deliverer.abandon(node)
-        entry = await self._names.current(path)
+        entry = await self._context.directories.current(path, within=RECENT)
         if entry is not None and entry.kind is EntryKind.DIRECTORY and draft is None:
             raise IsADirectory(f"{path!r} is a directory")
         # What else has its name by now is not to be removed.
@@ -180,9 +184,9 @@ class Namespace:
     async def _rename(self, old: bytes, new: bytes, *, noreplace: bool) -> None:
         context = self._context
         wire_path(new)
-        listed = await self._names.current(new, free=noreplace)
-        target = listed or await self._names.entry(new)
-        source = await self._names.need(old)
+        listed = await context.directories.current(new, within=RECENT)
+        target = listed or await self._context.entry(new)
+        source = await self._context.need(old)
         if target is None:
             await self._names.require_new(new)
         elif noreplace:
@@ -205,7 +209,7 @@ class Namespace:
         except NotSupported as error:
             raise CrossDevice(str(error)) from error
         if source.kind is EntryKind.DIRECTORY:
-            context.dentries.forget(old)
+            context.directories.forget(old)
         context.files.on_renamed(old, new)
         context.nodes.rename(old, new)
         context.own.follow_rename(old, new)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields
 
-from mavftpfs.cache.dentries import DIR_TIMEOUT
 from mavftpfs.shared.errors import UsageError
 from mavftpfs.shared.model import ROOT, normalise
 
@@ -14,6 +13,8 @@ MIB = 1024 * KIB
 MIN_CACHE_SIZE = MIB
 """Below this, a few of the kernel's read requests would not fit beside each other."""
 
+DIR_TIMEOUT = 20.0
+"""Seconds that a listing is fresh where the user did not say it."""
 
 DEFAULT_LOCAL = (".*.sw?", ".*.sw?x", "4913", ".~lock*", ".Trash-*", "._*")
 """What editors and file managers leave beside the files they work on; vim makes `.*.sw?x` for a moment, to

@@ -57,6 +57,6 @@ class Overlay:
         known = self.times.peek(node.path)
         if known is not None:
             return shown(known)
-        entry = self._context.dentries.entry(node.path)
+        entry = self._context.directories.entry(node.path)
         listed = entry.mtime if entry is not None and draft.state is State.CLEAN else None
         return shown_mtime(node.path, listed), 0

@@ -22,7 +22,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 
 from mavftpfs.cache.context import Context
-from mavftpfs.cache.dentries import Directory
+from mavftpfs.cache.directories import Directory
 from mavftpfs.cache.names import Names
 from mavftpfs.cache.nodes import Node
 from mavftpfs.cache.reserved import MAX_NAME, RENAME_ROOM, Kind, is_reserved, parse
@@ -191,10 +191,11 @@ class Cleaner:
 
     def _note_whole(self, path: bytes, directory: Directory) -> None:
         """The torn names that a listing just made shows are whole again."""
-        torn = self._context.own.torn
-        for torn_path in [torn_path for torn_path in torn if split(torn_path)[0] == path]:
-            if split(torn_path)[1] in directory.entries and directory is self._context.dentries.known(path):
-                del torn[torn_path]
+        if directory is self._context.directories.known(path):
+            for torn in list(self._context.own.torn):
+                parent, name = split(torn)
+                if parent == path and name in directory.entries:
+                    del self._context.own.torn[torn]
 
     def _is_torn(self, group: Group) -> bool:
         return not set(self._context.own.torn.values()).isdisjoint(group.paths.values())

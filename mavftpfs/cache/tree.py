@@ -16,7 +16,6 @@ from random import Random
 import trio
 
 from mavftpfs.cache.attributes import SECOND, UNKNOWN_MTIME, Stat, shown_mtime
-from mavftpfs.cache.dentries import Dentries
 from mavftpfs.cache.directories import Directories, Found
 from mavftpfs.cache.files import Files
 from mavftpfs.cache.kept import KeptCache
@@ -65,7 +64,7 @@ class Tree:
         spool: SpoolDirectory | None = None,
         wall: Callable[[], float] = time.time,
         rng: Random | None = None,
-        keep: Callable[[Dentries], KeptCache] | None = None,
+        keep: Callable[[Directories], KeptCache] | None = None,
     ) -> None:
         """`invalidate(path)`: the kernel's pages and attributes of a path are wrong; must not block.
 
@@ -78,10 +77,7 @@ class Tree:
         self._clock = clock
         self._tell_kernel = invalidate
         self._store = store
-        self._dentries = Dentries(
-            clock=clock, dir_timeout=options.dir_timeout, max_entries=options.max_entries
-        )
-        self._directories = Directories(store, self._dentries, options.root, nursery=nursery)
+        self._directories = Directories(store, options, clock=clock, nursery=nursery)
         self._blocks = BlockCache(options.cache_size, clock=clock, patience=options.op_deadline)
         self._files = Files(
             store,
@@ -91,7 +87,7 @@ class Tree:
             invalidate=self._invalidate,
         )
         self._directories.ask_size = self._files.learn_size
-        self._files.kept = None if keep is None else keep(self._dentries)
+        self._files.kept = None if keep is None else keep(self._directories)
         self._virtual = VirtualTrees(
             store, self._directories, options, invalidate=self._invalidate, nursery=nursery
         )
@@ -135,7 +131,7 @@ class Tree:
                 size = await self._files.learn_size(remote)
             except FtpNak:
                 size = 0  # until it is listed again
-            self._dentries.learn_size(remote, size)
+            self._directories.learn_size(remote, size)
         return self._listed_stat(remote, found)
 
     def negative_valid_for(self, path: bytes) -> float:
@@ -146,7 +142,7 @@ class Tree:
         remote = self._remote(path)
         until = self._virtual.absent_until(remote)
         parent, name = split(remote)
-        directory = self._dentries.known(parent)
+        directory = self._directories.known(parent)
         if directory is not None and directory.complete and name not in directory.entries:
             until = max(until, directory.fresh_until)
         return max(0.0, min(self._options.negative_timeout, until - self._clock()))
@@ -358,13 +354,13 @@ class Tree:
 
     def forget_caches(self) -> None:
         """Drop everything that is not in use by an open file."""
-        self._dentries.forget(ROOT)
+        self._directories.forget(ROOT)
         self._files.forget_closed()
         self._virtual.forget()
 
     def expire(self, path: bytes) -> None:
         """Have the vehicle list a file's directory again before its size is told the next time."""
-        self._dentries.expire(split(self._remote(path))[0])
+        self._directories.expire(split(self._remote(path))[0])
 
     def status(self) -> dict[str, object]:
         """Return counters; bytes_... in bytes, rate in bytes per second or None."""
@@ -375,8 +371,8 @@ class Tree:
             "bytes_local": self._local.used,
             "bytes_cached": blocks.bytes_cached + self._virtual.bytes_cached,
             "rate": blocks.meter.rate,
-            "listings_cached": len(self._dentries),
-            "entries_cached": self._dentries.entry_count,
+            "listings_cached": len(self._directories),
+            "entries_cached": self._directories.entry_count,
             "listings_asked": self._directories.sweeps,
         }
 
@@ -391,7 +387,6 @@ class Tree:
 
     def rebooted(self) -> None:
         """The vehicle restarted: what was known of it must be asked again."""
-        self._dentries.expire_all()
         self._directories.rebooted()
         self._virtual.rebooted()
         self._files.rebooted()

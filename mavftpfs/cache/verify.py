@@ -93,11 +93,11 @@ class Verifier:
         """Return whether a file on the vehicle is still the one that is known of it.
 
         Raises:
-            As VehicleStore.stat_size and Directories.ask.
+            As VehicleStore.stat_size and Directories.current.
         """
         context, options = self._context, self._context.options
         if context.directories.tells_times:
-            entry = await self._names.ask(path)
+            entry = await self._context.directories.current(path)
             if entry is None or entry.size != base.size:
                 return False
             if None not in (entry.mtime, base.mtime) and entry.mtime != base.mtime:

@@ -77,7 +77,6 @@ class Writeback:
         self._context = context = Context(
             store=store,
             directories=directories,
-            dentries=directories.dentries,
             files=files,
             options=options,
             clock=directories.clock,
@@ -133,7 +132,7 @@ class Writeback:
         require_writable(path)
         require_listable(path)
         async with self._context.paths.hold(path, shared=True):
-            if await self._names.entry(path) is None:
+            if await self._context.entry(path) is None:
                 await self._names.require_new(path)
                 context, node = self._context, self._context.nodes.need(path)
                 made = node.draft is None
@@ -157,7 +156,7 @@ class Writeback:
         if node is not None and node.draft is not None:
             return node
         require_writable(path)
-        entry = await self._names.need(path)
+        entry = await context.need(path)
         if entry.kind is not EntryKind.FILE:
             raise IsADirectory(f"{path!r} is a directory")
         if truncate:

@@ -8,7 +8,7 @@ import pytest
 import trio
 
 from mavftpfs.cache.context import Context
-from mavftpfs.cache.dentries import Directory
+from mavftpfs.cache.directories import Directory
 from mavftpfs.cache.repair import Cleaner
 from mavftpfs.cache.reserved import Kind, Reserved
 from mavftpfs.cache.tree import Tree
@@ -65,7 +65,7 @@ async def test_a_file_that_took_the_place_of_another_is_read_anew(store: FakeWri
     context.own.torn[FILE] = old
     store.files[old] = store.files.pop(FILE)
     store.add(new, OLD[::-1])  # of the same size
-    context.dentries.expire(DIRECTORY)
+    context.directories.expire(DIRECTORY)
     assert await read_file(tree, FILE) == OLD[::-1]
     assert context.own.torn == {}
     assert litter(store) == []

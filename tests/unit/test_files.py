@@ -156,7 +156,7 @@ async def test_a_newer_listing_can_end_a_recent_proof(store: FakeStore, tree: Tr
     store.add(LOG, DATA)
     await read_file(tree, LOG)
     await trio.sleep(5)
-    tree._dentries.expire_all()
+    tree._directories.rebooted()
     if grown:
         store.add(LOG, DATA + b"more")
     handle = await tree.open(LOG)

@@ -9,7 +9,7 @@ from typing import cast
 import pytest
 import trio
 
-from mavftpfs.cache.dentries import Dentries
+from mavftpfs.cache.directories import Directories
 from mavftpfs.cache.kept import CRC_LIMIT, PERIOD, SETTLED, KeptCache
 from mavftpfs.cache.kept_disk import KeptDisk
 from mavftpfs.cache.openfile import OpenFile
@@ -48,12 +48,12 @@ class Mounts:
     def mount(self, **options: object) -> Tree:
         """Return a tree that knows nothing but what lies in the directory."""
 
-        def keep(dentries: Dentries) -> KeptCache:
-            dentries.is_growing = self.growing.__contains__  # type: ignore[assignment,method-assign]
+        def keep(directories: Directories) -> KeptCache:
+            directories.is_growing = self.growing.__contains__  # type: ignore[assignment,method-assign]
             self.caches.append(
                 KeptCache(
                     KeptDisk(self.path, 1 << 24),
-                    dentries,
+                    directories,
                     identity=lambda: self.vehicle,
                     crc32=self.store.crc32,
                     crc_limit=lambda: self.crc_limit,

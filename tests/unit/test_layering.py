@@ -48,7 +48,6 @@ PURE_MODULES = {
     "session.doubt",
     "session.vehicle",
     "cache.attributes",
-    "cache.dentries",
     "cache.options",
     "cache.readahead",
     "cache.reserved",

@@ -154,7 +154,7 @@ async def test_a_cancelled_sweep(store: FakeStore, nursery: trio.Nursery, backgr
 
 
 async def test_a_listing_that_is_always_raced_is_given_up_on(store: FakeStore, tree: Tree) -> None:
-    store.during_list = lambda path: tree._dentries.put(b"/never", None)
+    store.during_list = lambda path: tree._directories.put(b"/never", None)
     assert b"top" in dict(await tree.list(b"/"))
     assert store.count("list", b"/") == SWEEP_TRIES
     assert tree.negative_valid_for(b"/none") == 0.0

@@ -6,11 +6,15 @@ whatever a sweep saw of one page before a change and of the next one after it.
 
 from __future__ import annotations
 
+from typing import cast
+
 from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
-from mavftpfs.cache.dentries import Dentries, Sweep
+from mavftpfs.cache.directories import Directories, Sweep
+from mavftpfs.cache.options import CacheOptions
+from mavftpfs.cache.remote import RemoteStore
 from mavftpfs.shared.model import DirEntry, EntryKind, Listing, join, split
 
 DIRECTORIES = (b"/", b"/d", b"/e")
@@ -37,7 +41,8 @@ class Racing(RuleBasedStateMachine):
     def __init__(self) -> None:
         super().__init__()
         self.now = 0.0
-        self.dentries = Dentries(clock=lambda: self.now, dir_timeout=20, max_entries=9)
+        options = CacheOptions(dir_timeout=20, max_entries=9)
+        self.directories = Directories(cast(RemoteStore, None), options, clock=lambda: self.now)
         self.truth: dict[bytes, dict[bytes, DirEntry]] = {path: {} for path in DIRECTORIES}
         self.sweeps: list[Paging] = []
         self.unnoted: list[tuple[str, bytes, bytes, int]] = []
@@ -47,7 +52,7 @@ class Racing(RuleBasedStateMachine):
     @rule(path=directories)
     def begin(self, path: bytes) -> None:
         if path not in [paging.sweep.path for paging in self.sweeps]:
-            self.sweeps.append(Paging(self.dentries.begin(path)))
+            self.sweeps.append(Paging(self.directories.begin(path)))
 
     @precondition(lambda self: self.sweeps)
     @rule(data=st.data())
@@ -59,8 +64,8 @@ class Racing(RuleBasedStateMachine):
         if not entries:
             self.sweeps.remove(paging)
             listing = Listing(tuple(paging.seen.values()), 0.0)
-            self.dentries.end(paging.sweep)
-            directory = self.dentries.remember(paging.sweep, listing)
+            del self.directories._sweeps[paging.sweep.path]
+            directory = self.directories.remember(paging.sweep, listing)
             assert directory.listed_at == paging.sweep.began
 
     @precondition(lambda self: self.sweeps)
@@ -68,7 +73,7 @@ class Racing(RuleBasedStateMachine):
     def abandon(self, data: st.DataObject) -> None:
         paging = data.draw(st.sampled_from(self.sweeps))
         self.sweeps.remove(paging)
-        self.dentries.end(paging.sweep)
+        del self.directories._sweeps[paging.sweep.path]
 
     @rule(seconds=st.sampled_from([1.0, 19.0, 21.0]))
     def wait(self, seconds: float) -> None:
@@ -76,11 +81,11 @@ class Racing(RuleBasedStateMachine):
 
     @rule(path=directories)
     def expire(self, path: bytes) -> None:
-        self.dentries.expire(path)
+        self.directories.expire(path)
 
     @rule(path=directories)
     def forget(self, path: bytes) -> None:
-        self.dentries.forget(path)
+        self.directories.forget(path)
 
     # --- changes: the vehicle makes them first, we note them when the answer comes
 
@@ -119,13 +124,13 @@ class Racing(RuleBasedStateMachine):
         what, path, new, size = self.unnoted.pop()
         if what == "create":
             name = path.rpartition(b"/")[2]
-            self.dentries.put(path, DirEntry(name, EntryKind.FILE, size))
+            self.directories.put(path, DirEntry(name, EntryKind.FILE, size))
         elif what == "remove":
-            self.dentries.put(path, None)
+            self.directories.put(path, None)
         elif what == "resize":
-            self.dentries.put(path, DirEntry(split(path)[1], EntryKind.FILE, size), proven=True)
+            self.directories.put(path, DirEntry(split(path)[1], EntryKind.FILE, size), proven=True)
         else:
-            self.dentries.rename(path, new)
+            self.directories.rename(path, new)
 
     # --- what must hold
 
@@ -134,7 +139,7 @@ class Racing(RuleBasedStateMachine):
         if self.unnoted:
             return
         for path in DIRECTORIES:
-            directory = self.dentries.fresh(path)
+            directory = self.directories.fresh(path)
             if directory is not None:
                 assert directory.complete
                 assert directory.entries == self.truth[path]
@@ -144,15 +149,15 @@ class Racing(RuleBasedStateMachine):
         if self.unnoted:
             return
         for path in DIRECTORIES:
-            directory = self.dentries.known(path)
+            directory = self.directories.known(path)
             for name in () if directory is None else directory.proven:
-                assert self.dentries.entry(join(path, name)) == self.truth[path][name]
+                assert self.directories.entry(join(path, name)) == self.truth[path][name]
 
     @invariant()
     def memory_is_bounded(self) -> None:
-        known = [d for d in (self.dentries._directories.get(p) for p in DIRECTORIES) if d is not None]
-        assert self.dentries.entry_count == sum(len(directory.entries) for directory in known)
-        assert len(self.dentries) == len(known)
+        known = [d for d in (self.directories._known.get(p) for p in DIRECTORIES) if d is not None]
+        assert self.directories.entry_count == sum(len(directory.entries) for directory in known)
+        assert len(self.directories) == len(known)
 
 
 TestRacing = Racing.TestCase
