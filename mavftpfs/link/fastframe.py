@@ -31,7 +31,6 @@ _FULL = 254  # payload of 110 before trimming
 _SHORTEST = 15  # with the three target bytes
 _ZEROS = bytes(224)
 _SHORT = FTP_PAYLOAD_SIZE - len(_ZEROS)
-_MAX_ROUTES = 1024
 
 # all before the content but the magic byte: payload size, both flags, seq, and the route
 _head = struct.Struct("<BHB8s").pack
@@ -61,7 +60,6 @@ class FtpFrameCodec:
     def __init__(self, source: Address, crc_extra: int) -> None:
         self.source = source
         self._extra = bytes((crc_extra,))
-        self._routes: dict[bytes, tuple[Address, Address]] = {}
         self._alike: tuple[bytes, bytes, int, tuple[Address, Address]] = (b"", b"", 0, (source, source))
 
     def encode(self, seq: int, target: Address, payloads: Iterable[bytes]) -> list[bytes]:
@@ -91,10 +89,13 @@ class FtpFrameCodec:
         # This loop runs once per chunk of every transfer, mostly over frames that are alike.
         while start + _SHORTEST <= end:
             if data[start : start + 4] != before_seq or data[start + 5 : start + 13] != route:
-                if not self._look(data, start):
+                magic, size, flags, route = _fields(data, start)
+                if magic != _MAGIC or flags or not 3 <= size <= _FULL or route[2:6] != _FTP_ROUTE:
                     break
-                before_seq, route, length, addresses = self._alike
-                payloads = None
+                if route != self._alike[1]:
+                    addresses = Address(route[0], route[1]), Address(route[6], route[7])
+                before_seq, length, payloads = data[start : start + 4], size + _OVERHEAD, None
+                self._alike = (before_seq, route, length, addresses)
             stop = start + length
             if stop > end:
                 break
@@ -111,23 +112,3 @@ class FtpFrameCodec:
                 payloads.append(payload)
             start = stop
         return start
-
-    def _look(self, data: bytes, start: int) -> bool:
-        """Return whether a frame of ours seems to begin there, and remember what those alike begin with."""
-        magic, size, flags, route = _fields(data, start)
-        if magic != _MAGIC or flags or not 3 <= size <= _FULL:
-            return False
-        addresses = self._routes.get(route) or self._learn(route)
-        if addresses is None:
-            return False
-        self._alike = (data[start : start + 4], route, size + _OVERHEAD, addresses)
-        return True
-
-    def _learn(self, route: bytes) -> tuple[Address, Address] | None:
-        """Return source and target of a route, None if it is not one of our message."""
-        if route[2:6] != _FTP_ROUTE:
-            return None
-        if len(self._routes) >= _MAX_ROUTES:
-            self._routes.clear()  # a flood of invented senders must not grow the cache
-        self._routes[route] = addresses = Address(route[0], route[1]), Address(route[6], route[7])
-        return addresses

@@ -192,19 +192,14 @@ class Framer:
         stop = position + header + data[position + 1] + 2 + signature
         if stop > len(data):
             return position
-        return self._judge(data, position, stop, message_id, signature, out)
-
-    def _judge(
-        self, data: bytes, start: int, stop: int, message_id: int, signature: int, out: list[Message | FtpRun]
-    ) -> int:
-        frame = data[start:stop]
+        frame = data[position:stop]
         crc_at = len(frame) - signature - 2
         extra = _CRC_EXTRA.get(message_id)
         if extra is None or frame_crc(frame[1:crc_at], extra) != frame[crc_at] | frame[crc_at + 1] << 8:
             if stop == len(data) and self.stream:
-                return start  # the byte behind decides
+                return position  # the byte behind decides
             if stop < len(data) and data[stop] not in (_V1, _V2):
-                return self._skip(start, start + 1)
+                return self._skip(position, position + 1)
             if extra is not None:
                 self.stats.bad_crc += 1
                 return stop
@@ -218,9 +213,12 @@ class Framer:
     def _accept(self, frame: bytes, message_id: int, signed: bool, out: list[Message | FtpRun]) -> None:
         at = 5 if frame[0] == _V2 else 3
         source = Address(frame[at], frame[at + 1])
-        if not self._authentic(frame, message_id, signed, source):
-            self.stats.bad_signature += 1
-            return
+        if self._check is not None and message_id not in _UNSIGNED_ALLOWED:
+            accepted = signed and self._check.accept(frame, source)
+            self.stats.bad_time = self._check.bad_times
+            if not accepted:
+                self.stats.bad_signature += 1
+                return
         try:
             fields = self._decoder.decode(bytearray(frame)) if message_id in READABLE else None
             message = read_message(source, message_id, fields)
@@ -229,13 +227,6 @@ class Framer:
         out.append(FtpRun(*message[:2], [message.payload]) if isinstance(message, FtpFrame) else message)
         if self.on_frame is not None:
             self.on_frame(frame)
-
-    def _authentic(self, frame: bytes, message_id: int, signed: bool, source: Address) -> bool:
-        if self._check is None or message_id in _UNSIGNED_ALLOWED:
-            return True
-        accepted = signed and self._check.accept(frame, source)
-        self.stats.bad_time = self._check.bad_times
-        return accepted
 
     # ------------------------------------------------------------------ sending
 

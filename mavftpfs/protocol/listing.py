@@ -33,35 +33,20 @@ def parse_page(data: bytes, *, with_time: bool = False) -> Page:
     A last string without NUL counts: a server that fills all 239 bytes may have cut the NUL only.
     """
     entries: list[DirEntry] = []
-    hidden = 0
-    texts = [text for text in data.split(b"\0") if text]
-    for text in texts:
-        entry = _parse_entry(text, with_time=with_time)
-        if entry is not None and usable_name(entry.name):
-            entries.append(entry)
-        elif not _is_silent(text):
-            hidden += 1
-    return Page(entries, len(texts), hidden)
-
-
-def _is_silent(text: bytes) -> bool:
-    """Whether an entry is left out without loss: a skip mark, or the directory itself and its parent."""
-    return text[:1] == b"S" or text[1:].split(b"\t", 1)[0] in (b".", b"..")
-
-
-def _parse_entry(text: bytes, *, with_time: bool) -> DirEntry | None:
-    kind = _KINDS.get(text[:1])
-    if kind is None:
-        return None
-    # A tab in a name (MAVSDK lists those) shows as a field that is no number: such a name is not believed.
-    name, *fields = text[1:].split(b"\t")
-    if not all(_is_number(field) for field in fields):
-        return None
-    is_file = kind is EntryKind.FILE
-    size = int(fields[0]) if fields and is_file else None
-    mtime = int(fields[1]) if with_time and len(fields) > 1 else 0
-    return DirEntry(name, kind, size, mtime or None)
-
-
-def _is_number(field: bytes) -> bool:
-    return field.isdigit() and len(field) <= _MAX_DIGITS
+    strings = hidden = 0
+    for text in data.split(b"\0"):
+        if not text:
+            continue
+        strings += 1
+        kind, (name, *fields) = _KINDS.get(text[:1]), text[1:].split(b"\t")
+        # A tab in a name (MAVSDK lists those) shows as a field that is no number: it is hidden.
+        understood = kind is not None and usable_name(name)
+        for field in fields:
+            understood = understood and field.isdigit() and len(field) <= _MAX_DIGITS
+        if kind is not None and understood:
+            size = int(fields[0]) if fields and kind is EntryKind.FILE else None
+            mtime = int(fields[1]) if with_time and len(fields) > 1 else 0
+            entries.append(DirEntry(name, kind, size, mtime or None))
+        elif text[:1] != b"S" and name not in (b".", b".."):
+            hidden += 1  # neither a skip mark, nor the directory itself or its parent
+    return Page(entries, strings, hidden)

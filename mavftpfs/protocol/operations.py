@@ -134,7 +134,7 @@ class ListDirectory(Operation):
         complete: False when a cap or empty pages ended the sweep: absence of a name then proves nothing.
         hidden: names that cannot be shown (with a slash, a tab, or unparsable).
         strings: how many strings were received so far, which is where the next page begins.
-        on_page: called for each page.
+        on_page: called for each page, where it is not None.
     """
 
     def __init__(self, path: bytes, with_time: bool = False) -> None:
@@ -144,7 +144,7 @@ class ListDirectory(Operation):
         self.entries: list[DirEntry] = []
         self.complete = True
         self.hidden = 0
-        self.on_page: Callable[[], None] = lambda: None
+        self.on_page: Callable[[], None] | None = None
         self._path = path
         self._with_time = with_time
         self._opcode = Opcode.LIST_DIRECTORY_WITH_TIME if with_time else Opcode.LIST_DIRECTORY
@@ -168,11 +168,17 @@ class ListDirectory(Operation):
     def on_reply(self, request: Request, reply: Payload, now: float) -> None:
         """Take a page, or find that there are no more."""
         if reply.opcode == Opcode.NAK:
-            self._on_nak(nak_of(request, reply))
+            nak = nak_of(request, reply)
+            # PX4 says 8 for everything after one "file exists" (servers.md 12), the end included.
+            if nak.code == NakCode.EOF or (nak.code == NakCode.FILE_EXISTS and self._pages > 0):
+                self.finish()
+            else:
+                self.fail(nak)
             return
         self._asked = False
         self._pages += 1
-        self.on_page()
+        if self.on_page is not None:
+            self.on_page()
         page = parse_page(reply.data, with_time=self._with_time)
         if page.strings == 0:
             self._on_empty_page()
@@ -184,13 +190,23 @@ class ListDirectory(Operation):
             self._on_first_page_again()
         self.strings += page.strings
         self.hidden += page.hidden
-        self._take(page.entries)
+        known = len(self._names)
+        for entry in page.entries:  # a page may name something twice, too
+            if entry.name not in self._names:
+                self._names.add(entry.name)
+                self.entries.append(entry)
+        # MAVSDK repeats entries where it left some out; a server that ignores the offset never stops.
+        if len(self._names) > known:
+            self._stale_pages = 0
+        elif page.entries:
+            self._stale_pages += 1
         if (
             self._pages >= MAX_PAGES
             or len(self.entries) >= MAX_ENTRIES
             or self._stale_pages > _MAX_STALE_PAGES
         ):
-            self._cut_short()
+            self.complete = False
+            self.finish()
 
     def _on_first_page_again(self) -> None:
         """The server seems to ignore the offset, so what is behind its first page is not known.
@@ -202,27 +218,6 @@ class ListDirectory(Operation):
         if self._first_page_again > 1 or len(self._first_page) > MAX_DATA // 2:
             self.complete = False
 
-    def _take(self, entries: list[DirEntry]) -> None:
-        fresh = [entry for entry in entries if entry.name not in self._names]
-        for entry in fresh:
-            # A page may name something twice, too.
-            if entry.name not in self._names:
-                self._names.add(entry.name)
-                self.entries.append(entry)
-        # MAVSDK repeats entries where it left some out; a server that ignores the offset never stops.
-        if entries and not fresh:
-            self._stale_pages += 1
-        elif fresh:
-            self._stale_pages = 0
-
-    def _on_nak(self, nak: FtpNak) -> None:
-        # PX4 says 8 for everything after one "file exists" (servers.md 12), the end included.
-        ended = nak.code == NakCode.EOF or (nak.code == NakCode.FILE_EXISTS and self._pages > 0)
-        if ended:
-            self.finish()
-        else:
-            self.fail(nak)
-
     def _on_empty_page(self) -> None:
         # Old PX4 ends so; newer ones when an entry fits no page, and offset + 1 gets past it.
         self._empty_pages += 1
@@ -231,7 +226,3 @@ class ListDirectory(Operation):
             # So many neighbours whose names fit no page look the same: behind them there may be more.
             self.complete = self._pages == self._empty_pages
             self.finish()
-
-    def _cut_short(self) -> None:
-        self.complete = False
-        self.finish()

@@ -114,17 +114,6 @@ def test_a_wrong_extra_byte_is_a_wrong_crc() -> None:
     assert FtpFrameCodec(US, 85).decode_runs(reference(1, Address(1, 1), FULL), 0, out) == 0
 
 
-def test_a_flood_of_senders_does_not_grow_the_cache() -> None:
-    codec = FtpFrameCodec(US, EXTRA)
-    for system in range(256):
-        for component in range(0, 256, 16):
-            sender = FtpFrameCodec(Address(system, component), EXTRA)
-            out: list[Message | FtpRun] = []
-            codec.decode_runs(sender.encode(0, Address(1, 1), [FULL])[0], 0, out)
-            assert out[0].source == (system, component)
-    assert len(codec._routes) <= 1024
-
-
 def test_frame_crc_is_pymavlinks() -> None:
     frame = reference(3, Address(1, 1), FULL)
     assert frame_crc(frame[1:-2], EXTRA) == int.from_bytes(frame[-2:], "little")
