@@ -136,27 +136,15 @@ class Transfers:
                 self.engine.on_deadline(self.now)
 
 
-def test_a_file_is_read_by_short_chunks() -> None:
-    reads = Transfers(writes=False, passing=100)
-    reads.finish()
-    assert reads.sink.data == CONTENT
-    assert reads.chunks.size == SHORT
-    assert reads.engine.in_flight == 0
-
-
-def test_a_file_is_written_by_short_chunks() -> None:
-    writes = Transfers(writes=True, passing=100)
-    writes.finish()
-    assert writes.file == CONTENT
-    assert writes.source.acked.covers(0, len(CONTENT))
-    assert writes.source.in_flight.empty
-    assert writes.chunks.size == SHORT
-
-
 @pytest.mark.parametrize("writes", [False, True], ids=["read", "write"])
-def test_a_late_answer_to_a_long_request_changes_nothing(writes: bool) -> None:
+def test_a_file_is_moved_by_short_chunks_and_late_answers_to_long_ones_change_nothing(writes: bool) -> None:
     transfers = Transfers(writes=writes, passing=100)
     transfers.finish()
+    assert (transfers.file if writes else transfers.sink.data) == CONTENT
+    assert transfers.source.acked.covers(0, len(CONTENT)) is writes
+    assert transfers.source.in_flight.empty
+    assert transfers.chunks.size == SHORT
+    assert transfers.engine.in_flight == 0
     unknown = transfers.engine.stats.unknown
     for request in transfers.late:
         transfers.answer(request)

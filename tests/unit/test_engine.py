@@ -7,14 +7,13 @@ import random
 import pytest
 
 from mavftpfs.protocol.burst import BurstTransfer
-from mavftpfs.protocol.chunking import ChunkSize
 from mavftpfs.protocol.engine import Engine
 from mavftpfs.protocol.flow import Flow
 from mavftpfs.protocol.ledger import BURST_JUMP, FURTHEST_JUMP
 from mavftpfs.protocol.operations import ListDirectory, OpenFile, Simple
 from mavftpfs.protocol.payload import NakCode, Opcode, Payload
 from mavftpfs.protocol.reading import ReadTransfer
-from mavftpfs.shared.errors import FtpNak, LocalProtocolError, RequestTimeout
+from mavftpfs.shared.errors import FtpNak, RequestTimeout
 from mavftpfs.shared.traits import Traits
 from tests.support.replies import ack, burst_nak, chunk, nak, packet, sent
 from tests.support.virtual import MemorySink
@@ -117,16 +116,6 @@ def test_the_counter_jumps_at_a_burst(packets: int, jump: int) -> None:
     engine.start(mkdir(), 0.0)
     assert sent(engine, 0.0)[0].seq == 11 + jump
     assert jump >= min(2 * packets, FURTHEST_JUMP)
-
-
-def test_a_burst_in_small_packets_has_more_of_them() -> None:
-    engine = make(10)
-    transfer = BurstTransfer(3, 50_000, MemorySink(50_000), ChunkSize(10))
-    engine.start(transfer, 0.0)
-    transfer.want(10_000, 50_000, True)
-    sent(engine, 0.0)
-    engine.start(mkdir(), 0.0)
-    assert sent(engine, 0.0)[0].seq >= 11 + 2 * 4000
 
 
 @pytest.mark.holds("rule 14.3")
@@ -266,16 +255,6 @@ def test_requests_carry_the_engines_session_and_are_repeated_when_it_changed() -
     assert op.error.code == NakCode.INVALID_SESSION
 
 
-def test_an_explicit_session_is_not_second_guessed() -> None:
-    engine = make()
-    op = mkdir(session=3)
-    engine.start(op, 0.0)
-    (request,) = sent(engine, 0.0)
-    assert request.session == 3
-    engine.receive(nak(request, NakCode.INVALID_SESSION), 0.1)
-    assert isinstance(op.error, FtpNak)
-
-
 def test_a_session_that_changes_all_the_time_ends_somewhere() -> None:
     engine = make()
     op = mkdir()
@@ -331,17 +310,6 @@ def test_a_side_effect_goes_out_again_under_the_same_seq_with_growing_waits() ->
     assert engine.next_deadline() is None
 
 
-def test_a_late_reply_to_a_side_effect_is_taken_but_not_timed() -> None:
-    engine = make()
-    op, request = asked(engine)
-    engine.on_deadline(1.0)
-    assert len(sent(engine, 1.0)) == 1
-    engine.receive(ack(request), 1.05)
-    assert op.done
-    assert op.retransmitted
-    assert engine.rtt is None
-
-
 @pytest.mark.holds("fault duplicate")
 def test_reads_go_out_again_under_new_seqs_and_old_answers_still_count() -> None:
     engine = make(limit=1)
@@ -393,17 +361,6 @@ def test_what_was_lost_often_does_not_wait_for_its_timer() -> None:
     assert len(tries) >= 14
 
 
-def test_a_lost_listing_is_found_by_later_reads_too() -> None:
-    engine = make(limit=8)
-    engine.start(ListDirectory(b"/"), 0.0)
-    (listing,) = sent(engine, 0.0)
-    reading(engine)
-    for request in sent(engine, 0.0)[:3]:
-        engine.receive(chunk(request, bytes(SIZE)), 0.1)
-    again = [request for request in sent(engine, 0.1) if request.opcode == Opcode.LIST_DIRECTORY]
-    assert [request.data for request in again] == [listing.data]
-
-
 @pytest.mark.holds("fault duplicate")
 def test_reordering_is_learnt_and_forgotten() -> None:
     engine = make(limit=4)
@@ -424,18 +381,6 @@ def test_reordering_is_learnt_and_forgotten() -> None:
     assert engine._ledger.reorder == 3
 
 
-def test_a_resend_that_was_too_early_doubles_the_patience_with_reordering() -> None:
-    engine = make(limit=4)
-    reading(engine)
-    out = sent(engine, 0.0)
-    engine.receive(chunk(out[2], bytes(SIZE)), 0.1)
-    (again, _) = sent(engine, 0.1)
-    assert again.offset == out[0].offset
-    engine.receive(chunk(out[0], bytes(SIZE)), 0.15)
-    assert engine._ledger.reorder == 4
-    assert engine.stats.spurious == 1
-
-
 def test_a_server_that_became_slow_is_waited_for() -> None:
     """Answers that come after a resend tell the true round trip: no storm of needless resends."""
     engine = make(limit=4)
@@ -451,22 +396,6 @@ def test_a_server_that_became_slow_is_waited_for() -> None:
         engine.on_deadline(now)
     assert engine.stats.spurious < 20
     assert engine.timeout("data") > 0.3
-
-
-def test_the_last_chunk_does_not_wait_for_a_second() -> None:
-    engine = make(limit=1)
-    transfer, _ = reading(engine, 239 * 3)
-    now = 0.0
-    for _ in range(2):
-        (request,) = sent(engine, now)
-        now += 0.1
-        engine.receive(chunk(request, bytes(SIZE)), now)
-    (request,) = sent(engine, now)
-    engine.on_deadline(now + 0.35)
-    (again,) = sent(engine, now + 0.35)
-    assert again.offset == request.offset
-    engine.receive(chunk(again, bytes(SIZE)), now + 0.4)
-    assert transfer.idle
 
 
 def test_on_deadline_called_early_or_with_grown_round_trips_sends_nothing() -> None:
@@ -523,36 +452,6 @@ def test_who_begins_to_want_something_while_nothing_may_go_out_does_not_wait_for
     assert engine.next_deadline() == 130.0
     engine.on_deadline(130.0)
     assert isinstance(transfer.error, RequestTimeout)
-
-
-def test_progress_and_patience_may_end_at_the_same_moment() -> None:
-    engine = make(limit=1)
-    transfer, _ = reading(engine)
-    now = 0.0
-    while not transfer.done:
-        now += 0.5
-        sent(engine, now)
-        engine.on_deadline(now)
-    assert engine.stats.timeouts == 1
-    assert engine.take_finished() == [transfer]
-
-
-def test_one_chunk_that_is_never_answered_fails_the_transfer() -> None:
-    engine = make(limit=4)
-    transfer, _ = reading(engine, 239 * 100_000)
-    now = 0.0
-    cursed = None
-    while not transfer.done:
-        assert now < 100
-        for request in sent(engine, now):
-            cursed = request.offset if cursed is None else cursed
-            if request.offset != cursed:
-                engine.receive(ack(request, bytes(request.size)), now)
-        now += 0.05
-        engine.on_deadline(now)
-    assert isinstance(transfer.error, RequestTimeout)
-    assert 29 < now < 45
-    assert transfer.wants.covers(cursed or 0, 239)
 
 
 @pytest.mark.holds("rule 14.38")
@@ -643,17 +542,6 @@ def test_cancelled_requests_keep_their_place_until_they_are_answered() -> None:
     assert engine.next_deadline() is None
 
 
-def test_cancelling_forgets_what_was_to_be_sent_again() -> None:
-    engine = make()
-    op = mkdir()
-    engine.start(op, 0.0)
-    sent(engine, 0.0)
-    engine.on_deadline(1.0)
-    engine.cancel(op, 1.0)
-    assert sent(engine, 1.0) == []
-    assert engine.in_flight == 0
-
-
 def test_each_operation_gets_its_own_lost_requests_back() -> None:
     engine = make()
     first, second = mkdir(), mkdir()
@@ -665,25 +553,6 @@ def test_each_operation_gets_its_own_lost_requests_back() -> None:
     assert [request.seq for request in sent(engine, 1.0)] == [lost.seq, lost.seq + 1]
     engine.on_deadline(40.0)
     assert {type(op.error) for op in engine.take_finished()} == {RequestTimeout}
-
-
-def test_a_request_behind_others_finds_nothing_of_its_own_to_repeat() -> None:
-    engine = make(limit=1)
-    transfer, _ = reading(engine)
-    sent(engine, 0.0)
-    engine.on_deadline(1.0)
-    engine.start(mkdir(), 1.0)
-    assert [request.opcode for request in sent(engine, 1.0)] == [Opcode.CREATE_DIRECTORY]
-    engine.cancel(transfer, 1.0)
-    assert engine.in_flight == 1
-
-
-def test_an_operation_runs_once() -> None:
-    engine = make()
-    op = mkdir()
-    engine.start(op, 0.0)
-    with pytest.raises(LocalProtocolError):
-        engine.start(op, 0.0)
 
 
 def test_an_idle_transfer_waits_for_ever() -> None:
@@ -742,21 +611,6 @@ def test_packets_of_an_abandoned_burst_hold_timers_and_land_nowhere() -> None:
     assert engine.stats.unknown == 20
     engine.receive(ack(request), 4.0)
     assert engine.stats.replies == 1
-
-
-def test_incoherent_burst_packets_are_counted() -> None:
-    engine = make()
-    _, burst = bursting(engine)
-    engine.receive(packet(burst, 0, bytes(239)), 0.1)
-    engine.receive(packet(burst, 7, bytes(239), size=200), 0.1)
-    assert engine.stats.incoherent == 1
-
-
-def test_a_burst_that_fails_is_finished() -> None:
-    engine = make()
-    transfer, burst = bursting(engine)
-    engine.receive(burst_nak(burst, 0, NakCode.INVALID_SESSION), 0.1)
-    assert engine.take_finished() == [transfer]
 
 
 # --- pauses of the server

@@ -35,36 +35,11 @@ def reference(seq: int, target: Address, payload: bytes) -> bytes:
     return frame
 
 
-@pytest.mark.parametrize("payload", PAYLOADS)
-@pytest.mark.parametrize("target", TARGETS)
-def test_encodes_as_pymavlink(payload: bytes, target: Address) -> None:
-    codec = FtpFrameCodec(US, EXTRA)
-    for seq in (0, 1, 255):
-        assert codec.encode(seq, target, [payload]) == [reference(seq, target, payload)]
-
-
-@pytest.mark.parametrize("payload", PAYLOADS)
-def test_decodes_what_pymavlink_made(payload: bytes) -> None:
-    out: list[Message | FtpRun] = []
-    frame = reference(9, Address(1, 2), payload)
-    assert FtpFrameCodec(US, EXTRA).decode_runs(frame, 0, out) == len(frame)
-    assert out == [FtpRun(US, Address(1, 2), [payload])]
-
-
 def test_a_frame_trimmed_into_its_target_is_left_to_pymavlink() -> None:
     out: list[Message | FtpRun] = []
     for target in (Address(0, 0), Address(1, 0)):
         assert FtpFrameCodec(US, EXTRA).decode_runs(reference(9, target, bytes(251)), 0, out) == 0
     assert out == []
-
-
-def test_run_of_frames_stops_where_it_ends() -> None:
-    codec = FtpFrameCodec(US, EXTRA)
-    frames = codec.encode(0, Address(1, 1), [bytes([n]) * 251 for n in range(5)])
-    data = b"junk" + b"".join(frames) + b"\xfd\x09"
-    out: list[Message | FtpRun] = []
-    assert codec.decode_runs(data, 4, out) == len(data) - 2
-    assert [m.payload[0] for m in singly(out) if isinstance(m, FtpFrame)] == [0, 1, 2, 3, 4]
 
 
 @pytest.mark.parametrize("at", [0, 2, 3, 5, 6, 7, 8, 9, 10, 11, 12, 13, 100, 263, 264, 265])

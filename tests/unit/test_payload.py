@@ -5,7 +5,6 @@ from __future__ import annotations
 import pytest
 
 from mavftpfs.protocol.payload import (
-    MAX_DATA,
     PAYLOAD_SIZE,
     Payload,
     decode_reply,
@@ -26,11 +25,6 @@ def test_a_reply_holds_exactly_size_bytes() -> None:
     wire = bytearray(Payload(1, 0, 128, 2, 5, 0, 0, b"ab").encode())
     wire[14:20] = b"stray!"
     assert decode_reply(bytes(wire)).data == b"ab"
-
-
-def test_a_request_holds_the_whole_field() -> None:
-    wire = Payload(1, 0, 3, 1, 0, 0, 0, b"/").encode()
-    assert decode_request(wire).data == b"/" + bytes(MAX_DATA - 1)
 
 
 @pytest.mark.parametrize("length", [0, 250, 252])

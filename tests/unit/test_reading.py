@@ -13,7 +13,7 @@ from mavftpfs.protocol.flow import Flow
 from mavftpfs.protocol.payload import NakCode, Opcode, Payload
 from mavftpfs.protocol.reading import ReadTransfer
 from mavftpfs.protocol.requests import Priority
-from mavftpfs.shared.errors import FileChanged, FtpNak, LocalProtocolError, SessionLost
+from mavftpfs.shared.errors import FileChanged, FtpNak, SessionLost
 from mavftpfs.shared.extents import ExtentSet
 from mavftpfs.shared.traits import Traits
 from tests.support.replies import ack, burst_nak, chunk, nak, packet, sent
@@ -129,33 +129,6 @@ def test_readahead_can_be_dropped() -> None:
     assert reader.sent() == []
     assert reader.transfer.idle
     assert reader.sink.held == ExtentSet([(0, 239)])
-
-
-def test_gaps_nobody_waits_for_any_more_are_dropped() -> None:
-    reader = Reader(bursts=True, limit=1)
-    reader.transfer.want(0, 478, True)
-    reader.transfer.want(478, 956, False)
-    (request,) = reader.sent()
-    stream(reader, request, [4])
-    reader.engine.receive(burst_nak(request, 5, NakCode.EOF), reader.now)
-    reader.transfer.drop_readahead()
-    assert ranges(reader.finish()) == [(0, 239), (239, 478)]
-    assert reader.transfer.idle
-
-
-def test_readahead_that_is_wanted_twice_is_asked_once() -> None:
-    reader = Reader(limit=1)
-    reader.transfer.want(0, 239, True)
-    reader.transfer.want(0, 478, False)
-    assert reader.transfer.wants == ExtentSet([(0, 478)])
-    assert ranges(reader.finish()) == [(0, 239), (239, 478)]
-
-
-@pytest.mark.holds("rule 14.14")
-@pytest.mark.parametrize("block", [0, 240])
-def test_chunk_sizes(block: int) -> None:
-    with pytest.raises(LocalProtocolError):
-        ReadTransfer(0, 1, MemorySink(1), ChunkSize(block))
 
 
 # --- replies to ReadFile
@@ -307,14 +280,6 @@ def test_the_flag_and_a_short_quiet_end_it() -> None:
     assert reader.now < 0.3
 
 
-@pytest.mark.holds("fault burst end")
-def test_a_spurious_flag_does_not_end_it() -> None:
-    reader, request = bursting()
-    stream(reader, request, list(range(41)), complete=3)
-    assert bytes(reader.sink.data) == CONTENT
-    assert reader.engine.stats.by_opcode == {Opcode.BURST_READ_FILE: 1}
-
-
 @pytest.mark.holds("rule 14.17")
 def test_a_burst_waits_for_reads_and_reads_for_the_burst() -> None:
     reader = Reader(bursts=True)
@@ -362,32 +327,3 @@ def test_a_burst_without_session(code: int) -> None:
     assert isinstance(reader.transfer.error, SessionLost)
     assert reader.transfer.wants == ExtentSet([(0, SIZE)])
     assert not reader.transfer.bursting
-
-
-@pytest.mark.holds("rule 14.19")
-@pytest.mark.parametrize("kind", ["empty", "nak"])
-def test_an_endless_stream_must_be_terminated(kind: str) -> None:
-    reader, request = bursting()
-    stream(reader, request, [0, 1])
-    for index in (2, 3):
-        reply = burst_nak(request, index, 1)
-        if kind == "empty":
-            reply = packet(request, index, b"")._replace(offset=478)
-        reader.engine.receive(reply, reader.now)
-    assert isinstance(reader.transfer.error, SessionLost)
-    assert reader.transfer.wants == ExtentSet([(478, SIZE)])
-
-
-@pytest.mark.holds("fault chunk size")
-def test_px4_sends_239_whatever_was_asked() -> None:
-    reader, request = bursting(block=110)
-    assert request.size == 110
-    stream(reader, request, list(range(41)))
-    assert bytes(reader.sink.data) == CONTENT
-
-
-def test_packets_after_the_transfer_ended_are_dropped() -> None:
-    reader, request = bursting()
-    reader.engine.receive(burst_nak(request, 0, NakCode.EOF), 0.1)
-    assert not reader.transfer.on_burst(packet(request, 0, CONTENT[:239]), 0.2)
-    assert reader.sink.held.empty

@@ -8,7 +8,7 @@ from mavftpfs.protocol.ledger import Ghost
 from mavftpfs.protocol.operations import Simple
 from mavftpfs.protocol.payload import Opcode
 from mavftpfs.protocol.requests import MANNERS, READ_MANNER, Request
-from mavftpfs.protocol.timers import INITIAL_RTO, LONGEST_BACK_OFF, RttEstimator, Timers
+from mavftpfs.protocol.timers import LONGEST_BACK_OFF, RttEstimator, Timers
 
 
 def answered(timers: Timers, opcode: Opcode, rtt: float) -> None:
@@ -22,10 +22,6 @@ def sent(opcode: Opcode) -> Request:
     return request
 
 
-def test_nothing_known() -> None:
-    assert Timers().wait(sent(Opcode.OPEN_FILE_RO)) == INITIAL_RTO
-
-
 def test_a_lost_first_listing_does_not_cost_a_second() -> None:
     assert Timers().wait(sent(Opcode.LIST_DIRECTORY_WITH_TIME)) == 0.5
 
@@ -37,24 +33,12 @@ def test_nor_are_listings_piled_up_where_nothing_is_known() -> None:
     assert waits == [0.5, 1.0, 2.0, 3.0, 3.0]
 
 
-def test_a_first_listing_that_takes_longer_is_not_waited_for_less_than_it_takes() -> None:
-    timers = Timers()
-    answered(timers, Opcode.LIST_DIRECTORY, 0.8)
-    assert timers.wait(sent(Opcode.LIST_DIRECTORY)) == pytest.approx(2.4)
-
-
 @pytest.mark.parametrize(("rtt", "wait"), [(0.03, 0.1), (0.1, 0.3), (0.3, 0.9), (0.6, 1.0)])
 def test_an_open_waits_as_long_as_listings_took_and_not_a_second(rtt: float, wait: float) -> None:
     timers = Timers()
     answered(timers, Opcode.LIST_DIRECTORY, rtt)
     assert timers.wait(sent(Opcode.OPEN_FILE_RO)) == pytest.approx(wait)
     assert timers.wait(sent(Opcode.READ_FILE)) == pytest.approx(min(3 * rtt, 1.0))
-
-
-def test_what_is_slow_by_nature_keeps_its_patience() -> None:
-    timers = Timers()
-    answered(timers, Opcode.LIST_DIRECTORY, 0.03)
-    assert timers.wait(sent(Opcode.CALC_FILE_CRC32)) == 10.0
 
 
 def test_a_family_with_round_trips_of_its_own_borrows_nothing() -> None:
@@ -79,12 +63,6 @@ def test_variation_widens() -> None:
     assert timer.rto > 0.5
 
 
-def test_floor() -> None:
-    timer = RttEstimator(0.03)
-    timer.sample(0.0001)
-    assert timer.rto == 0.03
-
-
 def test_back_off_from_the_third_silence_on_up_to_a_cap_and_until_a_sample() -> None:
     timer = RttEstimator(0.03)
     timer.sample(0.1)
@@ -96,13 +74,6 @@ def test_back_off_from_the_third_silence_on_up_to_a_cap_and_until_a_sample() -> 
     assert waits[-1] == LONGEST_BACK_OFF
     timer.sample(0.1)
     assert timer.rto < 0.3
-
-
-def test_a_slow_family_keeps_its_floor_above_the_cap() -> None:
-    timer = RttEstimator(10.0)
-    for _ in range(9):
-        timer.on_silence()
-    assert timer.rto == 10.0
 
 
 def test_what_went_and_came_together_is_one_sample() -> None:
@@ -118,3 +89,90 @@ def test_what_went_and_came_together_is_one_sample() -> None:
     listing.sent_at = 1.0
     timers.sample(listing, 1.3)
     assert timers.of["list"].samples == 1
+
+
+# --- work of the server: checksums, cuts; and what is done at once
+
+CRC = Opcode.CALC_FILE_CRC32
+
+
+def work(server_time: float, *, sends: int = 1, opcode: Opcode = CRC) -> Request:
+    (request,) = Simple(opcode, b"/f", server_time=server_time).next_requests(1, 0.0)
+    request.sent_at, request.sends = 100.0, sends
+    return request
+
+
+def path(sends: int) -> Request:
+    request = Request(Simple(Opcode.OPEN_FILE_RO), Opcode.OPEN_FILE_RO, MANNERS[Opcode.OPEN_FILE_RO], 0, 0, 0)
+    request.sent_at, request.sends = 100.0, sends
+    return request
+
+
+def learned(*, rtt: float = 0.012, seen: tuple[float, float] | None = None, opcode: Opcode = CRC) -> Timers:
+    """Timers that measured round trips; seen: (the slowest server's time, the time it really took)."""
+    timers = Timers()
+    for _ in range(20):
+        timers.sample(path(1), 100.0 + rtt)
+        timers.sample(work(0.06), 100.0 + rtt)
+        rtt += 1e-6  # not in one batch
+    if seen is not None:
+        timers.sample(work(seen[0], opcode=opcode), 100.0 + seen[1])
+    return timers
+
+
+def test_a_small_file_s_checksum_is_asked_for_again_soon() -> None:
+    timers = learned()
+    assert timers.wait(work(0.06)) == pytest.approx(0.36, abs=0.01)
+    assert sum(timers.wait(work(0.06, sends=sends)) for sends in (1, 2, 3)) < 1.5
+
+
+@pytest.mark.holds("rule 14.38")
+def test_a_server_not_seen_at_work_gets_the_slowest_one_s_time() -> None:
+    timers = learned()
+    assert timers.wait(work(10.0, sends=3)) > 10.0
+    assert timers.wait(work(100.0, sends=5)) > 100.0
+    assert timers.wait(work(10.0, opcode=Opcode.TRUNCATE_FILE)) > 10.0
+
+
+def test_but_a_checksum_that_most_would_have_is_asked_for_twice_before() -> None:
+    """Nothing of it is done again: the same seq has the answer replayed."""
+    timers = learned()
+    assert [timers.wait(work(6.0, sends=sends)) for sends in (1, 2)] == [pytest.approx(0.9)] * 2
+    assert timers.wait(work(0.5)) == pytest.approx(0.4)
+    assert timers.wait(work(0.0)) == pytest.approx(0.3)
+
+
+def test_a_server_seen_at_work_gets_some_times_what_it_needed() -> None:
+    timers = learned(seen=(10.0, 1.0))
+    assert timers.wait(work(20.0)) == pytest.approx(0.3 + 8.0, abs=0.1)
+    timers.sample(work(10.0), 105.0)
+    assert timers.wait(work(20.0)) == pytest.approx(0.3 + 20.0, abs=0.1)
+
+
+def test_one_slow_answer_is_not_forgotten_by_a_few_fast_ones() -> None:
+    timers = learned(seen=(10.0, 2.0))
+    for _ in range(3):
+        timers.sample(work(10.0), 100.1)
+    assert timers.wait(work(20.0)) > 4.0
+
+
+def test_work_of_one_kind_tells_nothing_of_another() -> None:
+    timers = learned(seen=(10.0, 0.1))
+    assert timers.wait(work(20.0, opcode=Opcode.TRUNCATE_FILE)) > 20.0
+
+
+def test_long_work_does_not_make_small_files_wait() -> None:
+    timers = learned(seen=(100.0, 60.0))
+    assert timers.wait(work(0.06)) < 0.5
+
+
+def test_what_is_done_at_once_is_repeated_several_times_before_waits_double() -> None:
+    timers = learned()
+    waits = [timers.wait(path(sends)) for sends in range(1, 8)]
+    assert waits[:4] == [waits[0]] * 4
+    assert waits[4:] == [pytest.approx(waits[0] * factor) for factor in (2, 4, 8)]
+
+
+def test_without_a_round_trip_known_waits_double_at_once() -> None:
+    timers = Timers()
+    assert [timers.wait(path(sends)) for sends in (1, 2, 3)] == [1.0, 2.0, 3.0]

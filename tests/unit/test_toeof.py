@@ -11,7 +11,7 @@ from mavftpfs.protocol.flow import Flow
 from mavftpfs.protocol.payload import NakCode, Payload
 from mavftpfs.protocol.reading import ReadToEof
 from mavftpfs.shared.errors import DataUnproven, FtpNak, LocalProtocolError, MavftpfsError, SessionLost
-from tests.support.replies import ack, chunk, nak, sent
+from tests.support.replies import chunk, nak, sent
 
 
 class Reading:
@@ -57,40 +57,12 @@ def test_reads_what_is_there(size: int) -> None:
     assert reading.op.data == content
 
 
-def test_any_order_of_answers() -> None:
-    content = random.Random(0).randbytes(250)
-    reading = Reading(any_order=True)
-    assert sorted(reading.out) == [0, 100, 200, 300]
-    for offset in (200, 100, 0, 300):
-        reading.answer(offset, content)
-    assert reading.op.data == content
-    assert max(reading.out) == 300
-
-
 def test_nothing_is_asked_far_behind_the_end() -> None:
     reading = Reading()
     reading.answer(0, b"x" * 30)
     assert max(reading.out) == 300
     reading.answer(100, b"x" * 30)
     assert reading.op.data == b"x" * 30
-
-
-def test_a_lost_block_is_waited_for_behind_the_end() -> None:
-    content = random.Random(1).randbytes(250)
-    reading = Reading()
-    for offset in (100, 200, 300):
-        reading.engine.receive(chunk(reading.out[offset], content), 0.0)
-    again = sent(reading.engine, 0.0)
-    assert [request.offset for request in again] == [0]
-    reading.engine.receive(chunk(again[0], content), 0.0)
-    assert reading.op.data == content
-
-
-def test_an_overlong_block_is_clipped() -> None:
-    reading = Reading()
-    reading.engine.receive(ack(reading.out[0], b"y" * 150), 0.0)
-    reading.refuse(100, NakCode.EOF)
-    assert reading.op.data == b"y" * 100
 
 
 def test_the_limit() -> None:

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from mavftpfs.protocol.chunking import ChunkSize
 from mavftpfs.protocol.engine import Engine
 from mavftpfs.protocol.flow import Flow
-from mavftpfs.protocol.operations import OpenFile, Simple, Terminate
+from mavftpfs.protocol.operations import OpenFile, Terminate
 from mavftpfs.protocol.payload import Opcode
 from mavftpfs.protocol.writing import MAX_OFFSET, WriteTransfer
 from mavftpfs.shared.errors import (
@@ -19,7 +19,6 @@ from mavftpfs.shared.errors import (
     LocalProtocolError,
     MavftpfsError,
     RemoteProtocolError,
-    RequestTimeout,
     SessionLost,
 )
 from mavftpfs.sim.linkmodel import LinkSettings
@@ -181,17 +180,6 @@ def test_pause_drains_and_resume_goes_on() -> None:
     assert not transfer.done  # the pause was no silence
 
 
-def test_stop_gives_back_and_ends() -> None:
-    engine = make()
-    transfer, source = writing(engine)
-    sent(engine, 0.0)
-    transfer.stop()
-    assert transfer.done
-    assert transfer.error is None
-    assert source.dirty.covers(0, len(CONTENT))
-    transfer.stop()
-
-
 def test_what_is_closed_behind_is_not_repeated() -> None:
     engine = make()
     transfer, source = writing(engine, in_flight=4)
@@ -220,18 +208,6 @@ def test_what_waits_to_be_repeated_is_not_all_out() -> None:
 
 
 @pytest.mark.holds("rule 14.24")
-def test_strict_order_has_one_in_flight() -> None:
-    engine = make()
-    transfer, _ = writing(engine, in_flight=1)
-    [first] = sent(engine, 0.0)
-    assert sent(engine, 0.0) == []
-    engine.receive(ack(first), 0.1)
-    [second] = sent(engine, 0.1)
-    assert second.offset == 239
-    assert not transfer.starved
-
-
-@pytest.mark.holds("rule 14.24")
 def test_never_more_than_the_server_queues() -> None:
     engine = Engine(random.Random(3), Flow())
     engine.learn_session_echo(True)
@@ -244,33 +220,6 @@ def test_never_more_than_the_server_queues() -> None:
         now += 0.05
         engine.receive(ack(flying.pop(0)), now)
         flying += sent(engine, now)
-
-
-def test_a_lost_request_goes_again_with_the_same_bytes() -> None:
-    engine = make()
-    writing(engine, CONTENT[:239])
-    [first] = sent(engine, 0.0)
-    deadline = engine.next_deadline()
-    assert deadline is not None
-    engine.on_deadline(deadline)
-    [second] = sent(engine, deadline)
-    assert (second.offset, second.data) == (first.offset, first.data)
-    assert second.seq != first.seq
-
-
-def test_silence_times_out_and_gives_back() -> None:
-    engine = make()
-    transfer, source = writing(engine, CONTENT[:239])
-    now = 0.0
-    while not transfer.done:
-        sent(engine, now)
-        deadline = engine.next_deadline()
-        assert deadline is not None
-        now = deadline
-        engine.on_deadline(now)
-    assert isinstance(transfer.error, RequestTimeout)
-    assert 29 < now < 40
-    assert source.dirty.covers(0, 239)
 
 
 @pytest.mark.holds("rule 14.26")
@@ -288,14 +237,6 @@ def test_a_chunk_that_does_not_fit_is_refused_without_a_raise(piece: tuple[int, 
     engine.start(transfer, 0.0)
     assert sent(engine, 0.0) == []
     assert isinstance(transfer.error, LocalProtocolError)
-
-
-def test_reading_goes_before_writing_and_metadata_before_both() -> None:
-    engine = make(limit=1)
-    writing(engine)
-    listing = Simple(Opcode.CREATE_DIRECTORY, b"/d")
-    engine.start(listing, 0.0)
-    assert [one.opcode for one in sent(engine, 0.0)] == [Opcode.CREATE_DIRECTORY]
 
 
 # --- under adversarial links, against every server
