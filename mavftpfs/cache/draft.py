@@ -243,11 +243,11 @@ class Draft:
         stop = offset + len(data)
         if offset == stop:
             return
-        after = self._after(Event.CHANGED)
         self.content.put(offset, data)
+        self.on(Event.CHANGED)
         self._held.add(offset, stop)
         self._note_changed(min(offset, self.size), stop)
-        self.size, self.state = max(self.size, stop), after
+        self.size = max(self.size, stop)
 
     def truncate(self, size: int) -> None:
         """Cut, or extend with zeros.
@@ -257,9 +257,12 @@ class Draft:
         """
         if size == self.size:
             return
-        after = self._after(Event.CHANGED if size else Event.EMPTIED)
-        if size < self.size:
+        if size > self.size:
+            self.on(Event.CHANGED)
+            self._note_changed(self.size, size)
+        else:
             self.content.cut(size)
+            self.on(Event.CHANGED if size else Event.EMPTIED)
             for extents in (self._held, self._changed):
                 extents.discard(size, max(size, extents.end))
             self.base_limit = min(self.base_limit, size)
@@ -267,9 +270,7 @@ class Draft:
                 self.sending = None
             elif self.sending is not None:
                 self.sending.on_changed(size, size)
-        else:
-            self._note_changed(self.size, size)
-        self.size, self.state = size, after
+        self.size = size
 
     def fill(self, offset: int, data: bytes | memoryview) -> None:
         """Hold bytes of the base, where nothing newer is held.
@@ -335,13 +336,10 @@ class Draft:
         Raises:
             LocalProtocolError: that cannot happen now.
         """
-        self.state = self._after(event)
-
-    def _after(self, event: Event) -> State:
         after = TRANSITIONS[self.state].get(event)
         if after is None:
             raise LocalProtocolError(f"a file that is {self.state.value} cannot be {event.value}")
-        return after
+        self.state = after
 
     def check_invariants(self) -> None:
         """Raise AssertionError if the books are wrong (for tests)."""

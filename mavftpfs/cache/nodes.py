@@ -79,11 +79,6 @@ class Node:
         return self.draft is not None and not self.removed and self.draft.undelivered
 
     @property
-    def unneeded(self) -> bool:
-        """Whether nobody has it open, and the vehicle has it."""
-        return not self.handles and not self.undelivered
-
-    @property
     def changing(self) -> bool:
         """Whether what has its name on the vehicle is being changed, or was perhaps."""
         if self.draft is None:
@@ -177,8 +172,8 @@ class Nodes:
         return [n for p, n in self._by_path.items() if p == path or p.startswith(path + b"/")]
 
     def maybe_forget(self, node: Node) -> None:
-        """Forget a node that nobody needs; an attempt has to be called off first."""
-        if node.unneeded and not node.lock.locked() and node.attempt is None:
+        """Forget a node that nobody has open, and that the vehicle has."""
+        if not (node.handles or node.undelivered or node.lock.locked() or node.attempt):
             node.drop_draft()
             self.detach(node)
 
