@@ -26,7 +26,7 @@ class Context:
 
     clock: seconds, monotonic; wall: seconds since 1970. paths: see pathlocks. armed: nothing may be
     changed (only Writeback.armed_changed sets it). retry_later(): something was not delivered, or a name may
-    lack its file (Background sets it).
+    lack its file (Writeback sets it).
     """
 
     store: VehicleStore

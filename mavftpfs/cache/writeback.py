@@ -6,6 +6,7 @@ vehicle's. Paths are the vehicle's, normalised; those below `@` never come here 
 
 from __future__ import annotations
 
+import errno
 import logging
 from collections.abc import Callable
 from functools import partial
@@ -14,10 +15,9 @@ from random import Random
 
 import trio
 
-from mavftpfs.cache.background import Background
 from mavftpfs.cache.base import known_base, on_listed
 from mavftpfs.cache.context import Context
-from mavftpfs.cache.delivery import PASSING, Deliverer
+from mavftpfs.cache.delivery import PASSING, Deliverer, may_pass
 from mavftpfs.cache.directories import Directories
 from mavftpfs.cache.draft import Base, State
 from mavftpfs.cache.files import Files
@@ -34,10 +34,8 @@ from mavftpfs.cache.reserved import OwnNames, new_owner, require_writable
 from mavftpfs.cache.spool import Spool
 from mavftpfs.cache.throttle import Throttle
 from mavftpfs.cache.writefile import Parts, ReadFile, WriteFile
-from mavftpfs.shared.errors import (
-    AlreadyExists,
-    IsADirectory,
-)
+from mavftpfs.shared.errnos import errno_for
+from mavftpfs.shared.errors import AlreadyExists, IsADirectory, MavftpfsError
 from mavftpfs.shared.model import EntryKind, require_listable
 
 log = logging.getLogger("mavftpfs.cache")
@@ -45,8 +43,19 @@ log = logging.getLogger("mavftpfs.cache")
 RETRY_PAUSE = 1.0
 """Seconds between two rounds of delivering everything."""
 
+PAUSES = (2.0, 30.0)
+"""Seconds between two attempts to deliver what nobody has open: at first, and at most."""
+
+ROOM_PAUSES = (120.0, 3600.0)
+"""The same for what the card had no room for: most of a file may travel before that shows again."""
+
 REFUSALS = 3
 """After so many rounds in which the vehicle answered and refused all that is left, the end is not put off."""
+
+
+def _lacked_room(node: Node) -> bool:
+    """Return whether a file is not delivered because it did not fit: others may be removed."""
+    return node.error is not None and errno_for(node.error) == errno.ENOSPC
 
 
 class Writeback:
@@ -94,7 +103,8 @@ class Writeback:
         self._names = names = Names(context)
         self._cleaner = cleaner = Cleaner(context, names, dead)
         self._deliverer = deliverer = Deliverer(context, names, cleaner, throttle)
-        self._background = Background(context, deliverer, cleaner)
+        context.retry_later = self._retry_later
+        self._retried: set[Callable[[Node], bool]] = set()
         self.overlay = Overlay(context)
         self.namespace = Namespace(context, names, deliverer, self.overlay)
         self._parts = Parts(context, deliverer, throttle, self.overlay, self.namespace)
@@ -223,10 +233,10 @@ class Writeback:
         """See Tree.drain."""
         nodes, refused = self._context.nodes, 0
         with trio.move_on_after(timeout):
-            await self._background.deliver_each(lambda node: True)
+            await self._deliver_each(lambda node: True)
             while self.undelivered() and refused < REFUSALS:
                 await trio.sleep(RETRY_PAUSE)
-                await self._background.deliver_each(lambda node: True)
+                await self._deliver_each(lambda node: True)
                 passing = any(isinstance(n.error, PASSING) for n in nodes if n.undelivered)
                 refused = 0 if passing else refused + 1
 
@@ -251,7 +261,7 @@ class Writeback:
     def retry(self) -> None:
         """The vehicle is back, or may be written again: deliver what nobody has open any more."""
         if self._context.nursery is not None and (self._context.own.torn or self.undelivered()):
-            self._context.nursery.start_soon(self._background.link_back)
+            self._context.nursery.start_soon(self._try_all)
 
     def status(self) -> dict[str, object]:
         """Return counters; bytes_... in bytes. `undelivered`: of whole files; `held`: what they take here."""
@@ -272,3 +282,49 @@ class Writeback:
             "leftovers_mended": self._cleaner.mended,
             "armed": self._context.armed,
         }
+
+    # --- delivering while nobody waits for it
+
+    async def _try_all(self) -> None:
+        """What failed, or was refused, may work now."""
+        await self._cleaner.mend_torn()
+        for node in self._context.nodes:
+            node.start_after = float("-inf")
+        await self._deliver_each(self._is_left_to_us)
+
+    async def _deliver_each(self, wanted: Callable[[Node], bool]) -> None:
+        """Try once to deliver each file that is wanted, as long as it is; errors are kept with the file."""
+        for node in self._context.nodes:
+            if not node.undelivered or not wanted(node):
+                continue
+            try:
+                await self._deliverer.deliver(node, wanted=partial(wanted, node))
+            except MavftpfsError as error:
+                log.debug("%r is still not delivered: %s", node.path, error)
+            else:
+                self._context.nodes.maybe_forget(node)
+
+    def _retry_later(self) -> None:
+        """Something was not delivered, or left a name without a file: try again by and by."""
+        nursery = self._context.nursery
+        for which, pauses in ((may_pass, PAUSES), (_lacked_room, ROOM_PAUSES)):
+            if nursery is not None and which not in self._retried:
+                self._retried.add(which)
+                nursery.start_soon(self._retry, which, *pauses)
+
+    async def _retry(self, which: Callable[[Node], bool], pause: float, longest: float) -> None:
+        """Try again, ever more seldom, as long as there are such files: a link that fails and returns between
+        two looks at its heartbeats is no news to anybody, nor is room on a card that was full."""
+        nodes, own = self._context.nodes, self._context.own
+        try:
+            while (which is may_pass and own.torn) or any(n.undelivered and which(n) for n in nodes):
+                await trio.sleep(pause)
+                pause = min(2 * pause, longest)
+                await self._cleaner.mend_torn()
+                await self._deliver_each(lambda node: which(node) and self._is_left_to_us(node))
+        finally:
+            self._retried.discard(which)
+
+    def _is_left_to_us(self, node: Node) -> bool:
+        """Nobody writes it any more, or its name may lack a file."""
+        return not node.writers or node.path in self._context.own.torn

@@ -32,7 +32,7 @@ def noise(length: int, seed: int) -> bytes:
 
 
 LONG = 70_000
-"""Bytes of a write that is sent while the program goes on (more than `cache.background.START_AT`)."""
+"""Bytes of a write that is sent while the program goes on (more than `cache.delivery.START_AT`)."""
 
 
 def calls(largest: int = 3000, chunk: int = 900) -> SearchStrategy[tuple[Any, ...]]:

@@ -7,9 +7,9 @@ import errno
 import pytest
 import trio
 
-from mavftpfs.cache.background import PAUSES, ROOM_PAUSES
 from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.tree import Tree
+from mavftpfs.cache.writeback import PAUSES, ROOM_PAUSES
 from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.shared.errors import FtpNak, MavftpfsError, RequestTimeout, VehicleLost
 from tests.support.fake_writer import KINDS, FakeWriter, card, make_writable

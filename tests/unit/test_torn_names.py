@@ -7,9 +7,9 @@ from collections.abc import AsyncIterator
 import pytest
 import trio
 
-from mavftpfs.cache.background import PAUSES
 from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.tree import Tree
+from mavftpfs.cache.writeback import PAUSES
 from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.shared.errors import Armed, FtpNak, OutcomeUnknown, VehicleLost
 from mavftpfs.shared.model import split
