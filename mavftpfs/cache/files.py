@@ -367,13 +367,6 @@ class Files:
 
     # --- we changed the file ourselves
 
-    def cached(self, path: bytes) -> Version | None:
-        """Return what is cached of a path's present version, if all that is surely of one file."""
-        version = self._current.get(path)
-        if version is None or version.dead is not None:
-            return None
-        return version if version.compared or not self._listings_tell(version) else None
-
     def was_lost(self, path: bytes) -> bool:
         """Return whether somebody has a version of the path open, and is to read nothing more."""
         return any(v.path == path and v.lost for v in self.open_versions)
@@ -382,10 +375,6 @@ class Files:
         """What we are about to write there must not be given to who has another file open."""
         for version in [v for v in self.open_versions if v.path == path and v.dead is None]:
             self.kill(version)
-
-    def was_replaced(self, path: bytes) -> bool:
-        """Return whether somebody who is to read on has a version open that is not the vehicle's any more."""
-        return any(v.path == path and v.dead is not None and not v.lost for v in self.open_versions)
 
     def on_changed(self, path: bytes) -> None:
         """We wrote or removed what has the path: who has the old file open opens the path anew."""

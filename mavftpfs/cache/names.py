@@ -261,14 +261,22 @@ class Names:
             NotSupported: the server does not rename. Else as VehicleStore.rename. The old file has its name
             again then, unless the name is torn.
         """
-        if not keep_old and self._replaces_at_once(target) and await self._rename_over(source, target):
+        if not keep_old and await self._rename_over(source, target):
             return
         assert places.old is not None
-        moved = await self._move_aside(target, places.old)
+        moved = None
         try:
+            try:
+                await self.rename(target, places.old)
+                moved = True
+            except FtpNak as nak:
+                gone = errno_for(nak) == errno.ENOENT
+                if not gone or await self._context.directories.current(target) is not None:
+                    raise
+                moved = False
             await self.rename(source, target, completes=moved)
         except (OutcomeUnknown, trio.Cancelled):
-            if moved:
+            if moved is not False:
                 self.note_torn(target, places.old)
             raise
         except MavftpfsError:
@@ -302,14 +310,12 @@ class Names:
                 self._context.directories.expire(split(path)[0])
             raise
 
-    def _replaces_at_once(self, target: bytes) -> bool:
-        """Return whether the target has the old file or the new one at any time. NuttX, where storages are
-        mounted at /fs/NAME, removes the old one first (servers.md 9)."""
-        return self._context.store.traits.rename_replaces is not False and not target.startswith(b"/fs/")
-
     async def _rename_over(self, source: bytes, target: bytes) -> bool:
-        """Return whether the server replaced the target."""
+        """Return whether the server replaced the target, which had the old file or the new one at any time.
+        NuttX, where storages are mounted at /fs/NAME, removes the old one first (servers.md 9)."""
         traits = self._context.store.traits
+        if traits.rename_replaces is False or target.startswith(b"/fs/"):
+            return False
         try:
             await self.rename(source, target, over=True)
         except FtpNak as nak:
@@ -320,19 +326,6 @@ class Names:
             log.debug("the server does not rename %r over %r: %s", source, target, nak)
             return False
         traits.rename_replaces = True
-        return True
-
-    async def _move_aside(self, target: bytes, old: bytes) -> bool:
-        """Return whether there was something to move."""
-        try:
-            await self.rename(target, old)
-        except FtpNak as nak:
-            if errno_for(nak) == errno.ENOENT and await self._context.directories.current(target) is None:
-                return False
-            raise
-        except (OutcomeUnknown, trio.Cancelled):
-            self.note_torn(target, old)
-            raise
         return True
 
     async def _undo(self, place: bytes, path: bytes) -> None:

@@ -4,9 +4,9 @@ Servers check little: some remove files by rmdir, or move into directories by re
 and targets are looked up in listings first. Whoever changes a name holds its path alone (`pathlocks`); what a
 draft has undelivered is delivered before its path changes.
 
-Who has a file open that loses its name reads on. What is known here whole is held here. Else the file is kept
-on the vehicle under a reserved name until its last handle is closed. Where it cannot have one (LittleFS), the
-change of the name is refused (EBUSY).
+Who has a file open that loses its name reads on. What was written here whole is held here. Else the file is
+kept on the vehicle under a reserved name until its last handle is closed. Where the card cannot rename
+(LittleFS), the change of the name is refused (EBUSY).
 """
 
 from __future__ import annotations
@@ -19,12 +19,11 @@ import trio
 
 from mavftpfs.cache.context import Context
 from mavftpfs.cache.delivery import Deliverer
-from mavftpfs.cache.draft import Base, Draft, State
+from mavftpfs.cache.draft import State
 from mavftpfs.cache.names import Names
 from mavftpfs.cache.nodes import Node
 from mavftpfs.cache.overlay import Overlay
 from mavftpfs.cache.reserved import Kind, fits_rename, require_not_ours
-from mavftpfs.cache.versions import Version
 from mavftpfs.shared.errors import (
     AlreadyExists,
     CrossDevice,
@@ -33,12 +32,10 @@ from mavftpfs.shared.errors import (
     InvalidMove,
     IsADirectory,
     MavftpfsError,
-    NoSpace,
     NotADirectory,
     NotFound,
     NotSupported,
     PathTooLong,
-    SpoolFailed,
 )
 from mavftpfs.shared.model import DirEntry, EntryKind, require_listable, wire_path
 
@@ -47,9 +44,6 @@ log = logging.getLogger("mavftpfs.cache")
 RECENT = 2.0
 """Seconds for which what was seen of a name is taken to be true when the name is about to be changed. So the
 removal of many files does not list their directory before each."""
-
-PIECE = 64 * 1024
-"""Bytes copied at once."""
 
 
 class Namespace:
@@ -88,11 +82,7 @@ class Namespace:
         self._context.require_disarmed()
         require_not_ours(path)
         async with self._claim(path), self._context.paths.hold(path):
-            node = self._context.nodes.get(path)
-            if node is not None and await self._context.entry(path) is not None:
-                await self._unlink_node(node)
-            else:
-                await self._unlink_closed(path)
+            await self._unlink(path)
         self._overlay.times.forget(path)
 
     async def rename(self, old: bytes, new: bytes, *, noreplace: bool) -> None:
@@ -136,39 +126,30 @@ class Namespace:
 
     # --- inside: unlinking
 
-    async def _unlink_closed(self, path: bytes) -> None:
-        """Remove a file of which nothing is held here."""
-        entry = await self._context.directories.current(path, within=RECENT)
-        if entry is None:
-            raise NotFound(f"{path!r} does not exist")
-        if entry.kind is not EntryKind.FILE:
-            raise IsADirectory(f"{path!r} is a directory")
-        self._context.require_idle(path)
-        await self._names.purge(path)
-        await self._names.remove(path)
-        self._context.files.on_changed(path)
-
-    async def _unlink_node(self, node: Node) -> None:
-        """Remove a file that is open, or not delivered yet."""
-        path, draft = node.path, node.draft
-        await self._deliverer.abandon(node)
-        entry = await self._context.directories.current(path, within=RECENT)
-        if entry is not None and entry.kind is EntryKind.DIRECTORY and draft is None:
-            raise IsADirectory(f"{path!r} is a directory")
-        # What else has its name by now is not to be removed.
+    async def _unlink(self, path: bytes) -> None:
+        context, node = self._context, self._context.nodes.get(path)
+        draft = None if node is None else node.draft
+        if node is not None:
+            await self._deliverer.abandon(node)
+        entry = await context.directories.current(path, within=RECENT)
         there = entry is not None and entry.kind is EntryKind.FILE
-        if draft is not None:
+        if draft is not None:  # what else has its name by now is not to be removed
             there &= draft.base is not None or draft.begun or draft.state is State.TORN
-        elif there:
-            self._context.require_idle(path)
+        elif entry is None:
+            raise NotFound(f"{path!r} does not exist")
+        elif not there:
+            raise IsADirectory(f"{path!r} is a directory")
+        else:
+            context.require_idle(path)
         await self._names.purge(path)
-        if there and node.handles and not self._keep_local(node):
+        if there and node is not None and node.needs_card:
             await self._hide(node)
             return
         if there:
             await self._names.remove_if_there(path)
-            self._context.files.on_changed(path)
-        self._context.nodes.unnamed(node)
+            context.files.on_changed(path)
+        if node is not None:
+            context.nodes.unnamed(node)
 
     # --- inside: renaming
 
@@ -204,10 +185,7 @@ class Namespace:
         for path in (old, new):
             if context.nodes.get(path) is None:
                 context.require_idle(path)
-        try:
-            await self._rename_checked(old, new, listed)
-        except NotSupported as error:
-            raise CrossDevice(str(error)) from error
+        await self._move(old, new, listed)
         if source.kind is EntryKind.DIRECTORY:
             context.directories.forget(old)
         context.files.on_renamed(old, new)
@@ -215,68 +193,39 @@ class Namespace:
         context.own.follow_rename(old, new)
         self._overlay.times.rename(old, new)
 
-    async def _rename_checked(self, old: bytes, new: bytes, listed: DirEntry | None) -> None:
-        """Rename; `listed`: what the vehicle has at `new`, which may be replaced."""
-        displaced = self._context.nodes.get(new)
-        for node in self._context.nodes.below(old):
+    async def _move(self, old: bytes, new: bytes, listed: DirEntry | None) -> None:
+        """Rename on the vehicle. listed: what it has at `new`, which may be replaced; who has that open keeps
+        it."""
+        context, displaced = self._context, self._context.nodes.get(new)
+        for node in context.nodes.below(old):
             await self._deliverer.abandon(node)
             if node.draft is not None and node.draft.base is None:
                 raise FileBusy(f"{node.path!r} is being written, and not on the vehicle yet")
         if displaced is not None:
             await self._deliverer.abandon(displaced)
         await self._names.purge(old)
-        if listed is not None and listed.kind is EntryKind.FILE:
-            await self._replace(old, new, displaced)
-        else:
-            if listed is not None:
-                await self._names.remove_directory(new)
-            await self._names.rename(old, new)
-        if displaced is not None and not displaced.removed:
-            self._context.nodes.unnamed(displaced)
-
-    async def _replace(self, old: bytes, new: bytes, displaced: Node | None) -> None:
-        """Rename over a file; who has that open keeps it."""
-        context, places = self._context, self._context.own.places(new)
-        keep = displaced is not None and displaced.handles > 0 and not self._keep_local(displaced)
-        context.own.live |= places.all
+        keep = displaced is not None and displaced.needs_card
         try:
-            await self._names.replace(old, new, places, keep_old=keep)
-            if keep and displaced is not None and places.old is not None:
-                await self._on_hidden(displaced, places.old)
-        finally:
-            context.own.live -= places.all
-            context.own.live |= context.nodes.hidden.keys()
+            if listed is not None and listed.kind is EntryKind.FILE:
+                places = context.own.places(new)
+                context.own.live |= places.all
+                try:
+                    await self._names.replace(old, new, places, keep_old=keep)
+                    if keep and displaced is not None and places.old is not None:
+                        await self._on_hidden(displaced, places.old)
+                finally:
+                    context.own.live -= places.all
+                    context.own.live |= context.nodes.hidden.keys()
+            else:
+                if listed is not None:
+                    await self._names.remove_directory(new)
+                await self._names.rename(old, new)
+        except NotSupported as error:
+            raise CrossDevice(str(error)) from error
+        if displaced is not None and not displaced.removed:
+            context.nodes.unnamed(displaced)
 
     # --- inside: open files that lose their names
-
-    def _keep_local(self, node: Node) -> bool:
-        """Hold what is known of an open file; return whether it can be read on without the vehicle."""
-        draft, blocks = node.draft, self._context.files.cached(node.path)
-        if draft is not None and (draft.whole or blocks is None):
-            return draft.whole
-        if blocks is None or not blocks.complete or self._context.files.was_replaced(node.path):
-            return False  # who opened what was there before must not be given this
-        if draft is not None:
-            return self._fill(draft, blocks)
-        draft = node.begin_draft(self._context.spool, Base(blocks.size), self._context.clock())
-        if not self._fill(draft, blocks):
-            node.drop_draft()
-            return False
-        draft.content.settle()  # whatever becomes of this mount, nobody misses a copy
-        return True
-
-    def _fill(self, draft: Draft, blocks: Version) -> bool:
-        """Put what is cached into a draft; return whether all is held then."""
-        try:
-            for at in range(0, draft.base_limit, PIECE):
-                data = blocks.get(at, min(at + PIECE, draft.base_limit))
-                if data is None:
-                    return False
-                draft.fill(at, data)
-        except (NoSpace, SpoolFailed) as error:
-            log.info("what is cached cannot be held here: %s", error)
-            return False
-        return True
 
     async def _hide(self, node: Node) -> None:
         """Keep an unlinked file on the vehicle under a reserved name as long as somebody has it open.

@@ -103,6 +103,11 @@ class Node:
         finally:
             self.lock.release()
 
+    @property
+    def needs_card(self) -> bool:
+        """Whether somebody has it open of which the card has the only bytes."""
+        return self.handles > 0 and not (self.draft is not None and self.draft.whole)
+
     def require_reachable(self) -> None:
         """Raise FileChanged if its path may be another file's: it was replaced or removed, not hidden."""
         if self.removed and not self.hidden:
