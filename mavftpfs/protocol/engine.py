@@ -32,7 +32,7 @@ _MAX_SIDE_EFFECT_REPLAYS = 2
 _INVALID_SESSION = bytes((NakCode.INVALID_SESSION,))
 _FEW = 4
 _BURST = int(Opcode.BURST_READ_FILE)
-_ACK, _NAK = int(Opcode.ACK), int(Opcode.NAK)
+_NAK = int(Opcode.NAK)
 
 
 @dataclass(slots=True)
@@ -166,23 +166,28 @@ class Engine:
 
     def receive(self, reply: Payload, now: float) -> None:
         """Take a reply of our server to us; anything may be in it."""
-        seq, session, opcode, _, req_opcode, _, offset, _ = reply
-        if req_opcode == _BURST and self._on_burst(reply, now):
+        of_burst = reply.req_opcode == _BURST
+        if of_burst and self._on_burst(reply, now):
             return
-        request = self._ledger.find(seq)
+        request = self._ledger.find(reply.seq)
         if request is None:
-            if req_opcode == _BURST and self._burst_op is not None and self._burst_op.bursting:
+            if of_burst and self._burst_op is not None and self._burst_op.bursting:
                 self.stats.incoherent += 1
             else:
                 self._on_unknown(reply, now)
-        elif req_opcode != request.opcode:
+        elif reply.req_opcode != request.opcode:
             self._on_stale(request)
-        elif opcode == _ACK and offset == request.offset and session == request.session:
-            self._believe(request, reply, now)
         elif not request.fits(reply, self.traits):
             self.stats.incoherent += 1
         elif reply.opcode != _NAK or not self._asks_again(request, reply):
-            self._believe(request, reply, now)
+            if not self._ledger.settle(request, reply.seq):
+                self.stats.spurious += 1
+                self.flow.on_spurious()
+            self._on_answers(request, 1, now)
+            op = request.op
+            op.on_reply(request, reply, now)
+            if op.done:
+                self._drop(op)
 
     def receive_run(self, wires: Sequence[bytes], now: float) -> int:
         """Take replies of 251 bytes that came together as `receive` does; return how many were malformed."""
@@ -203,16 +208,6 @@ class Engine:
                     malformed += 1
             at += len(run) or 1
         return malformed
-
-    def _believe(self, request: Request, reply: Payload, now: float) -> None:
-        if not self._ledger.settle(request, reply.seq):
-            self.stats.spurious += 1
-            self.flow.on_spurious()
-        self._on_answers(request, 1, now)
-        op = request.op
-        op.on_reply(request, reply, now)
-        if op.done:
-            self._drop(op)
 
     def _on_answers(self, newest: Request, count: int, now: float) -> None:
         """Requests of one operation that went out together were answered; newest: the last of them."""

@@ -140,28 +140,24 @@ class ReadTransfer(Operation):
 
     def on_reply(self, request: Request, reply: Payload, now: float) -> None:
         """Place a chunk, or find out what a refusal means."""
-        del self._unanswered[request]
-        if reply.opcode == _NAK:
-            self._on_nak(request, nak_of(request, reply))
+        if reply.opcode != _NAK:
+            self.on_run([(request, reply.data)], now)
             return
-        self.chunks.on_answered(request.size, int(request.sends == 1), request.sent_at, now)
-        data = reply.data
-        count = len(data)
-        if count != request.size:
-            data = data[: request.size]
-            count = len(data)
-            if count < request.size:
-                self._on_short(request, count)
-        if count:
-            self.received_bytes += count
-            self._sink.on_data(request.offset, data)
+        del self._unanswered[request]
+        self._demand.add(request.offset, request.offset + request.size)
+        nak = nak_of(request, reply)
+        error = self._meaning(request, nak)
+        if error is not nak or self._errors >= _ERRORS_TOLERATED:
+            self.fail(error)
+        else:
+            self._errors += 1
 
     def on_run(self, run: Run, now: float) -> None:
         """Place chunks, those in a row together."""
-        unanswered = self._unanswered
-        self.chunks.on_answered(run[0][0].size, len(run), run[0][0].sent_at, now)
+        unanswered, first = self._unanswered, run[0][0]
+        self.chunks.on_answered(first.size, len(run) if first.sends == 1 else 0, first.sent_at, now)
         pieces: list[bytes] = []
-        start = stop = run[0][0].offset
+        start = stop = first.offset
         for request, data in run:
             offset, size = request.offset, request.size
             del unanswered[request]
@@ -189,14 +185,6 @@ class ReadTransfer(Operation):
         self._demand.add(start, request.offset + request.size)
         if count == 0:
             self.fail(FileChanged(f"the file ends at {start}, before its size of {self.size}"))
-
-    def _on_nak(self, request: Request, nak: FtpNak) -> None:
-        self._demand.add(request.offset, request.offset + request.size)
-        error = self._meaning(request, nak)
-        if error is not nak or self._errors >= _ERRORS_TOLERATED:
-            self.fail(error)
-        else:
-            self._errors += 1
 
     def _meaning(self, request: Request, nak: FtpNak) -> MavftpfsError:
         """Return what a refused ReadFile within the size means (servers.md 1, 7, 12)."""

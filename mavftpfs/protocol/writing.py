@@ -208,26 +208,18 @@ class WriteTransfer(Operation):
             self.failed_at = request.offset
             self.fail(self._meaning(nak_of(request, reply)))
             return
-        del self._unanswered[request]
-        self.chunks.on_answered(request.size, int(request.sends == 1), request.sent_at, now)
-        if reply.offset and reply.offset == request.offset:
-            self.port.traits.write_ack_offset = True
-        count = request.size
-        if reply.data != self._usual or count != self.chunks.most:
-            count = self._written(request, reply.data)
-        if count:
-            self._barren = 0
-            self.acked_bytes += count
-            self._source.on_acked(request.offset, count)
-        if count < request.size:
-            self._on_short(request, count)
+        self._take([(request, reply.data)], now, placed=reply.offset == request.offset)
 
     def on_run(self, run: Run, now: float) -> None:
         """Tell the source what was written, in a row at once."""
+        self._take(run, now, placed=True)  # a run's answers have the offsets of their requests
+
+    def _take(self, run: Run, now: float, *, placed: bool) -> None:
         unanswered, usual, full = self._unanswered, self._usual, self.chunks.most
-        start = stop = run[0][0].offset
-        self.chunks.on_answered(run[0][0].size, len(run), run[0][0].sent_at, now)
-        if run[-1][0].offset:  # a run's answers have the offsets of their requests
+        first = run[0][0]
+        start = stop = first.offset
+        self.chunks.on_answered(first.size, len(run) if first.sends == 1 else 0, first.sent_at, now)
+        if placed and run[-1][0].offset:
             self.port.traits.write_ack_offset = True
         for request, data in run:
             offset, count = request.offset, request.size
