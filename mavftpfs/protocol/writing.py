@@ -77,7 +77,7 @@ class WriteTransfer(Operation):
 
     Attributes:
         acked_bytes: written so far. failed_at: offset of the request that was refused, if that ended it.
-        trailing: see `repeat_nothing`.
+        trailing: see `repeat_nothing`. paused: send nothing new; what is on its way is still waited for.
 
     Fails with SessionLost (from the FtpNak that showed it), FtpNak or RequestTimeout; what was not ACKed was
     then given back by on_unsent, ascending.
@@ -107,7 +107,7 @@ class WriteTransfer(Operation):
         self._on_starved = on_starved
         self._rest: deque[tuple[int, bytes]] = deque()
         self._unanswered: dict[Request, None] = {}
-        self._paused = False
+        self.paused = False
         self.trailing = False
         self._starved = False
         self._barren = 0
@@ -119,17 +119,9 @@ class WriteTransfer(Operation):
         """The source has more."""
         self._starved = False
 
-    def pause(self) -> None:
-        """Send nothing new; what is on its way is still waited for."""
-        self._paused = True
-
-    def resume(self) -> None:
-        """Go on."""
-        self._paused = False
-
     def repeat_nothing(self) -> None:
         """The file is closed behind what is on its way: what of it is lost stays so until `stop`."""
-        self._paused = self.trailing = True
+        self.paused = self.trailing = True
         for request in self._unanswered:
             request.manner = LAST_WRITE_MANNER
 
@@ -157,7 +149,7 @@ class WriteTransfer(Operation):
     @property
     def idle(self) -> bool:
         """Whether nothing is wanted of the server."""
-        return not self._unanswered and (self._paused or (self._starved and not self._rest))
+        return not self._unanswered and (self.paused or (self._starved and not self._rest))
 
     # --- requests
 
@@ -165,7 +157,7 @@ class WriteTransfer(Operation):
         """Return WriteFile requests for bytes in a row."""
         if self._in_flight is not None:
             most = min(most, self._in_flight - len(self._unanswered))
-        if self._paused or most <= 0:
+        if self.paused or most <= 0:
             return []
         session = self.session
         chunk = self.chunks.next_size(now)

@@ -318,14 +318,14 @@ class Uploading:
             if self._is_stalled(transfer):
                 stop = Stop.DOUBT
             if stop is not None:
-                transfer.pause()
+                transfer.paused = True
                 if transfer.drained or stop in _ABRUPT or self._trails(upload, stop, transfer):
                     upload.endings += 1
                     return stop
             elif self.path_gate.wanted:
                 await self._let_paths_in(upload, transfer)
             else:
-                transfer.resume()
+                transfer.paused = False
             self._driver.kick()
             self._queue.expire_waiters()
             pressed = transfer.starved and self._queue.rival_use(upload) is not None
@@ -410,11 +410,11 @@ class Uploading:
 
     async def _let_paths_in(self, upload: Upload, transfer: WriteTransfer) -> None:
         """Drain, let path operations pass, arm again, go on."""
-        transfer.pause()
+        transfer.paused = True
         if transfer.drained:
             await self.path_gate.let_in(max(_TURN, 4.0 * (self._engine.rtt or 0.0)))
             await self._rearm(upload.path)
-            transfer.resume()
+            transfer.paused = False
 
     async def _rearm(self, path: bytes) -> None:
         """List the storage's root, whose trailing slash fits PX4's whitelist; also clears a sticky errno.

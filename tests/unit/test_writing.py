@@ -166,7 +166,7 @@ def test_pause_drains_and_resume_goes_on() -> None:
     engine = make()
     transfer, _ = writing(engine, in_flight=4)
     requests = sent(engine, 0.0)
-    transfer.pause()
+    transfer.paused = True
     for one in requests:
         assert not transfer.drained
         engine.receive(ack(one), 0.1)
@@ -174,7 +174,7 @@ def test_pause_drains_and_resume_goes_on() -> None:
     assert transfer.idle
     assert sent(engine, 0.1) == []
     assert engine.next_deadline() is None
-    transfer.resume()
+    transfer.paused = False
     assert len(sent(engine, 40.0)) == 3
     engine.on_deadline(45.0)
     assert not transfer.done  # the pause was no silence
@@ -199,7 +199,7 @@ def test_what_waits_to_be_repeated_is_not_all_out() -> None:
     engine = make()
     transfer, _ = writing(engine, in_flight=4)
     requests = sent(engine, 0.0)
-    transfer.pause()
+    transfer.paused = True
     assert transfer.all_out
     engine.receive(ack(requests[3]), 0.1)
     assert not transfer.all_out
