@@ -81,20 +81,6 @@ async def test_what_can_only_go_at_the_close_holds_nobody_back(
     nursery.cancel_scope.cancel()
 
 
-async def test_a_file_that_was_removed_while_its_upload_began_is_forgotten(
-    autojump_clock: object, store: FakeWriter, tree: Tree
-) -> None:
-    store.traits.rename_works = True
-    file = await tree.open(FILE, write=True, truncate=True)
-    await file.write(0, bytes(80 * KIB))
-    async with trio.open_nursery() as nursery:
-        nursery.start_soon(file.release)
-        nursery.start_soon(tree.unlink, FILE)
-    await trio.sleep(1)
-    assert list(tree._writing._context.nodes) == []
-    assert tree.status()["bytes_held"] == 0
-
-
 # --- redelivery
 
 
@@ -116,20 +102,6 @@ async def test_what_a_close_did_not_deliver_is_delivered_without_news(
     assert tree.undelivered() == []
     assert store.files[NEW].data == b"content"
     assert list(tree._writing._context.nodes) == []
-
-
-async def test_a_close_that_was_given_up_is_made_good(
-    autojump_clock: object, store: FakeWriter, tree: Tree
-) -> None:
-    """Whoever waits for it is cancelled: no error tells of it."""
-    store.write_delay = 1.0
-    file = await tree.create(NEW, exclusive=True)
-    await file.write(0, b"content")
-    with trio.move_on_after(0.5):
-        await file.release()
-    await trio.sleep(20)
-    assert tree.undelivered() == []
-    assert store.files[NEW].data == b"content"
 
 
 async def test_attempts_grow_seldom_and_go_on(autojump_clock: object, store: FakeWriter, tree: Tree) -> None:

@@ -14,7 +14,7 @@ import trio
 from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.tree import Tree
 from mavftpfs.protocol.payload import NakCode, Opcode
-from mavftpfs.shared.errors import AlreadyExists, FtpNak, MavftpfsError, NotFound, RequestTimeout
+from mavftpfs.shared.errors import FtpNak, MavftpfsError, RequestTimeout
 from mavftpfs.shared.model import Listing, split
 from tests.support.deliveries import in_the_middle
 from tests.support.fake_writer import CHUNK, KINDS, FakeWriter, Kind, litter, make_writable
@@ -73,37 +73,6 @@ async def test_a_name_that_stays_gets_its_file(
     await file.release()
     await tree.list(split(path)[0])
     assert litter(store) == []
-
-
-async def test_a_rename_that_may_not_replace_stops_nothing(autojump_clock: object, store: FakeWriter) -> None:
-    tree = make_writable(store)
-    file = await begun(tree, store, NEW)
-    async with in_the_middle(file):
-        with pytest.raises(AlreadyExists):
-            await tree.rename(OTHER, NEW, noreplace=True)
-    assert len(store.uploads) == 1
-    assert store.files[NEW].data == DATA
-    await file.release()
-
-
-async def test_a_file_that_is_being_renamed_can_be_removed(autojump_clock: object, store: FakeWriter) -> None:
-    """Whoever is first at the vehicle: the file is gone, by this name and by the other."""
-    tree = make_writable(store)
-    file = await begun(tree, store, NEW)
-    async with trio.open_nursery() as both:
-
-        async def rename() -> None:
-            with pytest.raises(NotFound):
-                await tree.rename(NEW, b"/card/dir/newer")
-
-        both.start_soon(rename)
-        await trio.sleep(1.05)
-        before = trio.current_time()
-        await tree.unlink(NEW)
-        assert trio.current_time() - before < 1.0
-    assert set(store.files) == {FILE, OTHER}
-    assert bytes(await file.read(0, len(DATA))) == DATA
-    await file.release()
 
 
 # --- at any moment

@@ -249,22 +249,6 @@ async def test_a_full_card_leaves_the_old_file(autojump_clock: object, store: Fa
     assert FILE not in store.files
 
 
-@pytest.mark.holds("promise 3")
-async def test_a_background_failure_that_a_retry_repaired_is_not_told(
-    autojump_clock: object, store: FakeWriter
-) -> None:
-    tree = make_writable(store)
-    store.fail_at[3] = RequestTimeout("once")
-    data = NEW * 200
-    file = await tree.create(b"/card/new", exclusive=True)
-    await file.write(0, data)
-    await trio.sleep(1)
-    assert store.fail_at == {}
-    await file.flush()
-    await file.release()
-    assert store.files[b"/card/new"].data == data
-
-
 async def test_bytes_travel_while_the_program_still_writes(autojump_clock: object, store: FakeWriter) -> None:
     tree = make_writable(store)
     file = await tree.create(b"/card/new", exclusive=True)
@@ -352,23 +336,6 @@ async def test_when_armed_ok_writes_on(store: FakeWriter) -> None:
 
 
 # --- the end of a mount
-
-
-async def test_what_a_close_did_not_confirm_outlives_the_process(store: FakeWriter, tmp_path: Path) -> None:
-    spool = SpoolDirectory(tmp_path / "spool", Random(1))
-    tree = make_writable(store, spool=spool)
-    file = await tree.create(b"/card/new", exclusive=True)
-    await file.write(0, NEW)
-    store.lost = True
-    with pytest.raises(VehicleLost):
-        await file.release()
-    spool.close()  # kill -9
-    again = SpoolDirectory(tmp_path / "spool", Random(2))
-    (saved,) = again.rescue(tmp_path / "recovered")
-    assert saved.read_bytes() == NEW
-    facts = json.loads(saved.with_name(saved.name + ".json").read_text())
-    assert (facts["path"], facts["size"], facts["whole"]) == ("/card/new", len(NEW), True)
-    again.close()
 
 
 async def test_what_is_still_open_when_the_mount_ends_is_not_kept(store: FakeWriter, tmp_path: Path) -> None:

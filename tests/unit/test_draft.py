@@ -11,7 +11,7 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, pr
 
 from mavftpfs.cache.draft import AHEAD, TRANSITIONS, Base, Draft, Event, Sending, State, Where
 from mavftpfs.cache.spool import Spool, SpoolContent
-from mavftpfs.shared.errors import LocalProtocolError, SpoolFailed
+from mavftpfs.shared.errors import LocalProtocolError
 
 SPOOL = Spool(memory_max=lambda: 1 << 40, spool_max=0)
 
@@ -65,22 +65,6 @@ def test_what_the_table_does_not_know_cannot_happen(state: State, event: Event) 
         assert draft.state is state
 
 
-def test_the_life_of_a_new_file() -> None:
-    draft = draft_over(None)
-    assert draft.undelivered, "also if it is empty"
-    sending = draft.begin(in_place=False)
-    draft.write(0, b"abc")
-    assert sent(sending) == [(0, b"abc")]
-    draft.commit()
-    with pytest.raises(LocalProtocolError):
-        draft.write(0, b"x")  # writers wait
-    draft.delivered()
-    assert not draft.undelivered
-    assert draft.base == Base(3)
-    draft.write(1, b"X")
-    assert draft.state is State.DIRTY
-
-
 def test_an_interrupted_commit_is_torn_and_no_base_counts_any_more() -> None:
     draft = draft_over(b"old")
     draft.fill(0, b"old")
@@ -111,29 +95,7 @@ def test_a_base_that_others_replaced() -> None:
     assert cut.state is State.DIRTY
 
 
-def test_an_attempt_that_is_given_up_leaves_it_dirty() -> None:
-    draft, _ = sending_of(b"abc")
-    draft.give_up()
-    draft.give_up()
-    assert draft.state is State.DIRTY
-    assert sent(draft.begin(in_place=True)) == [(0, b"abc")]
-    assert draft.begun
-
-
 # --- content
-
-
-def test_a_cut_that_fails_changes_nothing() -> None:
-    class Failing(SpoolContent):
-        def cut(self, size: int) -> None:
-            raise SpoolFailed("bad sector")
-
-    draft = Draft(Failing(SPOOL), None)
-    draft.write(0, b"abcdef")
-    with pytest.raises(SpoolFailed):
-        draft.truncate(2)
-    assert content(draft, b"") == b"abcdef"
-    assert sent(draft.begin(in_place=False)) == [(0, b"abcdef")]
 
 
 # --- sending

@@ -13,7 +13,7 @@ import trio
 
 from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.tree import Tree
-from mavftpfs.shared.errors import Armed, FileBusy, LinkError, OutcomeUnknown, RequestTimeout
+from mavftpfs.shared.errors import FileBusy, LinkError, OutcomeUnknown, RequestTimeout
 from tests.support.fake_writer import KINDS, FakeWriter, litter, make_writable
 
 FOLDER = b"/card/dir"
@@ -65,30 +65,6 @@ async def by_opening(tree: Tree, path: bytes, file: OpenFile) -> OpenFile:
     return await tree.open(path, write=True, truncate=True)
 
 
-async def test_an_error_is_that_of_what_the_file_is_now(autojump_clock: object, store: FakeWriter) -> None:
-    tree = writable(store)
-    file = await begun(tree, store, FILE)
-    async with trio.open_nursery() as waiting:
-
-        async def fsync() -> None:
-            with pytest.raises(RequestTimeout):
-                await file.fsync()
-
-        waiting.start_soon(fsync)
-        await trio.sleep(1.05)
-        other = await by_opening(tree, FILE, file)
-        store.before_request = refuse
-    store.before_request = None
-    assert tree.undelivered() == [FILE]
-    await other.release()
-    assert store.files[FILE].data == b""
-    await file.release()
-
-
-def refuse(*_: object) -> None:
-    raise OutcomeUnknown("no answer")
-
-
 async def test_emptying_waits_for_no_room(autojump_clock: object, store: FakeWriter) -> None:
     """Who writes too fast has to wait; who empties the file makes room, also for the other."""
     tree = make_writable(store, inplace=True, dirty_max=64 * 1024)
@@ -111,25 +87,6 @@ async def test_emptying_waits_for_no_room(autojump_clock: object, store: FakeWri
     assert store.files[NEW].data == SHORT
 
 
-async def test_a_rename_of_an_emptied_file_goes_on(autojump_clock: object, store: FakeWriter) -> None:
-    """It delivers the file first: what it is by now."""
-    if not store.kind.renames:
-        return
-    tree = writable(store)
-    file = await begun(tree, store, NEW)
-    async with trio.open_nursery() as waiting:
-        waiting.start_soon(tree.rename, NEW, FILE)
-        await trio.sleep(1.05)
-        before = trio.current_time()
-        await file.truncate(0)
-        assert trio.current_time() - before < PROMPT
-    assert store.files[FILE].data == b""
-    await file.write(0, SHORT)
-    await file.release()
-    assert store.files[FILE].data == SHORT
-    assert await left(tree, store) == {FILE}
-
-
 async def test_emptying_does_not_wait_for_ever(autojump_clock: object, nursery: trio.Nursery) -> None:
     """The renames of a replacement are not called off; they may last longer than a call may."""
     store = FakeWriter(KINDS["posix"], nursery)
@@ -148,17 +105,6 @@ async def test_emptying_does_not_wait_for_ever(autojump_clock: object, nursery: 
     assert store.files[FILE].data == DATA
     await file.release()
     nursery.cancel_scope.cancel()
-
-
-async def test_nothing_is_emptied_in_flight(autojump_clock: object, store: FakeWriter) -> None:
-    tree = writable(store)
-    file = await begun(tree, store, FILE)
-    tree.armed_changed(True)
-    with pytest.raises(Armed):
-        await file.truncate(0)
-    tree.armed_changed(False)
-    await file.release()
-    assert store.files[FILE].data == DATA
 
 
 @pytest.mark.parametrize("nth", [1, 2, 3])

@@ -143,26 +143,6 @@ async def test_the_log_says_once_that_the_full_disk_is_the_one_here(
     assert len(caplog.messages) == 1, "there was room meanwhile, so it is news"
 
 
-async def test_a_disk_without_room_for_what_was_in_memory_is_said_once(
-    store: FakeWriter, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    tree = make_writable(store, dirty_max=65536)
-    file = await begin(tree, store, b"in memory")
-
-    def full(*_: object) -> int:
-        raise OSError(errno.ENOSPC, "full")
-
-    with monkeypatch.context() as patch:
-        patch.setattr(os, "pwrite", full)
-        for _ in range(3):
-            with pytest.raises(NoSpace):
-                await file.write(65536, b"one more page")
-    assert len(caplog.messages) == 1
-    store.lost = False
-    await file.release()
-    assert store.files[FILE].data == b"in memory"
-
-
 # --- a process that is killed
 
 
@@ -189,12 +169,6 @@ async def written(store: FakeWriter, spool: SpoolDirectory) -> tuple[Tree, OpenF
     file = await tree.create(FILE, exclusive=True)
     await file.write(0, BIG)
     return tree, file
-
-
-async def test_killed_before_any_close(store: FakeWriter, spool: SpoolDirectory, tmp_path: Path) -> None:
-    tree = make_writable(store, spool=spool, dirty_max=65536)
-    await begin(tree, store)
-    assert await killed(tree, spool, tmp_path) == {"card__log.bin": ("/card/log.bin", BIG)}
 
 
 async def test_killed_after_a_rename(store: FakeWriter, spool: SpoolDirectory, tmp_path: Path) -> None:

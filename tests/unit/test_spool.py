@@ -361,26 +361,6 @@ def test_a_disk_that_fails_is_an_error_of_its_own(tmp_path: Path, monkeypatch: p
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_disk_that_is_full_leaves_what_was_kept_before(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    content = SpoolContent(spool_of(tmp_path, memory=0), lambda: "/f")
-    content.put(0, b"abcdef")
-    really = os.pwrite
-
-    def pwrite(descriptor: int, piece: bytes, offset: int) -> int:
-        if offset >= 6:
-            raise OSError(errno.ENOSPC, "full")
-        return really(descriptor, piece[: 6 - offset], offset)
-
-    monkeypatch.setattr(os, "pwrite", pwrite)
-    with pytest.raises(NoSpace):
-        content.put(3, b"new and longer")
-    assert content.get(0, 6) == b"abcdef"
-    content.put(3, b"DEF")
-    assert content.get(0, 6) == b"abcDEF"
-
-
 def test_a_name_that_cannot_be_written_down_is_no_space_and_nothing_stays(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

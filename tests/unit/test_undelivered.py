@@ -180,18 +180,6 @@ async def test_one_file_that_cannot_be_read_does_not_keep_the_others_from_being_
     spool.close()
 
 
-async def test_when_nothing_can_be_saved_that_is_said(
-    autojump_clock: object, store: FakeWriter, tmp_path: Path
-) -> None:
-    tree, spool = await two_on_disk(store, tmp_path)
-    for path in spool.path.glob("*.data"):
-        os.truncate(path, 10)
-    message = keep_the_rest(tree, lambda: tmp_path / "kept")
-    assert message.startswith("2 file(s) did not reach the vehicle")
-    assert "lost bytes" in message
-    spool.close()
-
-
 # --- a local disk that fails as the vehicle does
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Awaitable, Callable
-from typing import Any
 
 import pytest
 import trio
@@ -11,8 +10,8 @@ import trio
 from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.tree import Tree
 from mavftpfs.protocol.payload import NakCode, Opcode
-from mavftpfs.shared.errors import FtpNak, NotFound, NotSupported, RequestTimeout
-from tests.support.fake_writer import KINDS, FakeUpload, FakeWriter, make_writable, write_file
+from mavftpfs.shared.errors import FtpNak, NotFound, NotSupported
+from tests.support.fake_writer import KINDS, FakeWriter, make_writable, write_file
 
 FILE = b"/d/file"
 
@@ -147,68 +146,6 @@ async def test_a_file_is_opened_before_or_after_its_name_is_changed(
         assert store.crimes == []
 
 
-@pytest.mark.parametrize("kind", sorted(set(KINDS) - {"littlefs"}))
-async def test_a_file_is_made_before_or_after_another_gets_its_name(
-    nursery: trio.Nursery, autojump_clock: object, kind: str
-) -> None:
-    """Not meanwhile: it would be two files of one name, and the program's could never be delivered."""
-    for later in range(14):
-        store = FakeWriter(KINDS[kind], nursery)
-        store.add(OTHER, NEW)
-        tree = make_writable(store)
-        await tree.list(b"/d")
-        store.write_delay = store.list_delay = 0.1
-        async with trio.open_nursery() as both:
-            both.start_soon(tree.rename, OTHER, FILE)
-            await trio.sleep(later * 0.05)
-            file = await tree.create(FILE, exclusive=False)
-            await file.write(0, b"mid")
-            await file.release()
-        assert tree.undelivered() == []
-        ((path, left),) = store.files.items()
-        assert path == FILE
-        assert left.data in (NEW, b"mid" + NEW[3:])
-        assert store.crimes == []
-
-
-class SlowEnd(FakeWriter):
-    """Its uploads end slowly, as over a link that is silent."""
-
-    async def open_upload(self, *args: Any, **options: Any) -> FakeUpload:
-        upload = await super().open_upload(*args, **options)
-        abort = upload.abort
-
-        async def slow() -> None:
-            await trio.sleep(1)
-            await abort()
-
-        upload.abort = slow  # type: ignore[method-assign]
-        return upload
-
-
-async def test_what_is_opened_while_a_failed_truncation_is_given_up_is_written(
-    nursery: trio.Nursery, autojump_clock: object
-) -> None:
-    store = SlowEnd(KINDS["nuttx"], nursery)
-    store.add(FILE, b"x" * 700)
-    tree = make_writable(store)
-    await tree.list(b"/d")
-
-    async def cut() -> None:
-        store.fail_at = {4: RequestTimeout("silence")}
-        with pytest.raises(RequestTimeout):
-            await tree.truncate(FILE, 300)
-
-    async with trio.open_nursery() as both:
-        both.start_soon(cut)
-        await trio.sleep(0.5)
-        file = await tree.open(FILE, write=True)
-        await file.write(100, b"y")
-    await file.write(101, b"z")
-    await file.release()
-    assert store.files[FILE].data == b"x" * 100 + b"yz" + b"x" * 198
-
-
 # --- reading while names change
 
 
@@ -281,59 +218,3 @@ async def test_who_opened_an_older_version_follows_the_renames_too(
     for file in (first, last):
         assert bytes(await file.read(0, 900)) == b"old" * 300
         await file.release()
-
-
-# --- a caller that gives up
-
-
-class Afterwards(FakeWriter):
-    """Something happens when a change was made, before that is told."""
-
-    async def afterwards(self) -> None:
-        raise NotImplementedError
-
-    async def remove(self, path: bytes) -> None:  # type: ignore[override]
-        await super().remove(path)
-        await self.afterwards()
-
-    async def make_directory(self, path: bytes) -> None:
-        await super().make_directory(path)
-        await self.afterwards()
-
-    async def rename(self, old: bytes, new: bytes, *, completes: bool = False) -> None:
-        await super().rename(old, new, completes=completes)
-        await self.afterwards()
-
-
-class SlowAnswers(Afterwards):
-    """Does what it is asked at once, and says so late."""
-
-    async def afterwards(self) -> None:
-        await trio.sleep(1)
-
-
-CHANGES = {
-    "unlink": lambda tree: tree.unlink(FILE),
-    "mkdir": lambda tree: tree.mkdir(b"/d/made"),
-    "rename": lambda tree: tree.rename(FILE, b"/d/moved"),
-}
-
-
-def names_there(store: FakeWriter) -> set[bytes]:
-    return {path for path in (*store.files, *store.directories) if path.startswith(b"/d/")}
-
-
-@pytest.mark.parametrize("change", sorted(CHANGES))
-async def test_what_became_of_a_change_that_was_given_up_is_looked_up(
-    nursery: trio.Nursery, autojump_clock: object, change: str
-) -> None:
-    store = SlowAnswers(KINDS["posix"], nursery)
-    store.add(FILE, b"x")
-    tree = make_writable(store)
-    await tree.list(b"/d")
-    with trio.move_on_after(0.5) as scope:
-        await CHANGES[change](tree)
-    assert scope.cancelled_caught
-    there = names_there(store)
-    assert there == {"unlink": set(), "mkdir": {FILE, b"/d/made"}, "rename": {b"/d/moved"}}[change]
-    assert {b"/d/" + name for name, _ in await tree.list(b"/d")} == there

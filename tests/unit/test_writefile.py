@@ -13,13 +13,12 @@ from mavftpfs.shared.errors import (
     FileTooLarge,
     IsADirectory,
     LocalProtocolError,
-    NoSpace,
     NotADirectory,
     NotFound,
     NotSupported,
     ReadOnly,
 )
-from mavftpfs.shared.model import EntryKind, split
+from mavftpfs.shared.model import split
 from tests.support.fake_store import make_tree, read_file
 from tests.support.fake_writer import FakeWriter, card, make_writable, write_file
 
@@ -71,20 +70,6 @@ async def test_creating(store: FakeWriter, tree: Tree) -> None:
     assert store.requests == 0
 
 
-async def test_a_new_file_is_seen_before_it_is_delivered(store: FakeWriter, tree: Tree) -> None:
-    file = await tree.create(b"/card/new", exclusive=True)
-    await file.write(0, b"123")
-    assert dict(await tree.list(b"/card"))[b"new"].size == 3
-    assert (await tree.stat(b"/card/new")).kind is EntryKind.FILE
-    with pytest.raises(AlreadyExists):
-        await tree.create(b"/card/new", exclusive=True)
-    assert await read_file(tree, b"/card/new") == b"123"
-    assert b"/card/new" not in store.files
-    await file.release()
-    tree.forget_caches()
-    assert dict(await tree.list(b"/card"))[b"new"].size == 3
-
-
 async def test_a_write_waits_while_the_file_is_being_delivered(
     autojump_clock: object, store: FakeWriter, tree: Tree
 ) -> None:
@@ -125,16 +110,6 @@ async def test_no_file_is_larger_than_the_protocol_can_say(tree: Tree) -> None:
     with pytest.raises(FileTooLarge):
         await file.truncate(2**32)
     await file.release()
-
-
-async def test_a_full_spool_refuses_and_keeps_what_it_took(store: FakeWriter) -> None:
-    tree = make_writable(store, dirty_max=65536, spool_max=200_000)
-    file = await tree.create(b"/card/dir/new", exclusive=True)
-    await file.write(0, bytes(60_000))
-    with pytest.raises(NoSpace):
-        await file.write(100_000, bytes(200_000))
-    await file.release()
-    assert store.files[b"/card/dir/new"].data == bytes(60_000)
 
 
 async def test_read_only_and_virtual_trees_refuse_changes(store: FakeWriter) -> None:
