@@ -42,7 +42,7 @@ from mavftpfs.shared.errors import (
     VehicleLost,
 )
 from mavftpfs.shared.model import ROOT
-from mavftpfs.trace import JsonTrace, Tee, TextTrace, TlogWriter
+from mavftpfs.trace import JsonTrace, Sink, Tee, TextTrace, TlogWriter
 
 MIB = 1 << 20
 KEY_SIZE = 32
@@ -89,13 +89,13 @@ def open_sinks(options: MountOptions, *, debug: bool) -> Iterator[Sinks]:
         UsageError: a file cannot be created.
     """
     with ExitStack() as stack:
-        payload: list[PayloadTrace] = []
+        payload: list[Sink] = []
         if debug:
             payload.append(TextTrace(lambda line: print(line, file=sys.stderr)))
         if options.trace is not None:
             payload.append(stack.enter_context(JsonTrace(options.trace)))
         tlog = None if options.tlog is None else stack.enter_context(TlogWriter(options.tlog))
-        yield Sinks(Tee(payload) if payload else None, None if tlog is None else tlog.frame)
+        yield Sinks(Tee(payload).payload if payload else None, None if tlog is None else tlog.frame)
 
 
 @asynccontextmanager

@@ -5,7 +5,7 @@ nothing is computed. A sink that cannot write any more (disk full) says so once 
 never break what it watches.
 
 JSON lines: {"t", "time", "dir", "seq", "session", "opcode", "size", "offset", "data"}, in replies also
-"req_opcode" and "burst_complete", and "note" if there is one (retransmit, dup, stale, dropped); opcodes by
+"req_opcode" and "burst_complete", and "note" if there is one (see Remarks); opcodes by
 name, data in hex (the part that counts). "t" is in seconds of a clock that never jumps, "time" is UTC. The
 .tlog format is pymavlink's: 8 bytes big-endian microseconds since 1970, then the frame.
 """
@@ -17,15 +17,15 @@ import logging
 import os
 import struct
 import time
+from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from types import TracebackType
-from typing import BinaryIO, Self
+from typing import BinaryIO, Protocol, Self
 
 from mavftpfs.protocol.payload import HEADER_SIZE, PAYLOAD_SIZE, NakCode, Opcode, Payload, decode_request
-from mavftpfs.session.driver import PayloadTrace
 from mavftpfs.shared.errors import UsageError
 from mavftpfs.shared.private import open_private
 
@@ -33,6 +33,7 @@ REPLY = "reply"
 
 _FLUSH_PERIOD = 1.0
 _TEXT_DATA = 16
+_REMEMBERED = 1024
 _OPCODES = {opcode.value: opcode.name for opcode in Opcode}
 _NAK_CODES = {code.value: code.name for code in NakCode}
 _timestamp = struct.Struct(">Q").pack
@@ -111,7 +112,7 @@ class JsonTrace(_File):
         self._wall_clock = wall_clock
 
     def payload(self, now: float, direction: str, wire: bytes, note: str = "") -> None:
-        """See PayloadTrace."""
+        """See Sink."""
         record = describe(direction, wire, data_limit=self._data_limit)
         if note:
             record["note"] = note
@@ -150,21 +151,65 @@ class TextTrace:
         self._wall_clock = wall_clock
 
     def payload(self, now: float, direction: str, wire: bytes, note: str = "") -> None:
-        """See PayloadTrace."""
+        """See Sink."""
         time_of_day = datetime.fromtimestamp(self._wall_clock()).strftime("%H:%M:%S.%f")
         self._write(f"{time_of_day} {text_line(direction, wire)}{f' ({note})' if note else ''}")
 
 
-class Tee:
-    """Hands each payload to several sinks."""
-
-    def __init__(self, sinks: Sequence[PayloadTrace]) -> None:
-        self._sinks = tuple(sinks)
+class Sink(Protocol):
+    """Takes payloads with what is to be said of them."""
 
     def payload(self, now: float, direction: str, wire: bytes, note: str = "") -> None:
+        """Record a payload; note: see Remarks."""
+        ...
+
+
+class Tee:
+    """Hands each payload to several sinks, with a remark."""
+
+    def __init__(self, sinks: Sequence[Sink]) -> None:
+        self._sinks = tuple(sinks)
+        self._remarks = Remarks()
+
+    def payload(self, now: float, direction: str, wire: bytes) -> None:
         """See PayloadTrace."""
+        note = self._remarks.of(direction, wire)
         for sink in self._sinks:
             sink.payload(now, direction, wire, note)
+
+
+class Remarks:
+    """What is said of a payload beside its bytes, by what went over the link before."""
+
+    def __init__(self) -> None:
+        self._unanswered: OrderedDict[bytes, int] = OrderedDict()  # seq by all else of a request
+
+    def of(self, direction: str, wire: bytes) -> str:
+        """Return "" for a new request or an answer to one; else "retransmit", or what is wrong with the
+        answer."""
+        if len(wire) != PAYLOAD_SIZE:
+            return "malformed"
+        payload = decode_request(wire)
+        if direction != REPLY:
+            what = wire[2:5] + wire[8:]
+            earlier = self._unanswered.get(what)
+            self._unanswered[what] = payload.seq
+            if len(self._unanswered) > _REMEMBERED:
+                self._unanswered.popitem(last=False)
+            if earlier is None:
+                return ""
+            return "retransmit" if earlier == payload.seq else f"retransmit of {earlier}"
+        asked = (payload.seq - 1) & 0xFFFF
+        answered = [what for what, seq in self._unanswered.items() if seq == asked]
+        if payload.req_opcode == Opcode.BURST_READ_FILE:
+            return ""  # each request has many answers
+        if not answered:
+            return "late, duplicate or not ours"
+        if answered[0][1] != payload.req_opcode:
+            return "stale replay"
+        for what in answered:
+            del self._unanswered[what]
+        return ""
 
 
 def describe(direction: str, wire: bytes, *, data_limit: int | None = None) -> dict[str, str | int]:

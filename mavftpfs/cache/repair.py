@@ -25,9 +25,9 @@ from mavftpfs.cache.context import Context
 from mavftpfs.cache.directories import Directory
 from mavftpfs.cache.names import Names
 from mavftpfs.cache.nodes import Node
-from mavftpfs.cache.reserved import MAX_NAME, RENAME_ROOM, Kind, is_reserved, parse
+from mavftpfs.cache.reserved import MAX_NAME, Kind, is_reserved, parse
 from mavftpfs.shared.errors import MavftpfsError, NotADirectory, NotFound
-from mavftpfs.shared.model import MAX_WIRE_PATH, DirEntry, EntryKind, join, split
+from mavftpfs.shared.model import MAX_WIRE_PATH, RENAME_ROOM, DirEntry, EntryKind, join, split
 
 log = logging.getLogger("mavftpfs.cache")
 

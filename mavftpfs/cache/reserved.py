@@ -21,12 +21,9 @@ from enum import Enum
 from random import Random
 
 from mavftpfs.shared.errors import NotSupported, PathTooLong
-from mavftpfs.shared.model import MAX_WIRE_PATH, join, split, wire_path
+from mavftpfs.shared.model import MAX_WIRE_PATH, RENAME_ROOM, join, split, wire_path
 
 PREFIX = b".mavftpfs-"
-RENAME_ROOM = 238
-"""Bytes of both paths of a rename and the NUL between them (servers.md 9)."""
-
 MAX_NAME = 255
 """Bytes of a name that every card takes."""
 

@@ -26,9 +26,9 @@ from mavftpfs.protocol.budget import FRAME_OVERHEAD, SIGNATURE, Budget
 from mavftpfs.protocol.engine import Engine
 from mavftpfs.protocol.flow import Flow
 from mavftpfs.session.driver import Driver, PayloadTrace
-from mavftpfs.session.reader import ReadMode
-from mavftpfs.session.scheduler import Scheduler
+from mavftpfs.session.scheduler import ReadMode, Scheduler
 from mavftpfs.session.store import Store
+from mavftpfs.session.uploading import Upload
 from mavftpfs.session.vehicle import Standing, Vehicle
 from mavftpfs.shared.errors import MavftpfsError, VehicleLost
 
@@ -140,7 +140,7 @@ class Connection:
             "retransmissions": stats.retransmissions,
             "lists_times": self.store.lists_times,
             "write_traits": asdict(self.store.traits),
-            "uploads": [upload.status() for upload in self.scheduler.uploads()],
+            "uploads": [user.status() for user in self.scheduler.users if isinstance(user, Upload)],
             "link": {
                 "received_bytes": self.link.stats.received_bytes,
                 "sent_bytes": self.link.stats.sent_bytes,
@@ -170,7 +170,6 @@ class Connection:
     def _on_reboot(self) -> None:
         self.engine.forget_server()
         self.scheduler.on_reboot()
-        self.store.forget_server()
         self._tell("reboot")
 
     def _on_foreign(self, payload: bytes, newcomer: bool) -> None:
@@ -178,15 +177,19 @@ class Connection:
         self.scheduler.on_foreign(payload, newcomer=newcomer)
 
     def _on_armed(self, armed: bool) -> None:
-        self.scheduler.on_armed_changed()
+        for user in list(self.scheduler.users):
+            if isinstance(
+                user, Upload
+            ):  # terminated and held while armed, and going on afterwards (promise 9)
+                user.on_armed_changed()
+        self.scheduler.server.wake()
         self._tell("armed" if armed else "disarmed")
 
     def _move_away(self) -> None:
         """Somebody else uses our address: replies could not be told apart, so take the next component id."""
         own = self.vehicle.own
-        if (
-            own.component - self.options.source_component <= 5
-        ):  # more likely our own echo than five neighbours
+        # More are more likely our own echo than neighbours.
+        if own.component - self.options.source_component <= 5:
             self.vehicle.own = self.driver.framer.source = Address(own.system, own.component % 249 + 1)
 
     def _on_doubt(self) -> None:
@@ -222,55 +225,52 @@ class Connection:
                 self._tell("lost")
 
     async def _ask_about_vehicle(self) -> None:
-        """Ask for AUTOPILOT_VERSION, STORAGE_INFORMATION and SYSTEM_TIME a few times. None is needed."""
-        vehicle, driver = self.vehicle, self.driver
+        """Ask who it is, when it started, and for its card, a few times: none of that is needed. Ask for the
+        first two again each time that it may have restarted or become another one. The boot time first:
+        nothing else is asked before the id, and then a restart is known."""
+        vehicle, driver, identity = self.vehicle, self.driver, self.vehicle.identity
         await self._first_heartbeat.wait()
-        for attempt in range(_INFO_TRIES):
-            wanted = []
+        in_doubt = False
+        while True:
+            asked, asked_at, warned = 0, -inf, False
+            while vehicle.address is not None and (wanted := self._wanted(in_doubt, asked)):
+                # It may be gone again: then, and of a stranger, it has time.
+                soon = identity.heard_since(asked_at) and identity.standing is not Standing.STRANGER
+                pause = (0.0 if soon else _SELDOM) if in_doubt else _INFO_PERIOD
+                if self.clock() - asked_at >= pause:
+                    for message_id in wanted:
+                        driver.send(driver.framer.encode_request_message(vehicle.address, message_id))
+                    if asked >= _OLD_WAY_FROM and AUTOPILOT_VERSION_ID in wanted:
+                        driver.send(driver.framer.encode_request_capabilities(vehicle.address))
+                    asked, asked_at = asked + 1, self.clock()
+                await trio.sleep(_IDENTITY_PERIOD)
+                in_doubt = in_doubt or self._doubted.is_set()
+                if identity.standing is Standing.STRANGER and not warned:
+                    warned = True
+                    log.warning(_ANOTHER, *vehicle.address)
+                elif in_doubt and identity.heard_since(asked_at):
+                    identity.unanswered()
+                    driver.kick()
+            await self._doubted.wait()
+            self._doubted = trio.Event()
+            in_doubt = True
+
+    def _wanted(self, in_doubt: bool, asked: int) -> list[int]:
+        """Return the messages to ask for; asked: how often that was done."""
+        vehicle, wanted = self.vehicle, []
+        if in_doubt:
+            lacks_time = vehicle.lacks_boot_time(self.clock())
+            unsure = vehicle.identity.standing is not Standing.TRUSTED or (lacks_time and asked < _TIME_TRIES)
+            if unsure or not asked:
+                wanted = [SYSTEM_TIME_ID, AUTOPILOT_VERSION_ID] if lacks_time else [AUTOPILOT_VERSION_ID]
+        elif asked < _INFO_TRIES:
             if vehicle.version is None:
                 wanted.append(AUTOPILOT_VERSION_ID)
             if vehicle.storage is None:
                 wanted.append(STORAGE_INFORMATION_ID)
             if not vehicle.tells_boot_time:
                 wanted.append(SYSTEM_TIME_ID)
-            self._ask_for(*wanted)
-            if not wanted:
-                return
-            if attempt >= _OLD_WAY_FROM and vehicle.version is None and vehicle.address is not None:
-                driver.send(driver.framer.encode_request_capabilities(vehicle.address))
-            await trio.sleep(_INFO_PERIOD)
-
-    def _ask_for(self, *message_ids: int) -> None:
-        driver, address = self.driver, self.vehicle.address
-        for message_id in message_ids:
-            if address is not None:
-                driver.send(driver.framer.encode_request_message(address, message_id))
-
-    async def _ask_who_it_is(self) -> None:
-        """Have the vehicle tell its boot time and its unique id each time it may have restarted or become
-        another one. The boot time first: nothing is asked before the id, and then a restart is known."""
-        vehicle, driver, identity = self.vehicle, self.driver, self.vehicle.identity
-        while True:
-            await self._doubted.wait()
-            self._doubted = trio.Event()
-            asked, asked_at, warned = 0, -inf, False
-            while vehicle.address is not None and _is_unsure(vehicle, asked, now := self.clock()):
-                # It may be gone again: then, and of a stranger, it has time.
-                soon = identity.heard_since(asked_at) and identity.standing is not Standing.STRANGER
-                if soon or now - asked_at >= _SELDOM:
-                    if vehicle.lacks_boot_time(now):
-                        self._ask_for(SYSTEM_TIME_ID)
-                    self._ask_for(AUTOPILOT_VERSION_ID)
-                    if asked >= _OLD_WAY_FROM:
-                        driver.send(driver.framer.encode_request_capabilities(vehicle.address))
-                    asked, asked_at = asked + 1, now
-                await trio.sleep(_IDENTITY_PERIOD)
-                if identity.standing is Standing.STRANGER and not warned:
-                    warned = True
-                    log.warning(_ANOTHER, *vehicle.address)
-                elif identity.heard_since(asked_at):
-                    identity.unanswered()
-                    driver.kick()
+        return wanted
 
 
 @asynccontextmanager
@@ -288,7 +288,7 @@ async def connected(
     async with trio.open_nursery() as nursery:
         serving = _Task(nursery, connection.scheduler.serve)
         tasks = [serving, _Task(nursery, connection.driver.pump), _Task(nursery, connection._beat)]
-        tasks += [_Task(nursery, connection._ask_about_vehicle), _Task(nursery, connection._ask_who_it_is)]
+        tasks.append(_Task(nursery, connection._ask_about_vehicle))
         try:
             yield connection
         except Exception as error:  # raised again outside, so that it is not wrapped in a group
@@ -350,8 +350,7 @@ def _build(
         read_mode=options.read_mode if budget is None else "window",
         chunk=options.chunk,
     )
-    store = Store(scheduler, driver, clock=clock, op_deadline=options.op_deadline)
-    connection = Connection(store, vehicle, scheduler, engine, driver, link, options, clock)
+    connection = Connection(Store(scheduler), vehicle, scheduler, engine, driver, link, options, clock)
 
     vehicle.on_reboot = connection._on_reboot
     vehicle.on_foreign = connection._on_foreign
@@ -365,9 +364,3 @@ def _build(
 def signing_now() -> int:
     """Return the present as MAVLink 2 signing counts it: units of 10 µs since 2015-01-01 UTC."""
     return int((time.time() - SIGNING_EPOCH) * 100_000)
-
-
-def _is_unsure(vehicle: Vehicle, asked: int, now: float) -> bool:
-    """Return whether there is something to ask; asked: how often that was done."""
-    lacks_time = asked < _TIME_TRIES and vehicle.lacks_boot_time(now)
-    return not asked or lacks_time or vehicle.identity.standing is not Standing.TRUSTED

@@ -8,10 +8,8 @@ and a time-out per request cost more than the rest of a chunk together).
 from __future__ import annotations
 
 import logging
-from collections import OrderedDict
 from collections.abc import Callable
 from math import inf
-from typing import Protocol
 
 import trio
 
@@ -19,11 +17,10 @@ from mavftpfs.link.addresses import AddressBook, NetAddress, readable_address
 from mavftpfs.link.base import Link
 from mavftpfs.link.framing import Framer
 from mavftpfs.link.messages import Address, FtpRun, Message, singly
-from mavftpfs.protocol.engine import Engine, EngineStats
+from mavftpfs.protocol.engine import Engine
 from mavftpfs.protocol.operations import Operation
-from mavftpfs.protocol.payload import Payload, decode_reply
 from mavftpfs.session.vehicle import Standing, Vehicle
-from mavftpfs.shared.errors import RemoteProtocolError, RequestTimeout
+from mavftpfs.shared.errors import RequestTimeout
 
 log = logging.getLogger("mavftpfs.session")
 
@@ -44,15 +41,8 @@ BACKLOG_LIMIT = 16 * 1024
 """Bytes the link may hold unsent before the engine is asked for more: nothing overtakes what waits there."""
 
 
-_REMEMBERED_REQUESTS = 1024
-
-
-class PayloadTrace(Protocol):
-    """Sees every FTP payload, both ways."""
-
-    def payload(self, now: float, direction: str, wire: bytes, note: str = "") -> None:
-        """Record 251 bytes; direction is "request" or "reply"."""
-        ...
+PayloadTrace = Callable[[float, str, bytes], None]
+"""Told of each FTP payload (251 bytes): the time, "request" or "reply", and the payload."""
 
 
 class Driver:
@@ -83,10 +73,10 @@ class Driver:
         self.on_batch: Callable[[float], None] | None = None
         self._clock = clock
         self._trace = trace
-        self._remarks = Remarks(engine.stats)
         self._addresses = AddressBook()
         self._impostor_at: float | None = None
         self._scope: trio.CancelScope | None = None
+        self._deadline = inf  # of `pump`
         self._may_send = False
         self._under_way: dict[Operation, Callable[[], None]] = {}
         self._silences = 0
@@ -97,7 +87,7 @@ class Driver:
     async def pump(self) -> None:
         """Run until cancelled or the link is closed for good (LinkClosed)."""
         while True:
-            with trio.CancelScope(deadline=self._next_deadline()) as scope:
+            with trio.CancelScope(deadline=self._deadline) as scope:
                 self._scope = scope
                 try:
                     chunks = await self.link.receive()
@@ -177,8 +167,18 @@ class Driver:
             if on_finished is not None:
                 on_finished()
                 self._changed.unpark_all()
+        due = self.engine.next_deadline()
+        deadline = inf if due is None else due
+        if self.link.backlog >= BACKLOG_LIMIT:
+            # Nobody tells us that the link drained, and before that nothing can go out.
+            deadline = now + 0.01
+        elif not self._may_send:
+            deadline = max(deadline, now + 0.05)  # nothing can go out, whatever is due
+        if self.framer.waiting:
+            deadline = min(deadline, self._heard_at + QUIET)
+        self._deadline = deadline
         if self._scope is not None:
-            self._scope.deadline = self._next_deadline()
+            self._scope.deadline = deadline
 
     def send(self, frame: bytes) -> None:
         """Send one ready frame that is not FTP (a heartbeat, a command)."""
@@ -233,22 +233,10 @@ class Driver:
             return  # what was asked is asked again once it is known who answers
         if self._trace is not None:
             for wire in wires:
-                self._on_traced_reply(wire, now, self._trace)
-            return
+                self._trace(now, "reply", wire)
         malformed = self.engine.receive_run(wires, now)
         if malformed < len(wires):
             self.last_reply_at = now
-
-    def _on_traced_reply(self, wire: bytes, now: float, trace: PayloadTrace) -> None:
-        try:
-            reply = decode_reply(wire)
-        except RemoteProtocolError:
-            trace.payload(now, "reply", wire, "malformed")
-            return
-        self.last_reply_at = now
-        self._remarks.before_reply()
-        self.engine.receive(reply, now)
-        trace.payload(now, "reply", wire, self._remarks.after_reply(reply))
 
     def _on_other(self, message: Message, now: float, sender: NetAddress | None) -> None:
         vehicle = self.vehicle
@@ -275,7 +263,10 @@ class Driver:
         if is_vehicle and sender != self.peer:
             self._pass_on(now)
             if moves:
-                self._on_moved(sender, now)
+                self._impostor_at = None
+                if self.peer is not None:
+                    log.warning(_MOVED, readable_address(self.peer), readable_address(sender))
+                    self.vehicle.identity.moved(now)
             self._send_to(sender)
         return True
 
@@ -287,12 +278,6 @@ class Driver:
         elif self.vehicle.identity.heard_since(self._impostor_at):
             self._impostor_at = inf
             log.warning(_IGNORED, readable_address(sender), *source)
-
-    def _on_moved(self, sender: NetAddress, now: float) -> None:
-        self._impostor_at = None
-        if self.peer is not None:
-            log.warning(_MOVED, readable_address(self.peer), readable_address(sender))
-            self.vehicle.identity.moved(now)
 
     def _send_to(self, address: NetAddress) -> None:
         self.peer = address
@@ -313,56 +298,5 @@ class Driver:
                 self._budget.on_request(wire, now)
         if self._trace is not None:
             for wire in payloads:
-                self._trace.payload(now, "request", wire, self._remarks.on_request(wire))
+                self._trace(now, "request", wire)
         link.send_nowait(self.framer.encode_ftp_run(target, payloads))
-
-    def _next_deadline(self) -> float:
-        deadline, now = self.engine.next_deadline(), self._clock()
-        if deadline is None:
-            deadline = inf
-        if self.link.backlog >= BACKLOG_LIMIT:
-            # Nobody tells us that the link drained, and before that nothing can go out.
-            deadline = now + 0.01
-        elif not self._may_send:
-            deadline = max(deadline, now + 0.05)  # nothing can go out, whatever is due
-        return min(deadline, self._heard_at + QUIET) if self.framer.waiting else deadline
-
-
-class Remarks:
-    """What a trace says of a request or a reply beside its bytes. Used only while somebody traces."""
-
-    def __init__(self, stats: EngineStats) -> None:
-        self._stats = stats
-        self._before = (0, 0, 0)
-        self._unanswered: OrderedDict[tuple[int, int, int, bytes], int] = OrderedDict()
-
-    def on_request(self, wire: bytes) -> str:
-        """Return "", or whether these 251 bytes were sent before and are not answered yet."""
-        seq, rest = int.from_bytes(wire[:2], "little"), (wire[2], wire[3], wire[4], wire[8:])
-        earlier = self._unanswered.get(rest)
-        self._unanswered[rest] = seq
-        if len(self._unanswered) > _REMEMBERED_REQUESTS:
-            self._unanswered.popitem(last=False)
-        if earlier is None:
-            return ""
-        return "retransmit" if earlier == seq else f"retransmit of {earlier}"
-
-    def before_reply(self) -> None:
-        """The engine is about to see a reply."""
-        stats = self._stats
-        self._before = (stats.unknown, stats.stale, stats.incoherent)
-
-    def after_reply(self, reply: Payload) -> str:
-        """Return "" for a believed reply, else why it was not."""
-        stats, (unknown, stale, incoherent) = self._stats, self._before
-        if stats.unknown > unknown:
-            return "late, duplicate or not ours"
-        if stats.stale > stale:
-            return "stale replay"
-        if stats.incoherent > incoherent:
-            return "does not fit its request"
-        asked = (reply.seq - 1) & 0xFFFF
-        for rest, seq in list(self._unanswered.items()):
-            if seq == asked:
-                del self._unanswered[rest]
-        return ""

@@ -1,30 +1,54 @@
 """Gives the one server session to one user after another. Layer: session.
 
-One task (`serve`) opens, reads, writes and closes; streams, uploads and single requests only say what they
-want and wake it. Metadata requests do not need the session: they run beside it and carry its id (servers.md
-1).
+One task (`serve`) gives turns; readers, uploads and single requests only say what they want and wake it.
+
+Whoever used little of it lately (an editor, `head`) goes before whoever used much (a copy), at once. Those
+who used much take turns of a second or more, since changing files costs round trips. Whoever waited for long
+goes first all the same: one small file after another slows a copy down, and does not stop it.
 """
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
+from collections import deque
 from collections.abc import Awaitable, Callable
 from math import inf
+from typing import Literal
 
 import trio
 
 from mavftpfs.protocol.chunking import ChunkSize
-from mavftpfs.protocol.operations import Operation
 from mavftpfs.protocol.payload import Opcode, Payload
 from mavftpfs.protocol.reading import ReadToEof
 from mavftpfs.session.doubt import Doubt, session_used_by
 from mavftpfs.session.driver import Driver
-from mavftpfs.session.queue import Queue, SessionUser
-from mavftpfs.session.reader import RECENT, FileStream, Reading, ReadMode
 from mavftpfs.session.serversession import OpenSession, ServerSession, State
-from mavftpfs.session.upload import Upload
-from mavftpfs.session.uploading import Uploading
-from mavftpfs.shared.errors import DataUnproven, MavftpfsError, SessionLost
+from mavftpfs.shared.errors import DataUnproven, MavftpfsError, RequestTimeout, SessionLost
 from mavftpfs.shared.traits import WriteTraits
+
+ReadMode = Literal["window", "burst"]
+
+LIGHT_USE = 0.3
+"""Seconds of use in the recent past below which a user counts as a light one."""
+
+USE_MEMORY = 10.0
+"""Seconds after which use no longer counts."""
+
+MIN_TURN, MAX_TURN = 1.0, 4.0
+TURN_TRIPS = 10.0
+"""Seconds, and round trips, for which a heavy user keeps the session while another one waits."""
+
+LONG_WAIT = 3.0
+LONG_WAIT_TRIPS = 20.0
+"""Seconds, and round trips, of waiting after which a heavy user is not passed over any more. Opening the file
+of an upload again takes up to four round trips."""
+
+RELIEF = 0.5
+"""Seconds that whoever waited so long keeps what he got."""
+
+RECENT = 10.0
+"""Seconds for which what was read stays provisional, also of files that were closed since: another client is
+noticed late, because servers answer it on its own link, and a router may pass on only some of that."""
 
 IDLE_CLOSE = 1.5
 """Seconds a file stays open on the server without being read. Below the 2 s after which PX4 frees its
@@ -36,16 +60,99 @@ _OPENING = frozenset((Opcode.OPEN_FILE_RO, Opcode.OPEN_FILE_WO, Opcode.CREATE_FI
 Action = Callable[[OpenSession], Awaitable[None]]
 
 
+class SessionUser(ABC):
+    """Somebody who wants the session now and then: a reader, an upload, a single request.
+
+    Attributes:
+        path: of the file it uses.
+        asked_at: when it began to wait for its turn; None while it wants nothing. It stays set in the turn.
+    """
+
+    def __init__(self, path: bytes, scheduler: Scheduler, asked_at: float | None = None) -> None:
+        self.path = path
+        self.asked_at = asked_at
+        self._scheduler = scheduler
+        self._server = scheduler.server
+        self._used = 0.0
+        self._until = 0.0
+
+    @abstractmethod
+    def due_at(self) -> float:
+        """Return when it can use the session: 0 for now, inf if nothing is wanted that somebody waits for."""
+
+    @abstractmethod
+    async def turn(self) -> None:
+        """Use the session now. What fails is told to whoever waits."""
+
+    @abstractmethod
+    def fail(self, error: MavftpfsError) -> None:
+        """Tell whoever waits that what it wants cannot be had now."""
+
+    def prefetches(self) -> bool:
+        """Return whether it wants something that nobody waits for."""
+        return False
+
+    def expire(self, error: MavftpfsError) -> None:
+        """It waited too long. Who asks again waits anew."""
+        self.asked_at = None
+        self.fail(error)
+
+    def on_queued(self) -> None:
+        """It waits for its turn, and the vehicle answered in another's."""
+        return
+
+    def on_removed(self) -> None:
+        """The file of its path was removed or replaced."""
+        return
+
+    def has_read(self, now: float) -> bool:
+        """Return whether it reads now, or read something lately: that is provisional."""
+        return False
+
+    def on_suspect(self, reason: str) -> None:
+        """What it read since its file was opened may be another file's."""
+        return
+
+    def on_turn(self, began: float, now: float) -> None:
+        """It had the session until now."""
+        self._used = self.used(began) + now - began
+        self._until = now
+
+    def used(self, now: float) -> float:
+        """Return the seconds of use that still count: they fade, but not while it waits."""
+        until = now if self.asked_at is None else min(now, self.asked_at)
+        return self._used * min(1.0, max(0.0, 1.0 - (until - self._until) / USE_MEMORY))
+
+    def waited_long(self, now: float, rtt: float | None) -> bool:
+        """Return whether it is not to be passed over any more."""
+        limit = max(LONG_WAIT, LONG_WAIT_TRIPS * (rtt or 0.0))
+        return self.asked_at is not None and now - self.asked_at >= limit
+
+    def rank(self, now: float, rtt: float | None) -> tuple[bool, float]:
+        """Return what orders those who wait: the least goes first."""
+        heavy = self.used(now) >= LIGHT_USE and not self.waited_long(now, rtt)
+        return heavy, now if self.asked_at is None else self.asked_at
+
+    def gives_way(self, rival: float, began: float, now: float, rtt: float | None) -> bool:
+        """Return whether its turn, which began then, ends for whoever used so much (seconds) and waits."""
+        slice_ = now - began
+        if slice_ < RELIEF and self.waited_long(began, rtt):
+            return False
+        if rival < LIGHT_USE and max(self.used(now), slice_) >= LIGHT_USE:
+            return True
+        return slice_ >= min(MAX_TURN, max(MIN_TURN, TURN_TRIPS * (rtt or 0.0)))
+
+
 class _Job(SessionUser):
     """One open, an action, one Terminate."""
 
-    def __init__(self, path: bytes, opcode: Opcode, action: Action | None, now: float) -> None:
-        super().__init__(path, now)
-        self.opcode = opcode
-        self.action = action
+    def __init__(self, path: bytes, scheduler: Scheduler, opcode: Opcode, action: Action | None) -> None:
+        super().__init__(path, scheduler, scheduler.clock())
         self.session: OpenSession | None = None
         self.error: MavftpfsError | None = None
         self.finished = trio.Event()
+        self._opcode = opcode
+        self._action = action
 
     def due_at(self) -> float:
         """See SessionUser."""
@@ -56,6 +163,21 @@ class _Job(SessionUser):
         self.error = error
         self.finished.set()
 
+    async def turn(self) -> None:
+        """See SessionUser."""
+        server = self._server
+        try:
+            server.vehicle.require_there(server.clock())  # it may have died while others had the session
+            self.session = await server.open(self.path, self._opcode)
+            if self._action is not None:
+                await self._action(self.session)
+            await server.close()
+        except MavftpfsError as error:
+            self.error = error
+            await server.close_quietly()
+        finally:
+            self.finished.set()
+
 
 class Scheduler:
     """Serialises all use of the server session.
@@ -64,8 +186,9 @@ class Scheduler:
     chunk: bytes that a request carries, 1..239; None: see ChunkSize.
 
     Attributes:
+        users: those who want the session, now or later.
         traits: what the server was seen to do when written to; forgotten when it restarts.
-        read_chunks, write_chunks: the size of requests.
+        read_mode: by which requests files are read. read_chunks, write_chunks: the size of requests.
     """
 
     def __init__(
@@ -80,37 +203,81 @@ class Scheduler:
         self.traits = WriteTraits()
         self.read_mode: ReadMode = read_mode
         self.read_chunks, self.write_chunks = ChunkSize(chunk), ChunkSize(chunk)
-        self.op_deadline = op_deadline
         self.doubt = Doubt(clock)
         self.server = ServerSession(driver, self.doubt, clock, op_deadline)
-        self.queue = Queue(self.server, driver.engine, clock, op_deadline)
-        parts = (self.server, driver, self.queue, self.doubt)
-        self.reading = Reading(*parts, read_mode, self.read_chunks, clock)
-        self.uploading = Uploading(*parts, self.traits, self.write_chunks, clock)
+        self.clock = clock
+        self.users: dict[SessionUser, None] = {}
+        self._gone: deque[SessionUser] = deque()  # who read something lately, and wants nothing any more
         self._driver = driver
-        self._vehicle = driver.vehicle
-        self._clock = clock
+        self._op_deadline = op_deadline
         self._used_at = clock()
         self._touched_at = -inf
         driver.engine.on_unexplained = self._on_unexplained
-        self.doubt.on_raised = self.reading.on_doubt
+        self.doubt.on_raised = self._on_reads_doubted
 
-    def uploads(self) -> list[Upload]:
-        """Return those that were neither completed nor given up by their owners."""
-        return [user for user in self.queue.users if isinstance(user, Upload)]
+    # --- who wants the session
+
+    def add(self, user: SessionUser) -> None:
+        """Let somebody want the session from now on."""
+        self.users[user] = None
+        self.server.wake()
+
+    def remove(self, user: SessionUser) -> None:
+        """It wants nothing any more; harmless if that is known. What it read stays provisional."""
+        now = self.clock()
+        if user in self.users:
+            del self.users[user]
+            if user.has_read(now):
+                self._gone.append(user)
+        while self._gone and not self._gone[0].has_read(now):
+            self._gone.popleft()
+        self.server.wake()
+
+    def waiting(self, now: float) -> list[SessionUser]:
+        """Return all who wait for the session and could use it now."""
+        waiting = []
+        for user in self.users:
+            if user.due_at() <= now and not self.server.is_excluded(user.path):
+                waiting.append(user)
+        return waiting
+
+    def first(self) -> SessionUser | None:
+        """Return whoever is to use the session now. Readahead comes only if nobody waits for anything, and
+        that of the open file first."""
+        now, rtt = self.clock(), self._driver.engine.rtt
+        first, best = None, (True, inf)
+        for user in self.waiting(now):
+            rank = user.rank(now, rtt)
+            if first is None or rank < best:
+                first, best = user, rank
+        if first is not None:
+            return first
+        session = self.server.session
+        for user in self.users:
+            if user.prefetches() and not self.server.is_excluded(user.path):
+                if session is not None and user.path == session.path:
+                    return user
+                first = first or user
+        return first
+
+    def rival_use(self, user: SessionUser) -> float | None:
+        """Return how much the lightest of the others who wait used lately (seconds); None if nobody waits."""
+        now = self.clock()
+        least: float | None = None
+        for other in self.waiting(now):
+            if other is not user and (least is None or other.used(now) < least):
+                least = other.used(now)
+        return least
+
+    def expire_waiters(self) -> None:
+        """Somebody holds the session and cannot be interrupted: do not let others wait for ever."""
+        now = self.clock()
+        error = RequestTimeout("the vehicle's only session is taken by an upload that cannot be interrupted")
+        for user in self.waiting(now):
+            if user.asked_at is not None and user.asked_at < now - self._op_deadline:
+                user.expire(error)
 
     # --- what others ask for
-
-    async def metadata(self, operation: Operation) -> None:
-        """Run an operation that needs no session of its own, and carries a path to be looked up: some servers
-        take that amiss while a file is written.
-
-        Raises:
-            VehicleLost, or what the operation fails with.
-        """
-        self._vehicle.require_there(self._clock())
-        async with self.uploading.path_gate.passing():
-            await self._driver.run(operation)
 
     async def read_whole(self, path: bytes, limit: int) -> bytes:
         """Read a file to EOF whatever its size claims; once more if the session was lost or in doubt.
@@ -123,10 +290,11 @@ class Scheduler:
 
         async def read(session: OpenSession) -> None:
             nonlocal data
-            began = self._clock()
+            began = self.clock()
             operation = ReadToEof(session.id, self.read_chunks.size, limit)
             await self._driver.run(operation)
-            self.server.require(session)
+            if self.server.session is not session:
+                raise SessionLost("the vehicle restarted, or opened another file", by_server=True)
             if self.doubt.reads_arose_since(began):
                 raise DataUnproven(f"another FTP client was active while {path!r} was read")
             data = operation.data
@@ -143,14 +311,13 @@ class Scheduler:
         Raises:
             VehicleLost, RequestTimeout, or what opening, the action or closing fail with.
         """
-        now = self._clock()
-        self._vehicle.require_there(now)
-        job = _Job(path, opcode, action, now)
-        self.queue.add(job)
+        self.server.vehicle.require_there(self.clock())
+        job = _Job(path, self, opcode, action)
+        self.add(job)
         try:
             await job.finished.wait()
         finally:
-            self.queue.remove(job)
+            self.remove(job)
         if job.error is not None:
             raise job.error
         assert job.session is not None
@@ -161,7 +328,7 @@ class Scheduler:
         had the new name cannot be read any more."""
         self.on_removed(new)
         prefix = old + b"/"
-        for user in self.queue.users:
+        for user in self.users:
             if isinstance(user, _Job):
                 continue
             if user.path == old:
@@ -171,8 +338,8 @@ class Scheduler:
 
     def on_removed(self, path: bytes) -> None:
         """The file of this name was removed or replaced: what its readers still want cannot be had."""
-        for user in list(self.queue.users):  # who is told may close it
-            if user.path == path and isinstance(user, FileStream):
+        for user in list(self.users):  # who is told may close it
+            if user.path == path:
                 user.on_removed()
 
     # --- news
@@ -180,8 +347,9 @@ class Scheduler:
     def on_foreign(self, payload: bytes, *, newcomer: bool) -> None:
         """Another FTP client's payload was heard. newcomer: the first for a while, so earlier ones may have
         been missed."""
-        now, session = self._clock(), session_used_by(payload)
-        if session is not None and self.server.may_be_ours(session):
+        now, session, engine = self.clock(), session_used_by(payload), self._driver.engine
+        echoes = engine.traits.ack_carries_own_session  # then each client has an id of its own
+        if session is not None and (not echoes or session == engine.home_session):
             self._touched_at = now
         # Whoever uses sessions may just have used ours, too, in a request that was not heard.
         reads = newcomer or now - self._touched_at <= RECENT
@@ -196,85 +364,67 @@ class Scheduler:
         self.doubt.note_late(late)
         self.doubt.raise_it("an answer came that no request of ours explains", reads=other)
         if other:
-            self._end_session()
+            self.server.abandon()
 
-    def _end_session(self) -> None:
-        """What is open over there may be another file than we think, or nothing."""
-        self.reading.cut_off()
-        self.uploading.cut_off()
-        self.server.abandon()
+    def _on_reads_doubted(self, reason: str) -> None:
+        """What was read lately is provisional, also of files closed since."""
+        now = self.clock()
+        for user in [*self.users, *self._gone]:
+            if user.has_read(now):
+                user.on_suspect(reason)
 
     def on_reboot(self) -> None:
         """The vehicle restarted, perhaps as another one: nothing is open, nothing is known of it."""
         self.doubt.raise_it("the vehicle restarted")
         self.traits.forget()
-        self._end_session()
-
-    def on_armed_changed(self) -> None:
-        """On arming uploads are terminated and held; on disarming they go on (promise 9)."""
-        for upload in self.uploads():
-            upload.on_armed_changed()
-        self.server.wake()
+        self.server.abandon()
 
     # --- the one task
 
     async def serve(self) -> None:
         """Run until cancelled."""
+        server = self.server
         while True:
             await trio.lowlevel.checkpoint()
-            await self.server.close_excluded()
-            user, began = self.queue.first(), self._clock()
+            await server.close_excluded()
+            user, began = self.first(), self.clock()
             try:
                 if user is None:
                     await self._idle()
                     continue
-                session = self.server.session
+                session = server.session
                 if session is not None and session.path != user.path and not session.writing:
-                    await self.server.close_quietly()
+                    await server.close_quietly()
                     continue  # somebody may have come meanwhile who goes first
-                if isinstance(user, _Job):
-                    await self._serve_job(user)
-                elif isinstance(user, Upload):
-                    await self.uploading.serve(user)
-                elif isinstance(user, FileStream):
-                    await self.reading.serve(user)
+                await user.turn()
             except MavftpfsError:
                 # Closing the previous file failed; whoever wants something is asked again by the queue.
-                self.server.abandon()
-            self._used_at = self._clock()
+                server.abandon()
+            self._used_at = self.clock()
             if self._driver.last_reply_at >= began:
                 # The vehicle answered in this turn: who waits for a later one is not timed out.
-                for other in list(self.queue.users):
-                    if other is not user and isinstance(other, FileStream) and other.due_at() < inf:
-                        other.sink.on_queued()
+                for other in list(self.users):
+                    if other is not user and other.due_at() < inf:
+                        other.on_queued()
 
     async def _idle(self) -> None:
-        now = self._clock()
-        until_due = self.queue.next_due(now) - now
-        if self.server.session is not None:
+        """Nobody can use the session now: close it in time, and wait for news."""
+        server, now = self.server, self.clock()
+        until_due = inf
+        for user in self.users:
+            if now < user.due_at() < until_due + now:
+                until_due = user.due_at() - now
+        if server.session is not None:
             # Counted from the last use, not from the last news: there may always be news.
             left = max(0.0, self._used_at + IDLE_CLOSE - now)
-            if not await self.server.sleep(min(left, until_due)) and self.queue.first() is None:
-                await self.server.close()
-        elif self.server.state is State.MAYBE_OPEN and not self._vehicle.lost(now):
+            if not await server.sleep(min(left, until_due)) and self.first() is None:
+                await server.close()
+        elif server.state is State.MAYBE_OPEN and not server.vehicle.lost(now):
             # An open or a Terminate that was never answered: leave no orphan over there.
-            if not await self.server.sleep(min(_MAYBE_OPEN_RETRY, until_due)):
-                await self.server.close_maybe_open()
+            if not await server.sleep(min(_MAYBE_OPEN_RETRY, until_due)):
+                await server.close_maybe_open()
         else:
-            await self.server.sleep(until_due)
-
-    async def _serve_job(self, job: _Job) -> None:
-        try:
-            self._vehicle.require_there(self._clock())  # it may have died while others had the session
-            job.session = await self.server.open(job.path, job.opcode)
-            if job.action is not None:
-                await job.action(job.session)
-            await self.server.close()
-        except MavftpfsError as error:
-            job.error = error
-            await self.server.close_quietly()
-        finally:
-            job.finished.set()
+            await server.sleep(until_due)
 
     async def close(self) -> None:
         """Terminate the session, best effort: a server forgets it by itself, sooner or later. The caller

@@ -8,14 +8,15 @@ soon keeps a stale session alive. So there is one list of remedies: close what m
 if nobody else was heard. After those it is busy.
 
 Whoever is about to change a path excludes the session from it: the session is closed if it is open there,
-and stays off that path until the change was made.
+and stays off that path until the change was made. Requests that carry a path and need no session (`ask`) run
+beside it, and carry its id (docs/servers.md 1).
 """
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
-from contextlib import asynccontextmanager
-from dataclasses import dataclass, field, replace
+from collections.abc import AsyncIterator, Callable, Iterator
+from contextlib import asynccontextmanager, suppress
+from dataclasses import dataclass, field
 from enum import Enum
 from functools import partial
 from typing import TypeVar
@@ -27,7 +28,7 @@ from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.protocol.requests import Operation
 from mavftpfs.session.doubt import Doubt
 from mavftpfs.session.driver import Driver
-from mavftpfs.shared.errors import FtpNak, MavftpfsError, RequestTimeout, SessionBusy, SessionLost
+from mavftpfs.shared.errors import FtpNak, MavftpfsError, RequestTimeout, SessionBusy
 from mavftpfs.shared.model import wire_path
 
 SILENCE_ARDUPILOT = 3.5
@@ -47,7 +48,7 @@ _SURELY_OPEN = 8.0
 
 _TAKEN = frozenset((NakCode.INVALID_SESSION, NakCode.NO_SESSIONS_AVAILABLE))
 
-T = TypeVar("T")
+Asked = TypeVar("Asked", bound=Operation)
 
 
 class State(Enum):
@@ -111,15 +112,63 @@ class _Remedies:
     resets: int = 1
 
 
+class PathGate:
+    """Keeps requests that carry a path out while an upload writes, and lets them in now and then.
+
+    Attributes:
+        shut: they wait. waiting: how many do.
+    """
+
+    def __init__(self) -> None:
+        self.shut = False
+        self.waiting = 0
+        self._inside = 0
+        self._changed = trio.lowlevel.ParkingLot()
+
+    @asynccontextmanager
+    async def passing(self, on_shut: Callable[[], None]) -> AsyncIterator[None]:
+        """Wait to be let in, and stay inside for the length of the body; on_shut: who is to let us in."""
+        self.waiting += 1
+        try:
+            while self.shut:
+                on_shut()
+                await self._changed.park()
+        finally:
+            self.waiting -= 1
+            self._changed.unpark_all()
+        self._inside += 1
+        try:
+            yield
+        finally:
+            self._inside -= 1
+            self._changed.unpark_all()
+
+    def open(self) -> None:
+        """Keep nobody out any longer."""
+        self.shut = False
+        self._changed.unpark_all()
+
+    async def let_in(self, seconds: float) -> None:
+        """Let requests in for at most so long, and wait until the last of them is out. Then it is shut."""
+        self.open()
+        with trio.move_on_after(seconds):
+            while self.waiting or self._inside:
+                await self._changed.park()
+        self.shut = True
+        while self._inside:
+            await self._changed.park()
+
+
 class ServerSession:
     """Opens, closes and remembers; lets its user sleep until there is news.
 
     op_deadline: seconds to wait for a Terminate of whose failure somebody is told.
 
     Attributes:
-        state: see State. session: what is open in the state OPEN.
+        state: see State. session: what is open in the state OPEN. transfer: what reads or writes it now.
         maybe_open: files that may be open over there by our doing, by session id.
         kept_out: whether the last request that needs no session was refused because of somebody else's.
+        path_gate: what asks the server for a path passes it.
     """
 
     def __init__(
@@ -129,41 +178,34 @@ class ServerSession:
         clock: Callable[[], float],
         op_deadline: float = 30.0,
     ) -> None:
+        self.driver = driver
+        self.engine = driver.engine
+        self.vehicle = driver.vehicle
+        self.doubt = doubt
+        self.clock = clock
+        self.op_deadline = op_deadline
         self.state = State.CLOSED
         self.session: OpenSession | None = None
+        self.transfer: Operation | None = None
         self.maybe_open: dict[int, bytes] = {}
         self.kept_out = False
-        self._driver = driver
-        self._engine = driver.engine
-        self._vehicle = driver.vehicle
-        self._doubt = doubt
-        self._clock = clock
-        self._op_deadline = op_deadline
+        self.path_gate = PathGate()
         self._opening: bytes | None = None
         self._excluded: list[_Excluded] = []
         self._news = trio.Event()
         self._changed = trio.lowlevel.ParkingLot()  # the state did
 
-    def check_invariants(self) -> None:
-        """Raise AssertionError if the state and what is remembered disagree."""
-        assert (self.session is not None) == (self.state is State.OPEN)
-        if self.state in (State.CLOSED, State.MAYBE_OPEN):
-            assert bool(self.maybe_open) == (self.state is State.MAYBE_OPEN)
-
     def _enter(self, state: State, session: OpenSession | None = None) -> None:
+        """Go on to a state; to CLOSED only if nothing may be open by our doing, else to MAYBE_OPEN."""
+        if self.session is not None:  # it is open over there until Terminate is ACKed
+            self.maybe_open[self.session.id] = self.session.path
+            self.engine.session = self.engine.home_session
+        if state is State.CLOSED and self.maybe_open:
+            state = State.MAYBE_OPEN
         assert state in SESSION_NEXT[self.state], f"{self.state} does not become {state}"
+        assert (session is not None) == (state is State.OPEN)
         self.state, self.session = state, session
-        self.check_invariants()
         self._changed.unpark_all()
-
-    def _settle(self) -> None:
-        """Nothing is open, as far as is known."""
-        self._enter(State.MAYBE_OPEN if self.maybe_open else State.CLOSED)
-
-    @property
-    def _echoes(self) -> bool | None:
-        """Whether the session has the id that we ask for, or one that the server assigns; None: not seen."""
-        return self._engine.traits.ack_carries_own_session
 
     # --- waiting
 
@@ -191,15 +233,19 @@ class ServerSession:
         """
         self._opening = path  # from now on nobody may change that name, also while the other file is closed
         try:
-            if self.session is not None:
-                close = self.close if self.session.writing else self.close_quietly
-                await close()
+            if self.session is not None and self.session.writing:
+                await self.close()
+            elif self.session is not None:
+                await self.close_quietly()
             self._enter(State.OPENING)
             try:
+                if self.maybe_open:
+                    await self._close_what_may_be_ours()
                 session = await self._open_past_others(path, opcode)
             except BaseException:
-                self._settle()
+                self._enter(State.CLOSED)
                 raise
+            self.engine.session = session.id
             self._enter(State.OPEN, session)
         finally:
             self._opening = None
@@ -207,12 +253,14 @@ class ServerSession:
 
     async def _open_past_others(self, path: bytes, opcode: Opcode) -> OpenSession:
         """Open, by one remedy after the other while that is refused because a session is taken."""
-        if self.maybe_open:
-            await self._close_what_may_be_ours()
         remedies, resent = _Remedies(), False
         while True:
+            asked, traits = self.engine.home_session, self.engine.traits
+            operation = OpenFile(opcode, wire_path(path), asked)
+            # A time-out or a cancellation leaves it so: the open may have been carried out.
+            self.maybe_open[0 if traits.ack_carries_own_session is False else asked] = path
             try:
-                session = await self._ask_to_open(path, opcode)
+                await self.driver.run(operation)
             except FtpNak as nak:
                 resent |= nak.retransmitted
                 ours = self._may_be_ours(nak)
@@ -222,26 +270,13 @@ class ServerSession:
                 if not taken:
                     raise
                 await self._remedy(nak, remedies)
-            else:
-                return replace(session, resent=session.resent or resent)
-
-    async def _ask_to_open(self, path: bytes, opcode: Opcode) -> OpenSession:
-        asked = self._engine.home_session
-        operation = OpenFile(opcode, wire_path(path), asked)
-        # A time-out or a cancellation leaves it so: the open may have been carried out.
-        self.maybe_open[0 if self._echoes is False else asked] = path
-        await self._driver.run(operation)
-        self.maybe_open.clear()
-        self._engine.session = operation.session
-        return OpenSession(
-            path,
-            operation.session,
-            operation.size,
-            self._clock(),
-            writing=opcode != Opcode.OPEN_FILE_RO,
-            seq=operation.reply.seq,
-            resent=operation.retransmitted,
-        )
+                continue
+            self.maybe_open.clear()
+            resent |= operation.retransmitted
+            writing, seq = opcode != Opcode.OPEN_FILE_RO, operation.reply.seq
+            return OpenSession(
+                path, operation.session, operation.size, self.clock(), writing=writing, seq=seq, resent=resent
+            )
 
     def _means_taken(self, nak: FtpNak, ours: bool) -> bool:
         """Whether an open was refused because something is open; ours: perhaps by our doing.
@@ -252,12 +287,12 @@ class ServerSession:
         """
         if nak.code in _TAKEN or nak.code == NakCode.FILE_EXISTS:
             return True
-        return nak.code == NakCode.FAIL and ours and self._echoes is not False
+        return nak.code == NakCode.FAIL and ours and self.engine.traits.ack_carries_own_session is not False
 
     def _may_be_ours(self, nak: FtpNak) -> bool:
         """Whether an open of ours may have been carried out before this refusal: its ACK was lost, or the
         network brought an older one once more."""
-        return nak.retransmitted or (self._doubt.is_active() and not self._others_heard())
+        return nak.retransmitted or (self.doubt.is_active() and not self._others_heard())
 
     # --- closing
 
@@ -274,39 +309,32 @@ class ServerSession:
         session = self.session
         if session is None:
             return True
-        self._let_go(session, State.CLOSING)
+        self._enter(State.CLOSING)
+        operation, asked_at = Terminate(session.id), self.clock()
         try:
-            return await self._terminate(session, limit)
-        finally:
-            self._settle()
-
-    async def _terminate(self, session: OpenSession, limit: float | None) -> bool:
-        operation = Terminate(session.id)
-        asked_at = self._clock()
-        try:
-            with trio.fail_after(self._op_deadline if limit is None else limit):
-                await self._driver.run(operation)
+            with trio.fail_after(self.op_deadline if limit is None else limit):
+                await self.driver.run(operation)
+            self.maybe_open.pop(session.id, None)
         except trio.TooSlowError:
             if limit is None:  # a shorter one is no proof that the vehicle is lost
-                self._vehicle.note_timeout()
+                self.vehicle.note_timeout()
             raise RequestTimeout("no answer to TerminateSession") from None
         except FtpNak as nak:
             self.maybe_open.pop(session.id, None)
             if nak.code != NakCode.FILE_EXISTS:  # PX4's sticky errno for "no such session"
                 raise
             operation.already_closed = True
-        self.maybe_open.pop(session.id, None)
+        finally:
+            self._enter(State.CLOSED)
         if not operation.already_closed:
             return True
         # Our own first request closed it, if no server closes an idle session so soon.
-        return operation.retransmitted and self._clock() - asked_at < _SURELY_OPEN
+        return operation.retransmitted and self.clock() - asked_at < _SURELY_OPEN
 
-    async def close_quietly(self) -> bool:
+    async def close_quietly(self) -> None:
         """Close after a failure that is already being reported, or for somebody else's sake."""
-        try:
-            return await self.close(TERMINATE_LIMIT)
-        except MavftpfsError:
-            return False
+        with suppress(MavftpfsError):
+            await self.close(TERMINATE_LIMIT)
 
     async def close_maybe_open(self) -> None:
         """Close what may still be open by our doing; after a failure it may be open as before."""
@@ -314,11 +342,10 @@ class ServerSession:
             return
         self._enter(State.CLOSING)
         try:
-            await self._close_what_may_be_ours()
-        except MavftpfsError:
-            return
+            with suppress(MavftpfsError):
+                await self._close_what_may_be_ours()
         finally:
-            self._settle()
+            self._enter(State.CLOSED)
 
     async def _close_what_may_be_ours(self) -> bool:
         """Close what may be open by our doing, but not what another client may own; return whether something
@@ -331,43 +358,45 @@ class ServerSession:
         for session in list(self.maybe_open):
             if session != 0 or not self._others_heard():
                 already_closed = await self._try(Terminate(session))
-                if already_closed and session and self._echoes is None and not self._others_heard():
+                if (
+                    already_closed
+                    and session
+                    and self.engine.traits.ack_carries_own_session is None
+                    and not self._others_heard()
+                ):
                     await self._try(Terminate(0))  # the server may have given us that id instead
                 closed = True
             self.maybe_open.pop(session, None)
         return closed
 
-    def require(self, session: OpenSession) -> None:
-        """Raise SessionLost if this one is not believed in any more."""
-        if self.session is not session:
-            raise SessionLost("the vehicle restarted, or opened another file", by_server=True)
-
     def abandon(self) -> None:
-        """What is open is lost, or not to be believed: it is closed before the next open. After a restart,
-        too: that news may come after it was opened anew."""
+        """What is open is lost, or not to be believed: nothing more comes of it, and it is closed before the
+        next open. After a restart, too: that news may come after it was opened anew."""
+        if self.transfer is not None:
+            self.driver.cancel(self.transfer)
         if self.session is not None:
-            self._let_go(self.session, State.MAYBE_OPEN)
+            self._enter(State.MAYBE_OPEN)
         self.wake()
 
-    def _let_go(self, session: OpenSession, state: State) -> None:
-        self.maybe_open[session.id] = session.path
-        self._engine.session = self._engine.home_session
-        self._enter(state)
+    # --- requests beside the session, and what to do when it is taken
 
-    # --- when it is taken
-
-    async def retry_while_taken(self, attempt: Callable[[], Awaitable[T]], *, changes: bool = False) -> T:
-        """Do something that another client's session may keep out (ArduPilot), after silences if need be.
+    async def ask(self, make: Callable[[], Asked], *, changes: bool = False) -> Asked:
+        """Carry out a request that needs no session of its own, and carries a path to be looked up: some
+        servers take that amiss while a file is written. Another client's session may keep it out
+        (ArduPilot): then it is made and asked anew, after silences.
 
         changes: a refusal of what was sent twice may answer the second execution, and is the caller's news.
 
         Raises:
-            SessionBusy: it did not go away. Else what `attempt` raises.
+            VehicleLost. SessionBusy: that session did not go away. Else what the request fails with.
         """
         remedies = _Remedies(closings=0, resets=0)
         while True:
+            operation = make()
+            self.vehicle.require_there(self.clock())
             try:
-                result = await attempt()
+                async with self.path_gate.passing(self.wake):
+                    await self.driver.run(operation)
             except FtpNak as nak:
                 if nak.code not in _TAKEN or self.session is not None or (changes and nak.retransmitted):
                     raise
@@ -378,7 +407,7 @@ class ServerSession:
                     raise
             else:
                 self.kept_out = False
-                return result
+                return operation
 
     async def _remedy(self, nak: FtpNak, left: _Remedies) -> None:
         """Do the next thing about a refusal because the session is taken.
@@ -392,12 +421,12 @@ class ServerSession:
         if nak.code == NakCode.FAIL:
             raise nak
         for seconds in left.silences:
-            if await self._driver.be_silent(seconds):
+            if await self.driver.be_silent(seconds):
                 return
         if not left.resets or self._others_heard():
             raise SessionBusy("the vehicle's only FTP session is in use by another client") from nak
         left.resets -= 1
-        session = self._engine.home_session
+        session = self.engine.home_session
         await self._try(Simple(Opcode.RESET_SESSIONS, b"", session=session, side_effect=True))
 
     async def _close_ours(self, nak: FtpNak) -> bool:
@@ -413,27 +442,21 @@ class ServerSession:
             RequestTimeout: that is the caller's news.
         """
         try:
-            await self._driver.run(operation)
+            await self.driver.run(operation)
         except RequestTimeout:
             raise
         except MavftpfsError:
             return False
         return isinstance(operation, Terminate) and operation.already_closed
 
-    def may_be_ours(self, session: int) -> bool:
-        """Return whether an id may be that of our session: always, but where clients choose their ids."""
-        return not self._echoes or session == self._engine.home_session
-
     def _others_heard(self) -> bool:
-        return self._vehicle.foreign_client(self._clock())
+        return self.vehicle.foreign_client(self.clock())
 
     # --- paths that are about to change
 
     def is_excluded(self, path: bytes) -> bool:
         """Return whether somebody changes this path now."""
-        if not self._excluded:
-            return False
-        return any(excluded.covers(path) for excluded in self._excluded)
+        return bool(self._excluded) and any(excluded.covers(path) for excluded in self._excluded)
 
     @asynccontextmanager
     async def excluded(self, *paths: bytes, below: bool = False) -> AsyncIterator[None]:
@@ -445,7 +468,7 @@ class ServerSession:
         excluded = _Excluded(paths, below)
         self._excluded.append(excluded)
         try:
-            with trio.move_on_after(self._op_deadline) as scope:
+            with trio.move_on_after(self.op_deadline) as scope:
                 while self._uses(excluded):
                     self.wake()
                     await self._changed.park()

@@ -1,8 +1,17 @@
-"""The vehicle's files, as the caches see them. Layer: session; implements cache.remote.RemoteStore."""
+"""The vehicle's files, as the caches see them. Layer: session; implements cache.remote.VehicleStore.
+
+Did that change happen? A request whose answer may have been lost can be carried out twice, and the second
+answer is then a refusal (docs/servers.md 14.4). Such a refusal, and a silence, are never interpreted: a
+listing tells what became of it. While there is doubt (session.doubt) the network may do the same to a request
+that we sent once. Then a name is not changed twice within the time by which requests were seen to be late,
+either: the same request, carried out late once more, would change what has the name by then.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import asynccontextmanager, suppress
+from enum import Enum
 from functools import partial
 from math import inf
 
@@ -11,14 +20,31 @@ import trio
 from mavftpfs.cache.remote import ReadSink, UploadSource
 from mavftpfs.protocol.operations import ListDirectory, Simple
 from mavftpfs.protocol.payload import NakCode, Opcode
-from mavftpfs.session.changes import COPY_RATE, Changes
-from mavftpfs.session.driver import Driver
+from mavftpfs.session.doubt import MOST_LATE
 from mavftpfs.session.reader import FileStream
 from mavftpfs.session.scheduler import Scheduler
-from mavftpfs.session.upload import Upload
+from mavftpfs.session.uploading import Upload
 from mavftpfs.session.vehicle import SILENCE_LIMIT
-from mavftpfs.shared.errors import Armed, FtpNak, RemoteProtocolError, RequestTimeout
-from mavftpfs.shared.model import DirEntry, Listing, wire_path
+from mavftpfs.shared.errors import (
+    Armed,
+    FtpNak,
+    MavftpfsError,
+    OutcomeUnknown,
+    PathTooLong,
+    RemoteProtocolError,
+    RequestTimeout,
+)
+from mavftpfs.shared.model import (
+    DOT,
+    RENAME_ROOM,
+    DirEntry,
+    EntryKind,
+    Listing,
+    hides_files,
+    split,
+    wire_path,
+)
+from mavftpfs.shared.traits import Traits
 
 TIME_PROBE_LIMIT = 2.5
 """Seconds of silence after which ListDirectory is tried in place of ListDirectoryWithTime."""
@@ -27,63 +53,111 @@ TIME_SILENCES = 2
 """How often that must happen, with ListDirectory answering, before opcode 16 counts as unknown: loss may
 look the same once."""
 
+_NO_TIMES = frozenset((NakCode.FAIL, NakCode.UNKNOWN_COMMAND, NakCode.FILE_EXISTS))
+"""What servers say that do not know opcode 16; 8 may hide any other code on PX4."""
+
 CRC_PATIENCE = 120.0
 """Seconds a vehicle may need for a checksum (promise 2)."""
 
 CRC_TIME = 5.0
 """Seconds before a checksum is asked for again where the file's size is not known."""
 
+COPY_RATE = 100_000.0
+"""Bytes per second that the slowest card checksums; the question is not repeated before."""
+
+VERIFY_LIMIT = 4.0
+"""Seconds to spend on finding out what became of a request that was not answered. Whoever waits was promised
+an answer within `op_deadline`, and this comes after it."""
+
+SWEEPS = 3
+"""How often a directory is listed at most because names of it changed meanwhile."""
+
+_MISSING = frozenset((NakCode.FAIL, NakCode.FAIL_ERRNO, NakCode.FILE_NOT_FOUND))
+"""What servers say of a name that is not there (any more); the errno may be a stale one (docs/servers.md 12).
+"""
+
+_THERE = frozenset((NakCode.FAIL, NakCode.FAIL_ERRNO, NakCode.FILE_EXISTS))
+_SECOND = {
+    Opcode.REMOVE_FILE: _MISSING,
+    Opcode.REMOVE_DIRECTORY: _MISSING,
+    Opcode.RENAME: _MISSING,
+    Opcode.CREATE_DIRECTORY: _THERE,
+}
+"""What servers may say to a request that was done already, by opcode."""
+
+
+class Outcome(Enum):
+    """What a listing tells about a request."""
+
+    DONE = "done"
+    UNDONE = "undone"
+    CONFLICT = "conflict"
+    UNKNOWN = "unknown"
+
+
+Verdict = Callable[[], Awaitable[Outcome]]
+
 
 class Store:
-    """Reads, lists, checks and changes remote files.
+    """Reads, lists, checks and changes remote files; see cache.remote for what each call does.
 
-    Attributes:
-        lists_times: whether this server answers opcode 16; None until it was asked.
+    What changes the card raises FtpNak, RequestTimeout, VehicleLost, SessionBusy, PathTooLong or Armed: it
+    did not happen; or OutcomeUnknown: nobody knows. Only create_empty looks at no listing: after its
+    RequestTimeout the file may be there, and empty.
     """
 
-    def __init__(
-        self,
-        scheduler: Scheduler,
-        driver: Driver,
-        *,
-        clock: Callable[[], float],
-        op_deadline: float = 30.0,
-    ) -> None:
-        self.lists_times: bool | None = None
-        self._scheduler = scheduler
-        self._server = scheduler.server
-        self._driver = driver
-        self._op_deadline = op_deadline
-        self._vehicle = driver.vehicle
-        self._clock = clock
-        self._time_silences = 0
-        self._changes = Changes(scheduler, driver.vehicle, self.list_directory, clock)
-        # See cache.remote.VehicleStore.
+    def __init__(self, scheduler: Scheduler) -> None:
         self.traits = scheduler.traits
         self.in_doubt = scheduler.doubt.is_active
         self.doubted_since = scheduler.doubt.arose_since
-        self.remove = self._changes.remove
-        self.make_directory = self._changes.make_directory
-        self.remove_directory = self._changes.remove_directory
-        self.rename = self._changes.rename
-        self.create_empty = self._changes.create_empty
+        self.read_whole = scheduler.read_whole
+        self._scheduler = scheduler
+        self._server = scheduler.server
+        self._vehicle = scheduler.server.vehicle
+        self._clock = scheduler.clock
+        self._op_deadline = scheduler.server.op_deadline
+        self._sent = 0
+        self._under_way = 0
+        self._changed_at: dict[bytes, float] = {}
 
-    def forget_server(self) -> None:
-        """The vehicle rebooted, perhaps with other firmware."""
-        self.lists_times = None
-        self._time_silences = 0
+    @property
+    def lists_times(self) -> bool | None:
+        """Whether this server answers opcode 16; None until it was asked."""
+        return self._server.engine.traits.lists_times
 
     def is_silent(self) -> bool:
         """Return whether the vehicle is silent (see RemoteStore)."""
         return self._vehicle.silence(self._clock()) > SILENCE_LIMIT
 
+    # --- reading
+
     async def list_directory(self, path: bytes) -> Listing:
-        """Sweep a directory (see RemoteStore)."""
-        wire = wire_path(path)
-        started = self._clock()
-        sweep = self._sweep if self.lists_times is False else self._sweep_asking_times
-        operation = await self._server.retry_while_taken(partial(sweep, wire))
-        entries: tuple[DirEntry, ...] = tuple(operation.entries)
+        """Sweep a directory (see RemoteStore). Opcode 16 is tried first; that it is refused, or not answered,
+        counts only if opcode 3 then is."""
+        wire, started, traits = wire_path(path), self._clock(), self._server.engine.traits
+        operation: ListDirectory | None = None
+        tried: list[ListDirectory] = []
+        refused = False
+        if traits.lists_times is not False:
+            with trio.move_on_after(inf if traits.lists_times else TIME_PROBE_LIMIT) as scope:
+                try:
+                    operation = await self._server.ask(partial(_asking_times, wire, traits, scope, tried))
+                    traits.lists_times = True
+                except FtpNak as nak:
+                    if traits.lists_times or nak.code not in _NO_TIMES:
+                        raise
+                    refused = True
+                except RequestTimeout:
+                    if traits.lists_times:
+                        raise
+        if operation is None:
+            left = max(1.0, self._op_deadline - (self._clock() - started)) if tried else inf
+            operation = await self._server.ask(partial(_asking_names, wire, left))
+            if tried and tried[-1].error is None:
+                traits.time_silences += tried[-1].sent  # it may have had to wait for its turn all the time
+            if refused or traits.time_silences >= TIME_SILENCES:
+                traits.lists_times = False
+        entries = tuple(operation.entries)
         return Listing(entries, self._clock() - started, operation.complete, operation.hidden)
 
     async def open_reader(
@@ -93,7 +167,7 @@ class Store:
         wire_path(path)
         if expected_size is None:
             self._vehicle.require_there(self._clock())
-        stream = self._scheduler.reading.open_stream(path, sink, expected_size)
+        stream = FileStream(path, sink, expected_size, self._scheduler)
         try:
             await stream.wait_opened()
         except BaseException:
@@ -101,10 +175,13 @@ class Store:
             raise
         return stream
 
-    async def read_whole(self, path: bytes, limit: int) -> bytes:
-        """Read an `@` file to its end (see RemoteStore)."""
+    async def stat_size(self, path: bytes) -> int:
+        """See cache.remote.VehicleStore."""
         wire_path(path)
-        return await self._scheduler.read_whole(path, limit)
+        session = await self._scheduler.use_session(path, Opcode.OPEN_FILE_RO)
+        if session.size is None:
+            raise RemoteProtocolError("the vehicle's open reply holds no size")
+        return session.size
 
     async def crc32(self, path: bytes, *, size: int | None = None) -> int:
         """Ask for a checksum (see RemoteStore); size: of the file, if known: the question is not repeated
@@ -114,74 +191,232 @@ class Store:
         server_time, patience = CRC_TIME, CRC_PATIENCE
         if size is not None:
             server_time = size / COPY_RATE
-            patience = min(CRC_PATIENCE, self._scheduler.op_deadline + 2 * server_time)
-        wire = wire_path(path)
-
-        async def ask() -> bytes:
-            operation = Simple(Opcode.CALC_FILE_CRC32, wire, patience=patience, server_time=server_time)
-            self._vehicle.require_there(self._clock())
-            await self._driver.run(operation)
-            return operation.reply.data
-
-        data = await self._server.retry_while_taken(ask)
+            patience = min(CRC_PATIENCE, self._op_deadline + 2 * server_time)
+        operation = await self._server.ask(
+            partial(
+                Simple,
+                Opcode.CALC_FILE_CRC32,
+                wire_path(path),
+                patience=patience,
+                server_time=server_time,
+            )
+        )
+        data = operation.reply.data
         if len(data) < 4:
             raise RemoteProtocolError("the vehicle's checksum reply holds no checksum")
         return int.from_bytes(data[:4], "little")
 
-    def _on_times(self, scope: trio.CancelScope) -> None:
-        """Opcode 16 was answered: the rest of the listing may take as long as it takes."""
-        self.lists_times = True
-        scope.deadline = inf
-
-    async def _sweep(self, wire: bytes, *, patience: float = inf) -> ListDirectory:
-        operation = ListDirectory(wire)
-        operation.patience = patience
-        await self._scheduler.metadata(operation)
-        return operation
-
-    async def _sweep_asking_times(self, wire: bytes) -> ListDirectory:
-        """Try opcode 16; a refusal or a silence counts only if opcode 3 then answers."""
-        began = self._clock()
-        refused = False
-        limit = inf if self.lists_times else TIME_PROBE_LIMIT
-        asking = ListDirectory(wire, with_time=True)
-        try:
-            with trio.move_on_after(limit) as scope:
-                asking.on_page = partial(self._on_times, scope)
-                await self._scheduler.metadata(asking)
-                self.lists_times = True
-                return asking
-        except FtpNak as nak:
-            if self.lists_times or nak.code not in (
-                NakCode.FAIL,
-                NakCode.UNKNOWN_COMMAND,
-                NakCode.FILE_EXISTS,
-            ):
-                raise
-            refused = True
-        except RequestTimeout:
-            if self.lists_times:
-                raise
-        left = max(1.0, self._op_deadline - (self._clock() - began))
-        operation = await self._sweep(wire, patience=left)
-        self._time_silences += asking.sent  # it may have had to wait for its turn all the time
-        if refused or self._time_silences >= TIME_SILENCES:
-            self.lists_times = False
-        return operation
-
-    # --- changing files
+    # --- changing
 
     async def open_upload(self, path: bytes, source: UploadSource) -> Upload:
         """Queue an upload; nothing is sent before the source has something or finish is called."""
         wire_path(path)
         self._vehicle.require_writable(self._clock())
-        await self._changes.rest(path)
-        return self._scheduler.uploading.open_upload(path, source)
+        await self._rest(path)
+        return Upload(path, source, self._scheduler)
 
-    async def stat_size(self, path: bytes) -> int:
-        """See cache.remote.VehicleStore."""
+    async def create_empty(self, path: bytes) -> None:
+        """Make an empty file, or empty it; done twice it is the same."""
         wire_path(path)
-        session = await self._scheduler.use_session(path, Opcode.OPEN_FILE_RO)
-        if session.size is None:
-            raise RemoteProtocolError("the vehicle's open reply holds no size")
-        return session.size
+        self._vehicle.require_writable(self._clock())
+        await self._rest(path)
+        try:
+            await self._scheduler.use_session(path, Opcode.CREATE_FILE)
+        finally:
+            self._note_changed(path)
+
+    async def remove(self, path: bytes) -> None:
+        """Remove what is known to be a file."""
+        request = partial(Simple, Opcode.REMOVE_FILE, wire_path(path))
+        async with self._changing(path):
+            await self._perform(request, partial(self._is_absent, path))
+            self._scheduler.on_removed(path)
+
+    async def remove_directory(self, path: bytes) -> None:
+        """Remove what is known to be an empty directory."""
+        request = partial(Simple, Opcode.REMOVE_DIRECTORY, wire_path(path))
+        async with self._changing(path, below=True):
+            await self._perform(request, partial(self._is_absent, path))
+
+    async def make_directory(self, path: bytes) -> None:
+        """Make a directory."""
+        request = partial(Simple, Opcode.CREATE_DIRECTORY, wire_path(path))
+        async with self._changing(path):
+            await self._perform(request, partial(self._is_new_directory, path))
+
+    async def rename(self, old: bytes, new: bytes, *, completes: bool = False) -> None:
+        """Rename; who reads the old path goes on under the new one. completes: in flight, too."""
+        data = wire_path(old) + b"\0" + wire_path(new)
+        if len(data) > RENAME_ROOM:
+            raise PathTooLong(f"both paths of a rename have {len(data)} bytes, more than {RENAME_ROOM}")
+        async with self._changing(old, new, below=True, in_flight=completes):
+            await self._perform(partial(Simple, Opcode.RENAME, data), partial(self._is_renamed, old, new))
+            self._scheduler.on_renamed(old, new)
+
+    @asynccontextmanager
+    async def _changing(
+        self, *paths: bytes, below: bool = False, in_flight: bool = False
+    ) -> AsyncIterator[None]:
+        """Check that writing is allowed now, and keep our own session off the paths.
+
+        below: also off all that lies below the first. in_flight: armed or not.
+        """
+        require = self._vehicle.require_there if in_flight else self._vehicle.require_writable
+        require(self._clock())
+        with trio.move_on_after(self._op_deadline + VERIFY_LIMIT) as scope:
+            async with self._server.excluded(*paths, below=below):
+                for path in paths:
+                    await self._rest(path)
+                require(self._clock())  # closing our session may have taken a while
+                try:
+                    yield
+                finally:
+                    for path in paths:
+                        self._note_changed(path)
+        if scope.cancelled_caught:
+            raise OutcomeUnknown("the vehicle did not get round to it in time")
+
+    async def _rest(self, path: bytes) -> None:
+        """Wait while a late copy of the last change of this name may yet be carried out.
+
+        Names that differ by case alone count as one, as on many cards.
+        """
+        until = self._changed_at.get(path.lower(), -inf) + self._scheduler.doubt.lateness
+        await trio.sleep(max(0.0, until - self._clock()))
+
+    def _note_changed(self, path: bytes) -> None:
+        now = self._clock()
+        while self._changed_at and now - next(iter(self._changed_at.values())) > MOST_LATE:
+            del self._changed_at[next(iter(self._changed_at))]
+        self._changed_at.pop(path.lower(), None)
+        self._changed_at[path.lower()] = now  # the oldest are in front
+
+    # --- did that change happen?
+
+    async def _perform(self, make: Callable[[], Simple], verify: Verdict) -> None:
+        """Run a request; look what became of it if its answer may not be that to its first execution."""
+        for last in (False, True):
+            self._under_way += 1
+            self._sent += 1
+            try:
+                await self._server.ask(make, changes=True)
+                return
+            except (FtpNak, RequestTimeout) as failure:
+                error = failure
+            finally:
+                self._under_way -= 1
+            if isinstance(error, RequestTimeout):
+                outcome = await self._after_silence(verify)
+                if outcome is Outcome.DONE:
+                    return
+                if outcome is Outcome.UNDONE:
+                    raise error
+                raise OutcomeUnknown(str(error)) from error
+            twice = last or self._may_be_second(error)
+            # PX4 says 8 to everything after one "file exists", until a listing comes to its end.
+            if not twice and error.code != NakCode.FILE_EXISTS:
+                raise error
+            outcome = await self._after_refusal(error, verify)
+            if outcome is Outcome.DONE and twice:
+                return
+            if outcome is not Outcome.UNDONE or last:
+                raise error
+
+    def _may_be_second(self, nak: FtpNak) -> bool:
+        """Whether a refusal may answer the second execution of a request.
+
+        A rename is looked at in any case: its names were looked up just before, and one that is refused for
+        nothing would count as proof that the server renames none.
+        """
+        if nak.retransmitted:
+            return True
+        opcode = Opcode(nak.opcode)
+        looked_at = self._scheduler.doubt.is_active() or opcode == Opcode.RENAME
+        return looked_at and nak.code in _SECOND.get(opcode, ())
+
+    async def _after_refusal(self, nak: FtpNak, verify: Verdict) -> Outcome:
+        try:
+            outcome = await verify()
+        except FtpNak:
+            raise nak from None  # there is not even a parent to list
+        except MavftpfsError as error:
+            raise OutcomeUnknown(f"{nak}; whether it was done is not known") from error
+        if outcome is Outcome.UNKNOWN:
+            raise OutcomeUnknown(f"{nak}; whether it was done is not known") from nak
+        return outcome
+
+    async def _after_silence(self, verify: Verdict) -> Outcome:
+        with trio.move_on_after(VERIFY_LIMIT), suppress(MavftpfsError):
+            return await verify()
+        return Outcome.UNKNOWN
+
+    async def _names(self, directory: bytes) -> tuple[dict[bytes, DirEntry], bool]:
+        """Return what a fresh listing shows, by name, and whether it is complete.
+
+        It is listed again if changes of ours went on meanwhile. Servers count names: those behind one that is
+        taken away move up, past the place where a sweep goes on. If they never stood still: what any saw.
+        """
+        seen: dict[bytes, DirEntry] = {}
+        complete = False
+        for _ in range(SWEEPS):
+            before = self._sent
+            listing = await self.list_directory(directory)
+            complete = listing.complete
+            fresh = {entry.name: entry for entry in listing.entries}
+            if self._sent == before and not self._under_way:
+                seen = fresh
+                break
+            seen |= fresh
+        if hides_files(directory, tuple(seen.values())):
+            with suppress(FtpNak):
+                seen |= (await self._names(DOT))[0]
+        return seen, complete
+
+    async def _is_absent(self, path: bytes) -> Outcome:
+        parent, name = split(path)
+        names, complete = await self._names(parent)
+        if name in names:
+            return Outcome.UNDONE
+        return Outcome.DONE if complete else Outcome.UNKNOWN
+
+    async def _is_new_directory(self, path: bytes) -> Outcome:
+        """A directory that is there and empty may be the one we made; with entries it is somebody else's."""
+        parent, name = split(path)
+        names, complete = await self._names(parent)
+        if name not in names:
+            return Outcome.UNDONE if complete else Outcome.UNKNOWN
+        if names[name].kind is not EntryKind.DIRECTORY:
+            return Outcome.CONFLICT
+        listing = await self.list_directory(path)
+        return Outcome.CONFLICT if listing.entries else Outcome.DONE
+
+    async def _is_renamed(self, old: bytes, new: bytes) -> Outcome:
+        (parent, old_name), (target, new_name) = split(old), split(new)
+        names, complete = await self._names(parent)
+        others, new_complete = (names, complete) if target == parent else await self._names(target)
+        if old_name in names:
+            return Outcome.CONFLICT if new_name in others else Outcome.UNDONE
+        if new_name in others and complete:
+            return Outcome.DONE
+        return Outcome.CONFLICT if complete and new_complete else Outcome.UNKNOWN
+
+
+def _asking_times(
+    wire: bytes, traits: Traits, scope: trio.CancelScope, tried: list[ListDirectory]
+) -> ListDirectory:
+    """Make a listing that ends the scope's deadline once it is answered, and remember it as tried."""
+
+    def on_page() -> None:
+        traits.lists_times = True
+        scope.deadline = inf
+
+    operation = ListDirectory(wire, with_time=True)
+    operation.on_page = on_page
+    tried.append(operation)
+    return operation
+
+
+def _asking_names(wire: bytes, patience: float) -> ListDirectory:
+    operation = ListDirectory(wire)
+    operation.patience = patience
+    return operation

@@ -1,8 +1,7 @@
-"""One upload: what its owner sees, its state, and what is known of its progress. Layer: session."""
+"""What becomes of an upload: its state, what of it is proven, and who waits for it. Layer: session."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from enum import Enum
 from math import inf
 
@@ -10,9 +9,7 @@ import trio
 
 from mavftpfs.cache.remote import UploadSource
 from mavftpfs.protocol.writing import WriteTransfer
-from mavftpfs.session.queue import Queue, SessionUser
-from mavftpfs.session.serversession import ServerSession
-from mavftpfs.session.vehicle import Vehicle
+from mavftpfs.session.scheduler import Scheduler, SessionUser
 from mavftpfs.shared.errors import Armed, LocalProtocolError, MavftpfsError
 
 LONGEST_BACKOFF = 30.0
@@ -70,14 +67,13 @@ class Feed:
         unproven: bytes ACKed since then.
         reached: end of the highest ACKed byte; after a lost session, of the highest proven one.
         furthest: end of the highest byte that was ever ACKed.
+        on_unsent: see protocol.writing.ChunkSource.
     """
 
     def __init__(self, source: UploadSource, chunk: int) -> None:
         self.proven = False
-        self.unproven = 0
-        self.reached = 0
-        self.furthest = 0
-        self._proven_to = 0
+        self.unproven = self.reached = self.furthest = self._proven_to = 0
+        self.on_unsent = source.on_unsent
         self._source = source
         self._chunk = chunk
 
@@ -90,7 +86,7 @@ class Feed:
         piece = self._source.next_chunk(self._chunk)
         if piece is None:
             return False
-        self._source.on_unsent(piece[0], len(piece[1]))  # it was only looked at
+        self.on_unsent(piece[0], len(piece[1]))  # it was only looked at
         return True
 
     def next_chunk(self, limit: int) -> tuple[int, bytes] | None:
@@ -102,22 +98,15 @@ class Feed:
 
     def on_acked(self, offset: int, count: int) -> None:
         """See protocol.writing.ChunkSource."""
-        stop = offset + count
         self.unproven += count
-        if stop > self.reached:
-            self.reached = stop
-            self.furthest = max(self.furthest, stop)
+        if offset + count > self.reached:
+            self.reached = offset + count
+            self.furthest = max(self.furthest, self.reached)
         self._source.on_acked(offset, count)
-
-    def on_unsent(self, offset: int, count: int) -> None:
-        """See protocol.writing.ChunkSource."""
-        self._source.on_unsent(offset, count)
 
     def check_point(self) -> None:
         """Terminate was ACKed."""
-        self.proven = True
-        self.unproven = 0
-        self._proven_to = self.reached
+        self.proven, self.unproven, self._proven_to = True, 0, self.reached
         self._source.on_checkpoint()
 
     def roll_back(self, *, everything: bool) -> None:
@@ -125,58 +114,54 @@ class Feed:
         if not self.proven and not self.unproven:
             return
         if everything:
-            self.proven = False
-            self._proven_to = 0
-        self.reached = self._proven_to
-        self.unproven = 0
+            self.proven, self._proven_to = False, 0
+        self.reached, self.unproven = self._proven_to, 0
         self._source.on_rollback(everything)
 
 
-class Upload(SessionUser):
-    """Implements cache.remote.Upload; `uploading` does the work.
+class UploadProgress(SessionUser):
+    """What the owner of an upload and the scheduler see of it: cache.remote.Upload but for its turns.
 
     Attributes:
         state: see UploadState. error: why the last attempt failed; None while it goes well.
         transfer: what sends its bytes now. begun, resent: see cache.remote.Upload.
-        retry_at: not to be touched before. reboots: of the vehicle, when its file was opened last.
+        reboots: of the vehicle, when its file was opened last.
         endings: counted when a turn begins, and when all that the source had is out and the file is to be
             closed. What was given before is in that file: `complete` tells who called `finish` until then.
         refused_at: where a write was refused the last time as if the session were lost.
     """
 
-    def __init__(
-        self,
-        path: bytes,
-        feed: Feed,
-        queue: Queue,
-        server: ServerSession,
-        vehicle: Vehicle,
-        clock: Callable[[], float],
-    ) -> None:
-        super().__init__(path, clock())
-        self.feed = feed
+    def __init__(self, path: bytes, source: UploadSource, scheduler: Scheduler) -> None:
+        super().__init__(path, scheduler, scheduler.clock())
+        self.feed = Feed(source, scheduler.write_chunks.most)
         self.state = UploadState.QUEUED
         self.begun = self.resent = False
         self.error: MavftpfsError | None = None
         self.transfer: WriteTransfer | None = None
-        self.retry_at = 0.0
-        self.reboots = vehicle.reboots
+        self.reboots = scheduler.server.vehicle.reboots
+        self.endings = 0
         self.refused_at: int | None = None
-        self._queue = queue
-        self._server = server
-        self._vehicle = vehicle
-        self._clock = clock
+        self._vehicle = scheduler.server.vehicle
+        self._driver = scheduler.server.driver
+        self._engine = scheduler.server.engine
+        self._clock = scheduler.clock
+        self._traits = scheduler.traits
+        self._retry_at = 0.0  # not to be touched before
         self._failures = 0
         self._furthest = 0  # in the file, when the session was lost the last time
-        self.endings = 0
-        self._completed = 0  # the last of those that was ACKed
+        self._completed = 0  # the last of the endings that was ACKed
         self._awaited = 0  # the last of those that `finish` waits for
         self._changed = trio.lowlevel.ParkingLot()
+        scheduler.add(self)
 
     def _enter(self, state: UploadState) -> None:
         assert state in UPLOAD_NEXT[self.state], f"{self.state} does not become {state}"
         self.state = state
         self._changed.unpark_all()
+
+    def _queue_up(self, at: float) -> None:
+        self._enter(UploadState.QUEUED)
+        self._retry_at = self.asked_at = at
 
     # --- the owner's side
 
@@ -192,7 +177,8 @@ class Upload(SessionUser):
         """See cache.remote.Upload."""
         if self.state in (UploadState.ENDING, UploadState.ENDED):
             raise LocalProtocolError("the upload was aborted")
-        if self.state in (UploadState.IDLE, UploadState.HELD) and self._is_complete():
+        resting, feed = self.state in (UploadState.IDLE, UploadState.HELD), self.feed
+        if resting and feed.proven and not feed.unproven and self.error is None and not feed.has_more():
             return
         now = self._clock()
         self._vehicle.require_writable(now)
@@ -200,8 +186,8 @@ class Upload(SessionUser):
             self.error, self.refused_at, self._failures = None, None, 0
         if not self.finishing:
             self.asked_at = now
-        self.retry_at = 0.0
-        if self.state in (UploadState.IDLE, UploadState.HELD):
+        self._retry_at = 0.0
+        if resting:
             self._enter(UploadState.QUEUED)
         awaited = self._awaited = self.endings + 1
         self.wake()
@@ -222,7 +208,7 @@ class Upload(SessionUser):
             while self.state is UploadState.ENDING:
                 await self._changed.park()
         finally:
-            self._queue.remove(self)
+            self._scheduler.remove(self)
 
     def status(self) -> dict[str, object]:
         """Return facts for people and scripts; JSON-able."""
@@ -234,11 +220,7 @@ class Upload(SessionUser):
             "error": None if self.error is None else str(self.error),
         }
 
-    def _is_complete(self) -> bool:
-        """Whether the card has all that the source has."""
-        return self.feed.proven and not self.feed.unproven and self.error is None and not self.feed.has_more()
-
-    # --- the queue's side
+    # --- the scheduler's side
 
     @property
     def finishing(self) -> bool:
@@ -251,7 +233,7 @@ class Upload(SessionUser):
             return inf
         if not self.finishing and self._vehicle.lost(self._clock()):
             return inf
-        return self.retry_at
+        return self._retry_at
 
     def expire(self, error: MavftpfsError) -> None:
         """Tell whoever waits; it keeps its place if nobody does."""
@@ -266,11 +248,40 @@ class Upload(SessionUser):
             elif self.finishing:
                 self.fail(Armed("the vehicle was armed"))
 
+    def fail(self, error: MavftpfsError, *, refused: bool = False) -> None:
+        """Tell whoever waits, and try again in the background; refused: that is of no use before `finish`."""
+        self.error = error
+        self._failures += 1
+        self._awaited = self._completed
+        if self.state is UploadState.ENDING:
+            self._changed.unpark_all()
+        elif refused:
+            self._enter(UploadState.HELD)
+        else:
+            self._queue_up(self._clock() + min(LONGEST_BACKOFF, 2.0 ** min(self._failures, 5)))
+
     # --- one turn
 
-    def begin_turn(self, *, resumable: bool) -> bool:
+    def resumable(self) -> bool:
+        """Whether its file can be closed and written on later: it was seen to be so, or this is to tell."""
+        truncates = self._traits.wo_truncates
+        return truncates is False or (truncates is None and self.feed.reached > 0)
+
+    def end_turn(self, began: float) -> None:
+        """It has the session no more."""
+        now = self._clock()
+        self.on_turn(began, now)
+        if self.state is UploadState.ENDING:
+            self._enter(UploadState.ENDED)
+        elif self.state is UploadState.SENDING:
+            self._queue_up(now)
+        self.asked_at = max(now, self._retry_at)
+        if self.state is UploadState.QUEUED and self.finishing and not self._vehicle.may_write:
+            self.fail(Armed("the vehicle was armed"))  # perhaps while its file was opened or closed
+
+    def begin_turn(self) -> bool:
         """It has the session from now on. Return False if there is nothing to send, so that it is complete;
-        but an empty file has to be made once. resumable: see `complete`.
+        but an empty file has to be made, too, once.
 
         Raises:
             MavftpfsError: the source fails.
@@ -280,19 +291,17 @@ class Upload(SessionUser):
         feed = self.feed
         if feed.has_more() or feed.unproven or (self.finishing and not feed.proven):
             return True
-        self.complete(resumable=resumable)
+        self.complete()
         return False
 
-    def complete(self, *, resumable: bool) -> None:
-        """Everything given until `endings` was counted is ACKed, and the file was closed.
-
-        resumable: it can be written on. Else what comes from now on costs the whole file once more, so it is
-        held until somebody waits for it.
+    def complete(self) -> None:
+        """Everything given until `endings` was counted is ACKed, and the file was closed. Where it cannot be
+        written on, more costs the whole file once more, so it is held until somebody waits for it.
 
         Raises:
             MavftpfsError: the source fails.
         """
-        more = self.feed.has_more()
+        more, resumable = self.feed.has_more(), self.resumable()
         self._completed = self.endings
         self.error = None
         self._failures = 0
@@ -314,31 +323,3 @@ class Upload(SessionUser):
             self.fail(error)
         elif self.state is UploadState.SENDING:
             self._queue_up(self._clock() + (self._failures - 1) * 0.5)
-
-    def fail(self, error: MavftpfsError, *, refused: bool = False) -> None:
-        """Tell whoever waits, and try again in the background; refused: that is of no use before `finish`."""
-        self.error = error
-        self._failures += 1
-        self._awaited = self._completed
-        if self.state is UploadState.ENDING:
-            self._changed.unpark_all()
-        elif refused:
-            self._enter(UploadState.HELD)
-        else:
-            self._queue_up(self._clock() + min(LONGEST_BACKOFF, 2.0 ** min(self._failures, 5)))
-
-    def end_turn(self, began: float) -> None:
-        """It has the session no more."""
-        now = self._clock()
-        self.on_turn(began, now)
-        if self.state is UploadState.ENDING:
-            self._enter(UploadState.ENDED)
-        elif self.state is UploadState.SENDING:
-            self._queue_up(now)
-        self.asked_at = max(now, self.retry_at)
-        if self.state is UploadState.QUEUED and self.finishing and not self._vehicle.may_write:
-            self.fail(Armed("the vehicle was armed"))  # perhaps while its file was opened or closed
-
-    def _queue_up(self, at: float) -> None:
-        self._enter(UploadState.QUEUED)
-        self.retry_at = self.asked_at = at

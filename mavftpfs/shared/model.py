@@ -15,6 +15,9 @@ from mavftpfs.shared.errors import LocalProtocolError, PathTooLong
 MAX_WIRE_PATH = 200
 """Bytes of a path that fit every known server with room to spare (servers.md 14.33)."""
 
+RENAME_ROOM = 238
+"""Bytes that both paths of a rename and the NUL between them may have (servers.md 9)."""
+
 ROOT = b"/"
 
 

@@ -23,6 +23,7 @@ class Traits:
         write_ack_counts: WriteFile ACKs say how many bytes were written.
         write_ack_offset: they say where (MAVSDK's say 0), and are believed only if that is the place.
         paths_disarm: a path operation made it refuse the next write (PX4 on NuttX, servers.md 8).
+        lists_times: it answers opcode 16. time_silences: how often it did not, and then answered opcode 3.
     """
 
     ack_carries_own_session: bool | None = None
@@ -30,6 +31,8 @@ class Traits:
     write_ack_counts: bool | None = None
     write_ack_offset: bool | None = None
     paths_disarm: bool = False
+    lists_times: bool | None = None
+    time_silences: int = 0
 
     def learn_session_echo(self, echoed: bool) -> None:
         """Note whether an Open ACK carried the id asked for; an echoing server has the shared queue."""

@@ -82,8 +82,9 @@ async def test_a_sticky_file_exists_hides_no_other_refusal(profile: str, autojum
     faults = Faults(here)
 
     async def spoil(connection: Connection) -> None:
+        request = Simple(Opcode.CREATE_DIRECTORY, path(profile, "dir"))
         with pytest.raises(FtpNak):
-            await connection.scheduler.metadata(Simple(Opcode.CREATE_DIRECTORY, path(profile, "dir")))
+            await connection.driver.run(request)
 
     async with here.connection() as connection:
         await spoil(connection)
@@ -220,8 +221,7 @@ async def test_who_looks_misses_no_name_because_we_take_others_away(
     async with here.connection() as connection, trio.open_nursery() as nursery:
 
         async def sweep() -> None:
-            entries, _ = await connection.store._changes._entries(directory)
-            shown.update(entry.name for entry in entries)
+            shown.update((await connection.store._names(directory))[0])
 
         await connection.store.list_directory(directory)
         nursery.start_soon(sweep)

@@ -33,6 +33,7 @@ from mavftpfs.sim.linkmodel import Duplex, LinkModel, LinkSettings
 from mavftpfs.sim.profiles import PROFILES
 from mavftpfs.sim.tree import MemoryTree
 from mavftpfs.sim.vehicle import SimVehicle
+from mavftpfs.trace import Tee
 from tests.support.faults import Faults
 from tests.support.memory import MemoryLink
 from tests.support.uploads import put
@@ -55,7 +56,8 @@ async def test_the_trace_tells_what_was_repeated_and_what_was_not_believed(autoj
     here = World("px4", LinkSettings(rate=50_000.0, delay=0.02, loss=0.1, duplicate=0.1))
     here.tree.add(b"/f", DATA)
     trace = Collected()
-    async with connected(here.link, ConnectOptions(), rng=random.Random(1), trace=trace) as connection:
+    sink = Tee([trace]).payload
+    async with connected(here.link, ConnectOptions(), rng=random.Random(1), trace=sink) as connection:
         await connection.ready(10)
         assert await read_file(connection, b"/f") == DATA
         repeated = [line for line in trace.lines if line[0] == "request" and "retransmit" in line[2]]

@@ -10,7 +10,6 @@ import pytest
 import trio
 from trio.testing import MockClock
 
-from mavftpfs.cache.reserved import RENAME_ROOM
 from mavftpfs.cache.tree import Tree
 from mavftpfs.link.messages import Address
 from mavftpfs.protocol.payload import Opcode
@@ -22,7 +21,7 @@ from mavftpfs.shared.errors import (
     IsADirectory,
     PathTooLong,
 )
-from mavftpfs.shared.model import join, split
+from mavftpfs.shared.model import RENAME_ROOM, join, split
 from mavftpfs.sim.linkmodel import LinkSettings
 from mavftpfs.sim.profiles import PROFILES, Storage
 from mavftpfs.sim.tree import Kind

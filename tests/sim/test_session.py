@@ -17,8 +17,8 @@ from mavftpfs.link.messages import Address
 from mavftpfs.protocol.operations import OpenFile
 from mavftpfs.protocol.payload import Opcode, decode_request, request
 from mavftpfs.session.connection import Connection, ConnectOptions
-from mavftpfs.session.queue import Queue
 from mavftpfs.session.reader import REOPENS, STALL
+from mavftpfs.session.scheduler import Scheduler
 from mavftpfs.session.serversession import SILENCE_ARDUPILOT
 from mavftpfs.session.store import TIME_PROBE_LIMIT
 from mavftpfs.shared.errors import (
@@ -234,15 +234,15 @@ async def test_a_reader_goes_on_beside_a_job_that_has_to_wait(
     here.tree.add(b"/big", content(20_000))
     here.tree.add(b"/changing", b"old")
     rounds = 0
-    choose = Queue.first
+    choose = Scheduler.first
 
-    def counted(queue: Queue) -> object:
+    def counted(queue: Scheduler) -> object:
         nonlocal rounds
         rounds += 1
         assert rounds < ROUNDS, "it goes round without a moment in between"
         return choose(queue)
 
-    monkeypatch.setattr(Queue, "first", counted)
+    monkeypatch.setattr(Scheduler, "first", counted)
     async with here.connection() as connection, trio.open_nursery() as nursery:
         scheduler = connection.scheduler
         async with scheduler.server.excluded(b"/changing"):

@@ -2,9 +2,20 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import cast
+
 import pytest
 
-from mavftpfs.session.queue import LONG_WAIT, MAX_TURN, MIN_TURN, RELIEF, USE_MEMORY, SessionUser
+from mavftpfs.session.scheduler import (
+    LONG_WAIT,
+    MAX_TURN,
+    MIN_TURN,
+    RELIEF,
+    USE_MEMORY,
+    Scheduler,
+    SessionUser,
+)
 from mavftpfs.shared.errors import MavftpfsError
 
 
@@ -14,12 +25,18 @@ class User(SessionUser):
     def due_at(self) -> float:
         return 0.0
 
+    async def turn(self) -> None:
+        raise NotImplementedError
+
     def fail(self, error: MavftpfsError) -> None:
         raise error
 
 
+SCHEDULER = cast(Scheduler, SimpleNamespace(server=None))
+
+
 def heavy(seconds: float = 5.0) -> User:
-    user = User(b"/f")
+    user = User(b"/f", SCHEDULER)
     user.on_turn(100.0 - seconds, 100.0)
     return user
 
@@ -37,7 +54,7 @@ def test_use_fades_but_not_while_it_waits() -> None:
 
 
 def test_who_used_little_goes_first_until_another_waited_long() -> None:
-    busy, light = heavy(), User(b"/g")
+    busy, light = heavy(), User(b"/g", SCHEDULER)
     busy.asked_at = 100.0
     light.asked_at = 101.0
     assert light.rank(101.0, 0.02) < busy.rank(101.0, 0.02)

@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 
 from mavftpfs.cache.repair import DELETED_AFTER, STALE_AFTER, Action, Group, Staleness, leftovers, repair
 from mavftpfs.cache.reserved import (
-    RENAME_ROOM,
     Kind,
     OwnNames,
     Reserved,
@@ -20,7 +19,7 @@ from mavftpfs.cache.reserved import (
     parse,
 )
 from mavftpfs.shared.errors import PathTooLong
-from mavftpfs.shared.model import DirEntry, EntryKind, split, usable_name
+from mavftpfs.shared.model import RENAME_ROOM, DirEntry, EntryKind, split, usable_name
 
 names = st.binary(min_size=1, max_size=60).filter(usable_name)
 

@@ -12,11 +12,9 @@ from pymavlink import mavutil
 
 from mavftpfs.link.framing import Framer
 from mavftpfs.link.messages import Address
-from mavftpfs.protocol.engine import EngineStats
 from mavftpfs.protocol.payload import NakCode, Opcode, Payload, request
-from mavftpfs.session.driver import Remarks
 from mavftpfs.shared.errors import UsageError
-from mavftpfs.trace import REPLY, JsonTrace, TlogWriter, text_line
+from mavftpfs.trace import REPLY, JsonTrace, Remarks, TlogWriter, text_line
 
 READ = request(7, Opcode.READ_FILE, session=3, offset=478, size=100).encode()
 OPEN = request(8, Opcode.OPEN_FILE_RO, data=b"/fs/microsd/a.bin").encode()
@@ -129,25 +127,16 @@ def test_a_trace_shows_up_while_it_is_written(tmp_path: Path) -> None:
 
 
 def test_a_repeated_request_is_marked_until_it_is_answered() -> None:
-    stats = EngineStats()
-    remarks = Remarks(stats)
+    remarks = Remarks()
     first = request(10, Opcode.READ_FILE, session=1, offset=239, size=239).encode()
     again = request(14, Opcode.READ_FILE, session=1, offset=239, size=239).encode()
     other = request(15, Opcode.READ_FILE, session=1, offset=478, size=239).encode()
-    assert remarks.on_request(first) == ""
-    assert remarks.on_request(first) == "retransmit"
-    assert remarks.on_request(again) == "retransmit of 10"
-    assert remarks.on_request(other) == ""
-    remarks.before_reply()
-    assert remarks.after_reply(Payload(15, 1, Opcode.ACK, 1, Opcode.READ_FILE, offset=239)) == ""
-    assert remarks.on_request(first) == ""
-
-
-def test_what_the_engine_did_not_believe_is_named() -> None:
-    stats = EngineStats()
-    remarks = Remarks(stats)
-    reply = Payload(15, 1, Opcode.ACK, 0, Opcode.READ_FILE)
-    for counter, words in (("unknown", "late"), ("stale", "stale"), ("incoherent", "fit")):
-        remarks.before_reply()
-        setattr(stats, counter, getattr(stats, counter) + 1)
-        assert words in remarks.after_reply(reply)
+    answer = Payload(15, 1, Opcode.ACK, 1, Opcode.READ_FILE, offset=239).encode()
+    assert remarks.of("request", first) == ""
+    assert remarks.of("request", first) == "retransmit"
+    assert remarks.of("request", again) == "retransmit of 10"
+    assert remarks.of("request", other) == ""
+    assert remarks.of(REPLY, Payload(15, 1, Opcode.ACK, 1, Opcode.OPEN_FILE_RO).encode()) == "stale replay"
+    assert remarks.of(REPLY, answer) == ""
+    assert "late" in remarks.of(REPLY, answer)
+    assert remarks.of("request", first) == ""
