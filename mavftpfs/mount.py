@@ -30,11 +30,10 @@ from mavftpfs.control import ControlServer, Reply
 from mavftpfs.exits import ExitCode, MountFailed, exit_code_for
 from mavftpfs.farewell import Holder, say_goodbye
 from mavftpfs.fuse.device import never_blocking
-from mavftpfs.fuse.handles import Space, WritableTree
+from mavftpfs.fuse.handles import Presentation, Space, Tree
 from mavftpfs.fuse.inodes import InodeTable
-from mavftpfs.fuse.operations import Operations, Presentation
+from mavftpfs.fuse.operations import Operations
 from mavftpfs.fuse.options import MountOptions, fuse_words
-from mavftpfs.fuse.writing import WritingOperations
 from mavftpfs.link.uri import LinkSpec
 from mavftpfs.mountpoint import is_ours, stderr_of, unmount, unmount_what_is_left
 from mavftpfs.report import Watcher, snapshot
@@ -68,7 +67,7 @@ class MountRequest:
     sinks: Sinks = NO_SINKS
 
 
-class MountedTree(WritableTree, Holder, Protocol):
+class MountedTree(Tree, Holder, Protocol):
     """What a mount needs of cache.tree.Tree."""
 
 
@@ -229,8 +228,7 @@ class _Life:
         invalidator = Invalidator(inodes, pyfuse3.invalidate_inode)
         async with attach(invalidator.on_changed) as content:
             nursery.start_soon(content.watch)
-            kind = Operations if self.request.options.read_only else WritingOperations
-            operations: Operations = kind(
+            operations = Operations(
                 content.tree,
                 presentation(self.request.options),
                 inodes=inodes,

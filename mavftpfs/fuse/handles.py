@@ -5,12 +5,13 @@ Without pyfuse3, so that commands that mount nothing work where there is no libf
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import mmap
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Generic, Protocol, TypeVar
 
-from mavftpfs.shared.model import EntryKind
+from mavftpfs.cache.attributes import Stat
 
 XATTR_CRC32 = b"user.mavftp.crc32"
 XATTR_STATUS = b"user.mavftpfs.status"
@@ -24,24 +25,19 @@ class Space:
     free: int
 
 
-class Stat(Protocol):
-    """What the tree says of one path. size in bytes, mtime in seconds UTC and mtime_nsec to add to them,
-    valid_for in seconds."""
+@dataclass(frozen=True, slots=True)
+class Presentation:
+    """How entries look, and how long requests may take. Modes are permission bits; deadline in seconds."""
 
-    @property
-    def kind(self) -> EntryKind: ...
-    @property
-    def size(self) -> int: ...
-    @property
-    def mtime(self) -> int: ...
-    @property
-    def mtime_nsec(self) -> int: ...
-    @property
-    def valid_for(self) -> float: ...
+    uid: int
+    gid: int
+    file_mode: int
+    directory_mode: int
+    op_deadline: float
 
 
-class OpenFile(Protocol):
-    """A file open for reading; cache.openfile.OpenFile says more. size in bytes."""
+class File(Protocol):
+    """An open file (cache.writefile.OpenFile says more). size in bytes."""
 
     @property
     def size(self) -> int: ...
@@ -49,48 +45,46 @@ class OpenFile(Protocol):
     def direct_io(self) -> bool: ...
     @property
     def keep_cache(self) -> bool: ...
-    async def read(self, offset: int, size: int) -> bytes | memoryview: ...
-    def close(self) -> None: ...
-
-
-@contextmanager
-def closed_on_failure(file: OpenFile) -> Iterator[None]:
-    """Close a file whose opening fails after all: the kernel sends no release for it."""
-    try:
-        yield
-    except BaseException:
-        file.close()
-        raise
-
-
-class WritableFile(OpenFile, Protocol):
-    """A file open for whatever, as a mount that may be changed sees it."""
-
     @property
     def writable(self) -> bool: ...
+    async def read(self, offset: int, size: int) -> bytes | memoryview: ...
     async def write(self, offset: int, data: bytes) -> int: ...
     async def truncate(self, size: int) -> None: ...
     async def flush(self) -> None: ...
     async def fsync(self) -> None: ...
     async def release(self) -> None: ...
+    def close(self) -> None: ...
     def give_up(self) -> None: ...
 
 
-class FileTree(Protocol):
+@contextmanager
+def closed_on_failure(close: Callable[[], None]) -> Iterator[None]:
+    """Close a file whose opening fails after all: the kernel sends no release for it."""
+    try:
+        yield
+    except BaseException:
+        close()
+        raise
+
+
+def is_mapped_page(start: int, stop: int, told: int) -> bool:
+    """Return whether a write brings a page of a mapping instead of what a program appended.
+
+    The kernel brings pages by any handle that may write, also one with O_APPEND. They lie on page borders and
+    within the size it knows (`told`, bytes), where nothing can be appended.
+    """
+    return start < told and start % mmap.PAGESIZE == 0 and (stop == told or stop % mmap.PAGESIZE == 0)
+
+
+class Tree(Protocol):
     """The vehicle's files behind their caches (cache.tree.Tree); raises only MavftpfsError."""
 
     async def stat(self, path: bytes) -> Stat: ...
     def negative_valid_for(self, path: bytes) -> float: ...
     async def list(self, path: bytes) -> Sequence[tuple[bytes, Stat]]: ...
-    async def open(self, path: bytes) -> OpenFile: ...
     async def crc32(self, path: bytes) -> int: ...
-
-
-class WritableTree(FileTree, Protocol):
-    """The same, with what changes it."""
-
-    async def open(self, path: bytes, *, write: bool = False, truncate: bool = False) -> WritableFile: ...
-    async def create(self, path: bytes, *, exclusive: bool) -> WritableFile: ...
+    async def open(self, path: bytes, *, write: bool = False, truncate: bool = False) -> File: ...
+    async def create(self, path: bytes, *, exclusive: bool) -> File: ...
     async def truncate(self, path: bytes, size: int) -> None: ...
     async def set_times(self, path: bytes, mtime_ns: int) -> None: ...
     async def mkdir(self, path: bytes) -> None: ...
@@ -104,7 +98,7 @@ class FileHandle:
     """One open() of a file. flags: as given to open(2)."""
 
     ino: int
-    file: OpenFile
+    file: File
     flags: int = 0
 
 

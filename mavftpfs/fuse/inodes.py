@@ -19,10 +19,13 @@ An inode lives while its lookup count is above zero; the root always does.
 from __future__ import annotations
 
 import hashlib
+import stat as stat_bits
 from collections import OrderedDict
 from dataclasses import dataclass
+from typing import Any
 
-from mavftpfs.shared.model import ROOT
+from mavftpfs.cache.attributes import Stat
+from mavftpfs.shared.model import ROOT, EntryKind
 
 ROOT_INO = 1
 _INO_MASK = (1 << 63) - 1
@@ -171,16 +174,23 @@ class UserAttributes:
     mtime_ns: int | None = None
     changed_ns: int | None = None
 
-    def shown_mtime_ns(self, listed: int) -> int:
-        """Return the time to show of a file where the tree shows `listed` (seconds)."""
-        if self.mtime_ns is not None and self.mtime_ns // NANO == listed:
-            return self.mtime_ns
-        return listed * NANO
-
-    def directory_times(self, listed_ns: int) -> tuple[int, int]:
-        """Return (mtime, ctime) to show of a directory where the tree shows `listed_ns`."""
-        changed = listed_ns if self.changed_ns is None else max(self.changed_ns, listed_ns)
-        return changed if self.mtime_ns is None else self.mtime_ns, changed
+    def show(self, entry: Any, found: Stat) -> None:
+        """Put what was set into `entry` (pyfuse3.EntryAttributes); found: what the tree says."""
+        if self.mode is not None:
+            entry.st_mode = stat_bits.S_IFMT(entry.st_mode) | self.mode
+        if self.uid is not None:
+            entry.st_uid = self.uid
+        if self.gid is not None:
+            entry.st_gid = self.gid
+        same_second = self.mtime_ns is not None and self.mtime_ns // NANO == found.mtime
+        if found.kind is EntryKind.DIRECTORY:
+            entry.st_ctime_ns = max(self.changed_ns or 0, entry.st_mtime_ns)
+            entry.st_mtime_ns = entry.st_ctime_ns if self.mtime_ns is None else self.mtime_ns
+        elif same_second and not found.mtime_nsec:  # else the tree knows it to the nanosecond
+            entry.st_mtime_ns = entry.st_ctime_ns = self.mtime_ns
+        entry.st_atime_ns = entry.st_mtime_ns if self.atime_ns is None else self.atime_ns
+        if found.kind is EntryKind.FILE and self.mtime_ns is not None and not same_second:
+            self.atime_ns = None  # the file changed since
 
 
 class UserAttributeTable:

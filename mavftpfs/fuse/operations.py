@@ -5,6 +5,11 @@ loop and with it the mount; every handler has a deadline, because a caller that 
 killed; trio.Cancelled passes.
 
 Inodes are touched only between awaits: reserve, reply and count form one atomic step.
+
+flush is called for every closed descriptor, whoever wrote (pyfuse3 tells no owner), so it asks the handle:
+one that was opened for reading has nothing to say. fsync is asked for by name, and is about the file: any
+handle will do (`sync FILE` opens for reading). release cannot report; what it finds undelivered stays with
+the tree. A mount with `ro` is refused changes by the kernel, and by the tree.
 """
 
 from __future__ import annotations
@@ -15,26 +20,28 @@ import json
 import logging
 import os
 import stat as stat_bits
+import time
 from collections.abc import Awaitable, Callable, Coroutine, Sequence
-from dataclasses import dataclass
 from typing import Any, Concatenate, NoReturn, ParamSpec, TypeVar
 
 import pyfuse3
 import trio
-from pyfuse3 import EntryAttributes, FileInfo, FUSEError, RequestContext, StatvfsData
+from pyfuse3 import EntryAttributes, FileInfo, FUSEError, RequestContext, SetattrFields, StatvfsData
 
+from mavftpfs.cache.attributes import Stat
 from mavftpfs.fuse.handles import (
     XATTR_CRC32,
     XATTR_STATUS,
     DirectoryHandle,
     FileHandle,
-    FileTree,
     HandleTable,
+    Presentation,
     Space,
-    Stat,
+    Tree,
     closed_on_failure,
+    is_mapped_page,
 )
-from mavftpfs.fuse.inodes import ROOT_INO, Inode, InodeTable
+from mavftpfs.fuse.inodes import NANO, ROOT_INO, Inode, InodeTable, UserAttributeTable
 from mavftpfs.shared.errnos import errno_for
 from mavftpfs.shared.errors import Armed, ListingIncomplete, MavftpfsError, NotFound
 from mavftpfs.shared.model import MAX_WIRE_PATH, EntryKind, join, split
@@ -48,9 +55,23 @@ DEADLINE_MARGIN = 3.0
 CRC_BUDGET = 120.0
 """Seconds for a checksum: the drone reads the whole file for it (promise 2)."""
 
+DELIVERY_BUDGET = 4 * 3600.0
+"""Seconds for what moves bytes: the tree ends it by itself when there is no progress, so this only keeps
+a trickle from lasting for ever."""
+
+NAMESPACE_BUDGET = 240.0
+"""Seconds for a change of names: it may have to finish a delivery, and to look whether it was done."""
+
+_DELIVERING = frozenset({"write", "flush", "fsync", "release", "setattr", "open"})
+_NAMING = frozenset({"create", "mknod", "mkdir", "rmdir", "unlink", "rename"})
+
 SLOWEST_RATE = 256
 """Bytes/s of the slowest link worth waiting for. The tree ends a read without progress by itself; this
 only keeps a read that trickles from lasting for ever."""
+
+DOTS = (b".", b"..")
+"""Of these entries the kernel takes the number and the kind, and counts no lookup."""
+_ANY_DIRECTORY = Stat(EntryKind.DIRECTORY, 0, 0, 0.0)
 
 BLOCK_SIZE = 4096
 STAT_BLOCK = 512
@@ -61,17 +82,6 @@ P = ParamSpec("P")
 T = TypeVar("T")
 S = TypeVar("S", bound="Operations")
 Handler = Callable[Concatenate[S, P], Coroutine[Any, Any, T]]
-
-
-@dataclass(frozen=True, slots=True)
-class Presentation:
-    """How entries look, and how long requests may take. Modes are permission bits; deadline in seconds."""
-
-    uid: int
-    gid: int
-    file_mode: int
-    directory_mode: int
-    op_deadline: float
 
 
 Refresh = Callable[[int], Awaitable[None]]
@@ -104,33 +114,41 @@ def handler(method: Handler[S, P, T]) -> Handler[S, P, T]:
 
 
 class Operations(pyfuse3.Operations):
-    """One mount's request handlers. Read-only: whatever would change the tree is EROFS."""
+    """One mount's request handlers."""
 
     supports_dot_lookup = False
     enable_writeback_cache = False
 
     def __init__(
         self,
-        tree: FileTree,
+        tree: Tree,
         presentation: Presentation,
         *,
         inodes: InodeTable | None = None,
         refresh: Refresh = _no_refresh,
         space: Callable[[], Space | None] = lambda: None,
         status: Callable[[], dict[str, Any]] = dict,
+        now_ns: Callable[[], int] = time.time_ns,
     ) -> None:
+        """`now_ns()`: the time of day, nanoseconds since 1970 UTC."""
         super().__init__()
         self._tree = tree
         self._look = presentation
         self._refresh = refresh
         self._space = space
         self._status = status
+        self._now_ns = now_ns
+        self._set_by_users = UserAttributeTable()
         self.inodes = InodeTable() if inodes is None else inodes
         self.files: HandleTable[FileHandle] = HandleTable()
         self.directories: HandleTable[DirectoryHandle] = HandleTable()
 
     def budget(self, name: str, args: Sequence[Any]) -> float:
         """Return the seconds a handler may take."""
+        if name in _DELIVERING:
+            return DELIVERY_BUDGET
+        if name in _NAMING:
+            return NAMESPACE_BUDGET
         if name == "read":
             return self._look.op_deadline + DEADLINE_MARGIN + int(args[2]) / SLOWEST_RATE
         if name == "getxattr" and args[1] == XATTR_CRC32:
@@ -165,12 +183,6 @@ class Operations(pyfuse3.Operations):
             self.inodes.forget(ino, lookups)
 
     @handler
-    async def getattr(self, inode: int, ctx: RequestContext) -> EntryAttributes:
-        """Return attributes by number."""
-        known = self._inode(inode)
-        return self._attributes(known, await self._tree.stat(self._path(inode)))
-
-    @handler
     async def access(self, inode: int, mode: int, ctx: RequestContext) -> bool:
         """Never asked while default_permissions is on, which is always."""
         return True
@@ -202,13 +214,15 @@ class Operations(pyfuse3.Operations):
             await self._take_snapshot(handle)
         elif start_id >= len(handle.entries) and handle.cut_short:
             raise FUSEError(errno.EIO)
-        path = self._path(handle.ino)
         for offset, (name, found) in enumerate(handle.entries[start_id:], start_id + 1):
-            inode = self.inodes.reserve(join(path, name))
-            if not pyfuse3.readdir_reply(token, name, self._attributes(inode, found), offset):
+            inode = self.inodes.reserve(self._child(handle.ino, name))
+            sent = pyfuse3.readdir_reply(token, name, self._attributes(inode, found), offset)
+            if sent and name not in DOTS:
+                self.inodes.count(inode)
+            else:
                 self.inodes.discard(inode)
+            if not sent:
                 return
-            self.inodes.count(inode)
 
     async def _take_snapshot(self, handle: DirectoryHandle) -> None:
         """List a directory.
@@ -218,16 +232,17 @@ class Operations(pyfuse3.Operations):
         """
         handle.cut_short = False
         try:
-            handle.entries = await self._tree.list(self._path(handle.ino))
+            entries = await self._tree.list(self._path(handle.ino))
         except ListingIncomplete as incomplete:
-            handle.entries, handle.cut_short = incomplete.entries, True
-            if not handle.entries:
+            entries, handle.cut_short = list(incomplete.entries), True
+            if not entries:
                 raise
         except MavftpfsError as error:
             if errno_for(error) != errno.ENOENT:
                 raise
             log.debug("readdir: %s", error)
             raise FUSEError(errno.EIO) from error
+        handle.entries = [*((dot, _ANY_DIRECTORY) for dot in DOTS), *entries]
 
     @handler
     async def releasedir(self, fh: int) -> None:
@@ -242,17 +257,35 @@ class Operations(pyfuse3.Operations):
 
     @handler
     async def open(self, inode: int, flags: int, ctx: RequestContext) -> FileInfo:
-        """Open a file for reading."""
-        if flags & os.O_ACCMODE != os.O_RDONLY or flags & os.O_TRUNC:
-            raise FUSEError(errno.EROFS)
+        """Open a file; O_TRUNC comes in the flags and no setattr follows it."""
+        writing = flags & os.O_ACCMODE != os.O_RDONLY or bool(flags & os.O_TRUNC)
         known = self._inode(inode)
-        file = await self._tree.open(self._path(inode))
-        if known.told_size not in (None, file.size):
-            # Else the kernel ends reads at the size it remembers for up to attr_timeout.
-            with closed_on_failure(file):
+        path = self._path(inode)
+        file = await self._tree.open(path, write=writing, truncate=bool(flags & os.O_TRUNC))
+        if flags & os.O_TRUNC:
+            known.told_size = 0
+        elif known.told_size not in (None, file.size):
+            with closed_on_failure(file.close):
                 await self._refresh(inode)
-        fh = self.files.add(FileHandle(inode, file))
+        fh = self.files.add(FileHandle(inode, file, flags))
         return FileInfo(fh=fh, direct_io=file.direct_io, keep_cache=file.keep_cache)
+
+    @handler
+    async def create(
+        self, parent_inode: int, name: bytes, mode: int, flags: int, ctx: RequestContext
+    ) -> tuple[FileInfo, EntryAttributes]:
+        """Create a file and open it."""
+        path = self._child(parent_inode, name)
+        file = await self._tree.create(path, exclusive=bool(flags & os.O_EXCL))
+        with closed_on_failure(file.give_up):
+            if flags & os.O_TRUNC and file.size:
+                await file.truncate(0)
+            found = Stat(EntryKind.FILE, file.size, (await self._tree.stat(path)).mtime, 0.0)
+        self._made(path, mode)
+        inode = self.inodes.lookup(path)
+        fh = self.files.add(FileHandle(inode.ino, file, flags))
+        info = FileInfo(fh=fh, direct_io=file.direct_io, keep_cache=file.keep_cache)
+        return info, self._attributes(inode, found)
 
     @handler
     async def read(self, fh: int, off: int, size: int) -> bytes | memoryview:  # type: ignore[override]
@@ -268,19 +301,157 @@ class Operations(pyfuse3.Operations):
         return data
 
     @handler
+    async def write(self, fh: int, off: int, buf: bytes) -> int:
+        """Take bytes; what is taken is kept until it is proven to be on the card."""
+        handle = self._file(fh)
+        file = handle.file
+        if not file.writable:
+            raise FUSEError(errno.EBADF)
+        known = self._inode(handle.ino)
+        told, stop = known.told_size or 0, off + len(buf)
+        known.told_size = max(told, stop)  # the kernel counts on without asking
+        if handle.flags & os.O_APPEND and not is_mapped_page(off, stop, told):
+            off = file.size  # the kernel's idea of the size may be older than ours
+        return await file.write(off, buf)
+
+    @handler
     async def flush(self, fh: int) -> None:
-        """A handle for reading has nothing to deliver."""
+        """A descriptor was closed: 0 means that everything written is on the card, checked.
+
+        But a file that was only emptied, or made, is delivered by fsync or release.
+        """
+        file = self._file(fh).file
+        if file.writable:
+            await file.flush()
 
     @handler
     async def fsync(self, fh: int, datasync: bool) -> None:
-        """A handle for reading has nothing to deliver."""
+        """0 means that everything written is on the card, checked, by whichever handle."""
+        await self._file(fh).file.fsync()
 
     @handler
     async def release(self, fh: int) -> None:
-        """Close a file."""
+        """The last descriptor was closed; nobody hears errors any more, but the tree keeps the bytes."""
         handle = self.files.remove(fh)
-        if handle is not None:
+        if handle is None:
+            return
+        try:
+            await handle.file.release()  # also of a reader: the last one of an unlinked file has it removed
+        except MavftpfsError as exc:
+            log.debug("a closed file is not finished on the vehicle yet: %s", exc)  # the tree said it once
+        finally:
             handle.file.close()
+
+    # -- attributes -------------------------------------------------------------------------------
+
+    @handler
+    async def getattr(self, inode: int, ctx: RequestContext) -> EntryAttributes:
+        """Return attributes by number, also of a file that has no name any more."""
+        return await self._attributes_of(inode)
+
+    @handler
+    async def setattr(
+        self, inode: int, attr: EntryAttributes, fields: SetattrFields, fh: int | None, ctx: RequestContext
+    ) -> EntryAttributes:
+        """Cut or extend a file; keep modes, owners and times, which no server stores."""
+        if fields.update_size:
+            await self._resize(inode, attr.st_size, fh)
+        path = self._inode(inode).path
+        if path is not None:
+            await self._keep(path, attr, fields)
+        return await self._attributes_of(inode)
+
+    async def _resize(self, ino: int, size: int, fh: int | None) -> None:
+        handle = self.files.get(fh) if fh is not None else None
+        if handle is not None and handle.file.writable:
+            await handle.file.truncate(size)
+        else:
+            await self._tree.truncate(self._path(ino), size)
+
+    async def _keep(self, path: bytes, attr: EntryAttributes, fields: SetattrFields) -> None:
+        kept = self._set_by_users.at(path)
+        if fields.update_mode:
+            kept.mode = stat_bits.S_IMODE(attr.st_mode)
+        if fields.update_uid:
+            kept.uid = attr.st_uid
+        if fields.update_gid:
+            kept.gid = attr.st_gid
+        if fields.update_atime:
+            kept.atime_ns = attr.st_atime_ns
+        if fields.update_mtime:
+            kept.mtime_ns, kept.changed_ns = attr.st_mtime_ns, self._now_ns()
+            if (await self._tree.stat(path)).kind is EntryKind.FILE:
+                await self._tree.set_times(path, attr.st_mtime_ns)
+
+    # -- names ------------------------------------------------------------------------------------
+
+    @handler
+    async def mknod(
+        self, parent_inode: int, name: bytes, mode: int, rdev: int, ctx: RequestContext
+    ) -> EntryAttributes:
+        """Make an empty regular file; there are no devices on a card."""
+        if not stat_bits.S_ISREG(mode):
+            raise FUSEError(errno.EPERM)
+        path = self._child(parent_inode, name)
+        file = await self._tree.create(path, exclusive=True)
+        with closed_on_failure(file.give_up):
+            await file.release()
+        file.close()
+        return await self._new_entry(path, mode)
+
+    @handler
+    async def mkdir(self, parent_inode: int, name: bytes, mode: int, ctx: RequestContext) -> EntryAttributes:
+        """Make a directory."""
+        path = self._child(parent_inode, name)
+        await self._tree.mkdir(path)
+        self._set_by_users.entries_changed(path, self._now_ns())
+        return await self._new_entry(path, mode)
+
+    @handler
+    async def rmdir(self, parent_inode: int, name: bytes, ctx: RequestContext) -> None:
+        """Remove an empty directory."""
+        path = self._child(parent_inode, name)
+        await self._tree.rmdir(path)
+        self._gone(path)
+
+    @handler
+    async def unlink(self, parent_inode: int, name: bytes, ctx: RequestContext) -> None:
+        """Remove a file; who has it open keeps it."""
+        path = self._child(parent_inode, name)
+        await self._tree.unlink(path)
+        self._gone(path)
+
+    @handler
+    async def rename(
+        self,
+        parent_inode_old: int,
+        name_old: bytes,
+        parent_inode_new: int,
+        name_new: bytes,
+        flags: int,
+        ctx: RequestContext,
+    ) -> None:
+        """Move a name, and everything below it."""
+        if flags & ~pyfuse3.RENAME_NOREPLACE:
+            raise FUSEError(errno.EINVAL)  # EXCHANGE
+        old = self._child(parent_inode_old, name_old)
+        new = self._child(parent_inode_new, name_new)
+        await self._tree.rename(old, new, noreplace=bool(flags & pyfuse3.RENAME_NOREPLACE))
+        self.inodes.rename(old, new)
+        self._set_by_users.move(old, new)
+        self._entry_changed(old)
+        self._entry_changed(new)
+
+    async def _not_on_a_card(self, *_: object) -> NoReturn:
+        raise FUSEError(errno.EPERM)
+
+    async def _no_attribute(self, *_: object) -> NoReturn:
+        raise FUSEError(errno.ENOTSUP)
+
+    _never: Any = _not_on_a_card
+    _unset: Any = _no_attribute
+    symlink = link = _never
+    setxattr = removexattr = _unset
 
     # -- the file system --------------------------------------------------------------------------
 
@@ -314,15 +485,6 @@ class Operations(pyfuse3.Operations):
     async def listxattr(self, inode: int, ctx: RequestContext) -> list[bytes]:
         """List the root's status only: listed checksums would have `cp -a` ask for one of every log."""
         return [XATTR_STATUS] if inode == ROOT_INO else []
-
-    # -- what would change the tree ---------------------------------------------------------------
-
-    async def _refuse(self, *_: object) -> NoReturn:
-        raise FUSEError(errno.EROFS)
-
-    _refused: Any = _refuse
-    setattr = create = mknod = mkdir = unlink = rmdir = symlink = rename = link = _refused
-    write = setxattr = removexattr = _refused
 
     # -- helpers ----------------------------------------------------------------------------------
 
@@ -378,6 +540,39 @@ class Operations(pyfuse3.Operations):
         entry.st_size = found.size
         entry.st_blksize = BLOCK_SIZE
         entry.st_blocks = -(-found.size // STAT_BLOCK)
-        mtime_ns = found.mtime * 1_000_000_000 + found.mtime_nsec
+        mtime_ns = found.mtime * NANO + found.mtime_nsec
         entry.st_atime_ns = entry.st_mtime_ns = entry.st_ctime_ns = mtime_ns
+        kept = None if inode.path is None else self._set_by_users.get(inode.path)
+        if kept is not None:
+            kept.show(entry, found)
         return entry
+
+    def _gone(self, path: bytes) -> None:
+        self.inodes.unlink(path)
+        self._set_by_users.drop(path)
+        self._entry_changed(path)
+
+    def _made(self, path: bytes, mode: int) -> None:
+        kept = self._set_by_users.at(path)
+        kept.mode, kept.atime_ns = stat_bits.S_IMODE(mode), self._now_ns()
+        self._entry_changed(path)
+
+    def _entry_changed(self, path: bytes) -> None:
+        """A name came or went; the kernel asks for its directory's attributes again by itself."""
+        self._set_by_users.entries_changed(split(path)[0], self._now_ns())
+
+    async def _new_entry(self, path: bytes, mode: int) -> EntryAttributes:
+        self._made(path, mode)
+        found = await self._tree.stat(path)
+        return self._attributes(self.inodes.lookup(path), found)
+
+    async def _attributes_of(self, ino: int) -> EntryAttributes:
+        inode = self._inode(ino)
+        if inode.path is not None:
+            return self._attributes(inode, await self._tree.stat(inode.path))
+        for handle in self.files:
+            if handle.ino == ino:
+                entry = self._attributes(inode, Stat(EntryKind.FILE, handle.file.size, 0, 0.0))
+                entry.st_nlink = 0
+                return entry
+        raise FUSEError(errno.ESTALE)

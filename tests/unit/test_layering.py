@@ -60,7 +60,7 @@ IMPURE_MODULES = {"sim.endpoints", "sim.tree", "shared.private"}
 IMPURE_IMPORTS = {"trio", "time", "socket", "logging", "pyfuse3", "os", "pathlib"}
 
 SOLE_IMPORTERS = {
-    "pyfuse3": {"fuse.device", "fuse.operations", "fuse.writing", "mount"},
+    "pyfuse3": {"fuse.device", "fuse.operations", "mount"},
     "pymavlink": {"link.framing"},
     "serial": {"link.serial"},
     "rich": {"cli", "demo", "oneshot.progress"},
