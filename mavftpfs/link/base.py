@@ -26,7 +26,6 @@ class LinkStats:
 
     received_bytes: int = 0
     sent_bytes: int = 0
-    received_chunks: int = 0
     sent_chunks: int = 0
     dropped_sends: int = 0
     reopened: int = 0

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Awaitable, Callable, Sequence
+from contextlib import suppress
 from typing import Protocol
 
 import trio
@@ -42,7 +43,7 @@ Opener = Callable[[], Awaitable[Pipe]]
 
 
 class StreamLink:
-    """Implements link.base.Link over whatever `opener` opens.
+    """Implements link.base.Link over whatever `opener` opens; without one somebody calls `replace`.
 
     Args:
         pipe: the first one, where it is already open.
@@ -52,7 +53,13 @@ class StreamLink:
     is_stream = True
 
     def __init__(
-        self, description: str, opener: Opener, pipe: Pipe | None, *, is_serial: bool, outbox_limit: int
+        self,
+        description: str,
+        opener: Opener | None,
+        pipe: Pipe | None,
+        *,
+        is_serial: bool,
+        outbox_limit: int,
     ) -> None:
         self.stats = LinkStats()
         self.description = description
@@ -96,7 +103,11 @@ class StreamLink:
                     await trio.lowlevel.cancel_shielded_checkpoint()
                 return chunks or []
             waited = True
-            await self._wait_for_input()
+            if self._pipe is None:
+                await self._changed.wait()
+                continue
+            with suppress(trio.ClosedResourceError, OSError):  # replaced or lost meanwhile; look again
+                await trio.lowlevel.wait_readable(self._pipe.fileno())
 
     def send_nowait(self, frames: Sequence[bytes]) -> None:
         """Send frames in one write; drop and count, whole, what cannot be kept."""
@@ -155,11 +166,8 @@ class StreamLink:
         """Write what had to wait, and reopen what failed; runs until cancelled."""
         async with trio.open_nursery() as nursery:
             nursery.start_soon(self._write_waiting)
-            nursery.start_soon(self._keep_open)
-
-    async def run_writer(self) -> None:
-        """Only the writing half of `run`, where somebody else calls `replace`."""
-        await self._write_waiting()
+            if self._opener is not None:
+                nursery.start_soon(self._keep_open, self._opener)
 
     async def aclose(self) -> None:
         """Close; what the kernel does not take now is lost."""
@@ -174,15 +182,6 @@ class StreamLink:
     def _notify(self) -> None:
         self._changed.set()
         self._changed = trio.Event()
-
-    async def _wait_for_input(self) -> None:
-        if self._pipe is None:
-            await self._changed.wait()
-            return
-        try:
-            await trio.lowlevel.wait_readable(self._pipe.fileno())
-        except (trio.ClosedResourceError, OSError):
-            return  # replaced or lost meanwhile; look again
 
     def _drain(self) -> list[bytes]:
         chunks: list[bytes] = []
@@ -200,7 +199,6 @@ class StreamLink:
             if len(data) < _READ_SIZE:
                 break  # saves the read that would say "nothing more"
         if chunks:
-            self.stats.received_chunks += len(chunks)
             self.stats.received_bytes += sum(map(len, chunks))
         return chunks
 
@@ -239,18 +237,11 @@ class StreamLink:
                 sent = self._write(data)
                 if sent and self._outbox.head() is data:  # a pipe that broke has emptied the outbox
                     self._outbox.advance(sent)
-                if sent < len(data):
-                    await self._wait_for_room()
+                if sent < len(data) and self._pipe is not None:
+                    with suppress(trio.ClosedResourceError, OSError):
+                        await trio.lowlevel.wait_writable(self._pipe.fileno())
 
-    async def _wait_for_room(self) -> None:
-        if self._pipe is None:
-            return
-        try:
-            await trio.lowlevel.wait_writable(self._pipe.fileno())
-        except (trio.ClosedResourceError, OSError):
-            return
-
-    async def _keep_open(self) -> None:
+    async def _keep_open(self, opener: Opener) -> None:
         pause = FIRST_PAUSE
         while not self._closed:
             if self._pipe is not None:
@@ -258,7 +249,7 @@ class StreamLink:
                 await self._changed.wait()
                 continue
             try:
-                pipe = await self._opener()
+                pipe = await opener()
             except (OSError, LinkClosed):
                 await trio.sleep(pause)
                 pause = min(pause * 2, LONGEST_PAUSE)

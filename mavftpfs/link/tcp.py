@@ -63,19 +63,15 @@ async def open_tcp_server(spec: LinkSpec) -> AsyncIterator[StreamLink]:
         raise cannot_open(spec, exc) from exc
     with listener:
         bound = replace(spec, port=listener.getsockname()[1])
-        link = StreamLink(bound.description, _never, None, is_serial=False, outbox_limit=_OUTBOX_LIMIT)
+        link = StreamLink(bound.description, None, None, is_serial=False, outbox_limit=_OUTBOX_LIMIT)
 
         async def serve() -> None:
             async with trio.open_nursery() as nursery:
-                nursery.start_soon(link.run_writer)
+                nursery.start_soon(link.run)
                 nursery.start_soon(_accept_peers, listener, link)
 
         async with background(serve, link.aclose):
             yield link
-
-
-async def _never() -> Pipe:
-    raise OSError(errno.ENOTCONN, "a listening link is opened by its peer")
 
 
 async def _connect(spec: LinkSpec) -> socket.socket:

@@ -160,7 +160,6 @@ class UdpLink:
                 senders.append(sender)
         if chunks:
             self._senders = senders
-            self.stats.received_chunks += len(chunks)
             self.stats.received_bytes += sum(map(len, chunks))
             if self._only_host is None and not self._pinned:
                 self._peer = senders[-1]

@@ -161,47 +161,26 @@ def _number(text: str) -> int | None:
 def cannot_open(spec: LinkSpec, problem: OSError) -> LinkClosed:
     """Return the error to raise for an OSError met while opening `spec`."""
     if spec.kind is LinkKind.SERIAL:
-        reason = _serial_reason(spec, problem)
-    elif spec.kind in (LinkKind.UDP_IN, LinkKind.TCP_IN):
-        reason = _listen_reason(spec, problem)
-    else:
-        reason = _connect_reason(spec, problem)
-    return LinkClosed(f"{spec.description}: {reason}")
-
-
-def _listen_reason(spec: LinkSpec, problem: OSError) -> str:
-    if problem.errno == errno.EADDRINUSE:
-        return (
-            f"port {spec.port} is in use by another program (a ground station?);"
-            " close it, or have it forward to another port"
-        )
-    if problem.errno == errno.EADDRNOTAVAIL:
-        return f"{spec.host} is not an address of this computer; 0.0.0.0 listens on all of them"
-    if problem.errno in (errno.EACCES, errno.EPERM):
-        return f"no permission to listen on port {spec.port}; ports below 1024 are root's"
-    return _text(problem)
-
-
-def _connect_reason(spec: LinkSpec, problem: OSError) -> str:
-    if problem.errno == errno.ECONNREFUSED:
-        return f"nothing listens on port {spec.port} of {spec.host}; is the vehicle or its bridge running?"
-    if problem.errno in (errno.ETIMEDOUT, errno.EHOSTUNREACH, errno.ENETUNREACH):
-        return f"{spec.host} does not answer; is its network joined?"
-    return _text(problem)
-
-
-def _serial_reason(spec: LinkSpec, problem: OSError) -> str:
-    if problem.errno in (errno.ENOENT, errno.ENXIO, errno.ENODEV):
-        return f"there is no {spec.device}; is the vehicle plugged in? (ls /dev/ttyACM* /dev/ttyUSB*)"
-    if problem.errno in (errno.EACCES, errno.EPERM):
+        gone = f"there is no {spec.device}; is the vehicle plugged in? (ls /dev/ttyACM* /dev/ttyUSB*)"
+        taken = f"{spec.device} is in use by another program (a ground station? ModemManager?)"
+        other = f"{spec.device} is no serial port"
         remedy = "join its group (often: sudo usermod -aG dialout $USER) and log in again"
-        return f"no permission for {spec.device}; {remedy}"
-    if problem.errno in (errno.EBUSY, errno.EAGAIN, errno.EWOULDBLOCK):
-        return f"{spec.device} is in use by another program (a ground station? ModemManager?)"
-    if problem.errno in (errno.ENOTTY, errno.EISDIR):
-        return f"{spec.device} is no serial port"
-    return _text(problem)
-
-
-def _text(problem: OSError) -> str:
-    return problem.strerror or str(problem)
+        reasons = dict.fromkeys((errno.ENOENT, errno.ENXIO, errno.ENODEV), gone)
+        reasons |= dict.fromkeys((errno.EACCES, errno.EPERM), f"no permission for {spec.device}; {remedy}")
+        reasons |= dict.fromkeys((errno.EBUSY, errno.EAGAIN, errno.EWOULDBLOCK), taken)
+        reasons |= dict.fromkeys((errno.ENOTTY, errno.EISDIR), other)
+    elif spec.kind in (LinkKind.UDP_IN, LinkKind.TCP_IN):
+        taken = f"port {spec.port} is in use by another program (a ground station?);"
+        not_ours = f"{spec.host} is not an address of this computer; 0.0.0.0 listens on all of them"
+        refused = f"no permission to listen on port {spec.port}; ports below 1024 are root's"
+        reasons = dict.fromkeys((errno.EACCES, errno.EPERM), refused)
+        reasons[errno.EADDRINUSE] = f"{taken} close it, or have it forward to another port"
+        reasons[errno.EADDRNOTAVAIL] = not_ours
+    else:
+        silent = f"{spec.host} does not answer; is its network joined?"
+        reasons = dict.fromkeys((errno.ETIMEDOUT, errno.EHOSTUNREACH, errno.ENETUNREACH), silent)
+        reasons[errno.ECONNREFUSED] = (
+            f"nothing listens on port {spec.port} of {spec.host}; is the vehicle or its bridge running?"
+        )
+    reason = reasons.get(problem.errno or 0, problem.strerror or str(problem))
+    return LinkClosed(f"{spec.description}: {reason}")

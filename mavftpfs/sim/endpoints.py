@@ -21,7 +21,7 @@ import trio
 from mavftpfs.link.base import Link, background
 from mavftpfs.link.framing import Framer
 from mavftpfs.link.opening import open_link
-from mavftpfs.link.stream import Pipe, StreamLink
+from mavftpfs.link.stream import StreamLink
 from mavftpfs.link.tcp import open_tcp
 from mavftpfs.link.uri import LinkKind, LinkSpec, parse_source
 from mavftpfs.shared.errors import UsageError
@@ -191,15 +191,11 @@ async def _open_pty() -> AsyncIterator[Link]:
         os.set_blocking(master, False)
         # Our own hold on the slave keeps the master readable while clients come and go.
         description = os.ttyname(slave)
-        link = StreamLink(description, _never, _Descriptor(master), is_serial=True, outbox_limit=_PTY_OUTBOX)
-        async with background(link.run_writer, link.aclose):
+        link = StreamLink(description, None, _Descriptor(master), is_serial=True, outbox_limit=_PTY_OUTBOX)
+        async with background(link.run, link.aclose):
             yield link
     finally:
         os.close(slave)
-
-
-async def _never() -> Pipe:
-    raise OSError("a pty has one end")
 
 
 DEFAULT_LINK = "udpout:127.0.0.1:14550"

@@ -140,7 +140,6 @@ class MemoryLink:
             self._fresh = False
             return []
         chunks, self._inbox = self._inbox[:MAX_CHUNKS], self._inbox[MAX_CHUNKS:]
-        self.stats.received_chunks += len(chunks)
         self.stats.received_bytes += sum(map(len, chunks))
         return chunks
 
