@@ -78,7 +78,7 @@ class FtpFrameCodec:
             seq = (seq + 1) & 0xFF
         return frames
 
-    def decode_runs(self, data: bytes, start: int, out: list[Message | FtpRun]) -> int:
+    def decode_runs(self, data: bytes, start: int, out: list[Message]) -> int:
         """Append the unbroken row of whole, valid frames at `start` to `out`; return where it ends.
 
         Stops, without judging, at the first byte that does not begin such a frame: another message,

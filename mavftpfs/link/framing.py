@@ -33,11 +33,8 @@ from mavftpfs.link.messages import (
     MAV_AUTOPILOT_INVALID,
     READABLE,
     Address,
-    FtpFrame,
-    FtpRun,
     Message,
     read_message,
-    singly,
 )
 from mavftpfs.link.signing import SIGNATURE_BLOCK, SignatureCheck
 from mavftpfs.shared.errors import LocalProtocolError
@@ -122,15 +119,11 @@ class Framer:
 
     def feed(self, data: bytes) -> list[Message]:
         """Take a chunk of the stream, or a datagram, and return the messages it completed."""
-        return singly(self.feed_runs(data))
-
-    def feed_runs(self, data: bytes) -> list[Message | FtpRun]:
-        """As `feed`, but each FtpFrame comes in an FtpRun, with those behind it where there are any."""
         if self._tail:
             if not self.stream and data[:1] in (b"\xfd", b"\xfe"):
                 self.reset()
             data = self._tail + data
-        out: list[Message | FtpRun] = []
+        out: list[Message] = []
         position = after = 0
         while True:
             if self._check is None:
@@ -153,13 +146,13 @@ class Framer:
         self._tail = b""
         self.waiting = False
 
-    def give_up(self) -> list[Message | FtpRun]:
+    def give_up(self) -> list[Message]:
         """The stream fell silent in mid-frame: there was none; return what is found behind its beginning."""
-        out: list[Message | FtpRun] = []
+        out: list[Message] = []
         self.stream = False  # as at the end of a datagram: nothing more decides
         try:
             while self._tail:
-                out += self.feed_runs(b"")
+                out += self.feed(b"")
                 self._tail = self._tail[self._skip(0, min(1, len(self._tail))) :]
         finally:
             self.stream = True
@@ -171,7 +164,7 @@ class Framer:
             self.on_frame(data[start:end])
             start = end
 
-    def _step(self, data: bytes, position: int, out: list[Message | FtpRun]) -> int:
+    def _step(self, data: bytes, position: int, out: list[Message]) -> int:
         """Deal with what begins at `position`; return where to go on, the same if more is needed."""
         magic = data[position]
         if magic not in (_V1, _V2):
@@ -210,7 +203,7 @@ class Framer:
         self.stats.garbage_bytes += stop - start
         return stop
 
-    def _accept(self, frame: bytes, message_id: int, signed: bool, out: list[Message | FtpRun]) -> None:
+    def _accept(self, frame: bytes, message_id: int, signed: bool, out: list[Message]) -> None:
         at = 5 if frame[0] == _V2 else 3
         source = Address(frame[at], frame[at + 1])
         if self._check is not None and message_id not in _UNSIGNED_ALLOWED:
@@ -224,7 +217,7 @@ class Framer:
             message = read_message(source, message_id, fields)
         except (dialect.MAVError, AttributeError, TypeError, ValueError):
             return  # whole and valid, but its fields make no sense
-        out.append(FtpRun(*message[:2], [message.payload]) if isinstance(message, FtpFrame) else message)
+        out.append(message)
         if self.on_frame is not None:
             self.on_frame(frame)
 

@@ -5,7 +5,6 @@ Every other message is `Other`: traced, never an error.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, NamedTuple, TypeAlias
 
@@ -24,16 +23,9 @@ class Address(NamedTuple):
     component: int
 
 
-class FtpFrame(NamedTuple):
-    """One FILE_TRANSFER_PROTOCOL message. payload: exactly 251 bytes, zero-padded where v2 trimmed it."""
-
-    source: Address
-    target: Address
-    payload: bytes
-
-
 class FtpRun(NamedTuple):
-    """FtpFrames that came one behind the other from one source to one target; payloads: at least one."""
+    """FILE_TRANSFER_PROTOCOL messages that came in a row from one source to one target. payloads: at least
+    one, each of 251 bytes, zero-padded where MAVLink 2 trimmed it."""
 
     source: Address
     target: Address
@@ -114,20 +106,8 @@ class Other:
 
 
 Message: TypeAlias = (
-    FtpFrame | Heartbeat | AutopilotVersion | StorageInformation | SystemTime | CommandLong | Other
+    FtpRun | Heartbeat | AutopilotVersion | StorageInformation | SystemTime | CommandLong | Other
 )
-
-
-def singly(messages: Iterable[Message | FtpRun]) -> list[Message]:
-    """Return the messages with runs taken apart."""
-    single: list[Message] = []
-    for message in messages:
-        if isinstance(message, FtpRun):
-            source, target, payloads = message
-            single += [FtpFrame(source, target, payload) for payload in payloads]
-        else:
-            single.append(message)
-    return single
 
 
 READABLE = frozenset((0, 2, 76, 110, 148, 261))
@@ -145,7 +125,7 @@ def read_message(source: Address, message_id: int, m: Any) -> Message:
             params = (m.param1, m.param2, m.param3, m.param4, m.param5, m.param6, m.param7)
             return CommandLong(source, Address(m.target_system, m.target_component), m.command, params)
         case 110:
-            return FtpFrame(source, Address(m.target_system, m.target_component), bytes(m.payload))
+            return FtpRun(source, Address(m.target_system, m.target_component), [bytes(m.payload)])
         case 148:
             git_hash, uid2 = bytes(m.flight_custom_version), bytes(m.uid2)
             return AutopilotVersion(source, m.capabilities, m.flight_sw_version, git_hash, m.uid, uid2)

@@ -16,7 +16,7 @@ import trio
 from mavftpfs.link.addresses import AddressBook, NetAddress, readable_address
 from mavftpfs.link.base import Link
 from mavftpfs.link.framing import Framer
-from mavftpfs.link.messages import Address, FtpRun, Message, singly
+from mavftpfs.link.messages import Address, FtpRun, Message
 from mavftpfs.protocol.engine import Engine
 from mavftpfs.protocol.operations import Operation
 from mavftpfs.session.vehicle import Standing, Vehicle
@@ -192,7 +192,7 @@ class Driver:
             self.vehicle.identity.reopened(now)
             return
         self._heard_at = now
-        feed = self.framer.feed_runs
+        feed = self.framer.feed
         for index, chunk in enumerate(chunks):
             self._handle(feed(chunk), now, self.link.sender(index))
             if len(self._gathered) >= REFILL_AT:
@@ -205,7 +205,7 @@ class Driver:
         if self.on_batch is not None:
             self.on_batch(now)
 
-    def _handle(self, messages: list[Message | FtpRun], now: float, sender: NetAddress | None) -> None:
+    def _handle(self, messages: list[Message], now: float, sender: NetAddress | None) -> None:
         """Gather replies, and tell the vehicle everything else, in its turn."""
         vehicle = self.vehicle
         for message in messages:
@@ -216,8 +216,7 @@ class Driver:
                 self._gathered += message.payloads
             else:
                 self._pass_on(now)
-                for single in singly([message]):
-                    self._on_other(single, now, sender)
+                self._on_other(message, now, sender)
 
     def _pass_on(self, now: float) -> None:
         """Give the engine the gathered replies."""

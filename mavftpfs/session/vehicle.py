@@ -21,7 +21,7 @@ from mavftpfs.link.messages import (
     MAV_PROTOCOL_CAPABILITY_FTP,
     Address,
     AutopilotVersion,
-    FtpFrame,
+    FtpRun,
     Heartbeat,
     Message,
     StorageInformation,
@@ -275,7 +275,7 @@ class Vehicle:
         match message:
             case Heartbeat():
                 self._on_heartbeat(message, now)
-            case FtpFrame():
+            case FtpRun():
                 self._on_foreign_ftp(message, now)
             case _ if self.address is None or message.source.system != self.address.system:
                 return
@@ -349,18 +349,18 @@ class Vehicle:
             return True
         return self.address not in self.heard and source.component == MAV_COMP_ID_AUTOPILOT1
 
-    def _on_foreign_ftp(self, frame: FtpFrame, now: float) -> None:
-        if self.address is None or frame.source == self.own:
+    def _on_foreign_ftp(self, run: FtpRun, now: float) -> None:
+        if self.address is None or run.source == self.own:
             return
-        is_reply = frame.payload[_OPCODE_INDEX] in (Opcode.ACK, Opcode.NAK)
-        if is_reply:
-            theirs = frame.source == self.address and frame.target != self.own
-        else:
-            theirs = frame.target.system in (0, self.address.system)
-        if theirs:
-            newcomer = not self.foreign_client(now)
-            self.foreign_at = now
-            self.on_foreign(frame.payload, newcomer)
+        for payload in run.payloads:
+            if payload[_OPCODE_INDEX] in (Opcode.ACK, Opcode.NAK):
+                theirs = run.source == self.address and run.target != self.own
+            else:
+                theirs = run.target.system in (0, self.address.system)
+            if theirs:
+                newcomer = not self.foreign_client(now)
+                self.foreign_at = now
+                self.on_foreign(payload, newcomer)
 
     def _on_storage(self, message: StorageInformation) -> None:
         if self.storage is None or message.storage_id <= self.storage.storage_id:

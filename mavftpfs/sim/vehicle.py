@@ -217,7 +217,7 @@ class SimVehicle:
         if now < self._down_until:
             return
         address = self.address
-        for message in self.framer.feed_runs(data):
+        for message in self.framer.feed(data):
             if type(message) is FtpRun:  # a transfer is thousands of these a second
                 source, target, payloads = message
                 if target == address or self._is_for_us(target):

@@ -12,8 +12,9 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from mavftpfs.link.fastframe import FtpFrameCodec
 from mavftpfs.link.framing import Framer
-from mavftpfs.link.messages import Address, FtpFrame, FtpRun, Message, Other, singly
+from mavftpfs.link.messages import Address, FtpRun, Message, Other
 from mavftpfs.sim.vehicle import telemetry
+from tests.support.frames import feed, singly
 
 EXTRA = dialect.MAVLink_file_transfer_protocol_message.crc_extra
 KEY = bytes(32)
@@ -57,13 +58,13 @@ def test_fast_encoding_is_pymavlinks_byte_for_byte(
 @given(addresses, addresses, st.integers(0, 255), payloads)
 def test_fast_decoding_is_pymavlinks(source: Address, target: Address, seq: int, payload: bytes) -> None:
     frame = reference_frame(source, target, payload, seq=seq)
-    out: list[Message | FtpRun] = []
+    out: list[Message] = []
     if len(frame) >= 15:
         assert FtpFrameCodec(Address(9, 9), EXTRA).decode_runs(frame, 0, out) == len(frame)
         assert out == [FtpRun(source, target, [payload])]
     message = pymavlink(source).decode(bytearray(frame))
     assert bytes(message.payload) == payload
-    assert Framer(Address(9, 9), stream=True).feed(frame) == [FtpFrame(source, target, payload)]
+    assert feed(Framer(Address(9, 9), stream=True), frame) == [FtpRun(source, target, [payload])]
 
 
 @given(st.lists(st.tuples(addresses, addresses, payloads), max_size=8), st.integers(0, 255))
@@ -71,11 +72,11 @@ def test_fast_decoding_of_several_is_pymavlinks(
     several: list[tuple[Address, Address, bytes]], seq: int
 ) -> None:
     frames = [reference_frame(*one, seq=(seq + index) & 0xFF) for index, one in enumerate(several)]
-    data, wanted = b"".join(frames), [FtpFrame(*one) for one in several]
-    found = Framer(Address(9, 9), stream=True).feed_runs(data)
-    assert singly(found) == wanted
+    data, wanted = b"".join(frames), [FtpRun(one[0], one[1], [one[2]]) for one in several]
+    found = feed(Framer(Address(9, 9), stream=True), data)
+    assert found == wanted
     if all(len(frame) >= 15 for frame in frames):
-        out: list[Message | FtpRun] = []
+        out: list[Message] = []
         assert FtpFrameCodec(Address(9, 9), EXTRA).decode_runs(data, 0, out) == len(data)
         assert singly(out) == wanted
 
@@ -84,13 +85,13 @@ def test_fast_decoding_of_several_is_pymavlinks(
 def test_all_ways_in_give_the_same_value(
     source: Address, target: Address, payload: bytes, signed: bool
 ) -> None:
-    value = FtpFrame(source, target, payload)
+    value = FtpRun(source, target, [payload])
     key = KEY if signed else None
     framer = Framer(Address(9, 9), stream=True, signing_key=key)
     frame = reference_frame(source, target, payload, key=key)
-    assert framer.feed(frame) == [value]
+    assert feed(framer, frame) == [value]
     if not signed:
-        assert framer.feed(reference_frame(source, target, payload, old=True)) == [value]
+        assert feed(framer, reference_frame(source, target, payload, old=True)) == [value]
 
 
 @pytest.mark.holds("fault corrupt")
@@ -99,7 +100,7 @@ def test_no_changed_byte_gets_through(target: Address, payload: bytes, at: int, 
     frame = bytearray(reference_frame(Address(1, 1), target, payload))
     frame[at % len(frame)] ^= flip
     framer = Framer(Address(9, 9), stream=True)
-    found = framer.feed(bytes(frame) + b"\xfd")
+    found = feed(framer, bytes(frame) + b"\xfd")
     # Of a message that the dialect lacks nobody can check the CRC; it is believed for nothing.
     assert all(isinstance(message, Other) for message in found)
 
@@ -137,7 +138,7 @@ def streams(draw: st.DrawFn) -> bytes:
 
 def fed(pieces: list[bytes], key: bytes | None) -> tuple[list[Message], Framer]:
     framer = Framer(Address(9, 9), stream=True, signing_key=key)
-    return [message for piece in pieces for message in framer.feed(piece)], framer
+    return [message for piece in pieces for message in feed(framer, piece)], framer
 
 
 @given(streams(), st.lists(st.integers(0, 3000), max_size=20), st.sampled_from([None, KEY]))
@@ -158,16 +159,16 @@ def test_frames_survive_garbage_that_looks_like_nothing(parts: list[tuple[bytes,
     for garbage, payload in parts:
         data += garbage.replace(b"\xfd", b"").replace(b"\xfe", b"")
         data += reference_frame(Address(1, 1), Address(2, 2), payload)
-        values.append(FtpFrame(Address(1, 1), Address(2, 2), payload))
+        values.append(FtpRun(Address(1, 1), Address(2, 2), [payload]))
     assert fed([data], None)[0] == values
 
 
 @given(streams(), st.binary(max_size=600))
 def test_after_anything_the_stream_recovers(data: bytes, garbage: bytes) -> None:
     framer = Framer(Address(9, 9), stream=True)
-    framer.feed(data + garbage)
+    feed(framer, data + garbage)
     beat = Framer(Address(7, 7), stream=True).encode_heartbeat(2, 12)
-    found = framer.feed(beat * 30)
+    found = feed(framer, beat * 30)
     # One claimed frame (292 bytes at most) may swallow the beginning.
     assert len([m for m in found if m.source == (7, 7)]) >= 15
 
@@ -178,5 +179,5 @@ def test_after_anything_the_stream_recovers(data: bytes, garbage: bytes) -> None
 def test_nothing_raises_and_little_is_kept(pieces: list[bytes], stream: bool, key: bytes | None) -> None:
     framer = Framer(Address(9, 9), stream=stream, signing_key=key)
     for piece in pieces:
-        framer.feed(piece)
+        feed(framer, piece)
         assert len(framer._tail) <= 292

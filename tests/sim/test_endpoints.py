@@ -18,7 +18,7 @@ import trio.testing
 from trio.testing import MockClock
 
 from mavftpfs.link.framing import Framer
-from mavftpfs.link.messages import Address, FtpFrame, Heartbeat, Message
+from mavftpfs.link.messages import Address, FtpRun, Heartbeat, Message
 from mavftpfs.link.opening import open_link
 from mavftpfs.link.uri import parse_source
 from mavftpfs.protocol.payload import Opcode, request
@@ -200,4 +200,4 @@ async def test_the_process_joins_the_pieces_of_a_stream(tmp_path: Path) -> None:
             link.send_nowait([frame[:middle]])
             await trio.sleep(0.1)
             link.send_nowait([frame[middle:]])
-            await hear(FtpFrame)
+            await hear(FtpRun)

@@ -29,6 +29,7 @@ from mavftpfs.link.tcp import open_tcp
 from mavftpfs.link.udp import UdpLink
 from mavftpfs.link.uri import parse_source
 from mavftpfs.shared.errors import LinkClosed
+from tests.support.frames import feed
 from tests.support.vehicles import free_udp_port
 
 US = Address(254, 191)
@@ -399,7 +400,7 @@ async def test_a_slow_peer_costs_whole_frames_never_parts() -> None:
             with trio.fail_after(60):
                 while received < built - link.stats.dropped_sends:
                     await trio.lowlevel.wait_readable(peer)
-                    received += len(other.feed(peer.recv(65536)))
+                    received += len(feed(other, peer.recv(65536)))
             assert link.backlog == 0
             link.send_nowait([framer.encode_heartbeat(18)])
             await trio.lowlevel.wait_readable(peer)

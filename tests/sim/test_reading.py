@@ -10,7 +10,7 @@ from trio.testing import MockClock
 
 from mavftpfs.cache.options import CacheOptions
 from mavftpfs.cache.tree import Tree
-from mavftpfs.link.messages import Address, FtpFrame
+from mavftpfs.link.messages import Address, FtpRun
 from mavftpfs.protocol.payload import Opcode, Payload, request
 from mavftpfs.session.connection import Connection, ConnectOptions
 from mavftpfs.shared.errors import (
@@ -102,7 +102,7 @@ async def test_a_whole_read_beside_another_client_is_not_believed(profile: str, 
                 await trio.sleep(1.0)
                 session = connection.engine.home_session if profile == "ardupilot" else 0
                 reply = Payload(9, session, Opcode.ACK, 0, Opcode.READ_FILE).encode()
-                vehicle.on_message(FtpFrame(vehicle.address, STRANGER, reply), trio.current_time())
+                vehicle.on_message(FtpRun(vehicle.address, STRANGER, [reply]), trio.current_time())
 
         nursery.start_soon(interfere)
         with pytest.raises(DataUnproven):

@@ -9,7 +9,8 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from mavftpfs.link.fastframe import FtpFrameCodec, frame_crc
 from mavftpfs.link.framing import Framer
-from mavftpfs.link.messages import Address, FtpFrame, FtpRun, Message, singly
+from mavftpfs.link.messages import Address, FtpRun, Message
+from tests.support.frames import feed
 
 US = Address(254, 191)
 EXTRA = 84
@@ -36,7 +37,7 @@ def reference(seq: int, target: Address, payload: bytes) -> bytes:
 
 
 def test_a_frame_trimmed_into_its_target_is_left_to_pymavlink() -> None:
-    out: list[Message | FtpRun] = []
+    out: list[Message] = []
     for target in (Address(0, 0), Address(1, 0)):
         assert FtpFrameCodec(US, EXTRA).decode_runs(reference(9, target, bytes(251)), 0, out) == 0
     assert out == []
@@ -48,18 +49,18 @@ def test_a_row_of_frames_ends_at_a_damaged_one(at: int) -> None:
     payloads = [bytes([n]) * 251 for n in range(1, 6)]
     frames = codec.encode(254, Address(1, 1), payloads)
     frames[2] = frames[2][:at] + bytes([frames[2][at] ^ 1]) + frames[2][at + 1 :]
-    out: list[Message | FtpRun] = []
+    out: list[Message] = []
     assert codec.decode_runs(b"".join(frames), 0, out) == 2 * len(frames[0])
     assert out == [FtpRun(US, Address(1, 1), payloads[:2])]
-    found = singly(Framer(US, stream=False).feed_runs(b"".join(frames)))
-    assert [m.payload for m in found if isinstance(m, FtpFrame)] == payloads[:2] + payloads[3:]
+    found = feed(Framer(US, stream=False), b"".join(frames))
+    assert [p for m in found if isinstance(m, FtpRun) for p in m.payloads] == payloads[:2] + payloads[3:]
 
 
 def test_a_signed_frame_among_others_is_left_to_pymavlink() -> None:
     frame = reference(1, Address(1, 1), FULL)
     body = frame[1:2] + b"\1" + frame[3:-2]  # says that it is signed, and its CRC is right
     signed = b"\xfd" + body + frame_crc(body, EXTRA).to_bytes(2, "little") + bytes(13)
-    out: list[Message | FtpRun] = []
+    out: list[Message] = []
     assert FtpFrameCodec(US, EXTRA).decode_runs(frame + signed + frame, 0, out) == len(frame)
 
 
@@ -78,14 +79,14 @@ def test_a_signed_frame_among_others_is_left_to_pymavlink() -> None:
     ids=["cut", "crc", "content", "magic", "flags", "id", "id high", "nothing"],
 )
 def test_leaves_everything_else_alone(damage: Callable[[bytes], bytes]) -> None:
-    out: list[Message | FtpRun] = []
+    out: list[Message] = []
     frame = damage(reference(1, Address(1, 1), FULL))
     assert FtpFrameCodec(US, EXTRA).decode_runs(frame, 0, out) == 0
     assert out == []
 
 
 def test_a_wrong_extra_byte_is_a_wrong_crc() -> None:
-    out: list[Message | FtpRun] = []
+    out: list[Message] = []
     assert FtpFrameCodec(US, 85).decode_runs(reference(1, Address(1, 1), FULL), 0, out) == 0
 
 

@@ -14,15 +14,15 @@ from mavftpfs.link.messages import (
     Address,
     AutopilotVersion,
     CommandLong,
-    FtpFrame,
+    FtpRun,
     Heartbeat,
     Message,
     Other,
     StorageInformation,
     SystemTime,
-    singly,
 )
 from mavftpfs.shared.errors import LocalProtocolError, UsageError
+from tests.support.frames import feed
 
 pytestmark = pytest.mark.holds("promise 10")
 
@@ -52,7 +52,7 @@ def heartbeat(mav: Any = None, **how: bool) -> bytes:
 
 
 HEARTBEAT = Heartbeat(DRONE, 2, 12, 0x81, 4)
-FTP = FtpFrame(DRONE, US, PAYLOAD)
+FTP = FtpRun(DRONE, US, [PAYLOAD])
 
 MESSAGES: list[tuple[Any, Message]] = [
     (drone().heartbeat_encode(2, 3, 0x51, 7, 3), Heartbeat(DRONE, 2, 3, 0x51, 3)),
@@ -82,7 +82,7 @@ MESSAGES: list[tuple[Any, Message]] = [
 )
 def test_reads_what_pymavlink_writes(message: Any, value: Message, old: bool) -> None:
     framer = Framer(US, stream=True)
-    assert framer.feed(pack(message, force_mavlink1=old)) == [value]
+    assert feed(framer, pack(message, force_mavlink1=old)) == [value]
 
 
 BUILT: list[tuple[Callable[[Framer], bytes], str, dict[str, Any]]] = [
@@ -155,7 +155,7 @@ def test_replies_to_nobody_are_trimmed_into_the_header() -> None:
     mav = drone()
     frame = pack(mav.file_transfer_protocol_encode(0, 0, 0, [0] * 251), mav)
     assert frame[1] == 1
-    assert Framer(US, stream=True).feed(frame) == [FtpFrame(DRONE, Address(0, 0), bytes(251))]
+    assert feed(Framer(US, stream=True), frame) == [FtpRun(DRONE, Address(0, 0), [bytes(251)])]
 
 
 def with_payload(message_id: int, payload: bytes, extra: int, flags: int = 0) -> bytes:
@@ -168,7 +168,7 @@ def with_payload(message_id: int, payload: bytes, extra: int, flags: int = 0) ->
 def test_a_longer_payload_of_a_later_dialect_is_cut_and_the_target_network_does_not_matter(
     payload: bytes,
 ) -> None:
-    assert Framer(US, stream=True).feed(with_payload(110, payload, 84)) == [FTP]
+    assert feed(Framer(US, stream=True), with_payload(110, payload, 84)) == [FTP]
 
 
 # ---------------------------------------------------------------------- damage
@@ -192,49 +192,49 @@ def damaged(at: int = 100, frame: bytes = b"") -> bytes:
 )
 def test_damage_costs_one_frame(data: bytes, found: list[Message], bad_crc: int, garbage: int) -> None:
     framer = Framer(US, stream=True)
-    assert framer.feed(data) == found
+    assert feed(framer, data) == found
     assert (framer.stats.bad_crc, framer.stats.garbage_bytes) == (bad_crc, garbage)
 
 
 def test_a_damaged_last_frame_waits_for_what_follows_but_in_a_datagram() -> None:
     stream, datagrams = Framer(US, stream=True), Framer(US, stream=False)
-    assert stream.feed(damaged()) == datagrams.feed(damaged()) == []
+    assert feed(stream, damaged()) == feed(datagrams, damaged()) == []
     assert (stream.stats.bad_crc, datagrams.stats.bad_crc) == (0, 1)
     assert (stream.waiting, datagrams.waiting) == (True, False)
-    assert stream.feed(heartbeat()) == [HEARTBEAT]
+    assert feed(stream, heartbeat()) == [HEARTBEAT]
     assert stream.stats.bad_crc == 1
 
 
 def test_a_frame_split_over_datagrams_by_a_bridge_is_joined_but_never_holds_up_another() -> None:
     framer = Framer(US, stream=False)
     frame = ftp()
-    assert framer.feed(heartbeat() + frame[:99]) == [HEARTBEAT]
-    assert framer.feed(frame[99:] + heartbeat()) == [FTP, HEARTBEAT]
-    assert framer.feed(frame[:50]) == []
-    assert framer.feed(heartbeat()) == [HEARTBEAT]
+    assert feed(framer, heartbeat() + frame[:99]) == [HEARTBEAT]
+    assert feed(framer, frame[99:] + heartbeat()) == [FTP, HEARTBEAT]
+    assert feed(framer, frame[:50]) == []
+    assert feed(framer, heartbeat()) == [HEARTBEAT]
     assert framer.stats.garbage_bytes == 50
 
 
 def test_unknown_incompatible_flags_are_refused_and_a_signature_is_waited_for() -> None:
     framer = Framer(US, stream=True)
-    assert framer.feed(with_payload(110, b"\0\xfe\xbf" + PAYLOAD, 84, flags=0x02) + heartbeat()) == [
+    assert feed(framer, with_payload(110, b"\0\xfe\xbf" + PAYLOAD, 84, flags=0x02) + heartbeat()) == [
         HEARTBEAT
     ]
-    assert framer.feed(with_payload(110, b"\0\xfe\xbf" + PAYLOAD, 84, flags=0x01)) == []
-    assert framer.feed(bytes(13) + heartbeat()) == [FTP, HEARTBEAT]
+    assert feed(framer, with_payload(110, b"\0\xfe\xbf" + PAYLOAD, 84, flags=0x01)) == []
+    assert feed(framer, bytes(13) + heartbeat()) == [FTP, HEARTBEAT]
 
 
 def test_message_unknown_to_the_dialect_is_other_if_a_frame_follows() -> None:
     framer = Framer(US, stream=True)
-    assert framer.feed(with_payload(60_001, b"private", 77)) == []
-    assert framer.feed(heartbeat()) == [Other(DRONE, 60_001), HEARTBEAT]
+    assert feed(framer, with_payload(60_001, b"private", 77)) == []
+    assert feed(framer, heartbeat()) == [Other(DRONE, 60_001), HEARTBEAT]
 
 
 def test_reset_forgets_half_a_frame() -> None:
     framer = Framer(US, stream=True)
-    framer.feed(ftp()[:60])
+    feed(framer, ftp()[:60])
     framer.reset()
-    assert framer.feed(ftp()) == [FTP]
+    assert feed(framer, ftp()) == [FTP]
     assert framer.stats.garbage_bytes == 60
 
 
@@ -245,7 +245,7 @@ def test_messages_whose_fields_make_no_sense_are_left_out(monkeypatch: pytest.Mo
         raise dialect.MAVError("no")
 
     monkeypatch.setattr(framer._decoder, "decode", refuse)
-    assert framer.feed(heartbeat() + ftp()) == [FTP]
+    assert feed(framer, heartbeat() + ftp()) == [FTP]
 
 
 # ---------------------------------------------------------------------- a length that is far too large
@@ -254,21 +254,21 @@ def test_messages_whose_fields_make_no_sense_are_left_out(monkeypatch: pytest.Mo
 def test_one_flipped_bit_in_a_length_hides_what_follows_only_until_given_up() -> None:
     """280 bytes take many seconds on a quiet stream."""
     framer, chunk = Framer(US, stream=True), ftp(bytes(range(100)) + bytes(151))
-    assert framer.feed(damaged(1, heartbeat()) + heartbeat() + chunk) == []
+    assert feed(framer, damaged(1, heartbeat()) + heartbeat() + chunk) == []
     assert framer.waiting
-    assert singly(framer.give_up()) == [HEARTBEAT, FtpFrame(DRONE, US, bytes(range(100)) + bytes(151))]
+    assert framer.give_up() == [HEARTBEAT, FtpRun(DRONE, US, [bytes(range(100)) + bytes(151)])]
     assert not framer.waiting
-    assert framer.feed(heartbeat()) == [HEARTBEAT]
+    assert feed(framer, heartbeat()) == [HEARTBEAT]
     assert framer.give_up() == []
 
 
 @pytest.mark.parametrize("cut", [1, 5, 9, 12, 20])
 def test_a_frame_that_never_ends_is_dropped(cut: int) -> None:
     framer = Framer(US, stream=True)
-    framer.feed(heartbeat()[:cut])
+    feed(framer, heartbeat()[:cut])
     assert framer.give_up() == []
     assert not framer.waiting
-    assert framer.feed(heartbeat()) == [HEARTBEAT]
+    assert feed(framer, heartbeat()) == [HEARTBEAT]
 
 
 # ---------------------------------------------------------------------- hooks
@@ -279,7 +279,7 @@ def test_on_frame_sees_each_frame_once_in_both_directions() -> None:
     framer.on_frame = seen.append
     ours = [framer.encode_ftp(DRONE, PAYLOAD), framer.encode_heartbeat(18)]
     theirs = [ftp(), ftp(bytes(251)), heartbeat(), pack(drone().attitude_encode(1, 0, 0, 0, 0, 0, 0)), ftp()]
-    framer.feed(b"garbage".join(theirs))
+    feed(framer, b"garbage".join(theirs))
     assert seen == ours + theirs
 
 
@@ -296,7 +296,7 @@ def signer(timestamp: int = 1000, key: bytes = KEY, link_id: int = 0) -> Any:
 
 
 def test_signed_frames_are_accepted_without_a_key() -> None:
-    assert Framer(US, stream=True).feed(ftp(mav=signer()) + heartbeat(signer())) == [FTP, HEARTBEAT]
+    assert feed(Framer(US, stream=True), ftp(mav=signer()) + heartbeat(signer())) == [FTP, HEARTBEAT]
 
 
 def test_with_a_key_only_right_signatures_pass() -> None:
@@ -304,7 +304,7 @@ def test_with_a_key_only_right_signatures_pass() -> None:
     mav = signer()
     good = ftp(mav=mav) + heartbeat(mav)
     bad = ftp() + heartbeat() + heartbeat(force_mavlink1=True) + heartbeat(signer(key=bytes(32)))
-    assert framer.feed(good + bad + heartbeat(mav)) == [FTP, HEARTBEAT, HEARTBEAT]
+    assert feed(framer, good + bad + heartbeat(mav)) == [FTP, HEARTBEAT, HEARTBEAT]
     assert framer.stats.bad_signature == 4
     assert framer.stats.bad_time == 0
 
@@ -312,14 +312,14 @@ def test_with_a_key_only_right_signatures_pass() -> None:
 def test_a_radios_own_report_needs_no_signature() -> None:
     framer = Framer(US, stream=True, signing_key=KEY)
     report = pack(drone().radio_status_encode(1, 2, 3, 4, 5, 6, 7))
-    assert framer.feed(report) == [Other(DRONE, 109)]
+    assert feed(framer, report) == [Other(DRONE, 109)]
 
 
 def test_replayed_frames_are_refused() -> None:
     framer = Framer(US, stream=True, signing_key=KEY)
     frame = heartbeat(signer())
-    assert framer.feed(frame) == [HEARTBEAT]
-    assert framer.feed(frame + heartbeat(signer(timestamp=999))) == []
+    assert feed(framer, frame) == [HEARTBEAT]
+    assert feed(framer, frame + heartbeat(signer(timestamp=999))) == []
     assert framer.stats.bad_signature == 2
     assert framer.stats.bad_time == 2
 
@@ -328,16 +328,16 @@ def test_a_new_stream_may_be_a_minute_old_but_not_older() -> None:
     minute = 6_000_000
     now = 10 * minute
     framer = Framer(US, stream=True, signing_key=KEY, signing_clock=lambda: now)
-    assert framer.feed(heartbeat(signer(now - minute - 1, link_id=1))) == []
-    assert framer.feed(heartbeat(signer(now - minute, link_id=2))) == [HEARTBEAT]
+    assert feed(framer, heartbeat(signer(now - minute - 1, link_id=1))) == []
+    assert feed(framer, heartbeat(signer(now - minute, link_id=2))) == [HEARTBEAT]
 
 
 def test_a_forged_timestamp_locks_nobody_out() -> None:
     framer = Framer(US, stream=True, signing_key=KEY)
     forged = bytearray(heartbeat(signer()))
     forged[-12:-6] = b"\xff" * 6
-    assert framer.feed(bytes(forged)) == []
-    assert framer.feed(heartbeat(signer())) == [HEARTBEAT]
+    assert feed(framer, bytes(forged)) == []
+    assert feed(framer, heartbeat(signer())) == [HEARTBEAT]
 
 
 def test_our_timestamps_follow_the_clock_and_what_we_heard() -> None:
@@ -348,7 +348,7 @@ def test_our_timestamps_follow_the_clock_and_what_we_heard() -> None:
         return int.from_bytes(frame[-12:-6], "little")
 
     assert [timestamp(framer.encode_heartbeat(18)) for _ in range(3)] == [5000, 5001, 5002]
-    framer.feed(heartbeat(signer(9000)))
+    feed(framer, heartbeat(signer(9000)))
     assert timestamp(framer.encode_ftp(DRONE, PAYLOAD)) == 9000
     clock = 20_000
     assert timestamp(framer.encode_heartbeat(18)) == 20_000
@@ -361,5 +361,5 @@ def test_streams_are_bounded() -> None:
         for link_id in range(200):
             mav = signer(link_id=link_id)
             mav.srcComponent = component
-            accepted += len(framer.feed(heartbeat(mav)))
+            accepted += len(feed(framer, heartbeat(mav)))
     assert accepted == 256

@@ -8,7 +8,7 @@ from mavftpfs.link.messages import (
     MAV_AUTOPILOT_INVALID,
     Address,
     AutopilotVersion,
-    FtpFrame,
+    FtpRun,
     Heartbeat,
     Message,
     StorageInformation,
@@ -148,13 +148,13 @@ def test_ftp_of_others_is_foreign_and_our_own_replies_are_not() -> None:
     reply = Payload(2, 0, Opcode.ACK, 0, Opcode.READ_FILE).encode()
     ask = request(1, Opcode.READ_FILE).encode()
     assert (vehicle.address, vehicle.own) == (PILOT, OWN)  # by which the driver knows our replies
-    vehicle.on_message(FtpFrame(Address(5, 1), GCS, reply), 1.0)
-    vehicle.on_message(FtpFrame(GCS, Address(5, 1), ask), 1.0)
+    vehicle.on_message(FtpRun(Address(5, 1), GCS, [reply]), 1.0)
+    vehicle.on_message(FtpRun(GCS, Address(5, 1), [ask]), 1.0)
     assert not vehicle.foreign_client(1.0)
-    vehicle.on_message(FtpFrame(PILOT, GCS, reply), 2.0)
+    vehicle.on_message(FtpRun(PILOT, GCS, [reply]), 2.0)
     assert vehicle.foreign_client(2.0)
     assert not vehicle.foreign_client(2.0 + FOREIGN_MEMORY)
-    vehicle.on_message(FtpFrame(GCS, PILOT, ask), 20.0)
+    vehicle.on_message(FtpRun(GCS, PILOT, [ask]), 20.0)
     assert vehicle.foreign_client(20.0)
 
 

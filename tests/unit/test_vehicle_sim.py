@@ -10,7 +10,7 @@ import pytest
 from mavftpfs.link.framing import Framer
 from mavftpfs.link.messages import (
     Address,
-    FtpFrame,
+    FtpRun,
     Heartbeat,
     Message,
     Other,
@@ -20,6 +20,7 @@ from mavftpfs.protocol.payload import Opcode, decode_reply, request
 from mavftpfs.sim.profiles import PROFILES
 from mavftpfs.sim.tree import MemoryTree
 from mavftpfs.sim.vehicle import SimVehicle
+from tests.support.frames import feed
 
 T = TypeVar("T")
 US = Address(254, 191)
@@ -51,16 +52,16 @@ class Client:
                 return found
             self.now = max(self.now, due)
             for frame in self.vehicle.outgoing(self.now):
-                found += self.framer.feed(frame)
+                found += feed(self.framer, frame)
         raise AssertionError("the vehicle never comes to rest")
 
     def tell(self, frame: bytes) -> None:
         self.vehicle.receive(frame, self.now)
 
-    def ftp(self, target: Address = DRONE) -> list[FtpFrame]:
+    def ftp(self, target: Address = DRONE) -> list[FtpRun]:
         """Ask for a listing and return the FTP frames that come back within a second."""
         self.tell(self.framer.encode_ftp(target, LIST))
-        return [m for m in self.hear(0.9) if isinstance(m, FtpFrame)]
+        return [m for m in self.hear(0.9) if isinstance(m, FtpRun)]
 
 
 def of(kind: type[T], messages: list[Message]) -> list[T]:
@@ -86,7 +87,7 @@ def test_answers_requests_meant_for_it(profile: str, target: Address, answers: b
     replies = client.ftp(target)
     assert [(r.source, r.target) for r in replies] == ([(DRONE, US)] if answers else [])
     if answers:
-        assert decode_reply(replies[0].payload).req_opcode == Opcode.LIST_DIRECTORY
+        assert decode_reply(replies[0].payloads[0]).req_opcode == Opcode.LIST_DIRECTORY
 
 
 @pytest.mark.parametrize("rate", [200.0, 3000.0])
@@ -130,7 +131,7 @@ def test_reboot_loses_time_arming_and_sessions_but_no_files() -> None:
     assert client.vehicle.outgoing(client.now) == []
     assert client.hear(2.9) == []
     heard = client.hear(0.2)
-    assert of(FtpFrame, heard) == []
+    assert of(FtpRun, heard) == []
     assert of(SystemTime, heard)[0].time_boot_ms == 3000
     assert not of(Heartbeat, heard)[0].armed
     assert client.vehicle.server.open_sessions == 0
@@ -143,7 +144,7 @@ def test_another_ground_station_is_heard_with_its_answers() -> None:
     client.hear()
     gcs = Address(255, 190)
     client.vehicle.foreign_request(LIST, gcs, client.now)
-    heard = of(FtpFrame, client.hear(0.5))
+    heard = of(FtpRun, client.hear(0.5))
     assert [(f.source, f.target) for f in heard] == [(gcs, DRONE), (DRONE, gcs)]
     client.vehicle.foreign_request(LIST, gcs, client.now, audible=False)
-    assert [(f.source, f.target) for f in of(FtpFrame, client.hear(0.5))] == [(DRONE, gcs)]
+    assert [(f.source, f.target) for f in of(FtpRun, client.hear(0.5))] == [(DRONE, gcs)]
