@@ -11,7 +11,7 @@ import re
 from collections import OrderedDict
 from dataclasses import dataclass, replace
 
-from mavftpfs.shared.model import DirEntry, EntryKind
+from mavftpfs.shared.model import DirEntry, EntryKind, rename_keys
 
 UNKNOWN_MTIME = 315532800
 """1980-01-01 UTC: the same in every mount, so that rsync and make do not see changes that are none."""
@@ -128,10 +128,4 @@ class Times:
     def rename(self, old: bytes, new: bytes) -> None:
         """A file or directory with all below it has another path."""
         self._times.pop(new, None)
-        for path in [p for p in self._times if p == old or p.startswith(old + b"/")]:
-            self._times[new + path[len(old) :]] = self._times.pop(path)
-
-
-def shown(nanoseconds: int) -> tuple[int, int]:
-    """Return (seconds, nanoseconds within the second)."""
-    return divmod(nanoseconds, SECOND)
+        rename_keys(self._times, old, new)

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 import trio
 
+from mavftpfs.cache.attributes import SECOND, Times
 from mavftpfs.cache.directories import Directories
 from mavftpfs.cache.draft import State
 from mavftpfs.cache.files import Files
@@ -24,9 +25,10 @@ from mavftpfs.shared.model import DirEntry, EntryKind, split
 class Context:
     """The vehicle, what is remembered of it, and the files that are open or not delivered.
 
-    clock: seconds, monotonic; wall: seconds since 1970. paths: see pathlocks. armed: nothing may be
-    changed (only Writeback.armed_changed sets it). retry_later(): something was not delivered, or a name may
-    lack its file (Writeback sets it).
+    clock: seconds, monotonic; wall: seconds since 1970. paths: see pathlocks. times: mtimes that the vehicle
+    cannot be told. blocked: nothing may be changed, because the vehicle is armed (only
+    Writeback.armed_changed sets it). retry_later(): something was not delivered, or a name may lack its file
+    (Writeback sets it).
     """
 
     store: VehicleStore
@@ -40,13 +42,9 @@ class Context:
     paths: PathLocks
     spool: Spool
     nodes: Nodes = field(default_factory=Nodes)
-    armed: bool = False
+    times: Times = field(default_factory=Times)
+    blocked: bool = False
     retry_later: Callable[[], None] = lambda: None
-
-    @property
-    def blocked(self) -> bool:
-        """Whether nothing may be changed now, because the vehicle is armed."""
-        return self.armed and not self.options.write_armed
 
     def require_disarmed(self) -> None:
         """Raise Armed if nothing may be changed now."""
@@ -57,6 +55,10 @@ class Context:
         """Raise FileBusy if somebody on the vehicle seems to write the file."""
         if not self.options.force and self.directories.is_growing(path):
             raise FileBusy(f"{path!r} grows: somebody on the vehicle is writing it")
+
+    def touch(self, path: bytes) -> None:
+        """A file's content changed: it is of now, also where no listing tells times."""
+        self.times.set(path, int(self.wall() * SECOND))
 
     async def entry(self, path: bytes) -> DirEntry | None:
         """Return what a path is, drafts included; None if it does not exist though its directory does.

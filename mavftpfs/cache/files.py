@@ -409,8 +409,11 @@ class Files:
 
     def _at_or_below(self, path: bytes) -> list[Version]:
         """Return what is cached or open of a path, older ones too, and of what lies below it."""
-        known = dict.fromkeys((*self._current.values(), *self.open_versions))
-        return [v for v in known if v.path == path or v.path.startswith(path + b"/")]
+        found, below = [], path + b"/"
+        for version in dict.fromkeys((*self._current.values(), *self.open_versions)):
+            if version.path == path or version.path.startswith(below):
+                found.append(version)
+        return found
 
     # --- closing
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from fnmatch import translate
 from re import compile as compile_pattern
 
-from mavftpfs.cache.attributes import Stat, shown
+from mavftpfs.cache.attributes import SECOND, Stat
 from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.shared.errors import (
     AlreadyExists,
@@ -23,7 +23,7 @@ from mavftpfs.shared.errors import (
     NotADirectory,
     NotFound,
 )
-from mavftpfs.shared.model import EntryKind, join, split
+from mavftpfs.shared.model import EntryKind, join, rename_keys, split
 
 MAX_ENTRIES = 10_000
 
@@ -84,7 +84,7 @@ class LocalFiles:
             NotFound.
         """
         entry = self.find(path)
-        seconds, nanoseconds = shown(entry.mtime_ns)
+        seconds, nanoseconds = divmod(entry.mtime_ns, SECOND)
         return Stat(entry.kind, len(entry.data or b""), seconds, 0.0, nanoseconds)
 
     def names(self, directory: bytes) -> list[bytes]:
@@ -192,8 +192,7 @@ class LocalFiles:
 
     def move_below(self, old: bytes, new: bytes) -> None:
         """The directory `old` is called `new` now, whosever it is."""
-        for path in [p for p in self._entries if p == old or p.startswith(old + b"/")]:
-            self._entries[new + path[len(old) :]] = self._entries.pop(path)
+        rename_keys(self._entries, old, new)
 
     def resize(self, entry: LocalEntry, size: int) -> None:
         """Cut a file or extend it with zeros.

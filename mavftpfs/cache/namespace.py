@@ -22,7 +22,6 @@ from mavftpfs.cache.delivery import Deliverer
 from mavftpfs.cache.draft import State
 from mavftpfs.cache.names import Names
 from mavftpfs.cache.nodes import Node
-from mavftpfs.cache.overlay import Overlay
 from mavftpfs.cache.reserved import Kind, fits_rename, require_not_ours
 from mavftpfs.shared.errors import (
     AlreadyExists,
@@ -49,11 +48,10 @@ removal of many files does not list their directory before each."""
 class Namespace:
     """Changes of names. Paths are the vehicle's, not local, not below `@`."""
 
-    def __init__(self, context: Context, names: Names, deliverer: Deliverer, overlay: Overlay) -> None:
+    def __init__(self, context: Context, names: Names, deliverer: Deliverer) -> None:
         self._context = context
         self._names = names
         self._deliverer = deliverer
-        self._overlay = overlay
 
     async def mkdir(self, path: bytes) -> None:
         """See Tree.mkdir."""
@@ -75,7 +73,7 @@ class Namespace:
                 raise NotADirectory(f"{path!r} is not a directory")
             await self._names.require_empty(path)
             await self._names.remove_directory(path)
-        self._overlay.times.forget(path)
+        self._context.times.forget(path)
 
     async def unlink(self, path: bytes) -> None:
         """See Tree.unlink."""
@@ -83,7 +81,7 @@ class Namespace:
         require_not_ours(path)
         async with self._claim(path), self._context.paths.hold(path):
             await self._unlink(path)
-        self._overlay.times.forget(path)
+        self._context.times.forget(path)
 
     async def rename(self, old: bytes, new: bytes, *, noreplace: bool) -> None:
         """See Tree.rename."""
@@ -191,7 +189,7 @@ class Namespace:
         context.files.on_renamed(old, new)
         context.nodes.rename(old, new)
         context.own.follow_rename(old, new)
-        self._overlay.times.rename(old, new)
+        self._context.times.rename(old, new)
 
     async def _move(self, old: bytes, new: bytes, listed: DirEntry | None) -> None:
         """Rename on the vehicle. listed: what it has at `new`, which may be replaced; who has that open keeps

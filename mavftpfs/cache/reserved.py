@@ -21,7 +21,15 @@ from enum import Enum
 from random import Random
 
 from mavftpfs.shared.errors import NotSupported, PathTooLong
-from mavftpfs.shared.model import MAX_WIRE_PATH, RENAME_ROOM, join, split, wire_path
+from mavftpfs.shared.model import (
+    MAX_WIRE_PATH,
+    RENAME_ROOM,
+    join,
+    rename_keys,
+    renamed,
+    split,
+    wire_path,
+)
 
 PREFIX = b".mavftpfs-"
 MAX_NAME = 255
@@ -30,7 +38,7 @@ MAX_NAME = 255
 _ALPHABET = b"abcdefghijklmnopqrstuvwxyz234567"  # one spelling on cards that fold case
 _RESERVED = re.compile(rb"\.mavftpfs-([a-z2-7]{4})([ntod])([a-z2-7]{3})(?:-(.+))?", re.DOTALL)
 _SERIALS = 32**3
-_OWNER_LENGTH, _SERIAL_LENGTH = 4, 3
+_OWNER_LENGTH = 4
 
 
 class Kind(Enum):
@@ -88,7 +96,7 @@ def require_not_ours(path: bytes) -> None:
 def require_writable(path: bytes) -> None:
     """Raise NotSupported for a reserved name, PathTooLong where none fits beside the path."""
     require_not_ours(path)
-    shortest = Reserved(b"o" * _OWNER_LENGTH, Kind.NEW, b"s" * _SERIAL_LENGTH).name
+    shortest = Reserved(b"oooo", Kind.NEW, b"sss").name
     if not fits_rename(join(split(path)[0], shortest), path):
         raise PathTooLong(f"{path!r} is too long for a temporary name beside it")
 
@@ -104,7 +112,7 @@ def parse(name: bytes) -> Reserved | None:
 
 def new_owner(rng: Random) -> bytes:
     """Return a token for a mount."""
-    return _spell(rng.randrange(32**_OWNER_LENGTH), _OWNER_LENGTH)
+    return bytes(rng.choices(_ALPHABET, k=_OWNER_LENGTH))
 
 
 def fits_rename(old: bytes, new: bytes) -> bool:
@@ -130,17 +138,18 @@ class OwnNames:
 
     def beside(self, target: bytes, kind: Kind) -> bytes:
         """Return a path in the target's directory that does not tell its name. Raises PathTooLong."""
-        path = self._path(target, kind, self._next_serial(), tells=False)
-        if path is None:
+        path = join(split(target)[0], Reserved(self.owner, kind, self._next_serial()).name)
+        if not fits_rename(path, target):
             raise PathTooLong(f"{target!r} is too long for a temporary name beside it")
         return path
 
     def places(self, target: bytes) -> Places:
         """Return where to keep what replaces `target`. Raises PathTooLong."""
-        serial = self._next_serial()
-        for tells in (True, False):
-            new, old = (self._path(target, kind, serial, tells=tells) for kind in (Kind.NEW, Kind.OLD))
-            if new is not None:
+        serial, (parent, name) = self._next_serial(), split(target)
+        for told in (name, None):
+            ours = Reserved(self.owner, Kind.NEW, serial, told).name
+            new, old = join(parent, ours), join(parent, Reserved(self.owner, Kind.OLD, serial, told).name)
+            if len(ours) <= MAX_NAME and len(new) <= MAX_WIRE_PATH and fits_rename(new, target):
                 return Places(new, old)
         raise PathTooLong(f"{target!r} is too long for temporary names beside it")
 
@@ -151,29 +160,13 @@ class OwnNames:
 
     def follow_rename(self, old: bytes, new: bytes) -> None:
         """A directory has another name."""
-
-        def moved(path: bytes) -> bytes:
-            return new + path[len(old) :] if path.startswith(old + b"/") else path
-
-        self.live = {moved(path) for path in self.live}
-        self.torn = {moved(path): moved(place) for path, place in self.torn.items()}
+        rename_keys(self.torn, old, new)
+        for path, place in self.torn.items():
+            self.torn[path] = renamed(place, old, new)
+        for path in list(self.live):
+            self.live.remove(path)
+            self.live.add(renamed(path, old, new))
 
     def _next_serial(self) -> bytes:
-        self._serial = (self._serial + 1) % _SERIALS
-        return _spell(self._serial, _SERIAL_LENGTH)
-
-    def _path(self, target: bytes, kind: Kind, serial: bytes, *, tells: bool) -> bytes | None:
-        """Return a path beside the target, None if it does not fit a rename to it."""
-        parent, name = split(target)
-        ours = Reserved(self.owner, kind, serial, name if tells else None).name
-        path = join(parent, ours)
-        fits = len(ours) <= MAX_NAME and len(path) <= MAX_WIRE_PATH and fits_rename(path, target)
-        return path if fits else None
-
-
-def _spell(number: int, length: int) -> bytes:
-    letters = bytearray()
-    for _ in range(length):
-        number, digit = divmod(number, len(_ALPHABET))
-        letters.append(_ALPHABET[digit])
-    return bytes(letters)
+        number = self._serial = (self._serial + 1) % _SERIALS
+        return bytes((_ALPHABET[number >> 10], _ALPHABET[number >> 5 & 31], _ALPHABET[number & 31]))

@@ -17,8 +17,9 @@ import trio
 
 from mavftpfs.cache.attributes import SECOND, UNKNOWN_MTIME, Stat, shown_mtime
 from mavftpfs.cache.directories import Directories, Found
+from mavftpfs.cache.draft import Draft, State
 from mavftpfs.cache.files import Files
-from mavftpfs.cache.kept import KeptCache
+from mavftpfs.cache.kept import CLOCK_SET, KeptCache
 from mavftpfs.cache.localfiles import LocalFiles
 from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.options import CacheOptions
@@ -94,7 +95,7 @@ class Tree:
         self._local = LocalFiles(
             () if options.read_only else options.local, options.local_max, lambda: int(wall() * SECOND)
         )
-        self._checksums: dict[bytes, tuple[DirEntry | None, int | None, int]] = {}
+        self._checksums: dict[tuple[bytes, int | None, int], int] = {}
         self._writing = Writeback(
             store=store,
             directories=self._directories,
@@ -105,6 +106,7 @@ class Tree:
             nursery=nursery,
             spool_directory=spool,
         )
+        self._context = self._writing.context
 
     # --- asking
 
@@ -122,9 +124,9 @@ class Tree:
         if self._local.owns(remote):
             return self._local.stat(remote)
         self._require_not_hidden(remote)
-        ours = self._writing.overlay.stat(remote)
-        if ours is not None:
-            return ours
+        node = self._context.nodes.get(remote)
+        if node is not None and node.draft is not None:
+            return self._draft_stat(remote, node.draft)
         found = await self._directories.find(remote)
         if found.entry.kind is EntryKind.FILE and found.size is None:
             try:
@@ -164,10 +166,14 @@ class Tree:
         if remote == ROOT:
             for name in self._virtual.shown_in_root(directory.entries):
                 founds[name] = Found(DirEntry(name, EntryKind.DIRECTORY), directory)
-        shown = {name: self._listed_stat(join(remote, name), found) for name, found in founds.items()}
-        if not self._options.read_only:
-            shown = {name: stat for name, stat in shown.items() if not is_reserved(name)}
-        self._writing.overlay.lay_over(remote, shown)
+        shown = {}
+        for name, found in founds.items():
+            if self._options.read_only or not is_reserved(name):
+                shown[name] = self._listed_stat(join(remote, name), found)
+        for node in self._context.nodes:
+            parent, name = split(node.path)
+            if parent == remote and node.draft is not None:
+                shown[name] = self._draft_stat(node.path, node.draft)
         for name in self._local.names(remote):
             shown[name] = self._local.stat(join(remote, name))
         if directory.cut_short:
@@ -196,7 +202,8 @@ class Tree:
         return await self._writing.open_reader(remote)
 
     async def crc32(self, path: bytes) -> int:
-        """Return the vehicle's CRC32 of a file (start value 0, no final xor), as old as the listing at most.
+        """Return the vehicle's CRC32 of a file (start value 0, no final xor). Where its clock was set
+        it is asked for again only when size or mtime changed.
 
         Of an `@` file it is that of the bytes a reader gets: these are made anew at every open.
 
@@ -213,13 +220,14 @@ class Tree:
         found = await self._directories.find(remote)
         if found.entry.kind is not EntryKind.FILE:
             raise IsADirectory(f"{remote!r} is a directory")
-        entry, size, value = self._checksums.get(remote, (None, None, 0))
-        if entry is not found.entry or size != found.size:
-            size = found.size
-            value = await self._store.crc32(remote, size=size)
-            self._checksums[remote] = (found.entry, size, value)
-            if len(self._checksums) > MAX_CHECKSUMS:
-                del self._checksums[next(iter(self._checksums))]
+        key = (remote, found.size, found.entry.mtime or 0)
+        value = self._checksums.get(key)
+        if value is None:
+            value = await self._store.crc32(remote, size=found.size)
+            if len(self._checksums) == MAX_CHECKSUMS:
+                self._checksums.clear()
+            if key[2] >= CLOCK_SET:
+                self._checksums[key] = value
         return value
 
     # --- changing (all raise ReadOnly with `read_only`, and below `@` directories)
@@ -263,7 +271,7 @@ class Tree:
         if self._local.owns(remote):
             self._local.find(remote).mtime_ns = mtime_ns
         else:
-            self._writing.overlay.times.set(remote, mtime_ns)
+            self._context.times.set(remote, mtime_ns)
 
     async def mkdir(self, path: bytes) -> None:
         """Make a directory.
@@ -355,6 +363,7 @@ class Tree:
     def forget_caches(self) -> None:
         """Drop everything that is not in use by an open file."""
         self._directories.forget(ROOT)
+        self._checksums.clear()
         self._files.forget_closed()
         self._virtual.forget()
 
@@ -425,7 +434,19 @@ class Tree:
         unknown = found.entry.kind is EntryKind.FILE and found.size is None
         valid_for = 0.0 if unknown else max(0.0, min(self._options.attr_timeout, left))
         size = 0 if found.entry.kind is EntryKind.DIRECTORY else found.size or 0
-        user_set = self._writing.overlay.shown_time(remote, size, found.entry.mtime)
-        if user_set is not None:
-            return Stat(found.entry.kind, size, user_set[0], valid_for, user_set[1])
-        return Stat(found.entry.kind, size, shown_mtime(remote, found.entry.mtime), valid_for)
+        seconds, nanoseconds = shown_mtime(remote, found.entry.mtime), 0
+        node = self._context.nodes.get(remote)
+        if node is None or node.draft is None:  # else `_draft_stat` shows it: no listing tells of a draft
+            user_set = self._context.times.get(remote, size, found.entry.mtime)
+            if user_set is not None:
+                seconds, nanoseconds = divmod(user_set, SECOND)
+        return Stat(found.entry.kind, size, seconds, valid_for, nanoseconds)
+
+    def _draft_stat(self, remote: bytes, draft: Draft) -> Stat:
+        user_set = self._context.times.peek(remote)
+        if user_set is None:
+            entry = self._directories.entry(remote)
+            listed = entry.mtime if entry is not None and draft.state is State.CLEAN else None
+            user_set = shown_mtime(remote, listed) * SECOND
+        seconds, nanoseconds = divmod(user_set, SECOND)
+        return Stat(EntryKind.FILE, draft.size, seconds, self._options.attr_timeout, nanoseconds)

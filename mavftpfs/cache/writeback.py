@@ -26,7 +26,6 @@ from mavftpfs.cache.namespace import Namespace
 from mavftpfs.cache.nodes import Node
 from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.options import CacheOptions
-from mavftpfs.cache.overlay import Overlay
 from mavftpfs.cache.recovery import SpoolDirectory, recover
 from mavftpfs.cache.remote import VehicleStore
 from mavftpfs.cache.repair import Cleaner
@@ -62,7 +61,7 @@ class Writeback:
     """The writing half of the tree (see cache.tree.Tree for what each call does).
 
     Attributes:
-        overlay: what programs see that no listing shows. namespace: mkdir, rmdir, unlink and rename.
+        context: what its parts share. namespace: mkdir, rmdir, unlink and rename.
     """
 
     def __init__(
@@ -83,7 +82,7 @@ class Writeback:
         """
         owner = new_owner(rng) if spool_directory is None else spool_directory.owner
         dead = frozenset[bytes]() if spool_directory is None else spool_directory.dead_owners
-        self._context = context = Context(
+        self.context = self._context = context = Context(
             store=store,
             directories=directories,
             files=files,
@@ -105,9 +104,8 @@ class Writeback:
         self._deliverer = deliverer = Deliverer(context, names, cleaner, throttle)
         context.retry_later = self._retry_later
         self._retried: set[Callable[[Node], bool]] = set()
-        self.overlay = Overlay(context)
-        self.namespace = Namespace(context, names, deliverer, self.overlay)
-        self._parts = Parts(context, deliverer, throttle, self.overlay, self.namespace)
+        self.namespace = Namespace(context, names, deliverer)
+        self._parts = Parts(context, deliverer, throttle, self.namespace)
         if not options.read_only:
             directories.on_swept = cleaner.on_swept
         files.is_changing = context.is_changing
@@ -153,7 +151,7 @@ class Writeback:
                     node = context.nodes.need(path)
                 if made:
                     node.begin_draft(context.spool, None, context.clock())
-                    self.overlay.on_written(path)
+                    context.touch(path)
                 return WriteFile(self._parts, node, made=made)
         if exclusive:
             raise AlreadyExists(f"{path!r} exists")
@@ -251,10 +249,10 @@ class Writeback:
 
     def armed_changed(self, armed: bool) -> None:
         """See Tree.armed_changed."""
-        context = self._context
-        if armed == context.armed:
+        blocked = armed and not self._context.options.write_armed
+        if blocked == self._context.blocked:
             return
-        context.armed = armed
+        self._context.blocked = blocked
         self._throttle.let_go()
         self.retry()
 
@@ -280,7 +278,6 @@ class Writeback:
             "files_delivered": self._deliverer.delivered,
             **self._deliverer.verifier.status(),
             "leftovers_mended": self._cleaner.mended,
-            "armed": self._context.armed,
         }
 
     # --- delivering while nobody waits for it

@@ -22,7 +22,6 @@ from mavftpfs.cache.files import FileHandle
 from mavftpfs.cache.namespace import Namespace
 from mavftpfs.cache.nodes import Node
 from mavftpfs.cache.openfile import OpenFile
-from mavftpfs.cache.overlay import Overlay
 from mavftpfs.cache.throttle import Throttle
 from mavftpfs.shared.errors import FileBusy, FileChanged, FileTooLarge, LocalProtocolError, SpoolFailed
 
@@ -46,7 +45,6 @@ class Parts:
     context: Context
     deliverer: Deliverer
     throttle: Throttle
-    overlay: Overlay
     namespace: Namespace
 
 
@@ -282,5 +280,5 @@ class WriteFile(ReadFile):
 
     async def _on_written(self, node: Node) -> None:
         if not node.removed:
-            self._parts.overlay.on_written(node.path)
+            self._context.touch(node.path)
             await self._parts.deliverer.push(node)

@@ -6,9 +6,10 @@ Paths are bytes, absolute in the *mount's* spelling: `/a/b`, `/@SYS/uarts.txt`; 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import MutableMapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
+from typing import TypeVar
 
 from mavftpfs.shared.errors import LocalProtocolError, PathTooLong
 
@@ -19,6 +20,8 @@ RENAME_ROOM = 238
 """Bytes that both paths of a rename and the NUL between them may have (servers.md 9)."""
 
 ROOT = b"/"
+
+T = TypeVar("T")
 
 
 class EntryKind(Enum):
@@ -74,6 +77,19 @@ def split(path: bytes) -> tuple[bytes, bytes]:
     """Return (parent, name) of an absolute path; the root gives (b"/", b"")."""
     parent, _, name = path.rstrip(b"/").rpartition(b"/")
     return (parent or ROOT, name)
+
+
+def renamed(path: bytes, old: bytes, new: bytes) -> bytes:
+    """Return what a path is called when what was `old` is called `new`."""
+    return new + path[len(old) :] if path == old or path.startswith(old + b"/") else path
+
+
+def rename_keys(facts: MutableMapping[bytes, T], old: bytes, new: bytes) -> None:
+    """File what is known of a path, and of all below it, under its new name."""
+    for path in list(facts):
+        now = renamed(path, old, new)
+        if now != path:
+            facts[now] = facts.pop(path)
 
 
 def normalise(path: bytes) -> bytes:

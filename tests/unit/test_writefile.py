@@ -165,17 +165,7 @@ async def test_growth_shows_when_a_file_is_opened_too_and_force_goes_on(store: F
 # --- files without a name
 
 
-async def test_a_cached_file_is_removed_at_once_and_read_on(store: FakeWriter, tree: Tree) -> None:
-    file = await tree.open(FILE)
-    await file.read(0, len(DATA))
-    await tree.unlink(FILE)
-    assert store.files == {}
-    assert await file.read(0, len(DATA)) == DATA
-    await file.release()
-    assert tree.status()["bytes_held"] == 0
-
-
-async def test_a_file_partly_cached_is_hidden_until_it_is_closed(store: FakeWriter, tree: Tree) -> None:
+async def test_a_file_that_is_read_is_hidden_until_it_is_closed(store: FakeWriter, tree: Tree) -> None:
     store.files[FILE].data = DATA * 10
     file = await tree.open(FILE)
     assert await file.read(0, 10) == DATA[:10]
