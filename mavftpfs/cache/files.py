@@ -367,6 +367,15 @@ class Files:
 
     # --- we changed the file ourselves
 
+    def whole(self, path: bytes) -> Version | None:
+        """Return a path's version if all of it is held, surely of one file, and nobody has another open."""
+        version = self._current.get(path)
+        if version is None or version.dead is not None or not version.complete:
+            return None
+        sure = version.compared or not self._listings_tell(version)
+        alone = all(v is version or v.lost for v in self.open_versions if v.path == path)
+        return version if sure and alone else None
+
     def was_lost(self, path: bytes) -> bool:
         """Return whether somebody has a version of the path open, and is to read nothing more."""
         return any(v.path == path and v.lost for v in self.open_versions)

@@ -6,7 +6,7 @@ draft has undelivered is delivered before its path changes.
 
 Who has a file open that loses its name reads on. What was written here whole is held here. Else the file is
 kept on the vehicle under a reserved name until its last handle is closed. Where the card cannot rename
-(LittleFS), the change of the name is refused (EBUSY).
+(LittleFS), what is cached whole is held here, too; else the change of the name is refused (EBUSY).
 """
 
 from __future__ import annotations
@@ -19,10 +19,11 @@ import trio
 
 from mavftpfs.cache.context import Context
 from mavftpfs.cache.delivery import Deliverer
-from mavftpfs.cache.draft import State
+from mavftpfs.cache.draft import Base, State
 from mavftpfs.cache.names import Names
 from mavftpfs.cache.nodes import Node
 from mavftpfs.cache.reserved import Kind, fits_rename, require_not_ours
+from mavftpfs.cache.versions import BLOCK_SIZE
 from mavftpfs.shared.errors import (
     AlreadyExists,
     CrossDevice,
@@ -31,10 +32,12 @@ from mavftpfs.shared.errors import (
     InvalidMove,
     IsADirectory,
     MavftpfsError,
+    NoSpace,
     NotADirectory,
     NotFound,
     NotSupported,
     PathTooLong,
+    SpoolFailed,
 )
 from mavftpfs.shared.model import DirEntry, EntryKind, require_listable, wire_path
 
@@ -141,8 +144,12 @@ class Namespace:
             context.require_idle(path)
         await self._names.purge(path)
         if there and node is not None and node.needs_card:
-            await self._hide(node)
-            return
+            try:
+                await self._hide(node)
+                return
+            except FileBusy:
+                if not self._hold(node):
+                    raise
         if there:
             await self._names.remove_if_there(path)
             context.files.on_changed(path)
@@ -224,6 +231,22 @@ class Namespace:
             context.nodes.unnamed(displaced)
 
     # --- inside: open files that lose their names
+
+    def _hold(self, node: Node) -> bool:
+        """Keep here what a program reads of a file; return whether all of it is known."""
+        context, version = self._context, self._context.files.whole(node.path)
+        if version is None or node.draft is not None:
+            return False
+        draft = node.begin_draft(context.spool, Base(version.size), context.clock())
+        try:
+            for at in range(0, version.size, BLOCK_SIZE):
+                draft.fill(at, version.get(at, min(at + BLOCK_SIZE, version.size)) or b"")
+        except (NoSpace, SpoolFailed) as error:
+            log.info("%r cannot be held here: %s", node.path, error)
+            node.drop_draft()
+            return False
+        draft.content.settle()  # nobody misses a copy, whatever becomes of this mount
+        return True
 
     async def _hide(self, node: Node) -> None:
         """Keep an unlinked file on the vehicle under a reserved name as long as somebody has it open.

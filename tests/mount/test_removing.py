@@ -40,8 +40,8 @@ def test_the_name_goes_while_cp_waits_for_the_card(field: Field, command: str) -
     assert mount.unmount() == 0
 
 
-def test_a_file_keeps_its_name_while_a_program_reads_it(field: Field) -> None:
-    """Where nothing can be renamed."""
+def test_a_file_keeps_its_name_while_a_program_has_only_a_part_of_it(field: Field) -> None:
+    """Where nothing can be renamed. Once all of it is known here, the program has it without a name too."""
     card, old = field.local("card"), content("old", SIZE)
     (card / "file").write_bytes(old)
     mount = field.mount(field.sim(card, "littlefs").source)
@@ -49,6 +49,7 @@ def test_a_file_keeps_its_name_while_a_program_reads_it(field: Field) -> None:
         assert os.pread(file.fileno(), 100, 1000) == old[1000:1100]
         assert "Device or resource busy" in mount.run("rm", mount.path / "file", code=1).stderr
         assert file.read() == old
-    mount.run("rm", mount.path / "file")
-    assert os.listdir(card) == []
+        mount.run("rm", mount.path / "file")
+        assert os.listdir(card) == []
+        assert os.pread(file.fileno(), SIZE, 0) == old
     assert mount.unmount() == 0
