@@ -15,9 +15,8 @@ from typing import NoReturn
 
 import mavftpfs
 from mavftpfs import commands
-from mavftpfs.exits import ExitCode, exit_code_for
 from mavftpfs.fuse.options import option_help
-from mavftpfs.shared.errors import MavftpfsError, UsageError
+from mavftpfs.shared.errors import ExitCode, MavftpfsError, UsageError, exit_code_for
 from mavftpfs.shared.readable import readable
 
 _DESCRIPTION = """Mount a drone's files (MAVLink FTP: PX4, ArduPilot, MAVSDK) as a local directory.

@@ -14,19 +14,10 @@ from functools import partial
 from pathlib import Path
 
 from mavftpfs import control, daemon, mountpoint, report
-from mavftpfs.exits import ExitCode, MountFailed
-from mavftpfs.fuse.options import (
-    IGNORED_PREFIXES,
-    IGNORED_WORDS,
-    KERNEL_WORDS,
-    MountOptions,
-    parse_options,
-    split_words,
-    with_root,
-)
+from mavftpfs.fuse.options import MountOptions, parse_options, with_root
 from mavftpfs.link.uri import LinkSpec, parse_source
 from mavftpfs.mountpoint import DeadMount, canonical, is_ours
-from mavftpfs.shared.errors import UsageError
+from mavftpfs.shared.errors import ExitCode, MountFailed, UsageError
 from mavftpfs.shared.readable import readable, readable_time
 
 DELIVERY_PATIENCE = 3600.0
@@ -36,17 +27,6 @@ END_PATIENCE = 5.0
 SAY_AGAIN = 10.0
 """Seconds between two lines about a delivery, where these go to a file."""
 
-_OF_THE_MOUNT = (
-    "remount",
-    "ro",
-    "rw",
-    "user_id",
-    "group_id",
-    "default_permissions",
-    "allow_other",
-    "max_read",
-)
-"""What the kernel's table may say of a mount; mount(8) hands it over at a remount."""
 _PATH_OPTIONS = ("cache_dir", "signing_key", "log_file", "trace", "tlog")
 
 
@@ -56,9 +36,6 @@ _PATH_OPTIONS = ("cache_dir", "signing_key", "log_file", "trace", "tlog")
 def mount(args: argparse.Namespace) -> int:
     """Mount; in the background unless told otherwise."""
     place = canonical(args.mountpoint)
-    words = list(split_words(args.options))
-    if "remount" in words:
-        return remount(place, words)
     options, spec = connection_of(args)
     options = absolute_paths(options)
     mountpoint.check_fuse()
@@ -70,36 +47,6 @@ def mount(args: argparse.Namespace) -> int:
     if args.foreground or args.debug:
         return work(_report_in_foreground)
     return daemon.in_background(work)
-
-
-def remount(place: str, words: list[str]) -> int:
-    """Do what `mount -o remount` asks for: make a mount read-only, or writable again.
-
-    mount(8) adds the options that the mount has, and those of fstab; only ro and rw can change.
-
-    Raises:
-        UsageError: something else is asked for.
-        MountFailed: no vehicle is mounted there, it was mounted with ro, or the kernel refuses.
-    """
-    if not is_ours(place):
-        raise MountFailed(f"no vehicle is mounted on {place}")
-    wanted = [word for word in words if word in ("ro", "rw")]
-    others = [word for word in words if not _is_added_by_mount_8(word)]
-    asked = set(others).difference(split_words(mountpoint.fstab_options(place)))
-    if asked or not wanted:
-        named = f"{min(asked)}: " if asked else ""
-        raise UsageError(f"{named}remount changes only ro and rw; for other options unmount and mount anew")
-    read_only = wanted[-1] == "ro"
-    if not read_only and report.status_of(place).get("read_only"):
-        raise MountFailed(f"{place} was mounted with ro: unmount it, and mount it without")
-    mountpoint.remount(place, read_only=read_only)
-    return ExitCode.OK
-
-
-def _is_added_by_mount_8(word: str) -> bool:
-    """Return whether mount(8) may have added this to what `-o remount` asks for: generic, or of the mount."""
-    known = word in KERNEL_WORDS or word in IGNORED_WORDS or word.startswith(IGNORED_PREFIXES)
-    return known or word.partition("=")[0] in _OF_THE_MOUNT
 
 
 def connection_of(args: argparse.Namespace) -> tuple[MountOptions, LinkSpec]:

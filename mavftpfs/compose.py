@@ -22,7 +22,6 @@ from mavftpfs.cache.kept import KeptCache, vehicle_identity
 from mavftpfs.cache.kept_disk import KeptDisk
 from mavftpfs.cache.options import CacheOptions
 from mavftpfs.cache.tree import Tree
-from mavftpfs.exits import NoFtp
 from mavftpfs.farewell import rescue, spool_for
 from mavftpfs.fuse.handles import Space
 from mavftpfs.fuse.options import MountOptions
@@ -34,6 +33,7 @@ from mavftpfs.shared.errnos import errno_for
 from mavftpfs.shared.errors import (
     FtpNak,
     ListingIncomplete,
+    NoFtp,
     NotADirectory,
     NotFound,
     RequestTimeout,

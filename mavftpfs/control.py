@@ -23,8 +23,7 @@ from typing import Any
 
 import trio
 
-from mavftpfs.exits import MountFailed
-from mavftpfs.shared.errors import MavftpfsError
+from mavftpfs.shared.errors import MavftpfsError, MountFailed
 
 log = logging.getLogger("mavftpfs.control")
 

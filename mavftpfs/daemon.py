@@ -17,8 +17,7 @@ from io import TextIOWrapper
 from pathlib import Path
 from typing import NoReturn
 
-from mavftpfs.exits import SIGNALLED, ExitCode, exit_code_for
-from mavftpfs.shared.errors import MavftpfsError
+from mavftpfs.shared.errors import SIGNALLED, ExitCode, MavftpfsError, exit_code_for
 from mavftpfs.shared.private import make_private_directory, open_private
 from mavftpfs.shared.readable import readable
 

@@ -21,9 +21,8 @@ from pathlib import Path
 import shtab
 
 import mavftpfs
-from mavftpfs.exits import EXIT_CODES, ExitCode
 from mavftpfs.fuse.options import HELP, option_names
-from mavftpfs.shared.errors import UsageError
+from mavftpfs.shared.errors import EXIT_CODES, ExitCode, UsageError
 
 SHELLS = ("bash", "zsh", "fish")
 

@@ -12,6 +12,7 @@ import gc
 import logging
 import math
 import os
+import select
 import signal
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
@@ -27,17 +28,14 @@ import trio
 import mavftpfs
 from mavftpfs.compose import NO_SINKS, Sinks, attached
 from mavftpfs.control import ControlServer, Reply
-from mavftpfs.exits import ExitCode, MountFailed, exit_code_for
 from mavftpfs.farewell import Holder, say_goodbye
-from mavftpfs.fuse.device import never_blocking
-from mavftpfs.fuse.handles import Presentation, Space, Tree
-from mavftpfs.fuse.inodes import InodeTable
+from mavftpfs.fuse.handles import InodeTable, Presentation, Space, Tree
 from mavftpfs.fuse.operations import Operations
 from mavftpfs.fuse.options import MountOptions, fuse_words
 from mavftpfs.link.uri import LinkSpec
 from mavftpfs.mountpoint import is_ours, stderr_of, unmount, unmount_what_is_left
 from mavftpfs.report import Watcher, snapshot
-from mavftpfs.shared.errors import MavftpfsError
+from mavftpfs.shared.errors import ExitCode, MavftpfsError, MountFailed, exit_code_for
 
 log = logging.getLogger("mavftpfs.mount")
 
@@ -402,3 +400,78 @@ def presentation(options: MountOptions) -> Presentation:
         directory_mode=options.directory_mode(umask),
         op_deadline=options.op_deadline,
     )
+
+
+# -- reading /dev/fuse without blocking -------------------------------------------------------------
+
+
+@contextmanager
+def never_blocking() -> Iterator[None]:
+    """Have pyfuse3.main read /dev/fuse without blocking for the length of the body.
+
+    It waits until there is a request, and then reads it with a call that blocks, in the event loop's thread.
+    In between the request may be gone: the kernel takes it back when its caller is killed. Then nothing at
+    all would go on, the link included, until somebody asks for something else. So the descriptor is made
+    non-blocking, it is looked at once more right before each read, and a worker that found nothing begins
+    anew. (It loses its buffer then: 1 MiB of addresses, of which little was touched.)
+
+    The seam is the one that pyfuse3's own asyncio support uses: what it takes for the module `trio`.
+    """
+    setattr(pyfuse3, "trio", _Trio())  # noqa: B010 (which its types do not tell)
+    try:
+        yield
+    finally:
+        setattr(pyfuse3, "trio", trio)  # noqa: B010
+
+
+class _Delegate:
+    """Has whatever a module has, but for what a subclass defines."""
+
+    def __init__(self, module: object) -> None:
+        self._module = module
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._module, name)
+
+
+class _LowLevel(_Delegate):
+    async def wait_readable(self, fd: int) -> None:
+        """Wait until a read finds something, as far as that can be known."""
+        os.set_blocking(fd, False)
+        poll = select.poll()
+        poll.register(fd, select.POLLIN)
+        await trio.lowlevel.wait_readable(fd)
+        while not poll.poll(0):
+            await trio.lowlevel.wait_readable(fd)
+
+
+class _Trio(_Delegate):
+    def __init__(self) -> None:
+        super().__init__(trio)
+        self.lowlevel = _LowLevel(trio.lowlevel)
+
+    @asynccontextmanager
+    async def open_nursery(self) -> AsyncIterator[_Workers]:
+        """Open the one of pyfuse3's workers."""
+        async with trio.open_nursery() as nursery:
+            yield _Workers(nursery)
+
+
+class _Workers:
+    """Starts workers that outlive a read which found nothing."""
+
+    def __init__(self, nursery: trio.Nursery) -> None:
+        self._nursery = nursery
+
+    def start_soon(self, worker: Callable[..., Awaitable[None]], *args: object, name: object = None) -> None:
+        """As trio.Nursery's."""
+        self._nursery.start_soon(_work, worker, args, name=name)
+
+
+async def _work(worker: Callable[..., Awaitable[None]], args: tuple[object, ...]) -> None:
+    while True:
+        try:
+            await worker(*args)
+        except BlockingIOError:
+            continue  # it counts as running still
+        return

@@ -19,13 +19,12 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from mavftpfs.exits import MountFailed
 from mavftpfs.fuse.options import SUBTYPE
+from mavftpfs.shared.errors import MountFailed
 
 FUSE_DEVICE = "/dev/fuse"
 OUR_TYPE = f"fuse.{SUBTYPE}"
 MOUNT_TABLE = "/proc/self/mountinfo"
-FSTAB = "/etc/fstab"
 UNMOUNT_PATIENCE = 60.0
 """Seconds for an unmount: it waits for the last flush."""
 BUSY_PATIENCE = 1.0
@@ -113,16 +112,6 @@ def mounts(table: str = MOUNT_TABLE) -> dict[str, Mounted]:
     return found
 
 
-def fstab_options(path: str, *, table: str = FSTAB) -> list[str]:
-    """Return the options that fstab has for a mountpoint, as its lines have them."""
-    try:
-        lines = Path(table).read_text(errors="surrogateescape").splitlines()
-    except OSError:
-        return []
-    found = (line.split() for line in lines)
-    return [words[3] for words in found if len(words) > 3 and _unescape(words[1]).rstrip("/") == path]
-
-
 def unmount(path: str, *, lazy: bool = False) -> None:
     """Unmount, waiting for it; with `lazy` even if it is in use.
 
@@ -141,18 +130,6 @@ def unmount(path: str, *, lazy: bool = False) -> None:
         said = _said_by(words, path)
     if said is not None:
         raise MountFailed(_describe_unmount(path, said))
-
-
-def remount(path: str, *, read_only: bool) -> None:
-    """Have the kernel make a mount read-only, or writable again; only root may.
-
-    Raises:
-        MountFailed: with what mount(8) said.
-    """
-    # -i: not by way of our own helper, which would come here again.
-    said = _said_by(["mount", "-i", "-n", "-o", f"remount,{'ro' if read_only else 'rw'}", "--", path], path)
-    if said is not None:
-        raise MountFailed(f"cannot remount {path}: {_first_line(said)}")
 
 
 def unmount_what_is_left(path: str) -> None:

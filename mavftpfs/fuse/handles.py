@@ -1,17 +1,33 @@
-"""File and directory handles, and what the operations need of the tree. Layer: fuse; pure.
+"""What the kernel calls by number: inodes and handles; and what the operations need of the tree. Layer: fuse;
+pure. Without pyfuse3, so that commands that mount nothing work where there is no libfuse3.
 
-Without pyfuse3, so that commands that mount nothing work where there is no libfuse3.
+The kernel knows a file by number and says with forget how many of our answers it dropped. A number
+is a hash of the path at the time it was given out, so it is the same after the kernel forgot it, and in
+the next mount too: git's index and incremental backups compare st_ino, and every doubt costs them a
+re-read over a radio. A number that is taken (a hash collision, or a file that was renamed or unlinked
+while the kernel knows it) is stepped over. `generation` is a counter, so that a (number, generation)
+pair never names two files.
+
+An inode lives while its lookup count is above zero; the root always does.
+
+# INVARIANT: every inode with a path is found under that path, and no two share one.
+# INVARIANT: counts are never negative; an inode with count zero exists only between reserve and
+#            count/discard, which no await may part (except the root).
 """
 
 from __future__ import annotations
 
+import hashlib
 import mmap
+import stat as stat_bits
+from collections import OrderedDict
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Generic, Protocol, TypeVar
+from typing import Any, Generic, Protocol, TypeVar
 
 from mavftpfs.cache.attributes import Stat
+from mavftpfs.shared.model import ROOT, EntryKind
 
 XATTR_CRC32 = b"user.mavftp.crc32"
 XATTR_STATUS = b"user.mavftpfs.status"
@@ -146,3 +162,216 @@ class HandleTable(Generic[HandleT]):
     def remove(self, number: int) -> HandleT | None:
         """Forget a number and return what was open under it, or None."""
         return self._handles.pop(number, None)
+
+
+# -- inodes ---------------------------------------------------------------------------------------
+
+ROOT_INO = 1
+_INO_MASK = (1 << 63) - 1
+"""Numbers stay positive in a signed 64-bit field, which some programs use."""
+
+
+@dataclass(slots=True)
+class Inode:
+    """One number the kernel may use.
+
+    path: None once the name was removed. told_size: the size in bytes that the kernel last heard, if any.
+    """
+
+    ino: int
+    generation: int
+    path: bytes | None
+    lookups: int = 0
+    told_size: int | None = None
+
+
+class InodeTable:
+    """All inodes of one mount."""
+
+    def __init__(self) -> None:
+        self._generation = 0
+        root = Inode(ROOT_INO, 0, ROOT)
+        self._by_ino: dict[int, Inode] = {ROOT_INO: root}
+        self._by_path: dict[bytes, Inode] = {ROOT: root}
+        self.excess_forgets = 0
+        """Forgets beyond the count: a bug here or in the kernel, never a crash."""
+
+    def __len__(self) -> int:
+        """Return how many inodes are alive, the root included."""
+        return len(self._by_ino)
+
+    def get(self, ino: int) -> Inode | None:
+        """Return the inode behind a number, or None."""
+        return self._by_ino.get(ino)
+
+    def known(self, path: bytes) -> int | None:
+        """Return the number the kernel knows this path by, or None."""
+        inode = self._by_path.get(path)
+        return None if inode is None else inode.ino
+
+    def reserve(self, path: bytes) -> Inode:
+        """Return the path's inode, made if need be, without counting a lookup."""
+        inode = self._by_path.get(path)
+        if inode is None:
+            self._generation += 1
+            inode = Inode(self._free_number(path), self._generation, path)
+            self._by_ino[inode.ino] = inode
+            self._by_path[path] = inode
+        return inode
+
+    def count(self, inode: Inode) -> None:
+        """Count one answer that told the kernel about this inode."""
+        inode.lookups += 1
+
+    def discard(self, inode: Inode) -> None:
+        """Drop a reserved inode that the kernel was not told about after all."""
+        if inode.lookups == 0:
+            self._free(inode)
+
+    def lookup(self, path: bytes) -> Inode:
+        """Reserve and count in one step."""
+        inode = self.reserve(path)
+        self.count(inode)
+        return inode
+
+    def forget(self, ino: int, lookups: int) -> None:
+        """Take back `lookups` answers; at zero the inode is freed. Never raises: nobody could be told."""
+        inode = self._by_ino.get(ino)
+        if inode is None:
+            self.excess_forgets += 0 if ino == ROOT_INO else 1
+            return
+        if lookups > inode.lookups and ino != ROOT_INO:
+            self.excess_forgets += 1  # the kernel holds one uncounted reference to the root
+        inode.lookups = max(0, inode.lookups - lookups)
+        if inode.lookups == 0:
+            self._free(inode)
+
+    def unlink(self, path: bytes) -> None:
+        """The name is gone; the kernel may still hold the inode (an open file)."""
+        inode = self._by_path.pop(path, None)
+        if inode is not None:
+            inode.path = None
+
+    def rename(self, old: bytes, new: bytes) -> None:
+        """Move a name and everything below it; what was at `new` becomes nameless."""
+        if old == new:
+            return
+        self.unlink(new)
+        for path in self._subtree(old):
+            inode = self._by_path.pop(path)
+            inode.path = new + path[len(old) :]
+            self._by_path[inode.path] = inode
+
+    def check_invariants(self) -> None:
+        """Assert what the module's docstring promises (for tests)."""
+        assert self._by_ino[ROOT_INO].path == ROOT
+        for path, inode in self._by_path.items():
+            assert inode.path == path
+            assert self._by_ino[inode.ino] is inode
+        for ino, inode in self._by_ino.items():
+            assert inode.ino == ino
+            assert inode.lookups > 0 or ino == ROOT_INO
+            assert inode.path is None or self._by_path[inode.path] is inode
+
+    def _subtree(self, path: bytes) -> list[bytes]:
+        prefix = path if path.endswith(b"/") else path + b"/"
+        return [known for known in self._by_path if known == path or known.startswith(prefix)]
+
+    def _free_number(self, path: bytes) -> int:
+        digest = hashlib.blake2b(path, digest_size=8).digest()
+        number = int.from_bytes(digest, "little") & _INO_MASK
+        while number <= ROOT_INO or number in self._by_ino:
+            number = (number + 1) & _INO_MASK
+        return number
+
+    def _free(self, inode: Inode) -> None:
+        if inode.ino == ROOT_INO:
+            return
+        del self._by_ino[inode.ino]
+        if inode.path is not None:
+            del self._by_path[inode.path]
+
+
+MAX_KEPT = 100_000
+"""Paths of which something that was set is remembered."""
+NANO = 1_000_000_000
+
+
+@dataclass(slots=True)
+class UserAttributes:
+    """What programs set on one path, so that `cp -p`, `rsync -a`, `tar` and `touch` see what they set.
+
+    None = not set. mode: permission bits; times in nanoseconds since 1970 UTC.
+
+    changed_ns: when a directory's entries, or its times, were last changed through this mount.
+    """
+
+    mode: int | None = None
+    uid: int | None = None
+    gid: int | None = None
+    atime_ns: int | None = None
+    mtime_ns: int | None = None
+    changed_ns: int | None = None
+
+    def show(self, entry: Any, found: Stat) -> None:
+        """Put what was set into `entry` (pyfuse3.EntryAttributes); found: what the tree says."""
+        if self.mode is not None:
+            entry.st_mode = stat_bits.S_IFMT(entry.st_mode) | self.mode
+        if self.uid is not None:
+            entry.st_uid = self.uid
+        if self.gid is not None:
+            entry.st_gid = self.gid
+        same_second = self.mtime_ns is not None and self.mtime_ns // NANO == found.mtime
+        if found.kind is EntryKind.DIRECTORY:
+            entry.st_ctime_ns = max(self.changed_ns or 0, entry.st_mtime_ns)
+            entry.st_mtime_ns = entry.st_ctime_ns if self.mtime_ns is None else self.mtime_ns
+        elif same_second and not found.mtime_nsec:  # else the tree knows it to the nanosecond
+            entry.st_mtime_ns = entry.st_ctime_ns = self.mtime_ns
+        entry.st_atime_ns = entry.st_mtime_ns if self.atime_ns is None else self.atime_ns
+        if found.kind is EntryKind.FILE and self.mtime_ns is not None and not same_second:
+            self.atime_ns = None  # the file changed since
+
+
+class UserAttributeTable:
+    """What was set on a bounded number of paths; the least recently changed are forgotten first.
+
+    Kept by path for the life of the mount: the kernel forgets inodes at will. A file's time is shown while
+    the tree shows the same second, because the tree knows when a file changed. A directory's is the one that
+    was set, until entries are made, removed or renamed in it; from then on it is the time of that, or the
+    vehicle's where that is later: a memory card keeps none, and the programs that look for changes by it
+    (make, mail readers, git's untracked cache) would see none.
+    """
+
+    def __init__(self, limit: int = MAX_KEPT) -> None:
+        self._limit = limit
+        self._kept: OrderedDict[bytes, UserAttributes] = OrderedDict()
+
+    def get(self, path: bytes) -> UserAttributes | None:
+        """Return what was set on a path, or None."""
+        return self._kept.get(path)
+
+    def at(self, path: bytes) -> UserAttributes:
+        """Return what was set on a path, to be changed."""
+        kept = self._kept.get(path)
+        if kept is None:
+            kept = self._kept[path] = UserAttributes()
+            if len(self._kept) > self._limit:
+                self._kept.popitem(last=False)
+        self._kept.move_to_end(path)
+        return kept
+
+    def entries_changed(self, directory: bytes, now_ns: int) -> None:
+        """An entry was made, removed or renamed in a directory: a time that was set holds no longer."""
+        kept = self.at(directory)
+        kept.mtime_ns, kept.changed_ns = None, now_ns
+
+    def drop(self, path: bytes) -> None:
+        """The path is gone."""
+        self._kept.pop(path, None)
+
+    def move(self, old: bytes, new: bytes) -> None:
+        """The path, and everything below it, has another name."""
+        self.drop(new)
+        prefix = old + b"/"
+        for path in [known for known in self._kept if known == old or known.startswith(prefix)]:
+            self._kept[new + path[len(old) :]] = self._kept.pop(path)

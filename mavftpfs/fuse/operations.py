@@ -30,18 +30,22 @@ from pyfuse3 import EntryAttributes, FileInfo, FUSEError, RequestContext, Setatt
 
 from mavftpfs.cache.attributes import Stat
 from mavftpfs.fuse.handles import (
+    NANO,
+    ROOT_INO,
     XATTR_CRC32,
     XATTR_STATUS,
     DirectoryHandle,
     FileHandle,
     HandleTable,
+    Inode,
+    InodeTable,
     Presentation,
     Space,
     Tree,
+    UserAttributeTable,
     closed_on_failure,
     is_mapped_page,
 )
-from mavftpfs.fuse.inodes import NANO, ROOT_INO, Inode, InodeTable, UserAttributeTable
 from mavftpfs.shared.errnos import errno_for
 from mavftpfs.shared.errors import Armed, ListingIncomplete, MavftpfsError, NotFound
 from mavftpfs.shared.model import MAX_WIRE_PATH, EntryKind, join, split

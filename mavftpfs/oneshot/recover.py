@@ -15,13 +15,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from mavftpfs.exits import NotDelivered
 from mavftpfs.oneshot.fetch import NO_CHECKSUM
 from mavftpfs.oneshot.files import READ_SIZE, Session
 from mavftpfs.oneshot.progress import Progress
 from mavftpfs.oneshot.transfer import Piece, Put, Sent, put_paths
 from mavftpfs.protocol.payload import crc32
 from mavftpfs.shared.errors import (
+    NotDelivered,
     NotFound,
     UsageError,
 )

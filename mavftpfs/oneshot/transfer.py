@@ -18,7 +18,6 @@ import trio
 
 from mavftpfs.cache.attributes import Stat
 from mavftpfs.compose import plain_nursery
-from mavftpfs.exits import NotDelivered
 from mavftpfs.oneshot.fetch import (
     NO_CHECKSUM,
     Complain,
@@ -44,6 +43,7 @@ from mavftpfs.shared.errors import (
     LinkError,
     MavftpfsError,
     NotADirectory,
+    NotDelivered,
     UsageError,
 )
 from mavftpfs.shared.model import EntryKind, is_snapshot, join, split

@@ -21,7 +21,6 @@ import trio
 from mavftpfs import daemon
 from mavftpfs.commands import connection_of, left_by_killed_mounts_line
 from mavftpfs.compose import open_sinks, plain_nursery
-from mavftpfs.exits import ExitCode, exit_code_for
 from mavftpfs.farewell import recovered_directory
 from mavftpfs.fuse.options import parse_options
 from mavftpfs.oneshot import names, progress, transfer
@@ -30,7 +29,7 @@ from mavftpfs.oneshot import scan as scanning
 from mavftpfs.oneshot import sync as syncing
 from mavftpfs.oneshot.fetch import Fetched, Fetcher, Step
 from mavftpfs.oneshot.files import Session, Target, mountpoint_of
-from mavftpfs.shared.errors import MavftpfsError, UsageError
+from mavftpfs.shared.errors import ExitCode, MavftpfsError, UsageError, exit_code_for
 from mavftpfs.shared.readable import name_text, printable, readable, readable_size
 
 ResultT = TypeVar("ResultT")

@@ -120,6 +120,9 @@ _BY_CLASS: dict[type[BaseException], int] = {
     errors.NoSpace: errno.ENOSPC,
     errors.SpoolFailed: errno.EIO,
     errors.VerificationFailed: errno.EIO,
+    errors.MountFailed: errno.EIO,
+    errors.NoFtp: errno.EIO,
+    errors.NotDelivered: errno.EIO,
 }
 
 

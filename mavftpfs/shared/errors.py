@@ -1,4 +1,4 @@
-"""The exception tree. Layer: shared; imports only the standard library.
+"""The exception tree, and the exit code for each. Layer: shared; imports only the standard library.
 
 Every error that leaves a layer is one of these; `shared.errnos` turns them into the kernel's numbers.
 """
@@ -6,6 +6,7 @@ Every error that leaves a layer is one of these; `shared.errnos` turns them into
 from __future__ import annotations
 
 from collections.abc import Sequence
+from enum import IntEnum
 from typing import Any
 
 
@@ -153,6 +154,18 @@ class VerificationFailed(MavftpfsError):
     """What is on the card is not what was written, and sending it again did not help (EIO)."""
 
 
+class MountFailed(MavftpfsError):
+    """The kernel side cannot be set up or taken down."""
+
+
+class NoFtp(MavftpfsError):
+    """A vehicle is there, but its files are not."""
+
+
+class NotDelivered(MavftpfsError):
+    """Bytes that were to be written are not provably on the vehicle."""
+
+
 _REQUESTS = {
     1: "close the file",
     3: "list the directory",
@@ -206,3 +219,59 @@ class FtpNak(MavftpfsError):
         self.code = code
         self.server_errno = server_errno
         self.retransmitted = retransmitted
+
+
+# -- exit codes of the command line ----------------------------------------------------------------
+
+
+class ExitCode(IntEnum):
+    """What the shell is told."""
+
+    OK = 0
+    USAGE = 1
+    NO_VEHICLE = 2
+    INCOMPLETE = 2  # of several things some failed
+    MOUNT_FAILED = 3
+    UNDELIVERED = 4
+    BUG = 70
+    INTERRUPTED = 130
+
+
+EXIT_CODES = {
+    ExitCode.OK: "fine",
+    ExitCode.USAGE: "wrong usage, or not possible with the files as they are",
+    ExitCode.NO_VEHICLE: "no vehicle, no FTP, or no right answer from it",
+    ExitCode.MOUNT_FAILED: "mounting or unmounting failed",
+    ExitCode.UNDELIVERED: "data could not be delivered to the card; the message names where it lies",
+    ExitCode.BUG: "a bug of ours",
+    ExitCode.INTERRUPTED: "interrupted; 128 and the number of the signal for others",
+}
+"""What each means, for the man page."""
+
+SIGNALLED = 128
+"""Plus a signal's number: that signal ended it, as shells say it."""
+
+
+_NOT_POSSIBLE = (
+    UsageError,
+    *(NotFound, NotADirectory, IsADirectory, AlreadyExists, DirectoryNotEmpty, InvalidMove, CrossDevice),
+    *(ReadOnly, Armed, FileBusy, NotSupported, LocalProtocolError),
+)
+"""The vehicle is there, but what was asked cannot be done with the files as they are."""
+
+_CODES: tuple[tuple[type[MavftpfsError], ExitCode], ...] = (
+    *((cls, ExitCode.USAGE) for cls in _NOT_POSSIBLE),
+    (NotDelivered, ExitCode.UNDELIVERED),
+    (MountFailed, ExitCode.MOUNT_FAILED),
+    (NoFtp, ExitCode.NO_VEHICLE),
+    (LinkError, ExitCode.NO_VEHICLE),
+    (RequestTimeout, ExitCode.NO_VEHICLE),
+)
+
+
+def exit_code_for(error: MavftpfsError) -> ExitCode:
+    """Return the exit code an error ends a command with."""
+    for cls, code in _CODES:
+        if isinstance(error, cls):
+            return code
+    return ExitCode.NO_VEHICLE

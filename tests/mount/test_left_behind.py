@@ -11,9 +11,9 @@ from pathlib import Path
 import pytest
 
 from mavftpfs.cache.recovery import SpoolDirectory
-from mavftpfs.exits import ExitCode
 from mavftpfs.farewell import spool_base
 from mavftpfs.link.messages import Address
+from mavftpfs.shared.errors import ExitCode
 from tests.mount.conftest import Field
 from tests.support.mounts import Mount, wait_until
 

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from mavftpfs.exits import ExitCode
+from mavftpfs.shared.errors import ExitCode
 from tests.mount.conftest import Field
 from tests.support import terminal
 from tests.support.mounts import COMMAND_TIMEOUT, Mount, abort_mount, wait_until

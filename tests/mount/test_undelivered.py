@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from mavftpfs.exits import ExitCode
+from mavftpfs.shared.errors import ExitCode
 from tests.mount.conftest import Field
 from tests.mount.test_writing_ends import QUICK, write_to_nobody
 from tests.support.mounts import Mount, abort_mount, wait_until

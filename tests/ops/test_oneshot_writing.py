@@ -8,7 +8,6 @@ from typing import cast
 
 import pytest
 
-from mavftpfs.exits import ExitCode, NotDelivered, exit_code_for
 from mavftpfs.oneshot import names
 from mavftpfs.oneshot.files import Files, Session
 from mavftpfs.oneshot.progress import Progress
@@ -17,12 +16,15 @@ from mavftpfs.shared.errors import (
     AlreadyExists,
     CrossDevice,
     DirectoryNotEmpty,
+    ExitCode,
     IsADirectory,
     MavftpfsError,
     NotADirectory,
+    NotDelivered,
     NotFound,
     RequestTimeout,
     UsageError,
+    exit_code_for,
 )
 from mavftpfs.shared.model import EntryKind, split
 from tests.ops.faketree import FakeTree

@@ -15,8 +15,7 @@ import trio
 import trio.testing
 from pyfuse3 import FUSEError, RequestContext
 
-from mavftpfs.fuse.handles import XATTR_CRC32, XATTR_STATUS, Presentation, Space
-from mavftpfs.fuse.inodes import ROOT_INO
+from mavftpfs.fuse.handles import ROOT_INO, XATTR_CRC32, XATTR_STATUS, Presentation, Space
 from mavftpfs.fuse.operations import (
     UNKNOWN_SPACE,
     Operations,

@@ -12,8 +12,7 @@ import pyfuse3
 import pytest
 from pyfuse3 import EntryAttributes, RequestContext, SetattrFields
 
-from mavftpfs.fuse.handles import Presentation
-from mavftpfs.fuse.inodes import ROOT_INO
+from mavftpfs.fuse.handles import ROOT_INO, Presentation
 from mavftpfs.fuse.operations import Operations
 from mavftpfs.shared.errors import Armed, NoSpace, RequestTimeout
 from tests.ops.faketree import MTIME, FakeFile, FakeTree

@@ -16,11 +16,20 @@ import pytest
 import trio
 
 from mavftpfs import cli, commands, compose, control, report
-from mavftpfs.exits import ExitCode, MountFailed, NoFtp, NotDelivered, exit_code_for
 from mavftpfs.fuse.options import MountOptions
 from mavftpfs.oneshot.verbs import until_interrupted
 from mavftpfs.shared import errors
-from mavftpfs.shared.errors import LinkClosed, MavftpfsError, UsageError, VehicleLost
+from mavftpfs.shared.errors import (
+    ExitCode,
+    LinkClosed,
+    MavftpfsError,
+    MountFailed,
+    NoFtp,
+    NotDelivered,
+    UsageError,
+    VehicleLost,
+    exit_code_for,
+)
 
 SOURCE = "udpin:127.0.0.1:0"
 

@@ -1,4 +1,4 @@
-"""fuse.inodes: numbers, lookup counts, renames."""
+"""fuse.handles: inode numbers, lookup counts, renames."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
-from mavftpfs.fuse import inodes
-from mavftpfs.fuse.inodes import ROOT_INO, InodeTable
+from mavftpfs.fuse import handles
+from mavftpfs.fuse.handles import ROOT_INO, InodeTable
 
 
 def test_a_path_keeps_its_number_over_forget_and_mounts() -> None:
@@ -24,7 +24,7 @@ def test_a_path_keeps_its_number_over_forget_and_mounts() -> None:
 
 
 def test_a_taken_number_is_stepped_over(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(inodes, "_INO_MASK", 3)
+    monkeypatch.setattr(handles, "_INO_MASK", 3)
     table = InodeTable()
     numbers = {table.lookup(path).ino for path in (b"/a", b"/b")}
     assert numbers == {2, 3}

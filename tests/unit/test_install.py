@@ -9,9 +9,8 @@ from pathlib import Path
 import pytest
 
 from mavftpfs import cli, install
-from mavftpfs.exits import EXIT_CODES, ExitCode
 from mavftpfs.fuse.options import option_names
-from mavftpfs.shared.errors import UsageError
+from mavftpfs.shared.errors import EXIT_CODES, ExitCode, UsageError
 
 COMMANDS = [name for name in cli._COMMANDS if name != "mount"]
 

@@ -10,7 +10,7 @@ import pytest
 import trio
 import trio.testing
 
-from mavftpfs.fuse.inodes import InodeTable
+from mavftpfs.fuse.handles import InodeTable
 from mavftpfs.mount import Invalidator
 
 

@@ -52,7 +52,6 @@ PURE_MODULES = {
     "cache.readahead",
     "cache.reserved",
     "cache.draft",
-    "fuse.inodes",
     "fuse.handles",
     "fuse.options",
 }
@@ -60,7 +59,7 @@ IMPURE_MODULES = {"sim.endpoints", "sim.tree", "shared.private"}
 IMPURE_IMPORTS = {"trio", "time", "socket", "logging", "pyfuse3", "os", "pathlib"}
 
 SOLE_IMPORTERS = {
-    "pyfuse3": {"fuse.device", "fuse.operations", "mount"},
+    "pyfuse3": {"fuse.operations", "mount"},
     "pymavlink": {"link.framing"},
     "serial": {"link.serial"},
     "rich": {"cli", "demo", "oneshot.progress"},

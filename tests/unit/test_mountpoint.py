@@ -9,19 +9,18 @@ from pathlib import Path
 
 import pytest
 
-from mavftpfs.exits import MountFailed
 from mavftpfs.mountpoint import (
     Mounted,
     canonical,
     check_fuse,
     check_mountpoint,
-    fstab_options,
     is_ours,
     mounts,
     stderr_of,
     unmount,
     unmount_what_is_left,
 )
+from mavftpfs.shared.errors import MountFailed
 
 
 def table(tmp_path: Path, *lines: str) -> str:
@@ -47,19 +46,6 @@ def test_the_table_is_read_with_its_escapes_and_the_last_mount_wins(tmp_path: Pa
     assert is_ours("/mnt/a", table=path)
     assert not is_ours("/mnt/b", table=path)
     assert not is_ours("/mnt/c", table=path)
-
-
-def test_the_options_of_fstab(tmp_path: Path) -> None:
-    path = table(
-        tmp_path,
-        "# a comment",
-        "/dev/sda1 / ext4 errors=remount-ro 0 1",
-        "udpin:0.0.0.0:14550  /mnt/my\\040drone/  mavftpfs  noauto,uid=1000  0 0",
-        "none",
-    )
-    assert fstab_options("/mnt/my drone", table=path) == ["noauto,uid=1000"]
-    assert fstab_options("/mnt/other", table=path) == []
-    assert fstab_options("/mnt/other", table=str(tmp_path / "missing")) == []
 
 
 @pytest.mark.parametrize(("name", "reason"), [("missing", "mkdir -p"), ("file", "not a directory")])
