@@ -90,6 +90,7 @@ class Doubt:
     @property
     def lateness(self) -> float:
         """Seconds for which a copy of a request may still come; 0 while there is no doubt."""
-        if not self.is_active():
+        now = self._clock()
+        if now - self._at > LASTS:
             return 0.0
-        return self._late if self._clock() - self._late_at <= LASTS else LEAST_LATE
+        return self._late if now - self._late_at <= LASTS else LEAST_LATE

@@ -86,6 +86,7 @@ class Driver:
 
     async def pump(self) -> None:
         """Run until cancelled or the link is closed for good (LinkClosed)."""
+        identity = self.vehicle.identity
         while True:
             with trio.CancelScope(deadline=self._deadline) as scope:
                 self._scope = scope
@@ -98,11 +99,21 @@ class Driver:
                 self.engine.on_deadline(now)
                 if self.framer.waiting and now >= self._heard_at + QUIET:
                     self._handle(self.framer.give_up(), now, self.link.sender(-1))
-                    self._pass_on(now)
-                    if self.on_batch is not None:
-                        self.on_batch(now)
+            elif not chunks:  # the link was reopened
+                self.framer.reset()
+                identity.reopened(now)
             else:
-                self._take(chunks, now)
+                self._heard_at = now
+                for index, chunk in enumerate(chunks):
+                    self._handle(self.framer.feed(chunk), now, self.link.sender(index))
+                    if len(self._gathered) >= REFILL_AT:
+                        self._pass_on(now)
+                        self._refill(now)
+            self._pass_on(now)
+            if identity.heard_at == now and identity.standing is not Standing.STRANGER:
+                self.link.keep_peer()
+            if self.on_batch is not None:
+                self.on_batch(now)
             self.kick()
 
     async def run(self, operation: Operation) -> None:
@@ -185,25 +196,6 @@ class Driver:
         if self._budget is not None:
             self._budget.spend(len(frame), self._clock())
         self.link.send_nowait([frame])
-
-    def _take(self, chunks: list[bytes], now: float) -> None:
-        if not chunks:
-            self.framer.reset()
-            self.vehicle.identity.reopened(now)
-            return
-        self._heard_at = now
-        feed = self.framer.feed
-        for index, chunk in enumerate(chunks):
-            self._handle(feed(chunk), now, self.link.sender(index))
-            if len(self._gathered) >= REFILL_AT:
-                self._pass_on(now)
-                self._refill(now)
-        self._pass_on(now)
-        identity = self.vehicle.identity
-        if identity.heard_at == now and identity.standing is not Standing.STRANGER:
-            self.link.keep_peer()
-        if self.on_batch is not None:
-            self.on_batch(now)
 
     def _handle(self, messages: list[Message], now: float, sender: NetAddress | None) -> None:
         """Gather replies, and tell the vehicle everything else, in its turn."""

@@ -55,7 +55,6 @@ class FileStream(SessionUser):
             self.asked_at = scheduler.clock()
         else:
             self._opened.set()
-        scheduler.add(self)
 
     # --- the cache's side
 
@@ -96,6 +95,11 @@ class FileStream(SessionUser):
         self._wants_open = False
         if self._transfer is not None:
             self._server.driver.cancel(self._transfer)
+        if self in self._scheduler.users:
+            gone, now = self._scheduler.gone, self._scheduler.clock()
+            gone.append((now, self))
+            while gone[0][0] < now - RECENT:
+                gone.popleft()
         self._scheduler.remove(self)
 
     # --- the scheduler's side
@@ -129,13 +133,10 @@ class FileStream(SessionUser):
         if self.due_at() < inf:
             self.fail(FileChanged(f"{self.path!r} was removed or replaced"))
 
-    def has_read(self, now: float) -> bool:
-        """See SessionUser."""
-        return self._transfer is not None or self._last_data_at > now - RECENT
-
     def on_suspect(self, reason: str) -> None:
         """See SessionUser."""
-        self._sink.on_suspect(reason)
+        if self._transfer is not None or self._last_data_at > self._scheduler.clock() - RECENT:
+            self._sink.on_suspect(reason)
 
     # --- one turn
 
@@ -143,7 +144,7 @@ class FileStream(SessionUser):
         """See SessionUser."""
         server = self._server
         try:
-            server.vehicle.require_there(server.clock())
+            server.vehicle.require(server.clock())
             await self._open()
             await self._read()
         except SessionLost as error:  # the next turn goes on at the same offset (promise 5)

@@ -75,6 +75,8 @@ class SessionUser(ABC):
         self._server = scheduler.server
         self._used = 0.0
         self._until = 0.0
+        scheduler.users[self] = None
+        scheduler.server.wake()
 
     @abstractmethod
     def due_at(self) -> float:
@@ -105,12 +107,8 @@ class SessionUser(ABC):
         """The file of its path was removed or replaced."""
         return
 
-    def has_read(self, now: float) -> bool:
-        """Return whether it reads now, or read something lately: that is provisional."""
-        return False
-
     def on_suspect(self, reason: str) -> None:
-        """What it read since its file was opened may be another file's."""
+        """What was read lately may be another file's."""
         return
 
     def on_turn(self, began: float, now: float) -> None:
@@ -167,7 +165,7 @@ class _Job(SessionUser):
         """See SessionUser."""
         server = self._server
         try:
-            server.vehicle.require_there(server.clock())  # it may have died while others had the session
+            server.vehicle.require(server.clock())  # it may have died while others had the session
             self.session = await server.open(self.path, self._opcode)
             if self._action is not None:
                 await self._action(self.session)
@@ -186,7 +184,8 @@ class Scheduler:
     chunk: bytes that a request carries, 1..239; None: see ChunkSize.
 
     Attributes:
-        users: those who want the session, now or later.
+        users: those who want the session, now or later. gone: those who read, and want nothing any more,
+            with the time since when.
         traits: what the server was seen to do when written to; forgotten when it restarts.
         read_mode: by which requests files are read. read_chunks, write_chunks: the size of requests.
     """
@@ -207,7 +206,7 @@ class Scheduler:
         self.server = ServerSession(driver, self.doubt, clock, op_deadline)
         self.clock = clock
         self.users: dict[SessionUser, None] = {}
-        self._gone: deque[SessionUser] = deque()  # who read something lately, and wants nothing any more
+        self.gone: deque[tuple[float, SessionUser]] = deque()
         self._driver = driver
         self._op_deadline = op_deadline
         self._used_at = clock()
@@ -217,20 +216,9 @@ class Scheduler:
 
     # --- who wants the session
 
-    def add(self, user: SessionUser) -> None:
-        """Let somebody want the session from now on."""
-        self.users[user] = None
-        self.server.wake()
-
     def remove(self, user: SessionUser) -> None:
-        """It wants nothing any more; harmless if that is known. What it read stays provisional."""
-        now = self.clock()
-        if user in self.users:
-            del self.users[user]
-            if user.has_read(now):
-                self._gone.append(user)
-        while self._gone and not self._gone[0].has_read(now):
-            self._gone.popleft()
+        """It wants nothing any more; harmless if that is known."""
+        self.users.pop(user, None)
         self.server.wake()
 
     def waiting(self, now: float) -> list[SessionUser]:
@@ -311,9 +299,8 @@ class Scheduler:
         Raises:
             VehicleLost, RequestTimeout, or what opening, the action or closing fail with.
         """
-        self.server.vehicle.require_there(self.clock())
+        self.server.vehicle.require(self.clock())
         job = _Job(path, self, opcode, action)
-        self.add(job)
         try:
             await job.finished.wait()
         finally:
@@ -368,10 +355,8 @@ class Scheduler:
 
     def _on_reads_doubted(self, reason: str) -> None:
         """What was read lately is provisional, also of files closed since."""
-        now = self.clock()
-        for user in [*self.users, *self._gone]:
-            if user.has_read(now):
-                user.on_suspect(reason)
+        for user in [*self.users, *(user for _, user in self.gone)]:
+            user.on_suspect(reason)
 
     def on_reboot(self) -> None:
         """The vehicle restarted, perhaps as another one: nothing is open, nothing is known of it."""

@@ -393,7 +393,7 @@ class ServerSession:
         remedies = _Remedies(closings=0, resets=0)
         while True:
             operation = make()
-            self.vehicle.require_there(self.clock())
+            self.vehicle.require(self.clock())
             try:
                 async with self.path_gate.passing(self.wake):
                     await self.driver.run(operation)
@@ -469,7 +469,14 @@ class ServerSession:
         self._excluded.append(excluded)
         try:
             with trio.move_on_after(self.op_deadline) as scope:
-                while self._uses(excluded):
+                while True:
+                    used = list(self.maybe_open.values())
+                    if self.session is not None:
+                        used.append(self.session.path)
+                    if self._opening is not None:
+                        used.append(self._opening)
+                    if not any(map(excluded.covers, used)):
+                        break
                     self.wake()
                     await self._changed.park()
             if scope.cancelled_caught:
@@ -489,12 +496,3 @@ class ServerSession:
         for path in list(self.maybe_open.values()):
             if self.is_excluded(path):
                 await self.close_maybe_open()
-
-    def _uses(self, excluded: _Excluded) -> bool:
-        """Whether a file is open, may be open or is being opened there."""
-        paths = list(self.maybe_open.values())
-        if self.session is not None:
-            paths.append(self.session.path)
-        if self._opening is not None:
-            paths.append(self._opening)
-        return any(map(excluded.covers, paths))

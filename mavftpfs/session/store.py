@@ -166,7 +166,7 @@ class Store:
         """Open a regular file for reading (see RemoteStore)."""
         wire_path(path)
         if expected_size is None:
-            self._vehicle.require_there(self._clock())
+            self._vehicle.require(self._clock())
         stream = FileStream(path, sink, expected_size, self._scheduler)
         try:
             await stream.wait_opened()
@@ -211,14 +211,14 @@ class Store:
     async def open_upload(self, path: bytes, source: UploadSource) -> Upload:
         """Queue an upload; nothing is sent before the source has something or finish is called."""
         wire_path(path)
-        self._vehicle.require_writable(self._clock())
+        self._vehicle.require(self._clock(), writing=True)
         await self._rest(path)
         return Upload(path, source, self._scheduler)
 
     async def create_empty(self, path: bytes) -> None:
         """Make an empty file, or empty it; done twice it is the same."""
         wire_path(path)
-        self._vehicle.require_writable(self._clock())
+        self._vehicle.require(self._clock(), writing=True)
         await self._rest(path)
         try:
             await self._scheduler.use_session(path, Opcode.CREATE_FILE)
@@ -261,18 +261,17 @@ class Store:
 
         below: also off all that lies below the first. in_flight: armed or not.
         """
-        require = self._vehicle.require_there if in_flight else self._vehicle.require_writable
-        require(self._clock())
+        self._vehicle.require(self._clock(), writing=not in_flight)
         with trio.move_on_after(self._op_deadline + VERIFY_LIMIT) as scope:
             async with self._server.excluded(*paths, below=below):
                 for path in paths:
                     await self._rest(path)
-                require(self._clock())  # closing our session may have taken a while
+                # closing our session may have taken a while
+                self._vehicle.require(self._clock(), writing=not in_flight)
                 try:
                     yield
                 finally:
-                    for path in paths:
-                        self._note_changed(path)
+                    self._note_changed(*paths)
         if scope.cancelled_caught:
             raise OutcomeUnknown("the vehicle did not get round to it in time")
 
@@ -284,12 +283,13 @@ class Store:
         until = self._changed_at.get(path.lower(), -inf) + self._scheduler.doubt.lateness
         await trio.sleep(max(0.0, until - self._clock()))
 
-    def _note_changed(self, path: bytes) -> None:
+    def _note_changed(self, *paths: bytes) -> None:
         now = self._clock()
         while self._changed_at and now - next(iter(self._changed_at.values())) > MOST_LATE:
             del self._changed_at[next(iter(self._changed_at))]
-        self._changed_at.pop(path.lower(), None)
-        self._changed_at[path.lower()] = now  # the oldest are in front
+        for path in paths:
+            self._changed_at.pop(path.lower(), None)
+            self._changed_at[path.lower()] = now  # the oldest are in front
 
     # --- did that change happen?
 

@@ -152,7 +152,6 @@ class UploadProgress(SessionUser):
         self._completed = 0  # the last of the endings that was ACKed
         self._awaited = 0  # the last of those that `finish` waits for
         self._changed = trio.lowlevel.ParkingLot()
-        scheduler.add(self)
 
     def _enter(self, state: UploadState) -> None:
         assert state in UPLOAD_NEXT[self.state], f"{self.state} does not become {state}"
@@ -181,7 +180,7 @@ class UploadProgress(SessionUser):
         if resting and feed.proven and not feed.unproven and self.error is None and not feed.has_more():
             return
         now = self._clock()
-        self._vehicle.require_writable(now)
+        self._vehicle.require(now, writing=True)
         if self.error is not None:
             self.error, self.refused_at, self._failures = None, None, 0
         if not self.finishing:
@@ -278,21 +277,6 @@ class UploadProgress(SessionUser):
         self.asked_at = max(now, self._retry_at)
         if self.state is UploadState.QUEUED and self.finishing and not self._vehicle.may_write:
             self.fail(Armed("the vehicle was armed"))  # perhaps while its file was opened or closed
-
-    def begin_turn(self) -> bool:
-        """It has the session from now on. Return False if there is nothing to send, so that it is complete;
-        but an empty file has to be made, too, once.
-
-        Raises:
-            MavftpfsError: the source fails.
-        """
-        self._enter(UploadState.SENDING)
-        self.endings += 1
-        feed = self.feed
-        if feed.has_more() or feed.unproven or (self.finishing and not feed.proven):
-            return True
-        self.complete()
-        return False
 
     def complete(self) -> None:
         """Everything given until `endings` was counted is ACKed, and the file was closed. Where it cannot be

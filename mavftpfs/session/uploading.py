@@ -79,16 +79,21 @@ class Upload(UploadProgress):
 
     async def turn(self) -> None:
         """See SessionUser."""
-        began, doubt = self._clock(), self._server.doubt
+        began, feed = self._clock(), self.feed
+        self._enter(UploadState.SENDING)
+        self.endings += 1
         try:
-            if self.begin_turn():
-                self._vehicle.require_writable(began)
+            # An empty file has to be made, too, once.
+            if feed.has_more() or feed.unproven or (self.finishing and not feed.proven):
+                self._vehicle.require(began, writing=True)
                 session = await self._open()
                 await self._close(await self._write(session))
+            else:
+                self.complete()
         except SessionLost as lost:  # begin again from what is proven, a bounded number of times
             self._server.abandon()
             if lost.by_server:
-                doubt.raise_it(str(lost))
+                self._server.doubt.raise_it(str(lost))
             self._roll_back()
             cause = lost.__cause__
             self.lose_session(cause if isinstance(cause, MavftpfsError) else lost)
@@ -215,9 +220,14 @@ class Upload(UploadProgress):
                 raise SessionLost("the vehicle restarted, or opened another file", by_server=True)
             if not transfer.starved:
                 fed_at = clock()
-            stop = stop or self._reason_to_stop(session, transfer, fed_at)
-            if self._is_stalled(transfer):
-                stop = Stop.DOUBT
+            rival = self._scheduler.rival_use(self)
+            stop = stop or self._reason_to_stop(session, transfer, fed_at, rival)
+            limit = max(STALL, 4.0 * (self._engine.rtt or 0.0))
+            if not transfer.idle and clock() - max(driver.last_reply_at, transfer.progress_at) > limit:
+                # The session may be somebody else's (servers.md 14.9). Where closing would cost the whole
+                # file, only if there is somebody else; the server tells the rest.
+                rivals = self._traits.wo_truncates is False or self._vehicle.foreign_client(clock())
+                stop = Stop.DOUBT if rivals else stop
             if stop is not None:
                 transfer.paused = True
                 if transfer.drained or stop in _ABRUPT or self._trails(stop, transfer):
@@ -233,20 +243,21 @@ class Upload(UploadProgress):
                 transfer.paused = False
             driver.kick()
             self._scheduler.expire_waiters()
-            pressed = transfer.starved and self._scheduler.rival_use(self) is not None
+            pressed = transfer.starved and rival is not None
             await server.sleep(BRIEF_STARVE if pressed else _OFTEN)
         return None
 
-    def _reason_to_stop(self, session: OpenSession, transfer: WriteTransfer, fed_at: float) -> Stop | None:
-        """fed_at: when there was something to send the last time."""
+    def _reason_to_stop(
+        self, session: OpenSession, transfer: WriteTransfer, fed_at: float, rival: float | None
+    ) -> Stop | None:
+        """fed_at: when there was something to send the last time. rival: see Scheduler.rival_use."""
         if self.state is UploadState.ENDING:
             return Stop.ABORTED
         if not self._vehicle.may_write:
             return Stop.ARMED
         if self._server.is_excluded(self.path):
             return Stop.YIELD
-        now, rival = self._server.clock(), self._scheduler.rival_use(self)
-        resumable = self.resumable()
+        now, resumable = self._clock(), self.resumable()
         if transfer.starved:
             if self.finishing:
                 return Stop.FINISHED
@@ -261,17 +272,6 @@ class Upload(UploadProgress):
         else:
             over = resumable and self.gives_way(rival, session.opened_at, now, self._engine.rtt)
         return Stop.YIELD if over else None
-
-    def _is_stalled(self, transfer: WriteTransfer) -> bool:
-        """Whether it was silent for so long that the session may be somebody else's (servers.md 14.9).
-
-        Where closing would cost the whole file, only if there is somebody else; the server tells the rest.
-        """
-        now = self._server.clock()
-        limit = max(STALL, 4.0 * (self._engine.rtt or 0.0))
-        if transfer.idle or now - max(self._driver.last_reply_at, transfer.progress_at) <= limit:
-            return False
-        return self._traits.wo_truncates is False or self._vehicle.foreign_client(now)
 
     def _trails(self, stop: Stop, transfer: WriteTransfer) -> bool:
         """Whether the Terminate goes out right behind the last requests: a round trip less for who waits.

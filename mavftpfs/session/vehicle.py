@@ -181,6 +181,10 @@ class Vehicle:
     write_armed: write in flight, too.
     own: our address; replies to anyone else are another FTP client's. on_foreign: called with each payload of
     another client's, and whether none was heard for a while.
+
+    Attributes:
+        armed: whether to treat it as armed; never heard counts as armed. may_write: whether it may be written
+            to now (promise 9).
     """
 
     wanted_system: int
@@ -201,7 +205,9 @@ class Vehicle:
     reboots: int = 0
     identity: Identity = field(default_factory=Identity)
     heard: dict[Address, Heartbeat] = field(default_factory=dict)
-    _armed: bool | None = None
+    armed: bool = True
+    may_write: bool = False
+    _told_armed: bool | None = None
     _disarmed_at: float = -inf
     _boot_ms: int | None = None
     boot_heard_at: float = -inf
@@ -210,16 +216,7 @@ class Vehicle:
 
     def __post_init__(self) -> None:
         self.identity.on_settled = self._on_settled
-
-    @property
-    def armed(self) -> bool:
-        """Whether to treat the vehicle as armed; never heard counts as armed (promise 9)."""
-        return self._armed is not False
-
-    @property
-    def may_write(self) -> bool:
-        """Whether it may be written to now (promise 9)."""
-        return self.write_armed or self._armed is False
+        self.may_write = self.write_armed
 
     @property
     def ftp_flag(self) -> bool | None:
@@ -235,18 +232,15 @@ class Vehicle:
         strange = self.identity.standing is Standing.STRANGER
         return strange or (self._timed_out and self.silence(now) > SILENCE_LIMIT)
 
-    def require_there(self, now: float) -> None:
-        """Raise VehicleLost while requests that need the link should fail at once."""
+    def require(self, now: float, *, writing: bool = False) -> None:
+        """Raise VehicleLost while requests that need the link should fail at once; writing: or Armed while
+        nothing may be written (promise 9)."""
+        if writing and not self.may_write:
+            raise Armed("the vehicle is armed: nothing is written in flight")
         if self.identity.standing is Standing.STRANGER:
             raise VehicleLost("another vehicle answers in place of the one that was mounted")
-        if self.lost(now):
+        if self._timed_out and self.silence(now) > SILENCE_LIMIT:
             raise VehicleLost("the vehicle is silent; waiting for its heartbeat")
-
-    def require_writable(self, now: float) -> None:
-        """Raise Armed while nothing may be written (promise 9), or as `require_there`."""
-        if not self.may_write:
-            raise Armed("the vehicle is armed: nothing is written in flight")
-        self.require_there(now)
 
     def foreign_client(self, now: float) -> bool:
         """Return whether another FTP client of this vehicle was heard lately."""
@@ -325,8 +319,9 @@ class Vehicle:
         self._on_alive()
 
     def _on_armed(self, armed: bool) -> None:
-        if armed is not self._armed:
-            self._armed = armed
+        if armed is not self._told_armed:
+            self._told_armed = self.armed = armed
+            self.may_write = self.write_armed or not armed
             self.on_armed(armed)
 
     def _is_wanted(self, heartbeat: Heartbeat) -> bool:

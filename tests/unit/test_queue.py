@@ -1,12 +1,20 @@
-"""Who goes first when several want the session, as tables."""
+"""Who wants the session and who goes first, as tables; and what a reader wants of a file."""
 
 from __future__ import annotations
 
+import random
+from math import inf
 from types import SimpleNamespace
 from typing import cast
 
 import pytest
 
+from mavftpfs.link.messages import Address
+from mavftpfs.protocol.engine import Engine
+from mavftpfs.protocol.flow import Flow
+from mavftpfs.protocol.reading import ReadTransfer
+from mavftpfs.session.driver import Driver
+from mavftpfs.session.reader import FileStream
 from mavftpfs.session.scheduler import (
     LONG_WAIT,
     MAX_TURN,
@@ -16,7 +24,20 @@ from mavftpfs.session.scheduler import (
     Scheduler,
     SessionUser,
 )
+from mavftpfs.session.vehicle import Vehicle
 from mavftpfs.shared.errors import MavftpfsError
+from tests.support.worlds import MemorySink
+
+
+class NoLink:
+    """Stands in for the driver: nobody reads."""
+
+    engine = Engine(random.Random(1), Flow())
+    vehicle = Vehicle(0, 0, Address(254, 191))
+
+
+def scheduler() -> Scheduler:
+    return Scheduler(cast(Driver, NoLink()), clock=lambda: 0.0)
 
 
 class User(SessionUser):
@@ -32,11 +53,8 @@ class User(SessionUser):
         raise error
 
 
-SCHEDULER = cast(Scheduler, SimpleNamespace(server=None))
-
-
 def heavy(seconds: float = 5.0) -> User:
-    user = User(b"/f", SCHEDULER)
+    user = User(b"/f", scheduler())
     user.on_turn(100.0 - seconds, 100.0)
     return user
 
@@ -54,7 +72,7 @@ def test_use_fades_but_not_while_it_waits() -> None:
 
 
 def test_who_used_little_goes_first_until_another_waited_long() -> None:
-    busy, light = heavy(), User(b"/g", SCHEDULER)
+    busy, light = heavy(), User(b"/g", scheduler())
     busy.asked_at = 100.0
     light.asked_at = 101.0
     assert light.rank(101.0, 0.02) < busy.rank(101.0, 0.02)
@@ -89,3 +107,43 @@ def test_when_a_turn_ends(
     slice_: float, use: float, rival: float, rtt: float | None, gives_way: bool
 ) -> None:
     assert heavy(use).gives_way(rival, 100.0, 100.0 + slice_, rtt) is gives_way
+
+
+# --- a reader
+
+
+def make(size: int = 1000) -> tuple[FileStream, MemorySink]:
+    sink = MemorySink(size)
+    return FileStream(b"/f", sink, size, scheduler()), sink
+
+
+def test_what_was_delivered_is_not_wanted_again_when_the_cache_drops_it() -> None:
+    stream, sink = make()
+    stream.want(0, 600, demand=True)
+    stream.want(600, 900, demand=False)
+    for offset, size in ((0, 600), (600, 300)):
+        assert stream.prefetches()
+        sink.on_data(offset, bytes(size))
+        transfer = SimpleNamespace(received_bytes=offset + size, idle=False, done=False)
+        stream._transfer = cast(ReadTransfer, transfer)
+        stream._on_batch(0.0)
+        sink.have.clear()  # evicted
+        assert stream.due_at() == inf
+    assert not stream.prefetches()
+
+
+def test_only_what_the_cache_lacks_is_wanted() -> None:
+    stream, sink = make()
+    sink.on_data(100, bytes(100))
+    stream.want(100, 200, demand=True)
+    assert stream.due_at() == inf
+    stream.want(0, 300, demand=True)
+    assert list(stream._demand) == [(0, 100), (200, 300)]
+
+
+def test_a_closed_stream_wants_nothing() -> None:
+    stream, _ = make()
+    stream.want(0, 100, demand=True)
+    stream.close()
+    stream.want(0, 100, demand=True)
+    assert stream.due_at() == inf
