@@ -9,26 +9,18 @@ All handles of a path share its draft. Its state, and what may happen next, is i
 name beside it, verified there, and renamed into place. Only on cards that cannot rename it is sent under its
 own name. What is appended while that file is sent joins it; during a close writers wait.
 
-`Sending` has the books of one attempt. A new attempt gets new books, so whatever a late upload still says of
-the old one changes nothing.
 """
 
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
 from typing import Any, Protocol
 
 from mavftpfs.shared.errors import LocalProtocolError
 from mavftpfs.shared.extents import ExtentSet
-
-AHEAD = 64 * 1024
-"""Bytes fetched from the spool at once, since chunks are small."""
-
-FULL = 239
-"""Bytes of a full request (servers.md 1)."""
+from mavftpfs.shared.sending import Sending
 
 STEP = 64 * 1024
 """Bytes read from the spool at once for a checksum."""
@@ -357,85 +349,3 @@ class Draft:
         self._changed.add(start, stop)
         if self.sending is not None:
             self.sending.on_changed(start, max(self.size, stop))
-
-
-# --- how far it was sent
-
-
-class Sending:
-    """One attempt to send a file of `size` bytes, which `read(start, stop)` returns; a remote.UploadSource.
-
-    It goes from the file's begin to its end. What was handed out may not change: two copies of a byte could
-    reach the card in the wrong order.
-
-    Attributes:
-        progress: told how many bytes were ACKed.
-        overtaken: bytes that were handed out changed, or were cut off: the file is to be sent anew.
-        growing: more may be written behind the last byte; what fills no request there waits for it.
-    """
-
-    def __init__(self, read: Callable[[int, int], bytes], size: int) -> None:
-        self._read = read
-        self._size = size
-        self.overtaken = self.growing = False
-        self.progress: Callable[[int], None] | None = None
-        self._reached = 0  # one past the highest byte handed out
-        self._todo = ExtentSet([(0, size)])
-        self._acked = ExtentSet()
-        self._proven = ExtentSet()  # of these: a Terminate was ACKed after them
-        self._ahead = (0, b"")
-
-    @property
-    def unacked(self) -> int:
-        """Bytes not ACKed yet."""
-        return self._size - self._acked.total
-
-    def on_changed(self, start: int, size: int) -> None:
-        """The draft changed from `start` on, perhaps to its end, and has `size` bytes now."""
-        self.overtaken |= start < self._reached
-        if size > self._size:
-            self._todo.add(self._size, size)
-        else:
-            self._todo.discard(size, self._size)
-        self._size = size
-        if start < self._ahead[0] + len(self._ahead[1]):
-            self._ahead = (0, b"")
-
-    def next_chunk(self, limit: int) -> tuple[int, bytes] | None:
-        """See cache.remote.UploadSource."""
-        found = self._todo.first()
-        if found is None or self.overtaken:
-            return None
-        start, stop = found[0], min(found[1], found[0] + limit)
-        if self.growing and stop == self._size:
-            stop -= (stop - start) % FULL
-            if start == stop:
-                return None
-        at, ahead = self._ahead
-        if start < at or at + len(ahead) < stop:
-            at, ahead = start, self._read(start, max(stop, min(found[1], start + AHEAD)))
-            self._ahead = (at, ahead)
-        self._todo.discard(start, stop)
-        self._reached = max(self._reached, stop)
-        return start, ahead[start - at : stop - at]
-
-    def on_acked(self, offset: int, count: int) -> None:
-        """See cache.remote.UploadSource."""
-        self._acked.add(offset, offset + count)
-        if self.progress is not None:
-            self.progress(count)
-
-    def on_unsent(self, offset: int, count: int) -> None:
-        """See cache.remote.UploadSource."""
-        self._todo.add(offset, offset + count)
-
-    def on_checkpoint(self) -> None:
-        """See cache.remote.UploadSource."""
-        self._proven = self._acked.copy()
-
-    def on_rollback(self, everything: bool) -> None:
-        """See cache.remote.UploadSource."""
-        if everything:
-            self._proven.clear()
-        self._acked = self._proven.copy()
-        self._todo = ExtentSet(self._acked.missing(0, self._size))

@@ -14,12 +14,13 @@ from dataclasses import dataclass, field
 
 import trio
 
-from mavftpfs.cache.draft import Base, Draft, Sending, State
+from mavftpfs.cache.draft import Base, Draft, State
 from mavftpfs.cache.files import FileHandle
 from mavftpfs.cache.remote import Upload
 from mavftpfs.cache.reserved import Places
 from mavftpfs.cache.spool import Spool, SpoolContent
 from mavftpfs.shared.errors import FileChanged, MavftpfsError
+from mavftpfs.shared.sending import Sending
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -8,6 +8,7 @@ from __future__ import annotations
 from typing import Protocol
 
 from mavftpfs.shared.model import Listing
+from mavftpfs.shared.sending import Sending
 from mavftpfs.shared.traits import WriteTraits
 
 
@@ -110,34 +111,6 @@ class RemoteStore(Protocol):
         ...
 
 
-class UploadSource(Protocol):
-    """Where an upload's bytes come from (a draft). All methods are synchronous and must not block."""
-
-    def next_chunk(self, limit: int) -> tuple[int, bytes] | None:
-        """Return (offset, at most `limit` bytes), lowest offset first, now in flight; None = nothing for now.
-
-        A byte that is in flight is not returned again before on_acked or on_unsent said what became of it.
-        """
-        ...
-
-    def on_acked(self, offset: int, count: int) -> None:
-        """These bytes were ACKed as written."""
-        ...
-
-    def on_unsent(self, offset: int, count: int) -> None:
-        """These bytes were not written, and no request that carries them is under way any more."""
-        ...
-
-    def on_checkpoint(self) -> None:
-        """Terminate was ACKed: what was ACKed before is proven written (not yet verified)."""
-        ...
-
-    def on_rollback(self, everything: bool) -> None:
-        """The session was lost: what was ACKed since the checkpoint is to be sent again, or everything is
-        because the file was emptied by reopening it."""
-        ...
-
-
 class Upload(Protocol):
     """A remote file being written; survives reopening of the server's session."""
 
@@ -193,12 +166,12 @@ class VehicleStore(RemoteStore, Protocol):
         """Return whether such a thing was noticed after that time (the caches' clock)."""
         ...
 
-    async def open_upload(self, path: bytes, source: UploadSource) -> Upload:
+    async def open_upload(self, path: bytes, source: Sending) -> Upload:
         """Make a file by CreateFile and write it. Sends nothing before the source has something.
 
         `path` is a temporary of ours, or, on cards that cannot rename, a name that is known to be free. An
         upload that was interrupted goes on by OpenFileWO where that was seen to keep what the file has, else
-        the source is told on_rollback(everything=True).
+        all of it is sent again.
         """
         ...
 

@@ -17,7 +17,7 @@ from math import inf
 
 import trio
 
-from mavftpfs.cache.remote import ReadSink, UploadSource
+from mavftpfs.cache.remote import ReadSink
 from mavftpfs.protocol.operations import ListDirectory, Simple
 from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.session.doubt import MOST_LATE
@@ -44,6 +44,7 @@ from mavftpfs.shared.model import (
     split,
     wire_path,
 )
+from mavftpfs.shared.sending import Sending
 from mavftpfs.shared.traits import Traits
 
 TIME_PROBE_LIMIT = 2.5
@@ -208,7 +209,7 @@ class Store:
 
     # --- changing
 
-    async def open_upload(self, path: bytes, source: UploadSource) -> Upload:
+    async def open_upload(self, path: bytes, source: Sending) -> Upload:
         """Queue an upload; nothing is sent before the source has something or finish is called."""
         wire_path(path)
         self._vehicle.require(self._clock(), writing=True)

@@ -7,10 +7,10 @@ from math import inf
 
 import trio
 
-from mavftpfs.cache.remote import UploadSource
 from mavftpfs.protocol.writing import WriteTransfer
 from mavftpfs.session.scheduler import Scheduler, SessionUser
 from mavftpfs.shared.errors import Armed, LocalProtocolError, MavftpfsError
+from mavftpfs.shared.sending import Sending
 
 LONGEST_BACKOFF = 30.0
 """Most seconds between two attempts after a failure of the link."""
@@ -54,71 +54,6 @@ UPLOAD_NEXT: dict[UploadState, frozenset[UploadState]] = {
 """All transitions there are."""
 
 
-class Feed:
-    """Hands a source's chunks to the engine and remembers what is proven of them.
-
-    A source can fail: the local disk has its bytes. The engine, which serves everybody, is then told that
-    there is nothing for now. Whoever waits for the upload hears why: `has_more` is asked before its end.
-
-    chunk: most bytes of one.
-
-    Attributes:
-        proven: a Terminate was ACKed: the remote file holds all that was ACKed before it.
-        unproven: bytes ACKed since then.
-        reached: end of the highest ACKed byte; after a lost session, of the highest proven one.
-        furthest: end of the highest byte that was ever ACKed.
-        on_unsent: see protocol.writing.ChunkSource.
-    """
-
-    def __init__(self, source: UploadSource, chunk: int) -> None:
-        self.proven = False
-        self.unproven = self.reached = self.furthest = self._proven_to = 0
-        self.on_unsent = source.on_unsent
-        self._source = source
-        self._chunk = chunk
-
-    def has_more(self) -> bool:
-        """Whether the source has something to send now.
-
-        Raises:
-            MavftpfsError: it fails.
-        """
-        piece = self._source.next_chunk(self._chunk)
-        if piece is None:
-            return False
-        self.on_unsent(piece[0], len(piece[1]))  # it was only looked at
-        return True
-
-    def next_chunk(self, limit: int) -> tuple[int, bytes] | None:
-        """See protocol.writing.ChunkSource."""
-        try:
-            return self._source.next_chunk(limit)
-        except MavftpfsError:
-            return None
-
-    def on_acked(self, offset: int, count: int) -> None:
-        """See protocol.writing.ChunkSource."""
-        self.unproven += count
-        if offset + count > self.reached:
-            self.reached = offset + count
-            self.furthest = max(self.furthest, self.reached)
-        self._source.on_acked(offset, count)
-
-    def check_point(self) -> None:
-        """Terminate was ACKed."""
-        self.proven, self.unproven, self._proven_to = True, 0, self.reached
-        self._source.on_checkpoint()
-
-    def roll_back(self, *, everything: bool) -> None:
-        """What was ACKed since the last checkpoint, or everything, has to be sent again."""
-        if not self.proven and not self.unproven:
-            return
-        if everything:
-            self.proven, self._proven_to = False, 0
-        self.reached, self.unproven = self._proven_to, 0
-        self._source.on_rollback(everything)
-
-
 class UploadProgress(SessionUser):
     """What the owner of an upload and the scheduler see of it: cache.remote.Upload but for its turns.
 
@@ -126,14 +61,15 @@ class UploadProgress(SessionUser):
         state: see UploadState. error: why the last attempt failed; None while it goes well.
         transfer: what sends its bytes now. begun, resent: see cache.remote.Upload.
         reboots: of the vehicle, when its file was opened last.
+        source: see Sending.
         endings: counted when a turn begins, and when all that the source had is out and the file is to be
             closed. What was given before is in that file: `complete` tells who called `finish` until then.
         refused_at: where a write was refused the last time as if the session were lost.
     """
 
-    def __init__(self, path: bytes, source: UploadSource, scheduler: Scheduler) -> None:
+    def __init__(self, path: bytes, source: Sending, scheduler: Scheduler) -> None:
         super().__init__(path, scheduler, scheduler.clock())
-        self.feed = Feed(source, scheduler.write_chunks.most)
+        self.source = source
         self.state = UploadState.QUEUED
         self.begun = self.resent = False
         self.error: MavftpfsError | None = None
@@ -176,8 +112,8 @@ class UploadProgress(SessionUser):
         """See cache.remote.Upload."""
         if self.state in (UploadState.ENDING, UploadState.ENDED):
             raise LocalProtocolError("the upload was aborted")
-        resting, feed = self.state in (UploadState.IDLE, UploadState.HELD), self.feed
-        if resting and feed.proven and not feed.unproven and self.error is None and not feed.has_more():
+        resting, source = self.state in (UploadState.IDLE, UploadState.HELD), self.source
+        if resting and source.closed and source.acked.empty and self.error is None and not source.has_more():
             return
         now = self._clock()
         self._vehicle.require(now, writing=True)
@@ -214,8 +150,8 @@ class UploadProgress(SessionUser):
         return {
             "path": self.path.decode("utf-8", "replace"),
             "running": self.state is UploadState.SENDING,
-            "reached": self.feed.reached,
-            "unproven": self.feed.unproven,
+            "reached": self.source.reached,
+            "unproven": self.source.acked.total,
             "error": None if self.error is None else str(self.error),
         }
 
@@ -264,7 +200,7 @@ class UploadProgress(SessionUser):
     def resumable(self) -> bool:
         """Whether its file can be closed and written on later: it was seen to be so, or this is to tell."""
         truncates = self._traits.wo_truncates
-        return truncates is False or (truncates is None and self.feed.reached > 0)
+        return truncates is False or (truncates is None and self.source.reached > 0)
 
     def end_turn(self, began: float) -> None:
         """It has the session no more."""
@@ -285,7 +221,7 @@ class UploadProgress(SessionUser):
         Raises:
             MavftpfsError: the source fails.
         """
-        more, resumable = self.feed.has_more(), self.resumable()
+        more, resumable = self.source.has_more(), self.resumable()
         self._completed = self.endings
         self.error = None
         self._failures = 0
@@ -293,15 +229,15 @@ class UploadProgress(SessionUser):
             return
         if self.finishing or (more and resumable):
             self._queue_up(self._clock())
-        elif self.feed.proven and not resumable:
+        elif self.source.closed and not resumable:
             self._enter(UploadState.HELD)
         else:
             self._enter(UploadState.IDLE)
 
     def lose_session(self, error: MavftpfsError) -> None:
         """Try again from what is proven; after some times without getting further that is a failure."""
-        if self.feed.furthest > self._furthest:
-            self._furthest, self._failures = self.feed.furthest, 0
+        if self.source.furthest > self._furthest:
+            self._furthest, self._failures = self.source.furthest, 0
         self._failures += 1
         if self._failures > REOPENS:
             self.fail(error)

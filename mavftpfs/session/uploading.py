@@ -79,12 +79,12 @@ class Upload(UploadProgress):
 
     async def turn(self) -> None:
         """See SessionUser."""
-        began, feed = self._clock(), self.feed
+        began, source = self._clock(), self.source
         self._enter(UploadState.SENDING)
         self.endings += 1
         try:
             # An empty file has to be made, too, once.
-            if feed.has_more() or feed.unproven or (self.finishing and not feed.proven):
+            if source.has_more() or not source.acked.empty or (self.finishing and not source.closed):
                 self._vehicle.require(began, writing=True)
                 session = await self._open()
                 await self._close(await self._write(session))
@@ -108,17 +108,17 @@ class Upload(UploadProgress):
 
     async def _open(self) -> OpenSession:
         """Open the upload's file: to go on with it where that is possible, else to begin it."""
-        feed, server = self.feed, self._server
+        source, server = self.source, self._server
         if self.reboots != self._vehicle.reboots:  # what was proven may not be there any more
-            feed.roll_back(everything=True)
+            source.roll_back(everything=True)
         self.reboots = self._vehicle.reboots
-        if feed.proven and feed.reached and self._traits.wo_truncates is None:
+        if source.closed and source.reached and self._traits.wo_truncates is None:
             await self._find_out()
-        if feed.proven and self._traits.wo_truncates is False:
+        if source.closed and self._traits.wo_truncates is False:
             session = await self._reopen()
             if session is not None:
                 return session
-        feed.roll_back(everything=True)
+        source.roll_back(everything=True)
         if self.state is UploadState.ENDING:  # its owner was told that nothing was begun
             raise LocalProtocolError("the upload was given up before its file was made")
         self.resent |= self.begun
@@ -135,7 +135,7 @@ class Upload(UploadProgress):
         """Find out on an interrupted file of ours what OpenFileWO does (docs/servers.md 8): the size tells,
         asked afterwards, since the reply to OpenFileWO may say what it was before. What is not seen to keep
         the file passes for emptying it."""
-        path, reached = self.path, self.feed.reached
+        path, reached = self.path, self.source.reached
         try:
             await self._server.open(path, Opcode.OPEN_FILE_WO)
             size = (await self._server.open(path)).size
@@ -153,7 +153,7 @@ class Upload(UploadProgress):
             if errno_for(nak) != errno.ENOENT:
                 raise
             return None
-        if session.size is None or session.size >= self.feed.reached:
+        if session.size is None or session.size >= self.source.reached:
             return session
         await self._server.close()
         return None
@@ -177,7 +177,7 @@ class Upload(UploadProgress):
                 most = None if rival is None or rival >= LIGHT_USE else traits.queue_limit
                 chunks = self._scheduler.write_chunks
                 transfer = WriteTransfer(
-                    session.id, self.feed, chunks, in_flight=most, on_starved=server.wake
+                    session.id, self.source, chunks, in_flight=most, on_starved=server.wake
                 )
                 self.transfer = server.transfer = transfer
                 self._driver.on_batch = self._on_batch
@@ -337,7 +337,7 @@ class Upload(UploadProgress):
             self._note_refusal(transfer, last)
         if not ours or isinstance(last, SessionLost):
             raise SessionLost("the vehicle had closed the session before", by_server=True) from last
-        self.feed.check_point()
+        self.source.check_point()
         if isinstance(last, REFUSALS) and not is_disarmed(last):
             raise last
         if stop is Stop.ARMED:
@@ -368,13 +368,13 @@ class Upload(UploadProgress):
         else:
             self._server.abandon()
         if written:
-            self.feed.check_point()
+            self.source.check_point()
         else:
             self._roll_back()
 
     def _roll_back(self) -> None:
         self._end_transfer()
-        self.feed.roll_back(everything=self._traits.wo_truncates is not False or not self.feed.proven)
+        self.source.roll_back(everything=self._traits.wo_truncates is not False or not self.source.closed)
 
 
 def storage_root(path: bytes) -> bytes:

@@ -172,7 +172,7 @@ async def test_an_upload_makes_room_for_a_change_of_its_path(
         faults.at(Opcode.REMOVE_FILE, lambda: open_then.append(here.vehicle.server.open_paths))
         await connection.store.remove(path(profile, "file"))
         assert open_then == [[]]
-        assert not source.dirty.empty  # it did not wait for the upload's end
+        assert not source.todo.empty  # it did not wait for the upload's end
         await upload.abort()
     assert here.vehicle.server.open_sessions == 0
 

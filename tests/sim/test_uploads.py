@@ -201,11 +201,10 @@ class FailingSource(MemorySource):
 
     bad: int | None = None
 
-    def next_chunk(self, limit: int) -> tuple[int, bytes] | None:
-        first = self.dirty.first()
-        if self.bad is not None and first is not None and first[0] >= self.bad:
+    def read(self, start: int, stop: int) -> bytes:
+        if self.bad is not None and stop > self.bad:
             raise SpoolFailed("the local disk fails")
-        return super().next_chunk(limit)
+        return super().read(start, stop)
 
 
 @pytest.mark.parametrize("probed", [False, True])
@@ -315,7 +314,7 @@ async def test_a_link_that_is_reopened_and_stays_silent_ends_the_wait(
         upload = await start(connection, profile, source)
         await trio.sleep(0.8)
         assert connection.scheduler.server.session is not None
-        assert source.dirty.empty
+        assert source.todo.empty
         assert source.in_flight.empty
         here.link.cut()
         here.link.restore()
@@ -338,9 +337,9 @@ async def test_abort_leaves_nothing_open_and_asks_for_nothing(profile: str, auto
         await upload.abort()
         assert source.in_flight.empty
         assert here.vehicle.server.open_sessions == 0
-        left = source.dirty.total
+        left = source.todo.total
         await trio.sleep(5)
-        assert source.dirty.total == left
+        assert source.todo.total == left
         assert upload not in connection.scheduler.users
 
 
@@ -513,7 +512,7 @@ async def test_an_aborted_upload_gives_back_what_was_only_looked_at(autojump: Mo
         await trio.sleep(0.1)  # the open is under way
         await upload.abort()
         assert source.in_flight.empty
-        assert source.dirty.total == 5
+        assert source.todo.total == 5
     assert here.vehicle.server.open_sessions == 0
 
 

@@ -16,7 +16,7 @@ import trio
 
 from mavftpfs.cache.options import CacheOptions
 from mavftpfs.cache.recovery import SpoolDirectory
-from mavftpfs.cache.remote import ReadSink, UploadSource
+from mavftpfs.cache.remote import ReadSink
 from mavftpfs.cache.reserved import is_reserved
 from mavftpfs.cache.tree import Tree
 from mavftpfs.protocol.payload import NakCode, Opcode
@@ -30,6 +30,7 @@ from mavftpfs.shared.errors import (
     VehicleLost,
 )
 from mavftpfs.shared.model import ROOT, join, split, wire_path
+from mavftpfs.shared.sending import Sending
 from mavftpfs.shared.traits import WriteTraits
 from tests.support.fake_store import FakeFile, FakeReader, FakeStore
 
@@ -147,7 +148,7 @@ class FakeWriter(FakeStore):
 
     # --- VehicleStore
 
-    async def open_upload(self, path: bytes, source: UploadSource) -> FakeUpload:
+    async def open_upload(self, path: bytes, source: Sending) -> FakeUpload:
         wire_path(path)
         upload = FakeUpload(self, path, source)
         self.uploads.append(upload)
@@ -349,7 +350,7 @@ def _maybe_lose(lost: bool) -> None:
 class FakeUpload:
     """Sends chunk by chunk, each one request; in the background too if the store has a nursery."""
 
-    def __init__(self, store: FakeWriter, path: bytes, source: UploadSource) -> None:
+    def __init__(self, store: FakeWriter, path: bytes, source: Sending) -> None:
         self.path = path
         self.aborted = False
         self._store = store
@@ -420,7 +421,7 @@ class FakeUpload:
 
     def _lose(self) -> None:
         self._open = False
-        self._source.on_rollback(self._store.kind.wo_truncates)
+        self._source.roll_back(everything=self._store.kind.wo_truncates)
 
     async def _open_file(self) -> None:
         store = self._store
@@ -430,7 +431,7 @@ class FakeUpload:
         if not reopened:
             store._create(self.path)
             if self._opened_before:
-                self._source.on_rollback(True)
+                self._source.roll_back(everything=True)
         self._open = self._opened_before = True
 
     async def _write(self, offset: int, data: bytes) -> None:
@@ -454,4 +455,4 @@ class FakeUpload:
         lost = await self._store.request("terminate", self.path)
         self._open = False
         _maybe_lose(lost)
-        self._source.on_checkpoint()
+        self._source.check_point()

@@ -9,9 +9,10 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
-from mavftpfs.cache.draft import AHEAD, TRANSITIONS, Base, Draft, Event, Sending, State, Where
+from mavftpfs.cache.draft import TRANSITIONS, Base, Draft, Event, State, Where
 from mavftpfs.cache.spool import Spool, SpoolContent
 from mavftpfs.shared.errors import LocalProtocolError
+from mavftpfs.shared.sending import AHEAD, Sending
 
 SPOOL = Spool(memory_max=lambda: 1 << 40, spool_max=0)
 
@@ -191,14 +192,14 @@ class DraftMachine(RuleBasedStateMachine):
         if self.draft.sending is None:
             return
         self.flight.clear()
-        self.draft.sending.on_rollback(everything)
+        self.draft.sending.roll_back(everything=everything)
         if everything:
             self.remote.clear()
 
     @rule()
     def terminate(self) -> None:
         if self.draft.sending is not None:
-            self.draft.sending.on_checkpoint()
+            self.draft.sending.check_point()
 
     @rule(end=st.sampled_from(["placed", "refused", "torn and placed", "torn and refused"]))
     def finish(self, end: str) -> None:

@@ -130,7 +130,7 @@ def test_acks_that_prove_nothing_end_it_after_a_few(number: int) -> None:
         now += 0.1
         engine.receive(ack(again, count(number)), now)
     assert isinstance(transfer.error, RemoteProtocolError)
-    assert source.dirty.covers(0, 239)
+    assert source.todo.covers(0, 239)
 
 
 @pytest.mark.parametrize("codes", [(1,), (4,), (10,), (2, 9)])
@@ -145,7 +145,7 @@ def test_a_lost_session_gives_everything_back(codes: tuple[int, ...]) -> None:
     assert isinstance(transfer.error.__cause__, FtpNak)
     assert transfer.failed_at == 478
     assert source.in_flight.empty
-    assert list(source.dirty) == [(239, len(CONTENT))]
+    assert list(source.todo) == [(239, len(CONTENT))]
     engine.receive(ack(requests[1]), 0.2)  # too late: nobody takes it for this file any more
     assert source.acked.total == 239
 
@@ -159,7 +159,7 @@ def test_other_refusals_are_the_callers(codes: tuple[int, ...]) -> None:
     assert isinstance(transfer.error, FtpNak)
     assert (transfer.error.opcode, transfer.error.code) == (Opcode.WRITE_FILE, codes[0])
     assert transfer.failed_at == 0
-    assert source.dirty.covers(0, len(CONTENT))
+    assert source.todo.covers(0, len(CONTENT))
 
 
 def test_pause_drains_and_resume_goes_on() -> None:
@@ -192,7 +192,7 @@ def test_what_is_closed_behind_is_not_repeated() -> None:
         assert sent(engine, 1.0) == []
     assert list(source.in_flight) == [(239, 717)]
     transfer.stop()
-    assert source.dirty.covers(239, 717)
+    assert source.todo.covers(239, 717)
 
 
 def test_what_waits_to_be_repeated_is_not_all_out() -> None:
@@ -294,7 +294,7 @@ def test_what_is_acked_is_on_the_card(
     transfer.stop()
     link.engine.cancel(transfer, link.now)
     assert source.in_flight.empty
-    assert source.acked.total + source.dirty.total == len(content)
+    assert source.acked.total + source.todo.total == len(content)
     close(link, opened.session)
     stored = tree.data(path)
     for start, stop in source.acked:

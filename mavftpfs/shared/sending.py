@@ -1,0 +1,145 @@
+"""What of a file is to be sent, is on its way, and is known to be on the card. Layer: shared; pure.
+
+The cache makes a `Sending` for each attempt to send a file, and says what changes; the session takes chunks
+from it, and says what became of them. A new attempt gets a new one, so whatever a late upload still says of
+the old one changes nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from mavftpfs.shared.errors import MavftpfsError
+from mavftpfs.shared.extents import ExtentSet
+
+AHEAD = 64 * 1024
+"""Bytes fetched at once, since chunks are small."""
+
+FULL = 239
+"""Bytes of a full request (servers.md 1)."""
+
+
+class Sending:
+    """One attempt to send a file of `size` bytes, which `read(start, stop)` returns; it raises MavftpfsError.
+
+    It goes from the file's begin to its end. What was handed out may not change: two copies of a byte could
+    reach the card in the wrong order.
+
+    Attributes:
+        todo, acked, proven: bytes to be handed out; ACKed since the file was closed the last time; ACKed
+            before that. What is in none of them is on its way.
+        closed: a Terminate was ACKed, so the card holds what is proven.
+        overtaken: bytes that were handed out changed, or were cut off: the file is to be sent anew.
+        growing: more may be written behind the last byte; what fills no request there waits for it.
+        progress: told how many bytes were ACKed.
+    """
+
+    def __init__(self, read: Callable[[int, int], bytes], size: int) -> None:
+        self.size = size
+        self.todo = ExtentSet([(0, size)])
+        self.acked = ExtentSet()
+        self.proven = ExtentSet()
+        self.closed = self.overtaken = self.growing = False
+        self.progress: Callable[[int], None] | None = None
+        self._read = read
+        self._handed_out = 0  # one past the highest byte
+        self._furthest = 0
+        self._failed: MavftpfsError | None = None
+        self._ahead = (0, b"")
+
+    @property
+    def unacked(self) -> int:
+        """Bytes not ACKed yet."""
+        return self.size - self.acked.total - self.proven.total
+
+    @property
+    def reached(self) -> int:
+        """One past the highest byte that was ACKed; after a rollback, that is proven."""
+        return max(self.acked.end, self.proven.end)
+
+    @property
+    def furthest(self) -> int:
+        """One past the highest byte that was ever ACKed."""
+        return max(self._furthest, self.reached)
+
+    def on_changed(self, start: int, size: int) -> None:
+        """The file changed from `start` on, perhaps to its end, and has `size` bytes now."""
+        self.overtaken |= start < self._handed_out
+        if size > self.size:
+            self.todo.add(self.size, size)
+        else:
+            self.todo.discard(size, self.size)
+        self.size = size
+        if start < self._ahead[0] + len(self._ahead[1]):
+            self._ahead = (0, b"")
+
+    def has_more(self) -> bool:
+        """Return whether there is something to send now.
+
+        Raises:
+            MavftpfsError: it could not be read. It is tried again from now on.
+        """
+        failed, self._failed = self._failed, None
+        if failed is not None:
+            raise failed
+        return self._next(FULL) is not None
+
+    def next_chunk(self, limit: int) -> tuple[int, bytes] | None:
+        """Return (offset, at most `limit` bytes), now on their way; None = nothing for now.
+
+        The engine serves everybody, so what cannot be read counts as nothing; `has_more` tells.
+        """
+        found = self._next(limit)
+        if found is None:
+            return None
+        start, stop = found
+        at, ahead = self._ahead
+        if start < at or at + len(ahead) < stop:
+            first = self.todo.first()
+            assert first is not None
+            try:
+                at, ahead = start, self._read(start, max(stop, min(first[1], start + AHEAD)))
+            except MavftpfsError as error:
+                self._failed = error
+                return None
+            self._ahead = (at, ahead)
+        self.todo.discard(start, stop)
+        self._handed_out = max(self._handed_out, stop)
+        return start, ahead[start - at : stop - at]
+
+    def on_acked(self, offset: int, count: int) -> None:
+        """These bytes were ACKed as written."""
+        self.acked.add(offset, offset + count)
+        if self.progress is not None:
+            self.progress(count)
+
+    def on_unsent(self, offset: int, count: int) -> None:
+        """These bytes were not written, and no request that carries them is under way any more."""
+        self.todo.add(offset, offset + count)
+
+    def check_point(self) -> None:
+        """Terminate was ACKed: what was ACKed before is proven written (not yet verified)."""
+        self.closed = True
+        for start, stop in self.acked:
+            self.proven.add(start, stop)
+        self.acked.clear()
+
+    def roll_back(self, *, everything: bool) -> None:
+        """The session was lost: what was ACKed since the checkpoint is to be sent again, or everything is
+        because the file was emptied by reopening it."""
+        self._furthest = self.furthest
+        self.acked.clear()
+        if everything:
+            self.closed = False
+            self.proven.clear()
+        self.todo = ExtentSet(self.proven.missing(0, self.size))
+
+    def _next(self, limit: int) -> tuple[int, int] | None:
+        """Return the next bytes to hand out."""
+        found = self.todo.first()
+        if found is None or self.overtaken:
+            return None
+        start, stop = found[0], min(found[1], found[0] + limit)
+        if self.growing and stop == self.size:
+            stop -= (stop - start) % FULL
+        return (start, stop) if start < stop else None
