@@ -48,6 +48,10 @@ log = logging.getLogger("mavftpfs.cache")
 COST_FACTOR = 50
 """A listing that took T seconds is fresh for at least COST_FACTOR * T: it costs at most 2 % of the link."""
 
+LOOK_FACTOR = 5
+"""A listing that took T seconds is good for changes of names for LOOK_FACTOR * T: else each mv and rm over a
+slow link lists a long directory anew."""
+
 STILL_GROWING = 30.0
 """A file that was seen to grow is taken to be open on the vehicle for so many seconds."""
 
@@ -279,15 +283,17 @@ class Directories:
     async def current(self, path: bytes, *, within: float = 0.0) -> DirEntry | None:
         """Return what the vehicle has there, not drafts, as it was shown to be at most `within` seconds ago.
 
-        That something is there counts from the end of a listing, or from our change; that nothing is, from
-        the beginning of a listing.
+        Where a listing takes long that is longer (LOOK_FACTOR); 0: it is asked for just now. That something
+        is there counts from the end of a listing, or from our change; that nothing is, from the beginning of
+        one.
 
         Raises:
             As ask, but None where its directory is gone.
         """
         parent, name = split(path)
-        known, since = self.known(parent), self.clock() - within
+        known = self.known(parent)
         if known is not None and within:
+            since = self.clock() - max(within, LOOK_FACTOR * (known.ended_at - known.listed_at))
             seen = known.proven.get(name, -inf)
             if self.clock() < known.fresh_until:
                 seen = max(seen, known.ended_at if name in known.entries else known.listed_at)

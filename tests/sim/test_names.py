@@ -5,6 +5,7 @@ from __future__ import annotations
 import random
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
+from typing import Any
 
 import pytest
 import trio
@@ -56,8 +57,10 @@ class Scene:
         self.world.tree.add(self.a, b"ours")
 
     @asynccontextmanager
-    async def mounted(self, **options: float) -> AsyncIterator[Tree]:
-        async with mounted(self.world, self.root, **options) as (_, tree):
+    async def mounted(self, **options: Any) -> AsyncIterator[Tree]:
+        async with mounted(self.world, **options) as (connection, tree):
+            await connection.store.list_directory(self.root)  # it tries opcode 16 too
+            await tree.list(self.root)
             yield tree
 
     def names(self, path: bytes | None = None) -> list[bytes]:

@@ -188,3 +188,20 @@ async def test_nor_does_that_of_a_checksum_cost_what_the_slowest_card_takes(
     """It was asked for again after 6.3 s, where the whole copy takes one or two."""
     usual = await upload(profile, -1)
     assert await upload(profile, victim) - usual <= 1.0
+
+
+async def test_changing_many_names_of_a_long_directory_seldom_lists_it(autojump: MockClock) -> None:
+    """Over a slow link each rename, and every seventh removal, listed the directory: five seconds each."""
+    count = 100
+    here = world("px4", LONG, **{f"a_file_with_a_long_name_{number}": b"x" for number in range(count)})
+    directory = split(path("px4", "f"))[0]
+    async with mounted(here, directory) as (_, tree):
+        names = [f"a_file_with_a_long_name_{number}".encode() for number in range(count)]
+        began = trio.current_time()
+        for name in names[: count // 2]:
+            await tree.rename(directory + b"/" + name, directory + b"/" + name[-4:], noreplace=True)
+        for name in names[count // 2 :]:
+            await tree.unlink(directory + b"/" + name)
+        took = trio.current_time() - began
+    assert len(here.tree.entries(directory)) == 2 + count // 2  # "." and ".."
+    assert took <= 1.5 * count * RTT
