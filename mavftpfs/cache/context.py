@@ -17,7 +17,7 @@ from mavftpfs.cache.pathlocks import PathLocks
 from mavftpfs.cache.remote import VehicleStore
 from mavftpfs.cache.reserved import OwnNames
 from mavftpfs.cache.spool import Spool
-from mavftpfs.shared.errors import Armed, FileBusy, NotFound
+from mavftpfs.shared.errors import Armed, FileBusy
 from mavftpfs.shared.model import DirEntry, EntryKind, split
 
 
@@ -70,13 +70,6 @@ class Context:
         if node is not None and node.draft is not None and node.draft.state is not State.STALE:
             return DirEntry(name, EntryKind.FILE, node.draft.size)
         return (await self.directories.get(parent)).entries.get(name)
-
-    async def need(self, path: bytes) -> DirEntry:
-        """Return what a path is, drafts included. Raises as entry; NotFound if it does not exist."""
-        entry = await self.entry(path)
-        if entry is None:
-            raise NotFound(f"{path!r} does not exist")
-        return entry
 
     def is_changing(self, path: bytes) -> bool:
         """Return whether we are changing what the vehicle has under a path, or may have done so in part."""

@@ -157,7 +157,10 @@ class Directories:
     @property
     def entry_count(self) -> int:
         """Names remembered over all listings."""
-        return sum([len(directory.entries) for directory in self._known.values()])
+        count = 0
+        for directory in self._known.values():
+            count += len(directory.entries)
+        return count
 
     # --- what is remembered
 

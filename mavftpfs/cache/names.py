@@ -103,13 +103,14 @@ class Names:
         """
         parent, name = split(path)
         entries = (await self._context.directories.get(parent)).entries
-        plain = _plain(name)
-        alike = [e for n, e in entries.items() if n != name and _plain(n) == plain and not is_reserved(n)]
+        plain, alike = _plain(name), set()
+        for other, entry in entries.items():
+            if _plain(other) == plain and not is_reserved(other):
+                alike.add(entry.kind)
         if not alike or name in entries:
             return
-        if await self.is_free(path, perhaps_directory=any(e.kind is EntryKind.DIRECTORY for e in alike)):
-            return
-        raise AlreadyExists(f"{path!r} is the name of another file on this card")
+        if not await self.is_free(path, perhaps_directory=EntryKind.DIRECTORY in alike):
+            raise AlreadyExists(f"{path!r} is the name of another file on this card")
 
     async def require_empty(self, path: bytes) -> None:
         """Check by a listing asked for just now that nothing is in a directory.
@@ -227,7 +228,7 @@ class Names:
         """
         own, (parent, name) = self._context.own, split(path)
         directory = self._context.directories.known(parent)
-        needed = own.live.union(place for torn, place in own.torn.items() if torn != path)
+        needed = own.live | set(own.torn.values()) - {own.torn.get(path)}
         for entry in [] if directory is None else list(directory.entries):
             reserved, left = parse(entry), join(parent, entry)
             if reserved is None or reserved.owner != own.owner or left in needed:

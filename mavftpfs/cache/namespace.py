@@ -71,7 +71,9 @@ class Namespace:
         """See Tree.rmdir."""
         self._context.require_disarmed()
         async with self._context.paths.hold(path):
-            entry = await self._context.need(path)
+            entry = await self._context.entry(path)
+            if entry is None:
+                raise NotFound(f"{path!r} does not exist")
             if entry.kind is not EntryKind.DIRECTORY:
                 raise NotADirectory(f"{path!r} is not a directory")
             await self._names.require_empty(path)
@@ -172,7 +174,9 @@ class Namespace:
         wire_path(new)
         listed = await context.directories.current(new, within=RECENT)
         target = listed or await self._context.entry(new)
-        source = await self._context.need(old)
+        source = await self._context.entry(old)
+        if source is None:
+            raise NotFound(f"{old!r} does not exist")
         if target is None:
             await self._names.require_new(new)
         elif noreplace:

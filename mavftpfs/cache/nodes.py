@@ -20,6 +20,7 @@ from mavftpfs.cache.remote import Upload
 from mavftpfs.cache.reserved import Places
 from mavftpfs.cache.spool import Spool, SpoolContent
 from mavftpfs.shared.errors import FileChanged, MavftpfsError
+from mavftpfs.shared.model import rename_keys
 from mavftpfs.shared.sending import Sending
 
 
@@ -219,9 +220,7 @@ class Nodes:
 
     def rename(self, old: bytes, new: bytes) -> None:
         """Nodes at `old` and below it have another path; `new` must have no nodes."""
-        for node in self.below(old):
-            del self._by_path[node.path]
-            node.path = new + node.path[len(old) :]
-            self._by_path[node.path] = node
-        for path in [p for p in self.hidden if p.startswith(old + b"/")]:
-            self.hide(self.hidden[path], new + path[len(old) :])
+        for nodes in (self._by_path, self.hidden):
+            rename_keys(nodes, old, new)
+            for path, node in nodes.items():
+                node.path = path

@@ -153,8 +153,15 @@ class Cleaner:
 
     async def on_swept(self, path: bytes, directory: Directory) -> None:
         """A directory was listed. Raises nothing of ours: the listing is right without us."""
-        reserved = [entry for name, entry in directory.entries.items() if is_reserved(name)]
-        self._note_whole(path, directory)
+        reserved, own = [], self._context.own
+        for name, entry in directory.entries.items():
+            if is_reserved(name):
+                reserved.append(entry)
+        if directory is self._context.directories.known(path):
+            for torn in list(own.torn):
+                parent, name = split(torn)
+                if parent == path and name in directory.entries:
+                    del own.torn[torn]  # it is whole again
         if path in self._busy or not reserved:
             return
         self._busy.add(path)
@@ -188,14 +195,6 @@ class Cleaner:
             await self._context.directories.ask(directory)
         except MavftpfsError as error:
             log.info("%r is mended at a later listing: %s", directory, error)
-
-    def _note_whole(self, path: bytes, directory: Directory) -> None:
-        """The torn names that a listing just made shows are whole again."""
-        if directory is self._context.directories.known(path):
-            for torn in list(self._context.own.torn):
-                parent, name = split(torn)
-                if parent == path and name in directory.entries:
-                    del self._context.own.torn[torn]
 
     def _is_torn(self, group: Group) -> bool:
         return not set(self._context.own.torn.values()).isdisjoint(group.paths.values())

@@ -34,7 +34,7 @@ from mavftpfs.cache.spool import Spool
 from mavftpfs.cache.throttle import Throttle
 from mavftpfs.cache.writefile import Parts, ReadFile, WriteFile
 from mavftpfs.shared.errnos import errno_for
-from mavftpfs.shared.errors import AlreadyExists, IsADirectory, MavftpfsError
+from mavftpfs.shared.errors import AlreadyExists, IsADirectory, MavftpfsError, NotFound
 from mavftpfs.shared.model import EntryKind, require_listable
 
 log = logging.getLogger("mavftpfs.cache")
@@ -164,7 +164,9 @@ class Writeback:
         if node is not None and node.draft is not None:
             return node
         require_writable(path)
-        entry = await context.need(path)
+        entry = await context.entry(path)
+        if entry is None:
+            raise NotFound(f"{path!r} does not exist")
         if entry.kind is not EntryKind.FILE:
             raise IsADirectory(f"{path!r} is a directory")
         if truncate:
