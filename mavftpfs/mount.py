@@ -104,9 +104,12 @@ def run_mount(request: MountRequest, report: Report) -> int:
             watcher = Watcher(up.connection.status, read_only_when_armed=read_only_armed)
 
             def status() -> dict[str, Any]:
-                when_armed = request.options.when_armed
                 return snapshot(
-                    up.connection.status(), up.tree.status(), watcher.traffic, when_armed=when_armed
+                    up.connection.status(),
+                    up.tree.status(),
+                    watcher.traffic,
+                    when_armed=request.options.when_armed,
+                    version=up.connection.vehicle.version,
                 )
 
             yield Content(up.tree, status, up.space, up.notice, up.tree.forget_caches, watcher.run)

@@ -30,6 +30,7 @@ import trio
 from mavftpfs import control
 from mavftpfs.control import ControlError, NobodyThere
 from mavftpfs.fuse.handles import XATTR_STATUS
+from mavftpfs.link.messages import AutopilotVersion
 from mavftpfs.mountpoint import OUR_TYPE, Mounted, mounts
 from mavftpfs.session.vehicle import SILENCE_LIMIT
 from mavftpfs.shared.readable import autopilot_name, printable, readable_size, readable_time
@@ -46,14 +47,22 @@ MOST = 100
 """Entries of each list: an extended attribute holds 64 KiB. `held` counts them all."""
 _TOLD = {"transfers", "errors", "reads"}
 """What the cache tells that stands in the snapshot's own lists."""
+_RELEASES = ((255, ""), (192, " rc"), (128, " beta"), (64, " alpha"), (0, " dev"))
 LOSSY = 0.1
 """From this share of lost packets on, the link is not called fine."""
 
 
-def snapshot(connection: Facts, cache: Facts, traffic: float | None, *, when_armed: str) -> dict[str, Any]:
+def snapshot(
+    connection: Facts,
+    cache: Facts,
+    traffic: float | None,
+    *,
+    when_armed: str,
+    version: AutopilotVersion | None = None,
+) -> dict[str, Any]:
     """Return the facts of a status, JSON-able; bytes, seconds, and bytes per second; None = unknown."""
     return {
-        "vehicle": _vehicle(connection, when_armed),
+        "vehicle": {**_vehicle(connection, when_armed), **version_facts(version)},
         "link": _link(connection, traffic),
         "transfers": _transfers(
             cache,
@@ -84,6 +93,28 @@ def _vehicle(connection: Facts, when_armed: str) -> dict[str, Any]:
         "says_ftp": connection.get("ftp_flag"),
         "restarts": connection.get("reboots", 0),
     }
+
+
+def version_facts(version: AutopilotVersion | None) -> dict[str, str | None]:
+    """Return what the vehicle said of itself; None = it did not."""
+    if version is None:
+        return {"firmware": None, "uid": None}
+    return {"firmware": _firmware(version), "uid": _unique_id(version)}
+
+
+def _firmware(version: AutopilotVersion) -> str:
+    """Return the flight stack's version: major.minor.patch and the kind of release, as MAVLink packs them."""
+    number = version.flight_sw_version
+    kind = number & 0xFF
+    release = next(word for least, word in _RELEASES if kind >= least)
+    return f"{number >> 24}.{number >> 16 & 0xFF}.{number >> 8 & 0xFF}{release}"
+
+
+def _unique_id(version: AutopilotVersion) -> str | None:
+    """Return the board's unique id in hex, the long one where it is told; None if it tells none."""
+    if any(version.uid2):
+        return version.uid2.hex()
+    return f"{version.uid:016x}" if version.uid else None
 
 
 def _link(connection: Facts, traffic: float | None) -> dict[str, Any]:
@@ -512,24 +543,11 @@ def print_status(statuses: Sequence[Status], *, verbose: bool) -> None:
 
 
 def panel(statuses: Sequence[Status], width: int, height: int, *, verbose: bool = False) -> list[str]:
-    """Return lines that fit a terminal: the first of each mount, and of its others what there is room for."""
-    if not statuses:
-        return [NOTHING]
-    blocks = [status_lines(status, verbose=verbose) for status in statuses]
-    shown: list[str] = []
-    for number, block in enumerate(blocks):
-        room = max(1, (height - len(shown)) // (len(blocks) - number))
-        shown += [line.fitted(width) for line in _cut(block, room)]
-    if len(shown) > height:
-        more = f"… and {len(shown) - height + 1} more mounts"
-        shown = [*shown[: height - 1], more]
-    return shown
-
-
-def _cut(block: list[Line], room: int) -> list[Line]:
-    if len(block) <= room or room < 2:
-        return block[:room]
-    return [*block[: room - 1], Line(f"  … and {len(block) - room + 1} more lines")]
+    """Return the lines of all mounts, as many and as long as a terminal has room for."""
+    lines = [line.fitted(width) for status in statuses for line in status_lines(status, verbose=verbose)]
+    if len(lines) > height:
+        lines[height - 1 :] = [f"… and {len(lines) - height + 1} more lines"[:width]]
+    return lines or [NOTHING]
 
 
 def screen(lines: Sequence[str]) -> str:

@@ -9,7 +9,6 @@ the same. Paths are normalised (shared.model.normalise).
 from __future__ import annotations
 
 import errno
-import json
 import os
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequence
 from contextlib import asynccontextmanager, suppress
@@ -18,10 +17,10 @@ from typing import Any, Protocol, TypeVar, cast
 
 import trio
 
-from mavftpfs import control
+from mavftpfs import control, report
 from mavftpfs.cache.attributes import Stat
 from mavftpfs.compose import NO_SINKS, Attached, Sinks, attached, no_answer, plain_nursery
-from mavftpfs.fuse.handles import XATTR_CRC32, XATTR_STATUS
+from mavftpfs.fuse.handles import XATTR_CRC32
 from mavftpfs.fuse.options import MountOptions
 from mavftpfs.link.uri import LinkKind, LinkSpec, parse_source
 from mavftpfs.mountpoint import canonical, is_ours, mounts
@@ -139,7 +138,7 @@ async def find_mount(spec: LinkSpec, options: MountOptions) -> Session | None:
     """Return the files of the mount that holds this link now, if one is up and may be read by us."""
     for mountpoint in [path for path in mounts() if is_ours(path)]:
         with suppress(errors.MavftpfsError, ValueError, KeyError, TypeError):
-            status = await _status(mountpoint)
+            status = await mount_status(mountpoint)
             if not _is_wanted(status["vehicle"], options):
                 continue
             if same_link(parse_source(status["source"]), spec):
@@ -158,7 +157,7 @@ async def open_mount(mountpoint: str, subtree: bytes) -> Session:
     Raises:
         LinkClosed: it does not answer.
     """
-    root = _root_of(await _status(mountpoint))
+    root = _root_of(await mount_status(mountpoint))
     return session_on(mountpoint, root, normalise(root + b"/" + subtree))
 
 
@@ -166,7 +165,7 @@ def session_on(mountpoint: str, mounted: bytes, root: bytes) -> Session:
     """Return the files below `root` of the vehicle, of which `mounted` is on `mountpoint`."""
 
     async def transfers() -> Transfers:
-        found = (await _status(mountpoint))["transfers"]
+        found = (await mount_status(mountpoint))["transfers"]
         return [
             {"path": facts["path"], "size": facts["size"], "bytes_left": facts["size"] - facts["done"]}
             for facts in found
@@ -194,14 +193,10 @@ async def mount_status(mountpoint: str) -> Mapping[str, Any]:
     Raises:
         LinkClosed: it does not answer.
     """
-    return await _status(mountpoint)
-
-
-async def _status(mountpoint: str) -> Mapping[str, Any]:
-    with trio.move_on_after(STATUS_PATIENCE):
-        text = await _in_thread(lambda: os.getxattr(mountpoint, XATTR_STATUS), ROOT)
-        facts: Mapping[str, Any] = json.loads(text)
-        return facts
+    with trio.move_on_after(STATUS_PATIENCE), suppress(control.ControlError):
+        status = await trio.to_thread.run_sync(report.status_of, mountpoint, abandon_on_cancel=True)
+        if not status.get("problem"):
+            return status
     raise errors.LinkClosed(f"the mount on {mountpoint} does not answer")
 
 

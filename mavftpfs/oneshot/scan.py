@@ -11,9 +11,10 @@ import trio
 from mavftpfs.compose import connect_options
 from mavftpfs.fuse.options import MountOptions
 from mavftpfs.link.base import Link
-from mavftpfs.link.messages import MAV_TYPE_GCS, Address, AutopilotVersion, Heartbeat
+from mavftpfs.link.messages import MAV_TYPE_GCS, Address, Heartbeat
 from mavftpfs.link.opening import open_link
 from mavftpfs.oneshot.files import Target, mount_status
+from mavftpfs.report import version_facts
 from mavftpfs.session.connection import Connection, connected
 from mavftpfs.shared.errors import FtpNak, MavftpfsError, VehicleLost
 from mavftpfs.shared.readable import autopilot_name, readable_time
@@ -48,7 +49,6 @@ _TYPES = {
     **{33: "gimbal", 34: "battery", 36: "battery", 35: "parachute", 37: "telemetry radio"},
 }
 """MAV_COMPONENT and MAV_TYPE values people meet."""
-_RELEASES = ((255, ""), (192, " rc"), (128, " beta"), (64, " alpha"), (0, " dev"))
 
 
 async def scan(target: Target) -> list[Entry]:
@@ -124,13 +124,11 @@ async def _probe(link: Link, options: MountOptions, heartbeat: Heartbeat, patien
         except MavftpfsError as exc:
             answer = f"no answer ({exc})"
         answers = answer.startswith("answers")
-        version = connection.vehicle.version
         entry.update(
             ftp=answer,
             seen=_seen(connection, answers=answers),
             answers=answers,
-            firmware=None if version is None else firmware(version),
-            uid=None if version is None else unique_id(version),
+            **version_facts(connection.vehicle.version),
             facts=connection.status(),
         )
     return entry
@@ -154,7 +152,7 @@ def _seen(connection: Connection, *, answers: bool) -> list[str]:
 
 
 def _of_mount(status: Mapping[str, Any]) -> Entry:
-    """Return what a mount knows of its vehicle; nobody else can be asked while it has the link."""
+    """Return what a mount tells of its vehicle; nobody else can be asked while it has the link."""
     facts = status["connection"]
     system, component = facts["vehicle"] or (0, 0)
     kind = "unknown" if facts["autopilot"] is None else autopilot_name(facts["autopilot"])
@@ -164,8 +162,8 @@ def _of_mount(status: Mapping[str, Any]) -> Entry:
         "what": f"{kind}, {'armed' if facts['armed'] else 'disarmed'}",
         "autopilot": facts["autopilot"],
         "armed": facts["armed"],
-        "firmware": None,
-        "uid": None,
+        "firmware": status["vehicle"].get("firmware"),
+        "uid": status["vehicle"].get("uid"),
         "ftp": f"mounted on {status['mountpoint']}",
         "answers": not facts["lost"],
         "seen": ["the vehicle is silent"] if facts["lost"] else [],
@@ -186,18 +184,3 @@ def describe_peer(heartbeat: Heartbeat) -> str:
         )
     words = [autopilot_name(heartbeat.autopilot), *([kind] if kind else [])]
     return f"{' '.join(words)}, {'armed' if heartbeat.armed else 'disarmed'}"
-
-
-def firmware(version: AutopilotVersion) -> str:
-    """Return the flight stack's version: major.minor.patch and the kind of release, as MAVLink packs them."""
-    number = version.flight_sw_version
-    kind = number & 0xFF
-    release = next(word for least, word in _RELEASES if kind >= least)
-    return f"{number >> 24}.{number >> 16 & 0xFF}.{number >> 8 & 0xFF}{release}"
-
-
-def unique_id(version: AutopilotVersion) -> str | None:
-    """Return the board's unique id in hex, the long one where it is told; None if it tells none."""
-    if any(version.uid2):
-        return version.uid2.hex()
-    return f"{version.uid:016x}" if version.uid else None

@@ -18,7 +18,6 @@ MISSION_MAGIC = 0x763D
 MAX_HANDLES = 4
 _PARAM_HEADER = struct.Struct("<HHH")
 _MISSION_HEADER = struct.Struct("<HHHHH")
-_MISSION_ITEM = 38
 _SYS_CLAIM = 100_000
 _MISSION_CLAIM = 2**20
 _FORMATS = {1: "<b", 2: "<h", 3: "<i", 4: "<f"}
@@ -130,7 +129,6 @@ class VirtualTrees:
         self.romfs = dict(romfs) if romfs is not None else _default_romfs()
         names = (b"mission.dat", b"fence.dat", b"rally.dat")
         self.missions = {name: list((missions or {}).get(name, ())) for name in names}
-        self.uploads: dict[bytes, bytes] = {}
         self._open = {b"@SYS": 0, b"@ROMFS": 0, b"@PARAM": 0, b"@MISSION": 0}
         self._leaked_listings = 0
 
@@ -217,7 +215,7 @@ class VirtualTrees:
         return self.params[start : start + count]
 
     def open(self, path: bytes, *, write: bool) -> VirtualFile:
-        """Open a file; at most four at a time in each tree (ENFILE)."""
+        """Open a file; at most four at a time in each tree (ENFILE). What is written to it goes nowhere."""
         tree, name = self._split(path)
         if not name:
             raise fail(errno.ENOENT, path)
@@ -233,16 +231,11 @@ class VirtualTrees:
             lambda block: self._content(tree, name, block),
             size,
             one_block=tree == b"@PARAM",
-            on_close=lambda uploaded: self._closed(tree, name, uploaded if write else None),
+            on_close=lambda: self._closed(tree),
         )
 
-    def _closed(self, tree: bytes, name: bytes, uploaded: bytes | None) -> None:
+    def _closed(self, tree: bytes) -> None:
         self._open[tree] = max(0, self._open[tree] - 1)
-        if uploaded is None:
-            return
-        if not _acceptable(tree, uploaded):
-            raise fail(errno.EINVAL, name)
-        self.uploads[tree + b"/" + name] = uploaded
 
     @staticmethod
     def _split(path: bytes) -> tuple[bytes, bytes]:
@@ -252,16 +245,6 @@ class VirtualTrees:
 
 def _mission_type(name: bytes) -> int:
     return (b"mission.dat", b"fence.dat", b"rally.dat").index(name)
-
-
-def _acceptable(tree: bytes, uploaded: bytes) -> bool:
-    """Whether the vehicle would apply an uploaded file; decided when it is closed."""
-    if tree == b"@PARAM":
-        return len(uploaded) >= 6 and bool(_PARAM_HEADER.unpack_from(uploaded)[2] == len(uploaded))
-    if len(uploaded) < _MISSION_HEADER.size:
-        return False
-    count = _MISSION_HEADER.unpack_from(uploaded)[4]
-    return bool(len(uploaded) == _MISSION_HEADER.size + count * _MISSION_ITEM)
 
 
 class VirtualFile:
@@ -277,7 +260,7 @@ class VirtualFile:
         size: int,
         *,
         one_block: bool,
-        on_close: Callable[[bytes], None],
+        on_close: Callable[[], None],
     ) -> None:
         self._make = make
         self._size = size
@@ -285,7 +268,6 @@ class VirtualFile:
         self._on_close = on_close
         self._block: int | None = None
         self._content = b""
-        self._uploaded = bytearray()
         self._closed = False
 
     def read(self, offset: int, size: int) -> bytes:
@@ -301,12 +283,6 @@ class VirtualFile:
 
     def write(self, offset: int, data: bytes) -> int:
         """See storage.OpenFile."""
-        stop = offset + len(data)
-        if stop > _MISSION_CLAIM:
-            raise fail(errno.EFBIG)
-        if stop > len(self._uploaded):
-            self._uploaded.extend(bytes(stop - len(self._uploaded)))
-        self._uploaded[offset:stop] = data
         return len(data)
 
     def size(self) -> int:
@@ -314,7 +290,7 @@ class VirtualFile:
         return self._size
 
     def close(self) -> None:
-        """See storage.OpenFile; EINVAL if an upload is not acceptable."""
+        """See storage.OpenFile."""
         if not self._closed:
             self._closed = True
-            self._on_close(bytes(self._uploaded))
+            self._on_close()

@@ -209,16 +209,6 @@ def test_an_interrupted_command_cleans_up() -> None:
     assert steps == ["cleaned"]
 
 
-def test_errors_of_a_command_are_not_wrapped() -> None:
-    async def work() -> None:
-        async with trio.open_nursery():
-            await trio.lowlevel.checkpoint()
-        raise VehicleLost("gone")
-
-    with pytest.raises(VehicleLost, match="gone"):
-        trio.run(until_interrupted, work)
-
-
 # -- status and umount ----------------------------------------------------------------------------
 
 
@@ -240,16 +230,6 @@ def test_status_of_nothing(sockets: Path, tmp_path: Path, capsys: pytest.Capture
     assert "no vehicle" in capsys.readouterr().out
 
 
-def test_nothing_to_put_back_is_no_error(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
-    assert cli.main(["recover", SOURCE, "--all"]) == 0
-    assert capsys.readouterr().out == "nothing was kept\n"
-    _, line = complaint(capsys, "recover", SOURCE)
-    assert "say which files" in line
-
-
 def test_a_dead_mount_s_socket_is_swept(sockets: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = sockets / "dead.sock"
     with socket.socket(socket.AF_UNIX) as dead:
@@ -257,14 +237,6 @@ def test_a_dead_mount_s_socket_is_swept(sockets: Path, capsys: pytest.CaptureFix
     assert cli.main(["status", "--json"]) == 0
     assert json.loads(capsys.readouterr().out) == []
     assert not path.exists()
-
-
-def test_umount_of_what_is_not_mounted(
-    sockets: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    code, line = complaint(capsys, "umount", str(tmp_path))
-    assert code == 3
-    assert str(tmp_path) in line
 
 
 # -- signing keys ---------------------------------------------------------------------------------

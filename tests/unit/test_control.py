@@ -202,20 +202,6 @@ def test_a_directory_that_others_may_enter_or_own_is_not_used(tmp_path: Path) ->
         control.usable_directory([open_to_all, link, too_long])
 
 
-def test_find_and_list(tmp_path: Path) -> None:
-    one, two = tmp_path / "one", tmp_path / "two"
-    one.mkdir()
-    two.mkdir()
-    path = two / control.socket_name("/mnt/drone")
-    with socket.socket(socket.AF_UNIX) as alive:
-        alive.bind(str(path))
-        (one / "x.sock").write_text("not a socket")
-        assert control.find_socket("/mnt/drone", [one, two]) == path
-        assert list(control.all_sockets([one, two, tmp_path / "none"])) == [path]
-        with pytest.raises(NobodyThere, match="/mnt/other"):
-            control.find_socket("/mnt/other", [one, two])
-
-
 def test_the_directory_of_another_user_holds_no_socket_of_ours(tmp_path: Path) -> None:
     """sudo and su leave HOME and XDG_RUNTIME_DIR as they were."""
     closed = tmp_path / "closed"

@@ -156,29 +156,11 @@ def test_where_there_is_syslog_the_log_goes_there(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("restored_logging")
-def test_a_log_file_is_appended_to(tmp_path: Path) -> None:
-    path = tmp_path / "log"
-    path.write_text("before\n")
-    daemon.log_to_file(str(path), logging.INFO)
-    logging.getLogger("mavftpfs").info("after")
-    logging.getLogger("mavftpfs").debug("unseen")
-    text = path.read_text()
-    assert text.startswith("before\n")
-    assert "after" in text
-    assert "unseen" not in text
-
-
-@pytest.mark.usefixtures("restored_logging")
 def test_a_name_that_is_no_text_is_logged_too(tmp_path: Path) -> None:
     path = tmp_path / "log"
     daemon.log_to_file(str(path), logging.INFO)
     logging.getLogger("mavftpfs").info("%s stays where it is", os.fsdecode(b"/spool/\xff"))
     assert path.read_text().endswith("/spool/\\udcff stays where it is\n")
-
-
-@pytest.mark.parametrize("text", ["cannot open /tmp/b'ü'", "no b'\\x' here", "b'one\ntwo'"])
-def test_what_only_looks_like_a_name_is_left_alone(text: str) -> None:
-    assert readable(text) == text
 
 
 def test_what_a_terminal_would_obey_is_shown_by_no_message() -> None:

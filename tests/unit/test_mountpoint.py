@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import os
-import subprocess
 from pathlib import Path
 
 import pytest
@@ -16,7 +15,6 @@ from mavftpfs.mountpoint import (
     check_mountpoint,
     is_ours,
     mounts,
-    stderr_of,
     unmount,
     unmount_what_is_left,
 )
@@ -97,26 +95,9 @@ def test_canonical_follows_links(tmp_path: Path) -> None:
     assert canonical(f"{tmp_path}/link/new") == f"{tmp_path}/real/new"
 
 
-def test_stderr_is_caught_from_children_and_given_back(capfd: pytest.CaptureFixture[str]) -> None:
-    with stderr_of() as said:
-        subprocess.run(["sh", "-c", "echo fuse: bad thing >&2; echo second >&2"], check=True)
-        assert said() == "bad thing"
-    os.write(2, b"after\n")
-    assert capfd.readouterr().err == "after\n"
-
-
 def test_what_somebody_else_has_unmounted_is_gone(tmp_path: Path) -> None:
     """After `fusermount3 -u` a mount ended with 3, `Invalid argument`, if a thread of it was still busy."""
     unmount_what_is_left(str(tmp_path))
-
-
-def test_what_is_still_mounted_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    program = tmp_path / "fusermount3"
-    program.write_text("#!/bin/sh\necho 'fusermount3: not permitted' >&2\nexit 1\n")
-    program.chmod(0o755)
-    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
-    with pytest.raises(MountFailed, match="not permitted"):
-        unmount_what_is_left("/")
 
 
 def test_what_is_busy_for_a_moment_is_unmounted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

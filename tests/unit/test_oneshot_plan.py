@@ -10,8 +10,9 @@ from mavftpfs.oneshot import fetch
 from mavftpfs.oneshot.fetch import Log, Step, Verify
 from mavftpfs.oneshot.files import same_link
 from mavftpfs.oneshot.names import parse_paths
-from mavftpfs.oneshot.scan import describe_peer, firmware, unique_id
+from mavftpfs.oneshot.scan import describe_peer
 from mavftpfs.oneshot.verbs import parse_date
+from mavftpfs.report import version_facts
 from mavftpfs.shared.errors import UsageError
 
 MAY, JUNE = 1_714_566_896, 1_717_245_296
@@ -35,11 +36,6 @@ MAY, JUNE = 1_714_566_896, 1_717_245_296
 )
 def test_what_to_do_about_a_file_of_100_bytes(here: int | None, part: int | None, step: Step) -> None:
     assert fetch.decide(100, here, part) is step
-
-
-def test_an_empty_file_that_is_here_is_skipped() -> None:
-    assert fetch.decide(0, 0, None) is Step.SKIP
-    assert fetch.decide(0, None, None) is Step.FETCH
 
 
 @pytest.mark.parametrize(
@@ -156,7 +152,7 @@ def test_what_a_heartbeat_says(kind: int, component: int, autopilot: int, mode: 
 )
 def test_firmware_and_board(number: int, words: str) -> None:
     version = AutopilotVersion(Address(1, 1), 0, number, b"", 0x1234, bytes(18))
-    assert firmware(version) == words
-    assert unique_id(version) == "0000000000001234"
-    assert unique_id(AutopilotVersion(Address(1, 1), 0, number, b"", 1, b"\1" * 18)) == "01" * 18
-    assert unique_id(AutopilotVersion(Address(1, 1), 0, number, b"", 0, bytes(18))) is None
+    assert version_facts(version)["firmware"] == words
+    assert version_facts(version)["uid"] == "0000000000001234"
+    assert version_facts(AutopilotVersion(Address(1, 1), 0, number, b"", 1, b"\1" * 18))["uid"] == "01" * 18
+    assert version_facts(AutopilotVersion(Address(1, 1), 0, number, b"", 0, bytes(18)))["uid"] is None

@@ -41,25 +41,6 @@ def test_five_wait_and_the_sixth_is_dropped_silently() -> None:
     assert c.server.firmware.dropped_requests == 3
 
 
-def test_the_worker_waits_for_room_and_nothing_else_happens() -> None:
-    c = big("ardupilot", 10_000)
-    room = 0
-    c.server.firmware.tx_room = lambda: room
-    c.send(Opcode.READ_FILE, session=7, size=100)
-    c.send(Opcode.NONE, session=7)
-    assert c.receive(100.0) == []
-    room = 1000
-    assert [p.req_opcode for p in c.receive(0.01)] == [Opcode.READ_FILE, Opcode.NONE]
-
-
-def test_a_checksum_holds_up_the_queue() -> None:
-    c = big("ardupilot5", 400_000)
-    c.send(Opcode.CALC_FILE_CRC32, A, session=8)
-    c.send(Opcode.NONE, session=8)
-    assert c.receive(0.99) == []
-    assert len(c.receive(0.1)) == 2
-
-
 # -- sessions, generation A ----------------------------------------------------------------------
 
 
@@ -127,29 +108,6 @@ def test_the_last_reply_of_the_server_is_replayed_exactly(profile: str) -> None:
     assert nak(again) == bytes([NakCode.FILE_EXISTS])
 
 
-def test_generation_b_does_not_replay_what_starts_with_five() -> None:
-    for profile, replays in (("ardupilot", 1), ("ardupilot5", 0)):
-        c = Client(profile)
-        c.open(FIVE, session=1)
-        assert ack(c.ask(Opcode.READ_FILE, session=1, size=1)) == b"\x05"
-        c.ask(Opcode.READ_FILE, session=1, size=1, seq=c.seq)
-        assert c.server.firmware.replays == replays
-
-
-# -- bursts --------------------------------------------------------------------------------------
-
-
-def summary(c: Client, size: int) -> list[tuple[int, int, int, int]]:
-    replies = c.ask_all(Opcode.BURST_READ_FILE, session=7, size=size, wait=60.0)
-    return [(p.opcode, p.offset, p.size, p.burst_complete) for p in replies[-2:]]
-
-
-def test_the_end_of_a_burst_in_generation_c() -> None:
-    assert summary(big("ardupilot5", 300), 200) == [(128, 200, 100, 0), (129, 300, 1, 1)]
-    assert summary(big("ardupilot5", 400), 200) == [(128, 200, 200, 0), (129, 400, 1, 1)]
-    assert summary(big("ardupilot5", 50_000), 20)[-1] == (128, 1999 * 20, 20, 1)
-
-
 # -- paths and listings --------------------------------------------------------------------------
 
 
@@ -177,36 +135,7 @@ def test_listings_of_generation_b_leave_out_tabs_and_tell_even_seconds() -> None
     assert timed == b"Ffile\t3\t1000\0Dsub\t0\t1000\0S\0"
 
 
-def test_a_name_too_long_ends_the_listing_or_is_dropped() -> None:
-    tree = MemoryTree()
-    tree.set_order(b"/", [b"before", b"n" * 240, b"after", b".", b".."])
-    for name in (b"before", b"n" * 240, b"after"):
-        tree.add(b"/" + name)
-    c = Client("ardupilot", tree, root_hides_files=False, virtual_trees=False)
-    assert c.listing(b"/") == b"Fbefore\t0\0\0"
-    assert nak(c.ask(Opcode.LIST_DIRECTORY, b"/", offset=1)) == EOF
-    assert c.listing(b"/", 2) == b"D.\0\0D..\0\0", "offsets count only what would fit"
-    c = Client("ardupilot5", tree, virtual_trees=False)
-    assert c.listing(b"/") == b"Fbefore\t0\0Fafter\t0\0"
-
-
-def test_unknown_opcodes() -> None:
-    for profile, code in (("ardupilot5", 7), ("littlefs", 1)):
-        for opcode in (77, Opcode.TRUNCATE_FILE):
-            assert nak(Client(profile).ask(opcode, A)) == bytes([code])
-    assert nak(Client("littlefs").ask(Opcode.LIST_DIRECTORY_WITH_TIME, b"/fs")) == FAIL
-
-
 # -- changing things -----------------------------------------------------------------------------
-
-
-def test_one_unlink_for_both() -> None:
-    c = Client("ardupilot")
-    ack(c.ask(Opcode.REMOVE_FILE, DIR))
-    ack(c.ask(Opcode.REMOVE_DIRECTORY, FIVE))
-    for profile, number in (("ardupilot", errno.EISDIR), ("ardupilot5", errno.EACCES), ("littlefs", 90)):
-        refused = Client(profile).ask(Opcode.REMOVE_DIRECTORY, b"/fs/microsd")
-        assert nak(refused) == bytes([NakCode.FAIL_ERRNO, number])
 
 
 def test_renaming_onto_a_file() -> None:
@@ -231,24 +160,6 @@ def test_fat_folds_case_and_drops_dots_and_blanks_at_the_end() -> None:
     assert nak(Client("littlefs").ask(Opcode.OPEN_FILE_RO, b"/FS/microsd/a.bin")) == NOT_FOUND
 
 
-def test_write_only_creates_since_generation_b() -> None:
-    assert nak(Client("ardupilot").ask(Opcode.OPEN_FILE_WO, b"/new")) == NOT_FOUND
-    c = Client("ardupilot5")
-    assert ack(c.open(b"/new", Opcode.OPEN_FILE_WO)) == b""
-    assert ack(c.ask(Opcode.WRITE_FILE, b"abc", offset=2)) == b""
-    assert isinstance(c.tree, MemoryTree)
-    assert len(c.tree.data(b"/new")) == 5
-    assert c.tree.data(b"/new")[2:] == b"abc"
-
-
-def test_gaps_hold_what_the_card_held() -> None:
-    c = Client("ardupilot5")
-    c.open(b"/new", Opcode.CREATE_FILE)
-    ack(c.ask(Opcode.WRITE_FILE, b"end", offset=1000))
-    assert isinstance(c.tree, MemoryTree)
-    assert any(c.tree.data(b"/new")[:1000])
-
-
 def test_a_full_card_is_acked_in_part_and_then_eio() -> None:
     tree = MemoryTree(capacity=300)
     c = Client("ardupilot5", tree)
@@ -258,14 +169,3 @@ def test_a_full_card_is_acked_in_part_and_then_eio() -> None:
     full = bytes([NakCode.FAIL_ERRNO, errno.EIO])
     assert nak(c.ask(Opcode.WRITE_FILE, b"x", offset=300)) == full
     assert nak(c.ask(Opcode.WRITE_FILE, b"")) == full, "and so is a write of nothing"
-
-
-def test_reboot_forgets_sessions_queue_and_slot() -> None:
-    c = big("ardupilot", 100)
-    c.ask(Opcode.CREATE_DIRECTORY, b"/x", session=7)
-    seq = c.seq
-    c.send(Opcode.NONE, session=7)
-    c.server.reboot(c.now)
-    assert c.receive(1.0) == []
-    assert c.server.open_sessions == 0
-    assert nak(c.ask(Opcode.CREATE_DIRECTORY, b"/x", session=7, seq=seq)) == bytes([NakCode.FILE_EXISTS])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import random
-from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -68,18 +67,6 @@ def test_half_duplex_shares_the_air_in_turn() -> None:
     assert link.counters(UP).delivered == 3
 
 
-def test_jitter_keeps_the_order_and_reorder_does_not() -> None:
-    frames = [bytes([i]) for i in range(200)]
-    for reorder in (0.0, 0.2):
-        link = model(jitter=0.01, reorder=reorder)
-        for i, frame in enumerate(frames):
-            link.push(UP, frame, i / 1000)
-        got = [frame for _, frame in drain(link, UP, 0.2)]
-        assert sorted(got) == frames
-        assert (got == frames) is (reorder == 0.0)
-        assert (link.counters(UP).reordered > 0) is (reorder > 0)
-
-
 @pytest.mark.parametrize(
     ("fields", "size", "low", "high"),
     [
@@ -109,21 +96,6 @@ def test_frames_beyond_a_limit_never_arrive() -> None:
         link.push(UP, frame, 0.0)
     assert [len(frame) for frame in link.pop(UP, 1.0)] == [99, 100, 1]
     assert link.counters(UP).lost == 1
-
-
-def test_burst_loss_comes_in_runs() -> None:
-    def runs(**fields: float) -> float:
-        link = model(**fields)
-        arrived = set()
-        for i in range(5000):
-            link.push(UP, i.to_bytes(2, "little"), float(i))
-            arrived.update(link.pop(UP, float(i)))
-        missing = [i.to_bytes(2, "little") not in arrived for i in range(5000)]
-        starts = sum(b and not a for a, b in zip([False, *missing], missing, strict=False))
-        return sum(missing) / starts
-
-    assert runs(burst_loss=0.1) > 5
-    assert runs(loss=0.1) < 1.5
 
 
 def test_a_cut_loses_what_is_on_the_way() -> None:
@@ -193,22 +165,3 @@ def test_every_frame_is_accounted_for_and_runs_repeat(
         assert c.pushed + c.duplicated == c.dropped + c.lost + c.cut + c.delivered + link.pending(side)
         assert link.pending(side) == 0
     assert run(LinkModel(random.Random(seed), chosen), pushes) == heard
-
-
-@settings(max_examples=40, deadline=None)
-@given(LINKS, PUSHES)
-def test_a_link_is_never_faster_than_its_rate(
-    chosen: LinkSettings, pushes: list[tuple[Direction, bytes, float]]
-) -> None:
-    calm = replace(
-        chosen, queue=50_000, duplicate=0.0, loss=0.0, burst_loss=0.0, delay=0.0, jitter=0.0, cuts=()
-    )
-    link = LinkModel(random.Random(0), calm)
-    heard = run(link, [(direction, frame, 0.0) for direction, frame, _ in pushes])
-    if calm.rate is None or not heard:
-        return
-    lanes = [list(Direction)] if calm.duplex is Duplex.HALF else [[side] for side in Direction]
-    for lane in lanes:
-        total = sum(len(frame) for _, side, frame in heard if side in lane)
-        last = max((when for when, side, _ in heard if side in lane), default=0.0)
-        assert total <= calm.rate * last * (1 + 1e-9)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import struct
 from typing import Any
 
 import pytest
@@ -76,51 +75,3 @@ def test_the_last_write_stays_in_a_buffer_until_terminate() -> None:
     assert c.tree.data(A) == b"abc"
     ack(c.ask(Opcode.TERMINATE_SESSION))
     assert c.tree.data(A) == b"abcdef"
-
-
-def test_a_full_disk_shows_late_or_never() -> None:
-    tree = MemoryTree(capacity=100)
-    c = Client("mavsdk", tree)
-    c.open(b"/new", Opcode.CREATE_FILE)
-    ack(c.ask(Opcode.WRITE_FILE, bytes(150)))
-    assert nak(c.ask(Opcode.WRITE_FILE, bytes(10), offset=150)) == FAIL
-    ack(c.ask(Opcode.TERMINATE_SESSION))
-    c.open(b"/new", Opcode.CREATE_FILE)
-    ack(c.ask(Opcode.WRITE_FILE, bytes(150)))
-    ack(c.ask(Opcode.TERMINATE_SESSION))
-    assert tree.stat(b"/new").size == 100
-
-
-# -- bursts --------------------------------------------------------------------------------------
-
-
-def test_old_versions_burst_to_the_end_of_the_file() -> None:
-    c = big(100_000, "mavsdk-old")
-    replies = c.ask_all(Opcode.BURST_READ_FILE, size=239, wait=10.0)
-    assert len(replies) == 419
-    assert [p.burst_complete for p in replies] == [0] * 418 + [1]
-
-
-# -- paths ---------------------------------------------------------------------------------------
-
-
-def test_a_name_too_long_hides_the_rest() -> None:
-    tree = MemoryTree()
-    tree.set_order(b"/", [b"before", b"n" * 236, b"after"])
-    for name in (b"before", b"n" * 236, b"after"):
-        tree.add(b"/" + name)
-    c = Client("mavsdk", tree)
-    assert c.listing(b"/") == b"Fbefore\t0\0"
-    assert nak(c.ask(Opcode.LIST_DIRECTORY, b"/", offset=1)) == EOF
-
-
-def test_a_checksum_blocks_the_handler() -> None:
-    tree = MemoryTree()
-    tree.add(b"/digits", b"123456789")
-    c = Client("mavsdk", tree, crc_rate=9.0)
-    c.send(Opcode.CALC_FILE_CRC32, b"/digits")
-    c.send(Opcode.RESET_SESSIONS)
-    assert c.receive(0.99) == []
-    crc, reset = c.receive(0.02)
-    assert crc.data == struct.pack("<I", 0x2DFD2D88)
-    assert reset.req_opcode == Opcode.RESET_SESSIONS

@@ -5,8 +5,6 @@ from __future__ import annotations
 import errno
 import struct
 
-import pytest
-
 from mavftpfs.protocol.payload import NakCode, Opcode, crc32
 from mavftpfs.sim.pseudo import VirtualTrees, pack_parameters
 from tests.support.sim_client import Client, ack, nak
@@ -49,44 +47,3 @@ def test_the_claimed_parameter_size_and_the_checksum_match_no_download() -> None
     checksum = struct.unpack("<I", ack(c.ask(Opcode.CALC_FILE_CRC32, PARAM)))[0]
     assert checksum == crc32(pack_parameters(virtual.params, 64))
     assert checksum != crc32(pack_parameters(virtual.params, 239))
-
-
-def test_four_handles_at_a_time() -> None:
-    c = Client("ardupilot5")
-    for session in range(4):
-        c.open(PARAM, session=session)
-    refused = c.ask(Opcode.OPEN_FILE_RO, PARAM, session=9)
-    assert nak(refused) == bytes([NakCode.FAIL_ERRNO, errno.ENFILE])
-    ack(c.ask(Opcode.TERMINATE_SESSION, session=0))
-    c.open(PARAM, session=9)
-
-
-def upload(profile: str, path: bytes, data: bytes) -> tuple[Client, VirtualTrees, int]:
-    virtual = VirtualTrees()
-    c = Client(profile, virtual=virtual)
-    c.open(path, Opcode.CREATE_FILE, session=1)
-    ack(c.ask(Opcode.WRITE_FILE, data, session=1))
-    return c, virtual, c.ask(Opcode.TERMINATE_SESSION, session=1).opcode
-
-
-def test_an_upload_is_judged_when_it_is_closed() -> None:
-    good = struct.pack("<HHH", 0x671B, 0, 6)
-    bad = struct.pack("<HHH", 0x671B, 0, 7)
-    for profile, refusal in (("ardupilot", Opcode.ACK), ("ardupilot5", Opcode.NAK)):
-        _, virtual, opcode = upload(profile, PARAM, good)
-        assert (virtual.uploads, opcode) == ({PARAM: good}, Opcode.ACK)
-        _, virtual, opcode = upload(profile, PARAM, bad)
-        assert (virtual.uploads, opcode) == ({}, refusal)
-    mission = struct.pack("<HHHHH", 0x763D, 0, 0, 0, 1) + bytes(38)
-    assert upload("ardupilot5", b"@MISSION/mission.dat", mission)[2] == Opcode.ACK
-    assert upload("ardupilot5", b"@MISSION/mission.dat", mission[:-1])[2] == Opcode.NAK
-    assert upload("ardupilot5", b"@MISSION/mission.dat", b"")[2] == Opcode.NAK
-
-
-@pytest.mark.parametrize("opcode", [Opcode.CREATE_DIRECTORY, Opcode.REMOVE_FILE, Opcode.REMOVE_DIRECTORY])
-def test_nothing_else_can_be_changed(opcode: int) -> None:
-    refused = bytes([NakCode.FAIL_ERRNO, errno.EROFS])
-    c = Client("ardupilot")
-    assert nak(c.ask(opcode, b"@SYS/x")) == refused
-    assert nak(c.ask(Opcode.RENAME, b"@SYS/tasks.txt\0/x")) == refused
-    assert nak(c.ask(Opcode.RENAME, b"/fs\0@SYS/x")) == refused

@@ -10,7 +10,7 @@ import pytest
 
 from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.sim.tree import MemoryTree
-from tests.support.sim_client import Client, ack, nak, small_tree
+from tests.support.sim_client import Client, ack, nak
 
 A = b"/fs/microsd/a.bin"
 FIVE = b"/fs/microsd/five"
@@ -53,41 +53,7 @@ def test_a_burst_does_not_keep_its_session_alive() -> None:
     assert c.now - sent_at > 10
 
 
-def test_reboot_forgets_what_waited_and_starts_its_ticks_anew() -> None:
-    c = client("px4-nuttx", stall_chance=1.0)
-    c.open(A)
-    for _ in range(100):
-        c.send(Opcode.READ_FILE, size=100)
-    dropped = c.server.firmware.dropped_requests
-    assert dropped > 0
-    c.now += 0.005
-    c.server.reboot(c.now)
-    assert c.receive(60.0) == []
-    ack(c.ask(Opcode.NONE))
-    for _ in range(dropped):
-        c.send(Opcode.NONE)
-    assert c.server.firmware.dropped_requests == dropped, "the receive buffer is empty again"
-    c.receive(1.0)
-    assert nak(c.ask(Opcode.BURST_READ_FILE)) == bytes([NakCode.EOF]), "and no file has a size"
-
-
 # -- the replay slot -----------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("path", [b"/fs/microsd/size5", FIVE])
-def test_an_ack_that_starts_with_five_is_not_cached(path: bytes) -> None:
-    """Open of a file whose size ends in 5: the retry is executed, and there is no session left."""
-    tree = small_tree()
-    tree.add(b"/fs/microsd/size5", bytes(256 + 5))
-    c = client(tree=tree)
-    c.open(path)
-    again = c.ask(Opcode.OPEN_FILE_RO, path, seq=c.seq)
-    if path == FIVE:
-        assert ack(again) == b"\1\0\0\0"
-        assert ack(c.ask(Opcode.READ_FILE, size=4)) == b"\x05"
-        assert nak(c.ask(Opcode.READ_FILE, session=1, seq=c.seq)) == bytes([NakCode.INVALID_SESSION])
-    else:
-        assert nak(again) == bytes([NakCode.NO_SESSIONS_AVAILABLE])
 
 
 def test_after_a_burst_the_slot_lies_ahead_of_the_client() -> None:
@@ -99,9 +65,6 @@ def test_after_a_burst_the_slot_lies_ahead_of_the_client() -> None:
     stale = c.ask(Opcode.TERMINATE_SESSION, seq=c.seq + 1)
     assert (stale.req_opcode, stale.opcode) == (Opcode.BURST_READ_FILE, Opcode.NAK)
     assert c.server.open_sessions == 1
-
-
-# -- errno ---------------------------------------------------------------------------------------
 
 
 # -- listings ------------------------------------------------------------------------------------
@@ -118,17 +81,6 @@ def test_nuttx_folds_case_and_drops_the_dot_of_short_names_only() -> None:
     other_case = (b"Short", b"Up.txt", b"mixed", b"MIXED", b"LONGER-THAN-8", b"E.HTML", b"A+B")
     for name in (*other_case, b"Mixed.", b"longer-than-8.", b"short ", b"short.."):
         assert nak(c.ask(Opcode.OPEN_FILE_RO, b"/fs/microsd/" + name)) == bytes([NakCode.FILE_NOT_FOUND])
-
-
-def test_a_name_too_long_for_a_page_blocks_the_rest() -> None:
-    tree = MemoryTree()
-    tree.set_order(b"/", [b"before", b"n" * 236, b"after", b".", b".."])
-    for name in (b"before", b"n" * 236, b"after"):
-        tree.add(b"/" + name)
-    c = client(tree=tree)
-    assert c.listing(b"/") == b"Fbefore\t0\0"
-    assert c.listing(b"/", 1) == b""
-    assert c.listing(b"/", 2) == b"Fafter\t0\0S\0S\0"
 
 
 def test_listing_with_time_is_data() -> None:
@@ -153,21 +105,6 @@ def burst_client(size: int, **changes: Any) -> Client:
     return made
 
 
-@pytest.mark.parametrize(("room", "packets"), [(1500, 5), (600, 2), (500, 1), (200, 0)])
-def test_the_transmit_buffer_paces_a_burst(room: int, packets: int) -> None:
-    c = burst_client(100_000)
-    c.server.firmware.tx_room = lambda: room
-    c.send(Opcode.BURST_READ_FILE, size=239)
-    assert [len(c.receive(0.01)) for _ in range(3)] == [packets] * 3
-
-
-def test_a_packet_alone_in_its_tick_may_claim_to_be_the_last() -> None:
-    c = burst_client(34_000, garbage_complete=1.0)
-    c.server.firmware.tx_room = lambda: 500
-    first, second, third = c.ask_all(Opcode.BURST_READ_FILE, size=239, wait=0.03)
-    assert (first.burst_complete, second.burst_complete, third.offset) == (1, 1, 478)
-
-
 def test_a_file_that_shrank_floods_empty_packets() -> None:
     c = burst_client(100_000)
     c.tree.truncate(A, 239)
@@ -176,13 +113,6 @@ def test_a_file_that_shrank_floods_empty_packets() -> None:
     assert {p.size for p in replies[1:]} == {0}
     assert {p.offset for p in replies[1:]} == {239}
     assert c.ask_all(Opcode.READ_FILE, size=10, offset=500, wait=0.0)[0].size == 0
-
-
-def test_replies_without_room_are_lost() -> None:
-    c = burst_client(1000)
-    c.server.firmware.tx_room = lambda: 20
-    assert c.ask_all(Opcode.READ_FILE, size=100) == []
-    assert c.server.firmware.dropped_replies == 1
 
 
 # -- writing -------------------------------------------------------------------------------------
@@ -253,14 +183,3 @@ def test_a_slow_card_loses_what_does_not_fit_the_receive_buffer() -> None:
     answered = c.receive(120.0)
     assert len(answered) == 80 - c.server.firmware.dropped_requests
     assert [p.offset for p in answered] == list(range(len(answered)))
-
-
-def test_a_checksum_takes_time_and_what_follows_waits() -> None:
-    tree = MemoryTree()
-    tree.add(A, b"123456789" * 20_000)
-    c = Client("px4-nuttx", tree, stall_chance=0.0)
-    c.send(Opcode.CALC_FILE_CRC32, A)
-    c.send(Opcode.NONE)
-    assert c.receive(0.2) == []
-    crc, none = c.receive(0.2)
-    assert (crc.req_opcode, none.req_opcode) == (Opcode.CALC_FILE_CRC32, Opcode.NONE)

@@ -48,14 +48,6 @@ def test_paths_are_forgiving_but_stay_below_the_root(tree: Tree, path: bytes) ->
     assert get(tree, path) == b"0123456789"
 
 
-def test_removed_file_stays_readable_while_open(tree: Tree) -> None:
-    opened = tree.open(b"/file")
-    tree.remove(b"/file")
-    assert opened.read(2, 3) == b"234"
-    opened.close()
-    assert failure(lambda: tree.open(b"/file")) == errno.ENOENT
-
-
 @pytest.mark.parametrize(
     ("call", "number"),
     [
@@ -137,19 +129,3 @@ def test_memory_tree_capacity_is_shared_and_given_back() -> None:
     assert tree.used == 10
     opened.resize(1)
     assert tree.used == 1
-
-
-def test_memory_tree_tells_times_and_order() -> None:
-    times = iter(range(1, 100))
-    tree = MemoryTree(clock=lambda: float(next(times)))
-    tree.add(b"/old", mtime=5)
-    tree.add(b"/file", b"x")
-    before = tree.stat(b"/file").mtime
-    opened = tree.open(b"/file", write=True)
-    opened.write(0, b"y")
-    assert tree.stat(b"/file").mtime > before
-    assert tree.stat(b"/old").mtime == 5
-    tree.set_order(b"/", [b"..", b"later", b"file"])
-    assert [entry.name for entry in tree.entries(b"/")] == [b"..", b"file", b".", b"old"]
-    tree.add(b"/later")
-    assert [entry.name for entry in tree.entries(b"/")] == [b"..", b"later", b"file", b".", b"old"]

@@ -13,7 +13,6 @@ from mavftpfs.link.messages import (
     FtpRun,
     Heartbeat,
     Message,
-    Other,
     SystemTime,
 )
 from mavftpfs.protocol.payload import Opcode, decode_reply, request
@@ -88,36 +87,6 @@ def test_answers_requests_meant_for_it(profile: str, target: Address, answers: b
     assert [(r.source, r.target) for r in replies] == ([(DRONE, US)] if answers else [])
     if answers:
         assert decode_reply(replies[0].payloads[0]).req_opcode == Opcode.LIST_DIRECTORY
-
-
-@pytest.mark.parametrize("rate", [200.0, 3000.0])
-def test_telemetry_keeps_its_rate(rate: float) -> None:
-    client = Client(telemetry=rate)
-    client.hear()
-    sizes = 0
-    for _ in range(60):
-        deadline = client.now + 1
-        while (due := client.vehicle.next_deadline()) <= deadline:
-            client.now = due
-            sizes += sum(len(f) for f in client.vehicle.outgoing(due) if f[7] not in (0, 2))
-    assert sizes / 60 == pytest.approx(rate, rel=0.05)
-
-
-def test_ardupilot_slows_its_telemetry_during_ftp() -> None:
-    def counts(profile: str) -> tuple[int, int]:
-        client = Client(profile, telemetry=2000.0)
-        client.hear()
-        quiet = len(of(Other, client.hear(5)))
-        busy = 0
-        for _ in range(10):
-            client.tell(client.framer.encode_ftp(DRONE, LIST))
-            busy += len(of(Other, client.hear(0.5)))
-        return quiet, busy
-
-    quiet, busy = counts("ardupilot")
-    assert busy < quiet / 3
-    quiet, busy = counts("px4")
-    assert busy == pytest.approx(quiet, rel=0.1)
 
 
 def test_reboot_loses_time_arming_and_sessions_but_no_files() -> None:
