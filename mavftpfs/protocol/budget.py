@@ -36,19 +36,6 @@ class Budget:
         held: somebody wanted to send and was not allowed to, since `begin`.
     """
 
-    __slots__ = (
-        "_at",
-        "_balance",
-        "_debt",
-        "_depth",
-        "_left",
-        "_lent",
-        "_overhead",
-        "_wanted",
-        "held",
-        "rate",
-    )
-
     def __init__(self, rate: float, overhead: int = FRAME_OVERHEAD) -> None:
         self.rate = rate
         self.held = False

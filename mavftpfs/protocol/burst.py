@@ -36,26 +36,6 @@ _BARREN_BURSTS = 2
 class Burst:
     """State of the running burst. start: offset asked for. size: of the file. asked: bytes per packet."""
 
-    __slots__ = (
-        "asked",
-        "complete_seen",
-        "empties",
-        "failures",
-        "first_at",
-        "highest",
-        "interval",
-        "last_at",
-        "nak",
-        "over",
-        "packet",
-        "packets",
-        "rto",
-        "sent_at",
-        "seq",
-        "size",
-        "start",
-    )
-
     def __init__(self, seq: int, start: int, size: int, asked: int, now: float, rto: float) -> None:
         self.seq = seq
         self.start = start

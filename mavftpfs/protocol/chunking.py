@@ -46,20 +46,6 @@ class ChunkSize:
         LocalProtocolError: a fixed size that is not within 1..239.
     """
 
-    __slots__ = (
-        "_answered",
-        "_first_lost_at",
-        "_least",
-        "_lost",
-        "_short_until",
-        "_shortest_lost",
-        "_since",
-        "_turn",
-        "most",
-        "size",
-        "trying",
-    )
-
     def __init__(self, fixed: int | None = None) -> None:
         if fixed is not None and not 1 <= fixed <= MAX_DATA:
             raise LocalProtocolError(f"a chunk of {fixed} bytes is not within 1..{MAX_DATA}")

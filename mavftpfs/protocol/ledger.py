@@ -43,8 +43,6 @@ class DuplicateDetector:
     Answers are known by their seq, which is the request's plus one.
     """
 
-    __slots__ = ("_expected", "_sent")
-
     def __init__(self) -> None:
         self._expected: dict[int, int] = {}
         self._sent: dict[int, float] = {}
@@ -103,20 +101,6 @@ class Ledger:
         reorder: how many transmissions later an answer must be to prove a loss; grows when that was wrong.
         duplicates: knows which answers that nobody waits for are due to repetitions of ours.
     """
-
-    __slots__ = (
-        "_seq",
-        "_table",
-        "again",
-        "duplicates",
-        "find",
-        "first",
-        "flying",
-        "ghost",
-        "newest_answered",
-        "order",
-        "reorder",
-    )
 
     def __init__(self, next_seq: int) -> None:
         self._seq = next_seq

@@ -54,33 +54,6 @@ class Pacer:
         window: the most that may be in flight.
     """
 
-    __slots__ = (
-        "_answered",
-        "_base_loss",
-        "_base_rtt",
-        "_best",
-        "_doubted",
-        "_from",
-        "_hold_until",
-        "_least_rtt",
-        "_limit",
-        "_limited",
-        "_longer",
-        "_lost",
-        "_raise",
-        "_seen",
-        "_sent_at",
-        "_since",
-        "_starved",
-        "_tokens",
-        "_tokens_at",
-        "_urgent_at",
-        "blocked",
-        "queue",
-        "rate",
-        "window",
-    )
-
     def __init__(self, queue: int, limit: int) -> None:
         self.queue = queue
         self._limit = limit

@@ -8,6 +8,7 @@ again under the *same* seq first, because PX4 and ArduPilot replay their last re
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from enum import IntEnum
 from math import inf
 from struct import Struct
@@ -71,6 +72,7 @@ class Transmission(NamedTuple):
     outrun: bool
 
 
+@dataclass(slots=True, eq=False)
 class Request:
     """What is asked, and what became of it so far.
 
@@ -78,62 +80,27 @@ class Request:
     seq, order, sent_at, single, outrun: of the present transmission (see Transmission).
     """
 
-    __slots__ = (
-        "aliases",
-        "data",
-        "first_sent",
-        "flying",
-        "follows",
-        "fresh_seq",
-        "manner",
-        "offset",
-        "op",
-        "opcode",
-        "order",
-        "outrun",
-        "replays",
-        "sends",
-        "sent_at",
-        "seq",
-        "session",
-        "single",
-        "size",
-        "timer",
-    )
-
+    op: Operation
+    opcode: int
+    manner: Manner
+    session: int
+    offset: int
+    size: int
+    data: bytes = b""
+    follows: bool = False
+    aliases: dict[int, Transmission] | None = None
+    flying: bool = False
+    fresh_seq: bool = False
+    sends: int = 0
+    replays: int = 0
+    single: bool = True
+    outrun: bool = False
     # Set by each transmission.
-    seq: int
-    order: int
-    sent_at: float
-    first_sent: float
-    timer: float
-
-    def __init__(
-        self,
-        op: Operation,
-        opcode: int,
-        manner: Manner,
-        session: int,
-        offset: int,
-        size: int,
-        data: bytes = b"",
-        follows: bool = False,
-    ) -> None:
-        self.op = op
-        self.opcode = opcode
-        self.manner = manner
-        self.session = session
-        self.offset = offset
-        self.size = size
-        self.data = data
-        self.follows = follows
-        self.aliases: dict[int, Transmission] | None = None
-        self.flying = False
-        self.fresh_seq = False
-        self.sends = 0
-        self.replays = 0
-        self.single = True
-        self.outrun = False
+    seq: int = field(init=False)
+    order: int = field(init=False)
+    sent_at: float = field(init=False)
+    first_sent: float = field(init=False)
+    timer: float = field(init=False)
 
     def fits(self, reply: Payload, traits: Traits) -> bool:
         """Whether this may be an answer to this request, whose seq and opcode it carries."""

@@ -54,8 +54,6 @@ class RttEstimator:
         floor: least timeout. first: the timeout before the first sample, if the floor is not more.
     """
 
-    __slots__ = ("_silences", "floor", "rto", "samples", "smoothed", "unfloored", "variation")
-
     def __init__(self, floor: float, first: float = INITIAL_RTO) -> None:
         self.floor = floor
         self._silences = 0
@@ -97,8 +95,6 @@ class RttEstimator:
 
 class Timers:
     """Round trips by family (see `requests.Manner`). of: the estimators, that of reads first."""
-
-    __slots__ = ("_at", "_manner", "_pace", "_sent_at", "of")
 
     def __init__(self) -> None:
         self.of = {
