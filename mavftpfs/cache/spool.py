@@ -26,8 +26,6 @@ from mavftpfs.shared.extents import ExtentSet
 
 log = logging.getLogger("mavftpfs.cache")
 
-PAGE = 64 * 1024
-
 
 class Spool:
     """The budget that all drafts share, in bytes.
@@ -81,11 +79,12 @@ class SpoolContent:
         """`name()`: the file's path on the vehicle, None once nobody wants it any more."""
         self._spool = spool
         self._name = name
-        self._pages: dict[int, bytearray] = {}
+        self._memory = bytearray()
         self._file: int | None = None
         self._path: Path | None = None
         self._stored = ExtentSet()
-        self._persisted = False
+        self._told: dict[str, Any] | None = None  # what is written down beside the file
+        self._durable = False
         self._settled = False
 
     def put(self, offset: int, data: bytes | memoryview) -> None:
@@ -95,10 +94,16 @@ class SpoolContent:
             NoSpace: the budget is used up, or the local disk is full. SpoolFailed: the local disk fails.
                 What was kept before is as it was.
         """
-        if self._file is None and self._put_in_memory(offset, memoryview(data)):
-            self._note_changed()
+        spool, memory = self._spool, self._memory
+        more = max(0, offset + len(data) - len(memory))
+        if self._file is None and spool.in_memory + more <= spool.memory_max():
+            if offset > len(memory):
+                memory.extend(bytes(offset - len(memory)))
+            memory[offset : offset + len(data)] = data
+            spool.in_memory += more
+            self._settled = False
             return
-        said = self._spool.full  # an attempt that fails frees what it had taken itself
+        said = spool.full  # an attempt that fails frees what it had taken itself
         try:
             self._spill()
             self._note_changed()
@@ -106,7 +111,7 @@ class SpoolContent:
         except NoSpace as error:
             if not said:  # to a program ENOSPC means the card
                 log.warning("no room here, not on the vehicle, for what is not delivered yet: %s", error)
-            self._spool.full = True
+            spool.full = True
             raise
 
     def get(self, start: int, stop: int) -> bytes:
@@ -115,20 +120,15 @@ class SpoolContent:
         Raises:
             SpoolFailed: the local disk does not give them back.
         """
-        if self._file is not None:
-            try:
-                data = os.pread(self._file, stop - start, start)
-            except OSError as exc:
-                raise SpoolFailed(f"cannot read {self._path}: {exc}") from exc
-            if len(data) != stop - start:
-                raise SpoolFailed(f"{self._path} lost bytes that were in it")
-            return data
-        parts = []
-        while start < stop:
-            index, at = divmod(start, PAGE)
-            parts.append(memoryview(self._pages[index])[at : min(PAGE, at + stop - start)])
-            start += len(parts[-1])
-        return b"".join(parts)
+        if self._file is None:
+            return bytes(self._memory[start:stop])
+        try:
+            data = os.pread(self._file, stop - start, start)
+        except OSError as exc:
+            raise SpoolFailed(f"cannot read {self._path}: {exc}") from exc
+        if len(data) != stop - start:
+            raise SpoolFailed(f"{self._path} lost bytes that were in it")
+        return data
 
     def cut(self, size: int) -> None:
         """Forget what lies at and beyond `size`; if it is extended again, zeros are there.
@@ -137,21 +137,18 @@ class SpoolContent:
             NoSpace, SpoolFailed: nothing changed.
         """
         self._note_changed()
-        if self._file is not None:
-            try:
-                os.ftruncate(self._file, min(size, os.fstat(self._file).st_size))
-            except OSError as exc:
-                raise SpoolFailed(f"cannot cut {self._path}: {exc}") from exc
-            before = self._stored.total
-            self._stored.discard(size, max(size, self._stored.end))
-            self._spool.on_disk += self._stored.total - before
+        if self._file is None:
+            before = len(self._memory)
+            del self._memory[size:]
+            self._spool.in_memory += len(self._memory) - before
             return
-        for index in [i for i in self._pages if i * PAGE >= size]:
-            del self._pages[index]
-            self._spool.in_memory -= PAGE
-        last = self._pages.get(size // PAGE)
-        if last is not None:
-            last[size % PAGE :] = bytes(PAGE - size % PAGE)
+        try:
+            os.ftruncate(self._file, min(size, os.fstat(self._file).st_size))
+        except OSError as exc:
+            raise SpoolFailed(f"cannot cut {self._path}: {exc}") from exc
+        before = self._stored.total
+        self._stored.discard(size, max(size, self._stored.end))
+        self._spool.on_disk += self._stored.total - before
 
     def settle(self) -> None:
         """The vehicle has all of it: until more is put the next mount need not offer it."""
@@ -160,11 +157,8 @@ class SpoolContent:
 
     def restate(self) -> None:
         """Its name changed, or nobody wants it any more: write that down; a failure is only logged."""
-        if self._path is None:
-            return
-        self._persisted = False
         try:
-            self._write_name(self._path)
+            self._write_down()
         except OSError as exc:
             log.warning("what %s is cannot be written down: %s", self._path, exc)
 
@@ -174,7 +168,7 @@ class SpoolContent:
         Raises:
             NoSpace, SpoolFailed, OSError.
         """
-        if self._persisted:
+        if self._durable:
             return
         self._spill()
         assert self._file is not None
@@ -182,69 +176,46 @@ class SpoolContent:
         os.ftruncate(self._file, facts["size"])
         os.fsync(self._file)
         write_facts(self._path, facts, durable=True)
-        self._persisted = True
+        self._told, self._durable = facts, True
 
     def close(self) -> None:
         """The vehicle has it, or nobody wants it: forget the bytes. Raises nothing."""
-        self._spool.in_memory -= len(self._pages) * PAGE
-        self._pages = {}
-        if self._file is None or self._path is None:
-            return
-        self._spool.on_disk -= self._stored.total
-        self._stored.clear()
-        try:
-            os.close(self._file)
-        except OSError as exc:
-            log.warning("closing %s: %s", self._path, exc)  # nobody needs its bytes any more
-        self._spool.remove_file(self._path)
-        self._file = self._path = None
+        self._spool.in_memory -= len(self._memory)
+        self._memory = bytearray()
+        self._drop_file()
 
     # --- inside
 
     def _note_changed(self) -> None:
         """Something of it is the vehicle's no longer: what is written down must not be less than true."""
-        before = (self._settled, self._persisted)
-        self._settled = self._persisted = False
-        if self._path is None or not any(before):
-            return
+        settled, self._settled = self._settled, False
         try:
-            self._write_name(self._path)
+            self._write_down()
         except OSError as exc:
-            self._settled, self._persisted = before  # else the next one would take it for written
+            self._settled = settled  # else the next one would take it for written
             raise disk_error(exc, self._path) from exc
 
-    def _write_name(self, data: Path) -> None:
-        name = self._name()
-        facts = {"path": name, "unfinished": True} if name and not self._settled else {"needed": False}
-        if name != "":
-            write_facts(data, facts, durable=False)
-
-    def _put_in_memory(self, offset: int, data: memoryview) -> bool:
-        """Return False, having kept nothing, if that is too much for memory."""
-        more = 0
-        for index in range(offset // PAGE, -(-(offset + len(data)) // PAGE)):
-            more += 0 if index in self._pages else PAGE
-        if self._spool.in_memory + more > self._spool.memory_max():
-            return False
-        self._spool.in_memory += more
-        while data:
-            index, at = divmod(offset, PAGE)
-            page = self._pages.get(index)
-            if page is None:
-                page = self._pages[index] = bytearray(PAGE)
-            count = min(len(data), PAGE - at)
-            page[at : at + count] = data[:count]
-            data, offset = data[count:], offset + count
-        return True
+    def _write_down(self) -> None:
+        """Have the text beside the file, if there is one, say what that is. Raises OSError."""
+        if self._path is None:
+            return
+        name = None if self._settled else self._name()
+        facts = {"needed": False} if name is None else {"path": name, "unfinished": True}
+        if facts != self._told:
+            write_facts(self._path, facts, durable=False)
+            self._told, self._durable = facts, False
 
     def _put_on_disk(self, offset: int, data: bytes | bytearray | memoryview) -> None:
         """Write what is new before what replaces something: a full disk refuses the former."""
         assert self._file is not None
         whole, stop, before = memoryview(data), offset + len(data), self._stored.total
-        new = self._stored.missing(offset, stop)
-        self._spool.require_disk(sum([b - a for a, b in new]))
+        old = self._stored.intersection(offset, stop)
+        more = len(data)
+        for a, b in old:
+            more -= b - a
+        self._spool.require_disk(more)
         try:
-            for a, b in [*new, *self._stored.intersection(offset, stop)]:
+            for a, b in [*self._stored.missing(offset, stop), *old]:
                 while a < b:
                     a += os.pwrite(self._file, whole[a - offset : b - offset], a)
         except OSError as exc:
@@ -260,22 +231,32 @@ class SpoolContent:
         """
         if self._file is not None:
             return
-        self._spool.require_disk(len(self._pages) * PAGE)
-        pages, path = self._pages, None
+        memory = self._memory
+        self._spool.require_disk(len(memory))
         try:
-            path = self._spool.new_file()
-            self._write_name(path)
-            self._file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
+            self._path = self._spool.new_file()
+            self._write_down()
+            self._file = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
         except OSError as exc:
-            if path is not None:
-                self._spool.remove_file(path)
+            self._drop_file()
             raise NoSpace(f"no local file for what waits for the vehicle: {exc}") from exc
-        self._path, self._pages = path, {}
         try:
-            for index, page in pages.items():
-                self._put_on_disk(index * PAGE, page)
+            self._put_on_disk(0, memory)
         except (NoSpace, SpoolFailed):
-            self.close()
-            self._pages = pages
+            self._drop_file()
             raise
-        self._spool.in_memory -= len(pages) * PAGE
+        self._memory = bytearray()
+        self._spool.in_memory -= len(memory)
+
+    def _drop_file(self) -> None:
+        self._spool.on_disk -= self._stored.total
+        self._stored.clear()
+        if self._file is not None:
+            try:
+                os.close(self._file)
+            except OSError as exc:
+                log.warning("closing %s: %s", self._path, exc)  # nobody needs its bytes any more
+        if self._path is not None:
+            self._spool.remove_file(self._path)
+        self._file = self._path = self._told = None
+        self._durable = False

@@ -13,7 +13,7 @@ from trio.testing import MockClock
 
 from mavftpfs.cache.kept_disk import FileKey, KeptDisk
 from mavftpfs.cache.recovery import SpoolDirectory
-from mavftpfs.cache.spool import PAGE, Spool, SpoolContent
+from mavftpfs.cache.spool import Spool, SpoolContent
 from mavftpfs.daemon import log_to_file
 from mavftpfs.farewell import keep_the_rest
 from mavftpfs.trace import JsonTrace, TlogWriter
@@ -63,7 +63,7 @@ def test_traces_and_logs_are_private_and_follow_no_link(
 def test_what_a_killed_mount_left_is_private(tmp_path: Path) -> None:
     state = tmp_path / "state"
     killed = SpoolDirectory(state / "spool" / "1-1", Random(1))
-    content = SpoolContent(Spool(memory_max=lambda: PAGE, spool_max=PAGE, directory=killed.path))
+    content = SpoolContent(Spool(memory_max=lambda: 65536, spool_max=65536, directory=killed.path))
     content.put(0, b"precious")
     content.persist({"path": "/card/a", "size": 8})
     assert exposed(state) == []

@@ -14,10 +14,13 @@ import pytest
 
 from mavftpfs.cache import spool as spooling
 from mavftpfs.cache.recovery import SLOTS, SpoolDirectory
-from mavftpfs.cache.spool import PAGE, Spool, SpoolContent
+from mavftpfs.cache.spool import Spool, SpoolContent
 from mavftpfs.shared.errors import NoSpace, SpoolFailed
 
 pytestmark = pytest.mark.holds("promise 3")
+
+
+PAGE = 64 * 1024
 
 
 def spool_of(tmp_path: Path, memory: int = 4 * PAGE, disk: int = 100 * PAGE) -> Spool:
@@ -82,7 +85,7 @@ def test_a_disk_that_fills_up_on_the_way_leaves_the_bytes_in_memory(
     def pwrite(descriptor: int, piece: bytes, offset: int) -> int:
         if next(calls) > 0:
             raise OSError(errno.ENOSPC, "full")
-        return really(descriptor, piece, offset)
+        return really(descriptor, piece[:PAGE], offset)
 
     monkeypatch.setattr(os, "pwrite", pwrite)
     with pytest.raises(NoSpace):
