@@ -253,6 +253,8 @@ class Store:
         async with self._changing(old, new, below=True, in_flight=completes):
             await self._perform(partial(Simple, Opcode.RENAME, data), partial(self._is_renamed, old, new))
             self._scheduler.on_renamed(old, new)
+        if old.lower() != new.lower():
+            self._changed_at.pop(new.lower(), None)  # nothing has the old name: a late copy is refused
 
     @asynccontextmanager
     async def _changing(

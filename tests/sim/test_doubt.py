@@ -169,6 +169,24 @@ async def test_a_name_is_not_changed_twice_while_the_first_may_come_late(
         assert copy.late >= 2.0
 
 
+@pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
+async def test_what_was_renamed_may_be_renamed_on_at_once(profile: str, autojump: MockClock) -> None:
+    """A late copy finds nothing under the old name. rsync renames each new file so: a second each."""
+    if profile == "littlefs":
+        return
+    here = world(profile, CLEAN, old=content(500, 1))
+    old, new, final = path(profile, "old"), path(profile, "new"), path(profile, "final")
+    async with here.connection() as connection:
+        connection.scheduler.doubt.raise_it("as if a copy had been late")
+        copy = Latecomer(here, Opcode.RENAME, after=Opcode.RENAME)
+        began = trio.current_time()
+        await connection.store.rename(old, new)
+        await connection.store.rename(new, final)
+        assert trio.current_time() - began < LEAST_LATE
+        assert copy.late is not None
+        assert here.tree.data(final) == content(500, 1)
+
+
 async def read_or_doubt(connection: Connection, target: bytes, expected: bytes) -> None:
     """Read a file; other bytes than its own are provisional by then."""
     sink = MemorySink(len(expected))
