@@ -27,9 +27,9 @@ from tests.support.worlds import World, content, path, read_file, world
 
 EVERY_PROFILE = sorted(PROFILES)
 
-BAD = LinkSettings(rate=60_000.0, delay=0.02, loss=0.1, duplicate=0.02, reorder=0.05)
+STRANGER = Address(255, 190)
 
-PLAIN = LinkSettings(rate=60_000.0, delay=0.02)
+BAD = LinkSettings(rate=60_000.0, delay=0.02, loss=0.1, duplicate=0.02, reorder=0.05)
 
 
 @pytest.mark.holds("rule 14.22")
@@ -42,18 +42,6 @@ async def test_what_is_on_the_card_is_what_was_given(profile: str, autojump: Moc
             await put(connection, path(profile, f"f{size}"), content(size, size))
             assert here.tree.data(path(profile, f"f{size}")) == content(size, size)
     assert here.vehicle.server.open_sessions == 0
-
-
-@pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
-async def test_a_small_file_costs_create_write_terminate(profile: str, autojump: MockClock) -> None:
-    here = world(profile)
-    async with here.connection() as connection:
-        await put(connection, path(profile, "small"), b"hello")
-        assert connection.engine.stats.by_opcode == {
-            Opcode.CREATE_FILE: 1,
-            Opcode.WRITE_FILE: 1,
-            Opcode.TERMINATE_SESSION: 1,
-        }
 
 
 @pytest.mark.parametrize("size", [SENT_TWICE + 1, 200_000])
@@ -85,12 +73,16 @@ async def reboot(here: World, connection: Connection) -> None:
 
 async def take_session(here: World, connection: Connection) -> None:
     """Another ground station terminates whatever it finds, as MAVSDK and QGroundControl do."""
-    session = connection.scheduler.server.session
-    assert session is not None
-    wire = request(77, Opcode.TERMINATE_SESSION, session=session.id).encode()
-    for source in (Address(255, 190), connection.vehicle.own):
-        here.vehicle.server.handle(wire, source, trio.current_time())
+    for source in (STRANGER, connection.vehicle.own):
+        steal(here, connection, source)
     here.link.kick()
+
+
+def steal(here: World, connection: Connection, source: Address = STRANGER) -> None:
+    """Have the session terminated; nobody hears it."""
+    session = connection.scheduler.server.session
+    wire = request(77, Opcode.TERMINATE_SESSION, session=session.id if session else 0).encode()
+    here.vehicle.server.handle(wire, source, trio.current_time())
 
 
 INTERRUPTIONS: dict[str, Callable[[World, Connection], Awaitable[None]]] = {
@@ -326,23 +318,6 @@ async def test_a_link_that_is_reopened_and_stays_silent_ends_the_wait(
             await upload.finish()
 
 
-@pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
-async def test_abort_leaves_nothing_open_and_asks_for_nothing(profile: str, autojump: MockClock) -> None:
-    here = world(profile, PLAIN)
-    async with here.connection() as connection:
-        source = MemorySource(content(60_000))
-        upload = await start(connection, profile, source)
-        await trio.sleep(1)
-        await upload.abort()
-        await upload.abort()
-        assert source.in_flight.empty
-        assert here.vehicle.server.open_sessions == 0
-        left = source.todo.total
-        await trio.sleep(5)
-        assert source.todo.total == left
-        assert upload not in connection.scheduler.users
-
-
 async def test_an_error_at_close_is_the_callers(autojump: MockClock) -> None:
     """ArduPilot with five sessions reports at Terminate that the card did not take the data."""
     here = world("ardupilot5", PLAIN)
@@ -413,16 +388,14 @@ async def test_a_server_that_always_loses_the_session_is_given_up(profile: str, 
     faults = Faults(here)
     async with here.connection() as connection:
 
-        async def steal() -> None:
-            for number in range(400):
-                session = connection.scheduler.server.session
-                if session is not None:
-                    wire = request(number, Opcode.TERMINATE_SESSION, session=session.id).encode()
-                    here.vehicle.server.handle(wire, connection.vehicle.own, trio.current_time())
+        async def steal_always() -> None:
+            while True:
+                if connection.scheduler.server.session is not None:
+                    steal(here, connection, connection.vehicle.own)
                 await trio.sleep(0.3)
 
         async with trio.open_nursery() as nursery:
-            nursery.start_soon(steal)
+            nursery.start_soon(steal_always)
             upload = await start(connection, profile, MemorySource(content(100_000)))
             with pytest.raises(MavftpfsError):
                 await upload.finish()
@@ -504,24 +477,6 @@ async def test_a_file_that_shrank_between_two_openings_is_sent_again(autojump: M
     assert here.tree.data(b"/d/new") == bytes(source.content)
 
 
-async def test_an_aborted_upload_gives_back_what_was_only_looked_at(autojump: MockClock) -> None:
-    here = world("px4", LinkSettings(rate=60_000.0, delay=0.3))
-    async with here.connection() as connection:
-        source = MemorySource(b"hello")
-        upload = await start(connection, "px4", source)
-        await trio.sleep(0.1)  # the open is under way
-        await upload.abort()
-        assert source.in_flight.empty
-        assert source.todo.total == 5
-    assert here.vehicle.server.open_sessions == 0
-
-
-def steal(here: World) -> None:
-    """Terminate the session of a PX4 as if by another client; nobody hears it."""
-    wire = request(77, Opcode.TERMINATE_SESSION, session=0).encode()
-    here.vehicle.server.handle(wire, Address(255, 190), trio.current_time())
-
-
 @pytest.mark.parametrize("probed", [False, True], ids=["unknown", "probed"])
 async def test_a_session_that_is_gone_at_the_end_proves_nothing(probed: bool, autojump: MockClock) -> None:
     here = world("px4", PLAIN)
@@ -531,7 +486,7 @@ async def test_a_session_that_is_gone_at_the_end_proves_nothing(probed: bool, au
             know(connection, "px4")
         source = MemorySource(content(3000))
         upload = await start(connection, "px4", source)
-        faults.at(Opcode.TERMINATE_SESSION, lambda: steal(here))
+        faults.at(Opcode.TERMINATE_SESSION, lambda: steal(here, connection))
         await upload.finish()
         assert source.rollbacks == [True]
         assert source.checkpoints == 1
@@ -573,35 +528,51 @@ async def test_only_what_was_not_proven_goes_again(autojump: MockClock) -> None:
         async with trio.open_nursery() as nursery:
             nursery.start_soon(upload.finish)
             await trio.sleep(1.5)
-            steal(here)
+            steal(here, connection)
         assert source.rollbacks == [False]
         assert source.all_proven
         assert faults.requests.count(Opcode.CREATE_FILE) == 0
     assert here.tree.data(b"/d/new") == bytes(source.content)
 
 
+@pytest.mark.parametrize("pause", [0.02, 1.0], ids=["while it is opened", "while it is sent"])
 @pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
-async def test_leaving_in_mid_upload_terminates(profile: str, autojump: MockClock) -> None:
+async def test_abort_leaves_nothing_open_and_asks_for_nothing(
+    profile: str, pause: float, autojump: MockClock
+) -> None:
     here = world(profile, PLAIN)
     async with here.connection() as connection:
-        upload = await start(connection, profile, MemorySource(content(60_000)))
-        with trio.move_on_after(1) as impatience:
-            await upload.finish()
-        assert impatience.cancelled_caught
-        assert here.vehicle.server.open_sessions == 1
+        source = MemorySource(content(60_000))
+        upload = await start(connection, profile, source)
+        await trio.sleep(pause)
+        await upload.abort()
+        await upload.abort()
+        assert source.in_flight.empty
+        assert here.vehicle.server.open_sessions == 0
+        left = source.todo.total
+        await trio.sleep(5)
+        assert source.todo.total == left
+        assert upload not in connection.scheduler.users
     assert here.vehicle.server.open_sessions == 0
 
 
+@pytest.mark.parametrize("leaves", [False, True])
 @pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
-async def test_who_stops_waiting_does_not_stop_the_upload(profile: str, autojump: MockClock) -> None:
+async def test_who_stops_waiting_does_not_stop_the_upload_and_who_leaves_terminates_it(
+    profile: str, leaves: bool, autojump: MockClock
+) -> None:
     data = content(40_000)
     here = world(profile, PLAIN)
     async with here.connection() as connection:
         source = MemorySource(data)
         upload = await start(connection, profile, source)
-        with trio.move_on_after(1):
+        with trio.move_on_after(1) as impatience:
             await upload.finish()
-        await trio.sleep(20)
-        assert source.all_proven
-        assert here.vehicle.server.open_sessions == 0
-    assert here.tree.data(path(profile, "new")) == data
+        assert impatience.cancelled_caught
+        assert here.vehicle.server.open_sessions == 1
+        if not leaves:
+            await trio.sleep(20)
+            assert source.all_proven
+            assert here.vehicle.server.open_sessions == 0
+            assert here.tree.data(path(profile, "new")) == data
+    assert here.vehicle.server.open_sessions == 0
