@@ -52,17 +52,6 @@ def tree(store: FakeStore) -> Tree:
 # --- reading
 
 
-async def test_reads_are_short_only_at_the_end(tree: Tree) -> None:
-    handle = await tree.open(LOG)
-    assert handle.size == len(DATA)
-    assert await handle.read(len(DATA) - 10, 100) == DATA[-10:]
-    assert await handle.read(len(DATA), 100) == b""
-    assert await handle.read(10**12, 100) == b""
-    assert await handle.read(5, 0) == b""
-    assert not handle.direct_io
-    handle.close()
-
-
 async def test_a_read_larger_than_the_cache_is_served_in_pieces(store: FakeStore) -> None:
     big = content(5 * MIB)
     store.add(b"/big", big)
@@ -116,15 +105,6 @@ async def test_a_directory_is_not_opened(tree: Tree) -> None:
 
 
 # --- close-to-open
-
-
-async def test_a_second_cat_asks_nothing(store: FakeStore, tree: Tree) -> None:
-    await read_file(tree, LOG)
-    before = list(store.calls)
-    handle = await tree.open(LOG)
-    assert handle.keep_cache
-    assert await handle.read(0, len(DATA)) == DATA
-    assert store.calls == before
 
 
 async def test_equal_size_and_mtime_prove_the_cache_for_ever(store: FakeStore, tree: Tree) -> None:
@@ -358,19 +338,6 @@ async def test_bytes_that_stay_suspect_are_an_error(store: FakeStore, tree: Tree
     assert trio.current_time() < began + 20
     store.suspect_chunks = 0
     assert await handle.read(0, len(DATA)) == DATA
-
-
-async def test_doubtful_bytes_do_not_survive_the_last_close(store: FakeStore, tree: Tree) -> None:
-    handle = await tree.open(LOG)
-    await handle.read(0, 100)
-    await trio.sleep(10)
-    store.readers[0].sink.on_suspect("late news")
-    handle.close()
-    assert store.invalidated == [LOG]
-    handle = await tree.open(LOG)
-    assert not handle.keep_cache
-    assert await handle.read(0, 100) == DATA[:100]
-    assert store.count("crc") == 0
 
 
 async def test_a_closed_file_whose_bytes_were_dropped_is_read_again_without_a_listing(

@@ -89,13 +89,6 @@ def test_a_vehicle_that_does_not_say_who_it_is_has_no_identity() -> None:
 # --- the disk
 
 
-def test_what_was_written_is_read(directory: KeptDisk) -> None:
-    assert directory.read(block(0)) is None
-    directory.write(block(0), DATA)
-    assert directory.read(block(0)) == DATA
-    assert directory.read(block(1)) is None
-
-
 @pytest.mark.parametrize("place", [0, 20, 40, -1])
 def test_a_changed_byte_is_a_miss_and_the_block_is_gone(
     directory: KeptDisk, tmp_path: Path, place: int

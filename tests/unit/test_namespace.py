@@ -159,12 +159,6 @@ async def test_renames_that_are_refused(store: FakeWriter) -> None:
     assert store.requests == 0
 
 
-async def test_noreplace_onto_a_free_name(fat: FakeWriter) -> None:
-    tree = make_writable(fat)
-    await tree.rename(b"/d/a", b"/d/new", noreplace=True)
-    assert fat.files[b"/d/new"].data == b"A"
-
-
 # --- spelling
 
 
@@ -186,16 +180,6 @@ async def test_another_spelling_of_a_name_is_refused(fat: FakeWriter, name: byte
 
 
 # --- case
-
-
-async def test_only_the_case_of_a_name_changes(store: FakeWriter) -> None:
-    tree = make_writable(store)
-    if store.kind.renames and not store.kind.folds_case:
-        await tree.rename(b"/d/a", b"/d/A")
-        await tree.rename(b"/d/full", b"/d/FULL")
-        tree.forget_caches()
-        assert shape(store) == {b"/d/A": b"A", b"/d/b": b"B", b"/d/FULL/x": b"X"}
-        assert {name for name, _ in await tree.list(b"/d")} == {b"A", b"b", b"FULL", b"empty"}
 
 
 # --- what others left

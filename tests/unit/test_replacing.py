@@ -14,7 +14,6 @@ from mavftpfs.cache.tree import Tree
 from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.shared.errors import FtpNak, RequestTimeout, VehicleLost
 from mavftpfs.shared.model import split
-from tests.support.fake_store import read_file
 from tests.support.fake_writer import KINDS, FakeWriter, list_all, litter, make_writable, write_file
 
 pytestmark = pytest.mark.holds("promise 3")
@@ -115,24 +114,6 @@ async def test_what_could_not_be_removed_brings_nothing_back(
     await tree.unlink(path)
     await list_all(store, tree)
     assert set(store.files) == {OTHER, FILE} - {path}
-
-
-async def test_the_same_when_it_is_listed_before(store: FakeWriter, tree: Tree) -> None:
-    store.traits.rename_replaces = False
-    store.kind = KINDS["fat"]
-    store.fail_at.clear()
-
-    def keep(*request: object) -> None:
-        if request[0] == "remove":
-            store.before_request = None
-            raise RequestTimeout("silence")
-
-    store.before_request = keep
-    await write_file(tree, FILE, NEW)
-    assert litter(store)
-    await list_all(store, tree)
-    assert litter(store) == []
-    assert await read_file(tree, FILE) == NEW
 
 
 @pytest.mark.parametrize("kind", ["posix", "fat"])

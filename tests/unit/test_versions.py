@@ -84,16 +84,6 @@ async def test_a_read_within_a_block_is_a_view_that_cannot_be_written() -> None:
     assert view.readonly
 
 
-@pytest.mark.holds("promise 1")
-async def test_a_hole_is_not_readable() -> None:
-    blocks = Version(make_cache(), b"/f", 1000)
-    deliver(blocks, 0, b"x" * 100)
-    deliver(blocks, 101, b"x" * 100)
-    assert blocks.get(0, 201) is None
-    assert blocks.get(0, 100) is not None
-    assert not blocks.complete
-
-
 # --- budget
 
 
@@ -129,20 +119,6 @@ async def test_blocks_with_waiters_are_not_evicted(nursery: trio.Nursery) -> Non
 # --- waiting
 
 
-async def test_a_reader_asks_for_what_is_missing_and_gets_it(nursery: trio.Nursery) -> None:
-    blocks = Version(make_cache(), b"/f", 1000)
-    data = content(1000)
-    deliver(blocks, 300, data[300:400])
-    reading = await start_read(nursery, blocks, 200, 600)
-    assert reading.wanted == [[(200, 300), (400, 600)]]
-    deliver(blocks, 200, data[200:300])
-    await trio.testing.wait_all_tasks_blocked()
-    assert reading.results == []
-    deliver(blocks, 400, data[400:600])
-    await trio.testing.wait_all_tasks_blocked()
-    assert reading.results == [data[200:600]]
-
-
 async def test_readers_wake_once_per_batch(nursery: trio.Nursery) -> None:
     blocks = Version(make_cache(), b"/f", 1000)
     reading = await start_read(nursery, blocks, 0, 1000)
@@ -152,16 +128,6 @@ async def test_readers_wake_once_per_batch(nursery: trio.Nursery) -> None:
     blocks.on_batch()
     await trio.testing.wait_all_tasks_blocked()
     assert reading.results == [content(1000)]
-
-
-async def test_no_progress_for_patience_is_a_timeout(nursery: trio.Nursery) -> None:
-    blocks = Version(make_cache(), b"/f", 1000)
-    reading = await start_read(nursery, blocks, 0, 1000)
-    await trio.sleep(20)
-    deliver(blocks, 0, content(10))
-    await trio.sleep(100)
-    assert [type(error) for error in reading.errors] == [RequestTimeout]
-    assert reading.took == pytest.approx(20 + PATIENCE)
 
 
 @pytest.mark.holds("promise 4")
