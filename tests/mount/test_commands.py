@@ -9,7 +9,6 @@ from typing import Any
 
 import pytest
 
-from mavftpfs.sim.tree import MemoryTree
 from tests.mount.conftest import Field
 from tests.support.mounts import mavftpfs
 from tests.support.trees import differing
@@ -77,19 +76,5 @@ def test_scan_shows_who_answers(vehicle: SimVehicle) -> None:
         (1, 1, "PX4 quadrotor, disarmed")
     ]
     assert (found[0]["ftp"], found[0]["answers"], found[0]["facts"]["ftp_flag"]) == ("answers", True, True)
-    out, _ = mavftpfs("scan", vehicle.source)
-    (line,) = out.splitlines()  # as a program reads it: no boxes
-    address, what, firmware, uid, ftp = line.split("\t")
-    assert (address, what, firmware) == ("1/1", "PX4 quadrotor, disarmed", found[0]["firmware"])
-    assert uid == found[0]["uid"] != "-"
-    assert ftp.startswith("answers, in ")
-
-
-def test_scan_of_a_vehicle_without_ftp(field: Field) -> None:
-    """Whatever its capability flag says."""
-    vehicle = field.lying(MemoryTree())
-    vehicle.server.answer = lambda request: []
-    out, _ = mavftpfs("scan", "--json", vehicle.source)
-    (peer,) = json.loads(out)
-    assert peer["answers"] is False
-    assert peer["ftp"].startswith("no answer")
+    assert found[0]["uid"] != "-"
+    assert found[0]["firmware"] != "-"

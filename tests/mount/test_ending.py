@@ -12,7 +12,6 @@ import pytest
 
 from tests.mount.conftest import Field
 from tests.support.mounts import Mount, mounted_at, wait_until
-from tests.support.vehicles import UdpVehicle
 
 BIG = 300 << 20
 """Bytes of a sparse file that no server sends within a test."""
@@ -91,9 +90,8 @@ def test_a_signal_while_a_file_is_read_ends_both(field: Field, big_tree: Path) -
 
 
 @pytest.mark.holds("promise 4", "fault silence")
-@pytest.mark.parametrize("kind", ["px4", "mavsdk-server"])
-def test_a_killed_vehicle_is_an_error_in_time_and_comes_back(field: Field, big_tree: Path, kind: str) -> None:
-    vehicle: UdpVehicle = field.mavsdk(big_tree) if kind == "mavsdk-server" else field.sim(big_tree, kind)
+def test_a_killed_vehicle_is_an_error_in_time_and_comes_back(field: Field, big_tree: Path) -> None:
+    vehicle = field.mavsdk(big_tree)
     mount = field.mount(vehicle.source, *QUICK)
     assert mount.run("cat", mount.path / "dir0/small.txt").stdout == "small 0\n"
     reader = start_reading(mount)

@@ -69,12 +69,3 @@ def test_yesterdays_logs_are_not_read_again(field: Field, profile: str) -> None:
     (logs / "00000003.BIN").write_bytes(content("new", 1000))
     mount.unmount()
     check_cost(field, vehicle, logs, cache, open=1, read=5)
-
-
-def test_without_mtimes_a_checksum_per_file_decides(field: Field) -> None:
-    card, cache = field.local("card"), field.local("cache")
-    logs = fill(card)
-    vehicle = field.counted_sim(card, "px4")
-    read_and_keep(field, vehicle, logs, cache)
-    (logs / "LASTLOG.TXT").write_bytes(b"12\n")
-    check_cost(field, vehicle, logs, cache, crc=3, open=1, read=1)

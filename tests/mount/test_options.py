@@ -113,19 +113,6 @@ def test_every_payload_is_printed_and_recorded_decoded(
     assert {"LIST_DIRECTORY", "OPEN_FILE_RO", "READ_FILE", "TERMINATE_SESSION"} <= answered
 
 
-@pytest.mark.holds("rule 14.15")
-def test_bursts_give_the_same_bytes(field: Field, tree: Path, tmp_path: Path) -> None:
-    trace = tmp_path / "trace"
-    options = ("read_mode=burst", f"trace={trace}")
-    mount = field.mount(field.sim(tree, "ardupilot", ("--loss", "0.02", "--seed", "3")).source, *options)
-    for size in (0, 1, 239, 478, 40152, 119500, 131073):
-        assert mount.read_bytes(mount.path / f"sizes/{size}.bin") == (tree / f"sizes/{size}.bin").read_bytes()
-    assert mount.unmount() == 0
-    records = [json.loads(line) for line in trace.read_text().splitlines()]
-    streamed = [r for r in records if r["dir"] == "reply" and r.get("req_opcode") == "BURST_READ_FILE"]
-    assert len(streamed) > (119500 + 131073) // 239
-
-
 # mount(8) runs the program named by the type from a fixed PATH, so one is made to hold it, in a mount
 # namespace of its own. The script prints what the test looks at; the mount is not seen outside.
 MOUNT_8 = """
@@ -213,21 +200,3 @@ def test_auto_unmount_clears_after_a_kill(field: Field, small_tree: Path) -> Non
     processors), so it has a few tries; without the option it never does."""
     source = field.sim(small_tree).source
     assert any(clears(field, source) for _ in range(4))
-
-
-def test_a_remote_change_is_seen_within_the_cache_time(field: Field, tmp_path: Path) -> None:
-    card = field.local("card")
-    (card / "a.txt").write_text("first\n")
-    mount = field.mount(
-        field.sim(card, "spec").source, "dir_timeout=1", "attr_timeout=0.2", "negative_timeout=0.2"
-    )
-    assert mount.run("cat", mount.path / "a.txt").stdout == "first\n"
-    (card / "a.txt").write_text("second, longer\n")
-    (card / "b.txt").write_text("new\n")
-
-    def seen() -> bool:
-        return mount.run("cat", mount.path / "a.txt", mount.path / "b.txt", code=None).stdout == (
-            "second, longer\nnew\n"
-        )
-
-    wait_until("the change is seen", seen)

@@ -35,7 +35,7 @@ class Counted:
         return self.costs[case.name]
 
 
-IN_SOAK = ("px4-nuttx", "ardupilot5", "mavsdk")
+IN_SOAK = ("px4-nuttx", "ardupilot", "ardupilot5", "mavsdk")
 
 
 @pytest.fixture(

@@ -42,7 +42,7 @@ print(json.dumps(confirmed))
 
 
 def start(mount: Mount, folder: str, name: str) -> subprocess.Popen[str]:
-    argv = [sys.executable, "-c", COPIER, str(mount.path / folder), name, "12"]
+    argv = [sys.executable, "-c", COPIER, str(mount.path / folder), name, "5"]
     return subprocess.Popen(argv, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 

@@ -13,7 +13,7 @@ import pytest
 from mavftpfs.shared.errors import ExitCode
 from tests.mount.conftest import Field
 from tests.mount.test_writing_ends import QUICK, write_to_nobody
-from tests.support.mounts import Mount, abort_mount, wait_until
+from tests.support.mounts import Mount, wait_until
 from tests.support.mounts import mavftpfs as run
 from tests.support.trees import content
 from tests.support.vehicles import SimVehicle
@@ -66,21 +66,6 @@ def test_umount_says_what_it_waits_for_and_ctrl_c_ends_the_waiting_only(
     assert (card / "lost.bin").read_bytes() == data.read_bytes()
 
 
-def test_mounting_over_a_dead_mount_tells_what_it_held(field: Field, data: Path) -> None:
-    vehicle = field.sim(field.local("card"))
-    vehicle.left_alone = True
-    mount = field.mount(vehicle.source, *QUICK)
-    write_to_nobody(mount, vehicle, data)
-    mount.kill()
-    try:
-        _, said = run(vehicle.source, mount.path, code=ExitCode.MOUNT_FAILED)
-        gone = f"is a dead mount whose program is gone; run: mavftpfs umount {mount.path}"
-        assert f"{gone}; 1 file(s) did not reach the vehicle when a mount was killed" in said
-        assert "1 file(s) did not reach the vehicle when a mount was killed" in run("recover")[0]
-    finally:
-        abort_mount(mount.path)
-
-
 def left_behind(field: Field, data: Path) -> tuple[Mount, SimVehicle, Path]:
     """Have a mount end with a file that is not delivered; return it, a vehicle that answers, and its card."""
     card = field.local("card")
@@ -98,10 +83,13 @@ def left_behind(field: Field, data: Path) -> tuple[Mount, SimVehicle, Path]:
     return mount, vehicle, card
 
 
+@pytest.mark.holds("promise 3")
 def test_what_was_kept_is_listed_and_put_back_on_demand(field: Field, data: Path, state: Path) -> None:
     assert run("recover")[0] == "nothing was kept\n"
     _, vehicle, card = left_behind(field, data)
     (directory,) = state.iterdir()
+    assert (directory / "lost.bin").read_bytes() == data.read_bytes()
+    assert directory.stat().st_mode & 0o777 == 0o700
     heading, line = run("recover")[0].splitlines()
     assert heading == f"{directory}:"
     assert line.startswith("  lost.bin for /lost.bin, 60.0 kB, 20")

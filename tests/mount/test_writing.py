@@ -26,7 +26,7 @@ FAT = ("px4-nuttx", "ardupilot5")
 NOT_ON_FAT = re.compile(rb'[?"*:<>|\\]')
 
 
-@pytest.fixture(scope="module", params=taking_turns(FOLDERS, soak=("mavsdk",)))
+@pytest.fixture(scope="module", params=taking_turns(FOLDERS, soak=("px4", "ardupilot", "mavsdk")))
 def kind(request: pytest.FixtureRequest) -> str:
     """The server's name; the library's own is here in place of the simulated MAVSDK."""
     name: str = request.param

@@ -9,8 +9,6 @@ import pytest
 import trio
 from trio.testing import MockClock
 
-from mavftpfs.compose import connect_options
-from mavftpfs.fuse.options import parse_options
 from mavftpfs.link.fastframe import FTP_MESSAGE_ID
 from mavftpfs.protocol.payload import Opcode
 from mavftpfs.session.connection import Connection, ConnectOptions
@@ -95,16 +93,6 @@ async def test_bulk_keeps_the_limit_and_uses_it(
         check(meter, limit, late=here.vehicle.server.profile.stall_chance and 0.3)
 
 
-async def test_losses_are_paid_for_too(autojump: MockClock) -> None:
-    here = world("px4", LinkSettings(rate=100_000.0, delay=0.03, loss=0.1, jitter=0.02))
-    async with here.connection(ConnectOptions(bwlimit=LIMIT)) as connection:
-        meter = Meter(connection)
-        await write(connection, here)
-        for seconds in (1.0, 2.0):
-            assert meter.most_within(seconds) <= 1.01 * seconds * LIMIT + FRAME
-        assert connection.engine.stats.retransmissions > 50
-
-
 async def test_a_listing_goes_ahead_of_a_copy(autojump: MockClock) -> None:
     here = world("px4")
     async with here.connection(ConnectOptions(bwlimit=LIMIT)) as connection:
@@ -135,19 +123,6 @@ async def test_the_slowest_limit_is_slow_and_no_time_out(autojump: MockClock) ->
         assert connection.engine.stats.retransmissions == 0
 
 
-async def test_a_dead_link_is_still_noticed(autojump: MockClock) -> None:
-    here = world("px4")
-    async with here.connection(ConnectOptions(bwlimit=2000)) as connection:
-        await trio.sleep(1.0)
-        here.link.cut()
-        source = MemorySource(DATA)
-        upload = await connection.store.open_upload(b"/d/g", source)
-        began = trio.current_time()
-        with pytest.raises(Exception, match=r"answer|silent"):
-            await upload.finish()
-        assert trio.current_time() - began < 45.0
-
-
 async def test_no_bursts_with_a_limit(autojump: MockClock) -> None:
     here = world("ardupilot")
     async with here.connection(ConnectOptions(bwlimit=LIMIT // 2, read_mode="burst")) as connection:
@@ -155,8 +130,3 @@ async def test_no_bursts_with_a_limit(autojump: MockClock) -> None:
         await read(connection, here)
         assert Opcode.BURST_READ_FILE not in connection.engine.stats.by_opcode
         check(meter, LIMIT // 2)
-
-
-def test_the_option_arrives() -> None:
-    assert connect_options(parse_options(["bwlimit=5000"])).bwlimit == 5000
-    assert connect_options(parse_options([])).bwlimit is None

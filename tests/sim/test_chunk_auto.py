@@ -10,7 +10,7 @@ from trio.testing import MockClock
 
 from mavftpfs.protocol.chunking import SHORT, SHORT_SECONDS
 from mavftpfs.protocol.payload import MAX_DATA
-from mavftpfs.session.connection import Connection, ConnectOptions
+from mavftpfs.session.connection import Connection
 from mavftpfs.sim.linkmodel import LinkSettings
 from tests.support.uploads import put
 from tests.support.worlds import content, path, read_file, world
@@ -49,14 +49,6 @@ async def test_a_file_is_written_where_no_full_frame_passes(profile: str, autoju
     assert here.vehicle.server.open_sessions == 0
 
 
-async def test_a_file_of_one_chunk_passes_too(autojump: MockClock) -> None:
-    here = world("px4", replace(RADIO, mtu=LIMIT), small=content(200))
-    async with here.connection() as connection:
-        assert await read_file(connection, path("px4", "small")) == content(200)
-        await put(connection, path("px4", "new"), content(200))
-    assert here.tree.data(path("px4", "new")) == content(200)
-
-
 @pytest.mark.parametrize("profile", ["px4", "ardupilot", "mavsdk"])
 async def test_a_link_that_recovers_gets_full_chunks_back(profile: str, autojump: MockClock) -> None:
     data = content(20_000)
@@ -70,24 +62,3 @@ async def test_a_link_that_recovers_gets_full_chunks_back(profile: str, autojump
         assert await read_file(connection, path(profile, "file")) == data
         assert sizes(connection)[0] == MAX_DATA
         assert connection.engine.stats.requests - requests < 20_000 / MAX_DATA + 8
-
-
-async def take_both_ways(profile: str, settings: LinkSettings, options: ConnectOptions) -> object:
-    """Read and write a file; return what that cost."""
-    data = content(100_000)
-    here = world(profile, settings, file=data)
-    async with here.connection(options) as connection:
-        assert await read_file(connection, path(profile, "file")) == data
-        await put(connection, path(profile, "new"), data)
-        return trio.current_time(), dict(connection.engine.stats.by_opcode)
-
-
-@pytest.mark.parametrize("profile", ["px4", "ardupilot", "mavsdk"])
-def test_losses_of_a_fifth_change_nothing(profile: str) -> None:
-    """The same requests go out as with chunk=239, and it takes as long."""
-    settings = replace(RADIO, loss=0.2)
-    costs = [
-        trio.run(take_both_ways, profile, settings, options, clock=MockClock(autojump_threshold=0))
-        for options in (ConnectOptions(), ConnectOptions(chunk=MAX_DATA))
-    ]
-    assert costs[0] == costs[1]

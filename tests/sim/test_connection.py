@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import random
-from collections.abc import AsyncIterator, Sequence
+from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, closing
 from itertools import pairwise
 from pathlib import Path
@@ -26,7 +26,7 @@ from mavftpfs.link.messages import (
     Heartbeat,
 )
 from mavftpfs.link.uri import parse_source
-from mavftpfs.protocol.payload import MAX_DATA, Opcode, decode_request
+from mavftpfs.protocol.payload import Opcode, decode_request
 from mavftpfs.session.connection import ConnectOptions, connected
 from mavftpfs.shared.errors import VehicleLost
 from mavftpfs.sim.linkmodel import Duplex, LinkModel, LinkSettings
@@ -89,18 +89,6 @@ async def test_signing_both_ways(autojump: MockClock) -> None:
             await connection.ready(5)
 
 
-async def test_a_vehicle_whose_clock_is_behind_is_said_to_be(
-    autojump: MockClock, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """It has the right key, and does not take the time from us."""
-    vehicle = SimVehicle(MemoryTree(), PROFILES["px4"], rng=random.Random(1), signing_key=KEY)
-    monkeypatch.setattr(vehicle, "receive", lambda data, now: None)
-    link = MemoryLink(vehicle, LinkModel(random.Random(2), LinkSettings(delay=0.01)))
-    async with connected(link, ConnectOptions(signing_key=KEY), rng=random.Random(3)) as connection:
-        with pytest.raises(VehicleLost, match="compare the clocks"):
-            await connection.ready(5)
-
-
 class OldFirmware(SimVehicle):
     """Knows no MAV_CMD_REQUEST_MESSAGE."""
 
@@ -147,29 +135,6 @@ async def test_heartbeats_go_out_beside_a_copy(what: str, profile: str, autojump
     heard = [time for time in diary.times if began <= time <= began + took]
     assert len(heard) >= took - 2
     assert max(later - time for time, later in pairwise(heard)) < 2.5
-
-
-@pytest.mark.parametrize("write", [False, True])
-async def test_requests_go_out_in_batches(
-    write: bool, autojump: MockClock, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Frames that are handed to the link one by one become a datagram, or a write, each."""
-    here = world("px4", LinkSettings(delay=0.02), f=DATA * 2)
-    batches: list[int] = []
-    send = here.link.send_nowait
-
-    def send_nowait(frames: Sequence[bytes]) -> None:
-        batches.append(len(frames))
-        send(frames)
-
-    monkeypatch.setattr(here.link, "send_nowait", send_nowait)
-    async with here.connection() as connection:
-        if write:
-            await put(connection, path("px4", "new"), DATA * 2)
-        else:
-            assert await read_file(connection, path("px4", "f")) == DATA * 2
-    assert sum(batches) > len(DATA) * 2 / MAX_DATA
-    assert sum(batches) > 6 * len(batches)
 
 
 async def test_old_firmware_is_asked_for_its_capabilities_in_the_old_way(autojump: MockClock) -> None:
@@ -254,3 +219,15 @@ async def test_a_restart_while_leaving_has_nothing_delivered(
     assert up.connection.vehicle.reboots == 1
     assert up.tree.undelivered() == [b"/d/f"]
     assert here.tree.data(b"/d/f") == content(100)
+
+
+async def test_a_vehicle_whose_clock_is_behind_is_said_to_be(
+    autojump: MockClock, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It has the right key, and does not take the time from us."""
+    vehicle = SimVehicle(MemoryTree(), PROFILES["px4"], rng=random.Random(1), signing_key=KEY)
+    monkeypatch.setattr(vehicle, "receive", lambda data, now: None)
+    link = MemoryLink(vehicle, LinkModel(random.Random(2), LinkSettings(delay=0.01)))
+    async with connected(link, ConnectOptions(signing_key=KEY), rng=random.Random(3)) as connection:
+        with pytest.raises(VehicleLost, match="compare the clocks"):
+            await connection.ready(5)

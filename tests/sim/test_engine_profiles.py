@@ -16,12 +16,13 @@ from mavftpfs.sim.linkmodel import Direction, LinkSettings
 from mavftpfs.sim.profiles import PROFILES, Family
 from mavftpfs.sim.tree import MemoryTree
 from mavftpfs.sim.vehicle import FtpServer
+from tests.support.takingturns import taking_turns
 from tests.support.virtual import MemorySink, VirtualLink
 
 CHUNK = 239
 BAD = LinkSettings(delay=0.02, loss=0.2, duplicate=0.02, reorder=0.05)
 SIZES = (0, 1, 5, 238, 239, 240, 478, 4096, 35_850, 40_152, 119_500, 131_073)
-NAMES = sorted(PROFILES)
+NAMES = taking_turns(sorted(PROFILES))
 KINDS = [ReadTransfer, BurstTransfer]
 
 
@@ -105,15 +106,6 @@ def test_every_size_comes_whole(name: str, kind: type[ReadTransfer]) -> None:
         rig.tree.add(b"/s%d" % size, random.Random(size).randbytes(size))
     for size in SIZES:
         assert rig.read(b"/s%d" % size, kind) == random.Random(size).randbytes(size)
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_another_chunk_size(name: str) -> None:
-    rig, chunk = Rig(name, LinkSettings(delay=0.005)), 80
-    content = random.Random(2).randbytes(chunk * 30 + 7)
-    rig.tree.add(b"/f", content)
-    for kind in KINDS:
-        assert rig.read(b"/f", kind, chunk=chunk) == content
 
 
 @pytest.mark.holds("fault lost")

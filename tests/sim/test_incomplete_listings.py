@@ -5,14 +5,14 @@ size that only an open reply tells is not believed where it would make a copy sh
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 
 import pytest
 import trio
 from trio.testing import MockClock
 
 from mavftpfs.protocol.payload import NakCode, Opcode, Payload
-from mavftpfs.shared.errors import DataUnproven, FtpNak, ListingIncomplete, NotFound
+from mavftpfs.shared.errors import DataUnproven, FtpNak, ListingIncomplete, MavftpfsError, NotFound
 from mavftpfs.sim.linkmodel import LinkSettings
 from tests.support.lying import ack, lie_for, nak
 from tests.support.mounting import mounted
@@ -20,6 +20,7 @@ from tests.support.worlds import World, content, path, world
 
 pytestmark = pytest.mark.holds("promise 10")
 
+Spoil = Callable[[Payload, Payload], Payload]
 LISTS = (Opcode.LIST_DIRECTORY, Opcode.LIST_DIRECTORY_WITH_TIME)
 NAMES = [f"file_{number:02}" for number in range(60)]
 WHOLE = content(60_000)
@@ -138,6 +139,36 @@ async def test_a_file_that_became_smaller_since_it_was_listed_is_read(
         file = await tree.open(path(profile, "f"))
         assert file.size == 30_000
         assert bytes(await file.read(0, 60_000)) == WHOLE[:30_000]
+        file.close()
+
+
+def early_end(request: Payload, reply: Payload) -> Payload:
+    return nak(request, NakCode.EOF) if request.offset >= 500 else reply
+
+
+def empty_ack(request: Payload, reply: Payload) -> Payload:
+    return ack(request, b"") if request.offset >= 239 else reply
+
+
+def shifted(request: Payload, reply: Payload) -> Payload:
+    return reply._replace(offset=reply.offset + 1)
+
+
+def other_opcode(request: Payload, reply: Payload) -> Payload:
+    return reply._replace(req_opcode=Opcode.LIST_DIRECTORY)
+
+
+@pytest.mark.holds("promise 1")
+@pytest.mark.parametrize("spoil", [early_end, empty_ack, shifted, other_opcode])
+async def test_a_file_that_cannot_be_completed_is_an_error(spoil: Spoil, autojump: MockClock) -> None:
+    made = world("px4", f=WHOLE[:1000])
+    lie_for(made).change = lambda request, reply: [
+        spoil(request, reply) if request.opcode == Opcode.READ_FILE else reply
+    ]
+    async with mounted(made) as (_, tree):
+        file = await tree.open(path("px4", "f"))
+        with pytest.raises(MavftpfsError), trio.fail_after(150.0):
+            await file.read(0, 1000)
         file.close()
 
 

