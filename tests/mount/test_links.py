@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import signal
-import sys
 from pathlib import Path
 
 import pytest
 
 from tests.mount.conftest import Field
 from tests.support.mounts import Mount, wait_until
-from tests.support.trees import content
+from tests.support.trees import COMPARE, content
 from tests.support.vehicles import HOST, free_udp_port
 
 FLAWS = ("--loss", "0.1", "--dup", "0.05", "--reorder", "0.05", "--corrupt", "0.02")
@@ -29,8 +28,7 @@ def size_of(path: Path) -> int:
 
 def compare(mount: Mount, expected: Path, part: str = "") -> None:
     """Compare the whole tree, or a directory of it, byte for byte."""
-    argv = (sys.executable, "-m", "tests.support.trees", "compare", expected / part, mount.path / part)
-    mount.run(*argv, timeout=240)
+    mount.run(*COMPARE, expected / part, mount.path / part, timeout=240)
 
 
 @pytest.mark.parametrize("kind", ["udpout", "pty"])

@@ -36,7 +36,7 @@ def run_lockstep(field: Field, kind: str, link: Sequence[str], seed: int, count:
     said = f"{kind}, seed {seed}\n{result.stdout}\n{result.stderr}\n{mount.alive().text()[-3000:]}"
     assert result.returncode == 0, said
     assert mount.unmount() == 0, mount.alive_or_ended().text()
-    assert list(differing(bytes(local), bytes(place.card))) == [], said
+    assert differing(local, place.card) == [], said
 
 
 @pytest.mark.holds("promise 2")

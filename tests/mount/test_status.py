@@ -73,7 +73,7 @@ def test_the_log_tells_of_another_vehicle(field: Field, small_tree: Path) -> Non
 def test_the_log_tells_of_another_ftp_client(field: Field, small_tree: Path) -> None:
     vehicle = field.sim(small_tree)
     ports = (vehicle.vehicle_port, free_udp_port(), free_udp_port())
-    words = [sys.executable, "-m", "tests.support.fanout", *map(str, ports)]
+    words = [sys.executable, "-m", "tests.support.proxy", *map(str, ports)]
     fanout = Process("fanout", words, field.local("fanout"))
     try:
         mount = field.mount(f"udpin:127.0.0.1:{ports[1]}")

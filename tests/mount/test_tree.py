@@ -6,7 +6,6 @@ Each vehicle is mounted once for all tests of this module. Every tool runs as it
 from __future__ import annotations
 
 import subprocess
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,7 +15,7 @@ from mavftpfs.sim.profiles import PROFILES
 from tests.mount.conftest import Field
 from tests.support.mounts import Mount
 from tests.support.takingturns import taking_turns
-from tests.support.trees import SMALL_SIZES, build_tree
+from tests.support.trees import COMPARE, SMALL_SIZES, build_tree, differing
 from tests.support.vehicles import UdpVehicle
 
 BAD_LINK = ("--seed", "7", "--loss", "0.05", "--dup", "0.02", "--reorder", "0.02", "--corrupt", "0.01")
@@ -70,24 +69,15 @@ def bytes_of(*argv: str | Path) -> bytes:
     return subprocess.run([str(a) for a in argv], check=True, capture_output=True, timeout=30).stdout
 
 
-def local_copy_differs(expected: Path, actual: Path) -> str:
-    """Return the differences of two local trees."""
-    argv = ["diff", "-r", "--no-dereference", str(expected), str(actual)]
-    return subprocess.run(
-        argv, capture_output=True, text=True, errors="replace", timeout=60, check=False
-    ).stdout
-
-
 @pytest.mark.holds("promise 1", "rule 14.32", "rule 14.36")
 def test_walk_finds_the_same_names_sizes_and_bytes(scene: Scene) -> None:
-    command = (sys.executable, "-m", "tests.support.trees", "compare", scene.expected, scene.path)
-    scene.mount.run(*command, timeout=240)
+    scene.mount.run(*COMPARE, scene.expected, scene.path, timeout=240)
 
 
 def test_cp_r_copies_the_tree(scene: Scene, tmp_path: Path) -> None:
     for part in ("sizes", "names", "deep", "many"):
         scene.mount.run("cp", "-r", scene.path / part, tmp_path / part, timeout=240)
-        assert local_copy_differs(scene.expected / part, tmp_path / part) == ""
+        assert differing(scene.expected / part, tmp_path / part) == []
 
 
 def test_dd_reads_odd_offsets(scene: Scene, tmp_path: Path) -> None:
@@ -126,7 +116,7 @@ def test_rsync_twice_transfers_once(scene: Scene, tmp_path: Path) -> None:
     argv = ("rsync", "-a", "--exclude", "@*", "--itemize-changes", f"{scene.path}/", f"{tmp_path}/copy/")
     first = scene.mount.run(*argv, timeout=240).stdout
     assert "131073.bin" in first
-    assert local_copy_differs(scene.expected, tmp_path / "copy") == ""
+    assert differing(scene.expected, tmp_path / "copy") == []
     second = scene.mount.run(*argv, timeout=120).stdout
     assert second == ""
 

@@ -67,7 +67,7 @@ def test_two_mounts_at_once_confirm_nothing_wrong(field: Field, kind: str) -> No
     card.mkdir(parents=True, exist_ok=True)
     (card / "shared.bin").write_bytes(b"shared" * 2000)
     ports = [free_udp_port() for _ in range(3)]
-    argv = [sys.executable, "-m", "tests.support.fanout", *map(str, ports)]
+    argv = [sys.executable, "-m", "tests.support.proxy", *map(str, ports)]
     router = Process("router", argv, field.local("router"))
     vehicle = field.sim(root, kind, link=f"udpout:{HOST}:{ports[0]}")
     vehicle.left_alone = True  # each may have taken the other's session

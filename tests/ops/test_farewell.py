@@ -43,12 +43,6 @@ async def end_of(tree: FakeTree) -> list[str]:
     return said
 
 
-async def test_a_tree_that_holds_nothing_is_left_without_a_word() -> None:
-    tree = FakeTree()
-    assert await end_of(tree) == []
-    assert tree.calls == []
-
-
 async def test_what_cannot_be_delivered_is_kept_and_said(state: Path) -> None:
     tree = Patient(left=[b"/a", b"/b"])
     tree.can = False
@@ -96,12 +90,6 @@ def test_a_spool_is_private_and_by_vehicle(state: Path) -> None:
     with farewell.spool_for(None) as unknown:
         assert unknown is not None
         assert unknown.path.parent.name == "unknown"
-
-
-def test_a_user_without_a_place_for_it_has_no_spool(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("XDG_STATE_HOME", "/proc/nothing")
-    with farewell.spool_for(Address(1, 1)) as spool:
-        assert spool is None
 
 
 def test_what_a_dead_mount_left_is_named_once(state: Path) -> None:

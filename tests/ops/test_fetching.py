@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
-from io import BytesIO
 from pathlib import Path
 from typing import cast
 
@@ -24,7 +23,7 @@ from mavftpfs.oneshot.fetch import (
 from mavftpfs.oneshot.files import Files, Session
 from mavftpfs.oneshot.progress import Progress
 from mavftpfs.oneshot.sync import Outcome, Wish
-from mavftpfs.oneshot.transfer import Got, cat_paths, get_paths
+from mavftpfs.oneshot.transfer import Got, get_paths
 from mavftpfs.shared.errors import (
     Armed,
     DataUnproven,
@@ -42,14 +41,10 @@ BIG = bytes(range(251)) * 2000
 
 
 class SpoiltTree(FakeTree):
-    """A tree that can hand out wrong bytes, refuse checksums, and of which dropping the caches is counted.
-
-    grows: what is appended to a file each time that its size is to be asked for again.
-    """
+    """A tree that can hand out wrong bytes, refuse checksums, and of which dropping the caches is counted."""
 
     bad = 0
     forgotten = 0
-    grows = b""
     crc_error: Exception | None = None
     reads = 0
 
@@ -67,7 +62,7 @@ class SpoiltTree(FakeTree):
         return await super().crc32(path)
 
     def expire(self, path: bytes) -> None:
-        self.files[path] += self.grows
+        """Nothing is remembered."""
 
     def forget_caches(self) -> None:
         self.forgotten += 1
@@ -190,15 +185,6 @@ async def test_without_a_checksum_it_says_what_was_proven(
     fetched = await get(tree, b"/big", tmp_path / "big")
     assert fetched.proof.startswith("size (")
     assert words in fetched.proof
-
-
-@pytest.mark.parametrize("error", [FtpNak(14, 7), SessionBusy("x"), FileBusy("x")])
-async def test_without_a_checksum_what_is_written_out_counts(error: Exception) -> None:
-    tree = SpoiltTree({b"/big": BIG})
-    tree.crc_error = error
-    out, got = BytesIO(), Got()
-    await cat_paths(Session(cast(Files, tree), b"/"), [b"/big"], out, "all", pytest.fail, got)
-    assert (out.getvalue(), got.done) == (BIG, 1)
 
 
 @pytest.mark.parametrize(
@@ -362,11 +348,6 @@ async def test_the_logs_are_found(
     assert told
 
 
-async def test_where_no_logs_are_found_a_place_must_be_named(tmp_path: Path) -> None:
-    _, _, said = await sync(SpoiltTree({b"/x": b""}), tmp_path)
-    assert "--from" in said[0]
-
-
 async def test_a_log_that_grew_since_is_gone_on_with(tmp_path: Path) -> None:
     tree = SpoiltTree({b"/log/1": BIG[:2000]})
     await sync(tree, tmp_path)
@@ -395,13 +376,3 @@ async def test_one_that_fails_does_not_stop_the_others(tmp_path: Path) -> None:
     assert (told, said, outcome.complete) == (["d/1.ulg"], ["d/2.ulg: no answer"], False)
     states = {file["path"]: file["state"] for file in outcome.facts()["files"]}
     assert states == {"/fs/microsd/log/d/2.ulg": "failed", "/fs/microsd/log/d/1.ulg": "fetched"}
-
-
-async def test_a_directory_that_cannot_be_listed_is_said(tmp_path: Path) -> None:
-    tree = SpoiltTree({**LOGS, b"/fs/microsd/log/e/3.ulg": b"3"})
-    tree.on_call = refusing("list", b"/fs/microsd/log/d")
-    outcome, told, said = await sync(tree, tmp_path)
-    assert (told, said, outcome.complete) == (["e/3.ulg"], ["/fs/microsd/log/d: no answer"], False)
-    tree.on_call = lambda name, path: None
-    outcome, told, said = await sync(tree, tmp_path)
-    assert (len(told), said, outcome.complete) == (2, [], True)

@@ -93,11 +93,6 @@ async def test_a_directory_with_all_below(local: Path, to: bytes, place: bytes) 
     assert {sent.remote for sent in told} == expected.keys()
 
 
-async def test_a_file_in_the_way_of_a_directory(local: Path) -> None:
-    with pytest.raises(AlreadyExists):
-        await put(Card({b"/d": b"1"}, {b"/there"}), local, to=b"/d", recursive=True)
-
-
 @pytest.mark.parametrize("what", ["directory", "missing", "fifo", "link to a directory"])
 def test_what_cannot_be_put_is_said_before_anything_is_sent(local: Path, tmp_path: Path, what: str) -> None:
     place = local
@@ -111,14 +106,6 @@ def test_what_cannot_be_put_is_said_before_anything_is_sent(local: Path, tmp_pat
     with pytest.raises(UsageError) as caught:
         collect(place, recursive=what == "link to a directory")
     assert "directory" in str(caught.value) or "not there" in str(caught.value)
-
-
-async def test_several_files_need_a_directory(local: Path) -> None:
-    tree = Card({b"/x": b"1"})
-    for to in (b"/x", b"/new"):
-        with pytest.raises(NotADirectory):
-            await put(tree, local / "a", local / "e" / "none", to=to)
-    assert tree.files == {b"/x": b"1"}
 
 
 @pytest.mark.parametrize("call", ["create", "write", "fsync"])

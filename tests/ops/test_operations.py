@@ -80,13 +80,6 @@ class Listing:
 # -- attributes and lookup counts -----------------------------------------------------------------
 
 
-async def test_a_missing_name_is_cached_by_the_kernel_and_uses_no_inode() -> None:
-    ops = operations()
-    entry = await ops.lookup(ROOT_INO, b"nope", CTX)
-    assert (entry.st_ino, entry.entry_timeout) == (0, 2.0)
-    assert len(ops.inodes) == 1
-
-
 async def test_an_inode_forgotten_during_getattr_leaves_nothing_behind() -> None:
     tree = some_tree()
     ops = operations(tree)
@@ -345,14 +338,3 @@ async def test_a_checksum_gets_its_own_budget(autojump_clock: trio.testing.MockC
     ops, ino, _ = await prepared(tree)
     tree.delays = {"crc32": 119.0}
     assert len(await ops.getxattr(ino, XATTR_CRC32, CTX)) == 8
-
-
-@pytest.mark.parametrize("name", CALLS)
-async def test_cancellation_passes(name: str, autojump_clock: trio.testing.MockClock) -> None:
-    tree = some_tree()
-    ops, ino, fh = await prepared(tree)
-    tree.delays = dict.fromkeys(("stat", "list", "open", "read", "crc32"), 20.0)
-    with trio.move_on_after(1) as scope:
-        await CALLS[name](ops, ino, fh)
-    assert scope.cancelled_caught
-    ops.inodes.check_invariants()

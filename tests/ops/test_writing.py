@@ -206,15 +206,6 @@ async def test_a_directory_shows_when_its_entries_were_changed(change: Callable[
     assert await _times(ops, log) == (NOW + 9 * NANO - 5, NOW + 9 * NANO - 5)
 
 
-async def test_what_was_just_made_was_used_just_now() -> None:
-    """Mail readers remove by its atime what a program left behind long ago."""
-    tree = some_tree()
-    ops = operations(tree, now_ns=lambda: NOW)
-    _, made = await ops.create(ROOT_INO, b"new", 0o644, os.O_WRONLY, CTX)
-    tree.times[b"/new"] = 315532800  # the vehicle tells none
-    assert (await ops.getattr(made.st_ino, CTX)).st_atime_ns == NOW
-
-
 async def test_a_time_that_is_set_on_a_directory_holds_until_its_entries_change() -> None:
     clock = [NOW]
     tree = some_tree()

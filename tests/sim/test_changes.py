@@ -292,18 +292,6 @@ async def test_nobody_else_waits_for_a_long_delivery(autojump: MockClock) -> Non
         await file.release()
 
 
-async def test_changes_that_concern_one_another_take_turns(autojump: MockClock) -> None:
-    world = made("px4", LinkSettings(delay=0.5))
-    async with mounted(world, D) as (_, tree):
-        async with trio.open_nursery() as nursery:
-            nursery.start_soon(tree.rename, D, b"/e")
-            await trio.sleep(0.1)
-            with pytest.raises(Exception, match="does not exist"):
-                await tree.mkdir(D + b"/new")
-        await tree.mkdir(b"/e/new")
-        assert b"new" in {entry.name for entry in world.tree.entries(b"/e")}
-
-
 @pytest.mark.parametrize("profile", ["ardupilot", "mavsdk", "px4"])
 async def test_a_new_file_s_close_outlasts_bad_luck(profile: str, autojump_clock: MockClock) -> None:
     here = World(profile)
@@ -325,3 +313,15 @@ async def test_a_refusal_on_a_link_that_doubles_nothing_costs_no_listing(autojum
         with pytest.raises(FtpNak):
             await connection.store.remove(path("mavsdk", "missing"))
     assert not {Opcode.LIST_DIRECTORY, Opcode.LIST_DIRECTORY_WITH_TIME} & set(faults.requests)
+
+
+async def test_changes_that_concern_one_another_take_turns(autojump: MockClock) -> None:
+    world = made("px4", LinkSettings(delay=0.5))
+    async with mounted(world, D) as (_, tree):
+        async with trio.open_nursery() as nursery:
+            nursery.start_soon(tree.rename, D, b"/e")
+            await trio.sleep(0.1)
+            with pytest.raises(Exception, match="does not exist"):
+                await tree.mkdir(D + b"/new")
+        await tree.mkdir(b"/e/new")
+        assert b"new" in {entry.name for entry in world.tree.entries(b"/e")}

@@ -22,7 +22,7 @@ from mavftpfs.link.opening import open_link
 from mavftpfs.link.uri import parse_source
 from mavftpfs.protocol.payload import Opcode, request
 from mavftpfs.session.connection import ConnectOptions, connected
-from mavftpfs.shared.errors import LinkClosed, UsageError
+from mavftpfs.shared.errors import LinkClosed
 from mavftpfs.sim import endpoints
 from mavftpfs.sim.endpoints import Endpoint, client_source, open_endpoint
 from mavftpfs.sim.linkmodel import Duplex, LinkSettings
@@ -91,11 +91,6 @@ def test_nonsense_is_refused(words: str, capsys: pytest.CaptureFixture[str]) -> 
     with pytest.raises(SystemExit):
         arguments("DIR", *words.split())
     assert words.split()[0] in capsys.readouterr().err
-
-
-def test_a_missing_directory_is_the_users_error(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match=r"cannot serve [^:]*nowhere: No such file"):
-        endpoints.run(arguments(str(tmp_path / "nowhere")))
 
 
 @pytest.mark.parametrize(

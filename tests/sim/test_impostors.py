@@ -27,8 +27,9 @@ from mavftpfs.sim.profiles import PROFILES, Family
 from mavftpfs.sim.tree import MemoryTree
 from mavftpfs.sim.vehicle import SimVehicle
 from tests.support.fake_store import read_file as read_through
-from tests.support.lying import CrowdedLink, LyingVehicle, ack, ftp, heartbeat
+from tests.support.lying import CrowdedLink, LyingVehicle, ftp, heartbeat
 from tests.support.mounting import mounted
+from tests.support.replies import ack
 from tests.support.vehicles import HOST, free_udp_port
 from tests.support.worlds import ROOTS, World, read_file
 
@@ -129,23 +130,6 @@ async def test_another_vehicle_that_takes_the_address_is_not_read(
         await trio.sleep(5.0)
         assert await read_file(connection, b"/f") == OURS
         nursery.cancel_scope.cancel()
-
-
-@pytest.mark.holds("promise 10")
-async def test_nothing_is_asked_at_a_new_address_before_it_told(
-    autojump: MockClock, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Of a vehicle that never told who it is, too."""
-    scene = Crowd()
-    monkeypatch.setattr(scene.ours, "_on_command", lambda command, now: None)
-    monkeypatch.setattr(scene.other, "_on_command", lambda command, now: None)
-    async with scene.world.connection() as connection:
-        assert await read_file(connection, b"/f") == OURS
-        scene.move(scene.other, THERE)
-        with trio.move_on_after(12.0):
-            await read_file(connection, b"/f")
-        assert connection.status()["address"] == "10.0.0.2:14550"
-        assert scene.other.server.requests.total() == 0
 
 
 @pytest.mark.holds("promise 10")

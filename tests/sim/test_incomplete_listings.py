@@ -14,8 +14,9 @@ from trio.testing import MockClock
 from mavftpfs.protocol.payload import NakCode, Opcode, Payload
 from mavftpfs.shared.errors import DataUnproven, FtpNak, ListingIncomplete, MavftpfsError, NotFound
 from mavftpfs.sim.linkmodel import LinkSettings
-from tests.support.lying import ack, lie_for, nak
+from tests.support.lying import lie_for
 from tests.support.mounting import mounted
+from tests.support.replies import ack, nak
 from tests.support.worlds import World, content, path, world
 
 pytestmark = pytest.mark.holds("promise 10")

@@ -215,24 +215,6 @@ async def test_a_name_goes_in_a_few_round_trips_whatever_the_size(
             assert bytes(await file.read(0, len(LONG) + 1)) == LONG
 
 
-@pytest.mark.parametrize("by_name", [False, True])
-@pytest.mark.parametrize("profile", PROFILES)
-async def test_emptying_costs_no_more_whatever_the_size(
-    profile: str, by_name: bool, autojump: MockClock
-) -> None:
-    for moment in MOMENTS:
-        async with long_file(profile) as (world, tree, path, file):
-            async with in_the_middle(file, waiting=3, after=moment):
-                began = trio.current_time()
-                if by_name:
-                    await tree.truncate(path, 0)
-                else:
-                    (await tree.open(path, write=True, truncate=True)).close()
-                assert trio.current_time() - began < PROMPT
-            assert trio.current_time() - began < 3 * PROMPT
-            assert world.tree.data(path) == b""
-
-
 @pytest.mark.holds("fault overlap")
 @pytest.mark.parametrize("profile", ["px4-nuttx", "mavsdk"])
 async def test_a_file_gets_another_name_while_it_is_written(profile: str, autojump: MockClock) -> None:

@@ -19,7 +19,7 @@ from fastcrc import crc16
 
 from mavftpfs.link.addresses import NetAddress
 from mavftpfs.link.messages import Address
-from mavftpfs.protocol.payload import NakCode, Opcode, Payload, decode_reply, decode_request
+from mavftpfs.protocol.payload import Payload, decode_reply, decode_request
 from mavftpfs.sim.endpoints import Endpoint, client_source, open_endpoint
 from mavftpfs.sim.profiles import PROFILES
 from mavftpfs.sim.tree import Tree
@@ -196,17 +196,6 @@ class LyingVehicle:
                 self.source = client_source(link)
                 self._ready.set()
                 await self._endpoint.run()
-
-
-def ack(request: Payload, data: bytes) -> Payload:
-    """Return an ACK of a request."""
-    seq = (request.seq + 1) & 0xFFFF
-    return Payload(seq, request.session, Opcode.ACK, len(data), request.opcode, 0, request.offset, data)
-
-
-def nak(request: Payload, code: int = NakCode.FAIL) -> Payload:
-    """Return a NAK of a request."""
-    return ack(request, bytes([code]))._replace(opcode=Opcode.NAK)
 
 
 def frame(seq: int, source: Address, message: tuple[int, int], body: bytes) -> bytes:

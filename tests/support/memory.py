@@ -7,9 +7,7 @@ which moment does not depend on when the client looks.
 
 from __future__ import annotations
 
-import random
 from collections.abc import Sequence
-from itertools import pairwise
 
 import trio
 
@@ -25,39 +23,20 @@ _MAX_STEPS = 1_000_000
 
 
 class MemoryLink:
-    """Implements link.base.Link.
+    """Implements link.base.Link. model: the bad link in between."""
 
-    Args:
-        model: the bad link in between; None: instant, lossless, without limit.
-        stream: hand out bytes in random pieces instead of frame by frame, and give the vehicle likewise.
-        rng: for the pieces.
-    """
-
-    def __init__(
-        self,
-        vehicle: SimVehicle,
-        model: LinkModel | None = None,
-        *,
-        stream: bool = False,
-        is_serial: bool = False,
-        rng: random.Random | None = None,
-    ) -> None:
+    def __init__(self, vehicle: SimVehicle, model: LinkModel, *, is_serial: bool = False) -> None:
         self.stats = LinkStats()
         self.description = "memory"
-        self.is_stream = stream
+        self.is_stream = False
         self.is_serial = is_serial
         self.vehicle = vehicle
         self.model = model
-        self.lost_in_cut = 0
-        self._rng = rng if rng is not None else random.Random(0)
         self._inbox: list[bytes] = []
         self._time = float("-inf")
-        self._cut = False
-        self._fresh = False
         self._closed = False
         self._changed = trio.Event()
-        if model is not None:
-            vehicle.server.firmware.tx_room = lambda: model.room(Direction.TO_CLIENT)
+        vehicle.server.firmware.tx_room = lambda: model.room(Direction.TO_CLIENT)
 
     @property
     def backlog(self) -> int:
@@ -67,20 +46,12 @@ class MemoryLink:
     def cut(self) -> None:
         """Break the link: what is on the way and all that follows is lost, in both directions."""
         self._catch_up()
-        self._cut = True
-        if self.model is not None:
-            self.model.cut(self._time)
+        self.model.cut(self._time)
 
     def restore(self) -> None:
-        """Mend the link; a stream counts as reopened."""
+        """Mend the link."""
         self._catch_up()
-        self._cut = False
-        if self.model is not None:
-            self.model.restore(self._time)
-        if self.is_stream:
-            self._fresh = True
-            self.stats.reopened += 1
-            self.vehicle.framer.reset()
+        self.model.restore(self._time)
         self._notify()
 
     async def receive(self) -> list[bytes]:
@@ -91,7 +62,7 @@ class MemoryLink:
             if self._closed:
                 raise LinkClosed("memory is closed")
             self._catch_up()
-            if self._fresh or self._inbox:
+            if self._inbox:
                 if not waited:
                     await trio.lowlevel.cancel_shielded_checkpoint()
                 return self._take()
@@ -107,12 +78,7 @@ class MemoryLink:
         self.stats.sent_chunks += len(frames)
         self.stats.sent_bytes += sum(map(len, frames))
         for frame in frames:
-            if self.model is not None:
-                self.model.push(Direction.TO_VEHICLE, frame, now)
-            elif self._cut:
-                self.lost_in_cut += 1
-            else:
-                self._deliver(frame, now)
+            self.model.push(Direction.TO_VEHICLE, frame, now)
         self._notify()
 
     def sender(self, index: int) -> NetAddress | None:
@@ -136,9 +102,6 @@ class MemoryLink:
         self._notify()
 
     def _take(self) -> list[bytes]:
-        if self._fresh:
-            self._fresh = False
-            return []
         chunks, self._inbox = self._inbox[:MAX_CHUNKS], self._inbox[MAX_CHUNKS:]
         self.stats.received_bytes += sum(map(len, chunks))
         return chunks
@@ -149,7 +112,7 @@ class MemoryLink:
 
     def _next_deadline(self) -> float:
         due = self.vehicle.next_deadline()
-        model = self.model.next_deadline() if self.model is not None else None
+        model = self.model.next_deadline()
         return due if model is None else min(due, model)
 
     def _catch_up(self) -> None:
@@ -168,31 +131,12 @@ class MemoryLink:
 
     def _step(self, now: float) -> None:
         model = self.model
-        if model is None:
-            for frame in self.vehicle.outgoing(now):
-                if self._cut:
-                    self.lost_in_cut += 1
-                else:
-                    self._arrive(frame)
-            return
         for frame in model.pop(Direction.TO_VEHICLE, now):
-            self._deliver(frame, now)
+            self.vehicle.receive(frame, now)
         for frame in self.vehicle.outgoing(now):
             model.push(Direction.TO_CLIENT, frame, now)
         for frame in model.pop(Direction.TO_CLIENT, now):
             self._arrive(frame)
 
-    def _deliver(self, frame: bytes, now: float) -> None:
-        for piece in self._pieces(frame):
-            self.vehicle.receive(piece, now)
-
     def _arrive(self, frame: bytes) -> None:
-        self._inbox += self._pieces(frame)
-
-    def _pieces(self, frame: bytes) -> list[bytes]:
-        """Cut a frame in one to four where the link is a stream."""
-        if not self.is_stream:
-            return [frame]
-        cuts = sorted(self._rng.randrange(len(frame) + 1) for _ in range(self._rng.randrange(4)))
-        edges = [0, *cuts, len(frame)]
-        return [frame[start:stop] for start, stop in pairwise(edges) if start < stop]
+        self._inbox.append(frame)

@@ -7,9 +7,7 @@ a terminal and becomes an SVG.
 from __future__ import annotations
 
 import os
-import pty
 import re
-import select
 import subprocess
 import sys
 import tempfile
@@ -21,6 +19,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.text import Text
 
+from tests.support.terminal import Terminal
 from tests.support.vehicles import free_udp_port
 
 COLUMNS, ROWS = 100, 50
@@ -32,39 +31,13 @@ _CONTROL = re.compile(r"\x1b\[([0-9;?]*)([A-Za-z])|\r|\n")
 _MAVFTPFS = [sys.executable, "-m", "mavftpfs"]
 
 
-def in_terminal(command: Sequence[str], folder: Path | None = None) -> str:
+def in_terminal(command: Sequence[str]) -> str:
     """Return everything a command writes to a terminal, which it must end well with."""
-    ours, its = pty.openpty()
-    environment = {**os.environ, "TERM": "xterm-256color", "COLUMNS": str(COLUMNS), "LINES": str(ROWS)}
-    child = subprocess.Popen(
-        command, cwd=folder, env=environment, stdin=subprocess.DEVNULL, stdout=its, stderr=its
-    )
-    os.close(its)
-    try:
-        text = b"".join(_arriving(ours)).decode(errors="replace")
-        if child.wait(PATIENCE):
-            raise RuntimeError(f"{' '.join(command)} ended with {child.returncode}: {text[-500:]}")
-        return text
-    finally:
-        os.close(ours)
-        if child.poll() is None:
-            child.kill()
-            child.wait()
-
-
-def _arriving(terminal: int) -> Iterator[bytes]:
-    """Yield what arrives until the other side is closed."""
-    deadline = time.monotonic() + PATIENCE
-    while time.monotonic() < deadline:
-        if not select.select([terminal], [], [], 1.0)[0]:
-            continue
-        try:
-            data = os.read(terminal, 65536)
-        except OSError:  # EIO: nobody has the other side open any more
-            return
-        if not data:
-            return
-        yield data
+    terminal = Terminal(command, COLUMNS, ROWS)
+    code = terminal.finish(PATIENCE)
+    if code:
+        raise RuntimeError(f"{' '.join(command)} ended with {code}: {terminal.raw[-500:]}")
+    return terminal.raw
 
 
 def screen(output: str) -> list[str]:

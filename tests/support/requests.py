@@ -5,9 +5,9 @@ the card before anything is mounted, `before` runs on the mount uncounted, `scri
 first request to the last one that follows of it (the Terminate of an idle file, a background delivery).
 Listings are kept for the whole run (dir_timeout), so that what is cached does not depend on the time.
 
-Keep-alive requests (opcode 0) depend on time and are counted apart. A run in which the client repeated a
-request, because the machine was too busy to answer in time, is made again; if that goes on, the repetitions
-that the client reports have to explain every request too many.
+Keep-alive requests (opcode 0) depend on time and are counted apart. Where the client repeated a request,
+because the machine was too busy to answer in time, the repetitions that it reports have to explain every
+request too many.
 
 Before a new file gets its name that is opened, to see that it is free, unless a listing less than FREE_FOR
 old lacks it. `aged` makes that certain.
@@ -29,7 +29,6 @@ from tests.support.mounts import Mount
 from tests.support.twins import PRELUDE
 from tests.support.vehicles import HOST, free_udp_port
 
-ATTEMPTS = 5
 FREE_FOR = 2.0
 SETTLED = 0.3
 """Seconds without a request, with nothing open and nothing to deliver, after which a command has had its
@@ -75,7 +74,7 @@ class Case:
     """One command; `$1` is an empty directory on the local disk.
 
     aged: what was listed before is no news any more (FREE_FOR) when the script starts. fresh: it must be news
-    still when the script ends; a run in which it was not is made again.
+    still when the script ends, else names may be listed once more.
     """
 
     name: str
@@ -171,15 +170,8 @@ class Counting:
         return self.vehicle.cost_since(0)
 
     def run(self, case: Case) -> Cost:
-        """Run a case in each of its directories until the client repeated nothing and was in time."""
-        for attempt in range(ATTEMPTS):
-            cost = self._run_once(case, attempt)
-            if not cost.repeats and not cost.late:
-                break
-        return cost
-
-    def _run_once(self, case: Case, attempt: int) -> Cost:
-        where = self.folder / directory(case, attempt)
+        """Run a case in its directory."""
+        where = self.folder / directory(case)
         scratch = self.mount.folder / where.name
         scratch.mkdir()
         listed = time.monotonic()
@@ -227,15 +219,14 @@ class Counting:
         self.mount.run("bash", "-c", PRELUDE + script, "bash", where, scratch, timeout=timeout)
 
 
-def directory(case: Case, attempt: int) -> str:
-    """Return the name of the directory of one attempt at a case."""
-    return f"{case.name.replace(' ', '_').replace('/', '_')}_{attempt}"
+def directory(case: Case) -> str:
+    """Return the name of a case's directory."""
+    return case.name.replace(" ", "_").replace("/", "_")
 
 
 def prepare(root: Path, profile: str, cases: Sequence[Case]) -> None:
     """Fill a card with the directories of all cases."""
     for case in cases:
-        for attempt in range(ATTEMPTS):
-            folder = root / FOLDERS.get(profile, "") / ROOM / directory(case, attempt)
-            folder.mkdir(parents=True)
-            case.prepare(folder)
+        folder = root / FOLDERS.get(profile, "") / ROOM / directory(case)
+        folder.mkdir(parents=True)
+        case.prepare(folder)

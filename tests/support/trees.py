@@ -1,6 +1,4 @@
-"""Reference trees with deterministic content, and a byte-for-byte comparison that runs as its own process.
-
-    python -m tests.support.trees compare EXPECTED ACTUAL     # prints each difference, exit 1 if there is one
+"""Reference trees with deterministic content, and a byte-for-byte comparison.
 
 A mount is only ever touched from a process of its own, so that a hanging mount cannot hang the tests.
 """
@@ -9,7 +7,7 @@ from __future__ import annotations
 
 import os
 import random
-import sys
+import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -103,40 +101,13 @@ def walk(root: bytes) -> Iterator[tuple[bytes, str]]:
                 yield os.path.relpath(os.path.join(folder, name), root), kind
 
 
-def differing(expected: bytes, actual: bytes) -> Iterator[str]:
-    """Yield a line for each difference of two trees: names, kinds, sizes, bytes. `@` trees are left out."""
-    left = dict(walk(expected))
-    right = {path: kind for path, kind in walk(actual) if not path.startswith(b"@")}
-    for path in sorted(left.keys() | right.keys()):
-        if left.get(path) != right.get(path):
-            yield f"{path!r}: expected {left.get(path, 'nothing')}, is {right.get(path, 'nothing')}"
-        elif left[path] == "file":
-            yield from differing_file(os.path.join(expected, path), os.path.join(actual, path))
+COMPARE = ("diff", "-r", "--no-dereference", "--exclude=@*")
+"""Prints each difference of two directories: names, kinds, bytes. `@` trees are left out."""
 
 
-def differing_file(expected: bytes, actual: bytes) -> Iterator[str]:
-    """Yield a line if size or bytes differ."""
-    with open(expected, "rb") as file:
-        left = file.read()
-    size = os.stat(actual).st_size
-    with open(actual, "rb") as file:
-        right = file.read()
-    if size != len(left):
-        yield f"{actual!r}: stat says {size} bytes, expected {len(left)}"
-    if left != right:
-        pairs = enumerate(zip(left, right, strict=False))
-        first = next((i for i, (a, b) in pairs if a != b), min(len(left), len(right)))
-        yield f"{actual!r}: {len(right)} bytes, first difference at {first}"
-
-
-def main() -> int:
-    """Compare the two trees named on the command line."""
-    command, expected, actual = sys.argv[1:]
-    assert command == "compare"
-    differences = list(differing(os.fsencode(expected), os.fsencode(actual)))
-    print(*differences, sep="\n")
-    return 1 if differences else 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+def differing(expected: Path, actual: Path) -> list[str]:
+    """Return a line for each difference of two local trees."""
+    done = subprocess.run(
+        [*COMPARE, expected, actual], capture_output=True, text=True, errors="replace", check=False
+    )
+    return (done.stdout + done.stderr).splitlines()

@@ -8,15 +8,13 @@ from __future__ import annotations
 
 import os
 import subprocess
-import sys
 from dataclasses import dataclass
 from difflib import unified_diff
 from pathlib import Path
 
 from mavftpfs.cache.reserved import parse
 from tests.support.mounts import Mount, wait_until
-from tests.support.trees import differing, walk
-from tests.support.vehicles import PROJECT
+from tests.support.trees import COMPARE, differing, walk
 
 PRELUDE = """
 set -e
@@ -67,11 +65,10 @@ class Twins:
             wait_until("empty files are brought", lambda: not self._differences())
         differences = self._differences()
         assert differences == [], "\n".join(differences[:20])
-        argv = (sys.executable, "-m", "tests.support.trees", "compare", self.twin, self.shown)
-        self.mount.run(*argv, cwd=PROJECT)
+        self.mount.run(*COMPARE, self.twin, self.shown)
 
     def _differences(self) -> list[str]:
-        return list(differing(os.fsencode(self.twin), os.fsencode(self.card)))
+        return differing(self.twin, self.card)
 
     def _only_empty_files_differ(self) -> bool:
         there = {path for path, _ in walk(os.fsencode(self.card))}

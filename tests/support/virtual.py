@@ -58,21 +58,12 @@ class MemorySink:
 class VirtualLink:
     """The loop. `now` is virtual time in seconds."""
 
-    def __init__(
-        self,
-        server: Server,
-        settings: LinkSettings | None = None,
-        *,
-        seed: int = 0,
-        flow: Flow | None = None,
-        op_deadline: float = 30.0,
-    ) -> None:
+    def __init__(self, server: Server, settings: LinkSettings | None = None, *, seed: int = 0) -> None:
         rng = random.Random(seed)
         self.server = server
         self.model = LinkModel(rng, settings)
-        self.engine = Engine(random.Random(rng.random()), flow or Flow(), op_deadline=op_deadline)
+        self.engine = Engine(random.Random(rng.random()), Flow(), op_deadline=30.0)
         self.now = 100.0
-        self.on_step: Callable[[float], None] = lambda now: None
 
     def run(self, *operations: Operation, limit: float = 600.0) -> None:
         """Start operations and go on until all are done."""
@@ -90,12 +81,6 @@ class VirtualLink:
             self.now = self._next_time()
             assert self.now <= end, f"not finished within {limit} virtual seconds"
         raise AssertionError("too many steps")
-
-    def rest(self, seconds: float) -> None:
-        """Let time pass until nothing is under way, at least so long."""
-        end = self.now + seconds
-        self.run_until(lambda: self._next_time(end) >= end, seconds + 1.0)
-        self.now = end
 
     def _exchange(self) -> None:
         now = self.now
@@ -115,7 +100,6 @@ class VirtualLink:
         self.engine.take_finished()
         for wire in self.engine.outgoing(now):
             self.model.push(Direction.TO_VEHICLE, OVERHEAD + wire.rstrip(b"\0"), now)
-        self.on_step(now)
 
     def _receive(self, wire: bytes) -> None:
         try:
@@ -124,13 +108,9 @@ class VirtualLink:
             return
         self.engine.receive(reply, self.now)
 
-    def _next_time(self, default: float | None = None) -> float:
-        candidates = (
-            self.engine.next_deadline(),
-            self.server.next_deadline(),
-            self.model.next_deadline(),
-            default,
-        )
+    def _next_time(self) -> float:
+        ends = (self.engine, self.server, self.model)
+        candidates = [end.next_deadline() for end in ends]
         times = [time for time in candidates if time is not None]
         assert times, "everybody waits for ever"
         return max(min(times), self.now)
