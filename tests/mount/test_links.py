@@ -37,12 +37,6 @@ def test_each_kind_of_link(field: Field, tiny_tree: Path, kind: str) -> None:
     compare(field.mount(vehicle.source), tiny_tree, "sizes")
 
 
-def test_a_link_that_listens_for_tcp(field: Field, small_tree: Path) -> None:
-    port = free_udp_port()
-    field.sim(small_tree, "spec", link=f"tcp:{HOST}:{port}")
-    compare(field.mount(f"tcpin:{HOST}:{port}"), small_tree)
-
-
 @pytest.mark.holds("promise 5", "fault reboot")
 def test_a_reboot_in_mid_copy(field: Field, tmp_path: Path) -> None:
     card = field.local("card")

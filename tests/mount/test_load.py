@@ -153,12 +153,3 @@ def test_120_blocked_opens_do_not_freeze_df(field: Field, tree: Path) -> None:
     assert readers.returncode == 0, errors
     read = dict(line.partition(" ")[::2] for line in out.splitlines())
     assert read == {name: (tree / "many" / name).read_bytes().hex() for name in names}
-
-
-@pytest.mark.holds("rule 14.7")
-def test_several_files_are_read_at_once_over_one_session(field: Field, tree: Path) -> None:
-    mount = field.mount(field.sim(tree, "ardupilot").source)
-    names = ("40152.bin", "119500.bin", "131073.bin", "35850.bin")
-    starts = [f"cmp {mount.path}/sizes/{name} {tree}/sizes/{name} & p{i}=$!" for i, name in enumerate(names)]
-    waits = [f"wait $p{i} || exit 1" for i in range(len(names))]
-    mount.run("sh", "-c", "\n".join(starts + waits), timeout=120)

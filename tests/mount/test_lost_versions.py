@@ -50,36 +50,6 @@ for fd in (new, os.open(path, os.O_RDONLY)):
 require_stale(old)
 """
 
-SLOW_READER = """
-import errno, os, sys, time
-path, card = sys.argv[1:]
-size = 4_000_000
-fd = os.open(path, os.O_RDONLY)
-got = os.read(fd, 1000)
-time.sleep(4)  # nothing is open on the vehicle by now, if that is quick enough
-with open(card + ".new", "wb") as file:
-    file.write(b"N" * size)
-os.utime(card + ".new", (1_600_000_000, 1_600_000_000))
-os.replace(card + ".new", card)
-try:
-    while piece := os.read(fd, 100_000):
-        got += piece
-except OSError as error:
-    assert error.errno == errno.ESTALE, error
-else:
-    assert len(got) == size
-assert got == b"o" * len(got)
-"""
-
-
-def test_a_slow_reader_gets_nothing_of_a_successor_of_the_same_size(field: Field) -> None:
-    card = field.local("card")
-    file = card / "file.bin"
-    file.write_bytes(b"o" * 4_000_000)
-    os.utime(file, (1_500_000_000,) * 2)
-    mount = field.mount(field.sim(card, "mavsdk").source)
-    mount.python(SLOW_READER, mount.path / "file.bin", file, timeout=60)
-
 
 def test_who_has_the_old_file_open_gets_nothing_of_the_new_one(field: Field) -> None:
     card = field.local("card")

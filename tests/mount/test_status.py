@@ -112,7 +112,7 @@ def _reads(argv: tuple[str | Path, ...]) -> int:
     return sum(transfer["done"] for transfer in json.loads(done.stdout)["transfers"])
 
 
-def test_status_can_be_followed_by_a_program(field: Field, small_tree: Path) -> None:
+def test_status_is_for_programs_too(field: Field, small_tree: Path) -> None:
     mount = field.mount(field.sim(small_tree).source)
     argv = [*STATUS, "--json", "--watch", str(mount.path)]
     with subprocess.Popen(argv, stdout=subprocess.PIPE, cwd=PROJECT) as watch:
@@ -121,10 +121,6 @@ def test_status_can_be_followed_by_a_program(field: Field, small_tree: Path) -> 
         assert second["uptime"] > first["uptime"] >= 0
         watch.send_signal(signal.SIGINT)
         assert watch.wait(COMMAND_TIMEOUT) == 130
-
-
-def test_piped_status_is_plain_text(field: Field, small_tree: Path) -> None:
-    mount = field.mount(field.sim(small_tree).source)
     shown = mount.run(*STATUS, mount.path).stdout
     assert re.sub(r"RTT \d+ ms|loss [0-9<]+ %|, [0-9.]+ k?B/s", "", shown).splitlines() == [
         f"{mount.path}: PX4 1/1, disarmed, link fine: , ",
