@@ -19,7 +19,6 @@ from mavftpfs.shared.errors import (
     ExitCode,
     IsADirectory,
     MavftpfsError,
-    NotADirectory,
     NotDelivered,
     NotFound,
     RequestTimeout,

@@ -325,3 +325,22 @@ async def test_changes_that_concern_one_another_take_turns(autojump: MockClock) 
                 await tree.mkdir(D + b"/new")
         await tree.mkdir(b"/e/new")
         assert b"new" in {entry.name for entry in world.tree.entries(b"/e")}
+
+
+@pytest.mark.parametrize("same", [False, True])
+async def test_six_changes_are_not_answered_in_the_time_of_one(same: bool, autojump: MockClock) -> None:
+    world = made("px4")
+    faults = Faults(world)
+    async with mounted(world, D) as (_, tree):
+        faults.cut_after(0)
+
+        async def one(number: int) -> None:
+            await trio.sleep(3 * number)
+            began = trio.current_time()
+            with pytest.raises(RequestTimeout):
+                await tree.mkdir(D + b"/new%d" % (0 if same else number))
+            assert trio.current_time() - began <= LIMIT
+
+        async with trio.open_nursery() as nursery:
+            for number in range(6):
+                nursery.start_soon(one, number)

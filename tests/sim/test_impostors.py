@@ -393,3 +393,51 @@ async def test_ours_is_known_again_though_nobody_was_silent(autojump: MockClock)
         await swap(scene.world, scene.ours, gap=0.5)
         await trio.sleep(10.0)
         assert await read_through(tree, scene.file) == OUR_FILE
+
+
+@pytest.mark.holds("promise 10")
+async def test_a_target_without_heartbeats_moves_with_its_autopilot(
+    autojump: MockClock, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene = Crowd()
+    scene.world.vehicle = SimVehicle(
+        scene.world.tree, PROFILES["mavsdk"], rng=random.Random(1), address=Address(1, 191)
+    )
+    monkeypatch.setattr(
+        scene.world.vehicle,
+        "_beat",
+        lambda frames, now: scene.world.vehicle.__setattr__("_next_beat", now + 1),
+    )
+    link = CrowdedLink(scene.world, HERE)
+    async with trio.open_nursery() as nursery:
+
+        async def autopilot() -> None:
+            for seq in range(1 << 20):
+                link.intrude(link.address, heartbeat(seq))
+                await trio.sleep(1.0)
+
+        nursery.start_soon(autopilot)
+        async with scene.world.connection(ConnectOptions(target_component=191)) as connection:
+            assert await read_file(connection, b"/f") == OURS
+            link.address = THERE
+            await trio.sleep(20.0)
+            assert await read_file(connection, b"/f") == OURS
+            assert connection.status()["address"] == "10.0.0.2:14550"
+        nursery.cancel_scope.cancel()
+
+
+@pytest.mark.holds("fault another vehicle")
+async def test_a_vehicle_that_is_seldom_heard_and_told_once_is_believed(
+    autojump: MockClock, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Between two heartbeats another one could have come, each time."""
+    scene = Scene("px4", LinkSettings(delay=0.02))
+    async with scene.mounted() as tree:
+        monkeypatch.setattr(scene.ours, "_on_command", lambda command, now: None)
+        monkeypatch.setattr("mavftpfs.sim.vehicle.HEARTBEAT_PERIOD", 4.0)
+        await trio.sleep(120.0)
+        start = trio.current_time()
+        for _ in range(10):
+            assert await read_through(tree, scene.file) == OUR_FILE
+            await trio.sleep(5.0)
+        assert trio.current_time() - start < 120.0

@@ -28,6 +28,7 @@ from mavftpfs.sim.profiles import PROFILES, Storage
 from mavftpfs.sim.tree import Kind
 from tests.support.fake_store import read_file
 from tests.support.fake_writer import write_file
+from tests.support.faults import Faults
 from tests.support.mounting import mounted
 from tests.support.takingturns import taking_turns
 from tests.support.trees import content
@@ -117,6 +118,25 @@ async def test_what_became_a_directory_is_not_unlinked(
         if file is not None:
             file.close()
     assert scene.names() == [b"a"]
+
+
+async def test_the_removal_of_many_files_lists_their_directory_seldom(autojump: MockClock) -> None:
+    scene = Scene("px4", LinkSettings(rate=2000.0, delay=0.1))
+    paths = [scene.root + b"/%03d" % number for number in range(100)]
+    for path in paths:
+        scene.world.tree.add(path, b"")
+    faults = Faults(scene.world)
+    async with scene.mounted() as tree:
+        await trio.sleep(LONG)
+        faults.requests.clear()
+        began = trio.current_time()
+        for path in paths:
+            await tree.unlink(path)
+        took = trio.current_time() - began
+    removals = faults.requests.count(Opcode.REMOVE_FILE)
+    assert removals == len(paths)
+    sweeps = sum(faults.requests.count(opcode) for opcode in LISTS)
+    assert sweeps <= 10 * (1 + took / 2)  # of up to ten requests each, one in two seconds
 
 
 @pytest.mark.parametrize("profile", TELLING_CASE)

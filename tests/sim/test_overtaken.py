@@ -15,6 +15,7 @@ from trio.testing import MockClock
 
 from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.tree import Tree
+from mavftpfs.shared.errors import MavftpfsError
 from tests.support.deliveries import (
     GOOD,
     LONG,
@@ -238,3 +239,28 @@ async def test_a_file_gets_another_name_while_it_is_written(profile: str, autoju
         await tree.rename(path, other)
         assert len(world.tree.data(other)) >= 2 * len(piece)
     assert world.tree.data(other) == 8 * piece
+
+
+@pytest.mark.parametrize("profile", RENAMING)
+async def test_the_old_file_stays_while_nobody_waits(profile: str, autojump: MockClock) -> None:
+    """A delivery that is tried again by itself, over a link that was cut, is called off for good."""
+    world = World(profile, SLOW)
+    path = ROOTS.get(profile, b"") + b"/d/file"
+    world.tree.add(path, OLD)
+    faults = Faults(world)
+    async with mounted(world, path.rpartition(b"/")[0]) as (_, tree):
+        file = await tree.open(path, write=True, truncate=True)
+        await file.write(0, LONG)
+        faults.cut_after(60)
+        with pytest.raises(MavftpfsError):
+            await file.release()
+        faults.cut_after(None)
+        await trio.sleep(5)
+        began = trio.current_time()
+        file = await tree.open(path, write=True, truncate=True)
+        assert trio.current_time() - began < PROMPT
+        await trio.sleep(100)
+        assert world.tree.data(path) == OLD
+        await file.write(0, NEW)
+        await file.release()
+        assert world.tree.data(path) == NEW

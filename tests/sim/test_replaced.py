@@ -363,3 +363,24 @@ async def test_the_end_of_a_copy_by_turns_is_compared(autojump: MockClock) -> No
         card.replace()
         with pytest.raises(FileChanged):
             await read_on(handle, STEP)
+
+
+@pytest.mark.parametrize("profile", TIMED)
+async def test_turns_of_two_readers_cost_few_listings(profile: str, autojump: MockClock) -> None:
+    card = Card(profile)
+    card.world.tree.add(b"/second", OLD * 2, THEN)
+    card.world.tree.add(b"/third", OLD * 2, THEN)
+    async with card.mounted() as (_, tree):
+        await tree.stat(PATH)
+        before, began = int(str(tree.status()["listings_asked"])), trio.current_time()
+        got: list[bytes] = []
+
+        async def one(path: bytes) -> None:
+            got.append(await copy(tree, path))
+
+        async with trio.open_nursery() as nursery:
+            nursery.start_soon(one, b"/second")
+            nursery.start_soon(one, b"/third")
+        assert got == [OLD * 2] * 2
+        asked = int(str(tree.status()["listings_asked"])) - before
+        assert asked <= 2 * ((trio.current_time() - began) / 2.0 + 2)
