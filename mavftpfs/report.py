@@ -363,9 +363,6 @@ def _ask_or_remove(socket: Path) -> Status | None:
 WATCH_PERIOD = 1.0
 NOTHING = "no vehicle is mounted"
 
-_SUMMARISED = {"mountpoint", "state", "problem", "vehicle", "link", "transfers", "held"}
-"""What the first lines of a status say; the rest is for --verbose."""
-_SECONDS = {"rtt", "heartbeat_age", "uptime", "eta"}
 _SHORTEST_PATH = 12
 """Characters that are left of a path where a line is too narrow for all of it."""
 
@@ -392,16 +389,12 @@ class Line(NamedTuple):
 # -- what is said -----------------------------------------------------------------------------------
 
 
-def status_lines(status: Status, *, verbose: bool = False) -> list[Line]:
-    """Return a mount's lines: one for a pilot, what moves, what is held back; verbose: the rest, too."""
+def status_lines(status: Status) -> list[Line]:
+    """Return a mount's lines: one for a pilot, what moves, what is held back."""
     first = Line("", str(status.get("mountpoint", "?")), f": {_headline(status)}")
     if status.get("problem"):
         return [first]
-    lines = [first, *map(_transfer_line, status["transfers"]), *_held_lines(status)]
-    if verbose:
-        rest = {key: value for key, value in status.items() if key not in _SUMMARISED}
-        lines += [Line(f"  {name}: {value}") for name, value in rows({"link": status["link"], **rest})]
-    return lines
+    return [first, *map(_transfer_line, status["transfers"]), *_held_lines(status)]
 
 
 def _headline(status: Status) -> str:
@@ -493,58 +486,22 @@ def delivery_line(status: Status) -> str:
     return f"delivering {count_files(held['files'])}, {amount}{rate}{left}{_waits_for(status)}"
 
 
-# -- everything -------------------------------------------------------------------------------------
-
-
-def rows(facts: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
-    """Return the names and values of nested facts, but for those that say nothing."""
-    for key, value in facts.items():
-        name = prefix + key.replace("_", " ")
-        if isinstance(value, Mapping) and value:
-            yield from rows(value, f"{name}: ")
-        elif isinstance(value, bool) or value:
-            yield name, describe(key, value)
-
-
-def describe(key: str, value: Any) -> str:
-    """Return a fact as a person reads it."""
-    if isinstance(value, bool):
-        return "yes" if value else "no"
-    if isinstance(value, int | float):
-        return _number(key, value)
-    if isinstance(value, list | tuple):
-        return ", ".join(map(str, value))
-    return str(value)
-
-
-def _number(key: str, value: float) -> str:
-    if key in _SECONDS:
-        return readable_time(value)
-    if key.endswith("rate"):
-        return f"{readable_size(value)}/s"
-    if key == "loss":
-        return _percent(value)
-    if isinstance(value, int) and ("bytes" in key or key == "dirty_max"):
-        return readable_size(value)
-    return str(value)
-
-
 # -- showing ----------------------------------------------------------------------------------------
 
 
-def print_status(statuses: Sequence[Status], *, verbose: bool) -> None:
+def print_status(statuses: Sequence[Status]) -> None:
     """Print each mount's lines; the same to a terminal and to a pipe."""
     for status in statuses:
-        for line in status_lines(status, verbose=verbose):
+        for line in status_lines(status):
             print(line.fitted())
     if not statuses:
         print(NOTHING)
     sys.stdout.flush()
 
 
-def panel(statuses: Sequence[Status], width: int, height: int, *, verbose: bool = False) -> list[str]:
+def panel(statuses: Sequence[Status], width: int, height: int) -> list[str]:
     """Return the lines of all mounts, as many and as long as a terminal has room for."""
-    lines = [line.fitted(width) for status in statuses for line in status_lines(status, verbose=verbose)]
+    lines = [line.fitted(width) for status in statuses for line in status_lines(status)]
     if len(lines) > height:
         lines[height - 1 :] = [f"… and {len(lines) - height + 1} more lines"[:width]]
     return lines or [NOTHING]
@@ -559,11 +516,11 @@ def screen(lines: Sequence[str]) -> str:
     return "\x1b[H\x1b[J" + "\n".join(shown)
 
 
-def watch_status(fetch: Callable[[], Sequence[Status]], *, verbose: bool) -> None:
+def watch_status(fetch: Callable[[], Sequence[Status]]) -> None:
     """Show the status again each second until interrupted; on a terminal in place, on a screen of its own."""
     if not sys.stdout.isatty():
         while True:
-            print_status(fetch(), verbose=verbose)
+            print_status(fetch())
             print()
             time.sleep(WATCH_PERIOD)
     sys.stdout.write("\x1b[?1049h\x1b[?25l\x1b[?7l")  # the alternate screen, no cursor, no wrapping
@@ -571,7 +528,7 @@ def watch_status(fetch: Callable[[], Sequence[Status]], *, verbose: bool) -> Non
         while True:
             statuses = fetch()
             size = shutil.get_terminal_size()
-            lines = panel(statuses, size.columns, size.lines, verbose=verbose)
+            lines = panel(statuses, size.columns, size.lines)
             sys.stdout.write(screen(lines))
             sys.stdout.flush()
             time.sleep(WATCH_PERIOD)

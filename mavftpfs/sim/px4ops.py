@@ -15,7 +15,6 @@ from mavftpfs.sim.tree import Entry, Kind, fail
 
 _WORK_BUFFER = 256
 _RENAME_LIMIT = 255
-_COPY_BLOCK = 256
 
 
 class Server(Protocol):
@@ -55,7 +54,6 @@ def handlers(server: Server) -> dict[int, Callable[[Request], bytes]]:
         Opcode.CREATE_DIRECTORY: bind(_changing(Storage.mkdir)),
         Opcode.REMOVE_DIRECTORY: bind(_changing(Storage.rmdir)),
         Opcode.RENAME: bind(_rename),
-        Opcode.TRUNCATE_FILE: bind(_truncate),
         Opcode.CALC_FILE_CRC32: bind(_crc),
     }
     if server.profile.list_with_time:
@@ -183,48 +181,3 @@ def _crc(server: Server, request: Request) -> bytes:
     checksum, size = server.storage.crc(path)
     server.spend(size / server.profile.crc_rate)
     return u32(checksum)
-
-
-def _truncate(server: Server, request: Request) -> bytes:
-    server.scratch = path = path_of(server, request)
-    server.check_writable(path)
-    if server.storage.kind is profiles.Storage.NUTTX_FAT:
-        _copy_truncate(server, path, request.offset)
-        return b""
-    try:
-        server.storage.truncate(path, request.offset)
-    except OSError as exc:
-        raise StaleErrno from exc
-    return b""
-
-
-def _copy_truncate(server: Server, path: bytes, size: int) -> None:
-    """Truncate where there is no truncate(2): through a copy, which can destroy the file."""
-    stat = server.storage.stat(path)
-    if stat.kind is Kind.DIRECTORY:
-        raise fail(errno.EISDIR, path)
-    if size == 0:
-        server.storage.open(path, write=True, truncate=True).close()
-    elif size > stat.size:
-        opened = server.storage.open(path, write=True)
-        opened.write(size - 1, b"\0")
-        opened.close()
-    elif size < stat.size:
-        temporary = server.profile.writable_root + b".trunc.tmp"
-        server.spend(2 * size / server.profile.crc_rate)
-        _copy(server.storage, path, temporary, size)
-        _copy(server.storage, temporary, path, size)
-        server.storage.unlink(temporary)
-
-
-def _copy(storage: Storage, source: bytes, target: bytes, size: int) -> None:
-    reader = storage.open(source)
-    writer = storage.open(target, write=True, create=True, truncate=True)
-    offset = 0
-    while offset < size:
-        block = reader.read(offset, min(_COPY_BLOCK, size - offset))
-        if writer.write(offset, block) != len(block) or not block:
-            raise fail(errno.ENOSPC, target)
-        offset += len(block)
-    reader.close()
-    writer.close()

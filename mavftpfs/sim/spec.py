@@ -74,7 +74,6 @@ class Spec(Firmware):
             Opcode.CREATE_DIRECTORY: _on_path(storage.mkdir),
             Opcode.REMOVE_DIRECTORY: _on_path(storage.rmdir),
             Opcode.RENAME: self._rename,
-            Opcode.TRUNCATE_FILE: self._truncate,
             Opcode.CALC_FILE_CRC32: lambda request: u32(storage.crc(_path(request))[0]),
         }
 
@@ -213,10 +212,6 @@ class Spec(Firmware):
     def _rename(self, request: Request) -> bytes:
         old, _, new = request.data[: request.size].partition(b"\0")
         self.storage.rename(old, c_string(new))
-        return b""
-
-    def _truncate(self, request: Request) -> bytes:
-        self.storage.truncate(_path(request), request.offset)
         return b""
 
     # -- bursts ------------------------------------------------------------------------------

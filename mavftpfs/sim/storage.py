@@ -128,11 +128,6 @@ class Storage:
         finally:
             opened.close()
 
-    def truncate(self, path: bytes, size: int) -> None:
-        """Cut or extend a file."""
-        self._refuse_virtual(path)
-        self._tree.truncate(self._resolve(path), size)
-
     def mkdir(self, path: bytes) -> None:
         """Make a directory."""
         self._refuse_virtual(path)

@@ -79,10 +79,6 @@ class Tree(Protocol):
         """Open a file; EISDIR for a directory, ENOENT unless `create`."""
         ...
 
-    def truncate(self, path: bytes, size: int) -> None:
-        """Cut or extend (with zeros) a file."""
-        ...
-
     def remove(self, path: bytes) -> None:
         """Unlink a file; EISDIR for a directory."""
         ...
@@ -240,13 +236,6 @@ class MemoryTree:
         if truncate:
             self._resize(node, 0)
         return _MemoryFile(self, node, write)
-
-    def truncate(self, path: bytes, size: int) -> None:
-        """See Tree."""
-        node = self._find_file(path)
-        if size > self._limit(node):
-            raise fail(errno.EFBIG if size > MAX_FILE else errno.ENOSPC, path)
-        self._resize(node, size)
 
     def remove(self, path: bytes) -> None:
         """See Tree."""
@@ -488,10 +477,6 @@ class DirectoryTree:
             os.close(handle)
             raise fail(errno.EISDIR if os.path.isdir(here) else errno.ENXIO, path)
         return _RealFile(handle)
-
-    def truncate(self, path: bytes, size: int) -> None:
-        """See Tree."""
-        os.truncate(self._real(path), size)
 
     def remove(self, path: bytes) -> None:
         """See Tree."""
