@@ -54,6 +54,7 @@ def handlers(server: Server) -> dict[int, Callable[[Request], bytes]]:
         Opcode.CREATE_DIRECTORY: bind(_changing(Storage.mkdir)),
         Opcode.REMOVE_DIRECTORY: bind(_changing(Storage.rmdir)),
         Opcode.RENAME: bind(_rename),
+        Opcode.TRUNCATE_FILE: bind(_truncate),
         Opcode.CALC_FILE_CRC32: bind(_crc),
     }
     if server.profile.list_with_time:
@@ -181,3 +182,14 @@ def _crc(server: Server, request: Request) -> bytes:
     checksum, size = server.storage.crc(path)
     server.spend(size / server.profile.crc_rate)
     return u32(checksum)
+
+
+def _truncate(server: Server, request: Request) -> bytes:
+    """Cut or extend a file; only recordings ask for it."""
+    server.scratch = path = path_of(server, request)
+    server.check_writable(path)
+    try:
+        server.storage.truncate(path, request.offset)
+    except OSError as exc:
+        raise StaleErrno from exc
+    return b""

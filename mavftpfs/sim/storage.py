@@ -128,6 +128,13 @@ class Storage:
         finally:
             opened.close()
 
+    def truncate(self, path: bytes, size: int) -> None:
+        """Cut or extend a file."""
+        self._refuse_virtual(path)
+        opened = self._tree.open(self._resolve(path), write=True)
+        opened.resize(size)
+        opened.close()
+
     def mkdir(self, path: bytes) -> None:
         """Make a directory."""
         self._refuse_virtual(path)
