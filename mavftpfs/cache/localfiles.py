@@ -1,49 +1,34 @@
-"""Names that never reach the vehicle: swap files, locks, trash. Layer: cache.
+"""Files whose names never reach the vehicle: swap files, locks. Layer: cache.
 
-Editors and file managers put such files beside the ones they work on, by names that the `local=` patterns
-know. They live in memory, bounded, and are seen by this mount only. What lies below a directory of such a
-name is local as well. Between them and those on the vehicle nothing is renamed: they are two places, so
-programs hear EXDEV and copy.
+Editors put such files beside the ones they work on, by names that the `local=` patterns know. They live in
+memory, bounded, and are seen by this mount only. Directories of such names cannot be made: a trash would be
+lost with the mount, and file managers that find none offer to delete. Between these names and those on the
+vehicle nothing is renamed: they are two places, so programs hear EXDEV and copy.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from fnmatch import translate
 from re import compile as compile_pattern
 
 from mavftpfs.cache.attributes import SECOND, Stat
 from mavftpfs.cache.openfile import OpenFile
-from mavftpfs.shared.errors import (
-    AlreadyExists,
-    DirectoryNotEmpty,
-    IsADirectory,
-    NoSpace,
-    NotADirectory,
-    NotFound,
-)
-from mavftpfs.shared.model import EntryKind, join, rename_keys, split
+from mavftpfs.shared.errors import AlreadyExists, NoSpace, NotFound
+from mavftpfs.shared.model import EntryKind, rename_keys, split
 
-MAX_ENTRIES = 10_000
+MAX_FILES = 10_000
 
 
 @dataclass(slots=True, eq=False)
-class LocalEntry:
-    """A file (data is its content) or a directory (data is None).
+class LocalFile:
+    """mtime_ns: nanoseconds since 1970. handles: how many are open; named: it was not unlinked."""
 
-    handles: how many are open; named: it was not unlinked.
-    """
-
-    data: bytearray | None
     mtime_ns: int
+    data: bytearray = field(default_factory=bytearray)
     handles: int = 0
     named: bool = True
-
-    @property
-    def kind(self) -> EntryKind:
-        """File or directory."""
-        return EntryKind.DIRECTORY if self.data is None else EntryKind.FILE
 
 
 class LocalFiles:
@@ -59,179 +44,95 @@ class LocalFiles:
         self._pattern = compile_pattern(joined.encode("utf-8", "surrogateescape"))
         self._limit = limit
         self._now_ns = now_ns
-        self._entries: dict[bytes, LocalEntry] = {}
+        self._files: dict[bytes, LocalFile] = {}
         self.used = 0
 
     def owns(self, path: bytes) -> bool:
         """Return whether a path is local, whether it exists or not."""
         return any(map(self._pattern.match, path.split(b"/")))
 
-    def find(self, path: bytes) -> LocalEntry:
-        """Return what a path is.
+    def find(self, path: bytes) -> LocalFile:
+        """Return the file of a path.
 
         Raises:
             NotFound.
         """
-        entry = self._entries.get(path)
-        if entry is None:
+        file = self._files.get(path)
+        if file is None:
             raise NotFound(f"{path!r} does not exist")
-        return entry
+        return file
 
     def stat(self, path: bytes) -> Stat:
-        """Return attributes.
-
-        Raises:
-            NotFound.
-        """
-        entry = self.find(path)
-        seconds, nanoseconds = divmod(entry.mtime_ns, SECOND)
-        return Stat(entry.kind, len(entry.data or b""), seconds, 0.0, nanoseconds)
+        """Return attributes. Raises NotFound."""
+        file = self.find(path)
+        seconds, nanoseconds = divmod(file.mtime_ns, SECOND)
+        return Stat(EntryKind.FILE, len(file.data), seconds, 0.0, nanoseconds)
 
     def names(self, directory: bytes) -> list[bytes]:
-        """Return the local names in a directory, which may be the vehicle's."""
-        return [name for parent, name in map(split, self._entries) if parent == directory]
-
-    def list(self, path: bytes) -> list[tuple[bytes, Stat]]:
-        """Return the entries of a local directory.
-
-        Raises:
-            NotFound, NotADirectory.
-        """
-        if self.find(path).data is not None:
-            raise NotADirectory(f"{path!r} is not a directory")
-        return [(name, self.stat(join(path, name))) for name in self.names(path)]
+        """Return the local names in one of the vehicle's directories."""
+        return [name for parent, name in map(split, self._files) if parent == directory]
 
     def open(self, path: bytes, *, write: bool, truncate: bool = False) -> LocalHandle:
-        """Open a file.
-
-        Raises:
-            NotFound, IsADirectory.
-        """
-        entry = self.find(path)
-        if entry.data is None:
-            raise IsADirectory(f"{path!r} is a directory")
+        """Open a file. Raises NotFound."""
+        file = self.find(path)
         if truncate:
-            self.resize(entry, 0)
-        return LocalHandle(self, entry, writable=write)
-
-    def truncate(self, path: bytes, size: int) -> None:
-        """Cut a file or extend it with zeros.
-
-        Raises:
-            NotFound, IsADirectory, NoSpace.
-        """
-        entry = self.find(path)
-        if entry.data is None:
-            raise IsADirectory(f"{path!r} is a directory")
-        self.resize(entry, size)
+            self.resize(file, 0)
+        return LocalHandle(self, file, writable=write)
 
     def create(self, path: bytes, *, exclusive: bool) -> LocalHandle:
         """Make a file, or open the one that is there; the directory it is put in was checked.
 
         Raises:
-            AlreadyExists, IsADirectory, NoSpace.
+            AlreadyExists, NoSpace.
         """
-        if path not in self._entries:
-            self._add(path, LocalEntry(bytearray(), self._now_ns()))
+        if path not in self._files:
+            if len(self._files) >= MAX_FILES:
+                raise NoSpace(f"there may be {MAX_FILES} local files")
+            self._files[path] = LocalFile(self._now_ns())
         elif exclusive:
             raise AlreadyExists(f"{path!r} exists")
         return self.open(path, write=True)
 
-    def mkdir(self, path: bytes) -> None:
-        """Make a directory.
-
-        Raises:
-            AlreadyExists, NoSpace.
-        """
-        if path in self._entries:
-            raise AlreadyExists(f"{path!r} exists")
-        self._add(path, LocalEntry(None, self._now_ns()))
-
     def unlink(self, path: bytes) -> None:
-        """Remove a file; handles keep it.
-
-        Raises:
-            NotFound, IsADirectory.
-        """
-        entry = self.find(path)
-        if entry.data is None:
-            raise IsADirectory(f"{path!r} is a directory")
-        del self._entries[path]
-        entry.named = False
-        self.forget_unused(entry)
-
-    def rmdir(self, path: bytes) -> None:
-        """Remove an empty directory.
-
-        Raises:
-            NotFound, NotADirectory, DirectoryNotEmpty.
-        """
-        if self.find(path).data is not None:
-            raise NotADirectory(f"{path!r} is not a directory")
-        if self.names(path):
-            raise DirectoryNotEmpty(f"{path!r} is not empty")
-        del self._entries[path]
+        """Remove a file; handles keep it. Raises NotFound."""
+        file = self.find(path)
+        del self._files[path]
+        file.named = False
+        self.forget_unused(file)
 
     def rename(self, old: bytes, new: bytes, *, noreplace: bool) -> None:
-        """Rename within the local names, over a file or an empty directory of the same kind.
+        """Rename within the local names.
 
         Raises:
-            NotFound, AlreadyExists (noreplace), IsADirectory, NotADirectory, DirectoryNotEmpty.
+            NotFound, AlreadyExists (noreplace).
         """
-        entry, target = self.find(old), self._entries.get(new)
-        if noreplace and target is not None:
+        file = self.find(old)
+        if noreplace and new in self._files:
             raise AlreadyExists(f"{new!r} exists")
-        if target is entry:
-            return
-        if target is not None:
-            if entry.data is None:
-                self.rmdir(new)
-            else:
-                self.unlink(new)
-        self.move_below(old, new)
+        if new in self._files and self._files[new] is not file:
+            self.unlink(new)
+        self._files[new] = self._files.pop(old)
 
-    def move_below(self, old: bytes, new: bytes) -> None:
-        """The directory `old` is called `new` now, whosever it is."""
-        rename_keys(self._entries, old, new)
+    def follow_rename(self, old: bytes, new: bytes) -> None:
+        """One of the vehicle's directories has another name."""
+        rename_keys(self._files, old, new)
 
-    def resize(self, entry: LocalEntry, size: int) -> None:
-        """Cut a file or extend it with zeros.
-
-        Raises:
-            NoSpace.
-        """
-        assert entry.data is not None
-        more = size - len(entry.data)
+    def resize(self, file: LocalFile, size: int) -> None:
+        """Cut a file or extend it with zeros. Raises NoSpace."""
+        more = size - len(file.data)
         if more > 0 and self.used + more > self._limit:
             raise NoSpace(f"local files may take {self._limit} bytes in all")
         if more > 0:
-            entry.data.extend(bytes(more))
+            file.data.extend(bytes(more))
         else:
-            del entry.data[size:]
+            del file.data[size:]
         self.used += more
-        entry.mtime_ns = self._now_ns()
+        file.mtime_ns = self._now_ns()
 
-    def write(self, entry: LocalEntry, offset: int, data: bytes | memoryview) -> None:
-        """Write into a file.
-
-        Raises:
-            NoSpace.
-        """
-        assert entry.data is not None
-        if offset + len(data) > len(entry.data):
-            self.resize(entry, offset + len(data))
-        entry.data[offset : offset + len(data)] = data
-        entry.mtime_ns = self._now_ns()
-
-    def forget_unused(self, entry: LocalEntry) -> None:
+    def forget_unused(self, file: LocalFile) -> None:
         """A file has fewer names or handles; without any its bytes are not counted any more."""
-        if not entry.named and not entry.handles:
-            self.used -= len(entry.data or b"")
-
-    def _add(self, path: bytes, entry: LocalEntry) -> None:
-        if len(self._entries) >= MAX_ENTRIES:
-            raise NoSpace(f"there may be {MAX_ENTRIES} local files")
-        self._entries[path] = entry
+        if not file.named and not file.handles:
+            self.used -= len(file.data)
 
 
 class LocalHandle(OpenFile):
@@ -239,44 +140,35 @@ class LocalHandle(OpenFile):
 
     writable = False
 
-    def __init__(self, files: LocalFiles, entry: LocalEntry, *, writable: bool) -> None:
+    def __init__(self, files: LocalFiles, file: LocalFile, *, writable: bool) -> None:
         self._files = files
-        self._entry = entry
-        assert entry.data is not None
-        self._data = entry.data
+        self._file = file
         self._closed = False
         self.writable = writable
-        entry.handles += 1
+        file.handles += 1
 
     @property
     def size(self) -> int:
         """Bytes."""
-        return len(self._data)
+        return len(self._file.data)
 
     async def read(self, offset: int, size: int) -> bytes:
         """Return bytes, fewer only at the end."""
-        return bytes(self._data[offset : offset + size])
+        return bytes(self._file.data[offset : offset + size])
 
     async def write(self, offset: int, data: bytes | memoryview) -> int:
-        """Write.
-
-        Raises:
-            NoSpace.
-        """
-        self._files.write(self._entry, offset, data)
+        """Write. Raises NoSpace."""
+        self._files.resize(self._file, max(self.size, offset + len(data)))
+        self._file.data[offset : offset + len(data)] = data
         return len(data)
 
     async def truncate(self, size: int) -> None:
-        """Cut or extend.
-
-        Raises:
-            NoSpace.
-        """
-        self._files.resize(self._entry, size)
+        """Cut or extend. Raises NoSpace."""
+        self._files.resize(self._file, size)
 
     def close(self) -> None:
         """Close; closing twice is harmless."""
         if not self._closed:
             self._closed = True
-            self._entry.handles -= 1
-            self._files.forget_unused(self._entry)
+            self._file.handles -= 1
+            self._files.forget_unused(self._file)

@@ -38,6 +38,7 @@ from mavftpfs.shared.errors import (
     NotADirectory,
     NotDeliveredYet,
     NotFound,
+    NotSupported,
     ReadOnly,
 )
 from mavftpfs.shared.model import ROOT, DirEntry, EntryKind, is_snapshot, is_virtual, join, normalise, split
@@ -159,8 +160,8 @@ class Tree:
         remote = self._remote(path)
         if is_snapshot(remote):
             return await self._virtual.list(remote)
-        if self._local.owns(remote):
-            return self._local.list(remote)
+        if self._local.owns(remote) and self._local.find(remote):
+            raise NotADirectory(f"{remote!r} is not a directory")
         directory = await self._directories.get(remote)
         founds = {name: Found(entry, directory) for name, entry in directory.entries.items()}
         if remote == ROOT:
@@ -255,7 +256,7 @@ class Tree:
         remote = self._remote(path)
         self._require_writable(remote)
         if self._local.owns(remote):
-            self._local.truncate(remote, size)
+            self._local.resize(self._local.find(remote), size)
         else:
             await self._writing.truncate(remote, size)
 
@@ -277,15 +278,13 @@ class Tree:
         """Make a directory.
 
         Raises:
-            AlreadyExists, NotFound, NotADirectory, Armed, PathTooLong.
+            AlreadyExists, NotFound, NotADirectory, NotSupported (a local name), Armed, PathTooLong.
         """
         remote = self._remote(path)
         self._require_writable(remote)
         if self._local.owns(remote):
-            await self._require_parent(remote)
-            self._local.mkdir(remote)
-        else:
-            await self._writing.namespace.mkdir(remote)
+            raise NotSupported(f"{remote!r} is a name for files that stay in memory (local=)")
+        await self._writing.namespace.mkdir(remote)
 
     async def rmdir(self, path: bytes) -> None:
         """Remove an empty directory.
@@ -295,12 +294,11 @@ class Tree:
         """
         remote = self._remote(path)
         self._require_writable(remote)
-        if self._local.owns(remote):
-            self._local.rmdir(remote)
-        elif self._local.names(remote):
+        if self._local.owns(remote) and self._local.find(remote):
+            raise NotADirectory(f"{remote!r} is not a directory")
+        if self._local.names(remote):
             raise DirectoryNotEmpty(f"{remote!r} holds local files")
-        else:
-            await self._writing.namespace.rmdir(remote)
+        await self._writing.namespace.rmdir(remote)
 
     async def unlink(self, path: bytes) -> None:
         """Remove a file; who has it open goes on reading it.
@@ -332,7 +330,7 @@ class Tree:
             self._local.rename(source, target, noreplace=noreplace)
         else:
             await self._writing.namespace.rename(source, target, noreplace=noreplace)
-            self._local.move_below(source, target)
+            self._local.follow_rename(source, target)
 
     def undelivered(self) -> Sequence[bytes]:
         """Return the paths of files of which the vehicle does not provably have every byte."""

@@ -9,12 +9,11 @@ from mavftpfs.shared.errors import (
     AlreadyExists,
     CrossDevice,
     DirectoryNotEmpty,
-    IsADirectory,
     NoSpace,
     NotADirectory,
     NotFound,
+    NotSupported,
 )
-from mavftpfs.shared.model import EntryKind
 from tests.support.fake_store import read_file
 from tests.support.fake_writer import FakeWriter, card, make_writable, write_file
 
@@ -77,21 +76,20 @@ async def test_a_file_is_not_renamed_between_here_and_the_vehicle(store: FakeWri
     assert {path: file.data for path, file in store.files.items()} == {FILE: b"-- old"}
 
 
-async def test_trash(tree: Tree) -> None:
-    with pytest.raises(NotFound):
-        await tree.mkdir(TRASH + b"/files")
-    await tree.mkdir(TRASH)
-    await tree.mkdir(TRASH + b"/files")
-    with pytest.raises(AlreadyExists):
+async def test_a_trash_is_refused(store: FakeWriter, tree: Tree) -> None:
+    """It would be lost with the mount. File managers offer to delete, then."""
+    with pytest.raises(NotSupported):
         await tree.mkdir(TRASH)
-    assert (await tree.stat(TRASH)).kind is EntryKind.DIRECTORY
-    await write_file(tree, TRASH + b"/files/hover.lua", b"copy")
-    assert [name for name, _ in await tree.list(TRASH + b"/files")] == [b"hover.lua"]
-    with pytest.raises(DirectoryNotEmpty):
-        await tree.rmdir(TRASH)
+    with pytest.raises(NotFound):
+        await write_file(tree, TRASH + b"/files/hover.lua", b"copy")
     await write_file(tree, SWAP, b"")
     with pytest.raises(NotADirectory):
         await tree.list(SWAP)
+    with pytest.raises(NotADirectory):
+        await tree.rmdir(SWAP)
+    with pytest.raises(NotADirectory):
+        await write_file(tree, SWAP + b"/x", b"")
+    assert store.requests == 0
 
 
 async def test_local_renames_obey_the_rules(tree: Tree) -> None:
@@ -101,17 +99,10 @@ async def test_local_renames_obey_the_rules(tree: Tree) -> None:
         await tree.rename(SWAP, b"/scripts/._a", noreplace=True)
     await tree.rename(SWAP, b"/scripts/._a")
     assert await read_file(tree, b"/scripts/._a") == b"one"
-    await tree.mkdir(TRASH)
-    with pytest.raises(IsADirectory):
-        await tree.rename(b"/scripts/._a", TRASH)
-    with pytest.raises(NotADirectory):
-        await tree.rename(TRASH, b"/scripts/._a")
+    await tree.rename(b"/scripts/._a", b"/scripts/._a")
     with pytest.raises(NotFound):
         await tree.rename(b"/scripts/._a", b"/none/._a")
-    await tree.rename(TRASH, b"/.Trash-1")
-    assert (await tree.stat(b"/.Trash-1")).kind is EntryKind.DIRECTORY
-    with pytest.raises(IsADirectory):
-        await tree.open(b"/.Trash-1")
+    assert await read_file(tree, b"/scripts/._a") == b"one"
 
 
 async def test_a_directory_with_local_names_is_not_empty_and_takes_them_along(
