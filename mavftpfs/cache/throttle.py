@@ -41,8 +41,7 @@ class Throttle:
 
     def __init__(self, context: Context) -> None:
         self._context = context
-        self._moved = trio.Event()
-        self._has_moved = False
+        self._waiting = trio.lowlevel.ParkingLot()
         self.meter = RateMeter()
         self._uncounted = 0
         self._grain = 1
@@ -81,21 +80,18 @@ class Throttle:
 
     def is_full(self, node: Node) -> bool:
         """Return whether the writers of a file have to wait."""
-        draft, attempt = node.draft, node.attempt
+        draft = node.draft
         if draft is None or node.removed or draft.unacked <= LEAST:
             return False  # nothing is delivered of a file without a name
-        if node.start_after == float("inf") or (attempt is None and self._context.nursery is None):
+        if node.start_after == float("inf"):
             return False  # nothing of it moves before it is closed: it waits on the local disk
         streams = sum(other.attempt is not None for other in self._context.nodes)
         return draft.unacked > self.limit // max(streams, 1)
 
     async def wait(self) -> bool:
         """Wait for anything to move; return False if nothing did for STALL seconds."""
-        if self._has_moved:
-            self._has_moved = False
-            self._moved = trio.Event()
         with trio.move_on_after(STALL):
-            await self._moved.wait()
+            await self._waiting.park()
             return True
         return False
 
@@ -106,13 +102,12 @@ class Throttle:
             self.meter.on_bytes(self._uncounted, self._context.clock())
             self._uncounted = 0
             self._grain = COARSE if (self.meter.rate or 0.0) > FAST else 1
-        if not self._has_moved:
+        if self._waiting:
             self.let_go()
 
     def let_go(self) -> None:
-        """Have those who wait look again. Who waits from now on waits for the next news."""
-        self._has_moved = True  # `wait` makes the new event: one for each ACK would cost more than the ACK
-        self._moved.set()
+        """Have those who wait look again."""
+        self._waiting.unpark_all()
 
     def transfers(self) -> list[dict[str, object]]:
         """Return what is not delivered, what is on its way first; eta: seconds at the measured rate."""

@@ -134,13 +134,19 @@ class Verifier:
             VerificationFailed: the card has other bytes. SessionBusy: another client was active each time.
             Else as RemoteStore.open_reader.
         """
+        context = self._context
         for _ in range(READ_TRIES):
-            version = await _open(self._context, path)
+            blocks = BlockCache(4 * BLOCK_SIZE, clock=context.clock, patience=context.options.op_deadline)
+            version = Version(blocks, path)  # past every cache
+            version.reader = reader = await context.store.open_reader(path, version)
+            version.size = reader.size
             try:
                 same = version.size == draft.size
-                for at in range(0, draft.size, PIECE):
+                for at in range(0, draft.size if same else 0, PIECE):
                     stop = min(at + PIECE, draft.size)
-                    same = same and await _take(version, at, stop) == draft.local_bytes(at, stop)
+                    reader.want(at, stop, demand=True)
+                    await version.wait_for(at, stop)
+                    same = same and version.get(at, stop) == draft.local_bytes(at, stop)
             except FileChanged:
                 same = False
             finally:
@@ -152,22 +158,3 @@ class Verifier:
         if not same:
             raise VerificationFailed(f"{path!r} does not hold on the vehicle what was written")
         self.by_reading += 1
-
-
-async def _open(context: Context, path: bytes) -> Version:
-    """Open a file for reading past every cache."""
-    blocks = BlockCache(4 * BLOCK_SIZE, clock=context.clock, patience=context.options.op_deadline)
-    version = Version(blocks, path)
-    version.reader = await context.store.open_reader(path, version)
-    version.size = version.reader.size
-    return version
-
-
-async def _take(version: Version, start: int, stop: int) -> bytes | memoryview | None:
-    """Return the bytes [start, stop), None if they may be another file's."""
-    if start == stop:
-        return b""
-    assert version.reader is not None
-    version.reader.want(start, stop, demand=True)
-    await version.wait_for(start, stop)
-    return version.get(start, stop)
