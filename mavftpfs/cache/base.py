@@ -114,6 +114,6 @@ def _on_replaced(context: Context, node: Node, draft: Draft) -> None:
     if node.delivery is not None:
         return  # its delivery looks for itself
     draft.lose_base()
-    if draft.state is State.STALE and not draft.undelivered:
+    if draft.state is State.STALE and not draft.lacked:
         context.nodes.replaced(node)
         context.files.forget_pages(node.path)

@@ -139,6 +139,7 @@ class Draft:
         base_limit: below this, bytes that are not held are the base's.
         state: see State.
         sending: the present attempt's books, only while SENDING.
+        lacked: whether the vehicle lacked something of it when the base was replaced (STALE).
         begun: the file may exist under its own name because of us (cards that cannot rename).
     """
 
@@ -152,14 +153,9 @@ class Draft:
         self.begun = False
         self._held = ExtentSet()
         self._changed = ExtentSet()
-        self._lacked = False
+        self.lacked = False
 
     # --- what it is
-
-    @property
-    def undelivered(self) -> bool:
-        """Whether the vehicle lacks something of it that it should have."""
-        return self._lacked if self.state is State.STALE else self.state is not State.CLEAN
 
     @property
     def whole(self) -> bool:
@@ -318,7 +314,7 @@ class Draft:
     def lose_base(self) -> None:
         """Others replaced the file on the vehicle. If no byte of it was to stay that changes nothing."""
         if self.base_limit and self.state is not State.STALE:
-            self._lacked = self.state is not State.CLEAN
+            self.lacked = self.state is not State.CLEAN
             self.give_up()
             self.on(Event.REPLACED)
 

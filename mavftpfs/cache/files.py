@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import errno
 from collections import OrderedDict
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from functools import partial
 from itertools import islice
 
@@ -63,6 +63,9 @@ MAX_TRIES = 5
 PAUSES = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
 """Seconds that a read waits before it tries again because its bytes were dropped as doubtful: together longer
 than what is read stays provisional after another client of the vehicle used our session."""
+
+ADOPTED_AT_ONCE = 64 * 1024
+"""Bytes of a file we wrote that are read at once."""
 
 COMPARE_PAUSE = 2.0
 """Seconds between two listings that only compare one file; 50 times what the last one took where that is
@@ -392,16 +395,16 @@ class Files:
                 del self._current[version.path]
             version.end(f"{version.path!r} was changed here")
 
-    def adopt(self, path: bytes, size: int, pieces: Iterable[tuple[int, bytes]], *, proven_at: float) -> None:
-        """Take over the content of a file we wrote: (offset, bytes) of all of it, then proven."""
+    def adopt(self, path: bytes, size: int, read: Callable[[int, int], bytes], *, proven_at: float) -> None:
+        """Take over the content of a file we wrote, which was proven then; `read(start, stop)` returns it."""
         self.on_changed(path)
         if proven_at <= self._restarted_at:
             return
         version = Version(self.cache, path, size)
         version.proven_at, version.shown, version.given = proven_at, True, True
         self._replace(version)
-        for offset, data in pieces:
-            version.preload(offset, data)
+        for at in range(0, size, ADOPTED_AT_ONCE):
+            version.preload(at, read(at, min(at + ADOPTED_AT_ONCE, size)))
 
     def on_renamed(self, old: bytes, new: bytes) -> None:
         """A file, or a directory with all below it, has another path now; open files follow."""

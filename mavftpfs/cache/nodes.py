@@ -78,7 +78,10 @@ class Node:
     @property
     def undelivered(self) -> bool:
         """Whether the vehicle lacks something of it that it should have."""
-        return self.draft is not None and not self.removed and self.draft.undelivered
+        draft = self.draft
+        if draft is None or self.removed:
+            return False
+        return draft.lacked if draft.state is State.STALE else draft.state is not State.CLEAN
 
     @property
     def changing(self) -> bool:

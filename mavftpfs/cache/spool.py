@@ -35,7 +35,7 @@ class Spool:
     """
 
     def __init__(
-        self, *, memory_max: Callable[[], int], spool_max: int, directory: Path | None = None
+        self, *, spool_max: int, directory: Path | None = None, memory_max: Callable[[], int] = lambda: 0
     ) -> None:
         """`memory_max()` bytes in memory, `spool_max` on disk, in `directory` or one made when needed."""
         self.memory_max = memory_max

@@ -46,7 +46,6 @@ class Throttle:
         self._uncounted = 0
         self._grain = 1
 
-    @property
     def limit(self) -> int:
         """Bytes that may be un-ACKed over all uploads, and held in memory."""
         fixed = self._context.options.dirty_max
@@ -86,7 +85,7 @@ class Throttle:
         if node.start_after == float("inf"):
             return False  # nothing of it moves before it is closed: it waits on the local disk
         streams = sum(other.attempt is not None for other in self._context.nodes)
-        return draft.unacked > self.limit // max(streams, 1)
+        return draft.unacked > self.limit() // max(streams, 1)
 
     async def wait(self) -> bool:
         """Wait for anything to move; return False if nothing did for STALL seconds."""

@@ -93,12 +93,12 @@ class Writeback:
             own=OwnNames(owner, rng),
             paths=files.paths,
             spool=Spool(
-                memory_max=lambda: throttle.limit,
                 spool_max=options.spool_max,
                 directory=None if spool_directory is None else spool_directory.path,
             ),
         )
         self._throttle = throttle = Throttle(context)
+        context.spool.memory_max = throttle.limit
         self._names = names = Names(context)
         self._cleaner = cleaner = Cleaner(context, names, dead)
         self._deliverer = deliverer = Deliverer(context, names, cleaner, throttle)
@@ -271,7 +271,7 @@ class Writeback:
         return {
             "bytes_held": self._context.spool.in_memory + self._context.spool.on_disk,
             "bytes_held_on_disk": self._context.spool.on_disk,
-            "dirty_max": self._throttle.limit,
+            "dirty_max": self._throttle.limit(),
             "write_rate": self._throttle.meter.rate,
             "files_undelivered": len(self.undelivered()),
             "bytes_undelivered": sum(sizes),

@@ -31,9 +31,6 @@ TRIES = 3
 MAX_FILE = 2**32 - 1
 """Bytes: the protocol's offsets have 32 bits; ArduPilot's servers refuse from 2 GiB on (servers.md 8)."""
 
-STEP = 64 * 1024
-"""Bytes of a delivered file that are handed to the block cache at once."""
-
 ADOPTED_PART = 4
 """A delivered file of up to this part of the block cache is kept in it."""
 
@@ -134,10 +131,8 @@ class ReadFile(OpenFile):
         context, node = self._context, self._node
         fits = 0 < draft.size <= context.options.cache_size // ADOPTED_PART
         if fits and context.clock() - node.known_at < context.options.proof_time and draft.whole:
-            starts = range(0, draft.size, STEP)
-            pieces = ((at, draft.local_bytes(at, min(at + STEP, draft.size))) for at in starts)
             with suppress(SpoolFailed):  # the local disk does not give it back: it is on the vehicle
-                context.files.adopt(node.path, draft.size, pieces, proven_at=node.known_at)
+                context.files.adopt(node.path, draft.size, draft.local_bytes, proven_at=node.known_at)
 
     async def _read_changed(self, offset: int, size: int) -> bytes | memoryview:
         """Read a file that was written here since the handle was opened, or that is not open yet."""

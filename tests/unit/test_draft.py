@@ -76,18 +76,17 @@ def test_an_interrupted_commit_is_torn_and_no_base_counts_any_more() -> None:
     assert draft.state is State.TORN
     draft.lose_base()
     draft.write(0, b"Y")
-    assert draft.undelivered
     assert draft.local_bytes(0, 3) == b"Yld"
 
 
 def test_a_base_that_others_replaced() -> None:
     clean = draft_over(b"old")
     clean.lose_base()
-    assert (clean.state, clean.undelivered) == (State.STALE, False)
+    assert (clean.state, clean.lacked) == (State.STALE, False)
     cut = draft_over(b"old")
     cut.truncate(2)
     cut.lose_base()
-    assert (cut.state, cut.undelivered) == (State.STALE, True)
+    assert (cut.state, cut.lacked) == (State.STALE, True)
     with pytest.raises(LocalProtocolError):
         cut.write(0, b"x")
     cut.truncate(0)
