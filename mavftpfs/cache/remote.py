@@ -7,9 +7,8 @@ from __future__ import annotations
 
 from typing import Protocol
 
-from mavftpfs.shared.model import Listing
+from mavftpfs.shared.model import Listing, WriteTraits
 from mavftpfs.shared.sending import Sending
-from mavftpfs.shared.traits import WriteTraits
 
 
 class ReadSink(Protocol):

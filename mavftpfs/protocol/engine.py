@@ -24,7 +24,7 @@ from mavftpfs.protocol.payload import NakCode, Opcode, Payload, reply_of, split_
 from mavftpfs.protocol.requests import Operation, Priority, Request, encode
 from mavftpfs.protocol.timers import Timers
 from mavftpfs.shared.errors import LocalProtocolError, RemoteProtocolError, RequestTimeout
-from mavftpfs.shared.traits import Traits
+from mavftpfs.shared.model import Traits
 
 OP_DEADLINE = 30.0
 _MAX_REPLAYS = 8

@@ -16,7 +16,7 @@ from typing import NamedTuple, Protocol, TypeAlias
 
 from mavftpfs.protocol.payload import MAX_DATA, NakCode, Opcode, Payload
 from mavftpfs.shared.errors import FtpNak, MavftpfsError
-from mavftpfs.shared.traits import Traits
+from mavftpfs.shared.model import Traits
 
 _pack = Struct(f"<HBBBBBxI{MAX_DATA}s").pack  # fills up with zeros
 

@@ -24,7 +24,7 @@ from mavftpfs.session.doubt import Doubt, session_used_by
 from mavftpfs.session.driver import Driver
 from mavftpfs.session.serversession import OpenSession, ServerSession, State
 from mavftpfs.shared.errors import DataUnproven, MavftpfsError, RequestTimeout, SessionLost
-from mavftpfs.shared.traits import WriteTraits
+from mavftpfs.shared.model import WriteTraits
 
 ReadMode = Literal["window", "burst"]
 

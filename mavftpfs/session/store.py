@@ -40,12 +40,12 @@ from mavftpfs.shared.model import (
     DirEntry,
     EntryKind,
     Listing,
+    Traits,
     hides_files,
     split,
     wire_path,
 )
 from mavftpfs.shared.sending import Sending
-from mavftpfs.shared.traits import Traits
 
 TIME_PROBE_LIMIT = 2.5
 """Seconds of silence after which ListDirectory is tried in place of ListDirectoryWithTime."""

@@ -31,12 +31,11 @@ from mavftpfs.link.messages import (
 )
 from mavftpfs.protocol.payload import PAYLOAD_SIZE
 from mavftpfs.sim.ardupilot import ArduPilot
-from mavftpfs.sim.firmware import Firmware
+from mavftpfs.sim.firmware import Firmware, Spec
 from mavftpfs.sim.mavsdk import Mavsdk
 from mavftpfs.sim.profiles import Family, Profile
 from mavftpfs.sim.pseudo import VirtualTrees
 from mavftpfs.sim.px4 import Px4
-from mavftpfs.sim.spec import Spec
 from mavftpfs.sim.storage import Storage
 from mavftpfs.sim.tree import Tree
 

@@ -29,9 +29,8 @@ from mavftpfs.shared.errors import (
     OutcomeUnknown,
     VehicleLost,
 )
-from mavftpfs.shared.model import ROOT, join, split, wire_path
+from mavftpfs.shared.model import ROOT, WriteTraits, join, split, wire_path
 from mavftpfs.shared.sending import Sending
-from mavftpfs.shared.traits import WriteTraits
 from tests.support.fake_store import FakeFile, FakeReader, FakeStore
 
 CHUNK = 239

@@ -14,7 +14,7 @@ from mavftpfs.protocol.operations import ListDirectory, OpenFile, Simple
 from mavftpfs.protocol.payload import NakCode, Opcode, Payload
 from mavftpfs.protocol.reading import ReadTransfer
 from mavftpfs.shared.errors import FtpNak, RequestTimeout
-from mavftpfs.shared.traits import Traits
+from mavftpfs.shared.model import Traits
 from tests.support.replies import ack, burst_nak, chunk, nak, packet, sent
 from tests.support.virtual import MemorySink
 

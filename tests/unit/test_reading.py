@@ -15,7 +15,7 @@ from mavftpfs.protocol.reading import ReadTransfer
 from mavftpfs.protocol.requests import Priority
 from mavftpfs.shared.errors import FileChanged, FtpNak, SessionLost
 from mavftpfs.shared.extents import ExtentSet
-from mavftpfs.shared.traits import Traits
+from mavftpfs.shared.model import Traits
 from tests.support.replies import ack, burst_nak, chunk, nak, packet, sent
 from tests.support.virtual import MemorySink
 

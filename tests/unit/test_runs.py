@@ -14,7 +14,7 @@ from mavftpfs.protocol.payload import MAX_DATA, Opcode, Payload, decode_reply
 from mavftpfs.protocol.reading import ReadTransfer
 from mavftpfs.protocol.writing import WriteTransfer
 from mavftpfs.shared.errors import RemoteProtocolError
-from mavftpfs.shared.traits import Traits
+from mavftpfs.shared.model import Traits
 from tests.support.replies import ack, chunk, sent
 from tests.support.sources import MemorySource
 from tests.support.virtual import MemorySink
