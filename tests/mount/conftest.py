@@ -6,7 +6,7 @@ Nothing here skips: a machine that cannot mount fails these tests (scripts/setup
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TypeVar
@@ -83,21 +83,6 @@ class Field:
         path = self.folder / str(number)
         path.mkdir()
         return path
-
-
-LINES = pytest.StashKey[list[str]]()
-
-
-@pytest.fixture
-def report_line(request: pytest.FixtureRequest) -> Callable[[str], None]:
-    """Take a line that is shown at the end of the run: a measurement, which no test may assert."""
-    return request.config.stash.setdefault(LINES, []).append
-
-
-def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
-    """Show what was measured."""
-    for line in config.stash.get(LINES, []):
-        terminalreporter.write_line(line)
 
 
 @pytest.fixture

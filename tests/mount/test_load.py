@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -36,9 +35,7 @@ IN_SOAK = ("px4", "px4-nuttx", "ardupilot", "mavsdk")
 @pytest.mark.parametrize(
     "kind", [pytest.param(kind, marks=pytest.mark.soak if kind in IN_SOAK else ()) for kind in COPIES]
 )
-def test_ls_overtakes_a_large_copy(
-    field: Field, tmp_path: Path, kind: str, report_line: Callable[[str], None]
-) -> None:
+def test_ls_overtakes_a_large_copy(field: Field, tmp_path: Path, kind: str) -> None:
     size, link = COPIES[kind]
     card = field.local("card")
     (card / "large0.bin").write_bytes(content(kind, size))
@@ -49,29 +46,22 @@ def test_ls_overtakes_a_large_copy(
         (card / f"fresh{number}" / f"file{number}").touch()
     vehicle: UdpVehicle = field.mavsdk(card) if kind == "mavsdk-server" else field.sim(card, kind, link)
     mount = field.mount(vehicle.source)
-    fresh, times, beside = iter(range(FRESH_DIRECTORIES)), [], 0
+    fresh, beside = iter(range(FRESH_DIRECTORIES)), 0
     for attempt in range(COPIES_AT_MOST):  # whoever is kept from working for seconds needs a second one
-        start = time.monotonic()
         with mount.started("cp", mount.path / f"large{attempt}.bin", tmp_path / "copy") as copy:
             for number in fresh:
                 time.sleep(0.1)
                 if copy.poll() is not None:
                     break
-                before = time.monotonic()
                 names = mount.run("ls", mount.path / f"fresh{number}").stdout
-                times.append(time.monotonic() - before)
                 assert names == f"file{number}\n"
                 beside += copy.poll() is None
             _, errors = copy.communicate(timeout=300)
-        took = time.monotonic() - start
         assert (copy.returncode, errors) == (0, "")
         assert (tmp_path / "copy").read_bytes() == (card / "large0.bin").read_bytes()
         if beside >= 5:
             break
-    median, longest = sorted(times)[len(times) // 2], max(times)
-    report = f"cp {took:.1f} s, {beside} ls beside it: median {median:.3f} s, max {longest:.3f} s"
-    report_line(f"{kind}: {report}")
-    assert beside >= 5, f"ls waits for the copy: {report}"
+    assert beside >= 5, "ls waits for the copy"
 
 
 SLACK = 12 * MIB

@@ -1,6 +1,6 @@
 """Random system calls on a real mount, over bad links, compared with a local directory call by call.
 
-What fails prints its seed and the last calls; `tests.support.programs.lockstep` runs it again, in parts.
+What fails prints its seed and the last calls; `tests.support.programs.lockstep` runs it again.
 """
 
 from __future__ import annotations

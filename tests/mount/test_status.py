@@ -57,19 +57,6 @@ def test_the_log_has_one_line_for_each_thing_that_happens(field: Field, small_tr
     ]
 
 
-def test_the_log_tells_of_another_vehicle(field: Field, small_tree: Path) -> None:
-    vehicle = field.sim(small_tree, options=("--seed", "1"))
-    mount = field.mount(vehicle.source)
-    vehicle.kill()
-    logged(mount, "is lost")
-    vehicle.options = ("--seed", "2")
-    vehicle.start()
-    logged(mount, "another vehicle")
-    assert ", LOST: another vehicle answers in its place\n" in mount.run(*STATUS, mount.path).stdout
-    assert len([line for line in news(mount) if "another vehicle" in line]) == 1
-    assert not [line for line in news(mount) if "is back" in line]
-
-
 def test_the_log_tells_of_another_ftp_client(field: Field, small_tree: Path) -> None:
     vehicle = field.sim(small_tree)
     ports = (vehicle.vehicle_port, free_udp_port(), free_udp_port())

@@ -19,7 +19,6 @@ from mavftpfs.protocol.payload import (
     PAYLOAD_SIZE,
     Opcode,
     Payload,
-    crc32,
     decode_reply,
     decode_request,
 )
@@ -69,14 +68,6 @@ def test_any_bytes_decode_or_are_the_peers_fault(wire: bytes) -> None:
     else:
         assert len(reply.data) == reply.size
         assert reply.data == wire[12 : 12 + reply.size]
-
-
-@given(st.lists(st.binary(max_size=50)))
-def test_a_checksum_in_pieces(pieces: list[bytes]) -> None:
-    value = 0
-    for piece in pieces:
-        value = crc32(piece, value)
-    assert value == crc32(b"".join(pieces))
 
 
 @given(

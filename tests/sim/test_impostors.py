@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import random
 import socket
 from collections.abc import AsyncIterator, Callable, Iterable
@@ -381,8 +382,11 @@ async def test_a_vehicle_that_does_not_tell_who_it_is_is_believed(
 
 
 @pytest.mark.holds("fault another vehicle")
-async def test_ours_is_known_again_though_nobody_was_silent(autojump: MockClock) -> None:
+async def test_ours_is_known_again_though_nobody_was_silent(
+    autojump: MockClock, caplog: pytest.LogCaptureFixture
+) -> None:
     """A ground station asked the other one, which is switched on as ours is switched off."""
+    caplog.set_level(logging.INFO)
     scene = Scene("px4", LinkSettings(delay=0.02))
     async with scene.mounted() as tree:
         await swap(scene.world, scene.other, gap=0.5)
@@ -393,6 +397,7 @@ async def test_ours_is_known_again_though_nobody_was_silent(autojump: MockClock)
         await swap(scene.world, scene.ours, gap=0.5)
         await trio.sleep(10.0)
         assert await read_through(tree, scene.file) == OUR_FILE
+    assert len([line for line in caplog.messages if "another vehicle" in line]) == 1
 
 
 @pytest.mark.holds("promise 10")

@@ -14,7 +14,7 @@ from mavftpfs.protocol.payload import Opcode, request
 from tests.bench import __main__ as entry
 from tests.bench import bare, plots, record, tables
 from tests.bench.cases import Case
-from tests.bench.figures import BARE, US, Outcome, Row, Run, as_json, summarise
+from tests.bench.figures import BARE, US, Outcome, Run, as_json, summarise
 
 PROJECT = Path(__file__).parents[2]
 TIMEOUTS = {"wifi-5%": 20.0, "unshaped": 10.0}
@@ -24,11 +24,6 @@ def run(client: str, seconds: float | None, outcome: Outcome = Outcome.OK, **cha
     """A transfer of 1 MB from PX4 over the lossy link."""
     fields = {"server": "px4", "link": "wifi-5%", "direction": "read", "size": 1_000_000, "cpu": 0.5}
     return Run(**{**fields, "client": client, "seconds": seconds, "outcome": outcome, **changes})
-
-
-def row_of(rows: list[Row], client: str) -> Row:
-    """Return a client's row."""
-    return next(row for row in rows if row.client == client)
 
 
 def test_a_card_that_pauses_costs_where_nothing_bridges_it() -> None:

@@ -1,10 +1,10 @@
 """Random system calls, each made on a mount and on a local directory; stops at the first difference.
 
-    python lockstep.py MOUNTED LOCAL CARD --seed 7 --count 500 [--keep-names] [--only 3,9,20-31]
+    python lockstep.py MOUNTED LOCAL CARD --seed 7 --count 500 [--keep-names]
 
 MOUNTED: a directory of the mount. LOCAL: a directory of a local disk. CARD: where MOUNTED lies on the
 vehicle, seen without the mount; `-` if that cannot be seen. The calls follow from the seed alone, so what
-fails can be run again, and with fewer of its calls (`--only`; the numbers are those of the report).
+fails can be run again.
 
 After each call the results are compared: bytes, sizes, offsets or errno. After an fsync or close that said
 0 the file on the card must be the local one. Exit code 1 and a report if something differs.
@@ -289,15 +289,6 @@ def compare_file(expected: str, place: str) -> str | None:
     return f"on the card {place}: {len(right)} bytes instead of {len(left)}, first difference at {first}"
 
 
-def selected(text: str | None) -> Callable[[Call], bool]:
-    """Return whether a call is among those of `--only`; those that prepare always are."""
-    if text is None:
-        return lambda call: True
-    parts = [part.partition("-") for part in text.split(",")]
-    numbers = {n for low, _, high in parts for n in range(int(low), int(high or low) + 1)}
-    return lambda call: call.number < 0 or call.number in numbers
-
-
 def ending(local: Side) -> Iterator[Call]:
     """Yield what closes and compares everything."""
     yield from [Call(-2, "close", (slot,)) for slot in sorted(local.slots)]
@@ -314,14 +305,12 @@ def main() -> int:
     parser.add_argument("--seed", type=int, required=True)
     parser.add_argument("--count", type=int, required=True)
     parser.add_argument("--keep-names", action="store_true", help="do not rename")
-    parser.add_argument("--only", help="the calls to make")
     args = parser.parse_args()
     mounted, local = Side(args.mounted), Side(args.local)
-    wanted = selected(args.only)
     done: list[str] = []
 
     def run(call: Call) -> bool:
-        if (args.keep_names and call.name in RENAMES) or not wanted(call):
+        if args.keep_names and call.name in RENAMES:
             return True
         found = difference(mounted, local, args.card, call)
         done.append(str(call))
