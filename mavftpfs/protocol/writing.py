@@ -120,16 +120,10 @@ class WriteTransfer(Operation):
         self._starved = False
 
     def repeat_nothing(self) -> None:
-        """The file is closed behind what is on its way: what of it is lost stays so until `stop`."""
+        """The file is closed behind what is on its way: what of it is lost stays so until `finish`."""
         self.paused = self.trailing = True
         for request in self._unanswered:
             request.manner = LAST_WRITE_MANNER
-
-    def stop(self) -> None:
-        """End now: give back what was not ACKed. Its late effects are those of a repetition."""
-        if not self.done:
-            self._give_back()
-            self.finish()
 
     @property
     def drained(self) -> bool:
@@ -278,13 +272,10 @@ class WriteTransfer(Operation):
         self._rest.append((offset, data))
         return True
 
-    def fail(self, error: MavftpfsError) -> None:
-        """End; what was not ACKed goes back to the source."""
-        if not self.done:
-            self._give_back()
-        super().fail(error)
-
-    def _give_back(self) -> None:
+    def finish(self) -> None:
+        """End; what was not ACKed goes back to the source. Its late effects are those of a repetition."""
+        if self.done:
+            return
         pieces = ExtentSet()
         for request in self._unanswered:
             pieces.add(request.offset, request.offset + request.size)
@@ -294,3 +285,4 @@ class WriteTransfer(Operation):
         self._rest.clear()
         for start, stop in pieces:
             self._source.on_unsent(start, stop - start)
+        super().finish()

@@ -294,7 +294,7 @@ class Upload(UploadProgress):
         self.transfer = self._server.transfer = None
         if transfer.trailing and not transfer.drained:
             self._engine.stats.retransmissions += 1  # it goes again, and the first may come later than that
-        transfer.stop()
+        transfer.finish()
         self._driver.cancel(transfer)
         return transfer.error
 

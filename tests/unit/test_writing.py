@@ -191,7 +191,7 @@ def test_what_is_closed_behind_is_not_repeated() -> None:
         engine.on_deadline(engine.next_deadline() or 0.1)
         assert sent(engine, 1.0) == []
     assert list(source.in_flight) == [(239, 717)]
-    transfer.stop()
+    transfer.finish()
     assert source.todo.covers(239, 717)
 
 
@@ -291,7 +291,7 @@ def test_what_is_acked_is_on_the_card(
     assert transfer.error is None
     if cut_short is None:
         assert source.acked.total == len(content)
-    transfer.stop()
+    transfer.finish()
     link.engine.cancel(transfer, link.now)
     assert source.in_flight.empty
     assert source.acked.total + source.todo.total == len(content)
