@@ -27,8 +27,7 @@ class Simple(Operation):
         size: header field; None means len(data).
         side_effect: repeat under the same seq first, because a second execution would be another act.
         patience: seconds until RequestTimeout, inf for the engine's deadline.
-        server_time: seconds that the slowest server works at it; a repetition waits for so long, or for as
-            long as this server may need by what was seen of it.
+        server_time: seconds that the slowest server works at it; a repetition waits for so long.
 
     Attributes:
         reply: the ACK, once done without error.

@@ -28,7 +28,7 @@ class Manner(NamedTuple):
     in order, so answers to later requests prove a loss. echoes_offset: an ACK carries the request's
     offset. free_sends: transmissions before the waits double. patient_after: from so many transmissions
     on, wait at least `patience` seconds (a slow server executes every one of them, servers.md 14.38); of the
-    family "work", what the slowest server needs, of which one that was seen to be faster gets less.
+    family "work", what the slowest server needs.
     once: never repeated, and the engine tells nobody of its loss.
     """
 

@@ -29,18 +29,13 @@ it is repeated in vain its answer tells the round trip all the same, and a secon
 _WORK = "work"
 _NO_WORK = 0.1
 """Seconds of work that count as none: what takes no longer times the way and the server's readiness."""
-_PACE_MARGIN = 4.0
-"""A card may be so much slower than it was seen to be: others use it, and it stops to erase."""
-_LEAST_PACE = 0.05
 _USUAL_PACE = 0.1
-"""Cards read a megabyte per second and more: of a server never seen at work, a checksum is asked for again
-when one of those would have had it. It is under the same seq: PX4 and ArduPilot, which may be slower, replay
-their answer (servers.md 2), and MAVSDK, which works again, is a computer."""
+"""Cards read a megabyte per second and more: a checksum is asked for again when one of those would have had
+it. It is under the same seq: PX4 and ArduPilot, which may be slower, replay their answer (servers.md 2), and
+MAVSDK, which works again, is a computer."""
 
 _USUAL_SENDS = 2
 """Transmissions that may go out so; then the slowest card gets its time."""
-
-_FORGETTING = 0.125
 
 
 class RttEstimator:
@@ -103,7 +98,6 @@ class Timers:
         }
         self._at = self._sent_at = -inf
         self._manner: Manner | None = None
-        self._pace: dict[int, float] = {}
 
     def timeout(self, family: str) -> float:
         """Return the present retransmission timeout of a family of opcodes, in seconds."""
@@ -123,8 +117,7 @@ class Timers:
         if now != self._at or sent_at != self._sent_at or request.manner is not self._manner:
             self._at, self._sent_at, self._manner = now, sent_at, request.manner
             if request.manner.family == _WORK and request.manner.patience > _NO_WORK:
-                self._learn_pace(request, now - sent_at)
-                return now - sent_at
+                return now - sent_at  # most of it was work
             timer = self.of[request.manner.family]
             timer.sample(now - sent_at)
             if timer.samples == 1:
@@ -144,26 +137,12 @@ class Timers:
         patient = request.sends >= manner.patient_after
         if patient and manner.family == _WORK:
             # The way and the work take their times one after the other.
-            work = self._work_of(request)
+            work = manner.patience
+            if request.opcode == Opcode.CALC_FILE_CRC32 and request.sends <= _USUAL_SENDS:
+                work = max(work * _USUAL_PACE, min(work, _NO_WORK))
             base, rto = base + work, rto + work
         # Under the same seq no repetition tells the round trip: where that is not known, it may be longer.
         free = manner.free_sends if timer.samples or not manner.same_seq else 1
         doublings = min(max(0, request.sends - free), _MAX_DOUBLINGS)
         wait = max(rto, min(base * (1 << doublings), LONGEST_BACK_OFF))
         return max(wait, manner.patience) if patient and manner.family != _WORK else wait
-
-    def _learn_pace(self, request: Request, elapsed: float) -> None:
-        """Compare how long a server worked with what the slowest is given; the slowest lately counts."""
-        seen = elapsed / request.manner.patience
-        last = self._pace.get(request.opcode, seen)
-        self._pace[request.opcode] = max(seen, last + (seen - last) * _FORGETTING)
-
-    def _work_of(self, request: Request) -> float:
-        """Return how long to wait for the work of this server, in seconds; the slowest takes `patience`."""
-        patience = request.manner.patience
-        seen = self._pace.get(request.opcode)
-        if seen is not None:
-            return patience * min(1.0, max(_LEAST_PACE, seen * _PACE_MARGIN))
-        if request.opcode == Opcode.CALC_FILE_CRC32 and request.sends <= _USUAL_SENDS:
-            return max(patience * _USUAL_PACE, min(patience, _NO_WORK))
-        return patience
