@@ -20,6 +20,9 @@ from mavftpfs.shared.model import Traits
 
 _pack = Struct(f"<HBBBBBxI{MAX_DATA}s").pack  # fills up with zeros
 
+_LONG_FROM = 3
+"""The first transmission of a request that is sent in full length, however short it is."""
+
 
 class Manner(NamedTuple):
     """How requests of one opcode are timed and repeated.
@@ -113,10 +116,17 @@ class Request:
 
 
 def encode(requests: Sequence[Request]) -> list[bytes]:
-    """Return the 251 wire bytes of each under its present seq; its data must fit."""
+    """Return the 251 wire bytes of each under its present seq; its data must fit.
+
+    A parser that a damaged frame told a wrong length takes up to 255 bytes of what comes next for the rest of
+    it. So every second of the later repetitions has full length, by a last byte that no server reads.
+    """
     wires = []
     for r in requests:
-        wires.append(_pack(r.seq, r.session, r.opcode, r.size, 0, 0, r.offset, r.data))
+        wire = _pack(r.seq, r.session, r.opcode, r.size, 0, 0, r.offset, r.data)
+        if r.sends >= _LONG_FROM and r.sends % 2 and len(r.data) < MAX_DATA - 1:
+            wire = wire[:-1] + b"\xff"
+        wires.append(wire)
     return wires
 
 
