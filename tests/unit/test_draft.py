@@ -224,7 +224,7 @@ class DraftMachine(RuleBasedStateMachine):
         assert (self.draft.state is State.CLEAN) == end.endswith("placed")
 
     def give_up_if_overtaken(self) -> None:
-        if self.draft.sending is not None and self.draft.sending.overtaken:
+        if self.draft.sending is None or self.draft.sending.overtaken:
             self.give_up()
 
     @rule()
