@@ -12,13 +12,14 @@ new, old and target have the same number (see `reserved`):
                                 nobody can tell whether new is complete
   target not known, old         rename both to `recovered-...`: it may be the only copy
   target not known, new only    remove: old is moved aside before new is needed
-Nothing is touched while its owner may be alive: see `Staleness`.
+Nothing is touched while its owner may be alive: see STALE_AFTER.
 """
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 from mavftpfs.cache.context import Context
@@ -37,8 +38,8 @@ MAX_GROUPS = 64
 STALE_AFTER = 600.0
 """Seconds a stranger's reserved name must have stayed the same before it counts as left behind."""
 
-DELETED_AFTER = 24 * 3600.0
-"""The same for an unlinked file that is open: it stays the same as long as its reader lives."""
+MAX_SEEN = 1024
+"""Of how many such names it is remembered since when they are the same."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,32 +57,6 @@ class Group:
     paths: Mapping[Kind, bytes]
     serial: bytes
     target: bytes | None
-
-
-class Staleness:
-    """Tells since when a name was seen unchanged; bounded. Times are `now` of any monotonic clock."""
-
-    MAX = 1024
-
-    def __init__(self) -> None:
-        self._seen: dict[bytes, tuple[int | None, float]] = {}
-
-    def is_stale(self, path: bytes, size: int | None, now: float) -> bool:
-        """Note a sighting; return whether it was the same for as long as its kind demands."""
-        known = self._seen.get(path)
-        if known is None or known[0] != size:
-            self._seen.pop(path, None)
-            self._seen[path] = (size, now)
-            if len(self._seen) > self.MAX:
-                del self._seen[next(iter(self._seen))]
-            return False
-        name = parse(split(path)[1])
-        deleted = name is not None and name.kind is Kind.DELETED
-        return now - known[1] >= (DELETED_AFTER if deleted else STALE_AFTER)
-
-    def forget(self, path: bytes) -> None:
-        """The name is gone."""
-        self._seen.pop(path, None)
 
 
 def leftovers(
@@ -146,7 +121,7 @@ class Cleaner:
         self._context = context
         self._names = names
         self._dead_owners = dead_owners | {context.own.owner}
-        self._staleness = Staleness()
+        self._seen: dict[bytes, tuple[int | None, float]] = {}
         self._busy: set[bytes] = set()
         self._delivered: set[Node] = set()
         self.mended = 0
@@ -204,23 +179,27 @@ class Cleaner:
             return False
         if owner in self._dead_owners:
             return True
-        return self._staleness.is_stale(path, entry.size, self._context.clock())
+        seen, now = self._seen.get(path), self._context.clock()
+        if seen is None or seen[0] != entry.size:  # it is new, or it grows
+            seen = self._seen[path] = (entry.size, now)
+            if len(self._seen) > MAX_SEEN:
+                del self._seen[next(iter(self._seen))]
+        return now - seen[1] >= STALE_AFTER
 
     async def _mend(self, group: Group) -> None:
         if group.target is None:
             for path, place in self._context.own.torn.items():
                 if place in group.paths.values():
                     group = replace(group, target=path)
-        exists = group.target is not None and await self._exists(group.target)
-        node = None if group.target is None else self._context.nodes.get(group.target)
-        if exists or node is None or node.delivery is None or node in self._delivered:
-            await self._execute(group, target_exists=exists)
-        # else it is being written here: a later listing shows what came of it
-
-    async def _execute(self, group: Group, *, target_exists: bool) -> None:
-        context, torn = self._context, self._is_torn(group)
-        for action in repair(group, target_exists=target_exists):
-            self._staleness.forget(action.path)
+        context, torn, exists = self._context, self._is_torn(group), False
+        if group.target is not None:
+            with suppress(NotFound, NotADirectory):
+                await context.directories.find(group.target)
+                exists = True
+            node = context.nodes.get(group.target)
+            if not exists and node is not None and node.delivery is not None and node not in self._delivered:
+                return  # it is being written here: a later listing shows what came of it
+        for action in repair(group, target_exists=exists):
             if action.to is None:
                 await self._names.remove(action.path)
                 continue
@@ -230,10 +209,3 @@ class Cleaner:
                 context.files.on_changed(action.to)
             context.own.mended(group.paths.values())
         self.mended += 1
-
-    async def _exists(self, path: bytes) -> bool:
-        try:
-            await self._context.directories.find(path)
-        except (NotFound, NotADirectory):
-            return False
-        return True

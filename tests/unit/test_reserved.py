@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mavftpfs.cache.repair import DELETED_AFTER, STALE_AFTER, Action, Group, Staleness, leftovers, repair
+from mavftpfs.cache.repair import Action, Group, leftovers, repair
 from mavftpfs.cache.reserved import (
     Kind,
     OwnNames,
@@ -154,28 +154,6 @@ def test_a_group_of_which_a_part_is_alive_is_left_alone() -> None:
     alive = b"/d/" + entries[1].name
     (group,) = leftovers(b"/d", entries, lambda path, owner, entry: path != alive)
     assert group.serial == b"zzz"
-
-
-def test_strangers_names_go_stale_slowly() -> None:
-    watch = Staleness()
-    assert not watch.is_stale(b"/x", 5, 0.0)
-    assert not watch.is_stale(b"/x", 5, STALE_AFTER - 1)
-    assert watch.is_stale(b"/x", 5, STALE_AFTER)
-    assert not watch.is_stale(b"/x", 6, STALE_AFTER + 1), "it grows: somebody is at it"
-    assert not watch.is_stale(b"/x", 6, STALE_AFTER + 2)
-    watch.forget(b"/x")
-    assert not watch.is_stale(b"/x", 6, 10 * STALE_AFTER)
-    for number in range(3 * Staleness.MAX):
-        watch.is_stale(b"/%d" % number, 1, 0.0)
-    assert not watch.is_stale(b"/x", 6, 20 * STALE_AFTER), "what is remembered is bounded"
-
-
-def test_an_unlinked_file_that_is_read_never_changes_and_is_left_alone_for_longer() -> None:
-    watch, path = Staleness(), b"/d/" + Reserved(b"abcd", Kind.DELETED, b"sss").name
-    assert not watch.is_stale(path, 5, 0.0)
-    assert not watch.is_stale(path, 5, 2 * STALE_AFTER)
-    assert not watch.is_stale(path, 5, DELETED_AFTER - 1)
-    assert watch.is_stale(path, 5, DELETED_AFTER)
 
 
 def test_recovered_names_fit_a_rename() -> None:
