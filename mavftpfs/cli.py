@@ -280,6 +280,7 @@ def _status_parser(name: str) -> Parser:
     parser.add_argument("mountpoint", metavar="MOUNTPOINT", nargs="?", help="default: all that you may ask")
     parser.add_argument("--json", action="store_true", help="print JSON")
     parser.add_argument("--watch", action="store_true", help="again each second")
+    parser.add_argument("-v", "--verbose", action="store_true", help="everything the mount tells")
     return parser
 
 

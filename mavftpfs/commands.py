@@ -239,8 +239,8 @@ def status(args: argparse.Namespace) -> int:
         report.print_json(fetch, single=args.mountpoint is not None, watch=args.watch)
         return ExitCode.OK
     if args.watch:
-        report.watch_status(fetch)
+        report.watch_status(fetch, verbose=args.verbose)
     found = fetch()
-    report.print_status(found)
+    report.print_status(found, verbose=args.verbose)
     unanswered = args.mountpoint is not None and found[0].get("problem")
     return ExitCode.MOUNT_FAILED if unanswered else ExitCode.OK

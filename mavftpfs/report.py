@@ -389,12 +389,23 @@ class Line(NamedTuple):
 # -- what is said -----------------------------------------------------------------------------------
 
 
-def status_lines(status: Status) -> list[Line]:
-    """Return a mount's lines: one for a pilot, what moves, what is held back."""
+def status_lines(status: Status, *, verbose: bool = False) -> list[Line]:
+    """Return a mount's lines: one for a pilot, what moves, what is held back; verbose: the rest, too."""
     first = Line("", str(status.get("mountpoint", "?")), f": {_headline(status)}")
     if status.get("problem"):
         return [first]
-    return [first, *map(_transfer_line, status["transfers"]), *_held_lines(status)]
+    lines = [first, *map(_transfer_line, status["transfers"]), *_held_lines(status)]
+    return [*lines, *_rows(status, "  ")] if verbose else lines
+
+
+def _rows(facts: Mapping[str, Any], before: str) -> Iterator[Line]:
+    """Yield nested facts as `--json` has them, a line each, but for those that say nothing."""
+    for key, value in facts.items():
+        name = before + key.replace("_", " ")
+        if isinstance(value, Mapping):
+            yield from _rows(value, f"{name}: ")
+        elif value not in (None, "", [], ()):
+            yield Line(f"{name}: {value}")
 
 
 def _headline(status: Status) -> str:
@@ -489,22 +500,35 @@ def delivery_line(status: Status) -> str:
 # -- showing ----------------------------------------------------------------------------------------
 
 
-def print_status(statuses: Sequence[Status]) -> None:
+def print_status(statuses: Sequence[Status], *, verbose: bool) -> None:
     """Print each mount's lines; the same to a terminal and to a pipe."""
     for status in statuses:
-        for line in status_lines(status):
+        for line in status_lines(status, verbose=verbose):
             print(line.fitted())
     if not statuses:
         print(NOTHING)
     sys.stdout.flush()
 
 
-def panel(statuses: Sequence[Status], width: int, height: int) -> list[str]:
-    """Return the lines of all mounts, as many and as long as a terminal has room for."""
-    lines = [line.fitted(width) for status in statuses for line in status_lines(status)]
-    if len(lines) > height:
-        lines[height - 1 :] = [f"… and {len(lines) - height + 1} more lines"[:width]]
-    return lines or [NOTHING]
+def panel(statuses: Sequence[Status], width: int, height: int, *, verbose: bool = False) -> list[str]:
+    """Return lines that fit a terminal: the first of each mount, and of its others what there is room for."""
+    if not statuses:
+        return [NOTHING]
+    blocks = [status_lines(status, verbose=verbose) for status in statuses]
+    shown: list[str] = []
+    for number, block in enumerate(blocks):
+        room = max(1, (height - len(shown)) // (len(blocks) - number))
+        shown += [line.fitted(width) for line in _cut(block, room)]
+    if len(shown) > height:
+        more = f"… and {len(shown) - height + 1} more mounts"
+        shown = [*shown[: height - 1], more]
+    return shown
+
+
+def _cut(block: list[Line], room: int) -> list[Line]:
+    if len(block) <= room or room < 2:
+        return block[:room]
+    return [*block[: room - 1], Line(f"  … and {len(block) - room + 1} more lines")]
 
 
 def screen(lines: Sequence[str]) -> str:
@@ -516,11 +540,11 @@ def screen(lines: Sequence[str]) -> str:
     return "\x1b[H\x1b[J" + "\n".join(shown)
 
 
-def watch_status(fetch: Callable[[], Sequence[Status]]) -> None:
+def watch_status(fetch: Callable[[], Sequence[Status]], *, verbose: bool) -> None:
     """Show the status again each second until interrupted; on a terminal in place, on a screen of its own."""
     if not sys.stdout.isatty():
         while True:
-            print_status(fetch())
+            print_status(fetch(), verbose=verbose)
             print()
             time.sleep(WATCH_PERIOD)
     sys.stdout.write("\x1b[?1049h\x1b[?25l\x1b[?7l")  # the alternate screen, no cursor, no wrapping
@@ -528,7 +552,7 @@ def watch_status(fetch: Callable[[], Sequence[Status]]) -> None:
         while True:
             statuses = fetch()
             size = shutil.get_terminal_size()
-            lines = panel(statuses, size.columns, size.lines)
+            lines = panel(statuses, size.columns, size.lines, verbose=verbose)
             sys.stdout.write(screen(lines))
             sys.stdout.flush()
             time.sleep(WATCH_PERIOD)

@@ -310,6 +310,8 @@ def _take(word: str, values: dict[str, Any], kernel_words: list[str]) -> None:
 def _refusal(name: str, word: str) -> str:
     if name in FLAGS or name in KERNEL_WORDS or name in IGNORED_WORDS:
         return f"option {name} takes no value"
+    if name == "remount":
+        return "option remount is not supported: unmount, and mount with the new options"
     if name == "max_read":
         return "option max_read is not supported: the FUSE binding cannot start with it"
     return f"unknown option {word!r}"

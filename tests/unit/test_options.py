@@ -79,6 +79,7 @@ def test_the_last_word_wins() -> None:
     [
         ("frobnicate", "frobnicate"),
         ("max_read=131072", "max_read"),
+        ("remount", "unmount, and mount"),
         ("uid", "uid"),
         ("uid=-1", "uid"),
         ("ro=1", "ro"),
