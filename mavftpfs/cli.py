@@ -144,7 +144,14 @@ def _add_options(parser: Parser) -> None:
 
 
 def _sources_and_options() -> str:
-    return "\n".join([_SOURCES, "", "mount options, as -o ro,cache_size=1G:", *option_help()])
+    return "\n".join(
+        [
+            _SOURCES,
+            "",
+            "mount options, as -o ro,cache_size=1G:",
+            *(f"  {name:<19}{text}" for name, text in option_help().items()),
+        ]
+    )
 
 
 def _source_parser(name: str, description: str, *, short_help: bool = True) -> Parser:

@@ -21,7 +21,7 @@ from pathlib import Path
 import shtab
 
 import mavftpfs
-from mavftpfs.fuse.options import HELP, option_names
+from mavftpfs.fuse.options import option_help
 from mavftpfs.shared.errors import EXIT_CODES, ExitCode, UsageError
 
 SHELLS = ("bash", "zsh", "fish")
@@ -101,10 +101,10 @@ def _command_sections(parser: argparse.ArgumentParser) -> Iterator[str]:
 def _tail() -> Iterator[str]:
     yield ".SH MOUNT OPTIONS"
     yield r"Behind \fB\-o\fR, with commas between them, also for the commands without a mount."
-    for name in option_names():
+    for name, text in option_help().items():
         yield ".TP"
         yield f".B {_escaped(name)}"
-        yield _escaped(HELP[name])
+        yield _escaped(text)
     yield ".SH EXIT STATUS"
     for code, words in EXIT_CODES.items():
         yield ".TP"

@@ -10,7 +10,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 from mavftpfs.shared.errors import MavftpfsError, UsageError
 from mavftpfs.shared.model import ROOT, normalise
@@ -198,55 +198,73 @@ def patterns(text: str) -> tuple[str, ...]:
 
 _SIZE_MAX = 1 << 40
 
-VALUES: dict[str, Parser] = {
-    "uid": number(0, 2**32 - 2),
-    "gid": number(0, 2**32 - 2),
-    "umask": mask,
-    "fmask": mask,
-    "dmask": mask,
-    "fsname": text_value,
-    "root": remote_path,
-    "target_system": number(0, 255),
-    "target_component": number(0, 255),
-    "source_system": number(1, 255),
-    "source_component": number(1, 255),
-    "heartbeat": choice("onboard", "gcs", "none"),
-    "baud": number(300, 12_000_000),
-    "signing_key": text_value,
-    "dir_timeout": seconds(0, _DAY),
-    "attr_timeout": seconds(0, _DAY),
-    "negative_timeout": seconds(0, _DAY),
-    "cache_size": size(1 << 20, _SIZE_MAX),
-    "cache_dir": text_value,
-    "dirty_max": size(1 << 16, _SIZE_MAX, auto=True),
-    "spool_max": size(0, _SIZE_MAX),
-    "rmw_max": size(0, _SIZE_MAX, auto=True),
-    "op_deadline": seconds(1, 3600),
-    "connect_timeout": seconds(1, 3600),
-    "read_mode": choice("window", "burst"),
-    "chunk": number(16, 239, auto=True),
-    "window": number(1, 256, auto=True),
-    "bwlimit": size(100, _SIZE_MAX),
-    "verify": choice("auto", "size", "crc", "none"),
-    "verify_max": size(0, _SIZE_MAX),
-    "when_armed": choice("ro", "ok"),
-    "local": patterns,
-    "log_file": text_value,
-    "trace": text_value,
-    "tlog": text_value,
-}
-"""Options with a value."""
 
-FLAGS: dict[str, tuple[str, bool]] = {
-    "ro": ("read_only", True),
-    "rw": ("read_only", False),
-    "allow_other": ("allow_other", True),
-    "auto_unmount": ("auto_unmount", True),
-    "force": ("force", True),
-    "inplace": ("inplace", True),
-    "default_permissions": ("", True),
+class Value(NamedTuple):
+    """An option with a value: how it is parsed, and what help says of it, with the default."""
+
+    parse: Parser
+    help: str
+
+
+VALUES: dict[str, Value] = {
+    "uid": Value(number(0, 2**32 - 2), "whose the files are: you"),
+    "gid": Value(number(0, 2**32 - 2), "whose group's: yours"),
+    "umask": Value(mask, "octal; your umask"),
+    "fmask": Value(mask, "umask of files only"),
+    "dmask": Value(mask, "umask of directories only"),
+    "fsname": Value(text_value, "name in the table of mounts: SOURCE"),
+    "root": Value(remote_path, "mount this directory of the vehicle: /"),
+    "target_system": Value(number(0, 255), "which vehicle; 0: the first autopilot heard"),
+    "target_component": Value(number(0, 255), "which part of it; 0: the first heard"),
+    "source_system": Value(number(1, 255), "who we are on the link: 254"),
+    "source_component": Value(number(1, 255), "and which part: 191"),
+    "heartbeat": Value(choice("onboard", "gcs", "none"), "what we say we are: onboard, gcs or none"),
+    "baud": Value(number(300, 12_000_000), "of a serial line: 57600"),
+    "signing_key": Value(text_value, "file with the key of MAVLink 2 signing, mode 0600"),
+    "dir_timeout": Value(seconds(0, _DAY), "seconds that a listing is kept: 20, longer if it is slow"),
+    "attr_timeout": Value(seconds(0, _DAY), "seconds that the kernel keeps attributes: 1"),
+    "negative_timeout": Value(seconds(0, _DAY), "seconds that it keeps absent names: 2"),
+    "cache_size": Value(size(1 << 20, _SIZE_MAX), "memory for file data: 64M"),
+    "cache_dir": Value(text_value, "keep what was read for the next mount there"),
+    "dirty_max": Value(size(1 << 16, _SIZE_MAX, auto=True), "memory for what is not on the card yet: auto"),
+    "spool_max": Value(size(0, _SIZE_MAX), "local disk for what is not on the card yet: 1G"),
+    "rmw_max": Value(size(0, _SIZE_MAX, auto=True), "largest file sent again whole for a changed part: auto"),
+    "op_deadline": Value(seconds(1, 3600), "seconds without progress until an error: 30"),
+    "connect_timeout": Value(seconds(1, 3600), "seconds for the first heartbeat and listing: 30"),
+    "read_mode": Value(choice("window", "burst"), "window or burst"),
+    "chunk": Value(number(16, 239, auto=True), "bytes of a file in a packet, 16 to 239: auto"),
+    "window": Value(number(1, 256, auto=True), "requests in flight at most: auto"),
+    "bwlimit": Value(size(100, _SIZE_MAX), "bytes per second that we may cause on the link"),
+    "verify": Value(
+        choice("auto", "size", "crc", "none"), "written files: auto (size, and CRC32), size, crc, none"
+    ),
+    "verify_max": Value(size(0, _SIZE_MAX), "largest file whose CRC32 is asked for by auto: 4M"),
+    "when_armed": Value(choice("ro", "ok"), "an armed vehicle is read-only: ro, or ok"),
+    "local": Value(patterns, "names that never reach the card; +PATTERN adds to them"),
+    "log_file": Value(text_value, "log there, not to syslog"),
+    "trace": Value(text_value, "every request and reply as a line of JSON there"),
+    "tlog": Value(text_value, "raw MAVLink log there"),
 }
-"""Words without a value: the field and what it becomes; default_permissions is always on."""
+
+
+class Flag(NamedTuple):
+    """A word without a value: the field that it sets, to what, and what help says of it."""
+
+    field: str
+    becomes: bool
+    help: str
+
+
+FLAGS: dict[str, Flag] = {
+    "ro": Flag("read_only", True, "nothing is changed"),
+    "rw": Flag("read_only", False, "the default"),
+    "allow_other": Flag("allow_other", True, "other users may see it (permissions apply)"),
+    "auto_unmount": Flag("auto_unmount", True, "unmount when this process dies"),
+    "force": Flag("force", True, "change files that are seen to grow, too"),
+    "inplace": Flag("inplace", True, "replace files in place where the card cannot rename"),
+    "default_permissions": Flag("", True, ""),
+}
+"""default_permissions is always on, and not shown."""
 
 
 def parse_options(texts: Iterable[str]) -> MountOptions:
@@ -287,18 +305,12 @@ def fuse_words(options: MountOptions, source: str) -> set[str]:
     return words
 
 
-def option_names() -> list[str]:
-    """Return every option of the table, as written in help."""
-    flags = [name for name in FLAGS if name != "default_permissions"]
-    return flags + [f"{name}=" for name in VALUES]
-
-
 def _take(word: str, values: dict[str, Any], kernel_words: list[str]) -> None:
     name, equals, value = word.partition("=")
     if word in FLAGS:
-        field, becomes = FLAGS[word]
-        if field:
-            values[field] = becomes
+        flag = FLAGS[word]
+        if flag.field:
+            values[flag.field] = flag.becomes
     elif word in KERNEL_WORDS:
         _replace_word(word, kernel_words)
     elif name in VALUES:
@@ -332,7 +344,7 @@ def _parse(name: str, value: str, *, given: bool) -> Any:
     if not given:
         raise UsageError(f"option {name} needs a value ({name}=...)")
     try:
-        return VALUES[name](value)
+        return VALUES[name].parse(value)
     except (ValueError, MavftpfsError) as exc:
         raise UsageError(f"option {name}={value}: {exc}") from exc
 
@@ -384,54 +396,7 @@ def _within(value: NumberT, low: NumberT, high: NumberT, shown: Callable[[Number
     return value
 
 
-# -- help ----------------------------------------------------------------------------------------
-
-HELP: dict[str, str] = {
-    "ro": "nothing is changed",
-    "rw": "the default",
-    "allow_other": "other users may see it (permissions apply)",
-    "auto_unmount": "unmount when this process dies",
-    "force": "change files that are seen to grow, too",
-    "inplace": "replace files in place where the card cannot rename",
-    "uid=": "whose the files are: you",
-    "gid=": "whose group's: yours",
-    "umask=": "octal; your umask",
-    "fmask=": "umask of files only",
-    "dmask=": "umask of directories only",
-    "fsname=": "name in the table of mounts: SOURCE",
-    "root=": "mount this directory of the vehicle: /",
-    "target_system=": "which vehicle; 0: the first autopilot heard",
-    "target_component=": "which part of it; 0: the first heard",
-    "source_system=": "who we are on the link: 254",
-    "source_component=": "and which part: 191",
-    "heartbeat=": "what we say we are: onboard, gcs or none",
-    "baud=": "of a serial line: 57600",
-    "signing_key=": "file with the key of MAVLink 2 signing, mode 0600",
-    "dir_timeout=": "seconds that a listing is kept: 20, longer if it is slow",
-    "attr_timeout=": "seconds that the kernel keeps attributes: 1",
-    "negative_timeout=": "seconds that it keeps absent names: 2",
-    "cache_size=": "memory for file data: 64M",
-    "cache_dir=": "keep what was read for the next mount there",
-    "dirty_max=": "memory for what is not on the card yet: auto",
-    "spool_max=": "local disk for what is not on the card yet: 1G",
-    "rmw_max=": "largest file sent again whole for a changed part: auto",
-    "op_deadline=": "seconds without progress until an error: 30",
-    "connect_timeout=": "seconds for the first heartbeat and listing: 30",
-    "read_mode=": "window or burst",
-    "chunk=": "bytes of a file in a packet, 16 to 239: auto",
-    "window=": "requests in flight at most: auto",
-    "bwlimit=": "bytes per second that we may cause on the link",
-    "verify=": "written files: auto (size, and CRC32), size, crc, none",
-    "verify_max=": "largest file whose CRC32 is asked for by auto: 4M",
-    "when_armed=": "an armed vehicle is read-only: ro, or ok",
-    "local=": "names that never reach the card; +PATTERN adds to them",
-    "log_file=": "log there, not to syslog",
-    "trace=": "every request and reply as a line of JSON there",
-    "tlog=": "raw MAVLink log there",
-}
-"""Option as `option_names` has it -> what it does, with its default."""
-
-
-def option_help() -> list[str]:
-    """Return a line for each option."""
-    return [f"  {name:<19}{HELP[name]}" for name in option_names()]
+def option_help() -> dict[str, str]:
+    """Return each option as it is written in help -> what it does, with its default."""
+    flags = {name: flag.help for name, flag in FLAGS.items() if flag.help}
+    return flags | {f"{name}=": value.help for name, value in VALUES.items()}

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from mavftpfs import cli, install
-from mavftpfs.fuse.options import option_names
+from mavftpfs.fuse.options import option_help
 from mavftpfs.shared.errors import EXIT_CODES, ExitCode, UsageError
 
 COMMANDS = [name for name in cli._COMMANDS if name != "mount"]
@@ -69,7 +69,7 @@ def test_the_man_page_has_every_command_option_and_exit_code(pieces: dict[str, i
     page = pieces["usr/local/share/man/man1/mavftpfs.1"].text.replace("\\", "")
     for name in COMMANDS:
         assert f"\n.SS mavftpfs {name}\n" in page
-    for option in option_names():
+    for option in option_help():
         assert f"\n.B {option}\n" in page
     assert set(EXIT_CODES) == set(ExitCode)
     assert not re.search(r"^[.'](?!TH|SH|SS|B|BR|I|TP|PP|br|nf|fi)", page, re.MULTILINE)
