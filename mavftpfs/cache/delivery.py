@@ -125,11 +125,12 @@ class Deliverer:
         return False
 
     async def push(self, node: Node) -> None:
-        """The draft got more: send it, or begin to, if that can be done beside the program. The caller has
+        """The draft changed: send it, or begin to, if that can be done beside the program. The caller has
         the node's lock."""
         context, attempt, draft = self._context, node.attempt, node.draft
         if draft is None or not node.undelivered:
             return
+        context.touch(node.path)
         if attempt is not None and attempt.sending is draft.sending:
             if not attempt.sending.overtaken:
                 attempt.sending.growing = True

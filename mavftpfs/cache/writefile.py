@@ -119,20 +119,18 @@ class ReadFile(OpenFile):
         node = self._node
         node.handles -= 1
         node.writers -= self.writable
-        if not node.handles and not node.removed:
-            if node.draft is not None and node.draft.state is State.CLEAN and not node.lock.locked():
-                self._adopt(node.draft)
-            self._context.nodes.maybe_forget(node)
+        if node.handles or node.removed:
+            return
+        draft, context = node.draft, self._context
+        if draft is not None and draft.state is State.CLEAN and not node.lock.locked() and draft.whole:
+            # The vehicle has it: its content is ordinary cache from now on.
+            fits = 0 < draft.size <= context.options.cache_size // ADOPTED_PART
+            if fits and context.clock() - node.known_at < context.options.proof_time:
+                with suppress(SpoolFailed):  # the local disk does not give it back
+                    context.files.adopt(node.path, draft.size, draft.local_bytes, proven_at=node.known_at)
+        context.nodes.maybe_forget(node)
 
     # --- inside
-
-    def _adopt(self, draft: Draft) -> None:
-        """Nobody has the file open, and the vehicle has it: its content is ordinary cache from now on."""
-        context, node = self._context, self._node
-        fits = 0 < draft.size <= context.options.cache_size // ADOPTED_PART
-        if fits and context.clock() - node.known_at < context.options.proof_time and draft.whole:
-            with suppress(SpoolFailed):  # the local disk does not give it back: it is on the vehicle
-                context.files.adopt(node.path, draft.size, draft.local_bytes, proven_at=node.known_at)
 
     async def _read_changed(self, offset: int, size: int) -> bytes | memoryview:
         """Read a file that was written here since the handle was opened, or that is not open yet."""
@@ -188,7 +186,7 @@ class WriteFile(ReadFile):
             assert node.draft is not None
             self._parts.throttle.require_sendable(node.draft, max(node.draft.size, stop))
             node.draft.write(offset, data)
-            await self._on_written(node)
+            await self._parts.deliverer.push(node)
         return len(data)
 
     async def truncate(self, size: int) -> None:
@@ -271,9 +269,4 @@ class WriteFile(ReadFile):
         if size:
             self._parts.throttle.require_sendable(node.draft, size)
         node.draft.truncate(size)
-        await self._on_written(node)
-
-    async def _on_written(self, node: Node) -> None:
-        if not node.removed:
-            self._context.touch(node.path)
-            await self._parts.deliverer.push(node)
+        await self._parts.deliverer.push(node)
