@@ -227,7 +227,7 @@ class Tree:
             value = await self._store.crc32(remote, size=found.size)
             if len(self._checksums) == MAX_CHECKSUMS:
                 self._checksums.clear()
-            if key[2] >= CLOCK_SET:
+            if key[2] >= CLOCK_SET and self._directories.entry(remote) is found.entry:
                 self._checksums[key] = value
         return value
 
@@ -330,6 +330,7 @@ class Tree:
             self._local.rename(source, target, noreplace=noreplace)
         else:
             await self._writing.namespace.rename(source, target, noreplace=noreplace)
+            self._checksums.clear()  # two files may have one size and mtime
             self._local.follow_rename(source, target)
 
     def undelivered(self) -> Sequence[bytes]:
@@ -395,6 +396,7 @@ class Tree:
     def rebooted(self) -> None:
         """The vehicle restarted: what was known of it must be asked again."""
         self._directories.rebooted()
+        self._checksums.clear()
         self._virtual.rebooted()
         self._files.rebooted()
         self._writing.retry()

@@ -159,6 +159,16 @@ async def test_renames_that_are_refused(store: FakeWriter) -> None:
     assert store.requests == 0
 
 
+async def test_a_checksum_does_not_stay_with_the_name_of_another_file(fat: FakeWriter) -> None:
+    """They have one size and one mtime."""
+    tree = make_writable(fat)
+    for name in (b"a", b"b"):
+        fat.add(b"/d/" + name, name, 1_700_000_000)
+    sums = {name: await tree.crc32(b"/d/" + name) for name in (b"a", b"b")}
+    await tree.rename(b"/d/a", b"/d/b")
+    assert await tree.crc32(b"/d/b") == sums[b"a"] != sums[b"b"]
+
+
 # --- spelling
 
 
