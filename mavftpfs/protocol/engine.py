@@ -1,6 +1,6 @@
 """The client engine: matches replies, repeats what is lost, keeps the window. Layer: protocol; pure.
 
-Theory of operation. Operations say what to ask (`next_request`) and are told of believed answers. A reply
+Theory of operation. Operations say what to ask (`next_requests`) and are told of believed answers. A reply
 is found by its seq (request + 1) and believed when req_opcode, and where servers echo them session and
 offset, are the request's; what is not believed is counted and changes nothing. A loss is known by later
 answers (see `ledger`) or by a timer. Lost requests go out before new ones of the same operation. While

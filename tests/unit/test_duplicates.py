@@ -135,18 +135,6 @@ def test_two_answers_to_one_of_two_requests() -> None:
     assert engine.stats.unexplained == 1
 
 
-def test_two_answers_to_one_of_three_requests() -> None:
-    engine = make()
-    first, second = read_twice(engine)
-    again(engine, 3.0)
-    assert 0 in [request.offset for request in again(engine, 9.0)]
-    for request in (first, second):
-        engine.receive(chunk(request, CONTENT), 9.1)
-    assert engine.stats.unexplained == 0
-    engine.receive(chunk(second, CONTENT), 9.1)
-    assert engine.stats.unexplained == 1
-
-
 def test_work_may_take_its_time() -> None:
     engine = make()
     request = ask(engine, Opcode.CALC_FILE_CRC32, 0.0)

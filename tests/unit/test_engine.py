@@ -398,20 +398,6 @@ def test_a_server_that_became_slow_is_waited_for() -> None:
     assert engine.timeout("data") > 0.3
 
 
-def test_on_deadline_called_early_or_with_grown_round_trips_sends_nothing() -> None:
-    engine = make(limit=2)
-    reading(engine)
-    first, second = sent(engine, 0.0)
-    engine.on_deadline(0.5)
-    assert sent(engine, 0.5) == []
-    engine.receive(chunk(first, bytes(SIZE)), 0.9)
-    sent(engine, 0.9)
-    engine.on_deadline(1.0)
-    assert engine.stats.retransmissions == 0
-    engine.receive(chunk(second, bytes(SIZE)), 1.1)
-    assert engine.stats.spurious == 0
-
-
 def test_silence_narrows_the_window_until_something_is_heard() -> None:
     engine = make(limit=4)
     reading(engine)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
@@ -62,34 +60,3 @@ def test_a_signed_frame_among_others_is_left_to_pymavlink() -> None:
     signed = b"\xfd" + body + frame_crc(body, EXTRA).to_bytes(2, "little") + bytes(13)
     out: list[Message] = []
     assert FtpFrameCodec(US, EXTRA).decode_runs(frame + signed + frame, 0, out) == len(frame)
-
-
-@pytest.mark.parametrize(
-    "damage",
-    [
-        lambda f: f[:-1],
-        lambda f: f[:-1] + bytes([f[-1] ^ 1]),
-        lambda f: f[:40] + bytes([f[40] ^ 128]) + f[41:],
-        lambda f: b"\xfe" + f[1:],
-        lambda f: f[:2] + b"\1" + f[3:],
-        lambda f: f[:7] + b"\x6f" + f[8:],
-        lambda f: f[:9] + b"\1" + f[10:],
-        lambda f: b"",
-    ],
-    ids=["cut", "crc", "content", "magic", "flags", "id", "id high", "nothing"],
-)
-def test_leaves_everything_else_alone(damage: Callable[[bytes], bytes]) -> None:
-    out: list[Message] = []
-    frame = damage(reference(1, Address(1, 1), FULL))
-    assert FtpFrameCodec(US, EXTRA).decode_runs(frame, 0, out) == 0
-    assert out == []
-
-
-def test_a_wrong_extra_byte_is_a_wrong_crc() -> None:
-    out: list[Message] = []
-    assert FtpFrameCodec(US, 85).decode_runs(reference(1, Address(1, 1), FULL), 0, out) == 0
-
-
-def test_frame_crc_is_pymavlinks() -> None:
-    frame = reference(3, Address(1, 1), FULL)
-    assert frame_crc(frame[1:-2], EXTRA) == int.from_bytes(frame[-2:], "little")

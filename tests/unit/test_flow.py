@@ -233,11 +233,6 @@ def test_there_is_none_beside_somebody_who_waits() -> None:
     assert flow.room(flow.window, path.now, paced=True) <= 0
 
 
-def test_there_is_none_at_a_serial_port() -> None:
-    flow, path = paused(serial=True)
-    assert beyond(flow, path.now) <= 0
-
-
 def test_a_reserve_that_overflows_a_queue_shrinks() -> None:
     flow, path = paused()
     path.rounds(30)

@@ -300,17 +300,6 @@ def test_a_burst_waits_for_reads_and_reads_for_the_burst() -> None:
     assert {item.opcode for item in reader.sent()} == {Opcode.READ_FILE}
 
 
-def test_two_bursts_without_data_are_enough() -> None:
-    reader = Reader(bursts=True)
-    reader.transfer.want(0, SIZE, True)
-    for _ in range(2):
-        (request,) = reader.sent()
-        assert request.opcode == Opcode.BURST_READ_FILE
-        reader.pass_quiet()
-    reader.finish()
-    assert bytes(reader.sink.data) == CONTENT
-
-
 @pytest.mark.parametrize("code", [1, 2, 3, 6, 7])
 def test_a_refused_burst_gives_way_to_reads(code: int) -> None:
     reader, request = bursting()
