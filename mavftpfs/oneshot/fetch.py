@@ -214,6 +214,15 @@ def local_disk(place: Path) -> Iterator[None]:
         raise (LocalDiskFull if full else UsageError)(f"{place}: {exc.strerror}") from exc
 
 
+def local_crc32(file: Path) -> int:
+    """Return the CRC32 of a local file."""
+    crc = 0
+    with file.open("rb") as source:
+        while data := source.read(READ_SIZE):
+            crc = crc32(data, crc)
+    return crc
+
+
 class Part:
     """A .part, locked against a second program that fetches the same."""
 
@@ -242,14 +251,6 @@ class Part:
     def cut(self, size: int) -> None:
         """Keep the first `size` bytes only."""
         self._file.truncate(size)
-
-    def checksum(self) -> int:
-        """Return the CRC32 of what is here."""
-        crc = 0
-        self._file.seek(0)
-        while data := self._file.read(READ_SIZE):
-            crc = crc32(data, crc)
-        return crc
 
     def append(self, data: bytes | memoryview) -> None:
         """Add bytes; they are in the file when this returns, so that nothing is lost by a kill."""
@@ -357,7 +358,7 @@ class Fetcher:
         """Fetch what is missing, and prove the whole; returns its size, and how it was proven."""
         here = part.size
         self.progress.begin(wanted.name, wanted.size, here)
-        crc = await trio.to_thread.run_sync(part.checksum) if here else 0
+        crc = await trio.to_thread.run_sync(local_crc32, part.path) if here else 0
         size = wanted.size
         if here == 0 or here < wanted.size:
             file = await self.session.files.open(wanted.remote)

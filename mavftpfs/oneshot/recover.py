@@ -15,11 +15,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from mavftpfs.oneshot.fetch import NO_CHECKSUM
-from mavftpfs.oneshot.files import READ_SIZE, Session
+from mavftpfs.oneshot.fetch import NO_CHECKSUM, local_crc32
+from mavftpfs.oneshot.files import Session
 from mavftpfs.oneshot.progress import Progress
 from mavftpfs.oneshot.transfer import Piece, Put, Sent, put_paths
-from mavftpfs.protocol.payload import crc32
 from mavftpfs.shared.errors import (
     NotDelivered,
     NotFound,
@@ -206,7 +205,7 @@ async def _is_there(session: Session, path: bytes, kept: Kept, *, force: bool) -
         return False
     if found.kind is not EntryKind.FILE:
         raise UsageError(f"{name_text(path)} is a directory on the vehicle")
-    if found.size == kept.size and await _crc32(session, path) == _local_crc32(kept.file):
+    if found.size == kept.size and await _crc32(session, path) == local_crc32(kept.file):
         return True
     before = kept.facts.get("size_on_vehicle")
     if found.size not in (before, 0) and not force:  # an empty one holds nothing to lose
@@ -221,7 +220,7 @@ async def _is_there(session: Session, path: bytes, kept: Kept, *, force: bool) -
 async def _prove(session: Session, path: bytes, kept: Kept) -> None:
     """Compare the vehicle's checksum with the copy, where it gives one; the size was compared before."""
     theirs = await _crc32(session, path)
-    if theirs is not None and theirs != _local_crc32(kept.file):
+    if theirs is not None and theirs != local_crc32(kept.file):
         raise NotDelivered(f"{name_text(path)} differs on the vehicle; the copy stays in {kept.file}")
 
 
@@ -230,14 +229,6 @@ async def _crc32(session: Session, path: bytes) -> int | None:
         return await session.files.crc32(path)
     except NO_CHECKSUM:
         return None
-
-
-def _local_crc32(file: Path) -> int:
-    value = 0
-    with file.open("rb") as source:
-        while data := source.read(READ_SIZE):
-            value = crc32(data, value)
-    return value
 
 
 def _forget(kept: Kept) -> None:
