@@ -28,7 +28,7 @@ from mavftpfs.protocol.flow import Flow
 from mavftpfs.session.driver import Driver, PayloadTrace
 from mavftpfs.session.scheduler import ReadMode, Scheduler
 from mavftpfs.session.store import Store
-from mavftpfs.session.uploading import Upload
+from mavftpfs.session.upload import Upload
 from mavftpfs.session.vehicle import Standing, Vehicle
 from mavftpfs.shared.errors import MavftpfsError, VehicleLost
 

@@ -23,7 +23,7 @@ from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.session.doubt import MOST_LATE
 from mavftpfs.session.reader import FileStream
 from mavftpfs.session.scheduler import Scheduler
-from mavftpfs.session.uploading import Upload
+from mavftpfs.session.upload import Upload
 from mavftpfs.session.vehicle import SILENCE_LIMIT
 from mavftpfs.shared.errors import (
     Armed,

@@ -8,7 +8,7 @@ from contextlib import asynccontextmanager
 import trio
 
 from mavftpfs.session.connection import Connection
-from mavftpfs.session.uploading import Upload
+from mavftpfs.session.upload import Upload
 from mavftpfs.sim.profiles import PROFILES
 from tests.support.sources import MemorySource
 from tests.support.worlds import path
