@@ -24,7 +24,7 @@ from mavftpfs.session.doubt import Doubt, session_used_by
 from mavftpfs.session.driver import Driver
 from mavftpfs.session.serversession import OpenSession, ServerSession, State
 from mavftpfs.shared.errors import DataUnproven, MavftpfsError, RequestTimeout, SessionLost
-from mavftpfs.shared.model import WriteTraits
+from mavftpfs.shared.model import WriteTraits, renamed
 
 ReadMode = Literal["window", "burst"]
 
@@ -314,14 +314,9 @@ class Scheduler:
         """A file or directory was renamed: who reads or writes it, or in it, goes on under the new path. What
         had the new name cannot be read any more."""
         self.on_removed(new)
-        prefix = old + b"/"
         for user in self.users:
-            if isinstance(user, _Job):
-                continue
-            if user.path == old:
-                user.path = new
-            elif user.path.startswith(prefix):
-                user.path = new + user.path[len(old) :]
+            if not isinstance(user, _Job):
+                user.path = renamed(user.path, old, new)
 
     def on_removed(self, path: bytes) -> None:
         """The file of this name was removed or replaced: what its readers still want cannot be had."""

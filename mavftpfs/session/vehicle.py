@@ -279,7 +279,8 @@ class Vehicle:
             case _ if self.identity.standing is Standing.STRANGER:
                 return
             case StorageInformation():
-                self._on_storage(message)
+                if self.storage is None or message.storage_id <= self.storage.storage_id:
+                    self.storage = message
             case SystemTime() if message.source == self.address:
                 self._on_boot_time(message.time_boot_ms, now)
 
@@ -290,7 +291,8 @@ class Vehicle:
         if len(self.heard) < 256 or heartbeat.source in self.heard:
             self.heard[heartbeat.source] = heartbeat
         if self.address is None and self._is_wanted(heartbeat):
-            self.address = self._target_of(heartbeat)
+            component = self.wanted_component or heartbeat.source.component
+            self.address = Address(heartbeat.source.system, component)
         if heartbeat.is_autopilot and self.address and heartbeat.source.system == self.address.system:
             self._disarmed_at = -inf if heartbeat.armed else now
             # Who may be another one does not say that ours is on the ground.
@@ -327,14 +329,8 @@ class Vehicle:
     def _is_wanted(self, heartbeat: Heartbeat) -> bool:
         if self.wanted_system and heartbeat.source.system != self.wanted_system:
             return False
-        if self.wanted_component:
-            return heartbeat.source.component == self.wanted_component or heartbeat.is_autopilot
-        return heartbeat.is_autopilot
-
-    def _target_of(self, heartbeat: Heartbeat) -> Address:
-        if self.wanted_component:
-            return Address(heartbeat.source.system, self.wanted_component)
-        return heartbeat.source
+        wanted = self.wanted_component and heartbeat.source.component == self.wanted_component
+        return bool(wanted) or heartbeat.is_autopilot
 
     def _proves_life(self, source: Address) -> bool:
         """A component may send no heartbeats of its own; its system's autopilot then speaks for it."""
@@ -356,10 +352,6 @@ class Vehicle:
                 newcomer = not self.foreign_client(now)
                 self.foreign_at = now
                 self.on_foreign(payload, newcomer)
-
-    def _on_storage(self, message: StorageInformation) -> None:
-        if self.storage is None or message.storage_id <= self.storage.storage_id:
-            self.storage = message
 
     def _on_boot_time(self, boot_ms: int, now: float) -> None:
         before, elapsed_ms = self._boot_ms, (now - self.boot_heard_at) * 1000
