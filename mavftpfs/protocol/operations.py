@@ -134,10 +134,13 @@ class ListDirectory(Operation):
         hidden: names that cannot be shown (with a slash, a tab, or unparsable).
         strings: how many strings were received so far, which is where the next page begins.
         on_page: called for each page, where it is not None.
+
+    patience: as for Simple.
     """
 
-    def __init__(self, path: bytes, with_time: bool = False) -> None:
+    def __init__(self, path: bytes, with_time: bool = False, patience: float = inf) -> None:
         super().__init__()
+        self.patience = patience
         if len(path) > MAX_DATA:
             raise PathTooLong(f"path of {len(path)} bytes does not fit the {MAX_DATA} of a request")
         self.entries: list[DirEntry] = []

@@ -33,6 +33,7 @@ class FileStream(SessionUser):
 
     Attributes:
         size: by the first open ACK, in bytes; 0 before that.
+        opened: set when that came, or open_error.
         closed: nothing goes to the sink any more, but that what it got is in doubt.
     """
 
@@ -42,8 +43,8 @@ class FileStream(SessionUser):
         self.closed = False
         self._sink = sink
         self._wants_open = expected_size is None  # somebody waits for that ACK
-        self._opened = trio.Event()
-        self._open_error: MavftpfsError | None = None
+        self.opened = trio.Event()
+        self.open_error: MavftpfsError | None = None
         self._demand = ExtentSet()
         self._ahead = ExtentSet()
         self._removed = False
@@ -54,15 +55,9 @@ class FileStream(SessionUser):
         if self._wants_open:
             self.asked_at = scheduler.clock()
         else:
-            self._opened.set()
+            self.opened.set()
 
     # --- the cache's side
-
-    async def wait_opened(self) -> None:
-        """Wait for the first open's outcome; raise its error."""
-        await self._opened.wait()
-        if self._open_error is not None:
-            raise self._open_error
 
     def want(self, start: int, stop: int, *, demand: bool) -> None:
         """Ask for bytes of [start, stop), clamped to the size."""
@@ -117,11 +112,11 @@ class FileStream(SessionUser):
         self._wants_open = False
         self._demand.clear()
         self._ahead.clear()
-        if self._opened.is_set():
+        if self.opened.is_set():
             self._sink.on_failed(error)
         else:
-            self._open_error = error
-            self._opened.set()
+            self.open_error = error
+            self.opened.set()
 
     def on_queued(self) -> None:
         """See SessionUser."""
@@ -170,15 +165,15 @@ class FileStream(SessionUser):
         awaited = self._wants_open
         if session is None or session.path != self.path or session.writing or awaited:
             session = await server.open(self.path)
-        if session.size is None or (self._opened.is_set() and session.size < self.size):
+        if session.size is None or (self.opened.is_set() and session.size < self.size):
             await server.close_quietly()
             if session.size is None:
                 raise RemoteProtocolError("the vehicle's open reply holds no size")
             raise FileChanged(f"{self.path!r} shrank from {self.size} to {session.size} bytes")
         self._wants_open = False
-        if not self._opened.is_set():
+        if not self.opened.is_set():
             self.size = session.size
-            self._opened.set()
+            self.opened.set()
         if not self.closed:
             self._sink.on_opened(session.opened_at)
         if awaited:

@@ -313,9 +313,10 @@ class Scheduler:
     def on_renamed(self, old: bytes, new: bytes) -> None:
         """A file or directory was renamed: who reads or writes it, or in it, goes on under the new path. What
         had the new name cannot be read any more."""
-        self.on_removed(new)
-        for user in self.users:
-            if not isinstance(user, _Job):
+        for user in list(self.users):  # who is told may close it
+            if user.path == new:
+                user.on_removed()
+            elif not isinstance(user, _Job):
                 user.path = renamed(user.path, old, new)
 
     def on_removed(self, path: bytes) -> None:
@@ -367,18 +368,17 @@ class Scheduler:
         while True:
             await trio.lowlevel.checkpoint()
             await server.close_excluded()
-            user, began = self.first(), self.clock()
+            user, session, began = self.first(), server.session, self.clock()
             try:
                 if user is None:
-                    await self._idle()
+                    await self._idle(began)
                     continue
-                session = server.session
                 if session is not None and session.path != user.path and not session.writing:
                     await server.close_quietly()
                     continue  # somebody may have come meanwhile who goes first
                 await user.turn()
             except MavftpfsError:
-                # Closing the previous file failed; whoever wants something is asked again by the queue.
+                # Closing the previous file failed; whoever wants something is asked again.
                 server.abandon()
             self._used_at = self.clock()
             if self._driver.last_reply_at >= began:
@@ -387,13 +387,10 @@ class Scheduler:
                     if other is not user and other.due_at() < inf:
                         other.on_queued()
 
-    async def _idle(self) -> None:
+    async def _idle(self, now: float) -> None:
         """Nobody can use the session now: close it in time, and wait for news."""
-        server, now = self.server, self.clock()
-        until_due = inf
-        for user in self.users:
-            if now < user.due_at() < until_due + now:
-                until_due = user.due_at() - now
+        server = self.server
+        until_due = min([user.due_at() - now for user in self.users if user.due_at() > now], default=inf)
         if server.session is not None:
             # Counted from the last use, not from the last news: there may always be news.
             left = max(0.0, self._used_at + IDLE_CLOSE - now)

@@ -47,6 +47,8 @@ _SURELY_OPEN = 8.0
 """Seconds in which no server closes an idle session (PX4 does after 10)."""
 
 _TAKEN = frozenset((NakCode.INVALID_SESSION, NakCode.NO_SESSIONS_AVAILABLE))
+_OPEN_TAKEN = _TAKEN | {NakCode.FILE_EXISTS}
+"""NAK 8 may hide any other code on PX4 (sticky EEXIST), and makes no sense as an answer to an open."""
 
 Asked = TypeVar("Asked", bound=Operation)
 
@@ -264,7 +266,11 @@ class ServerSession:
             except FtpNak as nak:
                 resent |= nak.retransmitted
                 ours = self._may_be_ours(nak)
-                taken = self._means_taken(nak, ours)
+                # ArduPilot's 1 may mean that the session is open under our id, by an open whose ACK was lost;
+                # else it is a plain failure.
+                taken = nak.code in _OPEN_TAKEN or (
+                    nak.code == NakCode.FAIL and ours and traits.ack_carries_own_session is not False
+                )
                 if not ours or not taken:
                     self.maybe_open.clear()
                 if not taken:
@@ -277,17 +283,6 @@ class ServerSession:
             return OpenSession(
                 path, operation.session, operation.size, self.clock(), writing=writing, seq=seq, resent=resent
             )
-
-    def _means_taken(self, nak: FtpNak, ours: bool) -> bool:
-        """Whether an open was refused because something is open; ours: perhaps by our doing.
-
-        NAK 8 may hide any other code on PX4 (sticky EEXIST), and makes no sense as an answer to an open.
-        ArduPilot's 1 may mean that the session is open under our id, by an open whose ACK was lost; else it
-        is a plain failure.
-        """
-        if nak.code in _TAKEN or nak.code == NakCode.FILE_EXISTS:
-            return True
-        return nak.code == NakCode.FAIL and ours and self.engine.traits.ack_carries_own_session is not False
 
     def _may_be_ours(self, nak: FtpNak) -> bool:
         """Whether an open of ours may have been carried out before this refusal: its ACK was lost, or the

@@ -153,7 +153,7 @@ class Store:
                         raise
         if operation is None:
             left = max(1.0, self._op_deadline - (self._clock() - started)) if tried else inf
-            operation = await self._server.ask(partial(_asking_names, wire, left))
+            operation = await self._server.ask(partial(ListDirectory, wire, patience=left))
             if tried and tried[-1].error is None:
                 traits.time_silences += tried[-1].sent  # it may have had to wait for its turn all the time
             if refused or traits.time_silences >= TIME_SILENCES:
@@ -170,7 +170,9 @@ class Store:
             self._vehicle.require(self._clock())
         stream = FileStream(path, sink, expected_size, self._scheduler)
         try:
-            await stream.wait_opened()
+            await stream.opened.wait()
+            if stream.open_error is not None:
+                raise stream.open_error
         except BaseException:
             stream.close()
             raise
@@ -416,10 +418,4 @@ def _asking_times(
     operation = ListDirectory(wire, with_time=True)
     operation.on_page = on_page
     tried.append(operation)
-    return operation
-
-
-def _asking_names(wire: bytes, patience: float) -> ListDirectory:
-    operation = ListDirectory(wire)
-    operation.patience = patience
     return operation
