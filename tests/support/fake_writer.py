@@ -26,7 +26,6 @@ from mavftpfs.shared.errors import (
     FileChanged,
     FtpNak,
     MavftpfsError,
-    OutcomeUnknown,
     VehicleLost,
 )
 from mavftpfs.shared.model import ROOT, WriteTraits, join, split, wire_path
@@ -72,8 +71,8 @@ class FakeWriter(FakeStore):
     Attributes:
         traits: whether the card can rename was found out before.
         requests: how many changing requests were executed or failed.
-        log: what they were. fail_at: number -> error raised instead of executing it. lose_reply_at: executed,
-        but answered by silence. freeze_at: from this number on nothing is executed (power lost).
+        log: what they were. fail_at: number -> error raised instead of executing it.
+        freeze_at: from this number on nothing is executed (power lost).
         capacity: bytes of all files; beyond that WriteFile is refused.
         before_request: called with what is asked, before anything is decided.
         linger: seconds that it takes to give up an upload.
@@ -87,7 +86,6 @@ class FakeWriter(FakeStore):
         self.requests = 0
         self.log: list[tuple[str, ...]] = []
         self.fail_at: dict[int, MavftpfsError] = {}
-        self.lose_reply_at: set[int] = set()
         self.freeze_at: int | None = None
         self.capacity: int | None = None
         self.spoil_uploads = 0
@@ -98,8 +96,8 @@ class FakeWriter(FakeStore):
 
     # --- what requests go through
 
-    async def request(self, *what: object, in_flight: bool = False) -> bool:
-        """Count a request; raise if it is to fail; return whether its reply gets lost."""
+    async def request(self, *what: object, in_flight: bool = False) -> None:
+        """Count a request; raise if it is to fail."""
         await trio.lowlevel.checkpoint()
         if self.before_request is not None:
             self.before_request(*what)
@@ -116,7 +114,6 @@ class FakeWriter(FakeStore):
         error = self.fail_at.pop(self.requests, None)
         if error is not None:
             raise error
-        return self.requests in self.lose_reply_at
 
     def require_link(self) -> None:
         super().require_link()
@@ -127,7 +124,6 @@ class FakeWriter(FakeStore):
         """The power is back."""
         self.freeze_at = None
         self.fail_at.clear()
-        self.lose_reply_at.clear()
 
     def real(self, path: bytes) -> bytes:
         """Return the stored spelling of a path."""
@@ -155,9 +151,8 @@ class FakeWriter(FakeStore):
 
     async def create_empty(self, path: bytes) -> None:
         wire_path(path)
-        lost = await self.request("create", path)
+        await self.request("create", path)
         self._create(path)
-        _maybe_lose(lost)
 
     def in_doubt(self) -> bool:
         return False
@@ -166,26 +161,24 @@ class FakeWriter(FakeStore):
         return False
 
     async def remove(self, path: bytes) -> None:  # type: ignore[override]  # FakeStore's sets the scene
-        lost = await self.request("remove", path)
+        await self.request("remove", path)
         path = self.real(path)
         if path in self.directories:
             self.crimes.append(f"RemoveFile of the directory {path!r}")
         self._file(path, Opcode.REMOVE_FILE)
         del self.files[path]
         self._end_readers(path)
-        _maybe_lose(lost)
 
     async def make_directory(self, path: bytes) -> None:
-        lost = await self.request("mkdir", path)
+        await self.request("mkdir", path)
         path = self.real(path)
         if path in self.directories or path in self.files:
             raise FtpNak(Opcode.CREATE_DIRECTORY, NakCode.FILE_EXISTS)
         self._require_parent(path, Opcode.CREATE_DIRECTORY)
         self.directories.add(path)
-        _maybe_lose(lost)
 
     async def remove_directory(self, path: bytes) -> None:
-        lost = await self.request("rmdir", path)
+        await self.request("rmdir", path)
         path = self.real(path)
         if path in self.files:
             self.crimes.append(f"RemoveDirectory of the file {path!r}")
@@ -195,15 +188,13 @@ class FakeWriter(FakeStore):
             self.crimes.append(f"RemoveDirectory of the full {path!r}")
             raise FtpNak(Opcode.REMOVE_DIRECTORY, NakCode.FAIL)
         self.directories.discard(path)
-        _maybe_lose(lost)
 
     async def rename(self, old: bytes, new: bytes, *, completes: bool = False) -> None:
         assert len(wire_path(old)) + 1 + len(wire_path(new)) <= 238, "does not fit a request"
-        lost = await self.request("rename", old, new, in_flight=completes)
+        await self.request("rename", old, new, in_flight=completes)
         if not self.kind.renames:
             raise FtpNak(Opcode.RENAME, NakCode.FAIL_ERRNO, 2)
         self._rename(self.real(old), new)
-        _maybe_lose(lost)
 
     async def stat_size(self, path: bytes) -> int:
         await trio.lowlevel.checkpoint()
@@ -341,11 +332,6 @@ async def list_all(store: FakeWriter, tree: Tree) -> None:
         await tree.list(directory)
 
 
-def _maybe_lose(lost: bool) -> None:
-    if lost:
-        raise OutcomeUnknown("the reply was lost")
-
-
 class FakeUpload:
     """Sends chunk by chunk, each one request; in the background too if the store has a nursery."""
 
@@ -435,7 +421,7 @@ class FakeUpload:
 
     async def _write(self, offset: int, data: bytes) -> None:
         store = self._store
-        lost = await store.request("write", self.path, offset, len(data))
+        await store.request("write", self.path, offset, len(data))
         file = store._file(self.path, Opcode.WRITE_FILE)
         if offset > len(file.data):
             store.crimes.append(f"a gap in {self.path!r}")
@@ -447,11 +433,9 @@ class FakeUpload:
             raise FtpNak(Opcode.WRITE_FILE, NakCode.FAIL_ERRNO, 28)
         file.data = new
         file.mtime = None
-        _maybe_lose(lost)
         self._source.on_acked(offset, len(data))
 
     async def _terminate(self) -> None:
-        lost = await self._store.request("terminate", self.path)
+        await self._store.request("terminate", self.path)
         self._open = False
-        _maybe_lose(lost)
         self._source.check_point()

@@ -83,22 +83,17 @@ class Card(Protocol):
 
 @dataclass(eq=False)
 class File:
-    """A file of the model. confirmed: its content when a close or fsync last returned 0 and nothing changed
-    since, else None."""
+    """A file of the model."""
 
     data: bytearray = field(default_factory=bytearray)
-    confirmed: bytes | None = None
 
     def write(self, offset: int, data: bytes) -> None:
         """Like pwrite."""
         self.data.extend(bytes(max(0, offset - len(self.data))))
         self.data[offset : offset + len(data)] = data
-        self.confirmed = None
 
     def resize(self, size: int) -> None:
         """Like ftruncate."""
-        if size != len(self.data):
-            self.confirmed = None
         del self.data[size:]
         self.data.extend(bytes(size - len(self.data)))
 
@@ -126,7 +121,7 @@ class Model:
         self.card = card
         self.excused = excused
         self.failures = 0
-        self.names = {path: File(bytearray(data), data) for path, data in START.items()}
+        self.names = {path: File(bytearray(data)) for path, data in START.items()}
         self.handles: list[Handle] = []
 
     async def do(self, call: str, *args: Any) -> None:
@@ -256,8 +251,6 @@ class Model:
             self.failures += 1
             if file is not None and (await self.size(path)) == size:
                 file.resize(size)  # taken or done after all
-            elif file is not None:
-                file.confirmed = None
         else:
             assert file is not None
             file.resize(size)
@@ -285,7 +278,6 @@ class Model:
         named = [path for path, file in self.names.items() if file is handle.file]
         if handle.writes and named and (empty_too or handle.file.data):
             assert self.card.contents()[named[0]] == handle.file.data
-            handle.file.confirmed = bytes(handle.file.data)
 
     def renamed(self, old: bytes, new: bytes) -> dict[bytes, File]:
         if old == new or old not in self.names:

@@ -102,8 +102,8 @@ class Held(FakeWriter):
             await self.go.wait()
         return answer
 
-    async def request(self, *what: object, in_flight: bool = False) -> bool:
-        return await self.late(super().request(*what, in_flight=in_flight))
+    async def request(self, *what: object, in_flight: bool = False) -> None:
+        await self.late(super().request(*what, in_flight=in_flight))
 
     async def stat_size(self, path: bytes) -> int:
         return await self.late(super().stat_size(path))
