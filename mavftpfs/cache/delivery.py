@@ -312,7 +312,7 @@ class Deliverer:
         """Rename what was sent and verified into place.
 
         Raises:
-            As Names.put. VerificationFailed: it is not what it was any more.
+            As Names.rename and replace. VerificationFailed: it is not what it was any more.
         """
         own, path = self._context.own, node.path
         node.attempt = None
@@ -325,7 +325,10 @@ class Deliverer:
                 raise
             self._context.directories.put(places.new, DirEntry(b"", EntryKind.FILE, draft.size))
             draft.commit()
-            await self._names.put(places, path)
+            if places.old is None:
+                await self._names.rename(places.new, path)
+            else:
+                await self._names.replace(places.new, path, places)
             if attempt.upload.resent and await self._names.size(path) != draft.size:
                 draft.interrupted(ours=True)
                 raise VerificationFailed(f"{path!r} was emptied by a request that came twice")

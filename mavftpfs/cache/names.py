@@ -171,7 +171,8 @@ class Names:
         """Rename; both paths fit a request. completes: see VehicleStore. over: a file has the new name.
 
         Raises:
-            NotSupported: the card cannot rename. Else as VehicleStore.
+            NotSupported: the card cannot rename. AlreadyExists: the new name is not free, though not `over`.
+            Else as VehicleStore.
         """
         writer = self._context.store
         if writer.traits.rename_works is False:
@@ -180,11 +181,13 @@ class Names:
             async with self._changing(old, new):
                 await writer.rename(old, new, completes=completes)
         except FtpNak as nak:
-            expected = over and nak.code == NakCode.FILE_EXISTS  # FAT: the next rename tells more
-            if writer.traits.rename_works is None and not expected:
+            taken = nak.code == NakCode.FILE_EXISTS
+            if writer.traits.rename_works is None and not (over and taken):  # FAT: the next rename tells more
                 await self.find_out(old)
                 if writer.traits.rename_works is False:
                     raise NotSupported("this server cannot rename") from nak
+            if taken and not over:
+                raise AlreadyExists(f"{new!r} was made by somebody else in the meantime") from nak
             raise
         writer.traits.rename_works = True
         self._context.directories.rename(old, new)
@@ -238,22 +241,6 @@ class Names:
         own.torn.pop(path, None)
 
     # --- giving a verified file its name
-
-    async def put(self, places: Places, target: bytes) -> None:
-        """Give what was sent its name: in place of the old file, or, if it is new, one that is free.
-
-        Raises:
-            AlreadyExists: it is not. Else as replace.
-        """
-        if places.old is not None:
-            await self.replace(places.new, target, places)
-            return
-        try:
-            await self.rename(places.new, target)
-        except FtpNak as nak:
-            if nak.code == NakCode.FILE_EXISTS:
-                raise AlreadyExists(f"{target!r} was made by somebody else in the meantime") from nak
-            raise
 
     async def replace(self, source: bytes, target: bytes, places: Places, *, keep_old: bool = False) -> None:
         """Rename over a file that exists; with keep_old that lies at `places.old` afterwards.
