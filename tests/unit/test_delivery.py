@@ -256,10 +256,13 @@ async def test_bytes_travel_while_the_program_still_writes(autojump_clock: objec
     await trio.sleep(1)
     [there] = litter(store)
     assert len(store.files[there].data) == 100_000 // CHUNK * CHUNK  # the rest waits to fill a request
-    await file.write(50_000, b"again")
+    for number in range(3):
+        await file.write(50_000, b"again %d" % number)
+        await trio.sleep(10)
     await file.release()
     data = store.files[b"/card/new"].data
-    assert data == bytes(50_000) + b"again" + bytes(49_995)
+    assert data == bytes(50_000) + b"again 2" + bytes(49_993)
+    assert len(store.uploads) == 2, "who changes what was sent does so again: the rest waits for the close"
 
 
 async def test_writers_wait_for_a_slow_link(autojump_clock: object, store: FakeWriter) -> None:
