@@ -9,11 +9,11 @@ import stat
 import sys
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import ExitStack, asynccontextmanager, contextmanager, nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from pathlib import Path
 from random import SystemRandom
-from typing import Literal, cast
+from typing import Any
 
 import trio
 
@@ -240,43 +240,23 @@ def connect_options(options: MountOptions) -> ConnectOptions:
     Raises:
         UsageError: the signing key cannot be read.
     """
-    defaults = ConnectOptions()
-    return ConnectOptions(
-        target_system=options.target_system,
-        target_component=options.target_component,
-        source_system=options.source_system or defaults.source_system,
-        source_component=options.source_component or defaults.source_component,
-        heartbeat=cast(Literal["onboard", "gcs", "none"], options.heartbeat),
-        signing_key=None if options.signing_key is None else read_key(options.signing_key),
-        op_deadline=options.op_deadline,
-        read_mode=cast(Literal["window", "burst"], options.read_mode),
-        chunk=options.chunk,
-        window=options.window,
-        when_armed=cast(Literal["ro", "ok"], options.when_armed),
-        bwlimit=options.bwlimit,
-    )
+    given = _given(ConnectOptions, options)
+    if options.signing_key is not None:
+        given["signing_key"] = read_key(options.signing_key)
+    return ConnectOptions(**given)
 
 
 def cache_options(options: MountOptions, spec: LinkSpec) -> CacheOptions:
     """Return the caches' part of the options, for a link."""
-    return CacheOptions(
-        root=options.root,
-        dir_timeout=options.dir_timeout,
-        attr_timeout=options.attr_timeout,
-        negative_timeout=options.negative_timeout,
-        cache_size=options.cache_size,
-        op_deadline=options.op_deadline,
-        dirty_max=options.dirty_max,
-        spool_max=options.spool_max,
-        rmw_max=options.rmw_max,
-        link_rate=spec.baud / BITS_PER_BYTE if spec.kind is LinkKind.SERIAL else None,
-        verify=options.verify,
-        verify_max=options.verify_max,
-        write_armed=options.when_armed == "ok",
-        force=options.force,
-        inplace=options.inplace,
-        local=options.local,
-    )
+    link_rate = spec.baud / BITS_PER_BYTE if spec.kind is LinkKind.SERIAL else None
+    given = _given(CacheOptions, options)
+    return CacheOptions(**given, link_rate=link_rate, write_armed=options.when_armed == "ok")
+
+
+def _given(part: type[ConnectOptions | CacheOptions], options: MountOptions) -> dict[str, Any]:
+    """Return the values of the options that `part` has by the same name; None leaves its default."""
+    values = {field.name: getattr(options, field.name, None) for field in fields(part)}
+    return {name: value for name, value in values.items() if value is not None}
 
 
 def read_key(path: str) -> bytes:

@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, TypeVar
 
+from mavftpfs.cache.options import DEFAULT_LOCAL
 from mavftpfs.shared.errors import MavftpfsError, UsageError
 from mavftpfs.shared.model import ROOT, normalise
 
@@ -37,9 +38,6 @@ _FOR_OTHERS = {
 
 IGNORED_WORDS = frozenset(_NO_MEANING | _FOR_OTHERS)
 IGNORED_PREFIXES = ("x-", "X-", "comment=", "user=")
-
-DEFAULT_LOCAL = (".*.sw?", ".*.sw?x", "4913", ".~lock*", ".Trash-*", "._*")
-"""Names that editors and file managers make for themselves; they never reach the card."""
 
 _UNITS = {"": 1, "K": 1 << 10, "M": 1 << 20, "G": 1 << 30}
 _DAY = 86400.0

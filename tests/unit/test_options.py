@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from mavftpfs.cache.options import DEFAULT_LOCAL
 from mavftpfs.fuse.options import (
-    DEFAULT_LOCAL,
     FLAGS,
     IGNORED_WORDS,
     KERNEL_WORDS,
