@@ -21,6 +21,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import BinaryIO
 
 from rich.console import Console
 from rich.panel import Panel
@@ -111,52 +112,51 @@ class Tour:
 
 
 @contextmanager
-def running(words: Sequence[str], folder: Path) -> Iterator[subprocess.Popen[bytes]]:
-    """Run a command that may use the mount; it is ended with the body, gently first.
+def running(
+    words: Sequence[str], folder: Path, *, output: int | BinaryIO = subprocess.PIPE, apart: bool = False
+) -> Iterator[subprocess.Popen[bytes]]:
+    """Run a command in the temporary directory; it is ended with the body, gently first.
 
     It is not waited for long: a reader inside a mount ends only when the mount answers, and ending the mount
-    is another step's business.
+    is another step's business. apart: Ctrl-C reaches only the tour, which then ends things in order.
     """
-    child = subprocess.Popen(
-        words,
-        cwd=folder,
-        env={**os.environ, "XDG_STATE_HOME": str(folder / "state")},  # what a mount keeps goes with the tour
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-    )
+    child = None
     try:
+        with signals_held():
+            child = subprocess.Popen(
+                words,
+                cwd=folder,
+                env={
+                    **os.environ,
+                    "XDG_STATE_HOME": str(folder / "state"),
+                },  # what a mount keeps goes with it
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=output,
+                start_new_session=apart,
+            )
         yield child
     finally:
-        for end_it in (child.terminate, child.kill):
-            if child.poll() is None:
-                end_it()
-                with suppress(subprocess.TimeoutExpired):
-                    child.wait(END_TIMEOUT / 5)
+        if child is not None:
+            _end(child)
+
+
+def _end(child: subprocess.Popen[bytes]) -> None:
+    for end_it in (child.terminate, child.kill):
+        if child.poll() is None:
+            end_it()
+            with suppress(subprocess.TimeoutExpired):
+                child.wait(END_TIMEOUT / 5)
 
 
 @contextmanager
 def vehicle(arguments: Sequence[str], folder: Path) -> Iterator[subprocess.Popen[bytes]]:
-    """Run `mavftpfs sim ARGUMENTS` beside the tour; end it with SIGTERM, in the end with SIGKILL.
-
-    It gets a session of its own, so that Ctrl-C reaches only the tour, which then ends things in order.
-    """
-    process = None
-    try:
-        with (folder / "vehicle.log").open("wb") as log, signals_held():
-            argv = [*PROGRAM, "sim", *arguments]
-            process = subprocess.Popen(
-                argv, stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True
-            )
+    """Run `mavftpfs sim ARGUMENTS` beside the tour."""
+    with (
+        (folder / "vehicle.log").open("wb") as log,
+        running([*PROGRAM, "sim", *arguments], folder, output=log, apart=True) as process,
+    ):
         yield process
-    finally:
-        if process is not None and process.poll() is None:
-            process.terminate()
-            try:
-                process.wait(END_TIMEOUT)
-            except subprocess.TimeoutExpired:
-                process.kill()
-                process.wait(END_TIMEOUT)
 
 
 def ignore_interrupts() -> None:
