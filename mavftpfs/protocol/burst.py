@@ -50,15 +50,14 @@ class Burst:
         self.last_at = now
         self.interval = 0.0
         self.complete_seen = False
-        self.empties = 0
-        self.failures = 0
+        self.barren = 0  # packets without data since the last with some
         self.over = False
         self.nak: int | None = None
 
     @property
     def endless(self) -> bool:
         """Whether the server repeats itself for ever and must be stopped by Terminate (servers.md 14.19)."""
-        return self.empties >= 2 or self.failures >= 2
+        return self.barren >= 2
 
     def quiet_deadline(self) -> float:
         """Return when silence means that the burst is over.
@@ -78,29 +77,17 @@ class Burst:
         if reply.opcode == Opcode.ACK and reply.data:
             return self._take_data(reply, index, now)
         # Neither a NAK's offset nor that of an empty packet can be relied on: the seq must do.
-        if index > self._most_packets():
+        packets = (self.size - self.start) // (self.packet or self.asked) + 2
+        if index > min(packets, _MOST_PACKETS) or reply.opcode not in (Opcode.ACK, Opcode.NAK):
             return None
-        if reply.opcode == Opcode.ACK:
-            self.empties += 1
-        elif reply.opcode == Opcode.NAK:
-            self._take_nak(reply)
-        else:
-            return None
+        self.barren += 1
+        if reply.opcode == Opcode.NAK:
+            self.nak = reply.data[0] if reply.data else int(NakCode.NONE)
+            self.over = self.nak == NakCode.EOF or not self.packets
+            # ArduPilot stops after another one, MAVSDK never does: quiet, or the next one, will tell.
+            self.complete_seen = self.complete_seen or not self.over
         self._touch(now)
         return b""
-
-    def _most_packets(self) -> int:
-        packet = self.packet or self.asked
-        return min((self.size - self.start) // packet + 2, _MOST_PACKETS)
-
-    def _take_nak(self, reply: Payload) -> None:
-        self.nak = reply.data[0] if reply.data else int(NakCode.NONE)
-        if self.nak == NakCode.EOF or not self.packets:
-            self.over = True
-        else:
-            # ArduPilot stops after one, MAVSDK never does: quiet, or the next one, will tell.
-            self.complete_seen = True
-            self.failures += 1
 
     def _take_data(self, reply: Payload, index: int, now: float) -> bytes | None:
         data = reply.data
@@ -110,7 +97,7 @@ class Burst:
             return None
         self._touch(now)
         self.packets += 1
-        self.empties = self.failures = 0
+        self.barren = 0
         if reply.burst_complete:
             self.complete_seen = True
         if stop >= self.size:
