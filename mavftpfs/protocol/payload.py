@@ -105,21 +105,6 @@ def request(
     return Payload(seq, session, opcode, len(data) if size is None else size, 0, 0, offset, data)
 
 
-def decode_reply(wire: bytes) -> Payload:
-    """Decode a reply's 251 bytes.
-
-    Raises:
-        RemoteProtocolError: wrong length, or `size` over 239.
-    """
-    if len(wire) != PAYLOAD_SIZE:
-        raise _wrong_length(wire)
-    fields = _HEADER.unpack_from(wire)
-    size = fields[3]
-    if size > MAX_DATA:
-        raise _oversize(size)
-    return _new(Payload, (*fields, wire[HEADER_SIZE : HEADER_SIZE + size]))
-
-
 Fields: TypeAlias = tuple[int, int, int, int, int, int, int, bytes]
 """What a Payload has, as a plain tuple; `data` is the whole field of 239 bytes, and `size` is not checked."""
 
@@ -144,7 +129,7 @@ def reply_of(fields: Fields) -> Payload:
     """
     size = fields[3]
     if size > MAX_DATA:
-        raise _oversize(size)
+        raise RemoteProtocolError(f"reply says it holds {size} bytes of data, more than {MAX_DATA}")
     return _new(Payload, (*fields[:7], fields[7][:size]))
 
 
@@ -155,17 +140,9 @@ def decode_request(wire: bytes) -> Payload:
         RemoteProtocolError: wrong length. An oversize `size` is left for the server to refuse.
     """
     if len(wire) != PAYLOAD_SIZE:
-        raise _wrong_length(wire)
+        raise RemoteProtocolError(f"payload of {len(wire)} bytes, {PAYLOAD_SIZE} expected")
     fields: tuple[int, int, int, int, int, int, int] = _HEADER.unpack_from(wire)
     return Payload(*fields, wire[HEADER_SIZE:])
-
-
-def _oversize(size: int) -> RemoteProtocolError:
-    return RemoteProtocolError(f"reply says it holds {size} bytes of data, more than {MAX_DATA}")
-
-
-def _wrong_length(wire: bytes) -> RemoteProtocolError:
-    return RemoteProtocolError(f"payload of {len(wire)} bytes, {PAYLOAD_SIZE} expected")
 
 
 def crc32(data: bytes | bytearray | memoryview, previous: int = 0) -> int:

@@ -19,7 +19,6 @@ from mavftpfs.protocol.payload import (
     PAYLOAD_SIZE,
     Opcode,
     Payload,
-    decode_reply,
     decode_request,
 )
 from mavftpfs.protocol.reading import ReadToEof, ReadTransfer
@@ -30,7 +29,7 @@ from mavftpfs.sim.linkmodel import LinkSettings
 from mavftpfs.sim.profiles import PROFILES
 from mavftpfs.sim.tree import MemoryTree
 from mavftpfs.sim.vehicle import FtpServer
-from tests.support.replies import sent
+from tests.support.replies import decode_reply, sent
 from tests.support.virtual import CLIENT, MemorySink, VirtualLink
 
 BYTE = st.integers(0, 255)

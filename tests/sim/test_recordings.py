@@ -19,11 +19,12 @@ from typing import Any
 import pytest
 
 from mavftpfs.link.messages import Address
-from mavftpfs.protocol.payload import Payload, decode_reply
+from mavftpfs.protocol.payload import Payload
 from mavftpfs.sim.profiles import PROFILES
 from mavftpfs.sim.pseudo import VirtualTrees, pack_parameters, unpack_parameters
 from mavftpfs.sim.tree import MemoryTree
 from mavftpfs.sim.vehicle import FtpServer
+from tests.support.replies import decode_reply
 
 DATA = Path(__file__).parent.parent / "data"
 CLIENT = Address(255, 190)

@@ -19,12 +19,13 @@ from fastcrc import crc16
 
 from mavftpfs.link.addresses import NetAddress
 from mavftpfs.link.messages import Address
-from mavftpfs.protocol.payload import Payload, decode_reply, decode_request
+from mavftpfs.protocol.payload import Payload, decode_request
 from mavftpfs.sim.endpoints import Endpoint, client_source, open_endpoint
 from mavftpfs.sim.profiles import PROFILES
 from mavftpfs.sim.tree import Tree
 from mavftpfs.sim.vehicle import FtpServer, SimVehicle
 from tests.support.memory import MemoryLink
+from tests.support.replies import decode_reply
 from tests.support.worlds import World
 
 _FTP = (110, 84)

@@ -3,7 +3,17 @@
 from __future__ import annotations
 
 from mavftpfs.protocol.engine import Engine
-from mavftpfs.protocol.payload import NakCode, Opcode, Payload, decode_request
+from mavftpfs.protocol.payload import NakCode, Opcode, Payload, decode_request, reply_of, split_run
+
+
+def decode_reply(wire: bytes) -> Payload:
+    """Decode a reply's 251 bytes.
+
+    Raises:
+        RemoteProtocolError: wrong length, or `size` over 239.
+    """
+    (fields,) = split_run([wire])
+    return reply_of(fields)
 
 
 def sent(engine: Engine, now: float) -> list[Payload]:

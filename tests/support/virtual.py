@@ -14,10 +14,11 @@ from mavftpfs.link.messages import Address
 from mavftpfs.protocol.engine import Engine
 from mavftpfs.protocol.flow import Flow
 from mavftpfs.protocol.operations import Operation
-from mavftpfs.protocol.payload import PAYLOAD_SIZE, decode_reply
+from mavftpfs.protocol.payload import PAYLOAD_SIZE
 from mavftpfs.shared.errors import RemoteProtocolError
 from mavftpfs.shared.extents import ExtentSet
 from mavftpfs.sim.linkmodel import Direction, LinkModel, LinkSettings
+from tests.support.replies import decode_reply
 
 CLIENT = Address(254, 191)
 OVERHEAD = bytes(15)

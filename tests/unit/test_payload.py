@@ -7,10 +7,10 @@ import pytest
 from mavftpfs.protocol.payload import (
     PAYLOAD_SIZE,
     Payload,
-    decode_reply,
     decode_request,
 )
 from mavftpfs.shared.errors import LocalProtocolError, RemoteProtocolError
+from tests.support.replies import decode_reply
 
 
 def test_layout_is_the_guides() -> None:

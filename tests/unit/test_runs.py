@@ -10,12 +10,12 @@ import pytest
 from mavftpfs.protocol.engine import Engine
 from mavftpfs.protocol.flow import Flow
 from mavftpfs.protocol.operations import Operation
-from mavftpfs.protocol.payload import MAX_DATA, Opcode, Payload, decode_reply
+from mavftpfs.protocol.payload import MAX_DATA, Opcode, Payload
 from mavftpfs.protocol.reading import ReadTransfer
 from mavftpfs.protocol.writing import WriteTransfer
 from mavftpfs.shared.errors import RemoteProtocolError
 from mavftpfs.shared.model import Traits
-from tests.support.replies import ack, chunk, sent
+from tests.support.replies import ack, chunk, decode_reply, sent
 from tests.support.sources import MemorySource
 from tests.support.virtual import MemorySink
 

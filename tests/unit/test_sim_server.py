@@ -10,11 +10,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mavftpfs.link.messages import Address
-from mavftpfs.protocol.payload import Opcode, decode_reply, request
+from mavftpfs.protocol.payload import Opcode, request
 from mavftpfs.sim.profiles import PROFILES
 from mavftpfs.sim.storage import Storage
 from mavftpfs.sim.tree import DirectoryTree
 from mavftpfs.sim.vehicle import FtpServer
+from tests.support.replies import decode_reply
 from tests.support.sim_client import CLIENT, OTHER, small_tree
 
 A = b"/fs/microsd/a.bin"

@@ -15,11 +15,12 @@ from mavftpfs.link.messages import (
     Message,
     SystemTime,
 )
-from mavftpfs.protocol.payload import Opcode, decode_reply, request
+from mavftpfs.protocol.payload import Opcode, request
 from mavftpfs.sim.profiles import PROFILES
 from mavftpfs.sim.tree import MemoryTree
 from mavftpfs.sim.vehicle import SimVehicle
 from tests.support.frames import feed
+from tests.support.replies import decode_reply
 
 T = TypeVar("T")
 US = Address(254, 191)
