@@ -20,7 +20,7 @@ from tests.support.vehicles import PROJECT, Process, free_udp_port
 
 STATUS = (sys.executable, "-m", "mavftpfs", "status")
 NOBODY = ("setpriv", "--reuid=65534", "--regid=65534", "--clear-groups")
-SLOW = ("--rate", "20000")
+SLOW = ("--rate", "60000")
 
 
 def logged(mount: Mount, text: str) -> None:
@@ -80,7 +80,7 @@ def test_what_is_read_is_shown_on_a_terminal(field: Field) -> None:
     card = field.local("card")
     name = "log/2026-11-20-with-a-rather-long-name-for-a-folder/10_32_15.ulg"
     (card / name).parent.mkdir(parents=True)
-    (card / name).write_bytes(os.urandom(1_000_000))
+    (card / name).write_bytes(os.urandom(3_000_000))
     mount = field.mount(field.sim(card, options=SLOW).source)
     with mount.started("cat", mount.path / name):
         wait_until("it is read", lambda: _reads((*STATUS, "--json", mount.path)) > 0)
@@ -91,7 +91,7 @@ def test_what_is_read_is_shown_on_a_terminal(field: Field) -> None:
     shown = re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", screen.raw.split(CLEAR)[3]).split("\r\n")
     assert all(len(line) <= 80 for line in shown)
     assert "PX4 1/1, disarmed, link " in shown[0]
-    assert re.match(r"  reading .*10_32_15.ulg: \d+ % of 1.0 MB, .* kB/s, .* left$", shown[1]), shown
+    assert re.match(r"  reading .*10_32_15.ulg: \d+ % of 3.0 MB, .* kB/s, .* left$", shown[1]), shown
 
 
 def _reads(argv: tuple[str | Path, ...]) -> int:

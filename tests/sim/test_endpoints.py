@@ -21,16 +21,13 @@ from mavftpfs.link.messages import Address, FtpRun, Heartbeat, Message
 from mavftpfs.link.opening import open_link
 from mavftpfs.link.uri import parse_source
 from mavftpfs.protocol.payload import Opcode, request
-from mavftpfs.session.connection import ConnectOptions, connected
 from mavftpfs.shared.errors import LinkClosed
 from mavftpfs.sim import endpoints
-from mavftpfs.sim.endpoints import Endpoint, client_source, open_endpoint
 from mavftpfs.sim.linkmodel import Duplex, LinkSettings
 from mavftpfs.sim.profiles import PROFILES
 from mavftpfs.sim.tree import MemoryTree
 from mavftpfs.sim.vehicle import SimVehicle
 from tests.support.vehicles import free_udp_port
-from tests.support.worlds import read_file
 
 CONTENT = random.Random("content").randbytes(50_000)
 
@@ -42,21 +39,6 @@ def vehicle(profile: str = "px4", *, stream: bool = False, telemetry: float = 0.
 
 
 # ---------------------------------------------------------------------- real links
-
-
-@pytest.mark.parametrize("kind", ["udpout", "tcp"])
-async def test_pushes_to_a_listening_client(kind: str) -> None:
-    listen = {"udpout": "udpin", "tcp": "tcpin"}[kind]
-    with trio.fail_after(30):
-        async with open_link(parse_source(f"{listen}:127.0.0.1:0")) as client_link:
-            port = parse_source(client_link.description).port
-            async with open_endpoint(f"{kind}:127.0.0.1:{port}") as link, trio.open_nursery() as nursery:
-                assert client_source(link) == client_link.description
-                nursery.start_soon(Endpoint(vehicle(stream=link.is_stream), link).run)
-                async with connected(client_link, ConnectOptions()) as connection:
-                    await connection.ready(20.0)
-                    assert await read_file(connection, b"/log.bin") == CONTENT
-                nursery.cancel_scope.cancel()
 
 
 # ---------------------------------------------------------------------- the command

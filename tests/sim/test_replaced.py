@@ -205,17 +205,6 @@ async def test_the_same_file_is_read_on(profile: str, grown: bool, autojump: Moc
         assert profile in TIMED or tree.status()["listings_asked"] == sweeps
 
 
-async def test_a_newer_listing_ends_what_it_contradicts(autojump: MockClock) -> None:
-    card = Card("mavsdk")
-    async with card.opened() as (tree, handle):
-        assert await read_on(handle) == OLD
-        card.replace()
-        await trio.sleep(30.0)
-        assert (await tree.stat(PATH)).mtime == THEN + 100
-        with pytest.raises(FileChanged):
-            await handle.read(0, STEP)
-
-
 # --- changes of it wait here: what goes to the card is of one file
 
 MID = b"mid"
