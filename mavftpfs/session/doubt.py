@@ -59,7 +59,7 @@ class Doubt:
         self.on_raised: Callable[[str], None] = lambda reason: None
         self._clock = clock
         self._at = self._reads_at = -inf
-        self._late = LEAST_LATE
+        self._late = 0.0
         self._late_at = -inf
 
     def raise_it(self, reason: str, *, reads: bool = True) -> None:
@@ -85,12 +85,18 @@ class Doubt:
         """A copy of a request was answered so long after the request was sent first."""
         now = self._clock()
         if seconds >= self._late or now - self._late_at > LASTS:
-            self._late, self._late_at = min(MOST_LATE, max(LEAST_LATE, seconds)), now
+            self._late, self._late_at = min(MOST_LATE, seconds), now
+
+    @property
+    def seen_late(self) -> float:
+        """Seconds by which copies of requests were seen to be late at most; 0 while there is no doubt.
+
+        A file that was sent is left alone for so long: a copy of its CreateFile, and one of the rename that
+        follows, would put an empty file in the place of it.
+        """
+        return self._late if self.is_active() and self._clock() - self._late_at <= LASTS else 0.0
 
     @property
     def lateness(self) -> float:
         """Seconds for which a copy of a request may still come; 0 while there is no doubt."""
-        now = self._clock()
-        if now - self._at > LASTS:
-            return 0.0
-        return self._late if now - self._late_at <= LASTS else LEAST_LATE
+        return max(LEAST_LATE, self.seen_late) if self.is_active() else 0.0

@@ -164,14 +164,14 @@ class Upload(SessionUser):
         self._server.wake()
 
     async def finish(self) -> None:
-        """See cache.remote.Upload."""
+        """See cache.remote.Upload. Copies of what was sent have come by then, as far as was seen."""
         if self.state in (UploadState.ENDING, UploadState.ENDED):
             raise LocalProtocolError("the upload was aborted")
         resting, source = self.state in (UploadState.IDLE, UploadState.HELD), self._source
         if resting and source.closed and source.acked.empty and self.error is None and not source.has_more():
+            await trio.sleep(self._scheduler.doubt.seen_late)
             return
-        now = self._clock()
-        self._vehicle.require(now, writing=True)
+        self._vehicle.require(now := self._clock(), writing=True)
         if self.error is not None:
             self.error, self._refused_at, self._failures = None, None, 0
         if not self.finishing:
@@ -185,6 +185,7 @@ class Upload(SessionUser):
             if self.error is not None:
                 raise self.error
             await self._changed.park()
+        await trio.sleep(self._scheduler.doubt.seen_late)
 
     async def abort(self) -> None:
         """See cache.remote.Upload."""

@@ -315,6 +315,40 @@ async def test_an_older_copy_of_a_part_that_was_written_twice(
         file.close()
 
 
+@pytest.mark.holds("rule 14.12")
+@pytest.mark.parametrize("profile", ["px4", "ardupilot", "mavsdk", "littlefs"])
+async def test_new_files_stay_what_they_are_where_all_requests_come_twice(
+    profile: str, autojump: MockClock
+) -> None:
+    """Over two radios copies of a CreateFile and of the rename put an empty file in the place of one that
+    close had said to be there."""
+    here = world(profile, CLEAN, f=content(300))
+    directory = path(profile, "")[:-1]
+    handle = here.vehicle.server.handle
+    async with mounted(here, directory) as (connection, tree), trio.open_nursery() as nursery:
+
+        async def again(wire: bytes, source: Address) -> None:
+            await trio.sleep(0.5)
+            handle(wire, source, trio.current_time())
+            here.link.kick()
+
+        def twice(wire: bytes, source: Address, now: float) -> None:
+            nursery.start_soon(again, wire, source)
+            handle(wire, source, now)
+
+        here.vehicle.server.handle = twice  # type: ignore[method-assign]
+        await read_file(connection, path(profile, "f"))
+        await trio.sleep(3.0)  # the copies were seen
+        for number in range(8):
+            file = await tree.create(path(profile, f"new{number}"), exclusive=False)
+            await file.write(0, content(300 + number, number))
+            await file.flush()
+            await file.release()
+        await trio.sleep(3.0)
+        for number in range(8):
+            assert bytes(here.tree.data(path(profile, f"new{number}"))) == content(300 + number, number)
+
+
 @pytest.mark.parametrize("verify", ["auto", "size", "none"])
 async def test_the_head_of_a_large_new_file_written_at_the_end(verify: str, autojump: MockClock) -> None:
     world = World("px4", DOUBLING)
