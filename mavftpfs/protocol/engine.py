@@ -24,7 +24,7 @@ from mavftpfs.protocol.payload import NakCode, Opcode, Payload, reply_of, split_
 from mavftpfs.protocol.requests import Operation, Priority, Request, encode
 from mavftpfs.protocol.timers import Timers
 from mavftpfs.shared.errors import LocalProtocolError, RemoteProtocolError, RequestTimeout
-from mavftpfs.shared.model import Traits
+from mavftpfs.shared.model import SHARED_QUEUE_WINDOW, Traits
 
 OP_DEADLINE = 30.0
 _MAX_REPLAYS = 8
@@ -117,8 +117,10 @@ class Engine:
     # --- traits
 
     def learn_session_echo(self, echoed: bool) -> None:
-        """An Open ACK carried the id asked for, or another (servers.md 14.6)."""
-        self.traits.learn_session_echo(echoed)
+        """An Open ACK carried the id asked for (servers.md 14.6; then the queue is shared), or another."""
+        self.traits.ack_carries_own_session = echoed
+        if echoed:
+            self.traits.queue_limit = SHARED_QUEUE_WINDOW
         self.flow.set_queue_limit(self.traits.queue_limit)
 
     def forget_server(self) -> None:

@@ -177,10 +177,9 @@ class Connection:
         self.scheduler.on_foreign(payload, newcomer=newcomer)
 
     def _on_armed(self, armed: bool) -> None:
+        # Uploads are terminated and held while it is armed, and go on afterwards (promise 9).
         for user in list(self.scheduler.users):
-            if isinstance(
-                user, Upload
-            ):  # terminated and held while armed, and going on afterwards (promise 9)
+            if isinstance(user, Upload):
                 user.on_armed_changed()
         self.scheduler.server.wake()
         self._tell("armed" if armed else "disarmed")

@@ -178,12 +178,6 @@ class Traits:
     lists_times: bool | None = None
     time_silences: int = 0
 
-    def learn_session_echo(self, echoed: bool) -> None:
-        """Note whether an Open ACK carried the id asked for; an echoing server has the shared queue."""
-        self.ack_carries_own_session = echoed
-        if echoed and self.queue_limit is None:
-            self.queue_limit = SHARED_QUEUE_WINDOW
-
 
 @dataclass(slots=True)
 class WriteTraits:
