@@ -143,7 +143,7 @@ def _seen(connection: Connection, *, answers: bool) -> list[str]:
     if answers:
         if connection.engine.rtt is not None:
             facts.append(f"in {readable_time(connection.engine.rtt)}")
-        times = connection.store.lists_times
+        times = connection.engine.traits.lists_times
         if times is not None:
             facts.append("listings with times" if times else "listings without times")
     if connection.vehicle.foreign_client(connection.clock()):

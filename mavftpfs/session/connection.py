@@ -138,7 +138,7 @@ class Connection:
             "session_open": None if session is None else session.path.decode("utf-8", "replace"),
             "requests": stats.requests,
             "retransmissions": stats.retransmissions,
-            "lists_times": self.store.lists_times,
+            "lists_times": self.engine.traits.lists_times,
             "write_traits": asdict(self.store.traits),
             "uploads": [user.status() for user in self.scheduler.users if isinstance(user, Upload)],
             "link": {

@@ -268,9 +268,8 @@ class ServerSession:
                 ours = self._may_be_ours(nak)
                 # ArduPilot's 1 may mean that the session is open under our id, by an open whose ACK was lost;
                 # else it is a plain failure.
-                taken = nak.code in _OPEN_TAKEN or (
-                    nak.code == NakCode.FAIL and ours and traits.ack_carries_own_session is not False
-                )
+                echoes = self.engine.traits.ack_carries_own_session is not False
+                taken = nak.code in _OPEN_TAKEN or (nak.code == NakCode.FAIL and ours and echoes)
                 if not ours or not taken:
                     self.maybe_open.clear()
                 if not taken:

@@ -121,11 +121,6 @@ class Store:
         self._under_way = 0
         self._changed_at: dict[bytes, float] = {}
 
-    @property
-    def lists_times(self) -> bool | None:
-        """Whether this server answers opcode 16; None until it was asked."""
-        return self._server.engine.traits.lists_times
-
     def is_silent(self) -> bool:
         """Return whether the vehicle is silent (see RemoteStore)."""
         return self._vehicle.silence(self._clock()) > SILENCE_LIMIT

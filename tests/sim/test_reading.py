@@ -82,7 +82,7 @@ async def test_a_long_listing_with_times_is_not_taken_for_silence(autojump: Mock
         assert trio.current_time() - began > 3.0
         assert len(listing.entries) == 200
         assert all(entry.mtime is not None for entry in listing.entries)
-        assert connection.store.lists_times is True
+        assert connection.engine.traits.lists_times is True
         assert Opcode.LIST_DIRECTORY not in connection.engine.stats.by_opcode
 
 
@@ -213,9 +213,9 @@ async def test_times_that_could_not_be_asked_for_are_not_refused(autojump: MockC
             nursery.start_soon(keep_quiet)
             await trio.sleep(0.01)
             await connection.store.list_directory(b"/d")
-        assert connection.store.lists_times is None
+        assert connection.engine.traits.lists_times is None
         await connection.store.list_directory(b"/d")
-        assert connection.store.lists_times is True
+        assert connection.engine.traits.lists_times is True
 
 
 @pytest.mark.holds("rule 14.15")

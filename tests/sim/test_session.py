@@ -149,7 +149,7 @@ async def test_a_reboot_forgets_what_was_seen_of_the_server(profile: str, autoju
         await trio.sleep(3)
         assert connection.vehicle.reboots == 1
         assert connection.engine.traits.ack_carries_own_session is None
-        assert connection.store.lists_times is None
+        assert connection.engine.traits.lists_times is None
         assert await read_file(connection, path(profile, "small")) == b"hello"
 
 
@@ -486,7 +486,7 @@ async def test_two_silences_prove_that_listings_show_no_times(autojump: MockCloc
         log = Log(here)
         for known in (None, False, False):
             assert await _listed(connection) == [b"f"]
-            assert connection.store.lists_times is known
+            assert connection.engine.traits.lists_times is known
         asked = [opcode for _, opcode in log.asked]
         assert asked[-1] == Opcode.LIST_DIRECTORY
         times = [now for now, opcode in log.asked if opcode == Opcode.LIST_DIRECTORY_WITH_TIME]
@@ -506,9 +506,9 @@ async def test_an_answer_after_one_silence_is_taken(autojump: MockClock) -> None
                 await trio.sleep(TIME_PROBE_LIMIT)
                 here.link.restore()
         assert not scope.cancelled_caught
-        assert connection.store.lists_times is None
+        assert connection.engine.traits.lists_times is None
         assert await _listed(connection) == [b"f"]
-        assert connection.store.lists_times is True
+        assert connection.engine.traits.lists_times is True
 
 
 async def _listed(connection: Connection) -> list[bytes]:
