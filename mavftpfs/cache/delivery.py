@@ -46,7 +46,7 @@ from mavftpfs.shared.model import DirEntry, EntryKind, split
 log = logging.getLogger("mavftpfs.cache")
 
 MAX_STEPS = 8
-"""Steps of one delivery: each but the last learnt something of the server or fetched the base."""
+"""Steps of one delivery: each but the last learnt something of the server, or found a wrong copy."""
 
 MISMATCHES = 2
 """After so many copies that are not what was sent the delivery fails."""
