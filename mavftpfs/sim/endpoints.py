@@ -12,7 +12,7 @@ import random
 import signal
 import sys
 import tty
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from contextlib import AbstractAsyncContextManager, asynccontextmanager
 from typing import TextIO
 
@@ -264,8 +264,8 @@ def link_settings(args: argparse.Namespace) -> LinkSettings:
     """Return the model's settings; a link without any flaw is no model's business."""
     return LinkSettings(
         rate=args.rate,
-        queue=args.queue,
-        mtu=args.mtu,
+        queue=int(args.queue),
+        mtu=None if args.mtu is None else int(args.mtu),
         duplex=Duplex(args.duplex),
         delay=args.delay,
         jitter=args.jitter,
@@ -281,12 +281,12 @@ def _add_model_arguments(group: argparse._ArgumentGroup) -> None:
     group.add_argument("--rate", type=_positive, metavar="B/s", help="each way; without it, no limit")
     group.add_argument(
         "--queue",
-        type=_size,
+        type=_bytes,
         default=DEFAULT_QUEUE,
         metavar="B",
         help=f"bytes that wait for the transmitter (default {DEFAULT_QUEUE})",
     )
-    group.add_argument("--mtu", type=_size, metavar="B", help="longer frames are lost; without it, none")
+    group.add_argument("--mtu", type=_bytes, metavar="B", help="longer frames are lost; without it, none")
     group.add_argument(
         "--duplex", choices=[d.value for d in Duplex], default="full", help="half: directions share the rate"
     )
@@ -336,31 +336,23 @@ def _say(out: TextIO, line: str) -> None:
     print(line, file=out, flush=True)
 
 
-def _number(text: str, low: float, high: float, what: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = float("nan")
-    if not low <= value <= high:
-        raise argparse.ArgumentTypeError(f"{text!r} is no {what}")
-    return value
+def _between(low: float, high: float, what: str) -> Callable[[str], float]:
+    """Return a parser of numbers within [low, high]."""
+
+    def parse(text: str) -> float:
+        try:
+            value = float(text)
+        except ValueError:
+            value = float("nan")
+        if not low <= value <= high:
+            raise argparse.ArgumentTypeError(f"{text!r} is no {what}")
+        return value
+
+    return parse
 
 
-def _rate(text: str) -> float:
-    return _number(text, 0, 1e12, "rate in bytes per second")
-
-
-def _positive(text: str) -> float:
-    return _number(text, 1, 1e12, "rate in bytes per second (1 or more)")
-
-
-def _size(text: str) -> int:
-    return int(_number(text, 1, 1e9, "number of bytes"))
-
-
-def _seconds(text: str) -> float:
-    return _number(text, 0, 3600, "number of seconds")
-
-
-def _share(text: str) -> float:
-    return _number(text, 0, 1, "share between 0 and 1")
+_rate = _between(0, 1e12, "rate in bytes per second")
+_positive = _between(1, 1e12, "rate in bytes per second (1 or more)")
+_bytes = _between(1, 1e9, "number of bytes")
+_seconds = _between(0, 3600, "number of seconds")
+_share = _between(0, 1, "share between 0 and 1")
