@@ -224,9 +224,7 @@ class Ledger:
 
         Its order, sent_at, single and outrun are those of the answered transmission from then on.
         """
-        if request.sends > 1:
-            self.duplicates.on_settled(request, seq)
-        self._remove(request)
+        self.forget(request, seq)
         current = seq == request.seq + 1
         if not current and request.aliases is not None:
             request.order, request.sent_at, request.single, request.outrun = request.aliases[seq]
@@ -239,14 +237,10 @@ class Ledger:
             self.newest_answered = request.order
         return current
 
-    def forget(self, request: Request) -> None:
-        """Give up a request that was not answered."""
-        if request.sends:
-            self.duplicates.on_settled(request, None)
-        self._remove(request)
-
-    def _remove(self, request: Request) -> None:
-        """Take a request out of everything."""
+    def forget(self, request: Request, answered: int | None = None) -> None:
+        """Take a request out of everything. answered: the seq of the answer that came, if one did."""
+        if answered is None or request.sends > 1:
+            self.duplicates.on_settled(request, answered)
         table = self._table
         table.pop(request.seq + 1, None)
         if request.aliases is not None:
