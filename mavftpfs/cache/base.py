@@ -67,8 +67,8 @@ async def read_base(context: Context, node: Node, start: int, stop: int) -> byte
             raise
 
 
-async def fetch(context: Context, node: Node) -> None:
-    """Get what only the vehicle has of a draft, if anything; the caller delivers it.
+async def fetch(context: Context, node: Node, draft: Draft) -> None:
+    """Get what only the vehicle has of a node's draft; the caller delivers it.
 
     Where listings tell no times, all of the old file is read, so that its checksum is known: it is compared
     before the old file is replaced.
@@ -76,10 +76,7 @@ async def fetch(context: Context, node: Node) -> None:
     Raises:
         NoSpace; else as read_base.
     """
-    draft = node.draft
-    assert draft is not None
-    if draft.base is None or draft.whole:
-        return
+    assert draft.base is not None
     uncut = draft.base_limit == draft.base.size
     if context.directories.tells_times or not uncut or draft.base.size > context.options.verify_max:
         for start, stop in draft.missing_base():

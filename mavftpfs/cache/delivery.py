@@ -240,7 +240,8 @@ class Deliverer:
     async def _send(self, node: Node, draft: Draft) -> None:
         """Send the whole file, compare it, and rename it into place."""
         self._is_in_place(draft)  # before anything is fetched for it
-        await base.fetch(self._context, node)
+        if not draft.whole:
+            await base.fetch(self._context, node, draft)
         attempt, store = await self._attempt(node, draft), self._context.store
         attempt.sending.growing = False
         for _ in range(FINISHES):
@@ -265,7 +266,8 @@ class Deliverer:
         attempt, in_place = node.attempt, self._is_in_place(draft)
         if attempt is not None and attempt.fits(draft, in_place=in_place):
             return attempt
-        await self.abandon(node)
+        if attempt is not None:
+            await self.abandon(node)
         context, places = self._context, None
         # A card may have no room beside the file that `inplace` replaces, and never tell.
         ask_first = draft.size > SENT_TWICE or (context.options.inplace and draft.base is not None)

@@ -153,7 +153,8 @@ class SpoolContent:
     def settle(self) -> None:
         """The vehicle has all of it: until more is put the next mount need not offer it."""
         self._settled = True
-        self.restate()
+        if self._path is not None:
+            self.restate()
 
     def restate(self) -> None:
         """Its name changed, or nobody wants it any more: write that down; a failure is only logged."""
@@ -182,7 +183,8 @@ class SpoolContent:
         """The vehicle has it, or nobody wants it: forget the bytes. Raises nothing."""
         self._spool.in_memory -= len(self._memory)
         self._memory = bytearray()
-        self._drop_file()
+        if self._path is not None:
+            self._drop_file()
 
     # --- inside
 
