@@ -92,28 +92,19 @@ class _File:
 
 
 class JsonTrace(_File):
-    """Payloads as JSON lines.
-
-    data_limit: most bytes of data to record for a payload, None = all. wall_clock: seconds since 1970.
+    """Payloads as JSON lines. wall_clock: seconds since 1970.
 
     Raises:
         UsageError: the file cannot be created.
     """
 
-    def __init__(
-        self,
-        path: str | Path,
-        *,
-        data_limit: int | None = None,
-        wall_clock: Callable[[], float] = time.time,
-    ) -> None:
+    def __init__(self, path: str | Path, *, wall_clock: Callable[[], float] = time.time) -> None:
         super().__init__(path)
-        self._data_limit = data_limit
         self._wall_clock = wall_clock
 
     def payload(self, now: float, direction: str, wire: bytes, note: str = "") -> None:
         """See Sink."""
-        record = describe(direction, wire, data_limit=self._data_limit)
+        record = describe(direction, wire)
         if note:
             record["note"] = note
         wall = datetime.fromtimestamp(self._wall_clock(), UTC).isoformat(timespec="microseconds")
@@ -212,7 +203,7 @@ class Remarks:
         return ""
 
 
-def describe(direction: str, wire: bytes, *, data_limit: int | None = None) -> dict[str, str | int]:
+def describe(direction: str, wire: bytes) -> dict[str, str | int]:
     """Return a payload's fields by name, as JSON takes them; what is no payload shows as its bytes."""
     if len(wire) != PAYLOAD_SIZE:
         return {"dir": direction, "malformed": wire.hex()}
@@ -228,7 +219,7 @@ def describe(direction: str, wire: bytes, *, data_limit: int | None = None) -> d
     if direction == REPLY:
         record["req_opcode"] = opcode_name(payload.req_opcode)
         record["burst_complete"] = payload.burst_complete
-    record["data"] = _data_that_counts(direction, payload)[:data_limit].hex()
+    record["data"] = _data_that_counts(direction, payload).hex()
     return record
 
 

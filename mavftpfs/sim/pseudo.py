@@ -20,6 +20,7 @@ _PARAM_HEADER = struct.Struct("<HHH")
 _MISSION_HEADER = struct.Struct("<HHHHH")
 _SYS_CLAIM = 100_000
 _MISSION_CLAIM = 2**20
+_MISSIONS = (b"mission.dat", b"fence.dat", b"rally.dat")
 _FORMATS = {1: "<b", 2: "<h", 3: "<i", 4: "<f"}
 _SIZES = {1: 1, 2: 2, 3: 4, 4: 4}
 _REAL_SIZES = (b"storage.bin",)
@@ -121,14 +122,11 @@ class VirtualTrees:
         params: Iterable[Param] | None = None,
         sys_files: Mapping[bytes, bytes] | None = None,
         romfs: Mapping[bytes, bytes] | None = None,
-        missions: Mapping[bytes, Sequence[bytes]] | None = None,
     ) -> None:
         self._exact = exact
         self.params = list(params) if params is not None else _default_params()
         self.sys_files = dict(sys_files) if sys_files is not None else _default_sys()
         self.romfs = dict(romfs) if romfs is not None else _default_romfs()
-        names = (b"mission.dat", b"fence.dat", b"rally.dat")
-        self.missions = {name: list((missions or {}).get(name, ())) for name in names}
         self._open = {b"@SYS": 0, b"@ROMFS": 0, b"@PARAM": 0, b"@MISSION": 0}
         self._leaked_listings = 0
 
@@ -195,10 +193,8 @@ class VirtualTrees:
     def _content(self, tree: bytes, name: bytes, block: int) -> bytes:
         if tree == b"@PARAM" and name.partition(b"?")[0] == b"param.pck":
             return pack_parameters(self._selected_params(name), block)
-        if tree == b"@MISSION" and name in self.missions:
-            items = self.missions[name]
-            header = _MISSION_HEADER.pack(MISSION_MAGIC, _mission_type(name), 0, 0, len(items))
-            return header + b"".join(items)
+        if tree == b"@MISSION" and name in _MISSIONS:  # of no items
+            return _MISSION_HEADER.pack(MISSION_MAGIC, _MISSIONS.index(name), 0, 0, 0)
         files = {b"@SYS": self.sys_files, b"@ROMFS": self.romfs}.get(tree, {})
         if name not in files:
             raise fail(errno.ENOENT, name)
@@ -241,10 +237,6 @@ class VirtualTrees:
     def _split(path: bytes) -> tuple[bytes, bytes]:
         tree, _, name = path.removeprefix(b"/").partition(b"/")
         return tree, name.strip(b"/")
-
-
-def _mission_type(name: bytes) -> int:
-    return (b"mission.dat", b"fence.dat", b"rally.dat").index(name)
 
 
 class VirtualFile:

@@ -27,7 +27,7 @@ WALL = 1795426200.25
 
 
 def test_json_lines(tmp_path: Path) -> None:
-    with JsonTrace(tmp_path / "trace", data_limit=3, wall_clock=lambda: WALL) as trace:
+    with JsonTrace(tmp_path / "trace", wall_clock=lambda: WALL) as trace:
         trace.payload(1.5, "request", READ, "retransmit")
         trace.payload(2.25, REPLY, DATA)
         trace.payload(3.0, "request", OPEN)
@@ -54,7 +54,7 @@ def test_json_lines(tmp_path: Path) -> None:
             "size": 4,
             "req_opcode": "BURST_READ_FILE",
             "burst_complete": 1,
-            "data": b"abc".hex(),
+            "data": b"abcd".hex(),
             **common,
         },
         {
@@ -65,7 +65,7 @@ def test_json_lines(tmp_path: Path) -> None:
             "opcode": "OPEN_FILE_RO",
             "size": 17,
             "offset": 0,
-            "data": b"/fs".hex(),
+            "data": b"/fs/microsd/a.bin".hex(),
         },
         {"t": 4.0, "dir": "reply", "malformed": b"short".hex()},
     ]
