@@ -182,7 +182,7 @@ class Remarks:
             return "malformed"
         payload = decode_request(wire)
         if direction != REPLY:
-            what = wire[2:5] + wire[8:]
+            what = wire[2:5] + wire[8:-1]  # the last byte may be what gives a repetition its full length
             earlier = self._unanswered.get(what)
             self._unanswered[what] = payload.seq
             if len(self._unanswered) > _REMEMBERED:
