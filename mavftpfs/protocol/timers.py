@@ -34,7 +34,7 @@ _USUAL_PACE = 0.1
 it. It is under the same seq: PX4 and ArduPilot, which may be slower, replay their answer (servers.md 2), and
 MAVSDK, which works again, is a computer."""
 
-_USUAL_SENDS = 2
+_USUAL_SENDS = 3
 """Transmissions that may go out so; then the slowest card gets its time."""
 
 
