@@ -145,8 +145,11 @@ UPLOADS = [
     for profile in KEEPING
     for link, what in (("radio", "ls"), ("radio", "read"), ("slow", "read"), ("far", "ls"))
 ]
+MUCH = (("px4", "fast", "ls"), ("px4", "far", "ls"), ("px4", "far", "read"))
+"""Of these many bytes are copied."""
+
 CASES = [
-    pytest.param(*case, way, marks=pytest.mark.soak if case[0] in ALIKE else ())
+    pytest.param(*case, way, marks=pytest.mark.soak if case[0] in ALIKE or case in MUCH else ())
     for cases, way in ((DOWNLOADS, "download"), (UPLOADS, "upload"))
     for case in cases
 ]
