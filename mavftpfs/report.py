@@ -363,6 +363,7 @@ def _ask_or_remove(socket: Path) -> Status | None:
 WATCH_PERIOD = 1.0
 NOTHING = "no vehicle is mounted"
 
+_IN_THE_LINES = {"mountpoint", "problem", "transfers"}
 _SHORTEST_PATH = 12
 """Characters that are left of a path where a line is too narrow for all of it."""
 
@@ -395,7 +396,8 @@ def status_lines(status: Status, *, verbose: bool = False) -> list[Line]:
     if status.get("problem"):
         return [first]
     lines = [first, *map(_transfer_line, status["transfers"]), *_held_lines(status)]
-    return [*lines, *_rows(status, "  ")] if verbose else lines
+    rest = {key: value for key, value in status.items() if key not in _IN_THE_LINES}
+    return [*lines, *_rows(rest, "  ")] if verbose else lines
 
 
 def _rows(facts: Mapping[str, Any], before: str) -> Iterator[Line]:
