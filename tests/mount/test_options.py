@@ -46,6 +46,8 @@ def test_status_tells_about_vehicle_and_link(plain: Mount) -> None:
     assert speed["loss"] == 0.0 or status["connection"]["retransmissions"], "an answer may have come late"
     assert speed["window"] >= 1
     assert mavftpfs("status", plain.path)[0].startswith(f"{plain.path}: PX4 1/1, disarmed, link fine: RTT ")
+    shown, _ = mavftpfs("status", "--verbose", plain.path)
+    assert plain.source in shown
 
 
 def test_extended_attributes(plain: Mount) -> None:
