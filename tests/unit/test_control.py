@@ -79,8 +79,8 @@ async def test_refusals_name_the_reason(
 
 @pytest.mark.parametrize(
     "line",
-    [b"\n", b"{}\n", b"[]\n", b"[1]\n", b'{"command": []}\n', b"\xff\xfe\n", b"", b"[" * 200_000 + b"\n"],
-    ids=range(8),
+    [b"[1]\n", b'{"command": []}\n', b"\xff\xfe\n", b"", b"[" * 200_000 + b"\n"],
+    ids=range(5),
 )
 async def test_garbage_is_answered_and_harmless(tmp_path: Path, line: bytes) -> None:
     path = tmp_path / "s.sock"

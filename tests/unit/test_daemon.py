@@ -155,14 +155,6 @@ def test_where_there_is_syslog_the_log_goes_there(tmp_path: Path) -> None:
     assert not file.exists()
 
 
-@pytest.mark.usefixtures("restored_logging")
-def test_a_name_that_is_no_text_is_logged_too(tmp_path: Path) -> None:
-    path = tmp_path / "log"
-    daemon.log_to_file(str(path), logging.INFO)
-    logging.getLogger("mavftpfs").info("%s stays where it is", os.fsdecode(b"/spool/\xff"))
-    assert path.read_text().endswith("/spool/\\udcff stays where it is\n")
-
-
 def test_what_a_terminal_would_obey_is_shown_by_no_message() -> None:
     """A name may be in it as text already, as a vehicle listed it."""
     assert readable("/log\x1b[2J\x9b: one\r\n\ttwo") == "/log?[2J?: one?\n\ttwo"

@@ -101,7 +101,7 @@ def test_a_request_on_an_open_file_cannot_say_that_a_name_exists_or_is_missing(o
         assert nak(opcode, NakCode.FAIL_ERRNO, number) == errno.EIO
 
 
-@pytest.mark.parametrize("number", [1, 2, 5, 6, 12, 13, 16, 17, 18, 19, 20, 21, 22, 23, 24, 27, 28, 30])
+@pytest.mark.parametrize("number", [1, 13, 17, 28, 30])
 def test_low_errnos_are_the_same_everywhere(number: int) -> None:
     assert nak(Opcode.OPEN_FILE_RO, NakCode.FAIL_ERRNO, number) == number
 
@@ -118,9 +118,6 @@ def test_low_errnos_are_the_same_everywhere(number: int) -> None:
         (91, errno.ENAMETOOLONG),
         (92, errno.ELOOP),
         (0, errno.EIO),
-        (4, errno.EIO),
-        (11, errno.EIO),
-        (110, errno.EIO),
         (255, errno.EIO),
         (None, errno.EIO),
     ],

@@ -10,7 +10,7 @@ import pytest
 
 from mavftpfs import cli, install
 from mavftpfs.fuse.options import option_help
-from mavftpfs.shared.errors import EXIT_CODES, ExitCode, UsageError
+from mavftpfs.shared.errors import EXIT_CODES, ExitCode
 
 COMMANDS = [name for name in cli._COMMANDS if name != "mount"]
 
@@ -59,12 +59,6 @@ def test_a_user_needs_no_root(tmp_path: Path) -> None:
         assert piece.path.as_posix().startswith(("/data/", "/config/"))
 
 
-def test_where_nothing_can_be_written_is_an_error(tmp_path: Path) -> None:
-    (tmp_path / "usr").write_text("in the way")
-    with pytest.raises(UsageError, match="usr"):
-        cli._run(["install", "--root", str(tmp_path)])
-
-
 def test_the_man_page_has_every_command_option_and_exit_code(pieces: dict[str, install.Piece]) -> None:
     page = pieces["usr/local/share/man/man1/mavftpfs.1"].text.replace("\\", "")
     for name in COMMANDS:
@@ -91,17 +85,6 @@ def test_completions_can_be_read_and_know_the_commands(shell: str, tmp_path: Pat
     path = tmp_path / "mavftpfs"
     path.write_text(text)
     assert checked(shell, "-n", path) == ""
-
-
-def test_bash_completes_commands_and_options(tmp_path: Path) -> None:
-    path = tmp_path / "mavftpfs"
-    path.write_text(install.completion(cli.whole_parser(), "bash"))
-    script = (
-        'source "$1"; COMP_WORDS=(mavftpfs "${@:2}"); COMP_CWORD=$(($# - 1)); '
-        '_shtab_mavftpfs mavftpfs "${!#}" mavftpfs; printf "%s\\n" "${COMPREPLY[@]}"'
-    )
-    assert checked("bash", "-c", script, "-", path, "sta").split() == ["status"]
-    assert "--json" in checked("bash", "-c", script, "-", path, "scan", "--").split()
 
 
 def test_the_unit_calls_this_program(pieces: dict[str, install.Piece]) -> None:

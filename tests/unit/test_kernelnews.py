@@ -60,13 +60,3 @@ async def test_busy_while_a_thread_is_in_the_kernel_even_if_nobody_waits() -> No
     assert invalidator.busy
     kernel.gate.set()
     await idle(lambda: not invalidator.busy)
-
-
-async def test_a_call_cancelled_before_its_thread_is_not_busy() -> None:
-    kernel = Kernel()
-    invalidator = Invalidator(InodeTable(), kernel.notify)
-    with trio.CancelScope() as scope:
-        scope.cancel()
-        await invalidator.forget_attributes(7)
-    assert not invalidator.busy
-    assert kernel.calls == []

@@ -20,7 +20,6 @@ from mavftpfs.fuse.options import (
     fuse_words,
     option_help,
     parse_options,
-    with_root,
 )
 from mavftpfs.shared.errors import UsageError
 
@@ -107,13 +106,6 @@ def test_wrong_words_are_named(text: str, named: str) -> None:
 def test_any_text_is_parsed_or_refused(text: str) -> None:
     with suppress(UsageError):
         assert isinstance(parse_options([text]), MountOptions)
-
-
-def test_subtree_and_root_exclude_each_other() -> None:
-    assert with_root(MountOptions(), b"/log").root == b"/log"
-    assert with_root(MountOptions(root=b"/log"), b"/").root == b"/log"
-    with pytest.raises(UsageError, match="root="):
-        with_root(MountOptions(root=b"/log"), b"/fs")
 
 
 def test_what_goes_to_fuse() -> None:

@@ -72,15 +72,6 @@ def test_five_sessions_and_then_none() -> None:
     assert c.server.open_sessions == 5
 
 
-def test_sessions_are_closed_after_twenty_seconds() -> None:
-    c = Client("ardupilot5")
-    c.open(A, session=1)
-    c.receive(19.0)
-    assert c.server.open_sessions == 1
-    c.receive(2.0)
-    assert c.server.open_sessions == 0
-
-
 def test_ids_belong_to_who_uses_them_and_reset_closes_only_ones_own() -> None:
     c = Client("ardupilot5")
     c.open(A, session=1)
@@ -121,18 +112,6 @@ def test_size_must_be_the_length_of_the_path() -> None:
         assert (nak(counted) == bad) if refused else ack(counted)
         assert nak(c.ask(Opcode.RENAME, b"/a", size=2)) == bad
         assert nak(c.ask(Opcode.RENAME, b"/a\0/b", size=4)) == bad
-
-
-def test_listings_of_generation_b_leave_out_tabs_and_tell_even_seconds() -> None:
-    tree = MemoryTree()
-    tree.add(b"/d/file", b"123", mtime=1001)
-    tree.add(b"/d/tab\tname", b"1")
-    tree.add_directory(b"/d/sub", mtime=1001)
-    tree.set_order(b"/d", [b".", b"file", b"sub", b"tab\tname", b".."])
-    c = Client("ardupilot5", tree)
-    assert c.listing(b"/d") == b"Ffile\t3\0Dsub\0S\0"
-    timed = c.listing(b"/d", opcode=Opcode.LIST_DIRECTORY_WITH_TIME)
-    assert timed == b"Ffile\t3\t1000\0Dsub\t0\t1000\0S\0"
 
 
 # -- changing things -----------------------------------------------------------------------------

@@ -83,16 +83,6 @@ def test_nuttx_folds_case_and_drops_the_dot_of_short_names_only() -> None:
         assert nak(c.ask(Opcode.OPEN_FILE_RO, b"/fs/microsd/" + name)) == bytes([NakCode.FILE_NOT_FOUND])
 
 
-def test_listing_with_time_is_data() -> None:
-    c = client("px4-2026")
-    page = c.listing(b"/fs/microsd", opcode=Opcode.LIST_DIRECTORY_WITH_TIME)
-    assert page.startswith(b"S\0S\0Fa.bin\t1024\t1700000000\0")
-    assert page.endswith(b"Ddir\0")
-    c = client("px4-2026", bare_time_directories=False)
-    page = c.listing(b"/fs/microsd", opcode=Opcode.LIST_DIRECTORY_WITH_TIME)
-    assert page.endswith(b"Ddir\t0\t1700000000\0")
-
-
 # -- bursts --------------------------------------------------------------------------------------
 
 
