@@ -398,7 +398,7 @@ class Files:
     def adopt(self, path: bytes, size: int, read: Callable[[int, int], bytes], *, proven_at: float) -> None:
         """Take over the content of a file we wrote, which was proven then; `read(start, stop)` returns it."""
         self.on_changed(path)
-        if proven_at <= self._restarted_at:
+        if proven_at <= self._restarted_at or self._clock() - proven_at >= self._proof_time:
             return
         version = Version(self.cache, path, size)
         version.proven_at, version.shown, version.given = proven_at, True, True

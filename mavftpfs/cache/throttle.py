@@ -13,7 +13,7 @@ from mavftpfs.cache.context import Context
 from mavftpfs.cache.draft import Draft
 from mavftpfs.cache.nodes import Node
 from mavftpfs.cache.options import KIB, MIB
-from mavftpfs.cache.readahead import RateMeter
+from mavftpfs.cache.versions import RateMeter
 from mavftpfs.shared.errors import FileTooLarge
 
 SECONDS = 10.0

@@ -24,7 +24,7 @@ from dataclasses import dataclass
 import trio
 
 from mavftpfs.cache.kept_disk import Kept
-from mavftpfs.cache.readahead import MAX_WINDOW, RateMeter
+from mavftpfs.cache.readahead import MAX_WINDOW
 from mavftpfs.cache.remote import Reader
 from mavftpfs.shared.errors import FileChanged, MavftpfsError, RequestTimeout
 from mavftpfs.shared.extents import ExtentSet
@@ -47,6 +47,36 @@ SMALL_SECONDS = 2.0
 
 SMALL_FILE = 64 * 1024
 """Bytes of a file that is small whatever the rate."""
+
+
+class RateMeter:
+    """How many bytes per second come while some are wanted; pauses between requests are not counted."""
+
+    PAUSE = 1.0
+    ENOUGH = 0.2
+    MEMORY = 4.0
+
+    def __init__(self) -> None:
+        self._last: float | None = None
+        self._bytes = 0.0
+        self._busy = 0.0
+
+    def on_bytes(self, count: int, now: float) -> None:
+        """Note that `count` bytes arrived."""
+        elapsed = self.PAUSE if self._last is None else now - self._last
+        self._last = now
+        if elapsed >= self.PAUSE:
+            return
+        self._bytes += count
+        self._busy += elapsed
+        if self._busy > self.MEMORY:  # older traffic counts half
+            self._bytes /= 2
+            self._busy /= 2
+
+    @property
+    def rate(self) -> float | None:
+        """Bytes per second, None while too little was seen."""
+        return self._bytes / self._busy if self._busy >= self.ENOUGH else None
 
 
 class BlockCache:

@@ -125,7 +125,7 @@ class ReadFile(OpenFile):
         if draft is not None and draft.state is State.CLEAN and not node.lock.locked() and draft.whole:
             # The vehicle has it: its content is ordinary cache from now on.
             fits = 0 < draft.size <= context.options.cache_size // ADOPTED_PART
-            if fits and context.clock() - node.known_at < context.options.proof_time:
+            if fits:
                 with suppress(SpoolFailed):  # the local disk does not give it back
                     context.files.adopt(node.path, draft.size, draft.local_bytes, proven_at=node.known_at)
         context.nodes.maybe_forget(node)

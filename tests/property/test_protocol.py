@@ -12,8 +12,7 @@ from mavftpfs.link.messages import Address
 from mavftpfs.protocol.burst import BurstTransfer
 from mavftpfs.protocol.engine import Engine
 from mavftpfs.protocol.flow import Flow
-from mavftpfs.protocol.listing import parse_page
-from mavftpfs.protocol.operations import ListDirectory, OpenFile, Operation, Simple, Terminate
+from mavftpfs.protocol.operations import ListDirectory, OpenFile, Operation, Simple, Terminate, parse_page
 from mavftpfs.protocol.payload import (
     MAX_DATA,
     PAYLOAD_SIZE,

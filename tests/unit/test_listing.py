@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from mavftpfs.protocol.listing import parse_page
+from mavftpfs.protocol.operations import parse_page
 from mavftpfs.shared.model import DirEntry, EntryKind
 
 F, D = EntryKind.FILE, EntryKind.DIRECTORY

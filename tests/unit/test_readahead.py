@@ -12,11 +12,10 @@ from mavftpfs.cache.readahead import (
     MAX_WINDOW,
     NOTHING,
     Plan,
-    RateMeter,
     Readahead,
 )
 from mavftpfs.cache.throttle import Throttle
-from mavftpfs.cache.versions import SMALL_FILE, BlockCache
+from mavftpfs.cache.versions import SMALL_FILE, BlockCache, RateMeter
 
 KIB = 1024
 BIG = 100 * 1024 * KIB
