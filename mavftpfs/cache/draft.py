@@ -171,12 +171,12 @@ class Draft:
     @property
     def changed(self) -> ExtentSet:
         """What programs changed since the vehicle last had it all (a copy)."""
-        return self._changed.copy()
+        return ExtentSet(self._changed)
 
     @property
     def held(self) -> ExtentSet:
         """What the spool has (a copy)."""
-        return self._held.copy()
+        return ExtentSet(self._held)
 
     def missing_base(self) -> list[tuple[int, int]]:
         """Return the ranges of which only the vehicle has the bytes."""
@@ -308,7 +308,7 @@ class Draft:
         self.on(Event.PLACED)
         self.base, self.base_limit = Base(self.size, crc32=crc32), self.size
         self.begun = False
-        self._changed.clear()
+        self._changed = ExtentSet()
         self.content.settle()
 
     def lose_base(self) -> None:

@@ -252,7 +252,7 @@ class SpoolContent:
 
     def _drop_file(self) -> None:
         self._spool.on_disk -= self._stored.total
-        self._stored.clear()
+        self._stored = ExtentSet()
         if self._file is not None:
             try:
                 os.close(self._file)

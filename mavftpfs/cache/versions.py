@@ -297,7 +297,7 @@ class Version:
         """A reader is about to be opened: what is held now did not come from it."""
         self.close_reader()
         self.doubted = False
-        self._earlier = self._present.copy()
+        self._earlier = ExtentSet(self._present)
 
     def close_reader(self) -> None:
         """Drop readahead and the remote reader."""
@@ -396,7 +396,7 @@ class Version:
 
     def _forget_but(self, kept: ExtentSet) -> None:
         """Forget all bytes that are not in `kept`."""
-        self._present, self._earlier = kept.copy(), kept.copy()
+        self._present, self._earlier = ExtentSet(kept), ExtentSet(kept)
         for index in list(self._blocks):
             if self._present.overlaps(*self._extent(index)):
                 self._blocks[index] = bytearray(self._blocks[index])  # a view of the old one may be in use

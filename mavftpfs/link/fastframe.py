@@ -43,11 +43,6 @@ _crc = crc16.mcrf4xx
 _new = tuple.__new__
 
 
-def frame_crc(body: bytes, extra: int) -> int:
-    """Return the CRC of a frame: `body` is the frame without magic byte, CRC and signature."""
-    return _crc(body + bytes((extra,)))
-
-
 def _empty_body(seq: int, route: bytes) -> bytes:
     # An all-zero payload: trimming reaches into the target ids, but the first byte always stays.
     ids = route[5:].rstrip(b"\0") or b"\0"

@@ -26,15 +26,22 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from fastcrc import crc16
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
-from mavftpfs.link.fastframe import FTP_MESSAGE_ID, FTP_PAYLOAD_SIZE, FtpFrameCodec, frame_crc
+from mavftpfs.link.fastframe import FTP_MESSAGE_ID, FTP_PAYLOAD_SIZE, FtpFrameCodec
 from mavftpfs.link.messages import (
     MAV_AUTOPILOT_INVALID,
-    READABLE,
+    MAV_MODE_FLAG_SAFETY_ARMED,
     Address,
+    AutopilotVersion,
+    CommandLong,
+    FtpRun,
+    Heartbeat,
     Message,
-    read_message,
+    Other,
+    StorageInformation,
+    SystemTime,
 )
 from mavftpfs.link.signing import SIGNATURE_BLOCK, SignatureCheck
 from mavftpfs.shared.errors import LocalProtocolError
@@ -51,6 +58,7 @@ _SIGNED = 1
 _HIGHEST_ID = 0xFFFF  # no public dialect goes beyond; keeps garbage from claiming 280 bytes
 _UNSIGNED_ALLOWED = (109, 166)  # the radios' own reports: a radio has no key
 _MAGIC = re.compile(b"[\xfd\xfe]")
+_READABLE = frozenset((0, 2, 76, 110, 148, 261))  # the ids of messages whose fields matter
 _CRC_EXTRA: dict[int, int] = {number: kind.crc_extra for number, kind in dialect.mavlink_map.items()}
 
 
@@ -188,7 +196,8 @@ class Framer:
         frame = data[position:stop]
         crc_at = len(frame) - signature - 2
         extra = _CRC_EXTRA.get(message_id)
-        if extra is None or frame_crc(frame[1:crc_at], extra) != frame[crc_at] | frame[crc_at + 1] << 8:
+        body = frame[1:crc_at]
+        if extra is None or crc16.mcrf4xx(body + bytes((extra,))) != frame[crc_at] | frame[crc_at + 1] << 8:
             if stop == len(data) and self.stream:
                 return position  # the byte behind decides
             if stop < len(data) and data[stop] not in (_V1, _V2):
@@ -204,6 +213,7 @@ class Framer:
         return stop
 
     def _accept(self, frame: bytes, message_id: int, signed: bool, out: list[Message]) -> None:
+        """Append what a whole frame says, if it is signed as it must be, and its fields make sense."""
         at = 5 if frame[0] == _V2 else 3
         source = Address(frame[at], frame[at + 1])
         if self._check is not None and message_id not in _UNSIGNED_ALLOWED:
@@ -213,8 +223,28 @@ class Framer:
                 self.stats.bad_signature += 1
                 return
         try:
-            fields = self._decoder.decode(bytearray(frame)) if message_id in READABLE else None
-            message = read_message(source, message_id, fields)
+            m: Any = self._decoder.decode(bytearray(frame)) if message_id in _READABLE else None
+            message: Message = Other(source, message_id)
+            match message_id:
+                case 0:
+                    armed = bool(m.base_mode & MAV_MODE_FLAG_SAFETY_ARMED)
+                    message = Heartbeat(source, m.type, m.autopilot, armed)
+                case 2:
+                    message = SystemTime(source, m.time_unix_usec, m.time_boot_ms)
+                case 76:
+                    params = (m.param1, m.param2, m.param3, m.param4, m.param5, m.param6, m.param7)
+                    target = Address(m.target_system, m.target_component)
+                    message = CommandLong(source, target, m.command, params)
+                case 110:
+                    target = Address(m.target_system, m.target_component)
+                    message = FtpRun(source, target, [bytes(m.payload)])
+                case 148:
+                    git_hash, uid2 = bytes(m.flight_custom_version), bytes(m.uid2)
+                    version = (m.capabilities, m.flight_sw_version, git_hash, m.uid, uid2)
+                    message = AutopilotVersion(source, *version)
+                case 261:
+                    size = (m.total_capacity, m.used_capacity, m.available_capacity)
+                    message = StorageInformation(source, m.storage_id, m.storage_count, m.status, *size)
         except (dialect.MAVError, AttributeError, TypeError, ValueError):
             return  # whole and valid, but its fields make no sense
         out.append(message)

@@ -6,7 +6,7 @@ Every other message is `Other`: traced, never an error.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple, TypeAlias
+from typing import NamedTuple, TypeAlias
 
 MAV_TYPE_ONBOARD_CONTROLLER = 18
 MAV_TYPE_GCS = 6
@@ -34,23 +34,12 @@ class FtpRun(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Heartbeat:
-    """HEARTBEAT of anybody on the link."""
+    """HEARTBEAT of anybody on the link; autopilot: MAV_AUTOPILOT_INVALID of who is none."""
 
     source: Address
     vehicle_type: int
     autopilot: int
-    base_mode: int
-    system_status: int
-
-    @property
-    def armed(self) -> bool:
-        """The safety-armed flag of base_mode."""
-        return bool(self.base_mode & MAV_MODE_FLAG_SAFETY_ARMED)
-
-    @property
-    def is_autopilot(self) -> bool:
-        """Whether the sender says it is an autopilot."""
-        return self.autopilot != MAV_AUTOPILOT_INVALID
+    armed: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,29 +97,3 @@ class Other:
 Message: TypeAlias = (
     FtpRun | Heartbeat | AutopilotVersion | StorageInformation | SystemTime | CommandLong | Other
 )
-
-
-READABLE = frozenset((0, 2, 76, 110, 148, 261))
-"""The ids of messages that `read_message` looks into."""
-
-
-def read_message(source: Address, message_id: int, m: Any) -> Message:
-    """Return what pymavlink's message object says. One that lacks a field raises AttributeError or such."""
-    match message_id:
-        case 0:
-            return Heartbeat(source, m.type, m.autopilot, m.base_mode, m.system_status)
-        case 2:
-            return SystemTime(source, m.time_unix_usec, m.time_boot_ms)
-        case 76:
-            params = (m.param1, m.param2, m.param3, m.param4, m.param5, m.param6, m.param7)
-            return CommandLong(source, Address(m.target_system, m.target_component), m.command, params)
-        case 110:
-            return FtpRun(source, Address(m.target_system, m.target_component), [bytes(m.payload)])
-        case 148:
-            git_hash, uid2 = bytes(m.flight_custom_version), bytes(m.uid2)
-            return AutopilotVersion(source, m.capabilities, m.flight_sw_version, git_hash, m.uid, uid2)
-        case 261:
-            size = (m.total_capacity, m.used_capacity, m.available_capacity)
-            return StorageInformation(source, m.storage_id, m.storage_count, m.status, *size)
-        case _:
-            return Other(source, message_id)

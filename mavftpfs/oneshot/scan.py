@@ -11,7 +11,7 @@ import trio
 from mavftpfs.compose import connect_options
 from mavftpfs.fuse.options import MountOptions
 from mavftpfs.link.base import Link
-from mavftpfs.link.messages import MAV_TYPE_GCS, Address, Heartbeat
+from mavftpfs.link.messages import MAV_AUTOPILOT_INVALID, MAV_TYPE_GCS, Address, Heartbeat
 from mavftpfs.link.opening import open_link
 from mavftpfs.oneshot.files import Target, mount_status
 from mavftpfs.report import version_facts
@@ -176,7 +176,7 @@ def describe_peer(heartbeat: Heartbeat) -> str:
     kind = _TYPES.get(heartbeat.vehicle_type)
     if heartbeat.vehicle_type == MAV_TYPE_GCS:
         return "ground station"
-    if not heartbeat.is_autopilot:
+    if heartbeat.autopilot == MAV_AUTOPILOT_INVALID:
         return (
             kind
             or _COMPONENTS.get(heartbeat.source.component)

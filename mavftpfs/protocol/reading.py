@@ -92,7 +92,7 @@ class ReadTransfer(Operation):
 
     def drop_readahead(self) -> None:
         """Forget wants that nobody waits for; what is on its way still arrives."""
-        self._ahead.clear()
+        self._ahead = ExtentSet()
 
     @property
     def in_flight(self) -> int:
@@ -102,7 +102,7 @@ class ReadTransfer(Operation):
     @property
     def wants(self) -> ExtentSet:
         """What is wanted and has not come, requests on their way included."""
-        wants = self._demand.copy()
+        wants = ExtentSet(self._demand)
         for start, stop in self._ahead:
             wants.add(start, stop)
         for request in self._unanswered:

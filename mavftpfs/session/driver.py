@@ -206,9 +206,19 @@ class Driver:
             ours = (vehicle.address, vehicle.own)
             if type(message) is FtpRun and (message.source, message.target) == ours:
                 self._gathered += message.payloads
-            else:
-                self._pass_on(now)
-                self._on_other(message, now, sender)
+                continue
+            self._pass_on(now)
+            vehicle.on_message(message, now)
+            if sender is None or vehicle.address is None:
+                continue
+            if message is vehicle.heartbeat:
+                # A target without heartbeats of its own is where its system's autopilot is.
+                if vehicle.address in self._addresses:
+                    self._is_from(vehicle.address, sender, now)
+                else:
+                    self._send_to(sender)
+            strange = vehicle.identity.standing is Standing.STRANGER
+            self._addresses.distrusted = self.peer if strange else None
 
     def _pass_on(self, now: float) -> None:
         """Give the engine the gathered replies."""
@@ -228,20 +238,6 @@ class Driver:
         malformed = self.engine.receive_run(wires, now)
         if malformed < len(wires):
             self.last_reply_at = now
-
-    def _on_other(self, message: Message, now: float, sender: NetAddress | None) -> None:
-        vehicle = self.vehicle
-        vehicle.on_message(message, now)
-        if sender is None or vehicle.address is None:
-            return
-        if message is vehicle.heartbeat:
-            # A target without heartbeats of its own is where its system's autopilot is.
-            if vehicle.address in self._addresses:
-                self._is_from(vehicle.address, sender, now)
-            else:
-                self._send_to(sender)
-        strange = vehicle.identity.standing is Standing.STRANGER
-        self._addresses.distrusted = self.peer if strange else None
 
     def _is_from(self, source: Address, sender: NetAddress, now: float) -> bool:
         """Return whether a message counts that came from a network address; follow the vehicle that moves."""

@@ -45,8 +45,7 @@ class FileStream(SessionUser):
         self._wants_open = expected_size is None  # somebody waits for that ACK
         self.opened = trio.Event()
         self.open_error: MavftpfsError | None = None
-        self._demand = ExtentSet()
-        self._ahead = ExtentSet()
+        self._demand, self._ahead = ExtentSet(), ExtentSet()
         self._removed = False
         self._transfer: ReadTransfer | None = None
         self._received = 0  # by that transfer
@@ -78,15 +77,14 @@ class FileStream(SessionUser):
 
     def drop_readahead(self) -> None:
         """Forget what nobody waits for."""
-        self._ahead.clear()
+        self._ahead = ExtentSet()
         if self._transfer is not None:
             self._transfer.drop_readahead()
 
     def close(self) -> None:
         """No more wants; what is still wanted, or on its way, is forgotten."""
         self.closed = True
-        self._demand.clear()
-        self._ahead.clear()
+        self._demand, self._ahead = ExtentSet(), ExtentSet()
         self._wants_open = False
         if self._transfer is not None:
             self._server.driver.cancel(self._transfer)
@@ -110,8 +108,7 @@ class FileStream(SessionUser):
     def fail(self, error: MavftpfsError) -> None:
         """See SessionUser."""
         self._wants_open = False
-        self._demand.clear()
-        self._ahead.clear()
+        self._demand, self._ahead = ExtentSet(), ExtentSet()
         if self.opened.is_set():
             self._sink.on_failed(error)
         else:
@@ -213,8 +210,7 @@ class FileStream(SessionUser):
         finally:
             server.transfer = self._transfer = driver.on_batch = None
             if transfer.idle:  # everything wanted has come
-                self._demand.clear()
-                self._ahead.clear()
+                self._demand, self._ahead = ExtentSet(), ExtentSet()
             driver.cancel(transfer)
             self.on_turn(began, server.clock())
         if transfer.error is not None:
@@ -230,9 +226,8 @@ class FileStream(SessionUser):
             self._received, self._last_data_at, self._lost = transfer.received_bytes, now, 0
             if not self.closed:
                 for wanted in (self._demand, self._ahead):
-                    before = list(wanted)
-                    wanted.clear()
-                    for start, stop in before:
+                    for start, stop in wanted:
+                        wanted.discard(start, stop)
                         for gap_start, gap_stop in self._sink.missing(start, stop):
                             wanted.add(gap_start, gap_stop)
                 self._sink.on_batch()

@@ -390,7 +390,11 @@ class Scheduler:
     async def _idle(self, now: float) -> None:
         """Nobody can use the session now: close it in time, and wait for news."""
         server = self.server
-        until_due = min([user.due_at() - now for user in self.users if user.due_at() > now], default=inf)
+        until_due = inf
+        for user in self.users:
+            due = user.due_at()
+            if now < due:
+                until_due = min(until_due, due - now)
         if server.session is not None:
             # Counted from the last use, not from the last news: there may always be news.
             left = max(0.0, self._used_at + IDLE_CLOSE - now)

@@ -17,6 +17,7 @@ from enum import Enum
 from math import inf
 
 from mavftpfs.link.messages import (
+    MAV_AUTOPILOT_INVALID,
     MAV_COMP_ID_AUTOPILOT1,
     MAV_PROTOCOL_CAPABILITY_FTP,
     Address,
@@ -285,30 +286,35 @@ class Vehicle:
                 self._on_boot_time(message.time_boot_ms, now)
 
     def _on_heartbeat(self, heartbeat: Heartbeat, now: float) -> None:
-        if heartbeat.source == self.own:
+        """Learn from one, in this order: who is about, which of them is the vehicle, whether that is armed,
+        and that it lives."""
+        source, pilot = heartbeat.source, heartbeat.autopilot != MAV_AUTOPILOT_INVALID
+        if source == self.own:
             self.on_double()
             return
-        if len(self.heard) < 256 or heartbeat.source in self.heard:
-            self.heard[heartbeat.source] = heartbeat
-        if self.address is None and self._is_wanted(heartbeat):
-            component = self.wanted_component or heartbeat.source.component
-            self.address = Address(heartbeat.source.system, component)
-        if heartbeat.is_autopilot and self.address and heartbeat.source.system == self.address.system:
+        if len(self.heard) < 256 or source in self.heard:
+            self.heard[source] = heartbeat
+        if self.address is None and self.wanted_system in (0, source.system):
+            component = self.wanted_component or (source.component if pilot else 0)
+            if pilot or source.component == component != 0:
+                self.address = Address(source.system, component)
+        if self.address is None or source.system != self.address.system:
+            return
+        if pilot:
             self._disarmed_at = -inf if heartbeat.armed else now
             # Who may be another one does not say that ours is on the ground.
             if heartbeat.armed or self.identity.may_be_asked(now):
                 self._on_armed(heartbeat.armed)
-        if not self._proves_life(heartbeat.source):
+        # A component may send no heartbeats of its own; its system's autopilot then speaks for it.
+        speaks = self.address not in self.heard and source.component == MAV_COMP_ID_AUTOPILOT1
+        if source != self.address and not speaks:
             return
         self.heartbeat_at = now
         self.heartbeat = heartbeat
         self.identity.heard(now)
         if self.identity.standing is Standing.TRUSTED:
-            self._on_alive()
-
-    def _on_alive(self) -> None:
-        self._timed_out = False
-        self.on_heartbeat()
+            self._timed_out = False
+            self.on_heartbeat()
 
     def _on_settled(self, was_stranger: bool) -> None:
         """It is ours again. Whether it restarted while another one told its boot time is not known."""
@@ -318,27 +324,14 @@ class Vehicle:
             self.on_reboot()
         elif self._disarmed_at > self.identity.left_at:  # it was this one that said so
             self._on_armed(False)
-        self._on_alive()
+        self._timed_out = False
+        self.on_heartbeat()
 
     def _on_armed(self, armed: bool) -> None:
         if armed is not self._told_armed:
             self._told_armed = self.armed = armed
             self.may_write = self.write_armed or not armed
             self.on_armed(armed)
-
-    def _is_wanted(self, heartbeat: Heartbeat) -> bool:
-        if self.wanted_system and heartbeat.source.system != self.wanted_system:
-            return False
-        wanted = self.wanted_component and heartbeat.source.component == self.wanted_component
-        return bool(wanted) or heartbeat.is_autopilot
-
-    def _proves_life(self, source: Address) -> bool:
-        """A component may send no heartbeats of its own; its system's autopilot then speaks for it."""
-        if self.address is None or source.system != self.address.system:
-            return False
-        if source == self.address:
-            return True
-        return self.address not in self.heard and source.component == MAV_COMP_ID_AUTOPILOT1
 
     def _on_foreign_ftp(self, run: FtpRun, now: float) -> None:
         if self.address is None or run.source == self.own:

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Iterator
 
 
 class ExtentSet:
-    """A set of non-negative integers stored as half-open extents [start, stop)."""
+    """A set of non-negative integers stored as half-open extents [start, stop). ExtentSet(other) copies."""
 
     __slots__ = ("_starts", "_stops")
 
@@ -22,7 +22,7 @@ class ExtentSet:
             self.add(start, stop)
 
     def __iter__(self) -> Iterator[tuple[int, int]]:
-        """Yield (start, stop) in ascending order."""
+        """Yield (start, stop) in ascending order, as they are now; the set may be changed meanwhile."""
         return iter(list(zip(self._starts, self._stops, strict=True)))
 
     def __len__(self) -> int:
@@ -57,18 +57,6 @@ class ExtentSet:
     def end(self) -> int:
         """One past the last byte, 0 if empty."""
         return self._stops[-1] if self._stops else 0
-
-    def copy(self) -> ExtentSet:
-        """Return an independent copy."""
-        twin = ExtentSet()
-        twin._starts = self._starts.copy()
-        twin._stops = self._stops.copy()
-        return twin
-
-    def clear(self) -> None:
-        """Remove everything."""
-        self._starts.clear()
-        self._stops.clear()
 
     def add(self, start: int, stop: int) -> None:
         """Add [start, stop), merging with what it touches; an empty range changes nothing."""

@@ -30,6 +30,7 @@ class Sending:
             before that. What is in none of them is on its way.
         closed: a Terminate was ACKed, so the card holds what is proven.
         overtaken: bytes that were handed out changed, or were cut off: the file is to be sent anew.
+        furthest: one past the highest byte that was ever ACKed.
         growing: more may be written behind the last byte; what fills no request there waits for it.
         progress: told how many bytes were ACKed.
     """
@@ -43,7 +44,7 @@ class Sending:
         self.progress: Callable[[int], None] | None = None
         self._read = read
         self._handed_out = 0  # one past the highest byte
-        self._furthest = 0
+        self.furthest = 0
         self._failed: MavftpfsError | None = None
         self._ahead = (0, b"")
 
@@ -56,11 +57,6 @@ class Sending:
     def reached(self) -> int:
         """One past the highest byte that was ACKed; after a rollback, that is proven."""
         return max(self.acked.end, self.proven.end)
-
-    @property
-    def furthest(self) -> int:
-        """One past the highest byte that was ever ACKed."""
-        return max(self._furthest, self.reached)
 
     def on_changed(self, start: int, size: int) -> None:
         """The file changed from `start` on, perhaps to its end, and has `size` bytes now."""
@@ -110,6 +106,7 @@ class Sending:
     def on_acked(self, offset: int, count: int) -> None:
         """These bytes were ACKed as written."""
         self.acked.add(offset, offset + count)
+        self.furthest = max(self.furthest, offset + count)
         if self.progress is not None:
             self.progress(count)
 
@@ -122,16 +119,15 @@ class Sending:
         self.closed = True
         for start, stop in self.acked:
             self.proven.add(start, stop)
-        self.acked.clear()
+        self.acked = ExtentSet()
 
     def roll_back(self, *, everything: bool) -> None:
         """The session was lost: what was ACKed since the checkpoint is to be sent again, or everything is
         because the file was emptied by reopening it."""
-        self._furthest = self.furthest
-        self.acked.clear()
+        self.acked = ExtentSet()
         if everything:
             self.closed = False
-            self.proven.clear()
+            self.proven = ExtentSet()
         self.todo = ExtentSet(self.proven.missing(0, self.size))
 
     def _next(self, limit: int) -> tuple[int, int] | None:

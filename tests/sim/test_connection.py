@@ -164,7 +164,7 @@ async def test_what_we_say_we_are(options: ConnectOptions, said: int | None, aut
     here.tree.add(b"/f", DATA)
     async with here.connection(options) as connection:
         await trio.sleep(3)
-        heard = {} if said is None else {US: Heartbeat(US, said, MAV_AUTOPILOT_INVALID, 0, 4)}
+        heard = {} if said is None else {US: Heartbeat(US, said, MAV_AUTOPILOT_INVALID, False)}
         assert here.vehicle.heard == heard
         assert await read_file(connection, b"/f") == DATA
 

@@ -216,7 +216,7 @@ class FakeReader:
 
     def drop_readahead(self) -> None:
         self.drops += 1
-        self.ahead.clear()
+        self.ahead = ExtentSet()
 
     def close(self) -> None:
         self.closed = True
@@ -269,8 +269,8 @@ class FakeReader:
             if len(data) != stop - start:
                 raise FileChanged("early end")
         except Exception as error:
-            self.demand.clear()
-            self.ahead.clear()
+            self.demand = ExtentSet()
+            self.ahead = ExtentSet()
             if not self.closed:
                 self.sink.on_failed(error)
             return

@@ -28,6 +28,7 @@ from mavftpfs.shared.errors import (
     MavftpfsError,
     VehicleLost,
 )
+from mavftpfs.shared.extents import ExtentSet
 from mavftpfs.shared.model import ROOT, WriteTraits, join, split, wire_path
 from mavftpfs.shared.sending import Sending
 from tests.support.fake_store import FakeFile, FakeReader, FakeStore
@@ -254,8 +255,8 @@ class FakeWriter(FakeStore):
         """The session ends the readers of what we removed or replaced."""
         for reader in self.readers:
             if reader.path == path and not reader.closed:
-                reader.demand.clear()
-                reader.ahead.clear()
+                reader.demand = ExtentSet()
+                reader.ahead = ExtentSet()
                 reader.sink.on_failed(FileChanged(f"{path!r} was removed or replaced"))
 
     async def crc32(self, path: bytes, *, size: int | None = None) -> int:

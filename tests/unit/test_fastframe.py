@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import pytest
+from fastcrc import crc16
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
-from mavftpfs.link.fastframe import FtpFrameCodec, frame_crc
+from mavftpfs.link.fastframe import FtpFrameCodec
 from mavftpfs.link.framing import Framer
 from mavftpfs.link.messages import Address, FtpRun, Message
 from tests.support.frames import feed
@@ -57,6 +58,6 @@ def test_a_row_of_frames_ends_at_a_damaged_one(at: int) -> None:
 def test_a_signed_frame_among_others_is_left_to_pymavlink() -> None:
     frame = reference(1, Address(1, 1), FULL)
     body = frame[1:2] + b"\1" + frame[3:-2]  # says that it is signed, and its CRC is right
-    signed = b"\xfd" + body + frame_crc(body, EXTRA).to_bytes(2, "little") + bytes(13)
+    signed = b"\xfd" + body + crc16.mcrf4xx(body + bytes((EXTRA,))).to_bytes(2, "little") + bytes(13)
     out: list[Message] = []
     assert FtpFrameCodec(US, EXTRA).decode_runs(frame + signed + frame, 0, out) == len(frame)

@@ -51,11 +51,11 @@ def heartbeat(mav: Any = None, **how: bool) -> bytes:
     return pack(drone().heartbeat_encode(2, 12, 0x81, 0, 4), mav, **how)
 
 
-HEARTBEAT = Heartbeat(DRONE, 2, 12, 0x81, 4)
+HEARTBEAT = Heartbeat(DRONE, 2, 12, True)
 FTP = FtpRun(DRONE, US, [PAYLOAD])
 
 MESSAGES: list[tuple[Any, Message]] = [
-    (drone().heartbeat_encode(2, 3, 0x51, 7, 3), Heartbeat(DRONE, 2, 3, 0x51, 3)),
+    (drone().heartbeat_encode(2, 3, 0x51, 7, 3), Heartbeat(DRONE, 2, 3, False)),
     (drone().file_transfer_protocol_encode(0, 254, 191, list(PAYLOAD)), FTP),
     (drone().system_time_encode(5_000_000_000_000, 1234), SystemTime(DRONE, 5_000_000_000_000, 1234)),
     (

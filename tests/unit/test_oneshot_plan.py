@@ -125,20 +125,20 @@ def test_the_same_link(one: str, other: str, same: bool) -> None:
 
 
 @pytest.mark.parametrize(
-    ("kind", "component", "autopilot", "mode", "words"),
+    ("kind", "component", "autopilot", "armed", "words"),
     [
-        (2, 1, 12, 0x80, "PX4 quadrotor, armed"),
-        (12, 1, 3, 0, "ArduPilot submarine, disarmed"),
-        (6, 190, 8, 0, "ground station"),
-        (30, 100, 8, 0, "camera"),
-        (0, 154, 8, 0, "gimbal"),
-        (18, 191, 8, 0, "companion computer"),
-        (77, 200, 8, 0, "component of type 77"),
-        (99, 1, 99, 0, "autopilot type 99, disarmed"),
+        (2, 1, 12, True, "PX4 quadrotor, armed"),
+        (12, 1, 3, False, "ArduPilot submarine, disarmed"),
+        (6, 190, 8, False, "ground station"),
+        (30, 100, 8, False, "camera"),
+        (0, 154, 8, False, "gimbal"),
+        (18, 191, 8, False, "companion computer"),
+        (77, 200, 8, False, "component of type 77"),
+        (99, 1, 99, False, "autopilot type 99, disarmed"),
     ],
 )
-def test_what_a_heartbeat_says(kind: int, component: int, autopilot: int, mode: int, words: str) -> None:
-    assert describe_peer(Heartbeat(Address(1, component), kind, autopilot, mode, 4)) == words
+def test_what_a_heartbeat_says(kind: int, component: int, autopilot: int, armed: bool, words: str) -> None:
+    assert describe_peer(Heartbeat(Address(1, component), kind, autopilot, armed)) == words
 
 
 @pytest.mark.parametrize(

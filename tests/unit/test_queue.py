@@ -26,6 +26,7 @@ from mavftpfs.session.scheduler import (
 )
 from mavftpfs.session.vehicle import Vehicle
 from mavftpfs.shared.errors import MavftpfsError
+from mavftpfs.shared.extents import ExtentSet
 from tests.support.worlds import MemorySink
 
 
@@ -127,7 +128,7 @@ def test_what_was_delivered_is_not_wanted_again_when_the_cache_drops_it() -> Non
         transfer = SimpleNamespace(received_bytes=offset + size, idle=False, done=False)
         stream._transfer = cast(ReadTransfer, transfer)
         stream._on_batch(0.0)
-        sink.have.clear()  # evicted
+        sink.have = ExtentSet()  # evicted
         assert stream.due_at() == inf
     assert not stream.prefetches()
 

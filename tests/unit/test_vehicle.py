@@ -25,7 +25,7 @@ GCS = Address(255, 190)
 
 
 def heartbeat(source: Address, *, autopilot: int = 12, armed: bool = False) -> Heartbeat:
-    return Heartbeat(source, 2, autopilot, 0x80 if armed else 0, 4)
+    return Heartbeat(source, 2, autopilot, armed)
 
 
 def version(source: Address) -> AutopilotVersion:
