@@ -145,18 +145,15 @@ class Engine:
             op.patience = self._op_deadline
         self._ops.append(op)
 
-    def cancel(self, op: Operation, now: float) -> None:
-        """Forget an operation; its late replies are discarded. Harmless when it is finished."""
-        if op in self._ops:
-            self._drop(op)
-
     def take_finished(self) -> list[Operation]:
         """Return the operations that ended since the last call."""
         finished, self._finished = self._finished, []
         return finished
 
-    def _drop(self, op: Operation) -> None:
-        """It ended, or is to be forgotten."""
+    def drop(self, op: Operation) -> None:
+        """An operation ended, or is to be forgotten: late replies are discarded. Harmless when it was."""
+        if op not in self._ops:
+            return
         self._ops.remove(op)
         self._ledger.release(op)
         if op is self._burst_op:
@@ -189,7 +186,7 @@ class Engine:
             op = request.op
             op.on_reply(request, reply, now)
             if op.done:
-                self._drop(op)
+                self.drop(op)
 
     def receive_run(self, wires: Sequence[bytes], now: float) -> int:
         """Take replies of 251 bytes that came together as `receive` does; return how many were malformed."""
@@ -202,7 +199,7 @@ class Engine:
                 self._on_answers(run[-1][0], len(run), now)
                 op.on_run(run, now)
                 if op.done:
-                    self._drop(op)
+                    self.drop(op)
             else:
                 try:
                     self.receive(reply_of(replies[at]), now)
@@ -263,7 +260,7 @@ class Engine:
         self._heard_at = now
         op.progress_at = now
         if op.done:
-            self._drop(op)
+            self.drop(op)
         return True
 
     # --- what goes out
@@ -278,7 +275,7 @@ class Engine:
         for op in self._ops.copy():
             starved = starved and self._serve(op, now, wires)
             if op.done:
-                self._drop(op)
+                self.drop(op)
         if starved:
             self.flow.on_starved()
         if self.flow.budget is not None and self.flow.budget.held:
@@ -362,7 +359,7 @@ class Engine:
                 self.stats.timeouts += 1
                 op.fail(RequestTimeout(f"no answer within {op.patience:g} s"))
             if op.done:
-                self._drop(op)
+                self.drop(op)
 
     def _check_timers(self, now: float) -> set[Operation]:
         """Ask again for what is overdue; return the operations of which one request took too long."""

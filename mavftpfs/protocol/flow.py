@@ -349,8 +349,7 @@ class Flow:
         congested = self._lost > 0 and not excused and self._queued(1.0, waits)
         usual = self._usual_loss * total
         shy = congested or (not excused and self._lost > usual + UNUSUAL * sqrt(usual + 1.0))
-        self._learn_loss(total, learn=not (excused or self._queued() or (self._serial and shy)))
-        self._learn_round_trip(now)
+        self._learn_averages(now, total, losses=not (excused or self._queued() or (self._serial and shy)))
         if congested and not self.starved and self._queued(2.0, waits):
             self._rates.clear()  # only what came now is the path's
         rate, before = self._answered / took, self._rate
@@ -370,20 +369,27 @@ class Flow:
             self._flat = 0 if rate > (1.0 + STEP) * before else self._flat + 1
             overflown = self._lost >= max(2 * FIRST, MOST_LOSS * total) or self._queued()
             self._starting = self._flat < FLAT_ROUNDS and (excused or not overflown)
-        if not self._starting:
-            self.window = min(self.cap, self._target(more=self._round % CYCLE == 0 or rate > before))
+        if self._starting:
+            return
+        held = self._held()  # the window is to fill the path, and a little more
+        if self._probing > 1:
+            window = max(1, int((1.0 - STEP) * held))
+        else:
+            spread = min(self._rate * self._spread, held)
+            step = STEP * (held + spread) if self._round % CYCLE == 0 or rate > before else 0.0
+            window = max(LEAST, round(held + SLACK + self._bold * (spread + step)))
+        self.window = min(self.cap, window)
 
-    def _learn_loss(self, total: int, *, learn: bool) -> None:
+    def _learn_averages(self, now: float, total: int, *, losses: bool) -> None:
+        """Average the share of losses and the round trips. losses: those of this round are the link's."""
         loss, memory = self._lost / total, min(SMOOTHING, total / LOSS_MEMORY)
         self.loss += (loss - self.loss) * memory
         if loss < self._usual_loss:
             self._usual_loss += (loss - self._usual_loss) * memory
-        elif learn:
+        elif losses:
             self._usual_loss += (loss - self._usual_loss) * memory * (1.0 if self._starting else LOSS_RISE)
         plain = self._round % CYCLE == 1
         self._per_answer = 1.0 if plain else 1.0 / (1.0 - min(self._usual_loss, MOST_LOSS))
-
-    def _learn_round_trip(self, now: float) -> None:
         least = self._least
         if least == inf:
             return
@@ -410,12 +416,3 @@ class Flow:
         if self._base == inf:
             return LEAST
         return self._rate * max(self._base, BASE_LEAST) * self._per_answer
-
-    def _target(self, *, more: bool) -> int:
-        """Return the window that fills the path, and a little more. more: or a STEP."""
-        held = self._held()
-        if self._probing > 1:
-            return max(1, int((1.0 - STEP) * held))
-        spread = min(self._rate * self._spread, held)
-        step = STEP * (held + spread) if more else 0.0
-        return max(LEAST, round(held + SLACK + self._bold * (spread + step)))

@@ -51,7 +51,8 @@ class DuplicateDetector:
         """A request that changes names goes out under a new seq."""
         self._sent.pop(request.seq + 1, None)
         self._sent[request.seq + 1] = request.sent_at
-        _shorten(self._sent)
+        if len(self._sent) > _MOST_REMEMBERED:
+            del self._sent[next(iter(self._sent))]
 
     def on_settled(self, request: Request, answered: int | None) -> None:
         """Nobody waits for a request any more. answered: the seq of the answer that came, if one did."""
@@ -62,7 +63,8 @@ class DuplicateDetector:
             if left > 0:
                 self._expected.pop(seq, None)
                 self._expected[seq] = left
-        _shorten(self._expected)
+        while len(self._expected) > _MOST_REMEMBERED:
+            del self._expected[next(iter(self._expected))]
 
     def explains(self, seq: int) -> bool:
         """Return whether an answer that nobody waits for was still to come; it is not expected again."""
@@ -76,11 +78,6 @@ class DuplicateDetector:
     def late_by(self, seq: int, now: float) -> float:
         """Return the seconds since the request with this answer went out first; 0 if that is not known."""
         return now - self._sent.get(seq, now)
-
-
-def _shorten(remembered: dict[int, int] | dict[int, float]) -> None:
-    while len(remembered) > _MOST_REMEMBERED:
-        del remembered[next(iter(remembered))]
 
 
 class Ghost(Operation):

@@ -88,17 +88,16 @@ class Simple(Operation):
 
 
 class OpenFile(Simple):
-    """OpenFileRO, OpenFileWO or CreateFile. `sent` after a time-out: it may have been executed.
+    """OpenFileRO, OpenFileWO or CreateFile; session: the id to ask for. `sent` after a time-out: it may have
+    been executed.
 
     Attributes:
         session: the id that the ACK carried, to be used from then on (servers.md 14.6).
         size: as the ACK says, None where it says nothing (ArduPilot's CreateFile).
     """
 
-    def __init__(self, opcode: int, path: bytes, session: int) -> None:
-        super().__init__(opcode, path, session=session)
-        self.session = session
-        self.size: int | None = None
+    session: int
+    size: int | None = None
 
     def on_reply(self, request: Request, reply: Payload, now: float) -> None:
         """Take session and size; learn whether the server echoes ids."""

@@ -126,11 +126,6 @@ class WriteTransfer(Operation):
             request.manner = LAST_WRITE_MANNER
 
     @property
-    def drained(self) -> bool:
-        """Whether nothing is on its way."""
-        return not self._unanswered
-
-    @property
     def all_out(self) -> bool:
         """Whether nothing of what is unanswered waits to go out again."""
         return all(request.flying for request in self._unanswered)
@@ -142,7 +137,7 @@ class WriteTransfer(Operation):
 
     @property
     def idle(self) -> bool:
-        """Whether nothing is wanted of the server."""
+        """Whether nothing is wanted of the server; while paused: whether nothing is on its way."""
         return not self._unanswered and (self.paused or (self._starved and not self._rest))
 
     # --- requests
@@ -156,13 +151,24 @@ class WriteTransfer(Operation):
         session = self.session
         chunk = self.chunks.next_size(now)
         most = 1 if self.chunks.trying else min(most, _ROW)
-        piece = self._rest.popleft() if self._rest else self._next_piece(most * chunk)
-        if piece is None:
+        limit = most * chunk
+        if self._rest:
+            offset, data = self._rest.popleft()
+            if len(data) > limit:  # it went out in longer ones before
+                self._rest.appendleft((offset + limit, data[limit:]))
+                data = data[:limit]
+        elif self._starved or self.done:
             return []
-        offset, data = piece
-        if len(data) > most * chunk:  # it went out in longer ones before
-            self._rest.appendleft((offset + most * chunk, data[most * chunk :]))
-            data = data[: most * chunk]
+        elif (piece := self._source.next_chunk(limit)) is None:
+            self._starved = True
+            self._on_starved()
+            return []
+        else:
+            offset, data = piece
+            if not 1 <= len(data) <= limit or not 0 <= offset <= MAX_OFFSET - len(data):
+                self._rest.append(piece)
+                self.fail(LocalProtocolError(f"{len(data)} bytes at {offset} do not fit WriteFile requests"))
+                return []
         requests = []
         for at in range(0, len(data), chunk):
             part = data[at : at + chunk]
@@ -170,21 +176,6 @@ class WriteTransfer(Operation):
             requests.append(request)
             self._unanswered[request] = None
         return requests
-
-    def _next_piece(self, limit: int) -> tuple[int, bytes] | None:
-        if self._starved or self.done:
-            return None
-        piece = self._source.next_chunk(limit)
-        if piece is None:
-            self._starved = True
-            self._on_starved()
-            return None
-        offset, size = piece[0], len(piece[1])
-        if not 1 <= size <= limit or not 0 <= offset <= MAX_OFFSET - size:
-            self._rest.append(piece)
-            self.fail(LocalProtocolError(f"{size} bytes at {offset} do not fit WriteFile requests"))
-            return None
-        return piece
 
     # --- replies
 
@@ -194,13 +185,10 @@ class WriteTransfer(Operation):
             self.failed_at = request.offset
             self.fail(self._meaning(nak_of(request, reply)))
             return
-        self._take([(request, reply.data)], now, placed=reply.offset == request.offset)
+        self.on_run([(request, reply.data)], now, placed=reply.offset == request.offset)
 
-    def on_run(self, run: Run, now: float) -> None:
-        """Tell the source what was written, in a row at once."""
-        self._take(run, now, placed=True)  # a run's answers have the offsets of their requests
-
-    def _take(self, run: Run, now: float, *, placed: bool) -> None:
+    def on_run(self, run: Run, now: float, *, placed: bool = True) -> None:
+        """Tell the source what was written, in a row at once. placed: answers have the requests' offsets."""
         unanswered, usual, full = self._unanswered, self._usual, self.chunks.most
         first = run[0][0]
         start = stop = first.offset

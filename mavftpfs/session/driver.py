@@ -144,7 +144,7 @@ class Driver:
         """Forget an operation (harmless when it is finished)."""
         if self._under_way.pop(operation, None) is not None:
             self._changed.unpark_all()
-            self.engine.cancel(operation, self._clock())
+            self.engine.drop(operation)
             self.kick()
 
     async def be_silent(self, seconds: float) -> bool:

@@ -195,7 +195,12 @@ class FileStream(SessionUser):
             transfer.by_requests = engine.in_flight > 0
         try:
             await driver.start(transfer, server.wake)
-            while self._goes_on(transfer, began):
+            while not (transfer.done or transfer.idle or self.closed or server.session is None):
+                rival = self._scheduler.rival_use(self)
+                if rival is not None and self.gives_way(rival, began, server.clock(), engine.rtt):
+                    break
+                if server.is_excluded(self.path) or (rival is not None and self.due_at() == inf):
+                    break
                 if isinstance(transfer, BurstTransfer):
                     # Let no burst follow another while somebody else waits for an answer: PX4 fills with a
                     # burst what the link holds, and the answer finds no room there.
@@ -233,14 +238,3 @@ class FileStream(SessionUser):
                 self._sink.on_batch()
         if transfer.idle or transfer.done:
             self._server.wake()
-
-    def _goes_on(self, transfer: ReadTransfer, began: float) -> bool:
-        server = self._server
-        if transfer.done or transfer.idle or self.closed or server.session is None:
-            return False
-        if server.is_excluded(self.path):
-            return False
-        rival = self._scheduler.rival_use(self)
-        if rival is None:
-            return True
-        return self.due_at() < inf and not self.gives_way(rival, began, server.clock(), server.engine.rtt)

@@ -258,7 +258,7 @@ class ServerSession:
         remedies, resent = _Remedies(), False
         while True:
             asked, traits = self.engine.home_session, self.engine.traits
-            operation = OpenFile(opcode, wire_path(path), asked)
+            operation = OpenFile(opcode, wire_path(path), session=asked)
             # A time-out or a cancellation leaves it so: the open may have been carried out.
             self.maybe_open[0 if traits.ack_carries_own_session is False else asked] = path
             try:

@@ -445,12 +445,12 @@ class Upload(SessionUser):
                 stop = Stop.DOUBT if rivals else stop
             if stop is not None:
                 transfer.paused = True
-                if transfer.drained or stop in _ABRUPT or self._trails(stop, transfer):
+                if transfer.idle or stop in _ABRUPT or self._trails(stop, transfer):
                     self._endings += 1
                     return stop
             elif gate.shut and gate.waiting:
                 transfer.paused = True
-                if transfer.drained:
+                if transfer.idle:
                     await gate.let_in(max(_PATHS_TURN, 4.0 * (self._engine.rtt or 0.0)))
                     await self._rearm()
                     transfer.paused = False
@@ -507,7 +507,7 @@ class Upload(SessionUser):
         if transfer is None:
             return None
         self._transfer = self._server.transfer = None
-        if transfer.trailing and not transfer.drained:
+        if transfer.trailing and not transfer.idle:
             self._engine.stats.retransmissions += 1  # it goes again, and the first may come later than that
         transfer.finish()
         self._driver.cancel(transfer)

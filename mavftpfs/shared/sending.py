@@ -30,7 +30,8 @@ class Sending:
             before that. What is in none of them is on its way.
         closed: a Terminate was ACKed, so the card holds what is proven.
         overtaken: bytes that were handed out changed, or were cut off: the file is to be sent anew.
-        furthest: one past the highest byte that was ever ACKed.
+        reached: one past the highest byte that was ACKed; after a rollback, that is proven.
+        furthest: what `reached` was at most before the last rollback.
         growing: more may be written behind the last byte; what fills no request there waits for it.
         progress: told how many bytes were ACKed.
     """
@@ -44,7 +45,7 @@ class Sending:
         self.progress: Callable[[int], None] | None = None
         self._read = read
         self._handed_out = 0  # one past the highest byte
-        self.furthest = 0
+        self.reached = self.furthest = 0
         self._failed: MavftpfsError | None = None
         self._ahead = (0, b"")
 
@@ -52,11 +53,6 @@ class Sending:
     def unacked(self) -> int:
         """Bytes not ACKed yet."""
         return self.size - self.acked.total - self.proven.total
-
-    @property
-    def reached(self) -> int:
-        """One past the highest byte that was ACKed; after a rollback, that is proven."""
-        return max(self.acked.end, self.proven.end)
 
     def on_changed(self, start: int, size: int) -> None:
         """The file changed from `start` on, perhaps to its end, and has `size` bytes now."""
@@ -106,7 +102,7 @@ class Sending:
     def on_acked(self, offset: int, count: int) -> None:
         """These bytes were ACKed as written."""
         self.acked.add(offset, offset + count)
-        self.furthest = max(self.furthest, offset + count)
+        self.reached = max(self.reached, offset + count)
         if self.progress is not None:
             self.progress(count)
 
@@ -124,10 +120,12 @@ class Sending:
     def roll_back(self, *, everything: bool) -> None:
         """The session was lost: what was ACKed since the checkpoint is to be sent again, or everything is
         because the file was emptied by reopening it."""
+        self.furthest = max(self.furthest, self.reached)
         self.acked = ExtentSet()
         if everything:
             self.closed = False
             self.proven = ExtentSet()
+        self.reached = self.proven.end
         self.todo = ExtentSet(self.proven.missing(0, self.size))
 
     def _next(self, limit: int) -> tuple[int, int] | None:

@@ -126,7 +126,7 @@ def busy_engine(seed: int, kind: type[ReadTransfer]) -> tuple[Engine, list[Opera
     transfer = kind(0, len(CONTENT), sink)
     operations = [
         transfer,
-        OpenFile(Opcode.OPEN_FILE_RO, b"/f", 7),
+        OpenFile(Opcode.OPEN_FILE_RO, b"/f", session=7),
         ListDirectory(b"/d"),
         Terminate(3),
         Simple(Opcode.CALC_FILE_CRC32, b"/f"),
@@ -232,7 +232,7 @@ def test_a_transfer_ends_with_the_right_bytes_or_an_error(
     server = FtpServer(tree, PROFILES[name], rng=random.Random(rng.random()))
     wire = LinkSettings(delay=0.02, loss=loss, duplicate=duplicate, reorder=reorder, jitter=0.01)
     link = VirtualLink(server, wire, seed=seed)
-    opened = OpenFile(Opcode.OPEN_FILE_RO, b"/f", link.engine.home_session)
+    opened = OpenFile(Opcode.OPEN_FILE_RO, b"/f", session=link.engine.home_session)
     link.run(opened)
     if opened.error is not None:
         return  # the ACK was lost and the file is open over there: the session layer's business

@@ -48,7 +48,7 @@ class Answering:
         if isinstance(answer, int):
             raise FtpNak(opcode, NakCode(answer), retransmitted=answer % 2 == 1)
         if isinstance(operation, OpenFile):
-            operation.reply = Payload(1, 0, Opcode.ACK, 0, opcode)
+            operation.session, operation.reply = 1, Payload(1, 0, Opcode.ACK, 0, opcode)
 
     async def be_silent(self, seconds: float) -> bool:
         await trio.sleep(seconds)

@@ -46,7 +46,7 @@ class Rig:
         """Open a file, insisting: a lost ACK leaves it open over there (servers.md 14.10)."""
         engine = self.link.engine
         for _ in range(10):
-            op = OpenFile(Opcode.OPEN_FILE_RO, path, engine.home_session)
+            op = OpenFile(Opcode.OPEN_FILE_RO, path, session=engine.home_session)
             self.link.run(op)
             if op.error is None:
                 self.session = engine.session = op.session
@@ -82,7 +82,7 @@ class Rig:
         transfer.want(0, size, True)
         self.link.run_until(lambda: transfer.idle or transfer.done, 3600.0)
         assert transfer.error is None, transfer.error
-        self.link.engine.cancel(transfer, self.link.now)
+        self.link.engine.drop(transfer)
         self.close()
         assert sink.held.covers(0, size)
         return bytes(sink.data)
@@ -91,7 +91,7 @@ class Rig:
         """Whether another client can open a file at once."""
         self.link.model.settings = LinkSettings()
         engine = self.link.engine
-        op = OpenFile(Opcode.OPEN_FILE_RO, b"/big", (engine.home_session % 200) + 1)
+        op = OpenFile(Opcode.OPEN_FILE_RO, b"/big", session=(engine.home_session % 200) + 1)
         self.link.run(op)
         if op.error is None:
             self.link.run(Terminate(op.session))

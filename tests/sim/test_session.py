@@ -531,7 +531,7 @@ def others_session(connection: Connection) -> int:
 
 async def open_elsewhere(connection: Connection) -> None:
     """Leave a session open under an id that is not this connection's, as a killed client does."""
-    await connection.driver.run(OpenFile(Opcode.CREATE_FILE, b"/d/left", others_session(connection)))
+    await connection.driver.run(OpenFile(Opcode.CREATE_FILE, b"/d/left", session=others_session(connection)))
 
 
 async def test_a_session_in_use_is_told_in_time_and_is_not_asked_for_often(autojump_clock: MockClock) -> None:

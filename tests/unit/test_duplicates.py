@@ -72,7 +72,7 @@ def test_nor_is_one_of_which_nobody_wants_the_answer_any_more() -> None:
     asked = sent(engine, 0.0)
     asked += again(engine, 1.0)
     engine.on_deadline(2.0)  # lost, and not sent again before it is forgotten
-    engine.cancel(transfer, 2.0)
+    engine.drop(transfer)
     for request in asked:
         engine.receive(chunk(request, CONTENT), 3.0)
     assert engine.stats.unknown
@@ -83,7 +83,7 @@ def test_nor_what_comes_of_a_burst_that_was_given_up() -> None:
     engine = make()
     transfer = reading(engine, BurstTransfer)
     (burst,) = sent(engine, 0.0)
-    engine.cancel(transfer, 0.0)
+    engine.drop(transfer)
     engine.receive(packet(burst, 0, bytes(239)), 0.1)
     assert engine.stats.unknown
     assert engine.stats.unexplained == 0

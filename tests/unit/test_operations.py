@@ -76,7 +76,7 @@ def test_too_long_data_is_refused_before_a_byte_is_sent() -> None:
 
 @pytest.mark.parametrize("data", [b"", b"\1\2\3"])
 def test_an_open_ack_may_say_no_size(data: bytes) -> None:
-    op = OpenFile(Opcode.CREATE_FILE, b"/f", 9)
+    op = OpenFile(Opcode.CREATE_FILE, b"/f", session=9)
     engine, request = begin(op)
     engine.receive(ack(request, data), 0.1)
     assert op.size is None
@@ -85,7 +85,7 @@ def test_an_open_ack_may_say_no_size(data: bytes) -> None:
 
 @pytest.mark.holds("rule 14.6")
 def test_an_open_with_session_0_proves_nothing() -> None:
-    op = OpenFile(Opcode.OPEN_FILE_RO, b"/f", 0)
+    op = OpenFile(Opcode.OPEN_FILE_RO, b"/f", session=0)
     engine, request = begin(op)
     engine.receive(ack(request, bytes(4)), 0.1)
     assert engine.traits.ack_carries_own_session is None

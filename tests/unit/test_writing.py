@@ -168,9 +168,9 @@ def test_pause_drains_and_resume_goes_on() -> None:
     requests = sent(engine, 0.0)
     transfer.paused = True
     for one in requests:
-        assert not transfer.drained
+        assert not transfer.idle
         engine.receive(ack(one), 0.1)
-    assert transfer.drained
+    assert transfer.idle
     assert transfer.idle
     assert sent(engine, 0.1) == []
     assert engine.next_deadline() is None
@@ -272,7 +272,7 @@ def test_what_is_acked_is_on_the_card(
     server = FtpServer(tree, PROFILES[profile], rng=random.Random(seed))
     line = LinkSettings(rate=100_000.0, delay=0.01, loss=loss, duplicate=duplicate, reorder=reorder)
     link = VirtualLink(server, line, seed=seed)
-    opened = OpenFile(Opcode.CREATE_FILE, path, link.engine.home_session)
+    opened = OpenFile(Opcode.CREATE_FILE, path, session=link.engine.home_session)
     link.run(opened)
     if opened.error is not None:  # its ACK was lost and the repetition refused: not what is tested here
         return
@@ -292,7 +292,7 @@ def test_what_is_acked_is_on_the_card(
     if cut_short is None:
         assert source.acked.total == len(content)
     transfer.finish()
-    link.engine.cancel(transfer, link.now)
+    link.engine.drop(transfer)
     assert source.in_flight.empty
     assert source.acked.total + source.todo.total == len(content)
     close(link, opened.session)
