@@ -93,36 +93,31 @@ class Deliverer:
         Raises:
             The reason why not: as VehicleStore; VerificationFailed, NotSupported, FileTooLarge, FileChanged.
         """
-        done = False
-        while not done and (node.undelivered or node.attempt is not None) and (wanted is None or wanted()):
-            async with node.lock:
-                if not node.claims:  # else the name or the content goes first
-                    done = await self._deliver(node)
-
-    async def _deliver(self, node: Node) -> bool:
-        """Deliver; the caller has the node's lock. Return False if that was called off. Raises as deliver."""
         context = self._context
-        async with context.paths.steady(node, lasting=True):
-            draft = node.draft
-            if draft is None or not node.undelivered:
-                await self.abandon(node)
-                return True
-            with trio.CancelScope() as node.delivery:
-                try:
-                    if node.path not in context.own.torn:  # else its name lacks a file until then
-                        context.require_disarmed()
-                    await self._try(node, draft)
-                    node.error, node.start_after = None, float("-inf")
-                    return True
-                except MavftpfsError as error:
-                    self._note_failure(node, draft, error)
-                    raise
-                finally:
-                    node.delivery = None
-                    self._throttle.let_go()
-                    if node.undelivered:  # also if who waited for it gave up
-                        context.retry_later()
-        return False
+        while (node.undelivered or node.attempt is not None) and (wanted is None or wanted()):
+            async with node.lock:
+                if node.claims:  # the name or the content goes first
+                    continue
+                async with context.paths.steady(node, lasting=True):
+                    draft = node.draft
+                    if draft is None or not node.undelivered:
+                        await self.abandon(node)
+                        return
+                    with trio.CancelScope() as node.delivery:  # who cancels it has it begin again
+                        try:
+                            if node.path not in context.own.torn:  # else its name lacks a file until then
+                                context.require_disarmed()
+                            await self._try(node, draft)
+                            node.error, node.start_after = None, float("-inf")
+                            return
+                        except MavftpfsError as error:
+                            self._note_failure(node, draft, error)
+                            raise
+                        finally:
+                            node.delivery = None
+                            self._throttle.let_go()
+                            if node.undelivered:  # also if who waited for it gave up
+                                context.retry_later()
 
     async def push(self, node: Node) -> None:
         """The draft changed: send it, or begin to, if that can be done beside the program. The caller has
@@ -326,7 +321,7 @@ class Deliverer:
                 self._context.directories.expire(split(path)[0])
                 raise
             self._context.directories.put(places.new, DirEntry(b"", EntryKind.FILE, draft.size))
-            draft.commit()
+            draft.on(Event.COMMITS)
             if places.old is None:
                 await self._names.rename(places.new, path)
             else:

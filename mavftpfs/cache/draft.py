@@ -160,7 +160,7 @@ class Draft:
     @property
     def whole(self) -> bool:
         """Whether the content is known without asking the vehicle."""
-        return not self.missing_base()
+        return self._held.covers(0, min(self.base_limit, self.size))
 
     @property
     def unacked(self) -> int:
@@ -254,9 +254,7 @@ class Draft:
             for extents in (self._held, self._changed):
                 extents.discard(size, max(size, extents.end))
             self.base_limit = min(self.base_limit, size)
-            if size == 0:
-                self.sending = None
-            elif self.sending is not None:
+            if self.sending is not None:
                 self.sending.on_changed(size, size)
         self.size = size
 
@@ -286,12 +284,6 @@ class Draft:
         """The attempt ended without success."""
         if self.state is State.SENDING:
             self.on(Event.GIVEN_UP)
-        self.sending = None
-
-    def commit(self) -> None:
-        """What was sent is verified and about to be renamed."""
-        self.on(Event.COMMITS)
-        self.sending = None
 
     def interrupted(self, *, ours: bool = False) -> None:
         """Nobody knows which file has the name now; all of the draft is known here, so none matters. ours:
@@ -304,7 +296,7 @@ class Draft:
     def delivered(self, crc32: int | None = None) -> None:
         """The vehicle has it, checked: from now on that is the base. crc32: of the content, if known."""
         if self.state is State.SENDING:  # a card that cannot rename
-            self.commit()
+            self.on(Event.COMMITS)
         self.on(Event.PLACED)
         self.base, self.base_limit = Base(self.size, crc32=crc32), self.size
         self.begun = False
@@ -319,7 +311,7 @@ class Draft:
             self.on(Event.REPLACED)
 
     def on(self, event: Event) -> None:
-        """Go to the next state.
+        """Go to the next state; the books of an attempt end with SENDING.
 
         Raises:
             LocalProtocolError: that cannot happen now.
@@ -328,6 +320,8 @@ class Draft:
         if after is None:
             raise LocalProtocolError(f"a file that is {self.state.value} cannot be {event.value}")
         self.state = after
+        if after is not State.SENDING:
+            self.sending = None
 
     def check_invariants(self) -> None:
         """Raise AssertionError if the books are wrong (for tests)."""

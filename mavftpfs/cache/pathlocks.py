@@ -96,8 +96,14 @@ class PathLocks:
         for held in self._held:
             if held is wanted:
                 came_before = False
-            elif (held.granted or came_before) and held.blocks(wanted):
-                return True
+            if held is wanted or not (held.granted or came_before):
+                continue
+            if wanted.shared and (held.shared or not held.granted):
+                continue
+            for one in held.paths:
+                for two in wanted.paths:
+                    if one == two or one.startswith(two + b"/") or two.startswith(one + b"/"):
+                        return True
         return False
 
 
@@ -106,13 +112,3 @@ class _Hold:
     paths: tuple[bytes, ...]
     shared: bool
     granted: bool = False
-
-    def blocks(self, other: _Hold) -> bool:
-        """Return whether the other one has to wait for this."""
-        if other.shared and (self.shared or not self.granted):
-            return False
-        return any(
-            one == two or one.startswith(two + b"/") or two.startswith(one + b"/")
-            for one in self.paths
-            for two in other.paths
-        )

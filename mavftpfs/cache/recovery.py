@@ -12,7 +12,6 @@ knows what happened to the file since.
 from __future__ import annotations
 
 import contextlib
-import errno
 import fcntl
 import json
 import logging
@@ -25,7 +24,8 @@ from typing import BinaryIO
 
 from mavftpfs.cache.draft import Draft
 from mavftpfs.cache.reserved import new_owner
-from mavftpfs.shared.errors import NoSpace, SpoolFailed
+from mavftpfs.cache.spool import remove
+from mavftpfs.shared.errors import SpoolFailed
 from mavftpfs.shared.private import make_private_directory, open_private
 
 log = logging.getLogger("mavftpfs.cache")
@@ -39,7 +39,6 @@ TOKENS = 256
 PIECE = 1024 * 1024
 MANIFEST = "manifest.json"
 _LONGEST_NAME = 200
-_FULL = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
 
 
 class SpoolDirectory:
@@ -135,35 +134,6 @@ def data_in(slot: Path) -> list[Path]:
     return sorted(slot.glob("*.data"))
 
 
-def write_facts(data: Path, facts: Mapping[str, object], *, durable: bool) -> None:
-    """Write down what a spooled file is, so that being killed leaves the old text or the new one.
-
-    durable: also a loss of power does.
-
-    Raises:
-        OSError.
-    """
-    path = data.with_suffix(".json")
-    draft = path.with_suffix(".new")
-    with open(open_private(draft, os.O_WRONLY | os.O_TRUNC), "wb") as file:
-        file.write(json.dumps(facts, indent=1).encode())
-        file.flush()
-        if durable:
-            os.fsync(file.fileno())
-    draft.replace(path)
-    if durable:
-        _sync_directory(path.parent)
-
-
-def remove(data: Path) -> None:
-    """Remove a spooled file and its description; what cannot be removed is only logged."""
-    for path in (data, data.with_suffix(".json"), data.with_suffix(".new")):
-        try:
-            path.unlink(missing_ok=True)
-        except OSError as exc:
-            log.warning("cannot remove %s: %s", path, exc)
-
-
 def rescue(slot: Path, recovery: Path) -> tuple[list[Path], list[OSError]]:
     """Move a dead mount's spooled files to `recovery`; return their new paths, and why others stay.
 
@@ -211,12 +181,6 @@ def free_name(directory: Path, name: str) -> Path:
         if not path.exists():
             return path
         number += 1
-
-
-def disk_error(exc: OSError, path: Path | None) -> NoSpace | SpoolFailed:
-    """Return what a local disk's error means to whoever writes: it is full, or it fails."""
-    kind = NoSpace if exc.errno in _FULL else SpoolFailed
-    return kind(f"cannot keep bytes in {path}: {exc}")
 
 
 def recover(
@@ -275,14 +239,6 @@ def describe(
 
 
 # --- inside
-
-
-def _sync_directory(path: Path) -> None:
-    directory = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(directory)
-    finally:
-        os.close(directory)
 
 
 def _read_facts(data: Path) -> dict[str, object]:

@@ -13,18 +13,21 @@ Local files are written in the event loop: they go to the page cache, in pieces 
 from __future__ import annotations
 
 import contextlib
+import errno
+import json
 import logging
 import os
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from mavftpfs.cache.recovery import disk_error, remove, write_facts
 from mavftpfs.shared.errors import NoSpace, SpoolFailed
 from mavftpfs.shared.extents import ExtentSet
 
 log = logging.getLogger("mavftpfs.cache")
+
+_FULL = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
 
 
 class Spool:
@@ -42,15 +45,10 @@ class Spool:
         self.in_memory = 0
         self.on_disk = 0
         self.full = False
-        self._spool_max = spool_max
+        self.spool_max = spool_max
         self._directory = directory
         self._temporary: Path | None = None
         self._number = 0
-
-    def require_disk(self, more: int) -> None:
-        """Raise NoSpace unless `more` bytes may go to disk."""
-        if self.on_disk + more > self._spool_max:
-            raise NoSpace(f"{self.on_disk} bytes wait for the vehicle, spool_max is {self._spool_max}")
 
     def new_file(self) -> Path:
         """Return the path of a file that is not there yet. Raises OSError."""
@@ -106,7 +104,7 @@ class SpoolContent:
         said = spool.full  # an attempt that fails frees what it had taken itself
         try:
             self._spill()
-            self._note_changed()
+            self._write_down(settled=False)
             self._put_on_disk(offset, data)
         except NoSpace as error:
             if not said:  # to a program ENOSPC means the card
@@ -136,7 +134,7 @@ class SpoolContent:
         Raises:
             NoSpace, SpoolFailed: nothing changed.
         """
-        self._note_changed()
+        self._write_down(settled=False)
         if self._file is None:
             before = len(self._memory)
             del self._memory[size:]
@@ -153,14 +151,13 @@ class SpoolContent:
     def settle(self) -> None:
         """The vehicle has all of it: until more is put the next mount need not offer it."""
         self._settled = True
-        if self._path is not None:
-            self.restate()
+        self.restate()
 
     def restate(self) -> None:
         """Its name changed, or nobody wants it any more: write that down; a failure is only logged."""
         try:
-            self._write_down()
-        except OSError as exc:
+            self._write_down(settled=self._settled)
+        except (NoSpace, SpoolFailed) as exc:
             log.warning("what %s is cannot be written down: %s", self._path, exc)
 
     def persist(self, facts: dict[str, Any]) -> None:
@@ -188,24 +185,23 @@ class SpoolContent:
 
     # --- inside
 
-    def _note_changed(self) -> None:
-        """Something of it is the vehicle's no longer: what is written down must not be less than true."""
-        settled, self._settled = self._settled, False
-        try:
-            self._write_down()
-        except OSError as exc:
-            self._settled = settled  # else the next one would take it for written
-            raise disk_error(exc, self._path) from exc
+    def _write_down(self, *, settled: bool) -> None:
+        """Have the text beside the file, if there is one, say what that is: never less than is true.
 
-    def _write_down(self) -> None:
-        """Have the text beside the file, if there is one, say what that is. Raises OSError."""
-        if self._path is None:
-            return
-        name = None if self._settled else self._name()
+        settled: the vehicle has all of it.
+
+        Raises:
+            NoSpace, SpoolFailed: nothing changed.
+        """
+        name = None if settled else self._name()
         facts = {"needed": False} if name is None else {"path": name, "unfinished": True}
-        if facts != self._told:
-            write_facts(self._path, facts, durable=False)
+        if self._path is not None and facts != self._told:
+            try:
+                write_facts(self._path, facts, durable=False)
+            except OSError as exc:
+                raise disk_error(exc, self._path) from exc
             self._told, self._durable = facts, False
+        self._settled = settled
 
     def _put_on_disk(self, offset: int, data: bytes | bytearray | memoryview) -> None:
         """Write what is new before what replaces something: a full disk refuses the former."""
@@ -215,7 +211,9 @@ class SpoolContent:
         more = len(data)
         for a, b in old:
             more -= b - a
-        self._spool.require_disk(more)
+        spool = self._spool
+        if spool.on_disk + more > spool.spool_max:
+            raise NoSpace(f"{spool.on_disk} bytes wait for the vehicle, spool_max is {spool.spool_max}")
         try:
             for a, b in [*self._stored.missing(offset, stop), *old]:
                 while a < b:
@@ -223,7 +221,7 @@ class SpoolContent:
         except OSError as exc:
             raise disk_error(exc, self._path) from exc
         self._stored.add(offset, stop)
-        self._spool.on_disk += self._stored.total - before
+        spool.on_disk += self._stored.total - before
 
     def _spill(self) -> None:
         """Move from memory to disk.
@@ -234,12 +232,11 @@ class SpoolContent:
         if self._file is not None:
             return
         memory = self._memory
-        self._spool.require_disk(len(memory))
         try:
             self._path = self._spool.new_file()
-            self._write_down()
+            self._write_down(settled=self._settled)
             self._file = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
-        except OSError as exc:
+        except (OSError, NoSpace, SpoolFailed) as exc:
             self._drop_file()
             raise NoSpace(f"no local file for what waits for the vehicle: {exc}") from exc
         try:
@@ -262,3 +259,43 @@ class SpoolContent:
             self._spool.remove_file(self._path)
         self._file = self._path = self._told = None
         self._durable = False
+
+
+def write_facts(data: Path, facts: Mapping[str, object], *, durable: bool) -> None:
+    """Write down what a spooled file is, so that being killed leaves the old text or the new one.
+
+    durable: also a loss of power does.
+
+    Raises:
+        OSError.
+    """
+    path = data.with_suffix(".json")
+    new = path.with_suffix(".new")
+    flags = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_NOFOLLOW | os.O_CLOEXEC
+    with open(os.open(new, flags, 0o600), "wb") as file:
+        file.write(json.dumps(facts, indent=1).encode())
+        file.flush()
+        if durable:
+            os.fsync(file.fileno())
+    new.replace(path)
+    if durable:
+        directory = os.open(path.parent, os.O_RDONLY)
+        try:
+            os.fsync(directory)
+        finally:
+            os.close(directory)
+
+
+def remove(data: Path) -> None:
+    """Remove a spooled file and its description; what cannot be removed is only logged."""
+    for path in (data, data.with_suffix(".json"), data.with_suffix(".new")):
+        try:
+            path.unlink(missing_ok=True)
+        except OSError as exc:
+            log.warning("cannot remove %s: %s", path, exc)
+
+
+def disk_error(exc: OSError, path: Path | None) -> NoSpace | SpoolFailed:
+    """Return what a local disk's error means to whoever writes: it is full, or it fails."""
+    kind = NoSpace if exc.errno in _FULL else SpoolFailed
+    return kind(f"cannot keep bytes in {path}: {exc}")

@@ -104,18 +104,30 @@ class ReadFile(OpenFile):
         await self._parts.deliverer.deliver(self._node)
 
     async def release(self) -> None:
-        """Close the handle; the last one of an unlinked file has it removed."""
-        if not self._closed:
-            self.close()
-            if self._node.removed and not self._node.handles:
-                await self._parts.namespace.release(self._node)
+        """Deliver what was written by this handle, and close it. What could not be delivered stays held; the
+        last handle of an unlinked file has it removed.
+
+        Raises:
+            Why it is not delivered.
+        """
+        if self._closed:
+            return
+        try:
+            if self.writable:
+                await self._parts.deliverer.deliver(self._node)
+        finally:
+            if not self._closed:
+                self.close()
+                if self._node.removed and not self._node.handles:
+                    await self._parts.namespace.release(self._node)
 
     def close(self) -> None:
         """Close without delivering; closing twice is harmless."""
         if self._closed:
             return
         self._closed = True
-        self._close_handle()
+        if self._handle is not None:
+            self._handle.close()
         node = self._node
         node.handles -= 1
         node.writers -= self.writable
@@ -135,11 +147,14 @@ class ReadFile(OpenFile):
     async def _read_changed(self, offset: int, size: int) -> bytes | memoryview:
         """Read a file that was written here since the handle was opened, or that is not open yet."""
         node = self._node
-        if self._handle is not None:
-            self._handle.require_not_lost()
+        handle = self._handle
+        if handle is not None:
+            handle.require_not_lost()
         if node.draft is not None:
             return await self._read_draft(node.draft, offset, offset + size)
-        self._close_handle()
+        if handle is not None:
+            self._handle = None
+            handle.close()
         self._generation = node.generation
         self._handle = await open_node(self._context, node)
         return await self._handle.read(offset, size)
@@ -158,11 +173,6 @@ class ReadFile(OpenFile):
                 parts.append(draft.local_bytes(a, b))
             at = b
         return parts[0] if len(parts) == 1 else b"".join(parts)
-
-    def _close_handle(self) -> None:
-        handle, self._handle = self._handle, None
-        if handle is not None:
-            handle.close()
 
 
 class WriteFile(ReadFile):
@@ -218,19 +228,6 @@ class WriteFile(ReadFile):
         draft = self._node.draft
         if draft is not None and (draft.size > 0 or self._node.error is not None):
             await self._parts.deliverer.deliver(self._node)
-
-    async def release(self) -> None:
-        """Deliver and close; what could not be delivered stays held.
-
-        Raises:
-            Why it is not delivered.
-        """
-        if self._closed:
-            return
-        try:
-            await self._parts.deliverer.deliver(self._node)
-        finally:
-            await super().release()
 
     def give_up(self) -> None:
         """Close, also after release; see OpenFile.give_up."""

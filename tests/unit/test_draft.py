@@ -71,7 +71,7 @@ def test_an_interrupted_commit_is_torn_and_no_base_counts_any_more() -> None:
     draft.fill(0, b"old")
     draft.write(0, b"X")
     draft.begin(in_place=False)
-    draft.commit()
+    draft.on(Event.COMMITS)
     draft.interrupted()
     assert draft.state is State.TORN
     draft.lose_base()
@@ -213,7 +213,7 @@ class DraftMachine(RuleBasedStateMachine):
             assert self.flight
             self.answer(0, 12)
         assert self.remote == self.model
-        self.draft.commit()
+        self.draft.on(Event.COMMITS)
         if end.startswith("torn"):
             self.draft.interrupted()
         if end.endswith("placed"):
