@@ -103,7 +103,7 @@ class Files:
         self._current: OrderedDict[bytes, Version] = OrderedDict()
         self.open_versions: dict[Version, None] = {}
         self._opening: SingleFlight[bytes, tuple[Version, bool]] = SingleFlight()
-        self._reopening: SingleFlight[Version, None] = SingleFlight()
+        self.reopening: SingleFlight[Version, None] = SingleFlight()
         self._comparing: SingleFlight[Version, None] = SingleFlight()
         directories.on_listed.append(self._on_listed)
         cache.on_dropped = self._on_dropped
@@ -221,14 +221,12 @@ class Files:
         return entry
 
     async def open_reader(self, version: Version) -> None:
-        """Give a version a reader. In doubt the file is opened anew at once, else when bytes are wanted.
+        """Give a version a reader; call by `reopening`. In doubt the file is opened anew at once, else when
+        bytes are wanted.
 
         Raises:
             FileChanged: it is smaller now. Else as RemoteStore.open_reader.
         """
-        await self._reopening.run(version, partial(self._open_reader, version))
-
-    async def _open_reader(self, version: Version) -> None:
         async with self.paths.steady(version) as path:
             version.require_alive()
             expected = None if version.doubted else version.size
@@ -275,20 +273,20 @@ class Files:
             FileChanged: it is another one. Else as RemoteStore.list_directory.
         """
         for _ in range(MAX_TRIES):
-            if version.compared or self.is_changing(version.path):
+            if self._is_sure(version) or self.is_changing(version.path):
                 break
-            if not (self._listings_tell(version) and (now or self._clock() >= version.compare_after)):
+            if not now and self._clock() < version.compare_after:
                 break
             await self._comparing.run(version, partial(self._compare_once, version))
         version.require_alive()
 
-    def _is_restarted(self, version: Version) -> bool:
-        return version.compared_at < self._restarted_at
-
-    def _listings_tell(self, version: Version) -> bool:
-        """Return whether a listing tells more than an open reply: that the file did not become smaller."""
-        times = version.mtime is not None or self._directories.tells_times
-        return times or self._is_restarted(version)
+    def _is_sure(self, version: Version) -> bool:
+        """Return whether a version was compared since the server opened its file, or a listing would tell no
+        more than an open reply does: that it did not become smaller."""
+        if version.compared:
+            return True
+        restarted = version.compared_at < self._restarted_at
+        return not (restarted or version.mtime is not None or self._directories.tells_times)
 
     async def _compare_once(self, version: Version) -> None:
         path = version.path
@@ -322,7 +320,8 @@ class Files:
 
     def _is_another(self, version: Version, entry: DirEntry) -> bool:
         """A file that is larger after the vehicle restarted is another one: nobody went on writing it."""
-        resized = entry.size not in (None, version.size) and self._is_restarted(version)
+        restarted = version.compared_at < self._restarted_at
+        resized = entry.size not in (None, version.size) and restarted
         return resized or became_another(version.size, version.mtime, entry)
 
     def _on_listed(self, path: bytes, directory: Directory) -> None:
@@ -375,9 +374,8 @@ class Files:
         version = self._current.get(path)
         if version is None or version.dead is not None or not version.complete:
             return None
-        sure = version.compared or not self._listings_tell(version)
         alone = all(v is version or v.lost for v in self.open_versions if v.path == path)
-        return version if sure and alone else None
+        return version if alone and self._is_sure(version) else None
 
     def was_lost(self, path: bytes) -> bool:
         """Return whether somebody has a version of the path open, and is to read nothing more."""
@@ -439,7 +437,7 @@ class Files:
         version.on_failed(LocalProtocolError(f"{version.path!r} was closed while it was read"))
         if self._current.get(version.path) is not version:
             version.clear()
-        elif version.dead is not None or self._is_restarted(version):
+        elif version.dead is not None or version.compared_at < self._restarted_at:
             self._forget(version)
 
     def forget_closed(self) -> None:
@@ -534,7 +532,7 @@ class FileHandle(OpenFile):
                     version.require_alive()
                 if version.missing(start, stop):
                     if version.reader is None or version.doubted:
-                        await files.open_reader(version)
+                        await files.reopening.run(version, partial(files.open_reader, version))
                     if version.reader is None or version.doubted:
                         return None
                     version.reader.want(start, stop, demand=True)

@@ -249,7 +249,7 @@ class Namespace:
             log.info("%r cannot be held here: %s", node.path, error)
             node.drop_draft()
             return False
-        draft.content.settle()  # nobody misses a copy, whatever becomes of this mount
+        draft.content.restate(delivered=True)  # nobody misses a copy, whatever becomes of this mount
         return True
 
     async def _hide(self, node: Node) -> None:

@@ -148,13 +148,12 @@ class SpoolContent:
         self._stored.discard(size, max(size, self._stored.end))
         self._spool.on_disk += self._stored.total - before
 
-    def settle(self) -> None:
-        """The vehicle has all of it: until more is put the next mount need not offer it."""
-        self._settled = True
-        self.restate()
+    def restate(self, *, delivered: bool = False) -> None:
+        """Its name changed, or nobody wants it any more: write that down; a failure is only logged.
 
-    def restate(self) -> None:
-        """Its name changed, or nobody wants it any more: write that down; a failure is only logged."""
+        delivered: the vehicle has all of it, so that until more is put the next mount need not offer it.
+        """
+        self._settled |= delivered
         try:
             self._write_down(settled=self._settled)
         except (NoSpace, SpoolFailed) as exc:
@@ -179,9 +178,17 @@ class SpoolContent:
     def close(self) -> None:
         """The vehicle has it, or nobody wants it: forget the bytes. Raises nothing."""
         self._spool.in_memory -= len(self._memory)
-        self._memory = bytearray()
+        self._spool.on_disk -= self._stored.total
+        self._memory, self._stored = bytearray(), ExtentSet()
+        if self._file is not None:
+            try:
+                os.close(self._file)
+            except OSError as exc:
+                log.warning("closing %s: %s", self._path, exc)  # nobody needs its bytes any more
         if self._path is not None:
-            self._drop_file()
+            self._spool.remove_file(self._path)
+        self._file = self._path = self._told = None
+        self._durable = False
 
     # --- inside
 
@@ -231,34 +238,20 @@ class SpoolContent:
         """
         if self._file is not None:
             return
-        memory = self._memory
+        memory, self._memory = self._memory, bytearray()
         try:
-            self._path = self._spool.new_file()
-            self._write_down(settled=self._settled)
-            self._file = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
-        except (OSError, NoSpace, SpoolFailed) as exc:
-            self._drop_file()
-            raise NoSpace(f"no local file for what waits for the vehicle: {exc}") from exc
-        try:
+            try:
+                self._path = self._spool.new_file()
+                self._write_down(settled=self._settled)
+                self._file = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
+            except (OSError, NoSpace, SpoolFailed) as exc:
+                raise NoSpace(f"no local file for what waits for the vehicle: {exc}") from exc
             self._put_on_disk(0, memory)
         except (NoSpace, SpoolFailed):
-            self._drop_file()
+            self.close()
+            self._memory = memory
             raise
-        self._memory = bytearray()
         self._spool.in_memory -= len(memory)
-
-    def _drop_file(self) -> None:
-        self._spool.on_disk -= self._stored.total
-        self._stored = ExtentSet()
-        if self._file is not None:
-            try:
-                os.close(self._file)
-            except OSError as exc:
-                log.warning("closing %s: %s", self._path, exc)  # nobody needs its bytes any more
-        if self._path is not None:
-            self._spool.remove_file(self._path)
-        self._file = self._path = self._told = None
-        self._durable = False
 
 
 def write_facts(data: Path, facts: Mapping[str, object], *, durable: bool) -> None:

@@ -118,10 +118,6 @@ class BlockCache:
         self.used[owner, index] = size
         self.bytes_cached += size
 
-    def remove(self, owner: Version, index: int) -> None:
-        """A block is gone."""
-        self.bytes_cached -= self.used.pop((owner, index))
-
     def check_invariants(self) -> None:
         """Raise AssertionError if the books are wrong (for tests)."""
         assert self.bytes_cached == sum(self.used.values())
@@ -131,7 +127,7 @@ class BlockCache:
 
     def _evict_oldest(self) -> None:
         owner, index = next(iter(self.used))
-        if owner.pinned(index):
+        if index in owner.pinned():
             self.used.move_to_end((owner, index))  # in use after all
         else:
             owner.evict(index)
@@ -231,13 +227,25 @@ class Version:
             return
         stop = min(offset + count, self.size)
         for start, end in self._present.missing(offset, stop):
-            self._write(start, end, memoryview(data)[start - offset : end - offset])
             self._arrived += end - start
+        self.preload(offset, data)
 
     def preload(self, offset: int, data: bytes | memoryview) -> None:
-        """Keep bytes that did not come over the link."""
-        for start, end in self._present.missing(offset, min(offset + len(data), self.size)):
-            self._write(start, end, memoryview(data)[start - offset : end - offset])
+        """Keep bytes that did not come over the link, where none are held yet."""
+        whole = memoryview(data)
+        for at, stop in self._present.missing(offset, min(offset + len(data), self.size)):
+            while at < stop:
+                index = at // BLOCK_SIZE
+                base = index * BLOCK_SIZE
+                block = self._blocks.get(index)
+                if block is None:
+                    length = min(BLOCK_SIZE, self.size - base)
+                    self._cache.add(self, index, length)
+                    block = self._blocks[index] = bytearray(length)
+                end = min(stop, base + BLOCK_SIZE)
+                block[at - base : end - base] = whole[at - offset : end - offset]
+                self._present.add(at, end)
+                at = end
 
     def on_batch(self) -> None:
         """Wake those whose range is complete; give those whose range grew more time."""
@@ -324,23 +332,27 @@ class Version:
 
     def clear(self) -> None:
         """Forget every block that no reader waits on."""
+        pinned = self.pinned()
         for index in list(self._blocks):
-            if not self.pinned(index):
+            if index not in pinned:
                 self.evict(index)
 
     # --- for the cache
 
-    def pinned(self, index: int) -> bool:
-        """Return whether somebody waits on the block."""
-        start, stop = self._extent(index)
-        return any(waiter.start < stop and start < waiter.stop for waiter in self._waiters)
+    def pinned(self) -> set[int]:
+        """Return the blocks that somebody waits on."""
+        found: set[int] = set()
+        for waiter in self._waiters:
+            found.update(range(waiter.start // BLOCK_SIZE, -(-waiter.stop // BLOCK_SIZE)))
+        return found
 
     def evict(self, index: int) -> None:
         """Forget a block."""
-        self._forget_block(index)
-        start, stop = self._extent(index)
-        self._present.discard(start, stop)
-        self._earlier.discard(start, stop)
+        del self._blocks[index]
+        self._cache.bytes_cached -= self._cache.used.pop((self, index))
+        start = index * BLOCK_SIZE
+        self._present.discard(start, start + BLOCK_SIZE)
+        self._earlier.discard(start, start + BLOCK_SIZE)
 
     # --- reading
 
@@ -398,34 +410,11 @@ class Version:
         """Forget all bytes that are not in `kept`."""
         self._present, self._earlier = ExtentSet(kept), ExtentSet(kept)
         for index in list(self._blocks):
-            if self._present.overlaps(*self._extent(index)):
+            if self._present.overlaps(index * BLOCK_SIZE, (index + 1) * BLOCK_SIZE):
                 self._blocks[index] = bytearray(self._blocks[index])  # a view of the old one may be in use
             else:
-                self._forget_block(index)
+                self.evict(index)
         self.ask_again()
-
-    def _extent(self, index: int) -> tuple[int, int]:
-        start = index * BLOCK_SIZE
-        return start, min(start + BLOCK_SIZE, self.size)
-
-    def _write(self, start: int, stop: int, data: memoryview) -> None:
-        while start < stop:
-            index = start // BLOCK_SIZE
-            block = self._blocks.get(index)
-            if block is None:
-                first, last = self._extent(index)
-                self._cache.add(self, index, last - first)
-                block = self._blocks[index] = bytearray(last - first)
-            base = index * BLOCK_SIZE
-            end = min(stop, base + BLOCK_SIZE)
-            block[start - base : end - base] = data[: end - start]
-            self._present.add(start, end)
-            data = data[end - start :]
-            start = end
-
-    def _forget_block(self, index: int) -> None:
-        del self._blocks[index]
-        self._cache.remove(self, index)
 
 
 def became_another(size: int, mtime: int | None, entry: DirEntry) -> bool:

@@ -163,7 +163,7 @@ async def test_a_cancelled_read_leaves_nothing_behind(nursery: trio.Nursery) -> 
     reading = await start_read(nursery, blocks, 0, 100)
     reading.scope.cancel()
     await trio.testing.wait_all_tasks_blocked()
-    assert not blocks.pinned(0)
+    assert not blocks.pinned()
     again = await start_read(nursery, blocks, 0, 100)
     deliver(blocks, 0, content(100))
     await trio.testing.wait_all_tasks_blocked()
