@@ -123,7 +123,7 @@ class Cleaner:
         self._dead_owners = dead_owners | {context.own.owner}
         self._seen: dict[bytes, tuple[int | None, float]] = {}
         self._busy: set[bytes] = set()
-        self._delivered: set[Node] = set()
+        self._being_delivered: set[Node] = set()
         self.mended = 0
 
     async def on_swept(self, path: bytes, directory: Directory) -> None:
@@ -157,11 +157,11 @@ class Cleaner:
 
     async def mend(self, node: Node) -> None:
         """Do so for one file, whose lock the caller has."""
-        self._delivered.add(node)
+        self._being_delivered.add(node)
         try:
             await self._list(split(node.path)[0])
         finally:
-            self._delivered.discard(node)
+            self._being_delivered.discard(node)
 
     # --- inside
 
@@ -197,7 +197,12 @@ class Cleaner:
                 await context.directories.find(group.target)
                 exists = True
             node = context.nodes.get(group.target)
-            if not exists and node is not None and node.delivery is not None and node not in self._delivered:
+            if (
+                not exists
+                and node is not None
+                and node.delivery is not None
+                and node not in self._being_delivered
+            ):
                 return  # it is being written here: a later listing shows what came of it
         for action in repair(group, target_exists=exists):
             if action.to is None:

@@ -230,7 +230,7 @@ class Framer:
                     armed = bool(m.base_mode & MAV_MODE_FLAG_SAFETY_ARMED)
                     message = Heartbeat(source, m.type, m.autopilot, armed)
                 case 2:
-                    message = SystemTime(source, m.time_unix_usec, m.time_boot_ms)
+                    message = SystemTime(source, m.time_boot_ms)
                 case 76:
                     params = (m.param1, m.param2, m.param3, m.param4, m.param5, m.param6, m.param7)
                     target = Address(m.target_system, m.target_component)

@@ -69,10 +69,9 @@ class StorageInformation:
 
 @dataclass(frozen=True, slots=True)
 class SystemTime:
-    """SYSTEM_TIME; time_boot_ms going back means that the vehicle rebooted. unix_usec 0 = unknown."""
+    """SYSTEM_TIME; time_boot_ms going back means that the vehicle rebooted."""
 
     source: Address
-    unix_usec: int
     time_boot_ms: int
 
 

@@ -23,7 +23,6 @@ CONNECT_TIMEOUT = 5.0
 """Seconds for each attempt."""
 
 _OUTBOX_LIMIT = 64 * 1024
-_SOCKET_BUFFER = 1 << 20
 _MAX_ADDRESSES = 4
 _PAUSE = 0.2
 

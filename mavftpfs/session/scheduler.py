@@ -65,7 +65,8 @@ class SessionUser(ABC):
 
     Attributes:
         path: of the file it uses.
-        asked_at: when it began to wait for its turn; None while it wants nothing. It stays set in the turn.
+        asked_at: when it began to wait for its turn; None while it wants nothing (an upload keeps its
+            last). It stays set in the turn.
     """
 
     def __init__(self, path: bytes, scheduler: Scheduler, asked_at: float | None = None) -> None:

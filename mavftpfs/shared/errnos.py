@@ -23,7 +23,7 @@ PATH_OPCODES = frozenset(
 )
 """Requests that carry a path: only for these can a NAK say something about a name."""
 
-_FAIL, _FAIL_ERRNO, _DATA_SIZE, _SESSION, _NO_SESSIONS, _EOF, _UNKNOWN = 1, 2, 3, 4, 5, 6, 7
+_FAIL, _FAIL_ERRNO, _DATA_SIZE, _SESSION, _NO_SESSIONS, _UNKNOWN = 1, 2, 3, 4, 5, 7
 _EXISTS, _PROTECTED, _NOT_FOUND = 8, 9, 10
 
 _BY_CODE: dict[int, int] = {

@@ -75,8 +75,6 @@ class Profile:
     """OpenFileWO cuts the file to nothing (MAVSDK)."""
     write_only_creates: bool = True
     """OpenFileWO makes a missing file (PX4, ArduPilot generation B)."""
-    short_write_acks: bool = False
-    """A write that found room for a part is ACKed as if whole (ArduPilot)."""
     sticky_stream_failure: bool = False
     """A read that crossed the end spoils every later read until reopened (MAVSDK before 4.1)."""
 
@@ -137,7 +135,6 @@ _ARDUPILOT = Profile(
     root_hides_files=True,
     counted_path_nul=False,
     write_only_creates=False,
-    short_write_acks=True,
     burst_packets=500,
     burst_interval=0.0056,
     short_packet_completes=True,
@@ -154,7 +151,6 @@ _ARDUPILOT5 = Profile(
     drop_long_names=True,
     sessions=5,
     idle_close=20.0,
-    short_write_acks=True,
     crc_rate=400e3,
     burst_packets=2000,
     burst_interval=0.0056,

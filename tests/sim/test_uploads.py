@@ -16,7 +16,7 @@ from mavftpfs.session.connection import Connection, ConnectOptions
 from mavftpfs.shared.errnos import errno_for
 from mavftpfs.shared.errors import Armed, FtpNak, MavftpfsError, SpoolFailed
 from mavftpfs.sim.linkmodel import LinkSettings
-from mavftpfs.sim.profiles import PROFILES
+from mavftpfs.sim.profiles import PROFILES, Family
 from tests.support.fake_writer import write_file
 from tests.support.faults import Faults
 from tests.support.mounting import mounted
@@ -173,7 +173,7 @@ async def test_a_full_card_is_told(profile: str, autojump: MockClock) -> None:
     async with here.connection() as connection:
         source = MemorySource(content(9_000))
         upload = await start(connection, profile, source)
-        silent = PROFILES[profile].short_write_acks  # partly written and ACKed: the size tells, later
+        silent = PROFILES[profile].family is Family.ARDUPILOT  # partly written, ACKed: the size tells later
         with pytest.raises(FtpNak) as refusal:
             await upload.finish()
         assert refusal.value.opcode == Opcode.WRITE_FILE

@@ -57,7 +57,7 @@ FTP = FtpRun(DRONE, US, [PAYLOAD])
 MESSAGES: list[tuple[Any, Message]] = [
     (drone().heartbeat_encode(2, 3, 0x51, 7, 3), Heartbeat(DRONE, 2, 3, False)),
     (drone().file_transfer_protocol_encode(0, 254, 191, list(PAYLOAD)), FTP),
-    (drone().system_time_encode(5_000_000_000_000, 1234), SystemTime(DRONE, 5_000_000_000_000, 1234)),
+    (drone().system_time_encode(5_000_000_000_000, 1234), SystemTime(DRONE, 1234)),
     (
         drone().command_long_encode(1, 2, 512, 0, 148, 0.5, 0, 0, 0, 0, -1),
         CommandLong(DRONE, Address(1, 2), 512, (148.0, 0.5, 0.0, 0.0, 0.0, 0.0, -1.0)),

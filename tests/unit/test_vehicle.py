@@ -43,7 +43,7 @@ def listener(system: int = 0, component: int = 0) -> Vehicle:
 def tell_boot_times(vehicle: Vehicle, *times: tuple[float, int]) -> None:
     """Have it tell at each of these times how many milliseconds ago it booted."""
     for now, boot_ms in times:
-        vehicle.on_message(SystemTime(PILOT, 0, boot_ms), now)
+        vehicle.on_message(SystemTime(PILOT, boot_ms), now)
 
 
 @pytest.mark.holds("rule 14.37")
@@ -178,7 +178,7 @@ def test_when_boot_times_tell_of_a_reboot(told: list[tuple[float, int]], reboots
     vehicle = listener()
     vehicle.on_message(heartbeat(PILOT), 0.0)
     tell_boot_times(vehicle, *told)
-    vehicle.on_message(SystemTime(Address(8, 1), 0, 10), 2000.0)
+    vehicle.on_message(SystemTime(Address(8, 1), 10), 2000.0)
     assert vehicle.reboots == reboots
 
 
