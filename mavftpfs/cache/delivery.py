@@ -115,7 +115,7 @@ class Deliverer:
                             raise
                         finally:
                             node.delivery = None
-                            self._throttle.let_go()
+                            self._throttle.waiting.unpark_all()
                             if node.undelivered:  # also if who waited for it gave up
                                 context.retry_later()
 
@@ -150,7 +150,7 @@ class Deliverer:
             log.log(level, "%r is not sent just now: %s", node.path, error)
         finally:
             node.delivery = None
-            self._throttle.let_go()
+            self._throttle.waiting.unpark_all()
 
     async def abandon(self, node: Node) -> None:
         """Give up the present attempt; what it left under reserved names goes now or at the next listing. The

@@ -245,12 +245,25 @@ class Names:
     async def replace(self, source: bytes, target: bytes, places: Places, *, keep_old: bool = False) -> None:
         """Rename over a file that exists; with keep_old that lies at `places.old` afterwards.
 
+        One rename does where the server never leaves the name without a file. NuttX, where storages are
+        mounted at /fs/NAME, removes the old one first (servers.md 9).
+
         Raises:
             NotSupported: the server does not rename. Else as VehicleStore.rename. The old file has its name
             again then, unless the name is torn.
         """
-        if not keep_old and await self._rename_over(source, target):
-            return
+        traits = self._context.store.traits
+        if not keep_old and traits.rename_replaces is not False and not target.startswith(b"/fs/"):
+            try:
+                await self.rename(source, target, over=True)
+                traits.rename_replaces = True
+                return
+            except FtpNak as nak:
+                if errno_for(nak) in _HONEST:
+                    raise
+                if nak.code == NakCode.FILE_EXISTS:  # an errno may be a stale one
+                    traits.rename_replaces = False
+                log.debug("the server does not rename %r over %r: %s", source, target, nak)
         assert places.old is not None
         moved = None
         try:
@@ -297,24 +310,6 @@ class Names:
             for path in paths:
                 self._context.directories.expire(split(path)[0])
             raise
-
-    async def _rename_over(self, source: bytes, target: bytes) -> bool:
-        """Return whether the server replaced the target, which had the old file or the new one at any time.
-        NuttX, where storages are mounted at /fs/NAME, removes the old one first (servers.md 9)."""
-        traits = self._context.store.traits
-        if traits.rename_replaces is False or target.startswith(b"/fs/"):
-            return False
-        try:
-            await self.rename(source, target, over=True)
-        except FtpNak as nak:
-            if errno_for(nak) in _HONEST:
-                raise
-            if nak.code == NakCode.FILE_EXISTS:  # an errno may be a stale one
-                traits.rename_replaces = False
-            log.debug("the server does not rename %r over %r: %s", source, target, nak)
-            return False
-        traits.rename_replaces = True
-        return True
 
     async def _undo(self, place: bytes, path: bytes) -> None:
         try:

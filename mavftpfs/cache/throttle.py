@@ -37,11 +37,15 @@ STALL = 5.0
 
 
 class Throttle:
-    """Knows how fast bytes are ACKed, and which wait."""
+    """Knows how fast bytes are ACKed, and which wait.
+
+    Attributes:
+        waiting: the writers who wait for room; who changes what may be un-ACKed has them look again.
+    """
 
     def __init__(self, context: Context) -> None:
         self._context = context
-        self._waiting = trio.lowlevel.ParkingLot()
+        self.waiting = trio.lowlevel.ParkingLot()
         self.meter = RateMeter()
         self._uncounted = 0
         self._grain = 1
@@ -90,7 +94,7 @@ class Throttle:
     async def wait(self) -> bool:
         """Wait for anything to move; return False if nothing did for STALL seconds."""
         with trio.move_on_after(STALL):
-            await self._waiting.park()
+            await self.waiting.park()
             return True
         return False
 
@@ -101,12 +105,8 @@ class Throttle:
             self.meter.on_bytes(self._uncounted, self._context.clock())
             self._uncounted = 0
             self._grain = COARSE if (self.meter.rate or 0.0) > FAST else 1
-        if self._waiting:
-            self.let_go()
-
-    def let_go(self) -> None:
-        """Have those who wait look again."""
-        self._waiting.unpark_all()
+        if self.waiting:
+            self.waiting.unpark_all()
 
     def transfers(self) -> list[dict[str, object]]:
         """Return what is not delivered, what is on its way first; eta: seconds at the measured rate."""

@@ -50,13 +50,18 @@ SMALL_FILE = 64 * 1024
 
 
 class RateMeter:
-    """How many bytes per second come while some are wanted; pauses between requests are not counted."""
+    """How many bytes per second come while some are wanted; pauses between requests are not counted.
+
+    Attributes:
+        rate: bytes per second, None while too little was seen.
+    """
 
     PAUSE = 1.0
     ENOUGH = 0.2
     MEMORY = 4.0
 
     def __init__(self) -> None:
+        self.rate: float | None = None
         self._last: float | None = None
         self._bytes = 0.0
         self._busy = 0.0
@@ -72,11 +77,8 @@ class RateMeter:
         if self._busy > self.MEMORY:  # older traffic counts half
             self._bytes /= 2
             self._busy /= 2
-
-    @property
-    def rate(self) -> float | None:
-        """Bytes per second, None while too little was seen."""
-        return self._bytes / self._busy if self._busy >= self.ENOUGH else None
+        if self._busy >= self.ENOUGH:
+            self.rate = self._bytes / self._busy
 
 
 class BlockCache:

@@ -255,7 +255,7 @@ class Writeback:
         if blocked == self._context.blocked:
             return
         self._context.blocked = blocked
-        self._throttle.let_go()
+        self._throttle.waiting.unpark_all()
         self.retry()
 
     def retry(self) -> None:
