@@ -213,7 +213,7 @@ class SpoolContent:
     def _put_on_disk(self, offset: int, data: bytes | bytearray | memoryview) -> None:
         """Write what is new before what replaces something: a full disk refuses the former."""
         assert self._file is not None
-        whole, stop, before = memoryview(data), offset + len(data), self._stored.total
+        whole, stop = memoryview(data), offset + len(data)
         old = self._stored.intersection(offset, stop)
         more = len(data)
         for a, b in old:
@@ -228,7 +228,7 @@ class SpoolContent:
         except OSError as exc:
             raise disk_error(exc, self._path) from exc
         self._stored.add(offset, stop)
-        spool.on_disk += self._stored.total - before
+        spool.on_disk += more
 
     def _spill(self) -> None:
         """Move from memory to disk.
