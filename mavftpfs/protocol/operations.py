@@ -13,10 +13,10 @@ from typing import NamedTuple
 
 from mavftpfs.protocol.payload import MAX_DATA, NakCode, Opcode, Payload
 from mavftpfs.protocol.requests import MANNERS, Operation, Priority, Request, nak_of
-from mavftpfs.shared.errors import FtpNak, PathTooLong
+from mavftpfs.shared.errors import PathTooLong
 from mavftpfs.shared.model import DirEntry, EntryKind, usable_name
 
-__all__ = ["ListDirectory", "OpenFile", "Operation", "Priority", "Simple", "Terminate"]
+__all__ = ["ListDirectory", "OpenFile", "Operation", "Priority", "Simple"]
 
 MAX_ENTRIES = 100_000
 MAX_PAGES = 60_000
@@ -56,7 +56,6 @@ class Simple(Operation):
         patience: float = inf,
         server_time: float | None = None,
     ) -> None:
-        super().__init__()
         if len(data) > MAX_DATA:
             raise PathTooLong(f"{len(data)} bytes do not fit the {MAX_DATA} of a request")
         self.patience = patience
@@ -109,24 +108,6 @@ class OpenFile(Simple):
             self.size = int.from_bytes(reply.data[:4], "little")
         if request.session:
             self.port.learn_session_echo(reply.session == request.session)
-
-
-class Terminate(Simple):
-    """TerminateSession, whose ACK is what makes written data durable on some servers.
-
-    Attributes:
-        already_closed: the server knew no such session (NAK 4), which is no error here.
-    """
-
-    def __init__(self, session: int) -> None:
-        super().__init__(Opcode.TERMINATE_SESSION, session=session)
-        self.already_closed = False
-
-    def on_reply(self, request: Request, reply: Payload, now: float) -> None:
-        """A session that is not there is closed."""
-        super().on_reply(request, reply, now)
-        if isinstance(self.error, FtpNak) and self.error.code == NakCode.INVALID_SESSION:
-            self.error, self.already_closed = None, True
 
 
 class Page(NamedTuple):
@@ -182,7 +163,6 @@ class ListDirectory(Operation):
     """
 
     def __init__(self, path: bytes, with_time: bool = False, patience: float = inf) -> None:
-        super().__init__()
         self.patience = patience
         if len(path) > MAX_DATA:
             raise PathTooLong(f"path of {len(path)} bytes does not fit the {MAX_DATA} of a request")

@@ -64,7 +64,6 @@ class ReadTransfer(Operation):
     bulk = _READ
 
     def __init__(self, session: int, size: int, sink: DataSink, chunks: ChunkSize | None = None) -> None:
-        super().__init__()
         self.chunks = ChunkSize() if chunks is None else chunks
         self.session = session
         self.size = size
@@ -227,7 +226,6 @@ class ReadToEof(Operation):
     rank = Priority.DEMAND
 
     def __init__(self, session: int, chunk: int, limit: int) -> None:
-        super().__init__()
         if not 1 <= chunk <= MAX_DATA:
             raise LocalProtocolError(f"a chunk of {chunk} bytes is not within 1..{MAX_DATA}")
         self.data = b""

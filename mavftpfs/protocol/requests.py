@@ -183,16 +183,16 @@ class Operation:
     paced = True
     """Whether more may be on the way than a server queues, evenly spread (see `pacing`)."""
 
-    def __init__(self) -> None:
-        self.done = False
-        self.error: MavftpfsError | None = None
-        self.patience = inf
-        self.progress_at = inf
-        self.timer = inf
-        self.sent = False
-        self.started = False
-        self.port: Port
-        """The engine, once this was started."""
+    done = False
+    error: MavftpfsError | None = None
+    patience = inf
+    progress_at = inf
+    timer = inf
+    sent = False
+    started = False
+
+    port: Port
+    """The engine, once this was started."""
 
     @property
     def priority(self) -> Priority:

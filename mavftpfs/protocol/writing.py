@@ -97,7 +97,6 @@ class WriteTransfer(Operation):
         in_flight: int | None = None,
         on_starved: Callable[[], None] = lambda: None,
     ) -> None:
-        super().__init__()
         self.chunks = ChunkSize() if chunks is None else chunks
         self.session = session
         self.acked_bytes = 0

@@ -23,7 +23,7 @@ from typing import TypeVar
 
 import trio
 
-from mavftpfs.protocol.operations import ListDirectory, OpenFile, Simple, Terminate
+from mavftpfs.protocol.operations import ListDirectory, OpenFile, Simple
 from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.protocol.requests import Operation
 from mavftpfs.session.doubt import Doubt
@@ -49,6 +49,9 @@ _SURELY_OPEN = 8.0
 _TAKEN = frozenset((NakCode.INVALID_SESSION, NakCode.NO_SESSIONS_AVAILABLE))
 _OPEN_TAKEN = _TAKEN | {NakCode.FILE_EXISTS}
 """NAK 8 may hide any other code on PX4 (sticky EEXIST), and makes no sense as an answer to an open."""
+
+_NOT_OPEN = (NakCode.INVALID_SESSION, NakCode.FILE_EXISTS)
+"""What servers say to a Terminate of a session that is not there; 8 is PX4's sticky errno."""
 
 Asked = TypeVar("Asked", bound=Operation)
 
@@ -304,26 +307,24 @@ class ServerSession:
         if session is None:
             return True
         self._enter(State.CLOSING)
-        operation, asked_at = Terminate(session.id), self.clock()
+        asked_at = self.clock()
         try:
             with trio.fail_after(self.op_deadline if limit is None else limit):
-                await self.driver.run(operation)
+                await self.driver.run(Simple(Opcode.TERMINATE_SESSION, session=session.id))
             self.maybe_open.pop(session.id, None)
+            return True
         except trio.TooSlowError:
             if limit is None:  # a shorter one is no proof that the vehicle is lost
                 self.vehicle.note_timeout()
             raise RequestTimeout("no answer to TerminateSession") from None
         except FtpNak as nak:
             self.maybe_open.pop(session.id, None)
-            if nak.code != NakCode.FILE_EXISTS:  # PX4's sticky errno for "no such session"
+            if nak.code not in _NOT_OPEN:
                 raise
-            operation.already_closed = True
+            # Our own first request closed it, if no server closes an idle session so soon.
+            return nak.retransmitted and self.clock() - asked_at < _SURELY_OPEN
         finally:
             self._enter(State.CLOSED)
-        if not operation.already_closed:
-            return True
-        # Our own first request closed it, if no server closes an idle session so soon.
-        return operation.retransmitted and self.clock() - asked_at < _SURELY_OPEN
 
     async def close_quietly(self) -> None:
         """Close after a failure that is already being reported, or for somebody else's sake."""
@@ -351,14 +352,15 @@ class ServerSession:
         closed = False
         for session in list(self.maybe_open):
             if session != 0 or not self._others_heard():
-                already_closed = await self._try(Terminate(session))
+                already_closed = await self._try(Simple(Opcode.TERMINATE_SESSION, session=session))
                 if (
                     already_closed
                     and session
                     and self.engine.traits.ack_carries_own_session is None
                     and not self._others_heard()
                 ):
-                    await self._try(Terminate(0))  # the server may have given us that id instead
+                    # The server may have given us that id instead.
+                    await self._try(Simple(Opcode.TERMINATE_SESSION, session=0))
                 closed = True
             self.maybe_open.pop(session, None)
         return closed
@@ -430,18 +432,20 @@ class ServerSession:
         return self._may_be_ours(nak) and await self._close_what_may_be_ours()
 
     async def _try(self, operation: Operation) -> bool:
-        """Run a remedy whose refusal changes nothing; return whether it found the session closed.
+        """Run a remedy whose refusal changes nothing; return whether there was no such session.
 
         Raises:
             RequestTimeout: that is the caller's news.
         """
         try:
             await self.driver.run(operation)
+        except FtpNak as nak:
+            return nak.code == NakCode.INVALID_SESSION
         except RequestTimeout:
             raise
         except MavftpfsError:
-            return False
-        return isinstance(operation, Terminate) and operation.already_closed
+            pass
+        return False
 
     def _others_heard(self) -> bool:
         return self.vehicle.foreign_client(self.clock())

@@ -12,7 +12,7 @@ from mavftpfs.link.messages import Address
 from mavftpfs.protocol.burst import BurstTransfer
 from mavftpfs.protocol.engine import Engine
 from mavftpfs.protocol.flow import Flow
-from mavftpfs.protocol.operations import ListDirectory, OpenFile, Operation, Simple, Terminate, parse_page
+from mavftpfs.protocol.operations import ListDirectory, OpenFile, Operation, Simple, parse_page
 from mavftpfs.protocol.payload import (
     MAX_DATA,
     PAYLOAD_SIZE,
@@ -128,7 +128,7 @@ def busy_engine(seed: int, kind: type[ReadTransfer]) -> tuple[Engine, list[Opera
         transfer,
         OpenFile(Opcode.OPEN_FILE_RO, b"/f", session=7),
         ListDirectory(b"/d"),
-        Terminate(3),
+        Simple(Opcode.TERMINATE_SESSION, session=3),
         Simple(Opcode.CALC_FILE_CRC32, b"/f"),
         ReadToEof(0, 100, 100_000),
     ]

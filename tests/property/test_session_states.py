@@ -15,7 +15,7 @@ from trio.testing import MockClock
 from mavftpfs.link.messages import Address
 from mavftpfs.protocol.engine import Engine
 from mavftpfs.protocol.flow import Flow
-from mavftpfs.protocol.operations import OpenFile, Operation, Terminate
+from mavftpfs.protocol.operations import OpenFile, Operation, Simple
 from mavftpfs.protocol.payload import NakCode, Opcode, Payload
 from mavftpfs.session.doubt import Doubt
 from mavftpfs.session.driver import Driver
@@ -43,7 +43,7 @@ class Answering:
         if answer == "forever":
             await trio.sleep_forever()
         opcode = Opcode.OPEN_FILE_RO
-        if isinstance(operation, OpenFile | Terminate):
+        if isinstance(operation, Simple):
             opcode = Opcode(operation.opcode)
         if isinstance(answer, int):
             raise FtpNak(opcode, NakCode(answer), retransmitted=answer % 2 == 1)

@@ -8,8 +8,8 @@ import pytest
 
 from mavftpfs.protocol.burst import BurstTransfer
 from mavftpfs.protocol.chunking import ChunkSize
-from mavftpfs.protocol.operations import ListDirectory, OpenFile, Terminate
-from mavftpfs.protocol.payload import Opcode
+from mavftpfs.protocol.operations import ListDirectory, OpenFile, Simple
+from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.protocol.reading import ReadToEof, ReadTransfer
 from mavftpfs.shared.errors import FtpNak, SessionLost
 from mavftpfs.sim.linkmodel import Direction, LinkSettings
@@ -54,14 +54,16 @@ class Rig:
                 return op.size
             assert isinstance(op.error, FtpNak), op.error
             assert op.error.retransmitted, op.error
-            self.link.run(Terminate(engine.home_session if self.is_ardupilot else 0))
+            self.link.run(
+                Simple(Opcode.TERMINATE_SESSION, session=engine.home_session if self.is_ardupilot else 0)
+            )
         raise AssertionError("never opened")
 
     def close(self) -> None:
-        op = Terminate(self.session)
+        op = Simple(Opcode.TERMINATE_SESSION, session=self.session)
         self.link.run(op)
         if isinstance(op.error, FtpNak):  # sticky EEXIST, or a repeated Terminate
-            assert op.error.retransmitted
+            assert op.error.retransmitted or op.error.code == NakCode.INVALID_SESSION
         else:
             assert op.error is None, op.error
         self.link.engine.session = self.link.engine.home_session
@@ -94,7 +96,7 @@ class Rig:
         op = OpenFile(Opcode.OPEN_FILE_RO, b"/big", session=(engine.home_session % 200) + 1)
         self.link.run(op)
         if op.error is None:
-            self.link.run(Terminate(op.session))
+            self.link.run(Simple(Opcode.TERMINATE_SESSION, session=op.session))
         return op.error is None
 
 

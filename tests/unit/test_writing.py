@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from mavftpfs.protocol.chunking import ChunkSize
 from mavftpfs.protocol.engine import Engine
 from mavftpfs.protocol.flow import Flow
-from mavftpfs.protocol.operations import OpenFile, Terminate
+from mavftpfs.protocol.operations import OpenFile, Simple
 from mavftpfs.protocol.payload import Opcode
 from mavftpfs.protocol.writing import MAX_OFFSET, WriteTransfer
 from mavftpfs.shared.errors import (
@@ -302,6 +302,6 @@ def test_what_is_acked_is_on_the_card(
 
 
 def close(link: VirtualLink, session: int) -> None:
-    terminate = Terminate(session)
+    terminate = Simple(Opcode.TERMINATE_SESSION, session=session)
     link.run(terminate)
     assert terminate.error is None or isinstance(terminate.error, MavftpfsError)
