@@ -78,6 +78,7 @@ class Files:
     Attributes:
         is_changing: whether we are changing what the vehicle has of a path, or may have done so in part.
         kept: the cache on the local disk, if there is one. open_versions: those with open handles.
+        reopening: the versions that are given a reader now, see `open_reader`.
     """
 
     def __init__(
@@ -221,8 +222,8 @@ class Files:
         return entry
 
     async def open_reader(self, version: Version) -> None:
-        """Give a version a reader; call by `reopening`. In doubt the file is opened anew at once, else when
-        bytes are wanted.
+        """Give a version a reader; run by `reopening`, once for all who want one. In doubt the file is opened
+        anew at once, else when bytes are wanted.
 
         Raises:
             FileChanged: it is smaller now. Else as RemoteStore.open_reader.
