@@ -348,26 +348,15 @@ class Engine:
         return None if deadline == inf else deadline
 
     def on_deadline(self, now: float) -> None:
-        """Act on what is overdue; harmless when called early or late."""
-        late: set[Operation] = set()
-        if now >= self._due:
-            late = self._check_timers(now)
-        for op in self._ops.copy():
-            if op.timer <= now:
-                op.on_timer(now)
-            if (op in late or op.progress_at + op.patience <= now) and not op.done:
-                self.stats.timeouts += 1
-                op.fail(RequestTimeout(f"no answer within {op.patience:g} s"))
-            if op.done:
-                self.drop(op)
-
-    def _check_timers(self, now: float) -> set[Operation]:
-        """Ask again for what is overdue; return the operations of which one request took too long."""
-        self._due = inf
+        """Ask again for what is overdue, and end operations that took too long, or of which one request did.
+        Harmless when called early or late."""
         silent: list[str] = []
         late: set[Operation] = set()
         ledger, flow = self._ledger, self.flow
-        for request in list(ledger.flying.values()):
+        requests: list[Request] = []
+        if now >= self._due:
+            self._due, requests = inf, list(ledger.flying.values())
+        for request in requests:
             if request.timer <= now:
                 # Round trips may have grown meanwhile. And ArduPilot answers nothing else during a burst:
                 # silence proves nothing then (servers.md 4).
@@ -389,4 +378,11 @@ class Engine:
             self._timers.of[family].on_silence()
         if silent:
             flow.on_silence(len(silent))
-        return late
+        for op in self._ops.copy():
+            if op.timer <= now:
+                op.on_timer(now)
+            if (op in late or op.progress_at + op.patience <= now) and not op.done:
+                self.stats.timeouts += 1
+                op.fail(RequestTimeout(f"no answer within {op.patience:g} s"))
+            if op.done:
+                self.drop(op)

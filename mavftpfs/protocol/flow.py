@@ -302,8 +302,19 @@ class Flow:
         over = newest >= self._round_end and (self._round_end < 0 or now >= self._round_start + TICK)
         enough = self._answered >= ROUNDS or self._starting or self.starved or self._serial
         # At the start a queue grows fast: a few answers that waited in one are enough.
-        if (over and enough) or (self._starting and self._rtts >= FIRST and self._queued()):
-            self._end_round(now, next_order)
+        if not (over and enough) and not (self._starting and self._rtts >= FIRST and self._queued()):
+            return
+        self._round += 1  # it is over
+        if self._round_end >= 0 and now > self._round_start:
+            self._learn(now, now - self._round_start)
+        if not self._starting and self._rate > 0.0 and self._base >= BASE_LEAST:
+            self._pace = self._rate * (1.0 if self._round % CYCLE == 1 else (1.0 + STEP) * self._per_answer)
+        else:
+            self._pace = inf
+        self._round_end, self._round_start = next_order, now
+        self._answered = self._lost = 0
+        self._least, self._total_rtt, self._rtts = inf, 0.0, 0
+        self.starved = False
 
     def on_loss(self, order: int) -> None:
         """The transmission numbered `order` is taken to be lost."""
@@ -326,19 +337,6 @@ class Flow:
             self._pacer.on_silence()
 
     # --- rounds
-
-    def _end_round(self, now: float, next_order: int) -> None:
-        self._round += 1
-        if self._round_end >= 0 and now > self._round_start:
-            self._learn(now, now - self._round_start)
-        if not self._starting and self._rate > 0.0 and self._base >= BASE_LEAST:
-            self._pace = self._rate * (1.0 if self._round % CYCLE == 1 else (1.0 + STEP) * self._per_answer)
-        else:
-            self._pace = inf
-        self._round_end, self._round_start = next_order, now
-        self._answered = self._lost = 0
-        self._least, self._total_rtt, self._rtts = inf, 0.0, 0
-        self.starved = False
 
     def _learn(self, now: float, took: float) -> None:
         total = self._answered + self._lost
