@@ -35,6 +35,10 @@ from mavftpfs.sim.tree import Entry, Kind, Stat, fail
 
 NOBODY = Address(0, 0)
 _MAX_OFFSET = 2**31
+_QUEUE = 5
+"""Requests that wait; more are dropped silently."""
+_STEAL_AFTER = 3.0
+"""A session idle for so long, in seconds, may be taken by another."""
 
 
 @dataclass(slots=True)
@@ -118,7 +122,7 @@ class Operations:
 
     def _open_read(self, session: Session, request: Request, reply: Reply, now: float) -> None:
         if session.file is not None:
-            if now - session.last_sent <= self._profile.steal_after:
+            if now - session.last_sent <= _STEAL_AFTER:
                 raise Refusal(NakCode.FAIL)
             with contextlib.suppress(OSError):  # the firmware does not look
                 session.close()
@@ -158,7 +162,7 @@ class Operations:
         path = _path(self._profile, request)
         path = path[:-1] if len(path) > 1 and path.endswith(b"/") else path
         entries = self._storage.entries(path)
-        if path == b"/" and self._storage.virtual is not None:
+        if path == b"/":
             virtual = self._storage.virtual.roots()
             entries = entries + [Entry(name, Stat(Kind.DIRECTORY, 0, 0)) for name in virtual]
         with_time = request.opcode == Opcode.LIST_DIRECTORY_WITH_TIME
@@ -285,7 +289,7 @@ class ArduPilot(Firmware):
     def handle(self, wire: bytes, source: Address, now: float) -> None:
         """Queue a request, or drop it if five wait."""
         self.advance(now)
-        if len(self._queue) >= self.profile.queue_length:
+        if len(self._queue) >= _QUEUE:
             self.dropped_requests += 1
             return
         self._queue.append(parse(wire, source))
@@ -368,7 +372,7 @@ class ArduPilot(Firmware):
             self._nak(NakCode.INVALID_DATA_SIZE)
         elif ending and request.session != slot.number:
             self._reply.opcode = ACK  # believed to end another session, of which there is none
-        elif stranger and idle < self.profile.steal_after:
+        elif stranger and idle < _STEAL_AFTER:
             self._nak(NakCode.INVALID_SESSION)
         else:
             if stranger:
@@ -413,7 +417,7 @@ class ArduPilot(Firmware):
             if slot.owner == request.source and slot.number == request.session:
                 return slot
         oldest = min(self._slots, key=lambda slot: slot.last_sent)
-        if oldest.last_sent and self.now - oldest.last_sent < self.profile.steal_after:
+        if oldest.last_sent and self.now - oldest.last_sent < _STEAL_AFTER:
             return None
         self._close_quietly(oldest)
         oldest.owner, oldest.number = request.source, request.session

@@ -39,9 +39,7 @@ class LinkSettings:
     rate: bytes per second, None = no limit and no queue. queue: bytes that may wait for the transmitter.
     delay, jitter: seconds one way. loss, duplicate, reorder, corrupt: probabilities per frame.
     hold: seconds by which a reordered frame is late, and three of its airtimes more.
-    byte_loss: probability per byte that it is received wrong and its frame is thrown away for it.
-    mtu: bytes of the longest frame that ever arrives, None = any. piece, piece_loss: frames go in pieces of
-    so many bytes, each lost with this probability, and the frame with it.
+    mtu: bytes of the longest frame that ever arrives, None = any.
     burst_loss: share of frames lost in runs of 8 on average. cuts: (start, stop) times without a link.
     """
 
@@ -51,10 +49,7 @@ class LinkSettings:
     delay: float = 0.0
     jitter: float = 0.0
     loss: float = 0.0
-    byte_loss: float = 0.0
     mtu: int | None = None
-    piece: int = 64
-    piece_loss: float = 0.0
     burst_loss: float = 0.0
     duplicate: float = 0.0
     reorder: float = 0.0
@@ -247,17 +242,8 @@ class LinkModel:
             leave = 1 / _BURST_LENGTH
             enter = min(1.0, leave * share / (1 - share)) if share < 1 else 1.0
             lane.bad = not self._chance(leave) if lane.bad else self._chance(enter)
-        if (lane.bad and bool(share)) or self._chance(self.settings.loss):
-            return True
-        return self._is_lost_by_length(size)
-
-    def _is_lost_by_length(self, size: int) -> bool:
-        settings = self.settings
-        if settings.mtu is not None and size > settings.mtu:
-            return True
-        pieces = -(-size // settings.piece)
-        whole = (1.0 - settings.byte_loss) ** size * (1.0 - settings.piece_loss) ** pieces
-        return self._chance(1.0 - whole)
+        too_long = self.settings.mtu is not None and size > self.settings.mtu
+        return too_long or (lane.bad and bool(share)) or self._chance(self.settings.loss)
 
     def _maybe_corrupt(self, lane: _Lane, frame: bytes) -> bytes:
         if not frame or not self._chance(self.settings.corrupt):

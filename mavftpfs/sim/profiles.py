@@ -9,6 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from enum import Enum
 
+from mavftpfs.sim.pseudo import TREES
+
 
 class Family(Enum):
     """Whose code the server runs."""
@@ -29,7 +31,7 @@ class Storage(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Profile:
-    """One server. Times in seconds, sizes in bytes, rates in bytes per second.
+    """What differs between servers. Times in seconds, sizes in bytes, rates in bytes per second.
 
     Fields that a family has no use for are ignored by it.
     """
@@ -49,8 +51,8 @@ class Profile:
     """Opcode 16 lists directories as a bare D<name> (PX4 of early 2026)."""
     unknown_code: int = 7
     """NAK code for an unknown opcode (ArduPilot before mid-2026: 1)."""
-    virtual_trees: bool = False
-    """@SYS, @ROMFS, @PARAM and @MISSION exist (ArduPilot)."""
+    virtual_trees: tuple[bytes, ...] = ()
+    """The `@` trees that exist (ArduPilot, PX4 of 2026)."""
     exact_virtual_sizes: bool = False
     """Sizes of generated files are right (PX4 of 2026: @PARAM/param.pck)."""
     double_nul: bool = False
@@ -68,8 +70,6 @@ class Profile:
     sessions: int = 1
     idle_close: float | None = None
     """PX4: 10; ArduPilot generation B: 20 when the queue is idle."""
-    steal_after: float = 3.0
-    """ArduPilot: a session idle for so long may be taken by another."""
     write_only_truncates: bool = False
     """OpenFileWO cuts the file to nothing (MAVSDK)."""
     write_only_creates: bool = True
@@ -82,12 +82,8 @@ class Profile:
     """Writes must start with this; the check looks at a scratch buffer (servers.md 8)."""
 
     # Timing
-    tick: float = 0.010
-    """PX4: period of the loop that sends bursts."""
     latency: float = 0.010
     """ArduPilot: from an idle queue to the first answer."""
-    queue_length: int = 5
-    """ArduPilot: requests that wait; more are dropped silently."""
     request_cost: float = 0.0
     """Time each request takes, during which the server does nothing else."""
     stall_chance: float = 0.0
@@ -106,16 +102,12 @@ class Profile:
     # Bursts
     burst_packets: int = 0
     """Packets in one burst; 0 = no limit. PX4 counts bytes instead."""
-    burst_bytes: int = 35_000
-    """PX4: a burst ends with the first tick that ends beyond this."""
     burst_interval: float = 0.0
     """Time per burst packet at best."""
     short_packet_completes: bool = False
     """burst_complete is set on the short last packet and its NAK; else on the NAK (ArduPilot)."""
     exact_eof_offset: bool = True
     """False: the EOF NAK's offset is a packet too small where sizes divide (ArduPilot generation A)."""
-    garbage_complete: float = 0.0
-    """PX4: chance of a spurious burst_complete on a packet that is alone in its tick."""
 
 
 _PX4 = Profile(
@@ -123,13 +115,12 @@ _PX4 = Profile(
     family=Family.PX4,
     path_limit=237,
     idle_close=10.0,
-    garbage_complete=0.1,
 )
 _ARDUPILOT = Profile(
     name="ardupilot",
     family=Family.ARDUPILOT,
     unknown_code=1,
-    virtual_trees=True,
+    virtual_trees=TREES,
     double_nul=True,
     root_hides_files=True,
     counted_path_nul=False,
@@ -146,7 +137,7 @@ _ARDUPILOT5 = Profile(
     case_fold=True,
     newlib_errnos=True,
     list_with_time=True,
-    virtual_trees=True,
+    virtual_trees=TREES,
     drop_long_names=True,
     sessions=5,
     idle_close=20.0,
@@ -186,7 +177,7 @@ _ALL = (
         idle_close=30.0,
         list_with_time=True,
         bare_time_directories=True,
-        virtual_trees=True,
+        virtual_trees=(b"@PARAM",),
         exact_virtual_sizes=True,
     ),
     _ARDUPILOT,

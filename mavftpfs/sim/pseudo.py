@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 from mavftpfs.sim.tree import Entry, Kind, Stat, fail
 
+TREES = (b"@SYS", b"@ROMFS", b"@PARAM", b"@MISSION")
 PARAM_MAGIC = 0x671B
 MISSION_MAGIC = 0x763D
 MAX_HANDLES = 4
@@ -22,7 +23,6 @@ _SYS_CLAIM = 100_000
 _MISSION_CLAIM = 2**20
 _MISSIONS = (b"mission.dat", b"fence.dat", b"rally.dat")
 _FORMATS = {1: "<b", 2: "<h", 3: "<i", 4: "<f"}
-_SIZES = {1: 1, 2: 2, 3: 4, 4: 4}
 _REAL_SIZES = (b"storage.bin",)
 _SYS_NAMES = (
     b"threads.txt tasks.txt dma.txt memory.txt uarts.txt timers.txt can_log.txt can0_stats.txt "
@@ -58,28 +58,6 @@ def pack_parameters(params: Sequence[Param], block: int) -> bytes:
     return bytes(out)
 
 
-def unpack_parameters(packed: bytes) -> list[Param]:
-    """Parse param.pck; pad bytes are skipped.
-
-    Raises:
-        ValueError: this is not a parameter file.
-    """
-    if len(packed) < _PARAM_HEADER.size or _PARAM_HEADER.unpack_from(packed)[0] != PARAM_MAGIC:
-        raise ValueError("no parameter file")
-    params: list[Param] = []
-    at, last = _PARAM_HEADER.size, b""
-    while at < len(packed):
-        if packed[at] == 0:
-            at += 1
-            continue
-        kind, lengths = packed[at] & 15, packed[at + 1]
-        start = at + 3 + (lengths >> 4)
-        last = last[: lengths & 15] + packed[at + 2 : start]
-        at = start + _SIZES[kind]
-        params.append(Param(last, kind, packed[start:at]))
-    return params
-
-
 def _common_prefix(last: bytes, name: bytes) -> int:
     limit = min(len(last), len(name) - 1, 15)
     return next((i for i in range(limit) if last[i] != name[i]), max(limit, 0))
@@ -112,11 +90,12 @@ def _default_romfs() -> dict[bytes, bytes]:
 class VirtualTrees:
     """The trees of one vehicle.
 
-    exact: only @PARAM exists and its size is right (PX4 of 2026).
+    trees: their names. exact: claimed sizes are right (PX4 of 2026).
     """
 
     def __init__(
         self,
+        trees: Sequence[bytes] = TREES,
         *,
         exact: bool = False,
         params: Iterable[Param] | None = None,
@@ -127,7 +106,7 @@ class VirtualTrees:
         self.params = list(params) if params is not None else _default_params()
         self.sys_files = dict(sys_files) if sys_files is not None else _default_sys()
         self.romfs = dict(romfs) if romfs is not None else _default_romfs()
-        self._open = {b"@SYS": 0, b"@ROMFS": 0, b"@PARAM": 0, b"@MISSION": 0}
+        self._open = dict.fromkeys(trees, 0)
         self._leaked_listings = 0
 
     def reboot(self) -> None:
@@ -138,11 +117,11 @@ class VirtualTrees:
     def owns(self, path: bytes) -> bool:
         """Whether the path lies in one of these trees; one leading slash does not matter."""
         tree = path.removeprefix(b"/").partition(b"/")[0]
-        return tree == b"@PARAM" if self._exact else tree in self._open
+        return tree in self._open
 
     def roots(self) -> list[bytes]:
         """Return the trees that a listing of `/` shows."""
-        return [] if self._exact else [b"@ROMFS", b"@SYS"]
+        return [tree for tree in (b"@ROMFS", b"@SYS") if tree in self._open]
 
     def entries(self, path: bytes) -> list[Entry]:
         """List @SYS or a directory of @ROMFS; ENOENT for the rest.

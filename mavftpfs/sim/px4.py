@@ -34,6 +34,12 @@ from mavftpfs.sim.storage import OpenFile, StaleErrno, Storage
 
 _Fields = tuple[int, int, int, int, int, int, int]
 _BUFFER_LIFE = 2.0
+_TICK = 0.010
+"""Period of the loop that sends bursts, in seconds."""
+_BURST_BYTES = 35_000
+"""A burst ends with the first tick that ends beyond this."""
+_GARBAGE_COMPLETE = 0.1
+"""Chance of a spurious burst_complete on a packet that is alone in its tick."""
 _CACHED_DATA = 4
 _READ = int(Opcode.READ_FILE)
 _WRITE = int(Opcode.WRITE_FILE)
@@ -56,9 +62,7 @@ class Stream:
     seq: int
     sent: int = 0
 
-    def read(
-        self, opened: OpenFile, *, last: bool, alone: bool, profile: Profile, rng: random.Random
-    ) -> bytes:
+    def read(self, opened: OpenFile, *, last: bool, alone: bool, rng: random.Random) -> bytes:
         """Return the next packet; `complete` tells whether it ends the burst.
 
         last, alone: it is a tick's last packet, its only one.
@@ -68,16 +72,16 @@ class Stream:
         """
         data = opened.read(self.offset, MAX_DATA)
         self.sent += len(data)
-        over = last and self.sent > profile.burst_bytes
+        over = self.is_over(last)
         # The field is not written on a tick's last packet; only then is it the stack's garbage.
-        garbage = last and alone and not over and rng.random() < profile.garbage_complete
+        garbage = last and alone and not over and rng.random() < _GARBAGE_COMPLETE
         packed = self._pack(ACK, int(over or garbage), data)
         self.offset += len(data)
         return packed
 
-    def is_over(self, last: bool, profile: Profile) -> bool:
+    def is_over(self, last: bool) -> bool:
         """Whether the packet before was the last one."""
-        return last and self.sent > profile.burst_bytes
+        return last and self.sent > _BURST_BYTES
 
     def end(self, code: int, number: int) -> bytes:
         """Return the NAK that ends it; number: errno."""
@@ -243,12 +247,12 @@ class Px4(Firmware):
 
     def _next_tick(self) -> float:
         start = self._started or 0.0
-        return max(start + self._tick * self.profile.tick, self._busy_until)
+        return max(start + self._tick * _TICK, self._busy_until)
 
     def _tick_after(self, now: float) -> int:
-        start, period = self._started or 0.0, self.profile.tick
-        tick = int((now - start) / period) + 1
-        return tick + 1 if start + tick * period <= now else tick  # rounding
+        start = self._started or 0.0
+        tick = int((now - start) / _TICK) + 1
+        return tick + 1 if start + tick * _TICK <= now else tick  # rounding
 
     def _execute(self, wire: bytes, source: Address, now: float) -> None:
         seq, session, opcode, size, _, _, offset = fields = HEADER.unpack_from(wire)
@@ -491,8 +495,8 @@ class Px4(Firmware):
                 raise Refusal(_EOF)
             if self._file is None:
                 raise Refusal(_FAIL_ERRNO)
-            packed = stream.read(self._file, last=last, alone=alone, profile=self.profile, rng=self.rng)
-            if stream.is_over(last, self.profile):
+            packed = stream.read(self._file, last=last, alone=alone, rng=self.rng)
+            if stream.is_over(last):
                 self._stream = None
         except (Refusal, OSError) as exc:
             code = exc.code if isinstance(exc, Refusal) else _FAIL_ERRNO

@@ -68,18 +68,12 @@ class Storage:
         self._fold = profile.case_fold
         self._rng = rng
         self._fat = self.kind in (profiles.Storage.FATFS, profiles.Storage.NUTTX_FAT)
-        if virtual is None and profile.virtual_trees:
-            virtual = VirtualTrees(exact=profile.exact_virtual_sizes)
-        self.virtual = virtual
+        self.virtual = virtual or VirtualTrees(profile.virtual_trees, exact=profile.exact_virtual_sizes)
         self._writing: weakref.WeakSet[_FatFile] = weakref.WeakSet()
-
-    def is_virtual(self, path: bytes) -> bool:
-        """Whether `path` lies in an `@` tree."""
-        return self.virtual is not None and self.virtual.owns(path)
 
     def entries(self, path: bytes) -> list[Entry]:
         """Return the directory in readdir order; FAT has no dot entries."""
-        if self.virtual is not None and self.virtual.owns(path):
+        if self.virtual.owns(path):
             return self.virtual.entries(path)
         found = self._tree.entries(self._resolve(path))
         if self._fat:
@@ -88,7 +82,7 @@ class Storage:
 
     def stat(self, path: bytes) -> Stat:
         """Describe `path`."""
-        if self.virtual is not None and self.virtual.owns(path):
+        if self.virtual.owns(path):
             return self.virtual.stat(path)
         return self._tree.stat(self._resolve(path))
 
@@ -96,7 +90,7 @@ class Storage:
         self, path: bytes, *, write: bool = False, create: bool = False, truncate: bool = False
     ) -> OpenFile:
         """Open a file."""
-        if self.virtual is not None and self.virtual.owns(path):
+        if self.virtual.owns(path):
             return self.virtual.open(path, write=write)
         if create:
             self._check_name(path)
@@ -115,7 +109,7 @@ class Storage:
 
     def crc(self, path: bytes) -> tuple[int, int]:
         """Return the CRC32 of a file and how many bytes went into it."""
-        if self.virtual is not None and self.virtual.owns(path):
+        if self.virtual.owns(path):
             content = self.virtual.content(path, block=64)
             return crc32(content), len(content)
         opened = self._tree.open(self._resolve(path))
@@ -200,7 +194,7 @@ class Storage:
         return target
 
     def _refuse_virtual(self, path: bytes) -> None:
-        if self.is_virtual(path):
+        if self.virtual.owns(path):
             raise fail(errno.EROFS, path)
 
     def _check_name(self, path: bytes) -> None:

@@ -111,8 +111,7 @@ class FtpServer:
         """
         self.firmware.crashed = False
         self._storage.lose_power()
-        if self._storage.virtual is not None:
-            self._storage.virtual.reboot()
+        self._storage.virtual.reboot()
         self.firmware.reboot(now)
 
     @property

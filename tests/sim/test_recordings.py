@@ -21,7 +21,7 @@ import pytest
 from mavftpfs.link.messages import Address
 from mavftpfs.protocol.payload import Payload
 from mavftpfs.sim.profiles import PROFILES
-from mavftpfs.sim.pseudo import VirtualTrees, pack_parameters, unpack_parameters
+from mavftpfs.sim.pseudo import Param, VirtualTrees, pack_parameters
 from mavftpfs.sim.tree import MemoryTree
 from mavftpfs.sim.vehicle import FtpServer
 from tests.support.replies import decode_reply
@@ -131,6 +131,22 @@ def build_virtual(name: str, steps: list[Step]) -> VirtualTrees | None:
         sys_files=sys_files,
         romfs={b"locations.txt": locations, b"models/x": b""},
     )
+
+
+def unpack_parameters(packed: bytes) -> list[Param]:
+    """Parse param.pck: each name lies over the one before it; pad bytes are skipped."""
+    params: list[Param] = []
+    at, last = 6, b""
+    while at < len(packed):
+        if packed[at] == 0:
+            at += 1
+            continue
+        kind, lengths = packed[at] & 15, packed[at + 1]
+        start = at + 3 + (lengths >> 4)
+        last = last[: lengths & 15] + packed[at + 2 : start]
+        at = start + {1: 1, 2: 2, 3: 4, 4: 4}[kind]
+        params.append(Param(last, kind, packed[start:at]))
+    return params
 
 
 # -- the replay ----------------------------------------------------------------------------------

@@ -33,7 +33,7 @@ FAULTS = {
     "fault replay": "replay-slot collision, restarted client, seq wrap",
     "fault refused retry": "retried side effect answered by a refusal",
     "fault burst end": "burst_complete spurious or never; no EOF NAK, or a wrong offset in it",
-    "fault long frames": "frames lost by their length: beyond a limit, or with any piece of them",
+    "fault long frames": "frames beyond a length are lost",
     "fault chunk size": "chunk size differs from asked; short chunk in mid-file",
     "fault corrupt": "corrupt, cut, oversize, wrong target, foreign client",
     "fault NAK": "NAK at each step, every code",

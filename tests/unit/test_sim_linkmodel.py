@@ -68,23 +68,13 @@ def test_half_duplex_shares_the_air_in_turn() -> None:
 
 
 @pytest.mark.parametrize(
-    ("fields", "size", "low", "high"),
-    [
-        ({"loss": 0.1}, 1, 0.08, 0.12),
-        ({"burst_loss": 0.1}, 1, 0.06, 0.14),
-        ({"loss": 1.0}, 1, 1.0, 1.0),
-        ({"byte_loss": 1e-3}, 266, 0.21, 0.26),
-        ({"byte_loss": 1e-3}, 30, 0.02, 0.04),
-        ({"piece": 64, "piece_loss": 0.1}, 266, 0.39, 0.43),
-        ({"piece": 64, "piece_loss": 0.1}, 64, 0.09, 0.11),
-    ],
+    ("fields", "low", "high"),
+    [({"loss": 0.1}, 0.08, 0.12), ({"burst_loss": 0.1}, 0.06, 0.14), ({"loss": 1.0}, 1.0, 1.0)],
 )
-def test_loss_has_the_share_it_was_given(
-    fields: dict[str, float], size: int, low: float, high: float
-) -> None:
+def test_loss_has_the_share_it_was_given(fields: dict[str, float], low: float, high: float) -> None:
     link = model(**fields)
     for i in range(10_000):
-        link.push(UP, bytes(size), float(i))
+        link.push(UP, b"x", float(i))
     link.pop(UP, 1e6)
     assert low <= link.counters(UP).lost / 10_000 <= high
 
