@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 from mavftpfs.link.messages import Address
-from mavftpfs.protocol.payload import Opcode
+from mavftpfs.protocol.payload import HEADER_SIZE, NakCode, Opcode, Payload, decode_request
 from tests.support.worlds import World
 
 _OPCODE, _REQ_OPCODE = 3, 5
@@ -13,11 +14,35 @@ LOST = 400
 """Bytes that a card forgets: less than a sector."""
 
 
+@dataclass
+class _Meeting:
+    """What happens at the nth of the requests of a kind from now on, and at `times` - 1 more after it."""
+
+    opcode: Opcode
+    nth: int
+    times: int
+    action: Callable[[], object]
+    nak: bytes | None = None
+    drop: bool = False
+
+    def comes(self, opcode: int) -> bool:
+        """Count a request; return whether this one is meant."""
+        if opcode == self.opcode:
+            self.nth -= 1
+        return opcode == self.opcode and -self.times < self.nth <= 0
+
+    @property
+    def over(self) -> bool:
+        """Whether nothing more is to happen."""
+        return self.nth <= 1 - self.times
+
+
 class Faults:
     """Stands between a world's vehicle and its FTP server.
 
     Attributes:
         requests: opcodes that reached the server so far. refused: opcodes of requests that were NAKed.
+        spoil: in so many more WriteFiles the first byte arrives as another one.
     """
 
     def __init__(self, world: World) -> None:
@@ -28,7 +53,9 @@ class Faults:
         self._lose: list[int] = []
         self._deaf: set[int] = set()
         self._counted: dict[int, Callable[[], None]] = {}
-        self._hooks: list[tuple[int, Callable[[], None]]] = []
+        self._meetings: list[_Meeting] = []
+        self._naks: list[tuple[Address, bytes]] = []
+        self.spoil = 0
         self._repeated: set[int] = set()
         server = world.vehicle.server
         self._handle, self._outgoing = server.handle, server.outgoing
@@ -47,9 +74,19 @@ class Faults:
         """Have requests of this kind neither executed nor answered."""
         self._deaf.add(int(opcode))
 
-    def at(self, opcode: Opcode, action: Callable[[], None]) -> None:
-        """Do something before the next request of this kind is executed."""
-        self._hooks.append((int(opcode), action))
+    def at(self, opcode: Opcode, action: Callable[[], object], *, nth: int = 1, drop: bool = False) -> None:
+        """Do something before the nth request of this kind from now on is executed. drop: it never is."""
+        self._meetings.append(_Meeting(opcode, nth, 1, action, drop=drop))
+
+    def refuse(
+        self, opcode: Opcode, code: int, number: int | None = None, *, nth: int = 1, times: int = 1
+    ) -> None:
+        """NAK the nth request of this kind from now on, and `times` - 1 more, without executing them.
+        number: the errno that goes with FAIL_ERRNO."""
+        if number is not None:
+            assert code == NakCode.FAIL_ERRNO
+        nak = bytes([code]) if number is None else bytes([code, number])
+        self._meetings.append(_Meeting(opcode, nth, times, lambda: None, nak))
 
     def after(self, count: int, action: Callable[[], None]) -> None:
         """Do something when `count` more requests came to the server, before the last of them is executed."""
@@ -60,8 +97,9 @@ class Faults:
         self._repeated.add(len(self.requests) + count)
 
     def call_off(self) -> None:
-        """Let what was to happen at a count of requests not happen any more."""
+        """Let what was to happen at certain requests not happen any more."""
         self._counted.clear()
+        self._meetings.clear()
         self._repeated.clear()
 
     def _on_request(self, wire: bytes, source: Address, now: float) -> None:
@@ -75,13 +113,24 @@ class Faults:
             return
         self.requests.append(wire[_OPCODE])
         self._counted.pop(len(self.requests), lambda: None)()
-        for hook in [hook for hook in self._hooks if hook[0] == wire[_OPCODE]]:
-            self._hooks.remove(hook)
-            hook[1]()
-        self._handle(wire, source, now)
+        met = [meeting for meeting in self._meetings if meeting.comes(wire[_OPCODE])]
+        self._meetings = [meeting for meeting in self._meetings if not meeting.over]
+        for meeting in met:
+            meeting.action()
+        naks = [meeting.nak for meeting in met if meeting.nak is not None]
+        if naks:
+            self._naks.append((source, _refusal(decode_request(wire), naks[0])))
+        elif not any(meeting.drop for meeting in met):
+            self._handle(self._spoiled(wire), source, now)
+
+    def _spoiled(self, wire: bytes) -> bytes:
+        if wire[_OPCODE] != Opcode.WRITE_FILE or not self.spoil:
+            return wire
+        self.spoil -= 1
+        return wire[:HEADER_SIZE] + bytes([wire[HEADER_SIZE] ^ 1]) + wire[HEADER_SIZE + 1 :]
 
     def _on_replies(self, now: float) -> list[tuple[Address, bytes]]:
-        replies = self._outgoing(now)
+        replies, self._naks = [*self._naks, *self._outgoing(now)], []
         self.refused += [wire[_REQ_OPCODE] for _, wire in replies if wire[3] == Opcode.NAK]
         return [reply for reply in replies if not self._is_lost(reply[1])]
 
@@ -95,6 +144,13 @@ class Faults:
 
     def _is_cut(self) -> bool:
         return self._cut_after is not None and len(self.requests) >= self._cut_after
+
+
+def _refusal(request: Payload, data: bytes) -> bytes:
+    reply = Payload(
+        (request.seq + 1) & 0xFFFF, request.session, Opcode.NAK, len(data), request.opcode, data=data
+    )
+    return reply.encode()
 
 
 def power_goes_at_close(world: World, *, downtime: float, beat_after: float) -> None:
