@@ -23,7 +23,7 @@ from mavftpfs.cache.names import Names
 from mavftpfs.cache.nodes import Attempt, Node
 from mavftpfs.cache.recovery import describe
 from mavftpfs.cache.repair import Cleaner
-from mavftpfs.cache.reserved import Kind, Places
+from mavftpfs.cache.reserved import Kind
 from mavftpfs.cache.throttle import Throttle
 from mavftpfs.cache.verify import Verifier
 from mavftpfs.shared.errors import (
@@ -162,11 +162,10 @@ class Deliverer:
             node.draft.give_up()
         try:
             await attempt.upload.abort()
-            if attempt.places is not None and attempt.upload.begun:
+            if not attempt.in_place and attempt.upload.begun:
                 await self._names.discard(attempt.path)
         finally:
-            if attempt.places is not None:
-                self._context.own.live -= attempt.places.all
+            self._context.own.live.discard(attempt.path)
 
     # --- one delivery
 
@@ -248,12 +247,12 @@ class Deliverer:
             raise RemoteProtocolError(f"{attempt.path!r} was said to be finished, and was not")
         doubted = store.in_doubt() or store.doubted_since(attempt.begun_at)
         crc32 = await self.verifier.check(attempt.path, draft, doubted=doubted)
-        if attempt.places is None:
+        if attempt.in_place:
             node.attempt = None
             await attempt.upload.abort()
         else:
             await self._require_expected(node, draft)
-            await self._commit(node, draft, attempt, attempt.places)
+            await self._commit(node, draft, attempt)
         self._on_delivered(node, draft, crc32)
 
     async def _attempt(self, node: Node, draft: Draft) -> Attempt:
@@ -263,7 +262,7 @@ class Deliverer:
             return attempt
         if attempt is not None:
             await self.abandon(node)
-        context, places = self._context, None
+        context, path = self._context, node.path
         # A card may have no room beside the file that `inplace` replaces, and never tell.
         ask_first = draft.size > SENT_TWICE or (context.options.inplace and draft.base is not None)
         if ask_first and context.store.traits.rename_works is None:
@@ -271,23 +270,20 @@ class Deliverer:
             in_place = self._is_in_place(draft)
         if in_place or isinstance(node.error, AlreadyExists):  # which all of it was sent for
             await self._require_expected(node, draft)
-        if not in_place and draft.base is None:
-            places = Places(context.own.beside(node.path, Kind.FRESH))
-        elif not in_place:
-            places = context.own.places(node.path)
-        path, live = (node.path, set[bytes]()) if places is None else (places.new, places.all)
-        context.own.live |= live
+        if not in_place:
+            path = context.own.beside(node.path, Kind.NEW)
+            context.own.live.add(path)
         begun_at = context.clock()
         try:
-            sending = draft.begin(in_place=places is None)
+            sending = draft.begin(in_place=in_place)
             sending.progress = self._throttle.on_acked
             upload = await context.store.open_upload(path, sending)
         except BaseException:
             draft.give_up()
-            context.own.live -= live
+            context.own.live.discard(path)
             raise
-        node.attempt = Attempt(path, places, sending, upload, begun_at)
-        if places is None:
+        node.attempt = Attempt(path, in_place, sending, upload, begun_at)
+        if in_place:
             context.directories.put(path, DirEntry(b"", EntryKind.FILE))
         return node.attempt
 
@@ -305,7 +301,7 @@ class Deliverer:
         elif draft.base is None and not draft.begun and not await self._names.is_free(node.path):
             raise AlreadyExists(f"{node.path!r} was made by somebody else in the meantime")
 
-    async def _commit(self, node: Node, draft: Draft, attempt: Attempt, places: Places) -> None:
+    async def _commit(self, node: Node, draft: Draft, attempt: Attempt) -> None:
         """Rename what was sent and verified into place.
 
         Raises:
@@ -320,12 +316,12 @@ class Deliverer:
                 draft.give_up()
                 self._context.directories.expire(split(path)[0])
                 raise
-            self._context.directories.put(places.new, DirEntry(b"", EntryKind.FILE, draft.size))
+            self._context.directories.put(attempt.path, DirEntry(b"", EntryKind.FILE, draft.size))
             draft.on(Event.COMMITS)
-            if places.old is None:
-                await self._names.rename(places.new, path)
+            if draft.base is None:
+                await self._names.rename(attempt.path, path)
             else:
-                await self._names.replace(places.new, path, places)
+                await self._names.replace(attempt.path, path)
             if attempt.upload.resent and await self._names.size(path) != draft.size:
                 draft.interrupted(ours=True)
                 raise VerificationFailed(f"{path!r} was emptied by a request that came twice")
@@ -339,7 +335,7 @@ class Deliverer:
                     await self._names.discard(attempt.path)
             raise
         finally:
-            own.live -= places.all  # what is left there is for the next listing to clean up
+            own.live.discard(attempt.path)  # what is left there is for the next listing to clean up
 
     # --- after
 

@@ -24,7 +24,7 @@ from contextlib import asynccontextmanager
 import trio
 
 from mavftpfs.cache.context import Context
-from mavftpfs.cache.reserved import Kind, Places, is_reserved, parse
+from mavftpfs.cache.reserved import Kind, is_reserved, parse
 from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.shared.errnos import errno_for
 from mavftpfs.shared.errors import (
@@ -203,8 +203,8 @@ class Names:
         """
         context = self._context
         try:
-            first = context.own.beside(near, Kind.FRESH)
-            second = context.own.beside(first, Kind.FRESH)
+            first = context.own.beside(near, Kind.NEW)
+            second = context.own.beside(first, Kind.NEW)
         except PathTooLong:
             return
         context.own.live |= {first, second}
@@ -242,8 +242,11 @@ class Names:
 
     # --- giving a verified file its name
 
-    async def replace(self, source: bytes, target: bytes, places: Places, *, keep_old: bool = False) -> None:
-        """Rename over a file that exists; with keep_old that lies at `places.old` afterwards.
+    async def replace(self, source: bytes, target: bytes, *, keep_old: bool = False) -> bytes | None:
+        """Rename over a file that exists.
+
+        keep_old: return the reserved name that this file has from now on, which is in `OwnNames.live`; None
+        if it was gone.
 
         One rename does where the server never leaves the name without a file. NuttX, where storages are
         mounted at /fs/NAME, removes the old one first (servers.md 9).
@@ -257,18 +260,19 @@ class Names:
             try:
                 await self.rename(source, target, over=True)
                 traits.rename_replaces = True
-                return
+                return None
             except FtpNak as nak:
                 if errno_for(nak) in _HONEST:
                     raise
                 if nak.code == NakCode.FILE_EXISTS:  # an errno may be a stale one
                     traits.rename_replaces = False
                 log.debug("the server does not rename %r over %r: %s", source, target, nak)
-        assert places.old is not None
-        moved = None
+        own, moved = self._context.own, None
+        aside = own.beside(target, Kind.OLD)
+        own.live.add(aside)
         try:
             try:
-                await self.rename(target, places.old)
+                await self.rename(target, aside)
                 moved = True
             except FtpNak as nak:
                 gone = errno_for(nak) == errno.ENOENT
@@ -278,17 +282,24 @@ class Names:
             await self.rename(source, target, completes=moved)
         except (OutcomeUnknown, trio.Cancelled):
             if moved is not False:
-                self.note_torn(target, places.old)
+                self._note_torn(target, aside)
             raise
         except MavftpfsError:
             if moved:
-                await self._undo(places.old, target)
+                await self._undo(aside, target)
             raise
-        self._context.own.mended((places.old,))
-        if moved and not keep_old:
-            await self.discard(places.old)
+        finally:
+            own.live.discard(aside)
+        if moved and keep_old:
+            own.live.add(aside)
+            return aside
+        if moved:
+            await self.discard(aside)
+        return None
 
-    def note_torn(self, path: bytes, place: bytes) -> None:
+    # --- inside
+
+    def _note_torn(self, path: bytes, place: bytes) -> None:
         """The file of a name may lie at `place` beside it for now: show it on, and have that listed."""
         context = self._context
         entry = context.directories.entry(path) or context.directories.entry(place)
@@ -298,8 +309,6 @@ class Names:
         context.retry_later()
         context.directories.expire(split(path)[0])
         log.warning("%r may lie under %r until the vehicle is heard again", path, place)
-
-    # --- inside
 
     @asynccontextmanager
     async def _changing(self, *paths: bytes) -> AsyncIterator[None]:
@@ -315,7 +324,7 @@ class Names:
         try:
             await self.rename(place, path, completes=True)
         except BaseException as error:
-            self.note_torn(path, place)
+            self._note_torn(path, place)
             if not isinstance(error, MavftpfsError):
                 raise
             log.debug("%r did not get its file back: %s", path, error)

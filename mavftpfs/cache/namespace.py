@@ -216,15 +216,9 @@ class Namespace:
         keep = displaced is not None and displaced.needs_card
         try:
             if listed is not None and listed.kind is EntryKind.FILE:
-                places = context.own.places(new)
-                context.own.live |= places.all
-                try:
-                    await self._names.replace(old, new, places, keep_old=keep)
-                    if keep and displaced is not None and places.old is not None:
-                        await self._on_hidden(displaced, places.old)
-                finally:
-                    context.own.live -= places.all
-                    context.own.live |= context.nodes.hidden.keys()
+                kept = await self._names.replace(old, new, keep_old=keep)
+                if kept is not None and displaced is not None:
+                    await self._on_hidden(displaced, kept)
             else:
                 if listed is not None:
                     await self._names.remove_directory(new)

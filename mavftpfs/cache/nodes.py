@@ -17,7 +17,6 @@ import trio
 from mavftpfs.cache.draft import Base, Draft, State
 from mavftpfs.cache.files import FileHandle
 from mavftpfs.cache.remote import Upload
-from mavftpfs.cache.reserved import Places
 from mavftpfs.cache.spool import Spool, SpoolContent
 from mavftpfs.shared.errors import FileChanged, MavftpfsError
 from mavftpfs.shared.model import rename_keys
@@ -28,12 +27,12 @@ from mavftpfs.shared.sending import Sending
 class Attempt:
     """One try to deliver a draft.
 
-    path: where its bytes go. places: the reserved names, None where it is sent under the file's own name.
+    path: where its bytes go: a reserved name, or the file's own if it is sent `in_place`.
     begun_at: when, by the caches' clock.
     """
 
     path: bytes
-    places: Places | None
+    in_place: bool
     sending: Sending
     upload: Upload
     begun_at: float
@@ -42,7 +41,7 @@ class Attempt:
         """Return whether what it sent is still right, and where it goes is."""
         if self.sending is not draft.sending or self.sending.overtaken:
             return False
-        return in_place == (self.places is None)
+        return in_place == self.in_place
 
 
 @dataclass(slots=True, eq=False)
@@ -88,7 +87,7 @@ class Node:
         """Whether what has its name on the vehicle is being changed, or was perhaps."""
         if self.draft is None:
             return False
-        in_place = self.attempt is not None and self.attempt.places is None
+        in_place = self.attempt is not None and self.attempt.in_place
         return in_place or self.draft.begun or self.draft.state in (State.COMMITTING, State.TORN)
 
     @asynccontextmanager

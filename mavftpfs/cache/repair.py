@@ -1,39 +1,31 @@
 """What becomes of reserved names that an interruption left on the card. Layer: cache.
 
-`repair` decides from names alone, `Cleaner` does it whenever a listing shows such names.
-
-new, old and target have the same number (see `reserved`):
-  fresh (a new file's content)  remove
-  deleted                       remove
-  target there                  remove new, then old
-  target missing, old and new   rename new to target (it was verified before old was moved), remove old
-  target missing, old only      rename old to target
-  target missing, new only      rename new to `recovered-tSSS-NAME`: somebody else removed the target, and
-                                nobody can tell whether new is complete
-  target not known, old         rename both to `recovered-...`: it may be the only copy
-  target not known, new only    remove: old is moved aside before new is needed
+`leftovers` finds them in a listing, `Cleaner` acts on each:
+  what was sent, or was deleted  is removed: who sent it was not told that it is on the card
+  an old file, its name there    is removed: the new one has the name
+  an old file, its name missing  gets its name again
+  an old file of unknown name    is renamed to `recovered-oSSS`: it may be the only copy
 Nothing is touched while its owner may be alive: see STALE_AFTER.
 """
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from contextlib import suppress
-from dataclasses import dataclass, replace
 
 from mavftpfs.cache.context import Context
 from mavftpfs.cache.directories import Directory
 from mavftpfs.cache.names import Names
 from mavftpfs.cache.nodes import Node
-from mavftpfs.cache.reserved import MAX_NAME, Kind, is_reserved, parse
+from mavftpfs.cache.reserved import Kind, Reserved, is_reserved, parse
 from mavftpfs.shared.errors import MavftpfsError, NotADirectory, NotFound
-from mavftpfs.shared.model import MAX_WIRE_PATH, RENAME_ROOM, DirEntry, EntryKind, join, split
+from mavftpfs.shared.model import DirEntry, EntryKind, join, split
 
 log = logging.getLogger("mavftpfs.cache")
 
-MAX_GROUPS = 64
-"""Interrupted replacements mended per listing."""
+MAX_LEFTOVERS = 128
+"""Names mended per listing."""
 
 STALE_AFTER = 600.0
 """Seconds a stranger's reserved name must have stayed the same before it counts as left behind."""
@@ -42,75 +34,19 @@ MAX_SEEN = 1024
 """Of how many such names it is remembered since when they are the same."""
 
 
-@dataclass(frozen=True, slots=True)
-class Action:
-    """One step of a repair: remove a path, or rename it to `to`."""
-
-    path: bytes
-    to: bytes | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class Group:
-    """What one replacement left in a directory: the paths by kind, and the target's path if known."""
-
-    paths: Mapping[Kind, bytes]
-    serial: bytes
-    target: bytes | None
-
-
 def leftovers(
     directory: bytes, entries: Iterable[DirEntry], is_dead: Callable[[bytes, bytes, DirEntry], bool]
-) -> list[Group]:
-    """Return what interrupted work left in a listing.
+) -> list[tuple[bytes, Reserved]]:
+    """Return the paths in a listing that interrupted work left, files whose name may be missing first.
 
-    is_dead(path, owner, entry): whether nobody works with that name any more. A group is left alone unless
-    all of it is dead. Directories are never ours.
+    is_dead(path, owner, entry): whether nobody works with that name any more. Directories are never ours.
     """
-    found: dict[tuple[bytes, bytes], dict[Kind, tuple[bytes, DirEntry, bytes | None]]] = {}
+    found = []
     for entry in entries:
-        name = parse(entry.name)
-        if name is None or entry.kind is EntryKind.DIRECTORY:
-            continue
-        group = found.setdefault((name.owner, name.serial), {})
-        group[name.kind] = (join(directory, entry.name), entry, name.target)
-    groups = []
-    for (owner, serial), parts in sorted(found.items()):
-        # Every part is asked about, so that each one's age is noted.
-        dead = [is_dead(path, owner, entry) for path, entry, _ in parts.values()]
-        if not all(dead):
-            continue
-        targets = {target for _, _, target in parts.values() if target is not None}
-        target = join(directory, targets.pop()) if len(targets) == 1 else None
-        groups.append(Group({kind: path for kind, (path, _, _) in parts.items()}, serial, target))
-    return groups
-
-
-def repair(group: Group, *, target_exists: bool) -> list[Action]:
-    """Return the steps that undo or complete an interrupted replacement; any may be the last one done.
-
-    `target_exists` is asked for groups with a target.
-    """
-    order = (Kind.DELETED, Kind.FRESH, Kind.NEW, Kind.OLD)
-    paths = [group.paths[kind] for kind in order if kind in group.paths]
-    new, old = group.paths.get(Kind.NEW), group.paths.get(Kind.OLD)
-    if target_exists or (old is None and (new is None or group.target is None)):
-        return [Action(path) for path in paths]
-    if group.target is None or old is None:
-        return [Action(path, _recovered(group, path)) for path in (old, new) if path is not None]
-    if new is None:
-        return [Action(old, group.target)]
-    return [Action(new, group.target), Action(old)]
-
-
-def _recovered(group: Group, path: bytes) -> bytes:
-    name = parse(split(path)[1])
-    assert name is not None
-    target = b"" if group.target is None else b"-" + split(group.target)[1]
-    tail = name.kind.value + group.serial + target
-    directory = split(path)[0]
-    room = min(MAX_NAME, MAX_WIRE_PATH - len(directory) - 1, RENAME_ROOM - len(path) - len(directory) - 2)
-    return join(directory, (b"recovered-" + tail)[: max(room, 14)])
+        name, path = parse(entry.name), join(directory, entry.name)
+        if name is not None and entry.kind is not EntryKind.DIRECTORY and is_dead(path, name.owner, entry):
+            found.append((path, name))
+    return sorted(found, key=lambda left: left[1].kind is not Kind.OLD)
 
 
 class Cleaner:
@@ -128,10 +64,8 @@ class Cleaner:
 
     async def on_swept(self, path: bytes, directory: Directory) -> None:
         """A directory was listed. Raises nothing of ours: the listing is right without us."""
-        reserved, own = [], self._context.own
-        for name, entry in directory.entries.items():
-            if is_reserved(name):
-                reserved.append(entry)
+        own = self._context.own
+        reserved = [entry for name, entry in directory.entries.items() if is_reserved(name)]
         if directory is self._context.directories.known(path):
             for torn in list(own.torn):
                 parent, name = split(torn)
@@ -141,9 +75,9 @@ class Cleaner:
             return
         self._busy.add(path)
         try:
-            for group in leftovers(path, reserved, self._is_dead)[:MAX_GROUPS]:
-                if not self._context.blocked or self._is_torn(group):
-                    await self._mend(group)
+            for left, ours in leftovers(path, reserved, self._is_dead)[:MAX_LEFTOVERS]:
+                if not self._context.blocked or left in own.torn.values():
+                    await self._mend(left, ours)
         except MavftpfsError as error:
             log.info("%r is cleaned up at a later listing: %s", path, error)
         finally:
@@ -171,9 +105,6 @@ class Cleaner:
         except MavftpfsError as error:
             log.info("%r is mended at a later listing: %s", directory, error)
 
-    def _is_torn(self, group: Group) -> bool:
-        return not set(self._context.own.torn.values()).isdisjoint(group.paths.values())
-
     def _is_dead(self, path: bytes, owner: bytes, entry: DirEntry) -> bool:
         if path in self._context.own.live:
             return False
@@ -186,31 +117,24 @@ class Cleaner:
                 del self._seen[next(iter(self._seen))]
         return now - seen[1] >= STALE_AFTER
 
-    async def _mend(self, group: Group) -> None:
-        if group.target is None:
-            for path, place in self._context.own.torn.items():
-                if place in group.paths.values():
-                    group = replace(group, target=path)
-        context, torn, exists = self._context, self._is_torn(group), False
-        if group.target is not None:
-            with suppress(NotFound, NotADirectory):
-                await context.directories.find(group.target)
-                exists = True
-            node = context.nodes.get(group.target)
-            if (
-                not exists
-                and node is not None
-                and node.delivery is not None
-                and node not in self._being_delivered
-            ):
+    async def _mend(self, left: bytes, name: Reserved) -> None:
+        """Remove what is left, or give it its name."""
+        context, parent = self._context, split(left)[0]
+        torn = [path for path, place in context.own.torn.items() if place == left]
+        target = torn[0] if torn else join(parent, name.target or b"recovered-o" + name.serial)
+        if name.kind is not Kind.OLD or await self._exists(target):
+            await self._names.remove(left)
+        else:
+            node = context.nodes.get(target)
+            if node is not None and node.delivery is not None and node not in self._being_delivered:
                 return  # it is being written here: a later listing shows what came of it
-        for action in repair(group, target_exists=exists):
-            if action.to is None:
-                await self._names.remove(action.path)
-                continue
-            log.warning("%r was left by an interruption: renaming it to %r", action.path, action.to)
-            await self._names.rename(action.path, action.to, completes=torn)
-            if action.to == group.target and action.path != group.paths.get(Kind.OLD):
-                context.files.on_changed(action.to)
-            context.own.mended(group.paths.values())
+            log.warning("%r was left by an interruption: renaming it to %r", left, target)
+            await self._names.rename(left, target, completes=bool(torn))
+            context.own.mended(left)
         self.mended += 1
+
+    async def _exists(self, path: bytes) -> bool:
+        with suppress(NotFound, NotADirectory):
+            await self._context.directories.find(path)
+            return True
+        return False

@@ -2,12 +2,11 @@
 
 A reserved name is `.mavftpfs-OOOOkSSS` or `.mavftpfs-OOOOkSSS-NAME`: OOOO is the token of the mount that made
 it, SSS counts, and the kind k is
-  n  the content of a file that is new, perhaps incomplete;
-  t  the new content of NAME, which exists, perhaps incomplete;
-  o  the old NAME, moved aside only after the new content was verified;
+  n  what is sent of a file, perhaps incomplete (version 0.1 used t for some of these);
+  o  the old file of NAME, moved aside until the new one has its name;
   d  a file that was unlinked while somebody has it open.
-They lie beside the file they belong to. n and d have the short form; t and o have it where NAME does not fit:
-a rename carries both paths in one request of 238 bytes.
+They lie beside the file they belong to. Only o tells its NAME, if that fits: a rename carries both paths in
+one request of 238 bytes.
 
 `repair` says what becomes of those that an interruption left.
 """
@@ -15,7 +14,6 @@ a rename carries both paths in one request of 238 bytes.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import Enum
 from random import Random
@@ -44,8 +42,7 @@ _OWNER_LENGTH = 4
 class Kind(Enum):
     """What a reserved name stands for."""
 
-    FRESH = b"n"
-    NEW = b"t"
+    NEW = b"n"
     OLD = b"o"
     DELETED = b"d"
 
@@ -64,22 +61,6 @@ class Reserved:
         """The directory entry's name."""
         short = PREFIX + self.owner + self.kind.value + self.serial
         return short if self.target is None else short + b"-" + self.target
-
-
-@dataclass(frozen=True, slots=True)
-class Places:
-    """The reserved paths of one delivery.
-
-    new: what is sent. old: the file that is replaced, moved aside; None for a new file.
-    """
-
-    new: bytes
-    old: bytes | None = None
-
-    @property
-    def all(self) -> set[bytes]:
-        """Every path of it."""
-        return {self.new, self.old or self.new}
 
 
 def is_reserved(name: bytes) -> bool:
@@ -107,7 +88,7 @@ def parse(name: bytes) -> Reserved | None:
     if match is None:
         return None
     owner, kind, serial, target = match.groups()
-    return Reserved(owner, Kind(kind), serial, target)
+    return Reserved(owner, Kind(kind.replace(b"t", b"n")), serial, target)
 
 
 def new_owner(rng: Random) -> bytes:
@@ -137,26 +118,20 @@ class OwnNames:
         self._serial = rng.randrange(_SERIALS)
 
     def beside(self, target: bytes, kind: Kind) -> bytes:
-        """Return a path in the target's directory that does not tell its name. Raises PathTooLong."""
-        path = join(split(target)[0], Reserved(self.owner, kind, self._next_serial()).name)
-        if not fits_rename(path, target):
-            raise PathTooLong(f"{target!r} is too long for a temporary name beside it")
-        return path
+        """Return a path in the target's directory. Raises PathTooLong."""
+        number = self._serial = (self._serial + 1) % _SERIALS
+        serial = bytes((_ALPHABET[number >> 10], _ALPHABET[number >> 5 & 31], _ALPHABET[number & 31]))
+        parent, name = split(target)
+        for told in (name, None) if kind is Kind.OLD else (None,):
+            ours = Reserved(self.owner, kind, serial, told).name
+            path = join(parent, ours)
+            if len(ours) <= MAX_NAME and len(path) <= MAX_WIRE_PATH and fits_rename(path, target):
+                return path
+        raise PathTooLong(f"{target!r} is too long for a temporary name beside it")
 
-    def places(self, target: bytes) -> Places:
-        """Return where to keep what replaces `target`. Raises PathTooLong."""
-        serial, (parent, name) = self._next_serial(), split(target)
-        for told in (name, None):
-            ours = Reserved(self.owner, Kind.NEW, serial, told).name
-            new, old = join(parent, ours), join(parent, Reserved(self.owner, Kind.OLD, serial, told).name)
-            if len(ours) <= MAX_NAME and len(new) <= MAX_WIRE_PATH and fits_rename(new, target):
-                return Places(new, old)
-        raise PathTooLong(f"{target!r} is too long for temporary names beside it")
-
-    def mended(self, places: Iterable[bytes]) -> None:
+    def mended(self, place: bytes) -> None:
         """What lay there has its name again."""
-        where = set(places)
-        self.torn = {path: place for path, place in self.torn.items() if place not in where}
+        self.torn = {path: where for path, where in self.torn.items() if where != place}
 
     def follow_rename(self, old: bytes, new: bytes) -> None:
         """A directory has another name."""
@@ -166,7 +141,3 @@ class OwnNames:
         for path in list(self.live):
             self.live.remove(path)
             self.live.add(renamed(path, old, new))
-
-    def _next_serial(self) -> bytes:
-        number = self._serial = (self._serial + 1) % _SERIALS
-        return bytes((_ALPHABET[number >> 10], _ALPHABET[number >> 5 & 31], _ALPHABET[number & 31]))

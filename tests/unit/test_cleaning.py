@@ -13,8 +13,7 @@ from mavftpfs.cache.repair import Cleaner
 from mavftpfs.cache.reserved import Kind, Reserved
 from mavftpfs.cache.tree import Tree
 from mavftpfs.shared.model import DirEntry, EntryKind
-from tests.support.fake_store import read_file
-from tests.support.fake_writer import KINDS, FakeWriter, litter
+from tests.support.fake_writer import KINDS, FakeWriter
 
 OLD = bytes(range(256)) * 4
 DIRECTORY = b"/card/dir"
@@ -54,18 +53,3 @@ async def test_only_a_listing_that_counts_proves_a_torn_name_whole(store: FakeWr
     store.add(FILE, OLD)
     await tree.list(DIRECTORY)
     assert context.own.torn == {}
-
-
-async def test_a_file_that_took_the_place_of_another_is_read_anew(store: FakeWriter, tree: Tree) -> None:
-    """The new content of a replacement that was completed later is not served from what is remembered."""
-    store.add(FILE, OLD)
-    assert await read_file(tree, FILE) == OLD
-    context = parts(tree)[0]
-    new, old = (DIRECTORY + b"/" + reserved(tree, kind) for kind in (Kind.NEW, Kind.OLD))
-    context.own.torn[FILE] = old
-    store.files[old] = store.files.pop(FILE)
-    store.add(new, OLD[::-1])  # of the same size
-    context.directories.expire(DIRECTORY)
-    assert await read_file(tree, FILE) == OLD[::-1]
-    assert context.own.torn == {}
-    assert litter(store) == []
