@@ -313,14 +313,16 @@ class Directories:
         Raises:
             As get; VehicleLost instead of an old listing.
         """
-        known = None if began is None else self.fresh(path)
-        if known is not None and began is not None and known.listed_at >= began:
-            return known
-        asked = self.clock()
-        self.expire(path)
+        since = self.clock() if began is None else began
         for _ in range(SWEEP_TRIES):
+            sweep = self._sweeps.get(path)
+            if sweep is None or sweep.void or sweep.began < since:
+                known = self.fresh(path)
+                if began is not None and known is not None and known.listed_at >= began:
+                    return known
+                self.expire(path)
             directory = await self.get(path)
-            if directory.listed_at >= asked:
+            if directory.listed_at >= since:
                 return directory
         raise VehicleLost("the vehicle does not answer")
 

@@ -39,7 +39,6 @@ from mavftpfs.shared.errnos import errno_for
 from mavftpfs.shared.errors import (
     DataUnproven,
     FileChanged,
-    FileTooLarge,
     FtpNak,
     IsADirectory,
     LocalProtocolError,
@@ -51,14 +50,8 @@ from mavftpfs.shared.model import DirEntry, EntryKind, split
 MAX_CLOSED = 4096
 """How many files that nobody has open are remembered with their blocks."""
 
-WRAP = 1 << 32
-"""Open replies tell sizes modulo this, and no request reaches beyond it; MAVSDK lists true sizes."""
-
 READING = 3.0
 """Seconds for which a file of which bytes came counts as being read."""
-
-MAX_TRIES = 5
-"""How often a version is compared because the vehicle opened it anew meanwhile."""
 
 PAUSES = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
 """Seconds that a read waits before it tries again because its bytes were dropped as doubtful: together longer
@@ -105,7 +98,6 @@ class Files:
         self.open_versions: dict[Version, None] = {}
         self._opening: SingleFlight[bytes, tuple[Version, bool]] = SingleFlight()
         self.reopening: SingleFlight[Version, None] = SingleFlight()
-        self._comparing: SingleFlight[Version, None] = SingleFlight()
         directories.on_listed.append(self._on_listed)
         cache.on_dropped = self._on_dropped
 
@@ -148,7 +140,7 @@ class Files:
         """Return the version to serve, and whether it is the one that was served before."""
         entry, fresh = found.entry, self._clock() < found.directory.fresh_until
         version = self._current.get(path)
-        if version is not None and self._still_right(version, entry, found.directory.listed_at, fresh):
+        if version is not None and self._still_right(version, found, fresh):
             self._current.move_to_end(path)
             if self.kept is not None:
                 self.kept.watch(version)
@@ -166,34 +158,29 @@ class Files:
             self.kept.watch(version)
         return version, False
 
-    def _still_right(self, version: Version, entry: DirEntry, listed_at: float, fresh: bool) -> bool:
+    def _still_right(self, version: Version, found: Found, fresh: bool) -> bool:
         """Return whether a version is known to be what the vehicle holds now."""
-        if version.dead is not None:
-            return False
-        newer = listed_at > version.proven_at
-        if newer and became_another(version.size, version.mtime, entry):
+        entry, listed_at = found.entry, found.directory.listed_at
+        if listed_at > version.known_at and became_another(version.size, version.mtime, entry):
             self.kill(version)
+        if version.dead is not None or found.size not in (None, version.size):
             return False
-        same_size = entry.size in (None, version.size)
-        if fresh and entry.size == version.size and entry.mtime is not None and entry.mtime == version.mtime:
-            version.proven_at = max(version.proven_at, listed_at)
+        if fresh and entry.mtime is not None and entry.mtime == version.mtime:
+            version.known_at = max(version.known_at, listed_at)
             return True
-        recent = self._clock() - version.proven_at < self._proof_time
-        return recent and (same_size or not newer)
+        return self._clock() - version.known_at < self._proof_time
 
     async def _start_version(self, path: bytes, entry: DirEntry) -> Version:
         version = Version(self.cache, path)
         reader = await self._store.open_reader(path, version)
         try:
-            if entry.size is not None and entry.size >= WRAP and entry.size % WRAP == reader.size:
-                raise FileTooLarge(f"{path!r} has {entry.size} bytes, more than an open reply can tell")
             if entry.size is not None and reader.size < entry.size and not self.is_changing(path):
                 entry = await self._require_listed(path, reader.size)
         except BaseException:
             reader.close()
             raise
         version.reader, version.size = reader, reader.size
-        version.proven_at = version.compared_at = self._clock()
+        version.known_at = self._clock()
         if entry.size in (None, reader.size):
             version.mtime = entry.mtime
         old = self._current.get(path)
@@ -231,7 +218,8 @@ class Files:
         async with self.paths.steady(version) as path:
             version.require_alive()
             expected = None if version.doubted else version.size
-            version.begin_reading()
+            version.close_reader()
+            version.doubted = False
             reader = await self._store.open_reader(path, version, expected_size=expected)
         if version.handles == 0:
             reader.close()
@@ -273,23 +261,20 @@ class Files:
         Raises:
             FileChanged: it is another one. Else as RemoteStore.list_directory.
         """
-        for _ in range(MAX_TRIES):
-            if self._is_sure(version) or self.is_changing(version.path):
-                break
-            if not now and self._clock() < version.compare_after:
-                break
-            await self._comparing.run(version, partial(self._compare_once, version))
+        soon = not now and self._clock() < version.compare_after
+        if not (soon or self._is_sure(version) or self.is_changing(version.path)):
+            await self._compare(version)
         version.require_alive()
 
     def _is_sure(self, version: Version) -> bool:
-        """Return whether a version was compared since the server opened its file, or a listing would tell no
-        more than an open reply does: that it did not become smaller."""
+        """Return whether a version is known to be the path's file since the server opened that last, or a
+        listing would tell no more than an open reply does: that it did not become smaller."""
         if version.compared:
             return True
-        restarted = version.compared_at < self._restarted_at
+        restarted = version.known_at == NEVER
         return not (restarted or version.mtime is not None or self._directories.tells_times)
 
-    async def _compare_once(self, version: Version) -> None:
+    async def _compare(self, version: Version) -> None:
         path = version.path
         try:
             directory = await self._directories.ask(split(path)[0], began=version.opened_at)
@@ -304,33 +289,31 @@ class Files:
         self._compare_listed(version, directory)
 
     def _compare_listed(self, version: Version, directory: Directory) -> None:
-        """Take what a listing shows that began after a version was opened."""
+        """Take what a listing shows that began after a version was last known to be the path's file."""
         entry = directory.entries.get(split(version.path)[1])
         if entry is None or entry.kind is not EntryKind.FILE:
             if directory.complete or entry is not None:
                 self.kill(version)
-        elif not self._is_another(version, entry):
-            if directory.listed_at >= version.opened_at:
-                version.compared_at = directory.listed_at
+            return
+        # Nobody goes on writing a file after a restart.
+        resized = version.known_at == NEVER and entry.size not in (None, version.size)
+        if not resized and not became_another(version.size, version.mtime, entry):
+            if version.known_at < version.opened_at <= directory.listed_at:
+                version.known_at = directory.listed_at
             if version.mtime is None and entry.size == version.size:
                 version.mtime = entry.mtime
         elif version.given or entry.size != version.size:
             self.kill(version)
-        else:
-            version.start_over(entry.mtime, directory.listed_at)
-
-    def _is_another(self, version: Version, entry: DirEntry) -> bool:
-        """A file that is larger after the vehicle restarted is another one: nobody went on writing it."""
-        restarted = version.compared_at < self._restarted_at
-        resized = entry.size not in (None, version.size) and restarted
-        return resized or became_another(version.size, version.mtime, entry)
+        else:  # nobody got a byte of it: it is the file that is there now
+            version.mtime, version.known_at, version.kept = entry.mtime, directory.listed_at, None
+            version.on_suspect("another file has its name")
 
     def _on_listed(self, path: bytes, directory: Directory) -> None:
         """A directory was listed, for whatever reason."""
         for version in list(self.open_versions):
             parent, name = split(version.path)
             known = parent == path and name in directory.entries and version.dead is None
-            if known and directory.listed_at > version.proven_at and not self.is_changing(version.path):
+            if known and directory.listed_at > version.known_at and not self.is_changing(version.path):
                 self._compare_listed(version, directory)
 
     def kill(self, version: Version) -> None:
@@ -364,7 +347,7 @@ class Files:
         """Nothing is proven any more; open files are compared before more of them is given out."""
         self._restarted_at = self._clock()
         for version in dict.fromkeys((*self._current.values(), *self.open_versions)):
-            version.proven_at = version.compare_after = NEVER
+            version.known_at = version.compare_after = NEVER
             version.on_opened(self._restarted_at)
             version.kept = None
 
@@ -400,7 +383,7 @@ class Files:
         if proven_at <= self._restarted_at or self._clock() - proven_at >= self._proof_time:
             return
         version = Version(self.cache, path, size)
-        version.proven_at, version.shown, version.given = proven_at, True, True
+        version.known_at, version.shown, version.given = proven_at, True, True
         self._replace(version)
         for at in range(0, size, ADOPTED_AT_ONCE):
             version.preload(at, read(at, min(at + ADOPTED_AT_ONCE, size)))
@@ -438,7 +421,7 @@ class Files:
         version.on_failed(LocalProtocolError(f"{version.path!r} was closed while it was read"))
         if self._current.get(version.path) is not version:
             version.clear()
-        elif version.dead is not None or version.compared_at < self._restarted_at:
+        elif version.dead is not None or version.known_at == NEVER:
             self._forget(version)
 
     def forget_closed(self) -> None:

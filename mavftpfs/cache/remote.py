@@ -36,9 +36,9 @@ class ReadSink(Protocol):
         ...
 
     def on_suspect(self, reason: str) -> None:
-        """A session anomaly or a foreign FTP client was noticed while this file was read: all bytes
-        that came since the reader was opened are provisional (promise 1). This alone may be heard of a
-        reader that was closed, for some seconds: a rival is noticed late."""
+        """A session anomaly or a foreign FTP client was noticed while this file was read: what came is in
+        doubt (promise 1). This alone may be heard of a reader that was closed, for some seconds: a rival is
+        noticed late."""
         ...
 
     def on_failed(self, error: Exception) -> None:

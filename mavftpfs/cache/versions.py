@@ -10,9 +10,8 @@ is the byte budget over all: blocks of BLOCK_SIZE bytes, least recently used fir
 atomic (trio); nothing here awaits while state is half changed.
 
 Doubtful bytes (promise 1). Servers share session ids between clients, so perfectly matching replies can carry
-another file. When the session layer notices that this may have happened (`on_suspect`), every byte that came
-since the present reader was opened is dropped, and what still comes from it is ignored: who wants such bytes
-asks again, by a new reader.
+another file. When the session layer notices that this may have happened (`on_suspect`), every byte is
+dropped, and what still comes from the present reader is ignored: who wants bytes opens a new one.
 """
 
 from __future__ import annotations
@@ -152,15 +151,14 @@ class Version:
     Attributes:
         path: what it is called by now. size: in bytes, by the open reply. mtime: None if not known to belong
             to this size. reader: where its bytes come from, if it is open. handles: how many are open.
-        proven_at: when it was last known to be what the vehicle holds, so that opening it again needs no
-            request. compared_at: when the path was last known to be this file. compare_after: no listing is
-            asked for before, only to compare.
+        known_at: when the path was last known to be this file; NEVER after the vehicle restarted.
+            compare_after: no listing is asked for before, only to compare.
         shown: whether the kernel may hold pages of it and all of them are good. given: whether a program got
             any of the bytes. dead: why it is not the path's file any more; lost: somebody else changed that.
         kept: its part on the local disk, if it may have one.
         opened_at: when the server opened the file for the session that bytes come from now.
-        doubted: what comes from the present reader is ignored; cleared by `begin_reading`.
-        drops: how often bytes were dropped because they were in doubt, or another file's.
+        doubted: what comes from the present reader is ignored, until a new one is opened.
+        drops: how often all bytes were dropped because they were in doubt, or another file's.
     """
 
     def __init__(self, cache: BlockCache, path: bytes, size: int = 0, mtime: int | None = None) -> None:
@@ -169,7 +167,7 @@ class Version:
         self.mtime = mtime
         self.reader: Reader | None = None
         self.handles = 0
-        self.proven_at = self.compared_at = cache.clock()
+        self.known_at = cache.clock()
         self.compare_after = NEVER
         self.shown = self.given = self.lost = self.doubted = False
         self.dead: MavftpfsError | None = None
@@ -179,7 +177,6 @@ class Version:
         self._cache = cache
         self._blocks: dict[int, bytearray] = {}
         self._present = ExtentSet()
-        self._earlier = ExtentSet()  # held before the present reader; INVARIANT: a subset of _present
         self._waiters: list[_Waiter] = []
         self._arrived = 0
         self.received = 0
@@ -270,12 +267,14 @@ class Version:
             waiter.scope.deadline = trio.current_time() + self._cache.patience
 
     def on_suspect(self, reason: str) -> None:
-        """Drop what came since the reader was opened, given out or not; whoever waits asks again."""
+        """Drop every byte, given out or not; whoever waits asks again."""
         if self.doubted:
             return
         self.doubted = True
         self.drops += 1
-        self._forget_but(self._earlier)
+        for index in list(self._blocks):
+            self.evict(index)
+        self.ask_again()
         self._cache.on_dropped(self)
 
     def on_failed(self, error: Exception) -> None:
@@ -294,20 +293,13 @@ class Version:
 
     @property
     def compared(self) -> bool:
-        """Whether something showed that it is the path's file after the server opened that last, or
-        restarted."""
-        return self.compared_at >= self.opened_at
+        """Whether the path was known to be this file after the server opened it for what comes now."""
+        return self.known_at >= self.opened_at
 
     def require_alive(self) -> None:
         """Raise FileChanged if the file became another one."""
         if self.dead is not None:
             raise self.dead.with_traceback(None)
-
-    def begin_reading(self) -> None:
-        """A reader is about to be opened: what is held now did not come from it."""
-        self.close_reader()
-        self.doubted = False
-        self._earlier = ExtentSet(self._present)
 
     def close_reader(self) -> None:
         """Drop readahead and the remote reader."""
@@ -322,15 +314,6 @@ class Version:
         self.close_reader()
         self.on_failed(self.dead)
         self.clear()
-
-    def start_over(self, mtime: int | None, listed_at: float) -> None:
-        """Nothing of it was given out: it is the file that a listing of that time shows. Every byte goes."""
-        self.mtime, self.kept = mtime, None
-        self.compared_at, self.compare_after = listed_at, NEVER
-        self.close_reader()
-        self.drops += 1
-        self._forget_but(ExtentSet())
-        self._cache.on_dropped(self)
 
     def clear(self) -> None:
         """Forget every block that no reader waits on."""
@@ -354,7 +337,6 @@ class Version:
         self._cache.bytes_cached -= self._cache.used.pop((self, index))
         start = index * BLOCK_SIZE
         self._present.discard(start, start + BLOCK_SIZE)
-        self._earlier.discard(start, start + BLOCK_SIZE)
 
     # --- reading
 
@@ -401,22 +383,8 @@ class Version:
     def check_invariants(self) -> None:
         """Raise AssertionError if the books are wrong (for tests)."""
         assert self._present.end <= self.size
-        for start, stop in self._earlier:
-            assert self._present.covers(start, stop)
         for start, stop in self._present:
             assert all(i in self._blocks for i in range(start // BLOCK_SIZE, -(-stop // BLOCK_SIZE)))
-
-    # --- inside
-
-    def _forget_but(self, kept: ExtentSet) -> None:
-        """Forget all bytes that are not in `kept`."""
-        self._present, self._earlier = ExtentSet(kept), ExtentSet(kept)
-        for index in list(self._blocks):
-            if self._present.overlaps(index * BLOCK_SIZE, (index + 1) * BLOCK_SIZE):
-                self._blocks[index] = bytearray(self._blocks[index])  # a view of the old one may be in use
-            else:
-                self.evict(index)
-        self.ask_again()
 
 
 def became_another(size: int, mtime: int | None, entry: DirEntry) -> bool:

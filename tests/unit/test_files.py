@@ -15,7 +15,6 @@ from mavftpfs.cache.tree import Tree
 from mavftpfs.shared.errors import (
     DataUnproven,
     FileChanged,
-    FileTooLarge,
     IsADirectory,
     LocalProtocolError,
     NotFound,
@@ -231,7 +230,7 @@ async def test_a_size_that_does_not_fit_the_ack_is_an_error_not_a_short_file(
     store: FakeStore, tree: Tree
 ) -> None:
     store.files[LOG].claims = (1 << 32) + len(DATA)
-    with pytest.raises(FileTooLarge):
+    with pytest.raises(DataUnproven):
         await tree.open(LOG)
     assert all(reader.closed for reader in store.readers)
 

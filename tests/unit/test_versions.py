@@ -189,28 +189,26 @@ async def test_reads_that_wait_pin_no_more_than_half_and_take_turns(nursery: tri
 # --- doubtful bytes
 
 
-async def test_doubtful_bytes_are_dropped_and_older_ones_are_not() -> None:
+async def test_all_bytes_are_dropped_in_doubt_and_none_taken_before_a_new_reader_is_there() -> None:
     cache = make_cache()
     told: list[Version] = []
     blocks = Version(cache, b"/f", 3 * BLOCK_SIZE)
     cache.on_dropped = told.append
-    deliver(blocks, 0, content(10))
-    blocks.begin_reading()
-    deliver(blocks, 10, content(2 * BLOCK_SIZE))
+    deliver(blocks, 0, content(2 * BLOCK_SIZE))
     old = blocks.get(0, 20)
     assert old is not None
     before = bytes(old)
     for _ in range(2):
         blocks.on_suspect("test")
     assert (blocks.drops, told) == (1, [blocks])
-    assert blocks.missing(0, 3 * BLOCK_SIZE) == [(10, 3 * BLOCK_SIZE)]
-    assert cache.bytes_cached == BLOCK_SIZE
+    assert blocks.missing(0, 3 * BLOCK_SIZE) == [(0, 3 * BLOCK_SIZE)]
+    assert cache.bytes_cached == 0
     deliver(blocks, 10, b"\xff" * 20)  # from the reader that is in doubt
     assert blocks.get(10, 30) is None
-    blocks.begin_reading()
+    blocks.doubted = False
     deliver(blocks, 10, b"\xff" * 20)
     assert bytes(old) == before
-    assert bytes(blocks.get(0, 30) or b"") == content(10) + b"\xff" * 20
+    assert bytes(blocks.get(10, 30) or b"") == b"\xff" * 20
     cache.check_invariants()
 
 
