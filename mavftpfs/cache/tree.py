@@ -366,10 +366,6 @@ class Tree:
         self._files.forget_closed()
         self._virtual.forget()
 
-    def expire(self, path: bytes) -> None:
-        """Have the vehicle list a file's directory again before its size is told the next time."""
-        self._directories.expire(split(self._remote(path))[0])
-
     def status(self) -> dict[str, object]:
         """Return counters; bytes_... in bytes, rate in bytes per second or None."""
         files, blocks = self._files, self._blocks

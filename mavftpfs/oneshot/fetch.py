@@ -9,19 +9,17 @@ from __future__ import annotations
 import errno
 import fcntl
 import os
-import re
 import shutil
 import stat
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Awaitable, Callable, Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from enum import Enum
 from pathlib import Path
 from typing import Literal
 
 import trio
 
-from mavftpfs.oneshot.files import READ_SIZE, File, Session
+from mavftpfs.oneshot.files import READ_SIZE, Session
 from mavftpfs.oneshot.progress import Progress
 from mavftpfs.protocol.payload import crc32
 from mavftpfs.shared.errors import (
@@ -29,6 +27,7 @@ from mavftpfs.shared.errors import (
     DataUnproven,
     FileBusy,
     FtpNak,
+    IsADirectory,
     LinkError,
     MavftpfsError,
     NotDeliveredYet,
@@ -38,11 +37,8 @@ from mavftpfs.shared.errors import (
     UsageError,
     VehicleLost,
 )
-from mavftpfs.shared.model import is_snapshot
+from mavftpfs.shared.model import EntryKind, is_snapshot
 from mavftpfs.shared.readable import name_text, readable_size
-
-Complain = Callable[[str], None]
-"""Hears in a line what went wrong with one of several things."""
 
 Verify = Literal["auto", "all", "none"]
 
@@ -59,42 +55,9 @@ EARLIEST = 946_684_800
 """2000-01-01 UTC: an earlier time tells people nothing. (That a clock was set takes more: see cache.kept.)"""
 
 
-@dataclass(frozen=True, slots=True)
-class Log:
-    """A file on the vehicle. below: its path below the log directory; mtime: seconds UTC, None if unknown."""
-
-    path: bytes
-    below: bytes
-    size: int
-    mtime: int | None
-
-
-class Step(Enum):
-    """What to do about one file."""
-
-    SKIP = "it is here"
-    FETCH = "from the start"
-    RESUME = "go on with the .part"
-    EXTEND = "the file here may be the beginning"
-
-
 def known_time(mtime: int) -> int | None:
     """Return a listed time, None where it tells nothing."""
     return mtime if mtime >= EARLIEST else None
-
-
-def decide(size: int, here: int | None, part: int | None) -> Step:
-    """Say what to do about a file of `size` bytes on the vehicle.
-
-    here: size of the local file of that name; part: of the .part beside it; None where there is none.
-    """
-    if here == size:
-        return Step.SKIP
-    if part is not None and 0 < part <= size:
-        return Step.RESUME
-    if here is not None and 0 < here < size:
-        return Step.EXTEND
-    return Step.FETCH
 
 
 def proof_needed(verify: Verify, *, resumed: bool, size: int) -> bool:
@@ -114,32 +77,6 @@ def next_read_size(size: int, took: float) -> int:
     return max(size // 2, LEAST_READ) if took > SLOW else size
 
 
-def newest_first(logs: Iterable[Log]) -> list[Log]:
-    """Order logs: by time, then by their numbers. Those without a time come last, then what is no log."""
-
-    def age(log: Log) -> tuple[bool, int, object]:
-        return not log.below.endswith(NO_LOG), log.mtime or 0, natural(log.below)
-
-    return sorted(logs, key=age, reverse=True)
-
-
-def select(logs: Sequence[Log], *, newest: int | None, since: float | None) -> list[Log]:
-    """Return the newest N, of those that are not older than `since` (seconds UTC).
-
-    A log without a time is not left out by `since`: it may be a new one.
-    """
-    young = [log for log in logs if since is None or log.mtime is None or log.mtime >= since]
-    return young if newest is None else young[:newest]
-
-
-def natural(name: bytes) -> tuple[tuple[int, int, bytes], ...]:
-    """Return a key by which `log10` comes after `log9`."""
-    parts = re.split(rb"(\d+)", name)
-    return tuple((1, int(part), b"") if part.isdigit() else (0, 0, part) for part in parts)
-
-
-NO_LOG = b"LASTLOG.TXT"
-"""ArduPilot keeps the number of its last log beside the logs. `sync --newest` is not to count it as one."""
 PART_SUFFIX = ".part"
 MAX_RETURNS = 20
 """How often a vehicle may vanish and return while one file is fetched."""
@@ -152,6 +89,8 @@ _NOT_NOW: dict[type[MavftpfsError], str] = {
     FileBusy: "another program has the vehicle's session",  # so a mount says it
 }
 """Why there is no checksum now, though there may be one later."""
+
+_REFUSED = "the vehicle refused to compute a checksum"
 
 NO_CHECKSUM: tuple[type[MavftpfsError], ...] = (*_NOT_NOW, FtpNak, NotSupported)
 """Errors that say that there is no checksum, and nothing else about the file."""
@@ -173,26 +112,46 @@ class NotProvenYet(MavftpfsError):
 class Wanted:
     """A file to fetch. name: for people; size: as listed; mtime: seconds UTC, None if unknown.
 
-    part: where it lies until it is whole. keep_old: a local file of that name that is not the beginning of
-    this one is renamed to NAME.~1~.
+    part: where it lies until it is whole. keep_old: a local file of that name may be the beginning of this
+    one; where it is not, it is renamed to NAME.~1~.
     """
 
     remote: bytes
-    local: Path
     name: str
     size: int
     mtime: int | None
+    local: Path
     part: Path
     keep_old: bool = False
+
+    @property
+    def here(self) -> bool:
+        """Whether a local file has its name and its size."""
+        return _size(self.local) == self.size
+
+    @property
+    def begun(self) -> int:
+        """Bytes that can be gone on with: of the .part, or of a local file that may be the beginning."""
+        part = _size(self.part)
+        if 0 < part <= self.size:
+            return part
+        old = _size(self.local) if self.keep_old else 0
+        return old if 0 < old < self.size else 0
+
+
+def _size(path: Path) -> int:
+    """Return the size of a local file; -1 where none is."""
+    try:
+        return path.stat().st_size if path.is_file() else -1
+    except OSError:
+        return -1
 
 
 @dataclass(frozen=True, slots=True)
 class Fetched:
     """A file that was fetched. resumed: bytes that were here already; proof: how it was verified."""
 
-    remote: bytes
-    local: Path
-    name: str
+    wanted: Wanted
     size: int
     resumed: int
     proof: str
@@ -295,6 +254,10 @@ def _free_name(local: Path) -> Path:
     return place
 
 
+Take = Callable[[bytes | memoryview], Awaitable[None]]
+"""Takes the next bytes of a file."""
+
+
 @dataclass(frozen=True, slots=True)
 class Fetcher:
     """Fetches files of one session, one after the other."""
@@ -304,10 +267,8 @@ class Fetcher:
     verify: Verify = "auto"
     resume: bool = True
 
-    async def fetch(self, wanted: Wanted, *, beginning: Path | None = None) -> Fetched:
+    async def fetch(self, wanted: Wanted) -> Fetched:
         """Fetch a file, and go on when the vehicle is heard again after it was lost for a while.
-
-        beginning: a local file that may hold its first bytes, where there is no .part.
 
         Raises:
             DataUnproven: size or checksum disagreed twice. StillGrowing, NotProvenYet: its .part stays.
@@ -316,7 +277,7 @@ class Fetcher:
         """
         for _ in range(MAX_RETURNS):
             try:
-                return await self._fetch(wanted, beginning)
+                return await self._fetch(wanted)
             except (VehicleLost, RequestTimeout) as exc:
                 if not self.session.silent():
                     raise
@@ -325,16 +286,31 @@ class Fetcher:
                     raise VehicleLost("the vehicle is silent") from exc
         raise VehicleLost(f"the vehicle was lost {MAX_RETURNS} times")
 
-    async def _fetch(self, wanted: Wanted, beginning: Path | None) -> Fetched:
+    async def write_to(self, remote: bytes, take: Take) -> None:
+        """Hand a file's bytes on, and prove what was handed on.
+
+        Raises:
+            IsADirectory. DataUnproven, StillGrowing: it is not what the vehicle has. Else as `fetch`.
+        """
+        name = name_text(remote)
+        if (await self.session.files.stat(remote)).kind is EntryKind.DIRECTORY:
+            raise IsADirectory(f"{name} is a directory")
+        size, crc = await self._copy(remote, take, 0, 0)
+        await self._prove(remote, name, size, crc, resumed=False)
+
+    async def _fetch(self, wanted: Wanted) -> Fetched:
         if wanted.local.is_dir():
             raise UsageError(f"{wanted.local} is a directory")
         with local_disk(wanted.local):
+            if wanted.keep_old:  # logs keep their directories
+                wanted.local.parent.mkdir(parents=True, exist_ok=True)
             part = Part(wanted.part, wanted.local)
             try:
-                if not self.resume or part.size > wanted.size:
+                begun = wanted.begun if self.resume else 0
+                if part.size != begun:
                     part.cut(0)
-                if beginning is not None and part.size == 0:
-                    await trio.to_thread.run_sync(shutil.copyfile, beginning, part.path)
+                    if begun:
+                        await trio.to_thread.run_sync(shutil.copyfile, wanted.local, part.path)
                 return await self._fetch_and_commit(wanted, part)
             except DataUnproven:
                 part.drop()
@@ -352,98 +328,93 @@ class Fetcher:
             resumed = 0
             size, proof = await self._attempt(wanted, part)
         await trio.to_thread.run_sync(lambda: part.commit(wanted.mtime, keep_old=wanted.keep_old))
-        return Fetched(wanted.remote, wanted.local, wanted.name, size, resumed, proof)
+        return Fetched(wanted, size, resumed, proof)
 
     async def _attempt(self, wanted: Wanted, part: Part) -> tuple[int, str]:
         """Fetch what is missing, and prove the whole; returns its size, and how it was proven."""
-        here = part.size
+        here = size = part.size
         self.progress.begin(wanted.name, wanted.size, here)
         crc = await trio.to_thread.run_sync(local_crc32, part.path) if here else 0
-        size = wanted.size
-        if here == 0 or here < wanted.size:
-            file = await self.session.files.open(wanted.remote)
-            try:
-                size = file.size
-                if here > size:
-                    raise DataUnproven(f"{wanted.name} has shrunk from {here} to {size} bytes")
-                crc = await self._copy(file, part, here, crc)
-            finally:
-                file.close()
-        self.progress.check()
-        return size, await self._prove(wanted, size, crc, resumed=here > 0)
 
-    async def _copy(self, file: File, part: Part, offset: int, crc: int) -> int:
-        """Append the rest of a file and return the CRC32 of all of it."""
-        size = LEAST_READ
-        while offset < file.size:
-            began = trio.current_time()
-            data = await file.read(offset, size)
-            if not data:
-                raise DataUnproven(f"the file ended at {offset} of {file.size} bytes")
-            size = next_read_size(size, trio.current_time() - began)
+        async def take(data: bytes | memoryview) -> None:
             part.append(data)
-            crc = crc32(data, crc)
-            offset += len(data)
-            self.progress.at(offset)
-        return crc
 
-    async def _prove(self, wanted: Wanted, size: int, crc: int, *, resumed: bool) -> str:
+        if here == 0 or here < wanted.size:
+            size, crc = await self._copy(wanted.remote, take, here, crc)
+        self.progress.check()
+        return size, await self._prove(wanted.remote, wanted.name, size, crc, resumed=here > 0)
+
+    async def _copy(self, remote: bytes, take: Take, offset: int, crc: int) -> tuple[int, int]:
+        """Hand on a file from `offset` on, before which it has this CRC32; returns its size and CRC32."""
+        amount = LEAST_READ
+        file = await self.session.files.open(remote)
+        try:
+            if offset > file.size:
+                raise DataUnproven(f"{name_text(remote)} has shrunk from {offset} to {file.size} bytes")
+            while offset < file.size:
+                began = trio.current_time()
+                data = await file.read(offset, amount)
+                if not data:
+                    raise DataUnproven(f"{name_text(remote)} ended at {offset} of {file.size} bytes")
+                amount = next_read_size(amount, trio.current_time() - began)
+                await take(data)
+                crc = crc32(data, crc)
+                offset += len(data)
+                self.progress.at(offset)
+            return file.size, crc
+        finally:
+            file.close()
+
+    async def _prove(self, remote: bytes, name: str, size: int, crc: int, *, resumed: bool) -> str:
         """Compare with the vehicle's checksum where that is wanted and can be had; returns what was proven.
 
         Raises:
             DataUnproven: they differ, or what was resumed can only be had by fetching all of it again.
             StillGrowing, NotProvenYet.
         """
-        if is_snapshot(self.session.on_vehicle(wanted.remote)):
+        if is_snapshot(self.session.on_vehicle(remote)):
             if resumed:
-                raise DataUnproven(f"{wanted.name} is made anew at each opening, so it cannot be resumed")
+                raise DataUnproven(f"{name} is made anew at each opening, so it cannot be resumed")
             return "size (generated at each opening, so a checksum proves nothing)"
-        if not proof_needed(self.verify, resumed=resumed, size=size):
-            await self._require_size(wanted, size)
-            return "size"
+        theirs: int | str = ""
+        if proof_needed(self.verify, resumed=resumed, size=size):
+            theirs = await self._checksum(remote)
+        if theirs == crc:
+            return "size and CRC32"
+        await self._require_size(remote, name, size)
+        if not isinstance(theirs, str):
+            raise DataUnproven(
+                f"{name}: {size} bytes came with CRC32 {crc:08x}, the vehicle has {theirs:08x}"
+            )
+        if resumed and theirs == _REFUSED:
+            raise DataUnproven(f"{name} was resumed, and {theirs}")
+        if resumed:
+            raise NotProvenYet(
+                f"{name}: all of it is here, as {PART_SUFFIX}, but what an earlier run fetched is not proven "
+                f"({theirs}); the next run tries again"
+            )
+        return f"size ({theirs})" if theirs else "size"
+
+    async def _checksum(self, remote: bytes) -> int | str:
+        """Return the vehicle's checksum of a file, or why there is none."""
         try:
-            theirs = await self.session.files.crc32(wanted.remote)
+            return await self.session.files.crc32(remote)
         except LinkError:
             raise
-        except tuple(_NOT_NOW) as exc:
-            why = next(words for kind, words in _NOT_NOW.items() if isinstance(exc, kind))
-            await self._require_size(wanted, size)
-            if resumed:
-                raise NotProvenYet(
-                    f"{wanted.name}: all of it is here, as {wanted.part}, but what an earlier run "
-                    f"fetched is not proven ({why}); the next run tries again"
-                ) from exc
-            return f"size ({why})"
         except MavftpfsError as exc:
-            await self._require_size(wanted, size)
-            if resumed:
-                raise DataUnproven(f"{wanted.name}: the vehicle computes no checksum: {exc}") from exc
-            return "size (the vehicle refused to compute a checksum)"
-        if theirs != crc:
-            await self._require_size(wanted, size)
-            raise DataUnproven(
-                f"{wanted.name}: {size} bytes came with CRC32 {crc:08x}, the vehicle has {theirs:08x}"
-            )
-        return "size and CRC32"
+            return next((words for kind, words in _NOT_NOW.items() if isinstance(exc, kind)), _REFUSED)
 
-    async def _require_size(self, wanted: Wanted, size: int) -> None:
+    async def _require_size(self, remote: bytes, name: str, size: int) -> None:
         """Ask for the size again: no checksum says that the file was whole.
 
         Raises:
             StillGrowing: it has become larger. DataUnproven: it has become smaller.
         """
-        files = self.session.files
-        files.expire(wanted.remote)
-        now = (await files.stat(wanted.remote)).size
+        self.session.files.forget_caches()
+        file = await self.session.files.open(remote)
+        now = file.size
+        file.close()
         if now > size:
-            raise StillGrowing(
-                f"{wanted.name} is still growing: its first {readable_size(size)} are here, as {wanted.part}"
-            )
+            raise StillGrowing(f"{name} is still growing: only its first {readable_size(size)} came")
         if now < size:
-            raise DataUnproven(f"{name_text(wanted.remote)} has shrunk from {size} to {now} bytes")
-
-
-def named(path: bytes, error: MavftpfsError) -> str:
-    """Return an error with the name of what it is about, which some have already."""
-    name, text = name_text(path), str(error)
-    return text if name in text else f"{name}: {text}"
+            raise DataUnproven(f"{name} has shrunk from {size} to {now} bytes")

@@ -10,10 +10,11 @@ from __future__ import annotations
 
 import errno
 import os
-from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequence
+import stat
+from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass
-from typing import Any, Protocol, TypeVar, cast
+from typing import Any, Protocol, TypeVar
 
 import trio
 
@@ -28,7 +29,7 @@ from mavftpfs.session.vehicle import SILENCE_LIMIT
 from mavftpfs.shared import errors
 from mavftpfs.shared.errnos import errno_for
 from mavftpfs.shared.errors import NotFound
-from mavftpfs.shared.model import ROOT, EntryKind, normalise
+from mavftpfs.shared.model import ROOT, EntryKind, join, normalise
 from mavftpfs.shared.readable import name_text
 
 READ_SIZE = 128 * 1024
@@ -70,17 +71,15 @@ class Files(Protocol):
 
     async def rename(self, old: bytes, new: bytes) -> None: ...
 
-    def expire(self, path: bytes) -> None: ...
-
     def forget_caches(self) -> None: ...
 
 
-Transfers = Sequence[dict[str, Any]]
-"""Files of which the vehicle lacks bytes: "path", "size", "bytes_left" (see cache.throttle)."""
+Acknowledged = Mapping[str, int]
+"""Files of which the vehicle lacks bytes -> the bytes that it acknowledged."""
 
 
-async def _none() -> Transfers:
-    return []
+async def _none() -> Acknowledged:
+    return {}
 
 
 async def _no_return() -> bool:
@@ -91,14 +90,14 @@ async def _no_return() -> bool:
 class Session:
     """A vehicle's files for the length of one command.
 
-    root: where `/` of `files` lies on the vehicle. transfers: asks what is not on the vehicle yet.
+    root: where `/` of `files` lies on the vehicle. acknowledged: asks what is not on the vehicle yet.
     mountpoint: of the mount whose files these are, None for a connection of our own. silent: whether the
     vehicle is not heard; returned: waits for it, and returns whether it is heard again in time.
     """
 
     files: Files
     root: bytes = b"/"
-    transfers: Callable[[], Awaitable[Transfers]] = _none
+    acknowledged: Callable[[], Awaitable[Acknowledged]] = _none
     mountpoint: str | None = None
     silent: Callable[[], bool] = lambda: False
     returned: Callable[[], Awaitable[bool]] = _no_return
@@ -114,6 +113,37 @@ async def is_directory(files: Files, path: bytes) -> bool:
         return (await files.stat(path)).kind is EntryKind.DIRECTORY
     except NotFound:
         return False
+
+
+Found = list[tuple[bytes, Stat]]
+"""What is below a directory: (path from there, what it is)."""
+Unlisted = list[tuple[bytes, errors.MavftpfsError]]
+"""Directories that cannot be listed, and why."""
+
+
+async def walk(files: Files, top: bytes) -> tuple[Found, Unlisted]:
+    """Return all that is below a directory, parents first, and what could not be listed.
+
+    Raises:
+        LinkError; of `top` itself whatever Files.list raises.
+    """
+    found: Found = []
+    unlisted: Unlisted = []
+    pending = [b""]
+    while pending:
+        below = pending.pop()
+        path = join(top, below) if below else top
+        try:
+            entries = await files.list(path)
+        except errors.MavftpfsError as exc:
+            if not below or isinstance(exc, errors.LinkError):
+                raise
+            unlisted.append((path, exc))
+            continue
+        inner = [(join(below, name) if below else name, stat) for name, stat in entries]
+        found += inner
+        pending += [name for name, stat in reversed(inner) if stat.kind is EntryKind.DIRECTORY]
+    return found, unlisted
 
 
 STATUS_PATIENCE = 3.0
@@ -164,15 +194,11 @@ async def open_mount(mountpoint: str, subtree: bytes) -> Session:
 def session_on(mountpoint: str, mounted: bytes, root: bytes) -> Session:
     """Return the files below `root` of the vehicle, of which `mounted` is on `mountpoint`."""
 
-    async def transfers() -> Transfers:
+    async def acknowledged() -> Acknowledged:
         found = (await mount_status(mountpoint))["transfers"]
-        return [
-            {"path": facts["path"], "size": facts["size"], "bytes_left": facts["size"] - facts["done"]}
-            for facts in found
-            if facts["direction"] == "write"
-        ]
+        return {facts["path"]: facts["done"] for facts in found if facts["direction"] == "write"}
 
-    return Session(MountedFiles(mountpoint, mounted, root), root, transfers, mountpoint)
+    return Session(MountedFiles(mountpoint, mounted, root), root, acknowledged, mountpoint)
 
 
 def same_link(one: LinkSpec, other: LinkSpec) -> bool:
@@ -228,35 +254,36 @@ def _translated(error: OSError, path: bytes) -> errors.MavftpfsError:
     return kind(f"{name_text(path)}: {os.strerror(error.errno or errno.EIO)}{hint}")
 
 
-async def _in_thread(function: Callable[[], ResultT], path: bytes) -> ResultT:
+async def _call(path: bytes, function: Callable[..., ResultT], *args: object) -> ResultT:
+    """Have the kernel do something about a path, in a thread."""
     try:
-        return await trio.to_thread.run_sync(function, abandon_on_cancel=True)
+        return await trio.to_thread.run_sync(function, *args, abandon_on_cancel=True)
     except OSError as exc:
         raise _translated(exc, path) from exc
 
 
 @dataclass(slots=True)
 class MountedFile:
-    """An open file of a mount."""
+    """An open file of a mount; see File."""
 
     path: bytes
     fd: int
     size: int
 
     async def read(self, offset: int, size: int) -> bytes:
-        """See File."""
-        return await _in_thread(lambda: os.pread(self.fd, size, offset), self.path)
+        """As os.pread."""
+        return await _call(self.path, os.pread, self.fd, size, offset)
 
     async def write(self, offset: int, data: bytes | memoryview) -> int:
-        """See File."""
-        return await _in_thread(lambda: os.pwrite(self.fd, data, offset), self.path)
+        """As os.pwrite."""
+        return await _call(self.path, os.pwrite, self.fd, data, offset)
 
     async def fsync(self) -> None:
-        """See File."""
-        await _in_thread(lambda: os.fsync(self.fd), self.path)
+        """As os.fsync."""
+        await _call(self.path, os.fsync, self.fd)
 
     def close(self) -> None:
-        """See File; what was written was brought there by fsync."""
+        """What was written was brought there by fsync."""
         fd, self.fd = self.fd, -1
         if fd >= 0:
             with suppress(OSError):
@@ -264,14 +291,13 @@ class MountedFile:
 
 
 class MountedFiles:
-    """Implements Files."""
+    """Implements Files by the kernel's calls."""
 
     def __init__(self, mountpoint: str, mounted: bytes, root: bytes) -> None:
         """`mounted`: what of the vehicle is on the mountpoint; `root`: what of it is our `/`."""
         self._mountpoint = os.fsencode(mountpoint)
         self._mounted = mounted.rstrip(b"/")
         self._root = root.rstrip(b"/")
-        self._expired: set[bytes] = set()
 
     def _place(self, path: bytes) -> bytes:
         remote = normalise(self._root + b"/" + path)
@@ -283,70 +309,53 @@ class MountedFiles:
         return self._mountpoint + remote[len(self._mounted) :].rstrip(b"/")
 
     async def stat(self, path: bytes) -> Stat:
-        """See Files."""
-        place = self._place(path)
-        if path in self._expired:  # the kernel believes what it was told a second ago, but for an open
-            self._expired.discard(path)
-            (await self.open(path)).close()
-        return _stat_of(await _in_thread(lambda: os.stat(place), path))
+        """As os.stat."""
+        return _stat_of(await _call(path, os.stat, self._place(path)))
 
     async def list(self, path: bytes) -> list[tuple[bytes, Stat]]:
-        """See Files."""
-        place = self._place(path)
+        """As os.scandir."""
 
-        def scan() -> list[tuple[bytes, Stat]]:
+        def scan(place: bytes) -> list[tuple[bytes, Stat]]:
             with os.scandir(place) as entries:
                 return [(entry.name, _stat_of(entry.stat())) for entry in entries]
 
-        return await _in_thread(scan, path)
+        return await _call(path, scan, self._place(path))
 
     async def open(self, path: bytes, *, write: bool = False, truncate: bool = False) -> MountedFile:
-        """See Files."""
+        """As os.open."""
         flags = (os.O_RDWR if write else os.O_RDONLY) | (os.O_TRUNC if truncate else 0)
         return await self._open(path, flags)
 
     async def create(self, path: bytes, *, exclusive: bool) -> MountedFile:
-        """See Files."""
+        """As os.open with O_CREAT."""
         return await self._open(path, os.O_RDWR | os.O_CREAT | (os.O_EXCL if exclusive else 0))
 
     async def _open(self, path: bytes, flags: int) -> MountedFile:
-        place = self._place(path)
-
-        def opened() -> tuple[int, int]:
+        def opened(place: bytes) -> tuple[int, int]:
             fd = os.open(place, flags | os.O_CLOEXEC, 0o666)
             return fd, os.fstat(fd).st_size
 
-        return MountedFile(path, *await _in_thread(opened, path))
+        return MountedFile(path, *await _call(path, opened, self._place(path)))
 
     async def crc32(self, path: bytes) -> int:
-        """See Files."""
-        place = self._place(path)
-        return int(await _in_thread(lambda: os.getxattr(place, XATTR_CRC32), path), 16)
+        """Ask the vehicle."""
+        return int(await _call(path, os.getxattr, self._place(path), XATTR_CRC32), 16)
 
     async def mkdir(self, path: bytes) -> None:
-        """See Files."""
-        place = self._place(path)
-        await _in_thread(lambda: os.mkdir(place), path)
+        """As os.mkdir."""
+        await _call(path, os.mkdir, self._place(path))
 
     async def rmdir(self, path: bytes) -> None:
-        """See Files."""
-        place = self._place(path)
-        await _in_thread(lambda: os.rmdir(place), path)
+        """As os.rmdir."""
+        await _call(path, os.rmdir, self._place(path))
 
     async def unlink(self, path: bytes) -> None:
-        """See Files."""
-        place = self._place(path)
-        await _in_thread(lambda: os.unlink(place), path)
+        """As os.unlink."""
+        await _call(path, os.unlink, self._place(path))
 
     async def rename(self, old: bytes, new: bytes) -> None:
-        """See Files."""
-        source, target = self._place(old), self._place(new)
-        await _in_thread(lambda: os.rename(source, target), old)
-
-    def expire(self, path: bytes) -> None:
-        """See Files."""
-        self._expired.add(path)
-        self.forget_caches()
+        """As os.rename."""
+        await _call(old, os.rename, self._place(old), self._place(new))
 
     def forget_caches(self) -> None:
         """Have the mount ask the vehicle again; a mount of somebody else may go on with what it knows."""
@@ -356,7 +365,7 @@ class MountedFiles:
 
 
 def _stat_of(found: os.stat_result) -> Stat:
-    kind = EntryKind.DIRECTORY if (found.st_mode & 0o170000) == 0o040000 else EntryKind.FILE
+    kind = EntryKind.DIRECTORY if stat.S_ISDIR(found.st_mode) else EntryKind.FILE
     return Stat(kind, found.st_size, int(found.st_mtime), 0.0)
 
 
@@ -399,8 +408,9 @@ class Target:
 
 
 def _session_of(vehicle: Attached, options: MountOptions) -> Session:
-    async def transfers() -> Transfers:
-        return cast(Sequence[dict[str, object]], vehicle.tree.status().get("transfers", []))
+    async def acknowledged() -> Acknowledged:
+        found: Any = vehicle.tree.status().get("transfers", [])
+        return {facts["path"]: facts["size"] - facts["bytes_left"] for facts in found}
 
     def silent() -> bool:
         connection = vehicle.connection
@@ -413,7 +423,7 @@ def _session_of(vehicle: Attached, options: MountOptions) -> Session:
             await trio.sleep(_TICK)
         return not silent()
 
-    return Session(vehicle.tree, options.root, transfers, silent=silent, returned=returned)
+    return Session(vehicle.tree, options.root, acknowledged, silent=silent, returned=returned)
 
 
 @asynccontextmanager

@@ -10,7 +10,7 @@ from typing import Any
 
 from mavftpfs.cache.attributes import Stat
 from mavftpfs.oneshot.fetch import known_time
-from mavftpfs.oneshot.files import READ_SIZE, File, Files, Session, is_directory
+from mavftpfs.oneshot.files import READ_SIZE, File, Files, Session, is_directory, walk
 from mavftpfs.protocol.url import MftpUrl, is_url, parse_url
 from mavftpfs.shared.errors import (
     AlreadyExists,
@@ -246,22 +246,20 @@ async def remove_paths(session: Session, paths: Sequence[bytes], *, recursive: b
         if stat.kind is EntryKind.DIRECTORY and not recursive:
             raise IsADirectory(f"{name_text(path)} is a directory; remove it with -r")
     for path, stat in found:
-        await _remove(session.files, path, stat)
+        await _remove(session.files, path, stat.kind)
 
 
-async def _remove(files: Files, path: bytes, found: Stat) -> None:
+async def _remove(files: Files, path: bytes, kind: EntryKind) -> None:
     """Remove a file, or a directory from its leaves upwards."""
-    pending = [(path, found.kind, False)]
-    while pending:
-        here, kind, emptied_already = pending.pop()
-        if kind is EntryKind.FILE:
-            await files.unlink(here)
-        elif emptied_already:
-            await files.rmdir(here)
-        else:
-            pending.append((here, kind, True))
-            for name, below in await files.list(here):
-                pending.append((join(here, name), below.kind, False))
+    if kind is EntryKind.FILE:
+        await files.unlink(path)
+        return
+    found, unlisted = await walk(files, path)
+    for _, error in unlisted:
+        raise error
+    for below, stat in reversed(found):
+        await (files.unlink if stat.kind is EntryKind.FILE else files.rmdir)(join(path, below))
+    await files.rmdir(path)
 
 
 async def move_paths(session: Session, paths: Sequence[bytes], to: bytes) -> None:

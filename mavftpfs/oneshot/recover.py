@@ -18,7 +18,7 @@ from typing import Any
 from mavftpfs.oneshot.fetch import NO_CHECKSUM, local_crc32
 from mavftpfs.oneshot.files import Session
 from mavftpfs.oneshot.progress import Progress
-from mavftpfs.oneshot.transfer import Piece, Put, Sent, put_paths
+from mavftpfs.oneshot.upload import put_file
 from mavftpfs.shared.errors import (
     NotDelivered,
     NotFound,
@@ -169,19 +169,15 @@ async def put_back(
     for kept in wanted:
         if kept.hindrance:
             raise UsageError(f"{kept.file}: {kept.hindrance}; look at it, and use `mavftpfs put`")
+    progress.plan(len(wanted), sum(kept.size for kept in wanted))
     for kept in wanted:
         path = _in_session(session, kept)
         there_already = await _is_there(session, path, kept, force=force)
         if not there_already:
-            piece = Piece(kept.file, b"", False, kept.size)
-            await put_paths(session, [(kept.file, [piece])], path, progress, _nobody, Put())
+            await put_file(session, kept.file, path, progress)
             await _prove(session, path, kept)
         _forget(kept)
         tell(PutBack(kept, there_already))
-
-
-def _nobody(sent: Sent) -> None:
-    """Told of what was put: the caller is told when it is proven."""
 
 
 def _in_session(session: Session, kept: Kept) -> bytes:

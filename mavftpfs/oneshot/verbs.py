@@ -23,14 +23,13 @@ from mavftpfs.commands import connection_of, left_by_killed_mounts_line
 from mavftpfs.compose import open_sinks, plain_nursery
 from mavftpfs.farewell import recovered_directory
 from mavftpfs.fuse.options import parse_options
-from mavftpfs.oneshot import names, progress, transfer
+from mavftpfs.oneshot import download, names, progress, upload
 from mavftpfs.oneshot import recover as recovering
 from mavftpfs.oneshot import scan as scanning
-from mavftpfs.oneshot import sync as syncing
-from mavftpfs.oneshot.fetch import Fetched, Fetcher, Step
+from mavftpfs.oneshot.fetch import Fetched, Fetcher
 from mavftpfs.oneshot.files import Session, Target, mountpoint_of
 from mavftpfs.shared.errors import ExitCode, MavftpfsError, UsageError, exit_code_for
-from mavftpfs.shared.readable import name_text, printable, readable, readable_size
+from mavftpfs.shared.readable import printable, readable, readable_size
 
 ResultT = TypeVar("ResultT")
 Args = argparse.Namespace
@@ -123,7 +122,7 @@ def _name(path: bytes) -> str:
     return printable(os.fsdecode(path))
 
 
-# -- sync -----------------------------------------------------------------------------------------
+# -- sync, get and cat ----------------------------------------------------------------------------
 
 
 def sync(args: Args) -> int:
@@ -132,69 +131,117 @@ def sync(args: Args) -> int:
     if args.place is not None:
         (place,), component = names.parse_paths([args.place])
     since = None if args.since is None else parse_date(args.since)
-    wish = syncing.Wish(Path(args.local), place, args.newest, since, args.dry_run)
-    outcome = syncing.Outcome()
+    wish = download.Wish(Path(args.local), place, args.newest, since, args.dry_run)
+    outcome = download.Outcome()
+    tell = _ignore if args.json else _tell
     error: MavftpfsError | None = None
-
-    def tell(fetched: Fetched) -> None:
-        if not args.json:
-            print(_fetched_line(fetched), flush=True)
-
-    bar = progress.Progress()
-
-    async def work(session: Session) -> None:
-        fetcher = Fetcher(session, bar, args.verify)
-        await syncing.sync(session, wish, fetcher, outcome, tell, _say)
-
-    with _on_interrupt(lambda: f"{_here(outcome)}; the next run goes on where this one stopped"):
-        try:
-            with progress.shown(bar):
-                with_session(args, work, component)
-        except MavftpfsError as exc:
-            if not outcome.tasks:
-                raise
-            error = exc
+    try:
+        _download(args, outcome, lambda downloads: downloads.sync(wish), component, tell)
+    except MavftpfsError as exc:
+        if not outcome.wanted:
+            raise
+        error = exc
     if args.json:
         print(json.dumps(outcome.facts(), indent=2))
     elif wish.dry_run:
         _print_plan(outcome)
     else:
-        print(_sync_summary(outcome))
+        print(_sync_summary(outcome, since))
     if error is not None:
-        _say(f"{error}; {_here(outcome)}, the next run goes on where this one stopped")
+        _say(f"{error}; {_here(outcome)}")
         return max(exit_code_for(error), ExitCode.INCOMPLETE)
     return ExitCode.OK if outcome.complete else ExitCode.INCOMPLETE
 
 
-def _fetched_line(fetched: Fetched) -> str:
+def get(args: Args) -> int:
+    """Fetch files."""
+    if args.to == STDOUT:
+        if args.recursive:
+            raise UsageError("directories cannot be written to stdout; leave out -r or --to -")
+        return cat(args)
+    wanted, component = names.parse_paths(args.paths)
+    outcome = download.Outcome()
+
+    async def work(downloads: download.Downloads) -> None:
+        await downloads.get(wanted, Path(args.to), recursive=args.recursive)
+
+    _download(args, outcome, work, component)
+    return ExitCode.INCOMPLETE if outcome.failed else ExitCode.OK
+
+
+def cat(args: Args) -> int:
+    """Write files to stdout."""
+    wanted, component = names.parse_paths(args.paths)
+    outcome = download.Outcome()
+
+    def write(data: bytes | memoryview) -> None:
+        sys.stdout.buffer.write(data)
+        sys.stdout.buffer.flush()
+
+    async def take(data: bytes | memoryview) -> None:
+        # In a thread: who reads may take its time, and the vehicle is to hear of us meanwhile.
+        await trio.to_thread.run_sync(write, bytes(data), abandon_on_cancel=True)
+
+    async def work(session: Session) -> None:
+        fetcher = Fetcher(session, progress.Progress(), args.verify)
+        await download.Downloads(fetcher, outcome, _ignore, _say).cat(wanted, take)
+
+    with_session(args, work, component)
+    return ExitCode.INCOMPLETE if outcome.failed else ExitCode.OK
+
+
+def _tell(fetched: Fetched) -> None:
     resumed = f", resumed at {readable_size(fetched.resumed)}" if fetched.resumed else ""
-    return f"{printable(fetched.name)}: {readable_size(fetched.size)}{resumed}, verified by {fetched.proof}"
+    name = printable(fetched.wanted.name)
+    print(f"{name}: {readable_size(fetched.size)}{resumed}, verified by {fetched.proof}", flush=True)
 
 
-def _here(outcome: syncing.Outcome) -> str:
-    wanted = len(outcome.tasks)
-    return f"{wanted - len(outcome.to_fetch) + len(outcome.fetched)} of {wanted} logs are here"
+def _ignore(fetched: Fetched) -> None:
+    """For who prints nothing of single files."""
 
 
-def _sync_summary(outcome: syncing.Outcome) -> str:
+def _download(
+    args: Args,
+    outcome: download.Outcome,
+    function: Callable[[download.Downloads], Coroutine[Any, Any, None]],
+    component: int | None,
+    tell: Callable[[Fetched], None] = _tell,
+) -> None:
+    """Bring files with progress on the screen; Ctrl-C says how many are here."""
+    bar = progress.Progress()
+
+    async def work(session: Session) -> None:
+        fetcher = Fetcher(session, bar, args.verify, getattr(args, "resume", True))
+        await function(download.Downloads(fetcher, outcome, tell, _say))
+
+    with _on_interrupt(lambda: _here(outcome)), progress.shown(bar):
+        with_session(args, work, component)
+
+
+def _here(outcome: download.Outcome) -> str:
+    wanted, here = len(outcome.wanted) + len(outcome.here), len(outcome.fetched) + len(outcome.here)
+    return f"{here} of {wanted} files are here; the next run goes on where this one stopped"
+
+
+def _sync_summary(outcome: download.Outcome, since: float | None) -> str:
     new, size = len(outcome.fetched), sum(fetched.size - fetched.resumed for fetched in outcome.fetched)
-    before = len(outcome.tasks) - len(outcome.to_fetch)
-    line = f"{new} new ({readable_size(size)}), {before} here already, from {_name(outcome.place)}"
-    if outcome.missing:
-        line += f"; {len(outcome.missing)} not here, the next run goes on"
-    if outcome.undated:
-        line += f"; {outcome.undated} without a time were not left out by --since"
+    line = f"{new} new ({readable_size(size)}), {len(outcome.here)} here already, from {_name(outcome.place)}"
+    missing = sum(wanted.remote in outcome.failed for wanted in outcome.wanted)
+    if missing:
+        line += f"; {missing} not here, the next run goes on"
+    undated = sum(log.mtime is None for log in [*outcome.here, *outcome.wanted])
+    if undated and since is not None:
+        line += f"; {undated} without a time were not left out by --since"
     return line
 
 
-def _print_plan(outcome: syncing.Outcome) -> None:
-    for task in outcome.to_fetch:
-        on = f", {readable_size(task.there)} of it here" if task.step is not Step.FETCH else ""
-        print(f"{_name(task.log.below)}: {readable_size(task.log.size)}{on}")
-    left = sum(task.log.size - task.there for task in outcome.to_fetch)
-    before = len(outcome.tasks) - len(outcome.to_fetch)
+def _print_plan(outcome: download.Outcome) -> None:
+    for log in outcome.wanted:
+        on = f", {readable_size(log.begun)} of it here" if log.begun else ""
+        print(f"{printable(log.name)}: {readable_size(log.size)}{on}")
+    left = sum(log.size - log.begun for log in outcome.wanted)
     print(
-        f"would fetch {len(outcome.to_fetch)} ({readable_size(left)}), {before} here already, "
+        f"would fetch {len(outcome.wanted)} ({readable_size(left)}), {len(outcome.here)} here already, "
         f"from {_name(outcome.place)}"
     )
 
@@ -213,66 +260,24 @@ def parse_date(text: str) -> float:
         ) from None
 
 
-# -- get and cat ----------------------------------------------------------------------------------
-
-
-def get(args: Args) -> int:
-    """Fetch files."""
-    if args.to == STDOUT:
-        if args.recursive:
-            raise UsageError("directories cannot be written to stdout; leave out -r or --to -")
-        return cat(args)
-    wanted, component = names.parse_paths(args.paths)
-    got, bar = transfer.Got(), progress.Progress()
-
-    def tell(fetched: Fetched) -> None:
-        print(_fetched_line(fetched), flush=True)
-
-    async def work(session: Session) -> None:
-        fetcher = Fetcher(session, bar, args.verify, args.resume)
-        await transfer.get_paths(fetcher, wanted, Path(args.to), tell, _say, got, recursive=args.recursive)
-
-    def stopped() -> str:
-        begun = f"; what came of {printable(bar.name)} is kept, to go on with" if bar.name else ""
-        return f"{got.done} of {got.planned} files are here{begun}"
-
-    with _on_interrupt(stopped), progress.shown(bar):
-        with_session(args, work, component)
-    return ExitCode.INCOMPLETE if got.failed else ExitCode.OK
-
-
-def cat(args: Args) -> int:
-    """Write files to stdout."""
-    wanted, component = names.parse_paths(args.paths)
-    got = transfer.Got()
-
-    async def work(session: Session) -> None:
-        await transfer.cat_paths(session, wanted, sys.stdout.buffer, args.verify, _say, got)
-
-    with_session(args, work, component)
-    return ExitCode.INCOMPLETE if got.failed else ExitCode.OK
-
-
 # -- put and names --------------------------------------------------------------------------------
 
 
 def put(args: Args) -> int:
     """Put files on the vehicle."""
     (path,), component = names.parse_paths([args.path])
-    batches = [(local, transfer.collect(local, recursive=args.recursive)) for local in args.locals]
-    counts, bar = transfer.Put(), progress.Progress()
+    batches = [(local, upload.collect(local, recursive=args.recursive)) for local in args.locals]
+    bar = progress.Progress()
 
-    def tell(sent: transfer.Sent) -> None:
-        print(f"{_name(sent.remote)}: {readable_size(sent.size)}, delivered", flush=True)
+    def tell(remote: bytes, size: int) -> None:
+        print(f"{_name(remote)}: {readable_size(size)}, delivered", flush=True)
 
     async def work(session: Session) -> None:
-        await transfer.put_paths(session, batches, path, bar, tell, counts)
+        await upload.put_paths(session, batches, path, bar, tell)
 
     def stopped() -> str:
-        line = f"{counts.done} of {counts.planned} files are on the vehicle"
-        if counts.at_work is None:
-            return line
-        return f"{line}; {name_text(counts.at_work)} is not, and what was there under that name still is"
+        line = f"{bar.files_done} of {bar.files} files are on the vehicle"
+        return f"{line}; {bar.name} is not, and what was there under that name still is" if bar.name else line
 
     with _on_interrupt(stopped), progress.shown(bar):
         with_session(args, work, component, writing=True)

@@ -10,7 +10,7 @@ from typing import cast
 import pytest
 import trio
 
-from mavftpfs.oneshot import sync as syncing
+from mavftpfs.oneshot.download import Downloads, Outcome, Wish
 from mavftpfs.oneshot.fetch import (
     Fetched,
     Fetcher,
@@ -22,8 +22,6 @@ from mavftpfs.oneshot.fetch import (
 )
 from mavftpfs.oneshot.files import Files, Session
 from mavftpfs.oneshot.progress import Progress
-from mavftpfs.oneshot.sync import Outcome, Wish
-from mavftpfs.oneshot.transfer import Got, get_paths
 from mavftpfs.shared.errors import (
     Armed,
     DataUnproven,
@@ -61,9 +59,6 @@ class SpoiltTree(FakeTree):
             raise self.crc_error
         return await super().crc32(path)
 
-    def expire(self, path: bytes) -> None:
-        """Nothing is remembered."""
-
     def forget_caches(self) -> None:
         self.forgotten += 1
 
@@ -79,7 +74,7 @@ def names_in(folder: Path) -> list[str]:
 def wanted(tree: FakeTree, path: bytes, local: Path) -> Wanted:
     found = tree.stat_now(path)
     mtime = known_time(found.mtime)
-    return Wanted(path, local, path.decode(errors="replace"), found.size, mtime, part_of(local))
+    return Wanted(path, path.decode(errors="replace"), found.size, mtime, local, part_of(local))
 
 
 async def get(tree: FakeTree, path: bytes, local: Path, verify: Verify = "auto") -> Fetched:
@@ -101,7 +96,7 @@ async def test_wrong_bytes_are_fetched_again_without_the_caches(tmp_path: Path) 
 @pytest.mark.holds("promise 1")
 async def test_wrong_bytes_twice_leave_nothing_and_keep_the_old_file(tmp_path: Path) -> None:
     tree = SpoiltTree({b"/big": BIG})
-    tree.bad = 2
+    tree.bad = 9
     (tmp_path / "big").write_bytes(b"old")
     with pytest.raises(DataUnproven, match=r"/big.*CRC32"):
         await get(tree, b"/big", tmp_path / "big")
@@ -245,18 +240,13 @@ async def test_names_that_end_in_part_are_the_vehicle_s_too(tmp_path: Path) -> N
 # -- get ------------------------------------------------------------------------------------------
 
 
-async def get_all(tree: FakeTree, *paths: bytes, to: Path, recursive: bool = True) -> tuple[Got, list[str]]:
-    got, said = Got(), list[str]()
-    await get_paths(
-        fetcher_of(tree),
-        paths,
-        to,
-        lambda _: None,
-        said.append,
-        got,
-        recursive=recursive,
-    )
-    return got, said
+async def get_all(
+    tree: FakeTree, *paths: bytes, to: Path, recursive: bool = True
+) -> tuple[Outcome, list[str]]:
+    outcome, said = Outcome(), list[str]()
+    downloads = Downloads(fetcher_of(tree), outcome, lambda _: None, said.append)
+    await downloads.get(paths, to, recursive=recursive)
+    return outcome, said
 
 
 async def test_what_the_local_disk_refuses_is_told_in_a_line(tmp_path: Path) -> None:
@@ -284,8 +274,8 @@ async def test_a_directory_goes_on_after_what_fails(tmp_path: Path, call: tuple[
     inner = b"/d/b/x" if call[0] == "list" else b"/d/b"
     tree = SpoiltTree({b"/d/a": b"1", inner: b"2", b"/d/c": b"3"})
     tree.on_call = refusing(*call)
-    got, said = await get_all(tree, b"/d", to=tmp_path / "d")
-    assert (got.done, got.failed, said) == (2, 1, ["/d/b: no answer"])
+    outcome, said = await get_all(tree, b"/d", to=tmp_path / "d")
+    assert (len(outcome.fetched), list(outcome.failed), said) == (2, [b"/d/b"], ["/d/b: no answer"])
     assert (tmp_path / "d" / "c").read_bytes() == b"3"
 
 
@@ -317,11 +307,9 @@ async def sync(
 ) -> tuple[Outcome, list[str], list[str]]:
     outcome, told, said = Outcome(), list[str](), list[str]()
     fetcher = fetcher_of(tree, root)
-    wish = Wish(local, newest=newest, dry_run=dry_run)
+    downloads = Downloads(fetcher, outcome, lambda fetched: told.append(fetched.wanted.name), said.append)
     try:
-        await syncing.sync(
-            fetcher.session, wish, fetcher, outcome, lambda fetched: told.append(fetched.name), said.append
-        )
+        await downloads.sync(Wish(local, newest=newest, dry_run=dry_run))
     except MavftpfsError as exc:
         said.append(repr(exc))
     return outcome, told, said

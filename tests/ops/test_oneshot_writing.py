@@ -11,7 +11,7 @@ import pytest
 from mavftpfs.oneshot import names
 from mavftpfs.oneshot.files import Files, Session
 from mavftpfs.oneshot.progress import Progress
-from mavftpfs.oneshot.transfer import Put, Sent, collect, put_paths
+from mavftpfs.oneshot.upload import collect, put_paths
 from mavftpfs.shared.errors import (
     AlreadyExists,
     CrossDevice,
@@ -72,12 +72,12 @@ def local(tmp_path: Path) -> Path:
     return root
 
 
-async def put(tree: Card, *locals_: Path, to: bytes, recursive: bool = False) -> list[Sent]:
-    told: list[Sent] = []
+async def put(tree: Card, *locals_: Path, to: bytes, recursive: bool = False) -> list[bytes]:
+    told: list[bytes] = []
     batches = [(local, collect(local, recursive=recursive)) for local in locals_]
-    counts, progress = Put(), Progress()
-    await put_paths(session_of(tree), batches, to, progress, told.append, counts)
-    assert (counts.done, counts.at_work, progress.done) == (len(told), None, progress.total)
+    progress = Progress()
+    await put_paths(session_of(tree), batches, to, progress, lambda remote, _: told.append(remote))
+    assert (progress.files_done, progress.name, progress.done) == (len(told), "", progress.total)
     assert all(file.closed for file in tree.opened)
     return told
 
@@ -89,7 +89,7 @@ async def test_a_directory_with_all_below(local: Path, to: bytes, place: bytes) 
     expected = {place + b"/a": BIG, place + b"/e/none": b"", place + b"/e/\xff": b"3"}
     assert tree.files == expected
     assert place + b"/e/f" in tree.directories
-    assert {sent.remote for sent in told} == expected.keys()
+    assert set(told) == expected.keys()
 
 
 @pytest.mark.parametrize("what", ["directory", "missing", "fifo", "link to a directory"])
@@ -183,9 +183,7 @@ async def test_by_a_mount_a_file_is_written_beside_where_the_server_can_rename(
     tree = Card({b"/x": b"old"})
     tree.renames = renames
     session = Session(cast(Files, tree), mountpoint="/mnt/drone")
-    await put_paths(
-        session, [(local / "a", collect(local / "a", recursive=False))], b"/x", Progress(), print, Put()
-    )
+    await put_paths(session, [(local / "a", collect(local / "a", recursive=False))], b"/x", Progress(), print)
     assert tree.files == {b"/x": BIG}
     opened = [path for name, path in tree.calls if name == "open"]
     assert (b"/x" in opened) is not renames
@@ -202,6 +200,6 @@ async def test_by_a_mount_what_was_interrupted_is_taken_back(local: Path) -> Non
     session = Session(cast(Files, tree), mountpoint="/mnt/drone")
     batch = (local / "a", collect(local / "a", recursive=False))
     with pytest.raises(BaseException, match=r".*") as caught:
-        await put_paths(session, [batch], b"/x", Progress(), print, Put())
+        await put_paths(session, [batch], b"/x", Progress(), print)
     assert caught.group_contains(KeyboardInterrupt) or caught.type is KeyboardInterrupt
     assert tree.files == {b"/x": b"old"}

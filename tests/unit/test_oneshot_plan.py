@@ -1,13 +1,15 @@
-"""oneshot.fetch, names and scan: what to fetch, skip, resume and prove; what words mean."""
+"""oneshot.fetch, download, names and scan: what to fetch, skip, resume and prove; what words mean."""
 
 from __future__ import annotations
+
+from pathlib import Path
 
 import pytest
 
 from mavftpfs.link.messages import Address, AutopilotVersion, Heartbeat
 from mavftpfs.link.uri import parse_source
-from mavftpfs.oneshot import fetch
-from mavftpfs.oneshot.fetch import Log, Step, Verify
+from mavftpfs.oneshot import download, fetch
+from mavftpfs.oneshot.fetch import Verify, Wanted
 from mavftpfs.oneshot.files import same_link
 from mavftpfs.oneshot.names import parse_paths
 from mavftpfs.oneshot.scan import describe_peer
@@ -19,23 +21,29 @@ MAY, JUNE = 1_714_566_896, 1_717_245_296
 
 
 @pytest.mark.parametrize(
-    ("here", "part", "step"),
+    ("here", "part", "begun"),
     [
-        (None, None, Step.FETCH),
-        (100, None, Step.SKIP),
-        (100, 40, Step.SKIP),
-        (None, 40, Step.RESUME),
-        (None, 100, Step.RESUME),
-        (None, 101, Step.FETCH),
-        (None, 0, Step.FETCH),
-        (60, None, Step.EXTEND),
-        (60, 80, Step.RESUME),
-        (0, None, Step.FETCH),
-        (101, None, Step.FETCH),
+        (None, None, 0),
+        (100, 40, None),
+        (None, 40, 40),
+        (None, 100, 100),
+        (None, 101, 0),
+        (None, 0, 0),
+        (60, None, 60),
+        (60, 80, 80),
+        (0, None, 0),
+        (101, None, 0),
     ],
 )
-def test_what_to_do_about_a_file_of_100_bytes(here: int | None, part: int | None, step: Step) -> None:
-    assert fetch.decide(100, here, part) is step
+def test_what_is_here_of_a_file_of_100_bytes(
+    tmp_path: Path, here: int | None, part: int | None, begun: int | None
+) -> None:
+    wanted = Wanted(b"/a", "a", 100, None, tmp_path / "a", tmp_path / "a.part", keep_old=True)
+    for path, size in ((wanted.local, here), (wanted.part, part)):
+        if size is not None:
+            path.write_bytes(bytes(size))
+    assert wanted.here is (begun is None)
+    assert wanted.here or wanted.begun == begun
 
 
 @pytest.mark.parametrize(
@@ -53,28 +61,35 @@ def test_what_is_proven(verify: Verify, resumed: bool, size: int, needed: bool) 
     assert fetch.proof_needed(verify, resumed=resumed, size=size) is needed
 
 
-def log(below: bytes, mtime: int | None = None) -> Log:
-    return Log(b"/log/" + below, below, 1, mtime)
+def log(below: str, mtime: int | None = None) -> Wanted:
+    return Wanted(b"/log/" + below.encode(), below, 1, mtime, Path(below), Path(below))
 
 
-def test_the_newest_come_first_by_time_then_by_number() -> None:
-    logs = [log(b"s/log9"), log(b"a", MAY), log(b"s/log10"), log(b"b", JUNE), log(b"c", MAY)]
-    assert [one.below for one in fetch.newest_first(logs)] == [b"b", b"c", b"a", b"s/log10", b"s/log9"]
-
-
-def test_the_newest_log_is_not_the_file_that_holds_its_number() -> None:
-    for time in (None, JUNE):  # ArduPilot without and with times
-        logs = [log(b"00000001.BIN", time and MAY), log(b"LASTLOG.TXT", time), log(b"00000002.BIN", time)]
-        ordered = [one.below for one in fetch.newest_first(logs)]
-        assert ordered == [b"00000002.BIN", b"00000001.BIN", b"LASTLOG.TXT"]
+@pytest.mark.parametrize(
+    ("logs", "ordered"),
+    [
+        (
+            [log("s/log9"), log("a", MAY), log("s/log10"), log("b", JUNE), log("c", MAY)],
+            ["b", "c", "a", "s/log10", "s/log9"],
+        ),
+        # ArduPilot's number of the last log is none, with times and without
+        ([log("1.BIN"), log("LASTLOG.TXT"), log("2.BIN")], ["2.BIN", "1.BIN", "LASTLOG.TXT"]),
+        (
+            [log("1.BIN", MAY), log("LASTLOG.TXT", JUNE), log("2.BIN", JUNE)],
+            ["2.BIN", "1.BIN", "LASTLOG.TXT"],
+        ),
+    ],
+)
+def test_the_newest_come_first_by_time_then_by_number(logs: list[Wanted], ordered: list[str]) -> None:
+    assert [one.name for one in download.newest_first(logs)] == ordered
 
 
 def test_which_logs_are_wished_for() -> None:
-    logs = fetch.newest_first([log(b"a", MAY), log(b"b", JUNE), log(b"c")])
-    assert [one.below for one in fetch.select(logs, newest=1, since=None)] == [b"b"]
-    since = fetch.select(logs, newest=None, since=MAY + 1)
-    assert [one.below for one in since] == [b"b", b"c"]  # c may be a new one
-    assert fetch.select(logs, newest=9, since=None) == logs
+    logs = download.newest_first([log("a", MAY), log("b", JUNE), log("c")])
+    assert [one.name for one in download.select(logs, newest=1, since=None)] == ["b"]
+    since = download.select(logs, newest=None, since=MAY + 1)
+    assert [one.name for one in since] == ["b", "c"]  # c may be a new one
+    assert download.select(logs, newest=9, since=None) == logs
 
 
 def test_a_clock_that_was_not_set_tells_nothing() -> None:

@@ -1,0 +1,169 @@
+"""Putting local files and directories on the vehicle. Layer: top; prints nothing.
+
+A file counts as put when fsync says that it is on the card, checked; until then progress is what the vehicle
+has acknowledged.
+"""
+
+from __future__ import annotations
+
+import os
+import secrets
+from collections.abc import AsyncIterator, Callable, Sequence
+from contextlib import asynccontextmanager, suppress
+from pathlib import Path
+from typing import BinaryIO
+
+import trio
+
+from mavftpfs.compose import plain_nursery
+from mavftpfs.oneshot.files import READ_SIZE, File, Session, is_directory
+from mavftpfs.oneshot.names import emptied, make_directory
+from mavftpfs.oneshot.progress import Progress
+from mavftpfs.shared.errors import CrossDevice, MavftpfsError, NotADirectory, NotDelivered, UsageError
+from mavftpfs.shared.model import join, normalise, split
+from mavftpfs.shared.readable import name_text
+
+WITHDRAWAL_TIME = 10.0
+"""Seconds to take back what a mount was given."""
+
+ASK_PERIOD = 0.25
+"""Seconds between two looks at how much the vehicle has acknowledged."""
+
+
+def collect(local: Path, *, recursive: bool) -> list[Path]:
+    """Return a file, or a directory with all below, parents first.
+
+    Raises:
+        UsageError: it is not there or not readable, is neither file nor directory, or a directory without
+            `recursive`. Symbolic links to files count as files; cards have no links.
+    """
+
+    def fail(error: OSError) -> None:
+        raise UsageError(f"{error.filename}: {error.strerror}") from error
+
+    found = [local]
+    if local.is_dir():
+        if not recursive:
+            raise UsageError(f"{local} is a directory; put it with -r")
+        for folder, directories, files in os.walk(local, onerror=fail):
+            directories.sort()
+            found += [Path(folder, name) for name in sorted([*directories, *files])]
+    for path in found:
+        if path.is_symlink() and path.is_dir() and path != local:
+            raise UsageError(f"{path} is a link to a directory; a card cannot hold links")
+        if not path.exists():
+            raise UsageError(f"{path} is not there")
+        if not path.is_file() and not path.is_dir():
+            raise UsageError(f"{path} is neither a file nor a directory")
+    return found
+
+
+async def put_paths(
+    session: Session,
+    batches: Sequence[tuple[Path, Sequence[Path]]],
+    path: bytes,
+    progress: Progress,
+    tell: Callable[[bytes, int], None],
+) -> None:
+    """Put what `collect` found to `path`: an existing directory, or a new name for one thing.
+
+    `tell` hears name and size of each file that is on the vehicle.
+
+    Raises:
+        NotADirectory: several things, and `path` is no directory. UsageError: of what is local.
+        NotDelivered: a file did not get to the vehicle; what was told before is there.
+    """
+    into = await is_directory(session.files, path)
+    if not into and len(batches) > 1:
+        raise NotADirectory(f"{name_text(path)} is no directory, so only one thing can be put there")
+    sizes = [one.stat().st_size for _, found in batches for one in found if not one.is_dir()]
+    progress.plan(len(sizes), sum(sizes))
+    for local, found in batches:
+        place = join(path, os.fsencode(local.absolute().name)) if into else path
+        for one in found:
+            remote = normalise(join(place, os.fsencode(one.relative_to(local))))
+            if one.is_dir():
+                await make_directory(session.files, remote, may_exist=True)
+            else:
+                tell(remote, await put_file(session, one, remote, progress))
+
+
+async def put_file(session: Session, local: Path, remote: bytes, progress: Progress) -> int:
+    """Put one file, and return its size.
+
+    Raises:
+        UsageError: it cannot be read. NotDelivered.
+    """
+    try:
+        with local.open("rb") as source:
+            planned = os.fstat(source.fileno()).st_size
+            progress.begin(name_text(remote), planned)
+            size = await _send(session, source, remote, progress)
+    except OSError as exc:
+        raise UsageError(f"{local}: {exc.strerror}") from exc
+    except MavftpfsError as exc:
+        done = f"; {progress.files_done} file(s) before it are there" if progress.files_done else ""
+        raise NotDelivered(f"{name_text(remote)} was not delivered: {exc}{done}") from exc
+    progress.end(planned)
+    return size
+
+
+async def _send(session: Session, source: BinaryIO, remote: bytes, progress: Progress) -> int:
+    if session.mountpoint is not None:
+        try:
+            return await _send_beside(session, source, remote, progress)
+        except CrossDevice:  # this server cannot rename
+            source.seek(0)
+    file = await emptied(session.files, remote)
+    try:
+        async with _watched(session, remote, progress):
+            return await _copy(source, file)
+    finally:
+        file.close()
+
+
+async def _send_beside(session: Session, source: BinaryIO, remote: bytes, progress: Progress) -> int:
+    """Write a new file beside and rename it: of a put that was interrupted a mount would go on to deliver
+    what it was given."""
+    files = session.files
+    beside = join(split(remote)[0], b".put-" + secrets.token_hex(4).encode())
+    file = await files.create(beside, exclusive=True)
+    try:
+        async with _watched(session, beside, progress):
+            size = await _copy(source, file)
+        file.close()
+        await files.rename(beside, remote)
+    except BaseException:
+        with trio.move_on_after(WITHDRAWAL_TIME) as patience, suppress(MavftpfsError):
+            patience.shield = True
+            await files.unlink(beside)  # while it is open: closing delivers what has a name
+        file.close()
+        raise
+    return size
+
+
+async def _copy(source: BinaryIO, file: File) -> int:
+    offset = 0
+    while data := source.read(READ_SIZE):
+        offset += await file.write(offset, data)
+    await file.fsync()
+    return offset
+
+
+@asynccontextmanager
+async def _watched(session: Session, path: bytes, progress: Progress) -> AsyncIterator[None]:
+    """Tell progress what the vehicle has acknowledged of a file while the body sends it."""
+    name = session.on_vehicle(path).decode(errors="replace")
+
+    async def watch() -> None:
+        while True:
+            await trio.sleep(ASK_PERIOD)
+            acknowledged = (await session.acknowledged()).get(name)
+            if acknowledged is not None:
+                progress.at(min(acknowledged, progress.size))
+                if acknowledged >= progress.size:
+                    progress.check()
+
+    async with plain_nursery() as nursery:
+        nursery.start_soon(watch)
+        yield
