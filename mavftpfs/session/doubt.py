@@ -3,8 +3,11 @@
 Servers share session ids between clients, requests name a session and no file, and some links deliver a
 request twice, the second time late. Whatever shows that this happened raises the same doubt: an answer that
 nothing outstanding and no repetition of ours explains, another FTP client, a session that vanished under us,
-a restart of the vehicle. For ten minutes from then on the caches compare what was written, and a name is not
-changed twice within the time by which requests were seen to be late.
+a restart of the vehicle. For ten minutes from then on the caches compare what was written.
+
+Where requests were seen to come late, a name is not changed twice within that time, and a file that was sent
+is left alone for so long: a copy of its CreateFile, and one of the rename that follows, would put an empty
+file in the place of it.
 """
 
 from __future__ import annotations
@@ -83,20 +86,12 @@ class Doubt:
 
     def note_late(self, seconds: float) -> None:
         """A copy of a request was answered so long after the request was sent first."""
-        now = self._clock()
-        if seconds >= self._late or now - self._late_at > LASTS:
-            self._late, self._late_at = min(MOST_LATE, seconds), now
-
-    @property
-    def seen_late(self) -> float:
-        """Seconds by which copies of requests were seen to be late at most; 0 while there is no doubt.
-
-        A file that was sent is left alone for so long: a copy of its CreateFile, and one of the rename that
-        follows, would put an empty file in the place of it.
-        """
-        return self._late if self.is_active() and self._clock() - self._late_at <= LASTS else 0.0
+        now, late = self._clock(), min(MOST_LATE, max(LEAST_LATE, seconds))
+        if late >= self.lateness:
+            self._late, self._late_at = late, now
 
     @property
     def lateness(self) -> float:
-        """Seconds for which a copy of a request may still come; 0 while there is no doubt."""
-        return max(LEAST_LATE, self.seen_late) if self.is_active() else 0.0
+        """Seconds for which a copy of a request may still come: the most by which one was late in the last
+        ten minutes, within bounds; 0 if none was."""
+        return self._late if self._clock() - self._late_at <= LASTS else 0.0

@@ -164,20 +164,16 @@ class Upload(SessionUser):
         self._server.wake()
 
     async def finish(self) -> None:
-        """See cache.remote.Upload. Copies of what was sent have come by then, as far as was seen."""
+        """See cache.remote.Upload. Where requests were seen to come late, their copies have come by then."""
         if self.state in (UploadState.ENDING, UploadState.ENDED):
             raise LocalProtocolError("the upload was aborted")
-        resting, source = self.state in (UploadState.IDLE, UploadState.HELD), self._source
-        if resting and source.closed and source.acked.empty and self.error is None and not source.has_more():
-            await trio.sleep(self._scheduler.doubt.seen_late)
-            return
         self._vehicle.require(now := self._clock(), writing=True)
         if self.error is not None:
             self.error, self._refused_at, self._failures = None, None, 0
         if not self.finishing:
             self.asked_at = now
         self._retry_at = 0.0
-        if resting:
+        if self.state in (UploadState.IDLE, UploadState.HELD):
             self._enter(UploadState.QUEUED)
         awaited = self._awaited = self._endings + 1
         self.wake()
@@ -185,7 +181,7 @@ class Upload(SessionUser):
             if self.error is not None:
                 raise self.error
             await self._changed.park()
-        await trio.sleep(self._scheduler.doubt.seen_late)
+        await trio.sleep(self._scheduler.doubt.lateness)
 
     async def abort(self) -> None:
         """See cache.remote.Upload."""

@@ -47,9 +47,12 @@ def test_doubt_lasts_for_ten_minutes() -> None:
     assert doubt.is_active()
     assert doubt.arose_since(4.9)
     assert not doubt.arose_since(5.0)
+    assert doubt.lateness == 0.0
+    doubt.note_late(0.0)
     assert doubt.lateness == LEAST_LATE
     now += LASTS
     assert doubt.is_active()
+    assert doubt.lateness == LEAST_LATE
     now += 0.1
     assert not doubt.is_active()
     assert doubt.lateness == 0.0
@@ -58,7 +61,6 @@ def test_doubt_lasts_for_ten_minutes() -> None:
 def test_the_largest_lateness_counts_between_bounds() -> None:
     now = 0.0
     doubt = Doubt(lambda: now)
-    doubt.raise_it("a reason")
     for seconds, expected in ((0.1, LEAST_LATE), (4.0, 4.0), (2.0, 4.0), (40.0, MOST_LATE)):
         doubt.note_late(seconds)
         assert doubt.lateness == expected
@@ -347,6 +349,20 @@ async def test_new_files_stay_what_they_are_where_all_requests_come_twice(
         await trio.sleep(3.0)
         for number in range(8):
             assert bytes(here.tree.data(path(profile, f"new{number}"))) == content(300 + number, number)
+
+
+@pytest.mark.holds("rule 14.12")
+async def test_a_create_that_we_repeated_comes_after_the_file_was_compared(autojump: MockClock) -> None:
+    """Our own repetition explains its answer, so there is no doubt; its copy empties what was compared."""
+    here = world("px4", CLEAN)
+    async with mounted(here, b"/d") as (connection, tree):
+        connection.store.traits.rename_works = True  # else an empty file of ours finds that out first
+        copy = Latecomer(here, Opcode.CREATE_FILE, after=Opcode.CALC_FILE_CRC32)
+        Faults(here).lose_reply_to(Opcode.CREATE_FILE)
+        await make(tree, b"/d/new", content(300))
+        assert copy.late is not None
+        assert not connection.store.in_doubt()
+        assert here.tree.data(b"/d/new") == content(300)
 
 
 @pytest.mark.parametrize("verify", ["auto", "size", "none"])
