@@ -58,7 +58,7 @@ async def deliver(holder: Holder, limit: float = DRAIN_LIMIT) -> None:
 
 
 def keep_the_rest(holder: Holder, choose: Callable[[], Path]) -> str:
-    """Copy what is still undelivered to a local directory; return the line that says so, or ""."""
+    """Move what is still undelivered to a local directory; return the line that says so, or ""."""
     left = holder.undelivered()
     if not left:
         return ""
@@ -70,12 +70,12 @@ def keep_the_rest(holder: Holder, choose: Callable[[], Path]) -> str:
             f"{len(left)} file(s) did not reach the vehicle, and {directory} is not writable: {exc.strerror}"
         )
     except MavftpfsError as exc:
-        return f"{len(left)} file(s) did not reach the vehicle, and could not be copied to {directory}: {exc}"
+        return f"{len(left)} file(s) did not reach the vehicle, and could not be moved to {directory}: {exc}"
     if len(kept) == len(left):
         return f"{len(left)} file(s) did not reach the vehicle; they are kept in {directory}"
     return (
-        f"{len(left)} file(s) did not reach the vehicle; only {len(kept)} could be kept, in {directory}, "
-        "where manifest.json says why"
+        f"{len(left)} file(s) did not reach the vehicle; only {len(kept)} could be kept, in {directory}; "
+        "the log says why, and the next mount looks for the others"
     )
 
 

@@ -4,9 +4,9 @@ A spooled file `NNNNNN.data` lies in the mount's `SpoolDirectory` beside `NNNNNN
 `path` on the vehicle, and either `unfinished` (a program was still writing: no close was confirmed or refused
 yet), or what `describe` tells of a file that could not be delivered. `needed` false: the vehicle has it all,
 or nobody wants it any more. A name is written before the first byte, so that whenever the process is killed
-the next mount can say what it found: `SpoolDirectory.rescue` moves it to a recovery directory. A mount that
-ends copies there what it could not deliver (`recover`). Nothing is written to a vehicle by itself: nobody
-knows what happened to the file since.
+the next mount can say what it found: `SpoolDirectory.rescue` moves both files to a recovery directory. A
+mount that ends does so itself with what it could not deliver. Nothing is written to a vehicle by itself:
+nobody knows what happened to the file since.
 """
 
 from __future__ import annotations
@@ -17,16 +17,14 @@ import json
 import logging
 import os
 import shutil
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from random import Random
-from typing import BinaryIO
 
 from mavftpfs.cache.draft import Draft
 from mavftpfs.cache.reserved import new_owner
 from mavftpfs.cache.spool import remove
-from mavftpfs.shared.errors import SpoolFailed
-from mavftpfs.shared.private import make_private_directory, open_private
+from mavftpfs.shared.private import make_private_directory
 
 log = logging.getLogger("mavftpfs.cache")
 
@@ -36,9 +34,8 @@ SLOTS = 64
 TOKENS = 256
 """Mounts one after the other whose leftovers on the vehicle are known for ours."""
 
-PIECE = 1024 * 1024
-MANIFEST = "manifest.json"
-_LONGEST_NAME = 200
+LONGEST_NAME = 200
+"""Bytes of the names in a recovery directory, so that every local disk takes what is added to them."""
 
 
 class SpoolDirectory:
@@ -144,7 +141,7 @@ def rescue(slot: Path, recovery: Path) -> tuple[list[Path], list[OSError]]:
         facts = _read_facts(data)
         try:
             if _is_needed(data, facts):
-                found.append(_move(data, facts, recovery))
+                found.append(move(data, facts, recovery))
             else:
                 remove(data)
         except OSError as exc:
@@ -172,54 +169,28 @@ def left_in(slot: Path) -> list[Path]:
         os.close(descriptor)
 
 
-def free_name(directory: Path, name: str) -> Path:
-    """Return a path in `directory` that does not exist, made from at most 200 bytes of `name`."""
-    short = os.fsdecode(os.fsencode(name)[-_LONGEST_NAME:])
-    number = 0
-    while True:
-        path = directory / (short if not number else f"{short}.{number}")
-        if not path.exists():
-            return path
-        number += 1
-
-
-def recover(
-    files: Iterable[tuple[bytes, Draft, Exception | None]], directory: Path, wall: Callable[[], float]
-) -> dict[bytes, Path]:
-    """Copy undelivered files into a directory, with a manifest that says what each is; return the copies.
-
-    files: path, draft, and why it is not delivered.
-
-    Of a file that was changed in part only the bytes known here are there; the manifest lists them, the
-    rest of such a file is a hole. One that the local disk does not give back stays where it is, for the next
-    mount, and costs no other: the manifest says why under `not_saved`; what could be read of it may be
-    there, too.
+def move(data: Path, facts: Mapping[str, object], recovery: Path) -> Path:
+    """Move a spooled file and its description to a directory, which is made; return its new path.
 
     Raises:
-        OSError, SpoolFailed: nothing could be copied.
+        OSError: it is where it was.
     """
-    copied: dict[bytes, Path] = {}
-    failed: list[OSError | SpoolFailed] = []
-    manifest = []
-    for path, draft, reason in files:
-        make_private_directory(directory)
-        name = path.decode(errors="surrogateescape").strip("/").replace("/", "__")
-        copy = free_name(directory, name)
-        facts = {"file": copy.name, **describe(path, draft, reason, wall)}
-        try:
-            _copy(draft, copy)
-            copied[path] = copy
-        except (OSError, SpoolFailed) as error:
-            log.error("%r could not be saved: %s", path, error)
-            failed.append(error)
-            facts["not_saved"] = str(error)
-        manifest.append(facts)
-    if failed and not copied:
-        raise failed[0]
-    if copied:
-        with _created(free_name(directory, MANIFEST)) as file:
-            file.write(json.dumps(manifest, indent=1).encode())
-    return copied
+    make_private_directory(recovery)
+    name = os.fsdecode(os.fsencode(_name_for(data, facts))[-LONGEST_NAME:])
+    target, number = recovery / name, 0
+    while target.exists() or _description(target).exists():
+        number += 1
+        target = recovery / f"{name}.{number}"
+    try:
+        shutil.move(data, target)
+    except OSError:
+        target.unlink(missing_ok=True)  # a part of a copy; the original is still there
+        raise
+    try:
+        shutil.move(data.with_suffix(".json"), _description(target))
+    except OSError as exc:
+        log.info("%s has no description: %s", target, exc)
+    return target
 
 
 def describe(
@@ -256,20 +227,8 @@ def _is_needed(data: Path, facts: Mapping[str, object]) -> bool:
     return facts.get("needed") is not False and not (facts.get("unfinished") and not data.stat().st_size)
 
 
-def _move(data: Path, facts: Mapping[str, object], recovery: Path) -> Path:
-    """Move a spooled file and its description; return its new path."""
-    make_private_directory(recovery)
-    target = free_name(recovery, _name_for(data, facts))
-    try:
-        shutil.move(data, target)
-    except OSError:
-        target.unlink(missing_ok=True)  # a part of a copy; the original is still there
-        raise
-    try:
-        shutil.move(data.with_suffix(".json"), target.with_name(target.name + ".json"))
-    except OSError as exc:
-        log.info("%s has no description: %s", target, exc)
-    return target
+def _description(target: Path) -> Path:
+    return target.with_name(target.name + ".json")
 
 
 def _name_for(data: Path, facts: Mapping[str, object]) -> str:
@@ -282,16 +241,3 @@ def _name_for(data: Path, facts: Mapping[str, object]) -> str:
     except UnicodeEncodeError:
         return data.name
     return path.replace("\0", "").strip("/").replace("/", "__") or data.name
-
-
-def _created(path: Path) -> BinaryIO:
-    return open(open_private(path, os.O_WRONLY | os.O_EXCL), "wb")
-
-
-def _copy(draft: Draft, path: Path) -> None:
-    with _created(path) as file:
-        for start, stop in draft.held:
-            file.seek(start)
-            for at in range(start, stop, PIECE):
-                file.write(draft.local_bytes(at, min(at + PIECE, stop)))
-        file.truncate(draft.size)

@@ -159,21 +159,26 @@ class SpoolContent:
         except (NoSpace, SpoolFailed) as exc:
             log.warning("what %s is cannot be written down: %s", self._path, exc)
 
-    def persist(self, facts: dict[str, Any]) -> None:
+    def persist(self, facts: dict[str, Any]) -> str:
         """Have bytes and `facts` (JSON) survive the end of this process; once until more is put or cut.
+
+        Returns the path of the file that holds the bytes.
 
         Raises:
             NoSpace, SpoolFailed, OSError.
         """
-        if self._durable:
-            return
         self._spill()
         assert self._file is not None
         assert self._path is not None
+        if os.fstat(self._file).st_size < self._stored.end:
+            raise SpoolFailed(f"{self._path} lost bytes that were in it")
+        if self._durable:
+            return str(self._path)
         os.ftruncate(self._file, facts["size"])
         os.fsync(self._file)
         write_facts(self._path, facts, durable=True)
         self._told, self._durable = facts, True
+        return str(self._path)
 
     def close(self) -> None:
         """The vehicle has it, or nobody wants it: forget the bytes. Raises nothing."""

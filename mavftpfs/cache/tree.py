@@ -343,13 +343,13 @@ class Tree:
         return self.undelivered()
 
     def recover_to(self, directory: Path) -> Sequence[Path]:
-        """Copy what could not be delivered into a directory, which is made, with a manifest.json.
+        """Move what could not be delivered to a directory, which is made, with what is known of each file.
 
-        Returns the copies, [] if there was nothing; what could not be copied stays held. Blocks: for the end
-        of a mount.
+        Returns the files, [] if there was nothing; what could not be moved stays held, and in the spool for
+        the next mount. Blocks: for the end of a mount.
 
         Raises:
-            OSError, SpoolFailed: nothing could be copied.
+            OSError, NoSpace, SpoolFailed: nothing could be moved.
         """
         return self._writing.recover_to(directory)
 

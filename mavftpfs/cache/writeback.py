@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import errno
 import logging
+import sys
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -26,7 +27,7 @@ from mavftpfs.cache.namespace import Namespace
 from mavftpfs.cache.nodes import Node
 from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.options import CacheOptions
-from mavftpfs.cache.recovery import SpoolDirectory, recover
+from mavftpfs.cache.recovery import SpoolDirectory, describe, move
 from mavftpfs.cache.remote import VehicleStore
 from mavftpfs.cache.repair import Cleaner
 from mavftpfs.cache.reserved import OwnNames, new_owner, require_writable
@@ -34,7 +35,7 @@ from mavftpfs.cache.spool import Spool
 from mavftpfs.cache.throttle import Throttle
 from mavftpfs.cache.writefile import Parts, ReadFile, WriteFile
 from mavftpfs.shared.errnos import errno_for
-from mavftpfs.shared.errors import AlreadyExists, IsADirectory, MavftpfsError, NotFound
+from mavftpfs.shared.errors import AlreadyExists, IsADirectory, MavftpfsError, NoSpace, NotFound, SpoolFailed
 from mavftpfs.shared.model import EntryKind, require_listable
 
 log = logging.getLogger("mavftpfs.cache")
@@ -242,12 +243,24 @@ class Writeback:
 
     def recover_to(self, directory: Path) -> list[Path]:
         """See Tree.recover_to."""
-        nodes = {node.path: node for node in self._context.nodes if node.undelivered}
-        lost = [(path, node.draft, node.error) for path, node in nodes.items() if node.draft is not None]
-        copies = recover(lost, directory, self._context.wall)
-        for path in copies:
-            nodes[path].drop_draft()  # the spool need not offer it again
-        return list(copies.values())
+        context, kept = self._context, []
+        context.spool.spool_max = sys.maxsize  # what lies in memory goes to disk now, however much is there
+        failed: OSError | NoSpace | SpoolFailed | None = None
+        for node in context.nodes:
+            if not node.undelivered or node.draft is None:
+                continue
+            facts = describe(node.path, node.draft, node.error, context.wall)
+            try:
+                data = Path(node.draft.content.persist(facts))
+                kept.append(move(data, facts, directory))
+            except (OSError, NoSpace, SpoolFailed) as error:
+                log.error("%r could not be saved: %s", node.path, error)
+                failed = error
+            else:
+                node.drop_draft()
+        if failed is not None and not kept:
+            raise failed
+        return kept
 
     def armed_changed(self, armed: bool) -> None:
         """See Tree.armed_changed."""

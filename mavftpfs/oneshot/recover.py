@@ -1,15 +1,15 @@
 """What did not reach a vehicle: listing it, and putting it where it belonged. Layer: top; prints nothing.
 
-A mount that ends with undelivered files copies them below `recovered`, with a `manifest.json`
-(cache.recovery). What a killed mount held is moved there by the next mount, with a `NAME.json` beside each
-file (cache.recovery). Nothing is put back by itself: nobody knows what happened to the file since.
+A mount that ends with undelivered files moves them below `recovered`, with a `NAME.json` beside each file
+(cache.recovery). What a killed mount held is moved there by the next mount. Nothing is put back by itself:
+nobody knows what happened to the file since.
 """
 
 from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -26,8 +26,6 @@ from mavftpfs.shared.errors import (
 )
 from mavftpfs.shared.model import EntryKind, normalise
 from mavftpfs.shared.readable import name_text
-
-MANIFEST = "manifest.json"
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,8 +51,6 @@ class Kept:
         """Why it cannot be put back by us, or ""."""
         if self.path is None:
             return "where it belongs was not written down"
-        if self.facts.get("not_saved"):
-            return "the local disk did not keep all of it"
         if self.facts.get("unfinished"):
             return "a program was still writing it, so it may be a part only"
         return "" if self.facts.get("whole") else "only the changed parts of it are here"
@@ -97,29 +93,19 @@ def kept_in(directory: Path) -> list[Kept]:
         raise UsageError(f"{directory}: {exc.strerror}") from exc
     described, descriptions = {}, set()
     for path in paths:
-        if path.name.startswith(MANIFEST):
-            for facts in _read_manifest(path):
-                described[str(facts["file"])] = facts
-                descriptions.add(path)
-        elif path.suffix == ".json" and path.with_suffix("") in paths:
-            described[path.stem] = _read_json(path, dict)
+        if path.suffix == ".json" and path.with_suffix("") in paths:
+            described[path.stem] = _read_facts(path)
             descriptions.add(path)
     return [Kept(path, described.get(path.name, {})) for path in paths if path not in descriptions]
 
 
-def _read_manifest(path: Path) -> Iterator[dict[str, Any]]:
-    for facts in _read_json(path, list):
-        if isinstance(facts, dict) and "file" in facts:
-            yield facts
-
-
-def _read_json(path: Path, kind: Callable[[], Any]) -> Any:
-    """Return what a file holds if it is JSON of this kind, else an empty one."""
+def _read_facts(path: Path) -> dict[str, Any]:
+    """Return what was written down, nothing if that is not what we write."""
     try:
         found = json.loads(path.read_text())
     except (OSError, ValueError, RecursionError):
-        return kind()
-    return found if isinstance(found, type(kind())) else kind()
+        return {}
+    return found if isinstance(found, dict) else {}
 
 
 def chosen(names: Sequence[str], base: Path) -> list[Kept]:
@@ -234,6 +220,4 @@ def _forget(kept: Kept) -> None:
     kept.file.with_name(f"{kept.file.name}.json").unlink(missing_ok=True)
     if not kept_in(directory):
         with suppress(OSError):
-            for manifest in directory.glob(f"{MANIFEST}*"):
-                manifest.unlink()
             directory.rmdir()

@@ -353,7 +353,7 @@ async def test_what_is_still_open_when_the_mount_ends_is_not_kept(store: FakeWri
     spool.close()
 
 
-async def test_what_cannot_be_delivered_is_copied_with_a_manifest(
+async def test_what_cannot_be_delivered_is_moved_with_its_description(
     autojump_clock: object, store: FakeWriter, tmp_path: Path
 ) -> None:
     tree = make_writable(store)
@@ -367,9 +367,10 @@ async def test_what_cannot_be_delivered_is_copied_with_a_manifest(
     contents = {path.name: path.read_bytes() for path in files}
     assert contents["card__dir__new"] == NEW
     assert contents["card__dir__file.txt"][500:504] == b"part"
-    manifest = {
-        entry["file"]: entry for entry in json.loads((tmp_path / "rescued/manifest.json").read_text())
-    }
-    assert manifest["card__dir__new"]["whole"]
-    assert manifest["card__dir__file.txt"]["changed"] == [[500, 504]]
-    assert not manifest["card__dir__file.txt"]["whole"]
+    whole, changed = (
+        json.loads(path.with_name(f"{path.name}.json").read_text())
+        for path in sorted(files, key=lambda path: "new" not in path.name)
+    )
+    assert whole["whole"]
+    assert changed["changed"] == [[500, 504]]
+    assert not changed["whole"]

@@ -13,8 +13,8 @@ from random import Random
 import pytest
 
 from mavftpfs.cache import spool as spooling
-from mavftpfs.cache.recovery import SLOTS, SpoolDirectory
-from mavftpfs.cache.spool import Spool, SpoolContent
+from mavftpfs.cache.recovery import SLOTS, SpoolDirectory, move
+from mavftpfs.cache.spool import Spool, SpoolContent, write_facts
 from mavftpfs.shared.errors import NoSpace, SpoolFailed
 
 pytestmark = pytest.mark.holds("promise 3")
@@ -376,3 +376,14 @@ def test_a_name_that_cannot_be_written_down_is_no_space_and_nothing_stays(
             content.put(9, bytes(5 * PAGE))
     assert content.get(0, 9) == b"in memory"
     assert list(tmp_path.iterdir()) == []
+
+
+def test_what_is_known_of_a_file_does_not_replace_another_one(tmp_path: Path) -> None:
+    kept = []
+    for number, name in enumerate(("a.json", "a", "a.json")):
+        data = tmp_path / f"{number}.data"
+        data.write_text(name)
+        write_facts(data, {"path": f"/{name}"}, durable=False)
+        kept.append(move(data, {"path": f"/{name}"}, tmp_path / "recovered"))
+    assert [path.read_text() for path in kept] == ["a.json", "a", "a.json"]
+    assert len(list((tmp_path / "recovered").iterdir())) == 6
