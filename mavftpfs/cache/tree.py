@@ -393,7 +393,7 @@ class Tree:
         """The vehicle restarted: what was known of it must be asked again."""
         self._directories.rebooted()
         self._checksums.clear()
-        self._virtual.rebooted()
+        self._virtual.forget()
         self._files.rebooted()
         self._writing.retry()
 

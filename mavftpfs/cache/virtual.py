@@ -13,6 +13,7 @@ import math
 import zlib
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 
@@ -51,10 +52,6 @@ TRUE_SIZES = frozenset({b"@ROMFS"})
 COST_FACTOR = 10
 """A snapshot that took T seconds to read is good for at least COST_FACTOR * T."""
 
-GRACE = 10.0
-"""An open may use a snapshot for so many seconds after it ceased to answer stat: who asked for the size just
-before gets the bytes of that size."""
-
 MAX_SEEN = 4096
 """Of how many files it is remembered how reading them went."""
 
@@ -64,18 +61,18 @@ def tree_of(path: bytes) -> bytes:
     return path[1:].partition(b"/")[0]
 
 
-@dataclass(slots=True)
+@dataclass(frozen=True, slots=True)
 class Seen:
-    """What the last try to read an `@` file showed.
+    """What the last try to read an `@` file showed, and until when that holds.
 
-    size: its true size in bytes, None if it was not read. data: all of it, None if that is not remembered.
-    good_until: when that no longer answers stat. absent_until: when it is shown again, for it did not open.
+    data: all of it; it tells the size also when it does not hold any more. None: it did not open.
     """
 
-    size: int | None = None
-    data: bytes | None = None
-    good_until: float = -math.inf
-    absent_until: float = -math.inf
+    data: bytes | None
+    until: float
+
+
+UNSEEN = Seen(None, -math.inf)
 
 
 class SnapshotHandle(OpenFile):
@@ -104,11 +101,7 @@ class SnapshotHandle(OpenFile):
 
 
 class VirtualTrees:
-    """stat, list and open below `/@...`. Paths are the vehicle's.
-
-    Attributes:
-        bytes_cached: of remembered snapshots.
-    """
+    """stat, list and open below `/@...`. Paths are the vehicle's."""
 
     def __init__(
         self,
@@ -125,21 +118,25 @@ class VirtualTrees:
         self._clock = directories.clock
         self._invalidate = invalidate
         self._reading: SingleFlight[bytes, bytes] = SingleFlight(nursery)
-        self._param_opens: bool | None = None
         self._seen: OrderedDict[bytes, Seen] = OrderedDict()
-        self.bytes_cached = 0
+
+    @property
+    def bytes_cached(self) -> int:
+        """Bytes of remembered snapshots."""
+        return sum(len(seen.data or b"") for seen in self._seen.values())
 
     # --- what the tree asks
 
     def shown_in_root(self, names: Iterable[bytes]) -> tuple[bytes, ...]:
         """Return the directories that appear beside the listed `names` of `/`; costs no traffic."""
-        if self._param_opens or not ANNOUNCERS.isdisjoint(names):
-            return tuple(UNLISTABLE)
-        return ()
+        if self._look(PARAM_FILE).data is None and ANNOUNCERS.isdisjoint(names):
+            return ()
+        return tuple(UNLISTABLE)
 
     def absent_until(self, path: bytes) -> float:
         """Return until when a path, listed or not, is not shown because it did not open."""
-        return self._look(path).absent_until
+        seen = self._look(path)
+        return seen.until if seen.data is None else -math.inf
 
     async def stat(self, path: bytes) -> Stat:
         """Return attributes; of a file with its true size, reading it where the listed one lies.
@@ -149,12 +146,12 @@ class VirtualTrees:
         """
         found = await self._find(path)
         seen = self._look(path)
-        known = seen.data is not None and self._clock() < seen.good_until
+        known = self._clock() < seen.until
         if not known and self._is_read_to_know(path, found) and not self._directories.lost:
             try:
                 await self._read(path)
             except (FtpNak, DataUnproven, LinkError, SessionBusy):
-                if found is None and seen.size is None:
+                if found is None and seen.data is None:
                     raise
         return self.listed_stat(path, found)
 
@@ -166,9 +163,10 @@ class VirtualTrees:
         if found is not None and (kind is EntryKind.DIRECTORY or tree_of(path) in TRUE_SIZES):
             until = found.directory.fresh_until
         elif seen.data is not None:
-            until = seen.good_until
-        size = seen.size
-        if size is None:
+            until = seen.until
+        if seen.data is not None:
+            size = len(seen.data)
+        else:
             size = 0 if found is None or kind is EntryKind.DIRECTORY else found.size or 0
         valid_for = max(0.0, min(self._options.attr_timeout, until - self._clock()))
         return Stat(kind, size, shown_mtime(path, None if found is None else found.entry.mtime), valid_for)
@@ -198,7 +196,7 @@ class VirtualTrees:
         shown = [
             (split(child)[1], self.listed_stat(child, found))
             for child, found in founds.items()
-            if self._look(child).absent_until <= now
+            if self.absent_until(child) <= now
         ]
         if cut_short:
             raise ListingIncomplete(f"{path!r} was not listed to its end", shown)
@@ -214,7 +212,7 @@ class VirtualTrees:
         if found is not None and found.entry.kind is not EntryKind.FILE:
             raise IsADirectory(f"{path!r} is a directory")
         seen = self._look(path)
-        if seen.data is not None and self._clock() < seen.good_until + GRACE:
+        if seen.data is not None and self._clock() < seen.until:
             return SnapshotHandle(seen.data)
         return SnapshotHandle(await self._read(path))
 
@@ -230,17 +228,11 @@ class VirtualTrees:
     def forget(self) -> None:
         """Forget all snapshots, and what opened or did not."""
         self._seen.clear()
-        self.bytes_cached = 0
-
-    def rebooted(self) -> None:
-        """Forget what this server was seen to do, too."""
-        self._param_opens = None
-        self.forget()
 
     # --- finding
 
     def _look(self, path: bytes) -> Seen:
-        return self._seen.get(path) or Seen()
+        return self._seen.get(path, UNSEEN)
 
     async def _find(self, path: bytes) -> Found | None:
         """Return what the listing says, None for a file in a tree that cannot be listed.
@@ -260,24 +252,18 @@ class VirtualTrees:
             # No such file starts with a dot, but file managers ask for many that do.
             if b"/" in name or name.startswith(b"."):
                 raise NotFound(f"{path!r} does not exist")
-        if self._clock() < self._look(path).absent_until:
+        if self._clock() < self.absent_until(path):
             raise NotFound(f"the vehicle does not open {path!r}")
         return found
 
     async def _require_shown(self, tree: bytes) -> None:
-        """Raise NotFound unless this server has such trees; asks it at most once in its life."""
+        """Raise NotFound unless this server has such trees; one that does not announce any is asked."""
         root = await self._directories.get(ROOT)
         if self.shown_in_root(root.entries):
             return
-        if tree == tree_of(PARAM_FILE) and self._param_opens is None:
-            try:
-                await self._read(PARAM_FILE)
-            except (FtpNak, NotFound):
-                self._param_opens = False
-            else:
-                self._param_opens = True
-                return
-        raise NotFound(f"this vehicle has no {tree.decode()}")
+        if tree != tree_of(PARAM_FILE) or self._clock() < self.absent_until(PARAM_FILE):
+            raise NotFound(f"this vehicle has no {tree.decode()}")
+        await self._read(PARAM_FILE)
 
     # --- reading
 
@@ -291,19 +277,12 @@ class VirtualTrees:
         return size is None or (tree_of(path) not in TRUE_SIZES and size <= self._options.at_stat_limit)
 
     async def _read_unread(self, founds: Mapping[bytes, Found | None]) -> None:
-        """Read what no one tried to read yet, until `probe_time` is over or the link is too bad."""
-        with trio.move_on_after(self._options.probe_time):
+        """Read what was not read yet, until `probe_time` is over or the link is too bad."""
+        with trio.move_on_after(self._options.probe_time), suppress(LinkError, RequestTimeout, SessionBusy):
             for path, found in founds.items():
-                if path in self._seen or not self._is_read_to_know(path, found):
-                    continue
-                self._seen[path] = Seen()  # what is too slow is not tried by each listing
-                try:
-                    await self._read(path)
-                except (LinkError, RequestTimeout, SessionBusy):
-                    self._seen.pop(path, None)
-                    return
-                except (FtpNak, DataUnproven, NotFound):
-                    pass  # it is shown with its listed size, or not at all
+                if path not in self._seen and self._is_read_to_know(path, found):
+                    with suppress(FtpNak, DataUnproven, NotFound):  # it has its listed size, or is not shown
+                        await self._read(path)
 
     async def _read(self, path: bytes) -> bytes:
         """Take a snapshot; concurrent callers share it.
@@ -322,30 +301,17 @@ class VirtualTrees:
             if nak.opcode != Opcode.OPEN_FILE_RO or not (unlistable or nak.code == NakCode.FILE_NOT_FOUND):
                 raise
             # What is listed and does not open is hidden until the vehicle restarts.
-            absent_until = self._clock() + self._options.proof_time if unlistable else math.inf
-            self._note(path, Seen(self._look(path).size, absent_until=absent_until))
+            self._note(path, Seen(None, self._clock() + self._options.proof_time if unlistable else math.inf))
             raise NotFound(f"the vehicle does not open {path!r}") from nak
-        now = self._clock()
-        life = max(self._options.proof_time, COST_FACTOR * (now - began))
-        known = self._look(path).size
-        self._note(path, Seen(len(data), data, now + life))
-        if known not in (None, len(data)):
+        now, before = self._clock(), self._look(path).data
+        self._note(path, Seen(data, now + max(self._options.proof_time, COST_FACTOR * (now - began))))
+        if before is not None and len(before) != len(data):
             self._invalidate(path)
         return data
 
     def _note(self, path: bytes, seen: Seen) -> None:
-        """Remember how reading a file went, and the bytes of as many as the budget holds."""
-        self._drop_data(self._look(path))
+        """Remember how reading a file went, of as many as the budget holds."""
         self._seen.pop(path, None)
         self._seen[path] = seen
-        self.bytes_cached += len(seen.data or b"")
-        if len(self._seen) > MAX_SEEN:
-            self._drop_data(self._seen.popitem(last=False)[1])
-        for older in self._seen.values():
-            if self.bytes_cached <= self._options.at_cache_size:
-                break
-            self._drop_data(older)
-
-    def _drop_data(self, seen: Seen) -> None:
-        self.bytes_cached -= len(seen.data or b"")
-        seen.data = None
+        while self.bytes_cached > self._options.at_cache_size or len(self._seen) > MAX_SEEN:
+            self._seen.popitem(last=False)
