@@ -236,7 +236,7 @@ class Deliverer:
         self._is_in_place(draft)  # before anything is fetched for it
         if not draft.whole:
             await base.fetch(self._context, node, draft)
-        attempt, store = await self._attempt(node, draft), self._context.store
+        attempt = await self._attempt(node, draft)
         attempt.sending.growing = False
         for _ in range(FINISHES):
             attempt.upload.wake()
@@ -245,7 +245,7 @@ class Deliverer:
                 break
         else:
             raise RemoteProtocolError(f"{attempt.path!r} was said to be finished, and was not")
-        doubted = store.in_doubt() or store.doubted_since(attempt.begun_at)
+        doubted = self._context.store.in_doubt(attempt.begun_at)
         crc32 = await self.verifier.check(attempt.path, draft, doubted=doubted)
         if attempt.in_place:
             node.attempt = None

@@ -128,19 +128,16 @@ class Node:
         if base is not None:
             base.close()
 
-    def spool_name(self) -> str | None:
-        """Return what the local disk is told of it: its path, or None if nobody would miss it."""
-        return None if self.removed else self.path.decode(errors="surrogateescape")
-
     def lose_name(self) -> None:
         """It has no name any more; only who has it open needs its bytes."""
         self.removed = True
         if self.draft is not None:
+            self.draft.content.name = None
             self.draft.content.restate()
 
     def begin_draft(self, spool: Spool, base: Base | None, now: float) -> Draft:
         """It is going to be changed. base: the vehicle's file, None for a new one."""
-        self.draft = Draft(SpoolContent(spool, self.spool_name), base)
+        self.draft = Draft(SpoolContent(spool, self.path), base)
         self.known_at = now
         return self.draft
 
@@ -226,3 +223,5 @@ class Nodes:
             rename_keys(nodes, old, new)
             for path, node in nodes.items():
                 node.path = path
+                if node.draft is not None and not node.removed:
+                    node.draft.content.name = path

@@ -5,6 +5,7 @@ All paths are normalised mount paths (shared.model). All calls raise only Mavftp
 
 from __future__ import annotations
 
+from math import inf
 from typing import Protocol
 
 from mavftpfs.shared.model import Listing, WriteTraits
@@ -156,13 +157,10 @@ class VehicleStore(RemoteStore, Protocol):
         """What the server was seen to do; forgotten when it restarts."""
         ...
 
-    def in_doubt(self) -> bool:
-        """Return whether something of the last ten minutes says that a file may hold other bytes than the
-        ACKs say: a late copy of a request, another FTP client, a lost session, a restart."""
-        ...
-
-    def doubted_since(self, at: float) -> bool:
-        """Return whether such a thing was noticed after that time (the caches' clock)."""
+    def in_doubt(self, since: float = inf) -> bool:
+        """Return whether something of the last ten minutes, or after a time of the caches' clock, says that a
+        file may hold other bytes than the ACKs say: a late copy of a request, another FTP client, a lost
+        session, a restart."""
         ...
 
     async def open_upload(self, path: bytes, source: Sending) -> Upload:

@@ -71,12 +71,15 @@ class Spool:
 
 
 class SpoolContent:
-    """The held bytes of one draft; implements cache.draft.Content."""
+    """The held bytes of one draft; implements cache.draft.Content.
 
-    def __init__(self, spool: Spool, name: Callable[[], str | None] = lambda: "") -> None:
-        """`name()`: the file's path on the vehicle, None once nobody wants it any more."""
+    Attributes:
+        name: the file's path on the vehicle, None once nobody wants it any more.
+    """
+
+    def __init__(self, spool: Spool, name: bytes | None = b"") -> None:
+        self.name = name
         self._spool = spool
-        self._name = name
         self._memory = bytearray()
         self._file: int | None = None
         self._path: Path | None = None
@@ -205,8 +208,9 @@ class SpoolContent:
         Raises:
             NoSpace, SpoolFailed: nothing changed.
         """
-        name = None if settled else self._name()
-        facts = {"needed": False} if name is None else {"path": name, "unfinished": True}
+        facts: dict[str, Any] = {"needed": False}
+        if self.name is not None and not settled:
+            facts = {"path": self.name.decode(errors="surrogateescape"), "unfinished": True}
         if self._path is not None and facts != self._told:
             try:
                 write_facts(self._path, facts, durable=False)

@@ -72,13 +72,9 @@ class Doubt:
             self._reads_at = self._at
             self.on_raised(reason)
 
-    def is_active(self) -> bool:
-        """Return whether something was noticed in the last ten minutes."""
-        return self._clock() - self._at <= LASTS
-
-    def arose_since(self, at: float) -> bool:
-        """Return whether something was noticed after that time."""
-        return self._at > at
+    def is_active(self, since: float = inf) -> bool:
+        """Return whether something was noticed in the last ten minutes, or after that time."""
+        return self._clock() - self._at <= LASTS or self._at > since
 
     def reads_arose_since(self, at: float) -> bool:
         """Return whether what was read then may be another file's."""

@@ -110,7 +110,6 @@ class Store:
     def __init__(self, scheduler: Scheduler) -> None:
         self.traits = scheduler.traits
         self.in_doubt = scheduler.doubt.is_active
-        self.doubted_since = scheduler.doubt.arose_since
         self.read_whole = scheduler.read_whole
         self._scheduler = scheduler
         self._server = scheduler.server

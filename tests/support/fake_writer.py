@@ -155,10 +155,7 @@ class FakeWriter(FakeStore):
         await self.request("create", path)
         self._create(path)
 
-    def in_doubt(self) -> bool:
-        return False
-
-    def doubted_since(self, at: float) -> bool:
+    def in_doubt(self, since: float = 0.0) -> bool:
         return False
 
     async def remove(self, path: bytes) -> None:  # type: ignore[override]  # FakeStore's sets the scene

@@ -199,12 +199,10 @@ def test_there_are_enough_slots_and_not_more(tmp_path: Path) -> None:
 # --- a process that is killed while a program writes
 
 
-def spilled(tmp_path: Path, name: str | None = "/card/log.bin") -> tuple[SpoolDirectory, SpoolContent]:
+def spilled(tmp_path: Path, name: bytes | None = b"/card/log.bin") -> tuple[SpoolDirectory, SpoolContent]:
     """A file of which so much was written that it went to disk."""
     directory = SpoolDirectory(tmp_path / "spool", Random(1))
-    content = SpoolContent(
-        Spool(memory_max=lambda: 0, spool_max=1 << 20, directory=directory.path), lambda: name
-    )
+    content = SpoolContent(Spool(memory_max=lambda: 0, spool_max=1 << 20, directory=directory.path), name)
     content.put(0, b"so far")
     return directory, content
 
@@ -337,7 +335,7 @@ def failing(*_: object) -> bytes:
 
 def test_a_disk_that_fails_is_an_error_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     spool = spool_of(tmp_path, memory=0)
-    content = SpoolContent(spool, lambda: "/f")
+    content = SpoolContent(spool, b"/f")
     content.put(0, b"abcdef")
     acts: dict[str, Callable[[], object]] = {
         "pread": lambda: content.get(0, 3),
@@ -368,7 +366,7 @@ def test_a_name_that_cannot_be_written_down_is_no_space_and_nothing_stays(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     spool = spool_of(tmp_path)
-    content = SpoolContent(spool, lambda: "/f")
+    content = SpoolContent(spool, b"/f")
     content.put(0, b"in memory")
     with monkeypatch.context() as patch:
         patch.setattr(Path, "replace", failing)
