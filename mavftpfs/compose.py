@@ -10,6 +10,7 @@ import sys
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import ExitStack, asynccontextmanager, contextmanager, nullcontext
 from dataclasses import dataclass, fields, replace
+from datetime import datetime
 from functools import partial
 from pathlib import Path
 from random import SystemRandom
@@ -42,7 +43,7 @@ from mavftpfs.shared.errors import (
     VehicleLost,
 )
 from mavftpfs.shared.model import ROOT
-from mavftpfs.trace import JsonTrace, Sink, Tee, TextTrace, TlogWriter
+from mavftpfs.trace import JsonTrace, TlogWriter, text_line
 
 MIB = 1 << 20
 KEY_SIZE = 32
@@ -89,13 +90,20 @@ def open_sinks(options: MountOptions, *, debug: bool) -> Iterator[Sinks]:
         UsageError: a file cannot be created.
     """
     with ExitStack() as stack:
-        payload: list[Sink] = []
-        if debug:
-            payload.append(TextTrace(lambda line: print(line, file=sys.stderr)))
+        traces: list[PayloadTrace] = [_print_payload] if debug else []
         if options.trace is not None:
-            payload.append(stack.enter_context(JsonTrace(options.trace)))
+            traces.append(stack.enter_context(JsonTrace(options.trace)).payload)
         tlog = None if options.tlog is None else stack.enter_context(TlogWriter(options.tlog))
-        yield Sinks(Tee(payload).payload if payload else None, None if tlog is None else tlog.frame)
+
+        def payload(now: float, direction: str, wire: bytes) -> None:
+            for trace in traces:
+                trace(now, direction, wire)
+
+        yield Sinks(payload if traces else None, None if tlog is None else tlog.frame)
+
+
+def _print_payload(now: float, direction: str, wire: bytes) -> None:
+    print(f"{datetime.now():%H:%M:%S.%f} {text_line(direction, wire)}", file=sys.stderr)
 
 
 @asynccontextmanager

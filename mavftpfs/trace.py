@@ -1,13 +1,13 @@
 """Records of what went over the link: FTP payloads as text or JSON lines, frames as .tlog. Layer: top.
 
-A sink is handed to the session layer, which calls `payload` for each of the 251-byte payloads; without a sink
-nothing is computed. A sink that cannot write any more (disk full) says so once and falls silent: a trace must
-never break what it watches.
+The session layer calls `payload` for each of the 251-byte payloads; without a trace nothing is computed. A
+file that cannot be written any more (disk full) is told of once and falls silent: a trace must never break
+what it watches.
 
 JSON lines: {"t", "time", "dir", "seq", "session", "opcode", "size", "offset", "data"}, in replies also
-"req_opcode" and "burst_complete", and "note" if there is one (see Remarks); opcodes by
-name, data in hex (the part that counts). "t" is in seconds of a clock that never jumps, "time" is UTC. The
-.tlog format is pymavlink's: 8 bytes big-endian microseconds since 1970, then the frame.
+"req_opcode" and "burst_complete"; opcodes by name, data in hex (the part that counts). "t" is in seconds of a
+clock that never jumps, "time" is UTC. The .tlog format is pymavlink's: 8 bytes big-endian microseconds since
+1970, then the frame.
 """
 
 from __future__ import annotations
@@ -17,13 +17,10 @@ import logging
 import os
 import struct
 import time
-from collections import OrderedDict
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
-from types import TracebackType
-from typing import BinaryIO, Protocol, Self
+from typing import Self
 
 from mavftpfs.protocol.payload import HEADER_SIZE, PAYLOAD_SIZE, NakCode, Opcode, Payload, decode_request
 from mavftpfs.shared.errors import UsageError
@@ -31,9 +28,7 @@ from mavftpfs.shared.private import open_private
 
 REPLY = "reply"
 
-_FLUSH_PERIOD = 1.0
 _TEXT_DATA = 16
-_REMEMBERED = 1024
 _OPCODES = {opcode.value: opcode.name for opcode in Opcode}
 _NAK_CODES = {code.value: code.name for code in NakCode}
 _timestamp = struct.Struct(">Q").pack
@@ -41,166 +36,53 @@ _log = logging.getLogger(__name__)
 
 
 class _File:
-    """A file that is written to until it fails.
+    """A file that is written to, without a buffer, until it fails. wall_clock: seconds since 1970.
 
     Raises:
         UsageError: it cannot be created.
     """
 
-    def __init__(self, path: str | Path) -> None:
+    def __init__(self, path: str | Path, *, wall_clock: Callable[[], float] = time.time) -> None:
         self._path = path
-        self._flushed_at = 0.0
+        self._wall_clock = wall_clock
+        self._failed = False
         try:
-            descriptor = open_private(path, os.O_WRONLY | os.O_TRUNC)
-            self._file: BinaryIO | None = open(descriptor, "wb")  # noqa: SIM115 (closed by close)
+            self._file = os.fdopen(open_private(path, os.O_WRONLY | os.O_TRUNC), "wb", buffering=0)
         except OSError as exc:
             raise UsageError(f"cannot write {path}: {exc.strerror}") from exc
 
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
+    def __exit__(self, *_: object) -> None:
+        self._file.close()
 
-    def close(self) -> None:
-        """Write out what is buffered and close."""
-        file, self._file = self._file, None
-        if file is not None:
-            try:
-                file.close()
-            except OSError as exc:
-                self._complain(exc)
-
-    def _write(self, data: bytes, now: float) -> None:
-        if self._file is None:
+    def _write(self, data: bytes) -> None:
+        if self._failed:
             return
         try:
             self._file.write(data)
-            if now - self._flushed_at > _FLUSH_PERIOD:
-                self._file.flush()
-                self._flushed_at = now
         except OSError as exc:
-            self._complain(exc)
-            file, self._file = self._file, None
-            with suppress(OSError):  # what is buffered cannot be written either; close() closes all the same
-                file.close()
-
-    def _complain(self, problem: OSError) -> None:
-        _log.warning("no further trace in %s: %s", self._path, problem.strerror)
+            self._failed = True
+            _log.warning("no further trace in %s: %s", self._path, exc.strerror)
 
 
 class JsonTrace(_File):
-    """Payloads as JSON lines. wall_clock: seconds since 1970.
+    """Payloads as JSON lines."""
 
-    Raises:
-        UsageError: the file cannot be created.
-    """
-
-    def __init__(self, path: str | Path, *, wall_clock: Callable[[], float] = time.time) -> None:
-        super().__init__(path)
-        self._wall_clock = wall_clock
-
-    def payload(self, now: float, direction: str, wire: bytes, note: str = "") -> None:
-        """See Sink."""
-        record = describe(direction, wire)
-        if note:
-            record["note"] = note
+    def payload(self, now: float, direction: str, wire: bytes) -> None:
+        """Record a payload that was sent ("request") or received ("reply")."""
         wall = datetime.fromtimestamp(self._wall_clock(), UTC).isoformat(timespec="microseconds")
-        line = json.dumps({"t": round(now, 6), "time": wall, **record}, separators=(",", ":"))
-        self._write(line.encode() + b"\n", now)
+        record = {"t": round(now, 6), "time": wall, **describe(direction, wire)}
+        self._write(json.dumps(record, separators=(",", ":")).encode() + b"\n")
 
 
 class TlogWriter(_File):
-    """Frames in pymavlink's .tlog format, for every tool that reads these.
-
-    wall_clock: seconds since 1970.
-
-    Raises:
-        UsageError: the file cannot be created.
-    """
-
-    def __init__(self, path: str | Path, *, wall_clock: Callable[[], float] = time.time) -> None:
-        super().__init__(path)
-        self._wall_clock = wall_clock
+    """Frames in pymavlink's .tlog format, for every tool that reads these."""
 
     def frame(self, frame: bytes) -> None:
         """Record a whole frame, received or sent; made to be Framer.on_frame."""
-        now = self._wall_clock()
-        self._write(_timestamp(int(now * 1e6)) + frame, now)
-
-
-class TextTrace:
-    """Payloads as lines for a person.
-
-    write: takes a line without line end; wall_clock: seconds since 1970.
-    """
-
-    def __init__(self, write: Callable[[str], None], *, wall_clock: Callable[[], float] = time.time) -> None:
-        self._write = write
-        self._wall_clock = wall_clock
-
-    def payload(self, now: float, direction: str, wire: bytes, note: str = "") -> None:
-        """See Sink."""
-        time_of_day = datetime.fromtimestamp(self._wall_clock()).strftime("%H:%M:%S.%f")
-        self._write(f"{time_of_day} {text_line(direction, wire)}{f' ({note})' if note else ''}")
-
-
-class Sink(Protocol):
-    """Takes payloads with what is to be said of them."""
-
-    def payload(self, now: float, direction: str, wire: bytes, note: str = "") -> None:
-        """Record a payload; note: see Remarks."""
-        ...
-
-
-class Tee:
-    """Hands each payload to several sinks, with a remark."""
-
-    def __init__(self, sinks: Sequence[Sink]) -> None:
-        self._sinks = tuple(sinks)
-        self._remarks = Remarks()
-
-    def payload(self, now: float, direction: str, wire: bytes) -> None:
-        """See PayloadTrace."""
-        note = self._remarks.of(direction, wire)
-        for sink in self._sinks:
-            sink.payload(now, direction, wire, note)
-
-
-class Remarks:
-    """What is said of a payload beside its bytes, by what went over the link before."""
-
-    def __init__(self) -> None:
-        self._unanswered: OrderedDict[bytes, int] = OrderedDict()  # seq by all else of a request
-
-    def of(self, direction: str, wire: bytes) -> str:
-        """Return "" for a new request or an answer to one; else "retransmit", or what is wrong with the
-        answer."""
-        if len(wire) != PAYLOAD_SIZE:
-            return "malformed"
-        payload = decode_request(wire)
-        if direction != REPLY:
-            what = wire[2:5] + wire[8:-1]  # the last byte may be what gives a repetition its full length
-            earlier = self._unanswered.get(what)
-            self._unanswered[what] = payload.seq
-            if len(self._unanswered) > _REMEMBERED:
-                self._unanswered.popitem(last=False)
-            if earlier is None:
-                return ""
-            return "retransmit" if earlier == payload.seq else f"retransmit of {earlier}"
-        asked = (payload.seq - 1) & 0xFFFF
-        answered = [what for what, seq in self._unanswered.items() if seq == asked]
-        if payload.req_opcode == Opcode.BURST_READ_FILE:
-            return ""  # each request has many answers
-        if not answered:
-            return "late, duplicate or not ours"
-        if answered[0][1] != payload.req_opcode:
-            return "stale replay"
-        for what in answered:
-            del self._unanswered[what]
-        return ""
+        self._write(_timestamp(int(self._wall_clock() * 1e6)) + frame)
 
 
 def describe(direction: str, wire: bytes) -> dict[str, str | int]:

@@ -26,14 +26,13 @@ from mavftpfs.link.messages import (
     Heartbeat,
 )
 from mavftpfs.link.uri import parse_source
-from mavftpfs.protocol.payload import Opcode, decode_request
+from mavftpfs.protocol.payload import Opcode
 from mavftpfs.session.connection import ConnectOptions, connected
 from mavftpfs.shared.errors import VehicleLost
 from mavftpfs.sim.linkmodel import Duplex, LinkModel, LinkSettings
 from mavftpfs.sim.profiles import PROFILES
 from mavftpfs.sim.tree import MemoryTree
 from mavftpfs.sim.vehicle import SimVehicle
-from mavftpfs.trace import Tee
 from tests.support.faults import Faults
 from tests.support.memory import MemoryLink
 from tests.support.uploads import put
@@ -42,28 +41,6 @@ from tests.support.worlds import World, content, path, read_file, world
 KEY = bytes(range(32))
 
 DATA = random.Random(5).randbytes(30_000)
-
-
-class Collected:
-    def __init__(self) -> None:
-        self.lines: list[tuple[str, int, str]] = []
-
-    def payload(self, now: float, direction: str, wire: bytes, note: str = "") -> None:
-        self.lines.append((direction, decode_request(wire).seq, note))
-
-
-async def test_the_trace_tells_what_was_repeated_and_what_was_not_believed(autojump: MockClock) -> None:
-    here = World("px4", LinkSettings(rate=50_000.0, delay=0.02, loss=0.1, duplicate=0.1))
-    here.tree.add(b"/f", DATA)
-    trace = Collected()
-    sink = Tee([trace]).payload
-    async with connected(here.link, ConnectOptions(), rng=random.Random(1), trace=sink) as connection:
-        await connection.ready(10)
-        assert await read_file(connection, b"/f") == DATA
-        repeated = [line for line in trace.lines if line[0] == "request" and "retransmit" in line[2]]
-        doubted = [line for line in trace.lines if line[0] == "reply" and line[2]]
-        assert len(repeated) == connection.engine.stats.retransmissions > 5
-        assert len(doubted) == connection.engine.stats.unknown > 3
 
 
 @pytest.mark.holds("promise 10", "rule 14.37")

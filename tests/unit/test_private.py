@@ -27,11 +27,11 @@ __all__ = ["restored_logging"]
 
 
 def trace(path: Path) -> None:
-    JsonTrace(path).close()
+    JsonTrace(path).__exit__()
 
 
 def tlog(path: Path) -> None:
-    TlogWriter(path).close()
+    TlogWriter(path).__exit__()
 
 
 def log(path: Path) -> None:

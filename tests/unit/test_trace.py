@@ -14,7 +14,7 @@ from mavftpfs.link.framing import Framer
 from mavftpfs.link.messages import Address
 from mavftpfs.protocol.payload import NakCode, Opcode, Payload, request
 from mavftpfs.shared.errors import UsageError
-from mavftpfs.trace import REPLY, JsonTrace, Remarks, TlogWriter, text_line
+from mavftpfs.trace import REPLY, JsonTrace, TlogWriter, text_line
 
 READ = request(7, Opcode.READ_FILE, session=3, offset=478, size=100).encode()
 OPEN = request(8, Opcode.OPEN_FILE_RO, data=b"/fs/microsd/a.bin").encode()
@@ -28,7 +28,7 @@ WALL = 1795426200.25
 
 def test_json_lines(tmp_path: Path) -> None:
     with JsonTrace(tmp_path / "trace", wall_clock=lambda: WALL) as trace:
-        trace.payload(1.5, "request", READ, "retransmit")
+        trace.payload(1.5, "request", READ)
         trace.payload(2.25, REPLY, DATA)
         trace.payload(3.0, "request", OPEN)
         trace.payload(4.0, REPLY, b"short")
@@ -43,7 +43,6 @@ def test_json_lines(tmp_path: Path) -> None:
             "opcode": "READ_FILE",
             "size": 100,
             "data": "",
-            "note": "retransmit",
             **common,
         },
         {
@@ -122,21 +121,4 @@ def test_a_full_disk_is_said_once_and_breaks_nothing(caplog: pytest.LogCaptureFi
 def test_a_trace_shows_up_while_it_is_written(tmp_path: Path) -> None:
     with JsonTrace(tmp_path / "trace") as trace:
         trace.payload(10.0, REPLY, DATA)
-        trace.payload(11.5, REPLY, DATA)
-        assert len((tmp_path / "trace").read_text().splitlines()) == 2
-
-
-def test_a_repeated_request_is_marked_until_it_is_answered() -> None:
-    remarks = Remarks()
-    first = request(10, Opcode.READ_FILE, session=1, offset=239, size=239).encode()
-    again = request(14, Opcode.READ_FILE, session=1, offset=239, size=239).encode()
-    other = request(15, Opcode.READ_FILE, session=1, offset=478, size=239).encode()
-    answer = Payload(15, 1, Opcode.ACK, 1, Opcode.READ_FILE, offset=239).encode()
-    assert remarks.of("request", first) == ""
-    assert remarks.of("request", first) == "retransmit"
-    assert remarks.of("request", again) == "retransmit of 10"
-    assert remarks.of("request", other) == ""
-    assert remarks.of(REPLY, Payload(15, 1, Opcode.ACK, 1, Opcode.OPEN_FILE_RO).encode()) == "stale replay"
-    assert remarks.of(REPLY, answer) == ""
-    assert "late" in remarks.of(REPLY, answer)
-    assert remarks.of("request", first) == ""
+        assert len((tmp_path / "trace").read_text().splitlines()) == 1
