@@ -39,7 +39,8 @@ RADIO_WORDS = "40 kB/s, 100 ms there and back, 8 of 100 packets lost in each dir
 LOG_SIZE = 300_000
 STEP_TIMEOUT = 60.0
 """Seconds after which any step of the tour counts as failed."""
-END_TIMEOUT = 15.0
+END_TIMEOUT = 3.0
+"""Seconds for a process to end."""
 
 PROGRAM = (sys.executable, "-m", "mavftpfs")
 
@@ -91,23 +92,19 @@ class Tour:
         argv = [*PROGRAM, *rest] if program == "mavftpfs" else words
         with running(argv, self.folder) as child:
             try:
-                output, errors = child.communicate(timeout=STEP_TIMEOUT)
+                output, _ = child.communicate(timeout=STEP_TIMEOUT)
             except subprocess.TimeoutExpired:
                 raise DemoFailed(f"{words[0]} did not end within {STEP_TIMEOUT:.0f} s") from None
-        text = output.decode(errors="replace") + errors.decode(errors="replace")
+        text = output.decode(errors="replace")
         if text.strip():
             self.console.print(text.rstrip(), highlight=False, markup=False)
         if child.returncode:
             raise DemoFailed(f"{words[0]} ended with {child.returncode}")
         return text
 
-    def prove(self, holds: bool) -> None:
-        """Record a comparison."""
-        self.proofs.append(holds)
-
     def verdict(self, same: bool) -> None:
         """Record a comparison, and say how it went."""
-        self.prove(same)
+        self.proofs.append(same)
         self.console.print("[bold green]Right, byte for byte.[/]" if same else "[bold red]It differs.[/]")
 
 
@@ -121,32 +118,26 @@ def running(
     is another step's business. apart: Ctrl-C reaches only the tour, which then ends things in order.
     """
     child = None
+    state = {"XDG_STATE_HOME": str(folder / "state")}  # what a mount keeps goes with it
     try:
         with signals_held():
             child = subprocess.Popen(
                 words,
                 cwd=folder,
-                env={
-                    **os.environ,
-                    "XDG_STATE_HOME": str(folder / "state"),
-                },  # what a mount keeps goes with it
+                env={**os.environ, **state},
                 stdin=subprocess.DEVNULL,
                 stdout=output,
-                stderr=output,
+                stderr=subprocess.STDOUT,
                 start_new_session=apart,
             )
         yield child
     finally:
         if child is not None:
-            _end(child)
-
-
-def _end(child: subprocess.Popen[bytes]) -> None:
-    for end_it in (child.terminate, child.kill):
-        if child.poll() is None:
-            end_it()
-            with suppress(subprocess.TimeoutExpired):
-                child.wait(END_TIMEOUT / 5)
+            for end_it in (child.terminate, child.kill):
+                if child.poll() is None:
+                    end_it()
+                    with suppress(subprocess.TimeoutExpired):
+                        child.wait(END_TIMEOUT)
 
 
 @contextmanager
@@ -157,11 +148,6 @@ def vehicle(arguments: Sequence[str], folder: Path) -> Iterator[subprocess.Popen
         running([*PROGRAM, "sim", *arguments], folder, output=log, apart=True) as process,
     ):
         yield process
-
-
-def ignore_interrupts() -> None:
-    """Let no further Ctrl-C stop the cleaning up half-way."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def free_port() -> int:
@@ -182,11 +168,6 @@ def fill_card(card: Path) -> None:
     (card / SCRIPT).write_text(SCRIPT_TEXT)
     for path in card.rglob("*"):
         os.utime(path, (1795170735, 1795170735))
-
-
-def is_mounted(path: Path) -> bool:
-    """Return whether something is mounted there, without asking it."""
-    return str(path) in mounts()
 
 
 def introduce(tour: Tour) -> None:
@@ -216,23 +197,12 @@ def mount(tour: Tour, stack: ExitStack) -> None:
 
 
 def release(path: Path) -> None:
-    """Unmount if that was not done. What is not delivered soon is given up: the drone is none."""
-    if not is_mounted(path):
+    """End a mount that was not unmounted. What is not delivered is given up: the drone is none."""
+    if str(path) not in mounts():
         return
-    process = 0
-    with suppress(control.ControlError):
-        process = int(report.status_of(str(path)).get("pid", 0))
-    try:
-        subprocess.run([*PROGRAM, "umount", str(path)], capture_output=True, timeout=END_TIMEOUT, check=False)
-    except subprocess.TimeoutExpired:
-        for _ in range(2 if process else 0):  # the second signal ends the delivery
-            with suppress(ProcessLookupError):
-                os.kill(process, signal.SIGTERM)
-            time.sleep(0.5)
-    if is_mounted(path):
-        subprocess.run(
-            ["fusermount3", "-uz", str(path)], capture_output=True, timeout=END_TIMEOUT, check=False
-        )
+    with suppress(control.ControlError, ProcessLookupError):
+        os.kill(int(report.status_of(str(path))["pid"]), signal.SIGKILL)
+    subprocess.run(["fusermount3", "-uz", path], capture_output=True, check=False)
 
 
 def look_around(tour: Tour) -> None:
@@ -241,7 +211,7 @@ def look_around(tour: Tour) -> None:
     tour.command("ls", "-l", f"drone/{Path(LOG).parent}")
     tour.say("Reading a file needs nothing special either:")
     text = tour.command("cat", f"drone/{SCRIPT}")
-    tour.prove(text == SCRIPT_TEXT)
+    tour.proofs.append(text == SCRIPT_TEXT)
 
 
 def copy_log(tour: Tour) -> None:
@@ -256,7 +226,9 @@ def copy_log(tour: Tour) -> None:
     with Progress(*columns, console=tour.console) as progress, running(words, tour.folder) as child:
         bar = progress.add_task("", total=LOG_SIZE)
         while child.poll() is None and time.monotonic() < deadline:
-            progress.update(bar, completed=fetched_bytes(tour))
+            # Not the copy's size: cp asks for 256 KiB at a time, so the bar would jump.
+            transfers = report.status_of(str(tour.drone))["transfers"]
+            progress.update(bar, completed=sum(transfer["done"] for transfer in transfers))
             time.sleep(0.1)
         if child.returncode == 0:
             progress.update(bar, completed=LOG_SIZE)
@@ -264,18 +236,6 @@ def copy_log(tour: Tour) -> None:
         raise DemoFailed(f"cp ended with {child.returncode}")
     sums = tour.command("md5sum", f"card/{LOG}", "flight.ulg")
     tour.verdict(len({line.split()[0] for line in sums.splitlines()}) == 1)
-
-
-def fetched_bytes(tour: Tour) -> int:
-    """Return how much of the log the mount has fetched so far.
-
-    Not the copy's size: cp asks for 256 KiB at a time, so the bar would jump.
-    """
-    try:
-        transfers = report.status_of(str(tour.drone))["transfers"]
-    except control.ControlError as error:
-        raise DemoFailed(f"no status: {error}") from error
-    return sum(transfer["done"] for transfer in transfers)
 
 
 def edit_script(tour: Tour) -> None:
@@ -298,8 +258,7 @@ def show_status(tour: Tour) -> None:
 def compare_all(tour: Tour) -> None:
     """diff the whole mount with the card."""
     tour.say("And the whole drone compared with what is on its card (silence means: no difference):")
-    output = tour.command("diff", "-r", "card", "drone")
-    tour.prove(output == "")
+    tour.proofs.append(tour.command("diff", "-r", "card", "drone") == "")
 
 
 def conclude(tour: Tour) -> int:
@@ -324,49 +283,40 @@ def conclude(tour: Tour) -> int:
     return 0 if good else 1
 
 
-def take_tour(tour: Tour) -> None:
-    """Go through all steps and end everything that was started."""
-    with ExitStack() as stack:
-        try:
-            mount(tour, stack)
-            look_around(tour)
-            copy_log(tour)
-            show_status(tour)
-            edit_script(tour)
-            compare_all(tour)
-            tour.say("Done. Unmounting:")
-            tour.command("mavftpfs", "umount", "drone")
-        finally:
-            ignore_interrupts()
-
-
-def remove(folder: Path) -> None:
-    """Delete the temporary directory; never what is still mounted in it."""
-    release(folder / "drone")
-    if not is_mounted(folder / "drone"):
-        shutil.rmtree(folder, ignore_errors=True)
+def take_tour(tour: Tour, stack: ExitStack) -> None:
+    """Go through all steps; `stack` ends everything that was started."""
+    tour.card.mkdir()
+    tour.drone.mkdir()
+    fill_card(tour.card)
+    introduce(tour)
+    mount(tour, stack)
+    try:
+        look_around(tour)
+        copy_log(tour)
+        show_status(tour)
+        edit_script(tour)
+        compare_all(tour)
+        tour.say("Done. Unmounting:")
+        tour.command("mavftpfs", "umount", "drone")
+    finally:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # no further Ctrl-C stops the cleaning up half-way
 
 
 def run() -> int:
     """Run the demo and return its exit code: 0 only if all comparisons held."""
     console = Console()
-    # The kernel's table and the mount's socket know the place by its real name.
-    tour = Tour(console, Path(tempfile.mkdtemp(prefix="mavftpfs-demo-")).resolve())
     for number in (signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.default_int_handler)
+    # The kernel's table and the mount's socket know the place by its real name.
+    tour = Tour(console, Path(tempfile.mkdtemp(prefix="mavftpfs-demo-")).resolve())
     try:
-        tour.card.mkdir()
-        tour.drone.mkdir()
-        fill_card(tour.card)
-        introduce(tour)
-        take_tour(tour)
-        return conclude(tour)
-    except DemoFailed as error:
+        with ExitStack() as stack:
+            stack.callback(shutil.rmtree, tour.folder, ignore_errors=True)
+            take_tour(tour, stack)
+    except (DemoFailed, control.ControlError) as error:
         console.print(f"[red]mavftpfs demo: {error}[/]", highlight=False)
         return 1
     except KeyboardInterrupt:
         console.print("\nStopped; everything is cleaned up.")
         return 130
-    finally:
-        ignore_interrupts()
-        remove(tour.folder)
+    return conclude(tour)
