@@ -1,6 +1,6 @@
 """Firmware profiles: what a simulated server is, as data. Layer: sim; pure.
 
-The firmwares that are simulated. Sources of the numbers: servers.md, PX4
+The firmwares that are simulated, and a few odd variants. Sources of the numbers: servers.md, PX4
 `mavlink_ftp.cpp`, ArduPilot `GCS_FTP.cpp`, MAVSDK `mavlink_ftp_server.cpp`, and the recordings in tests/data.
 """
 
@@ -15,6 +15,7 @@ from mavftpfs.sim.pseudo import TREES
 class Family(Enum):
     """Whose code the server runs."""
 
+    SPEC = "spec"
     PX4 = "px4"
     ARDUPILOT = "ardupilot"
     MAVSDK = "mavsdk"
@@ -157,6 +158,7 @@ _MAVSDK = Profile(
 )
 
 _ALL = (
+    Profile(name="spec", family=Family.SPEC, list_with_time=True, sessions=4, path_limit=239),
     _PX4,
     replace(
         _PX4,

@@ -24,7 +24,7 @@ VEHICLES = taking_turns(
 )
 """The library's own server says more about MAVSDK than a simulated one."""
 
-QUICK = ("px4", "px4-nuttx", "px4-2026", "mavsdk-server")
+QUICK = ("px4", "px4-nuttx", "px4-2026", "spec", "mavsdk-server")
 """Servers and links over which ten tools can read a megabyte, and hundreds of files."""
 
 DD_STEPS = ((1, 100, 37), (238, 5, 3), (241, 7, 11), (4097, 3, 2), (65537, 2, 1))

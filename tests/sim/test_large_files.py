@@ -99,7 +99,7 @@ async def opened(connection: Connection, path: bytes) -> OpenFile:
 
 
 @pytest.mark.holds("rule 14.27")
-@pytest.mark.parametrize("profile", ["px4", "px4-nuttx", "mavsdk"])
+@pytest.mark.parametrize("profile", ["px4", "px4-nuttx", "mavsdk", "spec"])
 async def test_any_place_of_a_huge_file_can_be_read(profile: str, autojump: MockClock) -> None:
     here, path = huge(profile)
     async with here.connection() as connection:

@@ -51,6 +51,8 @@ IN_TIME = 60.0
 CHANGING = {
     Opcode.CREATE_DIRECTORY, Opcode.CREATE_FILE, Opcode.REMOVE_DIRECTORY, Opcode.REMOVE_FILE, Opcode.RENAME
 }  # fmt: skip
+LEAKS = ("spec",)
+"""Servers that give ids which nobody learns if the answer is lost."""
 
 Call = Callable[[Tree, bytes], Awaitable[None]]
 
@@ -432,7 +434,7 @@ async def meet(profile: str, operation: Call, event: Event, count: int, place: P
         world.link.restore()
         async with mounted(world, place, 9) as (_, tree, _):
             await settle(tree, world, folder, (OPERATIONS[operation],) if done else allowed(operation))
-    assert world.vehicle.server.open_sessions == 0
+    assert profile in LEAKS or world.vehicle.server.open_sessions == 0
     return requests
 
 

@@ -16,6 +16,7 @@ REAL = "mavsdk-server"
 """The MAVSDK library's server; all others are simulated."""
 
 FOLDERS = {
+    "spec": "",
     "px4": "",
     "px4-2026": "",
     "px4-nuttx": "fs/microsd",
