@@ -226,6 +226,8 @@ class Firmware(ABC):
 # -- a server that does what the MAVLink FTP guide says ------------------------------------------------
 
 _BURST_PACKETS = 100
+_TICK = 0.010
+"""Seconds between two packets of a burst."""
 _CODES = {errno.ENOENT: NakCode.FILE_NOT_FOUND, errno.EEXIST: NakCode.FILE_EXISTS}
 
 
@@ -299,7 +301,7 @@ class Spec(Firmware):
         """See Firmware."""
         self.now = now
         while self._streams and self._tick_at <= now:
-            self._tick_at += self.profile.tick
+            self._tick_at += _TICK
             for session, stream in list(self._streams.items()):
                 self._send(session, stream)
 
