@@ -9,6 +9,9 @@ from trio.testing import MockClock
 
 from tests.support.clocks import use_virtual_time
 
+REAL_TIME = ("test_endpoints", "test_impostors", "test_links")
+"""Modules with sockets. A test of theirs runs on virtual time only if it asks for it."""
+
 
 @pytest.fixture
 def autojump() -> MockClock:
@@ -17,8 +20,7 @@ def autojump() -> MockClock:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Give virtual time also to tests that only use a fixture which asks for it."""
+    """Have all other tests of this tier run on virtual time."""
     for item in items:
-        virtual = {"autojump", "autojump_clock"} & set(getattr(item, "fixturenames", ()))
-        if virtual and item.path.parent == Path(__file__).parent:
+        if item.path.parent == Path(__file__).parent and item.path.stem not in REAL_TIME:
             use_virtual_time(item)

@@ -10,7 +10,7 @@ that part is the root of the mount. What happens to single requests is `here.fau
 from __future__ import annotations
 
 from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 from random import Random
 from typing import Any
 
@@ -24,7 +24,7 @@ from mavftpfs.cache.tree import Tree
 from mavftpfs.compose import subscribe
 from mavftpfs.protocol.payload import Opcode
 from mavftpfs.session.connection import Connection, ConnectOptions
-from mavftpfs.shared.errors import AlreadyExists
+from mavftpfs.shared.errors import AlreadyExists, RequestTimeout, VehicleLost
 from mavftpfs.shared.model import split
 from mavftpfs.sim.linkmodel import LinkSettings
 from mavftpfs.sim.profiles import PROFILES, Storage
@@ -135,10 +135,12 @@ class Rig:
         return sum(self.faults.requests.count(opcode) for opcode in opcodes)
 
     async def lose(self) -> None:
-        """Cut the link, and wait until the vehicle counts as lost."""
+        """Cut the link, and wait until the vehicle counts as lost: no heartbeat came, and no answer."""
         self.world.link.cut()
         await self._until(lambda: self.connection.store.is_silent())
-        await trio.sleep(1.0)
+        for _ in range(2):
+            with suppress(RequestTimeout, VehicleLost):
+                await self.connection.store.list_directory(self.root or b"/")
 
     async def find(self) -> None:
         """Mend the link, and wait until the vehicle is heard."""
@@ -197,7 +199,7 @@ def card(
     """Return a fixture: a rig with these files, of each profile in turn."""
 
     @pytest.fixture(params=profiles if len(profiles) > 1 else None)
-    async def here(request: pytest.FixtureRequest, autojump_clock: object) -> AsyncIterator[Rig]:
+    async def here(request: pytest.FixtureRequest) -> AsyncIterator[Rig]:
         async with rig(getattr(request, "param", profiles[0]), files, link=link, options=options) as made:
             yield made
 

@@ -1,0 +1,617 @@
+"""Files on their way to the card: under which name, what is compared, which errors are told.
+
+What becomes of them if something happens at any one request is judged in test_matrix.
+"""
+
+from __future__ import annotations
+
+import errno
+import json
+from collections.abc import Awaitable, Callable
+from contextlib import suppress
+from pathlib import Path
+from random import Random
+
+import pytest
+import trio
+
+from mavftpfs.cache.recovery import SpoolDirectory
+from mavftpfs.cache.throttle import LEAST, MOST, SECONDS, UNMEASURED
+from mavftpfs.protocol.payload import NakCode, Opcode, crc32
+from mavftpfs.session.connection import ConnectOptions
+from mavftpfs.shared.errnos import errno_for
+from mavftpfs.shared.errors import (
+    Armed,
+    FileChanged,
+    FileTooLarge,
+    FtpNak,
+    NotSupported,
+    RequestTimeout,
+    VehicleLost,
+    VerificationFailed,
+)
+from mavftpfs.sim.linkmodel import LinkSettings
+from tests.support.rigs import KINDS, Rig, card, list_all, read_file, rig, write_file
+from tests.support.worlds import content
+
+OLD = bytes(range(256)) * 4
+NEW = b"new content " * 100
+FILE, OTHER, FRESH = b"/d/file.txt", b"/d/other", b"/d/new"
+LONG = b"/" + b"f" * 150
+FAIL_ERRNO = NakCode.FAIL_ERRNO
+BACK_IN = 60.0
+"""Seconds in which what was not delivered is tried again by itself."""
+
+here = card({FILE: OLD, OTHER: NEW})
+each = card({FILE: OLD, OTHER: NEW}, profiles=KINDS)
+fat = card({FILE: OLD, OTHER: NEW}, profiles=["ardupilot5"])
+
+
+# --- names
+
+
+@pytest.mark.parametrize("data", [NEW, b""])
+async def test_a_new_file_gets_its_name_when_it_is_whole(each: Rig, data: bytes) -> None:
+    tree, named = each.mount(), []
+    for opcode in (Opcode.TERMINATE_SESSION, Opcode.CALC_FILE_CRC32):
+        each.faults.at(opcode, lambda: named.append(FRESH in each.files()))
+    file = await tree.create(FRESH, exclusive=True)
+    await file.write(0, data)
+    assert each.count(Opcode.CREATE_FILE) == 0
+    await file.release()
+    assert each.data(FRESH) == data
+    assert True not in named[: 1 + each.renames]
+    assert each.count(Opcode.CALC_FILE_CRC32) == bool(data) * (1 + (not each.renames))
+    opened = each.count(Opcode.OPEN_FILE_RO)
+    assert await read_file(tree, FRESH) == data
+    assert not data or each.count(Opcode.OPEN_FILE_RO) == opened, "what was just written is known"
+    assert each.litter() == []
+
+
+async def test_whether_the_card_can_rename_is_found_out_once(each: Rig) -> None:
+    tree, traits = each.mount(), each.connection.store.traits
+    await write_file(tree, FRESH, NEW)
+    assert traits.rename_works == each.renames
+    created, renamed = each.count(Opcode.CREATE_FILE), each.count(Opcode.RENAME)
+    await write_file(tree, b"/d/newer", NEW)
+    assert each.count(Opcode.CREATE_FILE) == created + 1
+    assert each.count(Opcode.RENAME) == renamed + each.renames
+
+
+async def test_a_refusal_of_that_moment_is_not_taken_for_a_card_that_cannot_rename(here: Rig) -> None:
+    here.faults.refuse(Opcode.RENAME, FAIL_ERRNO, errno.EIO)
+    await write_file(here.mount(), FILE, NEW)
+    assert here.data(FILE) == NEW
+    assert here.connection.store.traits.rename_works
+
+
+@pytest.mark.parametrize("number", [errno.EACCES, errno.EROFS, errno.ENOSPC])
+async def test_a_refusal_for_another_reason_says_nothing_of_replacing(here: Rig, number: int) -> None:
+    tree, traits = here.mount(), here.connection.store.traits
+    here.faults.refuse(Opcode.RENAME, FAIL_ERRNO, number)
+    with pytest.raises(FtpNak):
+        await tree.rename(OTHER, FILE)
+    assert here.files() == {FILE: OLD, OTHER: NEW}
+    assert traits.rename_replaces is None
+    assert traits.rename_works is not False
+    renamed = here.count(Opcode.RENAME)
+    await tree.rename(OTHER, FILE)
+    assert here.files() == {FILE: NEW}
+    assert here.count(Opcode.RENAME) == renamed + 1, "nothing was moved aside"
+
+
+async def test_a_server_that_says_no_by_an_odd_error_is_learnt_too(here: Rig) -> None:
+    here.faults.refuse(Opcode.RENAME, NakCode.FAIL)
+    await write_file(here.mount(), FILE, NEW)
+    assert here.files() == {FILE: NEW, OTHER: NEW}
+
+
+async def test_what_cannot_be_replaced_safely_stays() -> None:
+    async with rig("littlefs", {FILE: OLD}) as here:
+        tree = here.mount()
+        for size in (300, 1100, 0):
+            with pytest.raises(NotSupported):
+                await tree.truncate(FILE, size)
+            assert await read_file(tree, FILE) == OLD
+        assert tree.undelivered() == []
+        with pytest.raises(NotSupported):
+            await write_file(tree, FILE, NEW)
+        assert here.files() == {FILE: OLD}
+        assert await read_file(tree, FILE) == NEW, "what was accepted is kept and shown"
+
+
+@pytest.mark.holds("rule 14.25")
+async def test_what_is_cut_goes_to_the_card_as_a_whole(each: Rig) -> None:
+    tree = each.mount(inplace=not each.renames)
+    for size in (700, 300, 1100, 0):
+        before = each.data(FILE)
+        await tree.truncate(FILE, size)
+        assert each.data(FILE) == before[:size].ljust(size, b"\0") == await read_file(tree, FILE)
+    assert each.count(Opcode.TRUNCATE_FILE) == 0
+
+
+async def test_a_part_of_a_large_file_is_refused_where_it_would_be_sent_whole(here: Rig) -> None:
+    file = await here.mount(rmw_max=1000).open(FILE, write=True)
+    with pytest.raises(FileTooLarge):
+        await file.write(5, b"x")
+    await file.release()
+    assert here.data(FILE) == OLD
+
+
+@pytest.mark.parametrize("stale", [False, True], ids=["", "stale errno"])
+async def test_overwriting_in_place_needs_no_room_for_both_files(stale: bool) -> None:
+    """Whether the card can rename is found out on an empty file then. ArduPilot's refusal may tell what an
+    earlier request failed of."""
+    async with rig("littlefs", {FILE: OLD}) as here:
+        here.world.tree.capacity = len(NEW)
+        if stale:
+            here.faults.refuse(Opcode.RENAME, NakCode.FILE_EXISTS, times=9)
+        await write_file(here.mount(inplace=True), FILE, NEW)
+        assert here.files() == {FILE: NEW}
+        traits = here.connection.store.traits
+        assert (traits.rename_works, traits.rename_replaces) == (False, None)
+
+
+@pytest.mark.holds("fault full card")
+async def test_overwriting_in_place_that_failed_goes_on_later() -> None:
+    """What lies there is the old file, or a part of the new one: nobody else's."""
+    async with rig("littlefs", {FILE: OLD}) as here:
+        tree = here.mount(inplace=True)
+        await write_file(tree, FILE, NEW)
+        for number, nth in enumerate((1, 2, 3), 1):
+            here.faults.refuse(Opcode.WRITE_FILE, FAIL_ERRNO, errno.EIO, nth=nth)
+            file = await tree.open(FILE, write=True, truncate=True)
+            await file.write(0, b"%d" % number * 700)
+            with pytest.raises(FtpNak):
+                await file.flush()
+            await trio.sleep(100)
+            await file.flush()
+            assert here.data(FILE) == b"%d" % number * 700
+            await file.release()
+
+
+@pytest.mark.holds("promise 3")
+@pytest.mark.parametrize("target_too", [False, True])
+@pytest.mark.parametrize("verify", ["auto", "none"])
+async def test_a_temporary_that_vanished_is_not_taken_for_success(
+    here: Rig, verify: str, target_too: bool
+) -> None:
+    """While the link was lost between the verification and the rename, somebody tidied up."""
+    tree = here.mount(verify=verify)
+    here.put(FILE, NEW[::-1])  # of the same size
+    file = await tree.open(FILE, write=True, truncate=True)
+    await file.write(0, NEW)
+    here.faults.at(Opcode.RENAME, here.world.link.cut, drop=True)
+    with pytest.raises(RequestTimeout):
+        await file.fsync()
+    for path in here.litter():
+        here.take(path)
+    if target_too:
+        here.take(FILE)
+    await here.find()
+    await file.release()
+    assert here.data(FILE) == NEW
+
+
+@pytest.mark.holds("promise 3")
+@pytest.mark.parametrize("path", [FILE, LONG])
+async def test_what_could_not_be_removed_brings_nothing_back(fat: Rig, path: bytes) -> None:
+    tree = fat.mount()
+    fat.put(path, OLD)
+    await write_file(tree, OTHER, OLD)  # whether a rename replaces files is known from now on
+    removed = fat.count(Opcode.REMOVE_FILE)
+    fat.faults.refuse(Opcode.REMOVE_FILE, NakCode.FAIL)
+    await write_file(tree, path, NEW)
+    assert fat.count(Opcode.REMOVE_FILE) == removed + 1
+    await tree.unlink(path)
+    await list_all(fat, tree)
+    assert set(fat.files()) == {OTHER, FILE} - {path}
+
+
+@pytest.mark.parametrize("refused", [1, 2])
+@pytest.mark.parametrize("profile", ["px4", "ardupilot5"])
+async def test_what_is_refused_a_name_again_and_again_does_not_fill_the_card(
+    profile: str, refused: int
+) -> None:
+    """No listing is made that would show it."""
+    async with rig(profile, {FILE: OLD} | {b"/d/%d" % number: b"x" for number in range(10)}) as here:
+        tree = here.mount()
+        await tree.list(b"/d")
+        file = await tree.open(FILE, write=True, truncate=True)
+        await file.write(0, NEW)
+        for _ in range(5):
+            here.faults.call_off()
+            here.faults.refuse(Opcode.RENAME, FAIL_ERRNO, errno.EACCES, nth=refused)
+            with suppress(FtpNak):
+                await file.flush()
+            assert here.litter() == []
+            if not tree.undelivered():
+                await file.write(0, b"x")
+        here.faults.call_off()
+        await file.release()
+        assert here.data(FILE) in (NEW, b"x" + NEW[1:])
+
+
+# --- verification
+
+
+@pytest.mark.holds("promise 2", "rule 14.23")
+async def test_a_mismatch_is_sent_once_more(each: Rig) -> None:
+    each.faults.spoil = 1
+    await write_file(each.mount(), FRESH, NEW)
+    assert each.data(FRESH) == NEW
+    assert each.count(Opcode.CALC_FILE_CRC32) == 2 + (not each.renames)
+
+
+async def test_a_second_mismatch_is_an_error_and_the_old_file_stays(here: Rig) -> None:
+    here.faults.spoil = 1000
+    tree = here.mount()
+    with pytest.raises(VerificationFailed):
+        await write_file(tree, FILE, NEW)
+    assert here.files() == {FILE: OLD, OTHER: NEW}
+    here.faults.spoil = 0
+    assert await tree.drain(10) == []
+    assert here.data(FILE) == NEW
+
+
+@pytest.mark.holds("promise 2")
+async def test_an_unanswered_checksum_counts_as_verified_by_size_unless_it_is_demanded(here: Rig) -> None:
+    here.faults.ignore(Opcode.CALC_FILE_CRC32)
+    tree = here.mount()
+    await write_file(tree, FRESH, NEW)
+    assert (tree.status()["checksums_unanswered"], tree.status()["verified_by_size"]) == (1, 1)
+    with pytest.raises(VerificationFailed):
+        await write_file(here.mount(verify="crc"), b"/d/newer", NEW)
+
+
+@pytest.mark.parametrize(("verify", "asked"), [("size", 0), ("none", 0), ("auto", 0), ("crc", 1)])
+async def test_what_is_too_large_or_not_wanted_is_not_summed(here: Rig, verify: str, asked: int) -> None:
+    await write_file(here.mount(verify=verify, verify_max=100), FRESH, NEW)
+    assert here.count(Opcode.CALC_FILE_CRC32) == asked
+
+
+@pytest.mark.holds("promise 2")
+@pytest.mark.parametrize(("verify", "data"), [("size", NEW), ("auto", bytes(5000))])
+async def test_what_was_cut_off_is_noticed_by_its_size(here: Rig, verify: str, data: bytes) -> None:
+    """The checksum of zeros is right, however many there are."""
+    here.faults.at(Opcode.TERMINATE_SESSION, lambda: here.put(here.litter()[0], data[:300]))
+    await write_file(here.mount(verify=verify), FRESH, data)
+    assert here.data(FRESH) == data
+    assert here.count(Opcode.CREATE_FILE) == 2
+
+
+@pytest.mark.parametrize("profile", ["px4", "mavsdk"])
+async def test_what_was_sent_and_cut_off_is_not_there_though_nothing_is_verified(profile: str) -> None:
+    async with rig(profile, {FILE: OLD}) as here:
+        file = await here.mount(verify="none").open(FILE, write=True, truncate=True)
+        await file.write(0, b"n" * 100_000)
+        await trio.sleep(20)
+        assert here.litter(), "it is sent while the program writes"
+        await file.truncate(50_000)
+        await file.release()
+        assert here.files() == {FILE: b"n" * 50_000}
+
+
+@pytest.mark.holds("promise 9")
+async def test_a_checksum_that_is_not_asked_for_in_flight_sends_nothing_again() -> None:
+    """A second copy could not be checked either."""
+    async with rig(options=ConnectOptions(when_armed="ok")) as here:
+        tree = here.mount(verify="crc", write_armed=True)
+        await here.arm()
+        with pytest.raises(VerificationFailed):
+            await write_file(tree, b"/new", b"x" * 200)
+        assert (here.count(Opcode.WRITE_FILE), here.count(Opcode.CALC_FILE_CRC32)) == (1, 0)
+        await write_file(here.mount(write_armed=True), b"/newer", NEW)
+        assert here.data(b"/newer") == NEW
+
+
+@pytest.mark.holds("promise 9")
+@pytest.mark.parametrize("path", [FRESH, FILE])
+async def test_armed_while_the_checksum_is_asked_for(here: Rig, path: bytes) -> None:
+    """What is there is compared after it was disarmed."""
+    tree = here.mount(verify="crc")
+
+    def arm() -> None:
+        here.world.vehicle.arm()
+        here.world.link.kick()
+
+    here.faults.at(Opcode.TERMINATE_SESSION, arm, nth=2)  # the first is of what tries the card
+    with pytest.raises(Armed):
+        await write_file(tree, path, b"x" * 5000)
+    sent = here.count(Opcode.WRITE_FILE)
+    await here.disarm()
+    await trio.sleep(BACK_IN)
+    assert tree.undelivered() == []
+    assert here.data(path) == b"x" * 5000
+    assert here.count(Opcode.WRITE_FILE) == sent
+    assert here.litter() == []
+
+
+@pytest.mark.holds("promise 2")
+@pytest.mark.parametrize("part", [(100, b"changed"), (0, OLD[::-1])])
+async def test_what_is_remembered_of_a_file_goes_with_its_old_bytes(
+    here: Rig, part: tuple[int, bytes]
+) -> None:
+    """Its size stays the same, and no listing tells a time."""
+    tree = here.mount()
+    assert await tree.crc32(FILE) == crc32(OLD)
+    assert await read_file(tree, FILE) == OLD
+    file = await tree.open(FILE, write=True)
+    await file.write(*part)
+    await file.release()
+    new = OLD[: part[0]] + part[1] + OLD[part[0] + len(part[1]) :]
+    assert await tree.crc32(FILE) == crc32(new)
+    assert await read_file(tree, FILE) == new == here.data(FILE)
+
+
+@pytest.mark.parametrize("restarts", [False, True])
+async def test_what_was_written_is_believed_from_the_moment_when_it_was_verified(
+    here: Rig, restarts: bool
+) -> None:
+    """Not from when the program closed it: somebody else may have changed it before that."""
+    tree = here.mount(dir_timeout=20)
+    file = await tree.open(FILE, write=True, truncate=True)
+    await file.write(0, OLD)
+    await file.fsync()
+    await trio.sleep(0 if restarts else 15)
+    here.put(FILE, OLD[::-1])
+    if restarts:
+        await here.reboot()
+    await file.release()
+    await trio.sleep(0 if restarts else 15)
+    assert await read_file(tree, FILE) == OLD[::-1]
+
+
+# --- errors
+
+
+@pytest.mark.holds("promise 3")
+async def test_an_error_is_told_at_every_close_until_the_bytes_are_there(here: Rig) -> None:
+    tree = here.mount()
+    file = await tree.create(FRESH, exclusive=True)
+    await file.write(0, NEW)
+    await here.lose()
+    for ask in (file.flush, file.fsync, file.flush):
+        with pytest.raises(VehicleLost):
+            await ask()
+    assert tree.undelivered() == [FRESH]
+    assert list(tree.status()["errors"]) == ["/d/new"]  # type: ignore[call-overload]
+    assert tree.status()["bytes_undelivered"] == len(NEW)
+    reader = await tree.open(FRESH)
+    await reader.flush()
+    with pytest.raises(VehicleLost):
+        await reader.fsync()  # `sync FILE` opens for reading
+    with pytest.raises(VehicleLost):
+        await file.flush()
+    await here.find()
+    await reader.fsync()
+    assert here.data(FRESH) == NEW
+    await reader.release()
+    await file.release()
+    assert (tree.undelivered(), tree.status()["errors"], tree.status()["bytes_held"]) == ([], {}, 0)
+
+
+async def test_a_full_card_leaves_the_old_file(here: Rig) -> None:
+    here.world.tree.capacity = here.world.tree.used + 500
+    tree = here.mount()
+    with pytest.raises(FtpNak) as caught:
+        await write_file(tree, FILE, NEW)
+    assert errno_for(caught.value) == errno.ENOSPC
+    assert here.files() == {FILE: OLD, OTHER: NEW}
+    assert tree.undelivered() == [FILE]
+    assert await read_file(tree, FILE) == NEW
+    await tree.unlink(FILE)
+    assert tree.undelivered() == []
+    assert here.files() == {OTHER: NEW}
+
+
+@pytest.mark.parametrize("data", [b"abc", b""])
+async def test_a_file_that_could_not_be_made_can_be_made_later_or_removed(here: Rig, data: bytes) -> None:
+    tree = here.mount()
+    file = await tree.create(FRESH, exclusive=True)
+    await file.write(0, data)
+    here.faults.refuse(Opcode.CREATE_FILE, FAIL_ERRNO, errno.ENOSPC, times=2)
+    for ask in (file.fsync, file.flush):
+        with pytest.raises(FtpNak):
+            await ask()
+    await file.flush()
+    assert here.data(FRESH) == data
+    await file.release()
+    here.faults.refuse(Opcode.CREATE_FILE, FAIL_ERRNO, errno.ENOSPC)
+    with pytest.raises(FtpNak):
+        await write_file(tree, b"/d/newer", NEW)
+    await tree.unlink(b"/d/newer")
+    assert tree.undelivered() == []
+    assert b"newer" not in dict(await tree.list(b"/d"))
+
+
+@pytest.mark.holds("promise 9")
+async def test_armed_means_an_error_at_once_and_delivery_after(here: Rig) -> None:
+    tree = here.mount()
+    file = await tree.create(FRESH, exclusive=True)
+    await file.write(0, NEW)
+    await here.arm()
+    before, asked = trio.current_time(), len(here.faults.requests)
+    asks: list[Callable[[], Awaitable[object]]] = [
+        file.flush,
+        file.fsync,
+        lambda: file.write(0, b"x"),
+        lambda: file.truncate(1),
+        lambda: tree.create(b"/d/x", exclusive=False),
+        lambda: tree.open(FILE, write=True),
+        lambda: tree.open(FILE, write=True, truncate=True),
+        lambda: tree.truncate(FILE, 0),
+        lambda: tree.mkdir(b"/d/y"),
+        lambda: tree.rmdir(b"/d"),
+        lambda: tree.unlink(FILE),
+        lambda: tree.rename(FILE, b"/d/z"),
+        file.release,
+    ]
+    for ask in asks:
+        with pytest.raises(Armed):
+            await ask()
+    assert trio.current_time() - before < 1
+    assert len(here.faults.requests) == asked
+    await here.disarm()
+    await trio.sleep(1)
+    assert here.data(FRESH) == NEW
+    assert tree.undelivered() == []
+
+
+@pytest.mark.parametrize("profile", ["px4", "mavsdk"])
+@pytest.mark.parametrize("now", [OLD + b"grown on the vehicle", OLD[:10]])
+async def test_a_part_is_not_written_into_a_file_that_changed(profile: str, now: bytes) -> None:
+    async with rig(profile, {FILE: OLD}) as here:
+        tree = here.mount()
+        file = await tree.open(FILE, write=True)
+        await file.read(0, len(OLD))
+        await file.write(len(OLD), b"appended")
+        here.put(FILE, now)
+        for _ in range(2):
+            with pytest.raises(FileChanged):
+                await file.flush()
+        file.close()
+        assert here.files() == {FILE: now}
+        assert tree.undelivered() == [FILE]
+
+
+async def test_emptying_does_not_trust_a_remembered_size_of_nothing(here: Rig) -> None:
+    tree = here.mount()
+    here.put(FRESH, b"")
+    await tree.stat(FRESH)
+    here.put(FRESH, b"grown")
+    file = await tree.open(FRESH, write=True, truncate=True)
+    await file.fsync()
+    await file.release()
+    assert here.data(FRESH) == b""
+
+
+# --- while the program still writes
+
+
+async def test_bytes_travel_while_the_program_still_writes(here: Rig) -> None:
+    file = await here.mount().create(FRESH, exclusive=True)
+    await file.write(0, bytes(100_000))
+    await trio.sleep(10)
+    [there] = here.litter()
+    assert len(here.data(there)) == 100_000 // 239 * 239  # the rest waits to fill a request
+    for number in range(3):
+        await file.write(50_000, b"again %d" % number)
+        await trio.sleep(10)
+    await file.release()
+    assert here.data(FRESH) == bytes(50_000) + b"again 2" + bytes(49_993)
+    assert here.count(Opcode.CREATE_FILE) <= 3, "who changes what was sent does so again: by the close"
+
+
+SLOW = LinkSettings(rate=20_000.0, delay=0.02)
+
+
+async def test_writers_wait_for_a_slow_link() -> None:
+    async with rig(link=SLOW) as here:
+        tree = here.mount(dirty_max=100_000)
+        file = await tree.create(b"/new", exclusive=True)
+        for at in range(0, 300_000, 50_000):
+            await file.write(at, bytes(50_000))
+            assert 50_000 + at - here.world.tree.used < 250_000
+        await file.release()
+        assert tree.status()["bytes_held"] == 0
+
+
+async def test_a_writer_is_told_why_nothing_moves(here: Rig) -> None:
+    here.world.tree.capacity = here.world.tree.used + 2000
+    file = await here.mount(dirty_max=65536).create(FRESH, exclusive=True)
+
+    async def write() -> None:
+        for number in range(10):
+            await file.write(number * 100_000, bytes(100_000))
+
+    with pytest.raises(FtpNak):
+        await write()
+    file.close()
+
+
+async def rate_and_limit(rate: float, size: int) -> tuple[float, object]:
+    """Write a file over a link; return its rate and how much may wait then."""
+    async with rig(link=LinkSettings(rate=rate, delay=0.001)) as here:
+        tree = here.mount()
+        assert tree.status()["dirty_max"] == UNMEASURED
+        file = await tree.create(b"/new", exclusive=True)
+        began = trio.current_time()
+        await file.write(0, content(size))
+        await file.flush()
+        took = trio.current_time() - began
+        await file.release()
+        return size / took, tree.status()["dirty_max"]
+
+
+@pytest.mark.holds("promise 4")
+async def test_what_may_wait_is_what_ten_seconds_bring() -> None:
+    """A close cannot be killed."""
+    rate, limit = await rate_and_limit(30_000.0, 400_000)
+    assert limit == pytest.approx(SECONDS * rate, rel=0.2)
+    assert await rate_and_limit(1000.0, 20_000) == (pytest.approx(900, rel=0.3), LEAST)
+    assert (await rate_and_limit(2e6, 1_000_000))[1] == MOST
+
+
+# --- overlapping calls
+
+
+async def test_a_file_renamed_while_it_is_closed_is_forgotten(here: Rig) -> None:
+    tree = here.mount()
+    file = await tree.create(b"/d/a", exclusive=True)
+    await file.write(0, b"ours")
+    async with trio.open_nursery() as nursery:
+        nursery.start_soon(file.release)
+        await trio.sleep(0.005)
+        nursery.start_soon(tree.rename, b"/d/a", b"/d/b")
+    assert tree.status()["bytes_held"] == 0
+    here.put(b"/d/b", b"theirs, longer")
+    await trio.sleep(100)
+    assert (await tree.stat(b"/d/b")).size == len(b"theirs, longer")
+
+
+async def test_a_write_in_the_moment_a_delivery_begins_is_not_forgotten(here: Rig) -> None:
+    file = await here.mount().open(FILE, write=True)
+    for number in range(30):  # which of the two comes first is left to chance
+        mark = b"%04d" % number
+        await file.truncate(900 - number)
+        async with trio.open_nursery() as nursery:
+            nursery.start_soon(file.flush)
+            nursery.start_soon(file.write, 10, mark)
+        await file.flush()
+        assert here.data(FILE)[10:14] == mark
+    await file.release()
+
+
+# --- the end of a mount
+
+
+async def test_what_is_still_open_when_the_mount_ends_is_not_kept(here: Rig, tmp_path: Path) -> None:
+    """A kernel that lost its mount closes nothing: the next mount must not offer what was delivered."""
+    spool = SpoolDirectory(tmp_path / "spool", Random(1))
+    tree = here.mount(spool=spool, dirty_max=65536)
+    file = await tree.create(FRESH, exclusive=True)
+    await file.write(0, bytes(300_000))
+    assert await tree.drain(100) == []
+    spool.discard()
+    assert [path.name for path in spool.path.iterdir()] == ["owner"]
+    spool.close()
+
+
+async def test_what_cannot_be_delivered_is_moved_with_its_description(here: Rig, tmp_path: Path) -> None:
+    tree = here.mount()
+    new = await tree.create(FRESH, exclusive=True)
+    await new.write(0, NEW)
+    part = await tree.open(FILE, write=True)
+    await part.write(500, b"part")
+    await here.lose()
+    assert sorted(await tree.drain(5)) == [FILE, FRESH]
+    files = {path.name: path for path in tree.recover_to(tmp_path / "rescued")}
+    assert files["d__new"].read_bytes() == NEW
+    assert files["d__file.txt"].read_bytes()[500:504] == b"part"
+    whole, changed = (
+        json.loads(files[name].with_name(f"{name}.json").read_text()) for name in ("d__new", "d__file.txt")
+    )
+    assert whole["whole"]
+    assert changed["changed"] == [[500, 504]]
+    assert not changed["whole"]
