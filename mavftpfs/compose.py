@@ -23,6 +23,7 @@ from mavftpfs.cache.kept import KeptCache, vehicle_identity
 from mavftpfs.cache.kept_disk import KeptDisk
 from mavftpfs.cache.options import CacheOptions
 from mavftpfs.cache.tree import Tree
+from mavftpfs.cache.versions import BlockCache
 from mavftpfs.farewell import rescue, spool_for
 from mavftpfs.fuse.handles import Space
 from mavftpfs.fuse.options import MountOptions
@@ -51,7 +52,7 @@ BITS_PER_BYTE = 10
 """On a serial port: eight, and a start and a stop bit."""
 
 
-MakeKept = Callable[[Directories], KeptCache]
+MakeKept = Callable[[Directories, BlockCache], KeptCache]
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,8 +162,10 @@ async def attached(
                         spool.discard()
 
 
-def _start_kept(make: MakeKept, nursery: trio.Nursery, directories: Directories) -> KeptCache:
-    kept = make(directories)
+def _start_kept(
+    make: MakeKept, nursery: trio.Nursery, directories: Directories, blocks: BlockCache
+) -> KeptCache:
+    kept = make(directories, blocks)
     nursery.start_soon(kept.run)
     return kept
 

@@ -142,8 +142,6 @@ class Files:
         version = self._current.get(path)
         if version is not None and self._still_right(version, found, fresh):
             self._current.move_to_end(path)
-            if self.kept is not None:
-                self.kept.watch(version)
             return version, True
         kept = await self.kept.find(path, entry) if fresh and self.kept is not None else None
         if kept is not None:
@@ -154,8 +152,6 @@ class Files:
             version = await self._start_version(path, entry)
             if fresh and self.kept is not None:
                 self.kept.keep(version, entry)
-        if self.kept is not None:
-            self.kept.watch(version)
         return version, False
 
     def _still_right(self, version: Version, found: Found, fresh: bool) -> bool:

@@ -7,8 +7,9 @@ Off unless `cache_dir=` names a directory. What tells versions of a file apart:
   it is disarmed, of files up to verify_max, and for at most CRC_LIMIT seconds. Only whole files are kept so.
 
 Never kept: `@` files, a file that grows or was changed in the last minute, what was read within SETTLED
-seconds, and anything after the vehicle restarted (it may be another one by then). The disk is only touched
-in threads.
+seconds, and anything after the vehicle restarted (it may be another one by then). Every SETTLED seconds all
+blocks in memory are looked at, and those that were there the last time go to the disk. The disk is only
+touched in threads.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ import trio
 
 from mavftpfs.cache.directories import Directories
 from mavftpfs.cache.kept_disk import FileKey, Kept, KeptDisk
-from mavftpfs.cache.versions import BLOCK_SIZE, Version
+from mavftpfs.cache.versions import BLOCK_SIZE, NEVER, BlockCache, Version
 from mavftpfs.shared.errors import MavftpfsError
 from mavftpfs.shared.model import DirEntry, is_virtual
 
@@ -39,11 +40,11 @@ YOUNG = 60.0
 SETTLED = 12.0
 """Seconds after which bytes are beyond doubt: another client of the vehicle is noticed within 10."""
 
-PERIOD = 4.0
-"""Seconds between two looks at what may be kept."""
-
 CRC_LIMIT = 10.0
 """Seconds to wait for a checksum that only saves reading the file."""
+
+CRC_PAUSE = 600.0
+"""Seconds for which none is asked for after one that did not come."""
 
 
 def vehicle_identity(uid: int, uid2: bytes, flight_sw_version: int, git_hash: bytes) -> bytes | None:
@@ -71,6 +72,7 @@ class KeptCache:
         self,
         disk: KeptDisk,
         directories: Directories,
+        blocks: BlockCache,
         *,
         identity: Callable[[], bytes | None],
         crc32: Callable[[bytes], Awaitable[int]],
@@ -82,14 +84,13 @@ class KeptCache:
         file for which it may be asked now. `wall`: seconds since 1970. `run` calls a thread."""
         self._disk = disk
         self._directories = directories
+        self._blocks = blocks
         self._identity = identity
         self._crc32 = crc32
         self._crc_limit = crc_limit
         self._wall = wall
         self._run = run
-        self._watched: dict[Version, Kept] = {}
-        self._crc_silent = False
-        self._broken = False
+        self._ask_after = NEVER
         self.written = 0
 
     def status(self) -> dict[str, object]:
@@ -133,14 +134,16 @@ class KeptCache:
 
     async def _with_crc32(self, key: FileKey) -> FileKey | None:
         """Return the key of the file with the CRC32 that the vehicle has; asks only if one of it is kept."""
-        if self._crc_silent or await self._run(self._disk.read, key.block(0, 0)) is None:
+        clock = self._directories.clock
+        if clock() < self._ask_after or await self._run(self._disk.read, key.block(0, 0)) is None:
             return None
         with trio.move_on_after(CRC_LIMIT) as scope:
             try:
                 return _of_crc32(key, await self._crc32(key.path))
             except MavftpfsError:  # without one all is read
                 return None
-        self._crc_silent = scope.cancelled_caught
+        if scope.cancelled_caught:
+            self._ask_after = clock() + CRC_PAUSE
         return None
 
     # --- to the disk
@@ -152,24 +155,30 @@ class KeptCache:
             key = self._key(version.path, entry)
             version.kept = None if key is None else Kept(key)
 
-    def watch(self, version: Version) -> None:
-        """A version is open, perhaps again: more of it may be read."""
-        if version.kept is not None:
-            self._watched[version] = version.kept
-
     async def run(self) -> None:
-        """Keep what may be kept, until cancelled."""
+        """Keep what may be kept, until cancelled, or until the disk takes no more."""
         await self._run(self._disk.shrink)
-        while not self._broken:
-            await trio.sleep(PERIOD)
-            for version, kept in list(self._watched.items()):
-                if version.kept is not kept or not self._may_keep(version, kept.key):
-                    del self._watched[version]
-                    version.kept = None
-                    continue
-                await self._write_ripe(version, kept)
-                if not version.handles and kept.done.issuperset(kept.arrived):
-                    self._watched.pop(version, None)
+        seen: dict[Version, dict[int, bytearray]] = {}
+        try:
+            while True:
+                await trio.sleep(SETTLED)
+                before, seen = seen, self._held()
+                for version, held in seen.items():
+                    known = before.get(version, {})
+                    await self._write(version, {i: b for i, b in held.items() if known.get(i) is b})
+        except OSError as error:
+            log.warning("nothing more is kept in cache_dir: %s", error)
+
+    def _held(self) -> dict[Version, dict[int, bytearray]]:
+        """Return the blocks that are whole and not on the disk, of files that may be kept."""
+        held: dict[Version, dict[int, bytearray]] = {}
+        for version, index in self._blocks.used:
+            block = version.block(index)
+            if block is None or version.kept is None or index in version.kept.done:
+                continue
+            if not version.missing(*_extent(version.size, index)):
+                held.setdefault(version, {})[index] = block
+        return held
 
     def _may_keep(self, version: Version, key: FileKey) -> bool:
         """Return whether a version is still, for all we know, what its key says."""
@@ -180,50 +189,33 @@ class KeptCache:
         listed = self._directories.entry(key.path)
         return listed is None or (listed.size, listed.mtime) == (key.size, version.mtime)
 
-    async def _write_ripe(self, version: Version, kept: Kept) -> None:
-        """Write blocks that are not on the disk and were held whole for SETTLED seconds."""
-        now = self._directories.clock()
-        extents = [_extent(version.size, index) for index in range(-(-version.size // BLOCK_SIZE))]
-        whole = [i for i, extent in enumerate(extents) if i in version and not version.missing(*extent)]
-        kept.arrived = {index: kept.arrived.get(index, now) for index in whole if index not in kept.done}
-        ripe = [index for index, at in kept.arrived.items() if now - at >= SETTLED]
+    async def _write(self, version: Version, ripe: dict[int, bytearray]) -> None:
+        """Write blocks that were held whole for SETTLED seconds.
+
+        Raises:
+            OSError: the disk does not take them.
+        """
+        kept = version.kept
+        if kept is None or not self._may_keep(version, kept.key):
+            version.kept = None
+            return
         if version.mtime is not None and not version.compared:
             return
         if not kept.key.version:
-            if len(ripe) == len(extents):
-                await self._write_whole(version, kept.key, extents)
-            return
-        drops = version.drops
-        for index in ripe:
-            data = version.get(*extents[index])
-            if data is None or version.kept is not kept or version.drops != drops:
+            if sum(map(len, ripe.values())) < version.size:
+                return
+            value = 0xFFFFFFFF
+            for index in sorted(ripe):
+                value = zlib.crc32(ripe[index], value)
+            marker = kept.key.block(0, 0)  # it is worth asking for the checksum of this path and size
+            version.kept = kept = Kept(_of_crc32(kept.key, value ^ 0xFFFFFFFF))
+            await self._run(self._disk.write, marker, b"")
+        for index, block in ripe.items():
+            if version.kept is not kept or version.block(index) is not block:
                 return  # it is in doubt, or another file, by now
-            if not await self._to_disk(kept.key.block(*extents[index]), bytes(data)):
-                return
+            await self._run(self._disk.write, kept.key.block(*_extent(version.size, index)), bytes(block))
             kept.done.add(index)
-
-    async def _write_whole(self, version: Version, key: FileKey, extents: list[tuple[int, int]]) -> None:
-        """Write a file that only its CRC32 tells from others, and that there is one of that path and size."""
-        version.kept = None  # this was all
-        parts, value = [bytes(version.get(*extent) or b"") for extent in extents], 0xFFFFFFFF
-        for part in parts:
-            value = zlib.crc32(part, value)
-        known = _of_crc32(key, value ^ 0xFFFFFFFF)
-        for extent, part in zip(extents, parts, strict=True):
-            if not await self._to_disk(known.block(*extent), part):
-                return
-        await self._to_disk(key.block(0, 0), b"")
-
-    async def _to_disk(self, name: str, data: bytes) -> bool:
-        try:
-            await self._run(self._disk.write, name, data)
-        except OSError as error:
-            if not self._broken:
-                log.warning("nothing more is kept in cache_dir: %s", error)
-            self._broken = True
-            return False
-        self.written += bool(data)
-        return True
+            self.written += 1
 
 
 def _extent(size: int, index: int) -> tuple[int, int]:

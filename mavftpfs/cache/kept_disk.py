@@ -55,13 +55,9 @@ class FileKey:
 
 @dataclass(slots=True)
 class Kept:
-    """What the disk has, or will have, of one version of a file.
-
-    arrived: when each block that is not there yet was first seen whole. done: blocks that are on the disk.
-    """
+    """What the disk has, or will have, of one version of a file. done: blocks that are on the disk."""
 
     key: FileKey
-    arrived: dict[int, float] = field(default_factory=dict)
     done: set[int] = field(default_factory=set)
 
 

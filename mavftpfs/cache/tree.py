@@ -66,7 +66,7 @@ class Tree:
         spool: SpoolDirectory | None = None,
         wall: Callable[[], float] = time.time,
         rng: Random | None = None,
-        keep: Callable[[Directories], KeptCache] | None = None,
+        keep: Callable[[Directories, BlockCache], KeptCache] | None = None,
     ) -> None:
         """`invalidate(path)`: the kernel's pages and attributes of a path are wrong; must not block.
 
@@ -89,7 +89,7 @@ class Tree:
             invalidate=self._invalidate,
         )
         self._directories.ask_size = self._files.learn_size
-        self._files.kept = None if keep is None else keep(self._directories)
+        self._files.kept = None if keep is None else keep(self._directories, self._blocks)
         self._virtual = VirtualTrees(
             store, self._directories, options, invalidate=self._invalidate, nursery=nursery
         )

@@ -186,6 +186,10 @@ class Version:
         """Return whether the block is held."""
         return index in self._blocks
 
+    def block(self, index: int) -> bytearray | None:
+        """Return a block if it is held. It is another object when it came anew."""
+        return self._blocks.get(index)
+
     @property
     def waited_for(self) -> bool:
         """Whether somebody waits for bytes."""

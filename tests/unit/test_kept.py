@@ -10,13 +10,13 @@ import pytest
 import trio
 
 from mavftpfs.cache.directories import Directories
-from mavftpfs.cache.kept import CRC_LIMIT, PERIOD, SETTLED, KeptCache
+from mavftpfs.cache.kept import CRC_LIMIT, SETTLED, KeptCache
 from mavftpfs.cache.kept_disk import KeptDisk
 from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.options import CacheOptions
 from mavftpfs.cache.remote import VehicleStore
 from mavftpfs.cache.tree import Tree
-from mavftpfs.cache.versions import BLOCK_SIZE
+from mavftpfs.cache.versions import BLOCK_SIZE, BlockCache
 from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.shared.errors import FileChanged, FtpNak, SessionBusy
 from tests.support.fake_store import FakeStore, read_file
@@ -24,7 +24,7 @@ from tests.unit.test_files import DATA, LOG, content
 
 NOW = 1_800_000_000.0
 MTIME = 1_700_000_000
-ENOUGH = SETTLED + 2 * PERIOD + 1
+ENOUGH = 2 * SETTLED + 1
 
 
 class Mounts:
@@ -48,12 +48,13 @@ class Mounts:
     def mount(self, **options: object) -> Tree:
         """Return a tree that knows nothing but what lies in the directory."""
 
-        def keep(directories: Directories) -> KeptCache:
+        def keep(directories: Directories, blocks: BlockCache) -> KeptCache:
             directories.is_growing = self.growing.__contains__  # type: ignore[assignment,method-assign]
             self.caches.append(
                 KeptCache(
                     KeptDisk(self.path, 1 << 24),
                     directories,
+                    blocks,
                     identity=lambda: self.vehicle,
                     crc32=self.store.crc32,
                     crc_limit=lambda: self.crc_limit,
