@@ -135,7 +135,8 @@ async def attached(
     async with open_link(spec) as link, connected(link, settings, trace=sinks.payload) as connection:
         connection.driver.framer.on_frame = sinks.frame
         await connection.ready(options.connect_timeout)
-        keep = await kept_for(options, connection)
+        caches = replace(cache_options(options, spec), read_only=not writing)
+        keep = None if options.cache_dir is None else await kept_in(options.cache_dir, caches, connection)
         async with plain_nursery() as nursery:
             with spool_for(connection.vehicle.address) if writing else nullcontext() as spool:
                 notice: Callable[[], str] = str
@@ -143,7 +144,7 @@ async def attached(
                     notice = partial(rescue, spool, rescue_for)
                 tree = Tree(
                     connection.store,
-                    replace(cache_options(options, spec), read_only=not writing),
+                    caches,
                     clock=trio.current_time,
                     invalidate=invalidate,
                     nursery=nursery,
@@ -251,10 +252,8 @@ def connect_options(options: MountOptions) -> ConnectOptions:
     Raises:
         UsageError: the signing key cannot be read.
     """
-    given = _given(ConnectOptions, options)
-    if options.signing_key is not None:
-        given["signing_key"] = read_key(options.signing_key)
-    return ConnectOptions(**given)
+    key = None if options.signing_key is None else read_key(options.signing_key)
+    return ConnectOptions(**{**_given(ConnectOptions, options), "signing_key": key})
 
 
 def cache_options(options: MountOptions, spec: LinkSpec) -> CacheOptions:
@@ -265,9 +264,9 @@ def cache_options(options: MountOptions, spec: LinkSpec) -> CacheOptions:
 
 
 def _given(part: type[ConnectOptions | CacheOptions], options: MountOptions) -> dict[str, Any]:
-    """Return the values of the options that `part` has by the same name; None leaves its default."""
-    values = {field.name: getattr(options, field.name, None) for field in fields(part)}
-    return {name: value for name, value in values.items() if value is not None}
+    """Return the values of the options that `part` has by the same name."""
+    values = {**{name: getattr(options, name) for name in options.__slots__}, **options.passed_on}
+    return {field.name: values[field.name] for field in fields(part) if field.name in values}
 
 
 def read_key(path: str) -> bytes:
@@ -310,18 +309,16 @@ IDENTITY_PATIENCE = 5.0
 _IDENTITY_POLL = 0.02
 
 
-async def kept_for(options: MountOptions, connection: Connection) -> MakeKept | None:
-    """Return what makes a tree's kept cache, None without cache_dir; waits until the vehicle said who it is.
+async def kept_in(place: str, options: CacheOptions, connection: Connection) -> MakeKept:
+    """Return what makes a tree's kept cache in a directory; waits until the vehicle said who it is.
 
     Raises:
         UsageError: the directory cannot be used.
     """
-    if options.cache_dir is None:
-        return None
     try:
-        directory = KeptDisk(Path(options.cache_dir), DISK_PART * options.cache_size)
+        directory = KeptDisk(Path(place), DISK_PART * options.cache_size)
     except OSError as exc:
-        raise UsageError(f"cache_dir={options.cache_dir}: {exc.strerror}") from exc
+        raise UsageError(f"cache_dir={place}: {exc.strerror}") from exc
 
     with trio.move_on_after(IDENTITY_PATIENCE):
         while connection.vehicle.version is None:  # noqa: ASYNC110 (asked for once per mount)
@@ -346,7 +343,7 @@ def identity(connection: Connection) -> bytes | None:
     return vehicle_identity(version.uid, version.uid2, version.flight_sw_version, version.git_hash)
 
 
-def crc_limit(options: MountOptions, connection: Connection) -> int:
+def crc_limit(options: CacheOptions, connection: Connection) -> int:
     """Return the size in bytes of the largest file whose checksum may be asked for now."""
     allowed = options.verify in ("auto", "crc") and not connection.vehicle.armed
     return options.verify_max if allowed else 0

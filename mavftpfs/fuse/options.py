@@ -8,8 +8,8 @@ and everything else that is not in the table is refused by name.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple, TypeVar
 
 from mavftpfs.cache.options import DEFAULT_LOCAL
@@ -45,7 +45,11 @@ _DAY = 86400.0
 
 @dataclass(frozen=True, slots=True)
 class MountOptions:
-    """Everything `-o` can say. Seconds, bytes, bytes/s; None = auto or not given."""
+    """What `-o` says. Seconds, octal bits; None = not given.
+
+    passed_on: values for the session and the caches, by the names that they have there, where their defaults
+    are, too.
+    """
 
     read_only: bool = False
     allow_other: bool = False
@@ -57,37 +61,17 @@ class MountOptions:
     dmask: int | None = None
     fsname: str | None = None
     root: bytes = ROOT
-    target_system: int = 0
-    target_component: int = 0
-    source_system: int | None = None
-    source_component: int | None = None
-    heartbeat: str = "onboard"
     baud: int | None = None
     signing_key: str | None = None
-    dir_timeout: float | None = None
-    attr_timeout: float = 1.0
-    negative_timeout: float = 2.0
-    cache_size: int = 64 << 20
     cache_dir: str | None = None
-    dirty_max: int | None = None
-    spool_max: int = 1 << 30
-    rmw_max: int | None = None
     op_deadline: float = 30.0
     connect_timeout: float = 30.0
-    read_mode: str = "window"
-    chunk: int | None = None
-    window: int | None = None
-    bwlimit: int | None = None
-    verify: str = "auto"
-    verify_max: int = 4 << 20
     when_armed: str = "ro"
-    force: bool = False
-    inplace: bool = False
-    local: tuple[str, ...] = DEFAULT_LOCAL
     log_file: str | None = None
     trace: str | None = None
     tlog: str | None = None
     kernel_words: tuple[str, ...] = ()
+    passed_on: Mapping[str, Any] = field(default_factory=dict)
 
     def file_mode(self, default_umask: int) -> int:
         """Return the permission bits of files; write bits go where the mount is read-only."""
@@ -275,7 +259,8 @@ def parse_options(texts: Iterable[str]) -> MountOptions:
     words: list[str] = []
     for word in split_words(texts):
         _take(word, values, words)
-    return MountOptions(**values, kernel_words=tuple(words))
+    own = {name: values.pop(name) for name in MountOptions.__slots__ if name in values}
+    return MountOptions(**own, kernel_words=tuple(words), passed_on=values)
 
 
 def with_root(options: MountOptions, subtree: bytes) -> MountOptions:

@@ -177,8 +177,9 @@ async def find_mount(spec: LinkSpec, options: MountOptions) -> Session | None:
 
 
 def _is_wanted(vehicle: Mapping[str, Any], options: MountOptions) -> bool:
-    is_system = options.target_system in (0, vehicle["system"])
-    return is_system and options.target_component in (0, vehicle["component"])
+    wanted = options.passed_on
+    is_system = wanted.get("target_system", 0) in (0, vehicle["system"])
+    return is_system and wanted.get("target_component", 0) in (0, vehicle["component"])
 
 
 async def open_mount(mountpoint: str, subtree: bytes) -> Session:

@@ -43,9 +43,9 @@ def _target(args: Args, component: int | None) -> Target:
     no_device = place.startswith("/") and not place.startswith("/dev/") and not os.path.lexists(place)
     if no_device or os.path.isdir(place):
         raise UsageError(f"no vehicle is mounted on {place}")
-    options, spec = connection_of(args)
     if component is not None:
-        options = replace(options, target_component=component)
+        args.options.append(f"target_component={component}")
+    options, spec = connection_of(args)
     return Target(spec, options)
 
 

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mavftpfs.cache.options import DEFAULT_LOCAL
+from mavftpfs.cache.options import DEFAULT_LOCAL, CacheOptions
 from mavftpfs.fuse.options import (
     FLAGS,
     IGNORED_WORDS,
@@ -21,14 +21,19 @@ from mavftpfs.fuse.options import (
     option_help,
     parse_options,
 )
+from mavftpfs.session.connection import ConnectOptions
 from mavftpfs.shared.errors import UsageError
 
-FIELDS = {field.name for field in fields(MountOptions)}
+OWN, PASSED_ON = (
+    {field.name: field.default for part in parts for field in fields(part)}
+    for parts in ((MountOptions,), (CacheOptions, ConnectOptions))
+)
 
 
 def test_the_table_fills_fields_and_no_others() -> None:
-    flag_fields = {flag.field for flag in FLAGS.values() if flag.field}
-    assert set(VALUES) | flag_fields | {"kernel_words"} == FIELDS
+    named = set(VALUES) | {flag.field for flag in FLAGS.values() if flag.field}
+    assert set(OWN) <= named | {"kernel_words", "passed_on"}
+    assert named <= OWN.keys() | PASSED_ON.keys()
     assert not set(VALUES) & (KERNEL_WORDS | IGNORED_WORDS | set(FLAGS))
 
 
@@ -62,7 +67,8 @@ def test_words_for_others_are_ignored(word: str) -> None:
     ],
 )
 def test_values(text: str, field: str, value: object) -> None:
-    assert getattr(parse_options([text]), field) == value
+    options = parse_options([text])
+    assert (getattr(options, field) if field in OWN else options.passed_on[field]) == value
 
 
 def test_the_last_word_wins() -> None:
@@ -182,7 +188,7 @@ def test_guide_and_help_tell_the_real_defaults() -> None:
     checked = set()
     for name, value in told_defaults():
         with suppress(ValueError):
-            parsed, default = VALUES[name].parse(value), getattr(MountOptions(), name)
+            parsed, default = VALUES[name].parse(value), {**PASSED_ON, **OWN}[name]
             if default is not None or value == "auto":
                 assert (name, parsed) == (name, default)
                 checked.add(name)
