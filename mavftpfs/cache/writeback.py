@@ -6,7 +6,6 @@ vehicle's. Paths are the vehicle's, normalised; those below `@` never come here 
 
 from __future__ import annotations
 
-import errno
 import logging
 import sys
 from collections.abc import Callable
@@ -34,7 +33,6 @@ from mavftpfs.cache.reserved import OwnNames, new_owner, require_writable
 from mavftpfs.cache.spool import Spool
 from mavftpfs.cache.throttle import Throttle
 from mavftpfs.cache.writefile import Parts, ReadFile, WriteFile
-from mavftpfs.shared.errnos import errno_for
 from mavftpfs.shared.errors import AlreadyExists, IsADirectory, MavftpfsError, NoSpace, NotFound, SpoolFailed
 from mavftpfs.shared.model import EntryKind, require_listable
 
@@ -46,16 +44,8 @@ RETRY_PAUSE = 1.0
 PAUSES = (2.0, 30.0)
 """Seconds between two attempts to deliver what nobody has open: at first, and at most."""
 
-ROOM_PAUSES = (120.0, 3600.0)
-"""The same for what the card had no room for: most of a file may travel before that shows again."""
-
 REFUSALS = 3
 """After so many rounds in which the vehicle answered and refused all that is left, the end is not put off."""
-
-
-def _lacked_room(node: Node) -> bool:
-    """Return whether a file is not delivered because it did not fit: others may be removed."""
-    return node.error is not None and errno_for(node.error) == errno.ENOSPC
 
 
 class Writeback:
@@ -104,7 +94,7 @@ class Writeback:
         self._cleaner = cleaner = Cleaner(context, names, dead)
         self._deliverer = deliverer = Deliverer(context, names, cleaner, throttle)
         context.retry_later = self._retry_later
-        self._retried: set[Callable[[Node], bool]] = set()
+        self._retrying = False
         self.namespace = Namespace(context, names, deliverer)
         self._parts = Parts(context, deliverer, throttle, self.namespace)
         if not options.read_only:
@@ -318,24 +308,22 @@ class Writeback:
 
     def _retry_later(self) -> None:
         """Something was not delivered, or left a name without a file: try again by and by."""
-        nursery = self._context.nursery
-        for which, pauses in ((may_pass, PAUSES), (_lacked_room, ROOM_PAUSES)):
-            if nursery is not None and which not in self._retried:
-                self._retried.add(which)
-                nursery.start_soon(self._retry, which, *pauses)
+        if self._context.nursery is not None and not self._retrying:
+            self._retrying = True
+            self._context.nursery.start_soon(self._retry)
 
-    async def _retry(self, which: Callable[[Node], bool], pause: float, longest: float) -> None:
-        """Try again, ever more seldom, as long as there are such files: a link that fails and returns between
-        two looks at its heartbeats is no news to anybody, nor is room on a card that was full."""
-        nodes, own = self._context.nodes, self._context.own
+    async def _retry(self) -> None:
+        """Try again, ever more seldom, as long as that may help: a link that fails and returns between two
+        looks at its heartbeats is no news to anybody."""
+        nodes, own, (pause, longest) = self._context.nodes, self._context.own, PAUSES
         try:
-            while (which is may_pass and own.torn) or any(n.undelivered and which(n) for n in nodes):
+            while own.torn or any(n.undelivered and may_pass(n) for n in nodes):
                 await trio.sleep(pause)
                 pause = min(2 * pause, longest)
                 await self._cleaner.mend_torn()
-                await self._deliver_each(lambda node: which(node) and self._is_left_to_us(node))
+                await self._deliver_each(lambda node: may_pass(node) and self._is_left_to_us(node))
         finally:
-            self._retried.discard(which)
+            self._retrying = False
 
     def _is_left_to_us(self, node: Node) -> bool:
         """Nobody writes it any more, or its name may lack a file."""

@@ -9,7 +9,7 @@ import trio
 
 from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.tree import Tree
-from mavftpfs.cache.writeback import PAUSES, ROOM_PAUSES
+from mavftpfs.cache.writeback import PAUSES
 from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.shared.errors import FtpNak, MavftpfsError, RequestTimeout, VehicleLost
 from tests.support.fake_writer import KINDS, FakeWriter, card, make_writable
@@ -146,31 +146,6 @@ async def test_a_refusal_is_not_repeated_before_there_is_news(
     tree.link_back()
     await trio.sleep(1)
     assert tree.undelivered() == []
-
-
-@pytest.mark.holds("promise 3")
-async def test_what_did_not_fit_is_tried_again_seldom(
-    autojump_clock: object, store: FakeWriter, tree: Tree
-) -> None:
-    asked: list[float] = []
-
-    def refuse(*_: object) -> None:
-        asked.append(trio.current_time())
-        raise FtpNak(Opcode.WRITE_FILE, NakCode.FAIL_ERRNO, errno.ENOSPC)
-
-    store.before_request = refuse
-    await close_in_vain(tree)
-    asked.clear()
-    await trio.sleep(10 * ROOM_PAUSES[1])
-    times = sorted(set(asked))
-    assert 10 < len(times) < 30
-    assert times[-1] - times[-2] == pytest.approx(ROOM_PAUSES[1], abs=2)
-    store.before_request = None
-    await trio.sleep(ROOM_PAUSES[1] + 1)
-    assert tree.undelivered() == []
-    count = store.requests
-    await trio.sleep(10 * ROOM_PAUSES[1])
-    assert store.requests == count, "it ended"
 
 
 async def test_an_open_file_is_left_to_its_program(
