@@ -17,12 +17,10 @@ from trio.testing import MockClock
 from mavftpfs.cache.tree import Tree
 from mavftpfs.protocol.payload import MAX_DATA
 from mavftpfs.sim.linkmodel import LinkSettings
-from mavftpfs.sim.profiles import PROFILES
 from tests.bench.cases import FRAME, Case, Direction
 from tests.bench.goodput import measure
 from tests.support.mounting import mounted
 from tests.support.sources import MemorySource
-from tests.support.takingturns import taking_turns
 from tests.support.worlds import ROOTS, MemorySink, World
 
 LONG = 60.0
@@ -43,15 +41,27 @@ def target(case: Case) -> float:
 
 
 @pytest.mark.holds("fault overflow")
-@pytest.mark.parametrize(("rtt", "loss"), [(0.01, 0.0), (0.1, 0.05), (0.3, 0.1)])
-@pytest.mark.parametrize("profile", taking_turns(sorted(PROFILES)))
+@pytest.mark.parametrize(
+    ("profile", "rtt", "loss"),
+    [
+        ("px4", 0.01, 0.0),
+        ("px4", 0.1, 0.05),
+        ("px4", 0.3, 0.1),
+        ("px4-nuttx", 0.3, 0.1),
+        ("ardupilot", 0.01, 0.0),
+        ("ardupilot", 0.1, 0.05),
+        ("mavsdk", 0.1, 0.05),
+    ],
+)
 def test_a_radio_of_57600_baud_is_read(profile: str, rtt: float, loss: float) -> None:
     case = Case(profile, 5760.0, rtt, loss)
     assert measure(case, LONG).share >= target(case)
 
 
-@pytest.mark.parametrize("loss", [0.0, 0.1])
-@pytest.mark.parametrize("profile", taking_turns(sorted(PROFILES)))
+@pytest.mark.parametrize(
+    ("profile", "loss"),
+    [("px4", 0.0), ("px4", 0.1), ("px4-nuttx", 0.1), ("ardupilot", 0.1), ("mavsdk", 0.1)],
+)
 def test_a_radio_of_57600_baud_is_written_and_little_in_vain(profile: str, loss: float) -> None:
     case = Case(profile, 5760.0, 0.1, loss, "write")
     result = measure(case, LONG)
@@ -96,11 +106,10 @@ def serial_share(case: Case, seed: int) -> float:
 
 
 @BOTH
-@pytest.mark.parametrize("profile", ["px4", "px4-nuttx"])
-def test_a_radio_on_a_serial_port_is_used(profile: str, direction: Direction) -> None:
+def test_a_radio_on_a_serial_port_is_used(direction: Direction) -> None:
     """There the window grows from one and looks for what PX4's receive buffer survives. That takes the longer
     the longer the way is, and luck: so the mean of several runs counts."""
-    case = Case(profile, 5760.0, 0.3, 0.05, direction)
+    case = Case("px4-nuttx", 5760.0, 0.3, 0.05, direction)
     assert mean(serial_share(case, seed) for seed in range(1, 4)) >= target(case)
 
 
@@ -113,7 +122,6 @@ def test_a_radio_on_a_serial_port_is_used(profile: str, direction: Direction) ->
         ("px4", "read", 0.3, 0.1),
         ("px4-nuttx", "read", 0.1, 0.05),
         ("ardupilot", "read", 0.3, 0.1),
-        ("mavsdk", "read", 0.1, 0.05),
         ("ardupilot", "write", 0.01, 0.05),
         ("mavsdk", "write", 0.1, 0.0),
     ],
@@ -127,8 +135,8 @@ def test_a_hundred_kilobytes_per_second(profile: str, direction: Direction, rtt:
     ("direction", "rate", "rtt", "share", "requests"),
     [
         ("read", 100_000.0, 0.1, 0.92, 1.1),
-        ("read", 250_000.0, 0.1, 0.77, 1.3),
         ("write", 100_000.0, 0.3, 0.84, 1.2),  # 1.2 of its 30 s go to whether the card can rename
+        pytest.param("read", 250_000.0, 0.1, 0.77, 1.3, marks=pytest.mark.soak),
         pytest.param("read", 1_000_000.0, 0.01, 0.94, 1.5, marks=pytest.mark.soak),
         pytest.param("read", 1_000_000.0, 0.1, 0.83, 1.7, marks=pytest.mark.soak),
     ],
@@ -202,16 +210,21 @@ def test_nor_does_that_flood_a_short_queue(direction: Direction) -> None:
 
 @pytest.mark.holds("fault overflow")
 @BOTH
-@pytest.mark.parametrize("loss", [0.0, 0.05])
 @pytest.mark.parametrize(
-    ("rate", "rtt", "seconds", "telemetry"), [(5760.0, 0.3, LONG, 400.0), (100_000.0, 0.1, 10.0, 4000.0)]
+    ("profile", "rate", "rtt", "loss"),
+    [
+        ("px4", 5760.0, 0.3, 0.05),
+        ("px4", 100_000.0, 0.1, 0.0),
+        ("ardupilot", 5760.0, 0.3, 0.0),
+        ("ardupilot", 100_000.0, 0.1, 0.05),
+    ],
 )
-@pytest.mark.parametrize("profile", ["px4", "ardupilot"])
 def test_telemetry_gets_through_beside_a_copy(
-    profile: str, rate: float, rtt: float, seconds: float, telemetry: float, loss: float, direction: Direction
+    profile: str, rate: float, rtt: float, loss: float, direction: Direction
 ) -> None:
     """It shares a short queue with the answers, which must not fill it for long."""
     case = Case(profile, rate, rtt, loss, direction)
+    seconds, telemetry = (LONG, 400.0) if rate == 5760.0 else (10.0, 4000.0)
     result = measure(case, seconds, queue=SHORT_QUEUE, telemetry=telemetry)
     assert result.dropped <= 0.1 * case.limit * seconds / MAX_DATA
     assert result.share >= (target(case) - START if direction == "read" else 0.7)
@@ -220,7 +233,7 @@ def test_telemetry_gets_through_beside_a_copy(
 def test_a_short_shared_queue_does_not_empty_a_long_way() -> None:
     """ArduPilot, 300 ms away: five at a time would be 3.9 kB/s, its bursts 30; evenly asked it is more."""
     case = Case("ardupilot", 100_000.0, 0.3, 0.0)
-    assert measure(case, LONG).share * case.limit > 50_000.0
+    assert measure(case, SHORT).share * case.limit > 50_000.0
 
 
 @pytest.mark.holds("rule 14.24")
@@ -240,6 +253,7 @@ async def test_never_more_is_written_than_a_short_queue_holds(
     assert connection.engine.stats.retransmissions == 0
 
 
+@pytest.mark.soak
 async def test_a_way_that_becomes_longer_for_good_is_found_out(autojump: MockClock) -> None:
     """A slow link 50 ms away is full with a few requests; 3.7 kB/s stayed when it became a quick one 500 ms
     away."""
@@ -337,4 +351,4 @@ def test_the_last_percent_is_not_slow(direction: Direction) -> None:
         here.tree.add_directory(b"/d")
         return trio.run(ENDS[direction], here, clock=MockClock(autojump_threshold=0))
 
-    assert mean(map(run, range(1, 4))) <= allowed(Case("px4", RATE, RTT, LOSS, direction))
+    assert mean(map(run, (1, 2))) <= allowed(Case("px4", RATE, RTT, LOSS, direction))
