@@ -74,9 +74,18 @@ class Faults:
         """Have requests of this kind neither executed nor answered."""
         self._deaf.add(int(opcode))
 
-    def at(self, opcode: Opcode, action: Callable[[], object], *, nth: int = 1, drop: bool = False) -> None:
-        """Do something before the nth request of this kind from now on is executed. drop: it never is."""
-        self._meetings.append(_Meeting(opcode, nth, 1, action, drop=drop))
+    def at(
+        self,
+        opcode: Opcode,
+        action: Callable[[], object],
+        *,
+        nth: int = 1,
+        times: int = 1,
+        drop: bool = False,
+    ) -> None:
+        """Do something before the nth request of this kind from now on, and `times` - 1 more, are executed.
+        drop: they never are."""
+        self._meetings.append(_Meeting(opcode, nth, times, action, drop=drop))
 
     def refuse(
         self, opcode: Opcode, code: int, number: int | None = None, *, nth: int = 1, times: int = 1

@@ -1,0 +1,456 @@
+"""What the vehicle does not have: who is told, when it is tried again, what the local disk keeps of it."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import tempfile
+from pathlib import Path
+from random import Random
+
+import pytest
+import trio
+
+from mavftpfs.cache.openfile import OpenFile
+from mavftpfs.cache.recovery import SpoolDirectory
+from mavftpfs.cache.spool import SpoolContent
+from mavftpfs.cache.tree import Tree
+from mavftpfs.cache.writeback import PAUSES
+from mavftpfs.farewell import keep_the_rest
+from mavftpfs.protocol.payload import NakCode, Opcode, crc32
+from mavftpfs.session.connection import ConnectOptions
+from mavftpfs.shared.errnos import errno_for
+from mavftpfs.shared.errors import (
+    MavftpfsError,
+    NoSpace,
+    NotDeliveredYet,
+    RequestTimeout,
+    SpoolFailed,
+)
+from tests.support.rigs import Rig, card, read_file, rig, write_file
+from tests.support.worlds import content
+
+pytestmark = pytest.mark.holds("promise 3")
+
+OLD = bytes(range(256)) * 400
+FILE, NEW = b"/d/file.txt", b"/d/new"
+KIB = 1024
+BIG = content(70_000)
+DEADLINE = 5.0
+
+here = card({FILE: OLD}, options=ConnectOptions(op_deadline=DEADLINE))
+
+
+@pytest.fixture
+async def tree(here: Rig) -> Tree:
+    """A mount that keeps little in memory, and has listed the directory."""
+    tree = here.mount(dirty_max=64 * KIB)
+    await tree.list(b"/d")
+    return tree
+
+
+@pytest.fixture
+def spool(tmp_path: Path) -> SpoolDirectory:
+    return SpoolDirectory(tmp_path / "spool", Random(1))
+
+
+def fall_silent(here: Rig) -> None:
+    """Answer nothing more, but go on to send heartbeats."""
+    here.faults.cut_after(0)
+
+
+def speak(here: Rig) -> None:
+    """Answer again; nobody is told."""
+    here.faults.cut_after(None)
+
+
+async def close_in_vain(tree: Tree, data: bytes = b"content") -> None:
+    file = await tree.create(NEW, exclusive=True)
+    await file.write(0, data)
+    with pytest.raises(MavftpfsError):
+        await file.release()
+
+
+# --- who is told
+
+
+async def test_a_checksum_is_the_vehicle_s_or_none(here: Rig, tree: Tree) -> None:
+    """Never that of the bytes that are held here: who asks wants to know what is on the card."""
+    file = await tree.open(FILE, write=True)
+    await file.write(0, b"new")
+    with pytest.raises(NotDeliveredYet) as caught:
+        await tree.crc32(FILE)
+    assert errno_for(caught.value) == errno.EAGAIN
+    await file.fsync()
+    assert await tree.crc32(FILE) == crc32(b"new" + OLD[3:])
+    await file.release()
+
+
+async def test_a_file_whose_creation_failed_does_not_appear_later(here: Rig, tree: Tree) -> None:
+    file = await tree.create(NEW, exclusive=True)
+    fall_silent(here)
+    with pytest.raises(RequestTimeout):
+        await file.release()
+    file.give_up()
+    assert tree.undelivered() == []
+    speak(here)
+    await trio.sleep(100)
+    assert here.files() == {FILE: OLD}
+
+
+async def test_a_file_whose_creation_failed_stays_if_somebody_wrote_it_or_it_was_there(
+    here: Rig, tree: Tree
+) -> None:
+    file = await tree.create(NEW, exclusive=True)
+    other = await tree.open(NEW, write=True)
+    await other.write(0, b"abc")
+    file.give_up()
+    assert tree.undelivered() == [NEW]
+    other.close()
+    (await tree.create(NEW, exclusive=False)).give_up()
+    (await tree.open(FILE, write=True, truncate=True)).close()
+    (await tree.create(FILE, exclusive=False)).give_up()
+    assert sorted(tree.undelivered()) == [FILE, NEW]
+    assert await tree.drain(100) == []
+    assert here.files() == {NEW: b"abc", FILE: b""}
+
+
+@pytest.mark.parametrize("end", ["flush", "release"])
+async def test_an_upload_of_what_was_taken_back_is_called_off(end: str) -> None:
+    async with rig("mavsdk", {FILE: OLD}) as here:
+        tree = here.mount()
+        file = await tree.open(FILE, write=True)
+        await file.write(0, b"y")
+        await file.fsync()
+        await file.write(len(OLD), bytes(100 * KIB))
+        await trio.sleep(1)
+        assert here.litter(), "it was to begin beside the program"
+        await file.truncate(len(OLD))
+        await getattr(file, end)()
+        assert here.files() == {FILE: b"y" + OLD[1:]}
+        assert here.world.vehicle.server.open_sessions == 0
+        await file.release()
+        await tree.unlink(FILE)
+        await tree.rmdir(b"/d")
+
+
+# --- who waits
+
+
+async def test_a_lost_link_holds_writers_back_before_any_upload_began(here: Rig) -> None:
+    tree = here.mount(dirty_max=128 * KIB)
+    file = await tree.create(NEW, exclusive=True)
+    fall_silent(here)
+
+    async def fill(start: int, count: int) -> None:
+        for number in range(count):
+            await file.write(start + number * 32 * KIB, bytes(32 * KIB))
+
+    with pytest.raises(MavftpfsError):
+        await fill(0, 100)
+    taken = file.size
+    assert taken <= 128 * KIB + 32 * KIB
+    speak(here)
+    await fill(taken, 8)
+    await file.release()
+    assert len(here.data(NEW)) == taken + 8 * 32 * KIB
+
+
+async def test_what_can_only_go_at_the_close_holds_nobody_back(here: Rig, tree: Tree) -> None:
+    """A part of a file that has to be sent whole: the local disk takes it."""
+    file = await tree.open(FILE, write=True)
+    before = trio.current_time()
+    for at in range(0, 80 * KIB, 8 * KIB):
+        await file.write(at + 1000, b"x" * 8 * KIB)
+    assert trio.current_time() - before < 1
+    assert here.count(Opcode.WRITE_FILE) == 0
+    await file.release()
+    assert here.data(FILE)[1000:1008] == b"x" * 8
+
+
+# --- trying again
+
+
+async def test_what_a_close_did_not_deliver_is_delivered_without_news(here: Rig, tree: Tree) -> None:
+    """The link failed and returned between two looks at it."""
+    fall_silent(here)
+    await close_in_vain(tree)
+    assert tree.undelivered() == [NEW]
+    speak(here)
+    await trio.sleep(2 * PAUSES[0])
+    assert tree.undelivered() == []
+    assert here.data(NEW) == b"content"
+    assert tree._writing is not None
+    assert list(tree._writing._context.nodes) == []
+
+
+async def test_it_is_tried_on_and_on_without_a_flood_of_requests(here: Rig, tree: Tree) -> None:
+    asked: list[float] = []
+    here.faults.at(Opcode.CREATE_FILE, lambda: asked.append(trio.current_time()), times=10_000, drop=True)
+    await close_in_vain(tree)
+    await trio.sleep(300)
+    last_minute = [at for at in asked if at > trio.current_time() - 60]
+    assert 0 < len(last_minute) < 120
+    here.faults.call_off()
+    await trio.sleep(2 * PAUSES[1])
+    assert tree.undelivered() == []
+    count = len(here.faults.requests)
+    await trio.sleep(100)
+    assert len(here.faults.requests) == count, "it ended"
+    here.take(NEW)
+    tree.forget_caches()
+    await tree.list(b"/d")
+    fall_silent(here)
+    await close_in_vain(tree)
+    speak(here)
+    await trio.sleep(2 * PAUSES[0])
+    assert tree.undelivered() == [], "the next one begins anew"
+
+
+@pytest.mark.parametrize("number", [errno.EACCES, errno.ENOSPC])
+async def test_a_refusal_is_not_repeated_before_there_is_news(here: Rig, tree: Tree, number: int) -> None:
+    here.faults.refuse(Opcode.CREATE_FILE, NakCode.FAIL_ERRNO, number, times=20)
+    await close_in_vain(tree)
+    count = len(here.faults.requests)
+    await trio.sleep(200)
+    assert len(here.faults.requests) == count
+    here.faults.call_off()
+    tree.link_back()
+    await trio.sleep(1)
+    assert tree.undelivered() == []
+
+
+async def test_an_open_file_is_left_to_its_program(here: Rig, tree: Tree) -> None:
+    file = await tree.create(NEW, exclusive=True)
+    await file.write(0, b"content")
+    fall_silent(here)
+    with pytest.raises(RequestTimeout):
+        await file.fsync()
+    speak(here)
+    await trio.sleep(100)
+    assert tree.undelivered() == [NEW]
+    fall_silent(here)
+    with pytest.raises(RequestTimeout):
+        await file.release()
+    speak(here)
+    await trio.sleep(2 * PAUSES[1])
+    assert tree.undelivered() == []
+
+
+# --- a local disk that fails or is full
+
+
+def failing(*_: object) -> bytes:
+    raise OSError(errno.EIO, "bad sector")
+
+
+async def begin(here: Rig, tree: Tree, data: bytes = BIG) -> OpenFile:
+    """Write more to a file than memory takes, while the vehicle says nothing."""
+    file = await tree.create(NEW, exclusive=True)
+    fall_silent(here)
+    await file.write(0, data)
+    return file
+
+
+async def test_a_disk_that_fails_is_the_error_of_one_file(
+    here: Rig, tree: Tree, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = await begin(here, tree)
+    speak(here)
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "pread", failing)
+        for act in (file.flush(), file.fsync(), file.release(), read_file(tree, NEW)):
+            with pytest.raises(MavftpfsError) as told:
+                await act
+            assert errno_for(told.value) == errno.EIO
+        await write_file(tree, b"/d/other", b"small")
+        assert here.data(b"/d/other") == b"small"
+        assert tree.undelivered() == [NEW]
+    assert await tree.drain(100) == []
+    assert here.data(NEW) == BIG
+
+
+async def test_a_disk_that_fails_when_all_is_delivered_harms_nothing(
+    here: Rig, tree: Tree, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The last close would have kept the content as what was read; a cut changes nothing."""
+    file = await begin(here, tree)
+    speak(here)
+    await file.fsync()
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "ftruncate", failing)
+        with pytest.raises(MavftpfsError) as told:
+            await file.truncate(10)
+        assert errno_for(told.value) == errno.EIO
+        assert file.size == len(BIG)
+        patch.setattr(os, "pread", failing)
+        await file.release()
+    assert await read_file(tree, NEW) == BIG
+
+
+async def test_a_disk_that_fails_does_not_hide_why_the_vehicle_lacks_a_file(
+    here: Rig, spool: SpoolDirectory, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tree = here.mount(spool=spool)
+    await tree.list(b"/d")
+    fall_silent(here)
+
+    def persist(*_: object) -> None:
+        raise SpoolFailed("bad sector")
+
+    monkeypatch.setattr(SpoolContent, "persist", persist)
+    file = await tree.create(NEW, exclusive=True)
+    await file.write(0, b"abc")
+    with pytest.raises(RequestTimeout):
+        await file.release()
+    speak(here)
+    assert await tree.drain(100) == []
+    assert here.data(NEW) == b"abc"
+    spool.close()
+
+
+async def test_a_full_disk_is_told_to_the_writer_and_costs_nothing_accepted(
+    here: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tree = here.mount(dirty_max=1)  # more memory than that is not taken
+    file = await begin(here, tree, BIG[:65_000])  # more than that would have the writer wait
+    really = os.pwrite
+
+    def pwrite(descriptor: int, data: bytes, offset: int) -> int:
+        if offset + len(data) > 65_000:
+            raise OSError(errno.ENOSPC, "full")
+        return really(descriptor, data, offset)
+
+    monkeypatch.setattr(os, "pwrite", pwrite)
+    with pytest.raises(NoSpace):
+        await file.write(65_000 - 10, b"more than fits")
+    assert file.size == 65_000
+    speak(here)
+    await file.release()
+    assert here.data(NEW) == BIG[:65_000]
+
+
+async def test_the_log_says_once_that_the_full_disk_is_the_one_here(
+    here: Rig, caplog: pytest.LogCaptureFixture
+) -> None:
+    """To a program ENOSPC means the card."""
+    tree = here.mount(dirty_max=1, spool_max=65_010)
+    file = await begin(here, tree, BIG[:65_000])
+    for _ in range(3):
+        with pytest.raises(NoSpace):
+            await file.write(65_000, b"more than fits")
+    (said,) = caplog.messages
+    assert "here, not on the vehicle" in said
+    assert "spool_max" in said
+    speak(here)
+    await file.release()
+    again = await tree.create(b"/d/again", exclusive=True)
+    await again.write(0, BIG[:65_000])
+    caplog.clear()
+    with pytest.raises(NoSpace):
+        await again.write(65_000, b"more than fits")
+    assert len(caplog.messages) == 1, "there was room meanwhile, so it is news"
+
+
+@pytest.mark.parametrize("how", ["unlink", "rename over it"])
+async def test_removing_what_was_not_delivered_frees_its_place(here: Rig, how: str) -> None:
+    tree = here.mount(dirty_max=64 * KIB, spool_max=2 * len(BIG))
+    for _ in range(3):
+        file = await begin(here, tree)
+        with pytest.raises(MavftpfsError):
+            await file.flush()
+        file.close()
+        speak(here)
+        if how != "unlink":
+            await write_file(tree, b"/d/other", b"small")
+            await tree.rename(b"/d/other", NEW, noreplace=False)
+        await tree.unlink(NEW)
+        assert tree.status()["bytes_held_on_disk"] == 0
+
+
+async def test_nothing_stays_in_the_directory_for_temporaries(
+    here: Rig, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    tree = here.mount(dirty_max=64 * KIB)
+    file = await begin(here, tree)
+    assert os.listdir(tmp_path)
+    with pytest.raises(RequestTimeout):
+        await file.release()
+    speak(here)
+    await write_file(tree, b"/d/second", BIG)
+    assert await tree.drain(100) == []
+    assert os.listdir(tmp_path) == []
+    assert here.data(NEW) == here.data(b"/d/second") == BIG
+
+
+# --- a process that is killed
+
+
+async def killed_after(here: Rig, spool: SpoolDirectory, tmp_path: Path, what: str) -> dict[str, bytes]:
+    """Write more than memory takes, do something, and be killed; return what the next mount finds."""
+    tree = here.mount(spool=spool, dirty_max=64 * KIB)
+    file = await tree.create(NEW, exclusive=True)
+    await file.write(0, BIG)
+    if what == "rename":
+        await tree.rename(NEW, b"/d/name", noreplace=False)
+    elif what == "unlink":
+        await tree.unlink(NEW)
+        assert bytes(await file.read(0, len(BIG))) == BIG
+    else:
+        await file.fsync()
+    fall_silent(here)
+    if what in ("rename", "fsync and more"):
+        await file.write(0, b"X")
+    spool.close()
+    again = SpoolDirectory(tmp_path / "spool", Random(2))
+    found = again.rescue(tmp_path / "recovered")
+    again.close()
+    assert all(path.read_bytes() == b"X" + BIG[1:] for path in found)
+    return {path.name: json.loads(path.with_name(path.name + ".json").read_text())["path"] for path in found}
+
+
+@pytest.mark.parametrize(
+    ("what", "expected"),
+    [
+        ("rename", {"d__name": "/d/name"}),
+        ("fsync and more", {"d__new": "/d/new"}),
+        ("fsync", {}),
+        ("unlink", {}),
+    ],
+)
+async def test_what_a_killed_mount_leaves_is_what_the_vehicle_lacks(
+    here: Rig, spool: SpoolDirectory, tmp_path: Path, what: str, expected: dict[str, str]
+) -> None:
+    assert await killed_after(here, spool, tmp_path, what) == expected
+
+
+# --- what is kept at the end
+
+
+async def test_what_is_recovered_has_its_whole_size(here: Rig, tree: Tree, tmp_path: Path) -> None:
+    file = await tree.create(NEW, exclusive=True)
+    await file.write(0, b"abc")
+    await file.truncate(1000)
+    (saved,) = tree.recover_to(tmp_path / "r")
+    assert saved.read_bytes() == b"abc".ljust(1000, b"\0")
+
+
+async def test_one_file_that_cannot_be_read_does_not_keep_the_others_from_being_saved(
+    here: Rig, spool: SpoolDirectory, tmp_path: Path
+) -> None:
+    tree = here.mount(spool=spool)
+    await tree.list(b"/d")
+    fall_silent(here)
+    for name in (b"/d/a", b"/d/b"):
+        with pytest.raises(RequestTimeout):
+            await write_file(tree, name, name * 100)
+    os.truncate(min(spool.path.glob("*.data")), 10)
+    message = keep_the_rest(tree, lambda: tmp_path / "kept")
+    assert f"2 file(s) did not reach the vehicle; only 1 could be kept, in {tmp_path / 'kept'}" in message
+    assert (tmp_path / "kept/d__b").read_bytes() == b"/d/b" * 100
+    assert json.loads((tmp_path / "kept/d__b.json").read_text())["path"] == "/d/b"
+    assert tree.undelivered() == [b"/d/a"], "it stays in the spool"
+    assert len(list(spool.path.glob("*.data"))) == 1
+    spool.close()
