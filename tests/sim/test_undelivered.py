@@ -388,7 +388,7 @@ async def test_nothing_stays_in_the_directory_for_temporaries(
 # --- a process that is killed
 
 
-async def killed_after(here: Rig, spool: SpoolDirectory, tmp_path: Path, what: str) -> dict[str, bytes]:
+async def killed_after(here: Rig, spool: SpoolDirectory, tmp_path: Path, what: str) -> dict[str, str]:
     """Write more than memory takes, do something, and be killed; return what the next mount finds."""
     tree = here.mount(spool=spool, dirty_max=64 * KIB)
     file = await tree.create(NEW, exclusive=True)
