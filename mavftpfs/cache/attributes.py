@@ -6,10 +6,11 @@ until a listing shows another size or another mtime than the first one that was 
 
 from __future__ import annotations
 
-import calendar
 import re
 from collections import OrderedDict
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from datetime import UTC, datetime
 
 from mavftpfs.shared.model import DirEntry, EntryKind, rename_keys
 
@@ -28,23 +29,26 @@ SECOND = 1_000_000_000
 MAX_TIMES = 100_000
 """How many mtimes that users set are remembered."""
 
-_LOG_DATE = re.compile(rb"/log/(\d{4})-(\d{2})-(\d{2})(?:/(\d{2})_(\d{2})_(\d{2})[^/]*\.ulg)?")
+_LOG_DATE = re.compile(rb"/log/(\d{4})-(\d{2})-(\d{2})(?:/(\d{2})_(\d{2})_(\d{2})[^/]*\.ulg)?\Z")
 
 
 @dataclass(frozen=True, slots=True)
 class Stat:
     """What is known of one path.
 
-    size: bytes, 0 <= size < 2**63. mtime: seconds UTC, never unknown. valid_for: seconds the kernel
-    may keep these attributes; 0 means ask again. mtime_nsec: nanoseconds to add to mtime, not 0 only
-    where a user set it.
+    size: bytes, 0 <= size < 2**63. mtime_ns: nanoseconds since 1970 UTC, never unknown. valid_for: seconds
+    the kernel may keep these attributes; 0 means ask again.
     """
 
     kind: EntryKind
     size: int
-    mtime: int
+    mtime_ns: int
     valid_for: float
-    mtime_nsec: int = 0
+
+    @property
+    def mtime(self) -> int:
+        """Seconds since 1970 UTC."""
+        return self.mtime_ns // SECOND
 
 
 def tidy(entry: DirEntry) -> DirEntry:
@@ -60,26 +64,18 @@ def tidy(entry: DirEntry) -> DirEntry:
 
 
 def shown_mtime(path: bytes, mtime: int | None) -> int:
-    """Return the mtime to show, seconds UTC.
+    """Return the mtime to show, in nanoseconds since 1970 UTC; mtime: in seconds, as the server told it.
 
-    Where the server told none, PX4's logs carry theirs in the path (`log/2024-05-01/12_34_56.ulg`, UTC);
-    everything else is UNKNOWN_MTIME (logs without a clock lie in `log/sess001/`).
+    Where it told none, PX4's logs carry theirs in the path (`log/2024-05-01/12_34_56.ulg`, UTC); everything
+    else is UNKNOWN_MTIME (logs without a clock lie in `log/sess001/`).
     """
-    if mtime is not None:
-        return mtime
-    match = _LOG_DATE.search(path)
-    if match is None or match.end() != len(path):
-        return UNKNOWN_MTIME
-    return _utc(*(int(part or 0) for part in match.groups()))
-
-
-def _utc(year: int, month: int, day: int, hour: int, minute: int, second: int) -> int:
-    plausible = (
-        year >= 1980 and 1 <= month <= 12 and 1 <= day <= 31 and hour < 24 and minute < 60 and second < 60
-    )
-    if not plausible:
-        return UNKNOWN_MTIME
-    return min(calendar.timegm((year, month, day, hour, minute, second)), MAX_MTIME)
+    match = _LOG_DATE.search(path) if mtime is None else None
+    if match is not None:
+        year, month, day, hour, minute, second = [int(part or 0) for part in match.groups()]
+        with suppress(ValueError):
+            told = int(datetime(year, month, day, hour, minute, second, tzinfo=UTC).timestamp())
+            mtime = min(max(told, UNKNOWN_MTIME), MAX_MTIME)
+    return (UNKNOWN_MTIME if mtime is None else mtime) * SECOND
 
 
 @dataclass(slots=True)

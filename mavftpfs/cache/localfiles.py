@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from fnmatch import translate
 from re import compile as compile_pattern
 
-from mavftpfs.cache.attributes import SECOND, Stat
+from mavftpfs.cache.attributes import Stat
 from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.shared.errors import AlreadyExists, NoSpace, NotFound
 from mavftpfs.shared.model import EntryKind, rename_keys, split
@@ -65,8 +65,7 @@ class LocalFiles:
     def stat(self, path: bytes) -> Stat:
         """Return attributes. Raises NotFound."""
         file = self.find(path)
-        seconds, nanoseconds = divmod(file.mtime_ns, SECOND)
-        return Stat(EntryKind.FILE, len(file.data), seconds, 0.0, nanoseconds)
+        return Stat(EntryKind.FILE, len(file.data), file.mtime_ns, 0.0)
 
     def names(self, directory: bytes) -> list[bytes]:
         """Return the local names in one of the vehicle's directories."""

@@ -28,8 +28,9 @@ class ReadSink(Protocol):
         """Take proven-by-protocol bytes; what is already held must not be overwritten."""
         ...
 
-    def on_batch(self) -> None:
-        """A batch of on_data calls ended: wake whoever waits. Called once per batch, never per packet."""
+    def on_batch(self, count: int) -> None:
+        """A batch of on_data calls with so many bytes in all ended: wake whoever waits. Called once per
+        batch, never per packet."""
         ...
 
     def on_queued(self) -> None:

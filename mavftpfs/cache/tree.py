@@ -15,7 +15,7 @@ from random import Random
 
 import trio
 
-from mavftpfs.cache.attributes import SECOND, UNKNOWN_MTIME, Stat, shown_mtime
+from mavftpfs.cache.attributes import SECOND, Stat, shown_mtime
 from mavftpfs.cache.directories import Directories, Found
 from mavftpfs.cache.draft import Draft, State
 from mavftpfs.cache.files import Files
@@ -119,7 +119,7 @@ class Tree:
         """
         remote = self._remote(path)
         if remote == self._options.root:
-            return Stat(EntryKind.DIRECTORY, 0, UNKNOWN_MTIME, self._options.attr_timeout)
+            return Stat(EntryKind.DIRECTORY, 0, shown_mtime(remote, None), self._options.attr_timeout)
         if is_snapshot(remote):
             return await self._virtual.stat(remote)
         if self._local.owns(remote):
@@ -430,19 +430,16 @@ class Tree:
         unknown = found.entry.kind is EntryKind.FILE and found.size is None
         valid_for = 0.0 if unknown else max(0.0, min(self._options.attr_timeout, left))
         size = 0 if found.entry.kind is EntryKind.DIRECTORY else found.size or 0
-        seconds, nanoseconds = shown_mtime(remote, found.entry.mtime), 0
-        node = self._context.nodes.get(remote)
+        user_set, node = None, self._context.nodes.get(remote)
         if node is None or node.draft is None:  # else `_draft_stat` shows it: no listing tells of a draft
             user_set = self._context.times.get(remote, size, found.entry.mtime)
-            if user_set is not None:
-                seconds, nanoseconds = divmod(user_set, SECOND)
-        return Stat(found.entry.kind, size, seconds, valid_for, nanoseconds)
+        mtime_ns = shown_mtime(remote, found.entry.mtime) if user_set is None else user_set
+        return Stat(found.entry.kind, size, mtime_ns, valid_for)
 
     def _draft_stat(self, remote: bytes, draft: Draft) -> Stat:
-        user_set = self._context.times.peek(remote)
-        if user_set is None:
+        mtime_ns = self._context.times.peek(remote)
+        if mtime_ns is None:
             entry = self._directories.entry(remote)
             listed = entry.mtime if entry is not None and draft.state is State.CLEAN else None
-            user_set = shown_mtime(remote, listed) * SECOND
-        seconds, nanoseconds = divmod(user_set, SECOND)
-        return Stat(EntryKind.FILE, draft.size, seconds, self._options.attr_timeout, nanoseconds)
+            mtime_ns = shown_mtime(remote, listed)
+        return Stat(EntryKind.FILE, draft.size, mtime_ns, self._options.attr_timeout)

@@ -178,7 +178,6 @@ class Version:
         self._blocks: dict[int, bytearray] = {}
         self._present = ExtentSet()
         self._waiters: list[_Waiter] = []
-        self._arrived = 0
         self.received = 0
         self.received_at = NEVER
 
@@ -226,11 +225,7 @@ class Version:
             # The usual chunk of a file that is read from front to back.
             block[at : at + count] = data
             self._present.add(offset, offset + count)
-            self._arrived += count
             return
-        stop = min(offset + count, self.size)
-        for start, end in self._present.missing(offset, stop):
-            self._arrived += end - start
         self.preload(offset, data)
 
     def preload(self, offset: int, data: bytes | memoryview) -> None:
@@ -250,13 +245,11 @@ class Version:
                 self._present.add(at, end)
                 at = end
 
-    def on_batch(self) -> None:
+    def on_batch(self, count: int) -> None:
         """Wake those whose range is complete; give those whose range grew more time."""
-        if self._arrived:
-            self.received += self._arrived
-            self.received_at = self._cache.clock()
-            self._cache.meter.on_bytes(self._arrived, self._cache.clock())
-            self._arrived = 0
+        self.received += count
+        self.received_at = self._cache.clock()
+        self._cache.meter.on_bytes(count, self.received_at)
         for waiter in self._waiters:
             missing = self.missing(waiter.start, waiter.stop)
             if not missing:

@@ -301,9 +301,9 @@ NANO = 1_000_000_000
 class UserAttributes:
     """What programs set on one path, so that `cp -p`, `rsync -a`, `tar` and `touch` see what they set.
 
-    None = not set. mode: permission bits; times in nanoseconds since 1970 UTC.
-
-    changed_ns: when a directory's entries, or its times, were last changed through this mount.
+    None = not set. mode: permission bits; times in nanoseconds since 1970 UTC. mtime_ns: of a directory; the
+    tree knows those of files, and when these change. changed_ns: when a directory's entries, or its times,
+    were last changed through this mount.
     """
 
     mode: int | None = None
@@ -321,24 +321,18 @@ class UserAttributes:
             entry.st_uid = self.uid
         if self.gid is not None:
             entry.st_gid = self.gid
-        same_second = self.mtime_ns is not None and self.mtime_ns // NANO == found.mtime
         if found.kind is EntryKind.DIRECTORY:
             entry.st_ctime_ns = max(self.changed_ns or 0, entry.st_mtime_ns)
             entry.st_mtime_ns = entry.st_ctime_ns if self.mtime_ns is None else self.mtime_ns
-        elif same_second and not found.mtime_nsec:  # else the tree knows it to the nanosecond
-            entry.st_mtime_ns = entry.st_ctime_ns = self.mtime_ns
         entry.st_atime_ns = entry.st_mtime_ns if self.atime_ns is None else self.atime_ns
-        if found.kind is EntryKind.FILE and self.mtime_ns is not None and not same_second:
-            self.atime_ns = None  # the file changed since
 
 
 class UserAttributeTable:
     """What was set on a bounded number of paths; the least recently changed are forgotten first.
 
-    Kept by path for the life of the mount: the kernel forgets inodes at will. A file's time is shown while
-    the tree shows the same second, because the tree knows when a file changed. A directory's is the one that
-    was set, until entries are made, removed or renamed in it; from then on it is the time of that, or the
-    vehicle's where that is later: a memory card keeps none, and the programs that look for changes by it
+    Kept by path for the life of the mount: the kernel forgets inodes at will. A directory's time is the one
+    that was set, until entries are made, removed or renamed in it. From then on it is the time of that, or
+    the vehicle's where that is later: a memory card keeps none, and the programs that look for changes by it
     (make, mail readers, git's untracked cache) would see none.
     """
 

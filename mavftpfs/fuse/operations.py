@@ -30,7 +30,6 @@ from pyfuse3 import EntryAttributes, FileInfo, FUSEError, RequestContext, Setatt
 
 from mavftpfs.cache.attributes import Stat
 from mavftpfs.fuse.handles import (
-    NANO,
     ROOT_INO,
     XATTR_CRC32,
     XATTR_STATUS,
@@ -284,7 +283,7 @@ class Operations(pyfuse3.Operations):
         with closed_on_failure(file.give_up):
             if flags & os.O_TRUNC and file.size:
                 await file.truncate(0)
-            found = Stat(EntryKind.FILE, file.size, (await self._tree.stat(path)).mtime, 0.0)
+            found = Stat(EntryKind.FILE, file.size, (await self._tree.stat(path)).mtime_ns, 0.0)
         self._made(path, mode)
         inode = self.inodes.lookup(path)
         fh = self.files.add(FileHandle(inode.ino, file, flags))
@@ -383,9 +382,10 @@ class Operations(pyfuse3.Operations):
         if fields.update_atime:
             kept.atime_ns = attr.st_atime_ns
         if fields.update_mtime:
-            kept.mtime_ns, kept.changed_ns = attr.st_mtime_ns, self._now_ns()
             if (await self._tree.stat(path)).kind is EntryKind.FILE:
                 await self._tree.set_times(path, attr.st_mtime_ns)
+            else:
+                kept.mtime_ns, kept.changed_ns = attr.st_mtime_ns, self._now_ns()
 
     # -- names ------------------------------------------------------------------------------------
 
@@ -544,8 +544,7 @@ class Operations(pyfuse3.Operations):
         entry.st_size = found.size
         entry.st_blksize = BLOCK_SIZE
         entry.st_blocks = -(-found.size // STAT_BLOCK)
-        mtime_ns = found.mtime * NANO + found.mtime_nsec
-        entry.st_atime_ns = entry.st_mtime_ns = entry.st_ctime_ns = mtime_ns
+        entry.st_atime_ns = entry.st_mtime_ns = entry.st_ctime_ns = found.mtime_ns
         kept = None if inode.path is None else self._set_by_users.get(inode.path)
         if kept is not None:
             kept.show(entry, found)

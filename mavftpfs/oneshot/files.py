@@ -367,7 +367,7 @@ class MountedFiles:
 
 def _stat_of(found: os.stat_result) -> Stat:
     kind = EntryKind.DIRECTORY if stat.S_ISDIR(found.st_mode) else EntryKind.FILE
-    return Stat(kind, found.st_size, int(found.st_mtime), 0.0)
+    return Stat(kind, found.st_size, found.st_mtime_ns, 0.0)
 
 
 _TICK = 0.2

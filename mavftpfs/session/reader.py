@@ -227,7 +227,8 @@ class FileStream(SessionUser):
         transfer = self._transfer
         if transfer is None:
             return
-        if transfer.received_bytes != self._received:
+        count = transfer.received_bytes - self._received
+        if count:
             self._received, self._last_data_at, self._lost = transfer.received_bytes, now, 0
             if not self.closed:
                 for wanted in (self._demand, self._ahead):
@@ -235,6 +236,6 @@ class FileStream(SessionUser):
                         wanted.discard(start, stop)
                         for gap_start, gap_stop in self._sink.missing(start, stop):
                             wanted.add(gap_start, gap_stop)
-                self._sink.on_batch()
+                self._sink.on_batch(count)
         if transfer.idle or transfer.done:
             self._server.wake()

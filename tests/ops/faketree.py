@@ -82,7 +82,6 @@ class FakeTree:
     keep_cache: bool = False
     opened: list[FakeFile] = field(default_factory=list)
     times: dict[bytes, int] = field(default_factory=dict)
-    nanoseconds: int = 0
     left: list[bytes] = field(default_factory=list)
     on_call: Callable[[str, bytes], None] = lambda name, path: None
 
@@ -109,7 +108,7 @@ class FakeTree:
     def stat_now(self, path: bytes) -> Stat:
         kind = self.kind_of(path)
         size = len(self.files[path]) if kind is EntryKind.FILE else 0
-        return Stat(kind, size, self.times.get(path, MTIME), self.valid_for, self.nanoseconds)
+        return Stat(kind, size, self.times.get(path, MTIME * 10**9), self.valid_for)
 
     async def stat(self, path: bytes) -> Stat:
         await self.pause("stat", path)
@@ -149,7 +148,7 @@ class FakeTree:
 
     async def set_times(self, path: bytes, mtime_ns: int) -> None:
         await self.pause("set_times", path)
-        self.times[path] = mtime_ns // 10**9
+        self.times[path] = mtime_ns
 
     async def mkdir(self, path: bytes) -> None:
         await self.pause("mkdir", path)

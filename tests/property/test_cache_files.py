@@ -52,7 +52,7 @@ def test_blocks_hold_what_came_first_and_only_that(size: int, script: list[Step]
         stop = min(step.start + step.size, size)
         if step.what == "data":
             blocks.on_data(step.start, bytes([number]) * step.size)
-            blocks.on_batch()
+            blocks.on_batch(step.size)
             for at in sample:
                 if step.start <= at < stop and not blocks.doubted:
                     held.setdefault(at, number)

@@ -284,4 +284,4 @@ class FakeReader:
             self.sink.on_suspect("a foreign client was heard")
         else:
             self.sink.on_data(start, data)
-        self.sink.on_batch()
+        self.sink.on_batch(len(data))

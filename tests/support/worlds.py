@@ -100,7 +100,7 @@ class MemorySink:
         self.data[offset : offset + len(data)] = data
         self.have.add(offset, offset + len(data))
 
-    def on_batch(self) -> None:
+    def on_batch(self, count: int) -> None:
         self._tell()
 
     def on_queued(self) -> None:

@@ -221,4 +221,4 @@ def test_a_change_during_a_listing_beats_what_it_saw_and_leaves_it_incomplete() 
     ],
 )
 def test_log_paths_tell_their_time(path: bytes, expected: int) -> None:
-    assert shown_mtime(path, None) == expected
+    assert shown_mtime(path, None) == expected * 10**9

@@ -9,7 +9,7 @@ import pytest
 import trio
 import trio.testing
 
-from mavftpfs.cache.attributes import UNKNOWN_MTIME
+from mavftpfs.cache.attributes import SECOND, UNKNOWN_MTIME
 from mavftpfs.cache.directories import SWEEP_TRIES
 from mavftpfs.cache.options import MIN_CACHE_SIZE, CacheOptions
 from mavftpfs.cache.reserved import Kind, Reserved, new_owner
@@ -54,10 +54,10 @@ def tree(store: FakeStore) -> Tree:
 
 @pytest.mark.holds("promise 4")
 async def test_stat_walks_from_the_root_and_then_costs_nothing(store: FakeStore, tree: Tree) -> None:
-    assert await tree.stat(b"/fs/microsd/a.txt") == Stat(FILE, 5, 1_700_000_000, 1.0)
+    assert await tree.stat(b"/fs/microsd/a.txt") == Stat(FILE, 5, 1_700_000_000 * SECOND, 1.0)
     assert store.calls == [("list", b"/"), ("list", b"/fs"), ("list", b"/fs/microsd")]
     assert (await tree.stat(b"/fs/microsd/log")).kind is DIRECTORY
-    assert await tree.stat(b"/fs") == Stat(DIRECTORY, 0, UNKNOWN_MTIME, 1.0)
+    assert await tree.stat(b"/fs") == Stat(DIRECTORY, 0, UNKNOWN_MTIME * SECOND, 1.0)
     assert len(store.calls) == 3
 
 
@@ -183,7 +183,7 @@ async def test_expired_listings_are_served_while_the_vehicle_is_lost(store: Fake
     assert (await tree.stat(b"/fs/microsd/a.txt")).size == 5
     asked = len(store.calls)
     tree.link_lost()
-    assert await tree.stat(b"/fs/microsd/a.txt") == Stat(FILE, 5, 1_700_000_000, 0.0)
+    assert await tree.stat(b"/fs/microsd/a.txt") == Stat(FILE, 5, 1_700_000_000 * SECOND, 0.0)
     assert len(await tree.list(b"/fs/microsd")) == 2
     assert len(store.calls) == asked
     with pytest.raises(NotFound):
@@ -220,7 +220,7 @@ async def test_a_subtree_is_mounted(store: FakeStore) -> None:
     assert {name for name, _ in await tree.list(b"/")} == {b"a.txt", b"log"}
     assert await read_file(tree, b"/a.txt") == b"hello"
     assert (await tree.stat(b"/log/2024-05-01")).kind is DIRECTORY
-    assert await tree.stat(b"/") == Stat(DIRECTORY, 0, UNKNOWN_MTIME, 1.0)
+    assert await tree.stat(b"/") == Stat(DIRECTORY, 0, UNKNOWN_MTIME * SECOND, 1.0)
     with pytest.raises(NotFound):
         await tree.stat(b"/top")
     with pytest.raises(IsADirectory):
@@ -287,10 +287,10 @@ async def test_dot_is_asked_of_no_other_server(store: FakeStore, tree: Tree) -> 
 async def test_an_unknown_size_is_learnt_by_opening(store: FakeStore, tree: Tree) -> None:
     store.files[b"/top"].has_size = False
     stats = dict(await tree.list(b"/"))
-    assert stats[b"top"] == Stat(FILE, 0, UNKNOWN_MTIME, 0.0)
+    assert stats[b"top"] == Stat(FILE, 0, UNKNOWN_MTIME * SECOND, 0.0)
     assert store.count("open") == 0
-    assert await tree.stat(b"/top") == Stat(FILE, 1, UNKNOWN_MTIME, 1.0)
-    assert await tree.stat(b"/top") == Stat(FILE, 1, UNKNOWN_MTIME, 1.0)
+    assert await tree.stat(b"/top") == Stat(FILE, 1, UNKNOWN_MTIME * SECOND, 1.0)
+    assert await tree.stat(b"/top") == Stat(FILE, 1, UNKNOWN_MTIME * SECOND, 1.0)
     assert dict(await tree.list(b"/"))[b"top"].size == 1
     assert store.count("open") == 1
     assert store.readers[0].closed

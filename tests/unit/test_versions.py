@@ -27,7 +27,7 @@ def content(size: int, seed: int = 7) -> bytes:
 def deliver(blocks: Version, offset: int, data: bytes, *, batch: bool = True) -> None:
     blocks.on_data(offset, data)
     if batch:
-        blocks.on_batch()
+        blocks.on_batch(len(data))
     blocks.check_invariants()
 
 
@@ -125,7 +125,7 @@ async def test_readers_wake_once_per_batch(nursery: trio.Nursery) -> None:
     deliver(blocks, 0, content(1000), batch=False)
     await trio.testing.wait_all_tasks_blocked()
     assert reading.results == []
-    blocks.on_batch()
+    blocks.on_batch(1000)
     await trio.testing.wait_all_tasks_blocked()
     assert reading.results == [content(1000)]
 
