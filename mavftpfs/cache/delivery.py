@@ -85,7 +85,6 @@ class Deliverer:
         self._cleaner = cleaner
         self._throttle = throttle
         self.verifier = Verifier(context, names)
-        self.delivered = 0
 
     async def deliver(self, node: Node, *, wanted: Callable[[], bool] | None = None) -> None:
         """Have the vehicle hold the node's file, checked, as long as that is `wanted`.
@@ -350,7 +349,6 @@ class Deliverer:
         node.known_at = context.clock()
         node.close_base()
         context.files.on_changed(node.path)
-        self.delivered += 1
 
     def _note_failure(self, node: Node, draft: Draft, error: MavftpfsError) -> None:
         """Latch the error, and keep the bytes where the end of this process does not lose them."""

@@ -170,11 +170,6 @@ class Draft:
         return self._changed.total if sending is None or sending.overtaken else sending.unacked
 
     @property
-    def changed(self) -> ExtentSet:
-        """What programs changed since the vehicle last had it all (a copy)."""
-        return ExtentSet(self._changed)
-
-    @property
     def held(self) -> ExtentSet:
         """What the spool has (a copy)."""
         return ExtentSet(self._held)

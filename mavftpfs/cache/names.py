@@ -59,20 +59,18 @@ class Names:
     async def size(self, path: bytes) -> int:
         """Return the size of a file on the vehicle, asked just now.
 
-        Opening it needs the server's one session. That costs another upload all it sent where OpenFileWO
-        empties files: there the directory is listed.
+        Opening it needs the server's one session. Where OpenFileWO empties files that costs an upload beside
+        it all it sent: there the directory is listed.
 
         Raises:
             As VehicleStore.stat_size.
         """
         context = self._context
-        if context.store.traits.wo_truncates:
-            for node in context.nodes:
-                if node.attempt is not None and node.attempt.path != path:
-                    entry = await self._context.directories.current(path)
-                    if entry is not None and entry.size is not None:
-                        return entry.size
-                    break
+        beside = any(n.attempt is not None and n.attempt.path != path for n in context.nodes)
+        if beside and context.store.traits.wo_truncates:
+            entry = await context.directories.current(path)
+            if entry is not None and entry.size is not None:
+                return entry.size
         return await context.store.stat_size(path)
 
     async def is_free(self, path: bytes, *, perhaps_directory: bool = False) -> bool:

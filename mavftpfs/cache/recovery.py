@@ -202,7 +202,6 @@ def describe(
         "size": draft.size,
         "whole": draft.whole,
         "held": list(draft.held),
-        "changed": list(draft.changed),
         "size_on_vehicle": None if draft.base is None else draft.base.size,
         "error": None if error is None else str(error),
         "at": wall(),

@@ -60,7 +60,6 @@ class Cleaner:
         self._seen: dict[bytes, tuple[int | None, float]] = {}
         self._busy: set[bytes] = set()
         self._being_delivered: set[Node] = set()
-        self.mended = 0
 
     async def on_swept(self, path: bytes, directory: Directory) -> None:
         """A directory was listed. Raises nothing of ours: the listing is right without us."""
@@ -131,7 +130,6 @@ class Cleaner:
             log.warning("%r was left by an interruption: renaming it to %r", left, target)
             await self._names.rename(left, target, completes=bool(torn))
             context.own.mended(left)
-        self.mended += 1
 
     async def _exists(self, path: bytes) -> bool:
         with suppress(NotFound, NotADirectory):

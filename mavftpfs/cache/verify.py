@@ -36,23 +36,17 @@ READ_TRIES = 3
 
 
 class Verifier:
-    """Counts, too: files verified by CRC32, by reading back, by size alone, and CRC32s not answered."""
+    """Counts, too (for status): files verified by CRC32, by reading back, by size alone, and CRC32s that were
+    not answered."""
 
     def __init__(self, context: Context, names: Names) -> None:
         self._context = context
         self._names = names
-        self.by_crc = 0
-        self.by_reading = 0
-        self.by_size = 0
-        self.unanswered = 0
-
-    def status(self) -> dict[str, int]:
-        """Return the counters."""
-        return {
-            "verified_by_crc": self.by_crc,
-            "verified_by_reading": self.by_reading,
-            "verified_by_size": self.by_size,
-            "checksums_unanswered": self.unanswered,
+        self.counts = {
+            "verified_by_crc": 0,
+            "verified_by_reading": 0,
+            "verified_by_size": 0,
+            "checksums_unanswered": 0,
         }
 
     async def check(self, path: bytes, draft: Draft, *, doubted: bool) -> int | None:
@@ -82,11 +76,11 @@ class Verifier:
             if size != draft.size:
                 raise VerificationFailed(f"{path!r} has {size} bytes there, {draft.size} were written")
         if crc32 is not None:
-            self.by_crc += 1
+            self.counts["verified_by_crc"] += 1
         elif doubted and draft.size:
             await self._read_back(path, draft)
         elif draft.size:
-            self.by_size += 1
+            self.counts["verified_by_size"] += 1
         return crc32
 
     async def is_same(self, path: bytes, base: Base) -> bool:
@@ -124,7 +118,7 @@ class Verifier:
             self._context.require_disarmed()  # else it is asked for after the flight
             raise VerificationFailed(f"no checksum of {path!r}: {error}") from error
         if not isinstance(error, Armed):
-            self.unanswered += 1
+            self.counts["checksums_unanswered"] += 1
             log.warning("%r: its checksum was not told: %s", path, error)
 
     async def _read_back(self, path: bytes, draft: Draft) -> None:
@@ -157,4 +151,4 @@ class Verifier:
             raise SessionBusy(f"another FTP client was active whenever {path!r} was read back")
         if not same:
             raise VerificationFailed(f"{path!r} does not hold on the vehicle what was written")
-        self.by_reading += 1
+        self.counts["verified_by_reading"] += 1

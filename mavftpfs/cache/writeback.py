@@ -280,9 +280,7 @@ class Writeback:
             "bytes_undelivered": sum(sizes),
             "transfers": self._throttle.transfers(),
             "errors": {path.decode(errors="replace"): text for path, text in errors.items()},
-            "files_delivered": self._deliverer.delivered,
-            **self._deliverer.verifier.status(),
-            "leftovers_mended": self._cleaner.mended,
+            **self._deliverer.verifier.counts,
         }
 
     # --- delivering while nobody waits for it

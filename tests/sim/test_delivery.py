@@ -613,5 +613,5 @@ async def test_what_cannot_be_delivered_is_moved_with_its_description(here: Rig,
         json.loads(files[name].with_name(f"{name}.json").read_text()) for name in ("d__new", "d__file.txt")
     )
     assert whole["whole"]
-    assert changed["changed"] == [[500, 504]]
+    assert changed["held"] == [[500, 504]]
     assert not changed["whole"]
