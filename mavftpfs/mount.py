@@ -100,17 +100,10 @@ def run_mount(request: MountRequest, report: Report) -> int:
             rescue_for=request.source,
         )
         async with vehicle as up:
-            read_only_armed = request.options.when_armed == "ro" and not request.options.read_only
-            watcher = Watcher(up.connection.status, read_only_when_armed=read_only_armed)
+            watcher = Watcher(up.connection.status, writing=not request.options.read_only)
 
             def status() -> dict[str, Any]:
-                return snapshot(
-                    up.connection.status(),
-                    up.tree.status(),
-                    watcher.traffic,
-                    when_armed=request.options.when_armed,
-                    version=up.connection.vehicle.version,
-                )
+                return snapshot(up.connection.status(), up.tree.status(), watcher.traffic)
 
             yield Content(up.tree, status, up.space, up.notice, up.tree.forget_caches, watcher.run)
 

@@ -30,10 +30,8 @@ import trio
 from mavftpfs import control
 from mavftpfs.control import ControlError, NobodyThere
 from mavftpfs.fuse.handles import XATTR_STATUS
-from mavftpfs.link.messages import AutopilotVersion
 from mavftpfs.mountpoint import OUR_TYPE, Mounted, mounts
-from mavftpfs.session.vehicle import SILENCE_LIMIT
-from mavftpfs.shared.readable import autopilot_name, printable, readable_size, readable_time
+from mavftpfs.shared.readable import printable, readable_size, readable_time
 
 log = logging.getLogger("mavftpfs.vehicle")
 
@@ -47,103 +45,29 @@ MOST = 100
 """Entries of each list: an extended attribute holds 64 KiB. `held` counts them all."""
 _TOLD = {"transfers", "errors", "reads"}
 """What the cache tells that stands in the snapshot's own lists."""
-_RELEASES = ((255, ""), (192, " rc"), (128, " beta"), (64, " alpha"), (0, " dev"))
-LOSSY = 0.1
-"""From this share of lost packets on, the link is not called fine."""
 
 
-def snapshot(
-    connection: Facts,
-    cache: Facts,
-    traffic: float | None,
-    *,
-    when_armed: str,
-    version: AutopilotVersion | None = None,
-) -> dict[str, Any]:
+def snapshot(connection: Facts, cache: Facts, traffic: float | None) -> dict[str, Any]:
     """Return the facts of a status, JSON-able; bytes, seconds, and bytes per second; None = unknown."""
+    vehicle, link = connection["vehicle"], connection["link"]
+    moving = link["state"] in ("fine", "lossy")
     return {
-        "vehicle": {**_vehicle(connection, when_armed), **version_facts(version)},
-        "link": _link(connection, traffic),
-        "transfers": _transfers(
-            cache,
-            moving=link_state(connection) in ("fine", "lossy"),
-            writing=not connection.get("armed") or when_armed == "ok",
-        ),
+        **connection,
+        "link": {**link, "rate": traffic},
+        "transfers": _transfers(cache, moving=moving, writing=moving and not _read_only(vehicle)),
         "held": {
             "files": cache.get("files_undelivered", 0),
             "bytes": cache.get("bytes_undelivered", 0),
             "bytes_on_disk": cache.get("bytes_held_on_disk", 0),
             "errors": dict(islice(cache.get("errors", {}).items(), MOST)),
         },
-        "connection": connection,
         "cache": {key: value for key, value in cache.items() if key not in _TOLD},
     }
 
 
-def _vehicle(connection: Facts, when_armed: str) -> dict[str, Any]:
-    system, component = connection.get("vehicle") or (None, None)
-    autopilot = connection.get("autopilot")
-    return {
-        "system": system,
-        "component": component,
-        "autopilot": None if autopilot is None else autopilot_name(autopilot),
-        "armed": connection.get("armed"),
-        "when_armed": when_armed,
-        "heartbeat_age": connection.get("heartbeat_age"),
-        "says_ftp": connection.get("ftp_flag"),
-        "restarts": connection.get("reboots", 0),
-    }
-
-
-def version_facts(version: AutopilotVersion | None) -> dict[str, str | None]:
-    """Return what the vehicle said of itself; None = it did not."""
-    if version is None:
-        return {"firmware": None, "uid": None}
-    return {"firmware": _firmware(version), "uid": _unique_id(version)}
-
-
-def _firmware(version: AutopilotVersion) -> str:
-    """Return the flight stack's version: major.minor.patch and the kind of release, as MAVLink packs them."""
-    number = version.flight_sw_version
-    kind = number & 0xFF
-    release = next(word for least, word in _RELEASES if kind >= least)
-    return f"{number >> 24}.{number >> 16 & 0xFF}.{number >> 8 & 0xFF}{release}"
-
-
-def _unique_id(version: AutopilotVersion) -> str | None:
-    """Return the board's unique id in hex, the long one where it is told; None if it tells none."""
-    if any(version.uid2):
-        return version.uid2.hex()
-    return f"{version.uid:016x}" if version.uid else None
-
-
-def _link(connection: Facts, traffic: float | None) -> dict[str, Any]:
-    speed, counters = connection.get("speed", {}), connection.get("link", {})
-    return {
-        "source": connection.get("source"),
-        "address": connection.get("address"),
-        "state": link_state(connection),
-        "rtt": connection.get("rtt"),
-        "loss": speed.get("loss"),
-        "rate": traffic,
-        "other_ftp_client": bool(connection.get("other_ftp_client")),
-        "received_bytes": counters.get("received_bytes", 0),
-        "sent_bytes": counters.get("sent_bytes", 0),
-        "requests": connection.get("requests", 0),
-        "retransmissions": connection.get("retransmissions", 0),
-        "reopened": counters.get("reopened", 0),
-    }
-
-
-def link_state(connection: Facts) -> str:
-    """Return `fine`, `lossy`, `lost`, or `replaced` where another vehicle answers in place of ours."""
-    if connection.get("another_vehicle"):
-        return "replaced"
-    age = connection.get("heartbeat_age")
-    if connection.get("lost") or (age is not None and age > SILENCE_LIMIT):
-        return "lost"
-    loss = connection.get("speed", {}).get("loss") or 0.0
-    return "lossy" if loss >= LOSSY else "fine"
+def _read_only(vehicle: Facts) -> bool:
+    """Return whether nothing is written to a vehicle, because it is armed."""
+    return bool(vehicle["armed"]) and vehicle["when_armed"] == "ro"
 
 
 def _transfers(cache: Facts, *, moving: bool, writing: bool) -> list[dict[str, Any]]:
@@ -157,7 +81,7 @@ def _transfers(cache: Facts, *, moving: bool, writing: bool) -> list[dict[str, A
         eta = round(left / rate, 1) if rate else None
         found.append({"direction": "read", "state": "reading", **read, "rate": rate, "eta": eta})
     for write in cache.get("transfers", []):
-        sending = write["sending"] and moving and writing
+        sending = write["sending"] and writing
         found.append(
             {
                 "direction": "write",
@@ -166,7 +90,7 @@ def _transfers(cache: Facts, *, moving: bool, writing: bool) -> list[dict[str, A
                 "size": write["size"],
                 "done": max(0, write["size"] - write["bytes_left"]),
                 "rate": cache.get("write_rate") if sending else None,
-                "eta": write["eta"] if moving and writing else None,
+                "eta": write["eta"] if writing else None,
                 "error": cache.get("errors", {}).get(write["path"]),
             }
         )
@@ -176,11 +100,11 @@ def _transfers(cache: Facts, *, moving: bool, writing: bool) -> list[dict[str, A
 class Watcher:
     """Looks at a connection: logs each change that a pilot cares for, measures the traffic."""
 
-    def __init__(self, status: Callable[[], Facts], *, read_only_when_armed: bool) -> None:
-        """`status`: Connection.status."""
+    def __init__(self, status: Callable[[], Facts], *, writing: bool) -> None:
+        """`status`: Connection.status; `writing`: the mount is not a read-only one."""
         self._status = status
-        self._read_only_when_armed = read_only_when_armed
-        self._seen: dict[str, Any] = {}
+        self._writing = writing
+        self._seen: tuple[str, int, bool, bool] | None = None
         self._silent_since: float | None = None
         self._bytes: deque[tuple[float, int]] = deque(maxlen=RATE_SPAN + 1)
 
@@ -201,46 +125,35 @@ class Watcher:
     def look(self, now: float) -> None:
         """Look once."""
         facts = self._status()
-        counters = facts.get("link", {})
-        self._bytes.append((now, counters.get("received_bytes", 0) + counters.get("sent_bytes", 0)))
-        seen = {
-            "lost": link_state(facts) == "lost",
-            "replaced": link_state(facts) == "replaced",
-            "restarts": facts.get("reboots", 0),
-            "armed": bool(facts.get("armed")),
-            "other_client": bool(facts.get("other_ftp_client")),
-        }
-        before, self._seen = self._seen, seen
-        if before:
-            self._log_changes(before, facts, now)
+        vehicle, link = facts["vehicle"], facts["link"]
+        self._bytes.append((now, link["received_bytes"] + link["sent_bytes"]))
+        before = self._seen
+        self._seen = link["state"], vehicle["restarts"], bool(vehicle["armed"]), link["other_ftp_client"]
+        if before is None:
+            return
+        state, restarts, armed, rival = before
+        name = f"vehicle {vehicle['system']}/{vehicle['component']}"
+        if state != link["state"]:
+            self._log_state(name, state, link["state"], vehicle["heartbeat_age"] or 0.0, now)
+        if restarts < vehicle["restarts"]:
+            log.warning("%s restarted", name)
+        if armed and not vehicle["armed"]:
+            log.info("%s is disarmed", name)
+        if vehicle["armed"] and not armed:
+            waits = self._writing and _read_only(vehicle)
+            log.info("%s is armed%s", name, ": nothing is written to it until it is disarmed" * waits)
+        if rival is not link["other_ftp_client"]:
+            log.info("another FTP client of %s is heard%s", name, " no more" * rival)
 
-    def _log_changes(self, before: Facts, facts: Facts, now: float) -> None:
-        seen = self._seen
-        system, component = facts.get("vehicle") or ("?", "?")
-        name = f"vehicle {system}/{component}"
-        if seen["lost"] and not before["lost"]:
-            age = facts.get("heartbeat_age") or 0.0
-            self._silent_since = now - age
-            log.warning("%s is lost: no heartbeat for %s", name, readable_time(age))
-        if before["lost"] and not seen["lost"] and not seen["replaced"]:
+    def _log_state(self, name: str, before: str, state: str, silence: float, now: float) -> None:
+        if state == "lost":
+            self._silent_since = now - silence
+            log.warning("%s is lost: no heartbeat for %s", name, readable_time(silence))
+        elif before == "lost" and state != "replaced":
             away = "" if self._silent_since is None else f" after {readable_time(now - self._silent_since)}"
             log.info("%s is back%s", name, away)
-        if before["replaced"] and not seen["replaced"] and not seen["lost"]:
+        elif before == "replaced":
             log.info("%s is the one again that was mounted", name)
-        if seen["restarts"] > before["restarts"]:
-            log.warning("%s restarted", name)
-        if seen["armed"] is not before["armed"]:
-            log.info("%s is %s", name, self._armed_words(seen["armed"]))
-        if seen["other_client"] is not before["other_client"]:
-            words = "is heard" if seen["other_client"] else "is heard no more"
-            log.info("another FTP client of %s %s", name, words)
-
-    def _armed_words(self, armed: bool) -> str:
-        if not armed:
-            return "disarmed"
-        return (
-            "armed: nothing is written to it until it is disarmed" if self._read_only_when_armed else "armed"
-        )
 
 
 Status = Mapping[str, Any]
@@ -422,7 +335,7 @@ def _headline(status: Status) -> str:
 def _armed_words(vehicle: Status) -> str:
     if not vehicle["armed"]:
         return "disarmed"
-    return "ARMED (read-only)" if vehicle["when_armed"] == "ro" else "ARMED"
+    return "ARMED (read-only)" if _read_only(vehicle) else "ARMED"
 
 
 def _link_words(status: Status) -> str:
@@ -472,10 +385,9 @@ def _held_lines(status: Status) -> Iterator[Line]:
 
 
 def _waits_for(status: Status) -> str:
-    vehicle = status["vehicle"]
     if status["link"]["state"] in ("lost", "replaced"):
         return ", until the vehicle is back"
-    if vehicle["armed"] and vehicle["when_armed"] == "ro":
+    if _read_only(status["vehicle"]):
         return ", until the vehicle is disarmed"
     return ""
 

@@ -42,6 +42,9 @@ class Heartbeat:
     armed: bool
 
 
+_RELEASES = ((255, ""), (192, " rc"), (128, " beta"), (64, " alpha"), (0, " dev"))
+
+
 @dataclass(frozen=True, slots=True)
 class AutopilotVersion:
     """AUTOPILOT_VERSION; `git_hash` is flight_custom_version (8 bytes), `uid` 64-bit, `uid2` 18 bytes."""
@@ -52,6 +55,20 @@ class AutopilotVersion:
     git_hash: bytes
     uid: int
     uid2: bytes
+
+    @property
+    def firmware(self) -> str:
+        """The flight stack's version: major.minor.patch and the kind of release, as MAVLink packs them."""
+        major, minor, patch, kind = self.flight_sw_version.to_bytes(4, "big")
+        release = next(word for least, word in _RELEASES if kind >= least)
+        return f"{major}.{minor}.{patch}{release}"
+
+    @property
+    def board(self) -> str | None:
+        """The board's unique id in hex, the long one where it is told; None if it tells none."""
+        if any(self.uid2):
+            return self.uid2.hex()
+        return f"{self.uid:016x}" if self.uid else None
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,8 +14,7 @@ from mavftpfs.link.base import Link
 from mavftpfs.link.messages import MAV_AUTOPILOT_INVALID, MAV_TYPE_GCS, Address, Heartbeat
 from mavftpfs.link.opening import open_link
 from mavftpfs.oneshot.files import Target, mount_status
-from mavftpfs.report import version_facts
-from mavftpfs.session.connection import Connection, connected
+from mavftpfs.session.connection import connected
 from mavftpfs.shared.errors import FtpNak, MavftpfsError, VehicleLost
 from mavftpfs.shared.readable import autopilot_name, readable_time
 
@@ -124,50 +123,49 @@ async def _probe(link: Link, options: MountOptions, heartbeat: Heartbeat, patien
         except MavftpfsError as exc:
             answer = f"no answer ({exc})"
         answers = answer.startswith("answers")
+        facts = connection.status()
         entry.update(
             ftp=answer,
-            seen=_seen(connection, answers=answers),
+            seen=_seen(facts, answers=answers),
             answers=answers,
-            **version_facts(connection.vehicle.version),
-            facts=connection.status(),
+            firmware=facts["vehicle"]["firmware"],
+            uid=facts["vehicle"]["uid"],
+            facts=facts["connection"],
         )
     return entry
 
 
-def _seen(connection: Connection, *, answers: bool) -> list[str]:
+def _seen(facts: Mapping[str, Any], *, answers: bool) -> list[str]:
     """Return what was learnt of its FTP beside that it answers."""
-    facts = []
-    flag = connection.vehicle.ftp_flag
+    seen = []
+    flag, rtt, times = facts["vehicle"]["says_ftp"], facts["link"]["rtt"], facts["connection"]["lists_times"]
     if flag is not None and flag is not answers:
-        facts.append("says it supports FTP" if flag else "says it does not support FTP")
-    if answers:
-        if connection.engine.rtt is not None:
-            facts.append(f"in {readable_time(connection.engine.rtt)}")
-        times = connection.engine.traits.lists_times
-        if times is not None:
-            facts.append("listings with times" if times else "listings without times")
-    if connection.vehicle.foreign_client(connection.clock()):
-        facts.append("another FTP client is heard")
-    return facts
+        seen.append("says it supports FTP" if flag else "says it does not support FTP")
+    if answers and rtt is not None:
+        seen.append(f"in {readable_time(rtt)}")
+    if answers and times is not None:
+        seen.append("listings with times" if times else "listings without times")
+    if facts["link"]["other_ftp_client"]:
+        seen.append("another FTP client is heard")
+    return seen
 
 
 def _of_mount(status: Mapping[str, Any]) -> Entry:
     """Return what a mount tells of its vehicle; nobody else can be asked while it has the link."""
-    facts = status["connection"]
-    system, component = facts["vehicle"] or (0, 0)
-    kind = "unknown" if facts["autopilot"] is None else autopilot_name(facts["autopilot"])
+    vehicle, lost = status["vehicle"], status["link"]["state"] == "lost"
     return {
-        "system": system,
-        "component": component,
-        "what": f"{kind}, {'armed' if facts['armed'] else 'disarmed'}",
-        "autopilot": facts["autopilot"],
-        "armed": facts["armed"],
-        "firmware": status["vehicle"].get("firmware"),
-        "uid": status["vehicle"].get("uid"),
+        "system": vehicle["system"],
+        "component": vehicle["component"],
+        "what": f"{vehicle['autopilot'] or 'unknown'}, {'armed' if vehicle['armed'] else 'disarmed'}",
+        "autopilot": status["connection"]["autopilot"],
+        "type": status["connection"]["type"],
+        "armed": vehicle["armed"],
+        "firmware": vehicle["firmware"],
+        "uid": vehicle["uid"],
         "ftp": f"mounted on {status['mountpoint']}",
-        "answers": not facts["lost"],
-        "seen": ["the vehicle is silent"] if facts["lost"] else [],
-        "facts": facts,
+        "answers": not lost,
+        "seen": ["the vehicle is silent"] if lost else [],
+        "facts": status["connection"],
     }
 
 

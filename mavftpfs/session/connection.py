@@ -29,13 +29,16 @@ from mavftpfs.session.driver import Driver, PayloadTrace
 from mavftpfs.session.scheduler import ReadMode, Scheduler
 from mavftpfs.session.store import Store
 from mavftpfs.session.upload import Upload
-from mavftpfs.session.vehicle import Standing, Vehicle
+from mavftpfs.session.vehicle import SILENCE_LIMIT, Standing, Vehicle
 from mavftpfs.shared.errors import MavftpfsError, VehicleLost
 
 log = logging.getLogger("mavftpfs.session")
 
 SIGNING_EPOCH = 1_420_070_400
 """2015-01-01 UTC in seconds since 1970 (MAVLink guide, "Message Signing")."""
+
+LOSSY = 0.1
+"""From this share of lost packets on, the link is not called fine."""
 
 HEARTBEAT_PERIOD = 1.0
 TERMINATE_ON_EXIT = 5.0
@@ -109,46 +112,50 @@ class Connection:
         """Have `listener` called with "reboot", "armed", "disarmed", "lost" or "back"."""
         self.news.append(listener)
 
-    def status(self) -> dict[str, Any]:
-        """Return facts for people and scripts; JSON-able."""
-        now = self.clock()
-        vehicle = self.vehicle
-        stats = self.engine.stats
-        session = self.scheduler.server.session
-        return {
-            "source": self.link.description,
-            "address": None if self.driver.peer is None else readable_address(self.driver.peer),
-            "vehicle": None if vehicle.address is None else list(vehicle.address),
-            "autopilot": None if vehicle.heartbeat is None else vehicle.heartbeat.autopilot,
-            "armed": vehicle.armed,
-            "heartbeat_age": None if vehicle.heartbeat_at is None else round(vehicle.silence(now), 1),
-            "ftp_flag": vehicle.ftp_flag,
-            "lost": vehicle.lost(now),
-            "another_vehicle": vehicle.identity.standing is Standing.STRANGER,
-            "reboots": vehicle.reboots,
-            "other_ftp_client": vehicle.foreign_client(now),
-            "rtt": self.engine.rtt,
-            "speed": {
-                "read_mode": self.scheduler.read_mode,
-                "window": self.engine.flow.window,
-                "in_flight": self.engine.in_flight,
-                "chunk": self.scheduler.read_chunks.size,
-                "loss": round(self.engine.flow.loss, 4),
-            },
-            "session_open": None if session is None else session.path.decode("utf-8", "replace"),
-            "requests": stats.requests,
-            "retransmissions": stats.retransmissions,
-            "lists_times": self.engine.traits.lists_times,
+    def status(self) -> dict[str, dict[str, Any]]:
+        """Return JSON-able facts: `vehicle` and `link` (docs/guide.md, `status --json`), and details."""
+        now, stats, link = self.clock(), self.engine.stats, self.link
+        heartbeat, server = self.vehicle.heartbeat, self.scheduler.server.session
+        details = {
+            "autopilot": None if heartbeat is None else heartbeat.autopilot,
+            "type": None if heartbeat is None else heartbeat.vehicle_type,
+            "read_mode": self.scheduler.read_mode,
+            "window": self.engine.flow.window,
+            "in_flight": self.engine.in_flight,
+            "chunk": self.scheduler.read_chunks.size,
+            "session_open": None if server is None else server.path.decode("utf-8", "replace"),
+            **asdict(self.engine.traits),
             "write_traits": asdict(self.store.traits),
             "uploads": [user.status() for user in self.scheduler.users if isinstance(user, Upload)],
-            "link": {
-                "received_bytes": self.link.stats.received_bytes,
-                "sent_bytes": self.link.stats.sent_bytes,
-                "dropped_sends": self.link.stats.dropped_sends,
-                "reopened": self.link.stats.reopened,
-            },
+            "dropped_sends": link.stats.dropped_sends,
             "bad_frames": self.driver.framer.stats.bad_crc,
         }
+        return {
+            "vehicle": {**self.vehicle.status(now), "when_armed": self.options.when_armed},
+            "link": {
+                "state": self._link_state(now),
+                "rtt": self.engine.rtt,
+                "loss": round(self.engine.flow.loss, 4),
+                "other_ftp_client": self.vehicle.foreign_client(now),
+                "received_bytes": link.stats.received_bytes,
+                "sent_bytes": link.stats.sent_bytes,
+                "requests": stats.requests,
+                "retransmissions": stats.retransmissions,
+                "reopened": link.stats.reopened,
+                "source": link.description,
+                "address": None if self.driver.peer is None else readable_address(self.driver.peer),
+            },
+            "connection": details,
+        }
+
+    def _link_state(self, now: float) -> str:
+        """Return `fine`, `lossy`, `lost`, or `replaced` where another vehicle answers in place of ours."""
+        if self.vehicle.identity.standing is Standing.STRANGER:
+            return "replaced"
+        silent = self.vehicle.heartbeat_at is not None and self.vehicle.silence(now) > SILENCE_LIMIT
+        if silent or self.vehicle.lost(now):
+            return "lost"
+        return "lossy" if self.engine.flow.loss >= LOSSY else "fine"
 
     def _heard(self) -> str:
         heard = sorted(self.vehicle.heard)

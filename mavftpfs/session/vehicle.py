@@ -15,6 +15,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import Enum
 from math import inf
+from typing import Any
 
 from mavftpfs.link.messages import (
     MAV_AUTOPILOT_INVALID,
@@ -30,6 +31,7 @@ from mavftpfs.link.messages import (
 )
 from mavftpfs.protocol.payload import Opcode
 from mavftpfs.shared.errors import Armed, VehicleLost
+from mavftpfs.shared.readable import autopilot_name
 
 SILENCE_LIMIT = 5.0
 """Seconds without heartbeats after which one timed-out request means that the vehicle is lost."""
@@ -223,6 +225,21 @@ class Vehicle:
     def ftp_flag(self) -> bool | None:
         """AUTOPILOT_VERSION's FTP capability, None while unknown. It proves nothing (servers.md 5)."""
         return None if self.version is None else bool(self.version.capabilities & MAV_PROTOCOL_CAPABILITY_FTP)
+
+    def status(self, now: float) -> dict[str, Any]:
+        """Return JSON-able facts: those of `vehicle` in docs/guide.md, `status --json`."""
+        heartbeat, version = self.heartbeat, self.version
+        return {
+            "system": None if self.address is None else self.address.system,
+            "component": None if self.address is None else self.address.component,
+            "autopilot": None if heartbeat is None else autopilot_name(heartbeat.autopilot),
+            "armed": self.armed,
+            "heartbeat_age": None if heartbeat is None else round(self.silence(now), 1),
+            "says_ftp": self.ftp_flag,
+            "firmware": None if version is None else version.firmware,
+            "uid": None if version is None else version.board,
+            "restarts": self.reboots,
+        }
 
     def silence(self, now: float) -> float:
         """Return the seconds since the vehicle's last heartbeat (infinite before the first)."""

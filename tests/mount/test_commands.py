@@ -74,6 +74,6 @@ def test_scan_shows_who_answers(vehicle: SimVehicle) -> None:
     assert [(peer["system"], peer["component"], peer["what"]) for peer in found] == [
         (1, 1, "PX4 quadrotor, disarmed")
     ]
-    assert (found[0]["ftp"], found[0]["answers"], found[0]["facts"]["ftp_flag"]) == ("answers", True, True)
+    assert (found[0]["ftp"], found[0]["answers"]) == ("answers", True)
     assert found[0]["uid"] != "-"
     assert found[0]["firmware"] != "-"

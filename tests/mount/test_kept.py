@@ -55,7 +55,7 @@ def check_cost(field: Field, vehicle: CountedVehicle, logs: Path, cache: Path, *
     counts = vehicle.cost_since(mark).counts
     asked = Counter({name: counts[name] for name in ("open", "read", "burst", "crc") if counts[name]})
     assert asked >= Counter(expected), asked
-    assert (asked - Counter(expected)).total() <= mount.status()["connection"]["retransmissions"], asked
+    assert (asked - Counter(expected)).total() <= mount.status()["link"]["retransmissions"], asked
     return mount
 
 

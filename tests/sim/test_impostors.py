@@ -85,7 +85,7 @@ async def test_heartbeats_from_elsewhere_do_not_move_the_vehicle(
         for _ in range(10):
             assert await read_file(connection, b"/f") == OURS
             await trio.sleep(1.0)
-        assert connection.status()["address"] == "10.0.0.1:14550"
+        assert connection.status()["link"]["address"] == "10.0.0.1:14550"
         nursery.cancel_scope.cancel()
     assert [line for line in caplog.messages if "10.0.0.2:14550" in line] == [
         "10.0.0.2:14550 says that it is 1/1, too: ignored as long as the vehicle is heard where it was"
@@ -103,7 +103,7 @@ async def test_a_vehicle_whose_address_changes_is_found_again(
         scene.move(scene.ours, THERE)
         await trio.sleep(10.0)
         assert await read_file(connection, b"/f") == OURS
-        assert connection.status()["address"] == "10.0.0.2:14550"
+        assert connection.status()["link"]["address"] == "10.0.0.2:14550"
         assert not connection.vehicle.lost(trio.current_time())
     assert [line for line in caplog.messages if "10.0.0.2:14550" in line] == [
         "the vehicle is not heard at 10.0.0.1:14550 any more; asking who it is at 10.0.0.2:14550"
@@ -143,7 +143,7 @@ async def test_two_links_to_one_vehicle_do_no_harm(
         for _ in range(5):
             assert await read_file(connection, b"/f") == OURS
             await trio.sleep(3.0)
-        assert connection.status()["address"] == "10.0.0.1:14550"
+        assert connection.status()["link"]["address"] == "10.0.0.1:14550"
         scene.link.address, scene.link.mirrors = THERE, []  # one of them ends
         await trio.sleep(10.0)
         assert await read_file(connection, b"/f") == OURS
@@ -176,7 +176,7 @@ async def test_a_companion_has_an_address_of_its_own(
             assert connection.vehicle.armed
             await trio.sleep(10.0)
             assert await read_file(connection, b"/f") == OURS
-            assert connection.status()["address"] == "10.0.0.1:14550"
+            assert connection.status()["link"]["address"] == "10.0.0.1:14550"
         nursery.cancel_scope.cancel()
 
 
@@ -427,7 +427,7 @@ async def test_a_target_without_heartbeats_moves_with_its_autopilot(
             link.address = THERE
             await trio.sleep(20.0)
             assert await read_file(connection, b"/f") == OURS
-            assert connection.status()["address"] == "10.0.0.2:14550"
+            assert connection.status()["link"]["address"] == "10.0.0.2:14550"
         nursery.cancel_scope.cancel()
 
 

@@ -178,7 +178,7 @@ class Counting:
         self._bash(f"ls -l .. > /dev/null; {case.before}", where, scratch, case.timeout)
         self.settle()
         time.sleep(FREE_FOR + 0.1 if case.aged else 0)
-        mark, repeated = self.vehicle.asked(), self.status()["connection"]["retransmissions"]
+        mark, repeated = self.vehicle.asked(), self.status()["link"]["retransmissions"]
         started = time.monotonic()
         self._bash(case.script, where, scratch, case.timeout)
         seconds = time.monotonic() - started
@@ -186,7 +186,7 @@ class Counting:
         self.settle()
         cost = self.vehicle.cost_since(mark)
         cost.seconds, cost.late = seconds, late
-        cost.repeats = self.status()["connection"]["retransmissions"] - repeated
+        cost.repeats = self.status()["link"]["retransmissions"] - repeated
         return cost
 
     def settle(self) -> None:
@@ -198,7 +198,7 @@ class Counting:
             assert time.monotonic() < deadline, f"the mount does not come to rest: {status}"
             now = self.vehicle.asked()
             # A vehicle that had no time yet to take what was sent has not counted it.
-            quiet = SETTLED if now >= status["connection"]["requests"] else LOST
+            quiet = SETTLED if now >= status["link"]["requests"] else LOST
             # The mount's own word is not enough: a Terminate that comes later counts for the next case.
             if now != seen or not self._idle(status) or self.vehicle.sessions():
                 seen, since = now, time.monotonic()
@@ -208,7 +208,7 @@ class Counting:
     def _idle(status: dict[str, dict[str, Any]]) -> bool:
         connection = status["connection"]
         waiting = status["cache"].get("files_undelivered")
-        busy = connection["session_open"] is not None or connection["speed"]["in_flight"]
+        busy = connection["session_open"] is not None or connection["in_flight"]
         return not busy and not connection["uploads"] and not waiting
 
     def status(self) -> dict[str, dict[str, Any]]:

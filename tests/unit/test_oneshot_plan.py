@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -14,7 +15,6 @@ from mavftpfs.oneshot.files import same_link
 from mavftpfs.oneshot.names import parse_paths
 from mavftpfs.oneshot.scan import describe_peer
 from mavftpfs.oneshot.verbs import parse_date
-from mavftpfs.report import version_facts
 from mavftpfs.shared.errors import UsageError
 
 MAY, JUNE = 1_714_566_896, 1_717_245_296
@@ -167,7 +167,6 @@ def test_what_a_heartbeat_says(kind: int, component: int, autopilot: int, armed:
 )
 def test_firmware_and_board(number: int, words: str) -> None:
     version = AutopilotVersion(Address(1, 1), 0, number, b"", 0x1234, bytes(18))
-    assert version_facts(version)["firmware"] == words
-    assert version_facts(version)["uid"] == "0000000000001234"
-    assert version_facts(AutopilotVersion(Address(1, 1), 0, number, b"", 1, b"\1" * 18))["uid"] == "01" * 18
-    assert version_facts(AutopilotVersion(Address(1, 1), 0, number, b"", 0, bytes(18)))["uid"] is None
+    assert (version.firmware, version.board) == (words, "0000000000001234")
+    assert replace(version, uid2=b"\1" * 18).board == "01" * 18
+    assert replace(version, uid=0).board is None

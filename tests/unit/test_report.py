@@ -13,25 +13,41 @@ import trio
 from mavftpfs.report import Watcher, delivery_line, panel, screen, snapshot, status_lines
 from mavftpfs.shared.readable import printable, readable_size, readable_time
 
-CONNECTION = {
-    "vehicle": [1, 1],
-    "autopilot": 12,
+VEHICLE = {
+    "system": 1,
+    "component": 1,
+    "autopilot": "PX4",
     "armed": False,
+    "when_armed": "ro",
     "heartbeat_age": 0.4,
+    "restarts": 0,
+}
+LINK = {
+    "state": "fine",
     "rtt": 0.04,
-    "speed": {"loss": 0.0},
-    "link": {"received_bytes": 9000, "sent_bytes": 1000},
+    "loss": 0.0,
+    "other_ftp_client": False,
+    "received_bytes": 9000,
+    "sent_bytes": 1000,
 }
 READ = {"path": "/fs/microsd/log/2026-11-20/10_32_15.ulg", "size": 3_400_000, "done": 1_190_000}
 WRITE = {"path": "/a", "size": 4096, "bytes_left": 1024, "sending": True, "eta": 3.4}
 
 
+def connection(facts: dict[str, Any]) -> dict[str, Any]:
+    """Return what a connection tells, with these facts of the vehicle or the link."""
+    return {
+        "vehicle": {name: facts.get(name, value) for name, value in VEHICLE.items()},
+        "link": {name: facts.get(name, value) for name, value in LINK.items()},
+    }
+
+
 def status(
-    connection: dict[str, Any] | None = None, cache: dict[str, Any] | None = None, **more: Any
+    facts: dict[str, Any] | None = None, cache: dict[str, Any] | None = None, **more: Any
 ) -> dict[str, Any]:
     """Return a status as a mount gives it."""
-    facts = snapshot({**CONNECTION, **(connection or {})}, cache or {}, 5100.0, when_armed="ro")
-    return {"mountpoint": "/mnt/drone", "state": "mounted", "problem": None, **facts, **more}
+    told = snapshot(connection(facts or {}), cache or {}, 5100.0)
+    return {"mountpoint": "/mnt/drone", "state": "mounted", "problem": None, **told, **more}
 
 
 def lines(*args: Any, **more: Any) -> list[str]:
@@ -42,12 +58,11 @@ def lines(*args: Any, **more: Any) -> list[str]:
     ("facts", "line"),
     [
         ({}, "PX4 1/1, disarmed, link fine: RTT 40 ms, loss 0 %, 5.1 kB/s"),
-        ({"rtt": None, "autopilot": 3}, "ArduPilot 1/1, disarmed, link fine: loss 0 %, 5.1 kB/s"),
+        ({"rtt": None, "autopilot": "ArduPilot"}, "ArduPilot 1/1, disarmed, link fine: loss 0 %, 5.1 kB/s"),
         ({"armed": True}, "PX4 1/1, ARMED (read-only), link fine: RTT 40 ms, loss 0 %, 5.1 kB/s"),
-        ({"speed": {"loss": 0.2}}, "PX4 1/1, disarmed, link lossy: RTT 40 ms, loss 20 %, 5.1 kB/s"),
-        ({"heartbeat_age": 12.0}, "PX4 1/1, disarmed, LOST: last heard 12 s ago"),
-        ({"lost": True, "heartbeat_age": 80}, "PX4 1/1, disarmed, LOST: last heard 1 min 20 s ago"),
-        ({"another_vehicle": True}, "PX4 1/1, disarmed, LOST: another vehicle answers in its place"),
+        ({"state": "lossy", "loss": 0.2}, "PX4 1/1, disarmed, link lossy: RTT 40 ms, loss 20 %, 5.1 kB/s"),
+        ({"state": "lost", "heartbeat_age": 80}, "PX4 1/1, disarmed, LOST: last heard 1 min 20 s ago"),
+        ({"state": "replaced"}, "PX4 1/1, disarmed, LOST: another vehicle answers in its place"),
         (
             {"other_ftp_client": True},
             "PX4 1/1, disarmed, link fine: RTT 40 ms, loss 0 %, 5.1 kB/s, another FTP client is heard",
@@ -105,19 +120,19 @@ async def test_what_holds_from_one_heartbeat_to_the_next_is_logged(
     autojump_clock: object, caplog: pytest.LogCaptureFixture
 ) -> None:
     def facts() -> dict[str, Any]:
-        return {**CONNECTION, "armed": 0.05 < trio.current_time() - began < 0.95}
+        return connection({"armed": 0.05 < trio.current_time() - began < 0.95})
 
     caplog.set_level(logging.INFO, "mavftpfs")
     began = trio.current_time()
     with trio.move_on_after(3):
-        await Watcher(facts, read_only_when_armed=False).run()
+        await Watcher(facts, writing=False).run()
     assert caplog.messages == ["vehicle 1/1 is armed", "vehicle 1/1 is disarmed"]
 
 
 def test_a_delivery_says_what_it_waits_for() -> None:
     cache = {"transfers": [WRITE], "write_rate": 300.0, "files_undelivered": 1, "bytes_undelivered": 4096}
     assert delivery_line(status(None, cache)) == "delivering 1 file, 3.1 kB of 4.1 kB, 300 B/s, 3.4 s left"
-    lost = delivery_line(status({"lost": True}, {**cache, "transfers": [{**WRITE, "sending": False}]}))
+    lost = delivery_line(status({"state": "lost"}, {**cache, "transfers": [{**WRITE, "sending": False}]}))
     assert lost == "delivering 1 file, 3.1 kB of 4.1 kB, until the vehicle is back"
     assert delivery_line(status()) == ""
 
