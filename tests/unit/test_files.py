@@ -7,24 +7,30 @@ from collections.abc import AsyncIterator
 
 import pytest
 import trio
-import trio.testing
 
-from mavftpfs.cache.files import MAX_CLOSED
 from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.tree import Tree
+from mavftpfs.protocol.payload import Opcode, Payload
 from mavftpfs.shared.errors import (
     DataUnproven,
     FileChanged,
     IsADirectory,
     LocalProtocolError,
     NotFound,
+    RequestTimeout,
     VehicleLost,
 )
-from tests.support.fake_store import FakeStore, make_tree, read_file
+from mavftpfs.sim.linkmodel import LinkSettings
+from tests.support.rigs import Rig, card, read_file, rig
 
 KIB = 1024
 MIB = 1024 * KIB
 LOG = b"/logs/a.bin"
+MTIME = 1_700_000_000
+OPEN, READ = Opcode.OPEN_FILE_RO, Opcode.READ_FILE
+LISTS = (Opcode.LIST_DIRECTORY, Opcode.LIST_DIRECTORY_WITH_TIME)
+EXPIRED = 21.0
+"""Seconds after which neither a listing nor what was known of a file holds."""
 
 
 def content(size: int, seed: int = 7) -> bytes:
@@ -33,124 +39,123 @@ def content(size: int, seed: int = 7) -> bytes:
 
 DATA = content(300_000)
 
-
-@pytest.fixture
-async def store(nursery: trio.Nursery) -> AsyncIterator[FakeStore]:
-    store = FakeStore(nursery)
-    store.chunk = 16 * KIB
-    store.add(LOG, DATA, 1_700_000_000)
-    yield store
-    assert store.crimes == []
+here = card({LOG: DATA})
 
 
 @pytest.fixture
-def tree(store: FakeStore) -> Tree:
-    return make_tree(store)
+async def timed(autojump_clock: object) -> AsyncIterator[Rig]:
+    """A server whose listings tell times."""
+    async with rig("mavsdk") as made:
+        made.put(LOG, DATA, MTIME)
+        yield made
 
 
 # --- reading
 
 
-async def test_a_read_larger_than_the_cache_is_served_in_pieces(store: FakeStore) -> None:
+async def test_a_read_larger_than_the_cache_is_served_in_pieces(here: Rig) -> None:
     big = content(5 * MIB)
-    store.add(b"/big", big)
-    tree = make_tree(store, cache_size=MIB)
+    here.put(b"/big", big)
+    tree = here.mount(cache_size=MIB)
     handle = await tree.open(b"/big")
     assert await handle.read(0, len(big)) == big
     handle.close()
     assert int(str(tree.status()["bytes_cached"])) <= MIB
 
 
-async def test_a_second_reader_of_the_file_shares_blocks_and_session(store: FakeStore, tree: Tree) -> None:
+async def test_a_second_reader_of_the_file_shares_blocks_and_session(here: Rig) -> None:
+    tree = here.mount()
     first, second = await tree.open(LOG), await tree.open(LOG)
     async with trio.open_nursery() as readers:
         readers.start_soon(first.read, 0, len(DATA))
         readers.start_soon(second.read, 0, len(DATA))
-    assert store.count("reader") == store.count("open") == 1
+    assert here.count(OPEN) == 1
+    assert here.count(READ) == -(-len(DATA) // 239)
     first.close()
-    assert not store.readers[0].closed
+    assert await second.read(0, 10) == DATA[:10]
     second.close()
     second.close()
-    assert store.readers[0].closed
-    assert store.readers[0].drops == 1
     with pytest.raises(LocalProtocolError):
         await second.read(0, 1)
     assert tree._files.open_versions == {}
 
 
-async def test_sequential_reads_fetch_ahead_and_release_drops_it(store: FakeStore, tree: Tree) -> None:
-    store.add(b"/big", content(8 * MIB))
-    handle = await tree.open(b"/big")
-    for at in range(0, 512 * KIB, 128 * KIB):
-        await handle.read(at, 128 * KIB)
-    reader = store.readers[0]
-    assert not reader.ahead.empty
-    await handle.read(7 * MIB, 4 * KIB)
-    assert reader.drops == 1
-    await handle.read(512 * KIB, 4 * KIB)
-    assert reader.drops == 1
-    handle.close()
-    assert reader.ahead.empty
+@pytest.mark.parametrize("end", ["release", "seek"])
+async def test_sequential_reads_fetch_ahead_until_that_is_of_no_use(end: str) -> None:
+    async with rig(link=LinkSettings(rate=30_000.0, delay=0.02)) as here:
+        here.put(b"/big", content(2 * MIB))
+        handle = await here.mount().open(b"/big")
+        for at in range(0, 64 * KIB, 16 * KIB):
+            await handle.read(at, 16 * KIB)
+        asked = here.count(READ)
+        await trio.sleep(2.0)
+        assert here.count(READ) > asked + 50
+        asked = here.count(READ)
+        await handle.release() if end == "release" else await handle.read(1 * MIB, 239)
+        await trio.sleep(10.0)
+        assert here.count(READ) < asked + 50
+        await handle.release()
 
 
 @pytest.mark.holds("promise 6", "rule 14.30")
-async def test_a_directory_is_not_opened(tree: Tree) -> None:
-    with pytest.raises(IsADirectory):
-        await tree.open(b"/logs")
-    with pytest.raises(IsADirectory):
-        await tree.open(b"/")
+async def test_a_directory_is_not_opened(here: Rig) -> None:
+    tree = here.mount()
+    for path in (b"/logs", b"/"):
+        with pytest.raises(IsADirectory):
+            await tree.open(path)
     with pytest.raises(NotFound):
         await tree.open(b"/logs/none")
+    assert here.count(OPEN) == 0
 
 
 # --- close-to-open
 
 
-async def test_equal_size_and_mtime_prove_the_cache_for_ever(store: FakeStore, tree: Tree) -> None:
+async def test_equal_size_and_mtime_prove_the_cache_for_ever(timed: Rig) -> None:
+    tree = timed.mount()
     await read_file(tree, LOG)
     await trio.sleep(1000)
     handle = await tree.open(LOG)
     assert handle.keep_cache
     assert await handle.read(0, len(DATA)) == DATA
-    assert store.count("open") == 1
-    assert store.count("list", b"/logs") == 2
+    assert timed.count(OPEN) == 1
 
 
-async def test_without_mtime_the_proof_lasts_dir_timeout(store: FakeStore, tree: Tree) -> None:
-    store.add(LOG, DATA)
+async def test_without_mtime_the_proof_lasts_dir_timeout(here: Rig) -> None:
+    tree = here.mount()
     await read_file(tree, LOG)
     await trio.sleep(19)
     (await tree.open(LOG)).close()
-    assert store.count("open") == 1
+    assert here.count(OPEN) == 1
     await trio.sleep(1.5)
-    store.files[LOG].data = DATA[::-1]
+    here.put(LOG, DATA[::-1])
     handle = await tree.open(LOG)
     assert not handle.keep_cache
     assert await handle.read(0, len(DATA)) == DATA[::-1]
-    assert store.count("open") == 2
 
 
 @pytest.mark.parametrize("grown", [False, True])
-async def test_a_newer_listing_can_end_a_recent_proof(store: FakeStore, tree: Tree, grown: bool) -> None:
-    store.add(LOG, DATA)
+async def test_a_newer_listing_can_end_a_recent_proof(here: Rig, grown: bool) -> None:
+    tree = here.mount()
     await read_file(tree, LOG)
     await trio.sleep(5)
-    tree._directories.rebooted()
+    tree._directories.expire(b"/logs")
     if grown:
-        store.add(LOG, DATA + b"more")
+        here.put(LOG, DATA + b"more")
     handle = await tree.open(LOG)
     assert handle.keep_cache is not grown
-    assert handle.size == len(store.files[LOG].data)
-    assert store.count("open") == (2 if grown else 1)
+    assert handle.size == len(here.data(LOG))
+    assert here.count(OPEN) == (2 if grown else 1)
 
 
-async def test_a_changed_mtime_starts_a_new_version(store: FakeStore, tree: Tree) -> None:
+async def test_a_changed_mtime_starts_a_new_version(timed: Rig) -> None:
+    tree = timed.mount()
     old = await tree.open(LOG)
     await old.read(0, 100)
-    store.add(LOG, DATA[::-1], 1_700_000_001)
-    await trio.sleep(21)
+    timed.put(LOG, DATA[::-1], MTIME + 1)
+    await trio.sleep(EXPIRED)
     new = await tree.open(LOG)
-    assert set(store.invalidated) == {LOG}
+    assert set(timed.invalidated) == {LOG}
     assert not new.keep_cache
     assert await new.read(0, len(DATA)) == DATA[::-1]
     for _ in range(2):
@@ -160,28 +165,13 @@ async def test_a_changed_mtime_starts_a_new_version(store: FakeStore, tree: Tree
     assert await new.read(5, 5) == DATA[::-1][5:10]
 
 
-async def test_a_smaller_ack_is_another_file_even_if_the_listing_is_old(store: FakeStore) -> None:
-    tree = make_tree(store, dir_timeout=5)
-    store.list_delay = 2  # the listing stays fresh for 100 s, the proof for 5
-    store.add(LOG, DATA)
-    old = await tree.open(LOG)
-    await old.read(0, 100)
-    store.add(LOG, b"short")
-    await trio.sleep(6)
-    new = await tree.open(LOG)
-    assert new.size == 5
-    assert (await tree.stat(LOG)).size == 5
-    with pytest.raises(FileChanged):
-        await old.read(0, 100)
-
-
 @pytest.mark.holds("fault growing file", "rule 14.21")
-async def test_a_grown_file_is_served_at_its_opened_size(store: FakeStore, tree: Tree) -> None:
-    store.add(LOG, DATA)
+async def test_a_grown_file_is_served_at_its_opened_size(here: Rig) -> None:
+    tree = here.mount()
     old = await tree.open(LOG)
     await old.read(0, 100)
-    store.add(LOG, DATA + b"more")
-    await trio.sleep(21)
+    here.put(LOG, DATA + b"more")
+    await trio.sleep(EXPIRED)
     new = await tree.open(LOG)
     assert (old.size, new.size) == (len(DATA), len(DATA) + 4)
     assert await new.read(len(DATA), 100) == b"more"
@@ -190,16 +180,15 @@ async def test_a_grown_file_is_served_at_its_opened_size(store: FakeStore, tree:
     held = int(str(tree.status()["bytes_cached"]))
     old.close()
     assert int(str(tree.status()["bytes_cached"])) == held - len(DATA)
-    new.close()
-    assert all(reader.closed for reader in store.readers)
 
 
 @pytest.mark.holds("fault replaced file")
-async def test_versions_do_not_meet_in_the_kernels_page_cache(store: FakeStore, tree: Tree) -> None:
+async def test_versions_do_not_meet_in_the_kernels_page_cache(timed: Rig) -> None:
+    tree = timed.mount()
     old = await tree.open(LOG)
     assert not old.direct_io
-    store.add(LOG, DATA + b"more", 1_700_000_009)
-    await trio.sleep(21)
+    timed.put(LOG, DATA + b"more", MTIME + 9)
+    await trio.sleep(EXPIRED)
     new = await tree.open(LOG)
     assert new.direct_io
     new.close()
@@ -212,66 +201,70 @@ async def test_versions_do_not_meet_in_the_kernels_page_cache(store: FakeStore, 
     assert (await tree.open(LOG)).keep_cache
 
 
-async def test_the_ack_beats_the_listing(store: FakeStore, tree: Tree) -> None:
+async def test_the_ack_beats_the_listing(timed: Rig) -> None:
+    tree = timed.mount()
     await tree.stat(LOG)
-    store.add(LOG, DATA + b"more", 1_700_000_009)
+    timed.put(LOG, DATA + b"more", MTIME + 9)
     handle = await tree.open(LOG)
     assert handle.size == len(DATA) + 4
     assert (await tree.stat(LOG)).size == len(DATA) + 4
-    assert store.invalidated == [LOG]
+    assert timed.invalidated == [LOG]
     assert await handle.read(len(DATA), 10) == b"more"
     handle.close()
-    again = await tree.open(LOG)
-    assert again.keep_cache
+    assert (await tree.open(LOG)).keep_cache
 
 
 @pytest.mark.holds("rule 14.27")
-async def test_a_size_that_does_not_fit_the_ack_is_an_error_not_a_short_file(
-    store: FakeStore, tree: Tree
-) -> None:
-    store.files[LOG].claims = (1 << 32) + len(DATA)
+async def test_a_size_that_does_not_fit_the_ack_is_an_error_not_a_short_file(here: Rig) -> None:
+    listed, claimed = b"a.bin\t%d\0" % len(DATA), b"a.bin\t%d\0" % (len(DATA) + (1 << 32))
+
+    def change(request: Payload, reply: Payload) -> list[Payload]:
+        data = reply.data.replace(listed, claimed) if request.opcode in LISTS else reply.data
+        return [reply._replace(data=data, size=len(data))]
+
+    here.server.change = change
     with pytest.raises(DataUnproven):
-        await tree.open(LOG)
-    assert all(reader.closed for reader in store.readers)
+        await here.mount().open(LOG)
 
 
-async def open_partly_cached(store: FakeStore, tree: Tree) -> OpenFile:
+async def open_partly_cached(here: Rig, tree: Tree) -> OpenFile:
     """Open a large file again of which the beginning was read."""
-    store.add(b"/big", content(MIB), 5)
+    here.put(b"/big", content(MIB))
     handle = await tree.open(b"/big")
     await handle.read(0, 4 * KIB)
     handle.close()
+    await trio.sleep(3.0)  # the server's session is closed
     return await tree.open(b"/big")
 
 
 @pytest.mark.holds("fault idle close", "rule 14.9")
-async def test_a_partly_cached_file_is_opened_again_only_when_bytes_are_wanted(
-    store: FakeStore, tree: Tree
-) -> None:
-    handle = await open_partly_cached(store, tree)
-    assert store.count("open", b"/big") == 1
+async def test_a_partly_cached_file_is_opened_again_only_when_bytes_are_wanted(here: Rig) -> None:
+    handle = await open_partly_cached(here, here.mount())
+    assert here.count(OPEN) == 1
     await handle.read(512 * KIB, 4 * KIB)
-    assert store.count("open", b"/big") == 2
+    assert here.count(OPEN) == 2
 
 
-async def test_a_file_that_shrank_before_it_was_opened_again(store: FakeStore, tree: Tree) -> None:
-    handle = await open_partly_cached(store, tree)
-    store.add(b"/big", b"short", 6)
-    with pytest.raises(FileChanged):
-        await handle.read(512 * KIB, 4 * KIB)
-    with pytest.raises(FileChanged):
-        await handle.read(0, 4)
-    assert b"/big" in store.invalidated
+async def test_a_file_that_shrank_before_it_was_opened_again(here: Rig) -> None:
+    tree = here.mount()
+    handle = await open_partly_cached(here, tree)
+    here.put(b"/big", b"short")
+    for at in (512 * KIB, 0):
+        with pytest.raises(FileChanged):
+            await handle.read(at, 4)
+    assert b"/big" in here.invalidated
     handle.close()
     assert await read_file(tree, b"/big") == b"short"
 
 
-async def test_closed_files_are_bounded(store: FakeStore, tree: Tree) -> None:
-    for i in range(MAX_CLOSED + 3):
-        store.add(b"/many/%d" % i, b"x", 5)
-    for i in range(MAX_CLOSED + 3):
-        (await tree.open(b"/many/%d" % i)).close()
-    assert (await tree.open(b"/many/%d" % (MAX_CLOSED + 2))).keep_cache
+async def test_closed_files_are_bounded(here: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("mavftpfs.cache.files.MAX_CLOSED", 3)
+    tree = here.mount()
+    for number in range(5):
+        here.put(b"/many/%d" % number, b"x")
+    for number in range(5):
+        await read_file(tree, b"/many/%d" % number)
+    assert (await tree.open(b"/many/4")).keep_cache
     assert not (await tree.open(b"/many/1")).keep_cache
 
 
@@ -279,107 +272,90 @@ async def test_closed_files_are_bounded(store: FakeStore, tree: Tree) -> None:
 
 
 @pytest.mark.holds("promise 5")
-async def test_a_file_that_is_gone_after_a_reboot(store: FakeStore, tree: Tree) -> None:
-    handle = await tree.open(LOG)
+async def test_a_file_that_is_gone_after_a_reboot(here: Rig) -> None:
+    handle = await here.mount().open(LOG)
     await handle.read(0, 1000)
-    store.remove(LOG)
-    tree.rebooted()
+    here.take(LOG)
+    await here.reboot()
     with pytest.raises(FileChanged):
         await handle.read(0, 1000)
 
 
-async def test_a_reboot_with_the_link_still_down_proves_nothing(store: FakeStore, tree: Tree) -> None:
-    handle = await tree.open(LOG)
+async def test_a_reboot_with_the_link_still_down_proves_nothing(here: Rig) -> None:
+    handle = await here.mount().open(LOG)
     await handle.read(0, 1000)
-    await trio.sleep(1)
-    tree.rebooted()
-    store.lost = True
-    tree.link_lost()
-    with pytest.raises(VehicleLost):
+    await here.reboot()
+    await here.lose()
+    with pytest.raises((VehicleLost, RequestTimeout)):
         await handle.read(0, 1000)
-    store.lost = False
-    tree.link_back()
+    await here.find()
     assert await handle.read(0, 1000) == DATA[:1000]
 
 
-async def test_after_a_reboot_recency_is_no_proof(store: FakeStore, tree: Tree) -> None:
-    store.add(LOG, DATA)
+async def test_after_a_reboot_recency_is_no_proof(here: Rig) -> None:
+    tree = here.mount()
     await read_file(tree, LOG)
-    tree.rebooted()
+    await here.reboot()
     handle = await tree.open(LOG)
     assert not handle.keep_cache
-    assert store.count("open") == 2
-    handle.close()
+    assert here.count(OPEN) == 2
 
 
 # --- doubtful bytes (promise 1)
 
 
-def spoil(path: bytes, offset: int, data: bytes) -> bytes:
-    return bytes(byte ^ 0xFF for byte in data)
-
-
-async def test_wrong_bytes_are_fetched_again(store: FakeStore, tree: Tree) -> None:
-    store.suspect_chunks, store.spoil = 2, spoil
-    handle = await tree.open(LOG)
-    assert await handle.read(0, 40_000) == DATA[:40_000]
-    assert await handle.read(0, len(DATA)) == DATA
-    assert set(store.invalidated) == {LOG}
-
-
-async def test_bytes_that_stay_suspect_are_an_error(store: FakeStore, tree: Tree) -> None:
+async def test_bytes_that_stay_suspect_are_an_error() -> None:
     """In time: a handler waits for 33 s."""
-    began = trio.current_time()
-    store.suspect_chunks, store.spoil = 10**6, spoil
-    handle = await tree.open(LOG)
-    with pytest.raises(DataUnproven):
-        await handle.read(0, 100)
-    assert trio.current_time() < began + 20
-    store.suspect_chunks = 0
-    assert await handle.read(0, len(DATA)) == DATA
+    async with rig(files={LOG: DATA}, link=LinkSettings(delay=0.05)) as here:
+        wrong = True
+        here.server.change = lambda request, reply: [
+            reply._replace(data=bytes(reply.size)) if wrong and request.opcode == READ else reply
+        ]
 
+        async def raise_doubt() -> None:
+            while wrong:
+                here.connection.scheduler.doubt.raise_it("somebody else")
+                await trio.sleep(0.05)
 
-async def test_a_closed_file_whose_bytes_were_dropped_is_read_again_without_a_listing(
-    store: FakeStore, tree: Tree
-) -> None:
-    """A tree is read twice over a link that doubles: with a listing for each file that took minutes."""
-    handle = await tree.open(LOG)
-    await handle.read(0, len(DATA))
-    sink = store.readers[0].sink
-    handle.close()
-    sink.on_suspect("late news")
-    assert store.invalidated == [LOG]
-    listings = store.count("list")
-    assert await read_file(tree, LOG) == DATA
-    assert store.count("list") == listings
-    assert store.count("reader") == 2
-
-
-@pytest.mark.parametrize("delay", [0.0, 0.002])
-async def test_closing_the_last_handle_under_a_read_ends_it(
-    store: FakeStore, tree: Tree, delay: float
-) -> None:
-    (await tree.open(LOG)).close()
-    handle = await tree.open(LOG)
-    store.chunk_delay = 1
-    errors = []
-
-    async def read() -> None:
-        try:
+        handle = await here.mount().open(LOG)
+        here.nursery.start_soon(raise_doubt)
+        began = trio.current_time()
+        with pytest.raises(DataUnproven):
             await handle.read(0, 100)
-        except LocalProtocolError as error:
-            errors.append(error)
+        assert trio.current_time() < began + 20
+        wrong = False
+        assert await handle.read(0, len(DATA)) == DATA
 
-    began = trio.current_time()
-    async with trio.open_nursery() as readers:
-        readers.start_soon(read)
-        if delay:
-            await trio.sleep(delay)
-        else:  # while the reader is being opened
-            while store.count("reader") != 2:
-                await trio.lowlevel.checkpoint()
-        handle.close()
-    assert len(errors) == 1
-    assert trio.current_time() < began + 1
-    assert all(reader.closed for reader in store.readers)
+
+async def test_a_closed_file_whose_bytes_were_dropped_is_read_again_without_a_listing(timed: Rig) -> None:
+    """A tree is read twice over a link that doubles: with a listing for each file that took minutes."""
+    tree = timed.mount()
+    await read_file(tree, LOG)
+    timed.connection.scheduler.doubt.raise_it("late news")
+    assert timed.invalidated == [LOG]
+    listings = timed.count(*LISTS)
     assert await read_file(tree, LOG) == DATA
+    assert (timed.count(OPEN), timed.count(*LISTS)) == (2, listings)
+
+
+@pytest.mark.parametrize("opened", [False, True])
+async def test_closing_the_last_handle_under_a_read_ends_it(opened: bool) -> None:
+    async with rig(link=LinkSettings(delay=1.0)) as here:
+        here.put(LOG, DATA)
+        tree = here.mount()
+        if not opened:  # the reader is opened by the read
+            (await tree.open(LOG)).close()
+            await trio.sleep(5)
+        handle = await tree.open(LOG)
+
+        async def read() -> None:
+            with pytest.raises(LocalProtocolError):
+                await handle.read(0, 100)
+
+        async with trio.open_nursery() as readers:
+            readers.start_soon(read)
+            await trio.sleep(0.5)
+            began = trio.current_time()
+            handle.close()
+        assert trio.current_time() - began < 5
+        assert await read_file(tree, LOG) == DATA
