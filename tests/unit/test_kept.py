@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import AsyncIterator, Callable
 from pathlib import Path
-from typing import cast
 
 import pytest
 import trio
@@ -13,27 +12,25 @@ from mavftpfs.cache.directories import Directories
 from mavftpfs.cache.kept import CRC_LIMIT, SETTLED, KeptCache
 from mavftpfs.cache.kept_disk import KeptDisk
 from mavftpfs.cache.openfile import OpenFile
-from mavftpfs.cache.options import CacheOptions
-from mavftpfs.cache.remote import VehicleStore
 from mavftpfs.cache.tree import Tree
 from mavftpfs.cache.versions import BLOCK_SIZE, BlockCache
 from mavftpfs.protocol.payload import NakCode, Opcode
-from mavftpfs.shared.errors import FileChanged, FtpNak, SessionBusy
-from tests.support.fake_store import FakeStore, read_file
+from mavftpfs.shared.errors import FileChanged
+from tests.support.rigs import Rig, read_file, rig
 from tests.unit.test_files import DATA, LOG, content
 
 NOW = 1_800_000_000.0
 MTIME = 1_700_000_000
 ENOUGH = 2 * SETTLED + 1
+OPEN, CRC = Opcode.OPEN_FILE_RO, Opcode.CALC_FILE_CRC32
 
 
 class Mounts:
     """Mounts of one vehicle, one after the other, with one cache directory."""
 
-    def __init__(self, store: FakeStore, nursery: trio.Nursery, path: Path) -> None:
-        self.store = store
+    def __init__(self, here: Rig, path: Path) -> None:
+        self.here = here
         self.path = path
-        self.nursery = nursery
         self.vehicle: bytes | None = b"vehicle"
         self.crc_limit = 1 << 20
         self.growing: set[bytes] = set()
@@ -56,28 +53,22 @@ class Mounts:
                     directories,
                     blocks,
                     identity=lambda: self.vehicle,
-                    crc32=self.store.crc32,
+                    crc32=self.here.connection.store.crc32,
                     crc_limit=lambda: self.crc_limit,
                     wall=lambda: NOW,
                     run=self.run,
                 )
             )
-            self.nursery.start_soon(self.caches[-1].run)
+            self.here.nursery.start_soon(self.caches[-1].run)
             return self.caches[-1]
 
-        self.store.calls.clear()
-        return Tree(
-            cast(VehicleStore, self.store),
-            CacheOptions(read_only=True, **options),  # type: ignore[arg-type]
-            clock=trio.current_time,
-            invalidate=self.store.invalidated.append,
-            keep=keep,
-        )
+        self.here.faults.requests.clear()
+        return self.here.mount(keep=keep, **options)
 
-    async def read_and_settle(self, path: bytes = LOG) -> None:
-        """Read a file in a mount of its own, which ends after a while."""
+    async def read_and_settle(self) -> None:
+        """Read the file in a mount of its own, which ends after a while."""
         tree = self.mount()
-        assert await read_file(tree, path) == self.store.files[path].data
+        assert await read_file(tree, LOG) == self.here.data(LOG)
         await trio.sleep(ENOUGH)
 
     async def open_partly_kept(self) -> tuple[Tree, OpenFile]:
@@ -89,26 +80,31 @@ class Mounts:
         tree = self.mount()
         return tree, await tree.open(LOG)
 
-    def asked(self) -> list[str]:
-        """Return what was asked of the vehicle since the last mount, listings aside."""
-        return [call for call, *_ in self.store.calls if call != "list"]
+    def asked(self) -> tuple[int, int]:
+        """Return how often a file was opened, and a checksum asked for, since the last mount."""
+        return self.here.count(OPEN), self.here.count(CRC)
 
 
 @pytest.fixture
-async def mounts(nursery: trio.Nursery, tmp_path: Path) -> AsyncIterator[Mounts]:
-    store = FakeStore(nursery)
-    store.chunk = 16 * 1024
-    store.add(LOG, DATA, MTIME)
-    yield Mounts(store, nursery, tmp_path / "cache")
-    assert store.crimes == []
-    nursery.cancel_scope.cancel()
+async def mounts(tmp_path: Path) -> AsyncIterator[Mounts]:
+    """Of a server whose listings tell times."""
+    async with rig("mavsdk") as here:
+        here.put(LOG, DATA, MTIME)
+        yield Mounts(here, tmp_path / "cache")
+
+
+@pytest.fixture
+async def undated(tmp_path: Path) -> AsyncIterator[Mounts]:
+    """Of one whose listings tell none."""
+    async with rig("px4", {LOG: DATA}) as here:
+        yield Mounts(here, tmp_path / "cache")
 
 
 async def test_a_file_read_yesterday_costs_nothing(mounts: Mounts) -> None:
     await mounts.read_and_settle()
     tree = mounts.mount()
     assert await read_file(tree, LOG) == DATA
-    assert mounts.asked() == []
+    assert mounts.asked() == (0, 0)
 
 
 async def test_a_damaged_block_is_read_again(mounts: Mounts) -> None:
@@ -119,7 +115,7 @@ async def test_a_damaged_block_is_read_again(mounts: Mounts) -> None:
         path.write_bytes(data if number % 2 else data[:-1])
     tree = mounts.mount()
     assert await read_file(tree, LOG) == DATA
-    assert mounts.store.count("open") == 1
+    assert mounts.asked() == (1, 0)
 
 
 @pytest.mark.parametrize("change", ["size", "mtime", "vehicle", "unknown vehicle", "growing", "young"])
@@ -137,9 +133,9 @@ async def test_anything_else_is_read_again(mounts: Mounts, change: str) -> None:
         mounts.growing.add(LOG)
     else:
         mounts.vehicle = b"other" if change == "vehicle" else None
-    mounts.store.add(LOG, new, mtime)
+    mounts.here.put(LOG, new, mtime)
     assert await read_file(mounts.mount(), LOG) == new
-    assert mounts.store.count("open") == 1
+    assert mounts.asked() == (1, 0)
 
 
 @pytest.mark.parametrize(
@@ -147,7 +143,7 @@ async def test_anything_else_is_read_again(mounts: Mounts, change: str) -> None:
 )
 async def test_what_is_not_beyond_doubt_is_not_kept(mounts: Mounts, why: str) -> None:
     if why == "young":
-        mounts.store.add(LOG, DATA, int(NOW) - 1)
+        mounts.here.put(LOG, DATA, int(NOW) - 1)
     if why == "growing":
         mounts.growing.add(LOG)
     if why == "vehicle unknown":
@@ -157,7 +153,7 @@ async def test_what_is_not_beyond_doubt_is_not_kept(mounts: Mounts, why: str) ->
     for at in range(0, len(DATA), BLOCK_SIZE):
         await handle.read(at, BLOCK_SIZE)
     if why == "changed":
-        mounts.store.add(LOG, DATA, MTIME + 1)
+        mounts.here.put(LOG, DATA, MTIME + 1)
         await trio.sleep(6)
         await tree.list(b"/logs")
     if why == "other":
@@ -166,8 +162,7 @@ async def test_what_is_not_beyond_doubt_is_not_kept(mounts: Mounts, why: str) ->
         tree.rebooted()
     if why == "suspect":
         await trio.sleep(9)
-        for reader in mounts.store.readers:
-            reader.sink.on_suspect("somebody else")
+        mounts.here.connection.scheduler.doubt.raise_it("somebody else")
     await trio.sleep(SETTLED - 1 if why == "soon" else ENOUGH)
     assert mounts.caches[0].written == 0
     handle.close()
@@ -176,53 +171,43 @@ async def test_what_is_not_beyond_doubt_is_not_kept(mounts: Mounts, why: str) ->
 async def test_what_is_kept_is_no_part_of_the_file_that_came_by_a_restart(mounts: Mounts) -> None:
     tree, handle = await mounts.open_partly_kept()
     new = content(len(DATA), seed=8)
-    mounts.store.add(LOG, new, MTIME + 1)
+    mounts.here.put(LOG, new, MTIME + 1)
     await trio.sleep(1.0)
     tree.rebooted()
     assert await handle.read(0, len(DATA)) == new
     handle.close()
 
 
-async def test_without_an_mtime_a_checksum_decides(mounts: Mounts) -> None:
-    mounts.store.add(LOG, DATA, None)
-    await mounts.read_and_settle()
-    tree = mounts.mount()
-    assert await read_file(tree, LOG) == DATA
-    assert mounts.asked() == ["crc"]
+async def test_without_an_mtime_a_checksum_decides(undated: Mounts) -> None:
+    await undated.read_and_settle()
+    assert await read_file(undated.mount(), LOG) == DATA
+    assert undated.asked() == (0, 1)
     other = b"/logs/never_read"
-    mounts.store.add(other, DATA, None)
-    assert await read_file(mounts.mount(), other) == DATA
-    assert "crc" not in mounts.asked()
+    undated.here.put(other, DATA)
+    assert await read_file(undated.mount(), other) == DATA
+    assert undated.asked() == (1, 0)
     new = content(len(DATA), seed=9)
-    mounts.store.add(LOG, new, None)
-    assert await read_file(mounts.mount(), LOG) == new
-    assert mounts.store.count("open") == 1
+    undated.here.put(LOG, new)
+    assert await read_file(undated.mount(), LOG) == new
+    assert undated.asked() == (1, 1)
 
 
-@pytest.mark.parametrize("why", ["not allowed", "refused", "taken", "silent", "incomplete"])
-async def test_without_an_mtime_and_a_checksum_all_is_read(mounts: Mounts, why: str) -> None:
-    mounts.store.add(LOG, DATA, None)
-    await mounts.read_and_settle()
-    store = mounts.store
+@pytest.mark.parametrize("why", ["not allowed", "refused", "silent", "incomplete"])
+async def test_without_an_mtime_and_a_checksum_all_is_read(undated: Mounts, why: str) -> None:
+    await undated.read_and_settle()
     if why == "not allowed":
-        mounts.crc_limit = 0
+        undated.crc_limit = 0
     if why == "incomplete":
-        max((p for p in mounts.path.rglob("*") if p.is_file()), key=lambda p: p.stat().st_size).unlink()
-
-    async def refuse(path: bytes, *, size: int | None = None) -> int:
-        if why == "silent":
-            await trio.sleep(10 * CRC_LIMIT)
-        if why == "taken":
-            raise SessionBusy("by another ground station")
-        raise FtpNak(Opcode.CALC_FILE_CRC32, NakCode.FAIL)
-
-    if why in ("refused", "taken", "silent"):
-        store.crc32 = refuse  # type: ignore[method-assign]
-    tree = mounts.mount()
+        max((p for p in undated.path.rglob("*") if p.is_file()), key=lambda p: p.stat().st_size).unlink()
+    if why == "refused":
+        undated.here.faults.refuse(CRC, NakCode.FAIL)
+    if why == "silent":
+        undated.here.faults.ignore(CRC)
+    tree = undated.mount()
     began = trio.current_time()
     assert await read_file(tree, LOG) == DATA
     assert trio.current_time() - began < 2 * CRC_LIMIT
-    assert store.count("open") == 1
+    assert undated.here.count(OPEN) == 1
 
 
 async def test_a_full_disk_ends_the_keeping_not_the_reading(
@@ -248,7 +233,7 @@ async def test_a_handle_of_a_file_that_changed_gets_nothing_from_the_disk(mounts
     old = await tree.open(LOG)
     await old.read(0, 100)
     new = content(len(DATA), seed=3)
-    mounts.store.add(LOG, new, MTIME + 5)
+    mounts.here.put(LOG, new, MTIME + 5)
     await trio.sleep(6)
     assert await read_file(tree, LOG) == new
     with pytest.raises(FileChanged):
@@ -256,37 +241,36 @@ async def test_a_handle_of_a_file_that_changed_gets_nothing_from_the_disk(mounts
     old.close()
 
 
-async def test_a_file_that_changes_while_the_disk_is_slow(mounts: Mounts, nursery: trio.Nursery) -> None:
+async def test_a_file_that_changes_while_the_disk_is_slow(mounts: Mounts) -> None:
     await mounts.read_and_settle()
     tree = mounts.mount(dir_timeout=5)
     old = await tree.open(LOG)
     mounts.disk_delay = 10.0
     new = content(len(DATA), seed=3)
-    mounts.store.add(LOG, new, MTIME + 5)
+    mounts.here.put(LOG, new, MTIME + 5)
     await trio.sleep(6)
-    nursery.start_soon(tree.open, LOG)
+    mounts.here.nursery.start_soon(tree.open, LOG)
     assert await old.read(2 * BLOCK_SIZE, 100) == new[2 * BLOCK_SIZE :][:100]  # nothing was given out before
     assert await old.read(0, len(new)) == new
     old.close()
 
 
-@pytest.mark.parametrize("mtime", [MTIME, None])
+@pytest.mark.parametrize("dated", [True, False])
 async def test_a_file_that_changes_while_it_is_opened_from_the_disk(
-    mounts: Mounts, nursery: trio.Nursery, mtime: int | None
+    mounts: Mounts, undated: Mounts, dated: bool
 ) -> None:
-    mounts.store.add(LOG, DATA, mtime)
+    if not dated:
+        mounts = undated
     await mounts.read_and_settle()
     tree = mounts.mount(dir_timeout=5)
     await tree.list(b"/logs")
-    mounts.disk_delay = 4.0
+    new = content(len(DATA), seed=3)
+    mounts.disk_delay = 10.0 if dated else 4.0
 
     async def change() -> None:
         await trio.sleep(6)
-        mounts.store.add(LOG, new, mtime and mtime + 5)
+        mounts.here.put(LOG, new, MTIME + 5)
         await tree.list(b"/logs")
 
-    new = content(len(DATA), seed=3)
-    if mtime is not None:
-        mounts.disk_delay = 10.0
-    nursery.start_soon(change)
+    mounts.here.nursery.start_soon(change)
     assert await read_file(tree, LOG) == new
