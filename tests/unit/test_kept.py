@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import AsyncIterator, Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 import trio
@@ -42,7 +43,7 @@ class Mounts:
         await trio.sleep(self.disk_delay)
         return work(*args)
 
-    def mount(self, **options: object) -> Tree:
+    def mount(self, **options: Any) -> Tree:
         """Return a tree that knows nothing but what lies in the directory."""
 
         def keep(directories: Directories, blocks: BlockCache) -> KeptCache:
