@@ -61,7 +61,7 @@ class Endpoint:
                 if not chunks:
                     self._reset()
                 self.link.keep_peer()
-            if self._scope.cancelled_caught:
+            if self._scope.cancelled_caught or self.cut:
                 chunks = []
             now = trio.current_time()
             if self.model is None:
@@ -77,9 +77,6 @@ class Endpoint:
     def toggle_cut(self) -> bool:
         """Cut the link, or mend it; return whether it is cut now."""
         self.cut = not self.cut
-        if self.model is not None:
-            now = trio.current_time()
-            self.model.cut(now) if self.cut else self.model.restore(now)
         return self.cut
 
     def toggle_armed(self) -> bool:
@@ -108,16 +105,13 @@ class Endpoint:
         self._splitter.reset()
 
     def _exchange(self, chunks: list[bytes], now: float) -> None:
-        for chunk in chunks if not self.cut else ():
+        for chunk in chunks:
             self.vehicle.receive(chunk, now)
-            if (
-                self.vehicle.server.firmware.ready >= _ANSWER_AT
-            ):  # the client works on it while the next is served
-                self._answer(now)
-        self._answer(now)
+            if self.vehicle.server.firmware.ready >= _ANSWER_AT:
+                self._send(self.vehicle.outgoing(now))  # the client works on it while the next is served
+        self._send(self.vehicle.outgoing(now))
 
-    def _answer(self, now: float) -> None:
-        frames = self.vehicle.outgoing(now)
+    def _send(self, frames: list[bytes]) -> None:
         if frames and not self.cut:
             self.link.send_nowait(frames)
 
@@ -132,7 +126,7 @@ class Endpoint:
         for frame in self.vehicle.outgoing(now):
             model.push(Direction.TO_CLIENT, frame, now)
         for frame in model.pop(Direction.TO_CLIENT, now):
-            self.link.send_nowait([frame])  # one each: a radio's frames are lost one by one
+            self._send([frame])  # one each: a radio's frames are lost one by one
 
 
 def open_endpoint(text: str) -> AbstractAsyncContextManager[Link]:

@@ -102,16 +102,21 @@ def fail(number: int, path: bytes = b"") -> OSError:
 
 
 def split_path(path: bytes) -> list[bytes]:
-    """Split into names; empty names and `.` vanish, `..` stays.
+    """Split into names; empty names and `.` vanish, `..` takes the name before it away.
 
     Raises:
         OSError: ENAMETOOLONG for a name over 255 bytes, EINVAL for a NUL.
     """
     if b"\0" in path:
         raise fail(errno.EINVAL, path)
-    names = [name for name in path.split(b"/") if name not in (b"", b".")]
-    if any(len(name) > 255 for name in names):
-        raise fail(errno.ENAMETOOLONG, path)
+    names: list[bytes] = []
+    for name in path.split(b"/"):
+        if len(name) > 255:
+            raise fail(errno.ENAMETOOLONG, path)
+        if name == b"..":
+            names = names[:-1]
+        elif name not in (b"", b"."):
+            names.append(name)
     return names
 
 
@@ -123,15 +128,14 @@ def parent_and_name(path: bytes) -> tuple[bytes, bytes]:
 
 DEFAULT_MTIME = 1_700_000_000
 MAX_FILE = 256 * 2**20
-_MAX_LINKS = 8
 _DIRECTORY_SIZE = 4096
 _DOTS = (b".", b"..")
 
 
 class _Node:
-    """A file, directory, symlink or something else; `linked` until it is removed."""
+    """A file, directory or something else; `linked` until it is removed."""
 
-    __slots__ = ("children", "data", "kind", "linked", "mtime", "order", "target")
+    __slots__ = ("children", "data", "kind", "linked", "mtime", "order")
 
     def __init__(self, kind: Kind, mtime: int) -> None:
         self.kind = kind
@@ -139,16 +143,14 @@ class _Node:
         self.data = bytearray()
         self.children: dict[bytes, _Node] = {}
         self.order: dict[bytes, None] = {}
-        self.target = b""
         self.linked = True
 
     def stat(self) -> Stat:
-        size = _DIRECTORY_SIZE if self.kind is Kind.DIRECTORY else len(self.data) or len(self.target)
-        return Stat(self.kind, size, self.mtime)
+        return Stat(self.kind, _DIRECTORY_SIZE if self.kind is Kind.DIRECTORY else len(self.data), self.mtime)
 
 
 class MemoryTree:
-    """A tree in memory.
+    """A tree in memory, without symlinks.
 
     capacity: bytes all files together may hold; None = no limit. Single files end at 256 MiB (EFBIG).
     clock: tells new mtimes, seconds since 1970; a constant unless given.
@@ -189,14 +191,8 @@ class MemoryTree:
         if mtime is not None:
             self._find(path).mtime = mtime
 
-    def add_symlink(self, path: bytes, target: bytes) -> None:
-        """Put a symlink there; `target` may dangle."""
-        node = _Node(Kind.SYMLINK, self._now())
-        node.target = target
-        self._link(path, node)
-
     def add_other(self, path: bytes) -> None:
-        """Put a thing there that is neither file, directory nor symlink (a fifo, say)."""
+        """Put a thing there that is neither file nor directory (a fifo, say)."""
         self._link(path, _Node(Kind.OTHER, self._now()))
 
     def data(self, path: bytes) -> bytes:
@@ -251,7 +247,7 @@ class MemoryTree:
         target = new_parent.children.get(new_name)
         if target is node:
             return
-        if node in self._chain(new):
+        if node in self._walk(split_path(new)[:-1]):
             raise fail(errno.EINVAL, new)
         if target is not None:
             self._check_replaceable(node, target, new)
@@ -281,30 +277,15 @@ class MemoryTree:
     def _now(self) -> int:
         return int(self._clock()) if self._clock is not None else DEFAULT_MTIME
 
-    def _chain(self, path: bytes) -> list[_Node]:
-        """Return the nodes from the root to `path`'s parent, symlinks followed."""
-        return self._walk(split_path(path)[:-1])
-
     def _walk(self, names: list[bytes]) -> list[_Node]:
-        chain, pending, links = [self._root], list(reversed(names)), 0
-        while pending:
-            name = pending.pop()
+        """Return the nodes from the root to where these names lead."""
+        chain = [self._root]
+        for name in names:
             if chain[-1].kind is not Kind.DIRECTORY:
                 raise fail(errno.ENOTDIR, name)
-            if name == b"..":
-                chain = chain[:-1] or chain
-                continue
-            node = chain[-1].children.get(name)
-            if node is None:
+            if name not in chain[-1].children:
                 raise fail(errno.ENOENT, name)
-            if node.kind is Kind.SYMLINK:
-                links += 1
-                if links > _MAX_LINKS:
-                    raise fail(errno.ELOOP, name)
-                chain = [self._root] if node.target.startswith(b"/") else chain
-                pending += reversed(split_path(node.target))
-            else:
-                chain.append(node)
+            chain.append(chain[-1].children[name])
         return chain
 
     def _find(self, path: bytes) -> _Node:
@@ -320,7 +301,7 @@ class MemoryTree:
 
     def _parent(self, path: bytes) -> tuple[_Node, bytes]:
         names = split_path(path)
-        if not names or names[-1] == b"..":
+        if not names:
             raise fail(errno.EBUSY, path)
         parent = self._walk(names[:-1])[-1]
         if parent.kind is not Kind.DIRECTORY:
@@ -498,10 +479,7 @@ class DirectoryTree:
         os.rmdir(self._name(path))
 
     def _join(self, path: bytes) -> bytes:
-        names: list[bytes] = []
-        for name in split_path(path):
-            names = names[:-1] if name == b".." else [*names, name]
-        return os.path.join(self._root, *names)
+        return os.path.join(self._root, *split_path(path))
 
     def _inside(self, real: bytes) -> bytes:
         if real != self._root and not real.startswith(self._root + b"/"):

@@ -54,7 +54,6 @@ class FtpServer:
 
     tree: what it serves. profile: whose behaviour it has. rng: its stray memory and its bad luck.
     firmware: whose code answers, with its counters. requests: counts by opcode, of all that were handed in.
-    disabled: True = no request is answered (ArduPilot's BRD_OPTIONS can do that).
     """
 
     def __init__(
@@ -71,7 +70,6 @@ class FtpServer:
         self.address = address
         self.requests: Counter[int] = Counter()
         self.malformed = 0
-        self.disabled = False
         self._storage = Storage(tree, profile, rng, virtual)
         self.firmware = _FIRMWARES[profile.family](self._storage, profile, rng)
 
@@ -81,16 +79,15 @@ class FtpServer:
             self.malformed += 1
             return
         self.requests[wire[3]] += 1
-        firmware = self.firmware
-        if not self.disabled and not firmware.crashed:
-            firmware.handle(wire, source, now)
+        if not self.firmware.crashed:
+            self.firmware.handle(wire, source, now)
 
     def handle_run(self, wires: Sequence[bytes], source: Address, now: float) -> None:
         """Take payloads that came together: the same as one by one, in less time."""
         firmware = self.firmware
         alone = len(wires) == 1  # as over every link in memory, where tests look at each in `handle`
         unfit = firmware.crashed or any(len(wire) != PAYLOAD_SIZE for wire in wires)
-        if alone or unfit or self.disabled:
+        if alone or unfit:
             for wire in wires:
                 self.handle(wire, source, now)
             return
@@ -123,7 +120,7 @@ class FtpServer:
     @property
     def open_sessions(self) -> int:
         """How many sessions hold a file."""
-        return len(self.firmware.open_paths())
+        return len(self.open_paths)
 
 
 HEARTBEAT_PERIOD = 1.0

@@ -101,21 +101,6 @@ def test_directory_tree_does_not_block_on_a_fifo(tmp_path: Path) -> None:
     assert failure(lambda: DirectoryTree(tmp_path).open(b"/fifo")) == errno.ENXIO
 
 
-def test_memory_tree_follows_symlinks() -> None:
-    tree = MemoryTree()
-    tree.add(b"/a/b/file", b"data")
-    tree.add_symlink(b"/a/to_b", b"b")
-    tree.add_symlink(b"/absolute", b"/a/b/file")
-    tree.add_symlink(b"/loop", b"loop")
-    tree.add_symlink(b"/dangling", b"nowhere")
-    assert get(tree, b"/a/to_b/file") == b"data"
-    assert get(tree, b"/a/to_b/../b/file") == b"data"
-    assert get(tree, b"/absolute") == b"data"
-    assert failure(lambda: tree.stat(b"/loop")) == errno.ELOOP
-    assert failure(lambda: tree.stat(b"/dangling")) == errno.ENOENT
-    assert {entry.stat.kind for entry in tree.entries(b"/")} == {Kind.DIRECTORY, Kind.SYMLINK}
-
-
 def test_memory_tree_capacity_is_shared_and_given_back() -> None:
     tree = MemoryTree(capacity=10)
     tree.add(b"/a", b"123456")
