@@ -179,7 +179,7 @@ class _Delivery:
 
         print(
             "mavftpfs: not everything is on the vehicle yet: it is delivered for at most "
-            f"{readable_time(DRAIN_LIMIT)}, then the rest is kept in {recovered_directory(os.environ)}\n"
+            f"{readable_time(DRAIN_LIMIT)}, then the rest is kept in {recovered_directory()}\n"
             "mavftpfs: Ctrl-C ends only the waiting, not the delivery",
             file=sys.stderr,
             flush=True,
@@ -199,7 +199,7 @@ def left_by_killed_mounts_line() -> str:
     """Return a line about what killed mounts held, or ""."""
     from mavftpfs.farewell import left_by_killed_mounts
 
-    left = left_by_killed_mounts(os.environ)
+    left = left_by_killed_mounts()
     if not left:
         return ""
     places = ", ".join(sorted({str(data.parent) for data in left}))

@@ -6,13 +6,13 @@ import logging
 import os
 import re
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from random import SystemRandom
-from typing import Protocol
 
 from mavftpfs.cache.recovery import SpoolDirectory, left_in
+from mavftpfs.cache.tree import Tree
 from mavftpfs.link.messages import Address
 from mavftpfs.shared.errors import MavftpfsError
 
@@ -22,69 +22,53 @@ DRAIN_LIMIT = 300.0
 """Seconds to go on delivering after the kernel let go; a second signal ends it sooner."""
 
 
-class Holder(Protocol):
-    """What may still hold bytes the vehicle does not have (cache.tree.Tree)."""
-
-    def undelivered(self) -> Sequence[bytes]: ...
-    async def drain(self, timeout: float) -> Sequence[bytes]: ...
-    def recover_to(self, directory: Path) -> Sequence[Path]: ...
-
-
-def state_directory(environment: Mapping[str, str]) -> Path:
-    """Return where this user's programs keep what must survive them (XDG base directories)."""
-    given = environment.get("XDG_STATE_HOME", "")
-    return Path(given) if given.startswith("/") else Path.home() / ".local" / "state"
+def state_directory() -> Path:
+    """Return where this user's mounts keep what must survive them (XDG base directories)."""
+    given = os.environ.get("XDG_STATE_HOME", "")
+    base = Path(given) if given.startswith("/") else Path.home() / ".local" / "state"
+    return base / "mavftpfs"
 
 
-def recovered_directory(environment: Mapping[str, str]) -> Path:
+def recovered_directory() -> Path:
     """Return where all mounts of this user leave what did not reach a vehicle."""
-    return state_directory(environment) / "mavftpfs" / "recovered"
+    return state_directory() / "recovered"
 
 
-def recovery_directory(environment: Mapping[str, str], source: str, at: float) -> Path:
-    """Return a new name for what one mount leaves behind; `at` is seconds since 1970."""
-    when = time.strftime("%Y%m%d-%H%M%S", time.localtime(at))
+def recovery_directory(source: str) -> Path:
+    """Return a new name for what one mount leaves behind now."""
     what = re.sub(r"[^A-Za-z0-9._-]+", "_", source)[:60]
-    return recovered_directory(environment) / f"{when}-{os.getpid()}-{what}"
+    return recovered_directory() / f"{time.strftime('%Y%m%d-%H%M%S')}-{os.getpid()}-{what}"
 
 
-async def deliver(holder: Holder, limit: float = DRAIN_LIMIT) -> None:
-    """Deliver what is held, saying so, for at most `limit` seconds."""
-    waiting = holder.undelivered()
-    if not waiting:
-        return
-    log.warning("delivering %d file(s) to the vehicle before ending", len(waiting))
-    await holder.drain(limit)
-
-
-def keep_the_rest(holder: Holder, choose: Callable[[], Path]) -> str:
+def keep_the_rest(tree: Tree, directory: Path) -> str:
     """Move what is still undelivered to a local directory; return the line that says so, or ""."""
-    left = holder.undelivered()
+    left = tree.undelivered()
     if not left:
         return ""
-    directory = choose()
+    lost = f"{len(left)} file(s) did not reach the vehicle"
     try:
-        kept = holder.recover_to(directory)
+        kept = tree.recover_to(directory)
     except OSError as exc:
-        return (
-            f"{len(left)} file(s) did not reach the vehicle, and {directory} is not writable: {exc.strerror}"
-        )
+        return f"{lost}, and {directory} is not writable: {exc.strerror}"
     except MavftpfsError as exc:
-        return f"{len(left)} file(s) did not reach the vehicle, and could not be moved to {directory}: {exc}"
+        return f"{lost}, and could not be moved to {directory}: {exc}"
     if len(kept) == len(left):
-        return f"{len(left)} file(s) did not reach the vehicle; they are kept in {directory}"
+        return f"{lost}; they are kept in {directory}"
     return (
-        f"{len(left)} file(s) did not reach the vehicle; only {len(kept)} could be kept, in {directory}; "
+        f"{lost}; only {len(kept)} could be kept, in {directory}; "
         "the log says why, and the next mount looks for the others"
     )
 
 
-async def say_goodbye(holder: Holder, source: str, tell: Callable[[str], None]) -> None:
+async def say_goodbye(tree: Tree, source: str, tell: Callable[[str], None]) -> None:
     """Deliver or keep; `tell` gets the line that goes with exit code 4. Keeps also when cancelled."""
     try:
-        await deliver(holder)
+        waiting = tree.undelivered()
+        if waiting:
+            log.warning("delivering %d file(s) to the vehicle before ending", len(waiting))
+            await tree.drain(DRAIN_LIMIT)
     finally:
-        message = keep_the_rest(holder, lambda: recovery_directory(os.environ, source, time.time()))
+        message = keep_the_rest(tree, recovery_directory(source))
         if message:
             log.error("%s", message)
             tell(message)
@@ -93,17 +77,16 @@ async def say_goodbye(holder: Holder, source: str, tell: Callable[[str], None]) 
 # -- what an earlier mount left ---------------------------------------------------------------------
 
 
-def spool_base(environment: Mapping[str, str], vehicle: Address | None) -> Path:
+def spool_base(vehicle: Address | None) -> Path:
     """Return where the mounts of one vehicle keep what they hold: by its address, whatever the link."""
     name = "unknown" if vehicle is None else f"{vehicle.system}-{vehicle.component}"
-    return state_directory(environment) / "mavftpfs" / "spool" / name
+    return state_directory() / "spool" / name
 
 
-def left_by_killed_mounts(environment: Mapping[str, str]) -> list[Path]:
+def left_by_killed_mounts() -> list[Path]:
     """Return what killed mounts of this user hold that no vehicle has; the next mount of each offers it."""
-    spools = state_directory(environment) / "mavftpfs" / "spool"
     try:
-        slots = sorted(spools.glob("*/slot*"))
+        slots = sorted((state_directory() / "spool").glob("*/slot*"))
     except OSError:  # another user's, who left us his environment
         return []
     return [data for slot in slots for data in left_in(slot)]
@@ -112,7 +95,7 @@ def left_by_killed_mounts(environment: Mapping[str, str]) -> list[Path]:
 @contextmanager
 def spool_for(vehicle: Address | None) -> Iterator[SpoolDirectory | None]:
     """Claim a spool directory for the length of the body; None if this user can have none."""
-    base = spool_base(os.environ, vehicle)
+    base = spool_base(vehicle)
     try:
         spool = SpoolDirectory(base, SystemRandom())
     except OSError as exc:
@@ -127,7 +110,7 @@ def spool_for(vehicle: Address | None) -> Iterator[SpoolDirectory | None]:
 
 def rescue(spool: SpoolDirectory, source: str) -> str:
     """Move what a killed mount of this vehicle left to a recovery directory; return a line on it, or ""."""
-    directory = recovery_directory(os.environ, source, time.time())
+    directory = recovery_directory(source)
     try:
         found = spool.rescue(directory)
     except OSError as exc:

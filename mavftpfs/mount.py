@@ -20,16 +20,17 @@ from contextlib import AbstractAsyncContextManager, asynccontextmanager, context
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import pyfuse3
 import trio
 
 import mavftpfs
+from mavftpfs.cache.tree import Tree
 from mavftpfs.compose import NO_SINKS, Sinks, attached
 from mavftpfs.control import ControlServer, Reply
-from mavftpfs.farewell import Holder, say_goodbye
-from mavftpfs.fuse.handles import InodeTable, Presentation, Space, Tree
+from mavftpfs.farewell import say_goodbye
+from mavftpfs.fuse.handles import InodeTable, Presentation, Space
 from mavftpfs.fuse.operations import Operations
 from mavftpfs.fuse.options import MountOptions, fuse_words
 from mavftpfs.link.uri import LinkSpec
@@ -65,16 +66,12 @@ class MountRequest:
     sinks: Sinks = NO_SINKS
 
 
-class MountedTree(Tree, Holder, Protocol):
-    """What a mount needs of cache.tree.Tree."""
-
-
 @dataclass(frozen=True, slots=True)
 class Content:
     """What is behind a mount. notice: called once it is up, gives a line for whoever mounts, or "".
     forget: has what is cached asked for again. watch: runs beside it until the end."""
 
-    tree: MountedTree
+    tree: Tree
     status: Callable[[], dict[str, Any]] = dict
     space: Callable[[], Space | None] = lambda: None
     notice: Callable[[], str] = str

@@ -1,5 +1,6 @@
-"""What the kernel calls by number: inodes and handles; and what the operations need of the tree. Layer: fuse;
-pure. Without pyfuse3, so that commands that mount nothing work where there is no libfuse3.
+"""What the kernel calls by number: inodes and handles. Layer: fuse; pure.
+
+Without pyfuse3, so that commands that mount nothing work where there is no libfuse3.
 
 The kernel knows a file by number and says with forget how many of our answers it dropped. A number
 is a hash of the path at the time it was given out, so it is the same after the kernel forgot it, and in
@@ -24,9 +25,10 @@ from collections import OrderedDict
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Any, Generic, TypeVar
 
 from mavftpfs.cache.attributes import Stat
+from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.shared.model import ROOT, EntryKind
 
 XATTR_CRC32 = b"user.mavftp.crc32"
@@ -52,27 +54,6 @@ class Presentation:
     op_deadline: float
 
 
-class File(Protocol):
-    """An open file (cache.writefile.OpenFile says more). size in bytes."""
-
-    @property
-    def size(self) -> int: ...
-    @property
-    def direct_io(self) -> bool: ...
-    @property
-    def keep_cache(self) -> bool: ...
-    @property
-    def writable(self) -> bool: ...
-    async def read(self, offset: int, size: int) -> bytes | memoryview: ...
-    async def write(self, offset: int, data: bytes) -> int: ...
-    async def truncate(self, size: int) -> None: ...
-    async def flush(self) -> None: ...
-    async def fsync(self) -> None: ...
-    async def release(self) -> None: ...
-    def close(self) -> None: ...
-    def give_up(self) -> None: ...
-
-
 @contextmanager
 def closed_on_failure(close: Callable[[], None]) -> Iterator[None]:
     """Close a file whose opening fails after all: the kernel sends no release for it."""
@@ -92,29 +73,12 @@ def is_mapped_page(start: int, stop: int, told: int) -> bool:
     return start < told and start % mmap.PAGESIZE == 0 and (stop == told or stop % mmap.PAGESIZE == 0)
 
 
-class Tree(Protocol):
-    """The vehicle's files behind their caches (cache.tree.Tree); raises only MavftpfsError."""
-
-    async def stat(self, path: bytes) -> Stat: ...
-    def negative_valid_for(self, path: bytes) -> float: ...
-    async def list(self, path: bytes) -> Sequence[tuple[bytes, Stat]]: ...
-    async def crc32(self, path: bytes) -> int: ...
-    async def open(self, path: bytes, *, write: bool = False, truncate: bool = False) -> File: ...
-    async def create(self, path: bytes, *, exclusive: bool) -> File: ...
-    async def truncate(self, path: bytes, size: int) -> None: ...
-    async def set_times(self, path: bytes, mtime_ns: int) -> None: ...
-    async def mkdir(self, path: bytes) -> None: ...
-    async def rmdir(self, path: bytes) -> None: ...
-    async def unlink(self, path: bytes) -> None: ...
-    async def rename(self, old: bytes, new: bytes, *, noreplace: bool = False) -> None: ...
-
-
 @dataclass(slots=True)
 class FileHandle:
     """One open() of a file. flags: as given to open(2)."""
 
     ino: int
-    file: File
+    file: OpenFile
     flags: int = 0
 
 

@@ -29,6 +29,7 @@ import trio
 from pyfuse3 import EntryAttributes, FileInfo, FUSEError, RequestContext, SetattrFields, StatvfsData
 
 from mavftpfs.cache.attributes import Stat
+from mavftpfs.cache.tree import Tree
 from mavftpfs.fuse.handles import (
     ROOT_INO,
     XATTR_CRC32,
@@ -40,7 +41,6 @@ from mavftpfs.fuse.handles import (
     InodeTable,
     Presentation,
     Space,
-    Tree,
     UserAttributeTable,
     closed_on_failure,
     is_mapped_page,

@@ -14,12 +14,14 @@ import stat
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeAlias, TypeVar
 
 import trio
 
 from mavftpfs import control, report
 from mavftpfs.cache.attributes import Stat
+from mavftpfs.cache.openfile import OpenFile
+from mavftpfs.cache.tree import Tree
 from mavftpfs.compose import NO_SINKS, Attached, Sinks, attached, no_answer, plain_nursery
 from mavftpfs.fuse.handles import XATTR_CRC32
 from mavftpfs.fuse.options import MountOptions
@@ -34,44 +36,9 @@ from mavftpfs.shared.readable import name_text
 
 READ_SIZE = 128 * 1024
 
-
-class File(Protocol):
-    """An open file; see cache.openfile.OpenFile."""
-
-    @property
-    def size(self) -> int: ...
-
-    async def read(self, offset: int, size: int) -> bytes | memoryview: ...
-
-    async def write(self, offset: int, data: bytes | memoryview) -> int: ...
-
-    async def fsync(self) -> None: ...
-
-    def close(self) -> None: ...
-
-
-class Files(Protocol):
-    """A tree of files; all calls raise only MavftpfsError. See cache.tree.Tree."""
-
-    async def stat(self, path: bytes) -> Stat: ...
-
-    async def list(self, path: bytes) -> list[tuple[bytes, Stat]]: ...
-
-    async def open(self, path: bytes, *, write: bool = False, truncate: bool = False) -> File: ...
-
-    async def create(self, path: bytes, *, exclusive: bool) -> File: ...
-
-    async def crc32(self, path: bytes) -> int: ...
-
-    async def mkdir(self, path: bytes) -> None: ...
-
-    async def rmdir(self, path: bytes) -> None: ...
-
-    async def unlink(self, path: bytes) -> None: ...
-
-    async def rename(self, old: bytes, new: bytes) -> None: ...
-
-    def forget_caches(self) -> None: ...
+Files: TypeAlias = "Tree | MountedFiles"
+"""A tree of files. All calls raise only MavftpfsError."""
+File: TypeAlias = "OpenFile | MountedFile"
 
 
 Acknowledged = Mapping[str, int]

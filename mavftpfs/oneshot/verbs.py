@@ -320,7 +320,7 @@ def mv(args: Args) -> int:
 
 def recover(args: Args) -> int:
     """List what did not reach a vehicle, or put it where it belonged."""
-    base = recovered_directory(os.environ)
+    base = recovered_directory()
     if args.source is None:
         _list_kept(recovering.kept_below(base), as_json=args.json)
         return ExitCode.OK

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import random
 import re
 import subprocess
@@ -26,7 +25,7 @@ def test_a_mount_that_fails_takes_no_news_away(
     state = tmp_path / "state"
     state.mkdir()
     monkeypatch.setenv("XDG_STATE_HOME", str(state))
-    dead = SpoolDirectory(spool_base(os.environ, Address(1, 1)), random.Random(1))
+    dead = SpoolDirectory(spool_base(Address(1, 1)), random.Random(1))
     (dead.path / "000001.data").write_bytes(b"held")
     dead.close()
     source = field.sim(field.local("card")).source

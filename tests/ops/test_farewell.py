@@ -7,6 +7,7 @@ import random
 import stat
 from collections.abc import Sequence
 from pathlib import Path
+from typing import cast
 
 import pytest
 import trio
@@ -14,6 +15,7 @@ import trio.testing
 
 from mavftpfs import farewell
 from mavftpfs.cache.recovery import SpoolDirectory
+from mavftpfs.cache.tree import Tree
 from mavftpfs.link.messages import Address
 from tests.ops.faketree import FakeTree
 
@@ -39,7 +41,7 @@ class Patient(FakeTree):
 
 async def end_of(tree: FakeTree) -> list[str]:
     said: list[str] = []
-    await farewell.say_goodbye(tree, "udpin:0.0.0.0:14550", said.append)
+    await farewell.say_goodbye(cast(Tree, tree), "udpin:0.0.0.0:14550", said.append)
     return said
 
 
@@ -60,7 +62,7 @@ async def test_a_second_signal_ends_the_delivery_and_not_the_keeping() -> None:
     said: list[str] = []
     with trio.CancelScope() as scope:
         async with trio.open_nursery() as nursery:
-            nursery.start_soon(farewell.say_goodbye, tree, "x", said.append)
+            nursery.start_soon(farewell.say_goodbye, cast(Tree, tree), "x", said.append)
             await trio.testing.wait_all_tasks_blocked()
             scope.cancel()
     assert scope.cancelled_caught

@@ -15,6 +15,7 @@ import trio
 import trio.testing
 from pyfuse3 import FUSEError, RequestContext
 
+from mavftpfs.cache.tree import Tree
 from mavftpfs.fuse.handles import ROOT_INO, XATTR_CRC32, XATTR_STATUS, Presentation, Space
 from mavftpfs.fuse.operations import (
     UNKNOWN_SPACE,
@@ -33,7 +34,7 @@ def some_tree() -> FakeTree:
 
 
 def operations(tree: FakeTree | None = None, **more: Any) -> Operations:
-    return Operations(tree or some_tree(), LOOK, **more)
+    return Operations(cast(Tree, tree or some_tree()), LOOK, **more)
 
 
 async def failure(call: Coroutine[Any, Any, object]) -> int:

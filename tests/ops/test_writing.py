@@ -12,6 +12,7 @@ import pyfuse3
 import pytest
 from pyfuse3 import EntryAttributes, RequestContext, SetattrFields
 
+from mavftpfs.cache.tree import Tree
 from mavftpfs.fuse.handles import ROOT_INO, Presentation
 from mavftpfs.fuse.operations import Operations
 from mavftpfs.shared.errors import Armed, NoSpace, RequestTimeout
@@ -28,7 +29,7 @@ def some_tree() -> FakeTree:
 
 
 def operations(tree: FakeTree | None = None, **more: Any) -> Operations:
-    return Operations(tree or some_tree(), LOOK, **more)
+    return Operations(cast(Tree, tree or some_tree()), LOOK, **more)
 
 
 class Fields:
