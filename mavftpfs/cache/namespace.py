@@ -31,7 +31,6 @@ from mavftpfs.shared.errors import (
     FtpNak,
     InvalidMove,
     IsADirectory,
-    MavftpfsError,
     NoSpace,
     NotADirectory,
     NotFound,
@@ -103,17 +102,16 @@ class Namespace:
             await self._rename(old, new, noreplace=noreplace)
 
     async def release(self, node: Node) -> None:
-        """Nobody has an unlinked file open any more: remove what was hidden of it.
-
-        Raises:
-            As VehicleStore.remove; the next listing of the directory removes it then.
-        """
+        """Nobody has an unlinked file open any more: remove what was hidden of it. If that cannot be now, the
+        next listing of its directory has it removed."""
         node.drop_draft()
-        while node.hidden and not node.handles:
-            path = node.path
-            async with self._context.paths.hold(path):  # a directory above it may be about to move
-                if node.path == path and node.hidden:
-                    await self._remove_hidden(node)
+        if not node.hidden:
+            return
+        async with self._context.paths.steady(node) as path:  # a directory above it may be about to move
+            self._context.nodes.forget_hidden(node)
+            self._context.own.live.discard(path)
+            await self._names.discard(path)
+            self._context.files.on_changed(path)
 
     @asynccontextmanager
     async def _claim(self, path: bytes) -> AsyncIterator[None]:
@@ -273,21 +271,4 @@ class Namespace:
         self._context.files.on_renamed(node.path, hidden)
         self._context.nodes.hide(node, hidden)
         if not node.handles:  # the last one was closed before there was anything to remove
-            try:
-                await self._remove_hidden(node)
-            except MavftpfsError as error:
-                log.info("%r stays until its directory is listed again: %s", hidden, error)
-
-    async def _remove_hidden(self, node: Node) -> None:
-        """Remove what was hidden of a file that nobody has open; the caller holds its path alone.
-
-        Raises:
-            As VehicleStore.remove; the next listing of the directory removes it then.
-        """
-        context = self._context
-        try:
-            await self._names.remove_if_there(node.path)
-        finally:
-            context.nodes.forget_hidden(node)
-            context.own.live.discard(node.path)
-        context.files.on_changed(node.path)
+            await self.release(node)
