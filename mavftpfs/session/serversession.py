@@ -260,10 +260,13 @@ class ServerSession:
         """Open, by one remedy after the other while that is refused because a session is taken."""
         remedies, resent = _Remedies(), False
         while True:
-            asked, traits = self.engine.home_session, self.engine.traits
+            asked, echoes = self.engine.home_session, self.engine.traits.ack_carries_own_session
             operation = OpenFile(opcode, wire_path(path), session=asked)
-            # A time-out or a cancellation leaves it so: the open may have been carried out.
-            self.maybe_open[0 if traits.ack_carries_own_session is False else asked] = path
+            # A time-out or a cancellation leaves it so: the open may have been carried out, under either id.
+            if echoes is not False:
+                self.maybe_open[asked] = path
+            if not echoes:
+                self.maybe_open[0] = path
             try:
                 await self.driver.run(operation)
             except FtpNak as nak:
@@ -271,8 +274,7 @@ class ServerSession:
                 ours = self._may_be_ours(nak)
                 # ArduPilot's 1 may mean that the session is open under our id, by an open whose ACK was lost;
                 # else it is a plain failure.
-                echoes = self.engine.traits.ack_carries_own_session is not False
-                taken = nak.code in _OPEN_TAKEN or (nak.code == NakCode.FAIL and ours and echoes)
+                taken = nak.code in _OPEN_TAKEN or (nak.code == NakCode.FAIL and ours and echoes is not False)
                 if not ours or not taken:
                     self.maybe_open.clear()
                 if not taken:
@@ -352,15 +354,7 @@ class ServerSession:
         closed = False
         for session in list(self.maybe_open):
             if session != 0 or not self._others_heard():
-                already_closed = await self._try(Simple(Opcode.TERMINATE_SESSION, session=session))
-                if (
-                    already_closed
-                    and session
-                    and self.engine.traits.ack_carries_own_session is None
-                    and not self._others_heard()
-                ):
-                    # The server may have given us that id instead.
-                    await self._try(Simple(Opcode.TERMINATE_SESSION, session=0))
+                await self._try(Simple(Opcode.TERMINATE_SESSION, session=session))
                 closed = True
             self.maybe_open.pop(session, None)
         return closed
@@ -431,21 +425,18 @@ class ServerSession:
             return True
         return self._may_be_ours(nak) and await self._close_what_may_be_ours()
 
-    async def _try(self, operation: Operation) -> bool:
-        """Run a remedy whose refusal changes nothing; return whether there was no such session.
+    async def _try(self, operation: Operation) -> None:
+        """Run a remedy whose refusal changes nothing.
 
         Raises:
             RequestTimeout: that is the caller's news.
         """
         try:
             await self.driver.run(operation)
-        except FtpNak as nak:
-            return nak.code == NakCode.INVALID_SESSION
         except RequestTimeout:
             raise
         except MavftpfsError:
             pass
-        return False
 
     def _others_heard(self) -> bool:
         return self.vehicle.foreign_client(self.clock())

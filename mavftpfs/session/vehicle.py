@@ -257,7 +257,7 @@ class Vehicle:
             raise Armed("the vehicle is armed: nothing is written in flight")
         if self.identity.standing is Standing.STRANGER:
             raise VehicleLost("another vehicle answers in place of the one that was mounted")
-        if self._timed_out and self.silence(now) > SILENCE_LIMIT:
+        if self.lost(now):
             raise VehicleLost("the vehicle is silent; waiting for its heartbeat")
 
     def foreign_client(self, now: float) -> bool:

@@ -106,16 +106,6 @@ class ExtentSet:
         index = bisect_right(self._starts, start) - 1
         return index >= 0 and self._stops[index] >= stop
 
-    def __contains__(self, offset: int) -> bool:
-        return self.covers(offset, offset + 1)
-
-    def overlaps(self, start: int, stop: int) -> bool:
-        """Return whether any byte of [start, stop) is in the set."""
-        if start >= stop:
-            return False
-        index = bisect_right(self._stops, start)
-        return index < len(self._starts) and self._starts[index] < stop
-
     def missing(self, start: int, stop: int) -> list[tuple[int, int]]:
         """Return the ranges of [start, stop) that are not in the set, ascending."""
         if not self._stops or start >= self._stops[-1]:
