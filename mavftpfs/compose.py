@@ -233,7 +233,6 @@ def subscribe(connection: Connection, tree: Tree) -> None:
     reactions: dict[str, Callable[[], None]] = {
         "reboot": tree.rebooted,
         "back": tree.link_back,
-        "lost": tree.link_lost,
         "armed": partial(tree.armed_changed, True),
         "disarmed": partial(tree.armed_changed, False),
     }

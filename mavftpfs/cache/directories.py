@@ -7,7 +7,7 @@ Expired listings are kept to be served while the vehicle is out of reach.
 A listing takes many requests, and a change made by us meanwhile may show in it or not. So each sweep under
 way is a `Sweep` in which every change of ours is written down, and what was written down beats what the sweep
 saw. The entries behind a changed name shifted between the sweep's pages (servers.md 6, "Concurrent change"):
-so the result is incomplete and expires at once.
+so the result expires at once.
 
 Only a path that its parent's listing shows as a directory is listed: listing a file ends a MAVSDK server
 (servers.md 6), so a path is walked from the root. A walk costs nothing where listings are fresh.
@@ -70,8 +70,7 @@ class Directory:
     """A remembered listing.
 
     entries: by name, as listed. listed_at: when the sweep began, ended_at: when it was done; fresh_until:
-    after that it proves nothing. complete: whether a name that is not in it is absent. cut_short: the vehicle
-    did not list it to its end.
+    after that it proves nothing. complete: the vehicle listed it to its end.
     sizes: what opening told about an entry since, which beats the listing. growing: when a file was last seen
     to be larger than before, though we did not write it. proven: when the vehicle last confirmed that we gave
     a name to what is listed there.
@@ -82,7 +81,6 @@ class Directory:
     ended_at: float
     fresh_until: float
     complete: bool
-    cut_short: bool
     sizes: dict[bytes, int] = field(default_factory=dict)
     growing: dict[bytes, float] = field(default_factory=dict)
     proven: dict[bytes, float] = field(default_factory=dict)
@@ -124,7 +122,7 @@ class Directories:
 
     Attributes:
         ask_size: opens a file and returns its size. on_listed: called with each listing as it is made;
-            on_swept: before it is given out. lost: the vehicle is out of reach.
+            on_swept: before it is given out.
         tells_times: whether any listing told an mtime. sweeps: how many listings were asked for.
     """
 
@@ -147,7 +145,6 @@ class Directories:
         self._sweeping: SingleFlight[bytes, Directory] = SingleFlight(nursery)
         self.on_swept: Callable[[bytes, Directory], Awaitable[None]] | None = None
         self.on_listed: list[Callable[[bytes, Directory], None]] = []
-        self.lost = False
         self.sweeps = 0
         self.rebooted()
 
@@ -271,7 +268,7 @@ class Directories:
         parent, name = split(path)
         directory = await self.get(parent)
         entry = directory.entries.get(name)
-        if entry is None and directory.cut_short and name:
+        if entry is None and not directory.complete and name:
             try:
                 entry = DirEntry(name, EntryKind.FILE, await self.ask_size(path))
             except FtpNak as nak:
@@ -327,7 +324,7 @@ class Directories:
         raise VehicleLost("the vehicle does not answer")
 
     async def get(self, path: bytes) -> Directory:
-        """Return a directory's listing: fresh, else swept, else (the vehicle being silent) expired.
+        """Return a directory's listing: fresh, else swept, else (the vehicle being lost) expired.
 
         Raises:
             NotFound, NotADirectory; else as RemoteStore.list_directory.
@@ -336,8 +333,6 @@ class Directories:
         if directory is not None and self.clock() < directory.fresh_until:
             return directory
         try:
-            if self.lost and directory is not None:
-                raise VehicleLost("no heartbeats")
             if path == self._options.root:
                 await self._walk_to_root()
             elif path != ROOT and (await self.find(path)).entry.kind is not EntryKind.DIRECTORY:
@@ -434,7 +429,7 @@ class Directories:
     def remember(self, sweep: Sweep, listing: Listing) -> Directory:
         """Remember a listing and return it, our own changes applied."""
         now, old = self.clock(), self._known.get(sweep.path)
-        if not (listing.complete or (old is not None and old.cut_short)):
+        if not (listing.complete or (old is not None and not old.complete)):
             count = len(listing.entries)
             log.warning(
                 "%r was not listed to its end: %d names of it are known, and reading it is an error",
@@ -455,8 +450,7 @@ class Directories:
             life = max(DIR_TIMEOUT, COST_FACTOR * listing.took)
         if sweep.changes or sweep.void:
             life = 0.0
-        complete = listing.complete and not sweep.changes
-        new = Directory(entries, sweep.began, now, now + life, complete, not listing.complete)
+        new = Directory(entries, sweep.began, now, now + life, listing.complete)
         if old is not None:
             _see_growth(old, new, sweep)
         if not sweep.void:

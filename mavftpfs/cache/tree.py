@@ -177,7 +177,7 @@ class Tree:
                 shown[name] = self._draft_stat(node.path, node.draft)
         for name in self._local.names(remote):
             shown[name] = self._local.stat(join(remote, name))
-        if directory.cut_short:
+        if not directory.complete:
             raise ListingIncomplete(f"{remote!r} was not listed to its end", list(shown.items()))
         return list(shown.items())
 
@@ -380,13 +380,8 @@ class Tree:
             "listings_asked": self._directories.sweeps,
         }
 
-    def link_lost(self) -> None:
-        """Heartbeats stopped: expired listings are served until link_back."""
-        self._directories.lost = True
-
     def link_back(self) -> None:
         """Heartbeats are back."""
-        self._directories.lost = False
         self._writing.retry()
 
     def rebooted(self) -> None:

@@ -147,7 +147,7 @@ class VirtualTrees:
         found = await self._find(path)
         seen = self._look(path)
         known = self._clock() < seen.until
-        if not known and self._is_read_to_know(path, found) and not self._directories.lost:
+        if not known and self._is_read_to_know(path, found):
             try:
                 await self._read(path)
             except (FtpNak, DataUnproven, LinkError, SessionBusy):
@@ -179,7 +179,7 @@ class VirtualTrees:
         """
         tree = tree_of(path)
         founds: dict[bytes, Found | None] = {}
-        cut_short = False
+        complete = True
         if tree in UNLISTABLE:
             if path != b"/" + tree:
                 raise NotADirectory(f"{path!r} is not a directory")
@@ -188,7 +188,7 @@ class VirtualTrees:
                 founds[join(path, name)] = None
         else:
             directory = await self._directories.get(path)
-            cut_short = directory.cut_short
+            complete = directory.complete
             for name, entry in directory.entries.items():
                 founds[join(path, name)] = Found(entry, directory)
         await self._read_unread(founds)
@@ -198,7 +198,7 @@ class VirtualTrees:
             for child, found in founds.items()
             if self.absent_until(child) <= now
         ]
-        if cut_short:
+        if not complete:
             raise ListingIncomplete(f"{path!r} was not listed to its end", shown)
         return shown
 

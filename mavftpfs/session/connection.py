@@ -109,7 +109,7 @@ class Connection:
         raise VehicleLost(f"no vehicle on {self.link.description} within {timeout:g} s{self._heard()}")
 
     def subscribe(self, listener: Callable[[str], None]) -> None:
-        """Have `listener` called with "reboot", "armed", "disarmed", "lost" or "back"."""
+        """Have `listener` called with "reboot", "armed", "disarmed" or "back"."""
         self.news.append(listener)
 
     def status(self) -> dict[str, dict[str, Any]]:
@@ -215,7 +215,7 @@ class Connection:
     # --- what runs as long as the connection
 
     async def _beat(self) -> None:
-        """Each second: send a heartbeat, tell the window who else is about, tell when the vehicle is lost.
+        """Each second: send a heartbeat, tell the window who else is about, note when the vehicle is lost.
 
         Ours are an onboard controller's: those of a GCS would feed the GCS-loss failsafe (promise 6).
         """
@@ -228,7 +228,6 @@ class Connection:
             await trio.sleep(HEARTBEAT_PERIOD)
             if not self.was_lost and self.vehicle.lost(self.clock()):
                 self.was_lost = True
-                self._tell("lost")
 
     async def _ask_about_vehicle(self) -> None:
         """Ask who it is, when it started, and for its card, a few times: none of that is needed. Ask for the

@@ -198,7 +198,6 @@ class Session:
             await trio.sleep(self.rng.choice([1, 25]))
         elif trouble == "lost":
             self.store.lost = not self.store.lost
-            (self.tree.link_lost if self.store.lost else self.tree.link_back)()
         else:
             self.reboot()
 

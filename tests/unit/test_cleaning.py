@@ -45,9 +45,7 @@ async def test_only_a_listing_that_counts_proves_a_torn_name_whole(store: FakeWr
     place = DIRECTORY + b"/" + reserved(tree, Kind.OLD)
     context.own.torn[FILE] = place
     now = trio.current_time()
-    shown = Directory(
-        {b"file.txt": DirEntry(b"file.txt", EntryKind.FILE, 3)}, now, now, now + 20, True, False
-    )
+    shown = Directory({b"file.txt": DirEntry(b"file.txt", EntryKind.FILE, 3)}, now, now, now + 20, True)
     await cleaner.on_swept(DIRECTORY, shown)
     assert context.own.torn == {FILE: place}
     store.add(FILE, OLD)

@@ -38,7 +38,6 @@ async def store(nursery: trio.Nursery, autojump_clock: object) -> AsyncIterator[
 
 def lose(store: FakeWriter, tree: Tree) -> None:
     store.lost = True
-    tree.link_lost()
 
 
 def lose_at(store: FakeWriter, tree: Tree, number: int) -> None:
@@ -123,7 +122,6 @@ async def test_who_opens_a_torn_name_gets_its_file(store: FakeWriter, tree: Tree
     with pytest.raises(VehicleLost):
         await tree.rename(OTHER, FILE)
     store.lost = False
-    tree._directories.lost = False
     assert await read_file(tree, FILE) == OLD
 
 
@@ -159,7 +157,6 @@ async def test_removing_a_torn_file_removes_it(store: FakeWriter, tree: Tree, lo
     with pytest.raises(VehicleLost):
         await write_file(tree, path, NEW)
     store.lost = False
-    tree._directories.lost = False
     await tree.unlink(path)
     assert litter(store) == []
     assert tree._writing is not None
@@ -177,7 +174,6 @@ async def test_a_torn_name_in_a_directory_that_is_renamed(
     with pytest.raises(VehicleLost):
         await tree.rename(OTHER, FILE)
     store.lost = False
-    tree._directories.lost = False
     await tree.rename(b"/card/dir", b"/card/new")
     tree.link_back()
     await trio.sleep(100)
