@@ -33,13 +33,10 @@ Command = Callable[[Reply], Awaitable[Reply]]
 MAX_LINE = 1 << 20
 REQUEST_PATIENCE = 10.0
 """Seconds for a client to send its line, and for us to hand it the reply."""
-MAX_CLIENTS = 16
-"""Clients served at a time; more wait in the kernel, where they cost this process no descriptors."""
-ACCEPT_PAUSE = 0.25
-"""Seconds to wait where a client cannot be taken (no descriptors left): the mount must not end with it."""
+QUEUE = 128
+"""Clients that wait in the kernel until they are taken."""
 MEANWHILE = 1.0
 """Seconds between two calls of `meanwhile`."""
-_QUEUE_PAUSE = 0.05
 _MAX_SOCKET_PATH = 107
 _SUFFIX = ".sock"
 
@@ -113,7 +110,6 @@ class ControlServer:
     def __init__(self, path: Path, commands: Mapping[str, Command]) -> None:
         self._path = path
         self._commands = commands
-        self._places = trio.Semaphore(MAX_CLIENTS)
         self._accepting = trio.CancelScope()
         self.closed = trio.Event()
 
@@ -129,57 +125,39 @@ class ControlServer:
             async with trio.open_nursery() as clients:
                 task_status.started()
                 with self._accepting:
-                    await self._accept(listener, clients)
+                    await trio.serve_listeners(self._serve_client, [listener], handler_nursery=clients)
         finally:
             with suppress(FileNotFoundError):
                 # While we delivered, the next mount may have put its socket there.
                 if self._path.lstat().st_ino == ours:
                     self._path.unlink()
-            listener.close()
             self.closed.set()
 
     def close(self) -> None:
         """Take no more clients."""
         self._accepting.cancel()
 
-    async def _accept(self, listener: trio.socket.SocketType, clients: trio.Nursery) -> None:
-        while True:
-            await self._places.acquire()
-            try:
-                accepted, _ = await listener.accept()
-            except OSError as exc:
-                log.warning("a control client cannot be served now: %s", exc)
-                self._places.release()
-                await trio.sleep(ACCEPT_PAUSE)
-                continue
-            clients.start_soon(self._serve_client, trio.SocketStream(accepted))
-
     async def _serve_client(self, stream: trio.SocketStream) -> None:
-        try:
-            async with stream:
-                reply = await _answer(stream, self._commands)
-                with trio.move_on_after(REQUEST_PATIENCE):
-                    await stream.send_all(json.dumps(reply, default=str).encode() + b"\n")
-        except (trio.BrokenResourceError, trio.ClosedResourceError):
-            log.debug("a control client went away")
-        finally:
-            self._places.release()
+        with suppress(trio.BrokenResourceError, trio.ClosedResourceError):  # it went away
+            reply = await _answer(stream, self._commands)
+            with trio.move_on_after(REQUEST_PATIENCE):
+                await stream.send_all(json.dumps(reply, default=str).encode() + b"\n")
 
 
-def _bind(path: Path) -> trio.socket.SocketType:
+def _bind(path: Path) -> trio.SocketListener:
     """Bind and listen; the socket is never visible with wider permissions than 0600."""
     path.unlink(missing_ok=True)  # of a mount that was killed; a living one was refused before
     listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     mask = os.umask(0o177)
     try:
         listener.bind(str(path))
-        listener.listen(MAX_CLIENTS)
+        listener.listen(QUEUE)
     except OSError:
         listener.close()
         raise
     finally:
         os.umask(mask)
-    return trio.socket.from_stdlib_socket(listener)
+    return trio.SocketListener(trio.socket.from_stdlib_socket(listener))
 
 
 async def _answer(stream: trio.SocketStream, commands: Mapping[str, Command]) -> Reply:
@@ -227,11 +205,12 @@ def ask(path: Path, request: Reply, *, timeout: float, meanwhile: Callable[[], N
     """
     try:
         with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as client:
-            _connect(client, path, timeout)
+            client.settimeout(timeout)
+            client.connect(str(path))
             client.sendall(json.dumps(request).encode() + b"\n")
             deadline = time.monotonic() + timeout
-            while meanwhile is not None and time.monotonic() < deadline:
-                if select.select([client], [], [], MEANWHILE)[0]:
+            while meanwhile is not None and not select.select([client], [], [], MEANWHILE)[0]:
+                if time.monotonic() > deadline:
                     break
                 meanwhile()
             with client.makefile("rb") as lines:
@@ -244,20 +223,6 @@ def ask(path: Path, request: Reply, *, timeout: float, meanwhile: Callable[[], N
     if not isinstance(reply, dict) or not reply.get("ok"):
         raise ControlError(str(reply.get("error")) if isinstance(reply, dict) else "malformed answer")
     return reply
-
-
-def _connect(client: socket.socket, path: Path, timeout: float) -> None:
-    """Connect, waiting for room in the queue: there is none while many others wait."""
-    client.settimeout(timeout)
-    deadline = time.monotonic() + timeout
-    while True:
-        try:
-            client.connect(str(path))
-            return
-        except BlockingIOError:
-            if time.monotonic() >= deadline:
-                raise
-        time.sleep(_QUEUE_PAUSE)
 
 
 def find_socket(mountpoint: str, directories: list[Path]) -> Path:
