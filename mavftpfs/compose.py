@@ -29,6 +29,7 @@ from mavftpfs.fuse.handles import Space
 from mavftpfs.fuse.options import MountOptions
 from mavftpfs.link.opening import open_link
 from mavftpfs.link.uri import LinkKind, LinkSpec
+from mavftpfs.report import Watcher, snapshot
 from mavftpfs.session.connection import Connection, ConnectOptions, connected
 from mavftpfs.session.driver import PayloadTrace
 from mavftpfs.shared.errnos import errno_for
@@ -57,11 +58,19 @@ MakeKept = Callable[[Directories, BlockCache], KeptCache]
 
 @dataclass(frozen=True, slots=True)
 class Attached:
-    """A vehicle whose root was listed. notice: moves what earlier mounts left; gives a line on it, or ""."""
+    """A vehicle whose root was listed.
+
+    watcher: to be run by who stays. notice: moves what earlier mounts left; gives a line on it, or "".
+    """
 
     connection: Connection
     tree: Tree
+    watcher: Watcher
     notice: Callable[[], str] = str
+
+    def status(self) -> dict[str, Any]:
+        """Return what is known of vehicle, link and files, JSON-able."""
+        return snapshot(self.connection.status(), self.tree.status(), self.watcher.traffic)
 
     def space(self) -> Space | None:
         """Return what STORAGE_INFORMATION said, if it was sent."""
@@ -156,7 +165,7 @@ async def attached(
                 if list_root:
                     await _list_root(connection, tree, deadline, options)
                 try:
-                    yield Attached(connection, tree, notice)
+                    yield Attached(connection, tree, Watcher(connection.status, writing=writing), notice)
                 finally:
                     connection.news.clear()  # the tree can begin nothing while the session is closed
                     if spool is not None and (rescue_for is None or not tree.undelivered()):

@@ -26,16 +26,14 @@ import pyfuse3
 import trio
 
 import mavftpfs
-from mavftpfs.cache.tree import Tree
-from mavftpfs.compose import NO_SINKS, Sinks, attached
+from mavftpfs.compose import NO_SINKS, Attached, Sinks, attached
 from mavftpfs.control import ControlServer, Reply
 from mavftpfs.farewell import say_goodbye
-from mavftpfs.fuse.handles import InodeTable, Presentation, Space
+from mavftpfs.fuse.handles import InodeTable, Presentation
 from mavftpfs.fuse.operations import Operations
 from mavftpfs.fuse.options import MountOptions, fuse_words
 from mavftpfs.link.uri import LinkSpec
 from mavftpfs.mountpoint import is_ours, stderr_of, unmount, unmount_what_is_left
-from mavftpfs.report import Watcher, snapshot
 from mavftpfs.shared.errors import ExitCode, MavftpfsError, MountFailed, exit_code_for
 
 log = logging.getLogger("mavftpfs.mount")
@@ -66,29 +64,15 @@ class MountRequest:
     sinks: Sinks = NO_SINKS
 
 
-@dataclass(frozen=True, slots=True)
-class Content:
-    """What is behind a mount. notice: called once it is up, gives a line for whoever mounts, or "".
-    forget: has what is cached asked for again. watch: runs beside it until the end."""
-
-    tree: Tree
-    status: Callable[[], dict[str, Any]] = dict
-    space: Callable[[], Space | None] = lambda: None
-    notice: Callable[[], str] = str
-    forget: Callable[[], None] = lambda: None
-    watch: Callable[[], Awaitable[None]] = trio.sleep_forever
-
-
-Attach = Callable[[Callable[[bytes], None]], AbstractAsyncContextManager[Content]]
-"""Brings the content up; is given the callback for paths whose bytes changed."""
+Attach = Callable[[Callable[[bytes], None]], AbstractAsyncContextManager[Attached]]
+"""Brings the vehicle up; is given the callback for paths whose bytes changed."""
 
 
 def run_mount(request: MountRequest, report: Report) -> int:
     """Mount and serve until unmounted; returns the exit code."""
 
-    @asynccontextmanager
-    async def attach(invalidate: Callable[[bytes], None]) -> AsyncIterator[Content]:
-        vehicle = attached(
+    def attach(invalidate: Callable[[bytes], None]) -> AbstractAsyncContextManager[Attached]:
+        return attached(
             request.spec,
             request.options,
             invalidate=invalidate,
@@ -96,19 +80,12 @@ def run_mount(request: MountRequest, report: Report) -> int:
             writing=True,
             rescue_for=request.source,
         )
-        async with vehicle as up:
-            watcher = Watcher(up.connection.status, writing=not request.options.read_only)
-
-            def status() -> dict[str, Any]:
-                return snapshot(up.connection.status(), up.tree.status(), watcher.traffic)
-
-            yield Content(up.tree, status, up.space, up.notice, up.tree.forget_caches, watcher.run)
 
     return trio.run(serve_mount, request, attach, report)
 
 
 async def serve_mount(request: MountRequest, attach: Attach, report: Report) -> int:
-    """Bring the content up, mount it, serve until unmounted; returns the exit code."""
+    """Bring the vehicle up, mount it, serve until unmounted; returns the exit code."""
     life = _Life(request, report)
     async with trio.open_nursery() as nursery:
         await nursery.start(life.watch_signals)
@@ -206,7 +183,7 @@ class _Life:
         self._started = time.time()
 
     def fail(self, error: MavftpfsError) -> None:
-        """The content failed: tell whoever waits for the mount, or else the log."""
+        """The vehicle failed: tell whoever waits for the mount, or else the log."""
         self.code = exit_code_for(error)
         if self.mounted:
             log.error("unmounted: %s", error)
@@ -214,32 +191,29 @@ class _Life:
             self.report(self.code, str(error))
 
     async def attach_and_serve(self, attach: Attach, nursery: trio.Nursery) -> None:
-        """Run until the kernel mount is gone."""
+        """Run until the kernel mount is gone, and what programs wrote is delivered, or kept.
+
+        A second signal ends the delivery, not the keeping.
+        """
         inodes = InodeTable()
         invalidator = Invalidator(inodes, pyfuse3.invalidate_inode)
-        async with attach(invalidator.on_changed) as content:
-            nursery.start_soon(content.watch)
+        async with attach(invalidator.on_changed) as vehicle:
+            nursery.start_soon(vehicle.watcher.run)
             operations = Operations(
-                content.tree,
+                vehicle.tree,
                 presentation(self.request.options),
                 inodes=inodes,
                 refresh=invalidator.forget_attributes,
-                space=content.space,
-                status=lambda: self.status(content, operations),
+                space=vehicle.space,
+                status=lambda: self.status(vehicle, operations),
             )
             try:
                 with kernel_mount(operations, self.request, invalidator):
                     self.mounted = True
-                    await self._start_control(
-                        lambda: self.status(content, operations), content.forget, nursery
-                    )
-                    await self._serve(invalidator, content.notice)
+                    await self._start_control(vehicle, operations, nursery)
+                    await self._serve(invalidator, vehicle.notice)
             finally:
-                await self._leave(content)
-
-    async def _leave(self, content: Content) -> None:
-        """Deliver what programs wrote, or keep it; a second signal ends the delivery, not the keeping."""
-        await say_goodbye(content.tree, self.request.source, self._on_undelivered)
+                await say_goodbye(vehicle.tree, self.request.source, self._on_undelivered)
 
     def _on_undelivered(self, line: str) -> None:
         self.farewell = line
@@ -261,17 +235,15 @@ class _Life:
 
     # -- control ----------------------------------------------------------------------------------
 
-    async def _start_control(
-        self, facts: Callable[[], dict[str, Any]], drop: Callable[[], None], nursery: trio.Nursery
-    ) -> None:
+    async def _start_control(self, vehicle: Attached, operations: Operations, nursery: trio.Nursery) -> None:
         if self.request.control is None:
             return
 
         async def status(_: Reply) -> Reply:
-            return {"status": facts()}
+            return {"status": self.status(vehicle, operations)}
 
         async def forget(_: Reply) -> Reply:
-            drop()
+            vehicle.tree.forget_caches()
             return {}
 
         commands = {"status": status, "umount": self._umount, "forget": forget}
@@ -298,7 +270,7 @@ class _Life:
         await self.finished.wait()
         return {"exit_code": int(self.code), "pid": os.getpid(), "message": self.farewell}
 
-    def status(self, content: Content, operations: Operations) -> dict[str, Any]:
+    def status(self, vehicle: Attached, operations: Operations) -> dict[str, Any]:
         """Return facts for people and scripts; JSON-able."""
         return {
             "mountpoint": self.request.mountpoint,
@@ -310,7 +282,7 @@ class _Life:
             "version": mavftpfs.__version__,
             "read_only": self.request.options.read_only,
             "uptime": round(time.time() - self._started, 1),
-            **content.status(),
+            **vehicle.status(),
             "kernel": operations.counts(),
         }
 

@@ -12,13 +12,15 @@ import sys
 from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import asynccontextmanager
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, cast
 
 import trio
 
+from mavftpfs.compose import Attached
 from mavftpfs.fuse.options import MountOptions
 from mavftpfs.link.uri import parse_source
-from mavftpfs.mount import Content, MountRequest, serve_mount
+from mavftpfs.mount import MountRequest, serve_mount
 from tests.ops.faketree import FakeTree
 
 VALID_FOR = 1000.0
@@ -50,11 +52,13 @@ class Server:
         self.tree = QuietTree({**small, **many}, valid_for=VALID_FOR)
 
     @asynccontextmanager
-    async def attach(self, invalidate: Callable[[bytes], None]) -> AsyncIterator[Content]:
-        """Be mount's content."""
+    async def attach(self, invalidate: Callable[[bytes], None]) -> AsyncIterator[Attached]:
+        """Stand in for a vehicle, of which nothing but its files is known."""
         async with trio.open_nursery() as nursery:
             nursery.start_soon(self.listen, invalidate)
-            yield Content(cast(Any, self.tree))  # read-only, whatever a mount can hold
+            vehicle = SimpleNamespace(tree=self.tree, status=dict, space=lambda: None, notice=str)
+            vehicle.watcher = SimpleNamespace(run=trio.sleep_forever)
+            yield cast(Attached, vehicle)
             nursery.cancel_scope.cancel()
 
     async def listen(self, invalidate: Callable[[bytes], None]) -> None:
