@@ -54,9 +54,6 @@ MISMATCHES = 2
 LATE_WRITES = 1.0
 """Seconds before it is sent again: over two radios a copy of a write may come so late, into the new file."""
 
-FINISHES = 3
-"""How often an upload is asked to end because the source had more."""
-
 SENT_TWICE = 4096
 """Bytes of the largest file that is sent before it is known whether the card can rename. It goes in a round
 trip or two, so sending it again on the few cards that cannot costs less than four requests in each mount."""
@@ -237,12 +234,8 @@ class Deliverer:
             await base.fetch(self._context, node, draft)
         attempt = await self._attempt(node, draft)
         attempt.sending.growing = False
-        for _ in range(FINISHES):
-            attempt.upload.wake()
-            await attempt.upload.finish()
-            if not attempt.sending.unacked:
-                break
-        else:
+        await attempt.upload.finish()
+        if attempt.sending.unacked:
             raise RemoteProtocolError(f"{attempt.path!r} was said to be finished, and was not")
         doubted = self._context.store.in_doubt(attempt.begun_at)
         crc32 = await self.verifier.check(attempt.path, draft, doubted=doubted)
