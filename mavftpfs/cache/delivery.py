@@ -41,7 +41,7 @@ from mavftpfs.shared.errors import (
     SpoolFailed,
     VerificationFailed,
 )
-from mavftpfs.shared.model import DirEntry, EntryKind, split
+from mavftpfs.shared.model import DirEntry, EntryKind
 
 log = logging.getLogger("mavftpfs.cache")
 
@@ -302,12 +302,7 @@ class Deliverer:
         own, path = self._context.own, node.path
         node.attempt = None
         try:
-            try:
-                await attempt.upload.abort()
-            except BaseException:  # nobody waits any more: all of it is sent again
-                draft.give_up()
-                self._context.directories.expire(split(path)[0])
-                raise
+            await attempt.upload.abort()
             self._context.directories.put(attempt.path, DirEntry(b"", EntryKind.FILE, draft.size))
             draft.on(Event.COMMITS)
             if draft.base is None:
@@ -318,6 +313,7 @@ class Deliverer:
                 draft.interrupted(ours=True)
                 raise VerificationFailed(f"{path!r} was emptied by a request that came twice")
         except BaseException as error:
+            draft.give_up()  # unless it commits already
             if draft.state is State.COMMITTING:
                 unknown = isinstance(error, OutcomeUnknown) or not isinstance(error, MavftpfsError)
                 if unknown or path in own.torn:
