@@ -8,7 +8,6 @@ from enum import StrEnum
 from statistics import median
 from typing import Any
 
-from mavftpfs.protocol.payload import MAX_DATA
 from tests.bench.cases import Case, Direction
 
 US = "mavftpfs"
@@ -73,7 +72,7 @@ class Row:
     """What the runs of one client under the same conditions amount to: medians of those that went well.
 
     rate: bytes/s; at_most: it was cut off by the time-out, and rate and shares are what it can have reached.
-    of_us, of_bare, of_limit: shares. cpu: seconds per 10**6 bytes; per_chunk: seconds per 239 bytes.
+    of_us, of_bare, of_limit: shares. cpu: seconds per 10**6 bytes. memory: bytes at most.
     """
 
     server: str
@@ -81,17 +80,13 @@ class Row:
     direction: Direction
     client: str
     outcome: Outcome
-    good: int
-    runs: int
     rate: float | None
     at_most: bool
     of_us: float | None
     of_bare: float | None
     of_limit: float | None
     cpu: float | None
-    per_chunk: float | None
     memory: int | None
-    detail: str
 
 
 def limit(server: str, link: str, direction: Direction) -> float | None:
@@ -121,17 +116,13 @@ def summarise(runs: Iterable[Run], timeouts: dict[str, float]) -> list[Row]:
         row = Row(
             *key,
             outcome=good[0].outcome if good else group[-1].outcome,
-            good=len(good),
-            runs=len(group),
             rate=rate,
             at_most=at_most,
             of_us=ratio(rate, None if ours[1] else ours[0]),
             of_bare=ratio(rate, None if bare[1] else bare[0]),
             of_limit=ratio(rate, limit(server, link, direction)),
             cpu=None if cpu is None else cpu * 1e6,
-            per_chunk=None if cpu is None else cpu * MAX_DATA,
             memory=max((run.memory for run in group if run.memory is not None), default=None),
-            detail="" if good else group[-1].detail,
         )
         rows.append(row)
     return rows
@@ -158,11 +149,11 @@ def ratio(value: float | None, reference: float | None) -> float | None:
     return None if value is None or not reference else value / reference
 
 
-def as_json(thing: Run | Row) -> dict[str, Any]:
-    """Return a run or row as JSON has it: few digits, so that a rerun differs where it matters."""
+def as_json(row: Row) -> dict[str, Any]:
+    """Return a row as JSON has it: few digits, so that a rerun differs where it matters."""
     return {
         key: float(f"{value:.4g}") if isinstance(value, float) else value
-        for key, value in asdict(thing).items()
+        for key, value in asdict(row).items()
     }
 
 

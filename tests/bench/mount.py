@@ -178,7 +178,7 @@ def main(argv: Sequence[str]) -> int:
     parser.add_argument("--clients", nargs="+", choices=everybody, default=list(everybody))
     parser.add_argument("--repetitions", type=int, default=1, help="of each run, interleaved")
     parser.add_argument("--quick", action="store_true", help="two cells, shorter files")
-    parser.add_argument("--json", type=Path, help="put runs and rows into this file")
+    parser.add_argument("--json", type=Path, help="put the rows into this file")
     args = parser.parse_args(argv)
     chosen = list(cells(QUICK if args.quick else CELLS, quick=args.quick))
     load = os.getloadavg()[0]
@@ -190,6 +190,5 @@ def main(argv: Sequence[str]) -> int:
     rows = summarise(runs, {cell.link: cell.timeout for cell in chosen})
     print(tables.peers_table(rows), tables.cost_table(rows, "px4", "unshaped"), sep="\n\n")
     if args.json is not None:
-        found = {"peers": list(PINS), "rows": list(map(as_json, rows)), "runs": list(map(as_json, runs))}
-        record.put(args.json, "mount", argv, load, found)
+        record.put(args.json, "mount", argv, load, {"peers": list(PINS), "rows": list(map(as_json, rows))})
     return 0

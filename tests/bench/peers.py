@@ -26,7 +26,7 @@ from pathlib import Path
 from tests.bench.cases import Direction
 from tests.bench.figures import BARE, US, Outcome
 from tests.support.mounts import abort_mount, mounted_at
-from tests.support.vehicles import HOST, PROJECT, Process
+from tests.support.vehicles import HOST, PROJECT, Process, peak_memory
 
 PINS = ("fusepy==3.0.1", "loguru==0.7.3", "mavsdk==4.1.0", "pymavlink==2.4.50")
 CONNECT_TIMEOUT = 120.0
@@ -160,7 +160,7 @@ def _converse(child: subprocess.Popen[bytes], job: Job) -> Measured:
         return Measured(Outcome.TIMEOUT if seconds >= job.timeout else Outcome.FAILED)
     if answer != "done":
         return Measured(Outcome.FAILED, detail=answer.removeprefix("failed "))
-    return Measured(Outcome.OK, seconds, cpu_of(child.pid) - cpu, _peak(child.pid))
+    return Measured(Outcome.OK, seconds, cpu_of(child.pid) - cpu, peak_memory(child.pid))
 
 
 def _by_mount(argv: list[str], point: Path, job: Job) -> Measured:
@@ -175,7 +175,7 @@ def _by_mount(argv: list[str], point: Path, job: Job) -> Measured:
         if copied.cpu is None:
             return copied
         spent = copied.cpu + cpu_of(daemon.popen.pid) - cpu
-        return Measured(Outcome.OK, copied.seconds, spent, _peak(daemon.popen.pid))
+        return Measured(Outcome.OK, copied.seconds, spent, peak_memory(daemon.popen.pid))
     finally:
         if mounted_at(point) and daemon.running:
             subprocess.run(["fusermount3", "-u", point], capture_output=True, timeout=20, check=False)
@@ -218,12 +218,6 @@ def _await_mount(daemon: Process, point: Path) -> bool:
     return False
 
 
-def _peak(pid: int) -> int:
-    """Return the largest resident size of a process so far, in bytes."""
-    lines = Path(f"/proc/{pid}/status").read_text().splitlines()
-    return int(next(line for line in lines if line.startswith("VmHWM:")).split()[1]) * 1024
-
-
 def _last_line(log: Path) -> str:
     lines = log.read_text(errors="replace").strip().splitlines()
     return lines[-1][:200] if lines else ""
@@ -251,16 +245,8 @@ def install() -> None:
     print(f"installing the peers ({', '.join(PINS)}) in an environment of their own", file=sys.stderr)
     shutil.rmtree(place, ignore_errors=True)
     venv.create(place, with_pip=True)
-    command = [
-        str(place / "bin/python"),
-        "-m",
-        "pip",
-        "install",
-        "--quiet",
-        "--disable-pip-version-check",
-        *PINS,
-    ]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    pip = [str(place / "bin/python"), "-m", "pip", "install", "--quiet", "--disable-pip-version-check"]
+    done = subprocess.run([*pip, *PINS], capture_output=True, text=True, check=False)
     if done.returncode != 0:
         reason = done.stderr.strip().splitlines()[-1:] or ["pip failed"]
         raise NotToBeHadError(f"not installed: {reason[0][:200]}")

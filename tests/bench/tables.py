@@ -6,6 +6,7 @@ import re
 from collections.abc import Iterable, Sequence
 from typing import Any
 
+from mavftpfs.protocol.payload import MAX_DATA
 from tests.bench.figures import BARE, US, Outcome, Row, row_from_json
 from tests.support.request_costs import PROFILES, expected
 
@@ -110,9 +111,7 @@ def cost_table(rows: Sequence[Row], server: str, link: str) -> str:
         own = {row.direction: row for row in chosen if row.client == name}
         both = (own.get("read"), own.get("write"))
         cpu = [None if row is None or row.cpu is None else f"{row.cpu:.3f}" for row in both]
-        chunk = [
-            None if row is None or row.per_chunk is None else f"{row.per_chunk * 1e6:.0f}" for row in both
-        ]
+        chunk = [None if row is None or row.cpu is None else f"{row.cpu * MAX_DATA:.0f}" for row in both]
         memory = [None if row is None or row.memory is None else f"{row.memory / 1e6:.0f}" for row in both]
         lines.append([name, *(" / ".join(value or "–" for value in pair) for pair in (cpu, chunk, memory))])
     head = ["read / write", "CPU seconds per MB", "µs per packet of 239 bytes", "peak memory, MB"]

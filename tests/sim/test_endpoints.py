@@ -1,9 +1,8 @@
-"""The simulated vehicle on real links, on the command line, and in memory on a mock clock."""
+"""`mavftpfs sim`: its arguments, its signals, and what it says."""
 
 from __future__ import annotations
 
 import argparse
-import random
 import signal
 import subprocess
 import sys
@@ -14,7 +13,6 @@ from typing import IO
 
 import pytest
 import trio
-import trio.testing
 
 from mavftpfs.link.framing import Framer
 from mavftpfs.link.messages import Address, FtpRun, Heartbeat, Message
@@ -24,24 +22,7 @@ from mavftpfs.protocol.payload import Opcode, request
 from mavftpfs.shared.errors import LinkClosed
 from mavftpfs.sim import endpoints
 from mavftpfs.sim.linkmodel import Duplex, LinkSettings
-from mavftpfs.sim.profiles import PROFILES
-from mavftpfs.sim.tree import MemoryTree
-from mavftpfs.sim.vehicle import SimVehicle
 from tests.support.vehicles import free_udp_port
-
-CONTENT = random.Random("content").randbytes(50_000)
-
-
-def vehicle(profile: str = "px4", *, stream: bool = False, telemetry: float = 0.0) -> SimVehicle:
-    tree = MemoryTree()
-    tree.add(b"/log.bin", CONTENT)
-    return SimVehicle(tree, PROFILES[profile], rng=random.Random(1), stream=stream, telemetry=telemetry)
-
-
-# ---------------------------------------------------------------------- real links
-
-
-# ---------------------------------------------------------------------- the command
 
 
 def arguments(*words: str) -> argparse.Namespace:

@@ -67,6 +67,12 @@ def _is_free(port: int) -> bool:
     return True
 
 
+def peak_memory(pid: int) -> int:
+    """Return the largest resident size of a process so far, in bytes."""
+    lines = Path(f"/proc/{pid}/status").read_text().splitlines()
+    return int(next(line for line in lines if line.startswith("VmHWM:")).split()[1]) * 1024
+
+
 class Process:
     """A child with its output in files; ended by its own pid, never by name."""
 
@@ -110,9 +116,7 @@ class Process:
 
     def peak_memory(self) -> int:
         """Return the largest resident size so far, in bytes."""
-        lines = Path(f"/proc/{self.popen.pid}/status").read_text().splitlines()
-        peak = next(line for line in lines if line.startswith("VmHWM:"))
-        return int(peak.split()[1]) * 1024
+        return peak_memory(self.popen.pid)
 
     def pause(self) -> None:
         """Let it fall silent (SIGSTOP), as on a dead link."""

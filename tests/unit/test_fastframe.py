@@ -15,17 +15,6 @@ US = Address(254, 191)
 EXTRA = 84
 
 FULL = bytes(range(1, 252))
-PAYLOADS = [
-    FULL,
-    bytes(251),
-    bytes(250) + b"\1",
-    b"\1" + bytes(250),
-    FULL[:27] + bytes(224),
-    FULL[:26] + bytes(225),
-    FULL[:12] + bytes(239),
-    bytes(100) + FULL[:51] + bytes(100),
-]
-TARGETS = [Address(1, 1), Address(0, 0), Address(1, 0), Address(0, 1), Address(255, 255)]
 
 
 def reference(seq: int, target: Address, payload: bytes) -> bytes:

@@ -15,7 +15,6 @@ FIVE = b"/fs/microsd/five"
 DIR = b"/fs/microsd/dir"
 FAIL = bytes([NakCode.FAIL])
 EOF = bytes([NakCode.EOF])
-NOT_FOUND = bytes([NakCode.FILE_NOT_FOUND])
 
 
 def content(size: int) -> bytes:
