@@ -55,18 +55,6 @@ def test_fast_encoding_is_pymavlinks_byte_for_byte(
     ]
 
 
-@given(addresses, addresses, st.integers(0, 255), payloads)
-def test_fast_decoding_is_pymavlinks(source: Address, target: Address, seq: int, payload: bytes) -> None:
-    frame = reference_frame(source, target, payload, seq=seq)
-    out: list[Message] = []
-    if len(frame) >= 15:
-        assert FtpFrameCodec(Address(9, 9), EXTRA).decode_runs(frame, 0, out) == len(frame)
-        assert out == [FtpRun(source, target, [payload])]
-    message = pymavlink(source).decode(bytearray(frame))
-    assert bytes(message.payload) == payload
-    assert feed(Framer(Address(9, 9), stream=True), frame) == [FtpRun(source, target, [payload])]
-
-
 @given(st.lists(st.tuples(addresses, addresses, payloads), max_size=8), st.integers(0, 255))
 def test_fast_decoding_of_several_is_pymavlinks(
     several: list[tuple[Address, Address, bytes]], seq: int
@@ -151,16 +139,6 @@ def test_splitting_changes_nothing(data: bytes, cuts: list[int], key: bytes | No
     assert whole == split == single
     assert one.stats == other.stats == third.stats
     assert one._tail == other._tail == third._tail
-
-
-@given(st.lists(st.tuples(st.binary(max_size=40), payloads), max_size=6))
-def test_frames_survive_garbage_that_looks_like_nothing(parts: list[tuple[bytes, bytes]]) -> None:
-    data, values = b"", []
-    for garbage, payload in parts:
-        data += garbage.replace(b"\xfd", b"").replace(b"\xfe", b"")
-        data += reference_frame(Address(1, 1), Address(2, 2), payload)
-        values.append(FtpRun(Address(1, 1), Address(2, 2), [payload]))
-    assert fed([data], None)[0] == values
 
 
 @given(streams(), st.binary(max_size=600))

@@ -51,13 +51,6 @@ def test_the_size_is_learnt_from_a_later_packet_when_the_first_was_lost() -> Non
     assert burst.take(data(0, 80, step=80), 0.0) is not None
 
 
-def test_a_single_short_packet_at_the_end_tells_no_size() -> None:
-    burst = make(100, asked=239)
-    assert burst.take(data(0, 100), 0.0) == bytes(100)
-    assert burst.packet == 0
-    assert burst.over
-
-
 @pytest.mark.parametrize(
     "reply",
     [
@@ -141,11 +134,3 @@ def test_quiet_follows_the_packets() -> None:
     for index in range(20):
         crawling.take(data(index), 1.0 * index)
     assert crawling.quiet_deadline() > 19 + 6
-
-
-def test_quiet_is_short_behind_the_flag() -> None:
-    burst = make()
-    burst.take(data(0), 0.0)
-    burst.take(data(1, complete=1), 0.01)
-    assert burst.quiet_deadline() == pytest.approx(0.01 + RTO)
-    assert not burst.over

@@ -149,11 +149,3 @@ def test_a_file_is_moved_by_short_chunks_and_late_answers_to_long_ones_change_no
     for request in transfers.late:
         transfers.answer(request)
     assert transfers.engine.stats.unknown == unknown + len(transfers.late)
-
-
-def test_a_write_ack_that_counts_a_full_chunk_is_no_answer_to_a_short_one() -> None:
-    writes = Transfers(writes=True, passing=0)
-    writes.chunks.most = writes.chunks.size = 100
-    (first, *_) = sent(writes.engine, 0.0)
-    writes.engine.receive(ack(first, MAX_DATA.to_bytes(4, "little")), 0.1)
-    assert writes.source.acked.empty

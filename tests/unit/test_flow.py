@@ -7,10 +7,7 @@ from itertools import pairwise
 
 import pytest
 
-from mavftpfs.protocol.engine import Engine
 from mavftpfs.protocol.flow import KNOWN, MOST_SERIAL, QUEUE, Flow
-from mavftpfs.protocol.operations import Simple
-from mavftpfs.protocol.payload import Opcode
 
 
 class Path:
@@ -48,18 +45,6 @@ def test_grows_to_what_the_path_holds_and_not_far_beyond() -> None:
     path = Path(flow, rate=2000.0, base=0.1)
     path.rounds(40)
     assert 200 <= flow.window <= 400, "at most a tenth of a second more"
-
-
-def test_one_lost_request_is_no_silent_link() -> None:
-    engine = Engine(random.Random(1), Flow())
-    engine.start(Simple(Opcode.NONE), 0.0)
-    window = engine.flow.window
-    now = 0.0
-    for sends in range(1, 4):
-        engine.outgoing(now)
-        now = engine.next_deadline() or 0.0
-        engine.on_deadline(now)
-        assert (engine.flow.window == window) is (sends < 3)
 
 
 def test_random_loss_does_not_shrink_it() -> None:

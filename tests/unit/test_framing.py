@@ -151,13 +151,6 @@ def test_refuses_a_key_of_the_wrong_size(size: int) -> None:
 # ---------------------------------------------------------------------- the shape of a payload
 
 
-def test_replies_to_nobody_are_trimmed_into_the_header() -> None:
-    mav = drone()
-    frame = pack(mav.file_transfer_protocol_encode(0, 0, 0, [0] * 251), mav)
-    assert frame[1] == 1
-    assert feed(Framer(US, stream=True), frame) == [FtpRun(DRONE, Address(0, 0), [bytes(251)])]
-
-
 def with_payload(message_id: int, payload: bytes, extra: int, flags: int = 0) -> bytes:
     header = struct.pack("<BBBBBBBHB", 0xFD, len(payload), flags, 0, 0, *DRONE, message_id, 0)
     crc = dialect.x25crc(header[1:] + payload + bytes([extra])).crc

@@ -86,21 +86,6 @@ def test_room_is_left_in_the_queue_for_others() -> None:
     assert server.run(10.0) < 0.9 * 5 / 0.010
 
 
-def test_a_slow_link_is_left_alone() -> None:
-    server = Server(base=0.010, slowest=21.6)
-    server.run(60.0)
-    assert server.busiest <= QUEUE + 2
-    assert server.pacer.window <= QUEUE + 1
-
-
-def test_a_server_that_becomes_quicker_is_noticed() -> None:
-    server = Server(base=0.2, look=0.050)
-    server.run(30.0)
-    server.look = 0.010
-    server.run(60.0)
-    assert server.run(20.0) > 200.0
-
-
 def test_requests_go_out_one_by_one() -> None:
     pacer = Pacer(QUEUE, 2048)
     pacer.rate, pacer.window = 100.0, 50

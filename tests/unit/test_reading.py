@@ -102,13 +102,6 @@ def test_nothing_is_asked_beyond_the_end_or_twice() -> None:
     assert reader.transfer.wants == ExtentSet([(0, 478)])
 
 
-def test_what_the_sink_holds_is_not_asked() -> None:
-    reader = Reader()
-    reader.sink.on_data(100, CONTENT[100:200])
-    reader.transfer.want(0, 300, True)
-    assert ranges(reader.sent()) == [(0, 100), (200, 300)]
-
-
 def test_demand_goes_before_readahead_and_promotes_it() -> None:
     reader = Reader(limit=1)
     reader.transfer.want(0, 1000, False)
@@ -208,31 +201,6 @@ def stream(reader: Reader, request: Payload, indices: list[int], *, complete: in
         reader.now += 0.001
         data = CONTENT[start : start + 239]
         reader.engine.receive(packet(request, index, data, complete=int(index == complete)), reader.now)
-
-
-def test_a_whole_file_in_one_burst() -> None:
-    reader, request = bursting()
-    assert (request.opcode, request.offset, request.size) == (Opcode.BURST_READ_FILE, 0, 239)
-    assert reader.transfer.bursting
-    assert not reader.transfer.idle
-    assert reader.sent() == []
-    stream(reader, request, list(range(41)))
-    assert bytes(reader.sink.data) == CONTENT
-    assert reader.transfer.idle
-    reader.engine.receive(burst_nak(request, 41, NakCode.EOF), reader.now)
-    assert reader.engine.stats.unknown == 1
-
-
-def test_a_burst_begins_at_the_first_missing_wanted_byte_and_brings_more() -> None:
-    reader = Reader(bursts=True)
-    reader.transfer.want(1000, 2000, True)
-    (request,) = reader.sent()
-    assert request.offset == 1000
-    stream(reader, request, list(range(10)), complete=9)
-    assert reader.sink.held == ExtentSet([(1000, 1000 + 2390)])
-    assert not reader.transfer.idle
-    reader.pass_quiet()
-    assert reader.transfer.idle
 
 
 @pytest.mark.holds("fault burst tail", "rule 14.17")

@@ -22,10 +22,6 @@ def sent(opcode: Opcode) -> Request:
     return request
 
 
-def test_a_lost_first_listing_does_not_cost_a_second() -> None:
-    assert Timers().wait(sent(Opcode.LIST_DIRECTORY_WITH_TIME)) == 0.5
-
-
 def test_nor_are_listings_piled_up_where_nothing_is_known() -> None:
     request, waits = sent(Opcode.LIST_DIRECTORY), []
     for request.sends in range(1, 6):
@@ -46,13 +42,6 @@ def test_a_family_with_round_trips_of_its_own_borrows_nothing() -> None:
     answered(timers, Opcode.OPEN_FILE_RO, 0.5)
     answered(timers, Opcode.LIST_DIRECTORY, 0.03)
     assert timers.wait(sent(Opcode.OPEN_FILE_RO)) == pytest.approx(1.5)
-
-
-def test_first_sample_allows_three_times() -> None:
-    timer = RttEstimator(0.03)
-    timer.sample(0.1)
-    assert timer.samples
-    assert timer.rto == pytest.approx(0.3)
 
 
 @pytest.mark.holds("rule 14.38")

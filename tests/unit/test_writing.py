@@ -207,21 +207,6 @@ def test_what_waits_to_be_repeated_is_not_all_out() -> None:
     assert transfer.all_out
 
 
-@pytest.mark.holds("rule 14.24")
-def test_never_more_than_the_server_queues() -> None:
-    engine = Engine(random.Random(3), Flow())
-    engine.learn_session_echo(True)
-    source = MemorySource(bytes(239 * 200))
-    transfer = WriteTransfer(7, source)
-    engine.start(transfer, 0.0)
-    now, flying = 0.0, sent(engine, 0.0)
-    for _ in range(100):
-        assert len(flying) <= 4
-        now += 0.05
-        engine.receive(ack(flying.pop(0)), now)
-        flying += sent(engine, now)
-
-
 @pytest.mark.holds("rule 14.26")
 @pytest.mark.parametrize("piece", [(0, b""), (0, bytes(1 << 20)), (-1, b"x"), (MAX_OFFSET - 1, b"xy")])
 def test_a_chunk_that_does_not_fit_is_refused_without_a_raise(piece: tuple[int, bytes]) -> None:
