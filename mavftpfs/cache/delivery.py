@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from dataclasses import astuple
 
 import trio
 
@@ -182,7 +181,7 @@ class Deliverer:
         """Deliver, trying again as long as something was learnt of the server."""
         mismatches = 0
         for _ in range(MAX_STEPS):
-            known = astuple(self._context.store.traits)
+            known = self._context.store.traits.ways
             try:
                 if draft.state is State.TORN or node.path in self._context.own.torn:
                     await self._mend(node, draft)
@@ -199,7 +198,7 @@ class Deliverer:
             except MavftpfsError as error:
                 if not isinstance(error, PASSING) or not draft.size:
                     await self.abandon(node)
-                learnt = astuple(self._context.store.traits) != known
+                learnt = self._context.store.traits.ways != known
                 if not learnt or isinstance(error, LinkError | Armed):
                     raise
                 log.debug("%r: %s; trying another way", node.path, error)

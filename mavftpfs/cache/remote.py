@@ -8,7 +8,7 @@ from __future__ import annotations
 from math import inf
 from typing import Protocol
 
-from mavftpfs.shared.model import Listing, WriteTraits
+from mavftpfs.shared.model import Listing, Traits
 from mavftpfs.shared.sending import Sending
 
 
@@ -154,7 +154,7 @@ class VehicleStore(RemoteStore, Protocol):
     """
 
     @property
-    def traits(self) -> WriteTraits:
+    def traits(self) -> Traits:
         """What the server was seen to do; forgotten when it restarts."""
         ...
 

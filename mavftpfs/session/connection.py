@@ -125,7 +125,6 @@ class Connection:
             "chunk": self.scheduler.read_chunks.size,
             "session_open": None if server is None else server.path.decode("utf-8", "replace"),
             **asdict(self.engine.traits),
-            "write_traits": asdict(self.store.traits),
             "uploads": [user.status() for user in self.scheduler.users if isinstance(user, Upload)],
             "dropped_sends": link.stats.dropped_sends,
             "bad_frames": self.driver.framer.stats.bad_crc,

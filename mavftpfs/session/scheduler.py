@@ -24,7 +24,7 @@ from mavftpfs.session.doubt import Doubt, session_used_by
 from mavftpfs.session.driver import Driver
 from mavftpfs.session.serversession import OpenSession, ServerSession, State
 from mavftpfs.shared.errors import DataUnproven, MavftpfsError, RequestTimeout, SessionLost
-from mavftpfs.shared.model import WriteTraits, renamed
+from mavftpfs.shared.model import renamed
 
 ReadMode = Literal["window", "burst"]
 
@@ -187,7 +187,6 @@ class Scheduler:
     Attributes:
         users: those who want the session, now or later. gone: those who read, and want nothing any more,
             with the time since when.
-        traits: what the server was seen to do when written to; forgotten when it restarts.
         read_mode: by which requests files are read. read_chunks, write_chunks: the size of requests.
     """
 
@@ -200,7 +199,6 @@ class Scheduler:
         read_mode: ReadMode = "window",
         chunk: int | None = None,
     ) -> None:
-        self.traits = WriteTraits()
         self.read_mode: ReadMode = read_mode
         self.read_chunks, self.write_chunks = ChunkSize(chunk), ChunkSize(chunk)
         self.doubt = Doubt(clock)
@@ -358,7 +356,6 @@ class Scheduler:
     def on_reboot(self) -> None:
         """The vehicle restarted, perhaps as another one: nothing is open, nothing is known of it."""
         self.doubt.raise_it("the vehicle restarted")
-        self.traits.forget()
         self.server.abandon()
 
     # --- the one task

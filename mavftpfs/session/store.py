@@ -108,7 +108,6 @@ class Store:
     """
 
     def __init__(self, scheduler: Scheduler) -> None:
-        self.traits = scheduler.traits
         self.in_doubt = scheduler.doubt.is_active
         self.read_whole = scheduler.read_whole
         self._scheduler = scheduler
@@ -120,6 +119,11 @@ class Store:
         self._under_way = 0
         self._changed_at: dict[bytes, float] = {}
 
+    @property
+    def traits(self) -> Traits:
+        """What the server was seen to do (see RemoteStore)."""
+        return self._server.engine.traits
+
     def is_silent(self) -> bool:
         """Return whether the vehicle is silent (see RemoteStore)."""
         return self._vehicle.silence(self._clock()) > SILENCE_LIMIT
@@ -129,7 +133,7 @@ class Store:
     async def list_directory(self, path: bytes) -> Listing:
         """Sweep a directory (see RemoteStore). Opcode 16 is tried first; that it is refused, or not answered,
         counts only if opcode 3 then is."""
-        wire, started, traits = wire_path(path), self._clock(), self._server.engine.traits
+        wire, started, traits = wire_path(path), self._clock(), self.traits
         operation: ListDirectory | None = None
         tried: list[ListDirectory] = []
         refused = False

@@ -138,7 +138,6 @@ class Upload(SessionUser):
         self._driver = scheduler.server.driver
         self._engine = scheduler.server.engine
         self._clock = scheduler.clock
-        self._traits = scheduler.traits
         self._retry_at = 0.0  # not to be touched before
         self._failures = 0
         self._furthest = 0  # in the file, when the session was lost the last time
@@ -292,7 +291,7 @@ class Upload(SessionUser):
 
     def _resumable(self) -> bool:
         """Whether its file can be closed and written on later: it was seen to be so, or this is to tell."""
-        truncates = self._traits.wo_truncates
+        truncates = self._engine.traits.wo_truncates
         return truncates is False or (truncates is None and self._source.reached > 0)
 
     def _complete(self) -> None:
@@ -323,8 +322,8 @@ class Upload(SessionUser):
         if self._reboots != self._vehicle.reboots:  # what was proven may not be there any more
             source.roll_back(everything=True)
         self._reboots = self._vehicle.reboots
-        unknown = self._traits.wo_truncates is None and source.reached
-        if source.closed and (unknown or self._traits.wo_truncates is False):
+        unknown = self._engine.traits.wo_truncates is None and source.reached
+        if source.closed and (unknown or self._engine.traits.wo_truncates is False):
             session = await self._reopen()
             if session is not None:
                 return session
@@ -348,7 +347,7 @@ class Upload(SessionUser):
         asked afterwards, since the reply to OpenFileWO may say what it was before. What is not seen to keep
         the file passes for emptying it.
         """
-        server, traits, reached = self._server, self._traits, self._source.reached
+        server, traits, reached = self._server, self._engine.traits, self._source.reached
         try:
             session = await server.open(self.path, Opcode.OPEN_FILE_WO)
             if traits.wo_truncates is None:
@@ -437,7 +436,7 @@ class Upload(SessionUser):
             if not transfer.idle and clock() - max(driver.last_reply_at, transfer.progress_at) > limit:
                 # The session may be somebody else's (servers.md 14.9). Where closing would cost the whole
                 # file, only if there is somebody else; the server tells the rest.
-                rivals = self._traits.wo_truncates is False or self._vehicle.foreign_client(clock())
+                rivals = self._engine.traits.wo_truncates is False or self._vehicle.foreign_client(clock())
                 stop = Stop.DOUBT if rivals else stop
             if stop is not None:
                 transfer.paused = True
@@ -479,7 +478,7 @@ class Upload(SessionUser):
                 patience = 0.0
             return Stop.STARVED if now - fed_at >= patience else None
         if rival is None:
-            over = self._traits.wo_truncates is False and now - session.opened_at >= CHECKPOINT_EVERY
+            over = self._engine.traits.wo_truncates is False and now - session.opened_at >= CHECKPOINT_EVERY
         else:
             over = resumable and self.gives_way(rival, session.opened_at, now, self._engine.rtt)
         return Stop.YIELD if over else None
@@ -488,7 +487,7 @@ class Upload(SessionUser):
         """Whether the Terminate goes out right behind the last requests: a round trip less for who waits.
         Servers carry them out in order; what gets lost is sent when the file is open again. Where others'
         paths cause refusals, the answers are waited for: that alone sets it right."""
-        if stop is not Stop.YIELD or self._traits.wo_truncates is not False:
+        if stop is not Stop.YIELD or self._engine.traits.wo_truncates is not False:
             return False
         if self._engine.traits.paths_disarm or self._server.is_excluded(self.path):
             return False
@@ -588,7 +587,9 @@ class Upload(SessionUser):
 
     def _roll_back(self) -> None:
         self._end_transfer()
-        self._source.roll_back(everything=self._traits.wo_truncates is not False or not self._source.closed)
+        self._source.roll_back(
+            everything=self._engine.traits.wo_truncates is not False or not self._source.closed
+        )
 
 
 def is_disarmed(error: MavftpfsError) -> bool:

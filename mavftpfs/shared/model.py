@@ -168,6 +168,9 @@ class Traits:
         write_ack_offset: they say where (MAVSDK's say 0), and are believed only if that is the place.
         paths_disarm: a path operation made it refuse the next write (PX4 on NuttX, servers.md 8).
         lists_times: it answers opcode 16. time_silences: how often it did not, and then answered opcode 3.
+        wo_truncates: OpenFileWO empties the file (servers.md 8).
+        rename_works: a rename succeeded (False: LittleFS has none). Filled by the cache.
+        rename_replaces: a rename onto an existing file worked (False: FAT refuses it). Filled by the cache.
     """
 
     ack_carries_own_session: bool | None = None
@@ -177,22 +180,11 @@ class Traits:
     paths_disarm: bool = False
     lists_times: bool | None = None
     time_silences: int = 0
-
-
-@dataclass(slots=True)
-class WriteTraits:
-    """What one server was seen to do when written to; forgotten when the vehicle reboots.
-
-    Attributes:
-        wo_truncates: OpenFileWO empties the file (servers.md 8). Filled by the session.
-        rename_works: a rename succeeded (False: LittleFS has none). Filled by the cache.
-        rename_replaces: a rename onto an existing file worked (False: FAT refuses it). Filled by the cache.
-    """
-
     wo_truncates: bool | None = None
     rename_works: bool | None = None
     rename_replaces: bool | None = None
 
-    def forget(self) -> None:
-        """The vehicle rebooted, perhaps with other firmware."""
-        self.wo_truncates = self.rename_works = self.rename_replaces = None
+    @property
+    def ways(self) -> tuple[bool | None, ...]:
+        """What decides in which way a file goes to the card."""
+        return self.wo_truncates, self.rename_works, self.rename_replaces

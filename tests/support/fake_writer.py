@@ -29,7 +29,7 @@ from mavftpfs.shared.errors import (
     VehicleLost,
 )
 from mavftpfs.shared.extents import ExtentSet
-from mavftpfs.shared.model import ROOT, WriteTraits, join, split, wire_path
+from mavftpfs.shared.model import ROOT, Traits, join, split, wire_path
 from mavftpfs.shared.sending import Sending
 from tests.support.fake_store import FakeFile, FakeReader, FakeStore
 
@@ -83,7 +83,7 @@ class FakeWriter(FakeStore):
     def __init__(self, kind: Kind | None = None, nursery: trio.Nursery | None = None) -> None:
         super().__init__(nursery)
         self.kind = kind or Kind()
-        self.traits = WriteTraits(rename_works=self.kind.renames)
+        self.traits = Traits(rename_works=self.kind.renames)
         self.requests = 0
         self.log: list[tuple[str, ...]] = []
         self.fail_at: dict[int, MavftpfsError] = {}
