@@ -88,15 +88,11 @@ def kept_in(directory: Path) -> list[Kept]:
         UsageError: it cannot be read.
     """
     try:
-        paths = sorted(path for path in directory.iterdir() if path.is_file() and not path.is_symlink())
+        paths = {path for path in directory.iterdir() if path.is_file() and not path.is_symlink()}
     except OSError as exc:
         raise UsageError(f"{directory}: {exc.strerror}") from exc
-    described, descriptions = {}, set()
-    for path in paths:
-        if path.suffix == ".json" and path.with_suffix("") in paths:
-            described[path.stem] = _read_facts(path)
-            descriptions.add(path)
-    return [Kept(path, described.get(path.name, {})) for path in paths if path not in descriptions]
+    files = {path for path in paths if not (path.suffix == ".json" and path.with_suffix("") in paths)}
+    return [Kept(path, _read_facts(Path(f"{path}.json"))) for path in sorted(files)]
 
 
 def _read_facts(path: Path) -> dict[str, Any]:
@@ -129,25 +125,18 @@ def chosen(names: Sequence[str], base: Path) -> list[Kept]:
 # -- putting back ---------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True)
-class PutBack:
-    """A file that is on the vehicle now. there_already: nothing had to be sent."""
-
-    kept: Kept
-    there_already: bool
-
-
 async def put_back(
     session: Session,
     wanted: Sequence[Kept],
     progress: Progress,
-    tell: Callable[[PutBack], None],
+    tell: Callable[[Kept, bool], None],
     *,
     force: bool,
 ) -> None:
     """Put files where they belonged; a copy that the vehicle provably has is removed here.
 
-    force: also over a file that is not the one they were to replace.
+    tell: hears of each file, and whether it was there already. force: also over a file that is not the one
+    they were to replace.
 
     Raises:
         UsageError: one of them cannot be put back; the text says why. NotDelivered: it did not arrive.
@@ -161,9 +150,10 @@ async def put_back(
         there_already = await _is_there(session, path, kept, force=force)
         if not there_already:
             await put_file(session, kept.file, path, progress)
-            await _prove(session, path, kept)
+            if await _differs(session, path, kept):
+                raise NotDelivered(f"{name_text(path)} differs on the vehicle; the copy stays in {kept.file}")
         _forget(kept)
-        tell(PutBack(kept, there_already))
+        tell(kept, there_already)
 
 
 def _in_session(session: Session, kept: Kept) -> bytes:
@@ -187,7 +177,7 @@ async def _is_there(session: Session, path: bytes, kept: Kept, *, force: bool) -
         return False
     if found.kind is not EntryKind.FILE:
         raise UsageError(f"{name_text(path)} is a directory on the vehicle")
-    if found.size == kept.size and await _crc32(session, path) == local_crc32(kept.file):
+    if found.size == kept.size and await _differs(session, path, kept) is False:
         return True
     before = kept.facts.get("size_on_vehicle")
     if found.size not in (before, 0) and not force:  # an empty one holds nothing to lose
@@ -199,16 +189,10 @@ async def _is_there(session: Session, path: bytes, kept: Kept, *, force: bool) -
     return False
 
 
-async def _prove(session: Session, path: bytes, kept: Kept) -> None:
-    """Compare the vehicle's checksum with the copy, where it gives one; the size was compared before."""
-    theirs = await _crc32(session, path)
-    if theirs is not None and theirs != local_crc32(kept.file):
-        raise NotDelivered(f"{name_text(path)} differs on the vehicle; the copy stays in {kept.file}")
-
-
-async def _crc32(session: Session, path: bytes) -> int | None:
+async def _differs(session: Session, path: bytes, kept: Kept) -> bool | None:
+    """Compare with the vehicle's checksum; None where there is none."""
     try:
-        return await session.files.crc32(path)
+        return await session.files.crc32(path) != local_crc32(kept.file)
     except NO_CHECKSUM:
         return None
 

@@ -332,9 +332,9 @@ def recover(args: Args) -> int:
         raise UsageError("say which files: their names as `mavftpfs recover` lists them, or --all")
     bar = progress.Progress()
 
-    def tell(done: recovering.PutBack) -> None:
-        how = "was there already" if done.there_already else "is on the vehicle now, verified"
-        print(f"{_name(done.kept.path or b'')} {how}; the copy here is removed", flush=True)
+    def tell(kept: recovering.Kept, there_already: bool) -> None:
+        how = "was there already" if there_already else "is on the vehicle now, verified"
+        print(f"{_name(kept.path or b'')} {how}; the copy here is removed", flush=True)
 
     async def work(session: Session) -> None:
         await recovering.put_back(session, wanted, bar, tell, force=args.force)
