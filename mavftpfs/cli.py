@@ -19,10 +19,7 @@ from mavftpfs.fuse.options import option_help
 from mavftpfs.shared.errors import ExitCode, MavftpfsError, UsageError, exit_code_for
 from mavftpfs.shared.readable import readable
 
-_DESCRIPTION = """Mount a drone's files (MAVLink FTP: PX4, ArduPilot, MAVSDK) as a local directory.
-
-  mavftpfs SOURCE MOUNTPOINT [-o opt,...] [-f] [-d]
-"""
+_DESCRIPTION = "Mount a drone's files (MAVLink FTP: PX4, ArduPilot, MAVSDK) as a local directory."
 _SOURCES = """SOURCE: udpin:0.0.0.0:14550, udpout:host:port, tcp:host:port, tcpin:host:port, /dev/ttyACM0,
 /dev/ttyUSB0,57600, or the same as a URL; `#/remote/dir` behind it names a subtree."""
 
@@ -108,12 +105,16 @@ def _top_parser() -> Parser:
     parser = Parser(
         "mavftpfs",
         description=_DESCRIPTION,
-        epilog=f"commands: {', '.join(_COMMANDS)}; see mavftpfs COMMAND --help\n\n{_sources_and_options()}",
+        epilog=f"commands, each with --help:\n{_all_commands()}\n\n{_sources_and_options()}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("-V", "--version", action="version", version=f"mavftpfs {mavftpfs.__version__}")
     _add_mount_arguments(parser)
     return parser
+
+
+def _all_commands() -> str:
+    return "\n".join(f"  {name:<9}{make(name).description}" for name, (make, _) in _COMMANDS.items())
 
 
 def _mount_parser(name: str) -> Parser:
@@ -314,8 +315,7 @@ def _demo_parser(name: str) -> Parser:
 def _install_parser(name: str) -> Parser:
     parser = Parser(
         f"mavftpfs {name}",
-        description="Put man pages, completions and the systemd unit into place; as root for everybody, "
-        "with the udev rule that mounts a plugged-in autopilot.",
+        description="Put man pages, completions, the systemd unit and, as root, the udev rule into place.",
     )
     what = parser.add_mutually_exclusive_group()
     what.add_argument("--print", action="store_true", help="show what would be written")
