@@ -40,7 +40,7 @@ class LinkSettings:
     delay, jitter: seconds one way. loss, duplicate, reorder, corrupt: probabilities per frame.
     hold: seconds by which a reordered frame is late, and three of its airtimes more.
     mtu: bytes of the longest frame that ever arrives, None = any.
-    burst_loss: share of frames lost in runs of 8 on average. cuts: (start, stop) times without a link.
+    burst_loss: share of frames lost in runs of 8 on average.
     """
 
     rate: float | None = None
@@ -55,7 +55,6 @@ class LinkSettings:
     reorder: float = 0.0
     hold: float = 0.020
     corrupt: float = 0.0
-    cuts: tuple[tuple[float, float], ...] = ()
 
 
 @dataclass(slots=True)
@@ -66,16 +65,12 @@ class LinkCounters:
     """
 
     pushed: int = 0
-    pushed_bytes: int = 0
     dropped: int = 0
     """For want of room in the queue."""
     lost: int = 0
     cut: int = 0
     duplicated: int = 0
-    reordered: int = 0
-    corrupted: int = 0
     delivered: int = 0
-    delivered_bytes: int = 0
 
 
 class _Lane:
@@ -101,7 +96,7 @@ class LinkModel:
         self.settings = settings if settings is not None else LinkSettings()
         self._rng = rng
         self._lanes = (_Lane(), _Lane())
-        self._cuts: list[tuple[float, float]] = list(self.settings.cuts)
+        self._cuts: list[tuple[float, float]] = []
         self._turn = 0
         self._serial = 0
         self._now = float("-inf")
@@ -113,7 +108,6 @@ class LinkModel:
         self._advance(now)
         lane = self._lanes[direction]
         lane.counters.pushed += 1
-        lane.counters.pushed_bytes += len(frame)
         if self.settings.rate is not None and len(frame) > self.room(direction):
             lane.counters.dropped += 1
             return False
@@ -133,7 +127,6 @@ class LinkModel:
                 lane.counters.cut += 1
                 continue
             frames.append(frame)
-            lane.counters.delivered_bytes += len(frame)
         lane.counters.delivered += len(frames)
         return frames
 
@@ -218,7 +211,7 @@ class LinkModel:
         if self._is_lost(lane, len(frame)):
             lane.counters.lost += 1
             return
-        self._schedule(lane, sent, self._maybe_corrupt(lane, frame))
+        self._schedule(lane, sent, self._maybe_corrupt(frame))
         if self._chance(self.settings.duplicate):
             lane.counters.duplicated += 1
             self._schedule(lane, sent, frame)
@@ -228,7 +221,6 @@ class LinkModel:
         if self.settings.jitter:
             arrival += self._rng.random() * self.settings.jitter
         if self._chance(self.settings.reorder):
-            lane.counters.reordered += 1
             arrival += self.settings.hold + 3 * self._airtime(frame)
         else:
             arrival = lane.last_arrival = max(arrival, lane.last_arrival)
@@ -245,10 +237,9 @@ class LinkModel:
         too_long = self.settings.mtu is not None and size > self.settings.mtu
         return too_long or (lane.bad and bool(share)) or self._chance(self.settings.loss)
 
-    def _maybe_corrupt(self, lane: _Lane, frame: bytes) -> bytes:
+    def _maybe_corrupt(self, frame: bytes) -> bytes:
         if not frame or not self._chance(self.settings.corrupt):
             return frame
-        lane.counters.corrupted += 1
         damaged = bytearray(frame)
         for at in self._rng.sample(range(len(damaged)), min(len(damaged), self._rng.randint(1, 3))):
             damaged[at] ^= self._rng.randint(1, 255)

@@ -50,7 +50,6 @@ def test_the_queue_drops_its_tail() -> None:
     assert link.room(UP) == 50
     counters = link.counters(UP)
     assert (counters.pushed, counters.dropped, counters.delivered) == (7, 2, 5)
-    assert (counters.pushed_bytes, counters.delivered_bytes) == (70, 50)
 
 
 def test_half_duplex_shares_the_air_in_turn() -> None:
@@ -89,9 +88,13 @@ def test_frames_beyond_a_limit_never_arrive() -> None:
 
 
 def test_a_cut_loses_what_is_on_the_way() -> None:
-    link = model(rate=100.0, delay=1.0, cuts=((5.0, 6.0),))
-    for when in (0.0, 3.95, 4.5, 5.5, 6.0):
+    link = model(rate=100.0, delay=1.0)
+    for when in (0.0, 3.95, 4.5):
         link.push(UP, bytes(10), when)
+    link.cut(5.0)
+    link.push(UP, bytes(10), 5.5)
+    link.restore(6.0)
+    link.push(UP, bytes(10), 6.0)
     assert len(link.pop(UP, 10.0)) == 2
     assert link.counters(UP).cut == 3
     link.cut(20.0)
@@ -117,7 +120,6 @@ LINKS = st.builds(
     duplicate=st.floats(0, 1),
     reorder=st.floats(0, 1),
     corrupt=st.floats(0, 1),
-    cuts=st.just(()) | st.just(((0.5, 1.0),)),
 )
 PUSHES = st.lists(
     st.tuples(st.sampled_from(Direction), st.binary(max_size=300), st.floats(0, 0.2)), max_size=60
