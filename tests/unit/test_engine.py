@@ -256,20 +256,6 @@ def test_a_session_that_changes_all_the_time_ends_somewhere() -> None:
     assert engine.stats.requests == 9
 
 
-def test_a_late_refusal_under_an_old_session_does_not_repeat_twice() -> None:
-    engine = make()
-    op, request = asked(engine)
-    engine.on_deadline(1.0)
-    engine.session = 9
-    engine.receive(nak(request, NakCode.INVALID_SESSION), 1.1)
-    assert engine.in_flight == 0
-    (again,) = sent(engine, 1.1)
-    assert again.session == 9
-    engine.receive(ack(again), 1.2)
-    assert op.done
-    assert op.error is None
-
-
 # --- retransmission
 
 
@@ -457,17 +443,6 @@ def test_metadata_does_not_wait_for_what_a_wider_window_sent() -> None:
     assert [request.opcode for request in sent(engine, 0.1)] == [Opcode.CREATE_DIRECTORY]
 
 
-def test_demand_goes_before_readahead() -> None:
-    engine = make(limit=1)
-    ahead = ReadTransfer(1, SIZE, MemorySink(SIZE))
-    demand = ReadTransfer(2, SIZE, MemorySink(SIZE))
-    for transfer in (ahead, demand):
-        engine.start(transfer, 0.0)
-    ahead.want(0, SIZE, False)
-    demand.want(0, SIZE, True)
-    assert [request.session for request in sent(engine, 0.0)] == [2]
-
-
 def test_cancelled_requests_keep_their_place_until_they_are_answered() -> None:
     engine = make(limit=4)
     transfer, sink = reading(engine)
@@ -486,19 +461,6 @@ def test_cancelled_requests_keep_their_place_until_they_are_answered() -> None:
     assert engine.in_flight == 0
     assert engine.take_finished() == []
     assert engine.next_deadline() is None
-
-
-def test_each_operation_gets_its_own_lost_requests_back() -> None:
-    engine = make()
-    first, second = mkdir(), mkdir()
-    engine.start(first, 0.0)
-    (lost,) = sent(engine, 0.0)
-    engine.on_deadline(1.0)
-    engine.start(second, 1.0)
-    engine.flow.window = 1
-    assert [request.seq for request in sent(engine, 1.0)] == [lost.seq, lost.seq + 1]
-    engine.on_deadline(40.0)
-    assert {type(op.error) for op in engine.take_finished()} == {RequestTimeout}
 
 
 # --- bursts and others
@@ -544,18 +506,3 @@ def test_silence_proves_nothing_while_the_server_pauses_but_a_lone_requests_does
     assert (engine.stats.retransmissions == 0 and not engine._ledger.again) is patient
     engine.on_deadline(0.45)
     assert engine._ledger.again or sent(engine, 0.45)
-
-
-def test_answers_to_others_do_not_put_a_timer_off_for_ever() -> None:
-    """Where the path reorders, and after many losses, only its timer repeats a request."""
-    engine = make(limit=9)
-    reading(engine)
-    for request in sent(engine, 0.0):
-        engine.receive(chunk(request, bytes(SIZE)), 0.05)
-    engine.flow.window = 9
-    assert len(sent(engine, 0.05)) == 9
-    engine.flow.pause = 0.3
-    for step in range(1, 30):
-        engine._heard_at = 0.05 + step / 50
-        engine.on_deadline(engine._heard_at)
-    assert len(engine._ledger.again) == 9

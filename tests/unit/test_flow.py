@@ -246,13 +246,6 @@ def test_writes_go_on_while_answers_pause_but_not_for_long() -> None:
     assert flow.room(flow.window + 200, path.now + 15.0, paced=False) <= 0
 
 
-def test_a_silence_as_long_as_a_pause_proves_no_loss() -> None:
-    flow, path = paused()
-    assert flow.pause == pytest.approx(0.2, abs=0.05)
-    path.rounds(int(KNOWN / 0.1) + 10)
-    assert flow.starved or flow.pause == 0.0
-
-
 # --- a fast path
 
 

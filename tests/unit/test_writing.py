@@ -69,16 +69,6 @@ def test_chunks_go_out_ascending_and_full() -> None:
     assert engine.next_deadline() is None
 
 
-def test_more_goes_out_after_a_wake_only() -> None:
-    engine = make()
-    transfer, source = writing(engine, b"")
-    assert sent(engine, 0.0) == []
-    source.add(b"more")
-    assert sent(engine, 0.1) == []
-    transfer.wake()
-    assert [one.data for one in sent(engine, 0.2)] == [b"more"]
-
-
 @pytest.mark.holds("rule 14.23")
 def test_a_short_write_sends_the_rest() -> None:
     engine = make()
@@ -193,18 +183,6 @@ def test_what_is_closed_behind_is_not_repeated() -> None:
     assert list(source.in_flight) == [(239, 717)]
     transfer.finish()
     assert source.todo.covers(239, 717)
-
-
-def test_what_waits_to_be_repeated_is_not_all_out() -> None:
-    engine = make()
-    transfer, _ = writing(engine, in_flight=4)
-    requests = sent(engine, 0.0)
-    transfer.paused = True
-    assert transfer.all_out
-    engine.receive(ack(requests[3]), 0.1)
-    assert not transfer.all_out
-    sent(engine, 0.1)
-    assert transfer.all_out
 
 
 @pytest.mark.holds("rule 14.26")
