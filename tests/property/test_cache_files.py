@@ -6,7 +6,7 @@ import random
 from dataclasses import dataclass
 
 import trio
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from trio.testing import MockClock
 
@@ -15,7 +15,8 @@ from mavftpfs.cache.readahead import MAX_WINDOW, Readahead
 from mavftpfs.cache.tree import OpenFile, Tree
 from mavftpfs.cache.versions import BLOCK_SIZE, BlockCache, Version
 from mavftpfs.shared.errors import DataUnproven, FileChanged, RequestTimeout, VehicleLost
-from tests.support.fake_store import FakeStore, make_tree
+from mavftpfs.sim.linkmodel import LinkSettings
+from tests.support.rigs import Rig, read_file, rig
 
 KIB = 1024
 
@@ -90,72 +91,56 @@ class Opened:
     doubtful: bool = False
 
 
-class Session:
+class Programs:
     """Random actions of several programs on two files, and of the vehicle and the link meanwhile."""
 
     PATHS = (b"/small", b"/d/large")
 
-    def __init__(self, seed: int, nursery: trio.Nursery) -> None:
-        self.rng = random.Random(seed)
-        self.store = FakeStore(nursery)
-        self.store.chunk = self.rng.choice([1000, 4 * KIB, 64 * KIB])
-        self.store.spoil = lambda path, offset, data: bytes(byte ^ 0x55 for byte in data)
-        self.with_times = self.rng.random() < 0.5
-        self.mtime = 1000
-        self.store.add(b"/small", self.rng.randbytes(self.rng.choice([0, 1, 239, 5000])), self.next_mtime())
-        self.store.add(
-            b"/d/large", self.rng.randbytes(self.rng.choice([200, 900, 1500]) * KIB), self.next_mtime()
-        )
-        self.tree: Tree = make_tree(self.store, cache_size=MIN_CACHE_SIZE)
-        self.opened: dict[bytes, list[Opened]] = {path: [] for path in self.PATHS}
+    def __init__(self, here: Rig, rng: random.Random) -> None:
+        self.here = here
+        self.rng = rng
+        self.with_times = here.world.profile == "mavsdk"
+        self.mtime = 1_700_000_000
+        for path, sizes in zip(self.PATHS, ([0, 1, 239, 5000], [100 * KIB, 500 * KIB]), strict=True):
+            self.put(path, rng.randbytes(rng.choice(sizes)))
+        self.tree: Tree = here.mount(cache_size=MIN_CACHE_SIZE, dir_timeout=20.0)
+        self.opened: list[tuple[bytes, Opened]] = []
         self.good = 0
 
-    def next_mtime(self) -> int | None:
+    def put(self, path: bytes, data: bytes) -> None:
         self.mtime += 1
-        return self.mtime if self.with_times else None
+        self.here.put(path, data, self.mtime)
 
     async def run(self, actions: int) -> None:
+        """Act, and then see that every file can be read, and nothing is left open."""
+        choices = [self.read, self.read, self.read_many, self.open, self.close, self.disturb, self.change]
         for _ in range(actions):
-            action = self.rng.choice(
-                [
-                    self.read,
-                    self.read,
-                    self.read,
-                    self.read_many,
-                    self.open,
-                    self.close,
-                    self.disturb,
-                    self.change,
-                ]
-            )
-            await action()
+            await self.rng.choice(choices)()
             assert int(str(self.tree.status()["bytes_cached"])) <= MIN_CACHE_SIZE
-        await self.settle()
+        while self.opened:
+            await self.close()
+        for path in self.PATHS:
+            await trio.sleep(25)
+            assert await read_file(self.tree, path) == self.here.data(path)
+        assert self.tree._files.open_versions == {}
 
     async def open(self) -> None:
         path = self.rng.choice(self.PATHS)
-        try:
-            handle = await self.tree.open(path)
-        except VehicleLost:
-            return
-        self.opened[path].append(Opened(handle, self.store.files[path].data))
-        assert handle.size == len(self.store.files[path].data)
+        handle = await self.tree.open(path)
+        assert handle.size == len(self.here.data(path))
+        self.opened.append((path, Opened(handle, self.here.data(path))))
 
     async def close(self) -> None:
-        path = self.rng.choice(self.PATHS)
-        if self.opened[path]:
-            self.opened[path].pop(self.rng.randrange(len(self.opened[path]))).handle.close()
+        if self.opened:
+            self.opened.pop(self.rng.randrange(len(self.opened)))[1].handle.close()
 
     async def read(self) -> None:
-        handles = self.opened[self.rng.choice(self.PATHS)]
-        if not handles:
+        if not self.opened:
             return await self.open()
-        chosen = self.rng.choice(handles)
+        chosen = self.rng.choice(self.opened)[1]
         offset = self.rng.randrange(chosen.handle.size + 10)
-        size = self.rng.choice([1, 100, 4 * KIB, 128 * KIB, 400 * KIB])
-        with trio.move_on_after(self.rng.choice([0.002, 1000])):
-            await self.checked_read(chosen, offset, size)
-        return None
+        with trio.move_on_after(self.rng.choice([0.05, 1000])):
+            await self.checked_read(chosen, offset, self.rng.choice([1, 100, 4 * KIB, 128 * KIB]))
 
     async def checked_read(self, chosen: Opened, offset: int, size: int) -> None:
         try:
@@ -170,100 +155,58 @@ class Session:
             self.good += 1
 
     async def read_many(self) -> None:
-        """Several readers at once, one of them sequential."""
-        everyone = [opened for handles in self.opened.values() for opened in handles]
-        if not everyone:
-            return
+        """Several readers at once, with trouble among them."""
         async with trio.open_nursery() as readers:
-            for _ in range(4):
-                chosen = self.rng.choice(everyone)
-                readers.start_soon(
-                    self.checked_read, chosen, self.rng.randrange(chosen.handle.size + 1), 100_000
-                )
-            readers.start_soon(self.read_through, self.rng.choice(everyone))
-
-    async def read_through(self, chosen: Opened) -> None:
-        for offset in range(0, min(chosen.handle.size, 700 * KIB), 128 * KIB):
-            await self.checked_read(chosen, offset, 128 * KIB)
+            for _, chosen in self.rng.choices(self.opened, k=4) if self.opened else []:
+                start = self.rng.randrange(chosen.handle.size + 1)
+                readers.start_soon(self.checked_read, chosen, start, 100_000)
+            await trio.sleep(self.rng.choice([0.1, 1.0]))
+            await self.disturb()
 
     async def disturb(self) -> None:
-        trouble = self.rng.choice(["fail", "suspect", "suspect", "armed", "pause", "lost", "reboot"])
-        if trouble == "fail":
-            self.store.fail_chunks = [self.rng.choice([VehicleLost("gone"), RequestTimeout("silence")])]
-        elif trouble == "suspect":
-            self.store.suspect_chunks = self.rng.choice([1, 2, 5])
-        elif trouble == "armed":
-            self.store.armed = not self.store.armed
-        elif trouble == "pause":
-            await trio.sleep(self.rng.choice([1, 25]))
-        elif trouble == "lost":
-            self.store.lost = not self.store.lost
+        trouble = self.rng.choice(["doubt", "doubt", "cut", "reboot", "pause"])
+        if trouble == "doubt":
+            self.here.connection.scheduler.doubt.raise_it("somebody else")
+        elif trouble == "cut":
+            self.here.world.link.cut()
+            await trio.sleep(self.rng.choice([1.0, 8.0]))
+            await self.here.find()
+        elif trouble == "reboot":
+            for path, opened in self.opened:
+                opened.doubtful |= not self.with_times or opened.data != self.here.data(path)
+            await self.here.reboot()
         else:
-            self.reboot()
-
-    def reboot(self) -> None:
-        """Restart the vehicle; its files are the same, but the client cannot always prove it."""
-        self.tree.rebooted()
-        for path, handles in self.opened.items():
-            for opened in handles:
-                opened.doubtful |= not self.with_times or opened.data != self.store.files[path].data
+            await trio.sleep(25)
 
     async def change(self) -> None:
         """Append to a file, or replace it, and let every proof run out."""
         path = self.rng.choice(self.PATHS)
-        data = self.store.files[path].data
+        data = self.here.data(path)
         if self.rng.random() < 0.5:
-            self.store.add(path, data + self.rng.randbytes(300), self.next_mtime())
-        elif self.rng.random() < 0.2:
-            self.store.add(
-                path, self.rng.randbytes(max(0, len(data) - self.rng.choice([0, 1, 5000]))), self.next_mtime()
-            )
-            for opened in self.opened[path]:
-                opened.data = None
+            self.put(path, data + self.rng.randbytes(300))
+        else:
+            self.put(path, self.rng.randbytes(max(0, len(data) - self.rng.choice([0, 1, 5000]))))
+            for other, opened in self.opened:
+                if other == path:
+                    opened.data = None
         await trio.sleep(25)
-        if self.store.lost:
-            self.store.lost = False
-            self.tree.link_back()
-
-    async def settle(self) -> None:
-        """When everything is well again every file can be read, and nothing is left open."""
-        self.store.lost, self.store.armed, self.store.suspect_chunks = False, False, 0
-        self.store.fail_chunks = []
-        self.tree.link_back()
-        for path in self.PATHS:
-            for opened in self.opened[path]:
-                opened.handle.close()
-            await trio.sleep(25)
-            handle = await self.tree.open(path)
-            assert bytes(await handle.read(0, handle.size)) == self.store.files[path].data
-            handle.close()
-        assert all(reader.closed for reader in self.store.readers)
-        assert self.tree._files.open_versions == {}
-        assert self.store.crimes == []
 
 
-@settings(max_examples=60)
+async def act(seed: int, actions: int) -> int:
+    """Let programs act on a vehicle; return how many reads were right."""
+    rng = random.Random(seed)
+    async with rig(rng.choice(["mavsdk", "px4"]), link=LinkSettings(rate=200_000.0, delay=0.01)) as here:
+        programs = Programs(here, rng)
+        await programs.run(actions)
+    return programs.good
+
+
+@settings(max_examples=5)
 @given(st.integers(0, 2**32))
+@example(1)
 def test_every_read_is_right_or_an_error(seed: int) -> None:
-    async def main() -> None:
-        async with trio.open_nursery() as nursery:
-            await Session(seed, nursery).run(30)
-            nursery.cancel_scope.cancel()
-
-    trio.run(main, clock=MockClock(autojump_threshold=0))
-
-
-def test_the_session_above_reads_something() -> None:
-    """Guards the property against being vacuous."""
-
-    async def main() -> int:
-        async with trio.open_nursery() as nursery:
-            session = Session(1, nursery)
-            await session.run(60)
-            nursery.cancel_scope.cancel()
-        return session.good
-
-    assert trio.run(main, clock=MockClock(autojump_threshold=0)) > 20
+    good = trio.run(act, seed, 25, clock=MockClock(autojump_threshold=0))
+    assert good > 5 or seed != 1  # some are right
 
 
 # --- readahead

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Awaitable, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable
 from random import Random
 
 import pytest
 import trio
-import trio.testing
 
 from mavftpfs.cache.attributes import SECOND, UNKNOWN_MTIME
 from mavftpfs.cache.directories import SWEEP_TRIES
@@ -15,7 +14,7 @@ from mavftpfs.cache.options import MIN_CACHE_SIZE, CacheOptions
 from mavftpfs.cache.reserved import Kind, Reserved, new_owner
 from mavftpfs.cache.singleflight import SingleFlight
 from mavftpfs.cache.tree import Stat, Tree
-from mavftpfs.protocol.payload import NakCode, Opcode, crc32
+from mavftpfs.protocol.payload import NakCode, Opcode, Payload, crc32
 from mavftpfs.shared.errors import (
     Armed,
     FtpNak,
@@ -30,141 +29,168 @@ from mavftpfs.shared.errors import (
     VehicleLost,
 )
 from mavftpfs.shared.model import EntryKind
-from tests.support.fake_store import FakeFile, FakeStore, make_tree, read_file
+from mavftpfs.sim.linkmodel import LinkSettings
+from tests.support.replies import nak
+from tests.support.rigs import Rig, card, read_file, rig
 
 FILE, DIRECTORY = EntryKind.FILE, EntryKind.DIRECTORY
+OPEN, CRC = Opcode.OPEN_FILE_RO, Opcode.CALC_FILE_CRC32
+LISTS = (Opcode.LIST_DIRECTORY, Opcode.LIST_DIRECTORY_WITH_TIME)
+A = b"/fs/microsd/a.txt"
+MTIME = 1_700_000_000
+FILES = {A: b"hello", b"/fs/microsd/log/2024-05-01/12_34_56.ulg": b"u" * 10, b"/top": b"t"}
 
 
 @pytest.fixture
-def store(nursery: trio.Nursery) -> FakeStore:
-    store = FakeStore(nursery)
-    store.add(b"/fs/microsd/a.txt", b"hello", 1_700_000_000)
-    store.add(b"/fs/microsd/log/2024-05-01/12_34_56.ulg", b"u" * 10)
-    store.add(b"/top", b"t")
-    return store
+async def here() -> AsyncIterator[Rig]:
+    """A server whose listings tell times."""
+    async with rig("mavsdk", FILES) as made:
+        made.put(A, b"hello", MTIME)
+        yield made
+
+
+px4 = card(FILES)
 
 
 @pytest.fixture
-def tree(store: FakeStore) -> Tree:
-    return make_tree(store)
+def tree(here: Rig) -> Tree:
+    return here.mount()
+
+
+def listings(tree: Tree) -> int:
+    """Return how many listings were asked for so far."""
+    return int(str(tree.status()["listings_asked"]))
+
+
+def hide(here: Rig, shown: bytes, instead: bytes = b"") -> None:
+    """Have listings show something else than this line."""
+
+    def change(request: Payload, reply: Payload) -> list[Payload]:
+        data = reply.data.replace(shown, instead) if request.opcode in LISTS else reply.data
+        return [reply._replace(data=data, size=len(data))]
+
+    here.server.change = change
+
+
+def listed(here: Rig) -> list[bytes]:
+    """Return which directories are listed from now on."""
+    found: list[bytes] = []
+
+    def note(request: Payload) -> None:
+        if request.opcode in LISTS and request.offset == 0:
+            found.append(request.data.rstrip(b"\0"))
+
+    here.server.answer = note
+    return found
 
 
 # --- walking
 
 
 @pytest.mark.holds("promise 4")
-async def test_stat_walks_from_the_root_and_then_costs_nothing(store: FakeStore, tree: Tree) -> None:
-    assert await tree.stat(b"/fs/microsd/a.txt") == Stat(FILE, 5, 1_700_000_000 * SECOND, 1.0)
-    assert store.calls == [("list", b"/"), ("list", b"/fs"), ("list", b"/fs/microsd")]
+async def test_stat_walks_from_the_root_and_then_costs_nothing(here: Rig, tree: Tree) -> None:
+    asked = listed(here)
+    assert await tree.stat(A) == Stat(FILE, 5, MTIME * SECOND, 1.0)
+    assert asked == [b"/", b"/fs", b"/fs/microsd"]
     assert (await tree.stat(b"/fs/microsd/log")).kind is DIRECTORY
-    assert await tree.stat(b"/fs") == Stat(DIRECTORY, 0, UNKNOWN_MTIME * SECOND, 1.0)
-    assert len(store.calls) == 3
+    assert (await tree.stat(b"/fs")).valid_for == 1.0
+    assert len(asked) == 3
 
 
-async def test_absence_by_a_fresh_listing_costs_nothing(store: FakeStore, tree: Tree) -> None:
-    with pytest.raises(NotFound):
-        await tree.stat(b"/none")
-    with pytest.raises(NotFound):
-        await tree.stat(b"/none/deeper")
-    assert store.calls == [("list", b"/")]
+async def test_absence_by_a_fresh_listing_costs_nothing(tree: Tree) -> None:
+    for path in (b"/none", b"/none/deeper"):
+        with pytest.raises(NotFound):
+            await tree.stat(path)
+    assert listings(tree) == 1
     assert tree.negative_valid_for(b"/none") == 2.0
     await trio.sleep(19)
-    assert tree.negative_valid_for(b"/none") == pytest.approx(1.0)
+    assert tree.negative_valid_for(b"/none") == pytest.approx(1.0, abs=0.1)
     await trio.sleep(2)
     assert tree.negative_valid_for(b"/none") == 0.0
     assert tree.negative_valid_for(b"/unknown/none") == 0.0
 
 
 @pytest.mark.holds("promise 6", "rule 14.30")
-async def test_a_file_is_never_listed(store: FakeStore, tree: Tree) -> None:
-    for path in (b"/top/x", b"/top/x/y", b"/fs/microsd/a.txt/b"):
+async def test_a_file_is_never_listed(here: Rig, tree: Tree) -> None:
+    asked = listed(here)
+    for path in (b"/top/x", b"/top/x/y", A + b"/b"):
         with pytest.raises(NotADirectory):
             await tree.stat(path)
     with pytest.raises(NotADirectory):
         await tree.list(b"/top")
-    assert store.crimes == []
+    assert not {b"/top", A} & set(asked)
 
 
-async def test_a_refused_directory_is_looked_for_again(store: FakeStore, tree: Tree) -> None:
+async def test_a_refused_directory_is_looked_for_again(px4: Rig) -> None:
+    tree = px4.mount()
     await tree.stat(b"/fs/microsd")
-    store.remove(b"/fs/microsd")
+    px4.world.tree.rename(b"/fs/microsd", b"/elsewhere")
     with pytest.raises(FtpNak):
         await tree.list(b"/fs/microsd")
+    asked = listed(px4)
     with pytest.raises(NotFound):
         await tree.list(b"/fs/microsd")
-    assert store.count("list", b"/fs") == 2
+    assert asked == [b"/fs"]
 
 
-async def test_hostile_paths(store: FakeStore, tree: Tree) -> None:
+async def test_hostile_paths(here: Rig, tree: Tree) -> None:
     with pytest.raises(LocalProtocolError):
         await tree.stat(b"/fs/../etc")
     with pytest.raises(PathTooLong):
         await tree.stat(b"/x" * 1000)
-    assert store.calls == []
+    assert here.faults.requests == []
     assert (await tree.stat(b"//fs/./microsd/")).kind is DIRECTORY
 
 
 @pytest.mark.holds("rule 14.33")
-async def test_a_name_too_long_to_be_asked_for_is_still_shown(store: FakeStore, tree: Tree) -> None:
-    name = b"n" * 190
-    store.add(b"/fs/microsd/" + name, b"x")
-    assert (await tree.stat(b"/fs/microsd/" + name)).size == 1
+async def test_a_name_too_long_to_be_asked_for_is_still_shown(here: Rig, tree: Tree) -> None:
+    path = b"/fs/microsd/" + b"n" * 190
+    here.put(path, b"x")
+    assert (await tree.stat(path)).size == 1
     with pytest.raises(PathTooLong):
-        await tree.open(b"/fs/microsd/" + name)
+        await tree.open(path)
 
 
-async def test_attributes_are_valid_no_longer_than_the_listing(store: FakeStore, tree: Tree) -> None:
+async def test_attributes_are_valid_no_longer_than_the_listing(tree: Tree) -> None:
     await tree.stat(b"/top")
     await trio.sleep(19.5)
-    assert (await tree.stat(b"/top")).valid_for == pytest.approx(0.5)
+    assert (await tree.stat(b"/top")).valid_for == pytest.approx(0.5, abs=0.1)
 
 
 # --- sweeps
 
 
-async def test_requests_for_one_listing_share_a_sweep(store: FakeStore, tree: Tree) -> None:
-    store.list_delay = 1
-    async with trio.open_nursery() as askers:
+async def test_requests_for_one_listing_share_a_sweep() -> None:
+    async with rig(files=FILES, link=LinkSettings(delay=0.5)) as here, trio.open_nursery() as askers:
+        tree = here.mount()
         for _ in range(5):
             askers.start_soon(tree.list, b"/")
             askers.start_soon(tree.stat, b"/top")
-    assert store.count("list") == 1
-    assert tree.status()["listings_asked"] == 1
+    assert listings(tree) == 1
 
 
-@pytest.mark.parametrize("background", [False, True])
-async def test_a_cancelled_sweep(store: FakeStore, nursery: trio.Nursery, background: bool) -> None:
-    """With a nursery it goes on for the next caller; without one the other caller starts anew."""
-    tree = make_tree(store, nursery=nursery if background else None)
-    store.list_delay = 40
-    lists = []
-
-    async def ask() -> None:
-        lists.append(await tree.list(b"/"))
-
-    async with trio.open_nursery() as askers:
-        with trio.move_on_after(30):
-            async with trio.open_nursery() as inner:
-                inner.start_soon(tree.list, b"/")
-                await trio.testing.wait_all_tasks_blocked()
-                askers.start_soon(ask)
-    assert len(lists) == 1
-    assert trio.current_time() == pytest.approx(40 if background else 70)
-    assert store.count("list") == (1 if background else 2)
+async def test_a_cancelled_sweep_goes_on_for_the_next_caller() -> None:
+    async with rig(files=FILES, link=LinkSettings(delay=3.0)) as here:
+        tree = here.mount()
+        with trio.move_on_after(5):
+            await tree.list(b"/")
+        assert len(await tree.list(b"/")) == 2
+        assert listings(tree) == 1
 
 
-async def test_a_listing_that_is_always_raced_is_given_up_on(store: FakeStore, tree: Tree) -> None:
-    store.during_list = lambda path: tree._directories.put(b"/never", None)
+async def test_a_listing_that_is_always_raced_is_given_up_on(here: Rig, tree: Tree) -> None:
+    here.server.answer = lambda request: tree._directories.put(b"/never", None)
     assert b"top" in dict(await tree.list(b"/"))
-    assert store.count("list", b"/") == SWEEP_TRIES
+    assert listings(tree) == SWEEP_TRIES
     assert tree.negative_valid_for(b"/none") == 0.0
 
 
-async def test_a_tree_that_is_only_read_shows_what_others_left(store: FakeStore, tree: Tree) -> None:
+async def test_a_tree_that_is_only_read_shows_what_others_left(here: Rig) -> None:
     """Names like those of our own, too: there may be nothing else left of a file."""
+    tree = here.mount(read_only=True)
     left = Reserved(new_owner(Random(1)), Kind.NEW, b"sss", b"a.txt").name
     for name in (left, b".a.txt.swp"):
-        store.add(b"/fs/microsd/" + name, b"left")
+        here.put(b"/fs/microsd/" + name, b"left")
         assert await read_file(tree, b"/fs/microsd/" + name) == b"left"
         tree.forget_caches()
     assert {left, b".a.txt.swp"} < set(dict(await tree.list(b"/fs/microsd")))
@@ -176,26 +202,26 @@ async def test_a_tree_that_is_only_read_shows_what_others_left(store: FakeStore,
 
 
 @pytest.mark.holds("promise 4")
-async def test_expired_listings_are_served_while_the_vehicle_is_lost(store: FakeStore, tree: Tree) -> None:
+async def test_expired_listings_are_served_while_the_vehicle_is_lost(here: Rig, tree: Tree) -> None:
     await tree.list(b"/fs/microsd")
+    await here.lose()
     await trio.sleep(100)
-    store.lost = True
-    assert (await tree.stat(b"/fs/microsd/a.txt")).size == 5
-    assert await tree.stat(b"/fs/microsd/a.txt") == Stat(FILE, 5, 1_700_000_000 * SECOND, 0.0)
+    asked = len(here.faults.requests)
+    assert await tree.stat(A) == Stat(FILE, 5, MTIME * SECOND, 0.0)
     assert len(await tree.list(b"/fs/microsd")) == 2
     with pytest.raises(NotFound):
         await tree.stat(b"/fs/microsd/none")
     assert tree.negative_valid_for(b"/fs/microsd/none") == 0.0
+    assert len(here.faults.requests) == asked
     with pytest.raises(VehicleLost):
         await tree.list(b"/fs/microsd/log")
-    store.lost = False
-    tree.link_back()
-    store.add(b"/fs/microsd/b.txt", b"")
+    await here.find()
+    here.put(b"/fs/microsd/b.txt", b"")
     assert len(await tree.list(b"/fs/microsd")) == 3
 
 
-async def test_forgetting_the_caches(store: FakeStore, tree: Tree) -> None:
-    kept = await tree.open(b"/fs/microsd/a.txt")
+async def test_forgetting_the_caches(here: Rig, tree: Tree) -> None:
+    kept = await tree.open(A)
     await kept.read(0, 5)
     await read_file(tree, b"/top")
     await tree.crc32(b"/top")
@@ -203,17 +229,17 @@ async def test_forgetting_the_caches(store: FakeStore, tree: Tree) -> None:
     status = tree.status()
     assert (status["listings_cached"], status["entries_cached"], status["bytes_cached"]) == (0, 0, 5)
     await tree.crc32(b"/top")
-    assert store.count("crc") == 2
-    calls = len(store.calls)
+    assert here.count(CRC) == 2
+    asked = here.count(OPEN, Opcode.READ_FILE)
     assert await kept.read(0, 5) == b"hello"
-    assert len(store.calls) == calls
+    assert here.count(OPEN, Opcode.READ_FILE) == asked
 
 
 # --- the mount's root
 
 
-async def test_a_subtree_is_mounted(store: FakeStore) -> None:
-    tree = make_tree(store, root=b"/fs/microsd")
+async def test_a_subtree_is_mounted(here: Rig) -> None:
+    tree = here.mount(root=b"/fs/microsd")
     assert {name for name, _ in await tree.list(b"/")} == {b"a.txt", b"log"}
     assert await read_file(tree, b"/a.txt") == b"hello"
     assert (await tree.stat(b"/log/2024-05-01")).kind is DIRECTORY
@@ -222,111 +248,121 @@ async def test_a_subtree_is_mounted(store: FakeStore) -> None:
         await tree.stat(b"/top")
     with pytest.raises(IsADirectory):
         await tree.open(b"/")
-    assert store.count("list", b"/") == 1
 
 
-async def test_the_kernel_hears_of_paths_below_the_mounts_root(store: FakeStore) -> None:
-    tree = make_tree(store, root=b"/fs/microsd")
+async def test_the_kernel_hears_of_paths_below_the_mounts_root(here: Rig) -> None:
+    tree = here.mount(root=b"/fs/microsd")
     await tree.stat(b"/a.txt")
-    store.add(b"/fs/microsd/a.txt", b"hello again", 1_700_000_001)
+    here.put(A, b"hello again", MTIME + 1)
     await tree.open(b"/a.txt")
-    assert store.invalidated == [b"/a.txt"]
+    assert here.invalidated == [b"/a.txt"]
 
 
-async def test_a_root_that_no_listing_shows_may_be_listed(store: FakeStore) -> None:
-    store.unlisted.add(b"/fs")
-    tree = make_tree(store, root=b"/fs/microsd")
+async def test_a_root_that_no_listing_shows_may_be_listed(px4: Rig) -> None:
+    hide(px4, b"Dfs\0")
+    tree = px4.mount(root=b"/fs/microsd")
     assert {name for name, _ in await tree.list(b"/")} == {b"a.txt", b"log"}
-    store.remove(b"/fs")
-    tree.rebooted()
+    px4.world.tree.rename(b"/fs", b"/elsewhere")
+    await px4.reboot()
     with pytest.raises(FtpNak):
         await tree.list(b"/")
 
 
-@pytest.mark.parametrize("root", [b"/top", b"/top/deeper", b"/fs/microsd/a.txt"])
-async def test_a_root_that_is_a_file_is_not_listed(store: FakeStore, root: bytes) -> None:
-    tree = make_tree(store, root=root)
+@pytest.mark.parametrize("root", [b"/top", b"/top/deeper", A])
+async def test_a_root_that_is_a_file_is_not_listed(here: Rig, root: bytes) -> None:
+    asked = listed(here)
     with pytest.raises(NotADirectory):
-        await tree.list(b"/")
-    assert store.crimes == []
+        await here.mount(root=root).list(b"/")
+    assert root not in asked
 
 
 # --- SITL's root
 
 
-async def test_dot_shows_what_root_hides(store: FakeStore, tree: Tree) -> None:
-    store.add(b"/@SYS/tasks.txt", b"x")
-    store.unlisted |= {b"/top"}
-    store.dot = {b"top": store.files[b"/top"], b"fs": FakeFile(b"not this one")}
-    stats = dict(await tree.list(b"/"))
-    assert stats[b"top"].size == 1
-    assert stats[b"fs"].kind is DIRECTORY
-    assert await read_file(tree, b"/top") == b"t"
-    assert store.count("list", b".") == 1
-    await trio.sleep(21)
-    await tree.stat(b"/top")
-    assert store.count("list", b".") == 2
+async def test_dot_shows_what_root_hides() -> None:
+    async with rig("ardupilot", FILES) as here:
+        tree, asked = here.mount(), listed(here)
+        for _ in range(2):
+            stats = dict(await tree.list(b"/"))
+            assert (stats[b"top"].size, stats[b"fs"].kind) == (1, DIRECTORY)
+            await trio.sleep(21)
+        assert await read_file(tree, b"/top") == b"t"
+        assert asked.count(b".") == 3
 
 
-async def test_dot_is_asked_of_no_other_server(store: FakeStore, tree: Tree) -> None:
-    store.remove(b"/top")
-    await tree.list(b"/")
-    store.add(b"/@SYS/x", b"x")
-    store.add(b"/top", b"t")
-    await trio.sleep(21)
-    await tree.list(b"/")
-    assert store.count("list", b".") == 0
+async def test_dot_that_was_refused_is_not_asked_for_again() -> None:
+    async with rig("ardupilot", FILES) as here:
+        asked: list[Payload] = []
+
+        def answer(request: Payload) -> list[Payload] | None:
+            if request.opcode != Opcode.LIST_DIRECTORY or request.data.rstrip(b"\0") != b".":
+                return None
+            asked.append(request)
+            return [nak(request, NakCode.FILE_NOT_FOUND)]
+
+        here.server.answer = answer
+        tree = here.mount()
+        for _ in range(2):
+            assert b"fs" in dict(await tree.list(b"/"))
+            await trio.sleep(21)
+        assert len(asked) == 1
+
+
+@pytest.mark.parametrize("profile", ["ardupilot5", "px4-2026"])
+async def test_dot_is_asked_of_no_other_server(profile: str) -> None:
+    """One that shows files there, and one that shows no `@` trees."""
+    async with rig(profile, {b"/top" if profile == "ardupilot5" else b"/fs/a": b"t"}) as here:
+        asked = listed(here)
+        await here.mount().list(b"/")
+        assert asked == [b"/"]
 
 
 # --- sizes that listings do not tell
 
 
-async def test_an_unknown_size_is_learnt_by_opening(store: FakeStore, tree: Tree) -> None:
-    store.files[b"/top"].has_size = False
-    stats = dict(await tree.list(b"/"))
-    assert stats[b"top"] == Stat(FILE, 0, UNKNOWN_MTIME * SECOND, 0.0)
-    assert store.count("open") == 0
-    assert await tree.stat(b"/top") == Stat(FILE, 1, UNKNOWN_MTIME * SECOND, 1.0)
-    assert await tree.stat(b"/top") == Stat(FILE, 1, UNKNOWN_MTIME * SECOND, 1.0)
+async def test_an_unknown_size_is_learnt_by_opening(px4: Rig) -> None:
+    hide(px4, b"Ftop\t1\0", b"Ftop\0")
+    tree = px4.mount()
+    assert dict(await tree.list(b"/"))[b"top"] == Stat(FILE, 0, UNKNOWN_MTIME * SECOND, 0.0)
+    assert px4.count(OPEN) == 0
+    for _ in range(2):
+        assert await tree.stat(b"/top") == Stat(FILE, 1, UNKNOWN_MTIME * SECOND, 1.0)
     assert dict(await tree.list(b"/"))[b"top"].size == 1
-    assert store.count("open") == 1
-    assert store.readers[0].closed
+    assert px4.count(OPEN) == 1
     assert await read_file(tree, b"/top") == b"t"
 
 
-async def test_a_file_of_unknown_size_that_does_not_open_counts_as_empty(
-    store: FakeStore, tree: Tree
-) -> None:
-    store.files[b"/top"].has_size = False
-    store.fail["reader", b"/top"] = [FtpNak(Opcode.OPEN_FILE_RO, NakCode.FAIL)]
-    assert (await tree.stat(b"/top")).size == 0
-    assert (await tree.stat(b"/top")).size == 0
-    assert store.count("reader") == 1
+async def test_a_file_of_unknown_size_that_does_not_open_counts_as_empty(px4: Rig) -> None:
+    hide(px4, b"Ftop\t1\0", b"Ftop\0")
+    px4.faults.refuse(OPEN, NakCode.FAIL)
+    tree = px4.mount()
+    for _ in range(2):
+        assert (await tree.stat(b"/top")).size == 0
+    assert px4.count(OPEN) == 1
 
 
 # --- checksums
 
 
-@pytest.mark.parametrize(("mtime", "asked"), [(1_700_000_000, 2), (315_532_800, 4), (None, 4)])
+@pytest.mark.parametrize(("mtime", "asked"), [(MTIME, 2), (315_532_800, 4)])
 async def test_a_checksum_is_kept_as_long_as_size_and_mtime(
-    store: FakeStore, tree: Tree, mtime: int | None, asked: int
+    here: Rig, tree: Tree, mtime: int, asked: int
 ) -> None:
     """An mtime of a clock that was not set tells nothing."""
-    path = b"/fs/microsd/a.txt"
     for number, content in enumerate((b"hello", b"olleh")):
-        store.add(path, content, None if mtime is None else mtime + number)
+        here.put(A, content, mtime + number)
         for _ in range(2):
-            assert await tree.crc32(path) == crc32(content)
+            assert await tree.crc32(A) == crc32(content)
             await trio.sleep(30)
-    assert store.count("crc") == asked
+    assert here.count(CRC) == asked
 
 
-async def test_checksums_are_refused(store: FakeStore, tree: Tree) -> None:
-    store.armed = True
-    with pytest.raises(Armed):
-        await tree.crc32(b"/top")
+async def test_checksums_are_refused(here: Rig, tree: Tree) -> None:
     with pytest.raises(IsADirectory):
         await tree.crc32(b"/fs")
+    await here.arm()
+    with pytest.raises(Armed):
+        await tree.crc32(b"/top")
 
 
 # --- options and sharing
