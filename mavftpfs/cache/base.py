@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from mavftpfs.cache.context import Context
 from mavftpfs.cache.directories import Directory
-from mavftpfs.cache.draft import Base, Draft, State
+from mavftpfs.cache.draft import Draft, State
 from mavftpfs.cache.files import FileHandle
 from mavftpfs.cache.nodes import Node
 from mavftpfs.cache.versions import became_another
@@ -32,12 +32,6 @@ async def open_node(context: Context, node: Node) -> FileHandle:
             except (NotFound, FtpNak):
                 if node.path == path:
                     raise  # else it got a reserved name meanwhile
-
-
-def known_base(context: Context, path: bytes, size: int) -> Base:
-    """Return what is known of a file that was opened and has `size` bytes."""
-    entry = context.directories.entry(path)
-    return Base(size, entry.mtime if entry is not None and entry.size == size else None)
 
 
 async def read_base(context: Context, node: Node, start: int, stop: int) -> bytes | memoryview:

@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-import trio
-
 from mavftpfs.cache.attributes import SECOND, Times
 from mavftpfs.cache.directories import Directories
 from mavftpfs.cache.draft import State
@@ -37,7 +35,6 @@ class Context:
     options: CacheOptions
     clock: Callable[[], float]
     wall: Callable[[], float]
-    nursery: trio.Nursery | None
     own: OwnNames
     paths: PathLocks
     spool: Spool

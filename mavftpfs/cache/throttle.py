@@ -29,9 +29,6 @@ REWRITE_SECONDS = 120.0
 LEAST_REWRITE, MOST_REWRITE = 64 * KIB, 64 * MIB
 """Bytes of such a file that are always allowed, and the most that ever are, unless rmw_max is set."""
 
-FAST, COARSE = 1e6, 16 * KIB
-"""Above so many bytes per second it is enough to look at the clock every so many bytes."""
-
 STALL = 5.0
 """After so many seconds in which nothing was ACKed a writer asks why."""
 
@@ -47,8 +44,6 @@ class Throttle:
         self._context = context
         self.waiting = trio.lowlevel.ParkingLot()
         self.meter = RateMeter()
-        self._uncounted = 0
-        self._grain = 1
 
     def limit(self) -> int:
         """Bytes that may be un-ACKed over all uploads, and held in memory."""
@@ -100,13 +95,8 @@ class Throttle:
 
     def on_acked(self, count: int) -> None:
         """Bytes arrived."""
-        self._uncounted += count
-        if self._uncounted >= self._grain:
-            self.meter.on_bytes(self._uncounted, self._context.clock())
-            self._uncounted = 0
-            self._grain = COARSE if (self.meter.rate or 0.0) > FAST else 1
-        if self.waiting:
-            self.waiting.unpark_all()
+        self.meter.on_bytes(count, self._context.clock())
+        self.waiting.unpark_all()
 
     def transfers(self) -> list[dict[str, object]]:
         """Return what is not delivered, what is on its way first; eta: seconds at the measured rate."""

@@ -214,7 +214,8 @@ class Tree:
         remote = self._remote(path)
         if is_snapshot(remote):
             return await self._virtual.crc32(remote)
-        if self._writing.holds(remote):
+        node = self._context.nodes.get(remote)
+        if node is not None and node.undelivered:
             raise NotDeliveredYet(f"{remote!r} is not on the vehicle yet")
         if remote == self._options.root:
             raise IsADirectory("the mount's root is a directory")

@@ -15,7 +15,7 @@ from random import Random
 
 import trio
 
-from mavftpfs.cache.base import known_base, on_listed
+from mavftpfs.cache.base import on_listed
 from mavftpfs.cache.context import Context
 from mavftpfs.cache.delivery import PASSING, Deliverer, may_pass
 from mavftpfs.cache.directories import Directories
@@ -80,7 +80,6 @@ class Writeback:
             options=options,
             clock=directories.clock,
             wall=wall,
-            nursery=nursery,
             own=OwnNames(owner, rng),
             paths=files.paths,
             spool=Spool(
@@ -94,6 +93,7 @@ class Writeback:
         self._cleaner = cleaner = Cleaner(context, names, dead)
         self._deliverer = deliverer = Deliverer(context, names, cleaner, throttle)
         context.retry_later = self._retry_later
+        self._nursery = nursery
         self._retrying = False
         self.namespace = Namespace(context, names, deliverer)
         self._parts = Parts(context, deliverer, throttle, self.namespace)
@@ -165,7 +165,9 @@ class Writeback:
             base = Base(entry.size or await context.files.learn_size(path))
         else:
             handle = await context.files.open(path)  # its ACK tells the size better than a listing
-            base = known_base(context, path, handle.size)
+            listed = context.directories.entry(path)
+            told = listed is not None and listed.size == handle.size
+            base = Base(handle.size, listed.mtime if listed and told else None)
         try:
             context.require_idle(path)
             node = context.nodes.need(path)
@@ -176,11 +178,6 @@ class Writeback:
             if handle is not None:
                 handle.close()
         return node
-
-    def holds(self, path: bytes) -> bool:
-        """Return whether the vehicle lacks bytes of a file."""
-        node = self._context.nodes.get(path)
-        return node is not None and node.undelivered
 
     # --- names
 
@@ -263,8 +260,8 @@ class Writeback:
 
     def retry(self) -> None:
         """The vehicle is back, or may be written again: deliver what nobody has open any more."""
-        if self._context.nursery is not None and (self._context.own.torn or self.undelivered()):
-            self._context.nursery.start_soon(self._try_all)
+        if self._nursery is not None and (self._context.own.torn or self.undelivered()):
+            self._nursery.start_soon(self._try_all)
 
     def status(self) -> dict[str, object]:
         """Return counters; bytes_... in bytes. `undelivered`: of whole files; `held`: what they take here."""
@@ -306,9 +303,9 @@ class Writeback:
 
     def _retry_later(self) -> None:
         """Something was not delivered, or left a name without a file: try again by and by."""
-        if self._context.nursery is not None and not self._retrying:
+        if self._nursery is not None and not self._retrying:
             self._retrying = True
-            self._context.nursery.start_soon(self._retry)
+            self._nursery.start_soon(self._retry)
 
     async def _retry(self) -> None:
         """Try again, ever more seldom, as long as that may help: a link that fails and returns between two
