@@ -53,9 +53,7 @@ class Stat:
 
 def tidy(entry: DirEntry) -> DirEntry:
     """Return the entry with size and mtime in the kernel's ranges; an mtime out of range is unknown."""
-    size, mtime = entry.size, entry.mtime
-    if size is not None and not 0 <= size <= MAX_SIZE:
-        size = min(max(size, 0), MAX_SIZE)
+    size, mtime = min(entry.size, MAX_SIZE), entry.mtime
     if mtime is not None and not 0 < mtime <= MAX_MTIME:
         mtime = None
     if (size, mtime) == (entry.size, entry.mtime):

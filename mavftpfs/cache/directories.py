@@ -85,8 +85,8 @@ class Directory:
     growing: dict[bytes, float] = field(default_factory=dict)
     proven: dict[bytes, float] = field(default_factory=dict)
 
-    def size_of(self, name: bytes) -> int | None:
-        """Return the best known size of a listed name in bytes, None if nothing told it."""
+    def size_of(self, name: bytes) -> int:
+        """Return the best known size of a listed name in bytes."""
         return self.sizes.get(name, self.entries[name].size)
 
 
@@ -98,9 +98,9 @@ class Found:
     directory: Directory
 
     @property
-    def size(self) -> int | None:
+    def size(self) -> int:
         """Best known size in bytes."""
-        return self.directory.size_of(self.entry.name)
+        return self.directory.sizes.get(self.entry.name, self.entry.size)
 
 
 @dataclass(slots=True, eq=False)
@@ -121,12 +121,9 @@ class Directories:
     ones are dropped when they have more than `max_entries` names.
 
     Attributes:
-        ask_size: opens a file and returns its size. on_listed: called with each listing as it is made;
-            on_swept: before it is given out.
+        on_listed: called with each listing as it is made; on_swept: before it is given out.
         tells_times: whether any listing told an mtime. sweeps: how many listings were asked for.
     """
-
-    ask_size: Callable[[bytes], Awaitable[int]]
 
     def __init__(
         self,
@@ -193,7 +190,7 @@ class Directories:
             return
         before = directory.size_of(name)
         directory.sizes[name] = size
-        if before is not None and size > before:
+        if size > before:
             directory.growing[name] = self.clock()
 
     def put(self, path: bytes, entry: DirEntry | None, *, proven: bool = False) -> None:
@@ -270,7 +267,7 @@ class Directories:
         entry = directory.entries.get(name)
         if entry is None and not directory.complete and name:
             try:
-                entry = DirEntry(name, EntryKind.FILE, await self.ask_size(path))
+                entry = DirEntry(name, EntryKind.FILE, await self._store.stat_size(path))
             except FtpNak as nak:
                 if errno_for(nak) != errno.ENOENT:
                     raise
@@ -465,8 +462,7 @@ class Directories:
 def _see_growth(old: Directory, new: Directory, sweep: Sweep) -> None:
     """Note which files grew since the last listing without us, or did a short while ago."""
     for name in new.entries.keys() & old.entries.keys() - sweep.changes.keys():
-        before, after = old.size_of(name), new.size_of(name)
-        if before is not None and after is not None and after > before:
+        if new.size_of(name) > old.size_of(name):
             new.growing[name] = new.ended_at
         elif name in old.growing:
             new.growing[name] = old.growing[name]

@@ -123,19 +123,6 @@ class Files:
         self.open_versions[version] = None
         return FileHandle(self, version, keep_cache=keep_cache, direct_io=direct_io)
 
-    async def learn_size(self, path: bytes) -> int:
-        """Return the size that an open reply tells, for listings that tell none.
-
-        Raises:
-            As RemoteStore.open_reader.
-        """
-        version = self._current.get(path)
-        if version is not None and version.handles and version.dead is None:
-            return version.size
-        reader = await self._store.open_reader(path, Version(self.cache, path))
-        reader.close()
-        return reader.size
-
     async def _open_version(self, path: bytes, found: Found) -> tuple[Version, bool]:
         """Return the version to serve, and whether it is the one that was served before."""
         entry, fresh = found.entry, self._clock() < found.directory.fresh_until
@@ -159,7 +146,7 @@ class Files:
         entry, listed_at = found.entry, found.directory.listed_at
         if listed_at > version.known_at and became_another(version.size, version.mtime, entry):
             self.kill(version)
-        if version.dead is not None or found.size not in (None, version.size):
+        if version.dead is not None or found.size != version.size:
             return False
         if fresh and entry.mtime is not None and entry.mtime == version.mtime:
             version.known_at = max(version.known_at, listed_at)
@@ -170,14 +157,14 @@ class Files:
         version = Version(self.cache, path)
         reader = await self._store.open_reader(path, version)
         try:
-            if entry.size is not None and reader.size < entry.size and not self.is_changing(path):
+            if reader.size < entry.size and not self.is_changing(path):
                 entry = await self._require_listed(path, reader.size)
         except BaseException:
             reader.close()
             raise
         version.reader, version.size = reader, reader.size
         version.known_at = self._clock()
-        if entry.size in (None, reader.size):
+        if entry.size == reader.size:
             version.mtime = entry.mtime
         old = self._current.get(path)
         if old is not None and old.size > reader.size:
@@ -292,7 +279,7 @@ class Files:
                 self.kill(version)
             return
         # Nobody goes on writing a file after a restart.
-        resized = version.known_at == NEVER and entry.size not in (None, version.size)
+        resized = version.known_at == NEVER and entry.size != version.size
         if not resized and not became_another(version.size, version.mtime, entry):
             if version.known_at < version.opened_at <= directory.listed_at:
                 version.known_at = directory.listed_at

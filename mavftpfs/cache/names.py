@@ -69,7 +69,7 @@ class Names:
         beside = any(n.attempt is not None and n.attempt.path != path for n in context.nodes)
         if beside and context.store.traits.wo_truncates:
             entry = await context.directories.current(path)
-            if entry is not None and entry.size is not None:
+            if entry is not None:
                 return entry.size
         return await context.store.stat_size(path)
 

@@ -101,6 +101,14 @@ class RemoteStore(Protocol):
         """
         ...
 
+    async def stat_size(self, path: bytes) -> int:
+        """Return a file's size by a fresh OpenFileRO + Terminate.
+
+        Raises:
+            FtpNak: with a code that errnos maps to ENOENT if there is none.
+        """
+        ...
+
     async def crc32(self, path: bytes, *, size: int | None = None) -> int:
         """Ask the vehicle for a file's CRC32 (init 0, no final xor). size: in bytes, if known: it tells how
         long the vehicle may need, before which the question is not repeated.
@@ -192,12 +200,4 @@ class VehicleStore(RemoteStore, Protocol):
     async def rename(self, old: bytes, new: bytes, *, completes: bool = False) -> None:
         """Rename; both paths together must fit one request (238 bytes). completes: without it a name stays
         missing, so it is done though the vehicle was armed meanwhile."""
-        ...
-
-    async def stat_size(self, path: bytes) -> int:
-        """Return a file's size by a fresh OpenFileRO + Terminate.
-
-        Raises:
-            FtpNak: with a code that errnos maps to ENOENT if there is none.
-        """
         ...

@@ -57,7 +57,7 @@ class Cleaner:
         self._context = context
         self._names = names
         self._dead_owners = dead_owners | {context.own.owner}
-        self._seen: dict[bytes, tuple[int | None, float]] = {}
+        self._seen: dict[bytes, tuple[int, float]] = {}
         self._busy: set[bytes] = set()
         self._being_delivered: set[Node] = set()
 

@@ -32,7 +32,6 @@ from mavftpfs.cache.writeback import Writeback
 from mavftpfs.shared.errors import (
     CrossDevice,
     DirectoryNotEmpty,
-    FtpNak,
     IsADirectory,
     ListingIncomplete,
     NotADirectory,
@@ -88,7 +87,6 @@ class Tree:
             directories=self._directories,
             invalidate=self._invalidate,
         )
-        self._directories.ask_size = self._files.learn_size
         self._files.kept = None if keep is None else keep(self._directories, self._blocks)
         self._virtual = VirtualTrees(
             store, self._directories, options, invalidate=self._invalidate, nursery=nursery
@@ -96,7 +94,7 @@ class Tree:
         self._local = LocalFiles(
             () if options.read_only else options.local, options.local_max, lambda: int(wall() * SECOND)
         )
-        self._checksums: dict[tuple[bytes, int | None, int], int] = {}
+        self._checksums: dict[tuple[bytes, int, int], int] = {}
         self._writing = Writeback(
             store=store,
             directories=self._directories,
@@ -128,14 +126,7 @@ class Tree:
         node = self._context.nodes.get(remote)
         if node is not None and node.draft is not None:
             return self._draft_stat(remote, node.draft)
-        found = await self._directories.find(remote)
-        if found.entry.kind is EntryKind.FILE and found.size is None:
-            try:
-                size = await self._files.learn_size(remote)
-            except FtpNak:
-                size = 0  # until it is listed again
-            self._directories.learn_size(remote, size)
-        return self._listed_stat(remote, found)
+        return self._listed_stat(remote, await self._directories.find(remote))
 
     def negative_valid_for(self, path: bytes) -> float:
         """Return for how many seconds the kernel may remember that stat(path) raised NotFound.
@@ -423,9 +414,7 @@ class Tree:
         if is_snapshot(remote):
             return self._virtual.listed_stat(remote, found)
         left = found.directory.fresh_until - self._clock()
-        unknown = found.entry.kind is EntryKind.FILE and found.size is None
-        valid_for = 0.0 if unknown else max(0.0, min(self._options.attr_timeout, left))
-        size = 0 if found.entry.kind is EntryKind.DIRECTORY else found.size or 0
+        valid_for, size = max(0.0, min(self._options.attr_timeout, left)), found.size
         user_set, node = None, self._context.nodes.get(remote)
         if node is None or node.draft is None:  # else `_draft_stat` shows it: no listing tells of a draft
             user_set = self._context.times.get(remote, size, found.entry.mtime)

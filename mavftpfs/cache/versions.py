@@ -386,8 +386,6 @@ class Version:
 
 def became_another(size: int, mtime: int | None, entry: DirEntry) -> bool:
     """Return whether a newer listing contradicts what is known of a file; a larger one only grew."""
-    if entry.size is None or entry.size > size:
-        return False
-    if entry.size < size:
-        return True
+    if entry.size != size:
+        return entry.size < size
     return entry.mtime is not None and mtime is not None and entry.mtime != mtime

@@ -167,7 +167,7 @@ class VirtualTrees:
         if seen.data is not None:
             size = len(seen.data)
         else:
-            size = 0 if found is None or kind is EntryKind.DIRECTORY else found.size or 0
+            size = 0 if found is None else found.size
         valid_for = max(0.0, min(self._options.attr_timeout, until - self._clock()))
         return Stat(kind, size, shown_mtime(path, None if found is None else found.entry.mtime), valid_for)
 
@@ -273,8 +273,7 @@ class VirtualTrees:
             return True
         if found.entry.kind is not EntryKind.FILE:
             return False
-        size = found.size
-        return size is None or (tree_of(path) not in TRUE_SIZES and size <= self._options.at_stat_limit)
+        return tree_of(path) not in TRUE_SIZES and found.size <= self._options.at_stat_limit
 
     async def _read_unread(self, founds: Mapping[bytes, Found | None]) -> None:
         """Read what was not read yet, until `probe_time` is over or the link is too bad."""

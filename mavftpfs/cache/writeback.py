@@ -162,7 +162,7 @@ class Writeback:
             raise IsADirectory(f"{path!r} is a directory")
         if truncate:
             # A size of 0 would mean that there is nothing to do: it has to be true, not remembered.
-            base = Base(entry.size or await context.files.learn_size(path))
+            base = Base(entry.size or await context.store.stat_size(path))
         else:
             handle = await context.files.open(path)  # its ACK tells the size better than a listing
             listed = context.directories.entry(path)

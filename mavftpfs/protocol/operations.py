@@ -139,7 +139,7 @@ def parse_page(data: bytes, *, with_time: bool = False) -> Page:
         for field in fields:
             understood = understood and field.isdigit() and len(field) <= _MAX_DIGITS
         if kind is not None and understood:
-            size = int(fields[0]) if fields and kind is EntryKind.FILE else None
+            size = int(fields[0]) if fields and kind is EntryKind.FILE else 0
             mtime = int(fields[1]) if with_time and len(fields) > 1 else 0
             entries.append(DirEntry(name, kind, size, mtime or None))
         elif text[:1] != b"S" and name not in (b".", b".."):

@@ -177,7 +177,7 @@ class Store:
         return stream
 
     async def stat_size(self, path: bytes) -> int:
-        """See cache.remote.VehicleStore."""
+        """Open a file to know its size (see RemoteStore)."""
         wire_path(path)
         session = await self._scheduler.use_session(path, Opcode.OPEN_FILE_RO)
         if session.size is None:

@@ -33,11 +33,11 @@ class EntryKind(Enum):
 
 @dataclass(frozen=True, slots=True)
 class DirEntry:
-    """One listed name. size in bytes, None where the server sent none; mtime in seconds UTC or None."""
+    """One listed name. size: bytes, 0 of directories. mtime: seconds UTC, None if the server told none."""
 
     name: bytes
     kind: EntryKind
-    size: int | None = None
+    size: int = 0
     mtime: int | None = None
 
 

@@ -80,7 +80,7 @@ def test_the_listing_parser_is_total(data: bytes, with_time: bool) -> None:
     assert len(page.entries) + page.hidden <= page.strings
     for entry in page.entries:
         assert usable_name(entry.name)
-        assert entry.size is None or entry.size >= 0
+        assert entry.size >= 0
 
 
 RANGES = st.tuples(st.integers(0, 60), st.integers(0, 60))

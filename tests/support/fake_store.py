@@ -49,12 +49,11 @@ class FakeFile:
     data: bytes
     mtime: int | None = None
     claims: int | None = None
-    has_size: bool = True
 
     def entry(self, name: bytes) -> DirEntry:
         """Return the listing's line."""
         size = len(self.data) if self.claims is None else self.claims
-        return DirEntry(name, EntryKind.FILE, size if self.has_size else None, self.mtime)
+        return DirEntry(name, EntryKind.FILE, size, self.mtime)
 
 
 class FakeStore:
@@ -133,6 +132,12 @@ class FakeStore:
             self.during_list(path)
         await trio.sleep(self.list_delay)
         return Listing(entries, self.list_delay)
+
+    async def stat_size(self, path: bytes) -> int:
+        await self._begin("open", path, Opcode.OPEN_FILE_RO)
+        if path not in self.files:
+            raise FtpNak(Opcode.OPEN_FILE_RO, NakCode.FILE_NOT_FOUND)
+        return len(self.files[path].data)
 
     async def open_reader(
         self, path: bytes, sink: ReadSink, *, expected_size: int | None = None

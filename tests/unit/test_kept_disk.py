@@ -21,7 +21,7 @@ KEY = FileKey(VEHICLE, b"/log/a", 100_000, VERSION)
 DATA = bytes(range(256)) * 256
 
 
-def entry(size: int | None = 5, mtime: int | None = MTIME) -> DirEntry:
+def entry(size: int = 5, mtime: int | None = MTIME) -> DirEntry:
     return DirEntry(b"a", EntryKind.FILE, size, mtime)
 
 
@@ -60,7 +60,6 @@ def test_what_may_not_be_kept_has_no_key() -> None:
     assert key_of(VEHICLE, b"/a", entry(), NOW) == FileKey(VEHICLE, b"/a", 5, VERSION)
     assert key_of(None, b"/a", entry(), NOW) is None
     assert key_of(VEHICLE, b"/@SYS/tasks.txt", entry(), NOW) is None
-    assert key_of(VEHICLE, b"/a", entry(size=None), NOW) is None
     assert key_of(VEHICLE, b"/a", entry(size=0), NOW) is None
     assert (
         key_of(VEHICLE, b"/a", entry(mtime=int(NOW - YOUNG) + 1), NOW) is None

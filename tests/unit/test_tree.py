@@ -317,30 +317,6 @@ async def test_dot_is_asked_of_no_other_server(profile: str) -> None:
         assert asked == [b"/"]
 
 
-# --- sizes that listings do not tell
-
-
-async def test_an_unknown_size_is_learnt_by_opening(px4: Rig) -> None:
-    hide(px4, b"Ftop\t1\0", b"Ftop\0")
-    tree = px4.mount()
-    assert dict(await tree.list(b"/"))[b"top"] == Stat(FILE, 0, UNKNOWN_MTIME * SECOND, 0.0)
-    assert px4.count(OPEN) == 0
-    for _ in range(2):
-        assert await tree.stat(b"/top") == Stat(FILE, 1, UNKNOWN_MTIME * SECOND, 1.0)
-    assert dict(await tree.list(b"/"))[b"top"].size == 1
-    assert px4.count(OPEN) == 1
-    assert await read_file(tree, b"/top") == b"t"
-
-
-async def test_a_file_of_unknown_size_that_does_not_open_counts_as_empty(px4: Rig) -> None:
-    hide(px4, b"Ftop\t1\0", b"Ftop\0")
-    px4.faults.refuse(OPEN, NakCode.FAIL)
-    tree = px4.mount()
-    for _ in range(2):
-        assert (await tree.stat(b"/top")).size == 0
-    assert px4.count(OPEN) == 1
-
-
 # --- checksums
 
 
