@@ -85,10 +85,8 @@ class Node:
     @property
     def changing(self) -> bool:
         """Whether what has its name on the vehicle is being changed, or was perhaps."""
-        if self.draft is None:
-            return False
-        in_place = self.attempt is not None and self.attempt.in_place
-        return in_place or self.draft.begun or self.draft.state in (State.COMMITTING, State.TORN)
+        draft = self.draft
+        return draft is not None and (draft.begun or draft.state in (State.COMMITTING, State.TORN))
 
     @asynccontextmanager
     async def claim(self) -> AsyncIterator[None]:
