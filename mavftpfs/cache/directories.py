@@ -352,11 +352,13 @@ class Directories:
             VehicleLost: it is silent. The listing goes on, for whoever asks next.
         """
         patience = LOOK if older and self._sweeping.outlives_callers else inf
+        again = False
         while True:
             with trio.move_on_after(patience):
-                return await self._sweeping.run(path, partial(self._sweep, path))
+                return await self._sweeping.run(path, partial(self._sweep, path), again=again)
             if self._store.is_silent():
                 raise VehicleLost("no heartbeats")
+            again = True
 
     async def _walk_to_root(self) -> None:
         """See once that no part of the mount's root is a file.

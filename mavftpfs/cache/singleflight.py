@@ -39,15 +39,16 @@ class SingleFlight(Generic[K, T]):
     def __len__(self) -> int:
         return len(self._running)
 
-    async def run(self, key: K, work: Callable[[], Awaitable[T]]) -> T:
+    async def run(self, key: K, work: Callable[[], Awaitable[T]], *, again: bool = False) -> T:
         """Return what `work` returns, or what the work already under way for `key` returns.
 
-        A time-out of work that was under way before is not shared: who joined late starts anew.
+        A time-out of work that was under way before is not shared: who joined late starts anew, unless the
+        caller waited for it before (`again`).
 
         Raises:
             Exception: what the work raised; all who share it get the same object.
         """
-        joined = key in self._running
+        joined = key in self._running and not again
         while True:
             call = self._running.get(key)
             if call is None:
