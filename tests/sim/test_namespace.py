@@ -183,13 +183,9 @@ async def test_a_checksum_does_not_stay_with_the_name_of_another_file(fat: Rig) 
 async def test_another_spelling_of_a_name_is_refused(fat: Rig, name: bytes) -> None:
     """FatFs drops dots and blanks at the end, and knows names in any case: `a.` is `a`."""
     tree, path = fat.mount(), b"/d/" + name
-    for change in (
-        lambda: write_file(tree, path, b"other"),
-        lambda: tree.mkdir(path),
-        lambda: tree.rename(b"/d/b", path),
-    ):
+    for change in (write_file(tree, path, b"other"), tree.mkdir(path), tree.rename(b"/d/b", path)):
         with pytest.raises((AlreadyExists, FtpNak, NotFound)):
-            await change()
+            await change
     assert fat.files() == FILES
 
 
@@ -421,9 +417,7 @@ async def test_only_a_listing_that_counts_proves_a_torn_name_whole(torn: Rig) ->
     torn.take(FILE)
     own.torn[FILE] = b"/d/" + Reserved(own.owner, Kind.OLD, b"sss", b"file.txt").name
     now = trio.current_time()
-    shown = Directory(
-        {b"file.txt": DirEntry(b"file.txt", EntryKind.FILE, 3)}, now, now, now + 20, True, False
-    )
+    shown = Directory({b"file.txt": DirEntry(b"file.txt", EntryKind.FILE, 3)}, now, now, now + 20, True)
     await tree._writing._cleaner.on_swept(b"/d", shown)
     assert list(own.torn) == [FILE]
     torn.put(FILE, OLD)
