@@ -410,10 +410,7 @@ class Fetcher:
         Raises:
             StillGrowing: it has become larger. DataUnproven: it has become smaller.
         """
-        self.session.files.forget_caches()
-        file = await self.session.files.open(remote)
-        now = file.size
-        file.close()
+        now = await self.session.size_now(remote)
         if now > size:
             raise StillGrowing(f"{name} is still growing: only its first {readable_size(size)} came")
         if now < size:

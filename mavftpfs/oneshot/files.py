@@ -73,6 +73,13 @@ class Session:
         """Return the vehicle's own name of a path."""
         return self.root.rstrip(b"/") + path if path != b"/" else self.root
 
+    async def size_now(self, path: bytes) -> int:
+        """Ask the vehicle for a file's size, whatever is known of it."""
+        self.files.forget_caches()
+        if self.mountpoint is not None:  # the kernel believes what it was told a second ago, but for an open
+            (await self.files.open(path)).close()
+        return (await self.files.stat(path)).size
+
 
 async def is_directory(files: Files, path: bytes) -> bool:
     """Return whether a path is a directory; False also where nothing is."""
