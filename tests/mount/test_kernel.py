@@ -102,18 +102,15 @@ def test_one_listing_answers_the_stats_that_follow(server: KernelServer) -> None
     assert calls.count("stat") <= 3, "the directory itself, and what leads to it"
 
 
-def test_a_grown_file_is_read_to_its_new_end_at_the_next_open(server: KernelServer) -> None:
+@pytest.mark.parametrize(("name", "text"), [("a", "one and more"), ("b", "o")])
+def test_a_file_that_grew_or_shrank_is_read_to_its_new_end_at_the_next_open(
+    server: KernelServer, name: str, text: str
+) -> None:
     """The kernel believes in the old size for 1000 s; without a word from us it ends the read there."""
-    assert server.read("a") == "one"
-    server.do("write", path="/a", text="one and more")
-    assert server.read("a") == "one and more"
-    assert server.run("print(os.stat(sys.argv[1]).st_size)", server.path / "a") == "12"
-
-
-def test_a_file_that_shrank_is_read_to_its_new_end_at_the_next_open(server: KernelServer) -> None:
-    assert server.read("b") == "one"
-    server.do("write", path="/b", text="o")
-    assert server.read("b") == "o"
+    assert server.read(name) == "one"
+    server.do("write", path=f"/{name}", text=text)
+    assert server.read(name) == text
+    assert server.run("print(os.stat(sys.argv[1]).st_size)", server.path / name) == str(len(text))
 
 
 def test_pages_in_use_are_dropped_when_the_bytes_changed(server: KernelServer) -> None:

@@ -8,13 +8,12 @@ import subprocess
 import sys
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from mavftpfs.protocol.payload import crc32
 from tests.mount.conftest import Field
-from tests.support.mounts import Mount, abort_mount, mavftpfs, mounted_at, processes_in, wait_until
+from tests.support.mounts import Mount, abort_mount, mounted_at, processes_in, wait_until
 
 
 def mount_line(path: Path) -> list[str]:
@@ -36,18 +35,6 @@ def test_kernel_shows_source_and_type(plain: Mount) -> None:
     assert words[0] == plain.source
     assert words[2] == "fuse.mavftpfs"
     assert {"noatime", "nosuid", "nodev", "default_permissions"} <= set(words[3].split(","))
-
-
-def test_status_tells_about_vehicle_and_link(plain: Mount) -> None:
-    plain.run("cat", plain.path / "file")
-    status: dict[str, Any] = json.loads(mavftpfs("status", plain.path, "--json")[0])
-    details, link = status["connection"], status["link"]
-    assert (details["read_mode"], details["chunk"]) == ("window", 239)
-    assert link["loss"] == 0.0 or link["retransmissions"], "an answer may have come late"
-    assert details["window"] >= 1
-    assert mavftpfs("status", plain.path)[0].startswith(f"{plain.path}: PX4 1/1, disarmed, link fine: RTT ")
-    shown, _ = mavftpfs("status", "--verbose", plain.path)
-    assert plain.source in shown
 
 
 def test_extended_attributes(plain: Mount) -> None:

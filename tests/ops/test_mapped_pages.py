@@ -8,8 +8,7 @@ import os
 import pytest
 
 from tests.ops.faketree import FakeTree
-from tests.ops.test_operations import ino_of
-from tests.ops.test_writing import CTX, operations
+from tests.ops.test_operations import CTX, ino_of, operations
 
 PAGE = mmap.PAGESIZE
 SIZE = 2 * PAGE + 100

@@ -26,7 +26,7 @@ from tests.ops.faketree import FakeTree
 
 CTX = cast(RequestContext, None)
 TOKEN = cast(pyfuse3.ReaddirToken, None)
-LOOK = Presentation(uid=1000, gid=100, file_mode=0o444, directory_mode=0o555, op_deadline=30.0)
+LOOK = Presentation(uid=1000, gid=100, file_mode=0o644, directory_mode=0o755, op_deadline=30.0)
 
 
 def some_tree() -> FakeTree:

@@ -10,26 +10,15 @@ from typing import Any, cast
 
 import pyfuse3
 import pytest
-from pyfuse3 import EntryAttributes, RequestContext, SetattrFields
+from pyfuse3 import EntryAttributes, SetattrFields
 
-from mavftpfs.cache.tree import Tree
-from mavftpfs.fuse.handles import ROOT_INO, Presentation
+from mavftpfs.fuse.handles import ROOT_INO
 from mavftpfs.fuse.operations import Operations
 from mavftpfs.shared.errors import Armed, NoSpace, RequestTimeout
 from tests.ops.faketree import MTIME, FakeFile, FakeTree
-from tests.ops.test_operations import failure, ino_of
+from tests.ops.test_operations import CTX, failure, ino_of, operations, some_tree
 
-CTX = cast(RequestContext, None)
-LOOK = Presentation(uid=1000, gid=100, file_mode=0o644, directory_mode=0o755, op_deadline=30.0)
 NANO = 1_000_000_000
-
-
-def some_tree() -> FakeTree:
-    return FakeTree({b"/a.txt": b"hello\n", b"/log/1.ulg": b"x" * 100}, {b"/empty"})
-
-
-def operations(tree: FakeTree | None = None, **more: Any) -> Operations:
-    return Operations(cast(Tree, tree or some_tree()), LOOK, **more)
 
 
 class Fields:

@@ -55,32 +55,24 @@ def test_success_frees_the_parent_and_detaches_the_child(tmp_path: Path) -> None
     assert wait_for(tmp_path / "facts") == repr(("/", True, ["/dev/null"] * 3))
 
 
-def test_failure_is_the_parent_s_exit_code_and_line(tmp_path: Path) -> None:
-    done = run('report(2, "no vehicle\\non that link")\nreturn 2', tmp_path)
-    assert (done.returncode, done.stderr) == (2, "mavftpfs: no vehicle on that link\n")
-
-
-def test_an_error_of_ours_is_no_bug(tmp_path: Path) -> None:
-    work = """
-        from mavftpfs.shared.errors import UsageError
-        raise UsageError("cannot write that log")
-    """
-    done = run(work, tmp_path)
-    assert (done.returncode, done.stderr) == (1, "mavftpfs: cannot write that log\n")
-
-
 @pytest.mark.parametrize(
-    ("work", "words"),
+    ("work", "code", "line"),
     [
-        ("raise ValueError('a bug')", "a bug"),
-        ("os.kill(os.getpid(), signal.SIGKILL)", "signal 9"),
-        ("os._exit(5)", "exit code 5"),
+        ('report(2, "no vehicle\\non that link")\nreturn 2', 2, "no vehicle on that link"),
+        (
+            "from mavftpfs.shared.errors import UsageError\nraise UsageError('not that log')",
+            1,
+            "not that log",
+        ),
+        ("raise ValueError('a bug')", 3, "internal error: ValueError('a bug')"),
+        ("os.kill(os.getpid(), signal.SIGKILL)", 3, "signal 9"),
+        ("os._exit(5)", 3, "exit code 5"),
     ],
 )
-def test_a_child_that_dies_is_an_error_with_a_reason(tmp_path: Path, work: str, words: str) -> None:
+def test_failure_is_the_parent_s_exit_code_and_line(tmp_path: Path, work: str, code: int, line: str) -> None:
     done = run(work, tmp_path)
-    assert done.returncode == 3
-    assert words in done.stderr.splitlines()[-1]
+    assert done.returncode == code
+    assert line in done.stderr.splitlines()[-1]
 
 
 AT_FORK = "os.register_at_fork(after_in_parent=lambda: os.kill(os.getpid(), signal.{}))"

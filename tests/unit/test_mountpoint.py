@@ -46,30 +46,30 @@ def test_the_table_is_read_with_its_escapes_and_the_last_mount_wins(tmp_path: Pa
     assert not is_ours("/mnt/c", table=path)
 
 
-@pytest.mark.parametrize(("name", "reason"), [("missing", "mkdir -p"), ("file", "not a directory")])
-def test_a_bad_mountpoint(tmp_path: Path, name: str, reason: str) -> None:
-    (tmp_path / "file").touch()
-    with pytest.raises(MountFailed, match=reason):
-        check_mountpoint(str(tmp_path / name))
-
-
 @pytest.mark.parametrize(
-    ("number", "reason"), [(errno.ENOTCONN, "mavftpfs umount"), (errno.EACCES, "Permission denied")]
+    ("name", "number", "reason"),
+    [
+        ("missing", None, "mkdir -p"),
+        ("file", None, "not a directory"),
+        ("file", errno.ENOTCONN, "mavftpfs umount"),
+        ("file", errno.EACCES, "Permission denied"),
+        ("ours", None, "already mounted"),
+    ],
 )
-def test_what_stat_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int, reason: str) -> None:
+def test_a_bad_mountpoint(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, number: int | None, reason: str
+) -> None:
     def fail(path: str) -> os.stat_result:
         raise OSError(number, "x")
 
+    (tmp_path / "file").touch()
+    (tmp_path / "ours").mkdir()
+    known = table(tmp_path, LINE.format(tmp_path / "ours", "fuse.mavftpfs"))
     with monkeypatch.context() as patch:
-        patch.setattr(os, "stat", fail)
+        if number is not None:
+            patch.setattr(os, "stat", fail)
         with pytest.raises(MountFailed, match=reason):
-            check_mountpoint(str(tmp_path), table=os.devnull)
-
-
-def test_a_mount_of_ours_is_not_covered_by_another(tmp_path: Path) -> None:
-    path = table(tmp_path, LINE.format(tmp_path, "fuse.mavftpfs"))
-    with pytest.raises(MountFailed, match="already mounted"):
-        check_mountpoint(str(tmp_path), table=path)
+            check_mountpoint(str(tmp_path / name), table=known)
 
 
 def test_no_fuse_device(tmp_path: Path) -> None:
