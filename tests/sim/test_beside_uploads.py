@@ -250,56 +250,6 @@ SMALL = 40_000
 
 
 @pytest.mark.holds("promise 7")
-@pytest.mark.parametrize("profile", ["px4", "px4-nuttx"])
-async def test_no_answer_is_waited_for_before_it(profile: str, autojump: MockClock) -> None:
-    """A small read takes four round trips else: 1.2 s where 1.21 are allowed for all. In a
-    short queue there may be no place for it before an answer came."""
-    place = Place(profile, LINK)
-    async with place.world.connection() as connection, trio.open_nursery() as nursery:
-        data = random.Random(1).randbytes(SIZE)
-        nursery.start_soon(place.upload, connection, b"new", data)
-        await trio.sleep(1.5)
-        began = trio.current_time()
-        count = len(place.came)
-        await place.read(connection)
-        closed = next(at for opcode, at in place.came[count:] if opcode == Opcode.TERMINATE_SESSION)
-    assert closed - began < 3 * LINK.delay, "an answer, and the Terminate behind it, take longer"
-
-
-@pytest.mark.holds("promise 7")
-@pytest.mark.parametrize("profile", taking_turns(KEEPING))
-async def test_what_is_lost_before_it_is_sent_when_the_file_is_open_again(
-    profile: str, autojump: MockClock
-) -> None:
-    place = Place(profile, LINK)
-    async with place.world.connection() as connection, trio.open_nursery() as nursery:
-        data = random.Random(2).randbytes(SIZE)
-        nursery.start_soon(place.upload, connection, b"new", data)
-        await trio.sleep(1.5)
-        place.lose = [int(Opcode.WRITE_FILE)] * 2
-        count = len(place.came)
-        await place.read(connection)
-        between = [opcode for opcode, _ in place.came[count:]]
-        closed = between.index(Opcode.TERMINATE_SESSION)
-        assert Opcode.WRITE_FILE not in between[closed : between.index(Opcode.READ_FILE)]
-
-
-@pytest.mark.holds("promise 7")
-@pytest.mark.parametrize("opcode", [Opcode.OPEN_FILE_WO, Opcode.TERMINATE_SESSION])
-async def test_each_of_these_may_get_lost(opcode: Opcode, autojump: MockClock) -> None:
-    """Nothing stays open in the end."""
-    place = Place("ardupilot", LINK)
-    async with place.world.connection() as connection, trio.open_nursery() as nursery:
-        nursery.start_soon(place.upload, connection, b"new", random.Random(3).randbytes(SIZE))
-        for number in range(6):
-            await trio.sleep(1.5)
-            await place.read(connection)
-            place.lose = [int(opcode)] * (1 + number % 2)
-    assert not place.lose
-    assert place.world.vehicle.server.open_sessions == 0
-
-
-@pytest.mark.holds("promise 7")
 @pytest.mark.parametrize("profile", taking_turns(KEEPING))
 async def test_a_full_card_is_told_though_somebody_reads_all_the_time(
     profile: str, autojump: MockClock
