@@ -423,7 +423,10 @@ class ServerSession:
         if nak.code == NakCode.FILE_EXISTS:  # a listing that comes to its end clears the sticky errno
             await self._try(ListDirectory(b"/", False))
             return True
-        return self._may_be_ours(nak) and await self._close_what_may_be_ours()
+        if not self._may_be_ours(nak) or not await self._close_what_may_be_ours():
+            return False
+        await trio.sleep(self.doubt.lateness)  # a copy of that open would find it closed, and open it again
+        return True
 
     async def _try(self, operation: Operation) -> None:
         """Run a remedy whose refusal changes nothing.
