@@ -13,18 +13,16 @@ from pathlib import Path
 
 TESTS = Path(__file__).parents[1]
 
-PROMISES = {
-    "promise 1": "right bytes or an error",
-    "promise 2": "fsync or close = on the card",
-    "promise 3": "nothing accepted is lost",
-    "promise 4": "never hangs",
-    "promise 5": "comes back by itself",
-    "promise 6": "polite and harmless",
-    "promise 7": "interactive stays interactive",
-    "promise 8": "bounded",
-    "promise 9": "safe in flight",
-    "promise 10": "no trust in the peer",
-}
+PROJECT = TESTS.parent
+
+
+def numbered(page: str, heading: str) -> dict[str, str]:
+    """Return the numbered lines below a heading of one of our documents, each up to its first full stop."""
+    section = (PROJECT / page).read_text().partition(f"\n## {heading}")[2].partition("\n## ")[0]
+    return dict(re.findall(r"^(\d+)\. (.+?)(?:\. .*)?$", section, re.MULTILINE))
+
+
+PROMISES = {f"promise {number}": text for number, text in numbered("README.md", "What it promises").items()}
 
 FAULTS = {
     "fault lost": "request or reply lost",
@@ -56,47 +54,7 @@ FAULTS = {
     "fault cancel": "cancel (unmount, SIGINT) at each phase",
 }
 
-RULES = {
-    "rule 14.1": "random first seq, one counter",
-    "rule 14.2": "what makes a reply believable",
-    "rule 14.3": "jump after a burst",
-    "rule 14.4": "which retries keep their seq",
-    "rule 14.5": "only data[:size]",
-    "rule 14.6": "the id in the open ACK",
-    "rule 14.7": "one open file",
-    "rule 14.8": "the open session's id in all requests",
-    "rule 14.9": "keep-alive, or assume it is gone",
-    "rule 14.10": "a stale session is waited out in silence",
-    "rule 14.11": "Terminate, and check its reply",
-    "rule 14.12": "verify where ids are shared",
-    "rule 14.13": "clamp reads; @ files by constant blocks",
-    "rule 14.14": "sizes 1..239",
-    "rule 14.15": "place by offset; the end is a hint",
-    "rule 14.16": "no second burst but after quiet",
-    "rule 14.17": "gaps after the burst",
-    "rule 14.18": "bursts only for who asks for them, and while nobody else asks anything",
-    "rule 14.19": "endless streams",
-    "rule 14.20": "keep a long burst's session alive",
-    "rule 14.21": "growing files end at the opened size",
-    "rule 14.22": "write by a temporary name",
-    "rule 14.23": "short writes",
-    "rule 14.24": "write window",
-    "rule 14.25": "truncate",
-    "rule 14.26": "no empty WriteFile",
-    "rule 14.27": "2 GiB and 4 GiB",
-    "rule 14.28": "pages by non-empty strings",
-    "rule 14.29": "ends of a listing, capped",
-    "rule 14.30": "list only directories, open only files",
-    "rule 14.31": "opcode 16 probed once",
-    "rule 14.32": ". beside /",
-    "rule 14.33": "paths",
-    "rule 14.34": "check targets and types first",
-    "rule 14.35": "errno by context",
-    "rule 14.36": "silence is an answer",
-    "rule 14.37": "heartbeats first, explicit ids, one port",
-    "rule 14.38": "timers follow the round trip; slow requests are not piled up",
-    "rule 14.39": "other clients",
-}
+RULES = {f"rule 14.{number}": text for number, text in numbered("docs/servers.md", "14.").items()}
 
 CATALOGUE = {**PROMISES, **FAULTS, **RULES}
 
