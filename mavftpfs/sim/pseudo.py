@@ -24,6 +24,7 @@ _MISSION_CLAIM = 2**20
 _MISSIONS = (b"mission.dat", b"fence.dat", b"rally.dat")
 _FORMATS = {1: "<b", 2: "<h", 3: "<i", 4: "<f"}
 _REAL_SIZES = (b"storage.bin",)
+_STORAGE = bytes(i * 31 % 251 for i in range(16_384))
 _SYS_NAMES = (
     b"threads.txt tasks.txt dma.txt memory.txt uarts.txt timers.txt can_log.txt can0_stats.txt "
     b"can1_stats.txt crash_dump.bin storage.bin"
@@ -76,7 +77,7 @@ def _default_sys() -> dict[bytes, bytes]:
     files[b"uarts.txt"] = b"UARTV1\n" + b"".join(
         b"SERIAL%d TX=%8d RX=%8d TXBD=%6d RXBD=%6d\n" % (i, i * 1000, i * 900, 5760, 5760) for i in range(8)
     )
-    files[b"storage.bin"] = bytes(i * 31 % 251 for i in range(16_384))
+    files[b"storage.bin"] = _STORAGE
     return files
 
 

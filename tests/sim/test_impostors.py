@@ -27,10 +27,10 @@ from mavftpfs.sim.linkmodel import Direction, LinkSettings
 from mavftpfs.sim.profiles import PROFILES, Family
 from mavftpfs.sim.tree import MemoryTree
 from mavftpfs.sim.vehicle import SimVehicle
-from tests.support.fake_store import read_file as read_through
 from tests.support.lying import CrowdedLink, LyingVehicle, ftp, heartbeat
 from tests.support.mounting import mounted
 from tests.support.replies import ack
+from tests.support.rigs import read_file as read_through
 from tests.support.vehicles import HOST, free_udp_port
 from tests.support.worlds import ROOTS, World, read_file
 

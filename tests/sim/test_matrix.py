@@ -355,6 +355,9 @@ EVENTS: tuple[Event, ...] = (
     give_up, give_up_in_silence, power_off,
 )  # fmt: skip
 
+OVER = {arm: 25.0, silence: 45.0, give_up_in_silence: 45.0, fly_away: 60.0}
+"""Seconds after which an event that lasts is over, from its beginning."""
+
 UNNOTICED = (nothing, lose_answer, lose_for_good, arrive_twice, answer_the_second)
 """Whatever is lost or doubled once, the call succeeds."""
 
@@ -424,7 +427,7 @@ async def meet(profile: str, operation: Call, event: Event, count: int, place: P
         if event is power_off:
             world.link.cut()  # or leaving would tidy up
         else:
-            await trio.sleep(60.0)
+            await trio.sleep(OVER.get(event, 10.0))
             done = done or tree.undelivered() != []
             assert await tree.drain(300.0) == []
             await settle(tree, world, folder, (OPERATIONS[operation],) if done else allowed(operation)[:2])
@@ -461,7 +464,9 @@ async def settle(tree: Tree, world: World, folder: bytes, ends: tuple[State, ...
         tree.forget_caches()
         await tree.list(folder)
         await trio.sleep(15.0)
-    card = on_card(world, folder)
+        card = on_card(world, folder)
+        if card in ends:
+            break
     assert card in ends
     shown = {name: stat.size for name, stat in await tree.list(folder)}
     assert set(shown) == set(card)
