@@ -355,7 +355,7 @@ EVENTS: tuple[Event, ...] = (
     give_up, give_up_in_silence, power_off,
 )  # fmt: skip
 
-OVER = {arm: 25.0, silence: 45.0, give_up_in_silence: 45.0, fly_away: 60.0}
+OVER: dict[Event, float] = {arm: 25.0, silence: 45.0, give_up_in_silence: 45.0, fly_away: 60.0}
 """Seconds after which an event that lasts is over, from its beginning."""
 
 UNNOTICED = (nothing, lose_answer, lose_for_good, arrive_twice, answer_the_second)
