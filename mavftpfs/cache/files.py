@@ -464,11 +464,6 @@ class FileHandle(OpenFile):
                 await trio.sleep(pause)
         raise DataUnproven(f"bytes of {version.path!r} may be another file's, again and again")
 
-    @property
-    def lost(self) -> bool:
-        """Whether the file became another one by somebody else's doing."""
-        return self._version.lost
-
     def require_not_lost(self) -> None:
         """Raise FileChanged if the file became another one by somebody else's doing."""
         if self._version.lost:

@@ -10,7 +10,7 @@ import pytest
 import trio
 
 from mavftpfs.cache.directories import Directories
-from mavftpfs.cache.kept import CRC_LIMIT, SETTLED, KeptCache
+from mavftpfs.cache.kept import CRC_LIMIT, CRC_PAUSE, SETTLED, KeptCache
 from mavftpfs.cache.kept_disk import KeptDisk
 from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.tree import Tree
@@ -209,6 +209,20 @@ async def test_without_an_mtime_and_a_checksum_all_is_read(undated: Mounts, why:
     assert await read_file(tree, LOG) == DATA
     assert trio.current_time() - began < 2 * CRC_LIMIT
     assert undated.here.count(OPEN) == 1
+
+
+async def test_a_checksum_that_did_not_come_is_asked_for_again_after_a_while(undated: Mounts) -> None:
+    await undated.read_and_settle()
+    undated.here.faults.at(CRC, lambda: None, times=99, drop=True)
+    tree = undated.mount()
+    await read_file(tree, LOG)
+    undated.here.faults.call_off()
+    asked = undated.here.count(CRC)
+    for more in (0, 1):
+        await trio.sleep(0.6 * CRC_PAUSE)
+        tree.forget_caches()
+        await read_file(tree, LOG)
+        assert undated.here.count(CRC) == asked + more
 
 
 async def test_a_full_disk_ends_the_keeping_not_the_reading(
