@@ -21,7 +21,6 @@ class Outcome(StrEnum):
     TIMEOUT = "timeout"
     FAILED = "failed"
     CORRUPT = "corrupt"
-    UNAVAILABLE = "unavailable"
 
 
 @dataclass(frozen=True, slots=True)

@@ -24,7 +24,7 @@ from tempfile import TemporaryDirectory
 from tests.bench import record, tables
 from tests.bench.cases import Direction
 from tests.bench.figures import BARE, LINKS, US, LinkShape, Outcome, Run, as_json, summarise
-from tests.bench.peers import PINS, Client, Job, Measured, NotToBeHadError, clients
+from tests.bench.peers import PINS, Client, Job, Measured, clients, install
 from tests.support.mounts import wait_until
 from tests.support.vehicles import HOST, Process, free_udp_port
 
@@ -116,10 +116,6 @@ def server_argv(cell: Cell, root: Path, port: int, seed: int) -> list[str]:
 def run_one(cell: Cell, client: Client, source: Path, seed: int) -> Run:
     """Let one client move the file once."""
     what = (cell.server, cell.link, cell.direction, client.name, source.stat().st_size)
-    try:
-        client.prepare()
-    except NotToBeHadError as error:
-        return Run(*what, Outcome.UNAVAILABLE, detail=str(error))
     with TemporaryDirectory(prefix="mavftpfs-bench-") as name:
         folder = Path(name)
         card, here = folder / "card/bench", folder / "here"
@@ -180,6 +176,8 @@ def main(argv: Sequence[str]) -> int:
     parser.add_argument("--quick", action="store_true", help="two cells, shorter files")
     parser.add_argument("--json", type=Path, help="put the rows into this file")
     args = parser.parse_args(argv)
+    if {*args.clients} - {US, BARE}:
+        install()
     chosen = list(cells(QUICK if args.quick else CELLS, quick=args.quick))
     load = os.getloadavg()[0]
     if load > tables.BUSY * (os.cpu_count() or 1):

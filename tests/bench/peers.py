@@ -3,12 +3,11 @@
 Two kinds. A *worker* is a process that says `ready` when it is connected, waits for a line, moves the file,
 says `done` or `failed WHY`, and waits for another line so that its CPU time and memory can be read. A *mount*
 is a daemon; the transfer is a `cp`. Peers live in an environment of their own, with pinned versions, in the
-user's cache directory; what cannot be had there is reported as unavailable.
+user's cache directory; pymavlink's mount needs libfuse.so.2 (Debian: libfuse2) besides.
 """
 
 from __future__ import annotations
 
-import ctypes.util
 import hashlib
 import os
 import platform
@@ -32,10 +31,6 @@ PINS = ("fusepy==3.0.1", "loguru==0.7.3", "mavsdk==4.1.0", "pymavlink==2.4.50")
 CONNECT_TIMEOUT = 120.0
 END_TIMEOUT = 20.0
 HERE = Path(__file__).parent
-
-
-class NotToBeHadError(Exception):
-    """A peer cannot take part; the message says why and what would help."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,15 +66,13 @@ class Measured:
 class Client:
     """One way to move a file; `name` is what tables call it.
 
-    argv: the command line for a job, and the mount point. mounts: it is a mount. prepare: makes sure that it
-    can run, or raises NotToBeHadError.
+    argv: the command line for a job, and the mount point. mounts: it is a mount.
     """
 
     name: str
     argv: Callable[[Job, Path], list[str]]
     mounts: bool = False
     directions: tuple[Direction, ...] = ("read", "write")
-    prepare: Callable[[], object] = lambda: None
 
     def run(self, job: Job) -> Measured:
         """Do the job; everything that was started has ended on return."""
@@ -237,7 +230,7 @@ def install() -> None:
     """Make that environment if it is not there.
 
     Raises:
-        NotToBeHadError: the packages cannot be installed.
+        CalledProcessError: pip cannot install the packages; it said why.
     """
     place = _environment()
     if (place / "complete").exists():
@@ -246,22 +239,8 @@ def install() -> None:
     shutil.rmtree(place, ignore_errors=True)
     venv.create(place, with_pip=True)
     pip = [str(place / "bin/python"), "-m", "pip", "install", "--quiet", "--disable-pip-version-check"]
-    done = subprocess.run([*pip, *PINS], capture_output=True, text=True, check=False)
-    if done.returncode != 0:
-        reason = done.stderr.strip().splitlines()[-1:] or ["pip failed"]
-        raise NotToBeHadError(f"not installed: {reason[0][:200]}")
+    subprocess.run([*pip, *PINS], check=True)
     (place / "complete").touch()
-
-
-def install_with_fuse() -> None:
-    """As `install`; pymavlink's mount needs FUSE 2 besides.
-
-    Raises:
-        NotToBeHadError: something is missing.
-    """
-    if ctypes.util.find_library("fuse") is None:
-        raise NotToBeHadError("needs libfuse.so.2 (Debian: libfuse2)")
-    install()
 
 
 def clients() -> dict[str, Client]:
@@ -290,10 +269,10 @@ def clients() -> dict[str, Client]:
     everybody = [
         Client(BARE, bare),
         Client(US, ours, mounts=True),
-        Client("pymavlink mavftp", lambda job, point: peer("peer_pymavlink", job), prepare=install),
-        Client("pymavlink mavftp, tuned", tuned, prepare=install),
-        Client("pymavlink mavftpfs", fusepy, True, ("read",), install_with_fuse),
-        Client("MAVSDK", lambda job, point: peer("peer_mavsdk", job), prepare=install),
+        Client("pymavlink mavftp", lambda job, point: peer("peer_pymavlink", job)),
+        Client("pymavlink mavftp, tuned", tuned),
+        Client("pymavlink mavftpfs", fusepy, True, ("read",)),
+        Client("MAVSDK", lambda job, point: peer("peer_mavsdk", job)),
     ]
     return {client.name: client for client in everybody}
 
