@@ -43,8 +43,6 @@ class Request(NamedTuple):
     session: int
     opcode: int
     size: int
-    req_opcode: int
-    burst_complete: int
     offset: int
     data: bytes
     source: Address
@@ -80,8 +78,8 @@ class Reply:
 
 def parse(wire: bytes, source: Address) -> Request:
     """Split 251 wire bytes."""
-    seq, session, opcode, size, req_opcode, complete, offset = HEADER.unpack_from(wire)
-    return Request(seq, session, opcode, size, req_opcode, complete, offset, wire[12:], source)
+    seq, session, opcode, size, _, _, offset = HEADER.unpack_from(wire)
+    return Request(seq, session, opcode, size, offset, wire[HEADER_SIZE:], source)
 
 
 def c_string(data: bytes) -> bytes:
