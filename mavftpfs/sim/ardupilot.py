@@ -30,8 +30,8 @@ from mavftpfs.sim.firmware import (
     u32,
 )
 from mavftpfs.sim.profiles import Profile
-from mavftpfs.sim.storage import OpenFile, StaleErrno, Storage
-from mavftpfs.sim.tree import Entry, Kind, Stat, fail
+from mavftpfs.sim.storage import StaleErrno, Storage
+from mavftpfs.sim.tree import Entry, Kind, OpenFile, Stat, fail
 
 NOBODY = Address(0, 0)
 _MAX_OFFSET = 2**31

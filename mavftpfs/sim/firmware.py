@@ -22,8 +22,8 @@ from typing import NamedTuple
 from mavftpfs.link.messages import Address
 from mavftpfs.protocol.payload import MAX_DATA, NakCode, Opcode
 from mavftpfs.sim.profiles import Profile
-from mavftpfs.sim.storage import OpenFile, Storage
-from mavftpfs.sim.tree import Entry, Kind
+from mavftpfs.sim.storage import Storage
+from mavftpfs.sim.tree import Entry, Kind, OpenFile
 
 HEADER = struct.Struct("<HBBBBBxI")
 HEADER_SIZE = HEADER.size

@@ -15,8 +15,8 @@ from mavftpfs.link.messages import Address
 from mavftpfs.protocol.payload import MAX_DATA, NakCode, Opcode
 from mavftpfs.sim.firmware import ACK, HEADER, NAK, REPLY, Firmware, Request, parse, u32
 from mavftpfs.sim.profiles import Profile
-from mavftpfs.sim.storage import OpenFile, Storage
-from mavftpfs.sim.tree import Entry, Kind, Stat
+from mavftpfs.sim.storage import Storage
+from mavftpfs.sim.tree import Entry, Kind, OpenFile, Stat
 
 _READ = int(Opcode.READ_FILE)
 _BURST = int(Opcode.BURST_READ_FILE)

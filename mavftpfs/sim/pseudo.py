@@ -243,7 +243,7 @@ class VirtualFile:
         self._closed = False
 
     def read(self, offset: int, size: int) -> bytes:
-        """See storage.OpenFile."""
+        """See OpenFile."""
         if size == 0:
             return b""
         if self._block is None:
@@ -254,15 +254,15 @@ class VirtualFile:
         return self._content[offset : offset + size]
 
     def write(self, offset: int, data: bytes) -> int:
-        """See storage.OpenFile."""
+        """See OpenFile."""
         return len(data)
 
     def size(self) -> int:
-        """See storage.OpenFile."""
+        """See OpenFile."""
         return self._size
 
     def close(self) -> None:
-        """See storage.OpenFile."""
+        """See OpenFile."""
         if not self._closed:
             self._closed = True
             self._on_close()

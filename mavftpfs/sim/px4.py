@@ -30,7 +30,8 @@ from mavftpfs.sim.firmware import (
     parse,
 )
 from mavftpfs.sim.profiles import Profile
-from mavftpfs.sim.storage import OpenFile, StaleErrno, Storage
+from mavftpfs.sim.storage import StaleErrno, Storage
+from mavftpfs.sim.tree import OpenFile
 
 _Fields = tuple[int, int, int, int, int, int, int]
 _BUFFER_LIFE = 2.0

@@ -10,8 +10,8 @@ from mavftpfs.protocol.payload import MAX_DATA, NakCode, Opcode
 from mavftpfs.sim import profiles
 from mavftpfs.sim.firmware import Refusal, Request, c_string, u32
 from mavftpfs.sim.profiles import Profile
-from mavftpfs.sim.storage import OpenFile, StaleErrno, Storage
-from mavftpfs.sim.tree import Entry, Kind, fail
+from mavftpfs.sim.storage import StaleErrno, Storage
+from mavftpfs.sim.tree import Entry, Kind, OpenFile, fail
 
 _WORK_BUFFER = 256
 _RENAME_LIMIT = 255

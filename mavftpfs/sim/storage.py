@@ -10,13 +10,12 @@ import errno
 import random
 import re
 import weakref
-from typing import Protocol
 
 from mavftpfs.protocol.payload import crc32
 from mavftpfs.sim import profiles
 from mavftpfs.sim.profiles import Profile
 from mavftpfs.sim.pseudo import VirtualTrees
-from mavftpfs.sim.tree import Entry, Kind, Stat, Tree, TreeFile, fail, parent_and_name
+from mavftpfs.sim.tree import Entry, Kind, OpenFile, Stat, Tree, TreeFile, fail, parent_and_name
 
 _FAT_FORBIDDEN = frozenset(b'"*:<>?|\x7f') | frozenset(range(32))
 _SIGNS = rb"!#-)\-0-9@^-`{}~"
@@ -28,26 +27,6 @@ _SHORT = re.compile(
 _GAP_LIMIT = 65_536
 _CRC_BLOCK = 65_536
 _SECTOR = 512
-
-
-class OpenFile(Protocol):
-    """What a session reads from."""
-
-    def read(self, offset: int, size: int) -> bytes:
-        """Return up to `size` bytes. Raises OSError."""
-        ...
-
-    def write(self, offset: int, data: bytes) -> int:
-        """Write. Raises OSError."""
-        ...
-
-    def size(self) -> int:
-        """The size the server reports, which may be a lie."""
-        ...
-
-    def close(self) -> None:
-        """Close. Raises OSError."""
-        ...
 
 
 class StaleErrno(OSError):

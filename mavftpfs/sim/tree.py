@@ -38,8 +38,8 @@ class Entry(NamedTuple):
     stat: Stat
 
 
-class TreeFile(Protocol):
-    """An open file. All methods raise OSError."""
+class OpenFile(Protocol):
+    """An open file, as a session has it. All methods raise OSError."""
 
     def read(self, offset: int, size: int) -> bytes:
         """Return up to `size` bytes; fewer at the end of the file, none past it."""
@@ -50,15 +50,19 @@ class TreeFile(Protocol):
         ...
 
     def size(self) -> int:
-        """Return the present size."""
-        ...
-
-    def resize(self, size: int) -> None:
-        """Cut or extend (with zeros) the file."""
+        """Return the present size; that of a virtual file may be a lie."""
         ...
 
     def close(self) -> None:
         """Make what was written durable. May be called twice."""
+        ...
+
+
+class TreeFile(OpenFile, Protocol):
+    """An open file of a tree."""
+
+    def resize(self, size: int) -> None:
+        """Cut or extend (with zeros) the file."""
         ...
 
 
