@@ -10,7 +10,7 @@ import contextlib
 import errno
 import random
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from mavftpfs.link.messages import Address
@@ -23,7 +23,6 @@ from mavftpfs.sim.firmware import (
     HEADER_SIZE,
     NAK,
     REPLY,
-    Firmware,
     Refusal,
     Request,
     frame_size,
@@ -140,7 +139,7 @@ def write_row(wires: Sequence[bytes], opened: OpenFile, source: Address, replies
     return len(wires)
 
 
-class Px4(Firmware):
+class Px4(px4ops.PathRequests):
     """One instance, as each MAVLink link of a vehicle has one."""
 
     def __init__(self, storage: Storage, profile: Profile, rng: random.Random) -> None:
@@ -153,18 +152,15 @@ class Px4(Firmware):
         self._cached: bytes | None = None
         self._cached_seq = -1
         self._cached_target = Address(0, 0)
-        self._errno = 0
         self._last_request = 0.0
         self._started: float | None = None
         self._tick = 0
         self._busy_until = float("-inf")
         self._pending: deque[tuple[bytes, Address]] = deque()
         self._pending_bytes = 0
-        self._extra_cost = 0.0
         self._has_cost = bool(profile.request_cost or profile.stall_chance)
         self._idle_close = float("inf") if profile.idle_close is None else profile.idle_close
-        self.scratch = b""
-        self._handlers: dict[int, Callable[[Request], bytes]] = {
+        self._handlers |= {
             Opcode.NONE: lambda request: request.data[: request.size],
             Opcode.TERMINATE_SESSION: self._terminate,
             Opcode.RESET_SESSIONS: self._reset,
@@ -172,7 +168,7 @@ class Px4(Firmware):
             Opcode.CREATE_FILE: self._create,
             Opcode.OPEN_FILE_WO: self._open_write,
             Opcode.BURST_READ_FILE: self._burst,
-            **px4ops.handlers(self),
+            Opcode.READ_FILE: self._refuse_read,
         }
 
     # -- timeline ----------------------------------------------------------------------------
@@ -212,7 +208,7 @@ class Px4(Firmware):
         if not (idle and fresh and quick and self._started is not None):
             return False
         repeated = self._cached is not None and HEADER.unpack_from(wire)[0] + 1 == self._cached_seq
-        return not repeated and not (self._writing and self._is_protected(self.scratch))
+        return not repeated and not (self._writing and self.is_protected(self.scratch))
 
     def _wait(self, wire: bytes, source: Address) -> None:
         size = frame_size(wire)
@@ -342,14 +338,6 @@ class Px4(Firmware):
             cost += self.note_pause(self.rng.uniform(*self.profile.stall) if hit else 0.0)
         return cost
 
-    def set_errno(self, number: int) -> None:
-        """Set the errno that NAKs report."""
-        self._errno = number
-
-    def spend(self, seconds: float) -> None:
-        """Let the request that is being answered take longer."""
-        self._extra_cost += seconds
-
     # -- the session -------------------------------------------------------------------------
 
     def open_paths(self) -> list[bytes]:
@@ -391,13 +379,13 @@ class Px4(Firmware):
         return b""
 
     def _open_read(self, request: Request) -> bytes:
-        return self._open(px4ops.path_of(self, request), write=False, create=False, truncate=False)
+        return self._open(self.path_of(request), write=False, create=False, truncate=False)
 
     def _create(self, request: Request) -> bytes:
-        return self._open(px4ops.path_of(self, request), write=True, create=True, truncate=True)
+        return self._open(self.path_of(request), write=True, create=True, truncate=True)
 
     def _open_write(self, request: Request) -> bytes:
-        return self._open(px4ops.path_of(self, request), write=True, create=True, truncate=False)
+        return self._open(self.path_of(request), write=True, create=True, truncate=False)
 
     def _open(self, path: bytes, *, write: bool, create: bool, truncate: bool) -> bytes:
         """Open; the ACK tells the size before a truncation, and reads end there for ever."""
@@ -426,7 +414,7 @@ class Px4(Firmware):
         packed = REPLY.pack(seq + 1 & 0xFFFF, session, ACK, len(data), opcode, complete, offset, data)
         self._deliver(source, packed, now)
 
-    def refuse_read(self, request: Request) -> bytes:
+    def _refuse_read(self, request: Request) -> bytes:
         """Say why a ReadFile cannot be served."""
         if request.session != 0 or self._file is None:
             raise Refusal(NakCode.INVALID_SESSION)
@@ -458,15 +446,6 @@ class Px4(Firmware):
         self.check_writable(self.scratch)
         if self._file is None or not self._writing:
             raise OSError(errno.EBADF, "not open for writing")
-
-    def check_writable(self, path: bytes) -> None:
-        """Refuse paths outside the whitelist; for WriteFile the path is what the scratch buffer holds."""
-        if self._is_protected(path):
-            raise Refusal(NakCode.FILE_PROTECTED)
-
-    def _is_protected(self, path: bytes) -> bool:
-        root = self.profile.writable_root
-        return bool(root) and (not path.startswith(root) or b"/../" in path)
 
     # -- bursts ------------------------------------------------------------------------------
 

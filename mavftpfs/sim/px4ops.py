@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import errno
+import random
 from collections.abc import Callable
-from typing import Protocol
 
 from mavftpfs.protocol.payload import MAX_DATA, NakCode, Opcode
 from mavftpfs.sim import profiles
-from mavftpfs.sim.firmware import Refusal, Request, c_string, u32
+from mavftpfs.sim.firmware import Firmware, Refusal, Request, c_string, u32
 from mavftpfs.sim.profiles import Profile
 from mavftpfs.sim.storage import StaleErrno, Storage
 from mavftpfs.sim.tree import Entry, Kind, OpenFile, fail
@@ -17,49 +17,108 @@ _WORK_BUFFER = 256
 _RENAME_LIMIT = 255
 
 
-class Server(Protocol):
-    """What these requests need of the server."""
+class PathRequests(Firmware):
+    """Listings, and requests that name a path.
 
-    profile: Profile
-    storage: Storage
-    scratch: bytes
+    scratch: the buffer that most of them leave their path in.
+    """
+
+    def __init__(self, storage: Storage, profile: Profile, rng: random.Random) -> None:
+        super().__init__(storage, profile, rng)
+        self.scratch = b""
+        self._errno = 0
+        self._extra_cost = 0.0  # seconds that the request which is being answered takes longer
+        self._handlers: dict[int, Callable[[Request], bytes]] = {
+            Opcode.LIST_DIRECTORY: self._list,
+            Opcode.REMOVE_FILE: self._changing(storage.unlink),
+            Opcode.CREATE_DIRECTORY: self._changing(storage.mkdir),
+            Opcode.REMOVE_DIRECTORY: self._changing(storage.rmdir),
+            Opcode.RENAME: self._rename,
+            Opcode.TRUNCATE_FILE: self._truncate,
+            Opcode.CALC_FILE_CRC32: self._crc,
+        }
+        if profile.list_with_time:
+            self._handlers[Opcode.LIST_DIRECTORY_WITH_TIME] = self._list
+
+    def path_of(self, request: Request) -> bytes:
+        """Return the request's path, cut silently where the work buffer ends."""
+        return c_string(request.data[: min(request.size, MAX_DATA - 1)])[: self.profile.path_limit]
 
     def check_writable(self, path: bytes) -> None:
-        """Refuse a path outside the whitelist."""
-        ...
+        """Refuse paths outside the whitelist; for WriteFile the path is what the scratch buffer holds."""
+        if self.is_protected(path):
+            raise Refusal(NakCode.FILE_PROTECTED)
 
-    def refuse_read(self, request: Request) -> bytes:
-        """Say why a ReadFile cannot be served."""
-        ...
+    def is_protected(self, path: bytes) -> bool:
+        """Whether a path is outside the whitelist."""
+        root = self.profile.writable_root
+        return bool(root) and (not path.startswith(root) or b"/../" in path)
 
-    def spend(self, seconds: float) -> None:
-        """Take time."""
-        ...
+    def _list(self, request: Request) -> bytes:
+        """List from a raw readdir index; whatever fails is FileNotFound."""
+        self.scratch = path = self.path_of(request)
+        try:
+            entries = self.storage.entries(path)
+        except OSError as exc:
+            self._errno = exc.errno or 0
+            raise Refusal(NakCode.FILE_NOT_FOUND) from exc
+        with_time = request.opcode == Opcode.LIST_DIRECTORY_WITH_TIME
+        page = bytearray()
+        for index, entry in enumerate(entries[request.offset :], request.offset + 1):
+            text = _entry_text(self.profile, path, entry, with_time)
+            if len(page) + len(text) + 1 > MAX_DATA:
+                self._extra_cost += self.profile.readdir_cost * index
+                return bytes(page)
+            page += text + b"\0"
+        self._extra_cost += self.profile.readdir_cost * len(entries)
+        self._errno = 0
+        if request.offset >= len(entries):
+            raise Refusal(NakCode.EOF)
+        return bytes(page)
 
-    def set_errno(self, number: int) -> None:
-        """Set the errno that NAKs report."""
-        ...
+    def _changing(self, change: Callable[[bytes], None]) -> Callable[[Request], bytes]:
+        """Return the handler that does this to the path in a request."""
 
+        def handle(request: Request) -> bytes:
+            self.scratch = path = self.path_of(request)
+            self.check_writable(path)
+            change(path)
+            return b""
 
-def handlers(server: Server) -> dict[int, Callable[[Request], bytes]]:
-    """Return the handlers by opcode."""
+        return handle
 
-    def bind(function: Callable[[Server, Request], bytes]) -> Callable[[Request], bytes]:
-        return lambda request: function(server, request)
+    def _rename(self, request: Request) -> bytes:
+        data = request.data[: min(request.size, MAX_DATA - 1)]
+        old, _, rest = data.partition(b"\0")
+        if len(rest) < 2:
+            raise StaleErrno
+        self.scratch = old
+        new = c_string(rest)[:_RENAME_LIMIT]
+        self.check_writable(new)
+        self.storage.rename(old, new)
+        return b""
 
-    bound: dict[int, Callable[[Request], bytes]] = {
-        Opcode.READ_FILE: server.refuse_read,
-        Opcode.LIST_DIRECTORY: bind(_list),
-        Opcode.REMOVE_FILE: bind(_changing(Storage.unlink)),
-        Opcode.CREATE_DIRECTORY: bind(_changing(Storage.mkdir)),
-        Opcode.REMOVE_DIRECTORY: bind(_changing(Storage.rmdir)),
-        Opcode.RENAME: bind(_rename),
-        Opcode.TRUNCATE_FILE: bind(_truncate),
-        Opcode.CALC_FILE_CRC32: bind(_crc),
-    }
-    if server.profile.list_with_time:
-        bound[Opcode.LIST_DIRECTORY_WITH_TIME] = bind(_list)
-    return bound
+    def _crc(self, request: Request) -> bytes:
+        """Checksum a file; a failed open leaves errno as it was. Uses the other scratch buffer."""
+        path = c_string(request.data[: min(request.size, MAX_DATA - 1)])
+        try:
+            if self.storage.stat(path).kind is Kind.DIRECTORY:
+                raise fail(errno.EISDIR, path)
+        except FileNotFoundError as exc:
+            raise StaleErrno from exc
+        checksum, size = self.storage.crc(path)
+        self._extra_cost += size / self.profile.crc_rate
+        return u32(checksum)
+
+    def _truncate(self, request: Request) -> bytes:
+        """Cut or extend a file; only recordings ask for it."""
+        self.scratch = path = self.path_of(request)
+        self.check_writable(path)
+        try:
+            self.storage.truncate(path, request.offset)
+        except OSError as exc:
+            raise StaleErrno from exc
+        return b""
 
 
 def nak_data(code: int, number: int) -> bytes:
@@ -71,11 +130,6 @@ def nak_data(code: int, number: int) -> bytes:
     if number == errno.ENOENT:
         return bytes([NakCode.FILE_NOT_FOUND])
     return bytes([NakCode.FAIL_ERRNO, number & 0xFF])
-
-
-def path_of(server: Server, request: Request) -> bytes:
-    """Return the request's path, cut silently where the work buffer ends."""
-    return c_string(request.data[: min(request.size, MAX_DATA - 1)])[: server.profile.path_limit]
 
 
 def open_file(
@@ -110,30 +164,6 @@ class _OpenDirectory:
         return
 
 
-def _list(server: Server, request: Request) -> bytes:
-    """List from a raw readdir index; whatever fails is FileNotFound."""
-    path = path_of(server, request)
-    server.scratch = path
-    try:
-        entries = server.storage.entries(path)
-    except OSError as exc:
-        server.set_errno(exc.errno or 0)
-        raise Refusal(NakCode.FILE_NOT_FOUND) from exc
-    with_time = request.opcode == Opcode.LIST_DIRECTORY_WITH_TIME
-    page = bytearray()
-    for index, entry in enumerate(entries[request.offset :], request.offset + 1):
-        text = _entry_text(server.profile, path, entry, with_time)
-        if len(page) + len(text) + 1 > MAX_DATA:
-            server.spend(server.profile.readdir_cost * index)
-            return bytes(page)
-        page += text + b"\0"
-    server.spend(server.profile.readdir_cost * len(entries))
-    server.set_errno(0)
-    if request.offset >= len(entries):
-        raise Refusal(NakCode.EOF)
-    return bytes(page)
-
-
 def _entry_text(profile: Profile, directory: bytes, entry: Entry, with_time: bool) -> bytes:
     name, stat = entry
     if stat.kind is Kind.FILE:
@@ -145,51 +175,3 @@ def _entry_text(profile: Profile, directory: bytes, entry: Entry, with_time: boo
             return b"D%b\t0\t%d" % (name, stat.mtime)
         return b"D" + name
     return b"S"
-
-
-def _changing(change: Callable[[Storage, bytes], None]) -> Callable[[Server, Request], bytes]:
-    """Return the handler that does this to the path in a request."""
-
-    def handle(server: Server, request: Request) -> bytes:
-        server.scratch = path = path_of(server, request)
-        server.check_writable(path)
-        change(server.storage, path)
-        return b""
-
-    return handle
-
-
-def _rename(server: Server, request: Request) -> bytes:
-    data = request.data[: min(request.size, MAX_DATA - 1)]
-    old, _, rest = data.partition(b"\0")
-    if len(rest) < 2:
-        raise StaleErrno
-    server.scratch = old
-    new = c_string(rest)[:_RENAME_LIMIT]
-    server.check_writable(new)
-    server.storage.rename(old, new)
-    return b""
-
-
-def _crc(server: Server, request: Request) -> bytes:
-    """Checksum a file; a failed open leaves errno as it was. Uses the other scratch buffer."""
-    path = c_string(request.data[: min(request.size, MAX_DATA - 1)])
-    try:
-        if server.storage.stat(path).kind is Kind.DIRECTORY:
-            raise fail(errno.EISDIR, path)
-    except FileNotFoundError as exc:
-        raise StaleErrno from exc
-    checksum, size = server.storage.crc(path)
-    server.spend(size / server.profile.crc_rate)
-    return u32(checksum)
-
-
-def _truncate(server: Server, request: Request) -> bytes:
-    """Cut or extend a file; only recordings ask for it."""
-    server.scratch = path = path_of(server, request)
-    server.check_writable(path)
-    try:
-        server.storage.truncate(path, request.offset)
-    except OSError as exc:
-        raise StaleErrno from exc
-    return b""
