@@ -46,22 +46,24 @@ class SpoolDirectory:
     """
 
     def __init__(self, base: Path, rng: Random) -> None:
-        """Claim a free slot below `base`.
+        """Claim a slot below `base` that no mount uses, and in which none left anything.
 
         Raises:
             OSError: it cannot be made, or every slot is taken.
         """
         make_private_directory(base)
+        slots = [base / f"slot{number}" for number in range(SLOTS)]
         self._locks: dict[Path, int] = {}
-        self.dead_owners: frozenset[bytes] = frozenset()
-        free = [slot for slot in (base / f"slot{number}" for number in range(SLOTS)) if self._lock(slot)]
-        if not free:
-            raise OSError(f"all {SLOTS} slots of {base} are in use")
-        self.path = free[0]
+        free = [slot for slot in slots if slot.exists() and self._lock(slot)]
         self.dead_owners = frozenset(token for slot in free for token in self._tokens(slot))
-        self.owner = self._new_token(self.path, rng)
-        self._abandoned = free
-        self._left = frozenset(data_in(self.path))
+        usable = [slot for slot in free if not data_in(slot)]
+        new = (slot for slot in slots if slot not in free and self._lock(slot))
+        path = usable[0] if usable else next(new, None)
+        if path is None:
+            raise OSError(f"all {SLOTS} slots of {base} are in use")
+        self.path = path
+        self.owner = self._new_token(path, rng)
+        self._abandoned = [slot for slot in free if slot != path]
 
     def rescue(self, recovery: Path) -> list[Path]:
         """Move what dead mounts left to `recovery`; return the files, and let go of their slots.
@@ -77,10 +79,8 @@ class SpoolDirectory:
             moved, stuck = rescue(slot, recovery)
             found += moved
             failed += stuck
-            if slot != self.path:
-                self._unlock(slot)
+            self._unlock(slot)
         self._abandoned = []
-        self._left = frozenset(data_in(self.path))
         if failed and not found:
             raise failed[0]
         return found
@@ -88,8 +88,7 @@ class SpoolDirectory:
     def discard(self) -> None:
         """Remove what this mount put here: the vehicle has it, though a program may not have closed it."""
         for data in data_in(self.path):
-            if data not in self._left:
-                remove(data)
+            remove(data)
 
     def close(self) -> None:
         """Let go of the directory."""
@@ -97,8 +96,6 @@ class SpoolDirectory:
             self._unlock(slot)
 
     def _lock(self, slot: Path) -> bool:
-        if self._locks and not slot.exists():
-            return False  # one new slot is enough
         slot.mkdir(mode=0o700, exist_ok=True)
         descriptor = os.open(slot / "owner", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
         try:

@@ -54,11 +54,8 @@ class Spool:
         """Return the path of a file that is not there yet. Raises OSError."""
         if self._directory is None:
             self._directory = self._temporary = Path(tempfile.mkdtemp(prefix="mavftpfs-"))
-        while True:  # a dead mount may have left some
-            self._number += 1
-            path = self._directory / f"{self._number:06}.data"
-            if not path.exists():
-                return path
+        self._number += 1
+        return self._directory / f"{self._number:06}.data"
 
     def remove_file(self, path: Path) -> None:
         """Remove a file; a directory that was made here goes with its last one."""
