@@ -1,0 +1,496 @@
+"""Open files: who sees what, files that lose their name, and files that others replaced.
+
+A vehicle that replaces a file between two sessions of its server: test_replaced.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Awaitable, Callable
+
+import pytest
+import trio
+
+from mavftpfs.cache.openfile import OpenFile
+from mavftpfs.cache.throttle import STALL
+from mavftpfs.cache.tree import Tree
+from mavftpfs.protocol.payload import Opcode
+from mavftpfs.shared.errors import (
+    AlreadyExists,
+    FileBusy,
+    FileChanged,
+    FileTooLarge,
+    IsADirectory,
+    LocalProtocolError,
+    NotADirectory,
+    NotFound,
+    NotSupported,
+    ReadOnly,
+)
+from mavftpfs.sim.linkmodel import LinkSettings
+from tests.support.rigs import Rig, card, rig, write_file
+from tests.support.worlds import content
+
+DATA = bytes(range(256)) * 300
+FILE, NEW, OTHER = b"/d/file.bin", b"/d/new", b"/d/other"
+
+here = card({FILE: DATA})
+
+
+@pytest.fixture
+def tree(here: Rig) -> Tree:
+    """A mount with the defaults."""
+    return here.mount()
+
+
+# --- opening and writing
+
+
+async def test_the_shells_redirection_is_one_delivery(here: Rig, tree: Tree) -> None:
+    """open(O_TRUNC), dup2, close, write, close: flush comes before the first byte."""
+    file = await tree.open(FILE, write=True, truncate=True)
+    await file.flush()
+    assert here.count(Opcode.CREATE_FILE) == 0
+    assert file.size == (await tree.stat(FILE)).size == 0
+    await file.write(0, b"echo\n")
+    await file.flush()
+    asked = len(here.faults.requests)
+    await file.release()
+    assert len(here.faults.requests) == asked
+    assert here.count(Opcode.RENAME) == 1
+    assert here.data(FILE) == b"echo\n"
+
+
+async def test_creating(here: Rig, tree: Tree) -> None:
+    for path, exclusive, error in (
+        (FILE, True, AlreadyExists),
+        (b"/none/x", False, NotFound),
+        (FILE + b"/x", False, NotADirectory),
+        (b"/d", False, IsADirectory),
+        (b"/d/.mavftpfs-abcdnabc", False, NotSupported),
+    ):
+        with pytest.raises(error):
+            await tree.create(path, exclusive=exclusive)
+    file = await tree.create(FILE, exclusive=False)
+    assert file.size == len(DATA)
+    await file.release()
+    assert here.count(Opcode.CREATE_FILE, Opcode.REMOVE_FILE, Opcode.RENAME) == 0
+
+
+async def test_a_write_waits_while_the_file_is_being_delivered() -> None:
+    async with rig(link=LinkSettings(delay=0.5)) as here:
+        tree = here.mount()
+        one = await tree.create(b"/new", exclusive=True)
+        two = await tree.open(b"/new", write=True)
+        await one.write(0, b"one")
+        async with trio.open_nursery() as both:
+            both.start_soon(one.release)
+            await trio.sleep(0.5)
+            await two.write(0, b"ONE")
+            assert here.data(b"/new") == b"one"
+        await two.release()
+        assert here.data(b"/new") == b"ONE"
+
+
+async def test_handles_are_closed_once(tree: Tree) -> None:
+    file, reader = await tree.open(FILE, write=True), await tree.open(FILE)
+    for handle in (file, reader):
+        await handle.release()
+        await handle.release()
+        handle.close()
+    for use in (file.write(0, b"x"), file.read(0, 1), reader.write(0, b"x")):
+        with pytest.raises(LocalProtocolError):
+            await use
+
+
+@pytest.mark.holds("rule 14.27")
+async def test_no_file_is_larger_than_the_protocol_can_say(tree: Tree) -> None:
+    file = await tree.open(FILE, write=True)
+    for change in (file.write(2**32 - 1, b"x"), file.truncate(2**32)):
+        with pytest.raises(FileTooLarge):
+            await change
+    await file.release()
+
+
+async def test_read_only_and_virtual_trees_refuse_changes(here: Rig, tree: Tree) -> None:
+    reading = here.mount(read_only=True)
+    for change in (
+        reading.mkdir(b"/x"),
+        reading.open(FILE, write=True),
+        reading.unlink(FILE),
+        tree.create(b"/@SYS/x", exclusive=False),
+        tree.rename(FILE, b"/@SYS/x"),
+    ):
+        with pytest.raises(ReadOnly):
+            await change
+
+
+@pytest.mark.holds("promise 6")
+async def test_a_growing_file_is_busy(here: Rig) -> None:
+    tree = here.mount(dir_timeout=1)
+    await tree.stat(FILE)
+    here.put(FILE, DATA + b"more")
+    await trio.sleep(2)
+    await tree.stat(FILE)
+    for ask in (
+        tree.open(FILE, write=True),
+        tree.open(FILE, write=True, truncate=True),
+        tree.unlink(FILE),
+        tree.rename(FILE, b"/d/x"),
+        tree.truncate(FILE, 0),
+    ):
+        with pytest.raises(FileBusy):
+            await ask
+    reader = await tree.open(FILE)
+    with pytest.raises(FileBusy):
+        await tree.unlink(FILE)
+    await reader.release()
+    await trio.sleep(60)
+    await tree.truncate(FILE, 0)
+    assert here.data(FILE) == b""
+
+
+@pytest.mark.holds("promise 6")
+async def test_growth_shows_when_a_file_is_opened_too_and_force_goes_on(here: Rig, tree: Tree) -> None:
+    forced = here.mount(force=True)
+    for each in (tree, forced):
+        await each.stat(FILE)
+    here.put(FILE, DATA + b"more")
+    with pytest.raises(FileBusy):
+        await tree.open(FILE, write=True)
+    file = await forced.open(FILE, write=True)
+    assert file.size == len(DATA) + 4
+    await file.release()
+
+
+# --- files that lose their name: on the card
+
+
+async def test_a_file_that_is_read_is_hidden_until_it_is_closed(here: Rig, tree: Tree) -> None:
+    here.put(FILE, DATA * 5)
+    file = await tree.open(FILE)
+    assert await file.read(0, 10) == DATA[:10]
+    await tree.unlink(FILE)
+    (hidden,) = here.files()
+    assert here.litter() == [hidden]
+    assert await tree.list(b"/d") == []
+    with pytest.raises(NotFound):
+        await tree.stat(hidden)
+    with pytest.raises(FileBusy):
+        await tree.rmdir(b"/d")
+    await tree.rename(b"/d", b"/e")
+    assert await file.read(0, len(DATA) * 5) == DATA * 5
+    await file.release()
+    assert here.files() == {}
+    await tree.rmdir(b"/e")
+
+
+async def test_open_files_below_a_renamed_directory_follow(here: Rig, tree: Tree) -> None:
+    writer = await tree.create(NEW, exclusive=True)
+    await writer.write(0, b"abc")
+    reader = await tree.open(FILE)
+    await tree.rename(b"/d", b"/there")
+    assert await reader.read(0, len(DATA)) == DATA
+    await writer.write(3, b"def")
+    await writer.release()
+    await reader.release()
+    assert here.files() == {b"/there/new": b"abcdef", b"/there/file.bin": DATA}
+    assert (await tree.stat(b"/there/new")).size == 6
+    with pytest.raises(NotFound):
+        await tree.stat(NEW)
+
+
+async def rename_over_directory(tree: Tree) -> None:
+    await tree.unlink(FILE)
+    await tree.rename(b"/d", b"/moved", noreplace=False)
+
+
+LoseName = Callable[[Tree], Awaitable[None]]
+LOSE: dict[str, LoseName] = {
+    "unlink": lambda tree: tree.unlink(FILE),
+    "rename over": lambda tree: tree.rename(OTHER, FILE, noreplace=False),
+    "directory renamed": rename_over_directory,
+}
+
+
+@pytest.mark.parametrize("profile", ["px4", "ardupilot5"])
+@pytest.mark.parametrize("how", sorted(LOSE))
+async def test_nothing_stays_when_the_last_reader_closes_at_any_request(how: str, profile: str) -> None:
+    for count in range(1, 20):
+        async with rig(profile, {FILE: DATA * 7, OTHER: b"it"}, link=LinkSettings(delay=0.3)) as here:
+            tree, asked = here.mount(), trio.Event()
+            reading = await tree.open(FILE)
+            await reading.read(0, 1)
+            here.faults.after(count, asked.set)
+
+            async def close_beside(reading: OpenFile = reading, asked: trio.Event = asked) -> None:
+                with trio.move_on_after(30):
+                    await asked.wait()
+                await reading.release()
+
+            async with trio.open_nursery() as programs:
+                programs.start_soon(close_beside)
+                await LOSE[how](tree)
+                reached = asked.is_set()
+            await trio.sleep(5)
+            assert here.litter() == []
+            if not reached:
+                assert count > 2
+                return
+    raise AssertionError("it never ended")
+
+
+# --- files that lose their name: only here
+
+KIB = 1024
+PIECES, PIECE = 48, 32 * KIB
+
+
+async def fill(file: OpenFile) -> None:
+    for number in range(PIECES):
+        await file.write(number * PIECE, content(PIECE, number))
+
+
+async def assert_filled(file: OpenFile) -> None:
+    for number in range(PIECES):
+        assert await file.read(number * PIECE, PIECE) == content(PIECE, number)
+
+
+@pytest.mark.parametrize("over", [False, True])
+async def test_a_file_without_a_name_waits_for_no_vehicle(here: Rig, over: bool) -> None:
+    """Nor does it hold another writer back."""
+    tree = here.mount(dirty_max=256 * KIB)
+    nameless = await tree.create(NEW, exclusive=True)
+    if over:
+        await write_file(tree, OTHER, b"it")
+        await tree.rename(OTHER, NEW, noreplace=False)
+    else:
+        await tree.unlink(NEW)
+    there, before = here.files(), trio.current_time()
+    await fill(nameless)
+    assert trio.current_time() - before < STALL
+    assert tree.status()["bytes_held"] >= PIECES * PIECE  # type: ignore[operator]
+    assert tree.status()["bytes_held_on_disk"] > 0  # type: ignore[operator]
+    await nameless.fsync()
+    await write_file(tree, b"/d/another", bytes(300 * KIB), step=PIECE)
+    await assert_filled(nameless)
+    await nameless.release()
+    assert here.files() == there | {b"/d/another": bytes(300 * KIB)}
+    assert (tree.undelivered(), tree.status()["bytes_held"]) == ([], 0)
+
+
+async def test_a_writer_who_waits_when_the_name_goes_is_let_go() -> None:
+    async with rig(link=LinkSettings(rate=20_000.0)) as here:
+        tree, written = here.mount(dirty_max=256 * KIB), trio.Event()
+        file = await tree.create(b"/new", exclusive=True)
+
+        async def write() -> None:
+            await fill(file)
+            written.set()
+
+        async with trio.open_nursery() as nursery:
+            nursery.start_soon(write)
+            await trio.sleep(20)
+            assert not written.is_set()
+            with trio.fail_after(STALL):
+                await tree.unlink(b"/new")
+                await written.wait()
+        await assert_filled(file)
+        await file.release()
+        assert here.files() == {}
+
+
+# --- who has a file open that became another one gets ESTALE for good
+
+OLD, LATER = b"old" * 300, b"NEW" * 300
+"""As long as one another: only the times differ."""
+THEN = 1_700_000_000
+
+timed = card({FILE: b""}, profiles=["ardupilot5", "mavsdk"], link=LinkSettings(delay=0.01))
+
+
+@pytest.fixture
+def there(timed: Rig) -> Rig:
+    """A card whose listings tell times."""
+    timed.put(FILE, OLD, THEN)
+    return timed
+
+
+async def opened(tree: Tree, *, write: bool = False) -> OpenFile:
+    """Return who got bytes of the old file."""
+    file = await tree.open(FILE, write=write)
+    assert bytes(await file.read(0, 9)) == OLD[:9]
+    return file
+
+
+async def reader_of_another(there: Rig, tree: Tree) -> OpenFile:
+    """Return a reader that got bytes of a file which somebody else replaced afterwards."""
+    reader = await opened(tree)
+    there.put(FILE, LATER, THEN + 200)
+    tree.forget_caches()
+    return reader
+
+
+async def require_lost(reader: OpenFile) -> None:
+    for _ in range(2):
+        with pytest.raises(FileChanged):
+            await reader.read(9, 9)
+
+
+@pytest.mark.holds("promise 5")
+async def test_it_stays_lost_while_the_new_file_is_written_and_afterwards(there: Rig) -> None:
+    """The kernel keeps no pages of the new file meanwhile: it would give them to who has the old one open."""
+    tree = there.mount()
+    lost = await reader_of_another(there, tree)
+    later = await tree.open(FILE)
+    await require_lost(lost)
+    writer = await tree.open(FILE, write=True)
+    await require_lost(lost)
+    assert later.direct_io
+    assert writer.direct_io
+    await writer.write(0, b"mid")
+    await require_lost(lost)
+    await writer.fsync()
+    await require_lost(lost)
+    for file in (later, writer):
+        assert bytes(await file.read(0, 900)) == b"mid" + LATER[3:]
+        await file.release()
+    await require_lost(lost)
+    await lost.release()
+    assert there.data(FILE) == b"mid" + LATER[3:]
+    assert not (await tree.open(FILE)).direct_io
+
+
+@pytest.mark.holds("promise 5")
+async def test_all_older_versions_are_lost(there: Rig) -> None:
+    """Also the one that was opened before the file grew."""
+    tree = there.mount()
+    first = await opened(tree)
+    there.put(FILE, OLD + OLD, THEN + 200)
+    tree.forget_caches()
+    second = await tree.open(FILE)
+    assert bytes(await first.read(0, 900)) == OLD
+    assert bytes(await second.read(0, 9)) == OLD[:9]
+    there.put(FILE, LATER + LATER, THEN + 300)
+    tree.forget_caches()
+    third = await tree.open(FILE)
+    assert bytes(await third.read(0, 1800)) == LATER + LATER
+    await require_lost(second)
+    await require_lost(first)
+    for file in (first, second, third):
+        await file.release()
+
+
+async def test_what_we_write_ourselves_loses_nobody(there: Rig) -> None:
+    """Also where listings show the new file before its delivery is over."""
+    tree = there.mount()
+    reader, writer = await opened(tree), await tree.open(FILE, write=True)
+
+    async def look() -> None:
+        while True:
+            tree.forget_caches()
+            await (await tree.open(FILE)).release()
+            assert bytes(await reader.read(0, 3)) == b"new"
+            await trio.sleep(0.01)
+
+    async with trio.open_nursery() as both:
+        await writer.write(0, b"new")
+        both.start_soon(look)
+        await writer.fsync()
+        await writer.write(100, b"newer")
+        await writer.truncate(500)
+        await writer.fsync()
+        both.cancel_scope.cancel()
+    for file in (writer, reader):
+        await file.release()
+    assert there.data(FILE) == b"new" + OLD[3:100] + b"newer" + OLD[105:500]
+
+
+@pytest.mark.holds("promise 5")
+@pytest.mark.parametrize("look", ["stat", "read", "write", "empty", "make"])
+async def test_a_new_file_is_opened_though_a_writer_has_the_lost_one(there: Rig, look: str) -> None:
+    """That one changed nothing of it, and cannot any more; nobody is told that this came to the vehicle."""
+    tree = there.mount()
+    writer = await opened(tree, write=True)
+    there.put(FILE, LATER[:-100], THEN + 200)
+    await there.reboot()
+    await require_lost(writer)
+    expected = LATER[:-100]
+    if look == "stat":
+        assert (await tree.stat(FILE)).size == len(expected)
+    elif look == "make":
+        assert (await tree.create(FILE, exclusive=False)).size == len(expected)
+    else:
+        file = await tree.open(FILE, write=look != "read", truncate=look == "empty")
+        expected = b"" if look == "empty" else expected
+        assert bytes(await file.read(0, 2000)) == expected
+        await file.release()
+    await require_lost(writer)
+    for change in (writer.write(0, b"mid"), writer.truncate(0)):
+        with pytest.raises(FileChanged):
+            await change
+    await writer.fsync()
+    await writer.release()
+    assert there.data(FILE) == expected
+    assert tree.undelivered() == []
+
+
+@pytest.mark.holds("promise 5")
+async def test_who_has_a_file_open_that_others_removed_does_not_get_the_next_one(there: Rig) -> None:
+    tree = there.mount()
+    reader = await opened(tree)
+    there.take(FILE)
+    tree.forget_caches()
+    writer = await tree.create(FILE, exclusive=True)
+    await writer.write(0, LATER)
+    await require_lost(reader)
+    await writer.fsync()
+    await require_lost(reader)
+    assert bytes(await writer.read(0, 900)) == LATER
+    for file in (writer, reader):
+        await file.release()
+    assert there.data(FILE) == LATER
+
+
+@pytest.mark.parametrize("smaller", [False, True])
+async def test_what_is_held_of_a_lost_file_does_not_get_among_the_pages_of_the_new_one(
+    there: Rig, smaller: bool
+) -> None:
+    """The kernel keeps what it was given by one name, whoever asked."""
+    tree = there.mount()
+    writer = await tree.open(FILE, write=True)
+    await writer.write(0, b"mid")
+    await writer.fsync()
+    held = b"mid" + OLD[3:]
+    if not smaller:
+        await trio.sleep(30.0)
+        await tree.list(b"/d")
+    assert bytes(await writer.read(0, 900)) == held
+    new = LATER[:-100] if smaller else LATER
+    there.put(FILE, new, THEN + 600)
+    await trio.sleep(30.0)
+    await tree.list(b"/d")
+    assert (await tree.stat(FILE)).size == len(new)
+    assert FILE in there.invalidated
+    reader = await tree.open(FILE)
+    await require_lost(writer)
+    with pytest.raises(FileChanged):
+        await writer.write(0, b"more")
+    assert bytes(await reader.read(0, 900)) == new
+    beside = await tree.open(FILE, write=True)
+    assert [file.direct_io for file in (reader, beside)] == [True] * 2
+    for file in (beside, writer, reader):
+        await file.release()
+    assert not (await tree.open(FILE)).direct_io
+
+
+async def test_a_file_that_grew_after_it_was_written_stays_who_wrote_it_has_open(there: Rig) -> None:
+    tree = there.mount()
+    writer = await tree.open(FILE, write=True)
+    await writer.write(0, b"mid")
+    await writer.fsync()
+    for _ in range(2):
+        await trio.sleep(30.0)
+        there.put(FILE, there.data(FILE) + b"more")
+        await tree.list(b"/d")
+    assert bytes(await writer.read(0, 900)) == b"mid" + OLD[3:]
+    await writer.release()
