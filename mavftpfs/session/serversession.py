@@ -406,6 +406,8 @@ class ServerSession:
             SessionBusy: nothing is left that applies. FtpNak: nor did anything say that it was taken.
         """
         if left.closings and await self._close_ours(nak):
+            if left.closings < _LOST_ACKS:  # a copy of the open before found it closed, and opened it again
+                await trio.sleep(self.doubt.lateness)
             left.closings -= 1
             return
         if nak.code == NakCode.FAIL:
@@ -423,10 +425,7 @@ class ServerSession:
         if nak.code == NakCode.FILE_EXISTS:  # a listing that comes to its end clears the sticky errno
             await self._try(ListDirectory(b"/", False))
             return True
-        if not self._may_be_ours(nak) or not await self._close_what_may_be_ours():
-            return False
-        await trio.sleep(self.doubt.lateness)  # a copy of that open would find it closed, and open it again
-        return True
+        return self._may_be_ours(nak) and await self._close_what_may_be_ours()
 
     async def _try(self, operation: Operation) -> None:
         """Run a remedy whose refusal changes nothing.
