@@ -28,6 +28,7 @@ import trio
 import mavftpfs
 from mavftpfs.compose import NO_SINKS, Attached, Sinks, attached
 from mavftpfs.control import ControlServer, Reply
+from mavftpfs.daemon import Report
 from mavftpfs.farewell import say_goodbye
 from mavftpfs.fuse.handles import InodeTable, Presentation
 from mavftpfs.fuse.operations import Operations
@@ -47,9 +48,6 @@ GRACE = 2.0
 
 LAST_REPLIES = 3.0
 """Seconds to hand waiting control clients their reply at the end."""
-
-Report = Callable[[int, str], None]
-"""Takes (exit code, one line): 0 and perhaps a notice once the mount is up, else why there will be none."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,7 +175,6 @@ class _Life:
         self.farewell = ""
         self.control: ControlServer | None = None
         self._loop_scope: trio.CancelScope | None = None
-        self._signals = 0
         self._stop_asked = False
         self._let_go = False
         self._started = time.time()
@@ -289,35 +286,21 @@ class _Life:
     # -- signals ----------------------------------------------------------------------------------
 
     async def watch_signals(self, task_status: trio.TaskStatus[None] = trio.TASK_STATUS_IGNORED) -> None:
-        """Unmount on the first signal, stop waiting for anybody on the second, just end on the third."""
+        """Unmount on the first signal, stop waiting for anybody on the second."""
         with trio.open_signal_receiver(signal.SIGINT, signal.SIGTERM, signal.SIGHUP) as signals:
             task_status.started()
             async for number in signals:
                 log.info("signal %s", signal.Signals(number).name)
-                self._signals += 1
-                self._on_signal()
-
-    def _on_signal(self) -> None:
-        if self._signals > 2:
-            self._end_at_once()
-        elif self._signals == 2 or not self.mounted:
-            self.scope.cancel()
-        else:
-            self._stop_gently()
+                if self._stop_asked or not self.mounted:
+                    self.scope.cancel()
+                else:
+                    self._stop_gently()
 
     def _stop_gently(self) -> None:
         self._stop_asked = True
         if self._loop_scope is not None:
             pyfuse3.terminate()
             self._loop_scope.deadline = trio.current_time() + GRACE
-
-    def _end_at_once(self) -> None:
-        if self.mounted:
-            try:
-                unmount_what_is_left(self.request.mountpoint)
-            except MavftpfsError as exc:
-                log.warning("%s", exc)
-        os._exit(ExitCode.MOUNT_FAILED)
 
 
 async def fuse_loop() -> None:

@@ -81,18 +81,10 @@ PART_SUFFIX = ".part"
 MAX_RETURNS = 20
 """How often a vehicle may vanish and return while one file is fetched."""
 
-_NOT_NOW: dict[type[MavftpfsError], str] = {
-    Armed: "no checksums while armed",
-    NotDeliveredYet: "the vehicle is armed, or has not got all of it yet",
-    RequestTimeout: "the vehicle did not answer",
-    SessionBusy: "another program has the vehicle's session",
-    FileBusy: "another program has the vehicle's session",  # so a mount says it
-}
-"""Why there is no checksum now, though there may be one later."""
+NOT_NOW = (Armed, NotDeliveredYet, RequestTimeout, SessionBusy, FileBusy)
+"""Errors that say that there is no checksum now, though there may be one later."""
 
-_REFUSED = "the vehicle refused to compute a checksum"
-
-NO_CHECKSUM: tuple[type[MavftpfsError], ...] = (*_NOT_NOW, FtpNak, NotSupported)
+NO_CHECKSUM: tuple[type[MavftpfsError], ...] = (*NOT_NOW, FtpNak, NotSupported)
 """Errors that say that there is no checksum, and nothing else about the file."""
 
 
@@ -376,33 +368,29 @@ class Fetcher:
             if resumed:
                 raise DataUnproven(f"{name} is made anew at each opening, so it cannot be resumed")
             return "size (generated at each opening, so a checksum proves nothing)"
-        theirs: int | str = ""
+        theirs = error = None
         if proof_needed(self.verify, resumed=resumed, size=size):
-            theirs = await self._checksum(remote)
+            try:
+                theirs = await self.session.files.crc32(remote)
+            except LinkError:
+                raise
+            except MavftpfsError as exc:
+                error = exc
         if theirs == crc:
             return "size and CRC32"
         await self._require_size(remote, name, size)
-        if not isinstance(theirs, str):
+        if theirs is not None:
             raise DataUnproven(
                 f"{name}: {size} bytes came with CRC32 {crc:08x}, the vehicle has {theirs:08x}"
             )
-        if resumed and theirs == _REFUSED:
-            raise DataUnproven(f"{name} was resumed, and {theirs}")
-        if resumed:
-            raise NotProvenYet(
-                f"{name}: all of it is here, as {PART_SUFFIX}, but what an earlier run fetched is not proven "
-                f"({theirs}); the next run tries again"
-            )
-        return f"size ({theirs})" if theirs else "size"
-
-    async def _checksum(self, remote: bytes) -> int | str:
-        """Return the vehicle's checksum of a file, or why there is none."""
-        try:
-            return await self.session.files.crc32(remote)
-        except LinkError:
-            raise
-        except MavftpfsError as exc:
-            return next((words for kind, words in _NOT_NOW.items() if isinstance(exc, kind)), _REFUSED)
+        if not resumed:
+            return f"size (no checksum: {error})" if error else "size"
+        if not isinstance(error, NOT_NOW):
+            raise DataUnproven(f"{name} was resumed, and there is no checksum: {error}")
+        raise NotProvenYet(
+            f"{name}: all of it is here, as {PART_SUFFIX}, but what an earlier run fetched is not proven "
+            f"({error}); the next run tries again"
+        )
 
     async def _require_size(self, remote: bytes, name: str, size: int) -> None:
         """Ask for the size again: no checksum says that the file was whole.

@@ -223,10 +223,15 @@ _BY_ERRNO: dict[int, type[errors.MavftpfsError]] = {
 }
 
 
+_HINTS = {
+    errors.ReadOnly: " (the vehicle is armed, or mounted with ro)",
+    errors.NotDeliveredYet: " (the vehicle is armed, or has not got all of it yet)",
+}
+
+
 def _translated(error: OSError, path: bytes) -> errors.MavftpfsError:
     kind = _BY_ERRNO.get(error.errno or 0, errors.MavftpfsError)
-    hint = " (the vehicle is armed, or mounted with ro)" if kind is errors.ReadOnly else ""
-    return kind(f"{name_text(path)}: {os.strerror(error.errno or errno.EIO)}{hint}")
+    return kind(f"{name_text(path)}: {os.strerror(error.errno or errno.EIO)}{_HINTS.get(kind, '')}")
 
 
 async def _call(path: bytes, function: Callable[..., ResultT], *args: object) -> ResultT:
