@@ -52,25 +52,21 @@ class NobodyThere(ControlError):
 # -- where the sockets are ------------------------------------------------------------------------
 
 
-def socket_directories(environment: Mapping[str, str], uid: int, home: str) -> list[Path]:
-    """Return where sockets may lie, the preferred place first.
+def own_directories() -> list[Path]:
+    """Return where this user's sockets may lie, the preferred place first.
 
     A mount from fstab has no XDG_RUNTIME_DIR and a shell of the same user has one, so all are searched.
     """
-    directories = []
-    if environment.get("XDG_RUNTIME_DIR"):
-        directories.append(Path(environment["XDG_RUNTIME_DIR"]) / "mavftpfs")
-    directories += [Path(f"/run/user/{uid}/mavftpfs"), Path(home) / ".cache" / "mavftpfs"]
-    return list(dict.fromkeys(directories))
+    runtime, home = os.environ.get("XDG_RUNTIME_DIR"), os.environ.get("HOME")
+    given = [Path(runtime) / "mavftpfs"] if runtime else []
+    return list(dict.fromkeys([*given, *directories_of(os.getuid(), home)]))
 
 
-def own_directories() -> list[Path]:
-    """Return `socket_directories` of this process."""
-    try:
-        home = pwd.getpwuid(os.getuid()).pw_dir
-    except KeyError:
-        home = os.environ.get("HOME", "/tmp")
-    return socket_directories(os.environ, os.getuid(), os.environ.get("HOME") or home)
+def directories_of(uid: int, home: str | None = None) -> list[Path]:
+    """Return where any user's sockets may lie; home: if it is not the one in the table of users."""
+    with suppress(KeyError):
+        home = home or pwd.getpwuid(uid).pw_dir
+    return [Path(f"/run/user/{uid}/mavftpfs"), Path(home or "/tmp") / ".cache" / "mavftpfs"]
 
 
 def socket_name(mountpoint: str) -> str:

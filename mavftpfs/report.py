@@ -14,7 +14,6 @@ import errno
 import json
 import logging
 import os
-import pwd
 import shutil
 import sys
 import threading
@@ -204,19 +203,9 @@ def find_socket(mountpoint: str) -> Path:
     """
     mount = mounts().get(mountpoint)
     directories = control.own_directories()
-    if mount is not None and mount.uid is not None:
-        directories += _directories_of(mount.uid)
+    if mount is not None and mount.uid not in (None, os.getuid()):
+        directories += control.directories_of(mount.uid)
     return control.find_socket(mountpoint, directories)
-
-
-def _directories_of(uid: int) -> list[Path]:
-    if uid == os.getuid():
-        return []
-    try:
-        home = pwd.getpwuid(uid).pw_dir
-    except KeyError:
-        home = "/nonexistent"
-    return control.socket_directories({}, uid, home)
 
 
 def _status_of(path: str, mount: Mounted) -> Status | None:
