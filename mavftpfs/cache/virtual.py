@@ -48,7 +48,6 @@ UNLISTABLE: dict[bytes, tuple[bytes, ...]] = {
 
 PARAM_FILE = b"/@PARAM/param.pck"
 ANNOUNCERS = frozenset({b"@SYS", b"@ROMFS"})
-TRUE_SIZES = frozenset({b"@ROMFS"})
 COST_FACTOR = 10
 """A snapshot that took T seconds to read is good for at least COST_FACTOR * T."""
 
@@ -160,7 +159,7 @@ class VirtualTrees:
         a file that no listing shows."""
         seen, until = self._look(path), -math.inf
         kind = EntryKind.FILE if found is None else found.entry.kind
-        if found is not None and (kind is EntryKind.DIRECTORY or tree_of(path) in TRUE_SIZES):
+        if found is not None and kind is EntryKind.DIRECTORY:
             until = found.directory.fresh_until
         elif seen.data is not None:
             until = seen.until
@@ -273,7 +272,7 @@ class VirtualTrees:
             return True
         if found.entry.kind is not EntryKind.FILE:
             return False
-        return tree_of(path) not in TRUE_SIZES and found.size <= self._options.at_stat_limit
+        return found.size <= self._options.at_stat_limit
 
     async def _read_unread(self, founds: Mapping[bytes, Found | None]) -> None:
         """Read what was not read yet, until `probe_time` is over or the link is too bad."""

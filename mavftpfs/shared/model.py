@@ -114,9 +114,9 @@ def is_virtual(path: bytes) -> bool:
 
 
 def is_snapshot(path: bytes) -> bool:
-    """Return whether it is an `@` file that must be read whole; `@MAV_LOG` names the directory of
-    logs, which are real files."""
-    return is_virtual(path) and path.split(b"/", 2)[1] != b"@MAV_LOG"
+    """Return whether it is an `@` file that must be read whole. The logs below `@MAV_LOG` are real files, and
+    those of `@ROMFS` are like them: they have true sizes and do not change."""
+    return is_virtual(path) and path.split(b"/", 2)[1] not in (b"@MAV_LOG", b"@ROMFS")
 
 
 def wire_path(path: bytes) -> bytes:

@@ -16,6 +16,7 @@ from mavftpfs.shared.errors import (
     LocalProtocolError,
     NotADirectory,
     NotFound,
+    ReadOnly,
     RequestTimeout,
     VehicleLost,
 )
@@ -142,15 +143,15 @@ async def test_a_snapshot_lasts_dir_timeout(here: Rig, tree: Tree) -> None:
     assert await handle.read(0, 99) == b"longer than before"
 
 
-async def test_romfs_is_an_ordinary_tree_read_whole(here: Rig, tree: Tree) -> None:
+async def test_romfs_is_an_ordinary_tree(here: Rig, tree: Tree) -> None:
     path = b"/@ROMFS/defaults.parm"
     assert dict(await tree.list(b"/@ROMFS"))[b"defaults.parm"] == await tree.stat(path)
     assert (await tree.stat(path)).size == 50
     assert (await tree.stat(path)).valid_for == 1.0
     assert here.count(OPEN) == 0
-    handle = await tree.open(path)
-    assert handle.direct_io
-    assert await handle.read(0, 99) == b"d" * 50
+    assert await read_file(tree, path) == b"d" * 50
+    with pytest.raises(ReadOnly):
+        await tree.open(path, write=True)
 
 
 async def test_the_log_alias_is_read_by_blocks_where_it_is_the_root(here: Rig) -> None:
