@@ -47,6 +47,7 @@ async def settle(here: Rig, tree: Tree) -> None:
     """Let everything happen that follows by itself; nothing of ours stays."""
     for _ in range(2):
         await trio.sleep(8)
+        tree.forget_caches()
         await tree.list(b"/d")
     assert here.litter() == []
     assert tree.undelivered() == []
