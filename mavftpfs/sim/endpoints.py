@@ -14,6 +14,7 @@ import sys
 import tty
 from collections.abc import AsyncIterator, Callable
 from contextlib import AbstractAsyncContextManager, asynccontextmanager
+from io import FileIO
 from typing import TextIO
 
 import trio
@@ -162,21 +163,6 @@ def client_source(link: Link) -> str:
     return LinkSpec(kind, host=host, port=spec.port).description
 
 
-class _Descriptor:
-    """A bare file descriptor as a Pipe."""
-
-    def __init__(self, fd: int) -> None:
-        self._fd = fd
-
-    def fileno(self) -> int:
-        return self._fd
-
-    def close(self) -> None:
-        if self._fd >= 0:
-            os.close(self._fd)
-            self._fd = -1
-
-
 @asynccontextmanager
 async def _open_pty() -> AsyncIterator[Link]:
     master, slave = os.openpty()
@@ -185,7 +171,8 @@ async def _open_pty() -> AsyncIterator[Link]:
         os.set_blocking(master, False)
         # Our own hold on the slave keeps the master readable while clients come and go.
         description = os.ttyname(slave)
-        link = StreamLink(description, None, _Descriptor(master), is_serial=True, outbox_limit=_PTY_OUTBOX)
+        pipe = FileIO(master, "r+")
+        link = StreamLink(description, None, pipe, is_serial=True, outbox_limit=_PTY_OUTBOX)
         async with background(link.run, link.aclose):
             yield link
     finally:
