@@ -82,21 +82,16 @@ async def _connect(spec: LinkSpec) -> socket.socket:
     found = await trio.socket.getaddrinfo(spec.host, spec.port, type=socket.SOCK_STREAM)
     problem: OSError = OSError(errno.EHOSTUNREACH, "no address")
     for family, kind, protocol, _, address in found[:_MAX_ADDRESSES]:
-        sock = trio.socket.socket(family, kind, protocol)
-        try:
-            with trio.fail_after(CONNECT_TIMEOUT):
-                await sock.connect(address)
-        except OSError as exc:
-            problem = exc
-            sock.close()
-        except trio.TooSlowError:
-            problem = OSError(errno.ETIMEDOUT, "no answer")
-            sock.close()
-        except BaseException:
-            sock.close()
-            raise
-        else:
-            return _configure(socket.socket(fileno=sock.detach()))
+        with trio.socket.socket(family, kind, protocol) as sock:
+            try:
+                with trio.fail_after(CONNECT_TIMEOUT):
+                    await sock.connect(address)
+            except OSError as exc:
+                problem = exc
+            except trio.TooSlowError:
+                problem = OSError(errno.ETIMEDOUT, "no answer")
+            else:
+                return _configure(socket.socket(fileno=sock.detach()))
     raise problem
 
 

@@ -71,7 +71,7 @@ class Row:
     """What the runs of one client under the same conditions amount to: medians of those that went well.
 
     rate: bytes/s; at_most: it was cut off by the time-out, and rate and shares are what it can have reached.
-    of_us, of_bare, of_limit: shares. cpu: seconds per 10**6 bytes. memory: bytes at most.
+    of_us, of_bare, of_limit: shares. cpu: seconds per 10**6 bytes. memory: peak in bytes.
     """
 
     server: str
