@@ -60,17 +60,3 @@ def test_on_old_versions_it_spoils_the_stream() -> None:
     assert nak(c.ask(Opcode.READ_FILE, size=100)) == FAIL
     c.open(A)
     assert ack(c.ask(Opcode.READ_FILE, size=100)) == content(100)
-
-
-# -- writing -------------------------------------------------------------------------------------
-
-
-def test_the_last_write_stays_in_a_buffer_until_terminate() -> None:
-    c = Client("mavsdk")
-    assert ack(c.open(A, Opcode.CREATE_FILE)) == b""
-    ack(c.ask(Opcode.WRITE_FILE, b"abc"))
-    ack(c.ask(Opcode.WRITE_FILE, b"def", offset=3))
-    assert isinstance(c.tree, MemoryTree)
-    assert c.tree.data(A) == b"abc"
-    ack(c.ask(Opcode.TERMINATE_SESSION))
-    assert c.tree.data(A) == b"abcdef"

@@ -53,20 +53,6 @@ def test_a_burst_does_not_keep_its_session_alive() -> None:
     assert c.now - sent_at > 10
 
 
-# -- the replay slot -----------------------------------------------------------------------------
-
-
-def test_after_a_burst_the_slot_lies_ahead_of_the_client() -> None:
-    """A file of one packet: the request after the burst's is taken for a repeat, and answered by its NAK."""
-    c = client()
-    c.open(FIVE)
-    first, end = c.ask_all(Opcode.BURST_READ_FILE, size=239)
-    assert (first.data, nak(end)) == (b"\x05", bytes([NakCode.EOF]))
-    stale = c.ask(Opcode.TERMINATE_SESSION, seq=c.seq + 1)
-    assert (stale.req_opcode, stale.opcode) == (Opcode.BURST_READ_FILE, Opcode.NAK)
-    assert c.server.open_sessions == 1
-
-
 # -- listings ------------------------------------------------------------------------------------
 
 
