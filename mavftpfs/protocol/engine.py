@@ -2,7 +2,7 @@
 
 Theory of operation. Operations say what to ask (`next_requests`) and are told of believed answers. A reply
 is found by its seq (request + 1) and believed when req_opcode, and where servers echo them session and
-offset, are the request's; what is not believed is counted and changes nothing. A loss is known by later
+offset, are the request's; what is not believed changes nothing. A loss is known by later
 answers (see `ledger`) or by a timer. Lost requests go out before new ones of the same operation. While
 burst packets arrive timers stand still, because ArduPilot answers nothing else then (servers.md 4).
 
@@ -41,9 +41,8 @@ class EngineStats:
 
     requests: transmissions, by_opcode too. retransmissions: those of them that repeat a request, spurious:
     and those that turned out to be needless. replies: believed ones, burst packets included.
-    unknown: replies that fit nothing outstanding (late, duplicate, not ours). stale: right seq,
-    wrong req_opcode. incoherent: right seq, but session, offset or opcode cannot be. unexplained: unknown
-    ones that no repetition of ours explains. timeouts: operations failed with RequestTimeout.
+    unknown: replies that fit nothing outstanding (late, duplicate, not ours), unexplained: and those of them
+    that no repetition of ours explains.
     """
 
     requests: int = 0
@@ -51,10 +50,7 @@ class EngineStats:
     spurious: int = 0
     replies: int = 0
     unknown: int = 0
-    stale: int = 0
-    incoherent: int = 0
     unexplained: int = 0
-    timeouts: int = 0
     by_opcode: defaultdict[int, int] = field(default_factory=lambda: defaultdict(int))
 
 
@@ -165,19 +161,15 @@ class Engine:
 
     def receive(self, reply: Payload, now: float) -> None:
         """Take a reply of our server to us; anything may be in it."""
-        of_burst = reply.req_opcode == _BURST
-        if of_burst and self._on_burst(reply, now):
+        if reply.req_opcode == _BURST and self._on_burst(reply, now):
             return
         request = self._ledger.find(reply.seq)
         if request is None:
-            if of_burst and self._burst_op is not None and self._burst_op.bursting:
-                self.stats.incoherent += 1
-            else:
-                self._on_unknown(reply, now)
+            self._on_unknown(reply, now)
         elif reply.req_opcode != request.opcode:
             self._on_stale(request)
         elif not request.fits(reply, self.traits):
-            self.stats.incoherent += 1
+            return
         elif reply.opcode != _NAK or not self._asks_again(request, reply):
             if not self._ledger.settle(request, reply.seq):
                 self.stats.spurious += 1
@@ -229,7 +221,6 @@ class Engine:
 
     def _on_stale(self, request: Request) -> None:
         """A replay of some earlier reply under this seq: this seq will never be answered (servers.md 2)."""
-        self.stats.stale += 1
         request.replays += 1
         # It may not be a replay but the rest of an abandoned burst: each new seq may be one more execution.
         limit = _MAX_SIDE_EFFECT_REPLAYS if request.manner.same_seq else _MAX_REPLAYS
@@ -382,7 +373,6 @@ class Engine:
             if op.timer <= now:
                 op.on_timer(now)
             if (op in late or op.progress_at + op.patience <= now) and not op.done:
-                self.stats.timeouts += 1
                 op.fail(RequestTimeout(f"no answer within {op.patience:g} s"))
             if op.done:
                 self.drop(op)

@@ -139,25 +139,24 @@ def test_the_rest_of_an_abandoned_burst_does_not_repeat_a_side_effect() -> None:
 
 @pytest.mark.holds("promise 1", "rule 14.2")
 @pytest.mark.parametrize(
-    ("change", "counter"),
+    ("change", "stale"),
     [
-        ({"seq": 1003}, "unknown"),
-        ({"seq": 999}, "unknown"),
-        ({"offset": 1}, "incoherent"),
-        ({"opcode": 5}, "incoherent"),
-        ({"req_opcode": Opcode.BURST_READ_FILE}, "stale"),
-        ({"req_opcode": Opcode.LIST_DIRECTORY}, "stale"),
+        ({"seq": 1003}, False),
+        ({"seq": 999}, False),
+        ({"offset": 1}, False),
+        ({"opcode": 5}, False),
+        ({"req_opcode": Opcode.BURST_READ_FILE}, True),
+        ({"req_opcode": Opcode.LIST_DIRECTORY}, True),
     ],
 )
-def test_a_reply_that_does_not_fit_changes_nothing(change: dict[str, int], counter: str) -> None:
+def test_a_reply_that_does_not_fit_changes_nothing(change: dict[str, int], stale: bool) -> None:
     engine = make(limit=1)
     transfer, sink = reading(engine)
     (request,) = sent(engine, 0.0)
     engine.receive(chunk(request, bytes(SIZE))._replace(**change), 0.1)  # type: ignore[arg-type]
     assert sink.held.empty
     assert not transfer.done
-    assert getattr(engine.stats, counter) == 1
-    assert engine.in_flight == (counter != "stale")  # else the seq will never be answered
+    assert engine.in_flight == (not stale)  # then the seq will never be answered
 
 
 @pytest.mark.holds("rule 14.2")
@@ -167,7 +166,7 @@ def test_the_session_is_checked_once_it_is_known_to_be_echoed() -> None:
     _, sink = reading(engine)
     (request,) = sent(engine, 0.0)
     engine.receive(chunk(request, b"x" * SIZE)._replace(session=9), 0.1)
-    assert engine.stats.incoherent == 1
+    assert sink.held.empty
     engine.receive(chunk(request, b"y" * SIZE), 0.1)
     assert bytes(sink.data[:239]) == b"y" * 239
 
@@ -204,7 +203,6 @@ def test_a_stale_replay_is_asked_again_under_a_new_seq_and_only_so_often(opcode:
         seqs.append(request.seq)
     assert len(seqs) == len(set(seqs)) == most
     assert not op.done
-    assert engine.stats.stale == most
     engine.receive(ack(request), 0.2)
     assert op.done
     assert op.retransmitted
@@ -278,7 +276,6 @@ def test_a_side_effect_goes_out_again_under_the_same_seq_with_growing_waits() ->
     assert now == pytest.approx(30.0)
     assert times[:2] == pytest.approx([1.0, 3.0])
     assert len(times) <= 10
-    assert engine.stats.timeouts == 1
     engine.on_deadline(40.0)  # the last transmission is a ghost for a while
     assert engine.next_deadline() is None
 
