@@ -44,9 +44,6 @@ from mavftpfs.shared.model import DirEntry, EntryKind
 
 log = logging.getLogger("mavftpfs.cache")
 
-MAX_STEPS = 8
-"""Steps of one delivery: each but the last learnt something of the server, or found a wrong copy."""
-
 MISMATCHES = 2
 """After so many copies that are not what was sent the delivery fails."""
 
@@ -178,10 +175,10 @@ class Deliverer:
         return in_place
 
     async def _try(self, node: Node, draft: Draft) -> None:
-        """Deliver, trying again as long as something was learnt of the server."""
-        mismatches = 0
-        for _ in range(MAX_STEPS):
-            known = self._context.store.traits.ways
+        """Deliver; again after a copy that came out wrong, and after it showed that the card cannot rename."""
+        mismatches, store = 0, self._context.store
+        while True:
+            in_place = store.traits.rename_works is False
             try:
                 if draft.state is State.TORN or node.path in self._context.own.torn:
                     await self._mend(node, draft)
@@ -198,11 +195,9 @@ class Deliverer:
             except MavftpfsError as error:
                 if not isinstance(error, PASSING) or not draft.size:
                     await self.abandon(node)
-                learnt = self._context.store.traits.ways != known
-                if not learnt or isinstance(error, LinkError | Armed):
+                if in_place or store.traits.rename_works is not False:
                     raise
                 log.debug("%r: %s; trying another way", node.path, error)
-        raise VerificationFailed(f"no way of writing {node.path!r} led to an end")
 
     async def _mend(self, node: Node, draft: Draft) -> None:
         """The renames of this file were interrupted: have them completed or undone, and look what came of it.

@@ -183,8 +183,3 @@ class Traits:
     wo_truncates: bool | None = None
     rename_works: bool | None = None
     rename_replaces: bool | None = None
-
-    @property
-    def ways(self) -> tuple[bool | None, ...]:
-        """What decides in which way a file goes to the card."""
-        return self.wo_truncates, self.rename_works, self.rename_replaces
