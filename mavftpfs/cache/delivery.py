@@ -175,7 +175,7 @@ class Deliverer:
         return in_place
 
     async def _try(self, node: Node, draft: Draft) -> None:
-        """Deliver; again after a copy that came out wrong, and after it showed that the card cannot rename."""
+        """Deliver; again after a wrong copy, and after it showed that the card cannot rename."""
         mismatches, store = 0, self._context.store
         while True:
             in_place = store.traits.rename_works is False

@@ -121,7 +121,7 @@ class Engine:
 
     def forget_server(self) -> None:
         """The server restarted, perhaps as another one: nothing that was learned of it holds."""
-        self.traits = Traits()
+        self.traits.forget()
         self.session = self.home_session
         self.flow.set_queue_limit(self.traits.queue_limit)
 

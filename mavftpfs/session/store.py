@@ -108,6 +108,7 @@ class Store:
     """
 
     def __init__(self, scheduler: Scheduler) -> None:
+        self.traits = scheduler.server.engine.traits
         self.in_doubt = scheduler.doubt.is_active
         self.read_whole = scheduler.read_whole
         self._scheduler = scheduler
@@ -118,11 +119,6 @@ class Store:
         self._sent = 0
         self._under_way = 0
         self._changed_at: dict[bytes, float] = {}
-
-    @property
-    def traits(self) -> Traits:
-        """What the server was seen to do (see RemoteStore)."""
-        return self._server.engine.traits
 
     def is_silent(self) -> bool:
         """Return whether the vehicle is silent (see RemoteStore)."""

@@ -7,7 +7,7 @@ Paths are bytes, absolute in the *mount's* spelling: `/a/b`, `/@SYS/uarts.txt`; 
 from __future__ import annotations
 
 from collections.abc import MutableMapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from enum import Enum
 from typing import TypeVar
 
@@ -183,3 +183,8 @@ class Traits:
     wo_truncates: bool | None = None
     rename_works: bool | None = None
     rename_replaces: bool | None = None
+
+    def forget(self) -> None:
+        """The server restarted, perhaps as another one."""
+        for fact in fields(self):
+            setattr(self, fact.name, fact.default)
