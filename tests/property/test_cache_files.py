@@ -109,6 +109,7 @@ class Programs:
         self.with_times = here.world.profile == "mavsdk"
         self.mtime = 1_700_000_000
         self.had: dict[bytes, list[bytes]] = {path: [] for path in self.PATHS}
+        here.put_directory(b"/d")
         for path, sizes in zip(self.PATHS, ([0, 1, 239, 5000], [100 * KIB, 500 * KIB]), strict=True):
             self.put(path, rng.randbytes(rng.choice(sizes)))
         self.tree: Tree = here.mount(cache_size=MIN_CACHE_SIZE, dir_timeout=20.0)
@@ -117,7 +118,7 @@ class Programs:
 
     def put(self, path: bytes, data: bytes) -> None:
         self.mtime += 1
-        self.here.put(path, data, self.mtime)
+        self.here.replace(path, data, self.mtime)
         self.had[path].append(data)
 
     async def run(self, actions: int) -> None:

@@ -13,16 +13,11 @@ import pytest
 import trio
 from trio.testing import MockClock
 
-from mavftpfs.cache.reserved import is_reserved
 from mavftpfs.cache.tree import OpenFile, Tree
-from mavftpfs.compose import subscribe
 from mavftpfs.protocol.payload import Opcode
-from mavftpfs.session.connection import Connection
 from mavftpfs.shared.errors import FileChanged
 from mavftpfs.sim.linkmodel import LinkSettings
-from tests.support.faults import Faults
-from tests.support.mounting import mounted
-from tests.support.worlds import World
+from tests.support.rigs import Rig, rig
 
 pytestmark = pytest.mark.holds("fault replaced file")
 
@@ -49,32 +44,26 @@ TIMED = ["mavsdk", "ardupilot5"]
 EVERY = [*TIMED, "px4"]
 
 
-class Card:
-    """One vehicle with one file."""
+def replace(here: Rig, data: bytes = NEW[: len(OLD)], mtime: int = THEN + 100) -> None:
+    """Move another file over it, as others would."""
+    here.replace(PATH, data, mtime)
 
-    def __init__(self, profile: str, link: LinkSettings = LINK) -> None:
-        self.world = World(profile, link)
-        self.world.tree.add(PATH, OLD, THEN)
 
-    def replace(self, data: bytes = NEW[: len(OLD)], mtime: int = THEN + 100) -> None:
-        """Move another file over it, as others would."""
-        self.world.tree.add(b"/other", data, mtime)
-        self.world.tree.rename(b"/other", PATH)
+@asynccontextmanager
+async def mounted(profile: str, link: LinkSettings = LINK) -> AsyncIterator[tuple[Rig, Tree]]:
+    """Mount a vehicle that has the file."""
+    async with rig(profile, link=link) as here:
+        here.put(PATH, OLD, THEN)
+        yield here, here.mount()
 
-    @asynccontextmanager
-    async def mounted(self) -> AsyncIterator[tuple[Connection, Tree]]:
-        """Mount it: the tree is told of restarts."""
-        async with mounted(self.world) as (connection, tree):
-            subscribe(connection, tree)
-            yield connection, tree
 
-    @asynccontextmanager
-    async def opened(self) -> AsyncIterator[tuple[Tree, OpenFile]]:
-        """Mount it and open the file."""
-        async with self.mounted() as (_, tree):
-            handle = await tree.open(PATH)
-            yield tree, handle
-            handle.close()
+@asynccontextmanager
+async def opened(profile: str, link: LinkSettings = LINK) -> AsyncIterator[tuple[Rig, Tree, OpenFile]]:
+    """Mount it and open the file."""
+    async with mounted(profile, link) as (here, tree):
+        handle = await tree.open(PATH)
+        yield here, tree, handle
+        handle.close()
 
 
 async def read_on(handle: OpenFile, start: int = 0) -> bytes:
@@ -100,8 +89,7 @@ async def read_head(handle: OpenFile) -> None:
 @pytest.mark.parametrize("profile", TIMED)
 async def test_the_end_of_a_copy_waits_for_the_news_of_a_reboot(profile: str, autojump: MockClock) -> None:
     """A vehicle may answer before it tells its boot time, and what is left may come in between."""
-    card = Card(profile, SLOW)
-    async with card.opened() as (tree, handle), trio.open_nursery() as nursery:
+    async with opened(profile, SLOW) as (here, tree, handle), trio.open_nursery() as nursery:
         blocks = handle._handle._version  # type: ignore[attr-defined]
 
         async def reboot() -> None:
@@ -110,10 +98,10 @@ async def test_the_end_of_a_copy_waits_for_the_news_of_a_reboot(profile: str, au
                     break
                 await trio.sleep(0.02)
             now = trio.current_time()
-            card.world.vehicle.reboot(now, downtime=2.7)
-            card.world.vehicle._next_beat = now + 4.2
-            card.replace()
-            card.world.link.kick()
+            here.world.vehicle.reboot(now, downtime=2.7)
+            here.world.vehicle._next_beat = now + 4.2
+            replace(here)
+            here.world.link.kick()
 
         await trio.sleep(10)
         nursery.start_soon(reboot)
@@ -132,18 +120,17 @@ async def test_a_copy_over_a_reboot_is_of_one_version(
 ) -> None:
     """size: of the successor; None = the file stays. unasked: the vehicle tells its boot time so. Where
     listings tell no times, nothing but the size tells a successor."""
-    card = Card(profile, SLOW)
-    card.world.vehicle.tells_time = unasked
-    card.world.vehicle.reboot(-5.0)
-    async with card.mounted() as (connection, tree), trio.open_nursery() as nursery:
+    async with mounted(profile, SLOW) as (here, tree), trio.open_nursery() as nursery:
+        here.world.vehicle.tells_time = unasked
+        here.world.vehicle.reboot(trio.current_time() - 5.0)
         await trio.sleep(10)  # a boot time has to go back by some seconds to tell of a restart
 
         async def reboot() -> None:
             await trio.sleep(4.5)
-            card.world.vehicle.reboot(trio.current_time(), downtime=4.0)
+            here.world.vehicle.reboot(trio.current_time(), downtime=4.0)
             if size:
-                card.replace(NEW[:size])
-            card.world.link.kick()
+                replace(here, NEW[:size])
+            here.world.link.kick()
 
         nursery.start_soon(reboot)
         if size:
@@ -151,7 +138,7 @@ async def test_a_copy_over_a_reboot_is_of_one_version(
                 await copy(tree)
         else:
             assert await copy(tree) == OLD
-        assert connection.vehicle.reboots == 1
+        assert here.connection.vehicle.reboots == 1
         assert await copy(tree) == (NEW[:size] if size else OLD)
 
 
@@ -161,12 +148,11 @@ async def test_nobody_gets_the_head_of_one_file_and_the_rest_of_another(
     profile: str, closed: bool, autojump: MockClock
 ) -> None:
     """closed: the head was cached by who closed the file before."""
-    card = Card(profile)
-    async with card.opened() as (tree, handle):
+    async with opened(profile) as (here, tree, handle):
         await read_head(handle)
         if closed:
             handle.close()
-        card.replace()
+        replace(here)
         with pytest.raises(FileChanged):
             await (copy(tree) if closed else read_on(handle, STEP))
         assert await copy(tree) == NEW[: len(OLD)]
@@ -174,15 +160,14 @@ async def test_nobody_gets_the_head_of_one_file_and_the_rest_of_another(
 
 @pytest.mark.parametrize("profile", TIMED)
 async def test_what_nobody_got_yet_is_read_anew(profile: str, autojump: MockClock) -> None:
-    card = Card(profile)
-    async with card.opened() as (_, handle):
+    async with opened(profile) as (here, _, handle):
         blocks = handle._handle._version  # type: ignore[attr-defined]
         with trio.move_on_after(0.01):  # a read that is given up
             await handle.read(0, STEP)
         await trio.sleep(IDLE)
         assert 0 in blocks
         assert blocks.missing(0, len(OLD))
-        card.replace()
+        replace(here)
         assert await handle.read(0, len(OLD)) == NEW[: len(OLD)]
         await trio.sleep(IDLE)
         assert await read_on(handle) == NEW[: len(OLD)]
@@ -192,14 +177,13 @@ async def test_what_nobody_got_yet_is_read_anew(profile: str, autojump: MockCloc
 @pytest.mark.parametrize("profile", EVERY)
 async def test_the_same_file_is_read_on(profile: str, grown: bool, autojump: MockClock) -> None:
     """One that grew, to its opened size. Where listings tell no times none is asked for."""
-    card = Card(profile)
-    async with card.opened() as (tree, handle):
+    async with opened(profile) as (here, tree, handle):
         sweeps = tree.status()["listings_asked"]
         parts = []
         for start in range(0, len(OLD), 40_000):
             await trio.sleep(IDLE)
             if grown:
-                card.replace(OLD + b"more", THEN + 1 + start)
+                replace(here, OLD + b"more", THEN + 1 + start)
             parts.append(bytes(await handle.read(start, 40_000)))
         assert b"".join(parts) == OLD
         assert profile in TIMED or tree.status()["listings_asked"] == sweeps
@@ -212,53 +196,53 @@ MID = b"mid"
 SUCCESSOR = NEW[: len(OLD)]
 
 
-async def wait_and_replace(card: Card) -> None:
+async def wait_and_replace(here: Rig) -> None:
     """Have the server's session closed, and the file replaced."""
     await trio.sleep(IDLE)
-    card.replace()
+    replace(here)
 
 
-async def read_and_write(card: Card, tree: Tree, writer: OpenFile) -> None:
+async def read_and_write(here: Rig, tree: Tree, writer: OpenFile) -> None:
     assert bytes(await writer.read(0, STEP)) == OLD[:STEP]
     await writer.write(100, MID)
-    await wait_and_replace(card)
+    await wait_and_replace(here)
 
 
-async def write_only(card: Card, tree: Tree, writer: OpenFile) -> None:
+async def write_only(here: Rig, tree: Tree, writer: OpenFile) -> None:
     await writer.write(100, MID)
-    await wait_and_replace(card)
+    await wait_and_replace(here)
 
 
-async def write_late(card: Card, tree: Tree, writer: OpenFile) -> None:
+async def write_late(here: Rig, tree: Tree, writer: OpenFile) -> None:
     """Nothing was read that could be compared: the time at which it was opened decides."""
-    await wait_and_replace(card)
+    await wait_and_replace(here)
     await writer.write(100, MID)
 
 
-async def write_again(card: Card, tree: Tree, writer: OpenFile) -> None:
+async def write_again(here: Rig, tree: Tree, writer: OpenFile) -> None:
     await writer.write(100, MID)
     await writer.fsync()
-    await wait_and_replace(card)
+    await wait_and_replace(here)
     await writer.write(300, MID)
 
 
-async def write_and_list(card: Card, tree: Tree, writer: OpenFile) -> None:
+async def write_and_list(here: Rig, tree: Tree, writer: OpenFile) -> None:
     """The listing is the first one that shows a time of what was delivered, and it is the successor's."""
     await writer.write(100, MID)
     await writer.fsync()
     await trio.sleep(30.0)
-    card.replace()
+    replace(here)
     await tree.list(b"/")
     await writer.write(300, MID)
 
 
-async def cut(card: Card, tree: Tree, writer: OpenFile) -> None:
-    await wait_and_replace(card)
+async def cut(here: Rig, tree: Tree, writer: OpenFile) -> None:
+    await wait_and_replace(here)
     await writer.truncate(1000)
 
 
-async def cut_and_write(card: Card, tree: Tree, writer: OpenFile) -> None:
-    await cut(card, tree, writer)
+async def cut_and_write(here: Rig, tree: Tree, writer: OpenFile) -> None:
+    await cut(here, tree, writer)
     await writer.write(100, MID)
 
 
@@ -270,34 +254,32 @@ async def test_a_change_of_the_old_file_does_not_go_into_its_successor(
     profile: str, change: object, autojump: MockClock
 ) -> None:
     """What is written whole does."""
-    card = Card(profile)
-    async with mounted(card.world, b"/") as (_, tree):
+    async with mounted(profile) as (here, tree):
         writer = await tree.open(PATH, write=True)
-        await change(card, tree, writer)  # type: ignore[operator]
+        await change(here, tree, writer)  # type: ignore[operator]
         for _ in range(2):
             with pytest.raises(FileChanged):
                 await writer.fsync()
-        assert card.world.tree.data(PATH) == SUCCESSOR
+        assert here.data(PATH) == SUCCESSOR
         await writer.truncate(0)
         await writer.write(0, b"whole")
         await writer.release()
-        assert card.world.tree.data(PATH) == b"whole"
+        assert here.data(PATH) == b"whole"
 
 
 @pytest.mark.parametrize("successor", [SUCCESSOR, OLD + b"more"], ids=["as long", "grown"])
 async def test_one_that_comes_while_the_whole_file_is_sent_is_not_replaced(
     successor: bytes, autojump: MockClock
 ) -> None:
-    card = Card("mavsdk")
-    faults = Faults(card.world)
-    async with mounted(card.world, b"/") as (_, tree):
+    async with mounted("mavsdk") as (here, tree):
+        faults = here.faults
         writer = await tree.open(PATH, write=True)
         await writer.write(100, MID)
-        faults.at(Opcode.WRITE_FILE, lambda: faults.after(100, lambda: card.replace(successor)))
+        faults.at(Opcode.WRITE_FILE, lambda: faults.after(100, lambda: replace(here, successor)))
         with pytest.raises(FileChanged):
             await writer.fsync()
-        assert card.world.tree.data(PATH) == successor
-        assert not [entry for entry in card.world.tree.entries(b"/") if is_reserved(entry.name)]
+        assert here.data(PATH) == successor
+        assert here.litter() == []
         writer.give_up()
 
 
@@ -306,19 +288,18 @@ async def test_what_was_written_is_not_read_among_bytes_of_a_successor(
     profile: str, autojump: MockClock
 ) -> None:
     """The rest of the file is opened anew after its delivery."""
-    card = Card(profile)
-    async with mounted(card.world) as (_, tree):
+    async with mounted(profile) as (here, tree):
         writer = await tree.open(PATH, write=True)
         await writer.write(100, MID)
         await writer.fsync()
-        await wait_and_replace(card)
+        await wait_and_replace(here)
         try:
             assert bytes(await writer.read(0, len(OLD))) == OLD[:100] + MID + OLD[103:]
         except FileChanged:
             with pytest.raises(FileChanged):
                 await writer.write(0, MID)
         await writer.release()
-        assert card.world.tree.data(PATH) == SUCCESSOR
+        assert here.data(PATH) == SUCCESSOR
 
 
 @pytest.mark.parametrize("profile", TIMED)
@@ -326,13 +307,12 @@ async def test_what_may_be_of_two_files_is_not_kept_of_one_that_is_unlinked(
     profile: str, autojump: MockClock
 ) -> None:
     """All of it is held here, but of two sessions of the server, which were not compared yet."""
-    card = Card(profile)
-    async with mounted(card.world) as (_, tree):
+    async with mounted(profile) as (here, tree):
         reader = await tree.open(PATH)
         assert bytes(await reader.read(0, STEP)) == OLD[:STEP]
         version = reader._handle._version  # type: ignore[attr-defined]
         version.compare_after = float("inf")  # as while readers take turns
-        await wait_and_replace(card)
+        await wait_and_replace(here)
         for at in range(STEP, len(OLD) - STEP, STEP):
             await reader.read(at, STEP)
         await trio.sleep(IDLE)
@@ -345,21 +325,19 @@ async def test_what_may_be_of_two_files_is_not_kept_of_one_that_is_unlinked(
 
 async def test_the_end_of_a_copy_by_turns_is_compared(autojump: MockClock) -> None:
     """Between two comparisons bytes go out unproven, but for the last."""
-    card = Card("ardupilot5")
-    async with card.opened() as (_, handle):
+    async with opened("ardupilot5") as (here, _, handle):
         await read_head(handle)
         handle._handle._version.compare_after = float("inf")  # type: ignore[attr-defined]
-        card.replace()
+        replace(here)
         with pytest.raises(FileChanged):
             await read_on(handle, STEP)
 
 
 @pytest.mark.parametrize("profile", TIMED)
 async def test_turns_of_two_readers_cost_few_listings(profile: str, autojump: MockClock) -> None:
-    card = Card(profile)
-    card.world.tree.add(b"/second", OLD * 2, THEN)
-    card.world.tree.add(b"/third", OLD * 2, THEN)
-    async with card.mounted() as (_, tree):
+    async with mounted(profile) as (here, tree):
+        here.put(b"/second", OLD * 2, THEN)
+        here.put(b"/third", OLD * 2, THEN)
         await tree.stat(PATH)
         before, began = int(str(tree.status()["listings_asked"])), trio.current_time()
         got: list[bytes] = []

@@ -95,8 +95,13 @@ class Rig:
     # --- the card
 
     def put(self, path: bytes, data: bytes, mtime: int | None = None) -> None:
-        """Put a file there, as others would, replacing what was."""
+        """Put a file there, as others would; into the file that is there, if one is."""
         self.world.tree.add(self.root + path, data, mtime)
+
+    def replace(self, path: bytes, data: bytes, mtime: int | None = None) -> None:
+        """Move another file over it, as others would: who has the old one open keeps it."""
+        self.put(b"/another", data, mtime)
+        self.world.tree.rename(self.root + b"/another", self.root + path)
 
     def put_directory(self, path: bytes) -> None:
         """Make a directory and those above it."""
