@@ -1,23 +1,23 @@
 """What commands on a real mount cost: FTP requests by opcode, counted by the vehicle that got them.
 
-A `Case` is a shell script that runs in a directory of its own on the mount. `prepare` fills that directory on
-the card before anything is mounted, `before` runs on the mount uncounted, `script` is counted from its
-first request to the last one that follows of it (the Terminate of an idle file, a background delivery).
-Listings are kept for the whole run (dir_timeout), so that what is cached does not depend on the time.
+A `Case` is a shell script that runs in a directory of its own on the mount. It is counted from its first
+request to the last one that follows of it (the Terminate of an idle file, a background delivery). Listings
+are kept for the whole run (dir_timeout), so that what is cached does not depend on the time.
 
 Keep-alive requests (opcode 0) depend on time and are counted apart. Where the client repeated a request,
 because the machine was too busy to answer in time, the repetitions that it reports have to explain every
 request too many.
 
 Before a new file gets its name that is opened, to see that it is free, unless a listing less than FREE_FOR
-old lacks it. `aged` makes that certain.
+old lacks it, and before names are removed the directory is listed, unless it was so lately. A case that is
+`aged` waits until that is over; in the others it may be over where the machine is busy.
 """
 
 from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -26,6 +26,7 @@ from mavftpfs.protocol.payload import Opcode, Payload
 from mavftpfs.sim.tree import DirectoryTree
 from tests.support.lying import LyingVehicle
 from tests.support.mounts import Mount
+from tests.support.request_costs import Case
 from tests.support.twins import PRELUDE
 from tests.support.vehicles import HOST, free_udp_port
 
@@ -39,9 +40,6 @@ LOST = 10.0
 
 SETTLING = 60.0
 KEEP_ALIVE = "NONE"
-BY_SESSION = ("TERMINATE_SESSION", "RESET_SESSIONS", "READ_FILE", "WRITE_FILE", "BURST_READ_FILE")
-"""Opcodes whose data is not a path."""
-
 FOLDERS = {"px4-nuttx": "fs/microsd"}
 ROOM = "cases"
 """The directory of the card in which each case has its own."""
@@ -69,23 +67,6 @@ SHORT = {
 """Both opcodes for listing are one thing here: a server answers one of them."""
 
 
-@dataclass(frozen=True, slots=True)
-class Case:
-    """One command; `$1` is an empty directory on the local disk.
-
-    aged: what was listed before is no news any more (FREE_FOR) when the script starts. fresh: it must be news
-    still when the script ends, else names may be listed once more.
-    """
-
-    name: str
-    script: str
-    before: str = ""
-    prepare: Callable[[Path], None] = lambda folder: None
-    timeout: float = 120.0
-    aged: bool = False
-    fresh: bool = False
-
-
 @dataclass(slots=True)
 class Cost:
     """What one run of a case cost. payload: bytes of file data asked for or sent. repeats: how many of the
@@ -97,12 +78,6 @@ class Cost:
     repeats: int = 0
     late: bool = False
     seconds: float = 0.0
-    requests: list[str] = field(default_factory=list)
-
-    @property
-    def total(self) -> int:
-        """How many requests it were."""
-        return self.counts.total()
 
     def text(self) -> str:
         """Return it as words: "open 1, read 2, close 1; 300 B", or "0"."""
@@ -144,9 +119,6 @@ class CountedVehicle(LyingVehicle):
             cost.counts[SHORT[name]] += 1
             if name in ("READ_FILE", "WRITE_FILE"):
                 cost.payload += request.size
-            path = request.data.rstrip(b"\0").replace(b"\0", b" -> ").decode(errors="replace")
-            where = f"{request.offset}+{request.size}" if name in BY_SESSION else path
-            cost.requests.append(f"{name} {where}")
         return cost
 
 
@@ -175,14 +147,14 @@ class Counting:
         scratch = self.mount.folder / where.name
         scratch.mkdir()
         listed = time.monotonic()
-        self._bash(f"ls -l .. > /dev/null; {case.before}", where, scratch, case.timeout)
+        self._bash(f"ls -l .. > /dev/null; {case.before}", where, scratch)
         self.settle()
         time.sleep(FREE_FOR + 0.1 if case.aged else 0)
         mark, repeated = self.vehicle.asked(), self.status()["link"]["retransmissions"]
         started = time.monotonic()
-        self._bash(case.script, where, scratch, case.timeout)
+        self._bash(case.script, where, scratch)
         seconds = time.monotonic() - started
-        late = case.fresh and time.monotonic() - listed > FREE_FOR
+        late = not case.aged and time.monotonic() - listed > FREE_FOR
         self.settle()
         cost = self.vehicle.cost_since(mark)
         cost.seconds, cost.late = seconds, late
@@ -215,8 +187,8 @@ class Counting:
         """Return what the mount says of itself."""
         return self.mount.status()
 
-    def _bash(self, script: str, where: Path, scratch: Path, timeout: float) -> None:
-        self.mount.run("bash", "-c", PRELUDE + script, "bash", where, scratch, timeout=timeout)
+    def _bash(self, script: str, where: Path, scratch: Path) -> None:
+        self.mount.run("bash", "-c", PRELUDE + script, "bash", where, scratch)
 
 
 def directory(case: Case) -> str:
