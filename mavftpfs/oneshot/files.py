@@ -140,20 +140,18 @@ def mountpoint_of(source: str) -> tuple[str, bytes] | None:
 
 async def find_mount(spec: LinkSpec, options: MountOptions) -> Session | None:
     """Return the files of the mount that holds this link now, if one is up and may be read by us."""
+    wanted = options.passed_on
     for mountpoint in [path for path in mounts() if is_ours(path)]:
         with suppress(errors.MavftpfsError, ValueError, KeyError, TypeError):
             status = await mount_status(mountpoint)
-            if not _is_wanted(status["vehicle"], options):
-                continue
-            if same_link(parse_source(status["source"]), spec):
-                return session_on(mountpoint, _root_of(status), options.root)
+            vehicle = status["vehicle"]
+            if (
+                wanted.get("target_system", 0) in (0, vehicle["system"])
+                and wanted.get("target_component", 0) in (0, vehicle["component"])
+                and same_link(parse_source(status["source"]), spec)
+            ):
+                return session_on(status, options.root)
     return None
-
-
-def _is_wanted(vehicle: Mapping[str, Any], options: MountOptions) -> bool:
-    wanted = options.passed_on
-    is_system = wanted.get("target_system", 0) in (0, vehicle["system"])
-    return is_system and wanted.get("target_component", 0) in (0, vehicle["component"])
 
 
 async def open_mount(mountpoint: str, subtree: bytes) -> Session:
@@ -162,18 +160,20 @@ async def open_mount(mountpoint: str, subtree: bytes) -> Session:
     Raises:
         LinkClosed: it does not answer.
     """
-    root = _root_of(await mount_status(mountpoint))
-    return session_on(mountpoint, root, normalise(root + b"/" + subtree))
+    status = await mount_status(mountpoint)
+    return session_on(status, normalise(os.fsencode(status["root"]) + b"/" + subtree))
 
 
-def session_on(mountpoint: str, mounted: bytes, root: bytes) -> Session:
-    """Return the files below `root` of the vehicle, of which `mounted` is on `mountpoint`."""
+def session_on(status: Mapping[str, Any], root: bytes) -> Session:
+    """Return the files below `root` of a vehicle, as the mount that told its status has them."""
+    mountpoint = status["mountpoint"]
 
     async def acknowledged() -> Acknowledged:
         found = (await mount_status(mountpoint))["transfers"]
         return {facts["path"]: facts["done"] for facts in found if facts["direction"] == "write"}
 
-    return Session(MountedFiles(mountpoint, mounted, root), root, acknowledged, mountpoint)
+    files = MountedFiles(mountpoint, os.fsencode(status["root"]), root)
+    return Session(files, root, acknowledged, mountpoint)
 
 
 def same_link(one: LinkSpec, other: LinkSpec) -> bool:
@@ -199,10 +199,6 @@ async def mount_status(mountpoint: str) -> Mapping[str, Any]:
         if not status.get("problem"):
             return status
     raise errors.LinkClosed(f"the mount on {mountpoint} does not answer")
-
-
-def _root_of(status: Mapping[str, Any]) -> bytes:
-    return os.fsencode(str(status["root"]))
 
 
 # -- its files ------------------------------------------------------------------------------------

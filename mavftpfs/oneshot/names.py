@@ -198,11 +198,9 @@ async def make_directories(session: Session, paths: Sequence[bytes], *, parents:
     """
     files = session.files
     for path in paths:
-        for above in ancestors(path) if parents else ():
-            if not await is_directory(files, above):
-                await make_directory(files, above, may_exist=True)
-        if not (parents and await is_directory(files, path)):
-            await make_directory(files, path, may_exist=parents)
+        for wanted in [*ancestors(path), path] if parents else [path]:
+            if not (parents and await is_directory(files, wanted)):
+                await make_directory(files, wanted, may_exist=parents)
 
 
 def ancestors(path: bytes) -> list[bytes]:
@@ -237,10 +235,8 @@ async def remove_paths(session: Session, paths: Sequence[bytes], *, recursive: b
     """Remove files, and with `recursive` directories with all below.
 
     Raises:
-        UsageError: the root is named.
         IsADirectory: a directory without `recursive`. Nothing is removed before all paths were looked at.
     """
-    refuse_root(paths)
     found = [(path, await session.files.stat(path)) for path in paths]
     for path, stat in found:
         if stat.kind is EntryKind.DIRECTORY and not recursive:
