@@ -189,11 +189,6 @@ class Firmware(ABC):
             return due if wake is None else min(due, wake)
         return wake
 
-    def note_pause(self, seconds: float) -> float:
-        """Note that the card made a read or write wait so long, 0 included; return it."""
-        self.pauses.append(seconds)
-        return seconds
-
     def forget_outbox(self) -> None:
         """Drop what was not sent yet."""
         self._ready = []
@@ -384,8 +379,6 @@ class Spec(Firmware):
 
     def _list(self, request: Request) -> bytes:
         with_time = request.opcode == Opcode.LIST_DIRECTORY_WITH_TIME
-        if with_time and not self.profile.list_with_time:
-            raise Refusal(NakCode.UNKNOWN_COMMAND)
         entries = [entry for entry in self.storage.entries(_path(request)) if _shown(entry)]
         page = bytearray()
         for entry in entries[request.offset :]:

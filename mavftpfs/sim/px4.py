@@ -335,7 +335,8 @@ class Px4(px4ops.PathRequests):
         self._extra_cost = 0.0
         if opcode in (_READ, _WRITE):
             hit = self.rng.random() < self.profile.stall_chance
-            cost += self.note_pause(self.rng.uniform(*self.profile.stall) if hit else 0.0)
+            self.pauses.append(self.rng.uniform(*self.profile.stall) if hit else 0.0)
+            cost += self.pauses[-1]
         return cost
 
     # -- the session -------------------------------------------------------------------------

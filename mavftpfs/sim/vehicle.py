@@ -62,12 +62,10 @@ class FtpServer:
         profile: Profile,
         *,
         rng: random.Random,
-        address: Address = AUTOPILOT,
         virtual: VirtualTrees | None = None,
     ) -> None:
         self.tree = tree
         self.profile = profile
-        self.address = address
         self.requests: Counter[int] = Counter()
         self.malformed = 0
         self._storage = Storage(tree, profile, rng, virtual)
@@ -144,7 +142,6 @@ class SimVehicle:
 
     Args:
         telemetry: bytes per second of unasked messages beside heartbeat and system time.
-        stream: whether `receive` gets pieces of a byte stream rather than datagrams.
         armed: state at the start; also after a reboot it is disarmed.
         signing_key: as for Framer.
 
@@ -159,21 +156,18 @@ class SimVehicle:
         *,
         rng: random.Random,
         address: Address = AUTOPILOT,
-        virtual: VirtualTrees | None = None,
         telemetry: float = 0.0,
-        stream: bool = False,
         armed: bool = False,
         signing_key: bytes | None = None,
     ) -> None:
-        self.server = FtpServer(tree, profile, rng=rng, address=address, virtual=virtual)
-        self.framer = Framer(address, stream=stream, signing_key=signing_key)
+        self.server = FtpServer(tree, profile, rng=rng)
+        self.framer = Framer(address, stream=False, signing_key=signing_key)
         self.profile = profile
         self.address = address
         self.telemetry = telemetry
         self.armed = armed
         self.tells_time = True
         self.heard: dict[Address, Heartbeat] = {}
-        self.commands = 0
         self._uid = rng.getrandbits(64)
         self._booted_at: float | None = None
         self._down_until = float("-inf")
@@ -204,7 +198,7 @@ class SimVehicle:
         self._next_telemetry = float("-inf")
 
     def set_stream(self, stream: bool) -> None:
-        """Say what `receive` will get, before it gets anything."""
+        """Say, before it gets anything, whether `receive` will get pieces of a stream; else datagrams."""
         self.framer.stream = stream
 
     def receive(self, data: bytes, now: float) -> None:
@@ -307,7 +301,6 @@ class SimVehicle:
         self._next_telemetry = now  # nothing more is made up for: an autopilot skips what it could not send
 
     def _on_command(self, command: CommandLong, now: float) -> None:
-        self.commands += 1
         wanted = int(command.params[0]) if abs(command.params[0]) < 1e6 else -1
         asks = command.command == MAV_CMD_REQUEST_MESSAGE
         frame: bytes | None = None

@@ -91,7 +91,7 @@ class LyingServer(FtpServer):
 def lie_for(world: World) -> LyingServer:
     """Put a lying server in the place of a world's own, before anything was asked, and return it."""
     vehicle = world.vehicle
-    server = LyingServer(world.tree, vehicle.profile, rng=random.Random(world.seed), address=vehicle.address)
+    server = LyingServer(world.tree, vehicle.profile, rng=random.Random(world.seed))
     server.firmware.tx_room = vehicle.server.firmware.tx_room
     vehicle.server = server
     return server
