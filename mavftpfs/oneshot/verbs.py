@@ -220,7 +220,7 @@ def _download(
 
 def _here(outcome: download.Outcome) -> str:
     wanted, here = len(outcome.wanted) + len(outcome.here), len(outcome.fetched) + len(outcome.here)
-    return f"{here} of {wanted} files are here; the next run goes on where this one stopped"
+    return f"{here} of {wanted} files are here; the next run goes on with what came of the others"
 
 
 def _sync_summary(outcome: download.Outcome, since: float | None) -> str:
