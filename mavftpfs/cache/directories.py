@@ -278,26 +278,20 @@ class Directories:
         return Found(entry, directory)
 
     async def current(self, path: bytes, *, within: float = 0.0) -> DirEntry | None:
-        """Return what the vehicle has there, not drafts, as it was shown to be at most `within` seconds ago.
-
-        Where a listing takes long that is longer (LOOK_FACTOR); 0: it is asked for just now. That something
-        is there counts from the end of a listing, or from our change; that nothing is, from the beginning of
-        one.
+        """Return what the vehicle has there, not drafts, by a change of ours or a listing that began at most
+        `within` seconds ago. Where a listing takes long that is longer (LOOK_FACTOR). 0: just now.
 
         Raises:
             As ask, but None where its directory is gone.
         """
         parent, name = split(path)
-        known = self.known(parent)
+        known, began = self.known(parent), None
         if known is not None and within:
-            since = self.clock() - max(within, LOOK_FACTOR * (known.ended_at - known.listed_at))
-            seen = known.proven.get(name, -inf)
-            if self.clock() < known.fresh_until:
-                seen = max(seen, known.ended_at if name in known.entries else known.listed_at)
-            if seen >= since:
+            began = self.clock() - max(within, LOOK_FACTOR * (known.ended_at - known.listed_at))
+            if known.proven.get(name, -inf) >= began:
                 return known.entries.get(name)
         try:
-            return (await self.ask(parent)).entries.get(name)
+            return (await self.ask(parent, began=began)).entries.get(name)
         except (NotFound, NotADirectory):
             return None
 

@@ -23,7 +23,6 @@ import errno
 from collections import OrderedDict
 from collections.abc import Callable
 from functools import partial
-from itertools import islice
 
 import trio
 
@@ -183,8 +182,7 @@ class Files:
         Raises:
             DataUnproven: it shows another size. NotFound; else as RemoteStore.list_directory.
         """
-        parent, name = split(path)
-        entry = (await self._directories.ask(parent)).entries.get(name)
+        entry = await self._directories.current(path)
         if entry is None:
             raise NotFound(f"{path!r} does not exist any more")
         if entry.size != size:
@@ -219,8 +217,8 @@ class Files:
             old.clear()
         self._current[version.path] = version
         if len(self._current) > MAX_CLOSED:
-            closed = (v for v in self._current.values() if not v.handles and v is not version)
-            for surplus in list(islice(closed, 1)):
+            surplus = next((v for v in self._current.values() if not v.handles and v is not version), None)
+            if surplus is not None:
                 self._forget(surplus)
 
     def status(self) -> dict[str, object]:
