@@ -17,9 +17,9 @@ from mavftpfs.shared.errnos import errno_for
 from mavftpfs.shared.errors import Armed, FtpNak, MavftpfsError, SpoolFailed
 from mavftpfs.sim.linkmodel import LinkSettings
 from mavftpfs.sim.profiles import PROFILES, Family
-from tests.support.fake_writer import write_file
 from tests.support.faults import Faults
 from tests.support.mounting import mounted
+from tests.support.rigs import write_file
 from tests.support.sources import MemorySource
 from tests.support.takingturns import taking_turns
 from tests.support.uploads import know, put, start, under_way

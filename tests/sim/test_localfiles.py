@@ -14,42 +14,47 @@ from mavftpfs.shared.errors import (
     NotFound,
     NotSupported,
 )
-from tests.support.fake_store import read_file
-from tests.support.fake_writer import FakeWriter, card, make_writable, write_file
+from tests.support.rigs import Rig, card, read_file, write_file
 
 FILE = b"/scripts/hover.lua"
 SWAP = b"/scripts/.hover.lua.swp"
 TRASH = b"/.Trash-1000"
 
 
-store = card({FILE: b"-- old"}, kinds=["fat"])
+here = card({FILE: b"-- old"}, profiles=["ardupilot5"])
+
+
+@pytest.fixture
+def tree(here: Rig) -> Tree:
+    """A mount with the default patterns."""
+    return here.mount()
 
 
 @pytest.mark.parametrize(
     "name", [b".x.swp", b".x.swo", b".x.swpx", b"4913", b".~lock.a.odt#", b"._x", b".Trash-0"]
 )
-async def test_default_patterns(store: FakeWriter, tree: Tree, name: bytes) -> None:
+async def test_default_patterns(here: Rig, tree: Tree, name: bytes) -> None:
     await write_file(tree, b"/scripts/" + name, b"data")
     assert await read_file(tree, b"/scripts/" + name) == b"data"
     assert [n for n, _ in await tree.list(b"/scripts")] == [b"hover.lua", name]
-    assert store.requests == 0
+    assert here.files() == {FILE: b"-- old"}
     await tree.unlink(b"/scripts/" + name)
     with pytest.raises(NotFound):
         await tree.stat(b"/scripts/" + name)
 
 
-async def test_names_that_look_alike_are_the_vehicles(store: FakeWriter, tree: Tree) -> None:
+async def test_names_that_look_alike_are_the_vehicles(here: Rig, tree: Tree) -> None:
     for name in (b"x.swp", b"49131", b"lock", b".swp"):
         await write_file(tree, b"/scripts/" + name, b"data")
-        assert b"/scripts/" + name in store.files
+        assert b"/scripts/" + name in here.files()
 
 
-async def test_without_patterns_all_names_are_the_vehicles(store: FakeWriter) -> None:
-    await write_file(make_writable(store, local=()), SWAP, b"data")
-    assert store.files[SWAP].data == b"data"
+async def test_without_patterns_all_names_are_the_vehicles(here: Rig) -> None:
+    await write_file(here.mount(local=()), SWAP, b"data")
+    assert here.data(SWAP) == b"data"
 
 
-async def test_vim_saves(store: FakeWriter, tree: Tree) -> None:
+async def test_vim_saves(here: Rig, tree: Tree) -> None:
     """Swap file, a probe called 4913, a backup by renaming, the new file, backup removed."""
     swap = await tree.create(SWAP, exclusive=True)
     await swap.write(4096, b"b0VIM")
@@ -62,21 +67,21 @@ async def test_vim_saves(store: FakeWriter, tree: Tree) -> None:
     await swap.fsync()
     await swap.release()
     await tree.unlink(SWAP)
-    assert {path: file.data for path, file in store.files.items()} == {FILE: b"-- new"}
+    assert here.files() == {FILE: b"-- new"}
     assert tree.status()["bytes_local"] == 0
 
 
-async def test_a_file_is_not_renamed_between_here_and_the_vehicle(store: FakeWriter, tree: Tree) -> None:
+async def test_a_file_is_not_renamed_between_here_and_the_vehicle(here: Rig, tree: Tree) -> None:
     """They are two places: mv(1) copies then, and removes."""
     await write_file(tree, SWAP, b"local")
     for old, new in ((SWAP, FILE), (SWAP, b"/scripts/new"), (FILE, SWAP), (b"/scripts", TRASH)):
         with pytest.raises(CrossDevice):
             await tree.rename(old, new)
     assert await read_file(tree, SWAP) == b"local"
-    assert {path: file.data for path, file in store.files.items()} == {FILE: b"-- old"}
+    assert here.files() == {FILE: b"-- old"}
 
 
-async def test_a_trash_is_refused(store: FakeWriter, tree: Tree) -> None:
+async def test_a_trash_is_refused(here: Rig, tree: Tree) -> None:
     """It would be lost with the mount. File managers offer to delete, then."""
     with pytest.raises(NotSupported):
         await tree.mkdir(TRASH)
@@ -89,7 +94,7 @@ async def test_a_trash_is_refused(store: FakeWriter, tree: Tree) -> None:
         await tree.rmdir(SWAP)
     with pytest.raises(NotADirectory):
         await write_file(tree, SWAP + b"/x", b"")
-    assert store.requests == 0
+    assert here.files() == {FILE: b"-- old"}
 
 
 async def test_local_renames_obey_the_rules(tree: Tree) -> None:
@@ -105,9 +110,7 @@ async def test_local_renames_obey_the_rules(tree: Tree) -> None:
     assert await read_file(tree, b"/scripts/._a") == b"one"
 
 
-async def test_a_directory_with_local_names_is_not_empty_and_takes_them_along(
-    store: FakeWriter, tree: Tree
-) -> None:
+async def test_a_directory_with_local_names_is_not_empty_and_takes_them_along(here: Rig, tree: Tree) -> None:
     await write_file(tree, SWAP, b"swap")
     await tree.unlink(FILE)
     with pytest.raises(DirectoryNotEmpty):
@@ -116,11 +119,11 @@ async def test_a_directory_with_local_names_is_not_empty_and_takes_them_along(
     assert await read_file(tree, b"/programs/.hover.lua.swp") == b"swap"
     await tree.unlink(b"/programs/.hover.lua.swp")
     await tree.rmdir(b"/programs")
-    assert store.directories == {b"/"}
+    assert here.directories() == []
 
 
-async def test_they_are_bounded_also_those_that_are_open_without_a_name(store: FakeWriter) -> None:
-    tree = make_writable(store, local_max=1000)
+async def test_they_are_bounded_also_those_that_are_open_without_a_name(here: Rig) -> None:
+    tree = here.mount(local_max=1000)
     open_files = []
     for _ in range(3):
         file = await tree.create(SWAP, exclusive=True)
