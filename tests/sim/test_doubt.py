@@ -295,28 +295,6 @@ def come_late(world: World, nursery: trio.Nursery, late: float) -> trio.Event:
     return came
 
 
-@pytest.mark.parametrize(("profile", "late"), [("px4", 0.12), ("px4-nuttx", 0.15), ("ardupilot", 0.2)])
-async def test_an_older_copy_of_a_part_that_was_written_twice(
-    profile: str, late: float, autojump: MockClock
-) -> None:
-    world = World(profile, DOUBLING)
-    root = ROOTS.get(profile, b"") + b"/d"
-    world.tree.add(root + b"/f", b"x" * 300_000)
-    async with mounted(world, root, verify="size") as (_, tree), trio.open_nursery() as nursery:
-        file = await tree.open(root + b"/f", write=True)
-        await file.write(0, b"A" * 100)
-        await file.fsync()
-        await trio.sleep(20)
-        came = come_late(world, nursery, late)
-        await file.write(0, b"B" * 70_000)
-        await came.wait()
-        await trio.sleep(0.08)
-        await file.write(0, b"C" * 100)
-        await file.flush()
-        assert bytes(world.tree.data(root + b"/f"))[:200] == b"C" * 100 + b"B" * 100
-        file.close()
-
-
 @pytest.mark.holds("rule 14.12")
 @pytest.mark.parametrize("profile", ["px4", "ardupilot", "mavsdk", "littlefs"])
 async def test_new_files_stay_what_they_are_where_all_requests_come_twice(

@@ -95,25 +95,6 @@ async def test_what_is_asked_for_as_the_last_bytes_come_goes_out_at_once(
         reader.close()
 
 
-@pytest.mark.holds("promise 7")
-@pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
-async def test_what_is_asked_for_meanwhile_does_not_wait_for_an_answer(
-    profile: str, autojump: MockClock
-) -> None:
-    rtt = 1.0
-    here = world(profile, LinkSettings(rate=1e6, delay=rtt / 2), f=content(478))
-    async with here.connection() as connection:
-        sink = MemorySink(478)
-        reader = await connection.store.open_reader(path(profile, "f"), sink)
-        began = trio.current_time()
-        reader.want(0, 239, demand=True)
-        await trio.sleep(0.5 * rtt)
-        reader.want(239, 478, demand=True)
-        await sink.wait_for(0, 478)
-        assert trio.current_time() - began < 1.8 * rtt
-        reader.close()
-
-
 @pytest.mark.parametrize("profile", ["px4", "ardupilot"])
 async def test_one_small_file_after_another_does_not_stop_a_copy(profile: str, autojump: MockClock) -> None:
     small = {f"s{index}": bytes([index]) * 100 for index in range(200)}
