@@ -104,11 +104,12 @@ _PAUSES_KEPT = 1 << 18
 
 
 class Refusal(Exception):
-    """A NAK with a code of the server's own, which does not come from errno."""
+    """A NAK whose data the server chooses: a code, perhaps more; else they come from errno."""
 
-    def __init__(self, code: int) -> None:
-        super().__init__(code)
+    def __init__(self, code: int, *more: int) -> None:
+        super().__init__(code, *more)
         self.code = code
+        self.data = bytes([code, *more])
 
 
 class Firmware(ABC):
@@ -321,7 +322,7 @@ class Spec(Firmware):
         try:
             data = self._execute(request, reply)
         except Refusal as nak:
-            data = bytes([nak.code])
+            data = nak.data
         except OSError as exc:
             data = _errno_data(exc)
         else:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 from mavftpfs.link.messages import Address
 from mavftpfs.protocol.payload import MAX_DATA, NakCode, Opcode
-from mavftpfs.sim.firmware import ACK, HEADER, NAK, REPLY, Firmware, Request, parse, u32
+from mavftpfs.sim.firmware import ACK, HEADER, NAK, REPLY, Firmware, Refusal, Request, parse, u32
 from mavftpfs.sim.profiles import Profile
 from mavftpfs.sim.storage import Storage
 from mavftpfs.sim.tree import Entry, Kind, OpenFile, Stat
@@ -21,14 +21,6 @@ from mavftpfs.sim.tree import Entry, Kind, OpenFile, Stat
 _READ = int(Opcode.READ_FILE)
 _BURST = int(Opcode.BURST_READ_FILE)
 _IO_ERROR = 201
-
-
-class MavsdkNak(Exception):
-    """A refusal; `data` is the NAK's."""
-
-    def __init__(self, *data: int) -> None:
-        super().__init__(data)
-        self.data = bytes(data)
 
 
 class Silence(Exception):
@@ -148,7 +140,7 @@ class Mavsdk(Firmware):
         opcode, data = ACK, b""
         try:
             data = handler(request)
-        except MavsdkNak as nak:
+        except Refusal as nak:
             opcode, data = NAK, nak.data
         except OSError:
             opcode, data = NAK, bytes([NakCode.FAIL])
@@ -209,7 +201,7 @@ class Mavsdk(Firmware):
         for name in field.split(b"/"):
             if name == b"..":
                 if not names:
-                    raise MavsdkNak(NakCode.FAIL)
+                    raise Refusal(NakCode.FAIL)
                 names.pop()
             elif name not in (b"", b"."):
                 names.append(name)
@@ -219,7 +211,7 @@ class Mavsdk(Firmware):
         try:
             return self.storage.stat(path)
         except OSError as exc:
-            raise MavsdkNak(NakCode.FILE_NOT_FOUND) from exc
+            raise Refusal(NakCode.FILE_NOT_FOUND) from exc
 
     # -- directories -------------------------------------------------------------------------
 
@@ -239,7 +231,7 @@ class Mavsdk(Firmware):
                 break
             page += text
         if not page:
-            raise MavsdkNak(NakCode.EOF)
+            raise Refusal(NakCode.EOF)
         return bytes(page)
 
     def _entry_text(self, directory: bytes, entry: Entry, with_time: bool) -> bytes:
@@ -271,9 +263,9 @@ class Mavsdk(Firmware):
         try:
             self.storage.mkdir(path)
         except FileExistsError as exc:
-            raise MavsdkNak(NakCode.FILE_EXISTS) from exc
+            raise Refusal(NakCode.FILE_EXISTS) from exc
         except OSError as exc:
-            raise MavsdkNak(NakCode.FAIL_ERRNO, (exc.errno or errno.EIO) & 0xFF) from exc
+            raise Refusal(NakCode.FAIL_ERRNO, (exc.errno or errno.EIO) & 0xFF) from exc
         return b""
 
     def _rename(self, request: Request) -> bytes:
@@ -285,7 +277,7 @@ class Mavsdk(Firmware):
     def _crc(self, request: Request) -> bytes:
         path = self._path(request)
         if self._existing(path).kind is not Kind.FILE:
-            raise MavsdkNak(_IO_ERROR)
+            raise Refusal(_IO_ERROR)
         checksum, size = self.storage.crc(path)
         self._busy_until = max(self._busy_until, self.now) + size / self.profile.crc_rate
         return u32(checksum)
@@ -334,17 +326,17 @@ class Mavsdk(Firmware):
         if request.session != 0 or self._reader is None:
             self._close()
         if request.offset >= self._file_size:
-            raise MavsdkNak(NakCode.EOF)
+            raise Refusal(NakCode.EOF)
         sticky = self.profile.sticky_stream_failure
         if self._reader is None or not self._reader.seek(request.offset, sticky):
-            raise MavsdkNak(NakCode.FAIL)
+            raise Refusal(NakCode.FAIL)
         return self._reader
 
     def _read(self, request: Request) -> bytes:
         """Read exactly `size` bytes; a read that crosses the end fails."""
         data = self._seek(request).read(request.size)
         if data is None:
-            raise MavsdkNak(NakCode.FAIL)
+            raise Refusal(NakCode.FAIL)
         return data
 
     def _write(self, request: Request) -> bytes:
@@ -352,10 +344,10 @@ class Mavsdk(Firmware):
             self._close()
         writer = self._writer
         if writer is None:
-            raise MavsdkNak(NakCode.FAIL)
+            raise Refusal(NakCode.FAIL)
         writer.flush()
         if writer.failed:
-            raise MavsdkNak(NakCode.FAIL)
+            raise Refusal(NakCode.FAIL)
         writer.tail = (request.offset, request.data[: request.size])
         return b""
 
