@@ -156,23 +156,6 @@ def test_every_refusal_has_an_errno(liar: Mount, step: str) -> None:
         assert error == told
 
 
-@pytest.mark.holds("promise 1", "promise 10")
-def test_forged_replies_beside_each_answer_change_nothing(field: Field) -> None:
-    rng = random.Random(3)
-
-    def forge(request: Payload, reply: Payload) -> list[Payload]:
-        forged = ack(request, b"evil" * 50)
-        replay = [forged._replace(req_opcode=Opcode.RENAME)] * (rng.random() < 0.2)  # which costs a new seq
-        return [forged._replace(seq=(request.seq + 77) & 0xFFFF), *replay, reply]
-
-    vehicle = field.lying(card())
-    vehicle.server.change = forge
-    mount = field.mount(vehicle.source)
-    assert mount.read_bytes(mount.path / "fine.bin") == FINE
-    for name in sorted(GOOD_NAMES):
-        assert mount.read_bytes(mount.path / "names" / name) == GOOD
-
-
 def test_a_vehicle_that_never_answers_ftp_is_exit_2(field: Field) -> None:
     vehicle = field.lying(card())
     vehicle.server.answer = lambda request: []

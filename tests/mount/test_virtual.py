@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import filecmp
 from pathlib import Path
 
 import pytest
@@ -20,14 +19,6 @@ FILLED = {name.decode(): data for name, data in TRUTH.sys_files.items() if data}
 def ardupilot(module_field: Field, small_tree: Path) -> Mount:
     """A mount of a vehicle with all virtual trees."""
     return module_field.mount(module_field.sim(small_tree, "ardupilot").source)
-
-
-@pytest.mark.holds("fault growing file")
-def test_sys_files_are_whole_although_their_sizes_lie(ardupilot: Mount) -> None:
-    for name, data in FILLED.items():
-        path = ardupilot.path / "@SYS" / name
-        assert ardupilot.read_bytes(path) == data
-        assert int(ardupilot.run("stat", "-c", "%s", path).stdout) == len(data)
 
 
 def test_parameters_are_one_consistent_file(ardupilot: Mount, tmp_path: Path) -> None:
@@ -60,10 +51,3 @@ def test_copying_tools_get_the_true_bytes(ardupilot: Mount, tmp_path: Path, tool
 def test_writing_below_at_is_refused(ardupilot: Mount) -> None:
     assert ardupilot.errno_of("open(sys.argv[1], 'w')", ardupilot.path / "@PARAM/param.pck") == "EROFS"
     assert ardupilot.errno_of("open(sys.argv[1], 'w')", ardupilot.path / "@SYS/new.txt") == "EROFS"
-
-
-def test_px4_parameters_have_a_true_size(field: Field, small_tree: Path, tmp_path: Path) -> None:
-    mount = field.mount(field.sim(small_tree, "px4-2026").source)
-    mount.run("cp", mount.path / "@PARAM/param.pck", tmp_path)
-    (tmp_path / "truth").write_bytes(VirtualTrees(exact=True).content(b"@PARAM/param.pck", 239))
-    assert filecmp.cmp(tmp_path / "param.pck", tmp_path / "truth", shallow=False)

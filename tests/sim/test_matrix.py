@@ -27,18 +27,14 @@ from trio.testing import MockClock
 from mavftpfs.cache.recovery import SpoolDirectory
 from mavftpfs.cache.reserved import is_reserved
 from mavftpfs.cache.tree import Tree
-from mavftpfs.compose import subscribe
 from mavftpfs.link.messages import Address
 from mavftpfs.protocol.payload import Opcode, request
-from mavftpfs.session.connection import Connection, ConnectOptions
+from mavftpfs.session.connection import ConnectOptions
 from mavftpfs.shared.errors import MavftpfsError
 from mavftpfs.sim.profiles import PROFILES, Storage
-from mavftpfs.sim.tree import Kind
-from tests.support.faults import Faults
-from tests.support.mounting import writable_tree
+from tests.support.rigs import Rig
 from tests.support.takingturns import taking_turns
 from tests.support.trees import content
-from tests.support.worlds import ROOTS, World
 
 State = dict[bytes, bytes | None]
 """What is in the directory: contents of files by name, None for a directory."""
@@ -54,7 +50,8 @@ CHANGING = {
 LEAKS = ("spec",)
 """Servers that give ids which nobody learns if the answer is lost."""
 
-Call = Callable[[Tree, bytes], Awaitable[None]]
+Call = Callable[[Tree], Awaitable[None]]
+D = b"/d"
 
 
 # --- operations
@@ -70,23 +67,23 @@ async def write(tree: Tree, path: bytes, offset: int, data: bytes, *, truncate: 
         await file.release()
 
 
-async def list_names(tree: Tree, folder: bytes) -> None:
+async def list_names(tree: Tree) -> None:
     """Run ls."""
-    assert {name for name, _ in await tree.list(folder)} == set(BEFORE)
+    assert {name for name, _ in await tree.list(D)} == set(BEFORE)
 
 
-async def read(tree: Tree, folder: bytes) -> None:
+async def read(tree: Tree) -> None:
     """Run cat."""
-    file = await tree.open(folder + b"/file")
+    file = await tree.open(b"/d/file")
     try:
         assert bytes(await file.read(0, 2000)) == OLD
     finally:
         await file.release()
 
 
-async def create(tree: Tree, folder: bytes) -> None:
+async def create(tree: Tree) -> None:
     """Run cp to a new name."""
-    file = await tree.create(folder + b"/new", exclusive=False)
+    file = await tree.create(b"/d/new", exclusive=False)
     try:
         await file.flush()  # as a shell does before a program writes
         await file.write(0, NEW)
@@ -95,54 +92,54 @@ async def create(tree: Tree, folder: bytes) -> None:
         await file.release()
 
 
-async def touch(tree: Tree, folder: bytes) -> None:
+async def touch(tree: Tree) -> None:
     """Make an empty file."""
-    await (await tree.create(folder + b"/new", exclusive=True)).release()
+    await (await tree.create(b"/d/new", exclusive=True)).release()
 
 
-async def replace(tree: Tree, folder: bytes) -> None:
+async def replace(tree: Tree) -> None:
     """Run cp over a file."""
-    await write(tree, folder + b"/file", 0, NEW, truncate=True)
+    await write(tree, b"/d/file", 0, NEW, truncate=True)
 
 
-async def change(tree: Tree, folder: bytes) -> None:
+async def change(tree: Tree) -> None:
     """Write some bytes in the middle."""
-    await write(tree, folder + b"/file", 200, NEW[:100])
+    await write(tree, b"/d/file", 200, NEW[:100])
 
 
-async def append(tree: Tree, folder: bytes) -> None:
+async def append(tree: Tree) -> None:
     """Run echo >> file."""
-    await write(tree, folder + b"/file", len(OLD), NEW)
+    await write(tree, b"/d/file", len(OLD), NEW)
 
 
-async def truncate(tree: Tree, folder: bytes) -> None:
+async def truncate(tree: Tree) -> None:
     """Run truncate -s."""
-    await tree.truncate(folder + b"/file", 300)
+    await tree.truncate(b"/d/file", 300)
 
 
-async def rename(tree: Tree, folder: bytes) -> None:
+async def rename(tree: Tree) -> None:
     """Run mv to a free name."""
-    await tree.rename(folder + b"/file", folder + b"/new")
+    await tree.rename(b"/d/file", b"/d/new")
 
 
-async def rename_over(tree: Tree, folder: bytes) -> None:
+async def rename_over(tree: Tree) -> None:
     """Run mv over a file."""
-    await tree.rename(folder + b"/file", folder + b"/other")
+    await tree.rename(b"/d/file", b"/d/other")
 
 
-async def unlink(tree: Tree, folder: bytes) -> None:
+async def unlink(tree: Tree) -> None:
     """Run rm."""
-    await tree.unlink(folder + b"/file")
+    await tree.unlink(b"/d/file")
 
 
-async def mkdir(tree: Tree, folder: bytes) -> None:
+async def mkdir(tree: Tree) -> None:
     """Run mkdir."""
-    await tree.mkdir(folder + b"/new")
+    await tree.mkdir(b"/d/new")
 
 
-async def rmdir(tree: Tree, folder: bytes) -> None:
+async def rmdir(tree: Tree) -> None:
     """Run rmdir."""
-    await tree.rmdir(folder + b"/sub")
+    await tree.rmdir(b"/d/sub")
 
 
 def changed(**files: bytes | None) -> State:
@@ -190,13 +187,9 @@ def allowed(operation: Call) -> tuple[State, ...]:
 class Scene:
     """What an event may touch."""
 
-    world: World
-    faults: Faults
-    connection: Connection
+    here: Rig
     tree: Tree
-    folder: bytes
     operation: Call
-    nursery: trio.Nursery
     caller: trio.CancelScope
 
     def later(self, seconds: float, action: Callable[[], None]) -> None:
@@ -206,7 +199,7 @@ class Scene:
             await trio.sleep(seconds)
             action()
 
-        self.nursery.start_soon(wait)
+        self.here.nursery.start_soon(wait)
 
     def list_at_once(self) -> None:
         """Have another program list the directory."""
@@ -214,14 +207,14 @@ class Scene:
         async def ask() -> None:
             with suppress(MavftpfsError):
                 self.tree.forget_caches()
-                await self.tree.list(self.folder)
+                await self.tree.list(D)
 
-        self.nursery.start_soon(ask)
+        self.here.nursery.start_soon(ask)
 
     def whole(self) -> None:
         """Each file is there, old or new."""
-        if self.operation not in IN_PLACE or not in_place(self.world.profile):
-            found = on_card(self.world, self.folder)
+        if self.operation not in IN_PLACE or not in_place(self.here.world.profile):
+            found = on_card(self.here)
             shown = {name: data for name, data in found.items() if not is_reserved(name)}
             assert shown in allowed(self.operation)
 
@@ -231,22 +224,24 @@ Event = Callable[[Scene, int], None]
 
 def lose_answer(scene: Scene, count: int) -> None:
     """Lose the answer to a request."""
-    scene.faults.after(count, lambda: scene.faults.lose_reply_to(Opcode(scene.faults.requests[-1])))
+    scene.here.faults.after(
+        count, lambda: scene.here.faults.lose_reply_to(Opcode(scene.here.faults.requests[-1]))
+    )
 
 
 def lose_for_good(scene: Scene, count: int) -> None:
     """Lose the answer, and have something else asked, after which no server says the same once more."""
 
     def action() -> None:
-        scene.faults.lose_reply_to(Opcode(scene.faults.requests[-1]))
+        scene.here.faults.lose_reply_to(Opcode(scene.here.faults.requests[-1]))
         scene.list_at_once()
 
-    scene.faults.after(count, action)
+    scene.here.faults.after(count, action)
 
 
 def arrive_twice(scene: Scene, count: int) -> None:
     """Have a request arrive twice."""
-    scene.faults.repeat(count)
+    scene.here.faults.repeat(count)
 
 
 def answer_the_second(scene: Scene, count: int) -> None:
@@ -254,8 +249,8 @@ def answer_the_second(scene: Scene, count: int) -> None:
 
     Of a link that was not seen to do so before that is expected for a rename only."""
     if scene.operation in (unlink, mkdir, rmdir):
-        scene.connection.scheduler.doubt.raise_it("an answer that came twice")
-    scene.faults.repeat(count)
+        scene.here.connection.scheduler.doubt.raise_it("an answer that came twice")
+    scene.here.faults.repeat(count)
     lose_answer(scene, count)
 
 
@@ -263,55 +258,55 @@ def cut(scene: Scene, count: int) -> None:
     """Cut the link for 4 s."""
 
     def action() -> None:
-        scene.world.link.cut()
-        scene.later(4.0, scene.world.link.restore)
+        scene.here.world.link.cut()
+        scene.later(4.0, scene.here.world.link.restore)
 
-    scene.faults.after(count, action)
+    scene.here.faults.after(count, action)
 
 
 def silence(scene: Scene, count: int) -> None:
     """Lose everything for 40 s: no request can be repeated in time."""
 
     def action() -> None:
-        scene.faults.cut_after(0)
-        scene.later(40.0, lambda: scene.faults.cut_after(None))
+        scene.here.faults.cut_after(0)
+        scene.later(40.0, lambda: scene.here.faults.cut_after(None))
 
-    scene.faults.after(count, action)
+    scene.here.faults.after(count, action)
 
 
 def reboot(scene: Scene, count: int) -> None:
     """Restart the vehicle."""
 
     def action() -> None:
-        scene.world.vehicle.reboot(trio.current_time(), 2.0)
-        scene.world.link.kick()
+        scene.here.world.vehicle.reboot(trio.current_time(), 2.0)
+        scene.here.world.link.kick()
 
-    scene.faults.after(count, action)
+    scene.here.faults.after(count, action)
 
 
 def arm(scene: Scene, count: int) -> None:
     """Take off, and land 20 s later."""
 
     def action() -> None:
-        scene.world.vehicle.arm()
-        scene.world.link.kick()
+        scene.here.world.vehicle.arm()
+        scene.here.world.link.kick()
         scene.later(5.0, scene.whole)
-        scene.later(20.0, scene.world.vehicle.disarm)
+        scene.later(20.0, scene.here.world.vehicle.disarm)
 
-    scene.faults.after(count, action)
+    scene.here.faults.after(count, action)
 
 
 def fly_away(scene: Scene, count: int) -> None:
     """Cut the link, and take off before it is back: what lost its name gets it in flight."""
 
     def action() -> None:
-        scene.world.link.cut()
-        scene.later(30.0, scene.world.vehicle.arm)
-        scene.later(40.0, scene.world.link.restore)
+        scene.here.world.link.cut()
+        scene.later(30.0, scene.here.world.vehicle.arm)
+        scene.later(40.0, scene.here.world.link.restore)
         scene.later(50.0, scene.whole)
-        scene.later(55.0, scene.world.vehicle.disarm)
+        scene.later(55.0, scene.here.world.vehicle.disarm)
 
-    scene.faults.after(count, action)
+    scene.here.faults.after(count, action)
 
 
 def rival(scene: Scene, count: int) -> None:
@@ -319,31 +314,31 @@ def rival(scene: Scene, count: int) -> None:
 
     def action() -> None:
         wire = request(77, Opcode.RESET_SESSIONS).encode()
-        scene.world.vehicle.foreign_request(wire, Address(255, 190), trio.current_time())
-        scene.world.link.kick()
+        scene.here.world.vehicle.foreign_request(wire, Address(255, 190), trio.current_time())
+        scene.here.world.link.kick()
 
-    scene.faults.after(count, lambda: scene.later(0.0, action))
+    scene.here.faults.after(count, lambda: scene.later(0.0, action))
 
 
 def give_up(scene: Scene, count: int) -> None:
     """Cancel the call, as a handler's deadline does."""
-    scene.faults.after(count, scene.caller.cancel)
+    scene.here.faults.after(count, scene.caller.cancel)
 
 
 def give_up_in_silence(scene: Scene, count: int) -> None:
     """Cancel the call 5 s after the last answer: no error is left that would tell."""
 
     def action() -> None:
-        scene.faults.cut_after(0)
+        scene.here.faults.cut_after(0)
         scene.later(5.0, scene.caller.cancel)
-        scene.later(40.0, lambda: scene.faults.cut_after(None))
+        scene.later(40.0, lambda: scene.here.faults.cut_after(None))
 
-    scene.faults.after(count, action)
+    scene.here.faults.after(count, action)
 
 
 def power_off(scene: Scene, count: int) -> None:
     """Take the power from the vehicle and from us."""
-    scene.faults.after(count, scene.world.link.cut)
+    scene.here.faults.after(count, scene.here.world.link.cut)
 
 
 def nothing(scene: Scene, count: int) -> None:
@@ -365,14 +360,10 @@ UNNOTICED = (nothing, lose_answer, lose_for_good, arrive_twice, answer_the_secon
 # --- judging
 
 
-def on_card(world: World, folder: bytes) -> State:
+def on_card(here: Rig) -> State:
     """Return what is in the directory on the card, litter included."""
-    found: State = {}
-    for entry in world.tree.entries(folder):
-        if entry.name not in (b".", b".."):
-            is_file = entry.stat.kind is Kind.FILE
-            found[entry.name] = world.tree.data(folder + b"/" + entry.name) if is_file else None
-    return found
+    found: State = {path[len(D) + 1 :]: data for path, data in here.files().items()}
+    return found | {path[len(D) + 1 :]: None for path in here.directories() if path != D}
 
 
 @contextmanager
@@ -389,86 +380,76 @@ def in_place(profile: str) -> bool:
 
 
 @asynccontextmanager
-async def mounted(
-    world: World, place: Path, seed: int
-) -> AsyncIterator[tuple[Connection, Tree, trio.Nursery]]:
-    """Give what a mount has, and a nursery that ends with it. place: where it keeps what is held back."""
+async def mounted(here: Rig, place: Path, seed: int) -> AsyncIterator[Tree]:
+    """Give what a mount has. place: where it keeps what is held back."""
     spool = SpoolDirectory(place, Random(seed))
-    async with world.connection(QUICK, seed=seed) as connection, trio.open_nursery() as nursery:
-        tree = writable_tree(
-            connection, nursery, seed=seed, spool=spool, inplace=in_place(world.profile), op_deadline=8.0
-        )
-        subscribe(connection, tree)
-        yield connection, tree, nursery
-        nursery.cancel_scope.cancel()
+    async with here.connected(QUICK, seed=seed):
+        inplace = in_place(here.world.profile)
+        yield here.mount(seed=seed, spool=spool, inplace=inplace, op_deadline=8.0)
     spool.close()
 
 
 async def meet(profile: str, operation: Call, event: Event, count: int, place: Path) -> list[int]:
     """Have the event come at request `count` of an operation; return the opcodes of its requests."""
-    world = World(profile)
-    folder = ROOTS.get(profile, b"") + b"/d"
-    for name, data in BEFORE.items():
-        path = folder + b"/" + name
-        world.tree.add_directory(path) if data is None else world.tree.add(path, data)
-    faults = Faults(world)
-    async with mounted(world, place, 3) as (connection, tree, nursery):
-        await tree.list(folder)
+    here = Rig(profile, {D + b"/" + name: data for name, data in BEFORE.items() if data is not None})
+    here.put_directory(D + b"/sub")
+    faults = here.faults
+    async with mounted(here, place, 3) as tree:
+        await tree.list(D)
         await trio.sleep(3.0)
         began, done = len(faults.requests), False
         with trio.CancelScope() as caller:
-            event(Scene(world, faults, connection, tree, folder, operation, nursery, caller), count)
-            done = await attempt(operation, tree, folder)
+            event(Scene(here, tree, operation, caller), count)
+            done = await attempt(operation, tree)
         faults.call_off()
         assert done or event not in UNNOTICED
         if done:
-            assert_done(world, folder, OPERATIONS[operation])
+            assert_done(here, OPERATIONS[operation])
         requests = faults.requests[began:]
         if event is power_off:
-            world.link.cut()  # or leaving would tidy up
+            here.world.link.cut()  # or leaving would tidy up
         else:
             await trio.sleep(OVER.get(event, 10.0))
             done = done or tree.undelivered() != []
             assert await tree.drain(300.0) == []
-            await settle(tree, world, folder, (OPERATIONS[operation],) if done else allowed(operation)[:2])
-            assert connection.vehicle is not None
+            await settle(tree, here, (OPERATIONS[operation],) if done else allowed(operation)[:2])
     if event is power_off:
-        world.vehicle.reboot(trio.current_time())
-        world.link.restore()
-        async with mounted(world, place, 9) as (_, tree, _):
-            await settle(tree, world, folder, (OPERATIONS[operation],) if done else allowed(operation))
-    assert profile in LEAKS or world.vehicle.server.open_sessions == 0
+        here.world.vehicle.reboot(trio.current_time())
+        here.world.link.restore()
+        async with mounted(here, place, 9) as tree:
+            await settle(tree, here, (OPERATIONS[operation],) if done else allowed(operation))
+    assert profile in LEAKS or here.server.open_sessions == 0
     return requests
 
 
-async def attempt(operation: Call, tree: Tree, folder: bytes) -> bool:
+async def attempt(operation: Call, tree: Tree) -> bool:
     """Make the call; return whether it succeeded."""
     with in_time():
         try:
-            await operation(tree, folder)
+            await operation(tree)
         except MavftpfsError:
             return False
     return True
 
 
-def assert_done(world: World, folder: bytes, after: State) -> None:
+def assert_done(here: Rig, after: State) -> None:
     """A call that succeeded did all of it: under each name lies what shall be there."""
-    found = on_card(world, folder)
+    found = on_card(here)
     assert {name: found.get(name, b"absent") for name in after} == after
     assert [name for name in BEFORE if name not in after and name in found] == []
 
 
-async def settle(tree: Tree, world: World, folder: bytes, ends: tuple[State, ...]) -> None:
+async def settle(tree: Tree, here: Rig, ends: tuple[State, ...]) -> None:
     """Wait until all is tidied up: the card has one of these, and the tree shows the same."""
     for _ in range(3):  # listings, and time to clean up what they show
         tree.forget_caches()
-        await tree.list(folder)
+        await tree.list(D)
         await trio.sleep(15.0)
-        card = on_card(world, folder)
+        card = on_card(here)
         if card in ends:
             break
     assert card in ends
-    shown = {name: stat.size for name, stat in await tree.list(folder)}
+    shown = {name: stat.size for name, stat in await tree.list(D)}
     assert set(shown) == set(card)
     assert all(shown[name] == len(data) for name, data in card.items() if data is not None)
 

@@ -7,7 +7,7 @@ example alone, trio's order of tasks included (which hypothesis seeds), so what 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from functools import partial
 from random import Random
 from typing import Any, cast
 
@@ -18,16 +18,12 @@ from hypothesis import strategies as st
 from trio.testing import MockClock
 
 from mavftpfs.cache.tree import Tree
-from mavftpfs.compose import subscribe
-from mavftpfs.session.connection import Connection
 from mavftpfs.shared.errors import FtpNak, MavftpfsError, RequestTimeout
 from mavftpfs.sim.linkmodel import Duplex, LinkSettings
 from mavftpfs.sim.profiles import PROFILES, Storage
-from mavftpfs.sim.tree import Kind, MemoryTree
 from tests.support.filemodel import START, Model, calls, rewriting_calls
-from tests.support.mounting import writable_tree
+from tests.support.rigs import Rig, rig
 from tests.support.takingturns import taking_turns
-from tests.support.worlds import ROOTS, World
 
 LINKS = {
     "wifi": LinkSettings(delay=0.015, loss=0.05, duplicate=0.02, reorder=0.02),
@@ -67,63 +63,23 @@ short = st.lists(calls(largest=20_000, chunk=3000), min_size=CALLS // 4, max_siz
 rewriting = st.lists(rewriting_calls(20_000, 3000), min_size=CALLS, max_size=CALLS).filter(varied)
 
 
-class SimCard:
-    """All files of a simulated card below a root."""
-
-    def __init__(self, tree: MemoryTree, root: bytes) -> None:
-        self.tree = tree
-        self.root = root
-
-    def contents(self) -> Mapping[bytes, bytes]:
-        """Return every file by its path below the root."""
-        return dict(self._below(b""))
-
-    def _below(self, path: bytes) -> list[tuple[bytes, bytes]]:
-        found = []
-        for entry in self.tree.entries((self.root + path) or b"/"):
-            below = path + b"/" + entry.name
-            if entry.name in (b".", b".."):
-                continue
-            if entry.stat.kind is Kind.DIRECTORY:
-                found += self._below(below)
-            else:
-                found.append((below, self.tree.data(self.root + below)))
-        return found
-
-
-def mount(connection: Connection, nursery: trio.Nursery, profile: str, seed: int) -> Tree:
+def mount(here: Rig, seed: int) -> Tree:
     """Make the tree of a mount."""
-    tree = writable_tree(
-        connection,
-        nursery,
-        seed=seed,
-        root=ROOTS.get(profile, b"/"),
-        inplace=PROFILES[profile].storage is Storage.LITTLEFS,
-        dir_timeout=seed % 3 * 10.0,
-    )
-    subscribe(connection, tree)
-    return tree
+    inplace = PROFILES[here.world.profile].storage is Storage.LITTLEFS
+    return here.mount(seed=seed, inplace=inplace, dir_timeout=seed % 3 * 10.0)
 
 
-async def deliver_all(profile: str, link: LinkSettings, sequence: list[tuple[Any, ...]], seed: int) -> World:
+async def deliver_all(profile: str, link: LinkSettings, sequence: list[tuple[Any, ...]], seed: int) -> None:
     """Make the calls on both; in the end the card is the model and no session is open."""
-    here = World(profile, link, seed=seed)
-    root = ROOTS.get(profile, b"")
-    for path, data in START.items():
-        here.tree.add(root + path, data)
-    here.tree.add_directory(root + b"/d/sub")
-    async with here.connection(seed=seed) as connection, trio.open_nursery() as nursery:
-        model = Model(
-            mount(connection, nursery, profile, seed), SimCard(here.tree, root), (RequestTimeout, FtpNak)
-        )
+    async with rig(profile, START, link=link, seed=seed) as here:
+        here.put_directory(b"/d/sub")
+        model = Model(mount(here, seed), here.files, (RequestTimeout, FtpNak))
         for call in sequence:
             await model.do(*call)
             await model.check()
         await model.end()
         assert model.failures <= FAILURES
-        nursery.cancel_scope.cancel()
-    assert profile in LEAKS or here.vehicle.server.open_sessions == 0
-    return here
+    assert profile in LEAKS or here.server.open_sessions == 0
 
 
 def run(profile: str, link: LinkSettings, sequence: list[tuple[Any, ...]], seed: int) -> None:
@@ -183,21 +139,22 @@ class Below:
         return call
 
 
-async def trouble(here: World, rng: Random) -> None:
+async def trouble(here: Rig, rng: Random) -> None:
     """Cut the link, restart the vehicle, fly."""
+    link, vehicle = here.world.link, here.world.vehicle
     for number in range(10_000):
         await trio.sleep(rng.uniform(5, 20))
         if number % 7 == 3:
-            here.vehicle.reboot(trio.current_time(), downtime=rng.choice((0.0, 8.0)))
+            vehicle.reboot(trio.current_time(), downtime=rng.choice((0.0, 8.0)))
         elif number % 3 == 1:
-            here.vehicle.arm()
+            vehicle.arm()
             await trio.sleep(rng.uniform(5, 40))
-            here.vehicle.disarm()
+            vehicle.disarm()
         else:
-            here.link.cut()
+            link.cut()
             await trio.sleep(rng.choice((0.5, 15.0, 50.0)))
-            here.link.restore()
-        here.link.kick()
+            link.restore()
+        link.kick()
 
 
 async def work(model: Model, sequence: list[tuple[Any, ...]], rng: Random) -> None:
@@ -207,36 +164,40 @@ async def work(model: Model, sequence: list[tuple[Any, ...]], rng: Random) -> No
         await trio.sleep(rng.uniform(0.5, 8.0))
 
 
+def files_below(here: Rig, folder: bytes) -> dict[bytes, bytes]:
+    """Return the files on the card below a folder, by their paths there."""
+    below = folder + b"/"
+    return {path[len(folder) :]: data for path, data in here.files().items() if path.startswith(below)}
+
+
 async def lose_nothing(profile: str, programs: list[list[tuple[Any, ...]]], seed: int) -> None:
     """Have them work side by side in trouble; when it is over the card is what each of them wrote."""
-    here = World(profile, TROUBLED, seed=seed, telemetry=1200.0)
-    root = ROOTS.get(profile, b"")
-    async with here.connection(seed=seed) as connection, trio.open_nursery() as nursery:
-        tree = mount(connection, nursery, profile, seed)
+    async with rig(profile, link=TROUBLED, seed=seed, telemetry=1200.0) as here:
+        tree = mount(here, seed)
         models = []
         for number, _ in enumerate(programs):
             below = b"/%d" % number
             for path, data in START.items():
-                here.tree.add(root + below + path, data)
-            here.tree.add_directory(root + below + b"/d/sub")
-            card = SimCard(here.tree, root + below)
-            models.append(Model(cast(Tree, Below(tree, below)), card, MavftpfsError))
+                here.put(below + path, data)
+            here.put_directory(below + b"/d/sub")
+            models.append(
+                Model(cast(Tree, Below(tree, below)), partial(files_below, here, below), MavftpfsError)
+            )
         async with trio.open_nursery() as troubles:
             troubles.start_soon(trouble, here, Random(seed))
             async with trio.open_nursery() as working:
                 for number, (model, sequence) in enumerate(zip(models, programs, strict=True)):
                     working.start_soon(work, model, sequence, Random(number))
             troubles.cancel_scope.cancel()
-        here.link.restore()
-        here.vehicle.disarm()
-        here.link.kick()
+        here.world.link.restore()
+        here.world.vehicle.disarm()
+        here.world.link.kick()
         await trio.sleep(20.0)
         for model in models:
             while model.handles:
                 await model.on_close(0)
         for model in models:
             await model.end()
-        nursery.cancel_scope.cancel()
 
 
 @pytest.mark.holds("promise 3")

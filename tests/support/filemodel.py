@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from random import Random
-from typing import Any, Protocol
+from typing import Any
 
 import trio
 from hypothesis import strategies as st
@@ -74,13 +74,6 @@ def _on_handles(largest: int, chunk: int) -> list[SearchStrategy[tuple[Any, ...]
     ]
 
 
-class Card(Protocol):
-    """What lies on the vehicle's card, whatever a client believes."""
-
-    def contents(self) -> Mapping[bytes, bytes]:
-        """Return the content of each file, litter included."""
-
-
 @dataclass(eq=False)
 class File:
     """A file of the model."""
@@ -110,12 +103,16 @@ class Handle:
 class Model:
     """The tree under test beside the model.
 
-    excused: errors that a call may raise though the model knows no reason; such a call must have done all or
-    nothing, and counts as one of `failures`.
+    card: returns the content of each file on the vehicle's card, litter included. excused: errors that a call
+    may raise though the model knows no reason; such a call must have done all or nothing, and counts as one
+    of `failures`.
     """
 
     def __init__(
-        self, tree: Tree, card: Card, excused: type[Exception] | tuple[type[Exception], ...] = ()
+        self,
+        tree: Tree,
+        card: Callable[[], Mapping[bytes, bytes]],
+        excused: type[Exception] | tuple[type[Exception], ...] = (),
     ) -> None:
         self.tree = tree
         self.card = card
@@ -277,7 +274,7 @@ class Model:
             return
         named = [path for path, file in self.names.items() if file is handle.file]
         if handle.writes and named and (empty_too or handle.file.data):
-            assert self.card.contents()[named[0]] == handle.file.data
+            assert self.card()[named[0]] == handle.file.data
 
     def renamed(self, old: bytes, new: bytes) -> dict[bytes, File]:
         if old == new or old not in self.names:
@@ -326,6 +323,6 @@ class Model:
             self.tree.forget_caches()
             await self.check()
             await trio.sleep(20)
-        assert self.card.contents() == {path: file.data for path, file in self.names.items()}
+        assert self.card() == {path: file.data for path, file in self.names.items()}
         status = self.tree.status()
         assert (status["bytes_held"], status["errors"]) == (0, {})

@@ -48,8 +48,11 @@ class Rig:
         invalidated: paths whose pages the kernel was told to drop.
     """
 
-    def __init__(self, profile: str, files: Mapping[bytes, bytes], link: LinkSettings = GOOD_LINK) -> None:
-        self.world = World(profile, link)
+    def __init__(
+        self, profile: str, files: Mapping[bytes, bytes], link: LinkSettings = GOOD_LINK, **world: Any
+    ) -> None:
+        """`world`: more of World."""
+        self.world = World(profile, link, **world)
         self.root = ROOTS.get(profile, b"")
         self.world.tree.add_directory(self.root or b"/")
         for path, data in files.items():
@@ -63,9 +66,12 @@ class Rig:
     # --- this side
 
     @asynccontextmanager
-    async def connected(self, options: ConnectOptions = DEFAULTS) -> AsyncIterator[Connection]:
+    async def connected(
+        self, options: ConnectOptions = DEFAULTS, *, seed: int = 7
+    ) -> AsyncIterator[Connection]:
         """Connect; a second time is another process, after the first one was killed."""
-        async with self.world.connection(options) as self.connection, trio.open_nursery() as self.nursery:
+        connection = self.world.connection(options, seed=seed)
+        async with connection as self.connection, trio.open_nursery() as self.nursery:
             yield self.connection
             self.nursery.cancel_scope.cancel()
 
@@ -190,9 +196,10 @@ async def rig(
     *,
     link: LinkSettings = GOOD_LINK,
     options: ConnectOptions = DEFAULTS,
+    **world: Any,
 ) -> AsyncIterator[Rig]:
-    """Connect to a vehicle that has these files."""
-    here = Rig(profile, files or {}, link)
+    """Connect to a vehicle that has these files. world: as for Rig."""
+    here = Rig(profile, files or {}, link, **world)
     async with here.connected(options):
         yield here
 
