@@ -36,9 +36,6 @@ class SingleFlight(Generic[K, T]):
         self._nursery = nursery
         self._running: dict[K, _Call[T]] = {}
 
-    def __len__(self) -> int:
-        return len(self._running)
-
     async def run(self, key: K, work: Callable[[], Awaitable[T]], *, again: bool = False) -> T:
         """Return what `work` returns, or what the work already under way for `key` returns.
 

@@ -124,7 +124,7 @@ class BlockCache:
         assert self.bytes_cached == sum(self.used.values())
         assert self.bytes_cached <= self.budget
         for owner, index in self.used:
-            assert index in owner
+            assert owner.block(index) is not None
 
     def _evict_oldest(self) -> None:
         owner, index = next(iter(self.used))
@@ -180,10 +180,6 @@ class Version:
         self._waiters: list[_Waiter] = []
         self.received = 0
         self.received_at = NEVER
-
-    def __contains__(self, index: int) -> bool:
-        """Return whether the block is held."""
-        return index in self._blocks
 
     def block(self, index: int) -> bytearray | None:
         """Return a block if it is held. It is another object when it came anew."""

@@ -62,11 +62,11 @@ def test_blocks_hold_what_came_first_and_only_that(size: int, script: list[Step]
         elif step.what == "suspect":
             blocks.on_suspect("test")
             held = {}
-        elif step.what == "clear" or step.start // BLOCK_SIZE not in blocks:
+        elif step.what == "clear" or blocks.block(step.start // BLOCK_SIZE) is None:
             blocks.clear()
         else:
             blocks.evict(step.start // BLOCK_SIZE)
-        gone = {at for at in held if at // BLOCK_SIZE not in blocks}
+        gone = {at for at in held if blocks.block(at // BLOCK_SIZE) is None}
         held = {at: byte for at, byte in held.items() if at not in gone}
         blocks.check_invariants()
         cache.check_invariants()
