@@ -286,14 +286,15 @@ class Names:
             if moved:
                 await self._undo(aside, target)
             raise
+        else:
+            if moved and not keep_old:
+                await self.discard(aside)
         finally:
             own.live.discard(aside)
-        if moved and keep_old:
-            own.live.add(aside)
-            return aside
-        if moved:
-            await self.discard(aside)
-        return None
+        if not (moved and keep_old):
+            return None
+        own.live.add(aside)
+        return aside
 
     # --- inside
 
