@@ -14,38 +14,27 @@ from trio.testing import MockClock
 from mavftpfs.protocol.payload import NakCode, Opcode, Payload
 from mavftpfs.shared.errors import DataUnproven, FtpNak, ListingIncomplete, MavftpfsError, NotFound
 from mavftpfs.sim.linkmodel import LinkSettings
-from tests.support.lying import lie_for
-from tests.support.mounting import mounted
 from tests.support.replies import ack, nak
-from tests.support.worlds import World, content, path, world
+from tests.support.rigs import Rig, read_file, rig
+from tests.support.worlds import content
 
 pytestmark = pytest.mark.holds("promise 10")
 
 Spoil = Callable[[Payload, Payload], Payload]
 LISTS = (Opcode.LIST_DIRECTORY, Opcode.LIST_DIRECTORY_WITH_TIME)
-NAMES = [f"file_{number:02}" for number in range(60)]
+KINDS = ["px4", "ardupilot", "mavsdk"]
+SIXTY = {b"/d/file_%02d" % number: b"file_%02d" % number for number in range(60)}
 WHOLE = content(60_000)
-
-
-def sixty(profile: str = "px4") -> World:
-    made = world(profile)
-    for name in NAMES:
-        made.tree.add(path(profile, name), name.encode())
-    return made
-
-
-def names_in(error: pytest.ExceptionInfo[ListingIncomplete]) -> set[bytes]:
-    return {name for name, _ in error.value.entries}
+F = b"/d/f"
 
 
 class FirstPageAgain:
     """Has each request for a page below the end answered by the first one."""
 
-    def __init__(self, made: World, end: int) -> None:
+    def __init__(self, here: Rig, end: int) -> None:
         self.end = end
         self.first: bytes | None = None
-        self.server = lie_for(made)
-        self.server.change = self.change
+        here.server.change = self.change
 
     def change(self, request: Payload, reply: Payload) -> Iterable[Payload]:
         if request.opcode not in LISTS or not request.data.startswith(b"/d\0"):
@@ -61,86 +50,74 @@ class FirstPageAgain:
 async def test_a_server_that_repeats_its_first_page_is_not_believed(
     end: int, autojump: MockClock, caplog: pytest.LogCaptureFixture
 ) -> None:
-    made = sixty()
-    FirstPageAgain(made, end)
-    async with mounted(made) as (_, tree):
+    async with rig(files=SIXTY) as here:
+        FirstPageAgain(here, end)
+        tree = here.mount()
         for _ in range(2):
             with pytest.raises(ListingIncomplete) as error:
                 await tree.list(b"/d")
-            assert 1 < len(names_in(error)) < len(NAMES)
+            assert 1 < len(dict(error.value.entries)) < len(SIXTY)
     lines = [line for line in caplog.records if line.levelno >= logging.WARNING]
     assert len(lines) == 1
     assert "/d" in lines[0].getMessage()
 
 
 async def test_names_that_an_incomplete_listing_lacks_are_asked_for(autojump: MockClock) -> None:
-    made = sixty()
-    FirstPageAgain(made, 60)
-    async with mounted(made) as (_, tree):
+    async with rig(files=SIXTY) as here:
+        FirstPageAgain(here, 60)
+        tree = here.mount()
         with pytest.raises(ListingIncomplete) as error:
             await tree.list(b"/d")
-        lacking = next(name.encode() for name in NAMES if name.encode() not in names_in(error))
+        shown = dict(error.value.entries)
+        lacking = next(name for name in SIXTY.values() if name not in shown)
         assert (await tree.stat(b"/d/" + lacking)).size == len(lacking)
-        file = await tree.open(b"/d/" + lacking)
-        assert bytes(await file.read(0, 100)) == lacking
-        file.close()
-        made.tree.add(b"/d/later", b"12345")
+        assert await read_file(tree, b"/d/" + lacking) == lacking
+        here.put(b"/d/later", b"12345")
         assert (await tree.stat(b"/d/later")).size == 5
         with pytest.raises(NotFound):
             await tree.stat(b"/d/never")
         assert tree.negative_valid_for(b"/d/never") == 0
-        made.tree.add(b"/d/never", b"123")
+        here.put(b"/d/never", b"123")
         assert (await tree.stat(b"/d/never")).size == 3
 
 
-@pytest.mark.parametrize("profile", ["px4", "ardupilot", "mavsdk"])
+@pytest.mark.parametrize("profile", KINDS)
 async def test_a_listing_that_is_refused_midway_is_an_error(profile: str, autojump: MockClock) -> None:
-    made = sixty(profile)
-
     def refuse(request: Payload, reply: Payload) -> Iterable[Payload]:
         refused = request.opcode in LISTS and request.data.startswith(b"/d\0") and request.offset > 0
         return [nak(request, NakCode.FILE_NOT_FOUND) if refused else reply]
 
-    lie_for(made).change = refuse
-    async with mounted(made) as (_, tree):
+    async with rig(profile, SIXTY) as here:
+        here.server.change = refuse
         with pytest.raises(FtpNak):
-            await tree.list(b"/d")
+            await here.mount().list(b"/d")
 
 
-def claim(made: World, size: int) -> None:
-    """Have open replies tell this size."""
-
-    def change(request: Payload, reply: Payload) -> Iterable[Payload]:
-        opened = request.opcode == Opcode.OPEN_FILE_RO and reply.opcode == Opcode.ACK
-        return [reply._replace(data=size.to_bytes(4, "little")) if opened else reply]
-
-    lie_for(made).change = change
-
-
-@pytest.mark.parametrize("profile", ["px4", "ardupilot", "mavsdk"])
+@pytest.mark.parametrize("profile", KINDS)
 @pytest.mark.parametrize("size", [0, 30_000, 59_999])
 async def test_an_open_reply_that_tells_too_small_a_size_is_not_believed(
     profile: str, size: int, autojump: MockClock
 ) -> None:
-    made = world(profile, f=WHOLE)
-    claim(made, size)
-    async with mounted(made, path(profile, "")[:-1]) as (_, tree):
+    def claim(request: Payload, reply: Payload) -> Iterable[Payload]:
+        opened = request.opcode == Opcode.OPEN_FILE_RO and reply.opcode == Opcode.ACK
+        return [reply._replace(data=size.to_bytes(4, "little")) if opened else reply]
+
+    async with rig(profile, {F: WHOLE}) as here:
+        here.server.change = claim
         with pytest.raises(DataUnproven):
-            await tree.open(path(profile, "f"))
+            await here.mount().open(F)
 
 
-@pytest.mark.parametrize("profile", ["px4", "ardupilot", "mavsdk"])
+@pytest.mark.parametrize("profile", KINDS)
 async def test_a_file_that_became_smaller_since_it_was_listed_is_read(
     profile: str, autojump: MockClock
 ) -> None:
-    made = world(profile, f=WHOLE)
-    async with mounted(made, path(profile, "")[:-1]) as (_, tree):
+    async with rig(profile, {F: WHOLE}) as here:
+        tree = here.mount()
+        await tree.list(b"/d")
         await trio.sleep(1.0)
-        made.tree.add(path(profile, "f"), WHOLE[:30_000])
-        file = await tree.open(path(profile, "f"))
-        assert file.size == 30_000
-        assert bytes(await file.read(0, 60_000)) == WHOLE[:30_000]
-        file.close()
+        here.put(F, WHOLE[:30_000])
+        assert await read_file(tree, F) == WHOLE[:30_000]
 
 
 def early_end(request: Payload, reply: Payload) -> Payload:
@@ -162,25 +139,22 @@ def other_opcode(request: Payload, reply: Payload) -> Payload:
 @pytest.mark.holds("promise 1")
 @pytest.mark.parametrize("spoil", [early_end, empty_ack, shifted, other_opcode])
 async def test_a_file_that_cannot_be_completed_is_an_error(spoil: Spoil, autojump: MockClock) -> None:
-    made = world("px4", f=WHOLE[:1000])
-    lie_for(made).change = lambda request, reply: [
-        spoil(request, reply) if request.opcode == Opcode.READ_FILE else reply
-    ]
-    async with mounted(made) as (_, tree):
-        file = await tree.open(path("px4", "f"))
+    async with rig(files={F: WHOLE[:1000]}) as here:
+        here.server.change = lambda request, reply: [
+            spoil(request, reply) if request.opcode == Opcode.READ_FILE else reply
+        ]
+        file = await here.mount().open(F)
         with pytest.raises(MavftpfsError), trio.fail_after(150.0):
             await file.read(0, 1000)
         file.close()
 
 
 async def test_with_dir_timeout_0_a_new_file_is_found_by_the_next_open(autojump: MockClock) -> None:
-    made = World("px4", LinkSettings(rate=5_000, delay=0.1))  # a listing takes long
-    made.tree.add(b"/d/old", b"1")
-    async with mounted(made, b"/d", dir_timeout=0.0) as (_, tree):
+    slow = LinkSettings(rate=5_000, delay=0.1)  # a listing takes long
+    async with rig(files={b"/d/old": b"1"}, link=slow) as here:
+        tree = here.mount(dir_timeout=0.0)
         with pytest.raises(NotFound):
             await tree.open(b"/d/new")
         assert tree.negative_valid_for(b"/d/new") == 0
-        made.tree.add(b"/d/new", b"2")
-        file = await tree.open(b"/d/new")
-        assert bytes(await file.read(0, 9)) == b"2"
-        file.close()
+        here.put(b"/d/new", b"2")
+        assert await read_file(tree, b"/d/new") == b"2"

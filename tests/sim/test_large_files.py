@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
 from struct import pack
 
 import pytest
-import trio
 from trio.testing import MockClock
 
 from mavftpfs.cache.openfile import OpenFile
-from mavftpfs.cache.options import CacheOptions
-from mavftpfs.cache.tree import Tree
-from mavftpfs.session.connection import Connection
 from mavftpfs.shared.errors import FtpNak
 from mavftpfs.sim.linkmodel import LinkSettings
 from mavftpfs.sim.tree import DEFAULT_MTIME, Entry, Kind, MemoryTree, Stat, TreeFile
-from tests.support.worlds import ROOTS, World
+from tests.support.rigs import rig
 
 GIB = 1 << 30
 SIZE = 4 * GIB - 5
@@ -82,41 +80,33 @@ class HugeTree(MemoryTree):
         return super().open(path, write=True, create=True) if write else HugeFile()
 
 
-def huge(profile: str) -> tuple[World, bytes]:
-    here = World(profile, LinkSettings(delay=0.01), tree=HugeTree())
-    path = ROOTS.get(profile, b"") + b"/d/huge"
-    here.tree.add(path)
-    return here, path
-
-
-async def opened(connection: Connection, path: bytes) -> OpenFile:
-    options = CacheOptions(cache_size=1 << 20)
-    tree = Tree(connection.store, options, clock=trio.current_time, invalidate=lambda changed: None)
-    assert (await tree.stat(path)).size == SIZE
-    file = await tree.open(path)
-    assert file.size == SIZE
-    return file
+@asynccontextmanager
+async def huge(profile: str) -> AsyncIterator[OpenFile]:
+    """Open such a file."""
+    path = b"/d/huge"
+    async with rig(profile, {path: b""}, link=LinkSettings(delay=0.01), tree=HugeTree()) as here:
+        tree = here.mount(cache_size=1 << 20)
+        assert (await tree.stat(path)).size == SIZE
+        file = await tree.open(path)
+        assert file.size == SIZE
+        yield file
+        await file.release()
 
 
 @pytest.mark.holds("rule 14.27")
-@pytest.mark.parametrize("profile", ["px4", "px4-nuttx", "mavsdk", "spec"])
+@pytest.mark.parametrize("profile", ["px4", "px4-nuttx", "mavsdk"])
 async def test_any_place_of_a_huge_file_can_be_read(profile: str, autojump: MockClock) -> None:
-    here, path = huge(profile)
-    async with here.connection() as connection:
-        file = await opened(connection, path)
+    async with huge(profile) as file:
         for offset, count in READS:
             assert bytes(await file.read(offset, count)) == expected(offset, count)
         assert bytes(await file.read(SIZE, 10)) == b""
-        await file.release()
 
 
 @pytest.mark.holds("rule 14.27")
 @pytest.mark.parametrize("profile", ["ardupilot", "ardupilot5"])
 async def test_what_ardupilot_cannot_reach_is_an_error(profile: str, autojump: MockClock) -> None:
     """Offsets are signed 32 bits over there (AP_Filesystem::lseek)."""
-    here, path = huge(profile)
-    async with here.connection() as connection:
-        file = await opened(connection, path)
+    async with huge(profile) as file:
         for offset, count in READS:
             if offset + count <= 2 * GIB:
                 assert bytes(await file.read(offset, count)) == expected(offset, count)
@@ -124,4 +114,3 @@ async def test_what_ardupilot_cannot_reach_is_an_error(profile: str, autojump: M
                 with pytest.raises(FtpNak):
                     await file.read(offset, count)
         assert bytes(await file.read(4096, 1000)) == expected(4096, 1000)
-        await file.release()
