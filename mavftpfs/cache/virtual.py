@@ -14,13 +14,13 @@ import zlib
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import trio
 
 from mavftpfs.cache.attributes import Stat, shown_mtime
-from mavftpfs.cache.directories import Directories, Found
+from mavftpfs.cache.directories import Directories, Directory, Found
 from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.options import CacheOptions
 from mavftpfs.cache.remote import RemoteStore
@@ -145,30 +145,24 @@ class VirtualTrees:
         """
         found = await self._find(path)
         seen = self._look(path)
-        known = self._clock() < seen.until
-        if not known and self._is_read_to_know(path, found):
+        if self._clock() >= seen.until and self._is_read_to_know(found.entry):
             try:
                 await self._read(path)
             except (FtpNak, DataUnproven, LinkError, SessionBusy):
-                if found is None and seen.data is None:
+                if tree_of(path) in UNLISTABLE and seen.data is None:
                     raise
         return self.listed_stat(path, found)
 
-    def listed_stat(self, path: bytes, found: Found | None) -> Stat:
-        """Return what is known without traffic; valid_for is 0 where asking again tells more. found: None for
-        a file that no listing shows."""
-        seen, until = self._look(path), -math.inf
-        kind = EntryKind.FILE if found is None else found.entry.kind
-        if found is not None and kind is EntryKind.DIRECTORY:
+    def listed_stat(self, path: bytes, found: Found) -> Stat:
+        """Return what is known without traffic; valid_for is 0 where asking again tells more."""
+        entry, seen = found.entry, self._look(path)
+        size, until = entry.size, -math.inf
+        if entry.kind is EntryKind.DIRECTORY:
             until = found.directory.fresh_until
         elif seen.data is not None:
-            until = seen.until
-        if seen.data is not None:
-            size = len(seen.data)
-        else:
-            size = 0 if found is None else found.size
+            size, until = len(seen.data), seen.until
         valid_for = max(0.0, min(self._options.attr_timeout, until - self._clock()))
-        return Stat(kind, size, shown_mtime(path, None if found is None else found.entry.mtime), valid_for)
+        return Stat(entry.kind, size, shown_mtime(path, entry.mtime), valid_for)
 
     async def list(self, path: bytes) -> list[tuple[bytes, Stat]]:
         """Return the entries that can be opened, with true sizes as far as they are known in time.
@@ -177,19 +171,14 @@ class VirtualTrees:
             As Tree.list.
         """
         tree = tree_of(path)
-        founds: dict[bytes, Found | None] = {}
-        complete = True
-        if tree in UNLISTABLE:
-            if path != b"/" + tree:
-                raise NotADirectory(f"{path!r} is not a directory")
-            await self._require_shown(tree)
-            for name in UNLISTABLE[tree]:
-                founds[join(path, name)] = None
-        else:
+        if tree not in UNLISTABLE:
             directory = await self._directories.get(path)
-            complete = directory.complete
-            for name, entry in directory.entries.items():
-                founds[join(path, name)] = Found(entry, directory)
+        elif path != b"/" + tree:
+            raise NotADirectory(f"{path!r} is not a directory")
+        else:
+            entries = {name: DirEntry(name, EntryKind.FILE) for name in UNLISTABLE[tree]}
+            directory = replace(await self._shown(tree), entries=entries, complete=True)
+        founds = {join(path, name): Found(entry, directory) for name, entry in directory.entries.items()}
         await self._read_unread(founds)
         now = self._clock()
         shown = [
@@ -197,7 +186,7 @@ class VirtualTrees:
             for child, found in founds.items()
             if self.absent_until(child) <= now
         ]
-        if not complete:
+        if not directory.complete:
             raise ListingIncomplete(f"{path!r} was not listed to its end", shown)
         return shown
 
@@ -208,7 +197,7 @@ class VirtualTrees:
             NotFound, NotADirectory, IsADirectory; else as RemoteStore.read_whole.
         """
         found = await self._find(path)
-        if found is not None and found.entry.kind is not EntryKind.FILE:
+        if found.entry.kind is not EntryKind.FILE:
             raise IsADirectory(f"{path!r} is a directory")
         seen = self._look(path)
         if seen.data is not None and self._clock() < seen.until:
@@ -233,52 +222,52 @@ class VirtualTrees:
     def _look(self, path: bytes) -> Seen:
         return self._seen.get(path, UNSEEN)
 
-    async def _find(self, path: bytes) -> Found | None:
-        """Return what the listing says, None for a file in a tree that cannot be listed.
+    async def _find(self, path: bytes) -> Found:
+        """Return what the listing says; where none can, that it is a file.
 
         Raises:
             NotFound: also where it is listed, but was seen not to open. Else as Directories.find.
         """
         tree = tree_of(path)
-        found = None
         if tree not in UNLISTABLE:
             found = await self._directories.find(path)
         else:
-            await self._require_shown(tree)
-            name = path[len(tree) + 2 :]
+            root, name = await self._shown(tree), path[len(tree) + 2 :]
             if not name:
-                return Found(DirEntry(tree, EntryKind.DIRECTORY), await self._directories.get(ROOT))
+                return Found(DirEntry(tree, EntryKind.DIRECTORY), root)
             # No such file starts with a dot, but file managers ask for many that do.
             if b"/" in name or name.startswith(b"."):
                 raise NotFound(f"{path!r} does not exist")
+            found = Found(DirEntry(name, EntryKind.FILE), root)
         if self._clock() < self.absent_until(path):
             raise NotFound(f"the vehicle does not open {path!r}")
         return found
 
-    async def _require_shown(self, tree: bytes) -> None:
-        """Raise NotFound unless this server has such trees; one that does not announce any is asked."""
+    async def _shown(self, tree: bytes) -> Directory:
+        """Return the listing of `/`, beside which a tree is shown.
+
+        Raises:
+            NotFound: this server has no such trees. One that does not announce any is asked.
+        """
         root = await self._directories.get(ROOT)
         if self.shown_in_root(root.entries):
-            return
+            return root
         if tree != tree_of(PARAM_FILE) or self._clock() < self.absent_until(PARAM_FILE):
             raise NotFound(f"this vehicle has no {tree.decode()}")
         await self._read(PARAM_FILE)
+        return root
 
     # --- reading
 
-    def _is_read_to_know(self, path: bytes, found: Found | None) -> bool:
-        """Return whether a path is a file that is to be read to know its size, and whether it opens."""
-        if found is None:
-            return True
-        if found.entry.kind is not EntryKind.FILE:
-            return False
-        return found.size <= self._options.at_stat_limit
+    def _is_read_to_know(self, entry: DirEntry) -> bool:
+        """Return whether it is a file that is to be read to know its size, and whether it opens."""
+        return entry.kind is EntryKind.FILE and entry.size <= self._options.at_stat_limit
 
-    async def _read_unread(self, founds: Mapping[bytes, Found | None]) -> None:
+    async def _read_unread(self, founds: Mapping[bytes, Found]) -> None:
         """Read what was not read yet, until `probe_time` is over or the link is too bad."""
         with trio.move_on_after(self._options.probe_time), suppress(LinkError, RequestTimeout, SessionBusy):
             for path, found in founds.items():
-                if path not in self._seen and self._is_read_to_know(path, found):
+                if path not in self._seen and self._is_read_to_know(found.entry):
                     with suppress(FtpNak, DataUnproven, NotFound):  # it has its listed size, or is not shown
                         await self._read(path)
 
