@@ -15,6 +15,7 @@ from mavftpfs.protocol.url import MftpUrl, is_url, parse_url
 from mavftpfs.shared.errors import (
     AlreadyExists,
     CrossDevice,
+    DataUnproven,
     IsADirectory,
     LocalProtocolError,
     NotADirectory,
@@ -295,7 +296,10 @@ async def _copy(files: Files, old: bytes, new: bytes) -> None:
         try:
             offset = 0
             while offset < source.size:
-                offset += await file.write(offset, bytes(await source.read(offset, READ_SIZE)))
+                data = bytes(await source.read(offset, READ_SIZE))
+                if not data:
+                    raise DataUnproven(f"{name_text(old)} ended at {offset} of {source.size} bytes")
+                offset += await file.write(offset, data)
             await file.fsync()
         finally:
             file.close()

@@ -123,8 +123,8 @@ async def _send(session: Session, source: BinaryIO, remote: bytes, progress: Pro
 
 
 async def _send_beside(session: Session, source: BinaryIO, remote: bytes, progress: Progress) -> int:
-    """Write a new file beside and rename it: of a put that was interrupted a mount would go on to deliver
-    what it was given."""
+    """Write a new file beside and rename it: else a mount would deliver half a file of an interrupted put.
+    What a killed put leaves is a file like any other."""
     files = session.files
     beside = join(split(remote)[0], b".put-" + secrets.token_hex(4).encode())
     file = await files.create(beside, exclusive=True)

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import cast
 
 import pytest
+import trio
 
 from mavftpfs.oneshot import names
 from mavftpfs.oneshot.files import Files, Session
@@ -15,6 +16,7 @@ from mavftpfs.oneshot.upload import collect, put_paths
 from mavftpfs.shared.errors import (
     AlreadyExists,
     CrossDevice,
+    DataUnproven,
     DirectoryNotEmpty,
     ExitCode,
     IsADirectory,
@@ -168,6 +170,14 @@ async def test_mv_keeps_the_old_file_until_the_new_one_is_there() -> None:
 
     tree.on_call = refuse
     with pytest.raises(RequestTimeout):
+        await mv(tree, b"/a", to=b"/new")
+    assert tree.files[b"/a"] == BIG
+
+
+async def test_mv_ends_where_the_source_has_shrunk_meanwhile() -> None:
+    tree = Card({b"/a": BIG}, short_read=0)
+    tree.renames = False
+    with trio.fail_after(5.0), pytest.raises(DataUnproven, match="ended at 0 of"):
         await mv(tree, b"/a", to=b"/new")
     assert tree.files[b"/a"] == BIG
 
