@@ -159,7 +159,7 @@ async def attached(
                     nursery=nursery,
                     spool=spool,
                     rng=SystemRandom(),
-                    keep=None if keep is None else partial(_start_kept, keep, nursery),
+                    keep=keep,
                 )
                 subscribe(connection, tree)
                 if list_root:
@@ -170,14 +170,6 @@ async def attached(
                     connection.news.clear()  # the tree can begin nothing while the session is closed
                     if spool is not None and (rescue_for is None or not tree.undelivered()):
                         spool.discard()
-
-
-def _start_kept(
-    make: MakeKept, nursery: trio.Nursery, directories: Directories, blocks: BlockCache
-) -> KeptCache:
-    kept = make(directories, blocks)
-    nursery.start_soon(kept.run)
-    return kept
 
 
 @asynccontextmanager

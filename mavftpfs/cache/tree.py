@@ -72,7 +72,7 @@ class Tree:
         With a nursery, listings and snapshots under way survive the cancellation of who asked for them, and
         written bytes go to the vehicle while the program still writes.
         `spool` keeps what is not delivered; `wall`: seconds since 1970; `rng` numbers our temporary names;
-        `keep` makes the cache on the local disk.
+        With a nursery, `keep` makes the cache on the local disk.
         """
         self._options = options
         self._clock = clock
@@ -87,7 +87,9 @@ class Tree:
             directories=self._directories,
             invalidate=self._invalidate,
         )
-        self._files.kept = None if keep is None else keep(self._directories, self._blocks)
+        if keep is not None and nursery is not None:
+            self._files.kept = keep(self._directories, self._blocks)
+            nursery.start_soon(self._files.kept.run)
         self._virtual = VirtualTrees(
             store, self._directories, options, invalidate=self._invalidate, nursery=nursery
         )

@@ -60,7 +60,6 @@ class Mounts:
                     run=self.run,
                 )
             )
-            self.here.nursery.start_soon(self.caches[-1].run)
             return self.caches[-1]
 
         self.here.faults.requests.clear()
