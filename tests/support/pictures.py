@@ -8,19 +8,17 @@ from __future__ import annotations
 
 import os
 import re
-import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 
 from rich.console import Console
 from rich.text import Text
 
+from tests.mount.conftest import Field
 from tests.support.terminal import Terminal
-from tests.support.vehicles import free_udp_port
 
 COLUMNS, ROWS = 100, 50
 FOLDER = Path(__file__).parents[2] / "docs" / "pictures"
@@ -72,24 +70,6 @@ def draw(lines: Sequence[str], title: str, path: Path) -> None:
         path.write_text(console.export_svg(title=title, unique_id=path.stem))
 
 
-@contextmanager
-def running(*words: str, ready: str) -> Iterator[None]:
-    """Run `mavftpfs words`; the body begins when it printed `ready`."""
-    with subprocess.Popen(
-        [*_MAVFTPFS, *words], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
-    ) as process:
-        try:
-            assert process.stdout is not None
-            for line in process.stdout:
-                if ready in line:
-                    break
-            else:
-                raise RuntimeError(f"mavftpfs {' '.join(words)} said no {ready!r}")
-            yield
-        finally:
-            process.terminate()
-
-
 def draw_demo(path: Path) -> None:
     """Draw the tour from mounting to the edited file."""
     lines = screen(in_terminal([*_MAVFTPFS, "demo"]))
@@ -101,26 +81,22 @@ def draw_demo(path: Path) -> None:
 
 def draw_status(path: Path) -> None:
     """Draw `mavftpfs status` while a log is copied over a radio."""
-    with ExitStack() as stack:
-        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="mavftpfs-pictures-")))
-        log = folder / "card/fs/microsd/log/2026-11-20/10_32_15.ulg"
-        log.parent.mkdir(parents=True)
-        log.write_bytes(os.urandom(400_000))
-        (folder / "drone").mkdir()
-        port = free_udp_port()
-        link = ("--rate", "40000", "--delay", "0.03", "--jitter", "0.01", "--loss", "0.02")
-        vehicle = ("sim", str(folder / "card"), "--link", f"udpout:127.0.0.1:{port}", *link)
-        stack.enter_context(running(*vehicle, ready="MOUNTPOINT"))
-        source = f"udpin:127.0.0.1:{port}"
-        stack.enter_context(running(source, str(folder / "drone"), "-f", ready="mounted"))
-        with subprocess.Popen(["cp", folder / "drone" / log.relative_to(folder / "card"), "/dev/null"]):
-            time.sleep(5)
-            shown = in_terminal([*_MAVFTPFS, "status", str(folder / "drone")])
-    lines = [
-        "$ mavftpfs status ~/drone",
-        *shown.replace(str(folder / "drone"), "/home/me/drone").split("\r\n"),
-    ]
-    draw(lines, "mavftpfs status", path)
+    link = ("--rate", "40000", "--delay", "0.03", "--jitter", "0.01", "--loss", "0.02")
+    with tempfile.TemporaryDirectory(prefix="mavftpfs-pictures-") as name:
+        field = Field(Path(name))
+        try:
+            card = field.local("card")
+            log = Path("fs/microsd/log/2026-11-20/10_32_15.ulg")
+            (card / log.parent).mkdir(parents=True)
+            (card / log).write_bytes(os.urandom(400_000))
+            mount = field.mount(field.sim(card, "px4", link).source)
+            with mount.started("cp", mount.path / log, "/dev/null"):
+                time.sleep(5)
+                shown = in_terminal([*_MAVFTPFS, "status", str(mount.path)])
+        finally:
+            field.close()
+    shown = shown.replace(str(mount.path), "/home/me/drone")
+    draw(["$ mavftpfs status ~/drone", *shown.split("\r\n")], "mavftpfs status", path)
 
 
 def main(argv: Sequence[str]) -> int:
