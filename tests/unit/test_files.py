@@ -53,7 +53,7 @@ async def timed() -> AsyncIterator[Rig]:
 
 
 async def test_a_read_larger_than_the_cache_is_served_in_pieces(here: Rig) -> None:
-    big = content(5 * MIB)
+    big = content(2 * MIB)
     here.put(b"/big", big)
     tree = here.mount(cache_size=MIB)
     handle = await tree.open(b"/big")
