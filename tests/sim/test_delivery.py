@@ -570,19 +570,6 @@ async def test_a_file_renamed_while_it_is_closed_is_forgotten(here: Rig) -> None
     assert (await tree.stat(b"/d/b")).size == len(b"theirs, longer")
 
 
-async def test_a_write_in_the_moment_a_delivery_begins_is_not_forgotten(here: Rig) -> None:
-    file = await here.mount().open(FILE, write=True)
-    for number in range(30):  # which of the two comes first is left to chance
-        mark = b"%04d" % number
-        await file.truncate(900 - number)
-        async with trio.open_nursery() as nursery:
-            nursery.start_soon(file.flush)
-            nursery.start_soon(file.write, 10, mark)
-        await file.flush()
-        assert here.data(FILE)[10:14] == mark
-    await file.release()
-
-
 # --- the end of a mount
 
 

@@ -104,7 +104,7 @@ async def test_handles_are_closed_once(tree: Tree) -> None:
 
 @pytest.mark.holds("rule 14.27")
 async def test_no_file_is_larger_than_the_protocol_can_say(tree: Tree) -> None:
-    file = await tree.open(FILE, write=True)
+    file = await tree.create(NEW, exclusive=True)
     for change in (file.write(2**32 - 1, b"x"), file.truncate(2**32)):
         with pytest.raises(FileTooLarge):
             await change
