@@ -510,9 +510,9 @@ async def test_writers_wait_for_a_slow_link() -> None:
     async with rig(link=SLOW) as here:
         tree = here.mount(dirty_max=100_000)
         file = await tree.create(b"/new", exclusive=True)
-        for at in range(0, 300_000, 50_000):
+        for at in range(0, 200_000, 50_000):
             await file.write(at, bytes(50_000))
-            assert 50_000 + at - here.world.tree.used < 250_000
+            assert 50_000 + at - here.world.tree.used <= 160_000
         await file.release()
         assert tree.status()["bytes_held"] == 0
 
@@ -549,8 +549,8 @@ async def test_what_may_wait_is_what_ten_seconds_bring() -> None:
     """A close cannot be killed."""
     rate, limit = await rate_and_limit(30_000.0, 400_000)
     assert limit == pytest.approx(SECONDS * rate, rel=0.2)
-    assert (await rate_and_limit(1000.0, 20_000))[1] == LEAST
-    assert (await rate_and_limit(2e6, 1_000_000))[1] == MOST
+    assert (await rate_and_limit(1000.0, 10_000))[1] == LEAST
+    assert (await rate_and_limit(1.2e6, 600_000))[1] == MOST
 
 
 # --- overlapping calls
