@@ -131,19 +131,6 @@ def test_a_longer_way_is_noticed() -> None:
     assert flow.window >= 200
 
 
-@pytest.mark.parametrize("limit", [4, None])
-def test_rounds_without_a_round_trip_change_little(limit: int | None) -> None:
-    flow = Flow(limit=limit)
-    path = Path(flow, rate=1000.0, base=0.1)
-    if limit is None:
-        path.rounds(20)
-    least, most = min(flow.window, 100), 150
-    for order in range(path.order, path.order + 200):
-        path.now += 1.0 / 1000.0
-        flow.on_replies(path.now, None, 1, order, order + flow.window)
-    assert least <= flow.window <= most
-
-
 def test_a_short_queue_of_ones_own_takes_one_more() -> None:
     flow = Flow()
     flow.alone = True
@@ -208,14 +195,6 @@ def test_after_a_pause_answers_are_kept_in_reserve_for_reads() -> None:
     path.rounds(10)
     assert beyond(flow, path.now, paced=False) <= 0 < beyond(flow, path.now) <= QUEUE * 420
     assert beyond(flow, path.now + KNOWN) <= 0
-
-
-def test_there_is_none_beside_somebody_who_waits() -> None:
-    flow, path = paused()
-    path.rounds(10)
-    flow.begin()
-    flow.room(1, path.now, paced=True, urgent=True)
-    assert flow.room(flow.window, path.now, paced=True) <= 0
 
 
 def test_a_reserve_that_overflows_a_queue_shrinks() -> None:
