@@ -72,7 +72,7 @@ class Tree:
         With a nursery, listings and snapshots under way survive the cancellation of who asked for them, and
         written bytes go to the vehicle while the program still writes.
         `spool` keeps what is not delivered; `wall`: seconds since 1970; `rng` numbers our temporary names;
-        With a nursery, `keep` makes the cache on the local disk.
+        `keep` makes the cache on the local disk, which needs a nursery.
         """
         self._options = options
         self._clock = clock
