@@ -535,13 +535,17 @@ class Upload(SessionUser):
     # --- letting go
 
     async def _close(self, stop: Stop) -> None:
-        """Close the file, and judge by that what of it is written."""
+        """Close the file, and judge by that what of it is written.
+
+        A vehicle that restarted before may ACK it, too (ArduPilot ACKs the end of any session). That restart
+        is news that takes the bytes back (`_open`) and has the file compared (`Doubt`).
+        """
         transfer = self._transfer  # if any, its last requests are on their way
         if stop is Stop.ABORTED:
             await self._server.close_quietly()
             return
         try:
-            ours = await self._terminate(TERMINATE_LIMIT if stop is Stop.ARMED else None)
+            ours = await self._server.close(TERMINATE_LIMIT if stop is Stop.ARMED else None)
         except RequestTimeout as error:
             raise SessionLost(str(error)) from error
         last = self._end_transfer()
@@ -558,26 +562,13 @@ class Upload(SessionUser):
         elif stop in (Stop.FINISHED, Stop.STARVED):
             self._complete()
 
-    async def _terminate(self, limit: float | None) -> bool:
-        """Terminate; return whether what was ACKed counts as written.
-
-        A vehicle that restarted before may have answered: ArduPilot ACKs the end of a session that it does
-        not know. What it had in memory is lost then.
-        """
-        server, vehicle = self._server, self._vehicle
-        heard_at, reboots = self._driver.last_reply_at, vehicle.reboots
-        ours = await server.close(limit)
-        if vehicle.identity.away_since(heard_at, server.clock()):
-            server.doubt.raise_it("the vehicle was away when a file was closed, and may have restarted")
-        return ours and vehicle.reboots == reboots
-
     async def _clean_up(self, error: MavftpfsError) -> None:
         """Close what can be closed, and roll back what is not proven."""
         self._end_transfer()
         written, session = False, self._server.session  # None where it failed before it got it
         if isinstance(error, REFUSALS) and session is not None and session.writing:
             with suppress(MavftpfsError):  # another failure is no news
-                written = await self._terminate(TERMINATE_LIMIT)
+                written = await self._server.close(TERMINATE_LIMIT)
         else:
             self._server.abandon()
         if written:
