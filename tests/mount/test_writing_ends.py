@@ -124,16 +124,6 @@ CHANGES = (
 )
 
 
-@pytest.mark.holds("promise 9")
-def test_when_armed_ok_writes_in_flight(field: Field) -> None:
-    card = field.local("card")
-    mount = field.mount(field.sim(card, "px4", ("--armed",)).source, "when_armed=ok")
-    mount.run(
-        "sh", "-c", f"echo hello > {mount.path}/a; mkdir {mount.path}/d; mv {mount.path}/a {mount.path}/d/"
-    )
-    assert (card / "d" / "a").read_text() == "hello\n"
-
-
 def write_to_nobody(mount: Mount, vehicle: SimVehicle, data: Path) -> None:
     """Have a copy fail because the vehicle fell silent."""
     mount.run("sh", "-c", f"echo confirmed > {mount.path}/confirmed")
