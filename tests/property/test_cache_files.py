@@ -190,16 +190,19 @@ class Programs:
     async def change(self) -> None:
         """Append to a file, or replace it; by one of the same size only where times tell."""
         path = self.rng.choice(self.PATHS)
-        data = self.here.data(path)
-        if self.rng.random() < 0.5:
-            self.put(path, data + self.rng.randbytes(300))
-        else:
-            less = self.rng.choice([0, 1, 5000]) if self.with_times else 1
-            self.put(path, self.rng.randbytes(max(0, len(data) - less)))
-            for other, opened in self.opened:
-                if other == path:
-                    opened.contents += [self.here.data(path)] * (less == 0)
-                    opened.excused = True
+        old = self.here.data(path)
+        appended = self.rng.random() < 0.5
+        if appended:
+            new = old + self.rng.randbytes(300)
+        elif self.with_times:
+            new = self.rng.randbytes(max(0, len(old) - self.rng.choice([0, 1, 5000])))
+        else:  # a longer one would pass for one that grew
+            new = self.rng.randbytes(max(0, min(map(len, self.had[path])) - 1))
+        self.put(path, new)
+        for other, opened in self.opened:
+            if other == path:
+                opened.contents += [new] * (not appended and len(new) == opened.handle.size)
+                opened.excused = opened.excused or not appended or self.here.connection.vehicle.reboots > 0
         await trio.sleep(self.rng.choice([0.0, 5.0, 25.0]))
 
 
