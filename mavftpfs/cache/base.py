@@ -8,7 +8,7 @@ from dataclasses import replace
 from mavftpfs.cache.context import Context
 from mavftpfs.cache.directories import Directory
 from mavftpfs.cache.draft import Draft, State
-from mavftpfs.cache.files import FileHandle
+from mavftpfs.cache.files import VersionHandle
 from mavftpfs.cache.nodes import Node
 from mavftpfs.cache.versions import became_another
 from mavftpfs.shared.errors import FileChanged, FtpNak, LocalProtocolError, NotFound
@@ -18,7 +18,7 @@ STEP = 128 * 1024
 """Bytes fetched at once."""
 
 
-async def open_node(context: Context, node: Node) -> FileHandle:
+async def open_node(context: Context, node: Node) -> VersionHandle:
     """Open what the vehicle has of a node, whatever it is called by now.
 
     Raises:
@@ -38,7 +38,7 @@ async def read_base(context: Context, node: Node, start: int, stop: int) -> byte
     """Return bytes of the vehicle's file that a node's draft lies over.
 
     Raises:
-        FileChanged: it is another file by now. Else as Files.open and FileHandle.read.
+        FileChanged: it is another file by now. Else as Files.open and VersionHandle.read.
     """
     while True:
         node.require_current()

@@ -153,7 +153,7 @@ class Deliverer:
         if node.draft is not None and node.draft.sending is attempt.sending:
             node.draft.give_up()
         try:
-            await attempt.upload.abort()
+            await attempt.upload.end()
             if not attempt.in_place and attempt.upload.begun:
                 await self._names.discard(attempt.path)
         finally:
@@ -161,8 +161,8 @@ class Deliverer:
 
     # --- one delivery
 
-    def _is_in_place(self, draft: Draft) -> bool:
-        """Return whether it is sent under its own name, since the card was seen not to rename.
+    def _require_deliverable(self, draft: Draft) -> None:
+        """Check that it may replace what it changes.
 
         Raises:
             FileChanged: the base is another file now. NotSupported: it cannot be replaced safely.
@@ -172,7 +172,6 @@ class Deliverer:
         in_place = self._context.store.traits.rename_works is False
         if in_place and draft.base is not None and not (self._context.options.inplace or draft.begun):
             raise NotSupported("this server cannot rename, so a file cannot be replaced safely; see inplace")
-        return in_place
 
     async def _try(self, node: Node, draft: Draft) -> None:
         """Deliver; again after a wrong copy, and after it showed that the card cannot rename."""
@@ -223,7 +222,7 @@ class Deliverer:
 
     async def _send(self, node: Node, draft: Draft) -> None:
         """Send the whole file, compare it, and rename it into place."""
-        self._is_in_place(draft)  # before anything is fetched for it
+        self._require_deliverable(draft)  # before anything is fetched for it
         if not draft.whole:
             await base.fetch(self._context, node, draft)
         attempt = await self._attempt(node, draft)
@@ -235,7 +234,7 @@ class Deliverer:
         crc32 = await self.verifier.check(attempt.path, draft, doubted=doubted)
         if attempt.in_place:
             node.attempt = None
-            await attempt.upload.abort()
+            await attempt.upload.end()
         else:
             await self._require_expected(node, draft)
             await self._commit(node, draft, attempt)
@@ -243,7 +242,9 @@ class Deliverer:
 
     async def _attempt(self, node: Node, draft: Draft) -> Attempt:
         """Return the attempt under way if it still fits, else a new one."""
-        attempt, in_place = node.attempt, self._is_in_place(draft)
+        attempt, traits = node.attempt, self._context.store.traits
+        self._require_deliverable(draft)
+        in_place = traits.rename_works is False  # then it is sent under its own name
         if attempt is not None and attempt.fits(draft, in_place=in_place):
             return attempt
         if attempt is not None:
@@ -251,9 +252,10 @@ class Deliverer:
         context, path = self._context, node.path
         # A card may have no room beside the file that `inplace` replaces, and never tell.
         ask_first = draft.size > SENT_TWICE or (context.options.inplace and draft.base is not None)
-        if ask_first and context.store.traits.rename_works is None:
+        if ask_first and traits.rename_works is None:
             await self._names.find_out(node.path)
-            in_place = self._is_in_place(draft)
+            self._require_deliverable(draft)
+            in_place = traits.rename_works is False
         if in_place or isinstance(node.error, AlreadyExists):  # which all of it was sent for
             await self._require_expected(node, draft)
         if not in_place:
@@ -296,7 +298,7 @@ class Deliverer:
         own, path = self._context.own, node.path
         node.attempt = None
         try:
-            await attempt.upload.abort()
+            await attempt.upload.end()
             self._context.directories.put(attempt.path, DirEntry(b"", EntryKind.FILE, draft.size))
             draft.on(Event.COMMITS)
             if draft.base is None:

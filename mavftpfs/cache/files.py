@@ -8,10 +8,11 @@ At open it is decided whether what is cached of the path is still the vehicle's 
   sizes without an mtime prove nothing.
 
 While a file is open the server's session on it is closed and opened again: after losses, restarts, and turns
-of other files. Then size and mtime are compared (`FileHandle.read`): equal, or larger, means the same file,
-because logs grow. Else readers get FileChanged; only where the size is equal and none of them was given bytes
-they go on with the file that is there now. The open reply tells the size; the mtime takes a listing that
-began after the reopening, where listings tell any. After the vehicle restarted nothing is proven.
+of other files. Then size and mtime are compared (`VersionHandle.read`): equal, or larger, means the same
+file, because logs grow. Else readers get FileChanged; only where the size is equal and none of them was
+given bytes they go on with the file that is there now. The open reply tells the size; the mtime takes a
+listing that began after the reopening, where listings tell any. After the vehicle restarted nothing is
+proven.
 
 The kernel has one page cache for all handles of a path, so a new version bypasses it (direct_io) while
 handles of an older one are open.
@@ -102,7 +103,7 @@ class Files:
 
     # --- opening
 
-    async def open(self, path: bytes) -> FileHandle:
+    async def open(self, path: bytes) -> VersionHandle:
         """Open what the vehicle has there.
 
         Raises:
@@ -120,7 +121,7 @@ class Files:
         version.shown = not direct_io  # who has an older version open may have the kernel fetch pages of that
         version.handles += 1
         self.open_versions[version] = None
-        return FileHandle(self, version, keep_cache=keep_cache, direct_io=direct_io)
+        return VersionHandle(self, version, keep_cache=keep_cache, direct_io=direct_io)
 
     async def _open_version(self, path: bytes, found: Found) -> tuple[Version, bool]:
         """Return the version to serve, and whether it is the one that was served before."""
@@ -416,7 +417,7 @@ class Files:
         del self._current[version.path]
 
 
-class FileHandle(OpenFile):
+class VersionHandle(OpenFile):
     """One open() of a regular file."""
 
     size = 0

@@ -172,22 +172,22 @@ class Names:
             NotSupported: the card cannot rename. AlreadyExists: the new name is not free, though not `over`.
             Else as VehicleStore.
         """
-        writer = self._context.store
-        if writer.traits.rename_works is False:
+        store = self._context.store
+        if store.traits.rename_works is False:
             raise NotSupported("this server cannot rename")
         try:
             async with self._changing(old, new):
-                await writer.rename(old, new, completes=completes)
+                await store.rename(old, new, completes=completes)
         except FtpNak as nak:
             taken = nak.code == NakCode.FILE_EXISTS
-            if writer.traits.rename_works is None and not (over and taken):  # FAT: the next rename tells more
+            if store.traits.rename_works is None and not (over and taken):  # FAT: the next rename tells more
                 await self.find_out(old)
-                if writer.traits.rename_works is False:
+                if store.traits.rename_works is False:
                     raise NotSupported("this server cannot rename") from nak
             if taken and not over:
                 raise AlreadyExists(f"{new!r} was made by somebody else in the meantime") from nak
             raise
-        writer.traits.rename_works = True
+        store.traits.rename_works = True
         self._context.directories.rename(old, new)
 
     async def find_out(self, near: bytes) -> None:

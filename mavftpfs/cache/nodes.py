@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 import trio
 
 from mavftpfs.cache.draft import Base, Draft, State
-from mavftpfs.cache.files import FileHandle
+from mavftpfs.cache.files import VersionHandle
 from mavftpfs.cache.remote import Upload
 from mavftpfs.cache.spool import Spool, SpoolContent
 from mavftpfs.shared.errors import FileChanged, MavftpfsError
@@ -67,7 +67,7 @@ class Node:
     hidden: bool = False
     error: MavftpfsError | None = None
     attempt: Attempt | None = None
-    base: FileHandle | None = None
+    base: VersionHandle | None = None
     start_after: float = float("-inf")
     known_at: float = float("-inf")
     lock: trio.Lock = field(default_factory=trio.Lock)

@@ -148,8 +148,9 @@ class Upload(Protocol):
         """
         ...
 
-    async def abort(self) -> None:
-        """Terminate, best effort, and ask the source for nothing more. Raises nothing, twice too."""
+    async def end(self) -> None:
+        """Let it go, finished or not: Terminate, best effort, and ask the source for nothing more. It may be
+        called twice, and raises nothing."""
         ...
 
 

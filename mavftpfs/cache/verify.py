@@ -68,7 +68,7 @@ class Verifier:
             try:
                 crc32 = await self._context.store.crc32(path, size=draft.size)
             except (FtpNak, RequestTimeout, Armed) as error:
-                self._note_unanswered(path, error)
+                self._go_without(path, error)
         if crc32 is not None and crc32 != draft.crc32():
             raise VerificationFailed(f"the vehicle's checksum of {path!r} is not that of what was written")
         if not crc32:
@@ -113,7 +113,12 @@ class Verifier:
 
     # --- inside
 
-    def _note_unanswered(self, path: bytes, error: Exception) -> None:
+    def _go_without(self, path: bytes, error: Exception) -> None:
+        """No checksum came.
+
+        Raises:
+            VerificationFailed: verify=crc. Armed: it can be asked for after the flight.
+        """
         if self._context.options.verify == "crc":
             self._context.require_disarmed()  # else it is asked for after the flight
             raise VerificationFailed(f"no checksum of {path!r}: {error}") from error

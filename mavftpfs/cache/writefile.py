@@ -18,7 +18,7 @@ from mavftpfs.cache.base import open_node, read_base
 from mavftpfs.cache.context import Context
 from mavftpfs.cache.delivery import Deliverer
 from mavftpfs.cache.draft import Draft, State, Where
-from mavftpfs.cache.files import FileHandle
+from mavftpfs.cache.files import VersionHandle
 from mavftpfs.cache.namespace import Namespace
 from mavftpfs.cache.nodes import Node
 from mavftpfs.cache.openfile import OpenFile
@@ -48,7 +48,7 @@ class Parts:
 class ReadFile(OpenFile):
     """One open() for reading: of the draft if there is one, else of the vehicle's file."""
 
-    def __init__(self, parts: Parts, node: Node, handle: FileHandle | None = None) -> None:
+    def __init__(self, parts: Parts, node: Node, handle: VersionHandle | None = None) -> None:
         self._parts = parts
         self._context = parts.context
         self._node = node

@@ -165,7 +165,7 @@ class Upload(SessionUser):
     async def finish(self) -> None:
         """See cache.remote.Upload. Where requests were seen to come late, their copies have come by then."""
         if self.state in (UploadState.ENDING, UploadState.ENDED):
-            raise LocalProtocolError("the upload was aborted")
+            raise LocalProtocolError("the upload was ended")
         self._vehicle.require(now := self._clock(), writing=True)
         if self.error is not None:
             self.error, self._refused_at, self._failures = None, None, 0
@@ -182,9 +182,9 @@ class Upload(SessionUser):
             await self._changed.park()
         await trio.sleep(self._scheduler.doubt.lateness)
 
-    async def abort(self) -> None:
+    async def end(self) -> None:
         """See cache.remote.Upload."""
-        self.error = LocalProtocolError("the upload was aborted")
+        self.error = LocalProtocolError("the upload was ended")
         if self.state is UploadState.SENDING:
             self._enter(UploadState.ENDING)
         elif self.state not in (UploadState.ENDING, UploadState.ENDED):
@@ -405,7 +405,7 @@ class Upload(SessionUser):
                     assert stop is not None
                     return stop
                 if rearmed or not is_disarmed(error):
-                    self._note_refusal(transfer, error)
+                    self._check_refusal(transfer, error)
                     raise error
                 rearmed = True
                 # From now on path operations take turns with this upload: first those under way end.
@@ -440,7 +440,7 @@ class Upload(SessionUser):
                 stop = Stop.DOUBT if rivals else stop
             if stop is not None:
                 transfer.paused = True
-                if transfer.idle or stop in _ABRUPT or self._trails(stop, transfer):
+                if transfer.idle or stop in _ABRUPT or self._let_trail(stop, transfer):
                     self._endings += 1
                     return stop
             elif gate.shut and gate.waiting:
@@ -483,8 +483,10 @@ class Upload(SessionUser):
             over = resumable and self.gives_way(rival, session.opened_at, now, self._engine.rtt)
         return Stop.YIELD if over else None
 
-    def _trails(self, stop: Stop, transfer: WriteTransfer) -> bool:
-        """Whether the Terminate goes out right behind the last requests: a round trip less for who waits.
+    def _let_trail(self, stop: Stop, transfer: WriteTransfer) -> bool:
+        """Have the Terminate go out right behind the last requests if that is right; return whether it does.
+
+        It is a round trip less for who waits.
         Servers carry them out in order; what gets lost is sent when the file is open again. Where others'
         paths cause refusals, the answers are waited for: that alone sets it right."""
         if stop is not Stop.YIELD or self._engine.traits.wo_truncates is not False:
@@ -508,11 +510,12 @@ class Upload(SessionUser):
         self._driver.cancel(transfer)
         return transfer.error
 
-    def _note_refusal(self, transfer: WriteTransfer, error: MavftpfsError) -> None:
-        """A refusal that means a lost session may mean a full card, too: the same place twice is enough.
+    def _check_refusal(self, transfer: WriteTransfer, error: MavftpfsError) -> None:
+        """A refusal that means a lost session may mean a full card, too: raise it where it is the second one
+        at the same place.
 
         Raises:
-            FtpNak: it was the same place.
+            FtpNak.
         """
         nak = error.__cause__
         if isinstance(nak, FtpNak) and nak.code == NakCode.FAIL and transfer.failed_at is not None:
@@ -551,7 +554,7 @@ class Upload(SessionUser):
         last = self._end_transfer()
         if last is not None and transfer is not None:
             self._engine.traits.paths_disarm |= is_disarmed(last)
-            self._note_refusal(transfer, last)
+            self._check_refusal(transfer, last)
         if not ours or isinstance(last, SessionLost):
             raise SessionLost("the vehicle had closed the session before", by_server=True) from last
         self._source.check_point()

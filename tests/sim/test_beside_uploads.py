@@ -414,7 +414,7 @@ async def test_outside_the_whitelist_stays_refused(autojump: MockClock) -> None:
             await upload.finish()
         assert (refusal.value.opcode, refusal.value.code) == (Opcode.WRITE_FILE, 9)
         assert connection.engine.stats.by_opcode[Opcode.LIST_DIRECTORY] == 1, "the buffer was set right once"
-        await upload.abort()
+        await upload.end()
     assert here.vehicle.server.open_sessions == 0
 
 

@@ -67,7 +67,7 @@ async def write(connection: Connection, here: World) -> None:
     source = MemorySource(DATA)
     upload = await connection.store.open_upload(path, source)
     await upload.finish()
-    await upload.abort()
+    await upload.end()
     assert here.tree.data(path) == DATA
 
 

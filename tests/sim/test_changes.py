@@ -173,7 +173,7 @@ async def test_an_upload_makes_room_for_a_change_of_its_path(
         await connection.store.remove(path(profile, "file"))
         assert open_then == [[]]
         assert not source.todo.empty  # it did not wait for the upload's end
-        await upload.abort()
+        await upload.end()
     assert here.vehicle.server.open_sessions == 0
 
 
@@ -188,7 +188,7 @@ async def test_what_may_still_be_open_is_closed_first_too(profile: str, autojump
         upload = await connection.store.open_upload(path(profile, "new"), MemorySource(b"x"))
         with pytest.raises(RequestTimeout):
             await upload.finish()
-        await upload.abort()
+        await upload.end()
         faults.cut_after(None)
         assert here.vehicle.server.open_sessions == 1
         faults.at(Opcode.REMOVE_FILE, lambda: open_then.append(here.vehicle.server.open_paths))

@@ -100,7 +100,7 @@ class Copy:
         assert source.acked.total + source.proven.total > acked, "the upload goes on"
         there = self.world.tree.data(target)
         assert all(there[start:stop] == self.data[start:stop] for start, stop in source.proven)
-        await upload.abort()
+        await upload.end()
         return waits
 
     async def _sample(self, connection: Connection, kind: str) -> list[float]:

@@ -249,7 +249,7 @@ async def test_never_more_is_written_than_a_short_queue_holds(
     async with here.connection() as connection:
         upload = await connection.store.open_upload(b"/d/f", source)
         await upload.finish()
-        await upload.abort()
+        await upload.end()
     assert here.tree.data(b"/d/f") == source.content
     assert here.vehicle.server.firmware.dropped_requests == 0
     assert connection.engine.stats.retransmissions == 0
@@ -335,7 +335,7 @@ async def last_write(here: World) -> float:
         upload = await connection.store.open_upload(b"/d/f", source)
         await upload.finish()
         took = trio.current_time() - almost
-        await upload.abort()
+        await upload.end()
     assert here.tree.data(b"/d/f") == source.content
     return took
 

@@ -184,7 +184,7 @@ async def test_a_full_card_is_told(profile: str, autojump: MockClock) -> None:
         here.tree.capacity = None
         await upload.finish()
         assert source.all_proven or profile.startswith("mavsdk")
-        await upload.abort()
+        await upload.end()
     assert here.vehicle.server.open_sessions == 0
 
 
@@ -222,7 +222,7 @@ async def test_a_local_disk_that_fails_ends_one_upload_and_nothing_else(
         source.bad = None
         await upload.finish()
         assert source.all_proven
-        await upload.abort()
+        await upload.end()
     assert here.tree.data(path(profile, "new")) == bytes(source.content)
     assert here.vehicle.server.open_sessions == 0
 
@@ -245,7 +245,7 @@ async def test_arming_ends_it_and_disarming_lets_it_go_on(profile: str, autojump
                 other = await start(connection, profile, MemorySource(content(60_000)), "third")
                 with pytest.raises(Armed):
                     await other.finish()
-                await other.abort()
+                await other.end()
 
             nursery.start_soon(finish)
             nursery.start_soon(finish_other)
@@ -277,7 +277,7 @@ async def test_arming_ends_it_and_disarming_lets_it_go_on(profile: str, autojump
         source.add(b"more")
         with pytest.raises(Armed):
             await upload.finish()
-        await upload.abort()
+        await upload.end()
         assert source.in_flight.empty
     assert here.tree.data(path(profile, "new")) == data
 
@@ -356,7 +356,7 @@ async def test_a_long_upload_proves_what_it_has_from_time_to_time(autojump: Mock
         await trio.sleep(130)
         assert source.checkpoints == 2
         assert 40_000 < source.proven.total < 130_000
-        await upload.abort()
+        await upload.end()
 
 
 @pytest.mark.parametrize("probed", [False, True], ids=["unknown", "probed"])
@@ -401,7 +401,7 @@ async def test_a_server_that_always_loses_the_session_is_given_up(profile: str, 
                 await upload.finish()
             nursery.cancel_scope.cancel()
         assert faults.requests.count(Opcode.CREATE_FILE) < 30
-        await upload.abort()
+        await upload.end()
 
 
 @pytest.mark.parametrize("profile", taking_turns(EVERY_PROFILE))
@@ -545,8 +545,8 @@ async def test_abort_leaves_nothing_open_and_asks_for_nothing(
         source = MemorySource(content(60_000))
         upload = await start(connection, profile, source)
         await trio.sleep(pause)
-        await upload.abort()
-        await upload.abort()
+        await upload.end()
+        await upload.end()
         assert source.in_flight.empty
         assert here.vehicle.server.open_sessions == 0
         left = source.todo.total

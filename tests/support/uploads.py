@@ -29,7 +29,7 @@ async def put(connection: Connection, target: bytes, data: bytes) -> None:
     upload = await connection.store.open_upload(target, source)
     await upload.finish()
     assert source.all_proven
-    await upload.abort()
+    await upload.end()
 
 
 @asynccontextmanager
