@@ -1,10 +1,19 @@
-"""`python -m mavftpfs`."""
+"""The entry point of `mavftpfs`, and of `python -m mavftpfs`."""
 
 from __future__ import annotations
 
 import sys
 
-from mavftpfs.cli import main
+
+def main() -> int:
+    """Run a command; returns the exit code. Ctrl-C ends it without a traceback, also while modules load."""
+    try:
+        from mavftpfs import cli
+
+        return cli.main()
+    except KeyboardInterrupt:
+        return 130
+
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -25,6 +25,7 @@ from mavftpfs.cache.draft import Draft
 from mavftpfs.cache.reserved import new_owner
 from mavftpfs.cache.spool import remove
 from mavftpfs.shared.private import make_private_directory
+from mavftpfs.shared.readable import readable
 
 log = logging.getLogger("mavftpfs.cache")
 
@@ -200,7 +201,7 @@ def describe(
         "whole": draft.whole,
         "held": list(draft.held),
         "size_on_vehicle": None if draft.base is None else draft.base.size,
-        "error": None if error is None else str(error),
+        "error": None if error is None else readable(str(error)),
         "at": wall(),
     }
 

@@ -35,6 +35,7 @@ from mavftpfs.cache.throttle import Throttle
 from mavftpfs.cache.writefile import Parts, ReadFile, WriteFile
 from mavftpfs.shared.errors import AlreadyExists, IsADirectory, MavftpfsError, NoSpace, NotFound, SpoolFailed
 from mavftpfs.shared.model import EntryKind, require_listable
+from mavftpfs.shared.readable import readable
 
 log = logging.getLogger("mavftpfs.cache")
 
@@ -267,7 +268,7 @@ class Writeback:
         """Return counters; bytes_... in bytes. `undelivered`: of whole files; `held`: what they take here."""
         nodes = list(self._context.nodes)
         sizes = [node.draft.size for node in nodes if node.undelivered and node.draft is not None]
-        errors = {n.path: str(n.error) for n in nodes if n.error is not None}
+        errors = {n.path: readable(str(n.error)) for n in nodes if n.error is not None}
         return {
             "bytes_held": self._context.spool.in_memory + self._context.spool.on_disk,
             "bytes_held_on_disk": self._context.spool.on_disk,

@@ -220,6 +220,8 @@ def _download(
 
 def _here(outcome: download.Outcome) -> str:
     wanted, here = len(outcome.wanted) + len(outcome.here), len(outcome.fetched) + len(outcome.here)
+    if not wanted:
+        return "nothing was fetched yet"
     return f"{here} of {wanted} files are here; the next run goes on with what came of the others"
 
 
@@ -277,7 +279,9 @@ def put(args: Args) -> int:
 
     def stopped() -> str:
         line = f"{bar.files_done} of {bar.files} files are on the vehicle"
-        return f"{line}; {bar.name} is not, and what was there under that name still is" if bar.name else line
+        return (
+            f"{line}; {bar.name} was on its way: look what is there before you use it" if bar.name else line
+        )
 
     with _on_interrupt(stopped), progress.shown(bar):
         with_session(args, work, component, writing=True)

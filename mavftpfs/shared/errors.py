@@ -195,7 +195,14 @@ _REASONS = {
     9: "it is protected",
     10: "it does not exist",
 }
-"""What people are told, by opcode and NAK code; the numbers stand behind it."""
+_ERRNOS = {
+    5: "its card reports an error",
+    13: "permission denied",
+    28: "the card is full",
+    30: "it is read-only",
+}
+"""What people are told, by opcode, NAK code and errno (these are the same on all systems); the numbers stand
+behind it."""
 
 
 class FtpNak(MavftpfsError):
@@ -214,6 +221,7 @@ class FtpNak(MavftpfsError):
     ) -> None:
         numbers = f"opcode {opcode}, NAK {code}" + ("" if server_errno is None else f", errno {server_errno}")
         what, why = _REQUESTS.get(opcode, "do that"), _REASONS.get(code, "without a known reason")
+        why = why if server_errno is None else _ERRNOS.get(server_errno, why)
         super().__init__(f"the vehicle refused to {what}: {why} ({numbers})")
         self.opcode = opcode
         self.code = code

@@ -146,6 +146,9 @@ async def test_nor_one_that_others_made_meanwhile(profile: str, autojump: MockCl
         with pytest.raises(AlreadyExists):
             await file.release()
         assert here.data(ONE) == OLD_PAGE
+        told = tree.status()["errors"]
+        assert isinstance(told, dict)
+        assert told["/d/å"].startswith("'/d/å' "), "a name, not its bytes"
 
 
 # --- rm of an open file where nothing can be renamed

@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 import trio
 
-from mavftpfs import cli, commands, compose, control, report
+from mavftpfs import __main__, cli, commands, compose, control, report
 from mavftpfs.fuse.options import MountOptions
 from mavftpfs.oneshot.verbs import until_interrupted
 from mavftpfs.shared import errors
@@ -166,6 +166,14 @@ def test_a_reader_that_leaves_is_no_error(tmp_path: Path) -> None:
         assert child.stderr is not None
         assert child.stderr.read() == b""
         assert child.wait(90) == 0
+
+
+def test_ctrl_c_while_modules_load_is_no_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted() -> int:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cli, "main", interrupted)
+    assert __main__.main() == 130
 
 
 def test_commands_that_mount_nothing_need_no_libfuse() -> None:
