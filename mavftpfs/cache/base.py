@@ -1,4 +1,4 @@
-"""The vehicle's file below a draft: reads it, fetches it, notices that it is another. Layer: cache."""
+"""The vehicle's file below a draft: reads it, and fetches it. Layer: cache."""
 
 from __future__ import annotations
 
@@ -6,13 +6,10 @@ import zlib
 from dataclasses import replace
 
 from mavftpfs.cache.context import Context
-from mavftpfs.cache.directories import Directory
-from mavftpfs.cache.draft import Draft, State
+from mavftpfs.cache.draft import Draft
 from mavftpfs.cache.files import VersionHandle
 from mavftpfs.cache.nodes import Node
-from mavftpfs.cache.versions import became_another
 from mavftpfs.shared.errors import FileChanged, FtpNak, LocalProtocolError, NotFound
-from mavftpfs.shared.model import split
 
 STEP = 128 * 1024
 """Bytes fetched at once."""
@@ -57,7 +54,7 @@ async def read_base(context: Context, node: Node, start: int, stop: int) -> byte
             if node.base is not base:
                 continue  # we changed it there ourselves meanwhile
             if isinstance(error, FileChanged) and node.draft is not None and not node.changing:
-                _on_replaced(context, node, node.draft)
+                context.on_replaced(node, node.draft)
             raise
 
 
@@ -83,28 +80,3 @@ async def fetch(context: Context, node: Node, draft: Draft) -> None:
         value = zlib.crc32(data, value)
         draft.fill(at, data)
     draft.base = replace(draft.base, crc32=value ^ 0xFFFFFFFF)
-
-
-def on_listed(context: Context, path: bytes, directory: Directory) -> None:
-    """A directory was listed: notice which files others replaced since they were opened or delivered here."""
-    for node in context.nodes:
-        parent, name = split(node.path)
-        entry = directory.entries.get(name) if parent == path else None
-        draft = node.draft
-        if entry is None or draft is None or draft.base is None or directory.listed_at <= node.known_at:
-            continue
-        if node.changing or draft.state not in (State.CLEAN, State.DIRTY):
-            continue
-        if became_another(draft.base.size, draft.base.mtime, entry):
-            _on_replaced(context, node, draft)
-        elif draft.base.mtime is None and entry.size == draft.base.size:
-            draft.base = replace(draft.base, mtime=entry.mtime)
-
-
-def _on_replaced(context: Context, node: Node, draft: Draft) -> None:
-    if node.delivery is not None:
-        return  # its delivery looks for itself
-    draft.lose_base()
-    if draft.state is State.STALE and not draft.lacked:
-        context.nodes.replaced(node)
-        context.files.forget_pages(node.path)

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from mavftpfs.cache.attributes import SECOND, Times
-from mavftpfs.cache.directories import Directories
-from mavftpfs.cache.draft import State
+from mavftpfs.cache.directories import Directories, Directory
+from mavftpfs.cache.draft import Draft, State
 from mavftpfs.cache.files import Files
-from mavftpfs.cache.nodes import Nodes
+from mavftpfs.cache.nodes import Node, Nodes
 from mavftpfs.cache.options import CacheOptions
 from mavftpfs.cache.pathlocks import PathLocks
 from mavftpfs.cache.remote import VehicleStore
 from mavftpfs.cache.reserved import OwnNames
 from mavftpfs.cache.spool import Spool
+from mavftpfs.cache.versions import became_another
 from mavftpfs.shared.errors import Armed, FileBusy
 from mavftpfs.shared.model import DirEntry, EntryKind, split
 
@@ -72,3 +73,28 @@ class Context:
         """Return whether we are changing what the vehicle has under a path, or may have done so in part."""
         node = self.nodes.get(path)
         return path in self.own.torn or (node is not None and node.changing)
+
+    def on_listed(self, path: bytes, directory: Directory) -> None:
+        """A directory was listed: notice which files others replaced since they were opened or delivered
+        here."""
+        for node in self.nodes:
+            parent, name = split(node.path)
+            entry = directory.entries.get(name) if parent == path else None
+            draft = node.draft
+            if entry is None or draft is None or draft.base is None or directory.listed_at <= node.known_at:
+                continue
+            if node.changing or draft.state not in (State.CLEAN, State.DIRTY):
+                continue
+            if became_another(draft.base.size, draft.base.mtime, entry):
+                self.on_replaced(node, draft)
+            elif draft.base.mtime is None and entry.size == draft.base.size:
+                draft.base = replace(draft.base, mtime=entry.mtime)
+
+    def on_replaced(self, node: Node, draft: Draft) -> None:
+        """Others replaced the vehicle's file that a draft lies over."""
+        if node.delivery is not None:
+            return  # its delivery looks for itself
+        draft.lose_base()
+        if draft.state is State.STALE and not draft.lacked:
+            self.nodes.replaced(node)
+            self.files.forget_pages(node.path)

@@ -15,7 +15,6 @@ from random import Random
 
 import trio
 
-from mavftpfs.cache.base import on_listed
 from mavftpfs.cache.context import Context
 from mavftpfs.cache.delivery import PASSING, Deliverer, may_pass
 from mavftpfs.cache.directories import Directories
@@ -101,7 +100,7 @@ class Writeback:
         if not options.read_only:
             directories.on_swept = cleaner.on_swept
         files.is_changing = context.is_changing
-        directories.on_listed.append(partial(on_listed, context))
+        directories.on_listed.append(context.on_listed)
 
     # --- opening
 
