@@ -8,9 +8,9 @@ import sys
 def main() -> int:
     """Run a command; returns the exit code. Ctrl-C ends it without a traceback, also while modules load."""
     try:
-        from mavftpfs import cli
+        from mavftpfs.cli import main as command_line
 
-        return cli.main()
+        return command_line.main()
     except KeyboardInterrupt:
         return 130
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from mavftpfs.mountpoint import mounts
+from mavftpfs.client.mountpoint import mounts
 from tests.support.logs import suspects
 from tests.support.mounts import abort_mount, processes_in, wait_until
 from tests.support.vehicles import PROJECT

@@ -16,7 +16,7 @@ from typing import Any
 
 import pytest
 
-from mavftpfs.control import ask
+from mavftpfs.client.control import ask
 from tests.support.mounts import abort_mount, wait_until
 from tests.support.vehicles import PROJECT
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from mavftpfs.cache.recovery import SpoolDirectory
-from mavftpfs.farewell import spool_base
+from mavftpfs.client.leftovers import spool_base
 from mavftpfs.link.messages import Address
 from mavftpfs.shared.errors import ExitCode
 from tests.mount.conftest import Field

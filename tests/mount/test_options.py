@@ -148,7 +148,7 @@ def helper_in(folder: Path) -> Path:
     for name, function in (("mavftpfs", "main"), ("mount.mavftpfs", "mount_helper")):
         program = folder / name
         program.write_text(
-            f"#!{sys.executable}\nimport sys\nfrom mavftpfs import cli\nsys.exit(cli.{function}())\n"
+            f"#!{sys.executable}\nimport sys\nfrom mavftpfs.cli import main\nsys.exit(main.{function}())\n"
         )
         program.chmod(0o755)
     return folder

@@ -8,7 +8,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from mavftpfs import install
+from mavftpfs.cli import install
 from tests.mount.conftest import Field
 from tests.support.mounts import abort_mount, mounted_at, wait_until
 

@@ -14,8 +14,8 @@ from pathlib import Path
 
 import pytest
 
-from mavftpfs import control
 from mavftpfs.cache.reserved import is_reserved
+from mavftpfs.client import control
 from tests.mount.conftest import Field
 from tests.support.mounts import Mount, abort_mount, mavftpfs, mounted_at, wait_until
 from tests.support.trees import content

@@ -17,10 +17,10 @@ from typing import Any, cast
 
 import trio
 
-from mavftpfs.compose import Attached
-from mavftpfs.fuse.options import MountOptions
+from mavftpfs.client.connect import Attached
+from mavftpfs.client.options import MountOptions
 from mavftpfs.link.uri import parse_source
-from mavftpfs.mount import MountRequest, serve_mount
+from mavftpfs.mount.kernel import MountRequest, serve_mount
 from tests.ops.faketree import FakeTree
 
 VALID_FOR = 1000.0

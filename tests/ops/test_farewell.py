@@ -13,10 +13,11 @@ import pytest
 import trio
 import trio.testing
 
-from mavftpfs import farewell
 from mavftpfs.cache.recovery import SpoolDirectory
 from mavftpfs.cache.tree import Tree
+from mavftpfs.client import leftovers
 from mavftpfs.link.messages import Address
+from mavftpfs.mount import farewell
 from tests.ops.faketree import FakeTree
 
 
@@ -82,14 +83,14 @@ async def test_a_recovery_directory_that_cannot_be_made_is_said() -> None:
 
 @pytest.mark.holds("promise 3")
 def test_a_spool_is_private_and_by_vehicle(state: Path) -> None:
-    with farewell.spool_for(Address(1, 2)) as one, farewell.spool_for(Address(1, 2)) as two:
+    with leftovers.spool_for(Address(1, 2)) as one, leftovers.spool_for(Address(1, 2)) as two:
         assert one is not None
         assert two is not None
         assert one.path != two.path
         assert one.path.parent == two.path.parent == state / "mavftpfs" / "spool" / "1-2"
         for path in (one.path, one.path.parent, one.path.parent.parent, state / "mavftpfs"):
             assert stat.S_IMODE(path.stat().st_mode) == 0o700
-    with farewell.spool_for(None) as unknown:
+    with leftovers.spool_for(None) as unknown:
         assert unknown is not None
         assert unknown.path.parent.name == "unknown"
 
@@ -100,10 +101,10 @@ def test_what_a_dead_mount_left_is_named_once(state: Path) -> None:
     (dead.path / "000001.data").write_bytes(b"held")
     dead.close()
     spool = SpoolDirectory(base, random.Random(2))
-    line = farewell.rescue(spool, "tcp:x:1")
+    line = leftovers.rescue(spool, "tcp:x:1")
     assert line.startswith("1 file(s) of an earlier mount did not reach the vehicle; they are in ")
     assert [path.read_bytes() for path in Path(line.rpartition(" in ")[2]).iterdir()] == [b"held"]
-    assert farewell.rescue(spool, "tcp:x:1") == ""
+    assert leftovers.rescue(spool, "tcp:x:1") == ""
     spool.close()
 
 
@@ -113,5 +114,5 @@ def test_what_cannot_be_moved_is_said(state: Path, monkeypatch: pytest.MonkeyPat
 
     spool = SpoolDirectory(state / "base", random.Random(1))
     monkeypatch.setattr(SpoolDirectory, "rescue", fail)
-    assert "the disk is full" in farewell.rescue(spool, "x")
+    assert "the disk is full" in leftovers.rescue(spool, "x")
     spool.close()

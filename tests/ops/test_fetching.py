@@ -10,8 +10,8 @@ from typing import cast
 import pytest
 import trio
 
-from mavftpfs.oneshot.download import Downloads, Outcome, Wish
-from mavftpfs.oneshot.fetch import (
+from mavftpfs.client.download import Downloads, Outcome, Wish
+from mavftpfs.client.fetch import (
     Fetched,
     Fetcher,
     NotProvenYet,
@@ -20,8 +20,8 @@ from mavftpfs.oneshot.fetch import (
     known_time,
     part_of,
 )
-from mavftpfs.oneshot.files import Files, Session
-from mavftpfs.oneshot.progress import Progress
+from mavftpfs.client.files import Files, Session
+from mavftpfs.client.progress import Progress
 from mavftpfs.shared.errors import (
     Armed,
     DataUnproven,

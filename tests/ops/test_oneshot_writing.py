@@ -9,10 +9,10 @@ from typing import cast
 import pytest
 import trio
 
-from mavftpfs.oneshot import names
-from mavftpfs.oneshot.files import Files, Session
-from mavftpfs.oneshot.progress import Progress
-from mavftpfs.oneshot.upload import collect, put_paths
+from mavftpfs.client import names
+from mavftpfs.client.files import Files, Session
+from mavftpfs.client.progress import Progress
+from mavftpfs.client.upload import collect, put_paths
 from mavftpfs.shared.errors import (
     AlreadyExists,
     CrossDevice,

@@ -16,8 +16,10 @@ import trio.testing
 from pyfuse3 import FUSEError, RequestContext
 
 from mavftpfs.cache.tree import Tree
-from mavftpfs.fuse.handles import ROOT_INO, XATTR_CRC32, XATTR_STATUS, Presentation, Space
-from mavftpfs.fuse.operations import (
+from mavftpfs.client.connect import Space
+from mavftpfs.client.mountpoint import XATTR_CRC32, XATTR_STATUS
+from mavftpfs.mount.handles import ROOT_INO, Presentation
+from mavftpfs.mount.operations import (
     UNKNOWN_SPACE,
     Operations,
 )
@@ -264,7 +266,7 @@ CALLS: dict[str, Call] = {
 
 
 def _root() -> Any:
-    from mavftpfs.fuse.handles import DirectoryHandle
+    from mavftpfs.mount.handles import DirectoryHandle
 
     return DirectoryHandle(ROOT_INO)
 

@@ -12,8 +12,8 @@ import pyfuse3
 import pytest
 from pyfuse3 import EntryAttributes, SetattrFields
 
-from mavftpfs.fuse.handles import ROOT_INO
-from mavftpfs.fuse.operations import Operations
+from mavftpfs.mount.handles import ROOT_INO
+from mavftpfs.mount.operations import Operations
 from mavftpfs.shared.errors import Armed, NoSpace, RequestTimeout
 from tests.ops.faketree import MTIME, FakeFile, FakeTree
 from tests.ops.test_operations import CTX, failure, ino_of, operations, some_tree

@@ -13,9 +13,9 @@ import pytest
 import trio
 from trio.testing import MockClock
 
-from mavftpfs import compose
 from mavftpfs.cache.recovery import SpoolDirectory
-from mavftpfs.fuse.options import MountOptions
+from mavftpfs.client import connect as compose
+from mavftpfs.client.options import MountOptions
 from mavftpfs.link.framing import MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES, MAV_CMD_REQUEST_MESSAGE, Framer
 from mavftpfs.link.messages import (
     MAV_AUTOPILOT_INVALID,

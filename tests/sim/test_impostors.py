@@ -13,7 +13,7 @@ import trio
 from trio.testing import MockClock
 
 from mavftpfs.cache.tree import Tree
-from mavftpfs.compose import subscribe
+from mavftpfs.client.connect import subscribe
 from mavftpfs.link.messages import MAV_AUTOPILOT_INVALID, Address
 from mavftpfs.link.opening import open_link
 from mavftpfs.link.udp import UdpLink

@@ -18,7 +18,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from mavftpfs.control import ControlError, ask, find_socket, own_directories
+from mavftpfs.client.control import ControlError, ask, find_socket, own_directories
 from tests.support.logs import assert_clean, suspects
 from tests.support.vehicles import PROJECT, Process
 

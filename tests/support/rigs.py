@@ -21,7 +21,7 @@ from mavftpfs.cache.options import CacheOptions
 from mavftpfs.cache.recovery import SpoolDirectory
 from mavftpfs.cache.reserved import is_reserved
 from mavftpfs.cache.tree import Tree
-from mavftpfs.compose import subscribe
+from mavftpfs.client.connect import subscribe
 from mavftpfs.protocol.payload import Opcode
 from mavftpfs.session.connection import Connection, ConnectOptions
 from mavftpfs.shared.errors import AlreadyExists, RequestTimeout, VehicleLost

@@ -15,9 +15,13 @@ from typing import Any
 import pytest
 import trio
 
-from mavftpfs import __main__, cli, commands, compose, control, report
-from mavftpfs.fuse.options import MountOptions
-from mavftpfs.oneshot.verbs import until_interrupted
+from mavftpfs import __main__
+from mavftpfs.cli import commands
+from mavftpfs.cli import main as cli
+from mavftpfs.cli.verbs import until_interrupted
+from mavftpfs.client import connect as compose
+from mavftpfs.client import control, status
+from mavftpfs.client.options import MountOptions
 from mavftpfs.shared import errors
 from mavftpfs.shared.errors import (
     ExitCode,
@@ -152,7 +156,7 @@ def test_a_bug_is_one_line_without_d(
 
 def test_a_reader_that_leaves_is_no_error(tmp_path: Path) -> None:
     code = (
-        "import sys; from mavftpfs import cli, commands\n"
+        "import sys; from mavftpfs.cli import commands, main as cli\n"
         "def crowd(args):\n    [print('x' * 1000) for _ in range(1000)]\n"
         "cli._COMMANDS['ls'] = (cli._ls_parser, crowd)\n"
         "sys.exit(cli.main(['ls', 'udpin:127.0.0.1:0']))"
@@ -177,7 +181,7 @@ def test_ctrl_c_while_modules_load_is_no_traceback(monkeypatch: pytest.MonkeyPat
 
 
 def test_commands_that_mount_nothing_need_no_libfuse() -> None:
-    code = "import sys; sys.modules['pyfuse3'] = None; import mavftpfs.oneshot.verbs, mavftpfs.demo"
+    code = "import sys; sys.modules['pyfuse3'] = None; import mavftpfs.cli.verbs, mavftpfs.cli.demo"
     subprocess.run([sys.executable, "-c", code], check=True, timeout=90)
 
 
@@ -208,7 +212,7 @@ def sockets(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     directory = tmp_path / "run"
     directory.mkdir()
     monkeypatch.setattr(control, "own_directories", lambda: [directory])
-    monkeypatch.setattr(report, "mounts", dict)  # not those of other tests that run just now
+    monkeypatch.setattr(status, "mounts", dict)  # not those of other tests that run just now
     return directory
 
 

@@ -9,10 +9,10 @@ from typing import Any
 import pytest
 
 from mavftpfs.cache.options import CacheOptions
-from mavftpfs.compose import cache_options, connect_options
-from mavftpfs.fuse.options import VALUES, MountOptions, fuse_words
+from mavftpfs.client.connect import cache_options, connect_options
+from mavftpfs.client.options import VALUES, MountOptions, fuse_words
 from mavftpfs.link.uri import parse_source
-from mavftpfs.mount import presentation
+from mavftpfs.mount.kernel import presentation
 from mavftpfs.session.connection import ConnectOptions
 
 OTHER: dict[str, Any] = {

@@ -17,8 +17,8 @@ import pytest
 import trio
 import trio.testing
 
-from mavftpfs import control
-from mavftpfs.control import (
+from mavftpfs.client import control
+from mavftpfs.client.control import (
     Command,
     ControlError,
     ControlServer,

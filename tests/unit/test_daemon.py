@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from mavftpfs import daemon
+from mavftpfs.mount import daemon
 from mavftpfs.shared.readable import readable
 
 
@@ -22,7 +22,7 @@ def run(work: str, tmp_path: Path, timeout: float = 90.0) -> subprocess.Complete
     """Run `in_background(work)` in a fresh process; the body of `work` may use `report`, `here` and os."""
     code = f"""
 import os, pathlib, signal, sys, time
-from mavftpfs.daemon import in_background
+from mavftpfs.mount.daemon import in_background
 here = pathlib.Path({str(tmp_path)!r})
 def work(report):
 {textwrap.indent(textwrap.dedent(work), "    ")}
@@ -85,7 +85,7 @@ def test_interrupting_the_parent_ends_the_child(tmp_path: Path, form: str, numbe
     at_fork = form.format(number.name)
     code = f"""
 import os, pathlib, signal, sys, time
-from mavftpfs.daemon import in_background
+from mavftpfs.mount.daemon import in_background
 {at_fork}
 def work(report):
     pathlib.Path({str(tmp_path / "pid")!r}).write_text(str(__import__("os").getpid()))

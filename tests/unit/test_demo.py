@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from mavftpfs import demo
+from mavftpfs.cli import demo
 
 
 def test_an_interrupt_while_a_process_is_being_started_leaves_none(

@@ -12,7 +12,7 @@ import pytest
 import trio
 import trio.testing
 
-from mavftpfs.mount import never_blocking
+from mavftpfs.mount.kernel import never_blocking
 
 pytestmark = pytest.mark.holds("promise 4")
 

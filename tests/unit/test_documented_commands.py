@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from mavftpfs import cli
-from mavftpfs.fuse.options import parse_options
+from mavftpfs.cli import main as cli
+from mavftpfs.client.options import parse_options
 from mavftpfs.link.uri import parse_source
 
 PROJECT = Path(__file__).parents[2]

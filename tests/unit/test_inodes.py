@@ -7,8 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
-from mavftpfs.fuse import handles
-from mavftpfs.fuse.handles import ROOT_INO, InodeTable
+from mavftpfs.mount import handles
+from mavftpfs.mount.handles import ROOT_INO, InodeTable
 
 
 def test_a_path_keeps_its_number_over_forget_and_mounts() -> None:

@@ -8,8 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from mavftpfs import cli, install
-from mavftpfs.fuse.options import option_help
+from mavftpfs.cli import install
+from mavftpfs.cli import main as cli
+from mavftpfs.client.options import option_help
 from mavftpfs.shared.errors import EXIT_CODES, ExitCode
 
 COMMANDS = [name for name in cli._COMMANDS if name != "mount"]

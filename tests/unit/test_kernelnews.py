@@ -10,8 +10,8 @@ import pytest
 import trio
 import trio.testing
 
-from mavftpfs.fuse.handles import InodeTable
-from mavftpfs.mount import Invalidator
+from mavftpfs.mount.handles import InodeTable
+from mavftpfs.mount.kernel import Invalidator
 
 
 class Kernel:

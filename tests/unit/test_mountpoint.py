@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from mavftpfs.mountpoint import (
+from mavftpfs.client.mountpoint import (
     Mounted,
     canonical,
     check_fuse,

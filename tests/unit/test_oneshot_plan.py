@@ -7,14 +7,14 @@ from pathlib import Path
 
 import pytest
 
+from mavftpfs.cli.verbs import parse_date
+from mavftpfs.client import download, fetch
+from mavftpfs.client.fetch import Verify, Wanted
+from mavftpfs.client.files import same_link
+from mavftpfs.client.names import parse_paths
+from mavftpfs.client.scan import describe_peer
 from mavftpfs.link.messages import Address, AutopilotVersion, Heartbeat
 from mavftpfs.link.uri import parse_source
-from mavftpfs.oneshot import download, fetch
-from mavftpfs.oneshot.fetch import Verify, Wanted
-from mavftpfs.oneshot.files import same_link
-from mavftpfs.oneshot.names import parse_paths
-from mavftpfs.oneshot.scan import describe_peer
-from mavftpfs.oneshot.verbs import parse_date
 from mavftpfs.shared.errors import UsageError
 
 MAY, JUNE = 1_714_566_896, 1_717_245_296

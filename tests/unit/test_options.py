@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mavftpfs.cache.options import DEFAULT_LOCAL, CacheOptions
-from mavftpfs.fuse.options import (
+from mavftpfs.client.options import (
     FLAGS,
     IGNORED_WORDS,
     KERNEL_WORDS,

@@ -14,9 +14,9 @@ from trio.testing import MockClock
 from mavftpfs.cache.kept_disk import FileKey, KeptDisk
 from mavftpfs.cache.recovery import SpoolDirectory
 from mavftpfs.cache.spool import Spool, SpoolContent
-from mavftpfs.daemon import log_to_file
-from mavftpfs.farewell import keep_the_rest
-from mavftpfs.trace import JsonTrace, TlogWriter
+from mavftpfs.client.trace import JsonTrace, TlogWriter
+from mavftpfs.mount.daemon import log_to_file
+from mavftpfs.mount.farewell import keep_the_rest
 from tests.support.mounting import mounted
 from tests.support.worlds import world
 from tests.unit.test_daemon import restored_logging

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from mavftpfs.oneshot.progress import Progress, current, totals
+from mavftpfs.cli.drawing import current, totals
+from mavftpfs.client.progress import Progress
 
 
 class Clock:

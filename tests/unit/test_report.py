@@ -10,7 +10,8 @@ from typing import Any
 import pytest
 import trio
 
-from mavftpfs.report import Watcher, delivery_line, panel, screen, snapshot, status_lines
+from mavftpfs.cli.report import delivery_line, panel, screen, status_lines
+from mavftpfs.client.status import Watcher, snapshot
 from mavftpfs.shared.readable import printable, readable_size, readable_time
 
 VEHICLE = {

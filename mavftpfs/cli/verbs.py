@@ -1,4 +1,4 @@
-"""What each one-shot verb does with its words, and what it prints; `cli` parses them. Layer: top."""
+"""What each one-shot verb does with its words, and what it prints; `cli` parses them. Layer: cli."""
 
 from __future__ import annotations
 
@@ -18,16 +18,18 @@ from typing import Any, TypeVar
 
 import trio
 
-from mavftpfs import daemon
-from mavftpfs.commands import connection_of, left_by_killed_mounts_line
-from mavftpfs.compose import open_sinks, plain_nursery
-from mavftpfs.farewell import recovered_directory
-from mavftpfs.fuse.options import parse_options
-from mavftpfs.oneshot import download, names, progress, upload
-from mavftpfs.oneshot import recover as recovering
-from mavftpfs.oneshot import scan as scanning
-from mavftpfs.oneshot.fetch import Fetched, Fetcher
-from mavftpfs.oneshot.files import Session, Target, mountpoint_of
+from mavftpfs.cli import drawing
+from mavftpfs.cli.commands import connection_of, left_by_killed_mounts_line
+from mavftpfs.client import download, names, upload
+from mavftpfs.client import recover as recovering
+from mavftpfs.client import scan as scanning
+from mavftpfs.client.connect import open_sinks, plain_nursery
+from mavftpfs.client.fetch import Fetched, Fetcher
+from mavftpfs.client.files import Session, Target, mountpoint_of
+from mavftpfs.client.leftovers import recovered_directory
+from mavftpfs.client.options import parse_options
+from mavftpfs.client.progress import Progress
+from mavftpfs.mount import daemon
 from mavftpfs.shared.errors import ExitCode, MavftpfsError, UsageError, exit_code_for
 from mavftpfs.shared.readable import printable, readable, readable_size
 
@@ -183,7 +185,7 @@ def cat(args: Args) -> int:
         await trio.to_thread.run_sync(write, bytes(data), abandon_on_cancel=True)
 
     async def work(session: Session) -> None:
-        fetcher = Fetcher(session, progress.Progress(), args.verify)
+        fetcher = Fetcher(session, Progress(), args.verify)
         await download.Downloads(fetcher, outcome, _ignore, _say).cat(wanted, take)
 
     with_session(args, work, component)
@@ -208,13 +210,13 @@ def _download(
     tell: Callable[[Fetched], None] = _tell,
 ) -> None:
     """Bring files with progress on the screen; Ctrl-C says how many are here."""
-    bar = progress.Progress()
+    bar = Progress()
 
     async def work(session: Session) -> None:
         fetcher = Fetcher(session, bar, args.verify, getattr(args, "resume", True))
         await function(download.Downloads(fetcher, outcome, tell, _say))
 
-    with _on_interrupt(lambda: _here(outcome)), progress.shown(bar):
+    with _on_interrupt(lambda: _here(outcome)), drawing.shown(bar):
         with_session(args, work, component)
 
 
@@ -269,7 +271,7 @@ def put(args: Args) -> int:
     """Put files on the vehicle."""
     (path,), component = names.parse_paths([args.path])
     batches = [(local, upload.collect(local, recursive=args.recursive)) for local in args.locals]
-    bar = progress.Progress()
+    bar = Progress()
 
     def tell(remote: bytes, size: int) -> None:
         print(f"{_name(remote)}: {readable_size(size)}, delivered", flush=True)
@@ -283,7 +285,7 @@ def put(args: Args) -> int:
             f"{line}; {bar.name} was on its way: look what is there before you use it" if bar.name else line
         )
 
-    with _on_interrupt(stopped), progress.shown(bar):
+    with _on_interrupt(stopped), drawing.shown(bar):
         with_session(args, work, component, writing=True)
     return ExitCode.OK
 
@@ -334,7 +336,7 @@ def recover(args: Args) -> int:
         return ExitCode.OK
     if not wanted:
         raise UsageError("say which files: their names as `mavftpfs recover` lists them, or --all")
-    bar = progress.Progress()
+    bar = Progress()
 
     def tell(kept: recovering.Kept, there_already: bool) -> None:
         how = "was there already" if there_already else "is on the vehicle now, verified"
@@ -343,7 +345,7 @@ def recover(args: Args) -> int:
     async def work(session: Session) -> None:
         await recovering.put_back(session, wanted, bar, tell, force=args.force)
 
-    with progress.shown(bar):
+    with drawing.shown(bar):
         with_session(args, work, writing=True)
     return ExitCode.OK
 

@@ -1,4 +1,4 @@
-"""What outlives a mount that was written to: the spool, and what could not be delivered. Layer: top."""
+"""Where what no vehicle has lies on this machine: spools, and recovery directories. Layer: client."""
 
 from __future__ import annotations
 
@@ -6,20 +6,15 @@ import logging
 import os
 import re
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from random import SystemRandom
 
 from mavftpfs.cache.recovery import SpoolDirectory, left_in
-from mavftpfs.cache.tree import Tree
 from mavftpfs.link.messages import Address
-from mavftpfs.shared.errors import MavftpfsError
 
 log = logging.getLogger("mavftpfs.mount")
-
-DRAIN_LIMIT = 300.0
-"""Seconds to go on delivering after the kernel let go; a second signal ends it sooner."""
 
 
 def state_directory() -> Path:
@@ -38,43 +33,6 @@ def recovery_directory(source: str) -> Path:
     """Return a new name for what one mount leaves behind now."""
     what = re.sub(r"[^A-Za-z0-9._-]+", "_", source)[:60]
     return recovered_directory() / f"{time.strftime('%Y%m%d-%H%M%S')}-{os.getpid()}-{what}"
-
-
-def keep_the_rest(tree: Tree, directory: Path) -> str:
-    """Move what is still undelivered to a local directory; return the line that says so, or ""."""
-    left = tree.undelivered()
-    if not left:
-        return ""
-    lost = f"{len(left)} file(s) did not reach the vehicle"
-    try:
-        kept = tree.recover_to(directory)
-    except OSError as exc:
-        return f"{lost}, and {directory} is not writable: {exc.strerror}"
-    except MavftpfsError as exc:
-        return f"{lost}, and could not be moved to {directory}: {exc}"
-    if len(kept) == len(left):
-        return f"{lost}; they are kept in {directory}"
-    return (
-        f"{lost}; only {len(kept)} could be kept, in {directory}; "
-        "the log says why, and the next mount looks for the others"
-    )
-
-
-async def say_goodbye(tree: Tree, source: str, tell: Callable[[str], None]) -> None:
-    """Deliver or keep; `tell` gets the line that goes with exit code 4. Keeps also when cancelled."""
-    try:
-        waiting = tree.undelivered()
-        if waiting:
-            log.warning("delivering %d file(s) to the vehicle before ending", len(waiting))
-            await tree.drain(DRAIN_LIMIT)
-    finally:
-        message = keep_the_rest(tree, recovery_directory(source))
-        if message:
-            log.error("%s", message)
-            tell(message)
-
-
-# -- what an earlier mount left ---------------------------------------------------------------------
 
 
 def spool_base(vehicle: Address | None) -> Path:

@@ -1,4 +1,4 @@
-"""The command line: arguments, exit codes, one-line errors. Layer: top.
+"""The command line: arguments, exit codes, one-line errors. Layer: cli.
 
 What only one command needs is imported when it runs: a mount in the background should not hold rich or
 the simulator in memory.
@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import NoReturn
 
 import mavftpfs
-from mavftpfs import commands
-from mavftpfs.fuse.options import option_help
+from mavftpfs.cli import commands
+from mavftpfs.client.options import option_help
 from mavftpfs.shared.errors import ExitCode, MavftpfsError, UsageError, exit_code_for
 from mavftpfs.shared.readable import readable
 
@@ -346,7 +346,7 @@ def whole_parser() -> argparse.ArgumentParser:
 
 
 def _install(args: argparse.Namespace) -> int:
-    from mavftpfs.install import run
+    from mavftpfs.cli.install import run
 
     return run(args, whole_parser())
 
@@ -358,7 +358,7 @@ def _sim(args: argparse.Namespace) -> int:
 
 
 def _demo(args: argparse.Namespace) -> int:
-    from mavftpfs.demo import run
+    from mavftpfs.cli.demo import run
 
     return run()
 
@@ -367,7 +367,7 @@ def _verb(name: str) -> Run:
     """Return the command of that name without a mount."""
 
     def run(args: argparse.Namespace) -> int:
-        from mavftpfs.oneshot import verbs
+        from mavftpfs.cli import verbs
 
         command: Run = getattr(verbs, name)
         return command(args)

@@ -1,4 +1,4 @@
-"""Fetching one file so that it can go on after an interruption, and is proven. Layer: top.
+"""Fetching one file so that it can go on after an interruption, and is proven. Layer: client.
 
 What came lies beside the final name as NAME.part; the final name is given only to a whole file. A .part that
 an earlier run left is gone on with, and then the vehicle's CRC32 of the whole file must agree.
@@ -19,8 +19,8 @@ from typing import Literal
 
 import trio
 
-from mavftpfs.oneshot.files import READ_SIZE, Session
-from mavftpfs.oneshot.progress import Progress
+from mavftpfs.client.files import READ_SIZE, Session
+from mavftpfs.client.progress import Progress
 from mavftpfs.protocol.payload import crc32
 from mavftpfs.shared.errors import (
     Armed,

@@ -1,4 +1,4 @@
-"""Builds link, connection and tree from the options, for mounts and one-shot commands. Layer: top."""
+"""Builds link, connection and tree from the options, for mounts and one-shot commands. Layer: client."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ from mavftpfs.cache.kept_disk import KeptDisk
 from mavftpfs.cache.options import CacheOptions
 from mavftpfs.cache.tree import Tree
 from mavftpfs.cache.versions import BlockCache
-from mavftpfs.farewell import rescue, spool_for
-from mavftpfs.fuse.handles import Space
-from mavftpfs.fuse.options import MountOptions
+from mavftpfs.client.leftovers import rescue, spool_for
+from mavftpfs.client.options import MountOptions
+from mavftpfs.client.status import Watcher, snapshot
+from mavftpfs.client.trace import JsonTrace, TlogWriter, text_line
 from mavftpfs.link.opening import open_link
 from mavftpfs.link.uri import LinkKind, LinkSpec
-from mavftpfs.report import Watcher, snapshot
 from mavftpfs.session.connection import Connection, ConnectOptions, connected
 from mavftpfs.session.driver import PayloadTrace
 from mavftpfs.shared.errnos import errno_for
@@ -45,7 +45,6 @@ from mavftpfs.shared.errors import (
     VehicleLost,
 )
 from mavftpfs.shared.model import ROOT
-from mavftpfs.trace import JsonTrace, TlogWriter, text_line
 
 MIB = 1 << 20
 KEY_SIZE = 32
@@ -54,6 +53,14 @@ BITS_PER_BYTE = 10
 
 
 MakeKept = Callable[[Directories, BlockCache], KeptCache]
+
+
+@dataclass(frozen=True, slots=True)
+class Space:
+    """The card's size and free space in bytes."""
+
+    total: int
+    free: int
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,4 @@
-"""`mavftpfs install`: puts man pages, completions, the systemd unit and the udev rule into place. Layer: top.
+"""`mavftpfs install`: puts man pages, completions, the systemd unit and the udev rule into place. Layer: cli.
 
 For one user, or as root for everybody. Nothing else is touched: `--print` shows what would be written, and
 `--remove` takes the same files away. The man page and the completions are made of the command line's own
@@ -22,7 +22,7 @@ from pathlib import Path
 import shtab
 
 import mavftpfs
-from mavftpfs.fuse.options import option_help
+from mavftpfs.client.options import option_help
 from mavftpfs.shared.errors import EXIT_CODES, ExitCode, UsageError
 
 SHELLS = ("bash", "zsh", "fish")

@@ -1,4 +1,4 @@
-"""The vehicle's files as the one-shot verbs use them: of a mount that is up, or of a connection. Layer: top.
+"""The vehicle's files, of a mount that is up or of a connection. Layer: client.
 
 Two programs cannot share a serial port, and not well the vehicle's only FTP session, so while a mount of the
 vehicle is up its files are used in place of a second connection. Every call to a mount goes through the
@@ -18,15 +18,15 @@ from typing import Any, TypeAlias, TypeVar
 
 import trio
 
-from mavftpfs import control, report
 from mavftpfs.cache.attributes import Stat
 from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.tree import Tree
-from mavftpfs.compose import NO_SINKS, Attached, Sinks, attached, no_answer, plain_nursery
-from mavftpfs.fuse.handles import XATTR_CRC32
-from mavftpfs.fuse.options import MountOptions
+from mavftpfs.client import control
+from mavftpfs.client.connect import NO_SINKS, Attached, Sinks, attached, no_answer, plain_nursery
+from mavftpfs.client.mountpoint import XATTR_CRC32, canonical, is_ours, mounts
+from mavftpfs.client.options import MountOptions
+from mavftpfs.client.status import status_of
 from mavftpfs.link.uri import LinkKind, LinkSpec, parse_source
-from mavftpfs.mountpoint import canonical, is_ours, mounts
 from mavftpfs.session.vehicle import SILENCE_LIMIT
 from mavftpfs.shared import errors
 from mavftpfs.shared.errnos import errno_for
@@ -195,7 +195,7 @@ async def mount_status(mountpoint: str) -> Mapping[str, Any]:
         LinkClosed: it does not answer.
     """
     with trio.move_on_after(STATUS_PATIENCE), suppress(control.ControlError):
-        status = await trio.to_thread.run_sync(report.status_of, mountpoint, abandon_on_cancel=True)
+        status = await trio.to_thread.run_sync(status_of, mountpoint, abandon_on_cancel=True)
         if not status.get("problem"):
             return status
     raise errors.LinkClosed(f"the mount on {mountpoint} does not answer")

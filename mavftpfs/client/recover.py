@@ -1,4 +1,4 @@
-"""What did not reach a vehicle: listing it, and putting it where it belonged. Layer: top; prints nothing.
+"""What did not reach a vehicle: listing it, and putting it where it belonged. Layer: client; prints nothing.
 
 A mount that ends with undelivered files moves them below `recovered`, with a `NAME.json` beside each file
 (cache.recovery). What a killed mount held is moved there by the next mount. Nothing is put back by itself:
@@ -15,10 +15,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from mavftpfs.oneshot.fetch import NO_CHECKSUM, local_crc32
-from mavftpfs.oneshot.files import Session
-from mavftpfs.oneshot.progress import Progress
-from mavftpfs.oneshot.upload import put_file
+from mavftpfs.client.fetch import NO_CHECKSUM, local_crc32
+from mavftpfs.client.files import Session
+from mavftpfs.client.progress import Progress
+from mavftpfs.client.upload import put_file
 from mavftpfs.shared.errors import (
     NotDelivered,
     NotFound,

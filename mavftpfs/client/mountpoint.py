@@ -1,4 +1,4 @@
-"""Checks before a mount, one line each, and taking a mount down. Layer: top; only the standard library.
+"""Checks before a mount, one line each, and taking a mount down. Layer: client; only the standard library.
 
 Everything here is called before our own mount exists, or from another process or a worker thread: a
 system call on our own mount from the event loop would wait for itself.
@@ -19,7 +19,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from mavftpfs.fuse.options import SUBTYPE
+from mavftpfs.client.options import SUBTYPE
 from mavftpfs.shared.errors import MountFailed
 
 FUSE_DEVICE = "/dev/fuse"
@@ -27,6 +27,8 @@ OUR_TYPE = f"fuse.{SUBTYPE}"
 MOUNT_TABLE = "/proc/self/mountinfo"
 UNMOUNT_PATIENCE = 60.0
 """Seconds for an unmount: it waits for the last flush."""
+XATTR_CRC32 = b"user.mavftp.crc32"
+XATTR_STATUS = b"user.mavftpfs.status"
 BUSY_PATIENCE = 1.0
 """Seconds in which a mount may look busy without being it: the kernel lets go of the files of a program that
 ended a moment after its parent was told, and desktop services look at what is new."""

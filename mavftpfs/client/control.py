@@ -1,4 +1,4 @@
-"""The control socket: how `status` and `umount` talk to a running mount. Layer: top.
+"""The control socket: how `status` and `umount` talk to a running mount. Layer: client.
 
 One Unix socket (0600, in a 0700 directory) for each mount, named after a hash of the mountpoint. One
 request and one reply, each a JSON object on a line; the reply to `umount` comes when all is delivered and

@@ -1,4 +1,4 @@
-"""Who is on a link, and whose files can be had. Layer: top; prints nothing."""
+"""Who is on a link, and whose files can be had. Layer: client; prints nothing."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from typing import Any
 
 import trio
 
-from mavftpfs.compose import connect_options
-from mavftpfs.fuse.options import MountOptions
+from mavftpfs.client.connect import connect_options
+from mavftpfs.client.files import Target, mount_status
+from mavftpfs.client.options import MountOptions
 from mavftpfs.link.base import Link
 from mavftpfs.link.messages import MAV_AUTOPILOT_INVALID, MAV_TYPE_GCS, Address, Heartbeat
 from mavftpfs.link.opening import open_link
-from mavftpfs.oneshot.files import Target, mount_status
 from mavftpfs.session.connection import connected
 from mavftpfs.shared.errors import FtpNak, MavftpfsError, VehicleLost
 from mavftpfs.shared.readable import autopilot_name, readable_time

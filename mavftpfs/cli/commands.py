@@ -1,4 +1,4 @@
-"""The commands that make, ask and end mounts: mount, umount, status; `cli` parses the words. Layer: top."""
+"""The commands that make, ask and end mounts: mount, umount, status; `cli` parses the words. Layer: cli."""
 
 from __future__ import annotations
 
@@ -13,10 +13,13 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-from mavftpfs import control, daemon, mountpoint, report
-from mavftpfs.fuse.options import MountOptions, parse_options, with_root
+from mavftpfs.cli import report
+from mavftpfs.client import control, mountpoint
+from mavftpfs.client.mountpoint import DeadMount, canonical, is_ours
+from mavftpfs.client.options import MountOptions, parse_options, with_root
+from mavftpfs.client.status import PATIENCE, Status, all_statuses, find_socket, status_of
 from mavftpfs.link.uri import LinkSpec, parse_source
-from mavftpfs.mountpoint import DeadMount, canonical, is_ours
+from mavftpfs.mount import daemon
 from mavftpfs.shared.errors import ExitCode, MountFailed, UsageError
 from mavftpfs.shared.readable import readable, readable_time
 
@@ -70,10 +73,10 @@ def absolute_paths(options: MountOptions) -> MountOptions:
 def _serve(
     args: argparse.Namespace, options: MountOptions, spec: LinkSpec, place: str, report: daemon.Report
 ) -> int:
-    from mavftpfs.compose import open_sinks
+    from mavftpfs.client.connect import open_sinks
 
     try:
-        from mavftpfs.mount import MountRequest, run_mount
+        from mavftpfs.mount.kernel import MountRequest, run_mount
     except ImportError as exc:  # libfuse3 went away, or another version of it came, since pyfuse3 was built
         raise MountFailed(f"{exc}; install libfuse3 and mavftpfs anew (pipx reinstall mavftpfs)") from exc
 
@@ -120,7 +123,7 @@ def umount(args: argparse.Namespace) -> int:
     """Have a mount's process deliver and unmount; a mount whose process is gone is just taken away."""
     place = canonical(args.mountpoint)
     try:
-        socket = report.find_socket(place)
+        socket = find_socket(place)
         progress = _Delivery(socket)
         request = {"command": "umount", "lazy": args.lazy}
         try:
@@ -152,7 +155,7 @@ class _Delivery:
     def show(self) -> None:
         """Ask the mount, and say what it delivers; called about each second."""
         try:
-            status = control.ask(self._socket, {"command": "status"}, timeout=report.PATIENCE)["status"]
+            status = control.ask(self._socket, {"command": "status"}, timeout=PATIENCE)["status"]
         except control.ControlError:
             return  # it ends just now
         # One that is still in use holds bytes, too, but does not end.
@@ -175,7 +178,8 @@ class _Delivery:
             print(file=sys.stderr)
 
     def _explain(self) -> None:
-        from mavftpfs.farewell import DRAIN_LIMIT, recovered_directory
+        from mavftpfs.client.leftovers import recovered_directory
+        from mavftpfs.mount.farewell import DRAIN_LIMIT
 
         print(
             "mavftpfs: not everything is on the vehicle yet: it is delivered for at most "
@@ -197,7 +201,7 @@ def _after_a_killed_mount() -> int:
 
 def left_by_killed_mounts_line() -> str:
     """Return a line about what killed mounts held, or ""."""
-    from mavftpfs.farewell import left_by_killed_mounts
+    from mavftpfs.client.leftovers import left_by_killed_mounts
 
     left = left_by_killed_mounts()
     if not left:
@@ -228,12 +232,12 @@ def _wait_for_end(pid: int) -> None:
 def status(args: argparse.Namespace) -> int:
     """Show what one mount, or all mounts that this user may ask, are doing."""
     if args.mountpoint is None:
-        fetch = report.all_statuses
+        fetch = all_statuses
     else:
         place = canonical(args.mountpoint)
 
-        def fetch() -> list[report.Status]:
-            return [report.status_of(place)]
+        def fetch() -> list[Status]:
+            return [status_of(place)]
 
     if args.json:
         report.print_json(fetch, single=args.mountpoint is not None, watch=args.watch)

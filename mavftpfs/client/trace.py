@@ -1,4 +1,4 @@
-"""Records of what went over the link: FTP payloads as text or JSON lines, frames as .tlog. Layer: top.
+"""Records of what went over the link: FTP payloads as text or JSON lines, frames as .tlog. Layer: client.
 
 The session layer calls `payload` for each of the 251-byte payloads; without a trace nothing is computed. A
 file that cannot be written any more (disk full) is told of once and falls silent: a trace must never break

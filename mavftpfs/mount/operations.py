@@ -1,4 +1,4 @@
-"""pyfuse3's handlers: translate, delegate to the tree, map errors. Layer: fuse.
+"""pyfuse3's handlers: translate, delegate to the tree, map errors. Layer: mount.
 
 Rules (all held by `handler`): only FUSEError leaves a handler, because anything else ends pyfuse3's main
 loop and with it the mount; every handler has a deadline, because a caller that waits in the kernel cannot be
@@ -30,17 +30,16 @@ from pyfuse3 import EntryAttributes, FileInfo, FUSEError, RequestContext, Setatt
 
 from mavftpfs.cache.attributes import Stat
 from mavftpfs.cache.tree import Tree
-from mavftpfs.fuse.handles import (
+from mavftpfs.client.connect import Space
+from mavftpfs.client.mountpoint import XATTR_CRC32, XATTR_STATUS
+from mavftpfs.mount.handles import (
     ROOT_INO,
-    XATTR_CRC32,
-    XATTR_STATUS,
     DirectoryHandle,
     FileHandle,
     HandleTable,
     Inode,
     InodeTable,
     Presentation,
-    Space,
     UserAttributeTable,
     closed_on_failure,
     is_mapped_page,

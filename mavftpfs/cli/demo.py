@@ -1,4 +1,4 @@
-"""`mavftpfs demo`: a short tour with a simulated drone behind a bad radio. Layer: top, beside cli.
+"""`mavftpfs demo`: a short tour with a simulated drone behind a bad radio. Layer: cli, beside cli.
 
 It runs the same commands that a user would (`mavftpfs sim`, `mavftpfs SOURCE MOUNTPOINT`, ls, cat, cp, sed,
 diff, `mavftpfs status`), each as its own process, in one temporary directory, and leaves nothing behind: no
@@ -27,9 +27,10 @@ from rich.console import Console
 from rich.panel import Panel
 from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TransferSpeedColumn
 
-from mavftpfs import control, report
-from mavftpfs.daemon import signals_held
-from mavftpfs.mountpoint import mounts
+from mavftpfs.client import control
+from mavftpfs.client.mountpoint import mounts
+from mavftpfs.client.status import status_of
+from mavftpfs.mount.daemon import signals_held
 
 HOST = "127.0.0.1"
 PROFILE = "px4"
@@ -201,7 +202,7 @@ def release(path: Path) -> None:
     if str(path) not in mounts():
         return
     with suppress(control.ControlError, ProcessLookupError):
-        os.kill(int(report.status_of(str(path))["pid"]), signal.SIGKILL)
+        os.kill(int(status_of(str(path))["pid"]), signal.SIGKILL)
     subprocess.run(["fusermount3", "-uz", path], capture_output=True, check=False)
 
 
@@ -227,7 +228,7 @@ def copy_log(tour: Tour) -> None:
         bar = progress.add_task("", total=LOG_SIZE)
         while child.poll() is None and time.monotonic() < deadline:
             # Not the copy's size: cp asks for 256 KiB at a time, so the bar would jump.
-            transfers = report.status_of(str(tour.drone))["transfers"]
+            transfers = status_of(str(tour.drone))["transfers"]
             progress.update(bar, completed=sum(transfer["done"] for transfer in transfers))
             time.sleep(0.1)
         if child.returncode == 0:

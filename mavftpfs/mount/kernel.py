@@ -1,4 +1,4 @@
-"""The kernel mount: composition root, and a mount's life from first heartbeat to unmount. Layer: top.
+"""The kernel mount: composition root, and a mount's life from first heartbeat to unmount. Layer: mount.
 
 Order matters. The vehicle must have answered before the kernel mount appears; at the end the kernel lets go
 first and the server session is closed after it, each within a bound. While mounted, nothing in the event loop
@@ -26,15 +26,15 @@ import pyfuse3
 import trio
 
 import mavftpfs
-from mavftpfs.compose import NO_SINKS, Attached, Sinks, attached
-from mavftpfs.control import ControlServer, Reply
-from mavftpfs.daemon import Report
-from mavftpfs.farewell import say_goodbye
-from mavftpfs.fuse.handles import InodeTable, Presentation
-from mavftpfs.fuse.operations import Operations
-from mavftpfs.fuse.options import MountOptions, fuse_words
+from mavftpfs.client.connect import NO_SINKS, Attached, Sinks, attached
+from mavftpfs.client.control import ControlServer, Reply
+from mavftpfs.client.mountpoint import is_ours, stderr_of, unmount, unmount_what_is_left
+from mavftpfs.client.options import MountOptions, fuse_words
 from mavftpfs.link.uri import LinkSpec
-from mavftpfs.mountpoint import is_ours, stderr_of, unmount, unmount_what_is_left
+from mavftpfs.mount.daemon import Report
+from mavftpfs.mount.farewell import say_goodbye
+from mavftpfs.mount.handles import InodeTable, Presentation
+from mavftpfs.mount.operations import Operations
 from mavftpfs.shared.errors import ExitCode, MavftpfsError, MountFailed, exit_code_for
 
 log = logging.getLogger("mavftpfs.mount")

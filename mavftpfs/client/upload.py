@@ -1,4 +1,4 @@
-"""Putting local files and directories on the vehicle. Layer: top; prints nothing.
+"""Putting local files and directories on the vehicle. Layer: client; prints nothing.
 
 A file counts as put when fsync says that it is on the card, checked; until then progress is what the vehicle
 has acknowledged.
@@ -15,10 +15,10 @@ from typing import BinaryIO
 
 import trio
 
-from mavftpfs.compose import plain_nursery
-from mavftpfs.oneshot.files import READ_SIZE, File, Session, is_directory
-from mavftpfs.oneshot.names import emptied, make_directory
-from mavftpfs.oneshot.progress import Progress
+from mavftpfs.client.connect import plain_nursery
+from mavftpfs.client.files import READ_SIZE, File, Session, is_directory
+from mavftpfs.client.names import emptied, make_directory
+from mavftpfs.client.progress import Progress
 from mavftpfs.shared.errors import CrossDevice, MavftpfsError, NotADirectory, NotDelivered, UsageError
 from mavftpfs.shared.model import join, normalise, split
 from mavftpfs.shared.readable import name_text

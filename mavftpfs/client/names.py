@@ -1,4 +1,4 @@
-"""Names on the vehicle: how people write them, ls, mkdir, rmdir, rm, mv; and crc. Layer: top; silent."""
+"""Names on the vehicle: how people write them, ls, mkdir, rmdir, rm, mv; and crc. Layer: client; silent."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from datetime import UTC, datetime
 from typing import Any
 
 from mavftpfs.cache.attributes import Stat
-from mavftpfs.oneshot.fetch import known_time
-from mavftpfs.oneshot.files import READ_SIZE, File, Files, Session, is_directory, walk
+from mavftpfs.client.fetch import known_time
+from mavftpfs.client.files import READ_SIZE, File, Files, Session, is_directory, walk
 from mavftpfs.protocol.url import MftpUrl, is_url, parse_url
 from mavftpfs.shared.errors import (
     AlreadyExists,

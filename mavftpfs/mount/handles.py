@@ -1,4 +1,4 @@
-"""What the kernel calls by number: inodes and handles. Layer: fuse; pure.
+"""What the kernel calls by number: inodes and handles. Layer: mount; pure.
 
 Without pyfuse3, so that commands that mount nothing work where there is no libfuse3.
 
@@ -30,17 +30,6 @@ from typing import Any, Generic, TypeVar
 from mavftpfs.cache.attributes import Stat
 from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.shared.model import ROOT, EntryKind
-
-XATTR_CRC32 = b"user.mavftp.crc32"
-XATTR_STATUS = b"user.mavftpfs.status"
-
-
-@dataclass(frozen=True, slots=True)
-class Space:
-    """The card's size and free space in bytes."""
-
-    total: int
-    free: int
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,4 @@
-"""Going to the background, and logging there. Layer: top; imports no trio.
+"""Going to the background, and logging there. Layer: mount; imports no trio.
 
 The fork happens before trio and threads start. The parent stays until the child says over a pipe how it
 went, so that `mavftpfs SOURCE DIR && ls DIR` works and a failure has an exit code and a reason.

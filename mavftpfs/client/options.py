@@ -1,4 +1,4 @@
-"""Mount options: one table, parsed into a frozen value. Layer: fuse; pure.
+"""Mount options: one table, parsed into a frozen value. Layer: client; pure.
 
 `-o` text may come from a person, /etc/fstab or mount(8), which adds words of its own (`rw,dev,suid`).
 Words that the kernel understands go to FUSE, words that only mount(8) and systemd need are ignored,

@@ -1,4 +1,4 @@
-"""Bringing many files: what is named, or the vehicle's logs, the newest first. Layer: top; prints nothing."""
+"""Brings many files: what is named, or the logs, the newest first. Layer: client; prints nothing."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from mavftpfs.cache.attributes import Stat
-from mavftpfs.oneshot.fetch import (
+from mavftpfs.client.fetch import (
     Fetched,
     Fetcher,
     LocalDiskFull,
@@ -21,7 +21,7 @@ from mavftpfs.oneshot.fetch import (
     local_disk,
     part_of,
 )
-from mavftpfs.oneshot.files import Found, Session, Unlisted, walk
+from mavftpfs.client.files import Found, Session, Unlisted, walk
 from mavftpfs.shared.errors import (
     IsADirectory,
     LinkError,

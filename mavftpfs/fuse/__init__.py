@@ -1,1 +1,0 @@
-"""The kernel's side: inodes, handles, options, pyfuse3 operations."""
