@@ -75,10 +75,24 @@ class Profile:
     """OpenFileWO cuts the file to nothing (MAVSDK)."""
     write_only_creates: bool = True
     """OpenFileWO makes a missing file (PX4, ArduPilot generation B)."""
+    open_replaces: bool = False
+    """An open closes what is open, whoever opened it; else it is refused (PX4 of September 2026)."""
+    checks_sender: bool = False
+    """Only the client that asked gets the answer again, without stray bytes (PX4 of September 2026)."""
     sticky_stream_failure: bool = False
     """A read that crossed the end spoils every later read until reopened (MAVSDK before 4.1)."""
 
-    # Whitelist of PX4 on NuttX
+    # PX4
+    logs: bytes = b""
+    """The directory that `@MAV_LOG` names (PX4 of 2026)."""
+    refuses_parent: bool = False
+    """A path with `..` in it is protected (PX4 of September 2026)."""
+    needs_open_file: bool = False
+    """Bursts and writes with no file open are InvalidSession, and reading no bytes is EOF (PX4 of September
+    2026); else session 0 is enough."""
+    keeps_buffers: bool = False
+    """The scratch buffer is not freed after 2 s, and the whitelist for writes looks at the open file's path
+    (PX4 of September 2026)."""
     writable_root: bytes = b""
     """Writes must start with this; the check looks at a scratch buffer (servers.md 8)."""
 
@@ -177,6 +191,12 @@ _ALL = (
         _PX4,
         name="px4-2026",
         idle_close=30.0,
+        open_replaces=True,
+        checks_sender=True,
+        logs=b"/log",
+        refuses_parent=True,
+        needs_open_file=True,
+        keeps_buffers=True,
         list_with_time=True,
         bare_time_directories=True,
         virtual_trees=(b"@PARAM",),

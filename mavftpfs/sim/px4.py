@@ -208,7 +208,8 @@ class Px4(px4ops.PathRequests):
         if not (idle and fresh and quick and self._started is not None):
             return False
         repeated = self._cached is not None and HEADER.unpack_from(wire)[0] + 1 == self._cached_seq
-        return not repeated and not (self._writing and self.is_protected(self.scratch))
+        named = self._path if self.profile.keeps_buffers else self.scratch
+        return not repeated and not (self._writing and self.is_protected(named))
 
     def _wait(self, wire: bytes, source: Address) -> None:
         size = frame_size(wire)
@@ -253,12 +254,12 @@ class Px4(px4ops.PathRequests):
 
     def _execute(self, wire: bytes, source: Address, now: float) -> None:
         seq, session, opcode, size, _, _, offset = fields = HEADER.unpack_from(wire)
-        if now - self._last_request > _BUFFER_LIFE:
+        if now - self._last_request > _BUFFER_LIFE and not self.profile.keeps_buffers:
             self.scratch = b""  # freed, and allocated again uninitialised
         self._last_request = now
         if size > MAX_DATA:
             self._reply(source, wire, self._refuse(NakCode.INVALID_DATA_SIZE), now)
-        elif self._cached is not None and seq + 1 == self._cached_seq:
+        elif self._is_cached(seq, source):
             self._replay(now)
         elif opcode == _READ and self._readable(session, offset):
             self._read(wire, fields, source, now)
@@ -266,6 +267,12 @@ class Px4(px4ops.PathRequests):
             self._write(wire, fields, source, now)
         else:
             self._dispatch(parse(wire, source), wire, now)
+
+    def _is_cached(self, seq: int, source: Address) -> bool:
+        """Whether a request of this number was answered last."""
+        if self._cached is None or seq + 1 != self._cached_seq:
+            return False
+        return source == self._cached_target or not self.profile.checks_sender
 
     def _dispatch(self, request: Request, wire: bytes, now: float) -> None:
         try:
@@ -323,11 +330,13 @@ class Px4(px4ops.PathRequests):
             self.emit(target, wire, due, self.now)
 
     def _replay(self, now: float) -> None:
-        """Send 254 bytes out of a cache of 19: what follows the data is stray memory."""
+        """Send the last answer again. PX4 before September 2026 sends 254 bytes out of a cache of 19: what
+        follows the data is stray memory."""
         assert self._cached is not None
         self.replays += 1
-        stray = self.rng.randbytes(MAX_DATA - _CACHED_DATA)
-        self._transmit(self._cached_target, self._cached + stray, now)
+        missing = MAX_DATA - _CACHED_DATA
+        behind = bytes(missing) if self.profile.checks_sender else self.rng.randbytes(missing)
+        self._transmit(self._cached_target, self._cached + behind, now)
 
     def cost(self, opcode: int) -> float:
         """Return how long the request that is being answered takes."""
@@ -391,7 +400,9 @@ class Px4(px4ops.PathRequests):
     def _open(self, path: bytes, *, write: bool, create: bool, truncate: bool) -> bytes:
         """Open; the ACK tells the size before a truncation, and reads end there for ever."""
         if self._file is not None:
-            raise Refusal(NakCode.NO_SESSIONS_AVAILABLE)
+            if not self.profile.open_replaces:
+                raise Refusal(NakCode.NO_SESSIONS_AVAILABLE)
+            self._close()
         self.scratch = path
         size, opened = px4ops.open_file(self.storage, path, write=write, create=create, truncate=truncate)
         self._file, self._path, self._file_size, self._writing = opened, path, size, write
@@ -408,6 +419,11 @@ class Px4(px4ops.PathRequests):
         seq, session, opcode, size, _, complete, offset = fields
         try:
             data = self._file.read(offset, size)
+            if not data and self.profile.needs_open_file:
+                raise Refusal(_EOF)
+        except Refusal as refusal:
+            self._reply(source, wire, self._refuse(refusal.code), now)
+            return
         except OSError as exc:
             self._reply(source, wire, self._failed(exc), now)
             return
@@ -423,6 +439,10 @@ class Px4(px4ops.PathRequests):
             raise Refusal(_EOF)
         nuttx = bool(self.profile.writable_root)
         raise OSError(errno.EACCES if nuttx else errno.EBADF, "opened for writing")
+
+    def _check_session(self, session: int) -> None:
+        if self._file is None and (session != 0 or self.profile.needs_open_file):
+            raise Refusal(NakCode.INVALID_SESSION)
 
     def _write(self, wire: bytes, fields: _Fields, source: Address, now: float) -> None:
         seq, session, opcode, size, _, complete, offset = fields
@@ -442,18 +462,16 @@ class Px4(px4ops.PathRequests):
         self._deliver(source, packed, now)
 
     def _check_write(self, session: int) -> None:
-        if session != 0 and self._file is None:
-            raise Refusal(NakCode.INVALID_SESSION)
-        self.check_writable(self.scratch)
+        self._check_session(session)
+        self.check_writable(self._path if self.profile.keeps_buffers else self.scratch)
         if self._file is None or not self._writing:
             raise OSError(errno.EBADF, "not open for writing")
 
     # -- bursts ------------------------------------------------------------------------------
 
     def _burst(self, request: Request) -> bytes:
-        """Start a stream. Session 0 is accepted with no file open; the request's size is ignored."""
-        if request.session != 0 and self._file is None:
-            raise Refusal(NakCode.INVALID_SESSION)
+        """Start a stream. Session 0 may be accepted with no file open; the request's size is ignored."""
+        self._check_session(request.session)
         self._stream = Stream(request.source, request.offset, request.seq + 1)
         self._tick = max(self._tick, self._tick_after(self._last_request))
         return b""

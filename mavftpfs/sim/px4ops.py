@@ -15,6 +15,7 @@ from mavftpfs.sim.tree import Entry, Kind, OpenFile, fail
 
 _WORK_BUFFER = 256
 _RENAME_LIMIT = 255
+_LOGS = b"@MAV_LOG"
 
 
 class PathRequests(Firmware):
@@ -42,7 +43,16 @@ class PathRequests(Firmware):
 
     def path_of(self, request: Request) -> bytes:
         """Return the request's path, cut silently where the work buffer ends."""
-        return c_string(request.data[: min(request.size, MAX_DATA - 1)])[: self.profile.path_limit]
+        path = c_string(request.data[: min(request.size, MAX_DATA - 1)])[: self.profile.path_limit]
+        return self.resolve(path)
+
+    def resolve(self, path: bytes) -> bytes:
+        """Return what a client's path names here."""
+        if self.profile.refuses_parent and b".." in path.split(b"/"):
+            raise Refusal(NakCode.FILE_PROTECTED)
+        if self.profile.logs and path.startswith(_LOGS):
+            return self.profile.logs + path[len(_LOGS) :]
+        return path
 
     def check_writable(self, path: bytes) -> None:
         """Refuse paths outside the whitelist; for WriteFile the path is what the scratch buffer holds."""
@@ -92,15 +102,15 @@ class PathRequests(Firmware):
         old, _, rest = data.partition(b"\0")
         if len(rest) < 2:
             raise StaleErrno
-        self.scratch = old
-        new = c_string(rest)[:_RENAME_LIMIT]
+        self.scratch = old = self.resolve(old)
+        new = self.resolve(c_string(rest)[:_RENAME_LIMIT])
         self.check_writable(new)
         self.storage.rename(old, new)
         return b""
 
     def _crc(self, request: Request) -> bytes:
         """Checksum a file; a failed open leaves errno as it was. Uses the other scratch buffer."""
-        path = c_string(request.data[: min(request.size, MAX_DATA - 1)])
+        path = self.resolve(c_string(request.data[: min(request.size, MAX_DATA - 1)]))
         try:
             if self.storage.stat(path).kind is Kind.DIRECTORY:
                 raise fail(errno.EISDIR, path)

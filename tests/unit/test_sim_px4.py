@@ -10,7 +10,7 @@ import pytest
 
 from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.sim.tree import MemoryTree
-from tests.support.sim_client import Client, ack, nak
+from tests.support.sim_client import CLIENT, OTHER, Client, ack, nak
 
 A = b"/fs/microsd/a.bin"
 FIVE = b"/fs/microsd/five"
@@ -51,6 +51,34 @@ def test_a_burst_does_not_keep_its_session_alive() -> None:
     assert {p.opcode for p in packets} == {Opcode.ACK}
     assert c.server.open_sessions == 0
     assert c.now - sent_at > 10
+
+
+def test_of_2026_an_open_takes_the_place_of_another_clients_file() -> None:
+    c = client("px4-2026")
+    c.open(A)
+    c.source = OTHER
+    assert ack(c.ask(Opcode.OPEN_FILE_RO, FIVE))
+    c.source = CLIENT
+    assert ack(c.ask(Opcode.READ_FILE, size=10)) == b"\x05"
+    assert c.server.open_sessions == 1
+
+
+def test_of_2026_an_answer_is_repeated_for_the_client_that_asked_only() -> None:
+    c = client("px4-2026")
+    seq = c.send(Opcode.OPEN_FILE_RO, A)
+    c.receive()
+    c.source = OTHER
+    other = c.ask(Opcode.TERMINATE_SESSION, seq=seq)
+    assert other.req_opcode == Opcode.TERMINATE_SESSION
+    assert c.server.firmware.replays == 0
+
+
+def test_of_2026_a_write_needs_an_open_file_and_no_whitelisted_path_before_it() -> None:
+    c = client("px4-2026", writable_root=b"/fs/microsd/")
+    assert nak(c.ask(Opcode.WRITE_FILE, b"x")) == bytes([NakCode.INVALID_SESSION])
+    c.open(FIVE, Opcode.OPEN_FILE_WO)
+    c.ask(Opcode.LIST_DIRECTORY, b"/fs")
+    assert ack(c.ask(Opcode.WRITE_FILE, b"x"))
 
 
 # -- listings ------------------------------------------------------------------------------------
