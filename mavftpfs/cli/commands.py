@@ -16,10 +16,11 @@ from pathlib import Path
 from mavftpfs.cli import report
 from mavftpfs.client import control, mountpoint
 from mavftpfs.client.mountpoint import DeadMount, canonical, is_ours
-from mavftpfs.client.options import MountOptions, parse_options, with_root
+from mavftpfs.client.options import with_root
 from mavftpfs.client.status import PATIENCE, Status, all_statuses, find_socket, status_of
 from mavftpfs.link.uri import LinkSpec, parse_source
 from mavftpfs.mount import daemon
+from mavftpfs.mount.options import MountOptions, parse_options
 from mavftpfs.shared.errors import ExitCode, MountFailed, UsageError
 from mavftpfs.shared.readable import readable, readable_time
 
@@ -30,7 +31,7 @@ END_PATIENCE = 5.0
 SAY_AGAIN = 10.0
 """Seconds between two lines about a delivery, where these go to a file."""
 
-_PATH_OPTIONS = ("cache_dir", "signing_key", "log_file", "trace", "tlog")
+_PATH_OPTIONS = ("cache_dir", "signing_key", "trace", "tlog")
 
 
 # -- mount ----------------------------------------------------------------------------------------
@@ -60,14 +61,16 @@ def connection_of(args: argparse.Namespace) -> tuple[MountOptions, LinkSpec]:
     """
     options = parse_options(args.options)
     spec = parse_source(args.source)
-    options = with_root(options, spec.subtree)
-    return options, spec if options.baud is None else replace(spec, baud=options.baud)
+    client = with_root(options.client, spec.subtree)
+    return replace(options, client=client), spec if client.baud is None else replace(spec, baud=client.baud)
 
 
 def absolute_paths(options: MountOptions) -> MountOptions:
     """Return the options with local paths absolute: the background process works in `/`."""
-    found = {name: getattr(options, name) for name in _PATH_OPTIONS}
-    return replace(options, **{name: os.path.abspath(path) for name, path in found.items() if path})
+    client, log_file = options.client, options.log_file
+    found = {name: getattr(client, name) for name in _PATH_OPTIONS}
+    client = replace(client, **{name: os.path.abspath(path) for name, path in found.items() if path})
+    return replace(options, client=client, log_file=log_file and os.path.abspath(log_file))
 
 
 def _serve(
@@ -82,7 +85,7 @@ def _serve(
 
     foreground = args.foreground or args.debug
     _start_logging(options, foreground=foreground, debug=args.debug)
-    with open_sinks(options, debug=args.debug) as sinks:
+    with open_sinks(options.client, debug=args.debug) as sinks:
         request = MountRequest(args.source, spec, place, options, control=_control_path(place), sinks=sinks)
         return run_mount(request, report)
 

@@ -22,7 +22,7 @@ from pathlib import Path
 import shtab
 
 import mavftpfs
-from mavftpfs.client.options import option_help
+from mavftpfs.mount.options import option_help
 from mavftpfs.shared.errors import EXIT_CODES, ExitCode, UsageError
 
 SHELLS = ("bash", "zsh", "fish")

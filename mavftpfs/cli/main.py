@@ -15,7 +15,7 @@ from typing import NoReturn
 
 import mavftpfs
 from mavftpfs.cli import commands
-from mavftpfs.client.options import option_help
+from mavftpfs.mount.options import option_help
 from mavftpfs.shared.errors import ExitCode, MavftpfsError, UsageError, exit_code_for
 from mavftpfs.shared.readable import readable
 

@@ -27,9 +27,9 @@ from mavftpfs.client.connect import open_sinks, plain_nursery
 from mavftpfs.client.fetch import Fetched, Fetcher
 from mavftpfs.client.files import Session, Target, mountpoint_of
 from mavftpfs.client.leftovers import recovered_directory
-from mavftpfs.client.options import parse_options
 from mavftpfs.client.progress import Progress
 from mavftpfs.mount import daemon
+from mavftpfs.mount.options import parse_options
 from mavftpfs.shared.errors import ExitCode, MavftpfsError, UsageError, exit_code_for
 from mavftpfs.shared.readable import printable, readable, readable_size
 
@@ -40,7 +40,7 @@ Args = argparse.Namespace
 def _target(args: Args, component: int | None) -> Target:
     mount = mountpoint_of(args.source)
     if mount is not None:
-        return Target(None, parse_options(args.options), mount=mount)
+        return Target(None, parse_options(args.options).client, mount=mount)
     place = args.source.partition("#")[0]
     no_device = place.startswith("/") and not place.startswith("/dev/") and not os.path.lexists(place)
     if no_device or os.path.isdir(place):
@@ -48,7 +48,7 @@ def _target(args: Args, component: int | None) -> Target:
     if component is not None:
         args.options.append(f"target_component={component}")
     options, spec = connection_of(args)
-    return Target(spec, options)
+    return Target(spec, options.client)
 
 
 def run(

@@ -25,7 +25,7 @@ from mavftpfs.cache.options import CacheOptions
 from mavftpfs.cache.tree import Tree
 from mavftpfs.cache.versions import BlockCache
 from mavftpfs.client.leftovers import rescue, spool_for
-from mavftpfs.client.options import MountOptions
+from mavftpfs.client.options import Options
 from mavftpfs.client.status import Watcher, snapshot
 from mavftpfs.client.trace import JsonTrace, TlogWriter, text_line
 from mavftpfs.link.opening import open_link
@@ -100,7 +100,7 @@ NO_SINKS = Sinks()
 
 
 @contextmanager
-def open_sinks(options: MountOptions, *, debug: bool) -> Iterator[Sinks]:
+def open_sinks(options: Options, *, debug: bool) -> Iterator[Sinks]:
     """Open what trace=, tlog= and -d ask for, and close it after the body.
 
     Raises:
@@ -126,7 +126,7 @@ def _print_payload(now: float, direction: str, wire: bytes) -> None:
 @asynccontextmanager
 async def attached(
     spec: LinkSpec,
-    options: MountOptions,
+    options: Options,
     *,
     invalidate: Callable[[bytes], None] = lambda path: None,
     sinks: Sinks = NO_SINKS,
@@ -194,7 +194,7 @@ async def plain_nursery() -> AsyncIterator[trio.Nursery]:
         raise failure
 
 
-async def _list_root(connection: Connection, tree: Tree, deadline: float, options: MountOptions) -> None:
+async def _list_root(connection: Connection, tree: Tree, deadline: float, options: Options) -> None:
     try:
         with trio.move_on_at(deadline):
             await tree.list(ROOT)
@@ -214,7 +214,7 @@ async def _list_root(connection: Connection, tree: Tree, deadline: float, option
     raise no_answer(connection, options)
 
 
-def no_answer(connection: Connection, options: MountOptions) -> NoFtp:
+def no_answer(connection: Connection, options: Options) -> NoFtp:
     """Return what is said when no FTP request was answered within connect_timeout."""
     if connection.scheduler.server.kept_out:
         return NoFtp(f"another client keeps the only FTP session of {_vehicle(connection)} in use")
@@ -253,7 +253,7 @@ def subscribe(connection: Connection, tree: Tree) -> None:
     tree.armed_changed(connection.vehicle.armed)
 
 
-def connect_options(options: MountOptions) -> ConnectOptions:
+def connect_options(options: Options) -> ConnectOptions:
     """Return the session's part of the options.
 
     Raises:
@@ -263,17 +263,17 @@ def connect_options(options: MountOptions) -> ConnectOptions:
     return ConnectOptions(**{**_given(ConnectOptions, options), "signing_key": key})
 
 
-def cache_options(options: MountOptions, spec: LinkSpec) -> CacheOptions:
+def cache_options(options: Options, spec: LinkSpec) -> CacheOptions:
     """Return the caches' part of the options, for a link."""
     link_rate = spec.baud / BITS_PER_BYTE if spec.kind is LinkKind.SERIAL else None
     given = _given(CacheOptions, options)
     return CacheOptions(**given, link_rate=link_rate, write_armed=options.when_armed == "ok")
 
 
-def _given(part: type[ConnectOptions | CacheOptions], options: MountOptions) -> dict[str, Any]:
+def _given(part: type[ConnectOptions | CacheOptions], options: Options) -> dict[str, Any]:
     """Return the values of the options that `part` has by the same name."""
-    values = {**{name: getattr(options, name) for name in options.__slots__}, **options.passed_on}
-    return {field.name: values[field.name] for field in fields(part) if field.name in values}
+    names = {field.name for field in fields(options)}
+    return {field.name: getattr(options, field.name) for field in fields(part) if field.name in names}
 
 
 def read_key(path: str) -> bytes:

@@ -24,7 +24,7 @@ from mavftpfs.cache.tree import Tree
 from mavftpfs.client import control
 from mavftpfs.client.connect import NO_SINKS, Attached, Sinks, attached, no_answer, plain_nursery
 from mavftpfs.client.mountpoint import XATTR_CRC32, canonical, is_ours, mounts
-from mavftpfs.client.options import MountOptions
+from mavftpfs.client.options import Options
 from mavftpfs.client.status import status_of
 from mavftpfs.link.uri import LinkKind, LinkSpec, parse_source
 from mavftpfs.session.vehicle import SILENCE_LIMIT
@@ -138,16 +138,15 @@ def mountpoint_of(source: str) -> tuple[str, bytes] | None:
     return (path, normalise(os.fsencode(subtree))) if is_ours(path) else None
 
 
-async def find_mount(spec: LinkSpec, options: MountOptions) -> Session | None:
+async def find_mount(spec: LinkSpec, options: Options) -> Session | None:
     """Return the files of the mount that holds this link now, if one is up and may be read by us."""
-    wanted = options.passed_on
     for mountpoint in [path for path in mounts() if is_ours(path)]:
         with suppress(errors.MavftpfsError, ValueError, KeyError, TypeError):
             status = await mount_status(mountpoint)
             vehicle = status["vehicle"]
             if (
-                wanted.get("target_system", 0) in (0, vehicle["system"])
-                and wanted.get("target_component", 0) in (0, vehicle["component"])
+                options.target_system in (0, vehicle["system"])
+                and options.target_component in (0, vehicle["component"])
                 and same_link(parse_source(status["source"]), spec)
             ):
                 return session_on(status, options.root)
@@ -353,7 +352,7 @@ class Target:
     """Which vehicle, and how to talk to it. mount: (mountpoint, subtree) if SOURCE was a mountpoint."""
 
     spec: LinkSpec | None
-    options: MountOptions
+    options: Options
     sinks: Sinks = NO_SINKS
     mount: tuple[str, bytes] | None = None
 
@@ -383,7 +382,7 @@ class Target:
             yield _session_of(vehicle, self.options)
 
 
-def _session_of(vehicle: Attached, options: MountOptions) -> Session:
+def _session_of(vehicle: Attached, options: Options) -> Session:
     async def acknowledged() -> Acknowledged:
         found: Any = vehicle.tree.status().get("transfers", [])
         return {facts["path"]: facts["size"] - facts["bytes_left"] for facts in found}
@@ -403,7 +402,7 @@ def _session_of(vehicle: Attached, options: MountOptions) -> Session:
 
 
 @asynccontextmanager
-async def _answered_by(deadline: float, vehicle: Attached, options: MountOptions) -> AsyncIterator[None]:
+async def _answered_by(deadline: float, vehicle: Attached, options: Options) -> AsyncIterator[None]:
     """End the body when no FTP request was answered by the deadline.
 
     Raises:

@@ -19,10 +19,12 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from mavftpfs.client.options import SUBTYPE
 from mavftpfs.shared.errors import MountFailed
 
 FUSE_DEVICE = "/dev/fuse"
+SUBTYPE = "mavftpfs"
+"""The mount's type is fuse.mavftpfs: the same word that fstab has."""
+
 OUR_TYPE = f"fuse.{SUBTYPE}"
 MOUNT_TABLE = "/proc/self/mountinfo"
 UNMOUNT_PATIENCE = 60.0

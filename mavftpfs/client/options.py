@@ -1,90 +1,63 @@
-"""Mount options: one table, parsed into a frozen value. Layer: client; pure.
+"""What a program may say about a vehicle's files: one table, one frozen record. Layer: client; pure.
 
-`-o` text may come from a person, /etc/fstab or mount(8), which adds words of its own (`rw,dev,suid`).
-Words that the kernel understands go to FUSE, words that only mount(8) and systemd need are ignored,
-and everything else that is not in the table is refused by name.
+A mount, the commands and the library share it. `-o` text is parsed by it, and so are the library's keywords,
+so that both take the same names and values and refuse the same ones. What concerns only the kernel's side of
+a mount is in `mount.options`.
 """
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple, TypeVar
+from dataclasses import dataclass, replace
+from typing import Any, Literal, NamedTuple, TypeVar
 
 from mavftpfs.cache.options import DEFAULT_LOCAL
 from mavftpfs.shared.errors import MavftpfsError, UsageError
 from mavftpfs.shared.model import ROOT, normalise
-
-SUBTYPE = "mavftpfs"
-"""The mount's type is fuse.mavftpfs: the same word that fstab has."""
-
-KERNEL_WORDS = frozenset(
-    {"dev", "nodev", "suid", "nosuid", "exec", "noexec", "atime", "noatime", "sync", "async", "dirsync"}
-)
-"""VFS words that libfuse takes."""
-
-_NO_MEANING = {
-    *("defaults", "diratime", "nodiratime", "relatime", "norelatime", "strictatime", "nostrictatime"),
-    *("lazytime", "nolazytime", "nodirsync"),
-}
-"""VFS words for access times, which are not kept; libfuse does not know them."""
-
-_FOR_OTHERS = {
-    *("auto", "noauto", "user", "nouser", "users", "nousers", "owner", "noowner", "group", "nogroup"),
-    *("_netdev", "nofail"),
-}
-"""Words for mount(8) and systemd."""
-
-IGNORED_WORDS = frozenset(_NO_MEANING | _FOR_OTHERS)
-IGNORED_PREFIXES = ("x-", "X-", "comment=", "user=")
 
 _UNITS = {"": 1, "K": 1 << 10, "M": 1 << 20, "G": 1 << 30}
 _DAY = 86400.0
 
 
 @dataclass(frozen=True, slots=True)
-class MountOptions:
-    """What `-o` says. Seconds, octal bits; None = not given.
+class Options:
+    """How to reach a vehicle and how to treat its files.
 
-    passed_on: values for the session and the caches, by the names that they have there, where their defaults
-    are, too.
+    Seconds, bytes and bytes per second; None = found out, or not wanted. The session's values are explained
+    at `session.connection.ConnectOptions`, the caches' at `cache.options.CacheOptions`.
     """
 
     read_only: bool = False
-    allow_other: bool = False
-    auto_unmount: bool = False
-    uid: int | None = None
-    gid: int | None = None
-    umask: int | None = None
-    fmask: int | None = None
-    dmask: int | None = None
-    fsname: str | None = None
     root: bytes = ROOT
+    target_system: int = 0
+    target_component: int = 0
+    source_system: int = 254
+    source_component: int = 191
+    heartbeat: Literal["onboard", "gcs", "none"] = "onboard"
     baud: int | None = None
     signing_key: str | None = None
-    cache_dir: str | None = None
     op_deadline: float = 30.0
     connect_timeout: float = 30.0
-    when_armed: str = "ro"
-    log_file: str | None = None
+    read_mode: Literal["window", "burst"] = "window"
+    chunk: int | None = None
+    window: int | None = None
+    bwlimit: int | None = None
+    dir_timeout: float | None = None
+    attr_timeout: float = 1.0
+    negative_timeout: float = 2.0
+    cache_size: int = 64 << 20
+    cache_dir: str | None = None
+    dirty_max: int | None = None
+    spool_max: int = 1 << 30
+    rmw_max: int | None = None
+    verify: Literal["auto", "size", "crc", "none"] = "auto"
+    verify_max: int = 4 << 20
+    when_armed: Literal["ro", "ok"] = "ro"
+    force: bool = False
+    inplace: bool = False
+    local: tuple[str, ...] = DEFAULT_LOCAL
     trace: str | None = None
     tlog: str | None = None
-    kernel_words: tuple[str, ...] = ()
-    passed_on: Mapping[str, Any] = field(default_factory=dict)
-
-    def file_mode(self, default_umask: int) -> int:
-        """Return the permission bits of files; write bits go where the mount is read-only."""
-        return self._bits(0o666, self.fmask, default_umask)
-
-    def directory_mode(self, default_umask: int) -> int:
-        """Return the permission bits of directories."""
-        return self._bits(0o777, self.dmask, default_umask)
-
-    def _bits(self, full: int, own_mask: int | None, default_umask: int) -> int:
-        mask = own_mask if own_mask is not None else self.umask
-        bits = full & ~(default_umask if mask is None else mask)
-        return bits & ~0o222 if self.read_only else bits
 
 
 Parser = Callable[[str], Any]
@@ -151,13 +124,6 @@ def choice(*words: str) -> Parser:
     return parse
 
 
-def mask(text: str) -> int:
-    """Parse an octal permission mask."""
-    if not re.fullmatch("[0-7]{1,4}", text) or int(text, 8) > 0o777:
-        raise ValueError("must be an octal number of at most 777, as 022")
-    return int(text, 8)
-
-
 def text_value(text: str) -> str:
     """Take any text but none."""
     if not text:
@@ -188,13 +154,9 @@ class Value(NamedTuple):
     help: str
 
 
-VALUES: dict[str, Value] = {
-    "uid": Value(number(0, 2**32 - 2), "whose the files are: you"),
-    "gid": Value(number(0, 2**32 - 2), "whose group's: yours"),
-    "umask": Value(mask, "octal; your umask"),
-    "fmask": Value(mask, "umask of files only"),
-    "dmask": Value(mask, "umask of directories only"),
-    "fsname": Value(text_value, "name in the table of mounts: SOURCE"),
+Values = Mapping[str, Value]
+
+VALUES: Values = {
     "root": Value(remote_path, "mount this directory of the vehicle: /"),
     "target_system": Value(number(0, 255), "which vehicle; 0: the first autopilot heard"),
     "target_component": Value(number(0, 255), "which part of it; 0: the first heard"),
@@ -223,7 +185,6 @@ VALUES: dict[str, Value] = {
     "verify_max": Value(size(0, _SIZE_MAX), "largest file whose CRC32 is asked for by auto: 4M"),
     "when_armed": Value(choice("ro", "ok"), "an armed vehicle is read-only: ro, or ok"),
     "local": Value(patterns, "names that never reach the card; +PATTERN adds to them"),
-    "log_file": Value(text_value, "log there, not to syslog"),
     "trace": Value(text_value, "every request and reply as a line of JSON there"),
     "tlog": Value(text_value, "raw MAVLink log there"),
 }
@@ -237,33 +198,51 @@ class Flag(NamedTuple):
     help: str
 
 
-FLAGS: dict[str, Flag] = {
+Flags = Mapping[str, Flag]
+
+FLAGS: Flags = {
     "ro": Flag("read_only", True, "nothing is changed"),
     "rw": Flag("read_only", False, "the default"),
-    "allow_other": Flag("allow_other", True, "other users may see it (permissions apply)"),
-    "auto_unmount": Flag("auto_unmount", True, "unmount when this process dies"),
     "force": Flag("force", True, "change files that are seen to grow, too"),
     "inplace": Flag("inplace", True, "replace files in place where the card cannot rename"),
-    "default_permissions": Flag("", True, ""),
 }
-"""default_permissions is always on, and not shown."""
 
 
-def parse_options(texts: Iterable[str]) -> MountOptions:
-    """Parse the values of all `-o`; what is said later wins.
+def options_of(keywords: Mapping[str, object]) -> Options:
+    """Return the options that keywords name as `-o` does: `ro=True, target_system=2, cache_size="1G"`.
+
+    None as a value is as if it were not given.
 
     Raises:
-        UsageError: an unknown option, a missing or bad value; the message names the option.
+        UsageError: an unknown name, or a bad value; the message names it.
     """
     values: dict[str, Any] = {}
-    words: list[str] = []
-    for word in split_words(texts):
-        _take(word, values, words)
-    own = {name: values.pop(name) for name in MountOptions.__slots__ if name in values}
-    return MountOptions(**own, kernel_words=tuple(words), passed_on=values)
+    for name, value in keywords.items():
+        if value is None:
+            continue
+        if name in FLAGS:
+            if not isinstance(value, bool):
+                raise UsageError(f"option {name} is True or False, not {value!r}")
+            values[FLAGS[name].field] = FLAGS[name].becomes is value
+        elif name in VALUES:
+            values[name] = parse_value(VALUES, name, _as_text(name, value))
+        else:
+            raise UsageError(f"unknown option {name!r}")
+    return Options(**values)
 
 
-def with_root(options: MountOptions, subtree: bytes) -> MountOptions:
+def _as_text(name: str, value: object) -> str:
+    """Return a keyword's value as `-o` has it."""
+    path = getattr(value, "__fspath__", None)
+    text = value if path is None else path()
+    if isinstance(text, bytes):
+        text = text.decode("utf-8", "surrogateescape")
+    if isinstance(text, bool) or not isinstance(text, str | int | float):
+        raise UsageError(f"option {name} cannot be {value!r}")
+    return str(text)
+
+
+def with_root(options: Options, subtree: bytes) -> Options:
     """Return the options with the `#subtree` of SOURCE as root.
 
     Raises:
@@ -276,60 +255,16 @@ def with_root(options: MountOptions, subtree: bytes) -> MountOptions:
     return replace(options, root=subtree)
 
 
-def fuse_words(options: MountOptions, source: str) -> set[str]:
-    """Return the options that go to FUSE's init."""
-    name = options.fsname or source
-    words = {f"fsname={_escape(name)}", f"subtype={SUBTYPE}", "default_permissions", *options.kernel_words}
-    words.add("ro" if options.read_only else "rw")
-    if options.allow_other:
-        words.add("allow_other")
-    if options.auto_unmount:
-        words.add("auto_unmount")
-    return words
+def parse_value(values: Values, name: str, text: str) -> Any:
+    """Return the value of an option of a table.
 
-
-def _take(word: str, values: dict[str, Any], kernel_words: list[str]) -> None:
-    name, equals, value = word.partition("=")
-    if word in FLAGS:
-        flag = FLAGS[word]
-        if flag.field:
-            values[flag.field] = flag.becomes
-    elif word in KERNEL_WORDS:
-        _replace_word(word, kernel_words)
-    elif name in VALUES:
-        values[name] = _parse(name, value, given=bool(equals))
-    elif word not in IGNORED_WORDS and not word.startswith(IGNORED_PREFIXES):
-        raise UsageError(_refusal(name, word))
-
-
-def _refusal(name: str, word: str) -> str:
-    if name in FLAGS or name in KERNEL_WORDS or name in IGNORED_WORDS:
-        return f"option {name} takes no value"
-    if name == "remount":
-        return "option remount is not supported: unmount, and mount with the new options"
-    if name == "max_read":
-        return "option max_read is not supported: the FUSE binding cannot start with it"
-    return f"unknown option {word!r}"
-
-
-def _replace_word(word: str, words: list[str]) -> None:
-    """Keep one of a word and its opposite: libfuse would apply both in the order of a set."""
-    opposite = {"sync": "async", "async": "sync"}.get(
-        word, word[2:] if word.startswith("no") else "no" + word
-    )
-    for stale in (word, opposite):
-        if stale in words:
-            words.remove(stale)
-    words.append(word)
-
-
-def _parse(name: str, value: str, *, given: bool) -> Any:
-    if not given:
-        raise UsageError(f"option {name} needs a value ({name}=...)")
+    Raises:
+        UsageError: a bad one; the message names the option.
+    """
     try:
-        return VALUES[name].parse(value)
+        return values[name].parse(text)
     except (ValueError, MavftpfsError) as exc:
-        raise UsageError(f"option {name}={value}: {exc}") from exc
+        raise UsageError(f"option {name}={text}: {exc}") from exc
 
 
 def split_words(texts: Iterable[str]) -> Iterator[str]:
@@ -353,12 +288,6 @@ def _nonempty(word: str) -> Iterator[str]:
         yield word.strip()
 
 
-def _escape(name: str) -> str:
-    """Make a name fit for one ASCII option of a comma-separated list."""
-    ascii_name = name.encode("ascii", "backslashreplace").decode("ascii").replace("\n", " ")
-    return ascii_name.replace("\\", "\\\\").replace(",", "\\,")
-
-
 def _is_number(text: str) -> bool:
     return text.isascii() and text.isdigit()
 
@@ -377,9 +306,3 @@ def _within(value: NumberT, low: NumberT, high: NumberT, shown: Callable[[Number
     if not low <= value <= high:
         raise ValueError(f"must be within {shown(low)} and {shown(high)}")
     return value
-
-
-def option_help() -> dict[str, str]:
-    """Return each option as it is written in help -> what it does, with its default."""
-    flags = {name: flag.help for name, flag in FLAGS.items() if flag.help}
-    return flags | {f"{name}=": value.help for name, value in VALUES.items()}

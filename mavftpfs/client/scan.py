@@ -10,7 +10,7 @@ import trio
 
 from mavftpfs.client.connect import connect_options
 from mavftpfs.client.files import Target, mount_status
-from mavftpfs.client.options import MountOptions
+from mavftpfs.client.options import Options
 from mavftpfs.link.base import Link
 from mavftpfs.link.messages import MAV_AUTOPILOT_INVALID, MAV_TYPE_GCS, Address, Heartbeat
 from mavftpfs.link.opening import open_link
@@ -75,7 +75,7 @@ async def scan(target: Target) -> list[Entry]:
         return found
 
 
-async def _listen(link: Link, options: MountOptions) -> dict[Address, Heartbeat]:
+async def _listen(link: Link, options: Options) -> dict[Address, Heartbeat]:
     """Return who is heard in LISTEN_TIME after the first heartbeat, whoever sends it."""
     anybody = replace(connect_options(options), target_system=0, target_component=0)
     async with connected(link, anybody) as connection:
@@ -89,7 +89,7 @@ async def _listen(link: Link, options: MountOptions) -> dict[Address, Heartbeat]
         return dict(connection.vehicle.heard)
 
 
-async def _probe(link: Link, options: MountOptions, heartbeat: Heartbeat, patience: float) -> Entry:
+async def _probe(link: Link, options: Options, heartbeat: Heartbeat, patience: float) -> Entry:
     address = heartbeat.source
     entry: Entry = {
         "system": address.system,

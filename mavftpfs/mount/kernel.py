@@ -29,12 +29,12 @@ import mavftpfs
 from mavftpfs.client.connect import NO_SINKS, Attached, Sinks, attached
 from mavftpfs.client.control import ControlServer, Reply
 from mavftpfs.client.mountpoint import is_ours, stderr_of, unmount, unmount_what_is_left
-from mavftpfs.client.options import MountOptions, fuse_words
 from mavftpfs.link.uri import LinkSpec
 from mavftpfs.mount.daemon import Report
 from mavftpfs.mount.farewell import say_goodbye
 from mavftpfs.mount.handles import InodeTable, Presentation
 from mavftpfs.mount.operations import Operations
+from mavftpfs.mount.options import MountOptions, fuse_words
 from mavftpfs.shared.errors import ExitCode, MavftpfsError, MountFailed, exit_code_for
 
 log = logging.getLogger("mavftpfs.mount")
@@ -72,7 +72,7 @@ def run_mount(request: MountRequest, report: Report) -> int:
     def attach(invalidate: Callable[[bytes], None]) -> AbstractAsyncContextManager[Attached]:
         return attached(
             request.spec,
-            request.options,
+            request.options.client,
             invalidate=invalidate,
             sinks=request.sinks,
             writing=True,
@@ -274,10 +274,10 @@ class _Life:
             "state": "unmounting" if self._let_go else "mounted",
             "problem": None,
             "source": self.request.source,
-            "root": os.fsdecode(self.request.options.root),
+            "root": os.fsdecode(self.request.options.client.root),
             "pid": os.getpid(),
             "version": mavftpfs.__version__,
-            "read_only": self.request.options.read_only,
+            "read_only": self.request.options.client.read_only,
             "uptime": round(time.time() - self._started, 1),
             **vehicle.status(),
             "kernel": operations.counts(),
@@ -346,7 +346,7 @@ def presentation(options: MountOptions) -> Presentation:
         gid=os.getgid() if options.gid is None else options.gid,
         file_mode=options.file_mode(umask),
         directory_mode=options.directory_mode(umask),
-        op_deadline=options.op_deadline,
+        op_deadline=options.client.op_deadline,
     )
 
 

@@ -18,9 +18,10 @@ from typing import Any, cast
 import trio
 
 from mavftpfs.client.connect import Attached
-from mavftpfs.client.options import MountOptions
+from mavftpfs.client.options import Options
 from mavftpfs.link.uri import parse_source
 from mavftpfs.mount.kernel import MountRequest, serve_mount
+from mavftpfs.mount.options import MountOptions
 from tests.ops.faketree import FakeTree
 
 VALID_FOR = 1000.0
@@ -87,7 +88,7 @@ def main() -> int:
     source = "udpin:127.0.0.1:1"
     mountpoint, control = sys.argv[1:]
     request = MountRequest(
-        source, parse_source(source), mountpoint, MountOptions(read_only=True), control=Path(control)
+        source, parse_source(source), mountpoint, MountOptions(Options(read_only=True)), control=Path(control)
     )
     return trio.run(serve_mount, request, Server().attach, report)
 

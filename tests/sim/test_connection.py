@@ -15,7 +15,7 @@ from trio.testing import MockClock
 
 from mavftpfs.cache.recovery import SpoolDirectory
 from mavftpfs.client import connect as compose
-from mavftpfs.client.options import MountOptions
+from mavftpfs.client.options import Options
 from mavftpfs.link.framing import MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES, MAV_CMD_REQUEST_MESSAGE, Framer
 from mavftpfs.link.messages import (
     MAV_AUTOPILOT_INVALID,
@@ -180,7 +180,7 @@ async def test_a_restart_while_leaving_has_nothing_delivered(
     here = world("ardupilot", f=content(100))
     join(monkeypatch, here, tmp_path)
     faults = Faults(here)
-    async with compose.attached(parse_source("udpin:127.0.0.1:1"), MountOptions(), writing=True) as up:
+    async with compose.attached(parse_source("udpin:127.0.0.1:1"), Options(), writing=True) as up:
         await trio.sleep(60.0)
         file = await up.tree.open(b"/d/f", write=True)
         await file.write(0, b"changed")

@@ -21,7 +21,7 @@ from mavftpfs.cli import main as cli
 from mavftpfs.cli.verbs import until_interrupted
 from mavftpfs.client import connect as compose
 from mavftpfs.client import control, status
-from mavftpfs.client.options import MountOptions
+from mavftpfs.mount.options import MountOptions
 from mavftpfs.shared import errors
 from mavftpfs.shared.errors import (
     ExitCode,

@@ -8,12 +8,11 @@ from typing import Any
 
 import pytest
 
-from mavftpfs.cache.options import CacheOptions
 from mavftpfs.client.connect import cache_options, connect_options
-from mavftpfs.client.options import VALUES, MountOptions, fuse_words
+from mavftpfs.client.options import Options
 from mavftpfs.link.uri import parse_source
 from mavftpfs.mount.kernel import presentation
-from mavftpfs.session.connection import ConnectOptions
+from mavftpfs.mount.options import MountOptions, fuse_words
 
 OTHER: dict[str, Any] = {
     "read_only": True,
@@ -45,19 +44,18 @@ ELSEWHERE = {"baud", "connect_timeout", "cache_dir", "log_file", "trace", "tlog"
 def told(options: MountOptions) -> tuple[Any, ...]:
     """Return what kernel, session and caches are told."""
     return (
-        connect_options(options),
-        cache_options(options, parse_source("udpin:0.0.0.0:14550")),
+        connect_options(options.client),
+        cache_options(options.client, parse_source("udpin:0.0.0.0:14550")),
         fuse_words(options, "SOURCE"),
         presentation(options),
     )
 
 
-FIELDS = {field.name for part in (MountOptions, CacheOptions, ConnectOptions) for field in fields(part)}
+OWN, SHARED = ({field.name for field in fields(part)} for part in (MountOptions, Options))
 
 
-@pytest.mark.parametrize("name", sorted((FIELDS & VALUES.keys() | OTHER.keys()) - ELSEWHERE))
+@pytest.mark.parametrize("name", sorted((OWN | SHARED) - {"client"} - ELSEWHERE))
 def test_every_option_is_passed_on(name: str, tmp_path: Path) -> None:
-    defaults = MountOptions()
     value = OTHER.get(name, 77)
     if name == "signing_key":
         value = str(tmp_path / "key")
@@ -65,5 +63,5 @@ def test_every_option_is_passed_on(name: str, tmp_path: Path) -> None:
         (tmp_path / "key").chmod(0o600)
     elif name == "cache_size":
         value = 77 << 20
-    own = name in MountOptions.__slots__
-    assert told(replace(defaults, **{name: value} if own else {"passed_on": {name: value}})) != told(defaults)
+    changed = {name: value} if name in OWN else {"client": replace(Options(), **{name: value})}
+    assert told(MountOptions(**changed)) != told(MountOptions())

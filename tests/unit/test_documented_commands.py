@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from mavftpfs.cli import main as cli
-from mavftpfs.client.options import parse_options
 from mavftpfs.link.uri import parse_source
+from mavftpfs.mount.options import parse_options
 
 PROJECT = Path(__file__).parents[2]
 PAGES = ("README.md", "docs/guide.md", "docs/benchmarks.md")

@@ -10,7 +10,7 @@ import pytest
 
 from mavftpfs.cli import install
 from mavftpfs.cli import main as cli
-from mavftpfs.client.options import option_help
+from mavftpfs.mount.options import option_help
 from mavftpfs.shared.errors import EXIT_CODES, ExitCode
 
 COMMANDS = [name for name in cli._COMMANDS if name != "mount"]

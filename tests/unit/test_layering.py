@@ -30,6 +30,7 @@ LAYERS: dict[str, set[str]] = {
     "mount": {"shared", "protocol", "link", "cache", "session", "client"},
     "sim": {"shared", "protocol", "link"},
     "cli": {"shared", "protocol", "link", "cache", "session", "client", "mount", "sim"},
+    "api": {"shared", "protocol", "link", "cache", "session", "client"},
 }
 """Layer -> the layers below it that it may import. `__main__` runs the top one."""
 
@@ -53,6 +54,7 @@ PURE_MODULES = {
     "cache.draft",
     "client.options",
     "mount.handles",
+    "mount.options",
 }
 IMPURE_MODULES = {"sim.endpoints", "sim.tree", "shared.private"}
 IMPURE_IMPORTS = {"trio", "time", "socket", "logging", "pyfuse3", "os", "pathlib"}
@@ -271,6 +273,8 @@ def package(**sources: str) -> dict[str, Module]:
         ("session__store", "cache.files"),
         ("client__files", "mount.handles"),
         ("client__files", "cli.report"),
+        ("api__drone", "mount.kernel"),
+        ("api__drone", "cli.report"),
         ("mount__kernel", "sim.vehicle"),
         ("mount__kernel", "cli.report"),
         ("link__udp", "client.files"),

@@ -1,4 +1,4 @@
-"""fuse.options: every word that `-o` may hold."""
+"""Every word that `-o` may hold, and the library's keywords."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mavftpfs.cache.options import DEFAULT_LOCAL, CacheOptions
-from mavftpfs.client.options import (
+from mavftpfs.client.options import Options, options_of
+from mavftpfs.mount.options import (
     FLAGS,
     IGNORED_WORDS,
     KERNEL_WORDS,
@@ -24,17 +25,21 @@ from mavftpfs.client.options import (
 from mavftpfs.session.connection import ConnectOptions
 from mavftpfs.shared.errors import UsageError
 
-OWN, PASSED_ON = (
+OWN, SHARED, PASSED_ON = (
     {field.name: field.default for part in parts for field in fields(part)}
-    for parts in ((MountOptions,), (CacheOptions, ConnectOptions))
+    for parts in ((MountOptions,), (Options,), (CacheOptions, ConnectOptions))
 )
 
 
 def test_the_table_fills_fields_and_no_others() -> None:
     named = set(VALUES) | {flag.field for flag in FLAGS.values() if flag.field}
-    assert set(OWN) <= named | {"kernel_words", "passed_on"}
-    assert named <= OWN.keys() | PASSED_ON.keys()
+    assert named == OWN.keys() - {"client", "kernel_words"} | SHARED.keys()
     assert not set(VALUES) & (KERNEL_WORDS | IGNORED_WORDS | set(FLAGS))
+
+
+def test_defaults_are_those_of_the_session_and_the_caches() -> None:
+    both = SHARED.keys() & PASSED_ON.keys()
+    assert {name: SHARED[name] for name in both} == {name: PASSED_ON[name] for name in both}
 
 
 @pytest.mark.parametrize(
@@ -68,12 +73,12 @@ def test_words_for_others_are_ignored(word: str) -> None:
 )
 def test_values(text: str, field: str, value: object) -> None:
     options = parse_options([text])
-    assert (getattr(options, field) if field in OWN else options.passed_on[field]) == value
+    assert getattr(options if field in OWN else options.client, field) == value
 
 
 def test_the_last_word_wins() -> None:
     options = parse_options(["ro,uid=1", "rw,uid=2"])
-    assert (options.read_only, options.uid) == (False, 2)
+    assert (options.client.read_only, options.uid) == (False, 2)
     assert parse_options(["async,sync,async"]).kernel_words == ("async",)
 
 
@@ -112,6 +117,41 @@ def test_wrong_words_are_named(text: str, named: str) -> None:
 def test_any_text_is_parsed_or_refused(text: str) -> None:
     with suppress(UsageError):
         assert isinstance(parse_options([text]), MountOptions)
+
+
+@pytest.mark.parametrize(
+    ("keywords", "text"),
+    [
+        ({"ro": True, "force": False}, "ro"),
+        ({"ro": False}, "rw"),
+        ({"rw": False}, "ro"),
+        ({"cache_size": "1G", "target_system": 2, "baud": None}, "cache_size=1G,target_system=2"),
+        ({"cache_size": 1 << 30, "op_deadline": 2.5}, "cache_size=1G,op_deadline=2.5"),
+        ({"chunk": "auto", "local": "+*.tmp", "root": b"/fs"}, "chunk=auto,local=+*.tmp,root=/fs"),
+        ({"trace": Path("a/b")}, "trace=a/b"),
+    ],
+)
+def test_keywords_say_what_words_say(keywords: dict[str, object], text: str) -> None:
+    assert options_of(keywords) == parse_options([text]).client
+
+
+@pytest.mark.parametrize(
+    ("keywords", "named"),
+    [
+        ({"frobnicate": 1}, "unknown option 'frobnicate'"),
+        ({"uid": 0}, "unknown option 'uid'"),
+        ({"read_only": True}, "unknown option 'read_only'"),
+        ({"ro": "yes"}, "option ro is True or False"),
+        ({"target_system": True}, "option target_system cannot be True"),
+        ({"target_system": 2.5}, "target_system=2.5: must be a whole number"),
+        ({"local": ["a"]}, "option local cannot be"),
+        ({"verify": "perhaps"}, "verify=perhaps: must be one of"),
+        ({"cache_size": 1}, "cache_size=1: must be within"),
+    ],
+)
+def test_wrong_keywords_are_named(keywords: dict[str, object], named: str) -> None:
+    with pytest.raises(UsageError, match=named):
+        options_of(keywords)
 
 
 def test_what_goes_to_fuse() -> None:
@@ -188,7 +228,7 @@ def test_guide_and_help_tell_the_real_defaults() -> None:
     checked = set()
     for name, value in told_defaults():
         with suppress(ValueError):
-            parsed, default = VALUES[name].parse(value), {**PASSED_ON, **OWN}[name]
+            parsed, default = VALUES[name].parse(value), {**SHARED, **OWN}[name]
             if default is not None or value == "auto":
                 assert (name, parsed) == (name, default)
                 checked.add(name)
