@@ -75,7 +75,7 @@ class Link(Protocol):
         ...
 
     def sender(self, index: int) -> NetAddress | None:
-        """Return who sent a chunk of the list that `receive` returned last; None where only one can."""
+        """Return the sender of a chunk that `receive` returned last; None where there is only one sender."""
         ...
 
     def answer(self, address: NetAddress) -> None:
@@ -83,7 +83,7 @@ class Link(Protocol):
         ...
 
     def keep_peer(self) -> None:
-        """Whoever is served was heard just now: its connection keeps its place for some seconds more."""
+        """The peer that is served was heard just now: its connection keeps its place some seconds more."""
         ...
 
     async def aclose(self) -> None:

@@ -13,7 +13,7 @@ heartbeats must not be taken for live ones. The verdict depends on the bytes alo
 were split. What waits for its rest is at most one frame.
 
 A damaged length makes the search wait for up to 280 bytes, which on a link with nothing but heartbeats takes
-many seconds. So whoever feeds a stream says when it fell silent (`give_up`): frames come in one piece.
+many seconds. So the reader of a stream says when it fell silent (`give_up`): frames come in one piece.
 
 A datagram ends what it holds; a frame cut at its end is kept in case a serial bridge split it, and dropped
 when the next datagram begins with a frame of its own.
@@ -77,7 +77,7 @@ class Framer:
     """Both directions of one connection.
 
     Args:
-        source: who we are in the frames we send.
+        source: our address in the frames we send.
         stream: whether `feed` gets pieces of a stream, and no datagrams.
         signing_key: 32 bytes; then all is sent signed, and unsigned or wrongly signed frames are refused.
         signing_clock: now, in units of 10 µs since 2015-01-01; must not go back from one run to the next,
@@ -115,7 +115,7 @@ class Framer:
 
     @property
     def source(self) -> Address:
-        """Who we are in the frames we send; may be changed."""
+        """Our address in the frames we send; may be changed."""
         return Address(self._sender.srcSystem, self._sender.srcComponent)
 
     @source.setter

@@ -34,7 +34,7 @@ class FtpRun(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Heartbeat:
-    """HEARTBEAT of anybody on the link; autopilot: MAV_AUTOPILOT_INVALID of who is none."""
+    """HEARTBEAT of anything on the link; autopilot: MAV_AUTOPILOT_INVALID where the sender is none."""
 
     source: Address
     vehicle_type: int

@@ -142,7 +142,7 @@ class StreamLink:
         self._vouched_at = trio.current_time()
 
     def replace(self, pipe: Pipe, peer: NetAddress | None = None) -> None:
-        """Go on with another pipe (a new connection). peer: who opened it, if not we."""
+        """Go on with another pipe (a new connection). peer: the address that opened it, if it was not us."""
         if self._closed:
             pipe.close()
             return

@@ -125,7 +125,7 @@ async def _accept_peers(listener: socket.socket, link: StreamLink) -> None:
         except BaseException:
             peer.close()
             raise
-        # Each connection has a port of its own: who comes back has the same host.
+        # Each connection has a port of its own: a peer that comes back has the same host.
         link.replace(_configure(peer), address[:1])
 
 

@@ -1,6 +1,6 @@
 """UDP links. Layer: link.
 
-`udpin` binds a port and answers whoever spoke last, until `answer` names the vehicle's address. `udpout`
+`udpin` binds a port and answers the last sender, until `answer` names the vehicle's address. `udpout`
 speaks first, to one host. It keeps its source port for the life of the process: PX4 answers only the first
 address it heard (servers.md 5). The socket is never connected, so that the ICMP message "port unreachable" of
 a vehicle that reboots is not an error.
@@ -109,7 +109,7 @@ class UdpLink:
                     self.stats.dropped_sends += 1
 
     def sender(self, index: int) -> NetAddress | None:
-        """Return who sent a chunk of the last batch."""
+        """Return the sender of a chunk of the last batch."""
         return self._senders[index]
 
     def answer(self, address: NetAddress) -> None:

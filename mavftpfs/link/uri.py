@@ -24,7 +24,7 @@ _EXAMPLES = "udpin:0.0.0.0:14550, tcp:192.168.1.10:5760 or /dev/ttyUSB0,57600"
 
 
 class LinkKind(Enum):
-    """Who opens the conversation, and over what."""
+    """Which end opens the conversation, and over what."""
 
     UDP_IN = "udpin"
     UDP_OUT = "udpout"

@@ -2,7 +2,7 @@
 
 Every byte counts that would not be on the link without us: our frames, and the vehicle's replies to them,
 both ways together, because they share a radio's airtime. A read's reply is paid for when the read goes out;
-what else comes back is paid for when it comes. Who has to wait for that sends nothing, so no timer runs.
+what else comes back is paid for when it comes. What has to wait for that is not sent yet, so no timer runs.
 """
 
 from __future__ import annotations
@@ -48,10 +48,10 @@ class Budget:
         self._lent = 0.0
         self._wanted: float | None = None
 
-    # --- who may send
+    # --- what may go out
 
     def begin(self) -> None:
-        """It is looked at anew who wants to send."""
+        """See Flow.begin."""
         self.held = False
         self._wanted = None
 
@@ -77,7 +77,7 @@ class Budget:
         self._wanted = self._lent if self._wanted is None else max(self._wanted, self._lent)
 
     def next_room_at(self) -> float:
-        """Return when who had too little room will have more; infinite if nobody had."""
+        """Return when there will be more room; infinite if there was enough for everything."""
         if self._wanted is None:
             return inf
         return self._at + max(0.0, -self._balance - self._wanted) / self.rate + 1e-6

@@ -88,7 +88,7 @@ class Engine:
         self._finished: list[Operation] = []
         self._timers = Timers()
         self._due, self._heard_at = inf, -inf
-        self._burst_op: Operation | None = None  # whose the burst packets may be
+        self._burst_op: Operation | None = None  # to which burst packets belong
         self._burst_heard_at = -inf  # believed or not: an abandoned burst of ArduPilot goes on
 
     # --- facts
@@ -275,7 +275,7 @@ class Engine:
         return wires
 
     def hold(self, now: float) -> None:
-        """Nothing may go out now; who begins to want something meanwhile does not wait for ever either."""
+        """Nothing may go out now. The patience of operations that want something runs all the same."""
         for op in self._ops:
             op.waits(now)
 
@@ -291,7 +291,7 @@ class Engine:
         if room <= 0 and in_flight <= _FEW and (unheard := ledger.unheard()):
             room = self.flow.room(in_flight - unheard, now, paced=op.paced)
         if room <= 0 and urgent and in_flight < self.flow.most_beside:
-            # Nor must a window that was full when it shrank, of what may be answered late or never.
+            # A window that shrank may be full of requests that nobody answers. Metadata passes those, too.
             others = sum(other.sent and other.rank is Priority.METADATA for other in self._ops)
             room = self.flow.room(others, now, paced=op.paced, urgent=True)
         left = room

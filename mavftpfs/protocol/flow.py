@@ -88,8 +88,8 @@ QUEUE_SHARE = 0.15
 LITTLE, whichever is less, by TICK, and by twice what the answers of the round differ. Jitter is no queue."""
 
 QUEUE = 0.1
-"""Seconds of answers that wait in a link's queue: at most at a serial port, because who lists a directory
-waits for them; by intent where a server pauses, because the link sends them meanwhile."""
+"""Seconds of answers that wait in a link's queue: at most at a serial port, because a listing
+waits behind them; by intent where a server pauses, because the link sends them meanwhile."""
 
 SMOOTHING = 0.2
 """What one round counts for in an average, at most."""
@@ -181,10 +181,10 @@ class Flow:
         elif self._pacer is None or self._pacer.queue != self.cap:
             self._pacer, self.pause = Pacer(self.cap, self._limit), 0.0
 
-    # --- who may send
+    # --- what may go out
 
     def begin(self) -> None:
-        """It is looked at anew who has something to send: `room` follows for each."""
+        """A look at all operations begins: `room` follows for each that has something to send."""
         self._hurried = self._blocked = False
         self._wake = inf
         if self._pacer is not None:
@@ -342,12 +342,14 @@ class Flow:
         total = self._answered + self._lost
         # What arrives while a server pauses overflows its buffer, and its answers wait: that says nothing of
         # the link. It shows for a round trip after that.
-        excused = self.pause > 0.0 and self._paused_at + self._base >= self._round_start
+        paused = self.pause > 0.0 and self._paused_at + self._base >= self._round_start
         waits = self._reserve() if self.pause else 0.0
-        congested = self._lost > 0 and not excused and self._queued(1.0, waits)
+        congested = self._lost > 0 and not paused and self._queued(1.0, waits)
         usual = self._usual_loss * total
-        shy = congested or (not excused and self._lost > usual + UNUSUAL * sqrt(usual + 1.0))
-        self._learn_averages(now, total, losses=not (excused or self._queued() or (self._serial and shy)))
+        lost_too_much = congested or (not paused and self._lost > usual + UNUSUAL * sqrt(usual + 1.0))
+        self._learn_averages(
+            now, total, losses=not (paused or self._queued() or (self._serial and lost_too_much))
+        )
         if congested and not self.starved and self._queued(2.0, waits):
             self._rates.clear()  # only what came now is the path's
         rate, before = self._answered / took, self._rate
@@ -356,17 +358,17 @@ class Flow:
         self._rate = max(self._rates, default=0.0)
         if self.starved:
             return
-        if not excused:
-            self._bold = self._bold * (1.0 - STEP) if shy else min(1.0, self._bold + BOLDER)
+        if not paused:
+            self._bold = self._bold * (1.0 - STEP) if lost_too_much else min(1.0, self._bold + BOLDER)
         if self._serial:
-            back = shy or self._queued()
+            back = lost_too_much or self._queued()
             most = int(self._rate * (self._base + QUEUE)) + 2
             self.window = max(1, self.window - 1) if back else min(self.cap, self.window + 1, most)
             return
         if self._starting:
             self._flat = 0 if rate > (1.0 + STEP) * before else self._flat + 1
             overflown = self._lost >= max(2 * FIRST, MOST_LOSS * total) or self._queued()
-            self._starting = self._flat < FLAT_ROUNDS and (excused or not overflown)
+            self._starting = self._flat < FLAT_ROUNDS and (paused or not overflown)
         if self._starting:
             return
         held = self._held()  # the window is to fill the path, and a little more

@@ -37,8 +37,8 @@ _MOST_REMEMBERED = 1024
 class DuplicateDetector:
     """Knows which answers are still to come, and when requests that change names went out.
 
-    Whoever asks twice may be answered twice. Any further answer means that the network delivered a request,
-    or its answer, more than once, so that a request may be carried out once more at any time.
+    A request that was sent twice may be answered twice. Any further answer means that the network delivered
+    a request, or its answer, more than once. So a request may be carried out once more at any time.
 
     Answers are known by their seq, which is the request's plus one.
     """

@@ -16,7 +16,7 @@ from mavftpfs.protocol.requests import MANNERS, Operation, Priority, Request, na
 from mavftpfs.shared.errors import PathTooLong
 from mavftpfs.shared.model import DirEntry, EntryKind, usable_name
 
-__all__ = ["ListDirectory", "OpenFile", "Operation", "Priority", "Simple"]
+__all__ = ["ListDirectory", "OpenRequest", "Operation", "Priority", "Simple"]
 
 MAX_ENTRIES = 100_000
 MAX_PAGES = 60_000
@@ -86,7 +86,7 @@ class Simple(Operation):
             self.finish()
 
 
-class OpenFile(Simple):
+class OpenRequest(Simple):
     """OpenFileRO, OpenFileWO or CreateFile; session: the id to ask for. `sent` after a time-out: it may have
     been executed.
 
@@ -248,6 +248,6 @@ class ListDirectory(Operation):
         self._empty_pages += 1
         self.strings += 1
         if self._empty_pages >= _MAX_EMPTY_PAGES:
-            # So many neighbours whose names fit no page look the same: behind them there may be more.
+            # So many names in a row that fit no page look like the end, too: more may come behind them.
             self.complete = self._pages == self._empty_pages
             self.finish()

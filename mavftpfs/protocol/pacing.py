@@ -83,7 +83,7 @@ class Pacer:
     # --- sending
 
     def begin(self) -> None:
-        """It is looked at anew who has something to send."""
+        """See Flow.begin."""
         self.blocked, self._urgent_at = False, -inf
 
     def room(self, in_flight: int, now: float) -> int:

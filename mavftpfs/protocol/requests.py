@@ -143,7 +143,7 @@ def nak_of(request: Request, reply: Payload) -> FtpNak:
 
 
 class Priority(IntEnum):
-    """Who goes first when the window has room for one."""
+    """Which operation goes first when the window has room for one request."""
 
     METADATA = 0
     DEMAND = 1
@@ -175,7 +175,7 @@ class Operation:
     """
 
     rank = Priority.METADATA
-    """Who goes first; `priority` says it more exactly."""
+    """The order among operations; `priority` says it more exactly."""
 
     bulk = -1
     """The opcode whose ACKs may come as an `on_run`; -1: none."""
@@ -196,7 +196,7 @@ class Operation:
 
     @property
     def priority(self) -> Priority:
-        """Who goes first now."""
+        """The order among operations, now."""
         return self.rank
 
     @property

@@ -121,8 +121,8 @@ class Timers:
             timer = self.of[request.manner.family]
             timer.sample(now - sent_at)
             if timer.samples == 1:
-                # A lost Open after a few listings should not cost a second: that is what nothing known would
-                # mean. The first sample allows for three round trips, which is generous for who has none yet.
+                # A family without samples would wait 1 s. Start it from another family's first sample, which
+                # allows for three round trips.
                 for other in self.of.values():
                     if not other.samples and timer.unfloored < other.unfloored:
                         other.unfloored = timer.unfloored

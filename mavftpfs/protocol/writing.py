@@ -47,7 +47,7 @@ _NO_FILE_ERRNOS = frozenset((0, 9))
 
 _SESSION_CODES = frozenset((NakCode.FAIL, NakCode.INVALID_SESSION, NakCode.FILE_NOT_FOUND))
 """Refusals of a write that mean "no file is open": MAVSDK says 1, PX4 4, ArduPilot 10 (servers.md 1). On
-MAVSDK 1 may be a full card, too: who reopens and fails at the same place again knows."""
+MAVSDK 1 may be a full card, too: then the write fails at the same place again after the file was reopened."""
 
 
 class ChunkSource(Protocol):

@@ -23,7 +23,7 @@ from typing import TypeVar
 
 import trio
 
-from mavftpfs.protocol.operations import ListDirectory, OpenFile, Simple
+from mavftpfs.protocol.operations import ListDirectory, OpenRequest, Simple
 from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.protocol.requests import Operation
 from mavftpfs.session.doubt import Doubt
@@ -261,7 +261,7 @@ class ServerSession:
         remedies, resent = _Remedies(), False
         while True:
             asked, echoes = self.engine.home_session, self.engine.traits.ack_carries_own_session
-            operation = OpenFile(opcode, wire_path(path), session=asked)
+            operation = OpenRequest(opcode, wire_path(path), session=asked)
             # A time-out or a cancellation leaves it so: the open may have been carried out, under either id.
             if echoes is not False:
                 self.maybe_open[asked] = path

@@ -17,7 +17,7 @@ _AUTOPILOTS = {3: "ArduPilot", 12: "PX4", 0: "generic autopilot"}
 def readable(message: str) -> str:
     """Return a message in which names, which are bytes, are text: `b'/Fl\\xc3\\xbcge'` is `'/Flüge'`.
 
-    What is no UTF-8 stays escaped; what a terminal would obey is `?`, whoever put it there.
+    What is no UTF-8 stays escaped; what a terminal would obey is `?`.
     """
     return _CONTROL.sub("?", _BYTES.sub(_as_text, message))
 

@@ -12,7 +12,7 @@ from mavftpfs.link.messages import Address
 from mavftpfs.protocol.burst import BurstTransfer
 from mavftpfs.protocol.engine import Engine
 from mavftpfs.protocol.flow import Flow
-from mavftpfs.protocol.operations import ListDirectory, OpenFile, Operation, Simple, parse_page
+from mavftpfs.protocol.operations import ListDirectory, OpenRequest, Operation, Simple, parse_page
 from mavftpfs.protocol.payload import (
     MAX_DATA,
     PAYLOAD_SIZE,
@@ -125,7 +125,7 @@ def busy_engine(seed: int, kind: type[ReadTransfer]) -> tuple[Engine, list[Opera
     transfer = kind(0, len(CONTENT), sink)
     operations = [
         transfer,
-        OpenFile(Opcode.OPEN_FILE_RO, b"/f", session=7),
+        OpenRequest(Opcode.OPEN_FILE_RO, b"/f", session=7),
         ListDirectory(b"/d"),
         Simple(Opcode.TERMINATE_SESSION, session=3),
         Simple(Opcode.CALC_FILE_CRC32, b"/f"),
@@ -231,7 +231,7 @@ def test_a_transfer_ends_with_the_right_bytes_or_an_error(
     server = FtpServer(tree, PROFILES[name], rng=random.Random(rng.random()))
     wire = LinkSettings(delay=0.02, loss=loss, duplicate=duplicate, reorder=reorder, jitter=0.01)
     link = VirtualLink(server, wire, seed=seed)
-    opened = OpenFile(Opcode.OPEN_FILE_RO, b"/f", session=link.engine.home_session)
+    opened = OpenRequest(Opcode.OPEN_FILE_RO, b"/f", session=link.engine.home_session)
     link.run(opened)
     if opened.error is not None:
         return  # the ACK was lost and the file is open over there: the session layer's business

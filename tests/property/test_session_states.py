@@ -15,7 +15,7 @@ from trio.testing import MockClock
 from mavftpfs.link.messages import Address
 from mavftpfs.protocol.engine import Engine
 from mavftpfs.protocol.flow import Flow
-from mavftpfs.protocol.operations import OpenFile, Operation, Simple
+from mavftpfs.protocol.operations import OpenRequest, Operation, Simple
 from mavftpfs.protocol.payload import NakCode, Opcode, Payload
 from mavftpfs.session.doubt import Doubt
 from mavftpfs.session.driver import Driver
@@ -47,7 +47,7 @@ class Answering:
             opcode = Opcode(operation.opcode)
         if isinstance(answer, int):
             raise FtpNak(opcode, NakCode(answer), retransmitted=answer % 2 == 1)
-        if isinstance(operation, OpenFile):
+        if isinstance(operation, OpenRequest):
             operation.session, operation.reply = 1, Payload(1, 0, Opcode.ACK, 0, opcode)
 
     async def be_silent(self, seconds: float) -> bool:

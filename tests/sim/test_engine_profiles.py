@@ -8,7 +8,7 @@ import pytest
 
 from mavftpfs.protocol.burst import BurstTransfer
 from mavftpfs.protocol.chunking import ChunkSize
-from mavftpfs.protocol.operations import ListDirectory, OpenFile, Simple
+from mavftpfs.protocol.operations import ListDirectory, OpenRequest, Simple
 from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.protocol.reading import ReadToEof, ReadTransfer
 from mavftpfs.shared.errors import FtpNak, SessionLost
@@ -46,7 +46,7 @@ class Rig:
         """Open a file, insisting: a lost ACK leaves it open over there (servers.md 14.10)."""
         engine = self.link.engine
         for _ in range(10):
-            op = OpenFile(Opcode.OPEN_FILE_RO, path, session=engine.home_session)
+            op = OpenRequest(Opcode.OPEN_FILE_RO, path, session=engine.home_session)
             self.link.run(op)
             if op.error is None:
                 self.session = engine.session = op.session
@@ -93,7 +93,7 @@ class Rig:
         """Whether another client can open a file at once."""
         self.link.model.settings = LinkSettings()
         engine = self.link.engine
-        op = OpenFile(Opcode.OPEN_FILE_RO, b"/big", session=(engine.home_session % 200) + 1)
+        op = OpenRequest(Opcode.OPEN_FILE_RO, b"/big", session=(engine.home_session % 200) + 1)
         self.link.run(op)
         if op.error is None:
             self.link.run(Simple(Opcode.TERMINATE_SESSION, session=op.session))

@@ -14,7 +14,7 @@ import trio
 from trio.testing import MockClock
 
 from mavftpfs.link.messages import Address
-from mavftpfs.protocol.operations import OpenFile
+from mavftpfs.protocol.operations import OpenRequest
 from mavftpfs.protocol.payload import Opcode, decode_request, request
 from mavftpfs.session.connection import Connection, ConnectOptions
 from mavftpfs.session.reader import REOPENS, STALL
@@ -511,7 +511,9 @@ def others_session(connection: Connection) -> int:
 
 async def open_elsewhere(connection: Connection) -> None:
     """Leave a session open under an id that is not this connection's, as a killed client does."""
-    await connection.driver.run(OpenFile(Opcode.CREATE_FILE, b"/d/left", session=others_session(connection)))
+    await connection.driver.run(
+        OpenRequest(Opcode.CREATE_FILE, b"/d/left", session=others_session(connection))
+    )
 
 
 async def test_a_session_in_use_is_told_in_time_and_is_not_asked_for_often(autojump_clock: MockClock) -> None:

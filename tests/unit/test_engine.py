@@ -10,7 +10,7 @@ from mavftpfs.protocol.burst import BurstTransfer
 from mavftpfs.protocol.engine import Engine
 from mavftpfs.protocol.flow import Flow
 from mavftpfs.protocol.ledger import BURST_JUMP, FURTHEST_JUMP
-from mavftpfs.protocol.operations import ListDirectory, OpenFile, Simple
+from mavftpfs.protocol.operations import ListDirectory, OpenRequest, Simple
 from mavftpfs.protocol.payload import NakCode, Opcode, Payload
 from mavftpfs.protocol.reading import ReadTransfer
 from mavftpfs.shared.errors import FtpNak, RequestTimeout
@@ -174,7 +174,7 @@ def test_the_session_is_checked_once_it_is_known_to_be_echoed() -> None:
 @pytest.mark.holds("promise 6")
 def test_an_echoed_id_means_a_short_shared_queue() -> None:
     engine = make()
-    op = OpenFile(Opcode.OPEN_FILE_RO, b"/f", session=77)
+    op = OpenRequest(Opcode.OPEN_FILE_RO, b"/f", session=77)
     engine.start(op, 0.0)
     engine.receive(ack(sent(engine, 0.0)[0], b"\xff\xff\xff\xff"), 0.1)
     assert (op.session, op.size) == (77, 0xFFFFFFFF)

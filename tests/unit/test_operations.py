@@ -8,7 +8,7 @@ import pytest
 
 from mavftpfs.protocol.engine import Engine
 from mavftpfs.protocol.flow import Flow
-from mavftpfs.protocol.operations import MAX_ENTRIES, ListDirectory, OpenFile, Operation, Simple
+from mavftpfs.protocol.operations import MAX_ENTRIES, ListDirectory, OpenRequest, Operation, Simple
 from mavftpfs.protocol.payload import NakCode, Opcode, Payload
 from mavftpfs.shared.errors import FtpNak, PathTooLong
 from mavftpfs.shared.model import DirEntry, EntryKind
@@ -22,7 +22,7 @@ def begin(op: Operation) -> tuple[Engine, Payload]:
     return engine, request
 
 
-# --- Simple, OpenFile, Terminate
+# --- Simple, OpenRequest, Terminate
 
 
 @pytest.mark.holds("rule 14.4")
@@ -64,7 +64,7 @@ def test_too_long_data_is_refused_before_a_byte_is_sent() -> None:
 
 @pytest.mark.parametrize("data", [b"", b"\1\2\3"])
 def test_an_open_ack_may_say_no_size(data: bytes) -> None:
-    op = OpenFile(Opcode.CREATE_FILE, b"/f", session=9)
+    op = OpenRequest(Opcode.CREATE_FILE, b"/f", session=9)
     engine, request = begin(op)
     engine.receive(ack(request, data), 0.1)
     assert op.size is None
@@ -73,7 +73,7 @@ def test_an_open_ack_may_say_no_size(data: bytes) -> None:
 
 @pytest.mark.holds("rule 14.6")
 def test_an_open_with_session_0_proves_nothing() -> None:
-    op = OpenFile(Opcode.OPEN_FILE_RO, b"/f", session=0)
+    op = OpenRequest(Opcode.OPEN_FILE_RO, b"/f", session=0)
     engine, request = begin(op)
     engine.receive(ack(request, bytes(4)), 0.1)
     assert engine.traits.ack_carries_own_session is None

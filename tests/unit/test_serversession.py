@@ -13,7 +13,7 @@ from trio.testing import MockClock
 from mavftpfs.link.messages import Address
 from mavftpfs.protocol.engine import Engine
 from mavftpfs.protocol.flow import Flow
-from mavftpfs.protocol.operations import OpenFile, Operation, Simple
+from mavftpfs.protocol.operations import OpenRequest, Operation, Simple
 from mavftpfs.protocol.payload import NakCode, Opcode
 from mavftpfs.session.doubt import Doubt
 from mavftpfs.session.driver import Driver
@@ -36,7 +36,7 @@ class Refusing:
         await trio.lowlevel.checkpoint()
         opcode = operation.opcode if isinstance(operation, Simple) else Opcode.LIST_DIRECTORY
         self.log.append((trio.current_time(), Opcode(opcode)))
-        if isinstance(operation, OpenFile):
+        if isinstance(operation, OpenRequest):
             raise FtpNak(operation.opcode, self.code, retransmitted=self.retransmitted)
 
     async def be_silent(self, seconds: float) -> bool:

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from mavftpfs.protocol.chunking import ChunkSize
 from mavftpfs.protocol.engine import Engine
 from mavftpfs.protocol.flow import Flow
-from mavftpfs.protocol.operations import OpenFile, Simple
+from mavftpfs.protocol.operations import OpenRequest, Simple
 from mavftpfs.protocol.payload import Opcode
 from mavftpfs.protocol.writing import MAX_OFFSET, WriteTransfer
 from mavftpfs.shared.errors import (
@@ -235,7 +235,7 @@ def test_what_is_acked_is_on_the_card(
     server = FtpServer(tree, PROFILES[profile], rng=random.Random(seed))
     line = LinkSettings(rate=100_000.0, delay=0.01, loss=loss, duplicate=duplicate, reorder=reorder)
     link = VirtualLink(server, line, seed=seed)
-    opened = OpenFile(Opcode.CREATE_FILE, path, session=link.engine.home_session)
+    opened = OpenRequest(Opcode.CREATE_FILE, path, session=link.engine.home_session)
     link.run(opened)
     if opened.error is not None:  # its ACK was lost and the repetition refused: not what is tested here
         return
