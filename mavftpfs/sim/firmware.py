@@ -135,6 +135,7 @@ class Firmware(ABC):
         self.replays = 0
         self.pauses: deque[float] = deque(maxlen=_PAUSES_KEPT)
         self.now = float("-inf")
+        storage.virtual.clock = lambda: self.now
         self._ready: list[tuple[Address, bytes]] = []
         self._ready_bytes = 0
         self._later: deque[tuple[float, Address, bytes]] = deque()

@@ -1,28 +1,37 @@
 """ArduPilot's virtual `@` trees, which lie about sizes. Layer: sim; pure.
 
-Source: servers.md 11; AP_Filesystem_Param, _Sys, _Mission, _ROMFS. The parameter packing reproduces a
-recorded download byte for byte.
+Source: servers.md 11 and 16; AP_Filesystem_Sys, _Mission, _ROMFS, and recordings.
 """
 
 from __future__ import annotations
 
 import errno
 import struct
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Mapping, Sequence
 
-from mavftpfs.sim.tree import Entry, Kind, Stat, fail
+from mavftpfs.sim.parameters import (
+    FLOAT,
+    INT8,
+    INT16,
+    INT32,
+    LenientUpload,
+    Parameter,
+    ParameterFile,
+    StrictUpload,
+    Table,
+    Upload,
+    parameter,
+    selection,
+)
+from mavftpfs.sim.tree import Entry, Kind, OpenFile, Stat, fail
 
 TREES = (b"@SYS", b"@ROMFS", b"@PARAM", b"@MISSION")
-PARAM_MAGIC = 0x671B
 MISSION_MAGIC = 0x763D
 MAX_HANDLES = 4
-_PARAM_HEADER = struct.Struct("<HHH")
 _MISSION_HEADER = struct.Struct("<HHHHH")
 _SYS_CLAIM = 100_000
 _MISSION_CLAIM = 2**20
 _MISSIONS = (b"mission.dat", b"fence.dat", b"rally.dat")
-_FORMATS = {1: "<b", 2: "<h", 3: "<i", 4: "<f"}
 _REAL_SIZES = (b"storage.bin",)
 _STORAGE = bytes(i * 31 % 251 for i in range(16_384))
 _SYS_NAMES = (
@@ -31,43 +40,25 @@ _SYS_NAMES = (
 ).split()
 
 
-class Param(NamedTuple):
-    """A parameter: type 1 int8, 2 int16, 3 int32, 4 float; `value` as stored, little-endian."""
-
-    name: bytes
-    type: int
-    value: bytes
-
-
-def param(name: str, kind: int, value: float) -> Param:
-    """Build a parameter from a number."""
-    return Param(name.encode(), kind, struct.pack(_FORMATS[kind], value if kind == 4 else int(value)))
-
-
-def pack_parameters(params: Sequence[Param], block: int) -> bytes:
-    """Return param.pck as read in blocks of `block` bytes: no value crosses a block's end."""
-    out = bytearray(_PARAM_HEADER.pack(PARAM_MAGIC, len(params), len(params)))
-    last = b""
-    for name, kind, value in params:
-        common = _common_prefix(last, name)
-        record = bytes([kind, common | (len(name) - common - 1) << 4]) + name[common:] + value
-        over = (len(out) + len(record)) % block
-        if len(value) > 1 and 0 < over < len(value):
-            out += bytes(len(value) - over)
-        out += record
-        last = name
-    return bytes(out)
-
-
-def _common_prefix(last: bytes, name: bytes) -> int:
-    limit = min(len(last), len(name) - 1, 15)
-    return next((i for i in range(limit) if last[i] != name[i]), max(limit, 0))
-
-
-def _default_params() -> list[Param]:
-    made = [param("FORMAT_VERSION", 2, 120), param("SYSID_THISMAV", 2, 1)]
-    made += [param(f"SERVO{i}_{part}", 2, 1000 + i) for i in range(1, 17) for part in ("MIN", "MAX", "TRIM")]
-    made += [param(f"INS_GYR{i}OFFS_{axis}", 4, i / 64) for i in range(1, 4) for axis in "XYZ"]
+def _default_parameters() -> list[Parameter]:
+    made = [parameter("FORMAT_VERSION", INT16, 120), parameter("SYSID_THISMAV", INT16, 1)]
+    made += [
+        parameter(f"SERVO{i}_{part}", INT16, number + i, number)
+        for i in range(1, 17)
+        for part, number in (("MIN", 1100), ("MAX", 1900), ("TRIM", 1500))
+    ]
+    made += [parameter(f"INS_GYR{i}OFFS_{axis}", FLOAT, i / 64, 0) for i in range(1, 4) for axis in "XYZ"]
+    made += [
+        parameter("WPNAV_SPEED", FLOAT, 1000, 1000),
+        parameter("RTL_ALT", INT32, 1500, 1500),
+        parameter("LOG_BITMASK", INT32, 176126, 176126),
+        parameter("ATC_RAT_PIT_P", FLOAT, 0.135, 0.135),
+        parameter("GRIP_ENABLE", INT8, 0, 0),
+        parameter("GRIP_GRAB", INT16, 1900, 1900, needs="GRIP_ENABLE"),
+        parameter("BARO1_GND_PRESS", FLOAT, 94502.5, 0, drift=0.25),
+        parameter("STAT_BOOTCNT", INT16, 7, 0),
+        parameter("STAT_RUNTIME", INT32, 3600, 0, drift=1),
+    ]
     return made
 
 
@@ -88,10 +79,16 @@ def _default_romfs() -> dict[bytes, bytes]:
     }
 
 
+def _is_parameter_file(name: bytes) -> bool:
+    return name.partition(b"?")[0] == b"param.pck"
+
+
 class VirtualTrees:
     """The trees of one vehicle.
 
-    trees: their names. exact: claimed sizes are right (PX4 of 2026).
+    trees: their names. exact: claimed sizes are right, and an upload of parameters is parsed as it comes
+    (PX4 of 2026). says_so: ends a refused upload with an error (ArduPilot since mid-2025). clock: the
+    server's.
     """
 
     def __init__(
@@ -99,12 +96,15 @@ class VirtualTrees:
         trees: Sequence[bytes] = TREES,
         *,
         exact: bool = False,
-        params: Iterable[Param] | None = None,
+        says_so: bool = False,
+        table: Table | None = None,
         sys_files: Mapping[bytes, bytes] | None = None,
         romfs: Mapping[bytes, bytes] | None = None,
     ) -> None:
         self._exact = exact
-        self.params = list(params) if params is not None else _default_params()
+        self._says_so = says_so
+        self.clock: Callable[[], float] = lambda: 0.0
+        self.table = table if table is not None else Table(_default_parameters())
         self.sys_files = dict(sys_files) if sys_files is not None else _default_sys()
         self.romfs = dict(romfs) if romfs is not None else _default_romfs()
         self._open = dict.fromkeys(trees, 0)
@@ -163,7 +163,7 @@ class VirtualTrees:
         if self._exact or tree == b"@ROMFS" or name in _REAL_SIZES:
             return len(content)
         if tree == b"@PARAM":
-            return 12 * len(self.params)
+            return 12 * len(self.table.visible(self.clock()))
         return _SYS_CLAIM if tree == b"@SYS" else _MISSION_CLAIM
 
     def content(self, path: bytes, block: int) -> bytes:
@@ -171,8 +171,8 @@ class VirtualTrees:
         return self._content(*self._split(path), block)
 
     def _content(self, tree: bytes, name: bytes, block: int) -> bytes:
-        if tree == b"@PARAM" and name.partition(b"?")[0] == b"param.pck":
-            return pack_parameters(self._selected_params(name), block)
+        if tree == b"@PARAM" and _is_parameter_file(name):
+            return self.table.download(selection(name.partition(b"?")[2]), block, self.clock())
         if tree == b"@MISSION" and name in _MISSIONS:  # of no items
             return _MISSION_HEADER.pack(MISSION_MAGIC, _MISSIONS.index(name), 0, 0, 0)
         files = {b"@SYS": self.sys_files, b"@ROMFS": self.romfs}.get(tree, {})
@@ -180,34 +180,37 @@ class VirtualTrees:
             raise fail(errno.ENOENT, name)
         return files[name]
 
-    def _selected_params(self, name: bytes) -> list[Param]:
-        start, count = 0, len(self.params)
-        for option in name.partition(b"?")[2].split(b"&"):
-            key, _, value = option.partition(b"=")
-            if key == b"start" and value.isdigit():
-                start = int(value)
-            elif key == b"count" and value.isdigit():
-                count = int(value)
-        return self.params[start : start + count]
-
-    def open(self, path: bytes, *, write: bool) -> VirtualFile:
-        """Open a file; at most four at a time in each tree (ENFILE). What is written to it goes nowhere."""
+    def open(self, path: bytes, *, write: bool) -> OpenFile:
+        """Open a file; at most four at a time in each tree (ENFILE)."""
         tree, name = self._split(path)
         if not name:
             raise fail(errno.ENOENT, path)
         if write and tree in (b"@SYS", b"@ROMFS"):
             raise fail(errno.EROFS, path)
-        size = self._claimed_size(tree, name)
+        size = 0 if write and self._exact else self._claimed_size(tree, name)
         if not write and not self._content(tree, name, 239):
             raise fail(errno.ENOENT, path)  # listed, yet not there (AP_Filesystem_Sys::open)
         if self._open[tree] >= MAX_HANDLES:
             raise fail(errno.ENFILE, path)
         self._open[tree] += 1
-        return VirtualFile(
-            lambda block: self._content(tree, name, block),
-            size,
-            one_block=tree == b"@PARAM",
-            on_close=lambda: self._closed(tree),
+        if tree == b"@PARAM":
+            return self._open_parameters(name, size, write=write)
+        return VirtualFile(self._content(tree, name, 239), size, on_close=lambda: self._closed(tree))
+
+    def _open_parameters(self, name: bytes, size: int, *, write: bool) -> ParameterFile:
+        upload: Upload | None = None
+        if write and self._exact:
+            upload = StrictUpload(self.table)
+        elif write:
+            upload = LenientUpload(self.table, says_so=self._says_so)
+        return ParameterFile(
+            self.table,
+            selection(name.partition(b"?")[2]),
+            lambda: self.clock(),
+            claimed=size,
+            live=not self._exact,
+            upload=upload,
+            on_close=lambda: self._closed(b"@PARAM"),
         )
 
     def _closed(self, tree: bytes) -> None:
@@ -220,37 +223,16 @@ class VirtualTrees:
 
 
 class VirtualFile:
-    """An open virtual file; the content is made at the first read.
+    """An open virtual file. What is written to it goes nowhere."""
 
-    one_block: every read must ask for the size that the first one asked for, else EINVAL
-    (AP_Filesystem_Param::read).
-    """
-
-    def __init__(
-        self,
-        make: Callable[[int], bytes],
-        size: int,
-        *,
-        one_block: bool,
-        on_close: Callable[[], None],
-    ) -> None:
-        self._make = make
+    def __init__(self, content: bytes, size: int, *, on_close: Callable[[], None]) -> None:
+        self._content = content
         self._size = size
-        self._one_block = one_block
         self._on_close = on_close
-        self._block: int | None = None
-        self._content = b""
         self._closed = False
 
     def read(self, offset: int, size: int) -> bytes:
         """See OpenFile."""
-        if size == 0:
-            return b""
-        if self._block is None:
-            self._block = size
-            self._content = self._make(size)
-        if self._one_block and size != self._block:
-            raise fail(errno.EINVAL)
         return self._content[offset : offset + size]
 
     def write(self, offset: int, data: bytes) -> int:

@@ -47,7 +47,9 @@ class Storage:
         self._fold = profile.case_fold
         self._rng = rng
         self._fat = self.kind in (profiles.Storage.FATFS, profiles.Storage.NUTTX_FAT)
-        self.virtual = virtual or VirtualTrees(profile.virtual_trees, exact=profile.exact_virtual_sizes)
+        self.virtual = virtual or VirtualTrees(
+            profile.virtual_trees, exact=profile.exact_virtual_sizes, says_so=profile.sessions > 1
+        )
         self._writing: weakref.WeakSet[_FatFile] = weakref.WeakSet()
 
     def entries(self, path: bytes) -> list[Entry]:

@@ -6,26 +6,22 @@ compared field by field, all but stray bytes behind `size`.
 
 from __future__ import annotations
 
-import gzip
-import json
 import random
 from collections.abc import Iterator
-from dataclasses import dataclass, field
-from itertools import groupby
-from pathlib import Path
-from typing import Any
 
 import pytest
 
 from mavftpfs.link.messages import Address
 from mavftpfs.protocol.payload import Payload
+from mavftpfs.sim.parameters import Parameter, Selection, Table
 from mavftpfs.sim.profiles import PROFILES
-from mavftpfs.sim.pseudo import Param, VirtualTrees, pack_parameters
+from mavftpfs.sim.pseudo import VirtualTrees
 from mavftpfs.sim.tree import MemoryTree
 from mavftpfs.sim.vehicle import FtpServer
+from tests.support.recordings import Step, data_of
+from tests.support.recordings import load_recording as load
 from tests.support.replies import decode_reply
 
-DATA = Path(__file__).parent.parent / "data"
 CLIENT = Address(255, 190)
 NAMES = ("px4", "px4-2026", "ardupilot", "mavsdk")
 MTIMES = {"px4-2026": 1_795_490_017}
@@ -38,35 +34,6 @@ EXPLAINED = {
     }
 }
 """Steps in which the simulated replies differ, and why: neither their order nor their number is compared."""
-
-
-@dataclass
-class Step:
-    """What the client tried in one go: requests as (time, wire), and the replies that came."""
-
-    name: str
-    requests: list[tuple[float, bytes]] = field(default_factory=list)
-    replies: list[tuple[float, Payload]] = field(default_factory=list)
-
-
-def load(name: str) -> list[Step]:
-    with gzip.open(DATA / f"{name}.jsonl.gz", "rt", encoding="utf-8") as lines:
-        rows = [json.loads(line) for line in lines]
-    steps = []
-    for step, group in groupby(rows, key=lambda row: row["step"]):
-        steps.append(Step(str(step)))
-        for row in group:
-            payload = _payload(row)
-            if row["dir"] == "request":
-                steps[-1].requests.append((row["t"], payload.encode()))
-            else:
-                steps[-1].replies.append((row["t"], payload))
-    return steps
-
-
-def _payload(row: dict[str, Any]) -> Payload:
-    numbers = {key: int(row[key]) for key in Payload._fields if key != "data"}
-    return Payload(**numbers, data=bytes.fromhex(row["data"]))
 
 
 # -- the tree that was served --------------------------------------------------------------------
@@ -121,7 +88,7 @@ def add_root_entries(tree: MemoryTree, name: str, entries: list[bytes]) -> None:
 
 def downloaded(steps: list[Step], step_name: str) -> bytes:
     step = next(step for step in steps if step.name == step_name)
-    return b"".join(reply.data for _, reply in step.replies if reply.opcode == 128)
+    return data_of(step)
 
 
 def build_virtual(name: str, steps: list[Step]) -> VirtualTrees | None:
@@ -132,15 +99,15 @@ def build_virtual(name: str, steps: list[Step]) -> VirtualTrees | None:
     sys_files[b"storage.bin"] = bytes(16384)
     locations = downloaded(steps, "@ROMFS/locations.txt: burst 239")
     return VirtualTrees(
-        params=unpack_parameters(downloaded(steps, "@PARAM/param.pck: burst 239")),
+        table=Table(unpack_parameters(downloaded(steps, "@PARAM/param.pck: burst 239"))),
         sys_files=sys_files,
         romfs={b"locations.txt": locations, b"models/x": b""},
     )
 
 
-def unpack_parameters(packed: bytes) -> list[Param]:
+def unpack_parameters(packed: bytes) -> list[Parameter]:
     """Parse param.pck: each name lies over the one before it; pad bytes are skipped."""
-    params: list[Param] = []
+    params: list[Parameter] = []
     at, last = 6, b""
     while at < len(packed):
         if packed[at] == 0:
@@ -150,7 +117,7 @@ def unpack_parameters(packed: bytes) -> list[Param]:
         start = at + 3 + (lengths >> 4)
         last = last[: lengths & 15] + packed[at + 2 : start]
         at = start + {1: 1, 2: 2, 3: 4, 4: 4}[kind]
-        params.append(Param(last, kind, packed[start:at]))
+        params.append(Parameter(last, kind, packed[start:at]))
     return params
 
 
@@ -210,6 +177,7 @@ def test_parameter_file_depends_on_the_block_size() -> None:
     """The recorded vehicle's file had 14882 bytes in blocks of 239 and 14901 in blocks of 80."""
     packed = downloaded(load("ardupilot"), "@PARAM/param.pck: burst 239")
     params = unpack_parameters(packed)
-    assert pack_parameters(params, 239) == packed
-    assert len(pack_parameters(params, 80)) == 14901
-    assert unpack_parameters(pack_parameters(params, 80)) == params
+    table = Table(params)
+    assert table.download(Selection(), 239, 0) == packed
+    assert len(table.download(Selection(), 80, 0)) == 14901
+    assert unpack_parameters(table.download(Selection(), 80, 0)) == params

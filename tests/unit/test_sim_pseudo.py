@@ -6,7 +6,8 @@ import errno
 import struct
 
 from mavftpfs.protocol.payload import NakCode, Opcode, crc32
-from mavftpfs.sim.pseudo import VirtualTrees, pack_parameters
+from mavftpfs.sim.parameters import Selection
+from mavftpfs.sim.pseudo import VirtualTrees
 from tests.support.sim_client import Client, ack, nak
 
 PARAM = b"@PARAM/param.pck"
@@ -42,8 +43,8 @@ def test_the_claimed_parameter_size_and_the_checksum_match_no_download() -> None
     virtual = VirtualTrees()
     c = Client("ardupilot", virtual=virtual)
     claimed = struct.unpack("<I", ack(c.open(PARAM)))[0]
-    assert claimed == 12 * len(virtual.params)
+    assert claimed == 12 * len(virtual.table.visible(0))
     ack(c.ask(Opcode.TERMINATE_SESSION))
     checksum = struct.unpack("<I", ack(c.ask(Opcode.CALC_FILE_CRC32, PARAM)))[0]
-    assert checksum == crc32(pack_parameters(virtual.params, 64))
-    assert checksum != crc32(pack_parameters(virtual.params, 239))
+    assert checksum == crc32(virtual.table.download(Selection(), 64, 0))
+    assert checksum != crc32(virtual.table.download(Selection(), 239, 0))

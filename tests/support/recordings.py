@@ -1,0 +1,49 @@
+"""Recordings of real servers, from tests/data."""
+
+from __future__ import annotations
+
+import gzip
+import json
+from dataclasses import dataclass, field
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+from mavftpfs.protocol.payload import Payload
+
+DATA = Path(__file__).parent.parent / "data"
+
+
+@dataclass
+class Step:
+    """What the client tried in one go: requests as (time, wire), and the replies that came."""
+
+    name: str
+    requests: list[tuple[float, bytes]] = field(default_factory=list)
+    replies: list[tuple[float, Payload]] = field(default_factory=list)
+
+
+def load_recording(name: str) -> list[Step]:
+    """Read a recording."""
+    with gzip.open(DATA / f"{name}.jsonl.gz", "rt", encoding="utf-8") as lines:
+        rows = [json.loads(line) for line in lines]
+    steps = []
+    for step, group in groupby(rows, key=lambda row: row["step"]):
+        steps.append(Step(str(step)))
+        for row in group:
+            payload = _payload(row)
+            if row["dir"] == "request":
+                steps[-1].requests.append((row["t"], payload.encode()))
+            else:
+                steps[-1].replies.append((row["t"], payload))
+    return steps
+
+
+def _payload(row: dict[str, Any]) -> Payload:
+    numbers = {key: int(row[key]) for key in Payload._fields if key != "data"}
+    return Payload(**numbers, data=bytes.fromhex(row["data"]))
+
+
+def data_of(step: Step) -> bytes:
+    """Return what the ACKs of a step carry."""
+    return b"".join(reply.data for _, reply in step.replies if reply.opcode == 128)
