@@ -23,10 +23,11 @@ from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.tree import Tree
 from mavftpfs.client import control
 from mavftpfs.client.connect import NO_SINKS, Attached, Sinks, attached, no_answer, plain_nursery
-from mavftpfs.client.mountpoint import XATTR_CRC32, canonical, is_ours, mounts
+from mavftpfs.client.mountpoint import XATTR_CRC32, enclosing_mount, is_ours, mounts
 from mavftpfs.client.options import Options
-from mavftpfs.client.status import status_of
-from mavftpfs.link.uri import LinkKind, LinkSpec, parse_source
+from mavftpfs.client.status import has_link, told_by
+from mavftpfs.link.messages import MAV_AUTOPILOT_INVALID
+from mavftpfs.link.uri import LinkSpec
 from mavftpfs.session.vehicle import SILENCE_LIMIT
 from mavftpfs.shared import errors
 from mavftpfs.shared.errnos import errno_for
@@ -130,37 +131,56 @@ ResultT = TypeVar("ResultT")
 
 
 def mountpoint_of(source: str) -> tuple[str, bytes] | None:
-    """Return (mountpoint, subtree) where SOURCE is a mountpoint of ours, else None."""
+    """Return (mountpoint, subtree) where SOURCE is a mountpoint of ours or lies below one, else None."""
     place, _, subtree = source.partition("#")
     if not place or (":" in place and not place.startswith("/")):
         return None
-    path = canonical(place)
-    return (path, normalise(os.fsencode(subtree))) if is_ours(path) else None
+    found = enclosing_mount(place)
+    if found is None:
+        return None
+    mountpoint, below = found
+    return mountpoint, normalise(os.fsencode(f"{below}/{subtree}"))
 
 
 async def find_mount(spec: LinkSpec, options: Options) -> Session | None:
-    """Return the files of the mount that holds this link now, if one is up and may be read by us."""
+    """Return the files of the mount that has this link now, if it is up, of the vehicle that is wanted, and
+    we may read it."""
     for mountpoint in [path for path in mounts() if is_ours(path)]:
         with suppress(errors.MavftpfsError, ValueError, KeyError, TypeError):
             status = await mount_status(mountpoint)
-            vehicle = status["vehicle"]
-            if (
-                options.target_system in (0, vehicle["system"])
-                and options.target_component in (0, vehicle["component"])
-                and same_link(parse_source(status["source"]), spec)
-            ):
+            if has_link(status, spec) and is_wanted(status, options):
                 return session_on(status, options.root)
     return None
+
+
+def is_wanted(status: Mapping[str, Any], options: Options) -> bool:
+    """Return whether a mount is of the vehicle that the options ask for, and that one still answers there."""
+    vehicle, component = status["vehicle"], options.target_component
+    autopilot = status["connection"]["autopilot"] != MAV_AUTOPILOT_INVALID
+    return (
+        options.target_system in (0, vehicle["system"])
+        and (component == vehicle["component"] or (component == 0 and autopilot))
+        and status["link"]["state"] != "replaced"
+    )
 
 
 async def open_mount(mountpoint: str, subtree: bytes) -> Session:
     """Return the files below `subtree` of a mount.
 
     Raises:
-        LinkClosed: it does not answer.
+        LinkClosed: it does not answer. NotFound, NotADirectory: the subtree is none.
     """
     status = await mount_status(mountpoint)
-    return session_on(status, normalise(os.fsencode(status["root"]) + b"/" + subtree))
+    session = session_on(status, normalise(os.fsencode(status["root"]) + b"/" + subtree))
+    if subtree != ROOT:
+        place = name_text(os.fsencode(mountpoint) + subtree)
+        try:
+            kind = (await session.files.stat(ROOT)).kind
+        except errors.NotFound as exc:
+            raise errors.NotFound(f"{place}: {os.strerror(errno.ENOENT)}") from exc
+        if kind is EntryKind.FILE:
+            raise errors.NotADirectory(f"{place} is a file; give a directory, and the file's name behind it")
+    return session
 
 
 def session_on(status: Mapping[str, Any], root: bytes) -> Session:
@@ -175,27 +195,15 @@ def session_on(status: Mapping[str, Any], root: bytes) -> Session:
     return Session(files, root, acknowledged, mountpoint)
 
 
-def same_link(one: LinkSpec, other: LinkSpec) -> bool:
-    """Return whether two SOURCEs cannot be open at once, because they are the same link."""
-    if one.kind is not other.kind:
-        return False
-    if one.kind is LinkKind.SERIAL:
-        return os.path.realpath(one.device) == os.path.realpath(other.device)
-    if one.port != other.port:
-        return False
-    listens = one.kind in (LinkKind.UDP_IN, LinkKind.TCP_IN)
-    return one.host == other.host or (listens and bool({one.host, other.host} & {"0.0.0.0", "::"}))
-
-
 async def mount_status(mountpoint: str) -> Mapping[str, Any]:
-    """Return a mount's status.
+    """Return the status of a mount, as it tells it to who may read its files.
 
     Raises:
         LinkClosed: it does not answer.
     """
-    with trio.move_on_after(STATUS_PATIENCE), suppress(control.ControlError):
-        status = await trio.to_thread.run_sync(status_of, mountpoint, abandon_on_cancel=True)
-        if not status.get("problem"):
+    with trio.move_on_after(STATUS_PATIENCE):
+        status = await trio.to_thread.run_sync(told_by, mountpoint, abandon_on_cancel=True)
+        if status is not None:
             return status
     raise errors.LinkClosed(f"the mount on {mountpoint} does not answer")
 

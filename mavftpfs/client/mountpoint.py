@@ -54,6 +54,22 @@ def canonical(path: str) -> str:
     return candidate if candidate in mounts() else os.path.realpath(candidate)
 
 
+def enclosing_mount(path: str) -> tuple[str, str] | None:
+    """Return (mountpoint of ours, path below it or "") for a mountpoint or what lies below one, else None.
+
+    Symbolic links are followed only where the path as it is spelled does not lead there already.
+    """
+    return _enclosing(os.path.abspath(path)) or _enclosing(canonical(path))
+
+
+def _enclosing(path: str) -> tuple[str, str] | None:
+    mountpoint, table = path, mounts()
+    while mountpoint not in table and mountpoint != "/":
+        mountpoint = os.path.dirname(mountpoint)
+    mount = table.get(mountpoint)
+    return (mountpoint, path[len(mountpoint) :]) if mount is not None and mount.type == OUR_TYPE else None
+
+
 def check_mountpoint(path: str, *, table: str = MOUNT_TABLE) -> None:
     """Check that a file system can be mounted on `path`.
 

@@ -16,6 +16,7 @@ import os
 import threading
 from collections import deque
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,8 @@ import trio
 from mavftpfs.client import control
 from mavftpfs.client.control import ControlError, NobodyThere
 from mavftpfs.client.mountpoint import OUR_TYPE, XATTR_STATUS, Mounted, mounts
+from mavftpfs.link.uri import LinkKind, LinkSpec, parse_source
+from mavftpfs.shared.errors import MavftpfsError
 from mavftpfs.shared.readable import readable_time
 
 log = logging.getLogger("mavftpfs.vehicle")
@@ -190,6 +193,18 @@ def status_of(mountpoint: str) -> Status:
     return _ask(control.find_socket(mountpoint, control.own_directories()))
 
 
+def told_by(mountpoint: str) -> Status | None:
+    """Return what a mount says through itself, None if it cannot be looked into.
+
+    Its control socket is found by the mountpoint's name, which in another mount namespace is another mount.
+    """
+    answer = _read_xattr(mountpoint)
+    if not isinstance(answer, bytes):
+        return None
+    facts: Status = json.loads(answer)
+    return facts
+
+
 def find_socket(mountpoint: str) -> Path:
     """Return the control socket of a mount; root finds other users', too.
 
@@ -255,3 +270,38 @@ def _ask_or_remove(socket: Path) -> Status | None:
     except ControlError:
         pass  # which mount it is, only it could say
     return None
+
+
+# -- which mount has a link -------------------------------------------------------------------------
+
+
+def network_namespace() -> str:
+    """Return what tells this process's network namespace from others that exist now."""
+    facts = os.stat("/proc/self/ns/net")
+    return f"{facts.st_dev}:{facts.st_ino}"
+
+
+def same_link(one: LinkSpec, other: LinkSpec) -> bool:
+    """Return whether two SOURCEs cannot be open at once, because they are the same link."""
+    if one.kind is not other.kind:
+        return False
+    if one.kind is LinkKind.SERIAL:
+        return os.path.realpath(one.device) == os.path.realpath(other.device)
+    if one.port != other.port:
+        return False
+    listens = one.kind in (LinkKind.UDP_IN, LinkKind.TCP_IN)
+    return one.host == other.host or (listens and bool({one.host, other.host} & {"0.0.0.0", "::"}))
+
+
+def has_link(status: Status, spec: LinkSpec) -> bool:
+    """Return whether the mount that told this status has that link: a port is one in its namespace only."""
+    with suppress(MavftpfsError, KeyError):  # it cannot be asked, or is of an older version
+        return status["network_namespace"] == network_namespace() and same_link(
+            parse_source(status["source"]), spec
+        )
+    return False
+
+
+def holder_of(spec: LinkSpec) -> Status | None:
+    """Return the status of the mount that has a link, whoever may look into it; None if there is none."""
+    return next((status for status in all_statuses() if has_link(status, spec)), None)

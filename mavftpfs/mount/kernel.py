@@ -29,6 +29,7 @@ import mavftpfs
 from mavftpfs.client.connect import NO_SINKS, Attached, Sinks, attached
 from mavftpfs.client.control import ControlServer, Reply
 from mavftpfs.client.mountpoint import is_ours, stderr_of, unmount, unmount_what_is_left
+from mavftpfs.client.status import network_namespace
 from mavftpfs.link.uri import LinkSpec
 from mavftpfs.mount.daemon import Report
 from mavftpfs.mount.farewell import say_goodbye
@@ -275,6 +276,7 @@ class _Life:
             "problem": None,
             "source": self.request.source,
             "root": os.fsdecode(self.request.options.client.root),
+            "network_namespace": network_namespace(),
             "pid": os.getpid(),
             "version": mavftpfs.__version__,
             "read_only": self.request.options.client.read_only,

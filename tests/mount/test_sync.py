@@ -16,6 +16,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from mavftpfs.client.files import is_wanted
+from mavftpfs.client.options import Options
 from mavftpfs.link.framing import Framer
 from mavftpfs.link.messages import MAV_AUTOPILOT_INVALID, MAV_TYPE_GCS, Address
 from mavftpfs.protocol.payload import crc32
@@ -190,6 +192,61 @@ def test_a_mounted_subtree_and_what_lies_outside_of_it(field: Field, tmp_path: P
     assert run("ls", f"{mount.path}#/2024-05-01")[0] == "10_00_00.ulg\n"
     assert "outside" in run("cat", vehicle.source, "/other", code=1)[1]
     assert sync(vehicle.source, tmp_path / "a")["complete"]
+
+
+def test_a_path_inside_a_mount_is_a_source(field: Field, tmp_path: Path) -> None:
+    vehicle = field.sim(field.local("card"))
+    logs = logs_of(vehicle.root / "log")
+    (vehicle.root / "log/note").write_bytes(b"note")
+    mount = field.mount(vehicle.source)
+    link = tmp_path / "link"
+    link.symlink_to(mount.path / "log")
+    for place in (mount.path / "log", link):
+        assert run("ls", place)[0] == "2024-05-01/\n2024-05-02/\nnote\n"
+        assert run("cat", place, "note")[0] == "note"
+    assert run("ls", f"{link}#2024-05-01")[0] == "10_00_00.ulg\n"
+    assert len(sync(mount.path / "log", tmp_path / "logs")["files"]) == len(logs) + 1
+    assert "is a file" in run("ls", link / "note", code=1)[1]
+    assert f"{mount.path}/log/none: No such file" in run("ls", link / "none", code=1)[1]
+
+
+IN_A_NAMESPACE = """
+ip link set lo up
+"$1" -m mavftpfs sim "$2" --link "$3" >&2 & vehicle=$!
+trap 'kill $vehicle; wait $vehicle' EXIT
+"$1" -m mavftpfs ls "$4"
+"""
+
+
+def test_a_mount_of_another_network_namespace_is_another_vehicles(field: Field) -> None:
+    """Its port is spelled the same, and its files can be seen from there."""
+    vehicle = field.sim(field.local("card"))
+    (vehicle.root / "ours").touch()
+    (theirs := field.local("theirs") / "theirs").touch()
+    mount = field.mount(vehicle.source)
+    assert run("ls", vehicle.source)[0] == "ours\n"
+    link = vehicle.source.replace("udpin:", "udpout:")
+    words = (sys.executable, theirs.parent, link, vehicle.source)
+    command = ("unshare", "--net", "sh", "-c", IN_A_NAMESPACE, "sh", *words)
+    assert mount.run(*command, cwd=PROJECT).stdout == "theirs\n"
+
+
+def test_a_mount_counts_only_if_it_is_of_the_vehicle_that_is_wanted() -> None:
+    mounted = {"vehicle": {"system": 2, "component": 1}, "connection": {"autopilot": 12}}
+    camera = {"vehicle": {"system": 2, "component": 100}, "connection": {"autopilot": 8}}
+
+    def wanted(
+        system: int = 0, component: int = 0, of: dict[str, Any] = mounted, state: str = "fine"
+    ) -> bool:
+        status = {**of, "link": {"state": state}}
+        return is_wanted(status, Options(target_system=system, target_component=component))
+
+    assert wanted()
+    assert wanted(2, 1)
+    assert not wanted(1)
+    assert not wanted(of=camera)
+    assert wanted(0, 100, camera)
+    assert not wanted(state="replaced")  # another unique id answers there
 
 
 def test_a_growing_log_is_seen_through_a_mount(field: Field, tmp_path: Path) -> None:

@@ -10,9 +10,9 @@ import pytest
 from mavftpfs.cli.verbs import parse_date
 from mavftpfs.client import download, fetch
 from mavftpfs.client.fetch import Verify, Wanted
-from mavftpfs.client.files import same_link
 from mavftpfs.client.names import parse_paths
 from mavftpfs.client.scan import describe_peer
+from mavftpfs.client.status import same_link
 from mavftpfs.link.messages import Address, AutopilotVersion, Heartbeat
 from mavftpfs.link.uri import parse_source
 from mavftpfs.shared.errors import UsageError
