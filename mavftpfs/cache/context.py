@@ -49,6 +49,11 @@ class Context:
         if self.blocked:
             raise Armed("the vehicle is armed: nothing is written in flight (when_armed=ro)")
 
+    def require_changeable(self) -> None:
+        """Raise Armed if nothing may be changed now, VehicleLost if nothing can be."""
+        self.require_disarmed()
+        self.directories.require_reachable()
+
     def require_idle(self, path: bytes) -> None:
         """Raise FileBusy if somebody on the vehicle seems to write the file."""
         if not self.options.force and self.directories.is_growing(path):

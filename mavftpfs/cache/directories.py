@@ -59,7 +59,7 @@ MAX_DEPTH = 256
 """More components than any path that fits a request has."""
 
 LOOK = 1.0
-"""Seconds after which who waits for a listing, and knows an older one, looks whether the vehicle is heard."""
+"""Seconds after which a caller that has an older listing checks whether the vehicle is lost."""
 
 SWEEP_TRIES = 3
 """How often a listing is repeated because names came or went meanwhile through us."""
@@ -170,6 +170,11 @@ class Directories:
         directory = self.known(path)
         return directory if directory is not None and self.clock() < directory.fresh_until else None
 
+    def left(self, directory: Directory) -> float:
+        """Return for how many seconds a listing is the newest that can be had: while the vehicle is lost,
+        without end."""
+        return inf if self._store.is_lost() else directory.fresh_until - self.clock()
+
     def entry(self, path: bytes) -> DirEntry | None:
         """Return what a path was last known to be."""
         parent, name = split(path)
@@ -266,6 +271,7 @@ class Directories:
         directory = await self.get(parent)
         entry = directory.entries.get(name)
         if entry is None and not directory.complete and name:
+            self.require_reachable()
             try:
                 entry = DirEntry(name, EntryKind.FILE, await self._store.stat_size(path))
             except FtpNak as nak:
@@ -299,7 +305,7 @@ class Directories:
         """Return a directory's listing that is asked for just now, or began at that time or later.
 
         Raises:
-            As get; VehicleLost instead of an old listing.
+            NotFound, NotADirectory, VehicleLost; else as RemoteStore.list_directory.
         """
         since = self.clock() if began is None else began
         for _ in range(SWEEP_TRIES):
@@ -309,50 +315,60 @@ class Directories:
                 if began is not None and known is not None and known.listed_at >= began:
                     return known
                 self.expire(path)
-            directory = await self.get(path)
+            directory = await self._list(path)
             if directory.listed_at >= since:
                 return directory
         raise VehicleLost("the vehicle does not answer")
 
     async def get(self, path: bytes) -> Directory:
-        """Return a directory's listing: fresh, else swept, else (the vehicle being lost) expired.
+        """Return a directory's listing: fresh, else a new one. While the vehicle is lost, the one that is
+        known, at once.
 
         Raises:
-            NotFound, NotADirectory; else as RemoteStore.list_directory.
+            NotFound, NotADirectory, VehicleLost; else as RemoteStore.list_directory.
         """
         directory = self.known(path)
-        if directory is not None and self.clock() < directory.fresh_until:
+        if directory is None:
+            self.require_reachable()
+            return await self._list(path)
+        if self.clock() < directory.fresh_until or self._store.is_lost():
             return directory
         try:
-            if path == self._options.root:
-                await self._walk_to_root()
-            elif path != ROOT and (await self.find(path)).entry.kind is not EntryKind.DIRECTORY:
-                raise NotADirectory(f"{path!r} is not a directory")
-            swept = await self._swept(path, older=directory is not None)
+            return await self._list(path, until_lost=self._sweeping.outlives_callers)
         except VehicleLost:
-            if directory is None:
-                raise
             return directory
-        if self.on_swept is not None:
-            await self.on_swept(path, swept)
-        return swept
+
+    def require_reachable(self) -> None:
+        """Raise VehicleLost if the vehicle is known to be lost: what begins now would wait for nothing."""
+        if self._store.is_lost():
+            raise VehicleLost("the vehicle is silent; waiting for its heartbeat")
 
     # --- listing
 
-    async def _swept(self, path: bytes, *, older: bool) -> Directory:
-        """Return a new listing. older: one is known that will do while the vehicle is silent.
+    async def _list(self, path: bytes, *, until_lost: bool = False) -> Directory:
+        """List a directory that is known to be one, and repair what is found in it.
+
+        until_lost: wait for the listing until the vehicle is lost, and no longer. The listing goes on then,
+            for the next caller.
 
         Raises:
-            VehicleLost: it is silent. The listing goes on, for whoever asks next.
+            NotFound, NotADirectory, VehicleLost; else as RemoteStore.list_directory.
         """
-        patience = LOOK if older and self._sweeping.outlives_callers else inf
-        again = False
+        if path == self._options.root:
+            await self._walk_to_root()
+        elif path != ROOT and (await self.find(path)).entry.kind is not EntryKind.DIRECTORY:
+            raise NotADirectory(f"{path!r} is not a directory")
+        waited_for = False
         while True:
-            with trio.move_on_after(patience):
-                return await self._sweeping.run(path, partial(self._sweep, path), again=again)
-            if self._store.is_silent():
-                raise VehicleLost("no heartbeats")
-            again = True
+            with trio.move_on_after(LOOK if until_lost else inf):
+                sweep = partial(self._sweep, path)
+                directory = await self._sweeping.run(path, sweep, again=waited_for)
+                break
+            self.require_reachable()
+            waited_for = True
+        if self.on_swept is not None:
+            await self.on_swept(path, directory)
+        return directory
 
     async def _walk_to_root(self) -> None:
         """See once that no part of the mount's root is a file.

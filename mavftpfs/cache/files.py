@@ -154,6 +154,7 @@ class Files:
         return self._clock() - version.known_at < self._proof_time
 
     async def _start_version(self, path: bytes, entry: DirEntry) -> Version:
+        self._directories.require_reachable()
         version = Version(self.cache, path)
         reader = await self._store.open_reader(path, version)
         try:

@@ -57,7 +57,7 @@ class Namespace:
 
     async def mkdir(self, path: bytes) -> None:
         """See Tree.mkdir."""
-        self._context.require_disarmed()
+        self._context.require_changeable()
         require_not_ours(path)
         require_listable(path)
         async with self._context.paths.hold(path):
@@ -68,7 +68,7 @@ class Namespace:
 
     async def rmdir(self, path: bytes) -> None:
         """See Tree.rmdir."""
-        self._context.require_disarmed()
+        self._context.require_changeable()
         async with self._context.paths.hold(path):
             entry = await self._context.entry(path)
             if entry is None:
@@ -81,7 +81,7 @@ class Namespace:
 
     async def unlink(self, path: bytes) -> None:
         """See Tree.unlink."""
-        self._context.require_disarmed()
+        self._context.require_changeable()
         require_not_ours(path)
         async with self._claim(path), self._context.paths.hold(path):
             await self._unlink(path)
@@ -89,7 +89,7 @@ class Namespace:
 
     async def rename(self, old: bytes, new: bytes, *, noreplace: bool) -> None:
         """See Tree.rename."""
-        self._context.require_disarmed()
+        self._context.require_changeable()
         require_not_ours(old)
         require_not_ours(new)
         require_listable(new)

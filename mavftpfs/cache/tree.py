@@ -136,12 +136,12 @@ class Tree:
         0 where the absence is not proven: the listing was incomplete or is not fresh any more.
         """
         remote = self._remote(path)
-        until = self._virtual.absent_until(remote)
+        left = self._virtual.absent_until(remote) - self._clock()
         parent, name = split(remote)
         directory = self._directories.known(parent)
         if directory is not None and directory.complete and name not in directory.entries:
-            until = max(until, directory.fresh_until)
-        return max(0.0, min(self._options.negative_timeout, until - self._clock()))
+            left = max(left, self._directories.left(directory))
+        return max(0.0, min(self._options.negative_timeout, left))
 
     async def list(self, path: bytes) -> list[tuple[bytes, Stat]]:
         """Return a directory's entries without `.` and `..`.
@@ -218,6 +218,7 @@ class Tree:
         key = (remote, found.size, found.entry.mtime or 0)
         value = self._checksums.get(key)
         if value is None:
+            self._directories.require_reachable()
             value = await self._store.crc32(remote, size=found.size)
             if len(self._checksums) == MAX_CHECKSUMS:
                 self._checksums.clear()
@@ -415,8 +416,8 @@ class Tree:
     def _listed_stat(self, remote: bytes, found: Found) -> Stat:
         if is_snapshot(remote):
             return self._virtual.listed_stat(remote, found)
-        left = found.directory.fresh_until - self._clock()
-        valid_for, size = max(0.0, min(self._options.attr_timeout, left)), found.size
+        valid_for = max(0.0, min(self._options.attr_timeout, self._directories.left(found.directory)))
+        size = found.size
         user_set, node = None, self._context.nodes.get(remote)
         if node is None or node.draft is None:  # else `_draft_stat` shows it: no listing tells of a draft
             user_set = self._context.times.get(remote, size, found.entry.mtime)

@@ -156,12 +156,12 @@ class VirtualTrees:
     def listed_stat(self, path: bytes, found: Found) -> Stat:
         """Return what is known without traffic; valid_for is 0 where asking again tells more."""
         entry, seen = found.entry, self._look(path)
-        size, until = entry.size, -math.inf
+        size, left = entry.size, -math.inf
         if entry.kind is EntryKind.DIRECTORY:
-            until = found.directory.fresh_until
+            left = self._directories.left(found.directory)
         elif seen.data is not None:
-            size, until = len(seen.data), seen.until
-        valid_for = max(0.0, min(self._options.attr_timeout, until - self._clock()))
+            size, left = len(seen.data), seen.until - self._clock()
+        valid_for = max(0.0, min(self._options.attr_timeout, left))
         return Stat(entry.kind, size, shown_mtime(path, entry.mtime), valid_for)
 
     async def list(self, path: bytes) -> list[tuple[bytes, Stat]]:
@@ -280,6 +280,7 @@ class VirtualTrees:
         return await self._reading.run(path, partial(self._read_once, path))
 
     async def _read_once(self, path: bytes) -> bytes:
+        self._directories.require_reachable()
         began = self._clock()
         try:
             data = await self._store.read_whole(path, self._options.at_file_limit)

@@ -183,7 +183,7 @@ class Writeback:
 
     async def truncate(self, path: bytes, size: int) -> None:
         """See Tree.truncate."""
-        self._context.require_disarmed()
+        self._context.require_changeable()
         async with self._context.paths.hold(path, shared=True):
             node = await self._need_draft(path, truncate=size == 0)
             file = WriteFile(self._parts, node)  # also beside other writers: they may end meanwhile

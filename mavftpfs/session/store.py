@@ -120,9 +120,10 @@ class Store:
         self._under_way = 0
         self._changed_at: dict[bytes, float] = {}
 
-    def is_silent(self) -> bool:
-        """Return whether the vehicle is silent (see RemoteStore)."""
-        return self._vehicle.silence(self._clock()) > SILENCE_LIMIT
+    def is_lost(self) -> bool:
+        """Return whether the vehicle is known to be lost (see RemoteStore)."""
+        now = self._clock()
+        return self._vehicle.lost(now) or not self._vehicle.identity.heard_since(now - SILENCE_LIMIT)
 
     # --- reading
 

@@ -110,6 +110,29 @@ def test_a_killed_vehicle_is_an_error_in_time_and_comes_back(field: Field, big_t
     fresh.communicate(timeout=SILENCE)
 
 
+LIST_UNKNOWN = "os.listdir(sys.argv[1])"
+
+
+@pytest.mark.holds("promise 4")
+def test_ls_of_known_directories_asks_a_lost_vehicle_for_nothing(field: Field, small_tree: Path) -> None:
+    vehicle = field.sim(small_tree)
+    mount = field.mount(vehicle.source, "dir_timeout=0.5")
+    known = mount.path / "deep"
+    before = mount.run("ls", "-lR", known).stdout
+    time.sleep(1.0)  # what is known of it has expired
+    vehicle.pause()
+    wait_until("the vehicle is lost", lambda: mount.status()["link"]["state"] == "lost")
+    asked = mount.status()["cache"]["listings_asked"]
+    assert mount.run("ls", "-lR", known).stdout == before
+    assert mount.errno_of(LIST_UNKNOWN, mount.path / "sizes") == "ETIMEDOUT"
+    assert mount.errno_of(LIST_UNKNOWN, mount.path / "none") == "ENOENT"
+    assert mount.status()["cache"]["listings_asked"] == asked
+    vehicle.resume()
+    wait_until(
+        "files are readable again", lambda: mount.run("ls", mount.path / "sizes", code=None).stdout != ""
+    )
+
+
 def readable(mount: Mount, name: str, content: str) -> bool:
     """Return whether a file has the content; errors are a no."""
     return mount.run("cat", mount.path / name, code=None, timeout=SILENCE).stdout == content

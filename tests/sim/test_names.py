@@ -11,7 +11,16 @@ from trio.testing import MockClock
 
 from mavftpfs.cache.tree import Tree
 from mavftpfs.protocol.payload import Opcode
-from mavftpfs.shared.errors import AlreadyExists, CrossDevice, FileBusy, FtpNak, IsADirectory, PathTooLong
+from mavftpfs.shared.errors import (
+    AlreadyExists,
+    CrossDevice,
+    FileBusy,
+    FtpNak,
+    IsADirectory,
+    NotFound,
+    PathTooLong,
+    VehicleLost,
+)
 from mavftpfs.shared.model import RENAME_ROOM
 from mavftpfs.sim.profiles import PROFILES, Storage
 from tests.support.rigs import RENAMING, Rig, card, read_file, rig, write_file
@@ -308,17 +317,71 @@ async def test_230_bytes_are_refused_before_anything_is_changed(profile: str, au
         assert here.files() == {path: OLD, A: NEW}
 
 
+DEEP = [D + b"/e" * depth for depth in range(6)]
+UNKNOWN = D + b"/unknown"
+
+
+async def deep(here: Rig) -> Tree:
+    """Mount, and list six levels of directories; return the tree when they have expired."""
+    for folder in DEEP:
+        here.put(folder + b"/a", b"ours")
+    here.put(UNKNOWN + b"/a", b"ours")
+    tree = here.mount()
+    for folder in DEEP:
+        await tree.list(folder)
+    await trio.sleep(60.0)
+    return tree
+
+
+async def show(tree: Tree) -> None:
+    """As `ls -l` of each directory does, without the kernel's cache."""
+    for folder in DEEP:
+        for name, _ in await tree.list(folder):
+            await tree.stat(folder + b"/" + name)
+            with pytest.raises(NotFound):
+                await tree.stat(folder + b"/none")
+
+
 @pytest.mark.holds("promise 4")
 @pytest.mark.parametrize("profile", taking_turns(EVERY))
-async def test_a_known_directory_does_not_wait_for_a_silent_vehicle(
+async def test_while_the_vehicle_is_lost_nothing_is_waited_for(profile: str, autojump: MockClock) -> None:
+    """Also before a request has timed out."""
+    async with rig(profile) as here:
+        tree = await deep(here)
+        here.world.link.cut()
+        await trio.sleep(20.0)
+        began, asked = trio.current_time(), tree.status()["listings_asked"]
+        await show(tree)
+        acts: list[Callable[[], Awaitable[object]]] = [
+            lambda: tree.list(UNKNOWN),
+            lambda: tree.stat(UNKNOWN + b"/a"),
+            lambda: tree.open(A),
+            lambda: tree.open(b"/@PARAM/param.pck"),
+            lambda: tree.crc32(A),
+            lambda: tree.mkdir(B),
+            lambda: tree.rmdir(UNKNOWN),
+            lambda: tree.unlink(A),
+            lambda: tree.rename(A, B),
+            lambda: tree.truncate(A, 1),
+        ]
+        for act in acts:
+            with pytest.raises(VehicleLost):
+                await act()
+        assert trio.current_time() == began
+        assert tree.status()["listings_asked"] == asked
+        here.world.link.restore()
+        await trio.sleep(3.0)
+        assert await read_file(tree, UNKNOWN + b"/a") == b"ours"
+
+
+@pytest.mark.holds("promise 4")
+@pytest.mark.parametrize("profile", taking_turns(EVERY))
+async def test_known_directories_wait_until_the_vehicle_is_lost_and_no_longer(
     profile: str, autojump: MockClock
 ) -> None:
-    """Nor until a request has timed out."""
-    async with rig(profile, {A: b"ours"}) as here:
-        tree = here.mount()
-        known = dict(await tree.list(D))
-        await trio.sleep(60.0)
+    async with rig(profile) as here:
+        tree = await deep(here)
         here.world.link.cut()
         began = trio.current_time()
-        assert dict(await tree.list(D)).keys() == known.keys()
-        assert trio.current_time() - began < 10.0
+        await show(tree)
+        assert 4.0 < trio.current_time() - began < 7.0

@@ -207,11 +207,11 @@ async def test_expired_listings_are_served_while_the_vehicle_is_lost(here: Rig, 
     await here.lose()
     await trio.sleep(100)
     asked = len(here.faults.requests)
-    assert await tree.stat(A) == Stat(FILE, 5, MTIME * SECOND, 0.0)
+    assert await tree.stat(A) == Stat(FILE, 5, MTIME * SECOND, 1.0)
     assert len(await tree.list(b"/fs/microsd")) == 2
     with pytest.raises(NotFound):
         await tree.stat(b"/fs/microsd/none")
-    assert tree.negative_valid_for(b"/fs/microsd/none") == 0.0
+    assert tree.negative_valid_for(b"/fs/microsd/none") == 2.0
     assert len(here.faults.requests) == asked
     with pytest.raises(VehicleLost):
         await tree.list(b"/fs/microsd/log")
