@@ -198,7 +198,13 @@ def _sync_parser(name: str) -> Parser:
     )
     parser.add_argument("--newest", metavar="N", type=_count, help="only the N newest logs")
     parser.add_argument("--since", metavar="DATE", help="only logs since then: 2026-05-01, 2026-05-01T14:30")
-    parser.add_argument("-n", "--dry-run", action="store_true", help="only say what would be fetched")
+    instead = parser.add_mutually_exclusive_group()
+    instead.add_argument("-n", "--dry-run", action="store_true", help="only say what would be fetched")
+    instead.add_argument(
+        "--check",
+        action="store_true",
+        help="only compare what is here by CRC32 with the vehicle; exit code 1 if something differs",
+    )
     parser.add_argument("--json", action="store_true", help="print JSON")
     _add_verify(parser)
     return parser
@@ -215,18 +221,22 @@ def _add_verify(parser: Parser) -> None:
         "--verify",
         choices=("auto", "all", "none"),
         default="auto",
-        help="compare with the vehicle's CRC32: auto is up to 16 MB; what was resumed is always compared",
+        help="compare with the vehicle's CRC32: auto is up to 16 MB; all: sync also what is here already; "
+        "what was resumed is always compared",
     )
 
 
 def _get_parser(name: str) -> Parser:
-    parser = _paths_parser(name, "Fetch files, and verify them by size and CRC32.")
+    parser = _paths_parser(name, "Fetch files, and verify them; PATH may be a pattern, as '/log/*.ulg'.")
     parser.add_argument(
-        "--to", metavar="LOCAL", default=".", help="directory, new name of a single file, or - for stdout"
+        "--to",
+        metavar="LOCAL",
+        default=".",
+        help="directory (made if it ends in /, or for several), new name of one file, or - for stdout",
     )
     parser.add_argument("-r", dest="recursive", action="store_true", help="directories too")
     parser.add_argument(
-        "--no-resume", dest="resume", action="store_false", help="do not go on with an earlier NAME.part"
+        "--no-resume", dest="resume", action="store_false", help="fetch all anew, also what is here"
     )
     _add_verify(parser)
     return parser

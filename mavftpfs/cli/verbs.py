@@ -20,6 +20,7 @@ import trio
 
 from mavftpfs.cli import drawing
 from mavftpfs.cli.commands import connection_of, left_by_killed_mounts_line
+from mavftpfs.cli.report import count_files
 from mavftpfs.client import download, names, upload
 from mavftpfs.client import recover as recovering
 from mavftpfs.client import scan as scanning
@@ -128,7 +129,7 @@ def _name(path: bytes) -> str:
 
 
 def sync(args: Args) -> int:
-    """Bring the vehicle's logs into a local directory."""
+    """Bring the vehicle's logs into a local directory, or compare those that are there."""
     component, place = None, None
     if args.place is not None:
         (place,), component = names.parse_paths([args.place])
@@ -137,22 +138,37 @@ def sync(args: Args) -> int:
     outcome = download.Outcome()
     tell = _ignore if args.json else _tell
     error: MavftpfsError | None = None
+
+    async def work(downloads: download.Downloads) -> None:
+        await (downloads.check(wish) if args.check else downloads.sync(wish))
+
     try:
-        _download(args, outcome, lambda downloads: downloads.sync(wish), component, tell)
+        _download(args, outcome, work, component, tell)
     except MavftpfsError as exc:
-        if not outcome.wanted:
+        if not outcome.wanted and not outcome.here:
             raise
         error = exc
     if args.json:
         print(json.dumps(outcome.facts(), indent=2))
-    elif wish.dry_run:
+    else:
+        _print_outcome(args, outcome, since)
+    _say_what_is_not_proven(outcome)
+    if error is not None:
+        _say(f"{error}; {_here(outcome)}" if not args.check else str(error))
+        return max(exit_code_for(error), ExitCode.INCOMPLETE)
+    if outcome.differing:
+        return ExitCode.USAGE
+    complete = outcome.complete and not (args.check and outcome.lacking)
+    return ExitCode.OK if complete else ExitCode.INCOMPLETE
+
+
+def _print_outcome(args: Args, outcome: download.Outcome, since: float | None) -> None:
+    if args.check:
+        _print_comparison(outcome)
+    elif args.dry_run:
         _print_plan(outcome)
     else:
         print(_sync_summary(outcome, since))
-    if error is not None:
-        _say(f"{error}; {_here(outcome)}")
-        return max(exit_code_for(error), ExitCode.INCOMPLETE)
-    return ExitCode.OK if outcome.complete else ExitCode.INCOMPLETE
 
 
 def get(args: Args) -> int:
@@ -165,10 +181,12 @@ def get(args: Args) -> int:
     outcome = download.Outcome()
 
     async def work(downloads: download.Downloads) -> None:
-        await downloads.get(wanted, Path(args.to), recursive=args.recursive)
+        into = args.to.endswith("/")
+        await downloads.get(wanted, Path(args.to), into=into, recursive=args.recursive)
 
     _download(args, outcome, work, component)
-    return ExitCode.INCOMPLETE if outcome.failed else ExitCode.OK
+    _say_what_is_not_proven(outcome)
+    return _exit_code(outcome)
 
 
 def cat(args: Args) -> int:
@@ -189,17 +207,28 @@ def cat(args: Args) -> int:
         await download.Downloads(fetcher, outcome, _ignore, _say).cat(wanted, take)
 
     with_session(args, work, component)
-    return ExitCode.INCOMPLETE if outcome.failed else ExitCode.OK
+    return _exit_code(outcome)
+
+
+def _exit_code(outcome: download.Outcome) -> int:
+    """Return the code for what failed; that of a missing path is the same, however many were asked for."""
+    return max(map(exit_code_for, outcome.failed.values()), default=ExitCode.OK)
 
 
 def _tell(fetched: Fetched) -> None:
     resumed = f", resumed at {readable_size(fetched.resumed)}" if fetched.resumed else ""
+    before = ", here already" if fetched.was_here else resumed
     name = printable(fetched.wanted.name)
-    print(f"{name}: {readable_size(fetched.size)}{resumed}, verified by {fetched.proof}", flush=True)
+    print(f"{name}: {readable_size(fetched.size)}{before}, verified by {fetched.proof.words}", flush=True)
 
 
 def _ignore(fetched: Fetched) -> None:
     """For who prints nothing of single files."""
+
+
+def _say_what_is_not_proven(outcome: download.Outcome) -> None:
+    for lacking, count in outcome.lacking.items():
+        _say(f"not proven: {lacking} ({count_files(count)})")
 
 
 def _download(
@@ -229,7 +258,12 @@ def _here(outcome: download.Outcome) -> str:
 
 def _sync_summary(outcome: download.Outcome, since: float | None) -> str:
     new, size = len(outcome.fetched), sum(fetched.size - fetched.resumed for fetched in outcome.fetched)
-    line = f"{new} new ({readable_size(size)}), {len(outcome.here)} here already, from {_name(outcome.place)}"
+    proven = sum(
+        not outcome.proofs[log.remote].lacking for log in outcome.here if log.remote in outcome.proofs
+    )
+    line = f"{new} new ({readable_size(size)}), {len(outcome.here)} here already"
+    line += f" ({proven} proven now)" if proven else ""
+    line += f", from {_name(outcome.place)}"
     missing = sum(wanted.remote in outcome.failed for wanted in outcome.wanted)
     if missing:
         line += f"; {missing} not here, the next run goes on"
@@ -248,6 +282,17 @@ def _print_plan(outcome: download.Outcome) -> None:
         f"would fetch {len(outcome.wanted)} ({readable_size(left)}), {len(outcome.here)} here already, "
         f"from {_name(outcome.place)}"
     )
+
+
+def _print_comparison(outcome: download.Outcome) -> None:
+    for log in outcome.here:
+        if log.remote in outcome.differing:
+            print(f"{printable(log.name)} differs: {outcome.differing[log.remote]}")
+    same = sum(not proof.lacking for proof in outcome.proofs.values())
+    unproven = sum(outcome.lacking.values())
+    parts = [f"{same} the same", f"{len(outcome.differing)} differ"]
+    parts += [f"{unproven} not proven"] if unproven else []
+    print(f"{', '.join(parts)}, {len(outcome.wanted)} not here, from {_name(outcome.place)}")
 
 
 def parse_date(text: str) -> float:

@@ -1,15 +1,19 @@
-"""Brings many files: what is named, or the logs, the newest first. Layer: client; prints nothing."""
+"""Brings many files: what is named, or the logs, the newest first; compares logs. Layer: client; silent."""
 
 from __future__ import annotations
 
 import os
 import re
+from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import trio
+
 from mavftpfs.cache.attributes import Stat
+from mavftpfs.client.brought import Brought, Memory
 from mavftpfs.client.fetch import (
     Fetched,
     Fetcher,
@@ -22,6 +26,8 @@ from mavftpfs.client.fetch import (
     part_of,
 )
 from mavftpfs.client.files import Found, Session, Unlisted, walk
+from mavftpfs.client.names import matching
+from mavftpfs.client.proof import BY_CRC32, Proof, Verify, ask_crc32, local_crc32, proof_needed
 from mavftpfs.shared.errors import (
     IsADirectory,
     LinkError,
@@ -29,6 +35,7 @@ from mavftpfs.shared.errors import (
     NotADirectory,
     NotFound,
     RequestTimeout,
+    UsageError,
 )
 from mavftpfs.shared.model import EntryKind, join, split
 from mavftpfs.shared.readable import name_text
@@ -60,14 +67,19 @@ class Wish:
 class Outcome:
     """How far a run came. place: the directory of logs; here: files that were here already.
 
-    failed: why a file, or what is in a directory, is not here.
+    proofs: how those that were looked at were verified. failed: why a file, or what is in a directory, is not
+    here. grown: (bytes that were here, bytes that are) of each that is still growing. differing: what `check`
+    found.
     """
 
     place: bytes = b""
     here: list[Wanted] = field(default_factory=list)
     wanted: list[Wanted] = field(default_factory=list)
     fetched: list[Fetched] = field(default_factory=list)
+    proofs: dict[bytes, Proof] = field(default_factory=dict)
     failed: dict[bytes, MavftpfsError] = field(default_factory=dict)
+    grown: dict[bytes, tuple[int, int]] = field(default_factory=dict)
+    differing: dict[bytes, str] = field(default_factory=dict)
     finished: bool = False
 
     @property
@@ -75,32 +87,45 @@ class Outcome:
         """Whether everything that was wished for is here."""
         return self.finished and not self.failed
 
+    @property
+    def lacking(self) -> Counter[str]:
+        """Why checksums were not compared though they were to be, and of how many files."""
+        return Counter(proof.lacking for proof in self.proofs.values() if proof.lacking)
+
     def facts(self) -> dict[str, Any]:
         """Return what `sync --json` prints; the guide describes it."""
-        fetched = {one.wanted.remote: one for one in self.fetched}
         files = [(wanted, "here") for wanted in self.here] + [(wanted, "wanted") for wanted in self.wanted]
         known = {wanted.remote for wanted, _ in files}
+        fetched = {one.wanted.remote: one for one in self.fetched}
+        moved = sum(one.size - one.resumed for one in self.fetched)
         return {
             "from": os.fsdecode(self.place),
             "complete": self.complete,
-            "bytes_fetched": sum(one.size - one.resumed for one in self.fetched),
+            "bytes_fetched": moved + sum(now - before for before, now in self.grown.values()),
             "files": [self._facts(wanted, state, fetched.get(wanted.remote)) for wanted, state in files],
             "errors": [named(path, error) for path, error in self.failed.items() if path not in known],
         }
 
     def _facts(self, wanted: Wanted, state: str, fetched: Fetched | None) -> dict[str, Any]:
         why = self.failed.get(wanted.remote)
-        if why is not None:
-            state = "growing" if isinstance(why, StillGrowing) else "failed"
+        size, resumed = wanted.size, wanted.size if state == "here" else wanted.begun
+        if fetched is not None:
+            state, size, resumed = "fetched", fetched.size, fetched.resumed
+        if wanted.remote in self.grown:
+            state, (resumed, size) = "growing", self.grown[wanted.remote]
+        elif why is not None:
+            state = "failed"
+        proof = self.proofs.get(wanted.remote)
         return {
             "path": os.fsdecode(wanted.remote),
             "local": str(wanted.local),
-            "size": wanted.size if fetched is None else fetched.size,
+            "size": size,
             "mtime": wanted.mtime,
-            "state": "fetched" if fetched else state,
-            "resumed_at": fetched.resumed if fetched else wanted.size if state == "here" else wanted.begun,
-            "proof": None if fetched is None else fetched.proof,
-            "error": None if why is None else str(why),
+            "state": "differs" if wanted.remote in self.differing else state,
+            "resumed_at": resumed,
+            "proof": None if proof is None else proof.words,
+            "not_proven": (None if proof is None else proof.lacking) or None,
+            "error": self.differing.get(wanted.remote) or (None if why is None else str(why)),
         }
 
 
@@ -115,17 +140,74 @@ class Downloads:
     complain: Callable[[str], None]
 
     async def sync(self, wish: Wish) -> None:
-        """Bring the logs.
+        """Bring the logs, and prove those that are here if that is wished for, or was not possible before.
 
         Raises:
             NotFound: no directory of logs. LinkError: the vehicle, or the mount, is gone; UsageError: the
             local disk is full. RequestTimeout: for MAX_TIMEOUTS files. Of what else fails `complain` hears.
         """
+        logs = await self._logs(wish)
+        if wish.dry_run:
+            self.outcome.here = [log for log in logs if log.here]
+            self.outcome.wanted = [log for log in logs if not log.here]
+            self.outcome.finished = True
+            return
+        with local_disk(wish.local):
+            wish.local.mkdir(parents=True, exist_ok=True)
+            memory = Memory(wish.local)
+        for log in logs:
+            trusted = log.here and not self._to_be_proven(log, memory)
+            (self.outcome.here if trusted else self.outcome.wanted).append(log)
+        await self._fetch_all(alone=False, memory=memory)
+
+    async def check(self, wish: Wish) -> None:
+        """Compare the logs that are here with the vehicle's, and fetch nothing.
+
+        Raises:
+            As `sync`.
+        """
+        logs, progress = await self._logs(wish), self.fetcher.progress
+        self.outcome.here = [log for log in logs if log.local.is_file()]
+        self.outcome.wanted = [log for log in logs if not log.local.is_file()]
+        progress.plan(len(self.outcome.here), sum(log.size for log in self.outcome.here))
+        for log in self.outcome.here:
+            progress.begin(log.name, log.size, log.size)
+            progress.check()
+            try:
+                await self._compare(log)
+            except MavftpfsError as exc:
+                self.fail(log.remote, exc, log.name)
+            progress.end(log.size)
+        self.outcome.finished = True
+
+    async def _compare(self, log: Wanted) -> None:
+        if not log.here:
+            with local_disk(log.local):
+                size = log.local.stat().st_size
+            self.outcome.differing[log.remote] = f"{size} bytes here, {log.size} on the vehicle"
+            return
+        answer = await ask_crc32(self.fetcher.session, log.remote)
+        if answer.crc is None:
+            self.outcome.proofs[log.remote] = Proof("size", answer.lacking, answer.later)
+            return
+        with local_disk(log.local):
+            ours = await trio.to_thread.run_sync(local_crc32, log.local)
+        if ours == answer.crc:
+            self.outcome.proofs[log.remote] = BY_CRC32
+        else:
+            self.outcome.differing[log.remote] = f"CRC32 {ours:08x} here, {answer.crc:08x} on the vehicle"
+
+    async def _logs(self, wish: Wish) -> list[Wanted]:
+        """Look what logs there are; return those that are wished for, the newest first."""
         session = self.fetcher.session
+        if wish.local.exists() and not wish.local.is_dir():
+            raise UsageError(f"{wish.local} is a file; the logs go into a directory")
         if wish.place is None:
             place, found, unlisted = await find_logs(session)
         else:
             place = wish.place
+            if (await session.files.stat(place)).kind is EntryKind.FILE:
+                raise NotADirectory(f"{name_text(place)} is a file; get it with `mavftpfs get`")
             found, unlisted = await walk(session.files, place)
         self.outcome.place = session.on_vehicle(place)
         for path, error in unlisted:
@@ -135,18 +217,31 @@ class Downloads:
             for below, stat in found
             if stat.kind is EntryKind.FILE
         ]
-        chosen = _apart(select(newest_first(logs), newest=wish.newest, since=wish.since))
-        self.outcome.here = [log for log in chosen if log.here]
-        self.outcome.wanted = [log for log in chosen if not log.here]
-        if wish.dry_run:
-            self.outcome.finished = True
-            return
-        with local_disk(wish.local):
-            wish.local.mkdir(parents=True, exist_ok=True)
-        await self._fetch_all(alone=False)
+        return _apart(select(newest_first(logs), newest=wish.newest, since=wish.since))
 
-    async def get(self, paths: Sequence[bytes], local: Path, *, recursive: bool) -> None:
-        """Fetch files, and with `recursive` directories, to `local`: a directory, or one file's new name.
+    def _to_be_proven(self, log: Wanted, memory: Memory) -> bool:
+        """Return whether a log that is here is compared: all are to be, or its checksum could not be had."""
+        verify: Verify = self.fetcher.verify
+        known = memory.of(None, self._path(log))
+        unproven = known is not None and not known.proven and known.size == log.size
+        return verify == "all" or (unproven and proof_needed(verify, resumed=False, size=log.size))
+
+    def _path(self, log: Wanted) -> str:
+        return os.fsdecode(self.fetcher.session.on_vehicle(log.remote))
+
+    def _remember(self, fetched: Fetched, memory: Memory) -> None:
+        """Remember a log that was not proven, until it is."""
+        log, unproven = fetched.wanted, bool(fetched.proof.lacking) and fetched.proof.later
+        path = self._path(log)
+        if unproven or memory.of(None, path) is not None:
+            with local_disk(log.local):
+                memory.note(Brought(path, log.name, fetched.size, log.mtime, proven=not unproven))
+
+    async def get(self, paths: Sequence[bytes], local: Path, *, into: bool, recursive: bool) -> None:
+        """Fetch files, and with `recursive` directories; names may be patterns.
+
+        Where things go depends on what is asked for only, but for one file: it goes into `local` if that is a
+        directory, else under that name. All else goes into `local`, which is made.
 
         Raises:
             As Fetcher.fetch where only one file is asked for, else as `sync`.
@@ -154,23 +249,28 @@ class Downloads:
         alone = len(paths) == 1
         found: list[Wanted] = []
         for path in paths:
-            place = local_name(local, path, single=alone)
             try:
-                stat = await self.fetcher.session.files.stat(path)
-                if stat.kind is EntryKind.FILE:
-                    found.append(_wanted(path, place, path, stat))
-                    continue
-                if not recursive:
-                    raise IsADirectory(f"{name_text(path)} is a directory; get it with -r")
-                below, unlisted = await walk(self.fetcher.session.files, path)
-                found += _made(path, place, below)
-                for unreadable, error in unlisted:
-                    self.fail(unreadable, error)
-                alone = False
+                names = await matching(self.fetcher.session.files, path)
+                alone = alone and names == [path]
+                for name in names:
+                    found += await self._found(name, local, into=into or not alone, recursive=recursive)
             except MavftpfsError as exc:
                 self.fail(path, exc, alone=alone)
         self.outcome.wanted = _apart(found)
-        await self._fetch_all(alone=alone)
+        await self._fetch_all(alone=alone and [one.remote for one in found] == [*paths])
+
+    async def _found(self, path: bytes, local: Path, *, into: bool, recursive: bool) -> list[Wanted]:
+        """Return the files of a path, for which there are directories then."""
+        stat = await self.fetcher.session.files.stat(path)
+        name = os.fsdecode(split(path)[1])
+        if stat.kind is EntryKind.FILE:
+            return [_wanted(path, _place(local, name, into=into), path, stat)]
+        if not recursive:
+            raise IsADirectory(f"{name_text(path)} is a directory; get it with -r")
+        below, unlisted = await walk(self.fetcher.session.files, path)
+        for unreadable, error in unlisted:
+            self.fail(unreadable, error)
+        return _made(path, local / name, below)
 
     async def cat(self, paths: Sequence[bytes], take: Take) -> None:
         """Hand on the bytes of files, one behind the other.
@@ -180,26 +280,40 @@ class Downloads:
         """
         for path in paths:
             try:
-                await self.fetcher.write_to(path, take)
+                for name in await matching(self.fetcher.session.files, path):
+                    await self.fetcher.write_to(name, take)
             except MavftpfsError as exc:
                 self.fail(path, exc, alone=len(paths) == 1)
 
-    async def _fetch_all(self, *, alone: bool) -> None:
-        wanted, progress = self.outcome.wanted, self.fetcher.progress
+    async def _fetch_all(self, *, alone: bool, memory: Memory | None = None) -> None:
+        wanted, progress = list(self.outcome.wanted), self.fetcher.progress
         progress.plan(len(wanted), sum(one.size for one in wanted))
         timeouts = 0
         for one in wanted:
+            begun = one.begun
             try:
                 fetched = await self.fetcher.fetch(one)
             except MavftpfsError as exc:
                 timeouts = timeouts + 1 if isinstance(exc, RequestTimeout) else 0
+                if isinstance(exc, StillGrowing):
+                    self.outcome.grown[one.remote] = begun, exc.came
                 self.fail(one.remote, exc, one.name, alone=alone or timeouts == MAX_TIMEOUTS)
             else:
                 timeouts = 0
-                self.outcome.fetched.append(fetched)
-                self.tell(fetched)
+                self._arrived(fetched)
+                if memory is not None:
+                    self._remember(fetched, memory)
             progress.end(one.size)
         self.outcome.finished = True
+
+    def _arrived(self, fetched: Fetched) -> None:
+        self.outcome.proofs[fetched.wanted.remote] = fetched.proof
+        if fetched.was_here:
+            self.outcome.wanted.remove(fetched.wanted)
+            self.outcome.here.append(fetched.wanted)
+        else:
+            self.outcome.fetched.append(fetched)
+        self.tell(fetched)
 
     def fail(self, path: bytes, error: MavftpfsError, name: str = "", *, alone: bool = False) -> None:
         """Say it and go on, or end where the others would fare no better, or where there are none."""
@@ -209,10 +323,12 @@ class Downloads:
         self.complain(named(name or path, error))
 
 
-def local_name(local: Path, path: bytes, *, single: bool) -> Path:
-    """Return where a remote path goes: into a directory, or under the new name of a single thing."""
-    name = os.fsdecode(split(path)[1])
-    return local / name if local.is_dir() or not single else local
+def _place(local: Path, name: str, *, into: bool) -> Path:
+    """Return where one file goes."""
+    if into:
+        with local_disk(local):
+            local.mkdir(parents=True, exist_ok=True)
+    return local / name if local.is_dir() else local
 
 
 def _made(path: bytes, place: Path, found: Found) -> list[Wanted]:

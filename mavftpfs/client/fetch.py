@@ -13,38 +13,35 @@ import shutil
 import stat
 from collections.abc import Awaitable, Callable, Collection, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
 
 import trio
 
 from mavftpfs.client.files import READ_SIZE, Session
 from mavftpfs.client.progress import Progress
+from mavftpfs.client.proof import (
+    BY_CRC32,
+    BY_SIZE,
+    GENERATED,
+    NOT_ASKED,
+    Proof,
+    Verify,
+    ask_crc32,
+    local_crc32,
+    proof_needed,
+)
 from mavftpfs.protocol.payload import crc32
 from mavftpfs.shared.errors import (
-    Armed,
     DataUnproven,
-    FileBusy,
-    FtpNak,
     IsADirectory,
-    LinkError,
     MavftpfsError,
-    NotDeliveredYet,
-    NotSupported,
     RequestTimeout,
-    SessionBusy,
     UsageError,
     VehicleLost,
 )
 from mavftpfs.shared.model import EntryKind, is_snapshot
 from mavftpfs.shared.readable import name_text, readable_size
-
-Verify = Literal["auto", "all", "none"]
-
-PROVEN_BY_DEFAULT = 16_000_000
-"""Bytes up to which a file is proven that came in one piece. A vehicle computes about a megabyte of checksum
-a second, and most answer nobody meanwhile."""
 
 LEAST_READ, LARGEST_READ = 2048, 128 * 1024
 """Bytes of one read."""
@@ -58,13 +55,6 @@ EARLIEST = 946_684_800
 def known_time(mtime: int) -> int | None:
     """Return a listed time, None where it tells nothing."""
     return mtime if mtime >= EARLIEST else None
-
-
-def proof_needed(verify: Verify, *, resumed: bool, size: int) -> bool:
-    """Return whether the vehicle is asked for a checksum of the whole file."""
-    if resumed or verify == "all":
-        return True
-    return verify == "auto" and size <= PROVEN_BY_DEFAULT
 
 
 def next_read_size(size: int, took: float) -> int:
@@ -81,19 +71,21 @@ PART_SUFFIX = ".part"
 MAX_RETURNS = 20
 """How often a vehicle may vanish and return while one file is fetched."""
 
-NOT_NOW = (Armed, NotDeliveredYet, RequestTimeout, SessionBusy, FileBusy)
-"""Errors that say that there is no checksum now, though there may be one later."""
-
-NO_CHECKSUM: tuple[type[MavftpfsError], ...] = (*NOT_NOW, FtpNak, NotSupported)
-"""Errors that say that there is no checksum, and nothing else about the file."""
-
 
 class LocalDiskFull(UsageError):
     """Nothing more can be written on the local disk."""
 
 
 class StillGrowing(MavftpfsError):
-    """The vehicle writes the file; what came so far is kept as its .part."""
+    """The vehicle writes the file; what came so far is kept as its .part.
+
+    Attributes:
+        came: the bytes that are here.
+    """
+
+    def __init__(self, reason: str, came: int) -> None:
+        super().__init__(reason)
+        self.came = came
 
 
 class NotProvenYet(MavftpfsError):
@@ -141,12 +133,13 @@ def _size(path: Path) -> int:
 
 @dataclass(frozen=True, slots=True)
 class Fetched:
-    """A file that was fetched. resumed: bytes that were here already; proof: how it was verified."""
+    """A file that is here. resumed: bytes that were here before; was_here: it was, whole, under its name."""
 
     wanted: Wanted
     size: int
     resumed: int
-    proof: str
+    proof: Proof
+    was_here: bool = False
 
 
 def part_of(local: Path, finals: Collection[Path] = ()) -> Path:
@@ -163,15 +156,6 @@ def local_disk(place: Path) -> Iterator[None]:
     except OSError as exc:
         full = exc.errno in (errno.ENOSPC, errno.EDQUOT)
         raise (LocalDiskFull if full else UsageError)(f"{place}: {exc.strerror}") from exc
-
-
-def local_crc32(file: Path) -> int:
-    """Return the CRC32 of a local file."""
-    crc = 0
-    with file.open("rb") as source:
-        while data := source.read(READ_SIZE):
-            crc = crc32(data, crc)
-    return crc
 
 
 class Part:
@@ -294,6 +278,9 @@ class Fetcher:
         if wanted.local.is_dir():
             raise UsageError(f"{wanted.local} is a directory")
         with local_disk(wanted.local):
+            proof = await self._prove_here(wanted) if self.resume and wanted.here else None
+            if proof is not None:
+                return Fetched(wanted, wanted.size, wanted.size, proof, was_here=True)
             if wanted.keep_old:  # logs keep their directories
                 wanted.local.parent.mkdir(parents=True, exist_ok=True)
             part = Part(wanted.part, wanted.local)
@@ -310,6 +297,23 @@ class Fetcher:
             finally:
                 part.close()
 
+    async def _prove_here(self, wanted: Wanted) -> Proof | None:
+        """Return how a local file of the same size was proven to be this one; None if it is another one, or
+        nothing tells. A log is taken for the same by its size, another file by its time, too."""
+        if is_snapshot(self.session.on_vehicle(wanted.remote)):
+            return None
+        answer = NOT_ASKED
+        self.progress.begin(wanted.name, wanted.size, wanted.size)
+        if proof_needed(self.verify, resumed=False, size=wanted.size):
+            self.progress.check()
+            answer = await ask_crc32(self.session, wanted.remote)
+        if answer.crc is not None:
+            return BY_CRC32 if answer.crc == await _crc32_of(wanted.local) else None
+        if wanted.keep_old:
+            return Proof("size", answer.lacking, answer.later)
+        same_time = int(wanted.local.stat().st_mtime) == wanted.mtime
+        return Proof("size and time", answer.lacking, answer.later) if same_time else None
+
     async def _fetch_and_commit(self, wanted: Wanted, part: Part) -> Fetched:
         resumed = part.size
         try:
@@ -322,11 +326,11 @@ class Fetcher:
         await trio.to_thread.run_sync(lambda: part.commit(wanted.mtime, keep_old=wanted.keep_old))
         return Fetched(wanted, size, resumed, proof)
 
-    async def _attempt(self, wanted: Wanted, part: Part) -> tuple[int, str]:
+    async def _attempt(self, wanted: Wanted, part: Part) -> tuple[int, Proof]:
         """Fetch what is missing, and prove the whole; returns its size, and how it was proven."""
         here = size = part.size
         self.progress.begin(wanted.name, wanted.size, here)
-        crc = await trio.to_thread.run_sync(local_crc32, part.path) if here else 0
+        crc = await _crc32_of(part.path) if here else 0
 
         async def take(data: bytes | memoryview) -> None:
             part.append(data)
@@ -357,7 +361,7 @@ class Fetcher:
         finally:
             file.close()
 
-    async def _prove(self, remote: bytes, name: str, size: int, crc: int, *, resumed: bool) -> str:
+    async def _prove(self, remote: bytes, name: str, size: int, crc: int, *, resumed: bool) -> Proof:
         """Compare with the vehicle's checksum where that is wanted and can be had; returns what was proven.
 
         Raises:
@@ -367,30 +371,22 @@ class Fetcher:
         if is_snapshot(self.session.on_vehicle(remote)):
             if resumed:
                 raise DataUnproven(f"{name} is made anew at each opening, so it cannot be resumed")
-            return "size (generated at each opening, so a checksum proves nothing)"
-        theirs = error = None
+            return GENERATED
+        answer = NOT_ASKED
         if proof_needed(self.verify, resumed=resumed, size=size):
-            try:
-                theirs = await self.session.files.crc32(remote)
-            except LinkError:
-                raise
-            except MavftpfsError as exc:
-                error = exc
-        if theirs == crc:
-            return "size and CRC32"
+            answer = await ask_crc32(self.session, remote)
+        if answer.crc == crc:
+            return BY_CRC32
         await self._require_size(remote, name, size)
-        if theirs is not None:
+        if answer.crc is not None:
             raise DataUnproven(
-                f"{name}: {size} bytes came with CRC32 {crc:08x}, the vehicle has {theirs:08x}"
+                f"{name}: {size} bytes came with CRC32 {crc:08x}, the vehicle has {answer.crc:08x}"
             )
         if not resumed:
-            return f"size (no checksum: {error})" if error else "size"
-        if not isinstance(error, NOT_NOW):
-            raise DataUnproven(f"{name} was resumed, and there is no checksum: {error}")
-        raise NotProvenYet(
-            f"{name}: all of it is here, as {PART_SUFFIX}, but what an earlier run fetched is not proven "
-            f"({error}); the next run tries again"
-        )
+            return replace(BY_SIZE, lacking=answer.lacking, later=answer.later)
+        if not answer.later:
+            raise DataUnproven(f"{name} was resumed, and there is no checksum: {answer.lacking}")
+        raise NotProvenYet(f"all of {name} is here, as {PART_SUFFIX}, but not proven: {answer.lacking}")
 
     async def _require_size(self, remote: bytes, name: str, size: int) -> None:
         """Ask for the size again: no checksum says that the file was whole.
@@ -400,6 +396,10 @@ class Fetcher:
         """
         now = await self.session.size_now(remote)
         if now > size:
-            raise StillGrowing(f"{name} is still growing: only its first {readable_size(size)} came")
+            raise StillGrowing(f"{name} is still growing: only its first {readable_size(size)} came", size)
         if now < size:
             raise DataUnproven(f"{name} has shrunk from {size} to {now} bytes")
+
+
+async def _crc32_of(file: Path) -> int:
+    return await trio.to_thread.run_sync(local_crc32, file)

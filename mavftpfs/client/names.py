@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from fnmatch import fnmatchcase
 from typing import Any
 
 from mavftpfs.cache.attributes import Stat
@@ -47,6 +49,45 @@ def _plain_path(text: str) -> bytes:
         return normalise(os.fsencode(text))
     except LocalProtocolError as exc:
         raise UsageError(str(exc)) from exc
+
+
+def is_pattern(name: bytes) -> bool:
+    """Return whether it has what stands for other characters."""
+    return re.search(rb"[*?[]", name) is not None
+
+
+async def matching(files: Files, path: bytes) -> list[bytes]:
+    """Return the paths that match a pattern as in a shell, sorted; a path that is there, or is none, itself.
+
+    Raises:
+        NotFound: nothing matches. Else as Files.list.
+    """
+    if not is_pattern(path) or await _exists(files, path):
+        return [path]
+    found = [ROOT]
+    for part in path.strip(b"/").split(b"/"):
+        found = [join(top, name) for top in found for name in await _names_like(files, top, part)]
+    if not found:
+        raise NotFound(f"nothing matches {name_text(path)}")
+    return sorted(found)
+
+
+async def _exists(files: Files, path: bytes) -> bool:
+    try:
+        await files.stat(path)
+    except (NotFound, NotADirectory):
+        return False
+    return True
+
+
+async def _names_like(files: Files, directory: bytes, pattern: bytes) -> list[bytes]:
+    if not is_pattern(pattern):
+        return [pattern] if await _exists(files, join(directory, pattern)) else []
+    if not await is_directory(files, directory):
+        return []
+    names = [name for name, _ in await files.list(directory)]
+    hidden = pattern.startswith(b".")
+    return [name for name in names if fnmatchcase(name, pattern) and (hidden or not name.startswith(b"."))]
 
 
 Entry = dict[str, Any]

@@ -15,9 +15,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from mavftpfs.client.fetch import NO_CHECKSUM, local_crc32
 from mavftpfs.client.files import Session
 from mavftpfs.client.progress import Progress
+from mavftpfs.client.proof import NO_CHECKSUM, local_crc32
 from mavftpfs.client.upload import put_file
 from mavftpfs.shared.errors import (
     NotDelivered,

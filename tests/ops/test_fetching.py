@@ -15,19 +15,21 @@ from mavftpfs.client.fetch import (
     Fetched,
     Fetcher,
     NotProvenYet,
-    Verify,
     Wanted,
     known_time,
     part_of,
 )
 from mavftpfs.client.files import Files, Session
 from mavftpfs.client.progress import Progress
+from mavftpfs.client.proof import BY_CRC32, GENERATED, Proof, Verify
 from mavftpfs.shared.errors import (
     Armed,
     DataUnproven,
     FileBusy,
     FtpNak,
     MavftpfsError,
+    NotADirectory,
+    NotFound,
     RequestTimeout,
     SessionBusy,
     UsageError,
@@ -88,7 +90,7 @@ async def test_wrong_bytes_are_fetched_again_without_the_caches(tmp_path: Path) 
     assert (tmp_path / "big").read_bytes() == BIG
     assert tree.forgotten
     assert int((tmp_path / "big").stat().st_mtime) == MTIME
-    assert (fetched.size, fetched.resumed, fetched.proof) == (len(BIG), 0, "size and CRC32")
+    assert (fetched.size, fetched.resumed, fetched.proof) == (len(BIG), 0, BY_CRC32)
     assert all(file.closed for file in tree.opened)
     assert names_in(tmp_path) == ["big"]
 
@@ -131,7 +133,7 @@ async def test_a_vehicle_that_is_lost_is_waited_for(tmp_path: Path, returns: boo
         fetched = await fetcher.fetch(wanted(tree, b"/big", tmp_path / "big"))
         assert (tmp_path / "big").read_bytes() == BIG
         assert fetched.resumed > 0
-        assert (waited, fetched.proof) == (2, "size and CRC32")
+        assert (waited, fetched.proof) == (2, BY_CRC32)
         return
     with pytest.raises(VehicleLost):
         await fetcher.fetch(wanted(tree, b"/big", tmp_path / "big"))
@@ -151,7 +153,7 @@ async def test_what_was_resumed_waits_for_its_proof(tmp_path: Path, error: Excep
     tree = SpoiltTree({b"/big": BIG})
     tree.crc_error = error
     (tmp_path / "big.part").write_bytes(BIG[:1000])
-    with pytest.raises(NotProvenYet, match="next run"):
+    with pytest.raises(NotProvenYet, match="is here"):
         await get(tree, b"/big", tmp_path / "big")
     assert names_in(tmp_path) == ["big.part"]
     assert (tmp_path / "big.part").read_bytes() == BIG
@@ -168,12 +170,21 @@ async def test_where_no_checksum_can_be_had_all_is_fetched_anew(tmp_path: Path) 
     assert (fetched.resumed, (tmp_path / "big").read_bytes()) == (0, BIG)
 
 
-@pytest.mark.parametrize("error", [Armed("it is armed"), FtpNak(14, 7), RequestTimeout("no answer")])
-async def test_without_a_checksum_it_says_what_was_proven(tmp_path: Path, error: Exception) -> None:
+@pytest.mark.parametrize(
+    ("error", "lacking", "later"),
+    [
+        (Armed("checksums are not asked for in flight"), "armed", True),
+        (FtpNak(14, 7), "the vehicle computes no checksums", False),
+        (RequestTimeout("nobody answered within 30 s"), "no answer", True),
+    ],
+)
+async def test_without_a_checksum_it_says_what_was_proven(
+    tmp_path: Path, error: Exception, lacking: str, later: bool
+) -> None:
     tree = SpoiltTree({b"/big": BIG})
     tree.crc_error = error
     fetched = await get(tree, b"/big", tmp_path / "big")
-    assert fetched.proof == f"size (no checksum: {error})"
+    assert fetched.proof == Proof("size", lacking, later)
 
 
 @pytest.mark.parametrize(
@@ -187,7 +198,7 @@ async def test_what_is_made_anew_at_each_opening_is_not_proven(
     fetched = await fetcher_of(tree, root).fetch(wanted(tree, path, tmp_path / "x"))
     assert (tmp_path / "x").read_bytes() == b"now"
     assert (("crc32", path) in tree.calls) is proven
-    assert ("generated" in fetched.proof) is not proven
+    assert fetched.proof == (BY_CRC32 if proven else GENERATED)
 
 
 async def test_a_read_that_ends_early_is_no_file(tmp_path: Path) -> None:
@@ -235,11 +246,19 @@ async def test_names_that_end_in_part_are_the_vehicle_s_too(tmp_path: Path) -> N
 
 
 async def get_all(
-    tree: FakeTree, *paths: bytes, to: Path, recursive: bool = True
+    tree: FakeTree,
+    *paths: bytes,
+    to: Path,
+    recursive: bool = True,
+    into: bool = False,
+    verify: Verify = "auto",
+    resume: bool = True,
 ) -> tuple[Outcome, list[str]]:
     outcome, said = Outcome(), list[str]()
-    downloads = Downloads(fetcher_of(tree), outcome, lambda _: None, said.append)
-    await downloads.get(paths, to, recursive=recursive)
+    downloads = Downloads(
+        fetcher_of(tree, verify=verify, resume=resume), outcome, lambda _: None, said.append
+    )
+    await downloads.get(paths, to, into=into, recursive=recursive)
     return outcome, said
 
 
@@ -248,7 +267,7 @@ async def test_what_the_local_disk_refuses_is_told_in_a_line(tmp_path: Path) -> 
     (tmp_path / "file").write_bytes(b"in the way")
     with pytest.raises(UsageError, match=f"^{tmp_path / 'none' / 'a'}: No such file"):
         await get_all(tree, b"/d/a", to=tmp_path / "none" / "a")
-    with pytest.raises(UsageError, match=f"^{tmp_path / 'file'}: File exists"):
+    with pytest.raises(UsageError, match=f"^{tmp_path / 'file' / 'd'}: Not a directory"):
         await get_all(tree, b"/d", to=tmp_path / "file")
     assert (tmp_path / "file").read_bytes() == b"in the way"
 
@@ -270,7 +289,7 @@ async def test_a_directory_goes_on_after_what_fails(tmp_path: Path, call: tuple[
     tree.on_call = refusing(*call)
     outcome, said = await get_all(tree, b"/d", to=tmp_path / "d")
     assert (len(outcome.fetched), list(outcome.failed), said) == (2, [b"/d/b"], ["/d/b: no answer"])
-    assert (tmp_path / "d" / "c").read_bytes() == b"3"
+    assert (tmp_path / "d/d/c").read_bytes() == b"3"
 
 
 async def test_a_lost_vehicle_ends_it_at_once(tmp_path: Path) -> None:
@@ -287,6 +306,100 @@ async def test_a_lost_vehicle_ends_it_at_once(tmp_path: Path) -> None:
     assert [call for call in tree.calls if call[0] == "open"] == [("open", b"/d/a")]
 
 
+@pytest.mark.parametrize("there", [True, False])
+async def test_the_same_command_goes_on_in_the_same_place(tmp_path: Path, there: bool) -> None:
+    """Whether LOCAL was there before or not, it is after the first run."""
+    tree, to = SpoiltTree({b"/log/d/a": BIG, b"/log/b": b"2"}), tmp_path / "gg"
+    if there:
+        to.mkdir()
+    reads = 0
+
+    def interrupt(name: str, path: bytes) -> None:
+        nonlocal reads
+        reads += name == "read"
+        if reads == 5:
+            raise VehicleLost("gone")
+
+    tree.on_call = interrupt
+    with pytest.raises(VehicleLost):
+        await get_all(tree, b"/log", to=to)
+    tree.on_call = lambda name, path: None
+    outcome, _ = await get_all(tree, b"/log", to=to)
+    assert sum(one.resumed for one in outcome.fetched) > 0
+    assert names_in(to) == ["log"]
+    assert (to / "log/d/a").read_bytes() == BIG
+    tree.calls.clear()
+    outcome, said = await get_all(tree, b"/log", to=to)
+    assert (len(outcome.here), outcome.fetched, said) == (2, [], [])
+    assert {name for name, _ in tree.calls} == {"stat", "list", "crc32"}
+
+
+@pytest.mark.parametrize(
+    ("change", "how", "fetched"),
+    [
+        ("nothing", "crc32", False),
+        ("nothing", "armed", False),
+        ("nothing", "verify=none", False),
+        ("a byte", "crc32", True),
+        ("a byte", "armed", False),
+        ("its time", "crc32", False),
+        ("its time", "armed", True),
+        ("its time", "verify=none", True),
+        ("nothing", "no resume", True),
+    ],
+)
+async def test_what_is_here_is_skipped_if_it_is_the_same(
+    tmp_path: Path, change: str, how: str, fetched: bool
+) -> None:
+    tree, local = SpoiltTree({b"/d/a": BIG}), tmp_path / "a"
+    await get_all(tree, b"/d/a", to=tmp_path)
+    times = local.stat().st_mtime
+    if change == "a byte":
+        local.write_bytes(b"?" + BIG[1:])
+    os.utime(local, (times, times + 10 * (change == "its time")))
+    tree.crc_error = Armed("in flight") if how == "armed" else None
+    verify: Verify = "none" if how == "verify=none" else "auto"
+    outcome, _ = await get_all(tree, b"/d/a", to=tmp_path, verify=verify, resume=how != "no resume")
+    assert ([one.wanted.name for one in outcome.fetched] == ["/d/a"]) is fetched
+    assert (outcome.here == []) is fetched
+    if fetched:
+        assert local.read_bytes() == BIG
+    assert outcome.lacking == ({"armed": 1} if how == "armed" else {})
+
+
+async def test_what_is_made_anew_at_each_opening_is_never_skipped(tmp_path: Path) -> None:
+    tree = SpoiltTree({b"/@SYS/uarts.txt": b"1"})
+    await get_all(tree, b"/@SYS/uarts.txt", to=tmp_path)
+    tree.files[b"/@SYS/uarts.txt"] = b"2"
+    await get_all(tree, b"/@SYS/uarts.txt", to=tmp_path)
+    assert (tmp_path / "uarts.txt").read_bytes() == b"2"
+
+
+@pytest.mark.parametrize(
+    ("pattern", "come"),
+    [
+        (b"/l/*.ulg", ["a.ulg", "b.ulg"]),
+        (b"/l/[b-c].*", ["b.ulg"]),
+        (b"/?/a.ulg", ["a.ulg"]),
+        (b"/*/.*", [".x"]),
+        (b"/l/[odd]", ["[odd]"]),
+    ],
+)
+async def test_patterns(tmp_path: Path, pattern: bytes, come: list[str]) -> None:
+    files = {b"/l/a.ulg": b"1", b"/l/b.ulg": b"2", b"/l/.x": b"3", b"/l/[odd]": b"4", b"/f": b"5"}
+    for _ in range(2):
+        outcome, _ = await get_all(SpoiltTree(dict(files)), pattern, to=tmp_path / "new", into=True)
+    assert names_in(tmp_path / "new") == come
+    assert len(outcome.here) == len(come)
+
+
+async def test_a_pattern_for_one_file_means_a_directory_all_the_same(tmp_path: Path) -> None:
+    await get_all(SpoiltTree({b"/l/a": b"1"}), b"/l/*", to=tmp_path / "new")
+    assert names_in(tmp_path / "new") == ["a"]
+    with pytest.raises(NotFound, match=r"nothing matches /l/\*\.bin"):
+        await get_all(SpoiltTree({b"/l/a": b"1"}), b"/l/*.bin", to=tmp_path / "new")
+
+
 # -- sync -----------------------------------------------------------------------------------------
 
 LOGS = {
@@ -297,10 +410,16 @@ LOGS = {
 
 
 async def sync(
-    tree: FakeTree, local: Path, *, newest: int | None = None, dry_run: bool = False, root: bytes = b"/"
+    tree: FakeTree,
+    local: Path,
+    *,
+    newest: int | None = None,
+    dry_run: bool = False,
+    root: bytes = b"/",
+    verify: Verify = "auto",
 ) -> tuple[Outcome, list[str], list[str]]:
     outcome, told, said = Outcome(), list[str](), list[str]()
-    fetcher = fetcher_of(tree, root)
+    fetcher = fetcher_of(tree, root, verify)
     downloads = Downloads(fetcher, outcome, lambda fetched: told.append(fetched.wanted.name), said.append)
     try:
         await downloads.sync(Wish(local, newest=newest, dry_run=dry_run))
@@ -358,3 +477,67 @@ async def test_one_that_fails_does_not_stop_the_others(tmp_path: Path) -> None:
     assert (told, said, outcome.complete) == (["d/1.ulg"], ["d/2.ulg: no answer"], False)
     states = {file["path"]: file["state"] for file in outcome.facts()["files"]}
     assert states == {"/fs/microsd/log/d/2.ulg": "failed", "/fs/microsd/log/d/1.ulg": "fetched"}
+
+
+async def test_a_log_that_was_fetched_while_armed_is_proven_later(tmp_path: Path) -> None:
+    tree = SpoiltTree({b"/log/1": b"one", b"/log/2": b"two"})
+    tree.crc_error = Armed("in flight")
+    for moved in (6, 0):
+        outcome, _, said = await sync(tree, tmp_path)
+        assert outcome.facts()["bytes_fetched"] == moved
+        assert (outcome.lacking, said, outcome.complete) == ({"armed": 2}, [], True)
+    (tmp_path / "2").write_bytes(b"TWO")
+    tree.crc_error = None
+    outcome, _, _ = await sync(tree, tmp_path)
+    assert {name: (tmp_path / name).read_bytes() for name in names_in(tmp_path) if name[0] != "."} == {
+        "1": b"one",
+        "2": b"two",
+        "2.~1~": b"TWO",
+    }
+    assert outcome.proofs == {b"/log/1": BY_CRC32, b"/log/2": BY_CRC32}
+    tree.calls.clear()
+    await sync(tree, tmp_path)
+    assert not any(name == "crc32" for name, _ in tree.calls)
+
+
+async def test_all_that_is_here_is_proven_if_that_is_wished_for(tmp_path: Path) -> None:
+    tree = SpoiltTree({b"/log/1": b"one", b"/log/2": b"two"})
+    await sync(tree, tmp_path)
+    assert names_in(tmp_path) == ["1", "2"]
+    (tmp_path / "2").write_bytes(b"TWO")
+    assert len((await sync(tree, tmp_path))[0].here) == 2
+    outcome, _, _ = await sync(tree, tmp_path, verify="all")
+    assert ([log.name for log in outcome.here], [one.wanted.name for one in outcome.fetched]) == (
+        ["1"],
+        ["2"],
+    )
+    assert names_in(tmp_path) == ["1", "2", "2.~1~"]
+    assert (tmp_path / "2").read_bytes() == b"two"
+
+
+async def test_check_compares_and_fetches_nothing(tmp_path: Path) -> None:
+    tree = SpoiltTree({b"/log/1": b"one", b"/log/2": b"two", b"/log/3": b"three", b"/log/4": b"four"})
+    for name, data in (("1", b"one"), ("2", b"TWO"), ("3", b"thr")):
+        (tmp_path / name).write_bytes(data)
+    outcome = Outcome()
+    downloads = Downloads(fetcher_of(tree, verify="none"), outcome, lambda _: None, lambda _: None)
+    await downloads.check(Wish(tmp_path))
+    assert tree.reads == 0
+    assert names_in(tmp_path) == ["1", "2", "3"]
+    assert {file["path"]: file["state"] for file in outcome.facts()["files"]} == {
+        "/log/1": "here",
+        "/log/2": "differs",
+        "/log/3": "differs",
+        "/log/4": "wanted",
+    }
+    assert outcome.differing[b"/log/3"] == "3 bytes here, 5 on the vehicle"
+
+
+@pytest.mark.parametrize("what", ["LOCAL", "--from"])
+async def test_a_file_where_a_directory_is_needed_is_said(tmp_path: Path, what: str) -> None:
+    (tmp_path / "file").write_bytes(b"1")
+    tree = SpoiltTree({b"/log/1": b"one"})
+    downloads = Downloads(fetcher_of(tree), Outcome(), lambda _: None, lambda _: None)
+    place, local = (b"/log/1", tmp_path) if what == "--from" else (None, tmp_path / "file")
+    with pytest.raises((UsageError, NotADirectory), match="is a file"):
+        await downloads.sync(Wish(local, place))

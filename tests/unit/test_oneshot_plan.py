@@ -8,9 +8,10 @@ from pathlib import Path
 import pytest
 
 from mavftpfs.cli.verbs import parse_date
-from mavftpfs.client import download, fetch
-from mavftpfs.client.fetch import Verify, Wanted
+from mavftpfs.client import download, fetch, proof
+from mavftpfs.client.fetch import Wanted
 from mavftpfs.client.names import parse_paths
+from mavftpfs.client.proof import Verify
 from mavftpfs.client.scan import describe_peer
 from mavftpfs.client.status import same_link
 from mavftpfs.link.messages import Address, AutopilotVersion, Heartbeat
@@ -49,16 +50,16 @@ def test_what_is_here_of_a_file_of_100_bytes(
 @pytest.mark.parametrize(
     ("verify", "resumed", "size", "needed"),
     [
-        ("auto", False, fetch.PROVEN_BY_DEFAULT, True),
-        ("auto", False, fetch.PROVEN_BY_DEFAULT + 1, False),
-        ("auto", True, fetch.PROVEN_BY_DEFAULT + 1, True),
-        ("all", False, fetch.PROVEN_BY_DEFAULT + 1, True),
+        ("auto", False, proof.PROVEN_BY_DEFAULT, True),
+        ("auto", False, proof.PROVEN_BY_DEFAULT + 1, False),
+        ("auto", True, proof.PROVEN_BY_DEFAULT + 1, True),
+        ("all", False, proof.PROVEN_BY_DEFAULT + 1, True),
         ("none", False, 1, False),
         ("none", True, 1, True),
     ],
 )
 def test_what_is_proven(verify: Verify, resumed: bool, size: int, needed: bool) -> None:
-    assert fetch.proof_needed(verify, resumed=resumed, size=size) is needed
+    assert proof.proof_needed(verify, resumed=resumed, size=size) is needed
 
 
 def log(below: str, mtime: int | None = None) -> Wanted:

@@ -1,0 +1,101 @@
+"""What was brought into a local directory of logs, and is not to be forgotten: a file in it. Layer: client.
+
+Each line is a log as JSON; a later line of the same log counts. Lines are only added, so that a power cut
+loses at most the last one.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+NAME = ".mavftpfs-logs"
+"""Of the file."""
+
+_SPARE = 100
+"""Lines that no longer count, beyond which the file is written anew."""
+
+
+@dataclass(frozen=True, slots=True)
+class Brought:
+    """A log that was brought. path: on the vehicle; vehicle: its unique id, None if that was not asked for;
+    file: below the local directory; size: bytes; mtime: seconds UTC, None if unknown.
+
+    proven: its checksum was compared, or did not need to be.
+    """
+
+    path: str
+    file: str
+    size: int
+    mtime: int | None
+    vehicle: str | None = None
+    proven: bool = True
+
+
+Key = tuple[str | None, str]
+
+
+class Memory:
+    """What is known of the logs in a directory; read when it is made."""
+
+    def __init__(self, local: Path) -> None:
+        """Raises: OSError: it cannot be read."""
+        self._place = local / NAME
+        self._logs: dict[Key, Brought] = {}
+        lines = self._read()
+        for line in lines:
+            log = _parsed(line)
+            if log is not None:
+                self._logs[log.vehicle, log.path] = log
+        if len(lines) > 2 * len(self._logs) + _SPARE:
+            self._write_anew()
+
+    def of(self, vehicle: str | None, path: str) -> Brought | None:
+        """Return what is known of a log."""
+        return self._logs.get((vehicle, path))
+
+    def note(self, log: Brought) -> None:
+        """Remember a log, in place of what was known of it.
+
+        Raises:
+            OSError: the local disk does not take it.
+        """
+        if self.of(log.vehicle, log.path) == log:
+            return
+        with self._place.open("ab") as file:
+            file.write(_line(log))
+            file.flush()
+            os.fsync(file.fileno())
+        self._logs[log.vehicle, log.path] = log
+
+    def _read(self) -> list[bytes]:
+        try:
+            return self._place.read_bytes().splitlines()
+        except FileNotFoundError:
+            return []
+
+    def _write_anew(self) -> None:
+        new = self._place.with_name(f"{NAME}.new")
+        with new.open("wb") as file:
+            file.writelines(map(_line, self._logs.values()))
+            file.flush()
+            os.fsync(file.fileno())
+        new.replace(self._place)
+
+
+def _line(log: Brought) -> bytes:
+    """Return a log as a line; it begins with an end of line, for the case that the last one was cut."""
+    return b"\n" + json.dumps(asdict(log)).encode() + b"\n"
+
+
+def _parsed(line: bytes) -> Brought | None:
+    """Return the log of a line, None where that is not what we write."""
+    try:
+        facts: dict[str, Any] = json.loads(line)
+        log = Brought(**facts)
+    except (ValueError, TypeError, RecursionError):
+        return None
+    return log if isinstance(log.path, str) and isinstance(log.size, int) else None

@@ -1,0 +1,118 @@
+"""Whether what is here is what the vehicle has: when its checksum is asked for. Layer: client."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from mavftpfs.client.files import READ_SIZE, Session, mount_status
+from mavftpfs.protocol.payload import NakCode, crc32
+from mavftpfs.shared.errors import (
+    Armed,
+    FileBusy,
+    FtpNak,
+    LinkError,
+    MavftpfsError,
+    NotDeliveredYet,
+    NotSupported,
+    RequestTimeout,
+    SessionBusy,
+)
+
+Verify = Literal["auto", "all", "none"]
+
+PROVEN_BY_DEFAULT = 16_000_000
+"""Bytes up to which a file is proven that came in one piece. A vehicle computes about a megabyte of checksum
+a second, and most answer nobody meanwhile."""
+
+NOT_NOW = (Armed, NotDeliveredYet, RequestTimeout, SessionBusy, FileBusy)
+"""Errors that say that there is no checksum now, though there may be one later."""
+
+NO_CHECKSUM: tuple[type[MavftpfsError], ...] = (*NOT_NOW, FtpNak, NotSupported)
+"""Errors that say that there is no checksum, and nothing else about the file."""
+
+
+@dataclass(frozen=True, slots=True)
+class Proof:
+    """How a file was verified, in words. lacking: why its checksum was not compared though it was to be, or
+    ""; later: it may be had another time."""
+
+    words: str
+    lacking: str = ""
+    later: bool = False
+
+
+BY_CRC32 = Proof("size and CRC32")
+BY_SIZE = Proof("size")
+GENERATED = Proof("size (generated at each opening, so a checksum proves nothing)")
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """What came of the question for a checksum. crc: None if there is none; then `lacking` and `later` as of
+    Proof."""
+
+    crc: int | None = None
+    lacking: str = ""
+    later: bool = False
+
+
+NOT_ASKED = Answer()
+
+
+def proof_needed(verify: Verify, *, resumed: bool, size: int) -> bool:
+    """Return whether the vehicle is asked for a checksum of the whole file."""
+    if resumed or verify == "all":
+        return True
+    return verify == "auto" and size <= PROVEN_BY_DEFAULT
+
+
+async def ask_crc32(session: Session, remote: bytes) -> Answer:
+    """Ask the vehicle for a file's checksum.
+
+    Raises:
+        LinkError: the vehicle, or the mount, is gone.
+    """
+    try:
+        return Answer(await session.files.crc32(remote))
+    except LinkError:
+        raise
+    except MavftpfsError as exc:
+        return Answer(None, await _why_not(session, exc), isinstance(exc, NOT_NOW))
+
+
+async def _why_not(session: Session, error: MavftpfsError) -> str:
+    """Return in a few words why there is no checksum. A mount's answer does not tell what a vehicle that is
+    armed from one that has not got the file yet."""
+    match error:
+        case Armed():
+            return "armed"
+        case NotDeliveredYet():
+            return "armed" if await _armed(session) else "not all of it is on the vehicle yet"
+        case RequestTimeout():
+            return "no answer"
+        case SessionBusy():
+            return "another client keeps the vehicle's session"
+        case FileBusy():
+            return "the vehicle is writing it"
+        case NotSupported():
+            return "the vehicle computes no checksums"
+        case FtpNak() if error.code == NakCode.UNKNOWN_COMMAND:
+            return "the vehicle computes no checksums"
+    return str(error)
+
+
+async def _armed(session: Session) -> bool:
+    if session.mountpoint is None:
+        return False
+    return bool((await mount_status(session.mountpoint))["vehicle"]["armed"])
+
+
+def local_crc32(file: Path) -> int:
+    """Return the CRC32 of a local file."""
+    crc = 0
+    with file.open("rb") as source:
+        while data := source.read(READ_SIZE):
+            crc = crc32(data, crc)
+    return crc

@@ -1,0 +1,54 @@
+"""client.brought: what is remembered of logs, in a file that a power cut may end anywhere."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+from mavftpfs.client.brought import NAME, Brought, Memory
+
+LOG = Brought("/log/1.ulg", "1.ulg", 100, None, proven=False)
+
+
+def test_what_was_noted_last_counts(tmp_path: Path) -> None:
+    memory = Memory(tmp_path)
+    memory.note(LOG)
+    memory.note(replace(LOG, vehicle="a"))
+    memory.note(replace(LOG, proven=True))
+    again = Memory(tmp_path)
+    assert again.of(None, LOG.path) == replace(LOG, proven=True)
+    assert again.of("a", LOG.path) == replace(LOG, vehicle="a")
+    assert again.of("b", LOG.path) is None
+
+
+def test_a_name_that_is_no_text(tmp_path: Path) -> None:
+    odd = replace(LOG, path="/log/\udcff", file="\udcff")
+    Memory(tmp_path).note(odd)
+    assert Memory(tmp_path).of(None, odd.path) == odd
+
+
+def test_a_line_that_was_cut_spoils_no_other(tmp_path: Path) -> None:
+    Memory(tmp_path).note(LOG)
+    whole = (tmp_path / NAME).read_bytes()
+    for cut in range(len(whole)):
+        (tmp_path / NAME).write_bytes(whole + whole[:cut])
+        memory = Memory(tmp_path)
+        assert memory.of(None, LOG.path) == LOG
+        memory.note(replace(LOG, path="/log/2.ulg"))
+        assert Memory(tmp_path).of(None, "/log/2.ulg") is not None
+
+
+def test_what_others_wrote_there_is_left_out(tmp_path: Path) -> None:
+    (tmp_path / NAME).write_bytes(b'\xff\n[1]\n{"path": 1}\n{"path": 1, "file": "", "size": 2, "mtime": 3}\n')
+    memory = Memory(tmp_path)
+    memory.note(LOG)
+    assert Memory(tmp_path).of(None, LOG.path) == LOG
+
+
+def test_the_file_does_not_grow_for_ever(tmp_path: Path) -> None:
+    for number in range(5):
+        memory = Memory(tmp_path)
+        for size in range(100):
+            memory.note(replace(LOG, size=100 * number + size))
+    assert (tmp_path / NAME).stat().st_size < 250 * 150
+    assert Memory(tmp_path).of(None, LOG.path) == replace(LOG, size=499)
