@@ -159,6 +159,41 @@ class Deliverer:
         finally:
             self._context.own.live.discard(attempt.path)
 
+    async def withdraw(self, node: Node) -> bool | None:
+        """Take back what the vehicle does not have of a file, so that nothing of it is sent from now on.
+
+        What has the name on the vehicle keeps it, and whoever has this file open has one without a name.
+        Returns whether the vehicle has all of it; None if that is not known, or if others write it, too.
+        """
+        context = self._context
+        async with node.claim(), context.paths.steady(node, lasting=True):
+            draft = node.draft
+            if draft is None or not node.undelivered:
+                return not node.removed
+            if node.writers > 1:
+                return None
+            there: bool | None = False
+            try:
+                if draft.state is State.TORN:
+                    await self._mend(node, draft)
+                    if not node.undelivered:
+                        return True
+                await self.abandon(node)
+                if draft.begun:  # part of it may have the name
+                    if draft.base is None:
+                        await self._names.remove_if_there(node.path)
+                    else:
+                        there = None
+            except MavftpfsError as error:
+                log.info("%r is taken back, but nobody knows what has its name: %s", node.path, error)
+                there = None
+            finally:
+                context.nodes.unnamed(node)
+            context.times.forget(node.path)
+            context.files.on_changed(node.path)
+            context.files.forget_pages(node.path)
+            return there
+
     # --- one delivery
 
     def _require_deliverable(self, draft: Draft) -> None:

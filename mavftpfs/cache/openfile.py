@@ -74,7 +74,16 @@ class OpenFile:
         """
         self.close()
 
-    def give_up(self) -> None:
+    async def give_up(self) -> bool | None:
+        """Close, and take back what was written and is not on the vehicle: nothing of it is sent from now on.
+
+        Returns whether the vehicle has the file as it was written; None if nobody can tell, or if others
+        write the same file, who deliver what was written here with theirs.
+        """
+        self.close()
+        return True
+
+    def undo_open(self) -> None:
         """Close; the call that opened it failed, so a file that was made by that is not wanted either."""
         self.close()
 

@@ -328,6 +328,10 @@ class Tree:
             self._checksums.clear()  # two files may have one size and mtime
             self._local.follow_rename(source, target)
 
+    async def withdraw(self, path: bytes) -> bool | None:
+        """Take back what was written to an open file; see OpenFile.give_up. None also if it is not open."""
+        return await self._writing.withdraw(self._remote(path))
+
     def undelivered(self) -> Sequence[bytes]:
         """Return the paths of files of which the vehicle does not provably have every byte."""
         return [self._below(remote) for remote in self._writing.undelivered()]

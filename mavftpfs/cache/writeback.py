@@ -200,6 +200,11 @@ class Writeback:
                 await self._forget_draft(node)
             raise
 
+    async def withdraw(self, path: bytes) -> bool | None:
+        """See Tree.withdraw."""
+        node = self._context.nodes.get(path)
+        return None if node is None else await self._deliverer.withdraw(node)
+
     async def _forget_draft(self, node: Node) -> None:
         """What was to be written is not wanted any more, since its caller got an error. What may have the
         name already is completed later."""

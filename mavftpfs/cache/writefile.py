@@ -116,10 +116,7 @@ class ReadFile(OpenFile):
             if self.writable:
                 await self._parts.deliverer.deliver(self._node)
         finally:
-            if not self._closed:
-                self.close()
-                if self._node.removed and not self._node.handles:
-                    await self._parts.namespace.release(self._node)
+            await self._let_go()
 
     def close(self) -> None:
         """Close without delivering; closing twice is harmless."""
@@ -143,6 +140,13 @@ class ReadFile(OpenFile):
         context.nodes.maybe_forget(node)
 
     # --- inside
+
+    async def _let_go(self) -> None:
+        """Close; the last handle of an unlinked file has it removed."""
+        if not self._closed:
+            self.close()
+            if self._node.removed and not self._node.handles:
+                await self._parts.namespace.release(self._node)
 
     async def _read_changed(self, offset: int, size: int) -> bytes | memoryview:
         """Read a file that was written here since the handle was opened, or that is not open yet."""
@@ -229,8 +233,15 @@ class WriteFile(ReadFile):
         if draft is not None and (draft.size > 0 or self._node.error is not None):
             await self._parts.deliverer.deliver(self._node)
 
-    def give_up(self) -> None:
-        """Close, also after release; see OpenFile.give_up."""
+    async def give_up(self) -> bool | None:
+        """See OpenFile.give_up. Takes as long as requests that are not answered."""
+        try:
+            return await self._parts.deliverer.withdraw(self._node)
+        finally:
+            await self._let_go()
+
+    def undo_open(self) -> None:
+        """Close, also after release; see OpenFile.undo_open."""
         self.close()
         node = self._node
         wanted = node.handles or node.removed or node.attempt is not None or node.lock.locked()

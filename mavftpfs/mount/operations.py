@@ -279,7 +279,7 @@ class Operations(pyfuse3.Operations):
         """Create a file and open it."""
         path = self._child(parent_inode, name)
         file = await self._tree.create(path, exclusive=bool(flags & os.O_EXCL))
-        with closed_on_failure(file.give_up):
+        with closed_on_failure(file.undo_open):
             if flags & os.O_TRUNC and file.size:
                 await file.truncate(0)
             found = Stat(EntryKind.FILE, file.size, (await self._tree.stat(path)).mtime_ns, 0.0)
@@ -341,8 +341,6 @@ class Operations(pyfuse3.Operations):
             await handle.file.release()  # also of a reader: the last one of an unlinked file has it removed
         except MavftpfsError as exc:
             log.debug("a closed file is not finished on the vehicle yet: %s", exc)  # the tree said it once
-        finally:
-            handle.file.close()
 
     # -- attributes -------------------------------------------------------------------------------
 
@@ -397,9 +395,8 @@ class Operations(pyfuse3.Operations):
             raise FUSEError(errno.EPERM)
         path = self._child(parent_inode, name)
         file = await self._tree.create(path, exclusive=True)
-        with closed_on_failure(file.give_up):
+        with closed_on_failure(file.undo_open):
             await file.release()
-        file.close()
         return await self._new_entry(path, mode)
 
     @handler

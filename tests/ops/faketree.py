@@ -25,9 +25,10 @@ class FakeFile:
     content: bytes
     direct_io: bool = False
     keep_cache: bool = False
-    closed: int = 0
+    closed: bool = False
     writable: bool = False
     path: bytes = b""
+    made: bool = False
 
     @property
     def size(self) -> int:
@@ -52,19 +53,28 @@ class FakeFile:
         self.tree.files[self.path] = self.content
 
     async def release(self) -> None:
-        await self.tree.pause("release", self.path)
+        try:
+            await self.tree.pause("release", self.path)
+        finally:
+            self.closed = True
+
+    async def give_up(self) -> bool | None:
+        self.closed = True
+        if self.made:
+            del self.tree.files[self.path]
+        return False
 
     async def read(self, offset: int, size: int) -> bytes | memoryview:
         await self.tree.pause("read")
         data = memoryview(self.content)[offset : offset + size]
         return data[: self.tree.short_read] if self.tree.short_read is not None else data
 
-    def give_up(self) -> None:
-        self.tree.calls.append(("give_up", self.path))
-        self.closed += 1
+    def undo_open(self) -> None:
+        self.tree.calls.append(("undo_open", self.path))
+        self.closed = True
 
     def close(self) -> None:
-        self.closed += 1
+        self.closed = True
 
 
 @dataclass
@@ -139,8 +149,11 @@ class FakeTree:
         await self.pause("create", path)
         if exclusive and path in self.files:
             raise AlreadyExists(f"{path!r} is there")
+        made = path not in self.files
         self.files.setdefault(path, b"")
-        return await self.open(path, write=True)
+        file = await self.open(path, write=True)
+        file.made = made
+        return file
 
     async def truncate(self, path: bytes, size: int) -> None:
         await self.pause("truncate", path)

@@ -64,8 +64,8 @@ async def test_a_file_that_was_made_in_vain_is_given_up(call: str, step: str) ->
     last = os.O_WRONLY if call == "create" else 0
     told = await failure(getattr(ops, call)(ROOT_INO, b"new", stat.S_IFREG | 0o644, last, CTX))
     assert told == errno.ETIMEDOUT
-    assert ("give_up", b"/new") in tree.calls
-    assert tree.opened[0].closed == 1
+    assert ("undo_open", b"/new") in tree.calls
+    assert tree.opened[0].closed
     assert not list(ops.files)
 
 
@@ -86,7 +86,7 @@ async def test_an_unlinked_file_that_is_only_read_is_released_too() -> None:
     await ops.unlink(ROOT_INO, b"a.txt", CTX)
     await ops.release(info.fh)
     assert ("release", b"/a.txt") in tree.calls
-    assert tree.opened[0].closed == 1
+    assert tree.opened[0].closed
 
 
 @pytest.mark.holds("promise 2")
@@ -98,7 +98,7 @@ async def test_what_a_failing_delivery_says_reaches_flush_and_fsync_but_release_
     assert await failure(ops.flush(info.fh)) == errno.ENOSPC
     assert await failure(ops.fsync(info.fh, False)) == errno.ENOSPC
     await ops.release(info.fh)
-    assert tree.opened[0].closed == 1
+    assert tree.opened[0].closed
 
 
 @pytest.mark.parametrize(

@@ -280,7 +280,7 @@ async def test_one_that_comes_while_the_whole_file_is_sent_is_not_replaced(
             await writer.fsync()
         assert here.data(PATH) == successor
         assert here.litter() == []
-        writer.give_up()
+        writer.undo_open()
 
 
 @pytest.mark.parametrize("profile", TIMED)

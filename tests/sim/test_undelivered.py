@@ -92,7 +92,7 @@ async def test_a_file_whose_creation_failed_does_not_appear_later(here: Rig, tre
     fall_silent(here)
     with pytest.raises(RequestTimeout):
         await file.release()
-    file.give_up()
+    file.undo_open()
     assert tree.undelivered() == []
     speak(here)
     await trio.sleep(100)
@@ -105,12 +105,12 @@ async def test_a_file_whose_creation_failed_stays_if_somebody_wrote_it_or_it_was
     file = await tree.create(NEW, exclusive=True)
     other = await tree.open(NEW, write=True)
     await other.write(0, b"abc")
-    file.give_up()
+    file.undo_open()
     assert tree.undelivered() == [NEW]
     other.close()
-    (await tree.create(NEW, exclusive=False)).give_up()
+    (await tree.create(NEW, exclusive=False)).undo_open()
     (await tree.open(FILE, write=True, truncate=True)).close()
-    (await tree.create(FILE, exclusive=False)).give_up()
+    (await tree.create(FILE, exclusive=False)).undo_open()
     assert sorted(tree.undelivered()) == [FILE, NEW]
     assert await tree.drain(100) == []
     assert here.files() == {NEW: b"abc", FILE: b""}

@@ -1,0 +1,113 @@
+"""A program that gives up what it wrote: nothing of it comes later, and it is told what is there."""
+
+from __future__ import annotations
+
+import pytest
+import trio
+
+from mavftpfs.cache.openfile import OpenFile
+from mavftpfs.cache.tree import Tree
+from mavftpfs.protocol.payload import Opcode
+from mavftpfs.session.connection import ConnectOptions
+from mavftpfs.shared.errors import MavftpfsError, NotFound
+from tests.support.rigs import KINDS, Rig, card, read_file
+from tests.support.worlds import content
+
+pytestmark = pytest.mark.holds("promise 2", "promise 3")
+
+OLD = content(3_000)
+NEW = content(20_000)
+FILE, FRESH = b"/d/file", b"/d/fresh"
+DEADLINE = 5.0
+LONG = 300.0
+"""Seconds after which everything that is tried by itself was tried."""
+
+here = card({FILE: OLD}, profiles=KINDS, options=ConnectOptions(op_deadline=DEADLINE))
+
+
+@pytest.fixture
+async def tree(here: Rig) -> Tree:
+    tree = here.mount(op_deadline=DEADLINE)
+    await tree.list(b"/d")
+    return tree
+
+
+async def opened(tree: Tree, path: bytes) -> OpenFile:
+    """Open a file that is to be written whole."""
+    if path == FILE:
+        return await tree.open(path, write=True, truncate=True)
+    return await tree.create(path, exclusive=True)
+
+
+@pytest.mark.parametrize("after", [0, 30])
+@pytest.mark.parametrize("path", [FILE, FRESH])
+async def test_what_could_not_be_delivered_never_comes(
+    here: Rig, tree: Tree, path: bytes, after: int
+) -> None:
+    """The link is cut before, or while, it is sent."""
+    file = await opened(tree, path)
+    here.faults.cut_after(after)
+    await file.write(0, NEW)
+    with pytest.raises(MavftpfsError):
+        await file.fsync()
+    there = await file.give_up()
+    here.faults.cut_after(None)
+    await trio.sleep(LONG)
+    await tree.list(b"/d")
+    assert tree.undelivered() == []
+    if here.renames or path == FILE:
+        assert (there, here.files(), here.litter()) == (False, {FILE: OLD}, [])
+    else:  # only such a card has parts of a file under its name
+        assert there is None or FRESH not in here.files()
+        assert here.files().get(FRESH, NEW) in (b"", *(NEW[:end] for end in range(0, len(NEW) + 1)))
+
+
+@pytest.mark.parametrize("path", [FILE, FRESH])
+async def test_an_interrupted_name_is_looked_at(here: Rig, tree: Tree, path: bytes) -> None:
+    """Nobody answers the rename that gives it its name."""
+    if not here.renames:
+        return
+    file = await opened(tree, path)
+    await file.write(0, NEW)
+    here.faults.at(Opcode.RENAME, lambda: here.faults.cut_after(0), nth=2)  # the first one is a trial
+    with pytest.raises(MavftpfsError):
+        await file.fsync()
+    here.faults.cut_after(None)
+    there = await file.give_up()
+    await trio.sleep(LONG)
+    await tree.list(b"/d")
+    assert there is (here.files().get(path) == NEW)
+    assert here.files().get(FILE) in (OLD, NEW)
+    assert here.litter() == []
+
+
+async def test_it_is_what_it_was_for_everybody(here: Rig, tree: Tree) -> None:
+    file, fresh = await opened(tree, FILE), await opened(tree, FRESH)
+    reader = await tree.open(FILE)
+    await file.write(0, NEW)
+    await fresh.write(0, NEW)
+    assert await file.give_up() is False
+    assert await fresh.give_up() is False
+    assert await read_file(tree, FILE) == OLD
+    with pytest.raises(NotFound):
+        await tree.stat(FRESH)
+    assert await reader.read(0, len(OLD)) == NEW[: len(OLD)]  # of a file that has no name any more
+    await reader.release()
+
+
+async def test_what_is_there_is_there(here: Rig, tree: Tree) -> None:
+    file = await opened(tree, FRESH)
+    await file.write(0, NEW)
+    await file.fsync()
+    assert await file.give_up() is True
+    assert here.data(FRESH) == NEW
+
+
+async def test_what_others_write_too_is_theirs(here: Rig, tree: Tree) -> None:
+    file = await opened(tree, FRESH)
+    other = await tree.open(FRESH, write=True)
+    await file.write(0, b"ours")
+    await other.write(4, b"theirs")
+    assert await file.give_up() is None
+    await other.release()
+    assert here.data(FRESH) == b"ourstheirs"
