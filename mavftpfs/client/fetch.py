@@ -18,7 +18,7 @@ from pathlib import Path
 
 import trio
 
-from mavftpfs.client.files import READ_SIZE, Session
+from mavftpfs.client.files import READ_SIZE, Session, reading
 from mavftpfs.client.progress import Progress
 from mavftpfs.client.proof import (
     BY_CRC32,
@@ -343,8 +343,7 @@ class Fetcher:
     async def _copy(self, remote: bytes, take: Take, offset: int, crc: int) -> tuple[int, int]:
         """Hand on a file from `offset` on, before which it has this CRC32; returns its size and CRC32."""
         amount = LEAST_READ
-        file = await self.session.files.open(remote)
-        try:
+        async with reading(self.session.files, remote) as file:
             if offset > file.size:
                 raise DataUnproven(f"{name_text(remote)} has shrunk from {offset} to {file.size} bytes")
             while offset < file.size:
@@ -358,8 +357,6 @@ class Fetcher:
                 offset += len(data)
                 self.progress.at(offset)
             return file.size, crc
-        finally:
-            file.close()
 
     async def _prove(self, remote: bytes, name: str, size: int, crc: int, *, resumed: bool) -> Proof:
         """Compare with the vehicle's checksum where that is wanted and can be had; returns what was proven.

@@ -1,9 +1,9 @@
 """The vehicle's files, of a mount that is up or of a connection. Layer: client.
 
 Two programs cannot share a serial port, and not well the vehicle's only FTP session, so while a mount of the
-vehicle is up its files are used in place of a second connection. Every call to a mount goes through the
-kernel, in a thread: it may have to wait for its vehicle. For a connection of our own `cache.tree.Tree` offers
-the same. Paths are normalised (shared.model.normalise).
+vehicle is up its files are used in place of a second connection. `Files` and
+`File` say what both offer. Every call to a mount goes through the kernel, in a thread: it may have to wait
+for its vehicle. Paths are normalised (shared.model.normalise).
 """
 
 from __future__ import annotations
@@ -14,13 +14,12 @@ import stat
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass
-from typing import Any, TypeAlias, TypeVar
+from functools import partial
+from typing import Any, Protocol, TypeVar
 
 import trio
 
 from mavftpfs.cache.attributes import Stat
-from mavftpfs.cache.openfile import OpenFile
-from mavftpfs.cache.tree import Tree
 from mavftpfs.client import control
 from mavftpfs.client.connect import NO_SINKS, Attached, Sinks, attached, no_answer, plain_nursery
 from mavftpfs.client.mountpoint import XATTR_CRC32, enclosing_mount, is_ours, mounts
@@ -37,9 +36,117 @@ from mavftpfs.shared.readable import name_text
 
 READ_SIZE = 128 * 1024
 
-Files: TypeAlias = "Tree | MountedFiles"
-"""A tree of files. All calls raise only MavftpfsError."""
-File: TypeAlias = "OpenFile | MountedFile"
+
+class File(Protocol):
+    """An open file: cache.openfile.OpenFile, or MountedFile. All calls raise only MavftpfsError.
+
+    Whoever wrote it ends by `written`, which delivers it or takes it back.
+    """
+
+    @property
+    def size(self) -> int:
+        """Bytes; of a file being written they follow what was written."""
+
+    async def read(self, offset: int, size: int) -> bytes | memoryview:
+        """Return `size` bytes at `offset`, fewer only at the end."""
+
+    async def write(self, offset: int, data: bytes | memoryview) -> int:
+        """Take all of `data` and return its length."""
+
+    async def truncate(self, size: int) -> None:
+        """Cut or extend it; delivered like written bytes."""
+
+    async def fsync(self) -> None:
+        """Return when everything written is on the card, checked."""
+
+    async def release(self) -> None:
+        """Deliver what was written, and close, whatever came of it."""
+
+    async def give_up(self) -> bool | None:
+        """Close, and take back what is not on the card: nothing of it is sent from now on.
+
+        Returns whether the card has what was written, None if nobody can tell.
+        """
+
+
+class Files(Protocol):
+    """A tree of files: cache.tree.Tree, or MountedFiles. All calls raise only MavftpfsError."""
+
+    async def stat(self, path: bytes) -> Stat:
+        """Return a path's attributes."""
+
+    async def list(self, path: bytes) -> list[tuple[bytes, Stat]]:
+        """Return what is in a directory."""
+
+    async def open(self, path: bytes, *, write: bool = False, truncate: bool = False) -> File:
+        """Open a file that is there, for reading, or for both; `truncate` empties it."""
+
+    async def create(self, path: bytes, *, exclusive: bool) -> File:
+        """Make a file, or open the one that is there, for reading and writing."""
+
+    async def truncate(self, path: bytes, size: int) -> None:
+        """Cut or extend a file on the card."""
+
+    async def crc32(self, path: bytes) -> int:
+        """Return the vehicle's CRC32 of a file."""
+
+    async def mkdir(self, path: bytes) -> None:
+        """Make a directory."""
+
+    async def rmdir(self, path: bytes) -> None:
+        """Remove an empty directory."""
+
+    async def unlink(self, path: bytes) -> None:
+        """Remove a file."""
+
+    async def rename(self, old: bytes, new: bytes) -> None:
+        """Rename, over what is there as far as rename(2) allows."""
+
+    def forget_caches(self) -> None:
+        """Have the vehicle asked again for what is known of it."""
+
+
+WITHDRAWAL_TIME = 45.0
+"""Seconds to take back what was written: a request or two that nobody answers."""
+
+
+CLOSING_TIME = 5.0
+"""Seconds to close what nothing more is to be delivered of."""
+
+
+@asynccontextmanager
+async def reading(files: Files, path: bytes) -> AsyncIterator[File]:
+    """Give an open file to the body, and close it.
+
+    Raises:
+        As Files.open.
+    """
+    file = await files.open(path)
+    try:
+        yield file
+    finally:
+        with trio.CancelScope(deadline=trio.current_time() + CLOSING_TIME, shield=True):
+            await file.release()
+
+
+@asynccontextmanager
+async def written(file: File) -> AsyncIterator[None]:
+    """Write a file in the body: then it is delivered, else taken back, and closed in any case.
+
+    Raises:
+        NotDelivered: it is not delivered; its cause says why, and `there` what is on the card instead.
+    """
+    try:
+        yield
+        await file.fsync()
+    except BaseException as exc:
+        there: bool | None = None
+        with trio.CancelScope(deadline=trio.current_time() + WITHDRAWAL_TIME, shield=True):
+            there = await file.give_up()
+        if isinstance(exc, errors.MavftpfsError):
+            raise errors.NotDelivered(str(exc), there=there) from exc
+        raise
+    await file.release()
 
 
 Acknowledged = Mapping[str, int]
@@ -78,7 +185,8 @@ class Session:
         """Ask the vehicle for a file's size, whatever is known of it."""
         self.files.forget_caches()
         if self.mountpoint is not None:  # the kernel believes what it was told a second ago, but for an open
-            (await self.files.open(path)).close()
+            async with reading(self.files, path):
+                pass
         return (await self.files.stat(path)).size
 
 
@@ -247,11 +355,13 @@ async def _call(path: bytes, function: Callable[..., ResultT], *args: object) ->
 
 @dataclass(slots=True)
 class MountedFile:
-    """An open file of a mount; see File."""
+    """An open file of a mount; see File. withdraw: asks the mount to, and blocks; None if it cannot."""
 
     path: bytes
     fd: int
     size: int
+    withdraw: Callable[[], bool | None]
+    writable: bool
 
     async def read(self, offset: int, size: int) -> bytes:
         """As os.pread."""
@@ -259,18 +369,35 @@ class MountedFile:
 
     async def write(self, offset: int, data: bytes | memoryview) -> int:
         """As os.pwrite."""
-        return await _call(self.path, os.pwrite, self.fd, data, offset)
+        count = await _call(self.path, os.pwrite, self.fd, data, offset)
+        self.size = max(self.size, offset + count)
+        return count
 
     async def fsync(self) -> None:
         """As os.fsync."""
         await _call(self.path, os.fsync, self.fd)
 
-    def close(self) -> None:
-        """What was written was brought there by fsync."""
+    async def truncate(self, size: int) -> None:
+        """As os.ftruncate."""
+        await _call(self.path, os.ftruncate, self.fd, size)
+
+    async def release(self) -> None:
+        """As os.close, which goes on in its thread if it takes long."""
         fd, self.fd = self.fd, -1
         if fd >= 0:
-            with suppress(OSError):
-                os.close(fd)
+            with trio.CancelScope(deadline=trio.current_time() + CLOSING_TIME, shield=True):
+                await _call(self.path, os.close, fd)
+
+    async def give_up(self) -> bool | None:
+        """Have the mount take back what it has not delivered, before closing it would have it try again."""
+        there: bool | None = None
+        try:
+            if self.writable:
+                there = await trio.to_thread.run_sync(self.withdraw, abandon_on_cancel=True)
+        finally:
+            with suppress(errors.MavftpfsError):
+                await self.release()
+        return there
 
 
 class MountedFiles:
@@ -318,7 +445,20 @@ class MountedFiles:
             fd = os.open(place, flags | os.O_CLOEXEC, 0o666)
             return fd, os.fstat(fd).st_size
 
-        return MountedFile(path, *await _call(path, opened, self._place(path)))
+        place = self._place(path)
+        fd, size = await _call(path, opened, place)
+        return MountedFile(path, fd, size, partial(self._withdraw, place), bool(flags & os.O_RDWR))
+
+    def _withdraw(self, place: bytes) -> bool | None:
+        request = {"command": "withdraw", "path": os.fsdecode(place[len(self._mountpoint) :])}
+        with suppress(errors.MavftpfsError):
+            there = self._ask(request, timeout=WITHDRAWAL_TIME)["there"]
+            return None if there is None else bool(there)
+        return None
+
+    async def truncate(self, path: bytes, size: int) -> None:
+        """As os.truncate."""
+        await _call(path, os.truncate, self._place(path), size)
 
     async def crc32(self, path: bytes) -> int:
         """Ask the vehicle."""
@@ -343,8 +483,11 @@ class MountedFiles:
     def forget_caches(self) -> None:
         """Have the mount ask the vehicle again; a mount of somebody else may go on with what it knows."""
         with suppress(errors.MavftpfsError):
-            socket = control.find_socket(os.fsdecode(self._mountpoint), control.own_directories())
-            control.ask(socket, {"command": "forget"}, timeout=STATUS_PATIENCE)
+            self._ask({"command": "forget"}, timeout=STATUS_PATIENCE)
+
+    def _ask(self, request: control.Reply, *, timeout: float) -> control.Reply:
+        socket = control.find_socket(os.fsdecode(self._mountpoint), control.own_directories())
+        return control.ask(socket, request, timeout=timeout)
 
 
 def _stat_of(found: os.stat_result) -> Stat:

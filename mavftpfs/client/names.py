@@ -12,7 +12,7 @@ from typing import Any
 
 from mavftpfs.cache.attributes import Stat
 from mavftpfs.client.fetch import known_time
-from mavftpfs.client.files import READ_SIZE, File, Files, Session, is_directory, walk
+from mavftpfs.client.files import READ_SIZE, File, Files, Session, is_directory, reading, walk, written
 from mavftpfs.protocol.url import MftpUrl, is_url, parse_url
 from mavftpfs.shared.errors import (
     AlreadyExists,
@@ -331,18 +331,12 @@ async def _move(files: Files, old: bytes, new: bytes) -> None:
 
 
 async def _copy(files: Files, old: bytes, new: bytes) -> None:
-    source = await files.open(old)
-    try:
+    async with reading(files, old) as source:
         file = await emptied(files, new)
-        try:
+        async with written(file):
             offset = 0
             while offset < source.size:
                 data = bytes(await source.read(offset, READ_SIZE))
                 if not data:
                     raise DataUnproven(f"{name_text(old)} ended at {offset} of {source.size} bytes")
                 offset += await file.write(offset, data)
-            await file.fsync()
-        finally:
-            file.close()
-    finally:
-        source.close()

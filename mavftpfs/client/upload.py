@@ -16,15 +16,12 @@ from typing import BinaryIO
 import trio
 
 from mavftpfs.client.connect import plain_nursery
-from mavftpfs.client.files import READ_SIZE, File, Session, is_directory
+from mavftpfs.client.files import READ_SIZE, WITHDRAWAL_TIME, File, Session, is_directory, written
 from mavftpfs.client.names import emptied, make_directory
 from mavftpfs.client.progress import Progress
 from mavftpfs.shared.errors import CrossDevice, MavftpfsError, NotADirectory, NotDelivered, UsageError
 from mavftpfs.shared.model import join, normalise, split
 from mavftpfs.shared.readable import name_text
-
-WITHDRAWAL_TIME = 10.0
-"""Seconds to take back what a mount was given."""
 
 ASK_PERIOD = 0.25
 """Seconds between two looks at how much the vehicle has acknowledged."""
@@ -102,8 +99,9 @@ async def put_file(session: Session, local: Path, remote: bytes, progress: Progr
     except OSError as exc:
         raise UsageError(f"{local}: {exc.strerror}") from exc
     except MavftpfsError as exc:
+        there = exc.there if isinstance(exc, NotDelivered) else None
         done = f"; {progress.files_done} file(s) before it are there" if progress.files_done else ""
-        raise NotDelivered(f"{name_text(remote)} was not delivered: {exc}{done}") from exc
+        raise NotDelivered(f"{name_text(remote)} was not delivered: {exc}{done}", there=there) from exc
     progress.end(planned)
     return size
 
@@ -115,11 +113,8 @@ async def _send(session: Session, source: BinaryIO, remote: bytes, progress: Pro
         except CrossDevice:  # this server cannot rename
             source.seek(0)
     file = await emptied(session.files, remote)
-    try:
-        async with _watched(session, remote, progress):
-            return await _copy(source, file)
-    finally:
-        file.close()
+    async with _watched(session, remote, progress), written(file):
+        return await _copy(source, file)
 
 
 async def _send_beside(session: Session, source: BinaryIO, remote: bytes, progress: Progress) -> int:
@@ -128,16 +123,14 @@ async def _send_beside(session: Session, source: BinaryIO, remote: bytes, progre
     files = session.files
     beside = join(split(remote)[0], b".put-" + secrets.token_hex(4).encode())
     file = await files.create(beside, exclusive=True)
+    async with _watched(session, beside, progress), written(file):
+        size = await _copy(source, file)
     try:
-        async with _watched(session, beside, progress):
-            size = await _copy(source, file)
-        file.close()
         await files.rename(beside, remote)
     except BaseException:
         with trio.move_on_after(WITHDRAWAL_TIME) as patience, suppress(MavftpfsError):
             patience.shield = True
-            await files.unlink(beside)  # while it is open: closing delivers what has a name
-        file.close()
+            await files.unlink(beside)
         raise
     return size
 
@@ -146,7 +139,6 @@ async def _copy(source: BinaryIO, file: File) -> int:
     offset = 0
     while data := source.read(READ_SIZE):
         offset += await file.write(offset, data)
-    await file.fsync()
     return offset
 
 

@@ -244,7 +244,10 @@ class _Life:
             vehicle.tree.forget_caches()
             return {}
 
-        commands = {"status": status, "umount": self._umount, "forget": forget}
+        async def withdraw(request: Reply) -> Reply:
+            return {"there": await vehicle.tree.withdraw(os.fsencode(request["path"]))}
+
+        commands = {"status": status, "umount": self._umount, "forget": forget, "withdraw": withdraw}
         server = ControlServer(self.request.control, commands)
         try:
             await nursery.start(server.run)

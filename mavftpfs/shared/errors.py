@@ -163,7 +163,16 @@ class NoFtp(MavftpfsError):
 
 
 class NotDelivered(MavftpfsError):
-    """Bytes that were to be written are not provably on the vehicle."""
+    """Bytes that were to be written are not provably on the vehicle.
+
+    Attributes:
+        there: whether the file is there as it was written. False: it is not, and nothing of it is sent from
+            now on. None: nobody can tell.
+    """
+
+    def __init__(self, reason: str, *, there: bool | None = None) -> None:
+        super().__init__(reason)
+        self.there = there
 
 
 _REQUESTS = {

@@ -16,6 +16,8 @@ import pytest
 
 from mavftpfs.cache.reserved import is_reserved
 from mavftpfs.client import control
+from mavftpfs.client.files import session_on
+from mavftpfs.shared.errors import MavftpfsError
 from tests.mount.conftest import Field
 from tests.support.mounts import Mount, abort_mount, mavftpfs, mounted_at, wait_until
 from tests.support.trees import content
@@ -303,3 +305,29 @@ def test_a_put_that_is_refused_leaves_nothing_behind(
     monkeypatch.setenv("XDG_STATE_HOME", str(state))
     assert "protected" in mavftpfs("put", vehicle.source, data, "/outside-its-card", code=4)[1]
     assert [path for path in state.rglob("*") if path.is_file() and path.name != "owner"] == []
+
+
+async def test_what_a_client_takes_back_from_a_mount_never_comes(field: Field) -> None:
+    """It closes the file as any program does, and yet the mount does not go on with it."""
+    card = field.local("card")
+    (card / "old").write_text("old")
+    vehicle = field.sim(card)
+    mount = field.mount(vehicle.source, "op_deadline=2")
+    mount.allowed_log = ("is not delivered",)
+    session = session_on(mount.status(), b"/")
+    old = await session.files.open(b"/old", write=True, truncate=True)
+    new = await session.files.create(b"/new", exclusive=True)
+    for file in (old, new):
+        await file.write(0, b"new" * 5000)
+    vehicle.pause()
+    for file in (old, new):
+        with pytest.raises(MavftpfsError):
+            await file.fsync()
+        assert await file.give_up() is False
+    vehicle.resume()
+    wait_until("the vehicle is heard again", lambda: mount.status()["link"]["state"] != "lost")
+    assert mount.status()["held"]["files"] == 0
+    shown = [path for path in card.iterdir() if not is_reserved(os.fsencode(path.name))]
+    assert {path.name: path.read_text() for path in shown} == {"old": "old"}  # requests came out of its queue
+    assert (mount.path / "old").read_text() == "old"
+    assert os.listdir(mount.path) == ["old"]
