@@ -382,9 +382,11 @@ class Upload(SessionUser):
         gate.shut = traits.paths_disarm
         try:
             while True:
-                # Beside who is to wait for a window only, a short queue keeps a place for the Terminate.
+                # While a light user waits, a short queue is half filled: the Terminate finds a place in it, and
+                # is not behind as many writes.
                 rival = self._scheduler.rival_use(self)
-                most = None if rival is None or rival >= LIGHT_USE else traits.queue_limit
+                queue = traits.queue_limit
+                most = queue // 2 if queue and rival is not None and rival < LIGHT_USE else None
                 chunks = self._scheduler.write_chunks
                 transfer = WriteTransfer(
                     session.id, self._source, chunks, in_flight=most, on_starved=server.wake
