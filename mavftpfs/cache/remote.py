@@ -64,6 +64,10 @@ class Reader(Protocol):
         """Forget wants that nobody waits for (a seek, a release)."""
         ...
 
+    def drop_wants(self) -> None:
+        """Forget all wants (a read was interrupted). What is on its way still comes."""
+        ...
+
     def close(self) -> None:
         """No further wants. The server session is closed lazily by the scheduler."""
         ...

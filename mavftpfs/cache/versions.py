@@ -352,7 +352,8 @@ class Version:
 
     async def wait_for(self, start: int, stop: int) -> None:
         """Wait for what is missing of [start, stop), which was just asked for, at most a piece. `get` may
-        find nothing afterwards, where the bytes were dropped.
+        find nothing afterwards, where the bytes were dropped. What nobody waits for any more, because this
+        was cancelled or took too long, is not fetched.
 
         Raises:
             RequestTimeout: none of the missing bytes came for `patience` seconds. Else what on_failed got.
@@ -368,6 +369,10 @@ class Version:
                 await waiter.done.wait()
         finally:
             self._waiters.remove(waiter)
+            if not waiter.done.is_set() and self.reader is not None:
+                self.reader.drop_wants()
+                for other in self._waiters:
+                    self.reader.want(other.start, other.stop, demand=True)
         if waiter.error is not None:
             raise waiter.error.with_traceback(None)
         if not waiter.done.is_set():

@@ -64,11 +64,16 @@ def is_mapped_page(start: int, stop: int, told: int) -> bool:
 
 @dataclass(slots=True)
 class FileHandle:
-    """One open() of a file. flags: as given to open(2)."""
+    """One open() of a file. flags: as given to open(2).
+
+    ahead: ends each of the reads under way by which the kernel reads ahead. let_go: these were ended once.
+    """
 
     ino: int
     file: OpenFile
     flags: int = 0
+    ahead: dict[Callable[[], None], None] = field(default_factory=dict)
+    let_go: bool = False
 
 
 @dataclass(slots=True)

@@ -18,6 +18,7 @@ import errno
 import functools
 import json
 import logging
+import mmap
 import os
 import stat as stat_bits
 import time
@@ -295,8 +296,18 @@ class Operations(pyfuse3.Operations):
 
         A short reply in mid-file would look like the end: `cp` would exit 0 with half a file.
         """
-        file = self._file(fh).file
-        data = await file.read(off, size)
+        handle = self._file(fh)
+        file = handle.file
+        with trio.CancelScope() as scope:
+            # More than a page at once is read ahead into the page cache.
+            if size > mmap.PAGESIZE and not (file.writable or file.direct_io or handle.let_go):
+                handle.ahead[scope.cancel] = None
+            try:
+                data = await file.read(off, size)
+            finally:
+                handle.ahead.pop(scope.cancel, None)
+        if scope.cancelled_caught:
+            raise FUSEError(errno.EINTR)
         if len(data) != max(0, min(size, file.size - off)):
             log.error("bug: %d bytes for a read of %d at %d of %d", len(data), size, off, file.size)
             raise FUSEError(errno.EIO)
@@ -321,10 +332,17 @@ class Operations(pyfuse3.Operations):
         """A descriptor was closed: 0 means that everything written is on the card, checked.
 
         But a file that was only emptied, or made, is delivered by fsync or release.
+
+        The program that closed a descriptor for reading may have been interrupted. The kernel's reads for it
+        would hold the handle open, and go on for minutes on a slow link, so they end. That is no error for
+        another program that shares the handle: the kernel asks again, page by page. It is done only once.
         """
-        file = self._file(fh).file
-        if file.writable:
-            await file.flush()
+        handle = self._file(fh)
+        if handle.file.writable:
+            await handle.file.flush()
+        for cancel in list(handle.ahead):
+            handle.let_go = True
+            cancel()
 
     @handler
     async def fsync(self, fh: int, datasync: bool) -> None:

@@ -93,6 +93,11 @@ class ReadTransfer(Operation):
         """Forget wants that nobody waits for; what is on its way still arrives."""
         self._ahead = ExtentSet()
 
+    def drop_wants(self) -> None:
+        """Forget everything that is wanted; what is on its way still arrives."""
+        self._demand = ExtentSet()
+        self.drop_readahead()
+
     @property
     def in_flight(self) -> int:
         """How many ReadFile requests are on their way, or lost and to be repeated."""

@@ -81,6 +81,15 @@ class FileStream(SessionUser):
         if self._transfer is not None:
             self._transfer.drop_readahead()
 
+    def drop_wants(self) -> None:
+        """Nobody waits for anything any more: ask for nothing else. What is on its way still comes."""
+        self._demand = ExtentSet()
+        self.drop_readahead()
+        if self._transfer is not None:
+            self._transfer.drop_wants()
+        elif not self._wants_open:
+            self.asked_at = None
+
     def close(self) -> None:
         """No more wants; what is still wanted, or on its way, is forgotten."""
         self.closed = True

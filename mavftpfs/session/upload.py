@@ -382,8 +382,8 @@ class Upload(SessionUser):
         gate.shut = traits.paths_disarm
         try:
             while True:
-                # While a light user waits, a short queue is half filled: the Terminate finds a place in it, and
-                # is not behind as many writes.
+                # While a light user waits, a short queue is half filled: the Terminate finds a place in it,
+                # and is not behind as many writes.
                 rival = self._scheduler.rival_use(self)
                 queue = traits.queue_limit
                 most = queue // 2 if queue and rival is not None and rival < LIGHT_USE else None

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
+import signal
 import sys
 import time
 from pathlib import Path
@@ -10,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from tests.mount.conftest import Field
-from tests.support.mounts import Mount
+from tests.support.mounts import Mount, wait_until
 from tests.support.trees import content
 from tests.support.vehicles import UdpVehicle
 
@@ -143,3 +145,47 @@ def test_120_blocked_opens_do_not_freeze_df(field: Field, tree: Path) -> None:
     assert readers.returncode == 0, errors
     read = dict(line.partition(" ")[::2] for line in out.splitlines())
     assert read == {name: (tree / "many" / name).read_bytes().hex() for name in names}
+
+
+@pytest.mark.holds("promise 7")
+def test_the_link_is_free_once_a_copy_was_interrupted(field: Field, tmp_path: Path) -> None:
+    """The kernel asks for 256 KiB at once, and would have them come after Ctrl-C: 13 s of this link."""
+    card, rate = field.local("card"), 20_000
+    (card / "log.bin").write_bytes(content("log", 2_000_000))
+    mount = field.mount(field.sim(card, "px4", ("--rate", str(rate), "--delay", "0.03")).source)
+
+    def received() -> int:
+        return int(mount.status()["link"]["received_bytes"])
+
+    began = received()
+    with mount.started("cp", mount.path / "log.bin", tmp_path / "copy") as copy:
+        wait_until("the copy is under way", lambda: received() - began > 2 * rate)
+        copy.send_signal(signal.SIGINT)
+        copy.wait(20)
+    wait_until("its reads ended", lambda: mount.status()["connection"]["in_flight"] == 0, timeout=5)
+    before = received()
+    time.sleep(3)
+    assert received() - before < rate / 2, "no more than heartbeats, and what was on its way"
+
+
+def test_a_shared_descriptor_is_read_on_though_one_of_its_owners_closed_it(field: Field) -> None:
+    card = field.local("card")
+    (card / "log.bin").write_bytes(content("log", 300_000))
+    mount = field.mount(field.sim(card, "px4", ("--rate", "60000", "--delay", "0.03")).source)
+    code = """
+import hashlib, os, subprocess, sys, threading
+fd = os.open(sys.argv[1], os.O_RDONLY)
+parts = []
+def read():
+    while part := os.read(fd, 200_000):
+        parts.append(part)
+reader = threading.Thread(target=read)
+reader.start()
+while reader.is_alive():
+    copy = os.dup(fd)
+    os.close(copy)
+    reader.join(0.1)
+print(hashlib.sha256(b"".join(parts)).hexdigest())
+"""
+    said = mount.python(code, mount.path / "log.bin")
+    assert said.strip() == hashlib.sha256((card / "log.bin").read_bytes()).hexdigest()

@@ -335,6 +335,34 @@ async def test_a_big_read_on_a_slow_radio_gets_the_time_it_needs(
     assert await failure(ops.read(fh, 0, 131072)) == errno.ETIMEDOUT
 
 
+async def test_the_kernel_s_reads_ahead_end_with_the_program_that_closed_a_descriptor(
+    autojump_clock: trio.testing.MockClock,
+) -> None:
+    """Once: after that somebody else shares the handle, and waits for what is read."""
+    tree = FakeTree({b"/a.txt": bytes(262144)})
+    ops, _, fh = await prepared(tree)
+    ends: list[tuple[float, int]] = []
+
+    async def read(size: int) -> None:
+        try:
+            await ops.read(fh, 0, size)
+            ends.append((trio.current_time(), 0))
+        except FUSEError as error:
+            ends.append((trio.current_time(), error.errno))
+
+    for errno_then in (errno.EINTR, 0):
+        tree.delays = {"read": 20.0}
+        began = trio.current_time()
+        async with trio.open_nursery() as nursery:
+            nursery.start_soon(read, 262144)
+            nursery.start_soon(read, 4096)  # a program waits for a single page
+            await trio.sleep(5.0)
+            await ops.flush(fh)
+        expected = sorted([(began + (5.0 if errno_then else 20.0), errno_then), (began + 20.0, 0)])
+        assert sorted(ends) == expected
+        ends.clear()
+
+
 @pytest.mark.holds("promise 2")
 async def test_a_checksum_gets_its_own_budget(autojump_clock: trio.testing.MockClock) -> None:
     tree = some_tree()

@@ -14,6 +14,8 @@ from mavftpfs.cache.openfile import OpenFile
 from mavftpfs.cache.throttle import STALL
 from mavftpfs.cache.tree import Tree
 from mavftpfs.protocol.payload import Opcode
+from mavftpfs.session.connection import ConnectOptions
+from mavftpfs.session.scheduler import ReadMode
 from mavftpfs.shared.errors import (
     AlreadyExists,
     FileBusy,
@@ -40,6 +42,54 @@ here = card({FILE: DATA})
 def tree(here: Rig) -> Tree:
     """A mount with the defaults."""
     return here.mount()
+
+
+# --- readers that go
+
+
+@pytest.mark.parametrize(("mode", "on_its_way"), [("window", 6000), ("burst", 40_000)])
+@pytest.mark.parametrize("how", ["interrupted", "closed"])
+async def test_nothing_more_is_fetched_once_nobody_reads(how: str, mode: ReadMode, on_its_way: int) -> None:
+    """A radio that carries 15 kB/s; the program gives up in the middle of what it asked for.
+
+    on_its_way: bytes; a burst has up to 38 kB.
+    """
+    link, size = LinkSettings(rate=15_000.0, delay=0.03), 400_000
+    async with rig("spec", {FILE: content(size)}, link=link, options=ConnectOptions(read_mode=mode)) as here:
+        tree = here.mount()
+        file = await tree.open(FILE)
+        if how == "closed":  # what is read ahead is still to come
+            assert len(await file.read(0, 4096)) == 4096
+            assert len(await file.read(4096, 4096)) == 4096
+        with trio.move_on_after(5.0):
+            await file.read(8192, 256 * 1024)
+        asked, came = here.count(Opcode.READ_FILE), here.connection.link.stats.received_bytes
+        if how == "closed":
+            file.close()
+        await trio.sleep(30.0)
+        assert here.count(Opcode.READ_FILE) - asked <= 2
+        assert here.connection.link.stats.received_bytes - came < 30 * 60 + on_its_way, "30 heartbeats"
+        if how == "interrupted":
+            assert await file.read(8192, 30_000) == content(size)[8192:38192]
+            file.close()
+
+
+async def test_one_interrupted_read_leaves_others_theirs() -> None:
+    link, size = LinkSettings(rate=15_000.0, delay=0.03), 400_000
+    async with rig("px4", {FILE: content(size)}, link=link) as here:
+        tree = here.mount()
+        file, got = await tree.open(FILE), []
+
+        async def read_on() -> None:
+            got.append(bytes(await file.read(100_000, 100_000)))
+
+        async with trio.open_nursery() as nursery:
+            nursery.start_soon(read_on)
+            with trio.move_on_after(3.0):
+                await file.read(0, 150_000)
+        assert got == [content(size)[100_000:200_000]]
+        assert trio.current_time() < 15.0
+        file.close()
 
 
 # --- opening and writing
