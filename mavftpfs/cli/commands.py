@@ -85,9 +85,14 @@ def _serve(
 
     foreground = args.foreground or args.debug
     _start_logging(options, foreground=foreground, debug=args.debug)
-    with open_sinks(options.client, debug=args.debug) as sinks:
+    with open_sinks(options.client, debug=args.debug, tell=say) as sinks:
         request = MountRequest(args.source, spec, place, options, control=_control_path(place), sinks=sinks)
         return run_mount(request, report)
+
+
+def say(line: str) -> None:
+    """Say a line to the person at the terminal."""
+    print(f"mavftpfs: {readable(line)}", file=sys.stderr, flush=True)
 
 
 def _report_in_foreground(code: int, message: str) -> None:

@@ -39,6 +39,8 @@ Args = argparse.Namespace
 
 
 def _target(args: Args, component: int | None) -> Target:
+    if component is not None:
+        args.options.append(f"target_component={component}")
     mount = mountpoint_of(args.source)
     if mount is not None:
         return Target(None, parse_options(args.options).client, mount=mount)
@@ -46,8 +48,6 @@ def _target(args: Args, component: int | None) -> Target:
     no_device = place.startswith("/") and not place.startswith("/dev/") and not os.path.lexists(place)
     if no_device or os.path.isdir(place):
         raise UsageError(f"no vehicle is mounted on {place}")
-    if component is not None:
-        args.options.append(f"target_component={component}")
     options, spec = connection_of(args)
     return Target(spec, options.client)
 
@@ -62,7 +62,7 @@ def run(
     daemon.log_to_stderr(logging.DEBUG if args.debug else logging.WARNING)
     if not args.debug:  # whatever the caches warn of is raised, too, and errors are one line
         logging.getLogger("mavftpfs.cache").setLevel(logging.ERROR)
-    with open_sinks(target.options, debug=args.debug) as sinks:
+    with open_sinks(target.options, debug=args.debug, tell=_say) as sinks:
         return trio.run(until_interrupted, partial(function, replace(target, sinks=sinks)))
 
 

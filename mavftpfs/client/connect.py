@@ -7,8 +7,8 @@ import hashlib
 import os
 import stat
 import sys
-from collections.abc import AsyncIterator, Callable, Iterator
-from contextlib import ExitStack, asynccontextmanager, contextmanager, nullcontext
+from collections.abc import AsyncIterator, Callable, Iterator, Mapping
+from contextlib import AsyncExitStack, ExitStack, asynccontextmanager, contextmanager, nullcontext
 from dataclasses import dataclass, fields, replace
 from datetime import datetime
 from functools import partial
@@ -26,8 +26,9 @@ from mavftpfs.cache.tree import Tree
 from mavftpfs.cache.versions import BlockCache
 from mavftpfs.client.leftovers import rescue, spool_for
 from mavftpfs.client.options import Options
-from mavftpfs.client.status import Watcher, snapshot
+from mavftpfs.client.status import Watcher, holder_of, snapshot
 from mavftpfs.client.trace import JsonTrace, TlogWriter, text_line
+from mavftpfs.link.base import Link
 from mavftpfs.link.opening import open_link
 from mavftpfs.link.uri import LinkKind, LinkSpec
 from mavftpfs.session.connection import Connection, ConnectOptions, connected
@@ -35,6 +36,7 @@ from mavftpfs.session.driver import PayloadTrace
 from mavftpfs.shared.errnos import errno_for
 from mavftpfs.shared.errors import (
     FtpNak,
+    LinkClosed,
     ListingIncomplete,
     NoFtp,
     NotADirectory,
@@ -90,18 +92,20 @@ class Attached:
 
 @dataclass(frozen=True, slots=True)
 class Sinks:
-    """Where what goes over the link is recorded: FTP payloads, and whole frames."""
+    """Where what goes over the link is recorded: FTP payloads, and whole frames. tell: says to a person, in a
+    line, what is waited for."""
 
     payload: PayloadTrace | None = None
     frame: Callable[[bytes], None] | None = None
+    tell: Callable[[str], None] = lambda line: None
 
 
 NO_SINKS = Sinks()
 
 
 @contextmanager
-def open_sinks(options: Options, *, debug: bool) -> Iterator[Sinks]:
-    """Open what trace=, tlog= and -d ask for, and close it after the body.
+def open_sinks(options: Options, *, debug: bool, tell: Callable[[str], None]) -> Iterator[Sinks]:
+    """Open what trace=, tlog= and -d ask for, and close it after the body; tell: see Sinks.
 
     Raises:
         UsageError: a file cannot be created.
@@ -116,11 +120,58 @@ def open_sinks(options: Options, *, debug: bool) -> Iterator[Sinks]:
             for trace in traces:
                 trace(now, direction, wire)
 
-        yield Sinks(payload if traces else None, None if tlog is None else tlog.frame)
+        yield Sinks(payload if traces else None, None if tlog is None else tlog.frame, tell)
 
 
 def _print_payload(now: float, direction: str, wire: bytes) -> None:
     print(f"{datetime.now():%H:%M:%S.%f} {text_line(direction, wire)}", file=sys.stderr)
+
+
+HOLDER_PATIENCE = 3.0
+"""Seconds for mounts to say whether they have a link."""
+
+
+async def mount_with(spec: LinkSpec) -> Mapping[str, Any] | None:
+    """Return the status of the mount that has a link, None where none is known."""
+    with trio.move_on_after(HOLDER_PATIENCE):
+        return await trio.to_thread.run_sync(holder_of, spec, abandon_on_cancel=True)
+    return None
+
+
+@asynccontextmanager
+async def opened(spec: LinkSpec) -> AsyncIterator[Link]:
+    """Open a link for the length of the body, as open_link.
+
+    Raises:
+        LinkClosed: as open_link; a mount that has the port or the device is named.
+    """
+    async with AsyncExitStack() as stack:
+        try:
+            link = await stack.enter_async_context(open_link(spec))
+        except LinkClosed as exc:
+            cause = exc.__cause__
+            status = None
+            if isinstance(cause, OSError) and cause.errno in (errno.EADDRINUSE, errno.EBUSY, errno.EAGAIN):
+                status = await mount_with(spec)
+            if status is None:
+                raise
+            raise LinkClosed(_had_by(spec, status)) from exc
+        yield link
+
+
+def _had_by(spec: LinkSpec, status: Mapping[str, Any]) -> str:
+    vehicle, mountpoint = status["vehicle"], status["mountpoint"]
+    what = "device" if spec.kind is LinkKind.SERIAL else "port"
+    return (
+        f"{spec.description}: this {what} belongs to the mount on {mountpoint}, of vehicle "
+        f"{vehicle['system']}/{vehicle['component']}; unmount that (mavftpfs umount {mountpoint}), "
+        f"or use another {what}"
+    )
+
+
+def waiting(spec: LinkSpec, options: Options) -> str:
+    """Return what a person is told who waits for a vehicle."""
+    return f"waiting for a heartbeat on {spec.description} ({options.connect_timeout:g} s)"
 
 
 @asynccontextmanager
@@ -148,9 +199,9 @@ async def attached(
     deadline = trio.current_time() + options.connect_timeout
     settings = connect_options(options)
     writing = writing and not options.read_only
-    async with open_link(spec) as link, connected(link, settings, trace=sinks.payload) as connection:
+    async with opened(spec) as link, connected(link, settings, trace=sinks.payload) as connection:
         connection.driver.framer.on_frame = sinks.frame
-        await connection.ready(options.connect_timeout)
+        await connection.ready(options.connect_timeout, partial(sinks.tell, waiting(spec, options)))
         caches = replace(cache_options(options, spec), read_only=not writing)
         keep = None if options.cache_dir is None else await kept_in(options.cache_dir, caches, connection)
         async with plain_nursery() as nursery:

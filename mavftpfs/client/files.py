@@ -272,13 +272,17 @@ def is_wanted(status: Mapping[str, Any], options: Options) -> bool:
     )
 
 
-async def open_mount(mountpoint: str, subtree: bytes) -> Session:
+async def open_mount(mountpoint: str, subtree: bytes, options: Options) -> Session:
     """Return the files below `subtree` of a mount.
 
     Raises:
         LinkClosed: it does not answer. NotFound, NotADirectory: the subtree is none.
+        UsageError: the options ask for another vehicle or component.
     """
     status = await mount_status(mountpoint)
+    system, component = status["vehicle"]["system"], status["vehicle"]["component"]
+    if options.target_system not in (0, system) or options.target_component not in (0, component):
+        raise errors.UsageError(f"{mountpoint} is the mount of vehicle {system}/{component}")
     session = session_on(status, normalise(os.fsencode(status["root"]) + b"/" + subtree))
     if subtree != ROOT:
         place = name_text(os.fsencode(mountpoint) + subtree)
@@ -510,7 +514,7 @@ class Target:
     async def mounted(self) -> Session | None:
         """Return the files of the mount that is to be used, None where there is none."""
         if self.mount is not None:
-            return await open_mount(*self.mount)
+            return await open_mount(*self.mount, self.options)
         assert self.spec is not None
         return await find_mount(self.spec, self.options)
 

@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import trio
 
-from mavftpfs.client.connect import connect_options
+from mavftpfs.client.connect import connect_options, mount_with, opened, waiting
 from mavftpfs.client.files import Target, mount_status
 from mavftpfs.client.options import Options
 from mavftpfs.link.base import Link
 from mavftpfs.link.messages import MAV_AUTOPILOT_INVALID, MAV_TYPE_GCS, Address, Heartbeat
-from mavftpfs.link.opening import open_link
-from mavftpfs.session.connection import connected
+from mavftpfs.session.connection import HEARD_SOON, connected
 from mavftpfs.shared.errors import FtpNak, MavftpfsError, VehicleLost
 from mavftpfs.shared.readable import autopilot_name, readable_time
 
@@ -58,15 +58,16 @@ async def scan(target: Target) -> list[Entry]:
     Raises:
         VehicleLost: nobody at all within connect_timeout.
     """
-    mounted = await target.mounted()
-    if mounted is not None:
-        assert mounted.mountpoint is not None
-        return [_of_mount(await mount_status(mounted.mountpoint))]
+    if target.mount is not None:
+        return _of_mount(await mount_status(target.mount[0]))
     assert target.spec is not None
+    status = await mount_with(target.spec)
+    if status is not None:
+        return _of_mount(status)
     options = target.options
     deadline = trio.current_time() + options.connect_timeout
-    async with open_link(target.spec) as link:
-        heard = await _listen(link, options)
+    async with opened(target.spec) as link:
+        heard = await _listen(link, options, partial(target.sinks.tell, waiting(target.spec, options)))
         found = []
         for left, address in zip(range(len(heard), 0, -1), sorted(heard), strict=True):
             share = (deadline - trio.current_time()) / left
@@ -75,35 +76,42 @@ async def scan(target: Target) -> list[Entry]:
         return found
 
 
-async def _listen(link: Link, options: Options) -> dict[Address, Heartbeat]:
+async def _listen(link: Link, options: Options, on_wait: Callable[[], None]) -> dict[Address, Heartbeat]:
     """Return who is heard in LISTEN_TIME after the first heartbeat, whoever sends it."""
     anybody = replace(connect_options(options), target_system=0, target_component=0)
     async with connected(link, anybody) as connection:
-        for _ in range(round(options.connect_timeout / _TICK)):
+        for tick in range(round(options.connect_timeout / _TICK)):
             if connection.vehicle.heard:
-                await trio.sleep(min(LISTEN_TIME, options.connect_timeout / 2))
                 break
+            if tick == round(HEARD_SOON / _TICK):
+                on_wait()
             await trio.sleep(_TICK)
-        if not connection.vehicle.heard:
-            await connection.ready(0)  # it knows what to say
+        else:
+            raise connection.nobody(options.connect_timeout)
+        await trio.sleep(min(LISTEN_TIME, options.connect_timeout / 2))
         return dict(connection.vehicle.heard)
 
 
-async def _probe(link: Link, options: Options, heartbeat: Heartbeat, patience: float) -> Entry:
-    address = heartbeat.source
-    entry: Entry = {
-        "system": address.system,
-        "component": address.component,
+def _entry(heartbeat: Heartbeat, ftp: str) -> Entry:
+    """Return what a heartbeat tells; ftp: what is known of its sender's files."""
+    return {
+        "system": heartbeat.source.system,
+        "component": heartbeat.source.component,
         "what": describe_peer(heartbeat),
         "autopilot": heartbeat.autopilot,
         "type": heartbeat.vehicle_type,
         "armed": heartbeat.armed,
         "firmware": None,
         "uid": None,
-        "ftp": "not asked (a ground station)",
+        "ftp": ftp,
         "answers": None,
         "seen": [],
     }
+
+
+async def _probe(link: Link, options: Options, heartbeat: Heartbeat, patience: float) -> Entry:
+    address = heartbeat.source
+    entry = _entry(heartbeat, "not asked (a ground station)")
     if heartbeat.vehicle_type == MAV_TYPE_GCS:
         return entry
     wanted = replace(
@@ -150,10 +158,11 @@ def _seen(facts: Mapping[str, Any], *, answers: bool) -> list[str]:
     return seen
 
 
-def _of_mount(status: Mapping[str, Any]) -> Entry:
-    """Return what a mount tells of its vehicle; nobody else can be asked while it has the link."""
-    vehicle, lost = status["vehicle"], status["link"]["state"] == "lost"
-    return {
+def _of_mount(status: Mapping[str, Any]) -> list[Entry]:
+    """Return what a mount tells of its vehicle, and whom else it hears; nobody can be asked while it has the
+    link."""
+    vehicle, lost, mounted = status["vehicle"], status["link"]["state"] == "lost", status["mountpoint"]
+    own: Entry = {
         "system": vehicle["system"],
         "component": vehicle["component"],
         "what": f"{vehicle['autopilot'] or 'unknown'}, {'armed' if vehicle['armed'] else 'disarmed'}",
@@ -162,11 +171,17 @@ def _of_mount(status: Mapping[str, Any]) -> Entry:
         "armed": vehicle["armed"],
         "firmware": vehicle["firmware"],
         "uid": vehicle["uid"],
-        "ftp": f"mounted on {status['mountpoint']}",
+        "ftp": f"mounted on {mounted}",
         "answers": not lost,
         "seen": ["the vehicle is silent"] if lost else [],
         "facts": status["connection"],
     }
+    heard = [
+        Heartbeat(Address(*facts["source"]), facts["vehicle_type"], facts["autopilot"], facts["armed"])
+        for facts in status["connection"]["heard"]
+    ]
+    others = [one for one in heard if one.source != (vehicle["system"], vehicle["component"])]
+    return [own, *(_entry(one, f"not asked (the mount on {mounted} has the link)") for one in others)]
 
 
 def describe_peer(heartbeat: Heartbeat) -> str:

@@ -1,6 +1,7 @@
 """`mftp://` URLs: which component serves a file, and its path. Layer: protocol; pure.
 
-    mftp://[comp=ID:][@ALIAS/]path      MAVLink FTP guide; brackets mark what may be left out
+    mftp://[comp=ID:][@ALIAS/]path      MAVLink FTP guide; brackets mark what may be left out. Those around
+                                        the component may be written, too
     mftp://[;comp=ID]path               component metadata; these brackets are part of the URL
 
 Paths are given in the mount's spelling, absolute: `mftp://@SYS/uarts.txt` is `/@SYS/uarts.txt`. A `?` belongs
@@ -19,7 +20,7 @@ from mavftpfs.shared.model import normalise
 SCHEME = "mftp://"
 _EXAMPLE = "mftp://comp=1:/fs/microsd/log"
 
-_NEW_COMPONENT = re.compile(r"comp=([^:/]*):")
+_NEW_COMPONENT = re.compile(r"\[comp=([^:/\]]*):\]|comp=([^:/]*):")
 # Some senders put the slash before the bracket.
 _OLD_COMPONENT = re.compile(r"/?\[;comp=([^\]]*)\]")
 _BAD_ESCAPE = re.compile(r"%(?![0-9A-Fa-f]{2})")
@@ -50,9 +51,9 @@ def parse_url(text: str) -> MftpUrl:
     match = _OLD_COMPONENT.match(rest) or _NEW_COMPONENT.match(rest)
     component = None
     if match is not None:
-        component = _component(match[1], text)
+        component = _component(match[match.lastindex or 1], text)
         rest = rest[match.end() :]
-    elif rest.lstrip("/").startswith("[;") or rest.startswith(("comp=", ";comp=")):
+    elif rest.lstrip("/").startswith("[;") or rest.startswith(("comp=", ";comp=", "[comp=")):
         raise UsageError(f"{text!r}: the component is not closed; write for example {_EXAMPLE}")
     if _BAD_ESCAPE.search(rest):
         raise UsageError(f"{text!r}: '%' must be followed by two hex digits (%25 is a percent sign)")

@@ -41,6 +41,10 @@ LOSSY = 0.1
 """From this share of lost packets on, the link is not called fine."""
 
 HEARTBEAT_PERIOD = 1.0
+MOST_HEARD = 32
+"""Components on the link of which a status tells: it has to fit into an extended attribute."""
+HEARD_SOON = 1.2
+"""Seconds within which a vehicle that is there is heard: it sends one heartbeat a second."""
 TERMINATE_ON_EXIT = 5.0
 """Seconds to spend on closing the server's session when we leave."""
 
@@ -97,16 +101,25 @@ class Connection:
     _first_heartbeat: trio.Event = field(default_factory=trio.Event)
     _doubted: trio.Event = field(default_factory=trio.Event)
 
-    async def ready(self, timeout: float) -> None:
-        """Wait for the vehicle's first heartbeat.
+    async def ready(self, timeout: float, on_wait: Callable[[], None] = lambda: None) -> None:
+        """Wait for the vehicle's first heartbeat; on_wait: called when it does not come at once.
 
         Raises:
             VehicleLost: none within `timeout` seconds; the text says what was heard instead.
         """
-        with trio.move_on_after(timeout):
+        soon = min(HEARD_SOON, timeout)
+        with trio.move_on_after(soon):
             await self._first_heartbeat.wait()
             return
-        raise VehicleLost(f"no vehicle on {self.link.description} within {timeout:g} s{self._heard()}")
+        on_wait()
+        with trio.move_on_after(timeout - soon):
+            await self._first_heartbeat.wait()
+            return
+        raise self.nobody(timeout)
+
+    def nobody(self, timeout: float) -> VehicleLost:
+        """Return what is raised when no vehicle was heard within `timeout` seconds, with what was heard."""
+        return VehicleLost(f"no vehicle on {self.link.description} within {timeout:g} s{self._heard()}")
 
     def subscribe(self, listener: Callable[[str], None]) -> None:
         """Have `listener` called with "reboot", "armed", "disarmed" or "back"."""
@@ -126,6 +139,9 @@ class Connection:
             "session_open": None if server is None else server.path.decode("utf-8", "replace"),
             **asdict(self.engine.traits),
             "uploads": [user.status() for user in self.scheduler.users if isinstance(user, Upload)],
+            "heard": [
+                asdict(self.vehicle.heard[source]) for source in sorted(self.vehicle.heard)[:MOST_HEARD]
+            ],
             "dropped_sends": link.stats.dropped_sends,
             "bad_frames": self.driver.framer.stats.bad_crc,
         }

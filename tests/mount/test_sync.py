@@ -16,6 +16,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 from mavftpfs.client.files import is_wanted
 from mavftpfs.client.options import Options
 from mavftpfs.link.framing import Framer
@@ -207,6 +209,8 @@ def test_a_path_inside_a_mount_is_a_source(field: Field, tmp_path: Path) -> None
     assert run("ls", f"{link}#2024-05-01")[0] == "10_00_00.ulg\n"
     assert len(sync(mount.path / "log", tmp_path / "logs")["files"]) == len(logs) + 1
     assert "is a file" in run("ls", link / "note", code=1)[1]
+    assert run("cat", place, "mftp://[comp=1:]/note")[0] == "note"
+    assert "of vehicle 1/1" in run("cat", place, "mftp://comp=100:/note", code=1)[1]
     assert f"{mount.path}/log/none: No such file" in run("ls", link / "none", code=1)[1]
 
 
@@ -326,3 +330,42 @@ def test_scan_of_a_camera_and_a_ground_station_ends_in_its_time() -> None:
     assert camera[:4] == ["1/100", "camera", "-", "-"]
     assert camera[4].startswith("no answer")
     assert station == ["255/190", "ground station", "-", "-", "not asked (a ground station)"]
+
+
+def test_scan_beside_a_mount_shows_whom_that_hears(field: Field) -> None:
+    vehicle = field.sim(field.local("card"))
+    mount = field.mount(vehicle.source)
+    port = int(vehicle.source.rpartition(":")[2])
+    with heartbeats(port, (Address(255, 190), MAV_TYPE_GCS)):
+        wait_until(
+            "the mount hears the ground station", lambda: len(mount.status()["connection"]["heard"]) > 1
+        )
+    for source in (vehicle.source, mount.path):
+        own, station = (line.split("\t") for line in run("scan", source)[0].splitlines())
+        assert own[0] == "1/1"
+        assert own[4] == f"mounted on {mount.path}"
+        assert station[:2] == ["255/190", "ground station"]
+        assert str(mount.path) in station[4]
+
+
+def test_a_port_that_a_mount_has_is_said_by_its_name(field: Field) -> None:
+    vehicle = field.sim(field.local("card"))
+    mount = field.mount(vehicle.source)
+    second = field.local("second")
+    for words in (
+        (vehicle.source, second),
+        ("ls", "-o", "target_system=7", vehicle.source),
+    ):
+        said = run(*words, code=2)[1]
+        assert f"the mount on {mount.path}, of vehicle 1/1" in said
+        assert "another program" not in said
+
+
+@pytest.mark.parametrize("command", ["scan", "sync", "mount"])
+def test_who_waits_for_a_vehicle_is_told_so(command: str, tmp_path: Path) -> None:
+    source = f"udpin:{HOST}:{free_udp_port()}"
+    local = [] if command == "scan" else [tmp_path]
+    said = run(command, "-o", "connect_timeout=2", source, *local, code=2)[1]
+    first, last = said.splitlines()
+    assert first == f"mavftpfs: waiting for a heartbeat on {source} (2 s)"
+    assert last.startswith(f"mavftpfs: no vehicle on {source} within 2 s")

@@ -12,12 +12,14 @@ import pytest
 from mavftpfs.cli import main as cli
 from mavftpfs.link.uri import parse_source
 from mavftpfs.mount.options import parse_options
+from mavftpfs.protocol.url import MftpUrl, parse_url
 
 PROJECT = Path(__file__).parents[2]
 PAGES = ("README.md", "docs/guide.md", "docs/benchmarks.md")
 
 BLOCK_LINE = re.compile(r"^    (\S.*)$", re.MULTILINE)
 TABLE_ROW = re.compile(r"^\| `(mavftpfs [^`]*)`", re.MULTILINE)
+URL = re.compile(r"`(mftp://[^`]+)`")
 PLACEHOLDERS = {"SOURCE": "udpin:0.0.0.0:14550", "[PATH...]": "/a", "PATH...": "/a", "LOCAL...": "a"}
 """What stands for something in the guide's table of commands."""
 
@@ -61,6 +63,13 @@ def test_the_line_for_fstab(page: str) -> None:
     assert mountpoint.startswith("/")
     assert kind == "mavftpfs"
     assert parse_options([options]).allow_other
+
+
+def test_the_urls_that_are_shown_name_a_component() -> None:
+    urls = [url for page in PAGES for url in URL.findall((PROJECT / page).read_text())]
+    assert len(urls) >= 2
+    for url in urls:
+        assert parse_url(url) == MftpUrl(100, b"/log")
 
 
 def test_enough_of_them_are_found() -> None:
