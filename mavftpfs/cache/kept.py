@@ -1,15 +1,18 @@
 """Which blocks of files are kept on the local disk for the next mount, and when they are used. Layer: cache.
 
-Off unless `cache_dir=` names a directory. What tells versions of a file apart:
-- its size and mtime, where a listing tells an mtime of a clock that was set: blocks are then used without a
-  request;
-- else its size and CRC32: the vehicle is asked for it when blocks of that path and size are kept, only while
-  it is disarmed, of files up to verify_max, and for at most CRC_LIMIT seconds. Only whole files are kept so.
+Off unless `cache_dir=` names a directory. There are two kinds of keys that tell versions of a file apart:
+- its size and mtime, where a listing tells an mtime of a clock that was set. Blocks of such a key are used
+  without a request.
+- its size and CRC32. Only whole files have such a key, and the CRC32 is computed here. Before their blocks
+  are used the vehicle is asked for the CRC32 of its file: only where one of that path and size is kept, while
+  it is disarmed, of files up to verify_max, and for at most CRC_LIMIT seconds.
 
-Never kept: `@` files, a file that grows or was changed in the last minute, what was read within SETTLED
-seconds, and anything after the vehicle restarted (it may be another one by then). Every SETTLED seconds all
-blocks in memory are looked at, and those that were there the last time go to the disk. The disk is only
-touched in threads.
+Every SETTLED seconds all blocks in memory are looked at, and those that were there the last time go to the
+disk: bytes that were read lately may yet turn out to be another file's. At a clean unmount whole files are
+kept that were read lately, too, by their CRC32: if they are another file's, it will not agree.
+
+Never kept: `@` files, a file that grows or was changed in the last minute, and anything after the vehicle
+restarted (it may be another one by then). The disk is only touched in threads.
 """
 
 from __future__ import annotations
@@ -17,7 +20,7 @@ from __future__ import annotations
 import logging
 import time
 import zlib
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -33,6 +36,8 @@ log = logging.getLogger("mavftpfs.cache")
 
 CLOCK_SET = 1_420_070_400
 """2015-01-01 UTC: an older mtime is that of a vehicle whose clock was not set."""
+
+_DATED = "mtime "
 
 YOUNG = 60.0
 """Seconds after its mtime in which a file may change without its mtime changing (FAT: 2, clocks: more)."""
@@ -62,7 +67,7 @@ def key_of(vehicle: bytes | None, path: bytes, entry: DirEntry, now: float) -> F
     if entry.mtime is not None and entry.mtime > now - YOUNG:
         return None
     dated = entry.mtime is not None and entry.mtime >= CLOCK_SET
-    return FileKey(vehicle, path, entry.size, f"mtime {entry.mtime}" if dated else "")
+    return FileKey(vehicle, path, entry.size, _DATED + str(entry.mtime) if dated else "")
 
 
 class KeptCache:
@@ -91,6 +96,7 @@ class KeptCache:
         self._wall = wall
         self._run = run
         self._ask_after = NEVER
+        self._takes_more = True
         self.written = 0
 
     def status(self) -> dict[str, object]:
@@ -102,13 +108,17 @@ class KeptCache:
     async def find(self, path: bytes, entry: DirEntry) -> Kept | None:
         """Return what is kept of a freshly listed file, None if its beginning is not, or may be another's."""
         key = self._key(path, entry)
-        if key is not None and not key.version:
+        if key is not None and not (_is_dated(key) and await self._begins(key)):
             key = await self._with_crc32(key)
-        if key is None or await self._run(self._disk.read, key.block(*_extent(key.size, 0))) is None:
-            return None
-        if self._directories.entry(path) is not entry:
-            return None  # listed anew, or changed by us, meanwhile
+            if key is not None and not await self._begins(key):
+                return None
+        if key is None or self._directories.entry(path) is not entry:
+            return None  # or it was listed anew, or changed by us, meanwhile
         return Kept(key)
+
+    async def _begins(self, key: FileKey) -> bool:
+        """Return whether the first block of a file is kept."""
+        return await self._run(self._disk.read, key.block(*_extent(key.size, 0))) is not None
 
     async def fill(self, version: Version, start: int, stop: int) -> None:
         """Add the blocks of [start, stop) that are lacking and on the disk."""
@@ -135,10 +145,13 @@ class KeptCache:
     async def _with_crc32(self, key: FileKey) -> FileKey | None:
         """Return the key of the file with the CRC32 that the vehicle has; asks only if one of it is kept."""
         clock = self._directories.clock
-        if clock() < self._ask_after or await self._run(self._disk.read, key.block(0, 0)) is None:
+        if clock() < self._ask_after or key.size > self._crc_limit():
+            return None
+        if await self._run(self._disk.read, _marker(key)) is None:
             return None
         with trio.move_on_after(CRC_LIMIT) as scope:
             try:
+                self._directories.require_reachable()
                 return _of_crc32(key, await self._crc32(key.path))
             except MavftpfsError:  # without one all is read
                 return None
@@ -159,15 +172,18 @@ class KeptCache:
         """Keep what may be kept, until cancelled, or until the disk takes no more."""
         await self._run(self._disk.shrink)
         seen: dict[Version, dict[int, bytearray]] = {}
-        try:
-            while True:
-                await trio.sleep(SETTLED)
-                before, seen = seen, self._held()
-                for version, held in seen.items():
-                    known = before.get(version, {})
-                    await self._write(version, {i: b for i, b in held.items() if known.get(i) is b})
-        except OSError as error:
-            log.warning("nothing more is kept in cache_dir: %s", error)
+        while self._takes_more:
+            await trio.sleep(SETTLED)
+            before, seen = seen, self._held()
+            for version, held in seen.items():
+                known = before.get(version, {})
+                await self._keep(version, {i: b for i, b in held.items() if known.get(i) is b})
+
+    async def keep_whole_files(self) -> None:
+        """Keep what was read whole, also lately: the mount ends."""
+        for version in self._held():
+            if version.complete and version.size <= self._crc_limit():
+                await self._keep(version, version.blocks(), by_crc32=True)
 
     def _held(self) -> dict[Version, dict[int, bytearray]]:
         """Return the blocks that are whole and not on the disk, of files that may be kept."""
@@ -189,39 +205,66 @@ class KeptCache:
         listed = self._directories.entry(key.path)
         return listed is None or (listed.size, listed.mtime) == (key.size, version.mtime)
 
-    async def _write(self, version: Version, ripe: dict[int, bytearray]) -> None:
-        """Write blocks that were held whole for SETTLED seconds.
-
-        Raises:
-            OSError: the disk does not take them.
-        """
+    async def _keep(self, version: Version, blocks: dict[int, bytearray], *, by_crc32: bool = False) -> None:
+        """Write blocks of a version that are held whole. by_crc32: all of them, under its CRC32 only."""
         kept = version.kept
         if kept is None or not self._may_keep(version, kept.key):
             version.kept = None
             return
-        if version.mtime is not None and not version.compared:
-            return
-        if not kept.key.version:
-            if sum(map(len, ripe.values())) < version.size:
+        key = kept.key
+        if _is_dated(key) and not by_crc32:
+            if not version.compared:
                 return
-            value = 0xFFFFFFFF
-            for index in sorted(ripe):
-                value = zlib.crc32(ripe[index], value)
-            marker = kept.key.block(0, 0)  # it is worth asking for the checksum of this path and size
-            version.kept = kept = Kept(_of_crc32(kept.key, value ^ 0xFFFFFFFF))
-            await self._run(self._disk.write, marker, b"")
-        for index, block in ripe.items():
+        elif sum(map(len, blocks.values())) < version.size:
+            return
+        else:
+            key = _of_crc32(key, _crc32(blocks))
+        try:
+            if not _is_dated(key):
+                await self._run(self._disk.write, _marker(key), b"")
+            await self._write(version, kept, key, blocks)
+        except OSError as error:
+            if self._takes_more:
+                log.warning("nothing more is kept in cache_dir: %s", error)
+            self._takes_more = False
+
+    async def _write(self, version: Version, kept: Kept, key: FileKey, blocks: dict[int, bytearray]) -> None:
+        """Write blocks under a key, while they are not in doubt.
+
+        Raises:
+            OSError: the disk does not take them.
+        """
+        for index, block in blocks.items():
             if version.kept is not kept or version.block(index) is not block:
                 return  # it is in doubt, or another file, by now
-            await self._run(self._disk.write, kept.key.block(*_extent(version.size, index)), bytes(block))
+            await self._run(self._disk.write, key.block(*_extent(version.size, index)), bytes(block))
             kept.done.add(index)
             self.written += 1
+        if not _is_dated(kept.key):
+            kept.key = key
 
 
 def _extent(size: int, index: int) -> tuple[int, int]:
     return index * BLOCK_SIZE, min((index + 1) * BLOCK_SIZE, size)
 
 
+def _is_dated(key: FileKey) -> bool:
+    return key.version.startswith(_DATED)
+
+
+def _marker(key: FileKey) -> str:
+    """Return the name of the empty block that says: something of this path and size is kept by its CRC32."""
+    return replace(key, version="").block(0, 0)
+
+
+def _crc32(blocks: Mapping[int, bytearray]) -> int:
+    """Return the CRC32 of a whole file, as the vehicle computes it: start value 0, no final xor."""
+    value = 0xFFFFFFFF
+    for index in sorted(blocks):
+        value = zlib.crc32(blocks[index], value)
+    return value ^ 0xFFFFFFFF
+
+
 def _of_crc32(key: FileKey, crc32: int) -> FileKey:
-    """Return the key of the file of this CRC32 (start value 0, no final xor)."""
+    """Return the key of the file with this CRC32."""
     return replace(key, version=f"crc32 {crc32:08x}")

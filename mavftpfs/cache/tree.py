@@ -352,6 +352,11 @@ class Tree:
         """
         return self._writing.recover_to(directory)
 
+    async def keep_whole_files(self) -> None:
+        """Keep what was read whole for the next mount, as this one ends (with `keep`)."""
+        if self._files.kept is not None:
+            await self._files.kept.keep_whole_files()
+
     def armed_changed(self, armed: bool) -> None:
         """The vehicle was armed or disarmed: nothing is changed in flight unless when_armed=ok."""
         self._writing.armed_changed(armed)

@@ -185,6 +185,10 @@ class Version:
         """Return a block if it is held. It is another object when it came anew."""
         return self._blocks.get(index)
 
+    def blocks(self) -> dict[int, bytearray]:
+        """Return the blocks that are held, whole or in part, by their index."""
+        return dict(self._blocks)
+
     @property
     def waited_for(self) -> bool:
         """Whether somebody waits for bytes."""

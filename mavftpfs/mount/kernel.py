@@ -212,6 +212,7 @@ class _Life:
                     await self._serve(invalidator, vehicle.notice)
             finally:
                 await say_goodbye(vehicle.tree, self.request.source, self._on_undelivered)
+            await vehicle.tree.keep_whole_files()
 
     def _on_undelivered(self, line: str) -> None:
         self.farewell = line

@@ -59,6 +59,19 @@ def check_cost(field: Field, vehicle: CountedVehicle, logs: Path, cache: Path, *
     return mount
 
 
+@pytest.mark.parametrize("profile", taking_turns(["px4", "ardupilot5", "mavsdk"]))
+def test_a_copy_an_unmount_a_mount_and_a_copy_cost_one_copy_and_the_checksums(
+    field: Field, profile: str
+) -> None:
+    card, cache = field.local("card"), field.local("cache")
+    logs = fill(card)
+    vehicle = field.counted_sim(card, profile)
+    mount = field.mount(vehicle.source, f"cache_dir={cache}")
+    read_all(mount, logs)
+    assert mount.unmount() == 0
+    check_cost(field, vehicle, logs, cache, crc=len(FILES))
+
+
 @pytest.mark.parametrize("profile", taking_turns(["ardupilot5", "mavsdk"]))
 def test_yesterdays_logs_are_not_read_again(field: Field, profile: str) -> None:
     card, cache = field.local("card"), field.local("cache")

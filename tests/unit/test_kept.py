@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import AsyncIterator, Callable
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -190,6 +191,61 @@ async def test_without_an_mtime_a_checksum_decides(undated: Mounts) -> None:
     undated.here.put(LOG, new)
     assert await read_file(undated.mount(), LOG) == new
     assert undated.asked() == (1, 1)
+
+
+@pytest.mark.parametrize("dated", [True, False])
+async def test_what_was_read_whole_just_before_the_unmount_costs_a_checksum(
+    mounts: Mounts, undated: Mounts, dated: bool
+) -> None:
+    here = mounts if dated else undated
+    tree = here.mount()
+    assert await read_file(tree, LOG) == DATA
+    await tree.keep_whole_files()
+    assert here.caches[0].written == len(DATA) // BLOCK_SIZE + 1
+    assert await read_file(here.mount(), LOG) == DATA
+    assert here.asked() == (0, 1)
+    new = content(len(DATA), seed=9)
+    here.here.put(LOG, new, MTIME)
+    assert await read_file(here.mount(), LOG) == new
+    assert here.asked() == (1, 1)
+
+
+async def test_what_was_kept_by_its_time_is_not_kept_again_by_its_checksum(mounts: Mounts) -> None:
+    tree = mounts.mount()
+    assert await read_file(tree, LOG) == DATA
+    await trio.sleep(ENOUGH)
+    written = mounts.caches[0].written
+    await tree.keep_whole_files()
+    assert mounts.caches[0].written == written
+    assert await read_file(mounts.mount(), LOG) == DATA
+    assert mounts.asked() == (0, 0)
+
+
+LEFT_OUT = ["armed or large", "in part", "growing", "rebooted", "in doubt"]
+
+
+@pytest.mark.parametrize(("why", "dated"), [("young", True), *product(LEFT_OUT, [True, False])])
+async def test_what_is_not_kept_at_an_unmount(mounts: Mounts, undated: Mounts, why: str, dated: bool) -> None:
+    here = mounts if dated else undated
+    if why == "young":
+        here.here.put(LOG, DATA, int(NOW) - 1)
+    tree = here.mount()
+    if why == "in part":
+        handle = await tree.open(LOG)
+        await handle.read(len(DATA) - 1, 1)
+        handle.close()
+    else:
+        assert await read_file(tree, LOG) == DATA
+    if why == "armed or large":
+        here.crc_limit = len(DATA) - 1
+    if why == "growing":
+        here.growing.add(LOG)
+    if why == "rebooted":
+        tree.rebooted()
+    if why == "in doubt":
+        here.here.connection.scheduler.doubt.raise_it("somebody else")
+    await tree.keep_whole_files()
+    assert here.caches[0].written == 0
 
 
 @pytest.mark.parametrize("why", ["not allowed", "refused", "silent", "incomplete"])
