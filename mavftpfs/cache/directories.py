@@ -173,7 +173,7 @@ class Directories:
     def left(self, directory: Directory) -> float:
         """Return for how many seconds a listing is the newest that can be had: while the vehicle is lost,
         without end."""
-        return inf if self._store.is_lost() else directory.fresh_until - self.clock()
+        return directory.fresh_until - self.clock() if self._store.why_lost() is None else inf
 
     def entry(self, path: bytes) -> DirEntry | None:
         """Return what a path was last known to be."""
@@ -331,7 +331,7 @@ class Directories:
         if directory is None:
             self.require_reachable()
             return await self._list(path)
-        if self.clock() < directory.fresh_until or self._store.is_lost():
+        if self.clock() < directory.fresh_until or self._store.why_lost() is not None:
             return directory
         try:
             return await self._list(path, until_lost=self._sweeping.outlives_callers)
@@ -340,8 +340,9 @@ class Directories:
 
     def require_reachable(self) -> None:
         """Raise VehicleLost if the vehicle is known to be lost: what begins now would wait for nothing."""
-        if self._store.is_lost():
-            raise VehicleLost("the vehicle is silent; waiting for its heartbeat")
+        why = self._store.why_lost()
+        if why is not None:
+            raise VehicleLost(why)
 
     # --- listing
 

@@ -76,10 +76,10 @@ class Reader(Protocol):
 class RemoteStore(Protocol):
     """The vehicle's files."""
 
-    def is_lost(self) -> bool:
-        """Return whether the vehicle is known to be out of reach: nothing was heard of it for 5 s, or another
-        one answers in its place. What begins now would wait for nothing; what is under way may go on when it
-        comes back."""
+    def why_lost(self) -> str | None:
+        """Return why the vehicle counts as lost, None if it does not: nothing was heard of it for 5 s, or
+        another one answers in its place. What begins now would wait for nothing; what is under way may go on
+        when it comes back."""
         ...
 
     async def list_directory(self, path: bytes) -> Listing:

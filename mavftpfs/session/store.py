@@ -24,7 +24,6 @@ from mavftpfs.session.doubt import MOST_LATE
 from mavftpfs.session.reader import FileStream
 from mavftpfs.session.scheduler import Scheduler
 from mavftpfs.session.upload import Upload
-from mavftpfs.session.vehicle import SILENCE_LIMIT
 from mavftpfs.shared.errors import (
     Armed,
     FtpNak,
@@ -120,10 +119,9 @@ class Store:
         self._under_way = 0
         self._changed_at: dict[bytes, float] = {}
 
-    def is_lost(self) -> bool:
-        """Return whether the vehicle is known to be lost (see RemoteStore)."""
-        now = self._clock()
-        return self._vehicle.lost(now) or not self._vehicle.identity.heard_since(now - SILENCE_LIMIT)
+    def why_lost(self) -> str | None:
+        """Return why the vehicle counts as lost (see RemoteStore)."""
+        return self._vehicle.why_lost(self._clock())
 
     # --- reading
 

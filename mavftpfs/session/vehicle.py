@@ -47,6 +47,9 @@ PATIENCE = 20
 """Questions that a vehicle which is heard leaves unanswered before it is believed to be the same one: some
 tell their id only once. From then on it is asked as before, but believed meanwhile."""
 
+_REPLACED = "another vehicle answers in place of the one that was mounted"
+_SILENT = "the vehicle is silent; waiting for its heartbeat"
+
 _OPCODE_INDEX = 3
 _REBOOT_SLACK_MS = 2000
 _OLDEST_NEWS_MS = 20_000
@@ -256,9 +259,19 @@ class Vehicle:
         if writing and not self.may_write:
             raise Armed("the vehicle is armed: nothing is written in flight")
         if self.identity.standing is Standing.STRANGER:
-            raise VehicleLost("another vehicle answers in place of the one that was mounted")
+            raise VehicleLost(_REPLACED)
         if self.lost(now):
-            raise VehicleLost("the vehicle is silent; waiting for its heartbeat")
+            raise VehicleLost(_SILENT)
+
+    def why_lost(self, now: float) -> str | None:
+        """Return why nothing should begin that needs the vehicle; None if it may.
+
+        What is under way goes on until a request has timed out, too (`lost`): the vehicle may come back.
+        """
+        if self.identity.standing is Standing.STRANGER:
+            return _REPLACED
+        silent = not self.identity.heard_since(now - SILENCE_LIMIT)
+        return _SILENT if silent or self.lost(now) else None
 
     def foreign_client(self, now: float) -> bool:
         """Return whether another FTP client of this vehicle was heard lately."""

@@ -151,7 +151,7 @@ class Rig:
     async def lose(self) -> None:
         """Cut the link, and wait until the vehicle counts as lost: no heartbeat came, and no answer."""
         self.world.link.cut()
-        await self._until(lambda: self.connection.store.is_lost())
+        await self._until(lambda: self.connection.store.why_lost() is not None)
         for _ in range(2):
             with suppress(RequestTimeout, VehicleLost):
                 await self.connection.store.list_directory(self.root or b"/")
@@ -159,7 +159,7 @@ class Rig:
     async def find(self) -> None:
         """Mend the link, and wait until the vehicle is heard."""
         self.world.link.restore()
-        await self._until(lambda: not self.connection.store.is_lost())
+        await self._until(lambda: self.connection.store.why_lost() is None)
 
     async def arm(self) -> None:
         """Have the vehicle armed, and wait until that is known."""
