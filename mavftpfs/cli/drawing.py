@@ -12,13 +12,16 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
+from mavftpfs.cli.report import time_left
 from mavftpfs.client.progress import Progress
-from mavftpfs.shared.readable import printable, readable_size, readable_time
+from mavftpfs.shared.readable import printable, readable_size
 
 _REFRESH = 5
 _ROOM = 4
 """Columns that stay free: the terminal's ^C would else begin a line of which rich does not know."""
 _BAR = 40
+_LINE = len("999.9 MB of 999.9 MB, 999.9 kB/s, 59 min 59 s left")
+"""Columns of the longest total, for which there is room from the start: the bar keeps its width."""
 
 
 def totals(progress: Progress) -> str:
@@ -28,7 +31,7 @@ def totals(progress: Progress) -> str:
     if progress.rate is not None:
         parts.append(f"{readable_size(progress.rate)}/s")
     if progress.time_left is not None and progress.done < progress.total:
-        parts.append(f"{readable_time(max(1.0, progress.time_left))} left")
+        parts.append(time_left(progress.time_left))
     return ", ".join(parts)
 
 
@@ -45,6 +48,12 @@ def current(progress: Progress, width: int) -> str:
     return f"{name}  {state}".rstrip()
 
 
+def bar_width(progress: Progress, width: int) -> int:
+    """Return the columns of the bar on a terminal of that width; the same from the first byte to the last."""
+    counts = len(f"{progress.files}/{progress.files} files, ") if progress.files > 1 else 0
+    return max(8, min(_BAR, width - counts - _LINE - 8))
+
+
 class _Screen:
     """What rich draws, again and again."""
 
@@ -58,7 +67,7 @@ class _Screen:
             return Text("looking at what is there")
         line = totals(progress)
         share = progress.done / progress.total if progress.total else 1.0
-        bar = ProgressBar(total=1.0, completed=share, width=max(8, min(_BAR, width - len(line) - 8)))
+        bar = ProgressBar(total=1.0, completed=share, width=bar_width(progress, width))
         row = Table.grid(padding=(0, 1))
         row.add_row(bar, Text(f"{share * 100:3.0f} %"), Text(line, no_wrap=True))
         return Group(row, Text(current(progress, width - _ROOM), no_wrap=True))

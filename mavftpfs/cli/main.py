@@ -250,9 +250,13 @@ def _cat_parser(name: str) -> Parser:
 
 def _put_parser(name: str) -> Parser:
     parser = _source_parser(name, "Put local files on the vehicle, and verify them by size and CRC32.")
-    parser.add_argument("locals", metavar="LOCAL", nargs="+", type=Path, help="a local file or directory")
     parser.add_argument(
-        "path", metavar="PATH", help="a directory of the vehicle, or the new name of one LOCAL; or mftp://"
+        "locals", metavar="LOCAL", nargs="+", type=Path, help="a local file or directory, or - for stdin"
+    )
+    parser.add_argument(
+        "path",
+        metavar="PATH",
+        help="a directory of the vehicle, or the new name of one LOCAL or stdin; or mftp://",
     )
     parser.add_argument("-r", dest="recursive", action="store_true", help="directories too")
     return parser

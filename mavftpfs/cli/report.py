@@ -62,7 +62,17 @@ def _rows(facts: Mapping[str, Any], before: str) -> Iterator[Line]:
         if isinstance(value, Mapping):
             yield from _rows(value, f"{name}: ")
         elif value not in (None, "", [], ()):
-            yield Line(f"{name}: {value}")
+            yield Line(f"{name}: {_fact(value)}")
+
+
+def _fact(value: object) -> str:
+    """Return a value as people write it: yes and no, and no more digits than tell something."""
+    match value:
+        case bool():
+            return "yes" if value else "no"
+        case float():
+            return f"{value:.0f}" if abs(value) >= 100 else f"{value:.3g}"
+    return str(value)
 
 
 def _headline(status: Status) -> str:
@@ -107,7 +117,7 @@ def _transfer_line(transfer: Status) -> Line:
     if transfer["rate"]:
         facts.append(f"{readable_size(transfer['rate'])}/s")
     if transfer["eta"] is not None and transfer["state"] != "waiting":
-        facts.append(f"{readable_time(transfer['eta'])} left")
+        facts.append(time_left(transfer["eta"]))
     if transfer.get("error"):
         facts.append(transfer["error"])
     return Line(f"  {transfer['state']} ", transfer["path"], ": " + ", ".join(facts))
@@ -134,6 +144,11 @@ def _waits_for(status: Status) -> str:
     return ""
 
 
+def time_left(seconds: float) -> str:
+    """Return how much longer it takes; nobody can tell less than a second."""
+    return f"{readable_time(max(1.0, seconds))} left"
+
+
 def count_files(count: int) -> str:
     """Return `1 file`, `2 files`."""
     return f"{count} file" if count == 1 else f"{count} files"
@@ -147,7 +162,7 @@ def delivery_line(status: Status) -> str:
     sending = [transfer for transfer in status["transfers"] if transfer["state"] == "sending"]
     eta = max((t["eta"] for t in status["transfers"] if t["eta"] is not None), default=None)
     rate = f", {readable_size(sending[0]['rate'])}/s" if sending and sending[0]["rate"] else ""
-    left = "" if eta is None or not sending else f", {readable_time(eta)} left"
+    left = "" if eta is None or not sending else f", {time_left(eta)}"
     done, size = (sum(t[key] for t in status["transfers"]) for key in ("done", "size"))
     amount = f"{readable_size(done)} of {readable_size(size)}"
     return f"delivering {count_files(held['files'])}, {amount}{rate}{left}{_waits_for(status)}"
@@ -197,12 +212,16 @@ def screen(lines: Sequence[str]) -> str:
 
 
 def watch_status(fetch: Callable[[], Sequence[Status]], *, verbose: bool) -> None:
-    """Show the status again each second until interrupted; on a terminal in place, on a screen of its own."""
+    """Show the status again each second until interrupted; on a terminal in place, on a screen of its own.
+
+    What was shown last stays.
+    """
     if not sys.stdout.isatty():
         while True:
             print_status(fetch(), verbose=verbose)
             print()
             time.sleep(WATCH_PERIOD)
+    lines: Sequence[str] = ()
     sys.stdout.write("\x1b[?1049h\x1b[?25l\x1b[?7l")  # the alternate screen, no cursor, no wrapping
     try:
         while True:
@@ -214,7 +233,7 @@ def watch_status(fetch: Callable[[], Sequence[Status]], *, verbose: bool) -> Non
             time.sleep(WATCH_PERIOD)
     finally:
         sys.stdout.write("\x1b[?7h\x1b[?25h\x1b[?1049l")
-        sys.stdout.flush()
+        print(*lines, sep="\n", flush=True)
 
 
 def print_json(fetch: Callable[[], Sequence[Status]], *, single: bool, watch: bool) -> None:

@@ -6,6 +6,7 @@ import argparse
 import json
 import logging
 import os
+import shutil
 import signal
 import sys
 from collections.abc import Callable, Coroutine, Iterator, Sequence
@@ -14,6 +15,7 @@ from dataclasses import replace
 from datetime import datetime
 from functools import partial
 from pathlib import Path
+from tempfile import NamedTemporaryFile
 from typing import Any, TypeVar
 
 import trio
@@ -104,7 +106,7 @@ async def until_interrupted(function: Callable[[], Coroutine[Any, Any, ResultT]]
     return results[0]
 
 
-STDOUT = "-"
+STDIN = STDOUT = "-"
 
 
 def _say(line: str) -> None:
@@ -315,14 +317,34 @@ def parse_date(text: str) -> float:
 def put(args: Args) -> int:
     """Put files on the vehicle."""
     (path,), component = names.parse_paths([args.path])
+    if Path(STDIN) in args.locals:
+        if len(args.locals) > 1 or args.recursive:
+            raise UsageError("what comes from stdin is put alone; leave out -r and the other files")
+        with _spooled_stdin() as local:
+            return _put(args, component, partial(upload.put_alone, local=local, path=path))
     batches = [(local, upload.collect(local, recursive=args.recursive)) for local in args.locals]
+    return _put(args, component, partial(upload.put_paths, batches=batches, path=path))
+
+
+@contextmanager
+def _spooled_stdin() -> Iterator[Path]:
+    """Keep what stdin has in a file: how much it is has to be known before, and it may be sent twice."""
+    with NamedTemporaryFile(prefix="mavftpfs-") as file:
+        shutil.copyfileobj(sys.stdin.buffer, file)
+        file.flush()
+        yield Path(file.name)
+
+
+def _put(args: Args, component: int | None, function: Callable[..., Coroutine[Any, Any, None]]) -> int:
     bar = Progress()
+    unverified = parse_options(args.options).client.verify == "none"
+    how = "not verified" if unverified else "verified"
 
     def tell(remote: bytes, size: int) -> None:
-        print(f"{_name(remote)}: {readable_size(size)}, delivered", flush=True)
+        print(f"{_name(remote)}: {readable_size(size)}, {how}", flush=True)
 
     async def work(session: Session) -> None:
-        await upload.put_paths(session, batches, path, bar, tell)
+        await function(session, progress=bar, tell=tell)
 
     def stopped() -> str:
         line = f"{bar.files_done} of {bar.files} files are on the vehicle"

@@ -46,7 +46,7 @@ from mavftpfs.shared.readable import name_text, readable_size
 LEAST_READ, LARGEST_READ = 2048, 128 * 1024
 """Bytes of one read."""
 QUICK, SLOW = 0.25, 1.0
-"""Seconds after which reads become larger, or smaller."""
+"""Seconds: a read that took less is followed by a larger one, one that took more by a smaller one."""
 
 EARLIEST = 946_684_800
 """2000-01-01 UTC: an earlier time tells people nothing. (That a clock was set takes more: see cache.kept.)"""
@@ -64,7 +64,7 @@ def next_read_size(size: int, took: float) -> int:
     """
     if took < QUICK:
         return min(size * 2, LARGEST_READ)
-    return max(size // 2, LEAST_READ) if took > SLOW else size
+    return max(int(size * QUICK / took), LEAST_READ) if took > SLOW else size
 
 
 PART_SUFFIX = ".part"

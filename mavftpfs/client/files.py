@@ -447,6 +447,8 @@ class MountedFiles:
     async def _open(self, path: bytes, flags: int) -> MountedFile:
         def opened(place: bytes) -> tuple[int, int]:
             fd = os.open(place, flags | os.O_CLOEXEC, 0o666)
+            # Else the kernel asks for 128 KiB at once, 22 s on a radio. The mount reads ahead itself.
+            os.posix_fadvise(fd, 0, 0, os.POSIX_FADV_RANDOM)
             return fd, os.fstat(fd).st_size
 
         place = self._place(path)

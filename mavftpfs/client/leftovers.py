@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import re
+import shlex
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -33,6 +34,11 @@ def recovery_directory(source: str) -> Path:
     """Return a new name for what one mount leaves behind now."""
     what = re.sub(r"[^A-Za-z0-9._-]+", "_", source)[:60]
     return recovered_directory() / f"{time.strftime('%Y%m%d-%H%M%S')}-{os.getpid()}-{what}"
+
+
+def put_back_by(source: str, directory: Path) -> str:
+    """Return what people are told to do with a recovery directory."""
+    return f"put them back by: {shlex.join(['mavftpfs', 'recover', source, str(directory)])}"
 
 
 def spool_base(vehicle: Address | None) -> Path:
@@ -77,7 +83,8 @@ def rescue(spool: SpoolDirectory, source: str) -> str:
         if not found:
             return ""
         message = (
-            f"{len(found)} file(s) of an earlier mount did not reach the vehicle; they are in {directory}"
+            f"{len(found)} file(s) of an earlier mount did not reach the vehicle; they are in {directory}; "
+            + put_back_by(source, directory)
         )
     log.warning("%s", message)
     return message

@@ -7,6 +7,7 @@ has acknowledged.
 from __future__ import annotations
 
 import os
+import re
 import secrets
 from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import asynccontextmanager, suppress
@@ -19,9 +20,21 @@ from mavftpfs.client.connect import plain_nursery
 from mavftpfs.client.files import READ_SIZE, WITHDRAWAL_TIME, File, Session, is_directory, written
 from mavftpfs.client.names import emptied, make_directory
 from mavftpfs.client.progress import Progress
-from mavftpfs.shared.errors import CrossDevice, MavftpfsError, NotADirectory, NotDelivered, UsageError
+from mavftpfs.shared.errors import (
+    CrossDevice,
+    IsADirectory,
+    MavftpfsError,
+    NotADirectory,
+    NotDelivered,
+    NotFound,
+    UsageError,
+)
 from mavftpfs.shared.model import join, normalise, split
 from mavftpfs.shared.readable import name_text
+
+BESIDE = ".put-"
+"""Begins the name of a file that a mount has until it is whole."""
+_BESIDE = re.compile(re.escape(BESIDE) + "[0-9a-f]+")
 
 ASK_PERIOD = 0.25
 """Seconds between two looks at how much the vehicle has acknowledged."""
@@ -85,11 +98,25 @@ async def put_paths(
                 tell(remote, await put_file(session, one, remote, progress))
 
 
+async def put_alone(
+    session: Session, local: Path, path: bytes, progress: Progress, tell: Callable[[bytes, int], None]
+) -> None:
+    """Put one file under a name that its own does not tell, as of what came from stdin; else as `put_paths`.
+
+    Raises:
+        IsADirectory: the path is a directory.
+    """
+    if await is_directory(session.files, path):
+        raise IsADirectory(f"{name_text(path)} is a directory; name the file that stdin is to become")
+    progress.plan(1, os.stat(local).st_size)
+    tell(path, await put_file(session, local, path, progress))
+
+
 async def put_file(session: Session, local: Path, remote: bytes, progress: Progress) -> int:
     """Put one file, and return its size.
 
     Raises:
-        UsageError: it cannot be read. NotDelivered.
+        UsageError: it cannot be read. NotFound, NotADirectory: its directory is not there. NotDelivered.
     """
     try:
         with local.open("rb") as source:
@@ -99,9 +126,14 @@ async def put_file(session: Session, local: Path, remote: bytes, progress: Progr
     except OSError as exc:
         raise UsageError(f"{local}: {exc.strerror}") from exc
     except MavftpfsError as exc:
-        there = exc.there if isinstance(exc, NotDelivered) else None
+        name = name_text(remote)
+        # What is written beside has a name that only we know.
+        reason = re.sub(_BESIDE, lambda _: name_text(split(remote)[1]), str(exc)).removeprefix(f"{name}: ")
         done = f"; {progress.files_done} file(s) before it are there" if progress.files_done else ""
-        raise NotDelivered(f"{name_text(remote)} was not delivered: {exc}{done}", there=there) from exc
+        told = f"{name} was not delivered: {reason}{done}"
+        if isinstance(exc, NotFound | NotADirectory):
+            raise type(exc)(told) from exc
+        raise NotDelivered(told, there=exc.there if isinstance(exc, NotDelivered) else None) from exc
     progress.end(planned)
     return size
 
@@ -121,7 +153,7 @@ async def _send_beside(session: Session, source: BinaryIO, remote: bytes, progre
     """Write a new file beside and rename it: else a mount would deliver half a file of an interrupted put.
     What a killed put leaves is a file like any other."""
     files = session.files
-    beside = join(split(remote)[0], b".put-" + secrets.token_hex(4).encode())
+    beside = join(split(remote)[0], f"{BESIDE}{secrets.token_hex(4)}".encode())
     file = await files.create(beside, exclusive=True)
     async with _watched(session, beside, progress), written(file):
         size = await _copy(source, file)

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from mavftpfs.cache.tree import Tree
-from mavftpfs.client.leftovers import recovery_directory
+from mavftpfs.client.leftovers import put_back_by, recovery_directory
 from mavftpfs.shared.errors import MavftpfsError
 
 log = logging.getLogger("mavftpfs.mount")
@@ -44,7 +44,9 @@ async def say_goodbye(tree: Tree, source: str, tell: Callable[[str], None]) -> N
             log.warning("delivering %d file(s) to the vehicle before ending", len(waiting))
             await tree.drain(DRAIN_LIMIT)
     finally:
-        message = keep_the_rest(tree, recovery_directory(source))
+        directory = recovery_directory(source)
+        message = keep_the_rest(tree, directory)
         if message:
+            message += f"; {put_back_by(source, directory)}" if directory.exists() else ""
             log.error("%s", message)
             tell(message)

@@ -88,6 +88,7 @@ def test_what_is_read_is_shown_on_a_terminal(field: Field) -> None:
         screen.read_until(lambda _: screen.raw.count(CLEAR) > 3)
         screen.interrupt()
         assert screen.finish() == 130
+    assert "PX4 1/1, disarmed" in screen.raw.rpartition("\x1b[?1049l")[2]  # the last panel stays
     shown = re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", screen.raw.split(CLEAR)[3]).split("\r\n")
     assert all(len(line) <= 80 for line in shown)
     assert "PX4 1/1, disarmed, link " in shown[0]

@@ -261,7 +261,27 @@ def test_a_growing_log_is_seen_through_a_mount(field: Field, tmp_path: Path) -> 
     with growing(card / "now.ulg"):
         facts = sync(vehicle.source, local, code=2)
     assert states(facts) == {"now.ulg": "growing"}
+    (file,), came = facts["files"], (local / "now.ulg.part").stat().st_size
+    assert (file["size"], file["resumed_at"], facts["bytes_fetched"]) == (came, 0, came)
     assert local_files(local) == {"now.ulg.part"}
+
+
+def test_get_shows_what_a_mount_has_of_a_file(field: Field, tmp_path: Path) -> None:
+    """The kernel would read in pieces of 128 KiB, and get would know of none of them before it is whole."""
+    vehicle = field.sim(field.local("card"), "px4", ("--rate", "10000"))
+    write_log(vehicle.root / "log" / "a.ulg", 150_000, 1, 1)
+    mount = field.mount(vehicle.source, "op_deadline=3600")
+    part = tmp_path / "a.ulg.part"
+
+    def reads() -> int:
+        return sum(
+            transfer["done"] for transfer in json.loads(run("status", "--json", mount.path)[0])["transfers"]
+        )
+
+    with started("get", mount.path, "/log/a.ulg", "--to", f"{tmp_path}/"):
+        wait_until("some of it is read", lambda: reads() > 50_000)
+        vehicle.send_signal(signal.SIGUSR2)  # the link is cut
+        wait_until("get has what the mount has", lambda: part.stat().st_size >= reads() - 8192)
 
 
 # -- terminals ------------------------------------------------------------------------------------

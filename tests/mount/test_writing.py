@@ -20,6 +20,7 @@ from tests.support.mounts import mavftpfs
 from tests.support.places import FOLDERS, NO_RENAME, start_place
 from tests.support.takingturns import taking_turns
 from tests.support.twins import Twins
+from tests.support.vehicles import PROJECT
 
 FAT = ("px4-nuttx", "ardupilot5")
 NOT_ON_FAT = re.compile(rb'[?"*:<>|\\]')
@@ -160,7 +161,11 @@ def test_put_mv_and_rm_without_a_mount(field: Field, tiny_tree: Path) -> None:
     card, local = field.local("card"), field.local("twin")
     source = field.mavsdk(card).source
     said, _ = mavftpfs("put", "-r", source, tiny_tree / "sizes", tiny_tree / "README.txt", "/")
-    assert said.count("delivered") == len(list((tiny_tree / "sizes").iterdir())) + 1
+    assert said.count(", verified\n") == len(list((tiny_tree / "sizes").iterdir())) + 1
+    argv = [sys.executable, "-m", "mavftpfs", "put", source, "-", "/from_stdin"]
+    subprocess.run(argv, input=b"piped", check=True, capture_output=True, cwd=PROJECT, timeout=60)
+    assert (card / "from_stdin").read_bytes() == b"piped"
+    mavftpfs("rm", source, "/from_stdin")
     mavftpfs("mkdir", "-p", source, "/new/deep")
     mavftpfs("mv", source, "/README.txt", "mftp:///new/deep")
     mavftpfs("rm", "-r", source, "/sizes/1.bin", "/sizes/239.bin")

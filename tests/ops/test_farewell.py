@@ -39,6 +39,10 @@ class Patient(FakeTree):
             self.left = []
         return self.left
 
+    def recover_to(self, directory: Path) -> Sequence[Path]:
+        directory.mkdir(parents=True)
+        return super().recover_to(directory)
+
 
 async def end_of(tree: FakeTree) -> list[str]:
     said: list[str] = []
@@ -52,7 +56,11 @@ async def test_what_cannot_be_delivered_is_kept_and_said(state: Path) -> None:
     (line,) = await end_of(tree)
     name, directory = tree.calls[-1]
     assert name == "recover_to"
-    assert line == f"2 file(s) did not reach the vehicle; they are kept in {os.fsdecode(directory)}"
+    place = os.fsdecode(directory)
+    assert line == (
+        f"2 file(s) did not reach the vehicle; they are kept in {place}; "
+        f"put them back by: mavftpfs recover udpin:0.0.0.0:14550 {place}"
+    )
     assert Path(os.fsdecode(directory)).parent == state / "mavftpfs" / "recovered"
     assert os.fsdecode(directory).endswith("-udpin_0.0.0.0_14550")
 
@@ -77,6 +85,7 @@ async def test_a_recovery_directory_that_cannot_be_made_is_said() -> None:
             raise OSError(28, "No space left on device")
 
     (line,) = await end_of(Full(left=[b"/a"]))
+    assert "put them back" not in line
     assert "1 file(s) did not reach the vehicle" in line
     assert "No space left" in line
 
@@ -103,7 +112,9 @@ def test_what_a_dead_mount_left_is_named_once(state: Path) -> None:
     spool = SpoolDirectory(base, random.Random(2))
     line = leftovers.rescue(spool, "tcp:x:1")
     assert line.startswith("1 file(s) of an earlier mount did not reach the vehicle; they are in ")
-    assert [path.read_bytes() for path in Path(line.rpartition(" in ")[2]).iterdir()] == [b"held"]
+    place = line.rpartition(" in ")[2].partition("; ")[0]
+    assert [path.read_bytes() for path in Path(place).iterdir()] == [b"held"]
+    assert line.endswith(f"; put them back by: mavftpfs recover tcp:x:1 {place}")
     assert leftovers.rescue(spool, "tcp:x:1") == ""
     spool.close()
 

@@ -12,7 +12,7 @@ import trio
 from mavftpfs.client import names
 from mavftpfs.client.files import Files, Session
 from mavftpfs.client.progress import Progress
-from mavftpfs.client.upload import collect, put_paths
+from mavftpfs.client.upload import collect, put_alone, put_paths
 from mavftpfs.shared.errors import (
     AlreadyExists,
     CrossDevice,
@@ -22,6 +22,7 @@ from mavftpfs.shared.errors import (
     MavftpfsError,
     NotDelivered,
     NotFound,
+    ReadOnly,
     RequestTimeout,
     UsageError,
     exit_code_for,
@@ -123,6 +124,28 @@ async def test_what_does_not_arrive_is_undelivered(local: Path, call: str) -> No
     assert all(file.closed for file in tree.opened)
 
 
+async def test_a_missing_directory_is_that_and_no_undelivered_file(local: Path) -> None:
+    tree = Card({}, {b"/d"})
+
+    def look(name: str, path: bytes) -> None:
+        if name == "create":
+            tree.kind_of(split(path)[0])
+
+    tree.on_call = look
+    with pytest.raises(NotFound, match="/none/a was not delivered") as caught:
+        await put(tree, local / "a", to=b"/none/a")
+    assert exit_code_for(caught.value) is ExitCode.USAGE
+
+
+async def test_what_came_from_stdin_needs_a_name(local: Path) -> None:
+    tree, told = Card({b"/d/x": b""}), list[bytes]()
+    session = session_of(tree)
+    with pytest.raises(IsADirectory, match="stdin"):
+        await put_alone(session, local / "a", b"/d", Progress(), print)
+    await put_alone(session, local / "a", b"/d/new", Progress(), lambda path, _: told.append(path))
+    assert (tree.files[b"/d/new"], told) == (BIG, [b"/d/new"])
+
+
 # -- names ----------------------------------------------------------------------------------------
 
 
@@ -196,6 +219,21 @@ async def test_by_a_mount_a_file_is_written_beside_where_the_server_can_rename(
     assert tree.files == {b"/x": BIG}
     opened = [path for name, path in tree.calls if name == "open"]
     assert (b"/x" in opened) is not renames
+
+
+async def test_by_a_mount_an_error_names_the_file_and_not_what_is_written_beside(local: Path) -> None:
+    tree = Card({b"/x": b"old"})
+
+    def refuse(name: str, path: bytes) -> None:
+        if name == "create":
+            raise ReadOnly(f"{os.fsdecode(path)}: Read-only file system (the vehicle is armed)")
+
+    tree.on_call = refuse
+    session = Session(cast(Files, tree), mountpoint="/mnt/drone")
+    batch = (local / "a", collect(local / "a", recursive=False))
+    with pytest.raises(NotDelivered) as caught:
+        await put_paths(session, [batch], b"/x", Progress(), print)
+    assert str(caught.value) == ("/x was not delivered: Read-only file system (the vehicle is armed)")
 
 
 async def test_by_a_mount_what_was_interrupted_is_taken_back(local: Path) -> None:

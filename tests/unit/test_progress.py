@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from mavftpfs.cli.drawing import current, totals
+from mavftpfs.cli.drawing import bar_width, current, totals
 from mavftpfs.client.progress import Progress
 
 
@@ -42,3 +42,21 @@ def test_the_end_of_a_long_name_is_shown_and_nothing_a_terminal_obeys() -> None:
     assert line.startswith("…")
     assert line.endswith("/log.ulg  0 B of 1.0 kB")
     assert "\x1b" not in current(progress, 400)
+
+
+def test_the_bar_keeps_its_width() -> None:
+    clock = Clock()
+    progress = Progress(clock)
+    progress.plan(2, 300_000_000)
+    widths, lines = set(), set()
+    for name in ("/a", "/b"):
+        progress.begin(name, 150_000_000)
+        for step in range(1, 11):
+            clock.now += 90.0
+            progress.at(15_000_000 * step)
+            lines.add(len(totals(progress)))
+            widths.add(bar_width(progress, 100))
+        progress.end(150_000_000)
+    assert len(lines) > 3
+    assert len(widths) == 1
+    assert max(lines) + widths.pop() + 8 <= 100

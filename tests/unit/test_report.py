@@ -138,6 +138,22 @@ def test_a_delivery_says_what_it_waits_for() -> None:
     assert delivery_line(status()) == ""
 
 
+def test_nobody_is_told_of_half_a_second() -> None:
+    cache = {"transfers": [{**WRITE, "eta": 0.5}], "write_rate": 300.0, "files_undelivered": 1}
+    assert "1.0 s left" in lines(None, cache)[1]
+    assert "1.0 s left" in delivery_line(status(None, {**cache, "bytes_undelivered": 1}))
+
+
+def test_the_rest_is_in_round_numbers_and_in_words() -> None:
+    facts = {"rtt": 0.0412345678, "other_ftp_client": True, "received_bytes": 123456789}
+    shown = [line.fitted() for line in status_lines(status(facts), verbose=True)]
+    assert "  link: rtt: 0.0412" in shown
+    assert "  link: rate: 5100" in shown
+    assert "  link: other ftp client: yes" in shown
+    assert "  vehicle: armed: no" in shown
+    assert "  link: received bytes: 123456789" in shown
+
+
 @pytest.mark.parametrize(("width", "height"), [(80, 24), (200, 50), (40, 5), (20, 2)])
 @pytest.mark.parametrize("mounts", [1, 2, 7])
 def test_a_panel_fits_the_terminal(width: int, height: int, mounts: int) -> None:
