@@ -13,10 +13,11 @@ from mavftpfs.client.connect import connect_options, mount_with, opened, waiting
 from mavftpfs.client.files import Target, mount_status
 from mavftpfs.client.options import Options
 from mavftpfs.link.base import Link
-from mavftpfs.link.messages import MAV_AUTOPILOT_INVALID, MAV_TYPE_GCS, Address, Heartbeat
+from mavftpfs.link.messages import MAV_TYPE_GCS, Address, Heartbeat
+from mavftpfs.link.peers import describe_peer
 from mavftpfs.session.connection import HEARD_SOON, connected
 from mavftpfs.shared.errors import FtpNak, MavftpfsError, VehicleLost
-from mavftpfs.shared.readable import autopilot_name, readable_time
+from mavftpfs.shared.readable import readable_time
 
 Entry = dict[str, Any]
 
@@ -27,27 +28,6 @@ PROBE_TIME = 6.0
 LEAST_PROBE = 1.5
 """Seconds that each has at least, however many there are."""
 _TICK = 0.1
-
-_COMPONENTS = {
-    1: "autopilot",
-    68: "telemetry radio",
-    **dict.fromkeys(range(100, 106), "camera"),
-    154: "gimbal",
-    158: "peripheral",
-    190: "mission planner",
-    191: "companion computer",
-    **dict.fromkeys(range(192, 195), "companion computer"),
-    240: "MAVLink router",
-}
-_TYPES = {
-    **{1: "fixed wing", 2: "quadrotor", 3: "coaxial helicopter", 4: "helicopter", 5: "antenna tracker"},
-    **{7: "airship", 8: "balloon", 9: "rocket", 10: "rover", 11: "boat", 12: "submarine"},
-    **{13: "hexarotor", 14: "octorotor", 15: "tricopter", 29: "dodecarotor"},
-    **dict.fromkeys(range(19, 26), "VTOL"),
-    **{6: "ground station", 18: "companion computer", 26: "gimbal", 27: "ADS-B receiver", 30: "camera"},
-    **{33: "gimbal", 34: "battery", 36: "battery", 35: "parachute", 37: "telemetry radio"},
-}
-"""MAV_COMPONENT and MAV_TYPE values people meet."""
 
 
 async def scan(target: Target) -> list[Entry]:
@@ -182,18 +162,3 @@ def _of_mount(status: Mapping[str, Any]) -> list[Entry]:
     ]
     others = [one for one in heard if one.source != (vehicle["system"], vehicle["component"])]
     return [own, *(_entry(one, f"not asked (the mount on {mounted} has the link)") for one in others)]
-
-
-def describe_peer(heartbeat: Heartbeat) -> str:
-    """Return what a heartbeat says its sender is."""
-    kind = _TYPES.get(heartbeat.vehicle_type)
-    if heartbeat.vehicle_type == MAV_TYPE_GCS:
-        return "ground station"
-    if heartbeat.autopilot == MAV_AUTOPILOT_INVALID:
-        return (
-            kind
-            or _COMPONENTS.get(heartbeat.source.component)
-            or f"component of type {heartbeat.vehicle_type}"
-        )
-    words = [autopilot_name(heartbeat.autopilot), *([kind] if kind else [])]
-    return f"{' '.join(words)}, {'armed' if heartbeat.armed else 'disarmed'}"

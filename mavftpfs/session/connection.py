@@ -22,6 +22,7 @@ from mavftpfs.link.messages import (
     MAV_TYPE_ONBOARD_CONTROLLER,
     Address,
 )
+from mavftpfs.link.peers import describe_peer
 from mavftpfs.protocol.budget import FRAME_OVERHEAD, SIGNATURE, Budget
 from mavftpfs.protocol.engine import Engine
 from mavftpfs.protocol.flow import Flow
@@ -173,7 +174,7 @@ class Connection:
         return "lossy" if self.engine.flow.loss >= LOSSY else "fine"
 
     def _heard(self) -> str:
-        heard = sorted(self.vehicle.heard)
+        heard = [self.vehicle.heard[source] for source in sorted(self.vehicle.heard)]
         bad_signatures, bad_times = self.driver.framer.stats.bad_signature, self.driver.framer.stats.bad_time
         if not heard and bad_times:
             return (
@@ -184,7 +185,9 @@ class Connection:
             return f": heard only {bad_signatures} frames with no or a bad signature; check signing_key"
         if not heard:
             return ": no heartbeat heard at all; check SOURCE, cable, baud rate and port"
-        names = ", ".join(f"{system}/{component}" for system, component in heard)
+        names = ", ".join(
+            f"{one.source.system}/{one.source.component} ({describe_peer(one)})" for one in heard
+        )
         return f": heard only {names}; check target_system and target_component"
 
     # --- what the vehicle tells

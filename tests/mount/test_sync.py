@@ -282,6 +282,7 @@ def test_get_shows_what_a_mount_has_of_a_file(field: Field, tmp_path: Path) -> N
         wait_until("some of it is read", lambda: reads() > 50_000)
         vehicle.send_signal(signal.SIGUSR2)  # the link is cut
         wait_until("get has what the mount has", lambda: part.stat().st_size >= reads() - 8192)
+        vehicle.send_signal(signal.SIGUSR2)  # it can be unmounted
 
 
 # -- terminals ------------------------------------------------------------------------------------

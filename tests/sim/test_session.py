@@ -187,7 +187,7 @@ async def test_silence_fails_one_request_and_then_all_at_once(autojump: MockCloc
 
 async def test_no_vehicle_says_what_was_heard(autojump: MockClock) -> None:
     here = world("px4")
-    with pytest.raises(VehicleLost, match="heard only 1/1"):
+    with pytest.raises(VehicleLost, match=r"heard only 1/1 \(PX4 quadrotor, disarmed\); check target_system"):
         async with here.connection(ConnectOptions(target_system=9)):
             raise AssertionError("connected to nobody")
 

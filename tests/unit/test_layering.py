@@ -43,6 +43,7 @@ PURE_MODULES = {
     "link.framing",
     "link.fastframe",
     "link.messages",
+    "link.peers",
     "link.signing",
     "link.uri",
     "session.doubt",
