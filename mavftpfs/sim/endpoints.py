@@ -29,7 +29,7 @@ from mavftpfs.shared.errors import UsageError
 from mavftpfs.sim.linkmodel import Direction, Duplex, LinkModel, LinkSettings
 from mavftpfs.sim.profiles import PROFILES
 from mavftpfs.sim.tree import DirectoryTree
-from mavftpfs.sim.vehicle import SimVehicle
+from mavftpfs.sim.vehicle import AUTOPILOT, SimVehicle
 
 _PTY_OUTBOX = 16 * 1024
 _ANSWER_AT = 16
@@ -188,7 +188,8 @@ as PX4's simulator does; udpin:0.0.0.0:14550 waits to be spoken to; tcpin:127.0.
 simulator does; pty makes a serial port and prints its name. With any of --rate, --mtu, --delay, --jitter,
 --loss, --burst-loss, --dup, --corrupt or --reorder, frames go through the model of a bad link.
 
-Signals: SIGUSR1 arms or disarms, SIGUSR2 cuts or mends the link, SIGHUP reboots, SIGINT and SIGTERM end.
+Signals: SIGUSR1 arms or disarms (kill -USR1 PID), SIGUSR2 cuts or mends the link, SIGPWR reboots. It ends by
+SIGINT (Ctrl-C), by SIGTERM, and with its terminal.
 """
 
 
@@ -202,6 +203,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--profile", default="px4", choices=sorted(PROFILES), help="whose FTP server (default px4)"
     )
     parser.add_argument("--link", default=DEFAULT_LINK, metavar="URL", help=f"default {DEFAULT_LINK}")
+    parser.add_argument(
+        "--system", type=_system, default=AUTOPILOT.system, metavar="ID", help="its system id (default 1)"
+    )
+    parser.add_argument(
+        "--no-storage",
+        dest="tells_storage",
+        action="store_const",
+        const=False,
+        help="do not tell the size of the card (default: as the profile does)",
+    )
     parser.add_argument("--armed", action="store_true", help="be armed from the start")
     parser.add_argument(
         "--telemetry", type=_rate, default=0.0, metavar="B/s", help="other messages (default none)"
@@ -210,7 +221,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Serve until SIGINT or SIGTERM; returns the exit code.
+    """Serve until one of _ENDING comes; returns the exit code.
 
     Raises:
         UsageError: DIR or an option is wrong.
@@ -234,8 +245,10 @@ def run(args: argparse.Namespace) -> int:
         tree,
         profile,
         rng=rng,
+        address=AUTOPILOT._replace(system=args.system),
         telemetry=args.telemetry,
         armed=args.armed,
+        tells_storage=args.tells_storage,
     )
     trio.run(_serve, args.link, vehicle, model, sys.stdout)
     return 0
@@ -284,9 +297,12 @@ def _add_model_arguments(group: argparse._ArgumentGroup) -> None:
     group.add_argument("--seed", type=int, default=0, metavar="N", help="of everything random (default 0)")
 
 
+_ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+_REACTING = (signal.SIGUSR1, signal.SIGUSR2, signal.SIGPWR)
+
+
 async def _serve(link_text: str, vehicle: SimVehicle, model: LinkModel | None, out: TextIO) -> None:
-    signals = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGUSR2, signal.SIGHUP)
-    with trio.open_signal_receiver(*signals) as arriving:
+    with trio.open_signal_receiver(*_ENDING, *_REACTING) as arriving:
         async with open_endpoint(link_text) as link:
             # The vehicle was built before its link: only now is it known whether it hears a stream.
             vehicle.set_stream(link.is_stream)
@@ -295,7 +311,7 @@ async def _serve(link_text: str, vehicle: SimVehicle, model: LinkModel | None, o
             async with trio.open_nursery() as nursery:
                 nursery.start_soon(endpoint.run)
                 async for number in arriving:
-                    if number in (signal.SIGINT, signal.SIGTERM):
+                    if number in _ENDING:
                         break
                     _say(out, _react(number, endpoint))
                 nursery.cancel_scope.cancel()
@@ -330,6 +346,12 @@ def _between(low: float, high: float, what: str) -> Callable[[str], float]:
         return value
 
     return parse
+
+
+def _system(text: str) -> int:
+    if not text.isascii() or not text.isdigit() or not 1 <= int(text) <= 255:
+        raise argparse.ArgumentTypeError(f"{text!r} is no system id (1 to 255)")
+    return int(text)
 
 
 _rate = _between(0, 1e12, "rate in bytes per second")

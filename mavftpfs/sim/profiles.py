@@ -67,6 +67,9 @@ class Profile:
     path_limit: int = 238
     """Longer paths are cut silently (PX4, ArduPilot)."""
 
+    tells_storage: bool = True
+    """STORAGE_INFORMATION is sent to who asks for it (not by MAVSDK's server)."""
+
     # Sessions
     sessions: int = 1
     idle_close: float | None = None
@@ -163,6 +166,7 @@ _ARDUPILOT5 = Profile(
 _MAVSDK = Profile(
     name="mavsdk",
     family=Family.MAVSDK,
+    tells_storage=False,
     list_with_time=True,
     path_limit=239,
     write_only_truncates=True,

@@ -143,6 +143,7 @@ class SimVehicle:
     Args:
         telemetry: bytes per second of unasked messages beside heartbeat and system time.
         armed: state at the start; also after a reboot it is disarmed.
+        tells_storage: answers who asks for STORAGE_INFORMATION; None: as the profile does.
         signing_key: as for Framer.
 
     Attributes:
@@ -158,6 +159,7 @@ class SimVehicle:
         address: Address = AUTOPILOT,
         telemetry: float = 0.0,
         armed: bool = False,
+        tells_storage: bool | None = None,
         signing_key: bytes | None = None,
     ) -> None:
         self.server = FtpServer(tree, profile, rng=rng)
@@ -167,8 +169,9 @@ class SimVehicle:
         self.telemetry = telemetry
         self.armed = armed
         self.tells_time = True
+        self.tells_storage = profile.tells_storage if tells_storage is None else tells_storage
         self.heard: dict[Address, Heartbeat] = {}
-        self._uid = rng.getrandbits(64)
+        self._uid = rng.getrandbits(64) ^ address.system  # another one beside it, of the same seed
         self._booted_at: float | None = None
         self._down_until = float("-inf")
         self._next_beat = float("-inf")
@@ -310,7 +313,7 @@ class SimVehicle:
             frame = self._version()
         elif asks and wanted == SYSTEM_TIME_ID:
             frame = self._system_time(now)
-        elif asks and wanted == STORAGE_INFORMATION_ID:
+        elif asks and wanted == STORAGE_INFORMATION_ID and self.tells_storage:
             size = (CAPACITY_MIB, CAPACITY_MIB / 4, CAPACITY_MIB * 3 / 4)
             frame = self.framer.encode("storage_information", self._boot_ms(now), 1, 1, 2, *size, 0, 0)
         result = _UNSUPPORTED if frame is None else _ACCEPTED

@@ -46,7 +46,7 @@ def test_the_log_has_one_line_for_each_thing_that_happens(field: Field, small_tr
     assert ": PX4 1/1, disarmed, LOST: last heard " in mount.run(*STATUS, mount.path).stdout
     vehicle.send_signal(signal.SIGUSR2)
     logged(mount, "is back")
-    vehicle.send_signal(signal.SIGHUP)
+    vehicle.send_signal(signal.SIGPWR)
     logged(mount, "restarted")
     assert news(mount) == [
         "mavftpfs: vehicle 1/1 is armed: nothing is written to it until it is disarmed",

@@ -48,7 +48,18 @@ def test_arguments_reach_the_model() -> None:
 
 @pytest.mark.parametrize(
     "words",
-    ["--loss 1.5", "--loss -1", "--loss nan", "--rate 0", "--queue x", "--delay -1", "--profile mine"],
+    [
+        "--system 0",
+        "--system 256",
+        "--system x",
+        "--loss 1.5",
+        "--loss -1",
+        "--loss nan",
+        "--rate 0",
+        "--queue x",
+        "--delay -1",
+        "--profile mine",
+    ],
 )
 def test_nonsense_is_refused(words: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
@@ -108,12 +119,20 @@ def test_says_where_to_connect_reacts_to_signals_and_ends_cleanly(tmp_path: Path
             (signal.SIGUSR1, "disarmed"),
             (signal.SIGUSR2, "link cut"),
             (signal.SIGUSR2, "link mended"),
-            (signal.SIGHUP, "rebooted"),
+            (signal.SIGPWR, "rebooted"),
         ):
             child.send_signal(number)
             assert line(child.stdout) == says
         child.send_signal(signal.SIGTERM)
         assert line(child.stdout) == "ended after 0 FTP requests, open sessions: 0"
+        assert child.wait(60) == 0
+
+
+def test_it_ends_with_its_terminal(tmp_path: Path) -> None:
+    with running(str(tmp_path), "--link", f"udpout:127.0.0.1:{free_udp_port()}") as child:
+        line(child.stdout)
+        child.send_signal(signal.SIGHUP)
+        assert line(child.stdout).startswith("ended")
         assert child.wait(60) == 0
 
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import importlib.util
+import re
 import sys
+import tomllib
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -42,6 +44,18 @@ def test_an_index_shows_links_that_lead_somewhere(hook: Any) -> None:
     assert hook.for_an_index(PAGE, None) == (
         "\n\nSee the guide, [below](#below) and [others](https://example.org/).\n"
     )
+
+
+def test_the_readme_of_this_project_keeps_its_pictures(hook: Any) -> None:
+    root = HOOK.parent
+    urls = tomllib.loads((root / "pyproject.toml").read_text())["project"]["urls"]
+    project, metadata = hook.CustomMetadataHook(), {"urls": urls}
+    project.root = str(root)
+    project.update(metadata)
+    pictures = re.findall(r"!\[[^\]]+\]\(([^)]*)\)", metadata["readme"]["text"])
+    assert len(pictures) == len(re.findall(r"!\[", (root / "README.md").read_text())) >= 2
+    for picture in pictures:
+        assert (root / picture.removeprefix(f"{urls['Source']}/raw/HEAD/")).is_file()
 
 
 def test_a_machine_that_lacks_something_is_refused(hook: Any, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,12 +7,13 @@ from typing import TypeVar
 
 import pytest
 
-from mavftpfs.link.framing import Framer
+from mavftpfs.link.framing import STORAGE_INFORMATION_ID, Framer
 from mavftpfs.link.messages import (
     Address,
     FtpRun,
     Heartbeat,
     Message,
+    StorageInformation,
     SystemTime,
 )
 from mavftpfs.protocol.payload import Opcode, request
@@ -118,3 +119,22 @@ def test_another_ground_station_is_heard_with_its_answers() -> None:
     assert [(f.source, f.target) for f in heard] == [(gcs, DRONE), (DRONE, gcs)]
     client.vehicle.foreign_request(LIST, gcs, client.now, audible=False)
     assert [(f.source, f.target) for f in of(FtpRun, client.hear(0.5))] == [(DRONE, gcs)]
+
+
+def ask_for_storage(client: Client) -> list[StorageInformation]:
+    """Return what it says of its card, to who asks."""
+    client.tell(client.framer.encode_request_message(client.vehicle.address, STORAGE_INFORMATION_ID))
+    return [message for message in client.hear() if isinstance(message, StorageInformation)]
+
+
+def test_the_size_of_the_card_is_told_by_profile_unless_told_otherwise() -> None:
+    assert ask_for_storage(Client("px4"))
+    assert not ask_for_storage(Client("mavsdk"))
+    assert not ask_for_storage(Client("px4", tells_storage=False))
+
+
+def test_two_vehicles_of_one_seed_are_told_apart() -> None:
+    first, second = Client(), Client(address=Address(2, 1))
+    assert first.vehicle._uid != second.vehicle._uid
+    heard = [message for message in second.hear(1.5) if isinstance(message, Heartbeat)]
+    assert {message.source for message in heard} == {Address(2, 1)}
