@@ -10,7 +10,9 @@ from __future__ import annotations
 import argparse
 import os
 import re
+import shlex
 import shutil
+import stat
 import subprocess
 import sys
 from collections.abc import Iterator, Mapping
@@ -26,6 +28,8 @@ from mavftpfs.mount.options import option_help
 from mavftpfs.shared.errors import EXIT_CODES, ExitCode, UsageError
 
 SHELLS = ("bash", "zsh", "fish")
+HELPER = "mount.mavftpfs"
+"""What mount(8) runs for `-t mavftpfs`."""
 MAN_WIDTH = 72
 """Columns of what a man page shows as it is."""
 
@@ -86,13 +90,19 @@ def _escaped(text: str) -> str:
 SYSTEMD_RUNS = Path("/run/systemd/system")
 
 
+MARK = "# Made by mavftpfs install."
+"""In a program that is to be told from those of others by the same name."""
+
+
 @dataclass(frozen=True, slots=True)
 class Piece:
-    """One file to install. text: its content; link: what it points to, for a symbolic link."""
+    """One file to install. text: its content; link: what it points to, for a symbolic link. program: it is to
+    be run, and something that others put there stays."""
 
     path: Path
     text: str = ""
     link: Path | None = None
+    program: bool = False
 
     def shown(self) -> str:
         """Return path and content for `--print`."""
@@ -105,19 +115,32 @@ class Piece:
         self.path.parent.mkdir(parents=True, exist_ok=True)
         if self.link is None:
             self.path.write_text(self.text)
-        elif not self.is_there():
+            if self.program:
+                self.path.chmod(0o755)
+        else:
+            self.path.unlink(missing_ok=True)
             self.path.symlink_to(self.link)
 
     def is_there(self) -> bool:
         """Return whether something has its path; a symbolic link that leads nowhere counts."""
         return os.path.lexists(self.path)
 
+    def is_others(self) -> bool:
+        """Return whether what has its path was put there by somebody else, as pipx or a package."""
+        if self.link is not None:
+            return self.is_there() and not self.path.is_symlink()
+        return self.program and self.is_there() and (self.path.is_symlink() or MARK not in _text(self.path))
+
+
+def _text(path: Path) -> str:
+    return path.read_bytes().decode(errors="replace")
+
 
 def run(args: argparse.Namespace, parser: argparse.ArgumentParser) -> int:
     """Install, show or remove, for this user or, as root, for everybody.
 
     Raises:
-        UsageError: a file cannot be written or removed.
+        UsageError: a file cannot be written or removed, or others than root could change what all are to run.
     """
     program = own_program()
     everybody = os.geteuid() == 0
@@ -128,8 +151,10 @@ def run(args: argparse.Namespace, parser: argparse.ArgumentParser) -> int:
     if args.print:
         print("\n".join(piece.shown() for piece in pieces), end="")
         return ExitCode.OK
+    if everybody and not args.root and not args.remove:
+        check_program(program)
     for piece in pieces:
-        if args.remove and not piece.is_there():
+        if piece.is_others() or (args.remove and not piece.is_there()):
             continue
         try:
             (piece.path.unlink if args.remove else piece.put)()
@@ -144,12 +169,31 @@ def run(args: argparse.Namespace, parser: argparse.ArgumentParser) -> int:
 
 
 def own_program() -> Path:
-    """Return the path by which this program is called."""
+    """Return this program itself, not a link to it: that may be one of ours, which is taken away again."""
     name = sys.argv[0]
     found = name if os.sep in name else shutil.which(name)
     if found is None or not os.access(found, os.X_OK):
         found = shutil.which("mavftpfs") or name
-    return Path(os.path.abspath(found))
+    return Path(os.path.realpath(found))
+
+
+def check_program(program: Path) -> None:
+    """Check that only root can change what root and everybody are to run.
+
+    Raises:
+        UsageError: somebody else can, or there is no mount.mavftpfs beside the program.
+    """
+    if not program.with_name(HELPER).exists():
+        raise UsageError(f"there is no {HELPER} beside {program}; run the mavftpfs of an installation")
+    for place in (program, Path(mavftpfs.__file__), Path(os.path.realpath(sys.executable))):
+        for path in (place, *place.parents):
+            facts = path.stat()
+            open_to_all = facts.st_mode & stat.S_IWOTH and not facts.st_mode & stat.S_ISVTX
+            if facts.st_uid != 0 or open_to_all:
+                raise UsageError(
+                    f"{path} can be changed by others than root, who would run it; install a copy of root's "
+                    "own: sudo PIPX_HOME=/opt/pipx PIPX_BIN_DIR=/usr/local/bin pipx install ."
+                )
 
 
 def for_user(
@@ -172,9 +216,9 @@ def for_everybody(parser: argparse.ArgumentParser, program: Path, root: Path) ->
     yield from _completions(parser, data, data / "fish/vendor_completions.d")
     yield Piece(root / "usr/local/lib/systemd/user/mavftpfs@.service", _unit(program))
     yield Piece(root / "etc/udev/rules.d/70-mavftpfs.rules", _data("70-mavftpfs.rules"))
-    yield Piece(root / "sbin/mount.mavftpfs", link=program.with_name("mount.mavftpfs"))
-    if program.parent != Path("/usr/local/bin"):
-        yield Piece(root / "usr/local/bin/mavftpfs", link=program)
+    yield Piece(root / "sbin" / HELPER, link=program.with_name(HELPER))
+    caller = f'#!/bin/sh\n{MARK}\nexec {shlex.quote(str(program))} "$@"\n'  # for mount -t fuse.mavftpfs
+    yield Piece(root / "usr/local/bin/mavftpfs", caller, program=True)
 
 
 def _completions(parser: argparse.ArgumentParser, data: Path, fish: Path) -> Iterator[Piece]:

@@ -1,16 +1,22 @@
-"""The systemd unit by use: its own commands, as systemd would run them, on a simulated serial port."""
+"""What `mavftpfs install` brings, by use: the systemd unit's own commands, as systemd would run them, on a
+simulated serial port; and install, remove, install, upgrade and uninstall, as root and in a namespace."""
 
 from __future__ import annotations
 
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
+import mavftpfs
 from mavftpfs.cli import install
 from tests.mount.conftest import Field
 from tests.support.mounts import abort_mount, mounted_at, wait_until
+from tests.support.vehicles import PROJECT
 
 
 def commands(unit: str, key: str, home: Path, device: str, options: str) -> list[list[str]]:
@@ -57,3 +63,106 @@ def test_the_unit_mounts_and_unmounts(field: Field, tiny_tree: Path, tmp_path: P
         assert not mountpoint.exists()
     finally:
         abort_mount(mountpoint)
+
+
+# -- the life of an installation ------------------------------------------------------------------
+
+IN_A_NAMESPACE = """
+set -eu
+mkdir "$1"
+mount -t tmpfs none "$1"
+for place in usr/local usr/sbin etc; do
+    mkdir -p "$1/up/$place" "$1/work/$place"
+    mount -t overlay none -o "lowerdir=/$place,upperdir=$1/up/$place,workdir=$1/work/$place" "/$place"
+done
+written() { (cd "$1/up" && find . -type f -o -type l | sort | sed "s,^,$2 ,"); }
+"""
+
+
+class Installation:
+    """A program that root installed, run in a namespace whose /usr/local, /usr/sbin and /etc are copies."""
+
+    def __init__(self, folder: Path) -> None:
+        self.copy, self.library, self.programs = folder / "copy", folder / "library", folder / "bin"
+        shutil.copytree(PROJECT / "mavftpfs", self.library / "mavftpfs")
+        self.programs.mkdir()
+        for name, function in (("mavftpfs", "main"), ("mount.mavftpfs", "mount_helper")):
+            program = self.programs / name
+            program.write_text(
+                f"#!{sys.executable}\nimport sys\nsys.path.insert(0, {str(self.library)!r})\n"
+                f"from mavftpfs.cli import main\nsys.exit(main.{function}())\n"
+            )
+            program.chmod(0o755)
+
+    def run(self, *steps: str, code: int = 0) -> dict[str, list[str]]:
+        """Run the steps of a script; return what its lines say, by their first words."""
+        script = "\n".join([IN_A_NAMESPACE, *steps])
+        places = map(str, (self.copy, self.programs, self.library))
+        command = ["unshare", "--mount", "sh", "-c", script, "sh", *places]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
+        assert done.returncode == code, done.stdout + done.stderr
+        said: dict[str, list[str]] = {"error": done.stderr.splitlines()}
+        for line in done.stdout.splitlines():
+            key, _, words = line.partition(" ")
+            said.setdefault(key, []).append(words)
+        return said
+
+
+@pytest.fixture
+def installation(tmp_path: Path) -> Installation:
+    """One that is not installed yet."""
+    return Installation(tmp_path)
+
+
+CHECK = 'mount.mavftpfs -f udpin:127.0.0.1:14550 /mnt && echo "version $(/usr/local/bin/mavftpfs --version)"'
+
+
+def test_install_remove_install_upgrade_and_uninstall(installation: Installation) -> None:
+    said = installation.run(
+        '"$2/mavftpfs" install >/dev/null',
+        'written "$1" first',
+        CHECK,
+        "/usr/local/bin/mavftpfs install --remove >/dev/null",
+        'written "$1" removed',
+        '"$2/mavftpfs" install >/dev/null',
+        'written "$1" second',
+        CHECK,
+        # the next version, at another place
+        """sed -i 's/^__version__ = .*/__version__ = "9.8.7"/' "$3/mavftpfs/__init__.py" """,
+        'mv "$2" "$2.new"',
+        '"$2.new/mavftpfs" install >/dev/null',
+        'written "$1" upgraded',
+        CHECK,
+        "grep -c 9.8.7 /usr/local/share/man/man1/mavftpfs.1",
+        "mavftpfs install --remove >/dev/null",
+        'rm -r "$2.new"',
+        'written "$1" uninstalled',
+    )
+    assert len(said["first"]) >= 9
+    assert {"./usr/local/bin/mavftpfs", "./usr/sbin/mount.mavftpfs"} < set(said["first"])
+    assert said["first"] == said["second"] == said["upgraded"]
+    assert [version.split()[1] for version in said["version"]] == [mavftpfs.__version__] * 2 + ["9.8.7"]
+    assert "removed" not in said
+    assert "uninstalled" not in said
+
+
+def test_what_others_put_there_stays(installation: Installation) -> None:
+    said = installation.run(
+        'ln -s "$2/mavftpfs" /usr/local/bin/mavftpfs',  # as pipx does
+        "mavftpfs install >/dev/null",
+        CHECK,
+        "mavftpfs install --remove >/dev/null",
+        'written "$1" left',
+    )
+    assert said["left"] == ["./usr/local/bin/mavftpfs"]
+
+
+@pytest.mark.parametrize("place", ["$2/mavftpfs", "$3"])
+def test_root_does_not_run_what_another_user_owns(installation: Installation, place: str) -> None:
+    said = installation.run(
+        f'chown 1000 "{place}"', "trap 'written \"$1\" left' EXIT", '"$2/mavftpfs" install', code=1
+    )
+    assert "left" not in said
+    (line,) = said["error"]
+    assert "can be changed by others than root" in line
+    assert "PIPX_HOME" in line
