@@ -21,44 +21,22 @@ from functools import partial
 from importlib.resources import files
 from pathlib import Path
 
-import shtab
-
 import mavftpfs
+from mavftpfs.cli.completion import SHELLS, commands_of, completion
 from mavftpfs.mount.options import option_help
 from mavftpfs.shared.errors import EXIT_CODES, ExitCode, UsageError
 
-SHELLS = ("bash", "zsh", "fish")
 HELPER = "mount.mavftpfs"
 """What mount(8) runs for `-t mavftpfs`."""
 MAN_WIDTH = 72
 """Columns of what a man page shows as it is."""
-
-_PLACES = {
-    "source": shtab.FILE,
-    "mountpoint": shtab.DIRECTORY,
-    "locals": shtab.FILE,
-    "local": shtab.DIRECTORY,
-    "to": shtab.FILE,
-    "directory": shtab.DIRECTORY,
-}
-"""What an argument of that name is completed with, where it stands for a local file."""
-
-
-def completion(parser: argparse.ArgumentParser, shell: str) -> str:
-    """Return the completion script for `mavftpfs` in one of SHELLS."""
-    for each in (parser, *_commands(parser).values()):
-        for action in each._actions:
-            if action.dest in _PLACES:
-                action.complete = _PLACES[action.dest]  # type: ignore[attr-defined]  # shtab's way
-    script: str = shtab.complete(parser, shell)
-    return script
 
 
 def man_page(parser: argparse.ArgumentParser) -> str:
     """Return mavftpfs(1) in man's own language; the commands as their `--help` shows them."""
     commands = [
         f".SS mavftpfs {name}\n.nf\n{_escaped(_help(command))}\n.fi"
-        for name, command in _commands(parser).items()
+        for name, command in commands_of(parser).items()
     ]
     options = [f".TP\n.B {name}\n{_escaped(text)}" for name, text in option_help().items()]
     exits = [f".TP\n.B {code:d}\n{_escaped(words)}" for code, words in EXIT_CODES.items()]
@@ -71,14 +49,6 @@ def man_page(parser: argparse.ArgumentParser) -> str:
 def _help(command: argparse.ArgumentParser) -> str:
     command.formatter_class = partial(argparse.HelpFormatter, width=MAN_WIDTH)
     return command.format_help()
-
-
-def _commands(parser: argparse.ArgumentParser) -> Mapping[str, argparse.ArgumentParser]:
-    for action in parser._actions:
-        if isinstance(action, argparse._SubParsersAction):
-            found: Mapping[str, argparse.ArgumentParser] = action.choices
-            return found
-    return {}
 
 
 def _escaped(text: str) -> str:

@@ -113,15 +113,17 @@ def seconds(low: float, high: float) -> Parser:
     return parse
 
 
-def choice(*words: str) -> Parser:
-    """Return a parser that takes one of `words`."""
+class Choice:
+    """A parser that takes one of a few words."""
 
-    def parse(text: str) -> str:
-        if text not in words:
-            raise ValueError(f"must be one of {', '.join(words)}")
+    def __init__(self, *words: str) -> None:
+        self.words = words
+
+    def __call__(self, text: str) -> str:
+        """See Parser."""
+        if text not in self.words:
+            raise ValueError(f"must be one of {', '.join(self.words)}")
         return text
-
-    return parse
 
 
 def text_value(text: str) -> str:
@@ -162,7 +164,7 @@ VALUES: Values = {
     "target_component": Value(number(0, 255), "which part of it; 0: the first heard"),
     "source_system": Value(number(1, 255), "who we are on the link: 254"),
     "source_component": Value(number(1, 255), "and which part: 191"),
-    "heartbeat": Value(choice("onboard", "gcs", "none"), "what we say we are: onboard, gcs or none"),
+    "heartbeat": Value(Choice("onboard", "gcs", "none"), "what we say we are: onboard, gcs or none"),
     "baud": Value(number(300, 12_000_000), "of a serial line: 57600"),
     "signing_key": Value(text_value, "file with the key of MAVLink 2 signing, mode 0600"),
     "dir_timeout": Value(seconds(0, _DAY), "seconds that a listing is kept: 20, longer if it is slow"),
@@ -175,15 +177,15 @@ VALUES: Values = {
     "rmw_max": Value(size(0, _SIZE_MAX, auto=True), "largest file sent again whole for a changed part: auto"),
     "op_deadline": Value(seconds(1, 3600), "seconds without progress until an error: 30"),
     "connect_timeout": Value(seconds(1, 3600), "seconds for the first heartbeat and listing: 30"),
-    "read_mode": Value(choice("window", "burst"), "window or burst"),
+    "read_mode": Value(Choice("window", "burst"), "window or burst"),
     "chunk": Value(number(16, 239, auto=True), "bytes of a file in a packet, 16 to 239: auto"),
     "window": Value(number(1, 256, auto=True), "requests in flight at most: auto"),
     "bwlimit": Value(size(100, _SIZE_MAX), "bytes per second that we may cause on the link"),
     "verify": Value(
-        choice("auto", "size", "crc", "none"), "written files: auto (size, and CRC32), size, crc, none"
+        Choice("auto", "size", "crc", "none"), "written files: auto (size, and CRC32), size, crc, none"
     ),
     "verify_max": Value(size(0, _SIZE_MAX), "largest file whose CRC32 is asked for by auto: 4M"),
-    "when_armed": Value(choice("ro", "ok"), "an armed vehicle is read-only: ro, or ok"),
+    "when_armed": Value(Choice("ro", "ok"), "an armed vehicle is read-only: ro, or ok"),
     "local": Value(patterns, "names that never reach the card; +PATTERN adds to them"),
     "trace": Value(text_value, "every request and reply as a line of JSON there"),
     "tlog": Value(text_value, "raw MAVLink log there"),

@@ -59,6 +59,15 @@ class Terminal:
         os.close(self._ours)
         return self.child.wait(max(1.0, deadline - time.monotonic()))
 
+    def type(self, text: str) -> None:
+        """Press the keys of a text."""
+        os.write(self._ours, text.encode())
+
+    def end(self) -> None:
+        """End a program that would go on."""
+        self.child.kill()
+        self.finish()
+
     def interrupt(self) -> None:
         """Do what Ctrl-C does."""
         self.child.send_signal(signal.SIGINT)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from mavftpfs.cli import install
+from mavftpfs.cli import completion, install
 from mavftpfs.cli import main as cli
 from mavftpfs.mount.options import option_help
 from mavftpfs.shared.errors import EXIT_CODES, ExitCode
@@ -79,9 +79,9 @@ def test_man_reads_the_pages_without_a_warning(pieces: dict[str, install.Piece],
         assert "drone" in said
 
 
-@pytest.mark.parametrize("shell", install.SHELLS)
+@pytest.mark.parametrize("shell", completion.SHELLS)
 def test_completions_can_be_read_and_know_the_commands(shell: str, tmp_path: Path) -> None:
-    text = install.completion(cli.whole_parser(), shell)
+    text = completion.completion(cli.whole_parser(), shell)
     assert all(name in text for name in COMMANDS)
     path = tmp_path / "mavftpfs"
     path.write_text(text)
